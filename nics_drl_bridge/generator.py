@@ -26,7 +26,7 @@ from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Settings
 from nics_drl_bridge.identify.identify import Identified, identify
 from nics_drl_bridge.identify.joined import join_recordings
-from nics_drl_bridge.identify.report import fit_report, why_useless
+from nics_drl_bridge.identify.report import explain_uselessness, format_report
 from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.sensor import AnySensor, Sensor, check_sensors
 from nics_drl_bridge.lidar.shapes import Circle, Polygon, Shape
@@ -207,7 +207,7 @@ def generate(
     identified = identify(
         recording, robot, order=order, alpha=alpha, assume=assume, strict=strict
     )
-    if (reason := why_useless(identified, robot)) and not anyway:
+    if (reason := explain_uselessness(identified)) and not anyway:
         raise FitError(reason)
     # It may have another state, if the fit fell back to the textbook.
     robot = identified.drive.spec
@@ -222,7 +222,7 @@ def generate(
         bake(lidar, (*shapes, footprint_shape(robot))),
         identified.noise,
         round(round(steps) * dt, 9),
-        fit_report(recording.source, robot, identified),
+        format_report(recording.source, identified),
         recording.latency,
         tuple(sensors),
         identified.recording.gyro is not None,

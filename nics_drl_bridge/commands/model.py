@@ -359,7 +359,7 @@ def generate(
             sensors,
         )
         save_model(model, out)
-    from nics_drl_bridge.identify.report import opening
+    from nics_drl_bridge.identify.report import select_opening
     from nics_drl_bridge.report.fit_page import write_fit_page
     from nics_drl_bridge.report.fit_pictures import write_pictures
 
@@ -369,7 +369,7 @@ def generate(
             write_pictures(spec, identified, out / "pictures")
     why = "" if lidar or spec.lidar else ", as none is named: --lidar says which"
     lines = (
-        f"{opening(model.report)}\n",
+        f"{select_opening(model.report)}\n",
         f"its lidar is {model.lidar.name!r}{why}",
         f"all figures: {out / 'report.txt'}, with pictures: {out / 'report.html'}",
         f"model written to {out}",
@@ -392,13 +392,13 @@ def names_of_sources(recordings: Sequence[Path]) -> list[str]:
 def fit_facts(out: Path, robot: str, identified: "Identified") -> dict[str, Any]:
     """Returns the conclusion, equations and errors of a fit."""
     from nics_drl_bridge.identify.conclusion import conclude
-    from nics_drl_bridge.identify.report import equations_with_errors
+    from nics_drl_bridge.identify.report import format_equations
 
     return {
         "model": str(out),
         "robot": robot,
         **conclude(identified)._asdict(),
-        "equations": equations_with_errors(identified.model),
+        "equations": format_equations(identified.model),
         "errors": [asdict(each) for each in identified.judgement],
         "report": str(out / "report.txt"),
         "page": str(out / "report.html"),

@@ -222,6 +222,19 @@ class TimingEstimate:
     motors: Motors | None = None
 
 
+def check_state_is_known(recording: Recording, spec: RobotSpec) -> None:
+    """Raises RecordingError for a state that nothing measured, and that nothing determines."""
+    missing = [v.name for v in spec.state if v.must_be_measured]
+    if recording.state is not None or not missing:
+        return
+    place = recording.source
+    fault = f"no measured state, and {missing[0]!r} of robot {spec.name!r} follows no command"
+    inspect = f"`nics inspect {place} --map my.yaml`"
+    advice = f"start a mapping, which needs no `follows:`, with {inspect}"
+    advice += ", or record the state too, or add `follows:` to the robot's YAML file"
+    raise RecordingError(f"{place}: {fault}; {advice}.")
+
+
 def timing_of(drive: Drive) -> TimingEstimate:
     """Estimates clock offset, latency and lags as far as the recording allows (RecordingError)."""
     recording = drive.recording
@@ -230,15 +243,7 @@ def timing_of(drive: Drive) -> TimingEstimate:
     command = recording.command
     state = recording.state
     place = recording.source
-    missing = [v.name for v in spec.state if v.must_be_measured]
-    if state is None and missing:
-        fault = f"no measured state, and {missing[0]!r} of robot {spec.name!r} follows no command"
-        inspect = f"`nics inspect {place} --map my.yaml`"
-        advice = f"start a mapping, which needs no `follows:`, with {inspect}"
-        advice += (
-            ", or record the state too, or add `follows:` to the robot's YAML file"
-        )
-        raise RecordingError(f"{place}: {fault}; {advice}.")
+    check_state_is_known(recording, spec)
     if len(twists.start) < MIN_STAMPS:
         fault = f"pose: only {len(twists.start)} usable intervals"
         raise RecordingError(

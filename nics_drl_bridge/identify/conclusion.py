@@ -9,7 +9,7 @@ from nics_drl_bridge.identify.command_doubts import doubts_of_commands
 from nics_drl_bridge.identify.excitation import narrow
 from nics_drl_bridge.identify.gyro import relative_to
 from nics_drl_bridge.identify.identify import Identified
-from nics_drl_bridge.identify.verdict import Doubt, Mistake, missed
+from nics_drl_bridge.identify.verdict import Doubt, Mistake, list_missed
 from nics_drl_bridge.robot.kinds import describe_overdrive
 from nics_drl_bridge.robot.taylor import EndErrors
 
@@ -43,7 +43,7 @@ def conclude(identified: Identified) -> Conclusion:
     assessment = identified.assessment
     wrong = tuple(str(note) for note in identified.notes if isinstance(note, Mistake))
     strange = tuple(str(note) for note in identified.notes if isinstance(note, Doubt))
-    replaced = identified.findings.replaced
+    replaced = identified.findings.replacement
     about = (
         *wrong,
         *strange,
@@ -67,7 +67,7 @@ def _advice(identified: Identified, mistaken: bool, strange: bool, gaps: bool) -
     duration = identified.drive.duration_s
     if mistaken:
         return "fix the mapping as described above, or the robot's own driver, and generate again"
-    if missed(identified.fit, identified.drive.spec) or identified.model.assumed:
+    if list_missed(identified.fit, identified.drive.spec) or identified.model.assumed:
         return f"record another drive as described above; {UNSEEN}"
     if not identified.judgement:
         return f"record a longer drive than these {duration:.0f} s, best 60 s, and generate again"

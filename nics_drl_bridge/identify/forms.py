@@ -16,7 +16,7 @@ from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.motion import as_smooth, half_width
 from nics_drl_bridge.identify.signals import taken
-from nics_drl_bridge.identify.terms import linear_fit, sided
+from nics_drl_bridge.identify.terms import fit_motion_terms, tells_lever_from_wheels
 from nics_drl_bridge.identify.yardstick import structure_of
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.curve import InputCurve
@@ -248,7 +248,7 @@ def inputs_of(
             np.percentile(np.abs(rates[name]), STRONG) / max(np.mean(value**2), 1e-3)
         )
         rows[f"{name}.drag"] = (0.1 * size, 0.1 * size, 0.0, size)
-        for place in _drivers(drive.spec):
+        for place in list_driving_commands(drive.spec):
             effect = np.abs(samples.x[:, len(drive.spec.state) + place] * value)
             size = float(
                 np.percentile(np.abs(rates[name]), STRONG) / max(effect.mean(), 1e-3)
@@ -261,7 +261,7 @@ def inputs_of(
             rows[f"{name}.{word}"] = (size, 0.3 * size, 0.1 * size, 10.0 * size)
     if not drive.spec.state:  # the remaining error of the mounting
         reach = 2.0 * drive.spec.footprint_radius
-        aside = reach if sided(drive.spec) else 0.0
+        aside = reach if tells_lever_from_wheels(drive.spec) else 0.0
         rows["x"] = (0.0, LEVER_SCALE_M, -reach, reach)
         rows["y"] = (0.0, LEVER_SCALE_M, -aside, aside)
         rows["heading"] = (0.0, TURN_SCALE, -np.pi, np.pi)
@@ -310,7 +310,7 @@ def two_way(drive: Drive, samples: Samples) -> tuple[InputCurve, ...]:
     spec = drive.spec
     command = samples.x[:, len(spec.state) :]
     found = []
-    for place in _drivers(spec):
+    for place in list_driving_commands(spec):
         reach = command[:, place]
         if min((reach < 0.0).mean(), (reach > 0.0).mean()) > TWO_WAY:
             low = float(reach.min())
@@ -321,7 +321,7 @@ def two_way(drive: Drive, samples: Samples) -> tuple[InputCurve, ...]:
     return tuple(found)
 
 
-def _drivers(spec: RobotSpec) -> tuple[int, ...]:
+def list_driving_commands(spec: RobotSpec) -> tuple[int, ...]:
     """Returns the indices of the commands that drive a robot ahead, according to its textbook."""
     given = structure_of(spec)
     return () if given is None else tuple(np.flatnonzero(given[0][0]).tolist())
@@ -330,7 +330,7 @@ def _drivers(spec: RobotSpec) -> tuple[int, ...]:
 def with_dead(form: Form, drive: Drive, samples: Samples) -> Form:
     """Returns a form in which each command that drives the robot has a dead zone."""
     bent = {c.command: c for c in form.curves}
-    for place in _drivers(drive.spec):
+    for place in list_driving_commands(drive.spec):
         name = drive.spec.command[place].name
         reach = samples.x[:, len(drive.spec.state) + place]
         low = min(float(reach.min()), 0.0)
@@ -444,5 +444,7 @@ def _left(spec: RobotSpec, samples: Samples, command: Array) -> float:
     free = [3 + i for i, v in enumerate(spec.state) if v.twist] or [0, 2]
     x = np.concatenate([samples.x[:, :states], command], axis=1)
     return float(
-        (1.0 - linear_fit(replace(samples, x=x), spec, DELAY_ORDER).r2[free]).sum()
+        (
+            1.0 - fit_motion_terms(replace(samples, x=x), spec, DELAY_ORDER).r2[free]
+        ).sum()
     )

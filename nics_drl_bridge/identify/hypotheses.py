@@ -72,10 +72,12 @@ class Draft:
         samples = self.problem.samples
         spec = self.spec
         samples = samples if inside is None else samples.rows(inside)
-        allowed = partial(terms.by_textbook, tyres=self.form.tyres)
-        model = terms.linear_fit(samples, spec, BASE_ORDER, allowed).model
-        model, first = (model, None) if other is None else terms.together(model, other)
-        free = (model.coefficients != 0.0) & ~terms.defined(spec)[:, None]
+        allowed = partial(terms.select_textbook_terms, tyres=self.form.tyres)
+        model = terms.fit_motion_terms(samples, spec, BASE_ORDER, allowed).model
+        model, first = (
+            (model, None) if other is None else terms.merge_terms(model, other)
+        )
+        free = (model.coefficients != 0.0) & ~terms.select_defined_dofs(spec)[:, None]
         found = shooting.fitted(
             self.problem,
             model,
@@ -85,7 +87,7 @@ class Draft:
             BASE_EVALUATIONS,
             first=first,
         )
-        return replace(found, model=terms.stable(found.model, spec))
+        return replace(found, model=terms.stabilise(found.model, spec))
 
     def refined(
         self,
@@ -96,10 +98,10 @@ class Draft:
         pull: float = shooting.PULL,
     ) -> shooting.Predictive:
         """Adjusts the terms of a linear fit, and those of a base that they are pulled towards."""
-        base, first = terms.together(base, linear)
-        free = ((base.coefficients != 0.0) | (first != 0.0)) & ~terms.defined(
-            self.spec
-        )[:, None]
+        base, first = terms.merge_terms(base, linear)
+        free = (
+            (base.coefficients != 0.0) | (first != 0.0)
+        ) & ~terms.select_defined_dofs(self.spec)[:, None]
         return shooting.fitted(
             self.problem, base, free, self.inputs, inside, evaluations, pull, first
         )
@@ -156,7 +158,8 @@ class Draft:
         base = self.base(inside).model
         orders = {order for order, _ in asked if order}
         linear = {
-            order: terms.linear_fit(samples, self.spec, order).model for order in orders
+            order: terms.fit_motion_terms(samples, self.spec, order).model
+            for order in orders
         }
         for order, pull in asked:
             found = base
@@ -228,7 +231,7 @@ def changes(
     late = forms.likely_delays(drive, calibration, samples)
     if late:  # first, because a wrong delay hides other effects and is hidden by them
         yield lambda form: replace(form, delays=late), WORTH
-    if terms.tyres_slip(drive.spec):
+    if terms.has_slipping_tyres(drive.spec):
         yield lambda form: replace(form, tyres=True), WORTH
     if speeds:
         yield lambda form: replace(form, drag=speeds, friction=speeds), WORTH

@@ -1,9 +1,19 @@
-"""Identification of a model from a recording: the stages `STAGES`, run over a prepared drive."""
+"""Identification: a recording becomes a model, by the stages that `list_stages` lists in order.
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+A stage is a function `(drive, findings) -> findings`. It may take its data from three drives:
+
+- `findings.training` is the part to learn from, without faulty rows. All that a model or a
+  calibration is fitted to comes from here.
+- `findings.whole` is the whole drive, without faulty rows. It serves to judge a model on the part
+  held out from the fit, to measure the sensors' noise, and to fit the final model.
+- `drive` is the drive as recorded. A stage takes from it the robot, the settings, the names of
+  sources, and whether a state was measured: `derive_motion` adds one to the other two.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -14,19 +24,30 @@ from nics_drl_bridge.identify import (
     followers,
     hypotheses,
     open_loop,
-    shooting,
     verdict,
 )
 from nics_drl_bridge.identify import clocks as timings
 from nics_drl_bridge.identify import fit as fitting
 from nics_drl_bridge.identify import motion as motions
-from nics_drl_bridge.identify.acceptance import shortfall
 from nics_drl_bridge.identify.assume import assume_textbook
-from nics_drl_bridge.identify.by_recording import about_recordings
 from nics_drl_bridge.identify.calibration import Calibration, Response, align
 from nics_drl_bridge.identify.command_doubts import doubts_of_commands
 from nics_drl_bridge.identify.drive import Drive, Settings
-from nics_drl_bridge.identify.forms import CLEAR, curve_of, likely_delay, reached
+from nics_drl_bridge.identify.findings import (
+    Findings,
+    require,
+    require_fit,
+    require_model,
+    require_samples,
+    resample_drive,
+)
+from nics_drl_bridge.identify.forms import (
+    CLEAR,
+    curve_of,
+    likely_delay,
+    list_driving_commands,
+    reached,
+)
 from nics_drl_bridge.identify.gyro import turned_by_gyro
 from nics_drl_bridge.identify.judgement import (
     bands_of,
@@ -34,9 +55,11 @@ from nics_drl_bridge.identify.judgement import (
     judged,
     textbook_of,
 )
-from nics_drl_bridge.identify.mounting import Mounting, mounted, mounting_of
+from nics_drl_bridge.identify.motion_fit import fit_motion, refine_motion
+from nics_drl_bridge.identify.mounting import mounted, mounting_of
 from nics_drl_bridge.identify.noise import motion_noise, sensor_noise
-from nics_drl_bridge.identify.refine import refined
+from nics_drl_bridge.identify.notes import collect_notes, list_plain_calibration_notes
+from nics_drl_bridge.identify.refine import refine_by_predictions
 from nics_drl_bridge.identify.repair import (
     check_axes,
     check_commands,
@@ -46,7 +69,7 @@ from nics_drl_bridge.identify.repair import (
     repaired,
 )
 from nics_drl_bridge.identify.signals import speed_index
-from nics_drl_bridge.identify.terms import linear_fit, shared, through_state
+from nics_drl_bridge.identify.terms import select_terms_through_state
 from nics_drl_bridge.identify.textbook_model import (
     actuated_spec,
     needs_actuators,
@@ -57,679 +80,88 @@ from nics_drl_bridge.identify.textbook_model import (
 from nics_drl_bridge.identify.yardstick import Yardstick, fit_yardstick
 from nics_drl_bridge.recording.joining import LEARNT_SHARE
 from nics_drl_bridge.recording.recording import Recording, Samples, Stream, check
-from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.noise import Noise
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import HorizonErrors, TaylorModel
 from nics_drl_bridge.threads import one_blas_thread
 
-T = TypeVar("T")
-
 # orders that `auto` chooses from if the state follows commands
 ORDERS_OF_INFERRED = (2, 3, 4)
-
-
-@dataclass(frozen=True)
-class Findings:
-    """Findings of the stages in order; None or empty before they have run, or if not learnable."""
-
-    training: Drive  # the training part of the drive, repaired by `repair`
-    whole: Drive  # the whole drive, repaired by `repair`
-    timing: timings.TimingEstimate  # of `clocks`; nominal before
-    repairs: tuple[str, ...] = ()  # sentences from `repair`
-    # (n,) expected over the training part's twists, from `mounting`
-    speed: Array | None = None
-    mounting: Mounting | None = None  # from `mounting`
-    # From `clocks`, `mounting`, `responses` and `noise`; then from `refine`.
-    calibration: Calibration = field(default_factory=Calibration)
-    # the pose sensor's from `noise`; the rest from `judge`
-    noise: Noise = field(default_factory=Noise)
-    # from `motion`: half-width [s] of the parabolas that gave the state; None if it was not derived
-    width: float | None = None
-    samples: Samples | None = None  # of the training part on one time axis, from `fit`
-    clear: tuple[InputCurve, ...] = ()  # input curves beyond doubt, from `inputs`
-    base: hypotheses.Base | None = None  # of the textbook's terms, from `fit`
-    # of orders, on parts of the training part, from `fit`
-    trials: tuple[hypotheses.Trial, ...] = ()
-    regression: fitting.Regression | None = None  # on all features (Eq. 1), from `fit`
-    linear: fitting.Fit | None = None  # the pruned fit (Eq. 2), from `prune`
-    model: TaylorModel | None = None  # from `prune`; then from `refine` and `complete`
-    refinement: tuple[str, ...] = ()  # sentences from `refine`
-    assumptions: tuple[str, ...] = ()  # sentences from `complete`
-    unseen: Samples | None = None  # of the part that the fit did not see, from `judge`
-    # open-loop errors on that part, from `judge`
-    held_out: open_loop.OpenLoop | None = None
-    # on that part, compared with yardsticks, from `judge`
-    judgement: tuple[HorizonErrors, ...] = ()
-    # the textbook fitted to the training part, from `judge`
-    yardstick: Yardstick | None = None
-    # sentence on the model that the textbook replaced, from `settle`
-    replaced: str = ""
-    notes: tuple[str, ...] = ()  # all sentences, from `judge`
-    # on all data, from `refit`; None if the trial's model is kept
-    refit: "Findings | None" = None
-
+NO_PATH_M = 1e-9  # length of a path that counts as none
 
 Stage = Callable[[Drive, Findings], Findings]
 
 
-def known(found: T | None, name: str, stage: str) -> T:
-    """Returns a finding that a later stage needs. Raises FitError if it is missing."""
-    if found is None:
-        raise FitError(
-            f"{name} is missing; put the stage {stage!r} before those that need it."
-        )
-    return found
+@one_blas_thread
+@np.errstate(over="ignore", invalid="ignore")  # a diverging model shows in its figures
+def identify(
+    recording: Recording,
+    spec: RobotSpec,
+    order: fitting.Order = Settings.order,
+    alpha: fitting.Alpha = Settings.alpha,
+    train_until: float | None = None,
+    assume: bool = Settings.assume,
+    strict: bool = Settings.strict,
+) -> "Identified":
+    """Learns a model from the first part of a recording, tests it on the rest, and refits it.
 
+    Args:
+        recording: a drive of the robot.
+        spec: the robot.
+        order: of the Taylor expansion (Eq. 1), or `auto`.
+        alpha: threshold of the pruning (Eq. 2), or `auto`.
+        train_until: end of the first part, from the first pose [s]; by default two thirds.
+        assume: completes the model by the textbook for inputs that never moved.
+        strict: refuses a drive that did not move every input independently.
 
-def _fitted(findings: Findings) -> tuple[fitting.Fit, TaylorModel]:
-    name = "the pruned fit"
-    return known(findings.linear, name, "prune"), known(findings.model, name, "prune")
-
-
-def repair(drive: Drive, findings: Findings) -> Findings:
-    """Refuses other units, axes and orders; drops repeated rows and jumps, clips commands."""
-    check_pose_moves(findings.training)
-    training, _ = repaired(findings.training)
-    whole, repairs = repaired(findings.whole)
-    repairs += check_commands(training, findings.training.recording.command)
-    check_units(drive)
-    check_axes(training)
-    repairs += check_encoders(training)
-    check(training.recording, drive.spec)
-    return replace(findings, training=training, whole=whole, repairs=repairs)
-
-
-def clocks(drive: Drive, findings: Findings) -> Findings:
-    """Finds the period of bursts, the clock offset, the latency of commands, and lags."""
-    training = findings.training
-    spec = drive.spec
-    derived = motions.by_motion(spec, drive.recording)
-    followed = replace(training, spec=motions.surrogate(spec)) if derived else training
-    found = timings.timing_of(followed)
-    if not derived:
-        found = followers.apart(training, found)
-    names = [c.name for c in spec.command]
-    responses = (
-        Response(v.name, v.follows, float(found.lags[names.index(v.follows)]))
-        for v in spec.state
-        if derived and v.follows and v.twist is None
+    Raises:
+        RecordingError: the recording is unusable for this robot.
+        FitError: it does not show enough to fit a model.
+    """
+    drive = Drive(turned_by_gyro(check(recording, spec)), spec)
+    until = train_until if train_until is not None else recording.learn_until_s
+    until = LEARNT_SHARE * drive.duration_s if until is None else until
+    settings = Settings(
+        order=order, alpha=alpha, train_until_s=until, assume=assume, strict=strict
     )
-    calibration = replace(
-        findings.calibration,
-        responses=tuple(responses),
-        uncertainty=found.sigma,
-        inputs=followers.late_inputs(spec, found),
-        limits=followers.limits_of(spec, found),
-        clock_offset_s=found.offset,
-        command_latency_s=found.latency,
-        burst_period_s=training.bursts.period_s if training.bursts else 0.0,
-    )
-    return replace(findings, timing=found, calibration=calibration)
+    trial = run(list_stages(), replace(drive, settings=settings))
+    return _make_result(trial, trial.final or trial)
 
 
-def mounting(drive: Drive, findings: Findings) -> Findings:
-    """Finds where and how the tracked body is mounted on the robot."""
-    training = findings.training
-    states = None
-    place = speed_index(drive.spec)
-    if drive.spec.state and not motions.by_motion(drive.spec, drive.recording):
-        states = timings.expected_states(training, training.twists, findings.timing)
-    found = mounting_of(training, findings.timing, states)
-    speed = None if states is None or place is None else states[:, place]
-    calibration = mounted(findings.calibration, found)
-    return replace(findings, speed=speed, mounting=found, calibration=calibration)
-
-
-def responses(drive: Drive, findings: Findings) -> Findings:
-    """Finds how unmeasured states follow the commands, and the scale of the wheels."""
-    training = findings.training
-    calibration = findings.calibration
-    found = calibration.responses
-    if not motions.by_motion(drive.spec, drive.recording):
-        found = timings.responses_of(
-            training, calibration, findings.timing, findings.speed
-        )
-    calibration = timings.with_wheels(training, replace(calibration, responses=found))
-    return replace(findings, calibration=calibration)
-
-
-def noise(drive: Drive, findings: Findings) -> Findings:
-    """Measures the noise of the pose; a drive without noise and corrections is treated as exact."""
-    position, heading = findings.training.pose_noise or (0.0, 0.0)
-    noisy = replace(
-        findings.calibration, position_noise_m=position, heading_noise_rad=heading
-    )
-    return replace(findings, calibration=noisy, noise=sensor_noise(findings.whole))
-
-
-def motion(drive: Drive, findings: Findings) -> Findings:
-    """Derives the state from the poses, if it is an unmeasured part of the twist."""
-    if not motions.by_motion(drive.spec, drive.recording):
-        return findings
-    calibration = findings.calibration
-    width = motions.half_width(findings.training)
-    parts = []
-    for part in (findings.training, findings.whole):
-        grid = motions.grid_of(part, calibration, drive.settings.control_period_s)
-        parts.append(motions.with_motion(part, calibration, grid, width))
-    return replace(findings, training=parts[0], whole=parts[1], width=width)
-
-
-def aligned(drive: Drive, findings: Findings) -> Samples:
-    """Resamples a drive on one time axis, using the findings."""
-    if findings.width is None:
-        return align(drive, findings.calibration)
-    return motions.samples_of(drive, findings.calibration, findings.width)
-
-
-def inputs(drive: Drive, findings: Findings) -> Findings:
-    """Finds the latency, and the dead zones and saturation of commands, that explain a motion."""
-    if findings.width is None:
-        return findings
-    training = findings.training
-    samples = aligned(findings.training, findings)
-    findings = _with_delay(findings, samples)
-    samples = aligned(training, findings)
-    places = range(len(drive.spec.command))
-    curves = [
-        c for place in places if (c := curve_of(samples, drive.spec, place)) is not None
-    ]
-    calibration = replace(findings.calibration, inputs=tuple(c.curve for c in curves))
-    clear = tuple(c.curve for c in curves if c.gain >= CLEAR)
-    findings = replace(findings, calibration=calibration, clear=clear)
-    return _with_delay(findings, aligned(training, findings))
-
-
-def _with_delay(findings: Findings, samples: Samples) -> Findings:
-    delay = likely_delay(findings.training, findings.calibration, samples)
-    return replace(
-        findings, calibration=replace(findings.calibration, command_latency_s=delay)
-    )
-
-
-def _fit_of_motion(drive: Drive, findings: Findings) -> Findings:
-    """Fits the order that best predicts parts of the training data that its fits did not see."""
-    training = findings.training
-    spec = drive.spec
-    order = drive.settings.order
-    samples = aligned(training, findings)
-    try:
-        base = hypotheses.base_of(
-            training, findings.calibration, samples, findings.clear, findings.base
-        )
-        trials = findings.trials  # a refit reuses the choice
-        trials = trials or base.draft.tried(hypotheses.hypotheses(order))
-    except FitError as error:
-        raise FitError(f"{drive.recording.source}: {error}") from None
-    best = hypotheses.chosen(trials, order).order
-    curves = base.draft.form.curves_at(base.draft.inputs, base.found.values)
-    findings = replace(
-        findings, calibration=replace(findings.calibration, inputs=curves)
-    )
-    samples = aligned(training, findings)
-    linear = linear_fit(samples, spec, best or hypotheses.BASE_ORDER)
-    if drive.settings.strict:
-        verdict.refuse_unexcited(linear.regression.excitation, spec)
-    return replace(
-        findings,
-        samples=samples,
-        regression=linear.regression,
-        linear=linear,
-        model=replace(linear.model, inputs=curves),
-        trials=trials,
-        base=base,
-    )
-
-
-def fit(drive: Drive, findings: Findings) -> Findings:
-    """Resamples the streams on one time axis, and fits all terms by least squares (Eq. 1)."""
-    if findings.width is not None:
-        return _fit_of_motion(drive, findings)
-    calibration = findings.calibration
-    spec = drive.spec
-    settings = drive.settings
-    if spec.state and drive.recording.state is None:
-        known(calibration.responses or None, "the response of each state", "responses")
-    samples = align(findings.training, calibration)
-    trials = findings.trials
-    samples = followers.unlimited(samples, calibration, spec)
-    inferred = drive.recording.state is None and not calibration.is_exact
-    # a refit reuses the trials
-    if settings.order == "auto" and inferred and not trials:
-        trials = _trials_of_orders(drive, findings)
-    order = fitting.ORDER if settings.order == "auto" else settings.order
-    order = hypotheses.chosen(list(trials)).order if trials else order
-    centred = "lever_arm_y_m" in calibration.uncertainty
-    library = partial(through_state, centred=centred) if inferred else None
-    try:
-        regression = fitting.regress(
-            samples, spec, order, not calibration.is_exact, library
-        )
-    except FitError as error:
-        raise FitError(f"{drive.recording.source}: {error}") from None
-    if settings.strict:
-        verdict.refuse_unexcited(regression.excitation, spec)
-    return replace(findings, samples=samples, regression=regression, trials=trials)
-
-
-def _trials_of_orders(drive: Drive, findings: Findings) -> tuple[hypotheses.Trial, ...]:
-    """Tries each order on parts of the training data that its fits did not see."""
-    training = findings.training
-    trials = []
-    span = 0.0, training.duration_s, hypotheses.HORIZON_S, open_loop.SPACING_S
-    path = open_loop.windows(training, findings.calibration, *span).path
-    for order in ORDERS_OF_INFERRED:
-        errors = _left_out(drive, findings, order)
-        if hypotheses.HORIZON_S not in errors:
-            break
-        share = float(
-            errors[hypotheses.HORIZON_S].mean() / max(float(path.mean()), 1e-9)
-        )
-        trials.append(hypotheses.Trial(order, 0.0, share, errors))
-    return tuple(trials)
-
-
-def prune(drive: Drive, findings: Findings) -> Findings:
-    """Keeps the terms of Eq. 2, and refits them."""
-    regression = known(findings.regression, "the fit of all terms", "fit")
-    # keeps what mirror symmetry allows, because predictions weight these terms
-    if findings.width is not None:
-        return findings
-    linear = fitting.prune_and_refit(regression, drive.spec, drive.settings.alpha)
-    limits = followers.scaled_limits(findings.calibration, drive.spec)
-    model = replace(linear.model, inputs=findings.calibration.inputs, limits=limits)
-    return replace(findings, linear=replace(linear, model=model), model=model)
-
-
-def refine(drive: Drive, findings: Findings) -> Findings:
-    """Adjusts model and calibration to predictions over seconds, unless the drive is exact."""
-    _, model = _fitted(findings)
-    if findings.width is not None:
-        return _refined_motion(drive, findings)
-    if findings.calibration.is_exact:
-        return findings
-    tried = verdict.tried(model, findings.calibration, findings.training, 0.0)
-    if (
-        drive.settings.order == "auto"
-        and not findings.trials
-        and verdict.ran_away(tried)
-    ):
-        linear = replace(drive, settings=replace(drive.settings, order=1))
-        found = run((fit, prune, refine), linear, findings)
-        return replace(found, refinement=(*found.refinement, verdict.LINEAR))
-    model, calibration, note = refined(model, findings.calibration, findings.training)
-    sentences = (note, *hypotheses.about_orders(findings.trials))
-    return replace(findings, model=model, calibration=calibration, refinement=sentences)
-
-
-def _refined_motion(drive: Drive, findings: Findings) -> Findings:
-    linear, _ = _fitted(findings)
-    calibration = findings.calibration
-    spec = drive.spec
-    base = known(findings.base, "the base", "fit")
-    best = hypotheses.chosen(findings.trials, drive.settings.order)
-    draft = base.draft
-    book = base.found.model
-
-    def refined_by(draft: hypotheses.Draft) -> tuple[shooting.Predictive, bool]:
-        if best.order:
-            found = draft.refined(book, linear.model, pull=best.pull)
-        else:
-            found = None
-        if found is None or draft.error_of(found) > verdict.WORSE * draft.error_of(
-            base.found
-        ):
-            return draft.base(other=book), best.order == 0  # the search may diverge
-        return found, True
-
-    found, kept_order = refined_by(draft)
-    if draft.problem.mounted:
-        certain = hypotheses.with_certain_mounting(draft, calibration, found)
-        if certain is not None:
-            sigmas = hypotheses.remounted(calibration, found).uncertainty
-            calibration = replace(calibration, uncertainty=sigmas)
-            draft = certain
-            found, kept_order = refined_by(certain)
-    calibration = replace(
-        calibration,
-        command_latency_s=draft.form.latency_at(draft.inputs, found.values),
-        inputs=draft.form.curves_at(draft.inputs, found.values),
-        uncertainty=calibration.uncertainty | found.named_errors(draft.inputs.names),
-    )
-    values = found.values.copy()
-    if draft.problem.mounted:
-        calibration = hypotheses.remounted(calibration, found)
-        values[-3:] = 0.0
-    base = replace(
-        base, draft=replace(draft, inputs=replace(draft.inputs, start=values))
-    )
-    curves = draft.form.curves_at(draft.inputs, base.found.values)
-    lags = hypotheses.lags_of(replace(base.found.model, inputs=curves), spec)
-    sums: tuple[str, ...] = ()
-    if lags:
-        beside = draft.form.latency_at(draft.inputs, base.found.values)
-        sums = (hypotheses.about_lags(calibration.command_latency_s, lags, beside),)
-        told = {
-            n: e for n, e in calibration.uncertainty.items() if n != "command_latency_s"
-        }
-        calibration = replace(calibration, uncertainty=told)
-    errors = hypotheses.standard_errors(found)
-    model = replace(found.model, std_errors=errors, inputs=calibration.inputs)
-    model = shared(model, spec, known(findings.samples, "the training part", "fit"))
-    return replace(
-        findings,
-        calibration=calibration,
-        model=model,
-        base=base,
-        refinement=(
-            f"Coefficients and latency were refined by the open-loop errors over up to "
-            f"{max(shooting.HORIZONS_S):g} s.",
-            *sums,
-            *hypotheses.about_forms(base, findings.trials, drive.settings.order),
-            *about_options(drive, best.order, kept_order),
-        ),
-    )
-
-
-def about_options(drive: Drive, order: int, kept_order: bool) -> Iterator[str]:
-    """Yields the options that had no effect on a model whose state is the motion."""
-    settings = drive.settings
-    if settings.alpha != "auto":
-        why = "where the state is the motion, predictions of parts of the drive weight the terms"
-        yield f"alpha = {settings.alpha:g} was not used: {why}."
-    if settings.order != "auto" and not kept_order:
-        why = "predictions with its terms diverged, so only the textbook's terms were kept"
-        yield f"order = {order} was not used: {why}."
-
-
-def complete(drive: Drive, findings: Findings) -> Findings:
-    """Completes the model by the textbook for inputs that never moved, if requested."""
-    if not drive.settings.assume:
-        return findings
-    linear, model = _fitted(findings)
-    model, assumptions = assume_textbook(model, drive.spec, linear.unmoved)
-    return replace(findings, model=model, assumptions=assumptions)
-
-
-def judge(drive: Drive, findings: Findings) -> Findings:
-    """Tests the model on unseen data, measures what it leaves unexplained, and lists doubts."""
-    linear, model = _fitted(findings)
-    spec = drive.spec
-    whole = findings.whole
-    calibration = findings.calibration
-    samples = aligned(whole, findings)
-    begin = (
-        whole.recording.pose.t[0]
-        + calibration.clock_offset_s
-        + drive.settings.train_until_s
-    )
-    rest = samples.rows(samples.t > begin)
-    unseen = rest if len(rest.t) >= verdict.MIN_ROWS else None
-    held_out = verdict.tried(model, calibration, whole, drive.settings.train_until_s)
-    bands: dict[float, float] = {}
-    yardstick = findings.yardstick or textbook_of(whole, calibration)
-    if findings.replaced:
-        bands = bands_of_fixed(model, calibration, findings.training)
-    elif not calibration.is_exact and drive.duration_s > drive.settings.train_until_s:
-        derived = None
-        if findings.base is not None:
-            derived = aligned(findings.training, findings), findings.base
-        bands = bands_of(model, calibration, findings.training, derived)
-    judgement = judged(model, calibration, whole, bands, yardstick)
-    rated = verdict.with_quality(model, linear, unseen, held_out, judgement, spec)
-    findings = replace(
-        findings,
-        model=rated,
-        unseen=unseen,
-        held_out=held_out,
-        judgement=judgement,
-        yardstick=yardstick,
-        calibration=replace(calibration, notes=_plain(findings)),
-        noise=motion_noise(findings.noise, whole, calibration, model, samples),
-        linear=replace(linear, model=rated) if model is linear.model else linear,
-    )
-    return replace(findings, notes=_notes(drive, findings))
-
-
-def _with_actuators(
-    drive: Drive, findings: Findings, yardstick: Yardstick
-) -> tuple[Drive, Findings]:
-    """Returns a drive of a steered robot, and its findings, with speed and angle as state."""
-    calibration = findings.calibration
-    spec = actuated_spec(yardstick, findings.whole)
-    parts = [
-        with_actuators(part, spec, yardstick, calibration)
-        for part in (findings.training, findings.whole)
-    ]
-    actuated = replace(findings, training=parts[0], whole=parts[1], width=None)
-    return replace(drive, spec=spec), actuated
-
-
-def settle(drive: Drive, findings: Findings) -> Findings:
-    """Replaces a model by the fitted textbook if that predicts unseen data better."""
-    if findings.yardstick is None or not acceptance.loses_to_textbook(
-        findings.judgement
-    ):
-        return findings
-    _, model = _fitted(findings)
-    spec = drive.spec
-    until = drive.settings.train_until_s
-    start_spec = spec
-    try:
-        yardstick = fit_yardstick(
-            findings.whole, until, findings.calibration.clock_offset_s, one_limit=True
-        )
-        calibration = textbook_calibration(yardstick, findings.calibration, spec)
-        start = motion(drive, replace(findings, calibration=calibration))
-        if needs_actuators(yardstick, spec):
-            drive, start = _with_actuators(drive, start, yardstick)
-            spec = drive.spec
-        samples = aligned(start.training, start)
-        if spec is not start_spec:  # these figures are of another state's rates
-            linear = fitting.fit(samples, spec, noisy=True)
-            start = replace(start, regression=linear.regression, linear=linear)
-        book = textbook_model(yardstick, model, samples, spec)
-        if book is None:
-            return findings
-        (lost,) = acceptance.usual(findings.judgement)
-        tried = replace(
-            start,
-            model=book,
-            samples=samples,
-            refinement=(),
-            trials=(),
-            assumptions=(),
-            replaced=verdict.replaced_by_textbook(lost),
-        )
-        tried = judge(drive, tried)
-    except (FitError, RecordingError):
-        return findings
-    won = acceptance.usual(tried.judgement)
-    if won and won[0].model.position_m < lost.model.position_m:
-        return tried
-    return findings
-
-
-def _notes(drive: Drive, findings: Findings) -> tuple[str, ...]:
-    """Collects all sentences on a model, the most serious first."""
-    linear, _ = _fitted(findings)
-    spec = drive.spec
-    calibration = findings.calibration
-    beaten = [findings.replaced]
-    if not findings.replaced:
-        beaten = list(shortfall(findings.judgement))
+def list_stages() -> tuple[Stage, ...]:
+    """Returns the stages in order; each uses the findings of those before it."""
     return (
-        *about_recordings(_fitted(findings)[1], calibration, findings.whole),
-        *beaten,
-        *_why_replaced(drive, findings),
-        *drive.recording.repairs,
-        *findings.repairs,
-        *verdict.about_gaps(drive),
-        *_sentences(findings),
-        *findings.refinement,
-        *verdict.mirror_note(
-            known(findings.samples, "the training part", "fit"), spec, calibration
-        ),
-        *verdict.unlearnt(
-            linear,
-            calibration,
-            spec,
-            verdict.levels_of(findings.training.recording.command, spec),
-        ),
-        *(
-            verdict.doubts_of_fit(linear, calibration.is_exact)
-            if findings.width is None
-            else ()
-        ),
-        *verdict.untried(drive, findings.held_out, findings.judgement),
-        *findings.assumptions,
+        repair_drive,
+        estimate_timing,
+        find_mounting,
+        find_responses,
+        measure_noise,
+        derive_motion,
+        find_input_curves,
+        fit_terms,
+        prune_terms,
+        refine_model,
+        complete_model,
+        judge_model,
+        prefer_textbook,
+        refit_model,
     )
-
-
-def _why_replaced(drive: Drive, findings: Findings) -> Iterator[str]:
-    """Yields a sentence if a coarse sampling rate explains why a model lost to its textbook."""
-    if not findings.replaced or drive.recording.state is None:
-        return
-    linear, _ = _fitted(findings)
-    whole = findings.whole
-    if coarse := verdict.coarsest_state(whole.recording, whole.spec, linear.unmoved):
-        yield verdict.Gap(f"{coarse}.")
-
-
-def _left_out(
-    drive: Drive, findings: Findings, order: int | None = None
-) -> dict[float, Array]:
-    """Returns errors (W,) by horizon [s] on left-out parts; with an order, reusing the findings."""
-    training = findings.training
-    stages = STAGES[: STAGES.index(complete)]
-    pose = training.recording.pose
-    settings = replace(drive.settings, train_until_s=np.inf)
-    if order is not None:
-        stages = (fit, prune, refine)
-        settings = replace(settings, order=order)
-    errors: dict[float, list[Array]] = {h: [] for h in hypotheses.BANDS_S}
-    for block in np.array_split(np.arange(len(pose.t)), hypotheses.FOLDS):
-        others = np.ones(len(pose.t), dtype=np.bool_)
-        others[block] = False
-        rest = training.part(replace(training.recording, pose=pose.rows(others))).under(
-            settings
-        )
-        try:
-            found = run(
-                stages, rest, replace(findings, training=rest) if order else None
-            )
-        except (FitError, RecordingError):
-            return {}
-        part = training.part(replace(training.recording, pose=pose.rows(block)))
-        for horizon, errors_at in errors.items():
-            chosen = open_loop.windows(
-                part,
-                found.calibration,
-                0.0,
-                part.duration_s,
-                horizon,
-                open_loop.SPACING_S,
-            )
-            if len(chosen.start_t):
-                ends = open_loop.predict(
-                    _fitted(found)[1], found.calibration, part, chosen
-                )
-                errors_at.append(np.hypot(*(ends - chosen.end)[:, :2].T))
-    return {h: np.concatenate(each) for h, each in errors.items() if each}
-
-
-def refit(drive: Drive, findings: Findings) -> Findings:
-    """Refits the judged model to all data, unless it then predicts the training part worse."""
-    until = drive.settings.train_until_s
-    if findings.calibration.is_exact or until >= drive.duration_s or findings.replaced:
-        return findings
-    settings = replace(drive.settings, train_until_s=np.inf)
-    try:
-        start = replace(findings, training=findings.whole.under(settings))
-        stages = (motion, fit, prune, refine, complete)
-        final = run(stages, replace(drive, settings=settings), start)
-        error, before = (
-            open_loop.open_loop_error(
-                _fitted(each)[1], each.calibration, each.whole, 0.0, until
-            )
-            for each in (final, findings)
-        )
-        worse = (
-            error.mean_position_error_m > verdict.WORSE * before.mean_position_error_m
-        )
-    except (FitError, RecordingError):
-        worse = True
-    driven = drive.recording.driven_s
-    sentence = verdict.refitted(driven(until), driven(), worse)
-    if worse:
-        findings = replace(findings, refinement=(*findings.refinement, sentence))
-        return replace(findings, notes=_notes(drive, findings))
-    final = replace(
-        final,
-        refinement=(*final.refinement, sentence),
-        calibration=replace(final.calibration, notes=_plain(final)),
-        model=replace(_fitted(final)[1], quality=_fitted(findings)[1].quality),
-    )
-    return replace(findings, refit=replace(final, notes=_notes(drive, final)))
-
-
-def _plain(found: Findings) -> tuple[str, ...]:
-    # plain strings for a file, which has no kinds of sentences
-    return tuple(map(str, _sentences(found)))
-
-
-def _sentences(found: Findings) -> tuple[str, ...]:
-    drive = found.training
-    calibration = found.calibration
-    if found.replaced:  # latency, lags and mounting are those of the fitted textbook
-        timed = replace(calibration, command_latency_s=found.timing.latency)
-        return (
-            *verdict.about_stamps(drive),
-            *verdict.about_clocks(drive, timed, found.timing),
-        )
-    return (
-        *verdict.about_stamps(drive),
-        *verdict.about_clocks(drive, calibration, found.timing),
-        *followers.about_sums(calibration),
-        *verdict.about_mounting(drive, calibration, found.mounting),
-        *verdict.about_responses(drive, calibration, found.timing),
-    )
-
-
-STAGES: tuple[Stage, ...] = (
-    repair,
-    clocks,
-    mounting,
-    responses,
-    noise,
-    motion,
-    inputs,
-    fit,
-    prune,
-    refine,
-    complete,
-    judge,
-    settle,
-    refit,
-)
-"""In order; each uses the findings of those before it."""
-
-
-def begun(drive: Drive) -> Findings:
-    """Returns the findings on a drive before the first stage."""
-    training = drive.part(cut(drive.recording, drive.settings.train_until_s))
-    return Findings(training, drive, timings.nominal_timing(training))
 
 
 def run(
     stages: Sequence[Stage], drive: Drive, findings: Findings | None = None
 ) -> Findings:
-    """Runs stages over a drive, starting from given findings, and returns their findings."""
-    findings = findings or begun(drive)
+    """Runs stages over a drive as recorded, from given findings or the start; returns theirs."""
+    findings = findings or start_findings(drive)
     for stage in stages:
         findings = stage(drive, findings)
     return findings
+
+
+def start_findings(drive: Drive) -> Findings:
+    """Returns the findings on a drive as recorded, before the first stage."""
+    training = drive.part(cut(drive.recording, drive.settings.train_until_s))
+    return Findings(training, drive, timings.nominal_timing(training))
 
 
 @dataclass(frozen=True)
@@ -757,7 +189,7 @@ class Identified:
     @property
     def trial(self) -> "Identified":
         """The result of the trial: the model that was judged on data it never saw."""
-        return _result(self.findings, self.findings)
+        return _make_result(self.findings, self.findings)
 
     @property
     def recording(self) -> Recording:
@@ -792,12 +224,12 @@ class Identified:
         spec = self.drive.spec
         findings = self.findings
         mistaken = any(isinstance(note, verdict.Mistake) for note in self.notes)
-        unfit = mistaken or bool(verdict.missed(self.fit, spec))
-        textbook = bool(findings.replaced)
+        unfit = mistaken or bool(verdict.list_missed(self.fit, spec))
+        textbook = bool(findings.replacement)
         ratings = [
             acceptance.rate(self.judgement, spec.footprint_radius, textbook),
             acceptance.rate_unseen(
-                verdict.time_without_pose(self.drive), self.drive.duration_s
+                verdict.measure_time_without_pose(self.drive), self.drive.duration_s
             ),
         ]
         if unfit:
@@ -816,20 +248,11 @@ class Identified:
     @property
     def dead_zone(self) -> float:
         """Maximum of the driving command at which the robot stays at rest; 0 if none."""
-        # A state with dry friction starts to move when the command's effect exceeds the friction.
-        model = self.model
-        states = self.model.state_size
-        dead = {curve.command: curve.dead for curve in model.inputs}
-        zones = [0.0, *dead.values()]
-        for i, place in enumerate(states + model.drivers):
-            alone = np.arange(len(model.variables)) == place
-            gain = abs(
-                model.coefficients[3 + i, (model.powers == alone).all(axis=1)].sum()
-            )
-            if model.friction[i] * gain > 0.0:
-                zone = dead.get(model.variables[place], 0.0)
-                zones.append(zone + float(model.friction[i] / gain))
-        return max(zones)
+        spec = self.drive.spec
+        driving = {spec.command[place].name for place in list_driving_commands(spec)}
+        if not driving:  # no textbook says what each command moves
+            driving = {c.name for c in spec.command if not c.turns and c.unit != "rad"}
+        return _find_dead_zone(self.model, driving)
 
     @property
     def alpha(self) -> fitting.Alpha:
@@ -837,61 +260,516 @@ class Identified:
         return self.drive.settings.alpha
 
 
-@one_blas_thread
-@np.errstate(over="ignore", invalid="ignore")  # a diverging model shows in its figures
-def identify(
-    recording: Recording,
-    spec: RobotSpec,
-    order: fitting.Order = Settings.order,
-    alpha: fitting.Alpha = Settings.alpha,
-    train_until: float | None = None,
-    assume: bool = Settings.assume,
-    strict: bool = Settings.strict,
-) -> Identified:
-    """Learns a model up to `train_until` [s], and tests it on the rest; see `Settings`."""
-    # Default: two thirds. RecordingError: unusable for this robot. FitError: too little excitation.
-    drive = Drive(turned_by_gyro(check(recording, spec)), spec)
-    until = train_until if train_until is not None else recording.learn_until_s
-    until = LEARNT_SHARE * drive.duration_s if until is None else until
-    found = run(
-        STAGES, replace(drive, settings=Settings(order, alpha, until, assume, strict))
-    )
-    return _result(found, found.refit or found)
-
-
-def _result(trial: Findings, final: Findings) -> Identified:
-    linear, model = _fitted(final)
-    samples = known(final.samples, "the training part", "fit")
-    if final.width is not None:
+def _make_result(trial: Findings, final: Findings) -> Identified:
+    """Returns the result of a trial and of the final fit, which may be the same."""
+    samples = require_samples(final)
+    model = require_model(final)
+    if final.motion_width_s is not None:
         model = reached(model, final.whole, samples, final.calibration.uncertainty)
     return Identified(
-        final.whole,
-        model,
-        final.calibration,
-        linear,
-        samples,
-        trial.unseen,
-        trial.held_out,
-        trial.noise,
-        trial,
-        final.notes,
+        drive=final.whole,
+        model=model,
+        calibration=final.calibration,
+        fit=require_fit(final),
+        samples=samples,
+        unseen=trial.unseen,
+        held_out=trial.held_out,
+        noise=trial.noise,
+        findings=trial,
+        notes=final.notes,
     )
+
+
+def _find_dead_zone(model: TaylorModel, driving: set[str]) -> float:
+    """Returns the largest command of those that drive at which no state starts to move.
+
+    A state with dry friction starts when the effect of its command exceeds the friction.
+    """
+    dead = {c.command: c.dead for c in model.inputs if c.command in driving}
+    zones = [0.0, *dead.values()]
+    for i, place in enumerate(model.state_size + model.drivers):
+        if model.variables[place] not in driving:
+            continue
+        alone = np.arange(len(model.variables)) == place
+        gain = abs(model.coefficients[3 + i, (model.powers == alone).all(axis=1)].sum())
+        if model.friction[i] * gain > 0.0:
+            zone = dead.get(model.variables[place], 0.0)
+            zones.append(zone + float(model.friction[i] / gain))
+    return max(zones)
+
+
+def repair_drive(drive: Drive, findings: Findings) -> Findings:
+    """Refuses other units, axes and orders; drops repeated rows and jumps, clips commands."""
+    check_pose_moves(findings.training)
+    training, _ = repaired(findings.training)
+    whole, repairs = repaired(findings.whole)
+    repairs += check_commands(training, findings.training.recording.command)
+    check_units(drive)
+    check_axes(training)
+    repairs += check_encoders(training)
+    check(training.recording, drive.spec)
+    return replace(findings, training=training, whole=whole, repairs=repairs)
+
+
+def estimate_timing(drive: Drive, findings: Findings) -> Findings:
+    """Finds the period of bursts, the clock offset, the latency of commands, and lags."""
+    training = findings.training
+    spec = drive.spec
+    timings.check_state_is_known(drive.recording, spec)
+    responses: tuple[Response, ...] = ()
+    if motions.by_motion(spec, drive.recording):
+        by_command = replace(training, spec=motions.surrogate(spec))
+        found = timings.timing_of(by_command)
+        responses, found = _select_followers(spec, found)
+    else:
+        found = followers.apart(training, timings.timing_of(training))
+    calibration = replace(
+        findings.calibration,
+        responses=responses,
+        uncertainty=found.sigma,
+        inputs=followers.late_inputs(spec, found),
+        limits=followers.limits_of(spec, found),
+        clock_offset_s=found.offset,
+        command_latency_s=found.latency,
+        burst_period_s=training.bursts.period_s if training.bursts else 0.0,
+    )
+    return replace(findings, timing=found, calibration=calibration)
+
+
+def _select_followers(
+    spec: RobotSpec, timing: timings.TimingEstimate
+) -> tuple[tuple[Response, ...], timings.TimingEstimate]:
+    """Returns the states that follow a command, with their lags, from the lag of each command.
+
+    The timing that is returned has the lags of these states alone, in their order.
+    """
+    names = [c.name for c in spec.command]
+    states = [v for v in spec.state if v.follows and v.twist is None]
+    rows = [names.index(str(v.follows)) for v in states]
+    own = replace(timing, lags=timing.lags[rows], lag_sigma=timing.lag_sigma[rows])
+    responses = (
+        Response(v.name, str(v.follows), float(lag))
+        for v, lag in zip(states, own.lags, strict=True)
+    )
+    return tuple(responses), own
+
+
+def find_mounting(drive: Drive, findings: Findings) -> Findings:
+    """Finds where and how the tracked body is mounted on the robot."""
+    training = findings.training
+    states = None
+    speed = None
+    if drive.spec.state and not motions.by_motion(drive.spec, drive.recording):
+        states = timings.expected_states(training, training.twists, findings.timing)
+        index = speed_index(drive.spec)
+        if index is not None:
+            speed = states[:, index]
+    found = mounting_of(training, findings.timing, states)
+    return replace(
+        findings,
+        expected_speed=speed,
+        mounting=found,
+        calibration=mounted(findings.calibration, found),
+    )
+
+
+def find_responses(drive: Drive, findings: Findings) -> Findings:
+    """Finds how unmeasured states follow the commands, and the scale of the wheels."""
+    training = findings.training
+    calibration = findings.calibration
+    if not motions.by_motion(drive.spec, drive.recording):
+        responses = timings.responses_of(
+            training, calibration, findings.timing, findings.expected_speed
+        )
+        calibration = replace(calibration, responses=responses)
+    return replace(findings, calibration=timings.with_wheels(training, calibration))
+
+
+def measure_noise(drive: Drive, findings: Findings) -> Findings:
+    """Measures the noise of the pose; a drive without noise and corrections is treated as exact."""
+    position, heading = findings.training.pose_noise or (0.0, 0.0)
+    calibration = replace(
+        findings.calibration, position_noise_m=position, heading_noise_rad=heading
+    )
+    noise = sensor_noise(findings.whole)
+    return replace(findings, calibration=calibration, noise=noise)
+
+
+def derive_motion(drive: Drive, findings: Findings) -> Findings:
+    """Derives the state from the poses, if it is an unmeasured part of the twist."""
+    if not motions.by_motion(drive.spec, drive.recording):
+        return findings
+    calibration = findings.calibration
+    width = motions.half_width(findings.training)
+    parts = []
+    for part in (findings.training, findings.whole):
+        grid = motions.grid_of(part, calibration, drive.settings.control_period_s)
+        parts.append(motions.with_motion(part, calibration, grid, width))
+    training, whole = parts
+    return replace(findings, training=training, whole=whole, motion_width_s=width)
+
+
+def find_input_curves(drive: Drive, findings: Findings) -> Findings:
+    """Finds the latency, and the dead zones and saturation of commands, that explain a motion."""
+    if findings.motion_width_s is None:
+        return findings
+    training = findings.training
+    findings = _with_likely_latency(findings)
+    samples = resample_drive(training, findings)
+    places = range(len(drive.spec.command))
+    curves = [
+        c for place in places if (c := curve_of(samples, drive.spec, place)) is not None
+    ]
+    calibration = replace(findings.calibration, inputs=tuple(c.curve for c in curves))
+    clear = tuple(c.curve for c in curves if c.gain >= CLEAR)
+    findings = replace(findings, calibration=calibration, clear_curves=clear)
+    return _with_likely_latency(findings)  # the curves may hide a part of it
+
+
+def _with_likely_latency(findings: Findings) -> Findings:
+    """Returns findings with the latency of commands that best explains a motion."""
+    calibration = findings.calibration
+    samples = resample_drive(findings.training, findings)
+    latency = likely_delay(findings.training, calibration, samples)
+    calibration = replace(calibration, command_latency_s=latency)
+    return replace(findings, calibration=calibration)
+
+
+def fit_terms(drive: Drive, findings: Findings) -> Findings:
+    """Resamples the streams on one time axis, and fits all terms by least squares (Eq. 1)."""
+    if findings.motion_width_s is not None:
+        return fit_motion(drive, findings)
+    calibration = findings.calibration
+    spec = drive.spec
+    settings = drive.settings
+    if spec.state and drive.recording.state is None:
+        responses = calibration.responses or None
+        require(responses, "the response of each state", "find_responses")
+    samples = align(findings.training, calibration)
+    samples = followers.unlimited(samples, calibration, spec)
+    is_inferred = drive.recording.state is None and not calibration.is_exact
+    trials = findings.trials  # a refit reuses them
+    if settings.order == "auto" and is_inferred and not trials:
+        trials = _try_orders(drive, findings)
+    if trials:
+        order = hypotheses.chosen(list(trials)).order
+    else:
+        order = fitting.ORDER if settings.order == "auto" else settings.order
+    centred = "lever_arm_y_m" in calibration.uncertainty
+    library = None
+    if is_inferred:
+        library = partial(select_terms_through_state, centred=centred)
+    try:
+        regression = fitting.regress(
+            samples, spec, order, not calibration.is_exact, library
+        )
+    except FitError as error:
+        raise FitError(f"{drive.recording.source}: {error}") from None
+    if settings.strict:
+        verdict.refuse_unexcited(regression.excitation, spec)
+    return replace(findings, samples=samples, regression=regression, trials=trials)
+
+
+def _try_orders(drive: Drive, findings: Findings) -> tuple[hypotheses.Trial, ...]:
+    """Tries each order on parts of the training part that its fits did not see."""
+    training = findings.training
+    path = open_loop.windows(
+        training,
+        findings.calibration,
+        0.0,
+        training.duration_s,
+        hypotheses.HORIZON_S,
+        open_loop.SPACING_S,
+    ).path
+    trials = []
+    for order in ORDERS_OF_INFERRED:
+        errors = _cross_validate(drive, findings, order)
+        if hypotheses.HORIZON_S not in errors:
+            break
+        error_m = errors[hypotheses.HORIZON_S].mean()
+        share = float(error_m / max(float(path.mean()), NO_PATH_M))
+        trials.append(hypotheses.Trial(order, 0.0, share, errors))
+    return tuple(trials)
+
+
+def _cross_validate(drive: Drive, findings: Findings, order: int) -> dict[float, Array]:
+    """Returns errors (W,) [m] of an order by horizon [s], on parts that its fits did not see.
+
+    Errors of predictions that diverged are infinite; the result is empty if a fit is impossible.
+    """
+    training = findings.training
+    recording = training.recording
+    pose = recording.pose
+    settings = replace(drive.settings, order=order, train_until_s=np.inf)
+    errors: dict[float, list[Array]] = {h: [] for h in hypotheses.BANDS_S}
+    for block in np.array_split(np.arange(len(pose.t)), hypotheses.FOLDS):
+        others = np.ones(len(pose.t), dtype=np.bool_)
+        others[block] = False
+        rest = training.part(replace(recording, pose=pose.rows(others)))
+        rest = rest.under(settings)
+        try:
+            found = run(
+                (fit_terms, prune_terms, refine_model),
+                rest,
+                replace(findings, training=rest),
+            )
+        except (FitError, RecordingError):
+            return {}
+        part = training.part(replace(recording, pose=pose.rows(block)))
+        for horizon, errors_m in errors.items():
+            errors_m.append(_measure_errors(found, part, horizon))
+    joined = {h: np.concatenate(parts) for h, parts in errors.items()}
+    return {h: errors_m for h, errors_m in joined.items() if len(errors_m)}
+
+
+def _measure_errors(findings: Findings, part: Drive, horizon: float) -> Array:
+    """Returns the distances (W,) [m] of predictions over a horizon [s] from a part's poses."""
+    chosen = open_loop.windows(
+        part,
+        findings.calibration,
+        0.0,
+        part.duration_s,
+        horizon,
+        open_loop.SPACING_S,
+    )
+    if not len(chosen.start_t):
+        return np.zeros(0)
+    model = require_model(findings)
+    ends = open_loop.predict(model, findings.calibration, part, chosen)
+    distance = np.hypot(*(ends - chosen.end)[:, :2].T)
+    return np.where(np.isnan(distance), np.inf, distance)
+
+
+def prune_terms(drive: Drive, findings: Findings) -> Findings:
+    """Keeps the terms of Eq. 2, and refits them."""
+    regression = require(findings.regression, "the fit of all terms", "fit_terms")
+    # keeps what mirror symmetry allows, because predictions weight these terms
+    if findings.motion_width_s is not None:
+        return findings
+    linear = fitting.prune_and_refit(regression, drive.spec, drive.settings.alpha)
+    limits = followers.scaled_limits(findings.calibration, drive.spec)
+    model = replace(linear.model, inputs=findings.calibration.inputs, limits=limits)
+    return replace(findings, pruned_fit=replace(linear, model=model), model=model)
+
+
+def refine_model(drive: Drive, findings: Findings) -> Findings:
+    """Adjusts model and calibration to predictions over seconds, unless the drive is exact."""
+    if findings.motion_width_s is not None:
+        return refine_motion(drive, findings)
+    model = require_model(findings)
+    calibration = findings.calibration
+    training = findings.training
+    settings = drive.settings
+    if calibration.is_exact:
+        return findings
+    errors = verdict.try_model(model, calibration, training, 0.0)
+    may_lower_order = settings.order == "auto" and not findings.trials
+    if may_lower_order and verdict.runs_away(errors):
+        linear = replace(drive, settings=replace(settings, order=1))
+        found = run((fit_terms, prune_terms, refine_model), linear, findings)
+        return replace(found, refinement=(*found.refinement, verdict.LINEAR))
+    model, calibration, note = refine_by_predictions(model, calibration, training)
+    return replace(
+        findings,
+        model=model,
+        calibration=calibration,
+        refinement=(note, *hypotheses.about_orders(findings.trials)),
+    )
+
+
+def complete_model(drive: Drive, findings: Findings) -> Findings:
+    """Completes the model by the textbook for inputs that never moved, if requested."""
+    if not drive.settings.assume:
+        return findings
+    unmoved = require_fit(findings).unmoved
+    model, assumptions = assume_textbook(require_model(findings), drive.spec, unmoved)
+    return replace(findings, model=model, assumptions=assumptions)
+
+
+def judge_model(drive: Drive, findings: Findings) -> Findings:
+    """Tests the model on the held-out part, measures the motion's noise, and lists doubts."""
+    fit = require_fit(findings)
+    model = require_model(findings)
+    whole = findings.whole
+    calibration = findings.calibration
+    until = drive.settings.train_until_s
+    samples = resample_drive(whole, findings)
+    held_out_from = whole.recording.pose.t[0] + calibration.clock_offset_s + until
+    unseen: Samples | None = samples.rows(samples.t > held_out_from)
+    if unseen is not None and len(unseen.t) < verdict.MIN_ROWS:
+        unseen = None
+    held_out = verdict.try_model(model, calibration, whole, until)
+    yardstick = findings.yardstick or textbook_of(whole, calibration)
+    bands = _find_bands(drive, findings)
+    judgement = judged(model, calibration, whole, bands, yardstick)
+    rated = verdict.add_quality(model, fit, unseen, held_out, judgement, drive.spec)
+    if model is fit.model:
+        fit = replace(fit, model=rated)
+    notes = list_plain_calibration_notes(findings)
+    findings = replace(
+        findings,
+        pruned_fit=fit,
+        model=rated,
+        unseen=unseen,
+        held_out=held_out,
+        judgement=judgement,
+        yardstick=yardstick,
+        calibration=replace(calibration, notes=notes),
+        noise=motion_noise(findings.noise, whole, calibration, model, samples),
+    )
+    return replace(findings, notes=collect_notes(drive, findings))
+
+
+def _find_bands(drive: Drive, findings: Findings) -> dict[float, float]:
+    """Returns the distances within which 95 % of predictions should end [m], by horizon [s]."""
+    model = require_model(findings)
+    calibration = findings.calibration
+    training = findings.training
+    if findings.replacement:
+        return bands_of_fixed(model, calibration, training)
+    if calibration.is_exact or drive.duration_s <= drive.settings.train_until_s:
+        return {}
+    derived = None
+    if findings.base is not None:
+        derived = resample_drive(training, findings), findings.base
+    return bands_of(model, calibration, training, derived)
+
+
+def prefer_textbook(drive: Drive, findings: Findings) -> Findings:
+    """Replaces the model by the fitted textbook if that predicts the held-out part better."""
+    if findings.yardstick is None:
+        return findings
+    if not acceptance.loses_to_textbook(findings.judgement):
+        return findings
+    try:
+        textbook = _try_textbook(drive, findings)
+    except (FitError, RecordingError):
+        return findings
+    if textbook is None:
+        return findings
+    (lost,) = acceptance.usual(findings.judgement)
+    for won in acceptance.usual(textbook.judgement):
+        if won.model.position_m < lost.model.position_m:
+            return textbook
+    return findings
+
+
+def _try_textbook(drive: Drive, findings: Findings) -> Findings | None:
+    """Fits the textbook in place of the model, and judges it; None without terms for its state."""
+    model = require_model(findings)
+    spec = drive.spec
+    yardstick = fit_yardstick(
+        findings.whole,
+        drive.settings.train_until_s,
+        findings.calibration.clock_offset_s,
+        one_limit=True,
+    )
+    calibration = textbook_calibration(yardstick, findings.calibration, spec)
+    start = derive_motion(drive, replace(findings, calibration=calibration))
+    is_actuated = needs_actuators(yardstick, spec)
+    if is_actuated:
+        drive, start = _add_actuators(drive, start, yardstick)
+        spec = drive.spec
+    samples = resample_drive(start.training, start)
+    if is_actuated:  # the fit was of another state's rates
+        fit = fitting.fit(samples, spec, noisy=True)
+        start = replace(start, regression=fit.regression, pruned_fit=fit)
+    textbook = textbook_model(yardstick, model, samples, spec)
+    if textbook is None:
+        return None
+    (lost,) = acceptance.usual(findings.judgement)
+    start = replace(
+        start,
+        model=textbook,
+        samples=samples,
+        refinement=(),
+        trials=(),
+        assumptions=(),
+        replacement=verdict.describe_replacement(lost),
+    )
+    return judge_model(drive, start)
+
+
+def _add_actuators(
+    drive: Drive, findings: Findings, yardstick: Yardstick
+) -> tuple[Drive, Findings]:
+    """Returns a drive of a steered robot, and its findings, with speed and angle as state."""
+    calibration = findings.calibration
+    spec = actuated_spec(yardstick, findings.whole)
+    training, whole = (
+        with_actuators(part, spec, yardstick, calibration)
+        for part in (findings.training, findings.whole)
+    )
+    findings = replace(findings, training=training, whole=whole, motion_width_s=None)
+    return replace(drive, spec=spec), findings
+
+
+def refit_model(drive: Drive, findings: Findings) -> Findings:
+    """Refits the judged model to the whole drive, unless that predicts the training part worse."""
+    until = drive.settings.train_until_s
+    if findings.calibration.is_exact or until >= drive.duration_s:
+        return findings
+    if findings.replacement:
+        return findings
+    final = _fit_whole_drive(drive, findings)
+    driven = drive.recording.driven_s
+    sentence = verdict.describe_refit(driven(until), driven(), worse=final is None)
+    if final is None:
+        findings = replace(findings, refinement=(*findings.refinement, sentence))
+        return replace(findings, notes=collect_notes(drive, findings))
+    notes = list_plain_calibration_notes(final)
+    final = replace(
+        final,
+        refinement=(*final.refinement, sentence),
+        calibration=replace(final.calibration, notes=notes),
+        model=replace(require_model(final), quality=require_model(findings).quality),
+    )
+    final = replace(final, notes=collect_notes(drive, final))
+    return replace(findings, final=final)
+
+
+def _fit_whole_drive(drive: Drive, findings: Findings) -> Findings | None:
+    """Fits the whole drive; None if that fails, or predicts the training part worse."""
+    until = drive.settings.train_until_s
+    settings = replace(drive.settings, train_until_s=np.inf)
+    start = replace(findings, training=findings.whole.under(settings))
+    stages = (derive_motion, fit_terms, prune_terms, refine_model, complete_model)
+    try:
+        final = run(stages, replace(drive, settings=settings), start)
+        error_m = _measure_mean_error(final, until)
+        trial_error_m = _measure_mean_error(findings, until)
+    except (FitError, RecordingError):
+        return None
+    return None if verdict.is_worse(error_m, trial_error_m) else final
+
+
+def _measure_mean_error(findings: Findings, until: float) -> float:
+    """Returns the mean error [m] of predictions over 5 s of the whole drive up to a time [s]."""
+    errors = open_loop.open_loop_error(
+        require_model(findings), findings.calibration, findings.whole, 0.0, until
+    )
+    return errors.mean_position_error_m
 
 
 def cut(recording: Recording, until: float) -> Recording:
     """Returns a recording up to `until` [s] after its first pose; commands last slightly longer."""
-    pose = recording.pose.t
-
-    def part(stream: Stream, margin: float = 0.0) -> Stream:
-        overlap = stream.t[0] < pose[-1] and stream.t[-1] > pose[0]
-        origin = max(stream.t[0], pose[0]) if overlap else stream.t[0]
-        return stream.rows(stream.t <= origin + until + margin)
-
     if not until > 0.0:
         fault = f"{recording.source}: the training part ends at {until:g} s"
         raise RecordingError(f"{fault}; use more than 0.")
+    pose = recording.pose.t
+
+    def cut_stream(stream: Stream, margin: float = 0.0) -> Stream:
+        origin = stream.t[0]
+        if stream.t[0] < pose[-1] and stream.t[-1] > pose[0]:  # on the pose's clock
+            origin = max(stream.t[0], pose[0])
+        return stream.rows(stream.t <= origin + until + margin)
+
     parts: dict[str, Any] = {
-        name: part(stream) for name, stream in recording.streams.items()
+        name: cut_stream(stream) for name, stream in recording.streams.items()
     }
-    parts["command"] = part(recording.command, timings.SEARCH_S)
+    parts["command"] = cut_stream(recording.command, timings.SEARCH_S)
     return replace(recording, **parts)
+
+
+STAGES = list_stages()
+"""All stages, to run a part of them: `run(STAGES[:4], drive)`."""

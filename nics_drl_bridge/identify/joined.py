@@ -6,7 +6,7 @@ from dataclasses import replace
 from nics_drl_bridge.errors import FitError, RecordingError
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.gyro import turned_by_gyro
-from nics_drl_bridge.identify.identify import clocks, repair, run
+from nics_drl_bridge.identify.identify import estimate_timing, repair_drive, run
 from nics_drl_bridge.recording.joining import join
 from nics_drl_bridge.recording.recording import Recording, check
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -34,7 +34,7 @@ def clock_offset(recording: Recording, spec: RobotSpec) -> float:
         return 0.0
     drive = Drive(check(recording, spec), spec)
     try:
-        return run((repair, clocks), drive).calibration.clock_offset_s
+        return run((repair_drive, estimate_timing), drive).calibration.clock_offset_s
     except FitError as error:
         fault = f"{recording.source}: its two clocks can't be aligned by this drive alone ({error})"
         raise RecordingError(

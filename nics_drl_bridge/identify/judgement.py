@@ -21,8 +21,8 @@ from nics_drl_bridge.identify.open_loop import (
     predict,
     windows,
 )
-from nics_drl_bridge.identify.refine import readjusted
-from nics_drl_bridge.identify.terms import defined
+from nics_drl_bridge.identify.refine import readjust
+from nics_drl_bridge.identify.terms import select_defined_dofs
 from nics_drl_bridge.identify.yardstick import (
     Yardstick,
     fit_yardstick,
@@ -160,7 +160,7 @@ def bands_of(
         others[block] = False
         if derived is None:
             rest = training.part(replace(training.recording, pose=pose.rows(others)))
-            found = readjusted(model, calibration, rest)
+            found = readjust(model, calibration, rest)
         else:
             at = pose.t[block[[0, -1]]] + calibration.clock_offset_s
             kept = (derived[0].t < at[0]) | (derived[0].t > at[1])
@@ -192,7 +192,7 @@ def _with_motion(
     draft = base.draft
     problem = problem_of(training, calibration, samples, draft.form, draft.inputs)
     problem = replace(problem, spacing_s=hypotheses.SPACING_S)
-    free = (model.coefficients != 0.0) & ~defined(training.spec)[:, None]
+    free = (model.coefficients != 0.0) & ~select_defined_dofs(training.spec)[:, None]
     pull = hypotheses.PULLS[-1]
     found = shooting.fitted(problem, model, free, draft.inputs, kept, EVALUATIONS, pull)
     calibration = replace(

@@ -15,7 +15,7 @@ from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive, TwistIntervals
 from nics_drl_bridge.identify.signals import followed, held, speed_index
 from nics_drl_bridge.identify.statistics import standard_errors
-from nics_drl_bridge.identify.terms import mirrored, tyres_slip
+from nics_drl_bridge.identify.terms import has_slipping_tyres, list_reversed_variables
 from nics_drl_bridge.recording.recording import Stream
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.kernels import MAX_ORDER
@@ -83,7 +83,11 @@ def mounting_of(
     forward = _response(spec, command)[:, 0]
     _, noise = drive.pose_noise or (0.0, 0.0)
     found = mounting_without_lateral_motion(twists, forward, noise)
-    if found is not None and states is None and (tyres_slip(spec) or slips(spec)):
+    if (
+        found is not None
+        and states is None
+        and (has_slipping_tyres(spec) or slips(spec))
+    ):
         return with_slip(twists, found, spec)
     if found is None or states is None:
         return found
@@ -128,7 +132,7 @@ def by_instruments(
         return None
     across = 0.0
     across_sigma = np.nan
-    odd = mirrored(spec) or ()
+    odd = list_reversed_variables(spec) or ()
     aside = powers[:, [v.name in odd for v in spec.state]].sum(axis=1) % 2 == 1
     if aside.any():  # motion along x is even in what a mirror reverses
         even = np.hstack([orth(chi[:, ~aside], rcond=SAME), seen[:, 2:]])

@@ -1,4 +1,12 @@
-"""Refinement of a model by its errors over seconds (Ljung, System Identification, ch. 7)."""
+"""Refinement of a model by its errors over seconds (Ljung, System Identification, ch. 7).
+
+1. `apply_definitions` fixes what the data can't tell: the scale of an inferred speed.
+2. `make_problem` selects windows of the training part: pairs of poses one horizon apart.
+3. `minimise_errors` adjusts coefficients, rotation and one time so that predictions from the first
+   pose of each window end at the second: nonlinear least squares.
+4. `simplify` removes terms of the twist that hardly improve the predictions, weakest first.
+5. `drop_doubtful_rotation` sets a rotation below three standard errors to zero.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -20,126 +28,158 @@ from nics_drl_bridge.identify.statistics import (
     minimise,
     uncertainty,
 )
-from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
 
 Mask = NDArray[np.bool_]
-Errors = Mapping[str, Mapping[str, float]]
+NamedErrors = Mapping[str, Mapping[str, float]]  # by degree of freedom and term
+
+TWIST = slice(
+    0, 3
+)  # rows of a model's coefficients: the twist, then the rates of the state
+FIRST_STATE = 3
+VX = POSE_RATES.index("vx")
+VY = POSE_RATES.index("vy")
 
 HORIZONS_S = (1.0, 2.5, 5.0)
-SPACING_S = 0.25
-MIN_WINDOWS = 10
+SPACING_S = 0.25  # between the starts of windows
+MIN_WINDOWS = 10  # per horizon
 HEADING_ARM_M = 0.3  # a heading error counts as a position error at this distance
-# a window whose error exceeds this many times the median contains a jump
+# A window contains a jump of the pose if its error exceeds this many times the median error and
+# this fraction of the longest path,
 OUTLYING = 10.0
-# provided that the error also exceeds this fraction of the longest path
 OUTLYING_SHARE = 0.25
+# unless more than this fraction of the windows do.
 MOST_OUTLIERS = 0.3
-# slopes of a diverging model are clipped, so that their scaling stays finite
-STEEPEST = 1e100
-TURN_RAD = 1e-5  # step of the finite difference by the rotation
+
+# Errors [m] and slopes of a diverging model are clipped, so that their scaling stays finite.
 DIVERGED = 1e3
-LEAST_SCALE = 0.05
+STEEPEST = 1e100
+ROTATION_STEP_RAD = 1e-5  # of the finite difference by the rotation
+LEAST_SCALE = 0.05  # minimum scale of a parameter of the search; that of times [s] and angles [rad]
 # A model uses the values at the start of a step, so a time is uncertain by the standard deviation
 # of a uniform distribution over the step.
-WITHIN = 12.0**-0.5
+WITHIN_STEP = 12.0**-0.5
 # maximum fraction of its distance by which a state approaches its command in one step
 FASTEST = 0.99
 # terms are removed while the error rises by less than this fraction in total
 WORTH = 0.1
+TOO_SHORT = (
+    "The training part is too short to refine the model by its errors over seconds; record a "
+    "longer drive."
+)
+UNSTABLE = (
+    "The predictions of the fitted model diverge on the training part, so it could not "
+    "be refined."
+)
 
 
-def refined(
+def refine_by_predictions(
     linear: TaylorModel, calibration: Calibration, drive: Drive
 ) -> tuple[TaylorModel, Calibration, str]:
-    """Refines a linear fit by its predictions, removes terms; returns a sentence on the result."""
-    model, calibration = by_definition(linear.add_errors({}), calibration, drive.spec)
-    problem = problem_of(model, calibration, drive)
-    why = (
-        "The training part is too short to refine the model by its errors over seconds"
+    """Refines a linear fit by its predictions of the training part, and removes terms.
+
+    Returns:
+        The refined model and calibration, and a sentence on the result.
+    """
+    model, calibration = apply_definitions(
+        linear.add_errors({}), calibration, drive.spec
     )
-    note = f"{why}; record a longer drive."
-    if problem is not None:
-        try:
-            best = simplify(problem, refine(problem, model, calibration))
-            best = without_doubtful_rotation(problem, best, calibration)
-            errors = replace(best.model, std_errors=best.std_errors).named_errors
-            by = "Coefficients and calibration were refined by the open-loop errors over up to 5 s"
-            note = f"{by}: {best.error:.4f} m (root mean square) is left on the training part."
-            return merged(best.model, linear, errors), best.calibration, note
-        except np.linalg.LinAlgError:  # the model is unstable: its slopes overflow
-            why = "The predictions of the fitted model diverge on the training part"
-            note = f"{why}, so it could not be refined."
-    return merged(model, linear, {}), calibration, note
+    problem = make_problem(model, calibration, drive)
+    if problem is None:
+        return merge_errors(model, linear, {}), calibration, TOO_SHORT
+    try:
+        best = simplify(problem, minimise_errors(problem, model, calibration))
+        best = drop_doubtful_rotation(problem, best, calibration)
+    except np.linalg.LinAlgError:  # the model is unstable: its slopes overflow
+        return merge_errors(model, linear, {}), calibration, UNSTABLE
+    errors = replace(best.model, std_errors=best.std_errors).named_errors
+    note = _describe_result(problem, best, calibration)
+    return merge_errors(best.model, linear, errors), best.calibration, note
 
 
-def without_doubtful_rotation(
-    problem: "Problem", best: "Refined", before: Calibration
-) -> "Refined":
-    """Refines again without a rotation that is below three standard errors."""
-    calibration = best.calibration
-    sigma = calibration.uncertainty.get("rotation_rad", 0.0)
-    turned = calibration.rotation_rad
-    if turned in (0.0, before.rotation_rad) or abs(turned) >= CERTAIN * sigma:
-        return best
-    others = {k: v for k, v in calibration.uncertainty.items() if k != "rotation_rad"}
-    straight = replace(calibration, rotation_rad=0.0, uncertainty=others)
-    found = refine(problem, best.model, straight)
-    told = found.calibration.uncertainty | {"rotation_rad": sigma}
-    return replace(found, calibration=replace(found.calibration, uncertainty=told))
+def _describe_result(problem: "Problem", best: "Refined", before: Calibration) -> str:
+    what = "Coefficients"
+    if best.calibration != before:
+        what += " and calibration"
+    by = f"the open-loop errors over up to {problem.horizon_s:g} s"
+    parts = f"of x, y and heading times {HEADING_ARM_M:g} m"
+    left = f"the root mean square {parts} left on the training part"
+    return f"{what} were refined by {by}: {left} is {best.error:.4f} m."
 
 
-def readjusted(
+def readjust(
     model: TaylorModel, calibration: Calibration, drive: Drive
 ) -> tuple[TaylorModel, Calibration] | None:
     """Adjusts a refined model to another drive, term by term; None if that is not possible."""
-    problem = problem_of(model, calibration, drive)
+    problem = make_problem(model, calibration, drive)
+    if problem is None:
+        return None
     try:
-        found = None if problem is None else refine(problem, model, calibration)
+        found = minimise_errors(problem, model, calibration)
     except np.linalg.LinAlgError:
         return None
-    return None if found is None else (found.model, found.calibration)
+    return found.model, found.calibration
 
 
-def by_definition(
+def apply_definitions(
     model: TaylorModel, calibration: Calibration, spec: RobotSpec
 ) -> tuple[TaylorModel, Calibration]:
-    """Scales an inferred speed so that vx = 1 speed; lateral motion is noise unless commanded."""
-    coefficients = model.coefficients.copy()
-    limits = model.limits.copy()
-    if not spec.moves_sideways:
-        coefficients[1] = 0.0
-    responses = list(calibration.responses)
+    """Scales an inferred speed so that vx = 1 speed, and drops lateral motion that is noise.
+
+    Lateral motion is noise unless it is commanded or a state measures it.
+    """
+    slips = any(variable.twist == "vy" for variable in spec.state)
+    if not (spec.moves_sideways or slips):
+        coefficients = model.coefficients.copy()
+        coefficients[VY] = 0.0
+        model = replace(model, coefficients=coefficients)
     i = speed_index(spec)
-    if responses and i is not None:
-        (alone,) = linear_terms(model, spec.state[i].name)
-        scale = 0.0 if alone is None else float(coefficients[0, alone])
-        if scale > 0.0:
-            coefficients = coefficients / scale ** model.powers[:, i]
-            coefficients[3 + i] *= scale
-            limits[i] *= scale
-            responses[i] = replace(responses[i], gain=responses[i].gain * scale)
-            coefficients[0, alone] = 1.0
-    model = replace(model, coefficients=coefficients, limits=limits)
+    if not calibration.responses or i is None:
+        return model, calibration
+    (alone,) = find_linear_terms(model, spec.state[i].name)
+    if alone is None or model.coefficients[VX, alone] <= 0.0:
+        return model, calibration
+    return _scale_state(model, calibration, i, float(model.coefficients[VX, alone]))
+
+
+def _scale_state(
+    model: TaylorModel, calibration: Calibration, i: int, scale: float
+) -> tuple[TaylorModel, Calibration]:
+    """Expresses a state in a unit in which its values are `scale` times as large."""
+    coefficients = model.coefficients / scale ** model.powers[:, i]
+    coefficients[FIRST_STATE + i] *= scale
+    (alone,) = find_linear_terms(model, model.variables[i])
+    if alone is not None:
+        coefficients[VX, alone] = 1.0  # exactly
+    low = model.low.copy()
+    high = model.high.copy()
+    limits = model.limits.copy()
+    for values in (low, high, limits):
+        values[i] *= scale
+    model = replace(model, coefficients=coefficients, low=low, high=high, limits=limits)
+    responses = list(calibration.responses)
+    responses[i] = replace(responses[i], gain=responses[i].gain * scale)
     return model, replace(calibration, responses=tuple(responses))
 
 
-def merged(model: TaylorModel, linear: TaylorModel, refined: Errors) -> TaylorModel:
+def merge_errors(
+    model: TaylorModel, linear: TaylorModel, refined: NamedErrors
+) -> TaylorModel:
     """Adds standard errors: the linear fit's where a row is unchanged, else the larger of both."""
-    first = linear.named_errors
-    rows = {}
+    fitted = linear.named_errors
+    merged: dict[str, dict[str, float]] = {}
     for dof, old, new in zip(
         model.dofs, linear.coefficients, model.coefficients, strict=True
     ):
         before = dict(zip(linear.term_names, old, strict=True))
         after = zip(model.term_names, new, strict=True)
-        known = first.get(dof, {})
-        rows[dof] = (
-            dict(known) if all(before.get(k, 0.0) == v for k, v in after) else {}
-        )
+        is_unchanged = all(before.get(term, 0.0) == value for term, value in after)
+        errors = fitted.get(dof, {})
+        merged[dof] = dict(errors) if is_unchanged else {}
         for term, error in refined.get(dof, {}).items():
-            rows[dof][term] = max(error, known.get(term, 0.0))
-    return model.add_errors(rows)
+            merged[dof][term] = max(error, errors.get(term, 0.0))
+    return model.add_errors(merged)
 
 
 @dataclass(frozen=True)
@@ -147,200 +187,242 @@ class Problem:
     """Prediction problem of a refinement: windows of one drive, the same for every trial model."""
 
     drive: Drive
-    chosen: tuple[open_loop.Windows, ...]  # for each horizon, without jumps of the pose
+    horizon_s: float  # the longest horizon that fits into the drive
+    windows: tuple[
+        open_loop.Windows, ...
+    ]  # for each horizon, without jumps of the pose
     # courses of X over them if the state was measured, else empty
     courses: tuple[open_loop.Course, ...]
 
 
-def problem_of(
+def make_problem(
     model: TaylorModel, calibration: Calibration, drive: Drive
 ) -> Problem | None:
     """Selects the windows of a training part to predict; None if it is too short."""
     until = drive.settings.train_until_s
     chosen = []
+    longest = 0.0
     for horizon in HORIZONS_S:
-        found = open_loop.windows(drive, calibration, 0.0, until, horizon, SPACING_S)
-        if len(found.start_t) >= MIN_WINDOWS:
-            error = open_loop.predict(model, calibration, drive, found) - found.end
-            chosen.append(_without_outliers(found, error))
+        windows = open_loop.windows(drive, calibration, 0.0, until, horizon, SPACING_S)
+        if len(windows.start_t) >= MIN_WINDOWS:
+            ends = open_loop.predict(model, calibration, drive, windows)
+            chosen.append(_drop_jumps(windows, ends - windows.end))
+            longest = horizon
     if not chosen:
         return None
-    measured = drive.recording.state is not None
-    courses = (
-        open_loop.course_of(model, calibration, drive, w) for w in chosen if measured
-    )
-    return Problem(drive, tuple(chosen), tuple(courses))
+    courses: tuple[open_loop.Course, ...] = ()
+    if drive.recording.state is not None:
+        courses = tuple(
+            open_loop.course_of(model, calibration, drive, windows)
+            for windows in chosen
+        )
+    return Problem(drive, longest, tuple(chosen), courses)
 
 
-def _without_outliers(chosen: open_loop.Windows, error: Array) -> open_loop.Windows:
-    size = np.hypot(error[:, 0], error[:, 1])
+def _drop_jumps(windows: open_loop.Windows, error: Array) -> open_loop.Windows:
+    """Drops windows whose errors (W, 3) show a jump of the pose, if they are few."""
+    distance = np.hypot(error[:, 0], error[:, 1])
     far = max(
-        OUTLYING * float(np.median(size)), OUTLYING_SHARE * float(chosen.path.max())
+        OUTLYING * float(np.median(distance)),
+        OUTLYING_SHARE * float(windows.path.max()),
     )
-    inside = size <= far
-    if (
-        inside.all()
-        or inside.mean() < 1.0 - MOST_OUTLIERS
-        or inside.sum() < MIN_WINDOWS
-    ):
-        return chosen
-    return chosen.rows(inside)
+    inside = distance <= far
+    too_few = inside.mean() < 1.0 - MOST_OUTLIERS or inside.sum() < MIN_WINDOWS
+    if inside.all() or too_few:
+        return windows
+    return windows.rows(inside)
 
 
-def prediction_errors(
+def compute_errors(
     problem: Problem, model: TaylorModel, calibration: Calibration
 ) -> Array:
-    """Returns the errors (n,) of all predictions: x, y and heading of each window [m]."""
-    each = zip(*(vars(windows).values() for windows in problem.chosen), strict=True)
-    chosen = open_loop.Windows(*map(np.concatenate, each))
+    """Returns the errors (n,) of all predictions: x, y and heading of each window [m].
+
+    The heading counts at `HEADING_ARM_M`; noisy poses count less.
+    """
+    columns = zip(*(vars(windows).values() for windows in problem.windows), strict=True)
+    windows = open_loop.Windows(*map(np.concatenate, columns))
     with np.errstate(all="ignore"):  # a trial step may diverge and is then rejected
         if problem.courses:
             ends = [
                 open_loop.relative_ends(course, model)[0] for course in problem.courses
             ]
             predicted = open_loop.tracked_ends(
-                chosen, calibration, np.concatenate(ends)
+                windows, calibration, np.concatenate(ends)
             )
         else:  # all windows by a single rollout
-            predicted = open_loop.predict(model, calibration, problem.drive, chosen)
-        error = predicted - chosen.end
+            predicted = open_loop.predict(model, calibration, problem.drive, windows)
+        error = predicted - windows.end
         error[:, 2] = HEADING_ARM_M * geometry.wrap_angle(error[:, 2])
-        error *= _scale(problem, chosen)
-    return np.asarray(
-        np.clip(np.nan_to_num(error.ravel(), nan=DIVERGED), -DIVERGED, DIVERGED)
-    )
+        error *= _compute_weights(problem, windows)
+    error = np.nan_to_num(error.ravel(), nan=DIVERGED)
+    return np.asarray(np.clip(error, -DIVERGED, DIVERGED))
 
 
-def _scale(problem: Problem, chosen: open_loop.Windows) -> Array:
+def _compute_weights(problem: Problem, windows: open_loop.Windows) -> Array:
     """Returns factors (W, 3) of errors, from the variances of the poses at both ends."""
-    return np.asarray(np.sqrt(problem.drive.trust(chosen.start_t, chosen.end_t)))
+    return np.asarray(np.sqrt(problem.drive.trust(windows.start_t, windows.end_t)))
 
 
-def prediction_slopes(
-    problem: Problem, model: TaylorModel, calibration: Calibration, free: "_Free"
+def differentiate_errors(
+    problem: Problem,
+    model: TaylorModel,
+    calibration: Calibration,
+    free: "_FreeParameters",
 ) -> Array:
-    """Returns the derivatives (n, P) of `prediction_errors` for a measured state."""
+    """Returns the derivatives (n, P) of `compute_errors` for a measured state."""
     parts = []
     for course in problem.courses:
         ends, moved = open_loop.relative_ends(course, model, free.coefficients)
         slope = open_loop.tracked_slopes(course, calibration, ends, moved)
         if "rotation_rad" in free.names:
-            angles = calibration.rotation_rad + np.array([-TURN_RAD, TURN_RAD])
-            either = (replace(calibration, rotation_rad=angle) for angle in angles)
-            right, left = (
-                open_loop.tracked_ends(course.chosen, c, ends) for c in either
-            )
-            aside = (left - right)[:, :, None]
-            aside[:, 2] = geometry.wrap_angle(aside[:, 2])
-            slope = np.concatenate([slope, aside / (2.0 * TURN_RAD)], axis=2)
+            by_rotation = _differentiate_by_rotation(course, calibration, ends)
+            slope = np.concatenate([slope, by_rotation[:, :, None]], axis=2)
         slope[:, 2] *= HEADING_ARM_M
-        slope *= _scale(problem, course.chosen)[..., None]
+        slope *= _compute_weights(problem, course.chosen)[..., None]
         parts.append(slope.reshape(-1, slope.shape[2]))
-    return np.clip(np.nan_to_num(np.concatenate(parts), nan=0.0), -STEEPEST, STEEPEST)
+    slopes = np.nan_to_num(np.concatenate(parts), nan=0.0)
+    return np.clip(slopes, -STEEPEST, STEEPEST)
+
+
+def _differentiate_by_rotation(
+    course: open_loop.Course, calibration: Calibration, ends: Array
+) -> Array:
+    """Returns the derivatives (W, 3) of predicted poses by the rotation, by finite differences."""
+
+    def predict(rotation: float) -> Array:
+        rotated = replace(calibration, rotation_rad=rotation)
+        return open_loop.tracked_ends(course.chosen, rotated, ends)
+
+    right = predict(calibration.rotation_rad - ROTATION_STEP_RAD)
+    left = predict(calibration.rotation_rad + ROTATION_STEP_RAD)
+    difference = left - right
+    difference[:, 2] = geometry.wrap_angle(difference[:, 2])
+    return difference / (2.0 * ROTATION_STEP_RAD)
 
 
 @dataclass(frozen=True)
-class _Free:
+class _FreeParameters:
+    """The parameters (P,) of a refinement: coefficients, then fields of the calibration."""
+
     model: TaylorModel
     calibration: Calibration
     coefficients: Mask  # (D, K) free coefficients
-    time: str | None  # free field of the calibration
-    names: tuple[str, ...]  # all free fields
+    time: str | None  # free time of the calibration, a field's name
+    names: tuple[str, ...]  # all free fields of the calibration
 
     @classmethod
-    def of(
+    def select(
         cls, model: TaylorModel, calibration: Calibration, spec: RobotSpec
-    ) -> "_Free":
+    ) -> "_FreeParameters":
         """Frees what neither a definition nor a measurement fixes."""
         # The rotation is defined by the direction without motion; omnidirectional robots lack one.
         # A rotation known without a lever arm, and a known time, are fixed: a model that lacks
         # a term would change them to compensate.
         known = calibration.uncertainty
-        time = None
-        if calibration.responses and "clock_offset_s" in known:
-            time = "clock_offset_s"
-        elif calibration.responses and calibration.command_latency_s > 0.0:
-            time = "command_latency_s"
-        if time and known[time] <= TOLD_S and not lag_is_measured(calibration):
-            time = None
-        turn = (
+        time = _select_time(calibration)
+        is_turned = (
             "rotation_rad" in known
             and not calibration.is_exact
             and not spec.moves_sideways
         )
-        turn &= not (calibration.responses and "lever_arm_x_m" in known)
-        names = (*([time] if time else ()), *(["rotation_rad"] if turn else ()))
-        return cls(
-            model, calibration, free_coefficients(model, calibration), time, names
-        )
+        if calibration.responses and "lever_arm_x_m" in known:
+            is_turned = False
+        names = [time] if time else []
+        if is_turned:
+            names.append("rotation_rad")
+        coefficients = select_free_coefficients(model, calibration)
+        return cls(model, calibration, coefficients, time, tuple(names))
 
-    def at(self, theta: Array) -> tuple[TaylorModel, Calibration]:
+    def start(self) -> Array:
+        """Returns the parameters (P,) of the model and the calibration themselves."""
+        values = [float(getattr(self.calibration, name)) for name in self.names]
+        return np.append(self.model.coefficients[self.coefficients], values)
+
+    def insert(self, theta: Array) -> tuple[TaylorModel, Calibration]:
         """Returns model and calibration at parameters (P,); fixed gains follow their lags."""
         coefficients = self.model.coefficients.copy()
         count = int(self.coefficients.sum())
         coefficients[self.coefficients] = theta[:count]
-        for i, response in enumerate(self.calibration.responses):
-            own, command = linear_terms(self.model, response.state, response.command)
-            if (
-                own is not None
-                and command is not None
-                and not self.coefficients[3 + i, command]
-            ):
-                coefficients[3 + i, command] = -response.gain * coefficients[3 + i, own]
+        for row, response in enumerate(self.calibration.responses, start=FIRST_STATE):
+            own, command = find_linear_terms(
+                self.model, response.state, response.command
+            )
+            if own is None or command is None or self.coefficients[row, command]:
+                continue
+            coefficients[row, command] = -response.gain * coefficients[row, own]
         values: dict[str, Any] = dict(
             zip(self.names, map(float, theta[count:]), strict=True)
         )
-        return replace(self.model, coefficients=coefficients), replace(
-            self.calibration, **values
-        )
+        model = replace(self.model, coefficients=coefficients)
+        return model, replace(self.calibration, **values)
 
-    def bounds(self) -> tuple[Array, Array]:
+    def find_bounds(self) -> tuple[Array, Array]:
         """Returns bounds (P,) within which no state that follows a command overshoots in a step."""
         low = np.full(self.model.coefficients.shape, -np.inf)
         high = -low
-        rest = np.full(len(self.names), np.inf)
-        for i, response in enumerate(self.calibration.responses):
-            own, _ = linear_terms(self.model, response.state, response.command)
+        unbounded = np.full(len(self.names), np.inf)
+        for row, response in enumerate(self.calibration.responses, start=FIRST_STATE):
+            own, _ = find_linear_terms(self.model, response.state, response.command)
             if own is not None:
-                low[3 + i, own] = -FASTEST / self.model.dt
-                high[3 + i, own] = 0.0
-        return np.append(low[self.coefficients], -rest), np.append(
-            high[self.coefficients], rest
+                low[row, own] = -FASTEST / self.model.dt
+                high[row, own] = 0.0
+        return (
+            np.append(low[self.coefficients], -unbounded),
+            np.append(high[self.coefficients], unbounded),
         )
 
 
-def free_coefficients(model: TaylorModel, calibration: Calibration) -> Mask:
+def _select_time(calibration: Calibration) -> str | None:
+    """Returns the calibration's time to refine: clock offset or latency; None if it is known."""
+    known = calibration.uncertainty
+    if not calibration.responses:
+        return None
+    if "clock_offset_s" in known:
+        time = "clock_offset_s"
+    elif calibration.command_latency_s > 0.0:
+        time = "command_latency_s"
+    else:
+        return None
+    if known[time] <= TOLD_S and not are_lags_measured(calibration):
+        return None
+    return time
+
+
+def select_free_coefficients(model: TaylorModel, calibration: Calibration) -> Mask:
     """Selects the free coefficients (D, K): kept, and not fixed by the definition of a state."""
     # An inferred speed is along the direction of travel, vx = 1 speed; known lags are fixed.
     free = model.coefficients != 0.0
     if not calibration.responses:
         # the rates of a measured state were fitted to that state itself
-        free[3:] = False
-    for i, response in enumerate(calibration.responses):
-        alone, command = linear_terms(model, response.state, response.command)
-        if alone is None:
+        free[FIRST_STATE:] = False
+    for row, response in enumerate(calibration.responses, start=FIRST_STATE):
+        own, command = find_linear_terms(model, response.state, response.command)
+        if own is None:
             continue
-        if model.coefficients[0, alone] == 1.0:
-            free[0, alone] = False
-        else:  # the scale of this state is arbitrary, so its gain is fixed
-            free[3 + i, command] = False
-        if lag_is_measured(calibration):
-            free[3 + i, alone] = False
+        if model.coefficients[VX, own] == 1.0:
+            free[VX, own] = False
+        elif command is not None:
+            # the scale of this state is arbitrary, so its gain is fixed
+            free[row, command] = False
+        if are_lags_measured(calibration):
+            free[row, own] = False
     return np.asarray(free)
 
 
-def lag_is_measured(calibration: Calibration) -> bool:
+def are_lags_measured(calibration: Calibration) -> bool:
     """True if both offset and latency are known: only the wheels' response separates them."""
     return {"clock_offset_s", "command_latency_s"} <= set(calibration.uncertainty)
 
 
-def linear_terms(model: TaylorModel, *names: str | None) -> list[int | None]:
-    """Returns the columns of the terms of a single variable; None without such a term."""
-    wanted = (
-        np.array([v == name for v in model.variables], dtype=np.int64) for name in names
-    )
-    hits = (np.flatnonzero((model.powers == row).all(axis=1)) for row in wanted)
-    return [int(hit[0]) if len(hit) else None for hit in hits]
+def find_linear_terms(model: TaylorModel, *names: str | None) -> list[int | None]:
+    """Returns the index of each variable's linear term; None without such a term."""
+    found: list[int | None] = []
+    for name in names:
+        exponents = np.array([v == name for v in model.variables], dtype=np.int64)
+        terms = np.flatnonzero((model.powers == exponents).all(axis=1))
+        found.append(int(terms[0]) if len(terms) else None)
+    return found
 
 
 @dataclass(frozen=True)
@@ -348,90 +430,117 @@ class Refined:
     """A refined model."""
 
     model: TaylorModel
-    calibration: (
-        Calibration  # with refined offset (or latency), rotation, lags and gains
-    )
-    error: float  # root mean square of the open-loop errors on the training part [m]
+    # with refined offset (or latency), rotation, lags and gains
+    calibration: Calibration
+    # root mean square of `compute_errors` on the training part [m]
+    error: float
     std_errors: Array  # (D, K) of the refined coefficients; NaN for the others
 
 
-def refine(problem: Problem, model: TaylorModel, calibration: Calibration) -> Refined:
+def minimise_errors(
+    problem: Problem, model: TaylorModel, calibration: Calibration
+) -> Refined:
     """Adjusts coefficients and calibration to minimise the open-loop error; adds no terms."""
-    free = _Free.of(model, calibration, problem.drive.spec)
-    first = model.coefficients[free.coefficients]
-    theta = np.append(first, [float(getattr(calibration, name)) for name in free.names])
-    scale = np.maximum(np.abs(theta), LEAST_SCALE)
-    scale[len(first) :] = LEAST_SCALE  # s, rad
+    free = _FreeParameters.select(model, calibration, problem.drive.spec)
+    count = int(free.coefficients.sum())
+    start = free.start()
+    scale = np.maximum(np.abs(start), LEAST_SCALE)
+    scale[count:] = LEAST_SCALE
 
-    def residual(value: Array) -> Array:
-        return prediction_errors(problem, *free.at(value))
+    def residual(theta: Array) -> Array:
+        return compute_errors(problem, *free.insert(theta))
 
-    def jacobian(value: Array) -> Array:
-        return prediction_slopes(problem, *free.at(value), free)
+    def jacobian(theta: Array) -> Array:
+        return differentiate_errors(problem, *free.insert(theta), free)
 
-    given, (low, high) = jacobian if problem.courses else None, free.bounds()
-    begun = np.clip(theta, low, high)
-    theta, slope, rest = minimise(residual, begun, scale, (low, high), jacobian=given)
-    model, calibration = free.at(theta)
-    sigma = uncertainty(slope, rest)[len(first) :]
-    calibration = _with_uncertainty(free, model, calibration, sigma)
-    errors = _coefficient_errors(problem, free, slope, rest, model)
-    return Refined(model, calibration, float(np.sqrt(np.mean(rest**2))), errors)
+    low, high = free.find_bounds()
+    theta, slopes, rest = minimise(
+        residual,
+        np.clip(start, low, high),
+        scale,
+        (low, high),
+        jacobian=jacobian if problem.courses else None,
+    )
+    model, calibration = free.insert(theta)
+    sigma = uncertainty(slopes, rest)[count:]
+    return Refined(
+        model,
+        _add_uncertainty(free, model, calibration, sigma),
+        float(np.sqrt(np.mean(rest**2))),
+        _estimate_errors(problem, free, slopes, rest, model),
+    )
 
 
-def _coefficient_errors(
-    problem: Problem, free: _Free, jacobian: Array, rest: Array, model: TaylorModel
+def _estimate_errors(
+    problem: Problem,
+    free: _FreeParameters,
+    slopes: Array,
+    rest: Array,
+    model: TaylorModel,
 ) -> Array:
-    """Returns standard errors (D, K); windows of one stretch of the drive form a cluster."""
-    starts = np.concatenate([np.repeat(w.start_t, 3) for w in problem.chosen])
+    """Returns standard errors (D, K); windows of one stretch of the drive form a cluster.
+
+    Args:
+        problem: the windows.
+        free: the parameters.
+        slopes: (n, P) derivatives of the errors.
+        rest: (n,) errors that are left.
+        model: the refined model.
+    """
+    starts = np.concatenate([np.repeat(w.start_t, 3) for w in problem.windows])
     cluster = np.floor((starts - starts.min()) / max(HORIZONS_S)).astype(np.intp)
+    count = free.coefficients.sum()
     errors = np.full(model.coefficients.shape, np.nan)
-    errors[free.coefficients] = clustered_errors(jacobian, rest, cluster)[
-        : free.coefficients.sum()
-    ]
-    for d, state in enumerate(problem.drive.spec.state, start=3):
-        own, command = linear_terms(model, state.name, state.follows)
+    errors[free.coefficients] = clustered_errors(slopes, rest, cluster)[:count]
+    for row, state in enumerate(problem.drive.spec.state, start=FIRST_STATE):
+        own, command = find_linear_terms(model, state.name, state.follows)
         if own is None or command is None:
             continue
-        if free.coefficients[d, own] and not free.coefficients[d, command]:
-            gain = abs(model.coefficients[d, command] / model.coefficients[d, own])
-            errors[d, command] = gain * errors[d, own]
+        if free.coefficients[row, own] and not free.coefficients[row, command]:
+            gain = abs(model.coefficients[row, command] / model.coefficients[row, own])
+            errors[row, command] = gain * errors[row, own]
     return errors
 
 
-def _with_uncertainty(
-    free: _Free, model: TaylorModel, calibration: Calibration, sigma: Array
+def _add_uncertainty(
+    free: _FreeParameters, model: TaylorModel, calibration: Calibration, sigma: Array
 ) -> Calibration:
+    """Adds the standard errors of the refined fields, and the lags that the model has now."""
     known = calibration.uncertainty
-    spread = dict(zip(free.names, map(float, sigma), strict=True))
+    errors = dict(zip(free.names, map(float, sigma), strict=True))
     if free.time:
-        spread[free.time] = float(np.hypot(spread[free.time], WITHIN * model.dt))
+        errors[free.time] = float(np.hypot(errors[free.time], WITHIN_STEP * model.dt))
         if calibration.limits:  # a lag before a limit looks like a delay
-            spread[free.time] = max(spread[free.time], known[free.time])
-    if lag_is_measured(calibration) and "clock_offset_s" in spread:
-        both = np.hypot(spread["clock_offset_s"], known["command_latency_s"])
-        spread["clock_offset_s"] = float(both)
-    turned = calibration.rotation_rad
+            errors[free.time] = max(errors[free.time], known[free.time])
+    if are_lags_measured(calibration) and "clock_offset_s" in errors:
+        both = np.hypot(errors["clock_offset_s"], known["command_latency_s"])
+        errors["clock_offset_s"] = float(both)
+    rotation = calibration.rotation_rad
     if "rotation_rad" in free.names:
-        turned = float(geometry.wrap_angle(turned))
+        rotation = float(geometry.wrap_angle(rotation))
     responses = tuple(
-        _response(model, i, r) for i, r in enumerate(calibration.responses)
+        _update_response(model, row, response)
+        for row, response in enumerate(calibration.responses, start=FIRST_STATE)
     )
-    found = {**known, **spread}
     return replace(
-        calibration, rotation_rad=turned, uncertainty=found, responses=responses
+        calibration,
+        rotation_rad=rotation,
+        uncertainty={**known, **errors},
+        responses=responses,
     )
 
 
-def _response(model: TaylorModel, i: int, response: Response) -> Response:
+def _update_response(model: TaylorModel, row: int, response: Response) -> Response:
     """Returns the lag and gain that correspond to the coefficients of the state's rate."""
-    own, command = linear_terms(model, response.state, response.command)
-    row = model.coefficients[3 + i]
-    if own is None or command is None or not 0.0 < -row[own] * model.dt < 1.0:
+    own, command = find_linear_terms(model, response.state, response.command)
+    coefficients = model.coefficients[row]
+    if own is None or command is None:
         return response
-    rate = -float(row[own])
+    rate = -float(coefficients[own])
+    if not 0.0 < rate * model.dt < 1.0:
+        return response
     lag = -model.dt / float(np.log1p(-rate * model.dt))
-    return replace(response, lag_s=lag, gain=float(row[command]) / rate)
+    return replace(response, lag_s=lag, gain=float(coefficients[command]) / rate)
 
 
 def simplify(problem: Problem, refined: Refined) -> Refined:
@@ -439,21 +548,21 @@ def simplify(problem: Problem, refined: Refined) -> Refined:
     best = refined
     tried = set[tuple[int, int]]()
     limit = refined.error * (1.0 + WORTH)
-    while (weakest := _weakest(best, tried)) is not None:
+    while (weakest := _find_weakest(best, tried)) is not None:
         tried.add(weakest)
         coefficients = best.model.coefficients.copy()
         coefficients[weakest] = 0.0
         # the last term: without it the robot would not move
-        if not coefficients[:3].any():
+        if not coefficients[TWIST].any():
             break
         shorter = replace(best.model, coefficients=coefficients)
         try:
-            again = refine(problem, shorter, best.calibration)
+            candidate = minimise_errors(problem, shorter, best.calibration)
         # the remaining model is unstable: its slopes overflow
         except np.linalg.LinAlgError:
             continue
-        if again.error < limit:
-            best = again
+        if candidate.error < limit:
+            best = candidate
     used = np.abs(best.model.coefficients).sum(axis=0) > 0.0
     coefficients = np.ascontiguousarray(best.model.coefficients[:, used])
     model = replace(
@@ -462,15 +571,38 @@ def simplify(problem: Problem, refined: Refined) -> Refined:
     return replace(best, model=model, std_errors=best.std_errors[:, used])
 
 
-def _weakest(refined: Refined, tried: set[tuple[int, int]]) -> tuple[int, int] | None:
-    """Returns the untried free term of the twist with the smallest weight over the range of X."""
+def _find_weakest(
+    refined: Refined, tried: set[tuple[int, int]]
+) -> tuple[int, int] | None:
+    """Returns row and term of the untried free coefficient of the twist with the least weight.
+
+    The weight of a term is its share of the rate at the ends of the range of X.
+    """
     model = refined.model
-    free = free_coefficients(model, refined.calibration)[:3]
-    reach = np.maximum(np.abs(model.low), np.abs(model.high))
-    size = np.abs(model.coefficients[:3]) * np.prod(reach**model.powers, axis=1)
-    size = size / np.maximum(size.sum(axis=1, keepdims=True), 1e-12)
-    for flat in np.argsort(np.where(free, size, np.inf), axis=None):
-        d, k = divmod(int(flat), size.shape[1])
-        if free[d, k] and (d, k) not in tried:
-            return d, k
+    free = select_free_coefficients(model, refined.calibration)[TWIST]
+    largest = np.maximum(np.abs(model.low), np.abs(model.high))
+    effects = np.prod(largest**model.powers, axis=1)
+    weights = np.abs(model.coefficients[TWIST]) * effects
+    weights = weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)
+    for flat in np.argsort(np.where(free, weights, np.inf), axis=None):
+        row, term = divmod(int(flat), weights.shape[1])
+        if free[row, term] and (row, term) not in tried:
+            return row, term
     return None
+
+
+def drop_doubtful_rotation(
+    problem: Problem, best: Refined, before: Calibration
+) -> Refined:
+    """Refines again without a rotation that is below three standard errors."""
+    calibration = best.calibration
+    rotation = calibration.rotation_rad
+    sigma = calibration.uncertainty.get("rotation_rad", 0.0)
+    is_certain = abs(rotation) >= CERTAIN * sigma
+    if rotation in (0.0, before.rotation_rad) or is_certain:
+        return best
+    others = {k: v for k, v in calibration.uncertainty.items() if k != "rotation_rad"}
+    straight = replace(calibration, rotation_rad=0.0, uncertainty=others)
+    found = minimise_errors(problem, best.model, straight)
+    errors = found.calibration.uncertainty | {"rotation_rad": sigma}
+    return replace(found, calibration=replace(found.calibration, uncertainty=errors))

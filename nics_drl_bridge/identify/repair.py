@@ -11,6 +11,7 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.forms import list_driving_commands
 from nics_drl_bridge.identify.signals import (
     held,
     interval_means,
@@ -47,6 +48,8 @@ MOST_JUMPS = 0.02  # fraction of the steps above which jumps are noise
 # fraction of the rows above which jumps are not faults of single samples
 MOST = 0.15
 HELD_S = 0.5  # a pose that keeps one value for longer, and then leaps, was frozen
+# and one that does so to the end, while commands ask for this fraction of their maximum
+ASKS = 0.1
 EXCESS = 0.01  # commands may exceed their limits by this fraction of their range
 # ratio to the limit that suggests another unit: degrees give 57, rpm 9.5
 WRONG_UNIT = 5.0
@@ -94,6 +97,7 @@ def repaired(drive: Drive) -> tuple[Drive, tuple[str, ...]]:
     for repair in (
         _without_repetitions,
         _without_held_poses,
+        _without_held_end,
         _without_jumps,
         _joined,
         _within_limits,
@@ -148,8 +152,33 @@ def _without_held_poses(drive: Drive, notes: list[str]) -> recordings.Recording:
         leap_m = np.hypot(*(pose[end + 1] - pose[end])[:2])
         finding = f"The pose keeps one value {span} and then leaps by {leap_m:.2f} m"
         cause = "as if tracking was lost: these rows were left out"
-        notes.append(Gap(f"{finding}, {cause}, and what happened there is not known."))
+        notes.append(f"{finding}, {cause}.")  # the gap that this leaves is told as such
     return _with_rows(recording, "pose", ~held)
+
+
+def _without_held_end(drive: Drive, notes: list[str]) -> recordings.Recording:
+    """Ends a drive where its pose froze for good, though commands asked the robot to move.
+
+    Only a pose that otherwise never repeats itself, as noise sees to, shows this by itself.
+    """
+    recording = drive.recording
+    pose = recording.pose
+    command = recording.command
+    if len(pose.t) < 2 or pose.clock != command.clock:
+        return recording
+    same = np.append(False, (pose.values[1:] == pose.values[:-1]).all(axis=1))
+    last = int(np.flatnonzero(~same)[-1])  # that moved
+    if last == 0 or same[:last].any() or pose.t[-1] - pose.t[last] < HELD_S:
+        return recording
+    asked = np.abs(command.values[:, list(list_driving_commands(drive.spec))])
+    held = (command.t > pose.t[last]) & (command.t < pose.t[-1])
+    if not held.any() or (asked[held].mean(axis=0) <= ASKS * asked.max(axis=0)).all():
+        return recording
+    begin, end = pose.t[[last, -1]] - pose.t[0]
+    finding = f"The pose keeps one value from {begin:.1f} s to its end, {end:.1f} s"
+    cause = "though commands ask the robot to move, as if tracking was lost"
+    notes.append(Gap(f"{finding}, {cause}: the drive ends there."))
+    return _with_rows(recording, "pose", np.arange(len(pose.t)) <= last)
 
 
 def _without_jumps(drive: Drive, notes: list[str]) -> recordings.Recording:

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from textwrap import fill
 
 import numpy as np
@@ -12,7 +11,12 @@ from nics_drl_bridge.identify.fit import Alpha
 from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.identify.signals import moved_commands
 from nics_drl_bridge.identify.statistics import Curve
-from nics_drl_bridge.identify.verdict import FAR_OFF, Doubt, Mistake, coarsest_state
+from nics_drl_bridge.identify.verdict import (
+    FAR_OFF,
+    Doubt,
+    Mistake,
+    describe_coarsest_state,
+)
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import EndErrors, HorizonErrors, TaylorModel
 
@@ -27,68 +31,79 @@ LEAST_DIGITS = 3
 MOST_LEFT = 0.5
 
 
-def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
+def format_report(source: str, identified: Identified) -> str:
     """Returns the report on a recording from a source as text for people."""
-    # if the textbook replaced the model, its state may differ
-    spec = identified.drive.spec
     model = identified.model
-    latency = identified.recording.latency.sentences()
-    until = identified.train_until_s
-    joined = bool(identified.recording.episodes)
-    apart = "the last third of each drive" if joined else f"after {until:.1f} s"
-    units = units_of(spec)
-    ranges = zip(model.variables, model.low, model.high, strict=True)
-    around = list(stages(spec, identified))
-    notes = identified.notes or ("Nothing had to be corrected.",)
-    linear = not identified.findings.width and not identified.findings.replaced
-    of = f" of {identified.fit.regression.terms_total}" if linear else ""
-    listed = partial(
-        fill, width=WIDTH - 2, initial_indent="- ", subsequent_indent="    "
-    )
+    robot = identified.drive.spec.name
     sections: dict[str, Iterable[str]] = {
-        f"Fit report: robot {spec.name!r} from {source}": map(
-            listed, conclude(identified).lines
+        f"Fit report: robot {robot!r} from {source}": _list_items(
+            conclude(identified).lines
         ),
-        f"Kept {model.terms_kept}{of} terms, step {model.dt:g} s "
-        f"(X = {', '.join(model.variables)}), with standard errors:": equations_with_errors(
-            model
-        ),
-        **(
-            {"Effect of the motors (standard uncertainties):": around} if around else {}
-        ),
-        **_linear_fit(identified),
-        f"Open loop, on data held out from the fit ({apart}):": _held_out(identified),
-        **_compared(identified.judgement),
-        "Valid range, as covered by the drive:": (
-            f"{name:<24} {low:.4g} to {high:.4g} {units[name]}"
-            + " (assumed)" * (model.bounded and f"d_{name}" in dict(model.assumed))
-            for name, low, high in ranges
-        ),
-        "Calibration (standard uncertainties):": (
-            e.text for e in estimates(identified).values()
-        ),
-        "Noise that the simulator and the estimator use (standard deviations):": (
-            identified.noise.sentences()
-        ),
-        **(
-            {"Latency of the device, also used by simulator_node:": latency}
-            if latency
-            else {}
-        ),
-        "Findings, and what was not learnt:": map(listed, notes),
+        _describe_size(identified): format_equations(model),
     }
+    if motor_effects := list(list_motor_effects(identified)):
+        sections["Effect of the motors (standard uncertainties):"] = motor_effects
+    sections |= _describe_fit(identified)
+    apart = f"after {identified.train_until_s:.1f} s"
+    if identified.recording.episodes:
+        apart = "the last third of each drive"
+    held_out = f"Open loop, on data held out from the fit ({apart}):"
+    sections[held_out] = _describe_held_out(identified)
+    sections |= _format_comparison(identified.judgement)
+    sections["Valid range, as covered by the drive:"] = _describe_range(identified)
+    sections["Calibration (standard uncertainties):"] = (
+        estimate.text for estimate in collect_estimates(identified).values()
+    )
+    noise = "Noise that the simulator and the estimator use (standard deviations):"
+    sections[noise] = identified.noise.sentences()
+    if latency := identified.recording.latency.sentences():
+        sections["Latency of the device, also used by simulator_node:"] = latency
+    notes = identified.notes or ("Nothing had to be corrected.",)
+    sections["Findings, and what was not learnt:"] = _list_items(notes)
     paragraphs = (
         [head, *(f"  {line}" for line in lines)] for head, lines in sections.items()
     )
     return "\n\n".join("\n".join(lines) for lines in paragraphs) + "\n"
 
 
-def opening(report: str) -> str:
+def select_opening(report: str) -> str:
     """Returns the conclusion and the model of a fit report, which are read first."""
     return "\n\n".join(report.split("\n\n")[:2])
 
 
-def equations_with_errors(model: TaylorModel) -> list[str]:
+def _list_items(sentences: Iterable[str]) -> Iterator[str]:
+    for sentence in sentences:
+        yield fill(
+            sentence, width=WIDTH - 2, initial_indent="- ", subsequent_indent="    "
+        )
+
+
+def _is_pruned(identified: Identified) -> bool:
+    """True if the terms come from the pruned fit, unlike those of a motion or a textbook."""
+    findings = identified.findings
+    return findings.motion_width_s is None and not findings.replacement
+
+
+def _describe_size(identified: Identified) -> str:
+    model = identified.model
+    of = ""
+    if _is_pruned(identified):
+        of = f" of {identified.fit.regression.terms_total}"
+    variables = f"X = {', '.join(model.variables)}"
+    kept = f"Kept {model.terms_kept}{of} terms, step {model.dt:g} s ({variables})"
+    return f"{kept}, with standard errors:"
+
+
+def _describe_range(identified: Identified) -> Iterator[str]:
+    model = identified.model
+    units = list_units(identified.drive.spec)
+    assumed = dict(model.assumed)
+    for name, low, high in zip(model.variables, model.low, model.high, strict=True):
+        mark = " (assumed)" if model.bounded and f"d_{name}" in assumed else ""
+        yield f"{name:<24} {low:.4g} to {high:.4g} {units[name]}{mark}"
+
+
+def format_equations(model: TaylorModel) -> list[str]:
     """Returns one line per degree of freedom: `wz = (4.63 +- 0.02)*speed*steering  [rad/s]`."""
     errors = model.named_errors
     lines = [curve.equation for curve in model.inputs]
@@ -100,33 +115,35 @@ def equations_with_errors(model: TaylorModel) -> list[str]:
         for name, shown, value in terms:
             if value == 0.0:
                 continue
-            sign = (
-                ("-" if value < 0 else "")
-                if not text
-                else (" - " if value < 0 else " + ")
-            )
-            mark = " (assumed)" if (dof, name) in model.assumed else ""
-            number = with_error(abs(value), errors.get(dof, {}).get(name))
-            text += f"{sign}{number}" + ("" if name == "1" else f"*{shown}") + mark
+            sign = "-" if value < 0.0 else "+"
+            if text:
+                text += f" {sign} "
+            elif sign == "-":
+                text = sign
+            text += format_with_error(abs(value), errors.get(dof, {}).get(name))
+            if name != "1":
+                text += f"*{shown}"
+            if (dof, name) in model.assumed:
+                text += " (assumed)"
         lines.append(f"{dof} = {text or '0'}{model.describe_limits(dof)}  [{unit}]")
     return lines
 
 
-def units_of(spec: RobotSpec) -> dict[str, str]:
+def list_units(spec: RobotSpec) -> dict[str, str]:
     """Returns the units of a robot's variables, by name; empty for fractions."""
     names = zip(spec.variable_names, spec.variable_units, strict=True)
     return {name: unit * (unit != "1") for name, unit in names}
 
 
-def stages(spec: RobotSpec, identified: Identified) -> Iterator[str]:
-    """Yields a line per parameter of the stages around the terms, with its uncertainty.
+def list_motor_effects(identified: Identified) -> Iterator[str]:
+    """Yields a line per parameter of a motor or an input curve, with its uncertainty.
 
     The names are `throttle.dead`, `.least`, `.most`, `.back` and `.delay` for a command, `vx.fall`,
     `.rise`, `.friction` and `.drag` for a state, and `vx.back_emf.throttle` for a pair.
     """
     model = identified.model
     sigma = identified.calibration.uncertainty
-    units = units_of(spec)
+    units = list_units(identified.drive.spec)
     values = [
         (f"{curve.command}.{name}", words, getattr(curve, name), unit, usual)
         for curve in model.inputs
@@ -171,7 +188,7 @@ def stages(spec: RobotSpec, identified: Identified) -> Iterator[str]:
             yield f"{name:<24} {words}: {value:.4g}{spread} {unit}".rstrip()
 
 
-def with_error(value: float, error: float | None) -> str:
+def format_with_error(value: float, error: float | None) -> str:
     """Formats a number with its standard error, ready for computation: `(4.63 +- 0.02)`.
 
     Keeps the digits that the error allows, but at least `LEAST_DIGITS`.
@@ -188,9 +205,9 @@ def with_error(value: float, error: float | None) -> str:
     return f"({value:.{digits}f} +- {error:.{digits}f})"
 
 
-def _linear_fit(identified: Identified) -> dict[str, Iterable[str]]:
+def _describe_fit(identified: Identified) -> dict[str, Iterable[str]]:
     """Describes the pruned linear fit if the terms come from it, unlike those of a motion."""
-    if identified.findings.width is not None or identified.findings.replaced:
+    if not _is_pruned(identified):
         return {}
     fit = identified.fit
     model = identified.model
@@ -198,9 +215,9 @@ def _linear_fit(identified: Identified) -> dict[str, Iterable[str]]:
         model.dofs, model.dof_units, fit.rmse, fit.r2, fit.condition, strict=True
     )
     return {
-        fill(_pruning(identified.alpha), WIDTH): (),
+        fill(_describe_pruning(identified.alpha), WIDTH): (),
         "Cross-validated error against the number of terms, largest first, * for those kept:": (
-            line for curve in fit.curves for line in _curve(curve)
+            line for curve in fit.curves for line in _format_curve(curve)
         ),
         "Error of the linear fit per degree of freedom, on the part it was fitted to:": (
             f"{dof:<24} RMSE {rmse:.3g} {unit}, R2 {r2:.6f}, condition number {number:.3g}"
@@ -209,7 +226,7 @@ def _linear_fit(identified: Identified) -> dict[str, Iterable[str]]:
     }
 
 
-def _pruning(alpha: Alpha) -> str:
+def _describe_pruning(alpha: Alpha) -> str:
     if alpha == "auto":
         knee = "Pruned (Eq. 2) per degree of freedom at the knee of its accuracy curve"
         fewest = "the fewest terms, largest standardised coefficient first"
@@ -222,7 +239,7 @@ def _pruning(alpha: Alpha) -> str:
     return f"{pruned}; the term that crosses the threshold is kept too."
 
 
-def _curve(curve: Curve) -> list[str]:
+def _format_curve(curve: Curve) -> list[str]:
     shown = min(max(CURVE_POINTS, curve.kept + 1), len(curve.error))
     points = [
         f"{n}{'*' if n == curve.kept else ''}: {100.0 * curve.share[n]:.3g} %"
@@ -233,7 +250,7 @@ def _curve(curve: Curve) -> list[str]:
     return fill(text, WIDTH, subsequent_indent=" " * 15).splitlines()
 
 
-def _held_out(identified: Identified) -> Iterator[str]:
+def _describe_held_out(identified: Identified) -> Iterator[str]:
     found = identified.held_out
     model = identified.model
     quality = identified.model.quality
@@ -266,7 +283,7 @@ COMPARED = (
 )
 
 
-def judgement_rows(judgement: Sequence[HorizonErrors]) -> list[tuple[str, ...]]:
+def tabulate_judgement(judgement: Sequence[HorizonErrors]) -> list[tuple[str, ...]]:
     """Returns a table of predictions beside those of yardsticks, a row per horizon for `HEADS`."""
 
     def cell(errors: EndErrors | None, path: float) -> str:
@@ -290,8 +307,8 @@ def judgement_rows(judgement: Sequence[HorizonErrors]) -> list[tuple[str, ...]]:
     ]
 
 
-def _compared(judgement: Sequence[HorizonErrors]) -> dict[str, Iterator[str]]:
-    rows = [HEADS, *judgement_rows(judgement)]
+def _format_comparison(judgement: Sequence[HorizonErrors]) -> dict[str, Iterator[str]]:
+    rows = [HEADS, *tabulate_judgement(judgement)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ("  ".join(map(str.rjust, row, widths)) for row in rows)
     return {COMPARED: lines} if judgement else {}
@@ -319,7 +336,7 @@ class CalibratedValue:
         return f"{self.name} {self.value:.4g}{spread} {self.unit}{remark}"
 
 
-def estimates(identified: Identified) -> dict[str, CalibratedValue]:
+def collect_estimates(identified: Identified) -> dict[str, CalibratedValue]:
     """Returns all estimates of the calibration by their names in `Calibration`."""
     recording = identified.recording
     found = identified.calibration
@@ -331,7 +348,7 @@ def estimates(identified: Identified) -> dict[str, CalibratedValue]:
     clocks = "pose and commands are on one clock" if one_clock else untold
     both = "clock_offset_s" in sigma
     latency = "only its sum with the clock offset is known" if both else untold
-    if identified.findings.width is not None and not both:
+    if identified.findings.motion_width_s is not None and not both:
         latency = "it can't be separated from the lags"
     few = "the drive shows too few directions of motion"
     hidden = (few, few) if mounting is None else mounting.hidden
@@ -363,7 +380,7 @@ def estimates(identified: Identified) -> dict[str, CalibratedValue]:
             )
             remark = "below its uncertainty: taken as zero" if zero else ""
             values[key] = CalibratedValue(name, value, sigma[key], unit, remark)
-    if identified.findings.replaced:
+    if identified.findings.replacement:
         for key in TEXTBOOK_VALUES:
             name, value, unit, _ = rows[key]
             values[key] = CalibratedValue(
@@ -392,7 +409,7 @@ def is_useless(error: float, standing: float, path: float, radius: float) -> boo
     return not error <= max(MOST_LEFT * standing, FAR_OFF * path, radius)
 
 
-def why_useless(identified: Identified, spec: RobotSpec) -> str:
+def explain_uselessness(identified: Identified) -> str:
     """Returns a sentence on why a model is useless, by median errors; empty if it is not."""
     held_out = identified.held_out
     recording = identified.recording
@@ -409,15 +426,15 @@ def why_useless(identified: Identified, spec: RobotSpec) -> str:
     way = f"after {held_out.horizon_s:g} s and a path of {held_out.mean_path_m:.2f} m"
     still = f"while a robot standing still would be {standing:.2f} m off"
     fault = f"the fitted model is useless: on unseen data its predictions {end} {way}, {still}"
-    return f"{recording.source}: {fault}; {_suspicion(identified, spec)}."
+    return f"{recording.source}: {fault}; {_name_suspect(identified, spec)}."
 
 
-def _suspicion(identified: Identified, spec: RobotSpec) -> str:
+def _name_suspect(identified: Identified, spec: RobotSpec) -> str:
     recording = identified.recording
     unmoved = identified.trial.fit.unmoved
     rows = recording.pose if recording.state is None else recording.state
     apart = f"{np.median(np.diff(rows.t)):.2g} s apart"
-    if coarse := coarsest_state(recording, spec, unmoved):
+    if coarse := describe_coarsest_state(recording, spec, unmoved):
         return coarse
     if still := ", ".join(c.name for c in spec.command if c.name in unmoved):
         reason = f"{still} never moved in its first {identified.train_until_s:.0f} s"

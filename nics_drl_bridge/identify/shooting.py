@@ -112,6 +112,13 @@ class Shooting:
         some = whole.any(axis=1)
         return first[some], np.where(whole, steps, 0)[some]
 
+    @property
+    def longest_horizon_s(self) -> float:
+        """The longest horizon that fits into the drive; 0 if none does [s]."""
+        _, steps = self.starts()
+        horizons = zip(self.horizons, steps.T, strict=True)
+        return max((horizon for horizon, each in horizons if each.any()), default=0.0)
+
     def moved(self, first: Rows, steps: Rows) -> Array:
         """Returns the measured poses (W, H, 3) at windows' horizons, relative to the starts."""
         pose = self.samples.q[:, :3]
@@ -161,10 +168,14 @@ class Shooting:
     def errors(
         self, model: TaylorModel, values: Array, inside: Mask | None = None
     ) -> tuple[Array, Array]:
-        """Returns prediction errors (W, H, 3), and the lengths (W, H) of paths; may be NaN."""
+        """Returns prediction errors (W, H, 3), and the lengths (W, H) of paths.
+
+        Both are NaN where a horizon does not fit; errors of diverged predictions are infinite.
+        """
         first, steps = self.starts(inside)
         error = self.predict(model, values, first, steps)[0] - self.moved(first, steps)
         error[..., 2] = geometry.wrap_angle(error[..., 2])
+        error[np.isnan(error)] = np.inf
         error[steps == 0] = np.nan
         return error, np.where(steps > 0, self.paths(first, steps), np.nan)
 

@@ -1,4 +1,18 @@
-"""Terms that a model may have: by mirror symmetry, by its textbook, and through its state."""
+"""Terms that a model may have, and models that are put together from terms.
+
+A term filter gets the exponents (K, V) of all terms, and selects those that each degree of freedom
+may have (D, K). Least squares then fits only these.
+
+- `select_motion_terms`: for a state that is the motion, derived from the poses. All terms up to an
+  order that mirror symmetry allows; a state that is a component of the twist is so by definition.
+- `select_textbook_terms`: for the same state; only the terms by which textbooks describe it.
+- `select_terms_through_state`: for a state that follows commands and was not measured. The twist
+  depends on the state alone.
+
+A mirror image of a robot exchanges left and right: vy and wz change sign, and so do the variables
+that cause them, such as a steering angle. The motion of the image is the image of the motion, so
+that vx is even in these variables, and vy and wz are odd.
+"""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,285 +30,370 @@ from nics_drl_bridge.identify.fit import Fit, prune_and_refit, regress
 from nics_drl_bridge.identify.yardstick import structure_of
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.kinds import compute_steady_twist
-from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec
+from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec, StateVariable
 from nics_drl_bridge.robot.taylor import TaylorModel
 
 Mask = NDArray[np.bool_]
 Powers = NDArray[np.int64]
 
-NOTHING = 1e-9  # spread of a rate that counts as zero
+TWIST = slice(0, 3)  # degrees of freedom: the twist, then the rates of the state
+FIRST_STATE = 3
+VX = POSE_RATES.index("vx")
+VY = POSE_RATES.index("vy")
+MIRRORED_RATES = ("vy", "wz")
+IN_MIRROR = np.array([1.0, -1.0, -1.0])  # signs of vx, vy and wz
+NOTHING = 1e-9  # spread of a rate, or size of a coefficient, that counts as zero
 
 
-def mirrored(spec: RobotSpec) -> tuple[str, ...] | None:
-    """Names the variables that change sign in a mirror; None if the textbook does not say."""
-    rng = np.random.default_rng(0)
-    reach = np.maximum(spec.command_high, -spec.command_low)
-    some = rng.uniform(0.1, 0.9, (8, len(spec.command))) * reach
-    try:
-        twist = compute_steady_twist(spec, some) * np.array([1.0, -1.0, -1.0])
-        for signs in product((1.0, -1.0), repeat=len(spec.command)):
-            if np.allclose(compute_steady_twist(spec, some * signs), twist):
-                break
-        else:
-            return None
-    except ConfigError:
-        return None
-    odd = [c.name for c, sign in zip(spec.command, signs, strict=True) if sign < 0.0]
-    aside = [v.name for v in spec.state if v.twist in ("vy", "wz") or v.follows in odd]
-    return (*aside, *odd)
-
-
-def is_reversed(name: str, odd: tuple[str, ...]) -> bool:
-    """True if a variable or a rate of the twist changes sign in a mirror that reverses `odd`."""
-    return name in ("vy", "wz") or name.removeprefix("d_") in odd
-
-
-def sided(spec: RobotSpec) -> bool:
-    """True if a lever arm along y is distinguishable from unequal wheels."""
-    return spec.moves_sideways or mirrored(spec) is not None
-
-
-def tyres_slip(spec: RobotSpec) -> bool:
-    """True for a front-steered car whose motion is its state: it may slip sideways."""
-    given = structure_of(spec)
-    told = {v.twist for v in spec.state} >= {"vx", "vy", "wz"}
-    return told and given is not None and given[1].used and not given[1].front_drive
-
-
-def library(powers: Powers, spec: RobotSpec, held: tuple[str, ...] = ()) -> Mask:
-    """Selects the terms (D, K) that each degree of freedom may have.
-
-    A state that is a component of the twist is so by definition. Slip along y is proportional.
-    Beyond the first order, what a mirror reverses only has reversed terms. Commands that were
-    `held` at one value act as a constant.
-    """
-    names = spec.variable_names
-    odd = mirrored(spec)
-    order = powers.sum(axis=1)
-    slip = [names.index(v.name) for v in spec.state if v.twist == "vy"]
-    allowed = np.ones((len(spec.dof_names), len(powers)), dtype=np.bool_)
-    allowed[:, (powers[:, slip].sum(axis=1) > 0) & (order > 1)] = False
-    if odd is not None:
-        reversed_ = powers[:, [n in odd for n in names]].sum(axis=1) % 2 == 1
-        for d, name in enumerate(spec.dof_names):
-            allowed[d] &= (reversed_ == is_reversed(name, odd)) | (order <= 1)
-    if spec.state:  # commands act through the state
-        allowed[:3] &= (powers[:, len(spec.state) :] == 0).all(axis=1)
-    if not spec.state or odd is not None:  # without a command, the robot comes to rest
-        pushed = [is_reversed(name, odd or ()) for name in held]
-        rest = [is_reversed(name, odd or ()) not in pushed for name in spec.dof_names]
-        allowed[rest] &= order > 0
-    for i, variable in enumerate(spec.state):
-        alone = (order == 1) & (powers[:, i] == 1)
-        if variable.twist:
-            allowed[POSE_RATES.index(variable.twist)] = alone
-        else:
-            follows = names.index(str(variable.follows))
-            allowed[3 + i] = alone | ((order == 1) & (powers[:, follows] == 1))
-    return np.asarray(allowed)
-
-
-def through_state(powers: Powers, spec: RobotSpec, centred: bool) -> Mask:
-    """Selects the terms (D, K) that each degree of freedom may have.
-
-    If poses are those of the robot's `centred` reference point, motion along x is even in what a
-    mirror reverses, and beyond the first order the rest is odd. States lag behind their commands.
-    """
-    names = spec.variable_names
-    odd = mirrored(spec)
-    order = powers.sum(axis=1)
-    unmoved = [
-        name for name, most in zip(names, powers.max(axis=0), strict=True) if most == 0
-    ]
-    allowed = np.ones((len(spec.dof_names), len(powers)), dtype=np.bool_)
-    allowed[:3] = excitation.terms_through_state(powers, spec, tuple(unmoved))
-    if odd is not None and centred:
-        aside = powers[:, [name in odd for name in names]].sum(axis=1) % 2 == 1
-        allowed[0] &= ~aside
-        allowed[1:3] &= aside | (order <= 1)
-    for i, variable in enumerate(spec.state):
-        own = [names.index(variable.name), names.index(str(variable.follows))]
-        allowed[3 + i] = (order == 1) & powers[:, own].any(axis=1)
-    return allowed
-
-
-def by_textbook(
-    powers: Powers, spec: RobotSpec, held: tuple[str, ...] = (), tyres: bool = False
-) -> Mask:
-    """Selects the terms (D, K) by which the twist follows commands with a lag, as in textbooks."""
-    names = spec.variable_names
-    states = len(spec.state)
-    order = powers.sum(axis=1)
-    allowed, given = library(powers, spec, held) & (order <= 1), structure_of(spec)
-    if given is None or not states:
-        return np.asarray(allowed)
-    moves, bicycle = given
-    first = np.eye(len(names), dtype=np.int64)
-    speed = [i for i, v in enumerate(spec.state) if v.twist == "vx"]
-    paced = bool(speed) and powers[:, speed].any()  # else its speed never changed
-
-    def has(d: int, *rows: NDArray[np.int64]) -> None:
-        for row in rows:
-            allowed[d] |= (powers == row).all(axis=1)
-
-    for i, variable in enumerate(spec.state):
-        if variable.twist is None:
-            continue
-        part = POSE_RATES.index(variable.twist)
-        allowed[3 + i] = False
-        if tyres and paced and variable.twist != "vx":  # by the lateral acceleration
-            has(
-                3 + i,
-                2 * first[speed[0]] + first[[v.twist for v in spec.state].index("wz")],
-            )
-        # no constant, because without a command the robot comes to rest
-        has(3 + i, first[i])
-        commands = first[states:][np.abs(moves[part]) > 0.0]
-        if bicycle.used and variable.twist == "wz" and paced:
-            has(3 + i, first[speed[0]], *(commands + first[speed[0]]))
-            continue
-        has(3 + i, *commands)
-        if any(command @ [name in held for name in names] for command in commands):
-            has(3 + i, 0 * first[i])
-    return np.asarray(allowed)
-
-
-def linear_fit(
+def fit_motion_terms(
     samples: Samples,
     spec: RobotSpec,
     order: int,
-    allowed: Callable[..., Mask] = library,
+    allowed: Callable[..., Mask] | None = None,
 ) -> Fit:
-    """Fits all library terms up to an order to the rates (Eq. 1); the twist by definition."""
-    variables = (*spec.state, *spec.command)
-    unmoved = excitation.unmoved_variables(samples, spec)
-    mean = samples.x.mean(axis=0)
-    least = excitation.STILL * np.array([v.max - v.min for v in variables])
-    at = {
-        v.name: float(value) * bool(abs(value) > some)
-        for v, value, some in zip(variables, mean, least, strict=True)
-        if v.name in unmoved
-    }
-    held = tuple(c.name for c in spec.command if at.get(c.name))
+    """Fits the terms of a motion up to an order to its rates (Eq. 1), without pruning.
+
+    Args:
+        samples: rows of a drive whose state is the motion.
+        spec: the robot.
+        order: of the terms.
+        allowed: a term filter; by default `select_motion_terms`.
+    """
+    allowed = allowed or select_motion_terms
+    constants = _find_constant_variables(samples, spec)
+    held = tuple(c.name for c in spec.command if constants.get(c.name))
     found = prune_and_refit(
         regress(samples, spec, order, term_filter=partial(allowed, held=held)),
         spec,
         1.0,
     )
     still = samples.dq.std(axis=0) <= NOTHING
-    still[3:] |= np.array([v.name in at for v in spec.state], dtype=np.bool_)
+    still[FIRST_STATE:] |= np.array(
+        [v.name in constants for v in spec.state], dtype=np.bool_
+    )
     coefficients = np.where(still[:, None], 0.0, found.model.coefficients)
     model = replace(found.model, coefficients=coefficients)
-    return replace(found, model=_by_definition(model, spec, at))
+    return replace(found, model=_define_twist(model, spec, constants))
 
 
-def _by_definition(
-    model: TaylorModel, spec: RobotSpec, at: dict[str, float]
+def _find_constant_variables(samples: Samples, spec: RobotSpec) -> dict[str, float]:
+    """Returns the values of the variables that never moved, by name; 0 if close to it."""
+    variables = (*spec.state, *spec.command)
+    unmoved = excitation.unmoved_variables(samples, spec)
+    constants = {}
+    for variable, mean in zip(variables, samples.x.mean(axis=0), strict=True):
+        if variable.name in unmoved:
+            is_zero = abs(mean) <= excitation.STILL * (variable.max - variable.min)
+            constants[variable.name] = 0.0 if is_zero else float(mean)
+    return constants
+
+
+def _define_twist(
+    model: TaylorModel, spec: RobotSpec, constants: dict[str, float]
 ) -> TaylorModel:
-    """Sets the rows of the twist that are states; one that stayed `at` a value is a constant."""
-    first = np.eye(len(model.variables), dtype=np.int64)
-    rows = [0 * first[0], *first[: len(spec.state)]]
-    more = [row for row in rows if not (model.powers == row).all(axis=1).any()]
+    """Sets the rows of the twist that are states; a state that never moved is a constant there."""
+    linear = np.eye(len(model.variables), dtype=np.int64)
+    constant = 0 * linear[0]
+    needed = [constant, *linear[: len(spec.state)]]
+    more = [row for row in needed if not (model.powers == row).all(axis=1).any()]
     powers = np.concatenate(
-        [model.powers, np.reshape(more, (-1, len(first))).astype(np.int64)]
+        [model.powers, np.reshape(more, (-1, len(linear))).astype(np.int64)]
     )
     coefficients = np.zeros((len(model.dofs), len(powers)))
     coefficients[:, : len(model.powers)] = model.coefficients
     # remaining lateral motion is noise, unless it is a state
     if not spec.moves_sideways:
-        coefficients[1] = 0.0
+        coefficients[VY] = 0.0
     for i, variable in enumerate(spec.state):
-        if variable.twist:
-            value = at.get(variable.name)
-            own, share = (first[i], 1.0) if value is None else (rows[0], value)
-            coefficients[POSE_RATES.index(variable.twist)] = share * (
-                powers == own
-            ).all(axis=1)
+        if variable.twist is None:
+            continue
+        value = constants.get(variable.name)
+        if value is None:
+            row = (powers == linear[i]).all(axis=1) * 1.0
+        else:
+            row = value * (powers == constant).all(axis=1)
+        coefficients[POSE_RATES.index(variable.twist)] = row
     kept = coefficients.any(axis=0)
-    none = np.zeros((0, 0))
     return replace(
         model,
         powers=powers[kept],
         coefficients=coefficients[:, kept],
-        std_errors=none,
+        std_errors=np.zeros((0, 0)),
         bounded=True,
     )
 
 
-def shared(model: TaylorModel, spec: RobotSpec, samples: Samples) -> TaylorModel:
-    """Distributes an effect over commands of one unit that always moved together.
+def select_motion_terms(
+    powers: Powers, spec: RobotSpec, held: tuple[str, ...] = ()
+) -> Mask:
+    """Selects the terms (D, K) of a robot whose state is its motion.
 
-    Uses the minimum-norm coefficients, for example for four wheels and three degrees of freedom.
+    A state that is a component of the twist is so by definition. Slip along y is proportional.
+    Beyond the first order, mirror symmetry must hold. Without a command, the robot comes to rest.
+
+    Args:
+        powers: (K, V) exponents of the terms.
+        spec: the robot.
+        held: commands that had one value all the time, and therefore act as a constant.
     """
-    still = excitation.combinations(samples, spec)
-    command = samples.x[:, len(spec.state) :]
-    parts = np.abs(still).max(axis=0, initial=0.0) > NOTHING
-    constant = still / np.maximum(command.std(axis=0), NOTHING)
-    if (
-        len(
-            {
-                c.unit
-                for c, part in zip(spec.command, parts.tolist(), strict=True)
-                if part
-            }
-        )
-        != 1
-    ):
-        return model
-    if np.abs(constant @ command.mean(axis=0)).max() > excitation.TOGETHER:
-        return model
-    normal = orth(constant.T)
-    onto = np.eye(len(model.variables))
-    onto[len(spec.state) :, len(spec.state) :] -= normal @ normal.T
-    rows: dict[tuple[int, ...], Array] = {}
-    for powers, effect in zip(model.powers.tolist(), model.coefficients.T, strict=True):
-        factors = np.repeat(np.arange(len(powers)), powers)
-        for places in product(
-            *(np.flatnonzero(np.abs(onto[f]) > NOTHING) for f in factors)
-        ):
-            term = np.bincount(np.array(places, dtype=np.int64), minlength=len(powers))
-            share = float(np.prod(onto[factors, list(places)]))
-            key = tuple(term.tolist())
-            rows[key] = rows.get(key, np.zeros(len(effect))) + share * effect
-    coefficients = np.array(list(rows.values())).T
-    kept = (np.abs(coefficients) > NOTHING).any(axis=0)
-    powers = np.array(list(rows), dtype=np.int64)[kept]
-    none = np.zeros((0, 0))
-    return replace(
-        model, powers=powers, coefficients=coefficients[:, kept], std_errors=none
+    names = spec.variable_names
+    reversed_names = list_reversed_variables(spec)
+    order = powers.sum(axis=1)
+    allowed = np.ones((len(spec.dof_names), len(powers)), dtype=np.bool_)
+    slip = [names.index(v.name) for v in spec.state if v.twist == "vy"]
+    allowed[:, (powers[:, slip].sum(axis=1) > 0) & (order > 1)] = False
+    if reversed_names is not None:
+        is_odd = _are_odd(powers, names, reversed_names)
+        for row, dof in enumerate(spec.dof_names):
+            keeps_symmetry = is_odd == is_reversed(dof, reversed_names)
+            allowed[row] &= keeps_symmetry | (order <= 1)
+    if spec.state:  # commands act through the state
+        allowed[TWIST] &= (powers[:, len(spec.state) :] == 0).all(axis=1)
+    allowed[_come_to_rest(spec, reversed_names, held)] &= order > 0
+    for i, variable in enumerate(spec.state):
+        own = (order == 1) & (powers[:, i] == 1)
+        if variable.twist:
+            allowed[POSE_RATES.index(variable.twist)] = own
+        else:
+            command = find_followed_command(spec, variable)
+            by_command = (order == 1) & (powers[:, command] == 1)
+            allowed[FIRST_STATE + i] = own | by_command
+    return np.asarray(allowed)
+
+
+def _come_to_rest(
+    spec: RobotSpec, reversed_names: tuple[str, ...] | None, held: tuple[str, ...]
+) -> Mask:
+    """Selects the degrees of freedom (D,) without a constant: no command that was held acts there.
+
+    Without a known mirror, a command that was held may act on all of them.
+    """
+    if reversed_names is None:
+        return np.full(len(spec.dof_names), not (spec.state or held))
+    acting = [is_reversed(name, reversed_names) for name in held]
+    return np.array(
+        [is_reversed(dof, reversed_names) not in acting for dof in spec.dof_names]
     )
 
 
-def stable(model: TaylorModel, spec: RobotSpec) -> TaylorModel:
+def select_textbook_terms(
+    powers: Powers, spec: RobotSpec, held: tuple[str, ...] = (), tyres: bool = False
+) -> Mask:
+    """Selects the terms (D, K) by which the twist follows commands with a lag, as in textbooks.
+
+    Args:
+        powers: (K, V) exponents of the terms.
+        spec: the robot.
+        held: commands that had one value all the time, and therefore act as a constant.
+        tyres: allows terms of the lateral acceleration, which makes tyres slip.
+    """
+    names = spec.variable_names
+    states = len(spec.state)
+    allowed = select_motion_terms(powers, spec, held) & (powers.sum(axis=1) <= 1)
+    structure = structure_of(spec)
+    if structure is None or not states:
+        return np.asarray(allowed)
+    moves, bicycle = structure
+    linear = np.eye(len(names), dtype=np.int64)
+    twist = [v.twist for v in spec.state]
+    # without it, the speed never changed
+    has_speed = "vx" in twist and bool(powers[:, twist.index("vx")].any())
+    is_held = np.array([name in held for name in names])
+
+    def allow(row: int, *terms: NDArray[np.int64]) -> None:
+        for term in terms:
+            allowed[row] |= (powers == term).all(axis=1)
+
+    for i, component in enumerate(twist):
+        if component is None:
+            continue
+        row = FIRST_STATE + i
+        allowed[row] = False
+        if tyres and has_speed and component != "vx":  # by the lateral acceleration
+            allow(row, 2 * linear[twist.index("vx")] + linear[twist.index("wz")])
+        # no constant, because without a command the robot comes to rest
+        allow(row, linear[i])
+        is_moving = np.abs(moves[POSE_RATES.index(component)]) > 0.0
+        commands = linear[states:][is_moving]
+        if bicycle.used and component == "wz" and has_speed:
+            speed = linear[twist.index("vx")]
+            allow(row, speed, *(commands + speed))
+            continue
+        allow(row, *commands)
+        if is_held[states:][is_moving].any():
+            allow(row, 0 * linear[i])
+    return np.asarray(allowed)
+
+
+def select_terms_through_state(powers: Powers, spec: RobotSpec, centred: bool) -> Mask:
+    """Selects the terms (D, K) of a robot whose states follow commands and were not measured.
+
+    The twist depends on the state alone, and the rate of a state on itself and its command.
+
+    Args:
+        powers: (K, V) exponents of the terms.
+        spec: the robot.
+        centred: True if poses are those of the robot's reference point, so that mirror symmetry
+            must hold: for vx in all terms, for vy and wz beyond the first order.
+    """
+    names = spec.variable_names
+    reversed_names = list_reversed_variables(spec)
+    order = powers.sum(axis=1)
+    unmoved = tuple(
+        name for name, most in zip(names, powers.max(axis=0), strict=True) if most == 0
+    )
+    allowed = np.ones((len(spec.dof_names), len(powers)), dtype=np.bool_)
+    allowed[TWIST] = excitation.terms_through_state(powers, spec, unmoved)
+    if reversed_names is not None and centred:
+        is_odd = _are_odd(powers, names, reversed_names)
+        allowed[VX] &= ~is_odd
+        allowed[VX + 1 : FIRST_STATE] &= is_odd | (order <= 1)
+    for i, variable in enumerate(spec.state):
+        own = [i, find_followed_command(spec, variable)]
+        allowed[FIRST_STATE + i] = (order == 1) & powers[:, own].any(axis=1)
+    return allowed
+
+
+def find_followed_command(spec: RobotSpec, variable: StateVariable) -> int:
+    """Returns the index among X of the command that a state follows; ConfigError without one."""
+    if variable.follows is None:
+        fault = f"state {variable.name!r} of robot {spec.name!r} follows no command"
+        raise ConfigError(f"{fault}; add `follows:` to it, or record it.")
+    return spec.variable_names.index(variable.follows)
+
+
+def select_defined_dofs(spec: RobotSpec) -> Mask:
+    """Selects the degrees of freedom (D,) that the state defines, so that they are not fitted."""
+    is_defined = np.zeros(len(spec.dof_names), dtype=np.bool_)
+    for i, variable in enumerate(spec.state):
+        if variable.twist:
+            is_defined[POSE_RATES.index(variable.twist)] = True
+        else:
+            is_defined[FIRST_STATE + i] = True
+    return is_defined
+
+
+def list_reversed_variables(spec: RobotSpec) -> tuple[str, ...] | None:
+    """Names the variables that change sign in a mirror; None if the textbook does not say."""
+    rng = np.random.default_rng(0)
+    largest = np.maximum(spec.command_high, -spec.command_low)
+    commands = rng.uniform(0.1, 0.9, (8, len(spec.command))) * largest
+    try:
+        mirrored = compute_steady_twist(spec, commands) * IN_MIRROR
+        for signs in product((1.0, -1.0), repeat=len(spec.command)):
+            if np.allclose(compute_steady_twist(spec, commands * signs), mirrored):
+                break
+        else:
+            return None
+    except ConfigError:
+        return None
+    odd = [c.name for c, sign in zip(spec.command, signs, strict=True) if sign < 0.0]
+    states = (
+        v.name for v in spec.state if v.twist in MIRRORED_RATES or v.follows in odd
+    )
+    return (*states, *odd)
+
+
+def is_reversed(name: str, reversed_names: tuple[str, ...]) -> bool:
+    """True if a variable, or a degree of freedom, changes sign in a mirror."""
+    return name in MIRRORED_RATES or name.removeprefix("d_") in reversed_names
+
+
+def _are_odd(
+    powers: Powers, names: tuple[str, ...], reversed_names: tuple[str, ...]
+) -> Mask:
+    """Selects the terms (K,) that change sign in a mirror."""
+    is_reversed_variable = [name in reversed_names for name in names]
+    return np.asarray(powers[:, is_reversed_variable].sum(axis=1) % 2 == 1)
+
+
+def tells_lever_from_wheels(spec: RobotSpec) -> bool:
+    """True if a lever arm along y is distinguishable from unequal wheels."""
+    return spec.moves_sideways or list_reversed_variables(spec) is not None
+
+
+def has_slipping_tyres(spec: RobotSpec) -> bool:
+    """True for a front-steered car whose motion is its state: it may slip sideways."""
+    structure = structure_of(spec)
+    if structure is None or not {v.twist for v in spec.state} >= set(POSE_RATES):
+        return False
+    _, bicycle = structure
+    return bicycle.used and not bicycle.front_drive
+
+
+def share_effects(model: TaylorModel, spec: RobotSpec, samples: Samples) -> TaylorModel:
+    """Distributes an effect over commands of one unit that always moved together.
+
+    Uses the minimum-norm coefficients, for example for four wheels and three degrees of freedom:
+    commands u are replaced by P u, where P projects out the combinations that stayed constant.
+    """
+    combinations = excitation.combinations(samples, spec)
+    command = samples.x[:, len(spec.state) :]
+    is_part = np.abs(combinations).max(axis=0, initial=0.0) > NOTHING
+    parts = [c for c, part in zip(spec.command, is_part.tolist(), strict=True) if part]
+    if len({c.unit for c in parts}) != 1:
+        return model
+    constant = combinations / np.maximum(command.std(axis=0), NOTHING)
+    if np.abs(constant @ command.mean(axis=0)).max() > excitation.TOGETHER:
+        return model
+    normal = orth(constant.T)
+    projection = np.eye(len(model.variables))
+    projection[len(spec.state) :, len(spec.state) :] -= normal @ normal.T
+    effects: dict[tuple[int, ...], Array] = {}
+    columns = zip(model.powers.tolist(), model.coefficients.T, strict=True)
+    for exponents, effect in columns:
+        for term, share in _expand_term(exponents, projection):
+            so_far = effects.get(term, np.zeros(len(effect)))
+            effects[term] = so_far + share * effect
+    coefficients = np.array(list(effects.values())).T
+    kept = (np.abs(coefficients) > NOTHING).any(axis=0)
+    powers = np.array(list(effects), dtype=np.int64)[kept]
+    return replace(
+        model,
+        powers=powers,
+        coefficients=coefficients[:, kept],
+        std_errors=np.zeros((0, 0)),
+    )
+
+
+def _expand_term(
+    powers: list[int], projection: Array
+) -> list[tuple[tuple[int, ...], float]]:
+    """Returns the terms, and their factors, of a term (V,) whose variables are projected (V, V)."""
+    factors = np.repeat(np.arange(len(powers)), powers)
+    choices = [np.flatnonzero(np.abs(projection[f]) > NOTHING) for f in factors]
+    expanded = []
+    for places in product(*choices):
+        indices = np.array(places, dtype=np.int64)
+        term = np.bincount(indices, minlength=len(powers))
+        share = float(np.prod(projection[factors, list(places)]))
+        expanded.append((tuple(term.tolist()), share))
+    return expanded
+
+
+def stabilise(model: TaylorModel, spec: RobotSpec) -> TaylorModel:
     """Returns a model in which no state grows by itself."""
     coefficients = model.coefficients.copy()
-    alone = model.powers.sum(axis=1) == 1
+    is_linear = model.powers.sum(axis=1) == 1
     for i in range(len(spec.state)):
-        own = alone & (model.powers[:, i] == 1)
-        coefficients[3 + i, own] = np.minimum(coefficients[3 + i, own], 0.0)
+        row = FIRST_STATE + i
+        own = is_linear & (model.powers[:, i] == 1)
+        coefficients[row, own] = np.minimum(coefficients[row, own], 0.0)
     return replace(model, coefficients=coefficients)
 
 
-def together(base: TaylorModel, other: TaylorModel) -> tuple[TaylorModel, Array]:
+def merge_terms(base: TaylorModel, other: TaylorModel) -> tuple[TaylorModel, Array]:
     """Returns a model over the terms of both, and the other's coefficients (D, K) for them."""
     rows = {tuple(row): k for k, row in enumerate(other.powers.tolist())}
     more = [row for row in base.powers.tolist() if tuple(row) not in rows]
     rows |= {tuple(row): len(rows) + k for k, row in enumerate(more)}
     powers = np.array(list(rows), dtype=np.int64)
-    coefficients, first = np.zeros((2, len(base.dofs), len(powers)))
-    coefficients[:, [rows[tuple(row)] for row in base.powers.tolist()]] = (
-        base.coefficients
+    size = (len(base.dofs), len(powers))
+    of_other = np.zeros(size)
+    of_other[:, : len(other.powers)] = other.coefficients
+    of_base = np.zeros(size)
+    of_base[:, [rows[tuple(row)] for row in base.powers.tolist()]] = base.coefficients
+    model = replace(
+        base, powers=powers, coefficients=of_base, std_errors=np.zeros((0, 0))
     )
-    first[:, : len(other.powers)] = other.coefficients
-    none = np.zeros((0, 0))
-    return replace(
-        base, powers=powers, coefficients=coefficients, std_errors=none
-    ), first
-
-
-def defined(spec: RobotSpec) -> Mask:
-    """Selects the degrees of freedom (D,) that the state defines, so that they are not fitted."""
-    by_state = np.zeros(len(spec.dof_names), dtype=np.bool_)
-    for i, variable in enumerate(spec.state):
-        by_state[POSE_RATES.index(variable.twist) if variable.twist else 3 + i] = True
-    return by_state
+    return model, of_other

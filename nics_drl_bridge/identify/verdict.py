@@ -37,7 +37,10 @@ BACKWARDS = 0.3  # angle [rad] from half a turn, below which a body faces backwa
 GAP_STEPS = 3.0
 # maximum number of gaps to report individually: the longest, in order of time
 GAPS_TOLD = 12
-LINEAR = "Predictions by terms of a higher order diverged, so the model has only those of order 1."
+LINEAR = (
+    "Predictions by terms of a higher order ended farther away than the robot drove, so the model "
+    "has only those of order 1."
+)
 EARLY = "The robot moves"  # start of a note on motion before its commands
 # fraction of a state's range between two rows that is sampled too coarsely
 COARSE = 2.0 / 3.0
@@ -58,7 +61,7 @@ class Mistake(str):
     """A sentence on a wrong mapping; the model is only valid with that mapping."""
 
 
-def about_stamps(drive: Drive) -> Iterator[str]:
+def describe_stamps(drive: Drive) -> Iterator[str]:
     """Yields sentences on the stamps and the noise of the poses."""
     if (bursts := drive.bursts) is not None:
         finding = f"Poses arrive in bursts of about {bursts.size:.0f} every {bursts.period_s:.3f} s"
@@ -69,7 +72,7 @@ def about_stamps(drive: Drive) -> Iterator[str]:
         yield Gap(f"The noise of the pose was not measured; {fix}.")
 
 
-def time_without_pose(drive: Drive) -> float:
+def measure_time_without_pose(drive: Drive) -> float:
     """Returns the time in long gaps of the pose [s]."""
     t = drive.dated.t
     spans = [float(t[row + 1] - t[row]) for row in _gap_rows(drive)]
@@ -88,7 +91,7 @@ def _gap_rows(drive: Drive) -> list[int]:
     return [int(row) for row in rows[np.argsort(-span[rows], kind="stable")]]
 
 
-def about_gaps(drive: Drive) -> Iterator[str]:
+def describe_gaps(drive: Drive) -> Iterator[str]:
     """Yields a sentence per gap in the pose: when, how long, how far the pose moved across it."""
     t = drive.dated.t
     pose = drive.dated.values
@@ -110,7 +113,7 @@ def about_gaps(drive: Drive) -> Iterator[str]:
         )
 
 
-def coarsest_state(
+def describe_coarsest_state(
     recording: Recording, spec: RobotSpec, unmoved: Sequence[str]
 ) -> str:
     """Names the measured state that changes by most of its range between rows; "" if none."""
@@ -132,7 +135,7 @@ def coarsest_state(
     return f"{finding} apart, so record at a higher rate"
 
 
-def about_clocks(
+def describe_clocks(
     drive: Drive, calibration: Calibration, timing: TimingEstimate
 ) -> Iterator[str]:
     """Yields sentences on clock offset and latency."""
@@ -173,7 +176,7 @@ def about_clocks(
         yield f"Commands take effect {latency:.4f} s (+- {spread:.4f} s) after their stamps."
 
 
-def about_mounting(
+def describe_mounting(
     drive: Drive, calibration: Calibration, mounting: Mounting | None
 ) -> Iterator[str]:
     """Yields sentences on the position and rotation of the tracked body on the robot."""
@@ -223,13 +226,13 @@ def faces_backwards(calibration: Calibration) -> bool:
     return bool(abs(geometry.wrap_angle(calibration.rotation_rad - np.pi)) < BACKWARDS)
 
 
-def about_responses(
+def describe_responses(
     drive: Drive, calibration: Calibration, timing: TimingEstimate
 ) -> Iterator[str]:
     """Yields sentences on unmeasured states and the wheels."""
     moved = moved_commands(drive.recording.command)
     names = [c.name for c, m in zip(drive.spec.command, moved, strict=True) if m]
-    for response, sigma in zip(calibration.responses, timing.lag_sigma, strict=False):
+    for response, sigma in zip(calibration.responses, timing.lag_sigma, strict=True):
         state = response.state
         command = response.command
         if command not in names:
@@ -266,7 +269,7 @@ def refuse_unexcited(excitation: Excitation, spec: RobotSpec) -> None:
             )
 
 
-def missed(linear: Fit, spec: RobotSpec) -> tuple[str, ...]:
+def list_missed(linear: Fit, spec: RobotSpec) -> tuple[str, ...]:
     """Returns the variables that never moved, except sideways slip if it can't be commanded."""
     slips = [v.name for v in spec.state if v.twist == "vy" and not spec.moves_sideways]
     return tuple(
@@ -279,13 +282,13 @@ def _commands(names: Sequence[str], spec: RobotSpec) -> list[str]:
     return [c.name for c in spec.command if c.name in names]
 
 
-def levels_of(command: Stream, spec: RobotSpec) -> dict[str, int]:
+def count_levels(command: Stream, spec: RobotSpec) -> dict[str, int]:
     """Returns the number of different values of each command as recorded."""
     columns = zip(spec.command, command.values.T, strict=True)
     return {c.name: len(np.unique(np.round(values, 9))) for c, values in columns}
 
 
-def unlearnt(
+def describe_unlearnt(
     linear: Fit, calibration: Calibration, spec: RobotSpec, levels: dict[str, int]
 ) -> Iterator[str]:
     """Yields sentences on inputs not moved, alone or at many levels, and dependent states.
@@ -295,7 +298,7 @@ def unlearnt(
     """
     already = {name for r in calibration.responses for name in (r.command, r.state)}
     excitation = linear.regression.excitation
-    if unmoved := ", ".join(missed(linear, spec)):
+    if unmoved := ", ".join(list_missed(linear, spec)):
         finding = f"The model has no terms of {unmoved}, which never moved"
         yield Gap(f"{finding}: it is only valid for this drive's constant value.")
     still = _commands(excitation.unmoved, spec)
@@ -327,7 +330,7 @@ def unlearnt(
         )
 
 
-def doubts_of_fit(linear: Fit, exact: bool) -> Iterator[str]:
+def list_doubts_of_fit(linear: Fit, exact: bool) -> Iterator[str]:
     """Yields each reason to doubt a linear fit."""
     dofs = linear.model.dofs
     for dof, outliers, condition in zip(
@@ -354,7 +357,7 @@ def _list(names: Sequence[str]) -> str:
     return " and ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))
 
 
-def mirror_note(
+def describe_mirror_image(
     samples: Samples, spec: RobotSpec, calibration: Calibration
 ) -> Iterator[str]:
     """Yields a sentence if the robot turns against its command, and which sign explains it."""
@@ -387,7 +390,7 @@ def mirror_note(
         return
 
 
-def tried(
+def try_model(
     model: TaylorModel, calibration: Calibration, drive: Drive, t: float
 ) -> OpenLoop | None:
     """Tries a model on a drive from t [s] on; None if the rest is too short."""
@@ -397,12 +400,17 @@ def tried(
         return None
 
 
-def ran_away(tried: OpenLoop | None) -> bool:
+def is_worse(error_m: float, reference_m: float) -> bool:
+    """True if an error [m] clearly exceeds a reference [m], or is not a number."""
+    return bool(np.isnan(error_m)) or error_m > WORSE * reference_m
+
+
+def runs_away(errors: OpenLoop | None) -> bool:
     """True if predictions end farther away than the robot drove."""
-    return tried is not None and not tried.mean_position_error_m <= tried.mean_path_m
+    return errors is not None and not errors.mean_position_error_m <= errors.mean_path_m
 
 
-def untried(
+def describe_untried(
     drive: Drive, held_out: OpenLoop | None, judgement: tuple[HorizonErrors, ...]
 ) -> Iterator[str]:
     """Yields a sentence if a drive is too short to try a model on unseen data, or on 5 s."""
@@ -417,7 +425,7 @@ def untried(
         )
 
 
-def with_quality(
+def add_quality(
     model: TaylorModel,
     linear: Fit,
     unseen: Samples | None,
@@ -454,7 +462,7 @@ def with_quality(
     )
 
 
-def replaced_by_textbook(lost: HorizonErrors) -> str:
+def describe_replacement(lost: HorizonErrors) -> str:
     """Formats a sentence on a model that lost to its textbook and was replaced by it."""
     if lost.textbook is None:
         return ""
@@ -464,7 +472,7 @@ def replaced_by_textbook(lost: HorizonErrors) -> str:
     return f"{finding}: the model written is the textbook, fitted to the training part."
 
 
-def refitted(until: float, duration: float, worse: bool) -> str:
+def describe_refit(until: float, duration: float, worse: bool) -> str:
     """States how much of a drive a model covers, and what its errors refer to."""
     if worse:
         why = (

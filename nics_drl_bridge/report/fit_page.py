@@ -10,8 +10,8 @@ from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.identify.report import (
     COMPARED,
     HEADS,
-    equations_with_errors,
-    judgement_rows,
+    format_equations,
+    tabulate_judgement,
 )
 from nics_drl_bridge.report import fit_pictures, html
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -70,7 +70,7 @@ def make_path_blocks(identified: Identified) -> Blocks:
     caption = "Mean prediction errors on unseen data: those of a good model lie below the others."
     if any(at.band_m for at in identified.judgement):
         caption += " Bars: distances within which 95 % of its predictions should end."
-    rows = html.make_table(HEADS, judgement_rows(identified.judgement))
+    rows = html.make_table(HEADS, tabulate_judgement(identified.judgement))
     return [
         html.make_gallery([(png, "") for png in paths]),
         html.make_picture(fit_pictures.draw_yardsticks(identified), caption),
@@ -86,7 +86,7 @@ def model_blocks(spec: RobotSpec, identified: Identified, report: str) -> Blocks
         html.make_picture(png, fit_pictures.CAPTIONS[name])
         for name, png in drawn.items()
     ]
-    equations = "\n".join(equations_with_errors(identified.model))
+    equations = "\n".join(format_equations(identified.model))
     return [
         html.make_code(equations),
         html.make_details("All figures of the fit", [html.make_code(report)]),

@@ -17,7 +17,7 @@ from nics_drl_bridge.identify.drive import pose_residual
 from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.identify.noise import drift_growth, odometry_residual
 from nics_drl_bridge.identify.open_loop import HORIZON_S, Windows, predict, windows
-from nics_drl_bridge.identify.report import CalibratedValue, estimates
+from nics_drl_bridge.identify.report import CalibratedValue, collect_estimates
 from nics_drl_bridge.identify.signals import (
     DIFFERENCE,
     held,
@@ -79,8 +79,8 @@ def fit_pictures(
     spec: RobotSpec, identified: Identified, paths: bool = True
 ) -> dict[str, bytes]:
     """Returns the pictures of a fit that the recording allows, by name, each a PNG."""
-    by_motion = identified.findings.width is not None or bool(
-        identified.findings.replaced
+    by_motion = identified.findings.motion_width_s is not None or bool(
+        identified.findings.replacement
     )
     # then pruning did not choose its terms
     pictures = {} if by_motion else {"accuracy": draw_accuracy(identified)}
@@ -313,7 +313,7 @@ def _predict_rates(identified: Identified, chosen: Windows) -> Array:
 def draw_calibration(spec: RobotSpec, identified: Identified) -> dict[str, bytes]:
     """Returns the pictures of a calibration that the recording allows, by name, each a PNG."""
     drawn = {
-        "mounting": draw_mounting(identified, estimates(identified)),
+        "mounting": draw_mounting(identified, collect_estimates(identified)),
         "inputs": draw_inputs(spec, identified),
         "noise": draw_noise(identified),
     }

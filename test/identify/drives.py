@@ -11,6 +11,7 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.identify import identify as stages
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.notes import collect_calibration_notes
 from nics_drl_bridge.recording.recording import Recording, Stream, check
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot.spec import RobotSpec, build_robot
@@ -178,9 +179,14 @@ def without(recording: Recording, start: float, end: float) -> Recording:
 
 def calibrate(recording: Recording, spec: RobotSpec) -> Calibration:
     """A recording's corrections, and the sentences on them, by the stages before a fit."""
-    row = (stages.clocks, stages.mounting, stages.responses, stages.noise)
+    row = (
+        stages.estimate_timing,
+        stages.find_mounting,
+        stages.find_responses,
+        stages.measure_noise,
+    )
     found = stages.run(row, Drive(check(recording, spec), spec))
-    return replace(found.calibration, notes=stages._sentences(found))
+    return replace(found.calibration, notes=collect_calibration_notes(found))
 
 
 def slipping_car(

@@ -22,7 +22,7 @@ from nics_drl_bridge.identify.acceptance import (
 )
 from nics_drl_bridge.identify.conclusion import conclude
 from nics_drl_bridge.identify.identify import identify
-from nics_drl_bridge.identify.report import with_error
+from nics_drl_bridge.identify.report import format_with_error
 from nics_drl_bridge.robot.taylor import EndErrors, HorizonErrors
 
 RADIUS_M = 0.2
@@ -166,7 +166,7 @@ def test_in_one_stretch_the_noise_is_that_of_a_single_window():
     ],
 )
 def test_a_coefficient_is_printed_so_that_it_can_be_used(value, error, text):
-    assert with_error(value, error) == text
+    assert format_with_error(value, error) == text
 
 
 @pytest.mark.slow
@@ -198,13 +198,13 @@ def test_a_model_that_loses_to_its_textbook_is_not_written_but_the_textbook(
     commanded, tmp_path
 ):
     spec, recording, found = commanded
-    assert found.findings.replaced
+    assert found.findings.replacement
     told = conclude(found)
     assert "the model written is the textbook" in " ".join(told.doubts)
     (at,) = [at for at in found.judgement if at.horizon_s == 5.0]
     assert at.model.position_m < 0.03
     model, again = generate(recording, spec, mount_lidar(spec), (), alpha="auto")
-    assert again.findings.replaced
+    assert again.findings.replacement
     save_model(model, tmp_path / "model")
     opened = load_model(tmp_path / "model")
     assert opened.kinematics.named.terms == model.kinematics.named.terms

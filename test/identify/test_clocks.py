@@ -11,7 +11,7 @@ from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.clocks import TOLD_S, timing_of
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.verdict import about_clocks
+from nics_drl_bridge.identify.verdict import describe_clocks
 
 SUM = "command_latency_and_speed_lag_s"
 
@@ -72,7 +72,7 @@ def test_a_robot_that_moves_before_its_commands_has_poses_of_another_clock(car, 
     tried = Drive(replace(recording, pose=pose), car)
     timing = timing_of(tried)
     assert timing.latency == pytest.approx(0.0 if ahead else 0.05, abs=0.01)
-    told = " ".join(about_clocks(tried, Calibration(), timing))
+    told = " ".join(describe_clocks(tried, Calibration(), timing))
     assert ("The robot moves 0.15 s before its commands" in told) == (ahead > 0.0)
 
 
@@ -83,7 +83,7 @@ def test_a_measured_state_that_moves_before_its_commands_is_of_another_clock(car
         for name, stream in (("pose", recording.pose), ("state", recording.state))
     }
     tried = Drive(replace(recording, **ahead), car)
-    told = " ".join(about_clocks(tried, Calibration(), timing_of(tried)))
+    told = " ".join(describe_clocks(tried, Calibration(), timing_of(tried)))
     assert (
         "The robot moves 0.15 s before its commands: its state is stamped by another"
         in told

@@ -9,7 +9,7 @@ import pytest
 from nics_drl_bridge.identify.acceptance import Verdict
 from nics_drl_bridge.identify.conclusion import UNTRIED, accuracy, conclude, end_of
 from nics_drl_bridge.identify.identify import identify
-from nics_drl_bridge.identify.report import fit_report, opening
+from nics_drl_bridge.identify.report import format_report, select_opening
 from nics_drl_bridge.identify.verdict import Gap, Mistake
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot.spec import build_robot, load_robot
@@ -68,8 +68,8 @@ def test_a_model_that_is_beaten_is_not_to_be_trained_with(found):
 
 
 def test_the_report_opens_with_the_conclusion_and_the_model(found):
-    report = fit_report("here", CAR, found)
-    first = opening(report)
+    report = format_report("here", found)
+    first = select_opening(report)
     assert report.startswith(first)
     assert conclude(found).advice in " ".join(first.split())
     assert "Verdict: good. On unseen data" in first.split("\n\n")[0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from scipy.signal import lfilter
 from identify.drives import slipping_car
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive, Settings
+from nics_drl_bridge.identify.findings import Findings, resample_drive
 from nics_drl_bridge.identify.forms import (
     Form,
     curve_of,
@@ -21,7 +23,12 @@ from nics_drl_bridge.identify.forms import (
     with_back,
     with_dead,
 )
-from nics_drl_bridge.identify.identify import STAGES, Findings, aligned, inputs, run
+from nics_drl_bridge.identify.identify import (
+    STAGES,
+    Identified,
+    find_input_curves,
+    run,
+)
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.taylor import TaylorModel
@@ -35,12 +42,12 @@ def found() -> Findings:
     spec, recording = slipping_car()
     drive = Drive(recording, spec)
     drive = replace(drive, settings=Settings(train_until_s=drive.duration_s))
-    return run(STAGES[: STAGES.index(inputs)], drive)
+    return run(STAGES[: STAGES.index(find_input_curves)], drive)
 
 
 @pytest.fixture(scope="module")
 def samples(found) -> Samples:
-    return aligned(found.training, found)
+    return resample_drive(found.training, found)
 
 
 def form_inputs(found, samples, form):
@@ -206,3 +213,30 @@ def test_ends_and_limits_that_the_drive_never_reached_are_left_out(found, sample
     assert within.inputs[0].most == pytest.approx(0.8 * sent.max())
     assert within.inputs[0].least == -np.inf
     assert within.limits[0].tolist() == [-np.inf, 0.5 * asked.max()]
+
+
+def test_the_dead_zone_of_a_steering_is_none_of_the_drive():
+    spec, _ = slipping_car(duration=1.0)
+    size = len(spec.variable_names)
+    powers = np.eye(size, dtype=np.int64)
+    model = TaylorModel(
+        spec.variable_names,
+        spec.dof_names,
+        spec.dof_units,
+        powers,
+        np.zeros((len(spec.dof_names), size)),
+        0.01,
+        np.zeros(size),
+        np.ones(size),
+        inputs=(
+            InputCurve(command="throttle", dead=0.1),
+            InputCurve(command="steering", dead=0.3),
+        ),
+    )
+    found = SimpleNamespace(model=model, drive=SimpleNamespace(spec=spec))
+    assert Identified.dead_zone.fget(found) == 0.1
+    model.coefficients[3, spec.variable_names.index("throttle")] = 9.0
+    model.coefficients[5, spec.variable_names.index("steering")] = 9.0
+    rubbing = replace(model, friction=np.array([0.9, 0.0, 9.0]))
+    found.model = rubbing
+    assert Identified.dead_zone.fget(found) == pytest.approx(0.2)

@@ -11,6 +11,7 @@ import pytest
 from identify.drives import slipping_car
 from nics_drl_bridge.errors import FitError
 from nics_drl_bridge.identify.drive import Drive, Settings
+from nics_drl_bridge.identify.findings import resample_drive
 from nics_drl_bridge.identify.hypotheses import (
     Trial,
     about_lags,
@@ -19,8 +20,8 @@ from nics_drl_bridge.identify.hypotheses import (
     hypotheses,
     lags_of,
 )
-from nics_drl_bridge.identify.identify import STAGES, aligned, fit, identify, run
-from nics_drl_bridge.identify.terms import by_textbook
+from nics_drl_bridge.identify.identify import STAGES, fit_terms, identify, run
+from nics_drl_bridge.identify.terms import select_textbook_terms
 from nics_drl_bridge.robot import taylor
 
 
@@ -28,9 +29,9 @@ def base(**given):
     spec, recording = slipping_car(**given)
     drive = Drive(recording, spec)
     drive = replace(drive, settings=Settings(train_until_s=drive.duration_s))
-    found = run(STAGES[: STAGES.index(fit)], drive)
-    samples = aligned(found.training, found)
-    best = base_of(found.training, found.calibration, samples, found.clear)
+    found = run(STAGES[: STAGES.index(fit_terms)], drive)
+    samples = resample_drive(found.training, found)
+    best = base_of(found.training, found.calibration, samples, found.clear_curves)
     names = best.draft.inputs.names
     values = best.found.values.tolist()
     return best.draft.form, dict(zip(names, values, strict=True))
@@ -95,7 +96,7 @@ def test_a_latency_is_told_as_its_sums_with_the_lags():
 def test_a_lag_is_what_the_state_itself_takes_from_its_rate():
     spec, _ = slipping_car(duration=1.0)
     powers = taylor.list_exponents(len(spec.variable_names), 1)
-    allowed = by_textbook(powers, spec)
+    allowed = select_textbook_terms(powers, spec)
     model = taylor.TaylorModel(
         spec.variable_names,
         spec.dof_names,

@@ -18,9 +18,9 @@ from nics_drl_bridge.identify.conclusion import conclude
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.identify.joined import join_recordings
-from nics_drl_bridge.identify.report import fit_report
+from nics_drl_bridge.identify.report import format_report
 from nics_drl_bridge.identify.shooting import Shooting
-from nics_drl_bridge.identify.verdict import about_gaps, time_without_pose
+from nics_drl_bridge.identify.verdict import describe_gaps, measure_time_without_pose
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.spec import build_robot
 
@@ -69,8 +69,8 @@ TURNING = driven("turning.csv", 0.0, 1.5, seed=1)
 
 def test_the_time_between_two_recordings_is_no_gap_in_the_pose():
     drive = Drive(join_recordings([STRAIGHT, TURNING], ROBOT), ROBOT)
-    assert time_without_pose(drive) == 0.0
-    assert list(about_gaps(drive)) == []
+    assert measure_time_without_pose(drive) == 0.0
+    assert list(describe_gaps(drive)) == []
 
 
 @pytest.fixture(scope="module")
@@ -162,7 +162,7 @@ def test_a_recording_that_alone_is_off_is_named():
     assert named[0].startswith("slippery.csv alone is off: its predictions end")
     assert named[0] in conclude(found).doubts
     assert "slippery.csv alone is off" in " ".join(
-        fit_report("three", ROBOT, found).split()
+        format_report("three", found).split()
     )
 
 

@@ -13,7 +13,7 @@ from nics_drl_bridge.identify.acceptance import shortfall
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.identify.judgement import HORIZONS_S
-from nics_drl_bridge.identify.report import fit_report
+from nics_drl_bridge.identify.report import format_report
 from nics_drl_bridge.robot.spec import load_robot
 from nics_drl_bridge.robot.taylor import EndErrors, NamedTaylorModel
 
@@ -74,14 +74,14 @@ def test_a_model_that_does_not_beat_a_yardstick_says_so_on_top(found, yardstick,
     assert sentence.startswith(f"The model does not beat {named}: on unseen data")
     assert f"those of {named} 0.001 m" in sentence
     beaten = replace(found, findings=replace(found.findings, judgement=(at,)))
-    top = fit_report("here", load_robot("differential"), beaten).split("\n\n")[0]
+    top = format_report("here", beaten).split("\n\n")[0]
     assert sentence in " ".join(top.split())
-    assert "does not beat" not in fit_report("here", load_robot("differential"), found)
+    assert "does not beat" not in format_report("here", found)
 
 
 @pytest.mark.slow
 def test_the_report_has_a_row_for_each_horizon_and_what_reading_mended(found):
-    report = fit_report("here", load_robot("differential"), found)
+    report = format_report("here", found)
     table = report.partition("By horizon")[2].split("\n\n")[0].splitlines()[2:]
     assert [row.split()[0] for row in table] == ["0.5", "1", "2", "5", "10"]
     assert MENDED in found.notes

@@ -13,7 +13,7 @@ from identify import planted
 from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.identify.conclusion import conclude
 from nics_drl_bridge.identify.identify import identify
-from nics_drl_bridge.identify.report import fit_report, why_useless
+from nics_drl_bridge.identify.report import explain_uselessness, format_report
 from nics_drl_bridge.recording.recording import Recording
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -50,8 +50,8 @@ def statements(recording: Recording, spec: RobotSpec) -> str:
         found = identify(recording, spec, alpha="auto")
     except BridgeError as error:
         return str(error)
-    told = [*conclude(found).lines, *found.notes, why_useless(found, spec)]
-    return " ".join(" ".join([*told, fit_report("here", spec, found)]).split())
+    told = [*conclude(found).lines, *found.notes, explain_uselessness(found)]
+    return " ".join(" ".join([*told, format_report("here", found)]).split())
 
 
 def blamed(text: str) -> set[str]:

@@ -120,10 +120,32 @@ def test_a_pose_that_was_held_is_left_out_and_told(differential):
     plain = drive(differential, duration=20.0, noise=(5e-4, 1e-3))
     mended, notes = repaired(Drive(held(plain, 8.0, 11.0), differential))
     (told,) = notes
-    assert isinstance(told, Gap)
     assert "keeps one value from 8.0 s to 11.0 s and then leaps by" in told
     t = mended.recording.pose.t
     assert np.diff(t).max() == pytest.approx(3.0, abs=0.1)
+
+
+@pytest.mark.slow
+def test_a_pose_that_was_held_is_a_gap_to_the_verdict_and_in_the_notes(differential):
+    plain = drive(differential, duration=20.0, noise=(5e-4, 1e-3))
+    found = identify(held(plain, 8.0, 11.0), differential)
+    (gap,) = (each for each in found.gaps if "The pose has a gap of" in each)
+    assert "a gap of 3.0 s, from 8.0 s to 11.0 s" in gap
+    assert any("missing for 3.0 s, 15%" in each for each in found.assessment.reasons)
+
+
+def test_a_drive_ends_where_its_pose_froze_though_commands_went_on(differential):
+    plain = drive(differential, duration=20.0, noise=(5e-4, 1e-3))
+    frozen = held(plain, 16.0, 99.0)
+    mended, (told,) = repaired(Drive(frozen, differential))
+    assert isinstance(told, Gap)
+    assert "keeps one value from 16.0 s to its end, 20.0 s, though commands" in told
+    assert mended.duration_s == pytest.approx(16.0, abs=0.05)
+    values = np.where(frozen.command.t[:, None] > 16.0, 0.0, frozen.command.values)
+    parked = replace(frozen, command=replace(frozen.command, values=values))
+    mended, notes = repaired(Drive(parked, differential))
+    assert mended.recording is parked
+    assert notes == ()
 
 
 def test_a_robot_that_stood_and_goes_on_from_there_was_not_held(differential):

@@ -166,3 +166,14 @@ def test_nothing_free_leaves_the_model(car, problem):
     found = fitted(fixed, car, np.zeros((6, 4), dtype=np.bool_), NOTHING_FREE)
     assert np.array_equal(found.model.coefficients, car.coefficients)
     assert found.error < 0.005
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_the_error_of_a_prediction_that_diverged_is_infinite_and_none_is_left_out(
+    car, problem
+):
+    wild = replace(car, coefficients=np.where(car.coefficients > 3.0, 1e300, 1e200))
+    error, path = problem.errors(wild, np.array([DELAY]))
+    fits = np.isfinite(path)
+    assert fits.any()
+    assert np.isinf(error[fits]).any(axis=-1).all()

@@ -8,23 +8,24 @@ import pytest
 from identify.drives import MOTOR, servoed, slipping_car, tricycle
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive, Settings
+from nics_drl_bridge.identify.findings import resample_drive
 from nics_drl_bridge.identify.identify import (
     STAGES,
     Identified,
-    aligned,
-    complete,
-    fit,
+    complete_model,
+    fit_terms,
     identify,
     run,
 )
 from nics_drl_bridge.identify.terms import (
-    by_textbook,
-    linear_fit,
-    mirrored,
-    shared,
-    through_state,
-    together,
-    tyres_slip,
+    fit_motion_terms,
+    has_slipping_tyres,
+    list_reversed_variables,
+    merge_terms,
+    select_motion_terms,
+    select_terms_through_state,
+    select_textbook_terms,
+    share_effects,
 )
 from nics_drl_bridge.recording.recording import samples_on_one_clock
 from nics_drl_bridge.robot import taylor
@@ -86,7 +87,7 @@ def test_a_dead_zone_is_not_taken_for_a_mounting(seed):
     )
     settings = Settings(order=2, alpha="auto", train_until_s=40.0)
     found = run(
-        STAGES[: STAGES.index(complete)], Drive(recording, tricycle(), settings)
+        STAGES[: STAGES.index(complete_model)], Drive(recording, tricycle(), settings)
     )
     assert np.abs(off(found.calibration, mounting)).max() < 3.0
     assert found.calibration.rotation_rad == pytest.approx(0.0, abs=0.003)
@@ -95,7 +96,7 @@ def test_a_dead_zone_is_not_taken_for_a_mounting(seed):
 def test_a_mirror_leaves_even_terms_along_x_and_odd_ones_across():
     spec = tricycle()
     powers = taylor.list_exponents(4, 4)
-    allowed = through_state(powers, spec, centred=True)
+    allowed = select_terms_through_state(powers, spec, centred=True)
     names = [taylor.format_term(row, spec.variable_names) for row in powers]
     along, across = (
         [n for n, each in zip(names, allowed[d], strict=True) if each] for d in (0, 2)
@@ -105,13 +106,13 @@ def test_a_mirror_leaves_even_terms_along_x_and_odd_ones_across():
     assert {"speed", "speed*steering", "speed*steering^3"} <= set(across)
     assert "speed*steering^2" not in across
     assert not any("command" in name for name in along + across)
-    sided = through_state(powers, spec, centred=False)
+    sided = select_terms_through_state(powers, spec, centred=False)
     assert sided[0][names.index("speed*steering")]
 
 
 def test_a_mirror_turns_the_steering_and_what_it_moves_aside():
     spec, _ = slipping_car(duration=1.0)
-    assert mirrored(spec) == ("vy", "wz", "steering")
+    assert list_reversed_variables(spec) == ("vy", "wz", "steering")
 
 
 def test_the_twist_of_a_car_follows_its_commands_and_with_tyres_its_lateral_acceleration():
@@ -119,7 +120,9 @@ def test_the_twist_of_a_car_follows_its_commands_and_with_tyres_its_lateral_acce
     powers = taylor.list_exponents(len(spec.variable_names), 3)
 
     def terms(dof: str, **given: object) -> set[str]:
-        allowed = by_textbook(powers, spec, **given)[spec.dof_names.index(dof)]
+        allowed = select_textbook_terms(powers, spec, **given)[
+            spec.dof_names.index(dof)
+        ]
         return {taylor.format_term(row, spec.variable_names) for row in powers[allowed]}
 
     assert terms("d_vx") == {"vx", "throttle"}
@@ -131,15 +134,15 @@ def test_the_twist_of_a_car_follows_its_commands_and_with_tyres_its_lateral_acce
 
 def test_only_cars_that_steer_in_front_slip_by_their_tyres(differential):
     spec, _ = slipping_car(duration=1.0)
-    assert tyres_slip(spec)
-    assert not tyres_slip(differential)
-    assert not tyres_slip(tricycle())
+    assert has_slipping_tyres(spec)
+    assert not has_slipping_tyres(differential)
+    assert not has_slipping_tyres(tricycle())
 
 
 def test_two_models_are_put_together_over_the_terms_of_both():
     spec, _ = slipping_car(duration=1.0)
     one, other = (model_of(spec, names) for names in (["vx", "throttle"], ["wz", "vx"]))
-    base, first = together(one, other)
+    base, first = merge_terms(one, other)
     at = {
         taylor.format_term(row, spec.variable_names): k
         for k, row in enumerate(base.powers)
@@ -174,13 +177,13 @@ def model_of(spec, names):
 def held_throttle(**given):
     spec, recording = slipping_car(throttle=0.25, friction=0.0, duration=20.0, **given)
     drive = Drive(recording, spec, Settings(train_until_s=20.0))
-    found = run(STAGES[: STAGES.index(fit)], drive)
-    return spec, aligned(found.training, found)
+    found = run(STAGES[: STAGES.index(fit_terms)], drive)
+    return spec, resample_drive(found.training, found)
 
 
 def test_a_command_held_at_one_value_pushes_as_a_constant():
     spec, samples = held_throttle()
-    model = linear_fit(samples, spec, 3, by_textbook).model
+    model = fit_motion_terms(samples, spec, 3, select_textbook_terms).model
     assert model.rates(np.zeros(5))[3] == pytest.approx(9.0 * 0.15, rel=0.2)
     assert model.rates([0.0, 0, 0, 0, 0.5])[5] == pytest.approx(
         0.0, abs=0.1
@@ -191,11 +194,22 @@ def test_a_speed_that_never_changed_is_a_constant_of_the_twist():
     spec, samples = held_throttle()
     steady = samples.rows(samples.t > samples.t[0] + 10.0)
     steady.x[:, :2] = 2.0, 0.0
-    model = linear_fit(steady, spec, 3, by_textbook).model
+    model = fit_motion_terms(steady, spec, 3, select_textbook_terms).model
     assert model.rates(np.zeros(5))[:3] == pytest.approx([2.0, 0.0, 0.0])
     turning = model.rates([0.0, 0.0, 0.0, 0.25, 0.5])
     assert turning[3] == 0.0
     assert turning[5] > 1.0
+
+
+def test_a_wheel_that_was_held_drives_and_turns_as_a_constant():
+    two = {"kind": "differential_wheels", "footprint_radius": 0.3, "state": []}
+    limits = dict.fromkeys(("left_wheel", "right_wheel"), (-9.0, 9.0))
+    spec = build_robot(two, limits)
+    assert list_reversed_variables(spec) is None  # a mirror exchanges the wheels
+    powers = taylor.list_exponents(2, 1)
+    constant = (powers == 0).all(axis=1)
+    assert not select_motion_terms(powers, spec)[:, constant].any()
+    assert select_motion_terms(powers, spec, held=("left_wheel",))[:, constant].all()
 
 
 def test_wheels_that_always_move_together_share_what_they_do():
@@ -222,7 +236,7 @@ def test_wheels_that_always_move_together_share_what_they_do():
     )
     still = np.zeros((400, 3))
     samples = samples_on_one_clock(0.05 * np.arange(400), still, still[:, :0], wheels)
-    model = shared(alone, spec, samples)
+    model = share_effects(alone, spec, samples)
     assert model.rates(wheels) == pytest.approx(alone.rates(wheels))
     assert (
         model.coefficients @ model.powers @ [1.0, -1.0, -1.0, 1.0]
@@ -232,5 +246,5 @@ def test_wheels_that_always_move_together_share_what_they_do():
 
 def test_commands_that_move_on_their_own_share_nothing():
     spec, samples = held_throttle()
-    model = linear_fit(samples, spec, 2, by_textbook).model
-    assert shared(model, spec, samples) is model
+    model = fit_motion_terms(samples, spec, 2, select_textbook_terms).model
+    assert share_effects(model, spec, samples) is model

@@ -12,8 +12,8 @@ from nics_drl_bridge.identify import acceptance
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.identify.open_loop import open_loop_error
-from nics_drl_bridge.identify.report import is_useless, why_useless
-from nics_drl_bridge.identify.verdict import coarsest_state
+from nics_drl_bridge.identify.report import explain_uselessness, is_useless
+from nics_drl_bridge.identify.verdict import describe_coarsest_state
 from nics_drl_bridge.recording.recording import Recording
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -55,7 +55,7 @@ def held_up(recording: Recording, start: float, end: float) -> Recording:
 
 
 def verdict_on(recording: Recording, spec: RobotSpec) -> str:
-    return why_useless(identify(recording, spec, alpha="auto"), spec)
+    return explain_uselessness(identify(recording, spec, alpha="auto"))
 
 
 @pytest.mark.parametrize(
@@ -104,19 +104,24 @@ def no_textbook(monkeypatch):
 def test_the_textbook_takes_the_place_of_a_useless_model(name, request):
     spec = request.getfixturevalue(name)
     found = identify(coarse(spec, every=30), spec, alpha="auto")
-    assert found.findings.replaced in found.notes
-    assert why_useless(found, spec) == ""
+    assert found.findings.replacement in found.notes
+    assert explain_uselessness(found) == ""
     assert any(gap.endswith(TOO_COARSE) for gap in found.gaps)
 
 
 def test_only_rows_that_are_too_far_apart_are_named(differential):
-    assert coarsest_state(coarse(differential, every=5), differential, ()) == ""
+    assert (
+        describe_coarsest_state(coarse(differential, every=5), differential, ()) == ""
+    )
     far = coarse(differential, every=30)
-    named = coarsest_state(far, differential, ())
+    named = describe_coarsest_state(far, differential, ())
     assert named.split()[0] in {v.name for v in differential.state}
     assert f"{named}.".endswith(TOO_COARSE)
-    assert coarsest_state(far, differential, [v.name for v in differential.state]) == ""
-    assert coarsest_state(replace(far, state=None), differential, ()) == ""
+    assert (
+        describe_coarsest_state(far, differential, [v.name for v in differential.state])
+        == ""
+    )
+    assert describe_coarsest_state(replace(far, state=None), differential, ()) == ""
 
 
 @pytest.mark.slow
@@ -178,7 +183,7 @@ def test_what_the_textbook_fills_in_is_judged_with_it(car):
     recording = record(car, StraightFirst(), 90.0)
     filled = identify(recording, car, alpha="auto", assume=True)
     assert filled.fit.unmoved
-    assert why_useless(filled, car) == ""
+    assert explain_uselessness(filled) == ""
     sentence = verdict_on(recording, car)
     assert "steering" in sentence
     assert "never moved in its first 60 s" in sentence
@@ -186,7 +191,7 @@ def test_what_the_textbook_fills_in_is_judged_with_it(car):
 
 def test_a_model_of_too_few_terms_is_not_put_down_to_the_recording(car):
     found = identify(record(car, np.random.default_rng(0), 60.0), car, alpha=0.5)
-    sentence = why_useless(found, car)
+    sentence = explain_uselessness(found)
     assert sentence.endswith("it may lack terms, so leave order and alpha at `auto`.")
 
 
@@ -199,9 +204,9 @@ def test_a_model_that_predicts_nothing_is_told_of_in_one_sentence(name, request)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         found = identify(recording, spec)
-        sentence = why_useless(found, spec)
+        sentence = explain_uselessness(found)
     assert "is useless: on unseen data its predictions end" in sentence
     assert found.verdict is acceptance.Verdict.DO_NOT_TRAIN
     ran_away = replace(found.held_out, mean_position_error_m=np.inf)
-    sentence = why_useless(replace(found, held_out=ran_away), spec)
+    sentence = explain_uselessness(replace(found, held_out=ran_away))
     assert "its predictions have diverged after 5 s" in sentence

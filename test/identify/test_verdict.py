@@ -15,10 +15,10 @@ from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.excitation import Excitation
 from nics_drl_bridge.identify.mounting import Mounting
 from nics_drl_bridge.identify.verdict import (
-    about_clocks,
-    about_mounting,
+    describe_clocks,
+    describe_mounting,
+    describe_unlearnt,
     refuse_unexcited,
-    unlearnt,
 )
 from nics_drl_bridge.robot.spec import build_robot
 
@@ -32,7 +32,9 @@ def throttled():
 def told(spec, *unmoved: str) -> str:
     regression = SimpleNamespace(excitation=Excitation(unmoved, (), {}), dependent=())
     return " ".join(
-        unlearnt(SimpleNamespace(regression=regression), Calibration(), spec, {})
+        describe_unlearnt(
+            SimpleNamespace(regression=regression), Calibration(), spec, {}
+        )
     )
 
 
@@ -64,7 +66,9 @@ def test_a_car_that_never_moves_sideways_is_not_refused(throttled, car):
 def of_mounting(spec, sigma: tuple[float, float], **learnt: float) -> str:
     mounting = Mounting(0.0, np.array([0.1, 0.0]), 0.001, np.array(sigma), 2)
     calibration = Calibration(lever_arm_m=(0.1, 0.0), uncertainty=learnt)
-    return " ".join(about_mounting(SimpleNamespace(spec=spec), calibration, mounting))
+    return " ".join(
+        describe_mounting(SimpleNamespace(spec=spec), calibration, mounting)
+    )
 
 
 def test_a_lever_arm_that_was_not_learnt_has_one_reason(throttled):
@@ -92,5 +96,5 @@ def test_a_latency_below_three_standard_errors_is_not_told(car, sigma, told):
     calibration = Calibration(
         command_latency_s=0.0003, uncertainty={"command_latency_s": sigma}
     )
-    sentences = " ".join(about_clocks(tried, calibration, timing_of(tried)))
+    sentences = " ".join(describe_clocks(tried, calibration, timing_of(tried)))
     assert ("Commands take effect 0.0003 s" in sentences) == told

@@ -8,7 +8,7 @@ from identify.drives import drive, with_wheels
 
 from nics_drl_bridge.identify.identify import Identified, identify
 from nics_drl_bridge.identify.mounting import Mounting
-from nics_drl_bridge.identify.report import estimates, fit_report
+from nics_drl_bridge.identify.report import collect_estimates, format_report
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.report import fit_pictures
 from nics_drl_bridge.report.fit_pictures import CAPTIONS, draw_calibration
@@ -49,7 +49,7 @@ def exact() -> Found:
 
 
 def listed(found: Found):
-    return estimates(found[1])
+    return collect_estimates(found[1])
 
 
 def test_every_estimate_of_a_disturbed_drive_has_its_picture(disturbed):
@@ -80,8 +80,8 @@ def test_the_estimates_are_right_within_their_uncertainty(disturbed):
 
 
 def test_the_report_says_why_an_estimate_was_not_possible(exact):
-    spec, identified = exact
-    text = fit_report("here", spec, identified)
+    _, identified = exact
+    text = format_report("here", identified)
     for part in (
         "clock offset: not estimated, pose and commands are on one clock",
         "period of bursts: not estimated, the poses are stamped one by one",
@@ -104,7 +104,7 @@ def with_half_a_lever(identified: Identified) -> tuple[Identified, Mounting]:
 
 def test_the_table_gives_the_reason_that_the_sentence_gives(exact):
     known, mounting = with_half_a_lever(exact[1])
-    (_, y), found = mounting.hidden, estimates(known)
+    (_, y), found = mounting.hidden, collect_estimates(known)
     assert found["lever_arm_y_m"].text == f"lever arm y: not estimated, {y}"
 
 
@@ -146,7 +146,7 @@ def test_motors_are_drawn_and_reported_with_what_is_known_of_them(exact):
     sigma = {f"{name}.dead": 0.004}
     calibration = replace(found.calibration, uncertainty=sigma)
     motors = replace(found, model=model, calibration=calibration)
-    report = fit_report("drive", spec, motors)
+    report = format_report("drive", motors)
     assert (
         f"{name}' = 0 within +-0.12, else {name} -+ 0.12, {name} at least -0.5, {name} at "
         in report
@@ -164,5 +164,5 @@ def test_motors_are_drawn_and_reported_with_what_is_known_of_them(exact):
 
 
 def test_a_robot_whose_motors_do_no_more_than_its_terms_has_no_section_on_them(exact):
-    spec, found = exact
-    assert "Effect of the motors" not in fit_report("drive", spec, found)
+    _, found = exact
+    assert "Effect of the motors" not in format_report("drive", found)

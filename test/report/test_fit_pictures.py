@@ -8,7 +8,7 @@ import pytest
 
 from nics_drl_bridge import generator
 from nics_drl_bridge.identify.identify import identify
-from nics_drl_bridge.identify.report import fit_report, with_error
+from nics_drl_bridge.identify.report import format_report, format_with_error
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.report.fit_page import fit_tile, write_fit_page
 from nics_drl_bridge.report.fit_pictures import fit_pictures, write_pictures
@@ -41,7 +41,7 @@ def test_every_picture_of_a_fit_is_drawn(found, tmp_path):
 @slow
 def test_a_page_of_a_fit_begins_with_its_verdict_and_folds_all_figures(found, tmp_path):
     spec, identified = found
-    text = fit_report("here", spec, identified)
+    text = format_report("here", identified)
     write_fit_page(tmp_path / "report.html", "here", spec, identified, text)
     html = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert re.findall("<h2>(.*?)</h2>", html) == ["Verdict", "Paths", "Model"]
@@ -79,8 +79,8 @@ def test_a_short_drive_has_fewer_pictures():
 
 @slow
 def test_the_report_names_errors_pruning_and_validity(found):
-    spec, identified = found
-    text = fit_report("here", spec, identified)
+    _, identified = found
+    text = format_report("here", identified)
     for part in (
         "with standard errors",
         "Eq. 2",
@@ -93,8 +93,10 @@ def test_the_report_names_errors_pruning_and_validity(found):
 
 def test_what_pruning_would_have_kept_is_not_told_of_a_motion(found):
     spec, identified = found
-    by_motion = replace(identified, findings=replace(identified.findings, width=0.1))
-    text = fit_report("here", spec, by_motion)
+    by_motion = replace(
+        identified, findings=replace(identified.findings, motion_width_s=0.1)
+    )
+    text = format_report("here", by_motion)
     for part in (
         "Eq. 2",
         "Cross-validated",
@@ -118,4 +120,4 @@ def test_what_pruning_would_have_kept_is_not_told_of_a_motion(found):
     ],
 )
 def test_a_number_has_the_digits_that_its_error_leaves(value, error, text):
-    assert with_error(value, error) == text
+    assert format_with_error(value, error) == text
