@@ -162,9 +162,8 @@ TURNS_PER_RAD = 0.5 / math.pi
 class TableCell(NamedTuple):
     """A place in the table: a grid distance and the nearest grid rotation."""
 
-    place: (
-        int  # index in `TableArrays.cells`; the next one is of the next grid distance
-    )
+    # Index in `TableArrays.cells`; the next cell is that of the next grid distance.
+    place: int
     hull: int  # index in `TableArrays.hulls` from which the cell's corners are counted
     far_weight: np.float32  # weight of the row of the next grid distance
 
@@ -188,20 +187,21 @@ def find_cell(
         shape: its `TABLE_SHAPE`.
         table: the table.
     """
-    exact_ring = (distance - radius) * shape.distances_per_metre
-    last_ring = np.int32(table.distances - 2)
-    ring = np.int32(max(min(np.int32(exact_ring), last_ring), np.int32(0)))
+    # i and j number the grid distances and the grid rotations, see the formula above.
+    exact_i = (distance - radius) * shape.distances_per_metre
+    last_i = np.int32(table.distances - 2)
+    i = np.int32(max(min(np.int32(exact_i), last_i), np.int32(0)))
     turns = (heading - bearing) * TURNS_PER_RAD
     turns -= np.floor(turns)
-    rotation = np.int32(turns * shape.rotations + 0.5)
-    rotation = np.int32(max(min(rotation, np.int32(shape.rotations)), np.int32(0)))
+    j = np.int32(turns * shape.rotations + 0.5)
+    j = np.int32(max(min(j, np.int32(shape.rotations)), np.int32(0)))
     # Only one period of the rotational symmetry is in the table.
-    period = np.int32((rotation + 0.5) * shape.periods_per_rotation)
+    period = np.int32((j + 0.5) * shape.periods_per_rotation)
     first = shape.first_cell - period * shape.cells_per_period
     return TableCell(
-        first + rotation * table.distances + ring,
+        first + j * table.distances + i,
         shape.second_hull - period * shape.corners_per_period,
-        np.float32(exact_ring - ring),
+        np.float32(exact_i - i),
     )
 
 
@@ -215,7 +215,7 @@ class ShapeView(NamedTuple):
 
 @kernel(contracts=True, inline=True)
 def view_shape(dx: float, dy: float, cos: float, sin: float) -> ShapeView:
-    """Return the view of a shape at (dx, dy) from the lidar, with the cosine of its heading."""
+    """Return the view of a shape at (dx, dy) from the lidar, turned by its heading."""
     return ShapeView(dx * dx + dy * dy, cos * dx + sin * dy, sin * dx - cos * dy)
 
 
@@ -355,9 +355,8 @@ class Hits(NamedTuple):
 
     first_beam: np.int32
     beams: np.int32  # number of beams; 0 or less if none hits
-    point: (
-        np.int32
-    )  # the last point at or before the first beam; the bearing is point 0
+    # The last point at or before the first beam, counted from the bearing.
+    point: np.int32
     next_weight: np.float32  # weight of the point after it
 
 
@@ -450,7 +449,7 @@ def scan_exactly(
     ranges: Singles,
     lidar_pose: LidarPose,
     bodies: Array,
-    near: Any,
+    nearby: Any,
     own_body: int,
     walls: Array,
     lidar: LidarArrays,
@@ -462,14 +461,14 @@ def scan_exactly(
         ranges: (B,) the scan, which is changed.
         lidar_pose: of the lidar.
         bodies: (K, 7) of the lidar's world.
-        near: indices of the bodies to consider.
+        nearby: indices of the bodies to consider.
         own_body: index of the robot's own body, which it does not see; -1 for none.
         walls: (W, 4) of the lidar's world.
         lidar: the lidar.
         wall_scratch: memory for `exact_kernels.walls_into`.
     """
     has_bodies = False
-    for k in near:
+    for k in nearby:
         is_visible, is_looked_up = classify_body(bodies[k], lidar_pose, lidar)
         if k != own_body and is_visible and not is_looked_up:
             has_bodies = True

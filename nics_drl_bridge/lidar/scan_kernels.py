@@ -183,13 +183,13 @@ def scan_worlds(
             lidar_pose, heading = baked.locate_lidar(robot_poses[n, m], lidar.mount)
             own_body = first_robot + m if first_robot >= 0 else -1
             scan_start = (n * robots + m) * scan.shape[0]
-            near_count = cell_kernels.around(
+            nearby_count = cell_kernels.around(
                 n, lidar_pose.x, lidar_pose.y, lidar.range_max, cells
             )
             begin = 0
             exact_count = 0
-            while begin < near_count:
-                end = min(near_count, begin + LANES - in_use)
+            while begin < nearby_count:
+                end = min(nearby_count, begin + LANES - in_use)
                 in_use, not_looked_up = select_bodies(
                     bodies[n],
                     cells.found[begin:end],
@@ -211,7 +211,7 @@ def scan_worlds(
                     scan,
                     lidar_pose,
                     bodies[n],
-                    cells.found[: near_count if exact_count > 0 else 0],
+                    cells.found[: nearby_count if exact_count > 0 else 0],
                     own_body,
                     walls,
                     lidar,
@@ -225,7 +225,7 @@ def scan_worlds(
 @kernel(contracts=True, inline=True)
 def select_bodies(
     bodies: Array,
-    near: Integers,
+    nearby: Integers,
     own_body: int,
     lidar_pose: LidarPose,
     lidar_heading: float,
@@ -238,7 +238,7 @@ def select_bodies(
 
     Args:
         bodies: (K, 7) of the lidar's world.
-        near: indices of the bodies to consider, at most as many as lanes are left.
+        nearby: indices of the bodies to consider, at most as many as lanes are left.
         own_body: index of the robot's own body, which it does not see; -1 for none.
         lidar_pose: of the lidar.
         lidar_heading: of the lidar [rad].
@@ -252,10 +252,10 @@ def select_bodies(
     """
     doubles = lanes.doubles
     exact_count = 0
-    for j in range(near.shape[0]):
-        body = bodies[np.uintp(near[j])]
+    for j in range(nearby.shape[0]):
+        body = bodies[np.uintp(nearby[j])]
         is_visible, is_looked_up = baked.classify_body(body, lidar_pose, lidar)
-        is_other = near[j] != own_body
+        is_other = nearby[j] != own_body
         k = np.uintp(in_use)
         doubles[k + DX] = body[X] - lidar_pose.x
         doubles[k + DY] = body[Y] - lidar_pose.y
