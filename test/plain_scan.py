@@ -7,88 +7,79 @@ import numpy as np
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import exact_kernels
 from nics_drl_bridge.lidar.baked_kernels import (
-    LOOKED_UP,
-    beams_between,
-    blended,
-    compute,
-    in_beams,
-    nearest_cell,
-    points_of,
-    polar,
-    seen_at,
-    sensor_pose,
-    silhouette,
-    way_of,
+    LEFT,
+    LEFT_CORNERS,
+    RIGHT,
+    RIGHT_CORNERS,
+    ROW_EXTENT,
+    ROW_START,
+    BeamSpan,
+    BlendWeights,
+    RowPoints,
+    blend_range,
+    classify_body,
+    convert_to_beams,
+    find_cell,
+    find_hits,
+    find_points,
+    find_polar,
+    find_silhouette,
+    locate_lidar,
+    scan_exactly,
+    view_shape,
 )
-from nics_drl_bridge.lidar.exact_kernels import (
-    COS,
-    HEADING,
-    RADIUS,
-    SHAPE,
-    SIN,
-    LidarPose,
-    X,
-    Y,
-)
+from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SHAPE, SIN, X, Y
 
 
 @kernel(allocates=True)
-def scan_robot(out, pose, bodies, me, walls, lidar):  # type: ignore[no-untyped-def]
+def scan_robot(ranges, robot_pose, bodies, own_body, walls, lidar):  # type: ignore[no-untyped-def]
     """One scan (B,): the minimum over all bodies (K, 7) but the robot's own, and walls (Eq. 4)."""
-    for i in range(out.shape[0]):
-        out[i] = np.float32(np.inf)
-    x, y, heading = sensor_pose(pose, lidar.mount)
+    for i in range(ranges.shape[0]):
+        ranges[i] = np.float32(np.inf)
+    lidar_pose, heading = locate_lidar(robot_pose, lidar.mount)
     for k in range(bodies.shape[0]):
-        if k != me and way_of(bodies[k], x, y, lidar) == LOOKED_UP:
-            look_up(out, x, y, heading, bodies[k], lidar)
-    here = LidarPose(x, y, math.cos(heading), math.sin(heading))
-    found = np.zeros(11 * exact_kernels.TOGETHER)
-    compute(out, here, bodies, me, range(bodies.shape[0]), walls, lidar, found)
+        _, is_looked_up = classify_body(bodies[k], lidar_pose, lidar)
+        if k != own_body and is_looked_up:
+            look_up(ranges, lidar_pose, heading, bodies[k], lidar)
+    scratch = np.zeros(11 * exact_kernels.TOGETHER)
+    near = range(bodies.shape[0])
+    scan_exactly(ranges, lidar_pose, bodies, near, own_body, walls, lidar, scratch)
 
 
 @kernel(contracts=True, inline=True)
-def look_up(out, x, y, heading, body, lidar):  # type: ignore[no-untyped-def]
-    """Fuses one body into a scan (B,) by the table row of its nearest relative pose (Eq. 3)."""
+def look_up(ranges, lidar_pose, lidar_heading, body, lidar):  # type: ignore[no-untyped-def]
+    """Fuses one body into a scan (B,) by the table rows of its relative pose (Eq. 3)."""
     table = lidar.table
     shape = table.shapes[np.uintp(np.int32(body[SHAPE]))]
-    dx = body[X] - x
-    dy = body[Y] - y
-    distance, bearing = polar(dx, dy)
-    cell, hull, blend = nearest_cell(
-        distance, bearing, body[RADIUS], body[HEADING], shape, table
-    )
-    near = table.cells[np.uintp(cell)]
-    far = table.cells[np.uintp(cell + 1)]
-    seen = seen_at(dx, dy, body[COS], body[SIN])
-    right = silhouette(near[2], hull, shape, table.hulls, seen, 1.0)
-    left = silhouette(near[3], hull, shape, table.hulls, seen, -1.0)
-    middle, low, high = in_beams(right, left, bearing, heading, lidar.beams)
-    fuse(out, middle, low, high, near, far, blend, lidar)
+    dx = body[X] - lidar_pose.x
+    dy = body[Y] - lidar_pose.y
+    distance, bearing = find_polar(dx, dy)
+    cell = find_cell(distance, bearing, body[RADIUS], body[HEADING], shape, table)
+    near = table.cells[np.uintp(cell.place)]
+    far = table.cells[np.uintp(cell.place + 1)]
+    view = view_shape(dx, dy, body[COS], body[SIN])
+    hulls = table.hulls
+    right = find_silhouette(view, near[RIGHT_CORNERS], cell.hull, hulls, shape, RIGHT)
+    left = find_silhouette(view, near[LEFT_CORNERS], cell.hull, hulls, shape, LEFT)
+    span = convert_to_beams(bearing, right, left, lidar_heading, lidar.beams)
+    fuse(ranges, span, near, far, cell.far_weight, lidar)
     turn = 2.0 * math.pi / lidar.beams.step
-    if high >= turn:  # across the seam of the circle
-        fuse(out, middle - turn, low - turn, high - turn, near, far, blend, lidar)
+    if span.left >= turn:  # across the seam of the circle
+        turned = BeamSpan(span.centre - turn, span.right - turn, span.left - turn)
+        fuse(ranges, turned, near, far, cell.far_weight, lidar)
 
 
 @kernel(contracts=True, inline=True)
-def fuse(out, middle, low, high, near, far, blend, lidar):  # type: ignore[no-untyped-def]
-    """Lowers the beams from `low` to `high` to two blended rows, of cells (4,) (Eq. 4)."""
-    rows = lidar.table.rows
+def fuse(ranges, span, near, far, far_weight, lidar):  # type: ignore[no-untyped-def]
+    """Lowers the beams of a span to two blended rows, of cells (4,) (Eq. 4)."""
     shift = lidar.table.shift
-    begin, hits, point, share = beams_between(middle, low, high, out.shape[0], shift)
-    one, two = points_of(near[0], near[1], point, shift, hits)
-    other, other2 = points_of(far[0], far[1], point, shift, hits)
+    hits = find_hits(span, ranges.shape[0], shift)
+    near_points = find_points(near[ROW_START], near[ROW_EXTENT], hits, shift)
+    far_points = find_points(far[ROW_START], far[ROW_EXTENT], hits, shift)
+    points = RowPoints(near_points[0], near_points[1], far_points[0], far_points[1])
+    weights = BlendWeights(hits.next_weight, far_weight)
     range_min = np.float32(lidar.range_min)
     range_max = np.float32(lidar.range_max)
-    for j in range(hits):
-        value = blended(
-            rows,
-            one + j,
-            two + j,
-            other + j,
-            other2 + j,
-            share,
-            blend,
-            range_min,
-            range_max,
-        )
-        out[begin + j] = min(out[begin + j], value)
+    for j in range(hits.beams):
+        value = blend_range(lidar.table.rows, points, j, weights, range_min, range_max)
+        ranges[hits.first_beam + j] = min(ranges[hits.first_beam + j], value)

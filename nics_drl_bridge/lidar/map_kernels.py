@@ -175,8 +175,8 @@ def _begin(directions, first, u, v, c, s, columns, lanes):  # type: ignore[no-un
     v = np.float32(v)
     one = np.float32(1.0)
     none = np.float32(0.0)
-    singles = lanes.single
-    wholes = lanes.whole
+    singles = lanes.singles
+    wholes = lanes.integers
     for j in range(LANES):
         # idle lanes repeat the last beam
         k = np.uintp(j)
@@ -206,8 +206,8 @@ def _begin(directions, first, u, v, c, s, columns, lanes):  # type: ignore[no-un
 @kernel
 def _jump(flat, here, limit, lanes):  # type: ignore[no-untyped-def]
     """Move each lane to the end of its free square; True if any moved."""
-    singles = lanes.single
-    wholes = lanes.whole
+    singles = lanes.singles
+    wholes = lanes.integers
     # separate from the loop below, so that LLVM can vectorise that loop
     for j in range(LANES):
         k = np.uintp(j)
@@ -245,8 +245,8 @@ def _jump(flat, here, limit, lanes):  # type: ignore[no-untyped-def]
 @kernel
 def _end(out, x, y, shape, limit, resolution, lanes):  # type: ignore[no-untyped-def]
     """Fuse the lanes that ended at a solid cell, not in the border around the map."""
-    singles = lanes.single
-    wholes = lanes.whole
+    singles = lanes.singles
+    wholes = lanes.integers
     ranges = out.view(np.int32)
     for j in range(out.shape[0]):
         k = np.uintp(j)

@@ -1,14 +1,28 @@
-"""Scans of whole worlds: the bodies of several scans are looked up together.
+"""Scans of whole worlds: bodies of many scans are looked up together (Eq. 3 and 4).
 
-`look_up` is Eq. 3 (the ranges of a body, from the table) and Eq. 4 (the minimum per beam). Its
-steps are those of `baked_kernels`, which are written for one body. Here each step runs over all
-waiting bodies in a loop without branches, which LLVM vectorises: a look-up's time goes into cache
-misses, mispredicted branches and latencies. Steps hand on their results in lanes: one array per
-type of number, with `LANES` places for each quantity, so that LLVM can prove that they do not
-overlap.
+    scan[b] = min over the bodies m of r_m(a_b)     Eq. 4, for the beam b at the angle a_b
+
+Each r_m is a look-up of one body, Eq. 3. `baked_kernels` states it as a formula and has its steps
+for one body. Here each step runs over all waiting bodies in a loop without branches, which LLVM
+vectorises: the time of a look-up goes into cache misses, mispredicted branches and latencies.
+
+`scan_worlds` selects the bodies that are visible (step 1) and puts each of them into a lane. When
+the lanes are full, `look_up` takes all of them through the passes:
+
+2. `find_polars`: distance and bearing of each body.
+3. `find_cells`, `fetch_cells`: its cell in the table, and what the cell holds.
+4. `find_silhouettes`, `climb_to_silhouettes`: its silhouettes,
+5. and the beams that hit it.
+6. `find_all_points`: its points in the table.
+7. `fuse_body`: blends the range of each beam, and takes the minimum with the scan.
+
+Then come the bodies that are scanned exactly, the walls and the maps.
+
+The passes hand on their results in lanes: one array for each type of number, with `LANES` places
+for each quantity, so that LLVM can prove that quantities do not overlap. A quantity is named by its
+offset: `lanes.doubles[k + DX]` is `DX` of the body in lane k.
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -17,432 +31,564 @@ from numpy.typing import NDArray
 from nics_drl_bridge.kernels import kernel, prefetch
 from nics_drl_bridge.lidar import baked_kernels as baked
 from nics_drl_bridge.lidar import cell_kernels, exact_kernels, map_kernels
+from nics_drl_bridge.lidar.baked_kernels import (
+    LEFT,
+    LEFT_CORNERS,
+    RIGHT,
+    RIGHT_CORNERS,
+    BeamSpan,
+    BlendWeights,
+    LidarArrays,
+    RowPoints,
+    ShapeView,
+    TableArrays,
+)
+from nics_drl_bridge.lidar.cell_kernels import BodyCells
 from nics_drl_bridge.lidar.exact_kernels import (
     COS,
     HEADING,
     RADIUS,
     SHAPE,
     SIN,
+    Beams,
     LidarPose,
     X,
     Y,
 )
-from nics_drl_bridge.lidar.fixture_kernels import grid_of, walls_of
+from nics_drl_bridge.lidar.fixture_kernels import Fixtures, grid_of, walls_of
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int32]
+Singles = NDArray[np.float32]
 
 # Beams of a body are fused in blocks of so many.
 BLOCK = 16
+BLOCK_SHIFT = np.int32(4)  # log2 of BLOCK
+FEWEST_BLOCKS = np.int32(2)  # see `find_body_points`
 # Table rows are prefetched so many bodies before they are fused.
 PREFETCHED_AHEAD = 8
 # Bodies looked up together: few enough for their scans to stay in the L1 cache.
 LANES = 9 * BLOCK
 
-# Quantities in `ScanLanes.wide`: the body relative to the lidar.
-DX, DY, BODY_HEADING, BODY_COS, BODY_SIN, BODY_RADIUS = (
-    np.uintp(k * LANES) for k in range(6)
-)
-# Bearing of beam 0, and index of the scan's first range in memory.
-LIDAR_HEADING, FIRST_RANGE = (np.uintp(k * LANES) for k in range(6, 8))
-# The body's centre and its right and left silhouette [beams]; index of the first range to fuse.
-CENTRE_BEAM, RIGHT_BEAM, LEFT_BEAM, FUSED_FROM = (
-    np.uintp(k * LANES) for k in range(8, 12)
-)
-# Of either silhouette, the two corners of the hull that it may be.
-RIGHT_X, RIGHT_Y, RIGHT_X2, RIGHT_Y2, LEFT_X, LEFT_Y, LEFT_X2, LEFT_Y2 = (
-    np.uintp(k * LANES) for k in range(12, 20)
-)
-# Quantities in `ScanLanes.single`; the weights of the farther row and of the next point.
-DISTANCE, BEARING, ROW_WEIGHT, POINT_WEIGHT = (np.uintp(k * LANES) for k in range(4))
-# Quantities in `ScanLanes.whole`: the table's cell and the hull's first corner;
-BODY_SHAPE, CELL, HULL = (np.uintp(k * LANES) for k in range(3))
-# negative where two corners do not determine a silhouette;
-CLIMBS = np.uintp(3 * LANES)
-# where the row below the distance and the one above it start, and which beams they hold;
-ROW_START, ROW_BEAMS, FAR_ROW_START, FAR_ROW_BEAMS = (
-    np.uintp(k * LANES) for k in range(4, 8)
-)
-# blocks to fuse (0: beam by beam), beams that hit, and beams before them in the first block;
-BLOCKS, HITS, LEADING = (np.uintp(k * LANES) for k in range(8, 11))
-# the points around a beam, in the row and in the farther one.
-POINT, NEXT_POINT, FAR_POINT, FAR_NEXT_POINT = (
-    np.uintp(k * LANES) for k in range(11, 15)
-)
+# Quantities in `ScanLanes.doubles`.
+DOUBLES = 21
+(
+    DX,  # of the body from the lidar, along the axes of the world [m]
+    DY,
+    BODY_HEADING,  # in the world [rad]
+    BODY_COS,
+    BODY_SIN,
+    BODY_RADIUS,  # of the circle around the body [m]
+    ROUND_RADIUS,  # radius of a body that is a circle [m], 0 for any other
+    LIDAR_HEADING,  # in the world [rad]
+    SCAN_START,  # index of the scan's first range in memory
+    FUSED_FROM,  # index of the first range to fuse
+    CENTRE_BEAM,  # bearing and silhouettes of the body, see `BeamSpan`
+    RIGHT_BEAM,
+    LEFT_BEAM,
+    RIGHT_X,  # the two corners that may be the right silhouette [m]
+    RIGHT_Y,
+    RIGHT_X2,
+    RIGHT_Y2,
+    LEFT_X,  # the same for the left silhouette
+    LEFT_Y,
+    LEFT_X2,
+    LEFT_Y2,
+) = (np.uintp(k * LANES) for k in range(DOUBLES))
+
+# Quantities in `ScanLanes.singles`.
+SINGLES = 4
+(
+    DISTANCE,  # of the body from the lidar [m]
+    BEARING,  # of the body in the world [rad]
+    FAR_WEIGHT,  # of the far row
+    NEXT_WEIGHT,  # of the next point in each row
+) = (np.uintp(k * LANES) for k in range(SINGLES))
+
+# Quantities in `ScanLanes.integers`. The near row is that of the grid distance below the body's
+# distance, the far row that of the next grid distance.
+INTEGERS = 15
+(
+    BODY_SHAPE,  # index of the body's shape
+    CELL,  # index of its cell in the table
+    HULL,  # index from which the cell's corners are counted
+    CLIMBS,  # negative if two corners do not determine a silhouette
+    NEAR_START,  # where the near row starts
+    NEAR_EXTENT,  # its beams, see `unpack_extent`
+    FAR_START,
+    FAR_EXTENT,
+    BLOCKS,  # number of blocks to fuse; 0: fuse beam by beam
+    HITS,  # number of beams that hit
+    LEADING,  # beams that are fused before the first one that hits
+    NEAR_POINT,  # indices of the points of the first beam to fuse, see `RowPoints`
+    NEAR_NEXT,
+    FAR_POINT,
+    FAR_NEXT,
+) = (np.uintp(k * LANES) for k in range(INTEGERS))
 
 
 class ScanLanes(NamedTuple):
     """Scratch memory of the scans of one thread."""
 
-    wide: NDArray[np.float64]
-    single: NDArray[np.float32]
-    whole: NDArray[np.int32]
-    walls: NDArray[np.float64]
+    doubles: Array  # (DOUBLES * LANES,)
+    singles: Singles  # (SINGLES * LANES,)
+    integers: Integers  # (INTEGERS * LANES,)
+    walls: Array  # for `exact_kernels.walls_into`
 
 
 def scan_lanes() -> ScanLanes:
     """Allocate the memory that one thread needs to scan."""
     return ScanLanes(
-        np.zeros(20 * LANES),
-        np.zeros(4 * LANES, np.float32),
-        np.zeros(15 * LANES, np.int32),
+        np.zeros(DOUBLES * LANES),
+        np.zeros(SINGLES * LANES, np.float32),
+        np.zeros(INTEGERS * LANES, np.int32),
         np.zeros(11 * exact_kernels.TOGETHER),
     )
 
 
 @kernel
-def scan_worlds(ranges, poses, chosen, bodies, first, fixtures, lidar, cells, lanes):  # type: ignore[no-untyped-def]
-    """Scan from the robots of the worlds `chosen` (n,), at poses (N, M, 3), into ranges (N, M, B).
+def scan_worlds(
+    ranges: Singles,
+    robot_poses: Array,
+    chosen: NDArray[np.int64],
+    bodies: Array,
+    first_robot: int,
+    fixtures: Fixtures,
+    lidar: LidarArrays,
+    cells: BodyCells,
+    lanes: ScanLanes,
+) -> None:
+    """Scan from all robots of some worlds.
 
-    The bodies (N, K, 7) from index `first` on are the robots', or none where `first` is -1.
-    `fixtures` are walls and maps, `cells` (`BodyCells`) says which bodies are near. Bodies wait in
-    the lanes, across scans and worlds, and are looked up when the lanes are full.
+    Args:
+        ranges: (N, M, B) the scans [m], which are overwritten.
+        robot_poses: (N, M, 3).
+        chosen: (n,) the worlds to scan.
+        bodies: (N, K, 7).
+        first_robot: index of the first robot's own body, which the other robots' follow; -1 if
+            robots have no bodies.
+        fixtures: walls and maps of the worlds.
+        lidar: the lidar of every robot.
+        cells: which bodies are near a place.
+        lanes: scratch memory. Bodies wait there, across scans and worlds, until it is full.
     """
-    robots = poses.shape[1]
+    robots = robot_poses.shape[1]
     in_use = 0
     for n in chosen:
         walls = walls_of(n, fixtures)
         for m in range(robots):
-            out = ranges[n, m]
-            own_body = first + m if first >= 0 else -1
-            for i in range(out.shape[0]):
-                out[i] = np.float32(np.inf)
-            x, y, heading = baked.sensor_pose(poses[n, m], lidar.mount)
-            lidar_pose = LidarPose(x, y, math.cos(heading), math.sin(heading))
-            at = (n * robots + m) * out.shape[0]
-            count = cell_kernels.around(n, x, y, lidar.range_max, cells)
+            scan = ranges[n, m]
+            for i in range(scan.shape[0]):
+                scan[i] = np.float32(np.inf)
+            lidar_pose, heading = baked.locate_lidar(robot_poses[n, m], lidar.mount)
+            own_body = first_robot + m if first_robot >= 0 else -1
+            scan_start = (n * robots + m) * scan.shape[0]
+            nearby_count = cell_kernels.around(
+                n, lidar_pose.x, lidar_pose.y, lidar.range_max, cells
+            )
             begin = 0
-            computed = 0
-            while begin < count:
-                end = min(count, begin + LANES - in_use)
-                near = cells.found[begin:end]
-                in_use, rest = select_bodies(
-                    in_use,
-                    near,
+            exact_count = 0
+            while begin < nearby_count:
+                end = min(nearby_count, begin + LANES - in_use)
+                in_use, not_looked_up = select_bodies(
                     bodies[n],
+                    cells.found[begin:end],
                     own_body,
                     lidar_pose,
                     heading,
-                    at,
+                    scan_start,
                     lidar,
                     lanes,
+                    in_use,
                 )
                 begin = end
-                computed = computed + rest
+                exact_count = exact_count + not_looked_up
                 if in_use == LANES:
-                    look_up(in_use, ranges, lidar, lanes)
+                    look_up(ranges, lidar, lanes, in_use)
                     in_use = 0
-            if computed > 0 or walls.shape[0] > 0:
-                near = cells.found[: count if computed > 0 else 0]
-                baked.compute(
-                    out,
+            if exact_count > 0 or walls.shape[0] > 0:
+                baked.scan_exactly(
+                    scan,
                     lidar_pose,
                     bodies[n],
+                    cells.found[: nearby_count if exact_count > 0 else 0],
                     own_body,
-                    near,
                     walls,
                     lidar,
                     lanes.walls,
                 )
-    look_up(in_use, ranges, lidar, lanes)
+    look_up(ranges, lidar, lanes, in_use)
     if fixtures.squares.size > 0:
-        add_maps(ranges, poses, chosen, fixtures, lidar, lanes)
+        add_maps(ranges, robot_poses, chosen, fixtures, lidar, lanes)
 
 
 @kernel(contracts=True, inline=True)
-def select_bodies(in_use, near, bodies, own, lidar_pose, heading, at, lidar, lanes):  # type: ignore[no-untyped-def]
-    """Put the visible ones of the bodies `near` into lanes; return lanes in use, bodies to compute.
+def select_bodies(
+    bodies: Array,
+    nearby: Integers,
+    own_body: int,
+    lidar_pose: LidarPose,
+    lidar_heading: float,
+    scan_start: int,
+    lidar: LidarArrays,
+    lanes: ScanLanes,
+    in_use: int,
+) -> tuple[int, int]:
+    """Put those bodies that one scan looks up into lanes (step 1).
 
-    A body is computed instead of looked up where the table is too coarse, see `way_of`.
+    Args:
+        bodies: (K, 7) of the lidar's world.
+        nearby: indices of the bodies to consider, at most as many as lanes are left.
+        own_body: index of the robot's own body, which it does not see; -1 for none.
+        lidar_pose: of the lidar.
+        lidar_heading: of the lidar [rad].
+        scan_start: index of the scan's first range in memory.
+        lidar: the lidar.
+        lanes: where the bodies are put.
+        in_use: number of lanes in use before.
+
+    Returns:
+        The number of lanes in use, and of visible bodies that have to be scanned exactly.
     """
-    wide = lanes.wide
-    computed = 0
-    behind = lidar.beams.behind
-    for j in range(near.shape[0]):
-        b = np.uintp(near[j])
+    doubles = lanes.doubles
+    exact_count = 0
+    for j in range(nearby.shape[0]):
+        body = bodies[np.uintp(nearby[j])]
+        is_visible, is_looked_up = baked.classify_body(body, lidar_pose, lidar)
+        is_other = nearby[j] != own_body
         k = np.uintp(in_use)
-        dx = bodies[b, X] - lidar_pose.x
-        dy = bodies[b, Y] - lidar_pose.y
-        radius = bodies[b, RADIUS]
-        d2 = dx * dx + dy * dy
-        reach = lidar.range_max + radius
-        shape = np.int32(bodies[b, SHAPE])
-        wide[k + DX] = dx
-        wide[k + DY] = dy
-        wide[k + BODY_HEADING] = bodies[b, HEADING]
-        wide[k + BODY_COS] = bodies[b, COS]
-        wide[k + BODY_SIN] = bodies[b, SIN]
-        wide[k + BODY_RADIUS] = radius
-        wide[k + LIDAR_HEADING] = heading
-        wide[k + FIRST_RANGE] = at
-        lanes.whole[k + BODY_SHAPE] = shape
-        h = np.uintp(shape)
-        ahead = lidar_pose.c * dx + lidar_pose.s * dy
-        aside = lidar_pose.c * dy - lidar_pose.s * dx
-        is_behind = (behind[0, 0] * ahead + behind[0, 1] * aside >= radius) & (
-            behind[1, 0] * ahead + behind[1, 1] * aside >= radius
-        )
-        is_other = (radius > 0.0) & (near[j] != own)
-        is_visible = (d2 <= reach * reach) & is_other & (not is_behind)
-        is_in_table = is_visible & (d2 >= radius * radius)
-        is_in_table &= (d2 >= lidar.between[h, 0]) & (d2 <= lidar.between[h, 1])
+        doubles[k + DX] = body[X] - lidar_pose.x
+        doubles[k + DY] = body[Y] - lidar_pose.y
+        doubles[k + BODY_HEADING] = body[HEADING]
+        doubles[k + BODY_COS] = body[COS]
+        doubles[k + BODY_SIN] = body[SIN]
+        doubles[k + BODY_RADIUS] = body[RADIUS]
+        doubles[k + LIDAR_HEADING] = lidar_heading
+        doubles[k + SCAN_START] = scan_start
+        lanes.integers[k + BODY_SHAPE] = np.int32(body[SHAPE])
         # The lane counts only if its body is looked up; else the next body overwrites it.
-        in_use += is_in_table
-        computed += is_visible & (not is_in_table)
-    return in_use, computed
+        in_use += is_looked_up & is_other
+        exact_count += is_visible & is_other & (not is_looked_up)
+    return in_use, exact_count
 
 
 @kernel
-def look_up(in_use, ranges, lidar, lanes):  # type: ignore[no-untyped-def]
+def look_up(ranges: Singles, lidar: LidarArrays, lanes: ScanLanes, in_use: int) -> None:
     """Look up the bodies in the lanes (Eq. 3) and fuse them into their scans (N, M, B) (Eq. 4)."""
-    wide = lanes.wide
     table = lidar.table
-    flat = ranges.reshape(-1).view(np.int32)
+    shift = np.int32(table.shift)
+    flat_ranges = ranges.reshape(-1).view(np.int32)
     padded = (in_use + BLOCK - 1) // BLOCK * BLOCK
-    full_turn = 2.0 * math.pi / lidar.beams.step  # [beams]
+    full_turn = 2.0 * np.pi / lidar.beams.step  # [beams]
     beam_count = np.int32(ranges.shape[2])
-    compute_polar(padded, lanes)
+    find_polars(padded, lanes)
     find_cells(in_use, table, lanes)
     fetch_cells(in_use, table, lanes)
     find_silhouettes(padded, lidar.beams, lanes)
     for j in range(in_use):
-        if lanes.whole[np.uintp(j) + CLIMBS] < 0:
+        if lanes.integers[np.uintp(j) + CLIMBS] < 0:
             climb_to_silhouettes(np.uintp(j), lidar, lanes)
-    find_all_points(padded, beam_count, np.int32(table.shift), lanes)
+    find_all_points(padded, beam_count, shift, lanes)
     for j in range(in_use):
         upcoming = np.uintp(min(j + PREFETCHED_AHEAD, in_use - 1))
-        for row in (POINT, FAR_POINT):
-            prefetch(table.rows, np.intp(lanes.whole[upcoming + row]))
-            prefetch(table.rows, np.intp(lanes.whole[upcoming + row] + BLOCK))
-        fuse(flat, np.uintp(j), lidar, lanes)
+        for point in (NEAR_POINT, FAR_POINT):
+            prefetch(table.rows, np.intp(lanes.integers[upcoming + point]))
+            prefetch(table.rows, np.intp(lanes.integers[upcoming + point] + BLOCK))
+        fuse_body(flat_ranges, np.uintp(j), lidar, lanes)
     for j in range(in_use):
         # A body that spans the last beam and the first is fused again, a full turn on.
-        if wide[np.uintp(j) + LEFT_BEAM] >= full_turn:
-            find_points(
-                np.uintp(j), full_turn, beam_count, np.int32(table.shift), lanes
-            )
-            fuse(flat, np.uintp(j), lidar, lanes)
+        if lanes.doubles[np.uintp(j) + LEFT_BEAM] >= full_turn:
+            find_body_points(np.uintp(j), full_turn, beam_count, shift, lanes)
+            fuse_body(flat_ranges, np.uintp(j), lidar, lanes)
 
 
 @kernel(contracts=True)
-def compute_polar(padded, lanes):  # type: ignore[no-untyped-def]
-    """Compute distance and bearing of each body; unused lanes hold old values."""
+def find_polars(padded: int, lanes: ScanLanes) -> None:
+    """Find distance and bearing of each body (step 2); unused lanes hold old values."""
     for j in range(padded):
         k = np.uintp(j)
-        distance, bearing = baked.polar(lanes.wide[k + DX], lanes.wide[k + DY])
-        lanes.single[k + DISTANCE] = distance
-        lanes.single[k + BEARING] = bearing
+        distance, bearing = baked.find_polar(
+            lanes.doubles[k + DX], lanes.doubles[k + DY]
+        )
+        lanes.singles[k + DISTANCE] = distance
+        lanes.singles[k + BEARING] = bearing
 
 
 @kernel(contracts=True)
-def find_cells(in_use, table, lanes):  # type: ignore[no-untyped-def]
-    """Find the table's cell for each body, and the first corner of its hull."""
-    wide = lanes.wide
-    single = lanes.single
-    whole = lanes.whole
+def find_cells(in_use: int, table: TableArrays, lanes: ScanLanes) -> None:
+    """Find the cell in the table for each body (step 3)."""
+    doubles = lanes.doubles
+    singles = lanes.singles
+    integers = lanes.integers
     for j in range(in_use):
         k = np.uintp(j)
-        shape = table.shapes[np.uintp(whole[k + BODY_SHAPE])]
-        distance = single[k + DISTANCE]
-        whole[k + CELL], whole[k + HULL], single[k + ROW_WEIGHT] = baked.nearest_cell(
-            distance,
-            single[k + BEARING],
-            wide[k + BODY_RADIUS],
-            wide[k + BODY_HEADING],
+        shape = table.shapes[np.uintp(integers[k + BODY_SHAPE])]
+        cell = baked.find_cell(
+            singles[k + DISTANCE],
+            singles[k + BEARING],
+            doubles[k + BODY_RADIUS],
+            doubles[k + BODY_HEADING],
             shape,
             table,
         )
-        wide[k + BODY_RADIUS] = shape.round_radius
+        integers[k + CELL] = cell.place
+        integers[k + HULL] = cell.hull
+        singles[k + FAR_WEIGHT] = cell.far_weight
+        doubles[k + ROUND_RADIUS] = shape.round_radius
 
 
 @kernel
-def fetch_cells(in_use, table, lanes):  # type: ignore[no-untyped-def]
-    """Fetch cells and corners: most cache misses occur here, where no arithmetic waits for them."""
-    wide = lanes.wide
-    whole = lanes.whole
+def fetch_cells(in_use: int, table: TableArrays, lanes: ScanLanes) -> None:
+    """Fetch rows and corners of each cell (step 3).
+
+    Most cache misses occur here, where no arithmetic waits for them.
+    """
+    doubles = lanes.doubles
+    integers = lanes.integers
     for j in range(in_use):
         k = np.uintp(j)
-        hull = whole[k + HULL]
-        cell = np.uintp(whole[k + CELL])
+        hull = integers[k + HULL]
+        cell = np.uintp(integers[k + CELL])
         near = table.cells[cell]
         far = table.cells[cell + np.uintp(1)]
-        whole[k + ROW_START] = near[0]
-        whole[k + ROW_BEAMS] = near[1]
-        whole[k + FAR_ROW_START] = far[0]
-        whole[k + FAR_ROW_BEAMS] = far[1]
-        whole[k + CLIMBS] = (near[2] | near[3]) >> 16
-        for pair, at in ((near[2], RIGHT_X), (near[3], LEFT_X)):
-            corner = table.hulls[np.uintp(hull + (pair & 0xFFFF))]
-            corner2 = table.hulls[np.uintp(hull + max(pair >> 16, 0))]
-            wide[k + at] = corner[0]
-            wide[k + at + np.uintp(LANES)] = corner[1]
-            wide[k + at + np.uintp(2 * LANES)] = corner2[0]
-            wide[k + at + np.uintp(3 * LANES)] = corner2[1]
+        integers[k + NEAR_START] = near[baked.ROW_START]
+        integers[k + NEAR_EXTENT] = near[baked.ROW_EXTENT]
+        integers[k + FAR_START] = far[baked.ROW_START]
+        integers[k + FAR_EXTENT] = far[baked.ROW_EXTENT]
+        _, right_second = baked.unpack_corners(near[RIGHT_CORNERS])
+        _, left_second = baked.unpack_corners(near[LEFT_CORNERS])
+        integers[k + CLIMBS] = right_second | left_second
+        for packed, x_lane in (
+            (near[RIGHT_CORNERS], RIGHT_X),
+            (near[LEFT_CORNERS], LEFT_X),
+        ):
+            first, second = baked.unpack_corners(packed)
+            corner = table.hulls[np.uintp(hull + first)]
+            corner2 = table.hulls[np.uintp(hull + max(second, 0))]
+            doubles[k + x_lane] = corner[0]
+            doubles[k + x_lane + np.uintp(LANES)] = corner[1]
+            doubles[k + x_lane + np.uintp(2 * LANES)] = corner2[0]
+            doubles[k + x_lane + np.uintp(3 * LANES)] = corner2[1]
 
 
 @kernel(contracts=True)
-def find_silhouettes(padded, beams, lanes):  # type: ignore[no-untyped-def]
-    """Find centre and silhouettes of each body in beams, from the outer of two corners."""
-    wide = lanes.wide
+def find_silhouettes(padded: int, beams: Beams, lanes: ScanLanes) -> None:
+    """Find the silhouettes of each body (step 4), the outer of two corners, in beams (step 5)."""
+    doubles = lanes.doubles
     for j in range(padded):
         k = np.uintp(j)
-        seen = baked.seen_at(
-            wide[k + DX], wide[k + DY], wide[k + BODY_COS], wide[k + BODY_SIN]
+        view = view_body(k, lanes)
+        round_radius = doubles[k + ROUND_RADIUS]
+        right = baked.find_tangent(
+            view,
+            doubles[k + RIGHT_X],
+            doubles[k + RIGHT_Y],
+            doubles[k + RIGHT_X2],
+            doubles[k + RIGHT_Y2],
+            round_radius,
+            RIGHT,
         )
-        radius = wide[k + BODY_RADIUS]
-        x = wide[k + RIGHT_X]
-        y = wide[k + RIGHT_Y]
-        x2 = wide[k + RIGHT_X2]
-        y2 = wide[k + RIGHT_Y2]
-        right = baked.tangent(seen, x, y, x2, y2, radius, 1.0)
-        x = wide[k + LEFT_X]
-        y = wide[k + LEFT_Y]
-        x2 = wide[k + LEFT_X2]
-        y2 = wide[k + LEFT_Y2]
-        left = baked.tangent(seen, x, y, x2, y2, radius, -1.0)
-        bearing = lanes.single[k + BEARING]
-        ahead = wide[k + LIDAR_HEADING]
-        wide[k + CENTRE_BEAM], wide[k + RIGHT_BEAM], wide[k + LEFT_BEAM] = (
-            baked.in_beams(right, left, bearing, ahead, beams)
+        left = baked.find_tangent(
+            view,
+            doubles[k + LEFT_X],
+            doubles[k + LEFT_Y],
+            doubles[k + LEFT_X2],
+            doubles[k + LEFT_Y2],
+            round_radius,
+            LEFT,
         )
+        store_span(k, right, left, beams, lanes)
 
 
 @kernel(contracts=True)
-def climb_to_silhouettes(k, lidar, lanes):  # type: ignore[no-untyped-def]
-    """Find the silhouettes of a body that two corners do not determine."""
-    wide = lanes.wide
-    whole = lanes.whole
+def climb_to_silhouettes(k: int, lidar: LidarArrays, lanes: ScanLanes) -> None:
+    """Find the silhouettes of a body that two corners do not determine (steps 4 and 5)."""
+    integers = lanes.integers
     table = lidar.table
-    seen = baked.seen_at(
-        wide[k + DX], wide[k + DY], wide[k + BODY_COS], wide[k + BODY_SIN]
+    view = view_body(k, lanes)
+    shape = table.shapes[np.uintp(integers[k + BODY_SHAPE])]
+    cell = table.cells[np.uintp(integers[k + CELL])]
+    hull = integers[k + HULL]
+    right = baked.find_silhouette(
+        view, cell[RIGHT_CORNERS], hull, table.hulls, shape, RIGHT
     )
-    shape = table.shapes[np.uintp(whole[k + BODY_SHAPE])]
-    cell = table.cells[np.uintp(whole[k + CELL])]
-    right = baked.silhouette(cell[2], whole[k + HULL], shape, table.hulls, seen, 1.0)
-    left = baked.silhouette(cell[3], whole[k + HULL], shape, table.hulls, seen, -1.0)
-    bearing = lanes.single[k + BEARING]
-    ahead = wide[k + LIDAR_HEADING]
-    wide[k + CENTRE_BEAM], wide[k + RIGHT_BEAM], wide[k + LEFT_BEAM] = baked.in_beams(
-        right, left, bearing, ahead, lidar.beams
+    left = baked.find_silhouette(
+        view, cell[LEFT_CORNERS], hull, table.hulls, shape, LEFT
     )
+    store_span(k, right, left, lidar.beams, lanes)
 
 
 @kernel(contracts=True, inline=True)
-def find_points(k, turned_by, beam_count, shift, lanes):  # type: ignore[no-untyped-def]
-    """Find the beams that hit one body, and its points in the table.
+def view_body(k: int, lanes: ScanLanes) -> ShapeView:
+    """Return the view of the body in a lane."""
+    doubles = lanes.doubles
+    view: ShapeView = baked.view_shape(
+        doubles[k + DX], doubles[k + DY], doubles[k + BODY_COS], doubles[k + BODY_SIN]
+    )
+    return view
 
-    A body across the seam of the circle is fused twice, the second time `turned_by` a full turn.
-    Whole blocks of beams are fused, at least two, which most bodies need: a varying number would
-    often mispredict a branch. Where blocks would end beyond the last beam, they start `LEADING`
-    beams earlier.
+
+@kernel(contracts=True, inline=True)
+def store_span(
+    k: int, right: float, left: float, beams: Beams, lanes: ScanLanes
+) -> None:
+    """Store bearing and silhouettes of the body in a lane, as beams."""
+    doubles = lanes.doubles
+    bearing = lanes.singles[k + BEARING]
+    heading = doubles[k + LIDAR_HEADING]
+    span = baked.convert_to_beams(bearing, right, left, heading, beams)
+    doubles[k + CENTRE_BEAM] = span.centre
+    doubles[k + RIGHT_BEAM] = span.right
+    doubles[k + LEFT_BEAM] = span.left
+
+
+@kernel(contracts=True)
+def find_all_points(padded: int, beam_count: int, shift: int, lanes: ScanLanes) -> None:
+    """Find the beams that hit each body, and its points in the table (steps 5 and 6)."""
+    for j in range(padded):
+        find_body_points(np.uintp(j), 0.0, beam_count, shift, lanes)
+
+
+@kernel(contracts=True, inline=True)
+def find_body_points(
+    k: int, turned_by: float, beam_count: int, shift: int, lanes: ScanLanes
+) -> None:
+    """Find the beams that hit one body, and its points in the table (steps 5 and 6).
+
+    A body across the seam of the circle is fused twice, the second time `turned_by` a full turn
+    [beams]. Whole blocks of beams are fused, at least two, which most bodies need: a varying number
+    would often mispredict a branch. Where blocks would end beyond the last beam, they start
+    `LEADING` beams earlier.
     """
-    wide = lanes.wide
-    whole = lanes.whole
+    doubles = lanes.doubles
+    integers = lanes.integers
     zero = np.int32(0)
-    centre = wide[k + CENTRE_BEAM] - turned_by
-    right = wide[k + RIGHT_BEAM] - turned_by
-    left = wide[k + LEFT_BEAM] - turned_by
-    first_beam, hits, point, weight = baked.beams_between(
-        centre, right, left, beam_count, shift
+    span = BeamSpan(
+        doubles[k + CENTRE_BEAM] - turned_by,
+        doubles[k + RIGHT_BEAM] - turned_by,
+        doubles[k + LEFT_BEAM] - turned_by,
+    )
+    hits = baked.find_hits(span, beam_count, shift)
+    near, near_next = baked.find_points(
+        integers[k + NEAR_START], integers[k + NEAR_EXTENT], hits, shift
+    )
+    far, far_next = baked.find_points(
+        integers[k + FAR_START], integers[k + FAR_EXTENT], hits, shift
     )
     width = np.int32(
-        max(np.int32(hits + BLOCK - 1) & np.int32(-BLOCK), np.int32(2 * BLOCK))
+        max(
+            np.int32(hits.beams + BLOCK - 1) & np.int32(-BLOCK),
+            np.int32(FEWEST_BLOCKS * BLOCK),
+        )
     )
-    leading = np.int32(max(np.int32(first_beam + width - beam_count), zero))
-    near, near_next = baked.points_of(
-        whole[k + ROW_START], whole[k + ROW_BEAMS], point, shift, hits
-    )
-    far, far_next = baked.points_of(
-        whole[k + FAR_ROW_START], whole[k + FAR_ROW_BEAMS], point, shift, hits
-    )
-    lowest = np.int32(
-        min(min(near, near_next), min(min(far, far_next), first_beam)) - leading
-    )
+    leading = np.int32(max(np.int32(hits.first_beam + width - beam_count), zero))
     blocks = np.int32(
-        max(np.int32(hits + leading + BLOCK - 1) >> np.int32(4), np.int32(2))
+        max(np.int32(hits.beams + leading + BLOCK - 1) >> BLOCK_SHIFT, FEWEST_BLOCKS)
     )
-    whole[k + HITS] = hits
-    whole[k + LEADING] = leading
-    wide[k + FUSED_FROM] = wide[k + FIRST_RANGE] + (first_beam - leading)
-    whole[k + POINT] = np.int32(near - leading)
-    whole[k + NEXT_POINT] = np.int32(near_next - leading)
-    whole[k + FAR_POINT] = np.int32(far - leading)
-    whole[k + FAR_NEXT_POINT] = np.int32(far_next - leading)
-    # Blocks must not reach before the start of the table.
-    whole[k + BLOCKS] = blocks if (lowest >= 0) & (hits > 0) else zero
-    lanes.single[k + POINT_WEIGHT] = weight
-
-
-@kernel(contracts=True)
-def find_all_points(padded, beam_count, shift, lanes):  # type: ignore[no-untyped-def]
-    """Find the beams and the points of each body, see `find_points`."""
-    for j in range(padded):
-        find_points(np.uintp(j), 0.0, beam_count, shift, lanes)
+    # Blocks must start neither before the table nor before the scan.
+    lowest = np.int32(
+        min(min(near, near_next), min(min(far, far_next), hits.first_beam)) - leading
+    )
+    integers[k + BLOCKS] = blocks if (lowest >= 0) & (hits.beams > 0) else zero
+    integers[k + HITS] = hits.beams
+    integers[k + LEADING] = leading
+    integers[k + NEAR_POINT] = np.int32(near - leading)
+    integers[k + NEAR_NEXT] = np.int32(near_next - leading)
+    integers[k + FAR_POINT] = np.int32(far - leading)
+    integers[k + FAR_NEXT] = np.int32(far_next - leading)
+    lanes.singles[k + NEXT_WEIGHT] = hits.next_weight
+    doubles[k + FUSED_FROM] = doubles[k + SCAN_START] + (hits.first_beam - leading)
 
 
 @kernel(contracts=True, inline=True)
-def fuse_beam(flat, place, i, is_hit, rows, points, weights, limits):  # type: ignore[no-untyped-def]
-    """Lower the range of one beam at `place`, the i-th of a body, if it hits (Eq. 4).
+def fuse_body(
+    flat_ranges: Integers, k: int, lidar: LidarArrays, lanes: ScanLanes
+) -> None:
+    """Fuse one body into its scan (step 7), in blocks of beams or, where none fits, beam by beam.
+
+    `flat_ranges` are the ranges of all scans, see `fuse_beam`.
+    """
+    integers = lanes.integers
+    blocks = integers[k + BLOCKS]
+    hits = integers[k + HITS]
+    leading = integers[k + LEADING]
+    weights = BlendWeights(
+        lanes.singles[k + NEXT_WEIGHT], lanes.singles[k + FAR_WEIGHT]
+    )
+    skipped = np.int64(0 if blocks > 0 else leading)
+    points = RowPoints(
+        np.uintp(integers[k + NEAR_POINT] + skipped),
+        np.uintp(integers[k + NEAR_NEXT] + skipped),
+        np.uintp(integers[k + FAR_POINT] + skipped),
+        np.uintp(integers[k + FAR_NEXT] + skipped),
+    )
+    if blocks > 0:
+        fused_from = np.uintp(lanes.doubles[k + FUSED_FROM])
+        hit = np.int32(-leading)
+        for j in range(blocks * BLOCK):
+            # An unsigned comparison covers both ends: beams before the first hit are negative.
+            is_hit = np.uint32(hit) < np.uint32(hits)
+            fuse_beam(
+                flat_ranges, fused_from, np.uintp(j), is_hit, points, weights, lidar
+            )
+            hit = np.int32(hit + np.int32(1))  # 32 bits wide, like the ranges
+    else:
+        fused_from = np.uintp(lanes.doubles[k + FUSED_FROM] + leading)
+        for j in range(hits):
+            fuse_beam(
+                flat_ranges, fused_from, np.uintp(j), True, points, weights, lidar
+            )
+
+
+@kernel(contracts=True, inline=True)
+def fuse_beam(
+    flat_ranges: Integers,
+    fused_from: int,
+    offset: int,
+    is_hit: bool,
+    points: RowPoints,
+    weights: BlendWeights,
+    lidar: LidarArrays,
+) -> None:
+    """Lower the range of the beam at `fused_from + offset` to the body's, if it hits (Eq. 4).
 
     Ranges are compared as integers, because LLVM would mask the store of a float's minimum. Both
     orders agree: ranges are positive, or -inf, which as an integer is below all others.
     """
-    value = baked.blended(
-        rows,
-        points[0] + i,
-        points[1] + i,
-        points[2] + i,
-        points[3] + i,
-        weights[0],
-        weights[1],
-        limits[0],
-        limits[1],
+    value = baked.blend_range(
+        lidar.table.rows,
+        points,
+        offset,
+        weights,
+        np.float32(lidar.range_min),
+        np.float32(lidar.range_max),
     )
     value = value if is_hit else np.float32(np.inf)
-    flat[place] = min(flat[place], np.float32(value).view(np.int32))
-
-
-@kernel(contracts=True, inline=True)
-def fuse(flat, k, lidar, lanes):  # type: ignore[no-untyped-def]
-    """Fuse one body into its scan, in blocks of beams or, where none fits, beam by beam."""
-    whole = lanes.whole
-    rows = lidar.table.rows
-    blocks = whole[k + BLOCKS]
-    hits = whole[k + HITS]
-    leading = whole[k + LEADING]
-    weights = (lanes.single[k + POINT_WEIGHT], lanes.single[k + ROW_WEIGHT])
-    limits = (np.float32(lidar.range_min), np.float32(lidar.range_max))
-    skipped = np.int64(0 if blocks > 0 else leading)
-    points = (
-        np.uintp(whole[k + POINT] + skipped),
-        np.uintp(whole[k + NEXT_POINT] + skipped),
-        np.uintp(whole[k + FAR_POINT] + skipped),
-        np.uintp(whole[k + FAR_NEXT_POINT] + skipped),
-    )
-    if blocks > 0:
-        fused_from = np.uintp(lanes.wide[k + FUSED_FROM])
-        hit = np.int32(-leading)
-        for j in range(blocks * BLOCK):
-            i = np.uintp(j)
-            # An unsigned comparison covers both ends: beams before the first hit are negative.
-            is_hit = np.uint32(hit) < np.uint32(hits)
-            fuse_beam(flat, fused_from + i, i, is_hit, rows, points, weights, limits)
-            hit = np.int32(hit + np.int32(1))  # 32 bits wide, like the ranges
-    else:
-        fused_from = np.uintp(lanes.wide[k + FUSED_FROM] + leading)
-        for j in range(hits):
-            i = np.uintp(j)
-            fuse_beam(flat, fused_from + i, i, True, rows, points, weights, limits)
+    i = fused_from + offset
+    flat_ranges[i] = min(flat_ranges[i], np.float32(value).view(np.int32))
 
 
 @kernel
-def add_maps(ranges, poses, chosen, fixtures, lidar, lanes):  # type: ignore[no-untyped-def]
+def add_maps(
+    ranges: Singles,
+    robot_poses: Array,
+    chosen: NDArray[np.int64],
+    fixtures: Fixtures,
+    lidar: LidarArrays,
+    lanes: ScanLanes,
+) -> None:
     """Fuse static maps into the scans of some worlds, see `scan_worlds`."""
     for n in chosen:
         grid = grid_of(n, fixtures)
-        for m in range(poses.shape[1] if grid.squares.size > 0 else 0):
-            x, y, heading = baked.sensor_pose(poses[n, m], lidar.mount)
-            lidar_pose = LidarPose(x, y, math.cos(heading), math.sin(heading))
-            out = ranges[n, m]
-            far = lidar.range_max
+        for m in range(robot_poses.shape[1] if grid.squares.size > 0 else 0):
+            lidar_pose, _ = baked.locate_lidar(robot_poses[n, m], lidar.mount)
             map_kernels.map_into(
-                out, lidar.beams, lidar_pose, far, grid, lidar.exact, lanes
+                ranges[n, m],
+                lidar.beams,
+                lidar_pose,
+                lidar.range_max,
+                grid,
+                lidar.exact,
+                lanes,
             )
-            exact_kernels.finish(out, lidar.range_min, lidar.range_max)
+            exact_kernels.finish(ranges[n, m], lidar.range_min, lidar.range_max)

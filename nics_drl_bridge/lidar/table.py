@@ -127,22 +127,26 @@ class LidarTable:
         """The table for the kernels."""
         outlines = self.outlines
         distances = self.density.distances
-        parts = outlines.orders
+        orders = outlines.orders
         rotations = self.grid[:, 1]
         corners = np.diff(outlines.hull) // 2
         circles = np.array([isinstance(shape, Circle) for shape in self.shapes], bool)
         shapes = np.zeros(len(self.shapes), TABLE_SHAPE)
-        shapes["per_metre"] = (distances - 1) / (self.grid[:, 0] - outlines.radii)
-        shapes["rotations"] = np.where(circles, 0.0, rotations * parts)
-        shapes["parts_per_rotation"] = 1.0 / rotations
+        shapes["distances_per_metre"] = (distances - 1) / (
+            self.grid[:, 0] - outlines.radii
+        )
+        shapes["rotations"] = np.where(circles, 0.0, rotations * orders)
+        shapes["periods_per_rotation"] = 1.0 / rotations
         shapes["first_cell"] = self.grid[:, 2]
-        shapes["cells_per_part"] = rotations * distances
-        shapes["hull_end"] = outlines.hull[:-1] + corners
-        shapes["corners_per_part"] = corners // parts
+        shapes["cells_per_period"] = rotations * distances
+        shapes["second_hull"] = outlines.hull[:-1] + corners
+        shapes["corners_per_period"] = corners // orders
         shapes["corners"] = corners
         shapes["round_radius"] = np.where(circles, outlines.radii, 0.0)
         shift = self.density.phases.bit_length() - 1
         cell = self.cell.astype(np.int32)
+        # Extent of the row, corners on the right and on the left: see `unpack_extent` and
+        # `unpack_corners`.
         pairs = (cell[:, [0, 3, 5]] << 16) | (cell[:, [1, 2, 4]] & MOST_WIDE)
         cells = np.column_stack([self.start, pairs])
         missing = max(32 - padding(self.beam_angle), 0)  # at least two blocks are read

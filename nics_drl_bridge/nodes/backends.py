@@ -1,18 +1,26 @@
-"""Backends over ROS 2: one robot or several in lock-step with a simulator behind topics.
+"""Backends over ROS 2 in lock-step: a simulator moves one control period for each command.
 
-A step of `DdsBackend` is `send` and `receive`. `send` publishes the command, and the simulator
-simulates one control period. `receive` waits until the scan and the odometry of the end of that
-period are in the inbox, hands them to the middleware, and returns its view. Two threads work: the
-caller's, and the executor's, which takes messages from ROS 2 and puts them into the inbox.
+A step of `DdsBackend` is `send` and `receive`. With t, the simulated time at the end of the last
+step:
+
+1. `send` checks that the newest data are those of t, publishes the command, and adds one control
+   period to t.
+2. The simulator takes the command, simulates one control period, and publishes odometry and scan
+   with the stamp t.
+3. The executor's thread puts each message into the `Inbox`. As soon as the odometry of t is there,
+   it updates the estimator.
+4. `receive` waits until all messages of t are in the inbox, hands the scan to the middleware, and
+   returns the middleware's view of the robot at t.
+
+A message that is lost on the way is requested again. `reset` begins an episode by the simulator's
+services, and ends like a step.
 """
 
-import math
-import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, cast
 
 import numpy as np
 from nav_msgs.msg import Odometry
@@ -23,21 +31,15 @@ from nics_drl_bridge.config import validate
 from nics_drl_bridge.env.guard import halts_on_error
 from nics_drl_bridge.errors import BackendError, ConfigError, StaleDataError, suggest
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import (
-    NS_PER_S,
-    S_PER_NS,
-    Array,
-    BackendFacts,
-    RobotView,
-    Start,
-)
+from nics_drl_bridge.interface import NS_PER_S, Array, BackendFacts, RobotView, Start
 from nics_drl_bridge.lidar.spec import from_device
+from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.nodes import qos, wire
 from nics_drl_bridge.nodes.conversions import sensor_from_ros, sensor_type
 from nics_drl_bridge.nodes.device_parameters import default_namespaces
-from nics_drl_bridge.nodes.executor import HANDED_OVER
 from nics_drl_bridge.nodes.link import EpisodeServices, Link
+from nics_drl_bridge.nodes.lockstep_inbox import Inbox, Message, read_message
 from nics_drl_bridge.nodes.parameters import STANDARD
 from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
 from nics_drl_bridge.nodes.robot_topics import data_facts
@@ -46,141 +48,100 @@ from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
 from nics_drl_bridge.sim.simulator import EpisodeSampler
 from nics_drl_bridge.sim.world_set import AnyWorld
 
-T = TypeVar("T")
-SCAN = "scan"
-ODOM = "odom"
+LOCKSTEP = "lockstep"
+REALTIME = "realtime"
 TRUTH = "ground_truth"
 # The simulator is asked to repeat data that do not arrive within this time [s].
 REPEAT_S = 0.05
-ADVICE = "start `simulator_node` with mode:=lockstep in the same ROS_DOMAIN_ID and namespace."
+# What all robots of a fleet share; any other fact is of one robot.
+SHARED_FACTS = ("stamp_ns",)
 
 
-class _Message(NamedTuple):
-    stamp_ns: int = -1  # before any message
-    arrival_ns: int = 0
-    content: bytes = b""
+def dds_backend(
+    model: SimulatorModel,
+    world: AnyWorld,
+    mode: str = LOCKSTEP,
+    robots: int = 1,
+    estimator: bool = True,
+    randomisation: str | Randomisation | None = None,
+    **options: Any,
+) -> interface.Backend:
+    """Return the backend for the options.
 
+    Args:
+        model: the robot's model.
+        world: the world, which a simulator has to run, too.
+        mode: `lockstep` or `realtime`.
+        robots: number of robots; several need `namespaces`, or have the simulator's default ones.
+        estimator: True, because the state is always estimated.
+        randomisation: what the simulator draws from, or its name.
+        options: of `DdsBackend`, `FleetBackend` or `RealtimeBackend`.
 
-class _Inbox:
-    """The latest message of each topic, and the wait for those of one stamp.
-
-    The executor's thread puts messages in; the caller's thread waits. The caller is woken once,
-    when the messages of all topics are there, because each wake-up costs a good part of a step.
-    The executor's thread does not idle until then: it updates the estimator with the awaited
-    odometry while the scan is still in transit.
+    Raises:
+        ConfigError: if options conflict or are unknown.
+        BackendError: if the robot or the simulator can't be reached.
     """
-
-    def __init__(
-        self,
-        topics: tuple[str, ...],
-        update_estimator: Callable[[int, int, bytes], None],
-        lag_ns: int,
-    ) -> None:
-        # Messages may be older than the awaited stamp by this much.
-        self._lag_ns = lag_ns
-        self._messages = dict.fromkeys(topics, _Message())
-        self._update_estimator = update_estimator
-        self._lock = threading.Lock()
-        # Locked while the caller waits, released to wake it: cheaper than an Event.
-        self._caller_waits = threading.Lock()
-        self._awaited_ns = -1  # while nothing is awaited
-        self._estimated_ns = -1  # the awaited stamp of the last update of the estimator
-        self._failure: Exception | None = None
-
-    def put(self, topic: str, content: bytes) -> object:
-        """Store a message; returns HANDED_OVER if that woke the caller."""
-        with self._lock:
-            try:
-                stamp_ns = _read(topic, wire.stamp_of, content)
-                self._messages[topic] = _Message(stamp_ns, time.monotonic_ns(), content)
-                self._estimate_if_due()
-            except Exception as error:  # noqa: BLE001  (it is raised in the caller's thread)
-                self._failure = error
-            is_awaited = self._awaited_ns >= 0
-            if is_awaited and (self._failure or not self._find_late(self._awaited_ns)):
-                if self._caller_waits.locked():
-                    self._caller_waits.release()
-                return HANDED_OVER
-        return None
-
-    def _estimate_if_due(self) -> None:
-        """Update the estimator, once, with the odometry that is awaited, if it is there."""
-        awaited_ns = self._awaited_ns
-        if awaited_ns < 0 or self._estimated_ns == awaited_ns:
-            return
-        if awaited_ns <= self._messages[ODOM].stamp_ns + self._lag_ns:
-            self._estimated_ns = awaited_ns
-            self._update_estimator(*self._messages[ODOM])
-
-    def _find_late(self, stamp_ns: int) -> str | None:
-        """Return the first topic whose message of a stamp is not there; None if all are."""
-        for topic, message in self._messages.items():
-            if message.stamp_ns + self._lag_ns < stamp_ns:
-                return topic
-        return None
-
-    def stamp_ns(self, topic: str) -> int:
-        """Stamp of the latest message of a topic [ns]."""
-        return self._messages[topic].stamp_ns
-
-    def content(self, topic: str) -> bytes:
-        """The latest message of a topic, serialized."""
-        return self._messages[topic].content
-
-    def clear(self) -> None:
-        """Drop all messages."""
-        with self._lock:
-            self._messages = dict.fromkeys(self._messages, _Message())
-            self._estimated_ns = -1
-
-    def newest_ns(self) -> int:
-        """The newest stamp of any topic [ns]."""
-        return max(message.stamp_ns for message in self._messages.values())
-
-    def wait(self, stamp_ns: int, timeout_s: float) -> dict[str, _Message]:
-        """Wait for the messages of a stamp. Raises StaleDataError if a topic is late."""
-        with self._lock:
-            self._awaited_ns = stamp_ns
-            self._failure = None
-            self._caller_waits.acquire(blocking=False)
-            self._estimate_if_due()
-            late_topic = self._find_late(stamp_ns)
-        if late_topic is not None:
-            self._caller_waits.acquire(timeout=timeout_s)  # until `put` releases it
-        with self._lock:
-            self._awaited_ns = -1
-            if self._failure is not None:
-                raise self._failure
-            late_topic = self._find_late(stamp_ns)
-            if late_topic is None:
-                return dict(self._messages)
-            latest = self._messages[late_topic]
-            age_s = math.inf
-            if latest.content:
-                age_s = (time.monotonic_ns() - latest.arrival_ns) * S_PER_NS
-            raise StaleDataError(late_topic, age_s, timeout_s)
+    if not estimator:
+        raise ConfigError(
+            "backend 'dds' always estimates the state; leave out `estimator`."
+        )
+    is_single_lockstep = mode == LOCKSTEP and robots == 1
+    is_standard = options.get("simulator") == STANDARD.name
+    if randomisation is not None and not is_single_lockstep:
+        needed = "only one robot in mode 'lockstep' can be randomised"
+        raise ConfigError(f"backend 'dds': {needed}, not {robots} in mode {mode!r}.")
+    if is_standard and (randomisation is not None or not is_single_lockstep):
+        needed = "one robot in mode 'lockstep', without randomisation"
+        raise ConfigError(
+            f"simulator {STANDARD.name!r}: drives {needed}; leave out the rest."
+        )
+    if mode not in (LOCKSTEP, REALTIME):
+        fix = suggest(mode, (LOCKSTEP, REALTIME))
+        raise ConfigError(f"backend_options: there is no mode {mode!r}; {fix}")
+    if robots > 1:
+        namespaces = options.pop("namespaces", default_namespaces(robots))
+        _check_fleet(mode, robots, namespaces)
+        return FleetBackend(model, world, namespaces, **options)
+    if mode == REALTIME:
+        return RealtimeBackend(model, world, **options)
+    if isinstance(randomisation, str):
+        randomisation = load_randomisation(randomisation)
+    return DdsBackend(model, world, randomisation=randomisation, **options)
 
 
-def _put(inbox: _Inbox, topic: str, content: bytes) -> object:
-    return inbox.put(topic, content)
-
-
-def _update_estimator(
-    middleware: Middleware, stamp_ns: int, arrival_ns: int, content: bytes
-) -> None:
-    middleware.odometry(stamp_ns, arrival_ns, *_read(ODOM, wire.odometry_of, content))
+def _check_fleet(mode: str, robots: int, namespaces: Sequence[str]) -> None:
+    """Raise ConfigError unless a fleet is in lock-step and has a namespace for each robot."""
+    if mode == LOCKSTEP and len(namespaces) == robots:
+        return
+    needed = f"in mode 'lockstep' alone, with {robots} namespaces"
+    given = f"not in {mode!r} with {list(namespaces)!r}"
+    raise ConfigError(
+        f"backend_options: a team of {robots} robots is driven {needed}, {given}."
+    )
 
 
 class DdsBackend:
     """One robot behind `cmd_vel`, `scan` and `odom`, in lock-step with a simulator node.
 
-    `truth` adds the true pose to `info`. `timeout_s` bounds each wait. The simulator must draw from
-    the same `randomisation`. `stamped` selects TwistStamped for `cmd_vel`; by default the type to
-    which the simulator subscribes is used. With the `simulator` named `simulation_interfaces`, any
-    simulator that serves these interfaces will do; `standard` holds its `StandardOptions`.
+    Args:
+        model: the robot's model, which the simulator has to run, too.
+        world: the world, which the simulator has to run, too.
+        namespace: of the robot's topics.
+        simulator: name of the simulator's node; `simulation_interfaces` for any simulator that
+            serves these.
+        timeout_s: longest wait for a peer, an answer or data [s].
+        truth: True to add the true pose to `info`.
+        domain_id: of ROS 2; by default that of the environment.
+        randomisation: from which the simulator draws, too.
+        stamped: True for a TwistStamped on `cmd_vel`; by default what the simulator subscribes to.
+        standard: `StandardOptions` of the simulator `simulation_interfaces`.
 
-    Raises BackendError if there is no simulator, it refuses, it is not in lock-step or another node
-    moved it; ModelError if it runs another model or world; StaleDataError if data do not arrive.
+    Raises:
+        BackendError: if there is no simulator, if it refuses, if it is not in lock-step, or if
+            another node moved it.
+        ConfigError: if an option is wrong, or is for another kind of simulator.
+        ModelError: if the simulator runs another model or world.
+        StaleDataError: if data do not arrive.
     """
 
     def __init__(
@@ -196,87 +157,109 @@ class DdsBackend:
         stamped: bool | None = None,
         standard: Mapping[str, Any] | None = None,
     ) -> None:
-        self._robot = model.robot
-        self._lidar = model.lidar
-        self._robot.require_cmd_vel()
-        self._sensors = {sensor.name: sensor for sensor in model.sensors}
-        self._middleware = Middleware(model)
-        self._period_ns = round(model.control_period * NS_PER_S)
         self.timeout_s = timeout_s
-        self._topics = (ODOM, SCAN, *self._sensors)
-        if truth:
-            self._topics = (*self._topics, TRUTH)
-        options = validate(dict(standard or {}), client.StandardOptions, "standard")
-        # A simulator of the standard may round the length of its steps.
-        self._rounding_ns = 0
-        if simulator == STANDARD.name:
-            self._rounding_ns = round(client.TOLERANCE * self._period_ns)
-        self._lag_ns = max(round(options.slack_s * NS_PER_S), self._rounding_ns)
-        # Simulated time at the end of the last step.
-        self._now_ns = 0
-        # Callbacks hold no reference to the backend, so that it can be garbage-collected.
-        update_estimator = partial(_update_estimator, self._middleware)
-        self._inbox = _Inbox(self._topics, update_estimator, self._lag_ns)
+        self._robot = model.robot
+        self._robot.require_cmd_vel()
+        self._lidar = model.lidar
+        self._sensors = {sensor.name: sensor for sensor in model.sensors}
+        self._has_truth = truth
+        self._topics = (ODOM, SCAN, *self._sensors, *((TRUTH,) if truth else ()))
+        self._middleware = Middleware(model)
         self._facts: BackendFacts = {}
         if randomisation is not None:
             sampler = EpisodeSampler(model, world, randomisation=randomisation)
             self._facts["scenes"] = lambda seeds: sampler.draw(seeds)[0]
+
+        self._is_standard = simulator == STANDARD.name
+        if standard and not self._is_standard:
+            needed = f"options of the simulator {STANDARD.name!r}, not of {simulator!r}"
+            raise ConfigError(f"standard {dict(standard)!r}: {needed}; leave it out.")
+        options = validate(dict(standard or {}), client.StandardOptions, "standard")
+        self._period_ns = round(model.control_period * NS_PER_S)
+        # Stamps may differ from the end of a step by this much: a simulator of the standard may
+        # round the length of its steps.
+        self._rounding_ns = 0
+        if self._is_standard:
+            self._rounding_ns = round(client.TOLERANCE * self._period_ns)
+        # Data may be older than the end of a step by this much.
+        self._slack_ns = max(round(options.slack_s * NS_PER_S), self._rounding_ns)
+        self._now_ns = 0  # simulated time at the end of the last step
+        self._can_send = False  # True while the data of the last step are known
+
+        # Callbacks hold no reference to the backend, so that it can be garbage-collected.
+        update_estimator = partial(_update_estimator, self._middleware)
+        self._inbox = Inbox(self._topics, update_estimator, self._slack_ns)
         self._link = Link(namespace, domain_id, stamped=stamped, patience_s=timeout_s)
         try:
-            for topic in self._topics:
-                kind = LaserScan if topic == SCAN else Odometry
-                if topic in self._sensors:
-                    kind = sensor_type(self._sensors[topic])
-                put = partial(_put, self._inbox, topic)
-                self._link.node.create_subscription(
-                    kind, topic, put, qos.SENSOR, raw=True
+            self._subscribe()
+            self._episodes: client.StandardEpisodes | EpisodeServices
+            if self._is_standard:
+                self._episodes = client.StandardEpisodes(
+                    self._link, model, world, options, self._inbox
                 )
-            self._episodes = self._services(
-                model, world, simulator, options, randomisation
-            )
+            else:
+                self._episodes = EpisodeServices(
+                    self._link, simulator, model, world, randomisation
+                )
             self._link.begin()
             self._link.wait_for_peers(
-                self._topics, self._episodes.clients, timeout_s, ADVICE
+                self._topics, self._episodes.clients, timeout_s, self._advise_start()
             )
             self._episodes.open(timeout_s)
         except BaseException:
             self.close()
             raise
 
-    def _services(
-        self,
-        model: SimulatorModel,
-        world: AnyWorld,
-        simulator: str,
-        options: client.StandardOptions,
-        randomisation: Randomisation | None,
-    ) -> EpisodeServices | client.StandardEpisodes:
-        if simulator == STANDARD.name:
-            return client.StandardEpisodes(
-                self._link, model, world, options, self._inbox
+    def _subscribe(self) -> None:
+        kinds = dict.fromkeys(self._topics, Odometry)
+        kinds[SCAN] = LaserScan
+        kinds |= {name: sensor_type(each) for name, each in self._sensors.items()}
+        for topic, kind in kinds.items():
+            put = partial(_put, self._inbox, topic)
+            self._link.node.create_subscription(kind, topic, put, qos.SENSOR, raw=True)
+
+    def _advise_start(self) -> str:
+        """Return how to start the simulator, as the end of an error."""
+        if self._is_standard:
+            return (
+                f"start a simulator that serves {STANDARD.name}, in the same ROS_DOMAIN_ID and "
+                "namespace; `services` in `standard` is what its services' names begin with."
             )
-        return EpisodeServices(self._link, simulator, model, world, randomisation)
+        return (
+            "start `simulator_node` with mode:=lockstep in the same ROS_DOMAIN_ID and "
+            "namespace."
+        )
 
     @halts_on_error
     def reset(self, start: Start) -> RobotView:
         """Begin the episode of a seed in the simulator; see `interface.Backend`."""
-        return self.first(self.begin(start), start.pose)
+        stamp_ns = self.begin(start)
+        return self.receive_first(stamp_ns, start.pose)
 
     def begin(self, start: Start) -> int:
         """Begin an episode, the first half of a reset; return the stamp of its first data [ns]."""
-        self._link.check_open()
-        self._link.check_alone()
+        self.prepare()
         return self._episodes.begin(start, self.timeout_s)
 
-    def first(self, stamp_ns: int, pose: Array) -> RobotView:
+    def prepare(self) -> None:
+        """Check that an episode can begin, and forget what failed in the last one."""
+        self._link.check_open()
+        self._link.check_alone()
+        self._can_send = False
+        self._inbox.forget_failure()
+
+    def receive_first(self, stamp_ns: int, pose: Array) -> RobotView:
         """Wait for the first data of an episode, the second half of a reset.
 
-        stamp_ns: what `begin` returned; pose: (3,), where the robot stands.
+        Args:
+            stamp_ns: what `begin` returned.
+            pose: (3,) of the robot at the start.
         """
         self._now_ns = stamp_ns
         self._middleware.reset(stamp_ns, pose)
-        view = self.receive()[0]
-        self._link.frame = _read(ODOM, wire.frames_of, self._inbox.content(ODOM))[1]
+        view, _ = self.receive()
+        odometry = self._inbox.get_content(ODOM)
+        _, self._link.frame = read_message(ODOM, wire.frames_of, odometry)
         return view
 
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
@@ -288,9 +271,13 @@ class DdsBackend:
     def send(self, command: Array) -> None:
         """Check and publish a command (C,), the first half of a step."""
         self._link.check_open()
+        if not self._can_send:
+            reason = "its data did not arrive, or no episode has begun; call reset()."
+            raise BackendError(f"the last step did not end: {reason}")
         # If the simulator ran ahead, its data would be taken for the answer to this command.
         self._check_stamps()
         twist = self._robot.to_cmd_vel(command)
+        self._can_send = False
         self._link.send(twist)
         self._episodes.advance()
         # Checked while the simulator is busy: this is free.
@@ -298,50 +285,37 @@ class DdsBackend:
         self._middleware.command(self._now_ns, self._robot.from_cmd_vel(twist))
         self._now_ns += self._period_ns
 
-    def _check_stamps(self) -> None:
-        """Raise BackendError unless the latest data are those of the last step."""
-        for topic in self._topics:
-            ahead_ns = self._inbox.stamp_ns(topic) - self._now_ns
-            if not -self._lag_ns <= ahead_ns <= self._rounding_ns:
-                self._link.check_alone()
-                off = f"stamped {ahead_ns / NS_PER_S:+.3f} s off the step"
-                fix = "start the simulator with mode:=lockstep, and move it from here alone."
-                raise BackendError(f"topic {topic!r}: {off}; {fix}")
-
     @halts_on_error
     def receive(self) -> tuple[RobotView, dict[str, Any]]:
         """Wait for the data at the end of the period, the second half of a step.
 
-        Returns the view and `info`. The estimator has the odometry already, see `_Inbox`.
+        Returns the view and `info`. The estimator has the odometry already, see `Inbox`.
         """
-        messages = self._wait_for_data(self._now_ns)
+        messages = self._wait_for_data()
         self._check_stamps()
-        rounded_by_ns = self._inbox.stamp_ns(ODOM) - self._now_ns
-        if abs(rounded_by_ns) <= self._rounding_ns:
-            self._now_ns += rounded_by_ns
-        scan = messages[SCAN]
-        ranges = from_device(_read(SCAN, wire.ranges_of, scan.content), self._lidar)
-        self._middleware.scan(self._now_ns, scan.arrival_ns, ranges)
-        for name, sensor in self._sensors.items():
-            message = messages[name]
-            read = partial(sensor_from_ros, sensor)
-            reading = _read(name, read, message.content)
-            self._middleware.sense(name, self._now_ns, message.arrival_ns, reading)
+        self._follow_rounding(messages[ODOM].stamp_ns)
+        self._take_scan(messages[SCAN])
+        for name in self._sensors:
+            self._take_reading(name, messages[name])
         info: dict[str, Any] = {"stamp_ns": self._now_ns}
         info |= data_facts(self._middleware, time.monotonic_ns())
-        if TRUTH in self._topics:
-            true_pose = _read(TRUTH, wire.odometry_of, messages[TRUTH].content)[0]
+        if self._has_truth:
+            true_pose, _ = read_message(
+                TRUTH, wire.odometry_of, messages[TRUTH].content
+            )
             info["true_pose"] = true_pose
             self._facts["true_pose"] = true_pose
-        return self._middleware.view(self._now_ns), info
+        view = self._middleware.view(self._now_ns)
+        self._can_send = True
+        return view, info
 
-    def _wait_for_data(self, stamp_ns: int) -> dict[str, _Message]:
-        """Wait for the data of a stamp; have the simulator repeat what was lost on the way."""
+    def _wait_for_data(self) -> dict[str, Message]:
+        """Wait for the data of the step; have the simulator repeat what was lost on the way."""
         deadline = time.monotonic() + self.timeout_s
         while True:
             remaining_s = max(0.0, deadline - time.monotonic())
             try:
-                return self._inbox.wait(stamp_ns, min(REPEAT_S, remaining_s))
+                return self._inbox.wait(self._now_ns, min(REPEAT_S, remaining_s))
             except StaleDataError as error:
                 if remaining_s <= REPEAT_S:
                     raise StaleDataError(
@@ -349,8 +323,39 @@ class DdsBackend:
                     ) from None
                 self._episodes.repeat()
 
+    def _check_stamps(self) -> None:
+        """Raise BackendError unless the newest data are those of the last step."""
+        for topic in self._topics:
+            ahead_ns = self._inbox.get_stamp_ns(topic) - self._now_ns
+            if -self._slack_ns <= ahead_ns <= self._rounding_ns:
+                continue
+            self._link.check_alone()
+            if self._is_standard:
+                fix = "step it from here alone; `slack_s` in `standard` allows older data."
+            else:
+                fix = "start the simulator with mode:=lockstep, and move it from here alone."
+            off = f"stamped {ahead_ns / NS_PER_S:+.3f} s off the step"
+            raise BackendError(f"topic {topic!r}: {off}; {fix}")
+
+    def _follow_rounding(self, odometry_ns: int) -> None:
+        """Take the stamp of the odometry for the end of the step if it is off by rounding only."""
+        if abs(odometry_ns - self._now_ns) <= self._rounding_ns:
+            self._now_ns = odometry_ns
+
+    def _take_scan(self, message: Message) -> None:
+        device_ranges = read_message(SCAN, wire.ranges_of, message.content)
+        ranges = from_device(device_ranges, self._lidar)
+        stamp_ns = min(message.stamp_ns, self._now_ns)
+        self._middleware.scan(stamp_ns, message.arrival_ns, ranges)
+
+    def _take_reading(self, name: str, message: Message) -> None:
+        read = partial(sensor_from_ros, self._sensors[name])
+        reading = read_message(name, read, message.content)
+        stamp_ns = min(message.stamp_ns, self._now_ns)
+        self._middleware.sense(name, stamp_ns, message.arrival_ns, reading)
+
     def facts(self) -> BackendFacts:
-        """Return the newest true pose, if it was requested."""
+        """Return the newest true pose, if `truth`, and with a randomisation how to draw scenes."""
         return self._facts
 
     def halt(self) -> None:
@@ -362,17 +367,23 @@ class DdsBackend:
         self._link.close()
 
 
-def _read(topic: str, read: Callable[[bytes], T], content: bytes) -> T:
-    """Deserialize a message. Raises BackendError if it is damaged."""
-    try:
-        return read(content)
-    except wire.UNREADABLE as error:
-        reason = f"a message can't be read ({error}); look at who publishes it."
-        raise BackendError(f"topic {topic!r}: {reason}") from None
+def _put(inbox: Inbox, topic: str, content: bytes) -> object:
+    return inbox.put(topic, content)
+
+
+def _update_estimator(
+    middleware: Middleware, stamp_ns: int, arrival_ns: int, content: bytes
+) -> None:
+    pose, twist = read_message(ODOM, wire.odometry_of, content)
+    middleware.odometry(stamp_ns, arrival_ns, pose, twist)
 
 
 class FleetBackend:
-    """M robots (M, ...) in lock-step with one simulator node; BackendError if one is missing."""
+    """M robots in lock-step with one simulator node, each in its namespace.
+
+    Commands, poses and views have a leading (M,). `options` are those of `DdsBackend`. Raises
+    ConfigError for wrong namespaces, BackendError if a robot is missing.
+    """
 
     def __init__(
         self,
@@ -382,10 +393,10 @@ class FleetBackend:
         simulator: str = f"/{defaults.SIMULATOR_NODE}",
         **options: Any,
     ) -> None:
-        if len(set(namespaces)) < max(2, len(namespaces)):
-            given = f"namespaces {list(namespaces)!r}"
+        if len(namespaces) < 2 or len(set(namespaces)) < len(namespaces):
             raise ConfigError(
-                f"backend_options: {given} must name at least two different robots."
+                f"backend_options: namespaces {list(namespaces)!r} must name two robots or more, "
+                "each of them once."
             )
         self._robots: list[DdsBackend] = []
         try:
@@ -400,93 +411,43 @@ class FleetBackend:
     @halts_on_error
     def reset(self, start: Start) -> RobotView:
         """Begin one episode for all robots, at poses (M, 3); see `DdsBackend.reset`."""
+        for robot in self._robots[1:]:
+            robot.prepare()
         stamp_ns = self._robots[0].begin(start)
-        both = zip(self._robots, start.pose, strict=True)
-        return interface.stack_views(
-            [robot.first(stamp_ns, pose) for robot, pose in both]
-        )
+        views = [
+            robot.receive_first(stamp_ns, pose)
+            for robot, pose in zip(self._robots, start.pose, strict=True)
+        ]
+        return interface.stack_views(views)
 
     @halts_on_error
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
         """Publish all commands (M, C) and wait for all data after them."""
         for robot, robot_command in zip(self._robots, command, strict=True):
             robot.send(robot_command)
-        views, facts = zip(*(robot.receive() for robot in self._robots), strict=True)
-        return interface.stack_views(views), together(facts)
+        views, infos = zip(*(robot.receive() for robot in self._robots), strict=True)
+        return interface.stack_views(views), stack_facts(infos)
 
     def facts(self) -> BackendFacts:
-        """Return what is known of all robots, stacked."""
-        return cast("BackendFacts", together([robot.facts() for robot in self._robots]))
+        """Return the facts of all robots, stacked."""
+        facts = stack_facts([robot.facts() for robot in self._robots])
+        return cast("BackendFacts", facts)
 
     def halt(self) -> None:
         """Publish a zero command for each robot, even if one of them raises."""
-        with ExitStack() as each:
+        with ExitStack() as calls:
             for robot in self._robots:
-                each.callback(robot.halt)
+                calls.callback(robot.halt)
 
     def close(self) -> None:
         """Publish a zero command for each robot and end the nodes, even if one raises."""
-        with ExitStack() as each:
+        with ExitStack() as calls:
             for robot in self._robots:
-                each.callback(robot.close)
+                calls.callback(robot.close)
 
 
-def together(facts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Merge the facts of M robots: equal values stay as they are, others become (M, ...)."""
-    values = {name: [each[name] for each in facts] for name in facts[0]}
-    return {
-        name: every[0]
-        if all(np.array_equal(every[0], one) for one in every)
-        else np.stack(every)
-        for name, every in values.items()
-    }
-
-
-MODES = {"lockstep": DdsBackend, "realtime": RealtimeBackend}
-
-
-def dds_backend(
-    model: SimulatorModel,
-    world: AnyWorld,
-    mode: str = "lockstep",
-    robots: int = 1,
-    estimator: bool = True,
-    randomisation: str | Randomisation | None = None,
-    **options: Any,
-) -> interface.Backend:
-    """Return the backend for the options. Raises ConfigError if they conflict; BackendError."""
-    if not estimator:
-        raise ConfigError(
-            "backend 'dds' always estimates the state; leave out `estimator`."
-        )
-    if randomisation is not None:
-        if mode != "lockstep" or robots > 1:
-            needed = "only one robot in mode 'lockstep' can be randomised"
-            raise ConfigError(
-                f"backend 'dds': {needed}, not {robots} in mode {mode!r}."
-            )
-        if not isinstance(randomisation, Randomisation):
-            randomisation = load_randomisation(randomisation)
-        options["randomisation"] = randomisation
-    if options.get("simulator") == STANDARD.name and (
-        randomisation is not None or mode != "lockstep" or robots > 1
-    ):
-        needed = "one robot in mode 'lockstep', without randomisation"
-        raise ConfigError(
-            f"simulator {STANDARD.name!r}: drives {needed}; leave out the rest."
-        )
-    if mode not in MODES:
-        raise ConfigError(
-            f"backend_options: there is no mode {mode!r}; {suggest(mode, MODES)}"
-        )
-    if robots > 1:
-        names = options.pop("namespaces", default_namespaces(robots))
-        if mode != "lockstep" or len(names) != robots:
-            needed = f"in mode 'lockstep' alone, with {robots} namespaces"
-            given = (
-                f"a team of {robots} robots is driven {needed}, not in {mode!r} with"
-            )
-            raise ConfigError(f"backend_options: {given} {list(names)!r}.")
-        return FleetBackend(model, world, names, **options)
-    made: interface.Backend = MODES[mode](model, world, **options)
-    return made
+def stack_facts(facts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Merge the facts of M robots into arrays (M, ...); `SHARED_FACTS` stay as they are."""
+    stacked = {name: np.stack([each[name] for each in facts]) for name in facts[0]}
+    shared = {name: facts[0][name] for name in SHARED_FACTS if name in facts[0]}
+    return stacked | shared

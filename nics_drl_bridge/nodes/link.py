@@ -159,9 +159,7 @@ class Link:
         future = client.call_async(request)
         if not holds(future.done, deadline - time.monotonic(), POLL_S):
             client.remove_pending_request(future)
-            reason = (
-                f"no answer within {timeout_s:g} s; look at the simulator node's log."
-            )
+            reason = f"no answer within {timeout_s:g} s; look at the simulator's log."
             raise BackendError(f"service {client.srv_name}: {reason}")
         return future.result()
 

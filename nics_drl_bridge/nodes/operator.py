@@ -24,7 +24,8 @@ POLICY = ": policy"  # how the name of a policy node's status ends
 POLL_S = 0.02
 ASK_AGAIN_S = 1.0  # between two requests to a gate that refuses [s]
 SEND_AGAIN_S = 1.0  # between two goals to a policy node that refuses [s]
-ANSWER_S = 5.0  # for which a gate may take to answer [s]
+ANSWER_S = 5.0  # that a gate may take to answer [s]
+CALL_S = 10.0  # the same with the time to find its service [s]
 SETTLE_S = 1.0  # in which all gates are seen, once one of them is [s]
 Tell = Callable[[str], None]
 
@@ -116,22 +117,23 @@ class Operator(AbstractContextManager["Operator", None]):
         deadline = time.monotonic() + seconds
         gate = self._wait_for_gate(namespace, seconds)
         if reset:
-            self._call(gate, "reset")
-        answer = self._call(gate, "arm")
+            self._call(gate, "reset", deadline)
+        answer = self._call(gate, "arm", deadline)
         left_s = deadline - time.monotonic()
-        if not answer.granted and left_s > 0.0:
+        if not answer.granted and left_s > ASK_AGAIN_S:
             tell(
                 f"{gate} does not arm yet ({answer.told}); asking again for {left_s:.0f} s"
             )
-        while not answer.granted and time.monotonic() < deadline:
+        while not answer.granted and time.monotonic() + ASK_AGAIN_S < deadline:
             time.sleep(ASK_AGAIN_S)
-            answer = self._call(gate, "arm")
+            answer = self._call(gate, "arm", deadline)
         return answer
 
     def stop(self, namespace: str | None, seconds: float) -> list[GateAnswer]:
         """Presses the e-stop of one gate, or of every one that is seen if no namespace is given."""
         if namespace is not None:
-            return [self._call(self._wait_for_gate(namespace, seconds), "e_stop")]
+            gate = self._wait_for_gate(namespace, seconds)
+            return [self._call(gate, "e_stop", time.monotonic() + CALL_S)]
         calls: dict[str, _Call] = {}
         deadline = time.monotonic() + seconds
         while time.monotonic() < deadline:
@@ -243,8 +245,10 @@ class Operator(AbstractContextManager["Operator", None]):
             f"{told}; there is one in {', '.join(f'/{name}' for name in names)}: {fix}"
         )
 
-    def _call(self, gate: str, service: str) -> GateAnswer:
-        return _Call(self._node, gate, service).wait_for_answer(2.0 * ANSWER_S)
+    def _call(self, gate: str, service: str, deadline: float) -> GateAnswer:
+        """Calls a service of a gate; waits for its answer until a deadline, at most `CALL_S`."""
+        wait_s = min(deadline - time.monotonic(), CALL_S)
+        return _Call(self._node, gate, service).wait_for_answer(wait_s)
 
     def _take_diagnostics(self, message: Any) -> None:
         for status in message.status:

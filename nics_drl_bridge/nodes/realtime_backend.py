@@ -1,11 +1,16 @@
-"""RealtimeBackend: a vehicle, or a simulator on the wall clock, as a synchronous backend."""
+"""RealtimeBackend: a vehicle, or a simulator on the wall clock, as a synchronous backend.
+
+`reset` begins an episode: a simulator is reset by its services, a vehicle is awaited at the start.
+`step` publishes a command, waits for the end of the period on the steady clock, and returns the
+newest view. The executor's thread feeds the topics into the middleware in the meantime.
+"""
 
 import math
 import time
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
-from pydantic import Field, PositiveFloat
+from pydantic import Field, PositiveFloat, model_validator
 
 from nics_drl_bridge import defaults, geometry
 from nics_drl_bridge.config import Schema, validate
@@ -16,17 +21,22 @@ from nics_drl_bridge.interface import NS_PER_S, Array, BackendFacts, RobotView, 
 from nics_drl_bridge.middleware.measurement import CMD_VEL, SCAN
 from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes.link import EpisodeServices, Link
+from nics_drl_bridge.nodes.parameters import NO_POSE
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, data_facts, declare_sensors
 from nics_drl_bridge.nodes.runner import holds
 from nics_drl_bridge.sim.world_set import AnyWorld
 
 POLL_S = 0.01
+# Interval between two reports of what is missing for the start [s].
 SAY_EVERY_S = 2.0
-# a peer without services this long after its topics appeared is a vehicle [s]
+# A peer without services this long after its topics appeared is a vehicle [s].
 SERVICES_S = 0.5
-COMMAND_S = 0.5  # minimum time [s] and number of periods for which a command lasts
-PERIODS = 2  # after them a zero command follows
-STILL = (0.02, 0.05)  # a robot below these speeds is at rest [m/s, rad/s]
+# A command ends after this time [s] and this number of periods: a zero command follows.
+COMMAND_S = 0.5
+COMMAND_PERIODS = 2
+# A robot below these speeds is at rest.
+REST_SPEED = 0.02  # [m/s]
+REST_YAW_RATE = 0.05  # [rad/s]
 ADVICE = (
     "start the robot, or `simulator_node` with mode:=realtime, in the same ROS_DOMAIN_ID and "
     "namespace."
@@ -46,7 +56,8 @@ class RealtimeOptions(Schema):
     stale_after_s: PositiveFloat = 0.5  # age above which data are too old for a view
     # On a vehicle, wait until it stands at the requested pose, or start at the present one.
     start: Literal["wait", "present"] = defaults.VEHICLE_START
-    # Lay `map` so that the robot's present place is the start; not possible with a pose sensor.
+    # Lay `map` so that the robot's present pose is the start; with `present` and without a pose
+    # sensor only.
     lays_map: bool = False
     # tolerance of the start pose [m, rad]
     tolerance: tuple[PositiveFloat, PositiveFloat] = (0.1, 0.1)
@@ -64,18 +75,45 @@ class RealtimeOptions(Schema):
     # Topic of the gyro for the yaw rate; `auto`: the usual topics, if the model was made with one
     imu: str = Field(defaults.IMU_TOPIC, min_length=1)
 
+    @model_validator(mode="after")
+    def _check_map(self) -> "RealtimeOptions":
+        if self.lays_map and self.start != "present":
+            raise ValueError("lays_map needs start='present': leave one of them out")
+        if self.lays_map and self.pose_type != NO_POSE:
+            raise ValueError(
+                "lays_map is for a robot without a pose sensor: leave it out"
+            )
+        return self
+
     @property
     def gated(self) -> bool:
         """True if commands pass a `command_gate`."""
         return self.command_topic.rsplit("/", 1)[-1] == "cmd_vel_raw"
 
 
+class Hindrance(NamedTuple):
+    """What keeps a robot from beginning an episode."""
+
+    reason: str
+    fix: str
+
+
 class RealtimeBackend:
     """One robot behind its topics, stepped at a fixed period of the steady clock.
 
-    Deadlines that a late caller misses are counted, not made up for. Raises ConfigError if an
-    option can't be used; BackendError if there is no peer, or it refuses or does not come to rest;
-    ModelError for another model or world; StaleDataError for data older than `stale_after_s`.
+    Deadlines that a late caller misses are counted, not made up for.
+
+    Args:
+        model: the robot's model.
+        world: the world of the episodes, which a simulator has to run, too.
+        options: `RealtimeOptions`.
+
+    Raises:
+        ConfigError: if an option can't be used.
+        BackendError: if there is no peer, or it refuses, or a vehicle does not get ready to start.
+        ModelError: if a simulator runs another model or world.
+        StaleDataError: if data are older than `stale_after_s`, or do not arrive within `timeout_s`
+            after the reset of a simulator.
     """
 
     def __init__(self, model: SimulatorModel, world: AnyWorld, **options: Any) -> None:
@@ -83,10 +121,14 @@ class RealtimeBackend:
         self._options = chosen
         self._robot = model.robot
         self._period_ns = round((chosen.period_s or model.control_period) * NS_PER_S)
-        self._deadline_ns = self._misses = 0
+        self._deadline_ns = 0  # end of the present period, on the steady clock
+        self._misses = 0  # deadlines missed in this episode
         self._scan_ns = 0  # stamp of the scan in the newest view [ns]
+        self._has_seen_services = False  # those of a simulator
+        command_timeout_s = max(COMMAND_S, COMMAND_PERIODS * self._period_ns / NS_PER_S)
+        if chosen.gated:
+            command_timeout_s = math.inf  # a gate has its own timeout
         rehearse(model)
-        self._simulated = False
         self._link = Link(
             chosen.namespace,
             chosen.domain_id,
@@ -94,12 +136,10 @@ class RealtimeBackend:
             stamped=True if chosen.gated else chosen.stamped,
             patience_s=chosen.timeout_s,
             parameters={"pose_type": chosen.pose_type, "imu": chosen.imu},
-            command_timeout_s=math.inf  # a gate has its own timeout
-            if chosen.gated
-            else max(COMMAND_S, PERIODS * self._period_ns / NS_PER_S),
+            command_timeout_s=command_timeout_s,
         )
         try:
-            declare_sensors(self._link.node, self._commands_are_stamped())
+            declare_sensors(self._link.node, self._find_command_type())
             self._topics = RobotTopics(self._link.node, model, now_ns=time.monotonic_ns)
             self._episodes = EpisodeServices(self._link, chosen.simulator, model, world)
             self._link.begin()
@@ -113,7 +153,8 @@ class RealtimeBackend:
             self.close()
             raise
 
-    def _commands_are_stamped(self) -> bool:
+    def _find_command_type(self) -> bool:
+        """Return whether the robot itself gets stamped commands, maybe from a gate."""
         if self._options.stamped is not None:
             return self._options.stamped
         if not self._options.gated:
@@ -122,116 +163,21 @@ class RealtimeBackend:
 
     @halts_on_error
     def reset(self, start: Start) -> RobotView:
-        """Begin an episode by a simulator's service, or once a vehicle stands at the start."""
+        """Begin an episode by a simulator's services, or once a vehicle is ready at the start."""
         self._link.check_open()
         self._link.halt()
         if self._is_vehicle():
-            self._await_start(start)
-            if self._options.lays_map:
-                with self._topics.lock:
-                    self._topics.place(start.pose)
+            self._wait_until_ready(start)
+        # A simulator's services may be found only during that wait.
         if not self._is_vehicle():
-            timeout_s = self._options.timeout_s
-            stamp_ns = self._episodes.begin(start, timeout_s)
+            self._begin_in_simulator(start)
+        elif self._options.lays_map:
             with self._topics.lock:
-                self._topics.begin(stamp_ns, start.pose)
-            if not holds(lambda: math.isfinite(self._oldest()[1]), timeout_s, POLL_S):
-                raise StaleDataError(*self._oldest(), timeout_s)
+                self._topics.place(start.pose)
         self._misses = 0
         self._deadline_ns = time.monotonic_ns() + self._period_ns
-        return self._fresh_view()[0]
-
-    def present_pose(self) -> Array:
-        """Wait until the robot stands still, and return its pose (3,) in `map`."""
-        self._link.check_open()
-        self._await_start(None)
-        with self._topics.lock:
-            pose: Array = self._topics.view().pose
-        return pose
-
-    def _is_vehicle(self) -> bool:
-        if self._options.vehicle is not None:
-            return self._options.vehicle
-        self._simulated = self._simulated or self._episodes.there
-        return not self._simulated
-
-    def _await_start(self, start: Start | None) -> None:
-        say = self._options.say or self._link.node.get_logger().info
-        began = time.monotonic()
-        said = -math.inf
-        while (start is None or self._is_vehicle()) and (
-            missing := self._missing(start)
-        ):
-            now = time.monotonic()
-            if now - began > self._options.start_timeout_s:
-                late = (
-                    f"after {self._options.start_timeout_s:g} s the robot is not ready"
-                )
-                raise BackendError(
-                    f"{late}: {missing}; place it there, or choose start='present'."
-                )
-            if now - said >= SAY_EVERY_S:
-                say(f"waiting for the robot: {missing}")
-                said = now
-            time.sleep(POLL_S)
-
-    def _missing(self, start: Start | None) -> str:
-        """Return what is missing to begin at `start`, or anywhere if None; empty for nothing."""
-        topic, silence_s = self._oldest()
-        if math.isinf(silence_s):
-            return f"no {topic} yet"
-        if silence_s > self._options.stale_after_s:
-            return f"no {topic} for {silence_s:.1f} s"
-        with self._topics.lock:
-            view = self._topics.view()
-        if abs(view.twist[2]) > STILL[1] or math.hypot(*view.twist[:2]) > STILL[0]:
-            return "it is still moving"
-        if start is None or self._options.start == "present":
-            return ""
-        off = geometry.between(view.pose, start.pose)
-        distance = math.hypot(*off[:2])
-        turn = math.degrees(abs(off[2]))
-        if (
-            distance <= self._options.tolerance[0]
-            and abs(off[2]) <= self._options.tolerance[1]
-        ):
-            return ""
-        x, y, heading = start.pose
-        return (
-            f"it is {distance:.2f} m and {turn:.0f} deg off its start "
-            f"({x:.2f} m, {y:.2f} m, {math.degrees(heading):.0f} deg)"
-        )
-
-    def _oldest(self) -> tuple[str, float]:
-        """Return the topic that has been silent for longest, and how long [s]; inf: always.
-
-        After a clock jump no datum is left, but the arrival time of the last one is still known.
-        """
-        now_ns = time.monotonic_ns()
-        with self._topics.lock:
-            cache = self._topics.middleware.cache
-            newest = dict(cache.newest)
-            arrived_ns = {topic: times[-1] for topic, times in cache.arrivals.items()}
-        latest_ns = max((datum.stamp_ns for datum in newest.values()), default=0)
-        silences = dict.fromkeys(self._topics.expected, math.inf)
-        for topic in self._topics.expected:
-            if topic in newest:
-                behind_ns = latest_ns - newest[topic].stamp_ns
-                silences[topic] = (
-                    max(now_ns - newest[topic].arrival_ns, behind_ns) / NS_PER_S
-                )
-            elif topic in arrived_ns:
-                silences[topic] = (now_ns - arrived_ns[topic]) / NS_PER_S
-        oldest = max(silences, key=lambda topic: silences[topic])
-        return oldest, silences[oldest]
-
-    def _missing_topic(self) -> str | None:
-        """Return a topic without a datum on the present clock, or None if there is none."""
-        with self._topics.lock:
-            there = self._topics.middleware.cache.newest.keys()
-            return next(
-                (topic for topic in self._topics.expected if topic not in there), None
-            )
+        view, _ = self._take_view()
+        return view
 
     @halts_on_error
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
@@ -239,6 +185,11 @@ class RealtimeBackend:
         self._link.check_open()
         # A command carries the stamp of the scan that it was computed from, not of the newest scan.
         self._link.send(self._robot.to_cmd_vel(command), self._scan_ns)
+        self._wait_for_deadline()
+        return self._take_view()
+
+    def _wait_for_deadline(self) -> None:
+        """Wait for the end of the period, or if the caller missed it, for the next one."""
         late_ns = time.monotonic_ns() - self._deadline_ns
         if late_ns > 0:
             missed = late_ns // self._period_ns + 1
@@ -247,26 +198,152 @@ class RealtimeBackend:
         while (left_ns := self._deadline_ns - time.monotonic_ns()) > 0:
             time.sleep(left_ns / NS_PER_S)
         self._deadline_ns += self._period_ns
-        return self._fresh_view()
 
-    def _fresh_view(self) -> tuple[RobotView, dict[str, Any]]:
-        """Return the present view; after a clock jump, wait until all topics have arrived again."""
+    def _take_view(self) -> tuple[RobotView, dict[str, Any]]:
+        """Return the present view, and `info`. Raises StaleDataError if a topic is silent.
+
+        After a clock jump, wait until all topics have arrived again.
+        """
         limit_s = self._options.stale_after_s
-        holds(lambda: self._missing_topic() is None, limit_s, POLL_S)
+        holds(lambda: self._find_missing_topic() is None, limit_s, POLL_S)
         with self._topics.lock:
-            missing = self._missing_topic()
-            topic, age_s = self._oldest()
-            if missing is None and age_s <= limit_s:
-                facts = data_facts(self._topics.middleware, time.monotonic_ns())
-                self._scan_ns = self._topics.middleware.cache.newest[SCAN].stamp_ns
-                self._link.frame = self._topics.frames[1]
-                view = self._topics.view()
-                known = {
-                    "stamp_ns": self._topics.newest_ns,
-                    "deadline_misses": self._misses,
-                }
-                return view, known | facts
-        raise StaleDataError(topic, age_s, limit_s)
+            silences_s = self._measure_silences()
+            silent_topic = max(silences_s, key=lambda topic: silences_s[topic])
+            missing_topic = self._find_missing_topic()
+            if missing_topic is not None:
+                raise StaleDataError(missing_topic, silences_s[missing_topic], limit_s)
+            if silences_s[silent_topic] > limit_s:
+                raise StaleDataError(silent_topic, silences_s[silent_topic], limit_s)
+            info = {
+                "stamp_ns": self._topics.newest_ns,
+                "deadline_misses": self._misses,
+            }
+            info |= data_facts(self._topics.middleware, time.monotonic_ns())
+            self._scan_ns = self._topics.middleware.cache.newest[SCAN].stamp_ns
+            _, self._link.frame = self._topics.frames
+            return self._topics.view(), info
+
+    def _find_missing_topic(self) -> str | None:
+        """Return a topic without a datum on the present clock, or None if there is none."""
+        with self._topics.lock:
+            newest = self._topics.middleware.cache.newest
+            missing = [topic for topic in self._topics.expected if topic not in newest]
+        return missing[0] if missing else None
+
+    def _measure_silences(self) -> dict[str, float]:
+        """Return how long each topic has been silent [s]; inf for one that was never heard.
+
+        A topic is silent since its newest datum arrived, but at least for as long as that datum's
+        stamp is behind the newest stamp of all topics. After a clock jump no datum is left, but the
+        arrival time of the last one is still known.
+        """
+        now_ns = time.monotonic_ns()
+        with self._topics.lock:
+            cache = self._topics.middleware.cache
+            newest = dict(cache.newest)
+            arrived_ns = {topic: times[-1] for topic, times in cache.arrivals.items()}
+        latest_ns = max((datum.stamp_ns for datum in newest.values()), default=0)
+        silences_s = dict.fromkeys(self._topics.expected, math.inf)
+        for topic in self._topics.expected:
+            if topic in newest:
+                since_arrival_ns = now_ns - newest[topic].arrival_ns
+                behind_ns = latest_ns - newest[topic].stamp_ns
+                silences_s[topic] = max(since_arrival_ns, behind_ns) / NS_PER_S
+            elif topic in arrived_ns:
+                silences_s[topic] = (now_ns - arrived_ns[topic]) / NS_PER_S
+        return silences_s
+
+    def _begin_in_simulator(self, start: Start) -> None:
+        """Begin an episode by the simulator's services, and wait until each topic is heard."""
+        timeout_s = self._options.timeout_s
+        stamp_ns = self._episodes.begin(start, timeout_s)
+        with self._topics.lock:
+            self._topics.begin(stamp_ns, start.pose)
+        holds(lambda: self._find_unheard_topic() is None, timeout_s, POLL_S)
+        unheard_topic = self._find_unheard_topic()
+        if unheard_topic is not None:
+            raise StaleDataError(unheard_topic, math.inf, timeout_s)
+
+    def _find_unheard_topic(self) -> str | None:
+        """Return a topic that has never been heard in this episode, or None if there is none."""
+        silences_s = self._measure_silences()
+        unheard = [topic for topic in silences_s if math.isinf(silences_s[topic])]
+        return unheard[0] if unheard else None
+
+    def _is_vehicle(self) -> bool:
+        if self._options.vehicle is not None:
+            return self._options.vehicle
+        if self._episodes.there:
+            self._has_seen_services = True
+        return not self._has_seen_services
+
+    def present_pose(self) -> Array:
+        """Wait until the robot stands still, and return its pose (3,) in `map`."""
+        self._link.check_open()
+        self._wait_until_ready(None)
+        with self._topics.lock:
+            pose: Array = self._topics.view().pose
+        return pose
+
+    def _wait_until_ready(self, start: Start | None) -> None:
+        """Wait until the robot can begin at `start`, or anywhere if None; report what is missing.
+
+        The wait for a `start` also ends if the robot turns out to be in a simulator. Raises
+        BackendError after `start_timeout_s`, or if the backend is closed meanwhile.
+        """
+        say = self._options.say or self._link.node.get_logger().info
+        timeout_s = self._options.start_timeout_s
+        deadline = time.monotonic() + timeout_s
+        next_report = -math.inf
+        while True:
+            self._link.check_open()
+            if start is not None and not self._is_vehicle():
+                return
+            hindrance = self._find_hindrance(start)
+            if hindrance is None:
+                return
+            now = time.monotonic()
+            if now > deadline:
+                reason = (
+                    f"after {timeout_s:g} s the robot is not ready: {hindrance.reason}"
+                )
+                raise BackendError(f"{reason}; {hindrance.fix}.")
+            if now >= next_report:
+                say(f"waiting for the robot: {hindrance.reason}")
+                next_report = now + SAY_EVERY_S
+            time.sleep(POLL_S)
+
+    def _find_hindrance(self, start: Start | None) -> Hindrance | None:
+        """Return what keeps the robot from beginning at `start`, or anywhere if None."""
+        silences_s = self._measure_silences()
+        topic = max(silences_s, key=lambda topic: silences_s[topic])
+        fix = "check that its publisher runs in this ROS domain and namespace"
+        if math.isinf(silences_s[topic]):
+            return Hindrance(f"no {topic} yet", fix)
+        if silences_s[topic] > self._options.stale_after_s:
+            return Hindrance(f"no {topic} for {silences_s[topic]:.1f} s", fix)
+        with self._topics.lock:
+            view = self._topics.view()
+        vx, vy, yaw_rate = view.twist
+        if abs(yaw_rate) > REST_YAW_RATE or math.hypot(vx, vy) > REST_SPEED:
+            return Hindrance("it is still moving", "stop whatever else drives it")
+        if start is None or self._options.start == "present":
+            return None
+        return self._find_offset(view.pose, start.pose)
+
+    def _find_offset(self, pose: Array, start_pose: Array) -> Hindrance | None:
+        """Return how far a pose (3,) is off the start, or None within the tolerance."""
+        dx, dy, turn = geometry.between(pose, start_pose)
+        distance = math.hypot(dx, dy)
+        max_distance, max_turn = self._options.tolerance
+        if distance <= max_distance and abs(turn) <= max_turn:
+            return None
+        x, y, heading = start_pose
+        reason = (
+            f"it is {distance:.2f} m and {math.degrees(abs(turn)):.0f} deg off its start "
+            f"({x:.2f} m, {y:.2f} m, {math.degrees(heading):.0f} deg)"
+        )
+        return Hindrance(reason, "place it there, or choose start='present'")
 
     def facts(self) -> BackendFacts:
         """Return nothing: the topics carry all that is known."""

@@ -30,9 +30,9 @@ def test_climbing_along_a_hull_ends_at_its_silhouette_from_wherever_it_begins(
         across = twice[skip : skip + count] @ [sin, cos]
         angles = np.arctan2(across, along)
         for side, edge in ((1.0, angles.min()), (-1.0, angles.max())):
-            seen = kernels.Seen(distance**2, cos, sin)
-            x, y = kernels.outermost(
-                twice, skip, count, first, min(stride, count - 1), seen, side
+            view = kernels.ShapeView(distance**2, cos, sin)
+            x, y = kernels.climb_hull(
+                view, first, min(stride, count - 1), skip, twice, count, side
             )
             assert np.arctan2(y, x) == pytest.approx(edge, abs=1e-9)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from robots import lidar
 
-from nics_drl_bridge.lidar import scan_kernels
+from nics_drl_bridge.lidar import baked_kernels, scan_kernels
 from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.exact_kernels import LidarPose
 from nics_drl_bridge.lidar.scanner import Scanner
@@ -76,7 +76,7 @@ def looked_up(view: float, ahead: float, bearing: float) -> bool:
     lanes = scan_kernels.scan_lanes()
     near = np.zeros(1, int)
     found, computed = scan_kernels.select_bodies(
-        0, near, body, -1, here, 0.7, 0, scanner.arguments, lanes
+        body, near, -1, here, 0.7, 0, scanner.arguments, lanes, 0
     )
     assert computed == 0
     return bool(found)
@@ -94,3 +94,25 @@ def test_of_bodies_only_those_wholly_behind_all_beams_are_not_looked_up(view, ah
         np.pi - edge > view / 90.0
     )  # the disc fits between the last beam and the first
     assert looked_up(view, ahead, ahead + np.pi) != behind
+
+
+def test_a_body_behind_all_beams_is_not_scanned_exactly_either():
+    spec = lidar(beams=91, angle_min=-1.0, angle_max=1.0)
+    disc = Circle(radius=0.2)
+    scanner = Scanner(spec, bake(spec, [disc]), "exact")
+    body = scanner.place([disc], [[1.0, 0.0, 0.0]])
+    sensor = scanner.arguments
+    scratch = scan_kernels.scan_lanes().walls
+    near = np.zeros(1, np.int32)
+
+    def hits(sensor):
+        scan = np.full(91, np.inf, np.float32)
+        here = LidarPose(0.0, 0.0, 1.0, 0.0)
+        walls = np.zeros((0, 4))
+        baked_kernels.scan_exactly(scan, here, body, near, -1, walls, sensor, scratch)
+        return int(np.isfinite(scan).sum())
+
+    # The same beams, of which the kernels believe that they all point backwards.
+    turned = sensor.beams._replace(behind=-sensor.beams.behind)
+    assert hits(sensor) > 10
+    assert hits(sensor._replace(beams=turned)) == 0

@@ -25,8 +25,14 @@ from nics_drl_bridge.errors import BackendError, ConfigError, ModelError, StaleD
 from nics_drl_bridge.generator import builtin_model, open_model
 from nics_drl_bridge.interface import Start
 from nics_drl_bridge.nodes import qos
-from nics_drl_bridge.nodes.backends import DdsBackend, _Inbox, dds_backend
+from nics_drl_bridge.nodes.backends import (
+    DdsBackend,
+    FleetBackend,
+    dds_backend,
+    stack_facts,
+)
 from nics_drl_bridge.nodes.executor import HANDED_OVER
+from nics_drl_bridge.nodes.lockstep_inbox import Inbox
 from nics_drl_bridge.sim.scenes import member_of
 from nics_drl_bridge.sim.world import load_world
 
@@ -288,16 +294,22 @@ def test_a_message_that_cant_be_read_is_told_with_its_topic(
     drive(backend)
 
 
-def test_the_executor_rests_only_for_a_caller_that_waits_and_now_has_all():
-    def stamped(second):
-        message = LaserScan()
-        message.header.stamp.sec = second
-        return serialize_message(message)
+def stamped(second):
+    message = LaserScan()
+    message.header.stamp.sec = second
+    return serialize_message(message)
 
+
+@pytest.fixture
+def inbox():
+    return Inbox(("odom", "scan"), lambda *_: None, slack_ns=0)
+
+
+def test_the_executor_rests_only_for_a_caller_that_waits_and_now_has_all():
     estimated = []
     got = []
-    inbox = _Inbox(
-        ("odom", "scan"), lambda stamp, *_: estimated.append(stamp), lag_ns=0
+    inbox = Inbox(
+        ("odom", "scan"), lambda stamp, *_: estimated.append(stamp), slack_ns=0
     )
     assert inbox.put("odom", stamped(1)) is inbox.put("scan", stamped(1)) is None
     caller = threading.Thread(
@@ -311,6 +323,98 @@ def test_the_executor_rests_only_for_a_caller_that_waits_and_now_has_all():
     assert inbox.put("scan", stamped(2)) is HANDED_OVER
     caller.join(TIMEOUT_S)
     assert got[0].keys() == {"odom", "scan"}
+
+
+def test_what_fails_while_nothing_is_awaited_is_raised_at_the_next_wait(inbox):
+    inbox.put("odom", stamped(1))
+    inbox.put("scan", stamped(1))
+    inbox.put("scan", b"torn")
+    with pytest.raises(BackendError, match="topic 'scan': a message can't be read"):
+        inbox.wait(NS_PER_S, 0.0)
+    assert inbox.wait(NS_PER_S, 0.0).keys() == {"odom", "scan"}
+    inbox.put("scan", b"torn")
+    inbox.forget_failure()
+    inbox.wait(NS_PER_S, 0.0)
+
+
+def test_after_an_interrupted_wait_nothing_is_awaited(inbox, monkeypatch):
+    class Interrupted:
+        def acquire(self, blocking=True, timeout=None):
+            if timeout is not None:
+                raise KeyboardInterrupt
+
+        def locked(self):
+            return False
+
+    monkeypatch.setattr(inbox, "_caller_waits", Interrupted())
+    with pytest.raises(KeyboardInterrupt):
+        inbox.wait(NS_PER_S, TIMEOUT_S)
+    assert inbox.put("odom", stamped(1)) is inbox.put("scan", stamped(1)) is None
+
+
+def test_facts_of_a_fleet_have_one_shape_whatever_their_values():
+    for later in (3, 4):
+        facts = [
+            {"stamp_ns": 7, "scan_stamp_ns": stamp, "covariance": np.eye(3)}
+            for stamp in (3, later)
+        ]
+        found = stack_facts(facts)
+        assert found["stamp_ns"] == 7
+        assert found["scan_stamp_ns"].tolist() == [3, later]
+        assert found["covariance"].shape == (2, 3, 3)
+
+
+@pytest.mark.parametrize("namespaces", [["a"], ["a", "b", "b"]])
+def test_a_fleet_names_each_robot_once_and_at_least_two(model, arena, namespaces):
+    with pytest.raises(ConfigError, match=r"two robots or more, each of them once"):
+        FleetBackend(model, arena, namespaces)
+
+
+def test_options_of_the_standard_are_refused_for_a_simulator_of_this_package(
+    model, arena
+):
+    with pytest.raises(ConfigError, match="not of 'simulator_node'; leave it out"):
+        DdsBackend(model, arena, standard={"slack_s": 0.1})
+
+
+def test_an_older_scan_keeps_its_own_stamp(connect, monkeypatch):
+    backend = connect()
+    drive(backend)
+    period_ns = backend._period_ns
+    backend._slack_ns = backend._inbox._slack_ns = period_ns
+    put = backend._inbox.put
+    monkeypatch.setattr(
+        backend._inbox, "put", lambda kind, m: None if kind == "scan" else put(kind, m)
+    )
+    view, info = backend.step(np.array([0.5, 0.0]))
+    assert view.scan_age_s == pytest.approx(period_ns / NS_PER_S)
+    assert info["scan_stamp_ns"] == info["stamp_ns"] - period_ns
+
+
+def test_after_a_failed_step_a_command_asks_for_a_reset(connect, monkeypatch):
+    backend = connect()
+    with pytest.raises(BackendError, match=r"no episode has begun; call reset\(\)"):
+        backend.send(np.zeros(2))
+    drive(backend)
+    with monkeypatch.context() as patch:
+        patch.setattr(backend._inbox, "put", lambda *_: None)
+        patch.setattr(backend, "timeout_s", 0.2)
+        with pytest.raises(StaleDataError):
+            backend.step(np.array([0.5, 0.0]))
+    with pytest.raises(BackendError, match=r"data did not arrive.*call reset\(\)"):
+        backend.step(np.array([0.5, 0.0]))
+    drive(backend)
+
+
+def test_advice_is_for_the_kind_of_simulator(connect, monkeypatch):
+    backend = connect()
+    drive(backend)
+    assert "mode:=lockstep" in backend._advise_start()
+    monkeypatch.setattr(backend, "_is_standard", True)
+    assert "serves simulation_interfaces" in backend._advise_start()
+    backend._now_ns += 1
+    with pytest.raises(BackendError, match="`slack_s` in `standard`"):
+        backend.send(np.zeros(2))
 
 
 def test_another_model_is_refused_by_its_fingerprint(connect):
@@ -418,7 +522,8 @@ def test_somebody_else_who_moves_the_simulator_is_found_out(
             backend.reset(START)
             intruder.publish(Twist())
             peer.until(
-                lambda: backend._inbox.stamp_ns("odom") > backend._now_ns, "its effect"
+                lambda: backend._inbox.get_stamp_ns("odom") > backend._now_ns,
+                "its effect",
             )
             with pytest.raises(
                 BackendError, match=r"'odom': stamped \+0\.100 s off the step"

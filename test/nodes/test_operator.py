@@ -60,12 +60,35 @@ def test_the_time_left_to_arm_is_told_and_kept(clock, monkeypatch):
         return "/command_gate"
 
     monkeypatch.setattr(operator, "_wait_for_gate", wait_for_gate)
-    monkeypatch.setattr(operator, "_call", lambda gate, _: GateAnswer(gate, False, "x"))
+    monkeypatch.setattr(
+        operator, "_call", lambda gate, *_: GateAnswer(gate, False, "x")
+    )
     told = []
     answer = operator.arm("", 10.0, False, told.append)
     assert told == ["/command_gate does not arm yet (x); asking again for 3 s"]
     assert not answer.granted
-    assert clock.now == 10.0
+    assert 7.0 + module.ASK_AGAIN_S < clock.now <= 10.0
+
+
+@pytest.mark.parametrize("seconds", [0.0, 3.0])
+def test_a_gate_that_hangs_holds_up_the_arming_no_longer_than_was_given(
+    clock, monkeypatch, seconds
+):
+    class Call:
+        def __init__(self, node, gate, service):
+            self.gate = gate
+
+        def wait_for_answer(self, left_s):
+            clock.sleep(left_s)
+            return GateAnswer(self.gate, False, "it did not answer in time")
+
+    operator = Operator.__new__(Operator)
+    operator._node = None
+    monkeypatch.setattr(operator, "_wait_for_gate", lambda *_: "/command_gate")
+    monkeypatch.setattr(module, "_Call", Call)
+    answer = operator.arm("", seconds, True, lambda _: None)
+    assert answer == GateAnswer("/command_gate", False, "it did not answer in time")
+    assert clock.now == seconds
 
 
 def test_a_goal_without_an_answer_takes_no_longer_than_was_given(clock, monkeypatch):

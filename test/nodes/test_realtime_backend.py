@@ -20,6 +20,7 @@ from std_srvs.srv import SetBool
 from nics_drl_bridge.env.registry import NAVIGATION
 from nics_drl_bridge.errors import BackendError, ConfigError, StaleDataError
 from nics_drl_bridge.interface import Start
+from nics_drl_bridge.middleware.middleware import Datum
 from nics_drl_bridge.nodes import conversions, qos, realtime_backend
 from nics_drl_bridge.nodes.link import EpisodeServices
 from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
@@ -302,6 +303,60 @@ def test_a_vehicle_that_does_not_come_ends_the_reset_and_the_present_pose_would_
     waiting.close()
     present = connect(**options, start="present")
     assert present.reset(START).pose == pytest.approx(np.zeros(3), abs=0.05)
+
+
+def test_a_start_that_fails_is_explained_by_its_cause(connect, vehicle):
+    vehicle.peer.listen(TwistStamped, "cmd_vel")
+    backend = connect(
+        domain_id=vehicle.domain_id,
+        stale_after_s=PATIENCE_S,
+        say=lambda _: None,
+        start_timeout_s=0.3,
+    )
+    with pytest.raises(BackendError, match="no scan yet; check that its pub") as silent:
+        backend.reset(START)
+
+    def is_heard():
+        vehicle.stand(START.pose, (0.3, 0.0, 0.0))
+        return backend._find_unheard_topic() is None
+
+    vehicle.peer.until(is_heard, "the backend hears the vehicle")
+    with pytest.raises(BackendError, match="it is still moving; stop") as moves:
+        backend.present_pose()
+    assert "present" not in f"{silent.value} {moves.value}"
+
+
+def test_a_backend_that_is_closed_waits_no_longer_for_its_vehicle(connect, vehicle):
+    vehicle.peer.listen(TwistStamped, "cmd_vel")
+    backend = connect(
+        domain_id=vehicle.domain_id, say=lambda _: backend.close(), start_timeout_s=20.0
+    )
+    with pytest.raises(BackendError, match="this backend is closed"):
+        backend.reset(START)
+
+
+def test_the_topic_that_is_missing_is_named_not_one_that_is_silent_longer():
+    now_ns = time.monotonic_ns()
+    odom = Datum(stamp_ns=10**9, arrival_ns=now_ns - 10**9, sequence=0, value=None)
+    arrivals = {"odom": [odom.arrival_ns], "scan": [now_ns]}
+    cache = SimpleNamespace(newest={"odom": odom}, arrivals=arrivals)
+    backend = RealtimeBackend.__new__(RealtimeBackend)
+    backend._options = SimpleNamespace(stale_after_s=0.05)
+    backend._topics = SimpleNamespace(
+        lock=threading.RLock(),
+        expected=("odom", "scan"),
+        middleware=SimpleNamespace(cache=cache),
+    )
+    with pytest.raises(StaleDataError) as caught:
+        backend._take_view()
+    assert caught.value.topic == "scan"
+
+
+def test_a_map_is_laid_only_around_the_present_pose_without_a_pose_sensor(connect):
+    with pytest.raises(ConfigError, match="lays_map needs start='present'"):
+        connect(lays_map=True)
+    with pytest.raises(ConfigError, match="lays_map is for a robot without a pose"):
+        connect(lays_map=True, start="present", pose_type="PoseStamped")
 
 
 def test_a_wrong_option_is_one_sentence(connect, model, domain_id):

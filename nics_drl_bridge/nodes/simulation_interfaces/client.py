@@ -15,6 +15,7 @@ from nics_drl_bridge.interface import NS_PER_S, Array, Start
 from nics_drl_bridge.lidar.exact_kernels import RADIUS
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.link import POLL_S, Link
+from nics_drl_bridge.nodes.lockstep_inbox import Inbox
 from nics_drl_bridge.nodes.parameters import NEWEST
 from nics_drl_bridge.nodes.runner import holds
 from nics_drl_bridge.sim.entities import OBSTACLE
@@ -79,13 +80,13 @@ class StandardEpisodes:
         model: SimulatorModel,
         world: AnyWorld,
         options: StandardOptions,
-        inbox: Any,
+        inbox: Inbox,
     ) -> None:
         self._link = link
         self._model = model
         self._world = world
         self._options = options
-        self._inbox = inbox  # of the data, see `backends`
+        self._inbox = inbox
         self._types = module("srv")
         self._messages = module("msg")
         self._entity = options.entity or model.robot.name
@@ -205,12 +206,12 @@ class StandardEpisodes:
             return time_ns + self._period_ns
         # An answer without a stamp: by the first data, of several steps the last.
         holds(
-            lambda: self._pending[-1].done() and self._inbox.newest_ns() >= 0,
+            lambda: self._pending[-1].done() and self._inbox.find_newest_ns() >= 0,
             timeout_s,
             POLL_S,
         )
         time.sleep(POLL_S)
-        return max(0, int(self._inbox.newest_ns()))
+        return max(0, self._inbox.find_newest_ns())
 
     def _put_obstacles(self, start: Start, timeout_s: float) -> None:
         if not self._options.obstacles or not self._entities.service_is_ready():
