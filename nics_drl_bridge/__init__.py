@@ -5,8 +5,8 @@ kinematics and baked lidar tables), trains or tests a policy in it, and drives t
 and the same policy in process, over ROS 2 and on the vehicle.
 
 Importing this package needs neither ROS 2 nor any heavy library: each public name is loaded when
-it is first used. The environments are registered where Gymnasium was imported before, as by
-`gymnasium.make("nics_drl_bridge:NicsBridge/Navigation-v0")`, or when `make` is used.
+it is first used. The environments are registered if Gymnasium was imported before, as in
+`gymnasium.make("nics_drl_bridge:NicsBridge/Navigation-v0")`, or when `make` is first used.
 """
 
 import sys
@@ -83,4 +83,4 @@ def __dir__() -> list[str]:
 
 
 if "gymnasium" in sys.modules:
-    import_module("nics_drl_bridge.env.registry")  # registers as it is imported
+    import_module("nics_drl_bridge.env.registry")  # registers on import

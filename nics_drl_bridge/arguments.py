@@ -1,6 +1,6 @@
 """Checks of what callers pass to public functions: one sentence for each mistake.
 
-A robot and the model of it are one thing to a caller, so `robot=` and `model=` are one keyword.
+Callers may write `robot=` or `model=`: both name the same argument.
 """
 
 import math
@@ -29,12 +29,12 @@ _SHORT.maxother = 80
 
 
 def to_plain(value: Any) -> Any:
-    """Returns the number of a numpy scalar, and other values unchanged, without loading numpy."""
+    """Converts a numpy scalar to a Python number, without loading numpy; keeps other values."""
     return value.item() if getattr(value, "shape", None) == () else value
 
 
 def format_value(value: Any) -> str:
-    """Returns a value as a message quotes it: numbers and text in full, else the type."""
+    """Formats a value for a message: numbers and text in full, otherwise its type."""
     value = to_plain(value)
     if value is None or isinstance(value, str | bool | int | float | PathLike):
         return _SHORT.repr(value)
@@ -44,7 +44,7 @@ def format_value(value: Any) -> str:
 
 
 def check_kind(what: str, value: Any, annotation: Any) -> None:
-    """Raises ConfigError unless a value fits an annotation bool, int or float, maybe `| None`.
+    """Raises ConfigError unless a value fits its annotation: bool, int or float, also `| None`.
 
     Other annotations are not checked. A bool is not a number, and numbers must be finite.
     """
@@ -89,7 +89,7 @@ def check_options(what: str, value: Any) -> None:
 
 
 def check_path(what: str, value: Any) -> None:
-    """Raises ConfigError unless a value is a path: text, or an object that stands for one."""
+    """Raises ConfigError unless a value is a path: a string or a path-like object."""
     if not isinstance(value, str | PathLike):
         raise ConfigError(f"{what}={format_value(value)}: must be a name or a path.")
     if "\0" in str(value):
@@ -121,10 +121,10 @@ def refuse_unknown(
 def rename_robot_argument(
     place: str, word: str, named: dict[str, Any], positional: Any = None
 ) -> None:
-    """Renames the argument `robot` or `model`, in place, to the word that a function uses.
+    """Renames the argument `robot` or `model`, in place, to the name that a function uses.
 
-    `positional` is the value that was passed without a name. Raises ConfigError if the two words
-    name different robots.
+    `positional` is the value that was passed without a name. Raises ConfigError if both arguments
+    are passed with different values.
     """
     (synonym,) = set(ROBOT_WORDS) - {word}
     if synonym not in named:
@@ -155,9 +155,9 @@ def check_arguments(
 ) -> Callable[[Callable[P, T]], Callable[P, T]]:
     """Makes a function, called `place` in messages, refuse unknown and mistyped arguments.
 
-    It accepts both `robot=` and `model=` if it has either. An unknown keyword is a ConfigError, and
-    so is a value that does not fit its annotation bool, int or float. The function passes its
-    `**others` to `passes_to`, except those in `without`, which it sets itself.
+    If it has `robot` or `model`, it accepts either name. An unknown keyword, or a value that does
+    not fit an annotation of bool, int or float, raises ConfigError. The function passes its
+    `**others` to `passes_to`, except for those in `without`, which it sets itself.
     """
 
     def decorate(function: Callable[P, T]) -> Callable[P, T]:

@@ -52,7 +52,7 @@ Heading = Annotated[
 _Near = Annotated[
     float, _within(10.0, "in metres, within 10 (millimetres look like this)")
 ]
-# x, y [m] and heading [rad] of a sensor in `base_link`
+# pose of a sensor in `base_link`: x [m], y [m], heading [rad]
 Mount = tuple[_Near, _Near, Heading]
 
 
@@ -81,7 +81,7 @@ def validate(data: dict[str, Any], schema: type[SchemaT], source: str) -> Schema
 def _find_coerced(
     raw: Any, validated: Any, place: str = ""
 ) -> Iterator[tuple[str, Any]]:
-    """Yields strings and booleans that pydantic coerced to numbers: `true` is no length."""
+    """Yields strings and booleans that pydantic coerced to numbers; `true` is not a length."""
     pairs: list[tuple[Any, Any, Any]] = []
     if isinstance(raw, dict):
         parts = (
@@ -98,7 +98,7 @@ def _find_coerced(
         yield from _find_coerced(value, parsed, f"{place}.{key}")
 
 
-# unknown keys of a model, and of a dataclass
+# pydantic's error types for unknown keys, of a model and of a dataclass
 _UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
 _NO_KEYS = ("model_type", "model_attributes_type", "dict_type", "dataclass_type")
 _NO_LIST = ("tuple_type", "list_type")
@@ -139,7 +139,7 @@ def _explain_error(error: ValidationError, schema: type[BaseModel]) -> str:
         return f"key {key!r}: number of entries must be {bounds}, not {count}."
     message = first["msg"].removeprefix("Value error, ").rstrip(".")
     message = message[0].lower() + message[1:]
-    if not key:  # an error of several keys, which the message names
+    if not key:  # an error about several keys; the message names them
         return f"{message}."
     return f"key {key!r}: {message}, not {_SHORT.repr(first['input'])}."
 
@@ -147,7 +147,7 @@ def _explain_error(error: ValidationError, schema: type[BaseModel]) -> str:
 def _locate_fields(
     schema: type[BaseModel], location: tuple[int | str, ...]
 ) -> list[str]:
-    """Returns the field names at a location; in a union of models it names the present `kind`."""
+    """Returns the field names at a location, which names the `kind` chosen in a union of models."""
     current: Any = schema
     candidates: list[type] = []
     for part in location:
@@ -187,7 +187,7 @@ def _find_inner_models(annotation: Any) -> list[type]:
 
 
 def check_no_device(path: Path) -> Path:
-    """Returns the path. Raises ConfigError for a device or a pipe, which might never end."""
+    """Returns the path. Raises ConfigError for a device or a pipe: reading it might never end."""
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise ConfigError(f"{path}: is a device or a pipe, not a file; copy it to one.")
     return path
@@ -219,7 +219,7 @@ def load_yaml(path: str | Path, schema: type[SchemaT]) -> SchemaT:
 
 
 def share_folder() -> Path:
-    """Returns the folder of `config` and `launch`: the checkout, or `share/nics_drl_bridge`."""
+    """Returns the folder with `config` and `launch`: the checkout, or `share/nics_drl_bridge`."""
     checkout, *parents = Path(__file__).resolve().parents[1:]
     for folder in (checkout, *(parent / "share" / PACKAGE for parent in parents)):
         if (folder / "config" / "robots").is_dir():
@@ -236,7 +236,7 @@ def list_shipped(kind: str) -> list[str]:
 
 
 def find_config(name: str | Path, kind: str, extra_names: Iterable[str] = ()) -> Path:
-    """Finds `arena` in `config/KIND`, or a YAML file; ConfigError suggests a name."""
+    """Returns the path of a name in `config/KIND`, or of a YAML file. Raises ConfigError."""
     name = str(name)
     if name.endswith((".yaml", ".yml")):
         return Path(name)
@@ -251,7 +251,7 @@ def find_config(name: str | Path, kind: str, extra_names: Iterable[str] = ()) ->
     raise ConfigError(f"{unknown}; {hint} (or give the path of a YAML file).")
 
 
-# libyaml's parser is four times faster; its nodes are composed in Python in any case.
+# libyaml's parser is four times as fast; nodes are composed in Python either way.
 _BASES: Any = (
     (Composer, yaml.CSafeLoader) if yaml.__with_libyaml__ else (yaml.SafeLoader,)
 )
@@ -330,7 +330,7 @@ _Loader.add_constructor("tag:yaml.org,2002:int", _parse_whole)
 
 
 class _Dumper(yaml.SafeDumper):
-    """Dumper that quotes text that either `_Loader` or YAML 1.1 would take for a number."""
+    """Dumper that quotes strings that `_Loader` or YAML 1.1 would read as numbers."""
 
 
 _TAG = "tag:yaml.org,2002:"
@@ -366,7 +366,7 @@ def parse_yaml(text: str, source: str) -> dict[str, Any]:
         data = _Loader(text).get_single_data()
     except (yaml.YAMLError, ValueError) as error:
         mark = getattr(error, "problem_mark", None)
-        last = text.rstrip().count("\n")  # a mark may lie beyond the end
+        last = text.rstrip().count("\n")  # the mark may be past the end
         line = f", line {min(mark.line, last) + 1}" if mark else ""
         problem = getattr(error, "problem", None) or " ".join(str(error).split())
         raise ConfigError(
@@ -382,7 +382,7 @@ def parse_yaml(text: str, source: str) -> dict[str, Any]:
 
 
 class _QuotingDumper(_Dumper):
-    """Dumper that quotes every text, for readers that take other texts for numbers."""
+    """Dumper that quotes every string, for readers that would read other strings as numbers."""
 
 
 def _quote(dumper: _QuotingDumper, text: str) -> Any:

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 
 MISSING_ROS = "needs the module {module!r}; source your ROS 2 installation, or "
 MISSING_ROS += "pip install 'nics_drl_bridge[ros]'."
-# maximum length of a sentence [characters]; a longer one loses its middle
+# maximum length of a sentence [characters]; longer ones are cut in the middle
 LONGEST = 800
 LONGEST_NAME = 100  # characters of a name that are compared with the known names
 

@@ -52,7 +52,7 @@ TRAINING = ("torch", "stable_baselines3", "tensorboard", "onnx", "onnxruntime")
 
 @cache
 def find_extensions(group: str) -> dict[str, EntryPoint]:
-    """Returns the extensions of a group by name, sorted; other packages' replace ours."""
+    """Returns the extensions of a group by name, sorted; other packages override ours."""
     points = entry_points(group=f"{PACKAGE}.{group}")
     ours_first = sorted(
         points, key=lambda point: (point.name, not point.value.startswith(PACKAGE))
@@ -64,7 +64,7 @@ _imported: dict[str, dict[str, type]] = {}  # group -> name -> class of a user's
 
 
 def load(group: str, name: str) -> Any:
-    """Loads an extension. Raises ConfigError if it, or a library that it needs, is missing.
+    """Loads an extension. Raises ConfigError if it or a library that it needs is missing.
 
     The name is only looked up: the extension must be installed as an entry point, or have been
     imported by `import_class`.
@@ -122,7 +122,7 @@ def explain_missing(module: str) -> str:
 
 
 def find_lacking(modules: Iterable[str]) -> str | None:
-    """Returns the first of some modules that is not installed."""
+    """Returns the first module that is not installed, or None."""
     return next((module for module in modules if find_spec(module) is None), None)
 
 
@@ -136,9 +136,9 @@ def require(user: str, *modules: str) -> None:
 
 
 def explain_unmet(error: ImportError) -> str | None:
-    """Returns a clause about missing or outdated libraries, if an import failed for them.
+    """Returns a clause about missing or outdated libraries if they made an import fail, else None.
 
-    The packages of a system are often older than this one needs.
+    System packages are often older than this package needs.
     """
     if (error.name or "").partition(".")[0] == PACKAGE and isinstance(
         error, ModuleNotFoundError
@@ -165,7 +165,7 @@ def _find_wrong() -> Iterator[tuple[str, str]]:
         return
     for line in required:
         requirement = line.replace(" ", "")
-        if ";" in requirement:  # of an extra
+        if ";" in requirement:  # belongs to an extra
             continue
         name, bounds = re.match(r"([\w.-]*)(.*)", requirement).groups()  # type: ignore[union-attr]
         try:
@@ -190,7 +190,7 @@ def _parse_version(release: str) -> tuple[int, ...]:
 
 
 def explain_own_fault(error: BaseException) -> str | None:
-    """Returns a clause about an error that a user's own task raised, with its place; else None."""
+    """Returns a sentence about an error raised in a user's own task, with its place; else None."""
     for frame, line in reversed(list(walk_tb(error.__traceback__))):
         task = type(frame.f_locals.get("self"))
         module = str(frame.f_globals.get("__name__"))
@@ -203,7 +203,7 @@ def explain_own_fault(error: BaseException) -> str | None:
 
 
 def load_module(place: str, kind: str) -> Any:
-    """Imports a module by name or file, again if the file changed. Raises ConfigError."""
+    """Imports a module by name or file; reimports a changed file. Raises ConfigError."""
     if place.endswith(".py"):
         return _load(Path(place), kind)
     try:

@@ -24,7 +24,7 @@ except ImportError:  # Windows
 _AT_FDCWD = -100
 _RENAME_EXCHANGE = 2
 _POSIX = hasattr(os, "O_DIRECTORY")  # Windows opens no folders
-_BINARY = getattr(os, "O_BINARY", 0)  # of Windows
+_BINARY = getattr(os, "O_BINARY", 0)  # only on Windows
 
 
 def _fsync(path: Path) -> None:
@@ -54,7 +54,7 @@ def write_parts(path: str | Path, parts: Iterable[bytes]) -> None:
                 file.writelines(parts)
                 file.flush()
                 os.fsync(file.fileno())
-                if _POSIX:  # while the lock still shows that its writer lives
+                if _POSIX:  # while the lock still shows that the writer is alive
                     os.replace(temporary, path)
             if not _POSIX:  # Windows renames no open file
                 os.replace(temporary, path)
@@ -64,9 +64,9 @@ def write_parts(path: str | Path, parts: Iterable[bytes]) -> None:
     _fsync(path.parent)
 
 
-# An unfinished file or folder has a hidden name beside its final path. Its writer holds a lock on
-# it, which the system releases when the writer ends, even by a crash. `tempfile` would make files
-# that only their owner can read; here the umask applies.
+# An unfinished file or folder has a hidden name next to its final path. Its writer holds a lock
+# on it, which the system releases when the writer ends, even if it crashes. `tempfile` would make
+# files that only their owner can read; here the umask applies.
 
 UNFINISHED = "unfinished"
 REPLACED = "replaced"
@@ -74,12 +74,12 @@ _HIDDEN = re.compile(rf"\.(.+)\.[0-9a-f]{{8}}\.({UNFINISHED}|{REPLACED})", re.DO
 
 
 def make_hidden_name(path: Path, ending: str = "") -> Path:
-    """Returns a new hidden path beside a path; `ending` marks what a crash may leave behind."""
+    """Returns a new hidden path next to a path; `ending` marks what a crash may leave behind."""
     return path.parent / f".{path.name}.{secrets.token_hex(4)}{ending and f'.{ending}'}"
 
 
 def _begin_file(path: Path) -> tuple[Path, int]:
-    """Makes a hidden file beside a path; returns it with its descriptor, which holds the lock."""
+    """Makes a hidden file next to a path; returns it and its descriptor, which holds the lock."""
     while True:
         temporary = make_hidden_name(path, UNFINISHED)
         descriptor = os.open(
@@ -91,7 +91,7 @@ def _begin_file(path: Path) -> tuple[Path, int]:
 
 
 def begin_folder(path: Path) -> tuple[Path, int | None]:
-    """Makes a hidden folder beside a path; see `_begin_file`. Windows opens no folders: None."""
+    """Makes a hidden folder like `_begin_file`; the descriptor is None on Windows."""
     while True:
         temporary = make_hidden_name(path, UNFINISHED)
         temporary.mkdir()
@@ -108,7 +108,7 @@ def _lock_new(path: Path, descriptor: int) -> bool:
     """Locks a new file or folder; False if another process removed it as a leftover."""
     if fcntl is None:
         return True
-    # On a file system without locks, nothing is removed either.
+    # On a file system without locks, leftovers are not removed, so no lock is needed.
     with suppress(OSError):
         fcntl.flock(descriptor, fcntl.LOCK_EX)
     try:
@@ -118,7 +118,7 @@ def _lock_new(path: Path, descriptor: int) -> bool:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Removes what killed writers left in a folder, never what a living one still writes."""
+    """Removes what killed writers left in a folder, never what a live writer is still writing."""
     if fcntl is None:
         return
     with suppress(OSError), os.scandir(folder) as entries:
@@ -126,14 +126,14 @@ def remove_leftovers(folder: Path) -> None:
             match = _HIDDEN.fullmatch(entry.name)
             if match is None or entry.is_symlink():
                 continue
-            # If its writer was killed while swapping, the old version may be the only one left.
+            # If the writer was killed while swapping, this may be the only version left.
             if match[2] == REPLACED and not (folder / match[1]).exists():
                 continue
             _remove_if_left(Path(entry.path))
 
 
 def _remove_if_left(path: Path) -> None:
-    with suppress(OSError):  # somebody else removes it, or its writer lives
+    with suppress(OSError):  # another process removes it, or its writer is alive
         descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -151,7 +151,7 @@ def _remove_if_left(path: Path) -> None:
 def write_whole_file(path: str | Path) -> Iterator[Path]:
     """Yields a temporary path for a library that writes files itself; renames it to `path`.
 
-    It has the same file ending. If the block raises, nothing is left.
+    The temporary path has the same suffix. If the block raises, nothing is left behind.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -186,13 +186,13 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def format_json(data: Any, indent: int | None = None) -> str:
-    """Formats data as JSON, with null for numbers that are not finite and text for objects."""
+    """Formats data as JSON: null for non-finite numbers, `str` of other objects."""
     finite = json.loads(json.dumps(data, default=str), parse_constant=lambda _: None)
     return json.dumps(finite, allow_nan=False, indent=indent)
 
 
 def check_folder(path: str | Path, marker: str) -> Path:
-    """Resolves a path, creating nothing. Raises ConfigError if no folder can be written there."""
+    """Resolves a path; creates nothing. Raises ConfigError unless a folder can be written there."""
     path = Path(path).resolve()
     if path.exists() and not path.is_dir():
         raise ConfigError(
@@ -220,12 +220,12 @@ def check_above(path: Path) -> None:
 def write_whole_folder(
     path: str | Path, marker: str, is_own: Callable[[str], bool] = lambda _: True
 ) -> Iterator[Path]:
-    """Yields a temporary folder that replaces `path` if the block succeeds, else is removed.
+    """Yields a temporary folder that replaces `path` if the block succeeds, or else is removed.
 
-    It replaces only an empty folder, or one with the file `marker`, which all folders of this kind
-    hold: a wrong `--out` never deletes work. A symbolic link stays. Files of the user stay, too:
-    those that the block did not write and for whose relative path `is_own` is false. Raises
-    ConfigError, see `check_folder`.
+    It replaces only an empty folder or one with the file `marker`, which all folders of this kind
+    contain, so that a wrong `--out` never deletes work. A symbolic link is kept. The user's files
+    are kept, too: those that the block did not write and whose relative path `is_own` rejects.
+    Raises ConfigError, see `check_folder`.
     """
     path = check_folder(path, marker)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -264,7 +264,7 @@ def _keep_others(old: Path, new: Path, is_own: Callable[[str], bool]) -> None:
 
 
 def _swap(new: Path, path: Path) -> None:
-    """Moves `new` to `path`, atomically if the system can; the previous folder is removed."""
+    """Moves `new` to `path`, atomically if the system supports it; removes the previous folder."""
     if path.exists() and _exchange(new, path):
         _fsync(path.parent)
         return
@@ -284,7 +284,7 @@ def _swap(new: Path, path: Path) -> None:
 
 
 def _exchange(first: Path, second: Path) -> bool:
-    """Exchanges two paths atomically; False if the system can't (only Linux has renameat2)."""
+    """Exchanges two paths atomically; returns False if the system can't (only Linux can)."""
     library = ctypes.CDLL(None, use_errno=True) if _POSIX else None
     if (rename := getattr(library, "renameat2", None)) is None:
         return False
@@ -306,7 +306,7 @@ def sync_folder(folder: Path) -> None:
 
 # manifest of a folder, which `sha256sum -c SHA256SUMS` checks as well
 SUMS = "SHA256SUMS"
-# limit of a file of arrays: a day of driving, or a table of a thousand shapes
+# size limit of an array file: a day of driving, or a table of a thousand shapes
 MOST_BYTES = 256 * 2**20
 _SEAL = b"sha256 "
 _PART = 2**20
@@ -342,14 +342,14 @@ def check_sealed(file: BinaryIO) -> None:
 
 
 def read_file(path: Path) -> bytes:
-    """Returns the content of a file. Raises ValueError if it is larger than any file of arrays."""
+    """Returns the content of a file. Raises ValueError if it is larger than `MOST_BYTES`."""
     if path.stat().st_size > MOST_BYTES:
         raise ValueError(f"it is larger than {MOST_BYTES // 2**20} MB")
     return path.read_bytes()
 
 
 def names_in_sums(folder: Path) -> set[str]:
-    """Returns the names that the `SHA256SUMS` of a folder lists, or none if it can't be read."""
+    """Returns the names listed in a folder's `SHA256SUMS`; empty if it can't be read."""
     try:
         with (folder / SUMS).open("rb") as sums:
             lines = sums.read(_PART).decode(errors="replace").splitlines()
@@ -359,7 +359,7 @@ def names_in_sums(folder: Path) -> set[str]:
 
 
 def write_sums(folder: Path) -> None:
-    """Writes the SHA-256 of every file in a folder and below to its `SHA256SUMS`."""
+    """Writes the SHA-256 of every file in a folder and its subfolders to its `SHA256SUMS`."""
     files = sorted(
         path for path in folder.rglob("*") if path.is_file() and path != folder / SUMS
     )
@@ -371,7 +371,7 @@ def check_sums(folder: Path, names: Sequence[str], editable: str = "") -> None:
     """Checks files of a model or a lidar table against the `SHA256SUMS` of their folder.
 
     All names must be listed, except `editable`: a user may remove its line to edit it. Raises
-    ModelError if a file is missing, too large or changed, or if another file is listed.
+    ModelError if a file is missing, too large or changed, or if any other file is listed.
     """
     with _open_file(folder / SUMS) as file:
         listed = file.readlines(_PART)
@@ -404,7 +404,7 @@ def _format_line(folder: Path, name: str) -> bytes:
 
 
 def _open_file(path: Path) -> BinaryIO:
-    """Opens a file of a model. Raises ModelError for what is missing, no file, or too large."""
+    """Opens a file of a model. Raises ModelError if it is missing, not a file, or too large."""
     reason = "missing, or no file"
     try:
         if path.is_file():

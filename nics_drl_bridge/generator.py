@@ -43,8 +43,8 @@ MODEL_FILE = "model.yaml"
 TABLE_FOLDER = "lidar_table"
 REPORT_FILE = "report.txt"
 _OF_TABLE = (f"{TABLE_FOLDER}/{name}" for name in (files.SUMS, *TABLE_FILES))
-MODEL_FILES = (MODEL_FILE, REPORT_FILE, *_OF_TABLE)  # and a manifest
-# what `nics generate` draws; earlier versions wrote some of the pictures
+MODEL_FILES = (MODEL_FILE, REPORT_FILE, *_OF_TABLE)  # besides the manifest
+# Files that `nics generate` draws, including pictures that only earlier versions wrote.
 REPORT_PAGE = "report.html"
 PICTURES_FOLDER = "pictures"
 PICTURES = (
@@ -61,7 +61,7 @@ PICTURES = (
 )
 DRAWN_FILES = (REPORT_PAGE, *(f"{PICTURES_FOLDER}/{name}.png" for name in PICTURES))
 CONTROL_PERIOD_S = Settings.control_period_s
-MOTORS = "inputs", "limits"  # of a calibration
+MOTORS = "inputs", "limits"  # fields of a calibration
 DEFAULT_LIDAR = "paper"
 BUILTIN_SEED = 0
 
@@ -76,22 +76,22 @@ class Timing(NamedTuple):
 
 @dataclass(frozen=True)
 class SimulatorModel:
-    """All that a fast simulator needs to know about a robot."""
+    """Everything that a fast simulator needs to know about a robot."""
 
     robot: RobotSpec
     kinematics: TaylorModel  # fitted and pruned
-    # clock offset, latency, sensor frames, noise of the recording
+    # identified from the recording: clock offset, latency, sensor frames, noise
     calibration: Calibration
     lidar: LidarSpec
-    table: LidarTable  # baked ranges of the obstacles' shapes and of the robot itself
-    noise: Noise = field(default_factory=Noise)  # of sensors and motion
-    # between commands; a whole number of `kinematics.dt`
+    table: LidarTable  # baked ranges to the obstacles' shapes and the robot itself
+    noise: Noise = field(default_factory=Noise)  # sensor and motion noise
+    # time between commands [s], a multiple of `kinematics.dt`
     control_period: float = CONTROL_PERIOD_S
-    report: str = ""  # how the model was made, as readable text
-    # of scan and odometry, if the recording showed it
+    report: str = ""  # how the model was made, in plain text
+    # of scans and odometry, if it was measured in the recording
     latency: Latency = field(default_factory=Latency)
-    sensors: tuple[Sensor, ...] = ()  # besides the lidar
-    # True: a gyro measured the recorded headings, or confirmed them
+    sensors: tuple[Sensor, ...] = ()  # other than the lidar
+    # True: a gyro measured or confirmed the recorded headings
     gyro: bool = False
 
     def __post_init__(self) -> None:
@@ -113,7 +113,7 @@ class SimulatorModel:
 
     @property
     def timing(self) -> Timing:
-        """Length of a substep, substeps in a control period, delay of the commands."""
+        """Length of a substep, substeps per control period, command delay."""
         dt = self.kinematics.dt
         delay = max(0, round(self.calibration.command_latency_s / dt))
         return Timing(dt, round(self.control_period / dt), delay)
@@ -121,8 +121,7 @@ class SimulatorModel:
     @cached_property
     def text(self) -> str:
         """The content of `model.yaml`."""
-        # The kinematics hold the motors' parameters; a calibration that was just identified has a
-        # copy of them.
+        # The kinematics already hold the motors' parameters; a new calibration has a copy.
         calibration = {
             k: v for k, v in asdict(self.calibration).items() if k not in MOTORS
         }
@@ -150,7 +149,7 @@ class SimulatorModel:
 
     @property
     def fingerprint(self) -> str:
-        """Identifies the model: 16 digits of the SHA-256 of `text` and of the table's."""
+        """Identifies the model: 16 digits of the SHA-256 of `text` and the table's fingerprint."""
         return files.hash_bytes(f"{self.text}{self.table.fingerprint}".encode())[:16]
 
 
@@ -209,9 +208,9 @@ def generate(
     )
     if (reason := explain_uselessness(identified)) and not anyway:
         raise FitError(reason)
-    # It may have another state, if the fit fell back to the textbook.
+    # Its state may differ, if the fit fell back to the textbook model.
     robot = identified.drive.spec
-    # A lidar slower than the usual control period brings nothing new before its next scan.
+    # With a slow lidar, the control period is the time between two scans.
     dt = identified.model.dt
     steps = max(CONTROL_PERIOD_S, 1.0 / lidar.rate) / dt
     model = SimulatorModel(
@@ -231,7 +230,7 @@ def generate(
 
 
 def _check_given(recording: object, shapes: object, sensors: object) -> None:
-    """Raises ConfigError for a recording, shapes or sensors of a wrong type."""
+    """Raises ConfigError if the recording, shapes or sensors have a wrong type."""
     recordings = list(recording) if isinstance(recording, list | tuple) else [recording]
     if not recordings or not all(isinstance(item, Recording) for item in recordings):
         needed = "a Recording, as read_recording(path) gives, or a list of them"
@@ -268,10 +267,9 @@ def footprint_shape(robot: RobotSpec) -> Circle | Polygon:
 
 
 def mount_lidar(robot: RobotSpec, name: str | None = None) -> LidarSpec:
-    """Returns a lidar, by name or file, mounted where the robot's file says.
+    """Returns a lidar, by name or file, mounted as in the robot's file.
 
-    By default it is the lidar that the robot's file names, or else that of the paper. Raises
-    ConfigError.
+    By default it is the lidar named in the robot's file, or else the paper's. Raises ConfigError.
     """
     spec = load_lidar(name or robot.lidar or DEFAULT_LIDAR)
     mount = robot.lidar_mount
@@ -280,9 +278,9 @@ def mount_lidar(robot: RobotSpec, name: str | None = None) -> LidarSpec:
 
 @lru_cache(maxsize=8)
 def builtin_model(robot: str, content: str = "") -> SimulatorModel:
-    """Returns a model of a shipped robot or a robot's YAML file, by its textbook kinematics.
+    """Returns a model with the textbook kinematics of a shipped robot or a robot's YAML file.
 
-    Each model is generated once; that of a file once for each `content`.
+    Each model is generated once; for a file, once for each `content`.
     """
     spec = load_robot(robot)
     if Path(robot, MODEL_FILE).is_file():
@@ -298,8 +296,8 @@ def open_model(
 ) -> SimulatorModel:
     """Opens a model: a shipped robot (`ackermann`), a folder (`./mine`), or a robot's YAML file.
 
-    A `lidar`, shipped or a YAML file, replaces the model's own. An open model is returned
-    unchanged.
+    A `lidar`, shipped or a YAML file, replaces the model's own. Without one, an open model is
+    returned unchanged.
     """
     if not isinstance(name, str | Path | SimulatorModel) or name == "":
         needed = "a shipped robot's name, a model's folder, a robot's YAML, or a SimulatorModel"
@@ -312,7 +310,7 @@ def open_model(
         return name
     if Path(name).is_dir() and name not in list_shipped(
         "robots"
-    ):  # never so for a Path
+    ):  # A Path never equals a name.
         return load_model(name)
     if "/" in (name := str(name)) and not name.endswith((".yaml", ".yml")):
         raise ModelError(f"{name}: no such folder; make one with `nics generate`.")
@@ -327,7 +325,7 @@ def open_model(
 
 
 def check_place(folder: str | Path) -> None:
-    """Raises ConfigError, before the work of a fit, if `save_model` can't write to a folder."""
+    """Raises ConfigError, before a long fit, if `save_model` could not write to a folder."""
     if str(folder) in list_shipped("robots"):
         raise ConfigError(
             f"{folder}: a shipped robot has this name; name another folder."
@@ -338,7 +336,7 @@ def check_place(folder: str | Path) -> None:
 def save_model(model: SimulatorModel, folder: str | Path) -> None:
     """Writes a model as a folder, completely or not at all; see `check_place`.
 
-    It replaces an older model with its report and pictures. Other files in the folder stay.
+    It replaces an older model with its report and pictures, and keeps other files in the folder.
     """
     owned = {*MODEL_FILES, files.SUMS, *DRAWN_FILES, *files.names_in_sums(Path(folder))}
     with files.write_whole_folder(folder, MODEL_FILE, owned.__contains__) as temporary:
@@ -363,11 +361,11 @@ def load_model(folder: str | Path) -> SimulatorModel:
         reason = f"key 'format' is {data.get('format')!r}, not {FORMAT!r}"
         raise ModelError(f"{path}: {reason}; generate the model anew.")
     files.check_sums(folder, MODEL_FILES, editable=MODEL_FILE)
-    # A file without the key was written before the key's default changed.
+    # A file without this key was written before its default changed.
     if isinstance(data.get("robot"), dict):
         data["robot"].setdefault("angular_is", "steering")
     file = validate(data, _File, str(path))
-    # A file must say its calibration; the defaults are for a robot without any offset.
+    # A file must state its calibration; the defaults are for a robot without any offset.
     for key in fields(Calibration):
         if key.name not in (*data["calibration"], *MOTORS):
             raise ConfigError(

@@ -14,7 +14,7 @@ ECCENTRICITY_SQUARED = 0.00669437999014
 
 
 def wrap_angle(angle: ArrayLike) -> Array:
-    """Brings angles (...) [rad] into [-pi, pi)."""
+    """Wraps angles (...) [rad] to [-pi, pi)."""
     wrapped = np.mod(np.asarray(angle, dtype=np.float64) + np.pi, 2.0 * np.pi) - np.pi
     # A tiny negative sum rounds up to 2 pi in np.mod, which would leave +pi here.
     return np.where(wrapped >= np.pi, -np.pi, wrapped)
@@ -32,7 +32,7 @@ def rotate(vector: ArrayLike, angle: ArrayLike) -> Array:
 
 
 def compose(pose: ArrayLike, relative: ArrayLike) -> Array:
-    """Returns the pose at `relative` as seen from `pose`; both (..., 3): x, y, heading."""
+    """Returns the pose that lies at `relative` in the frame of `pose`; (..., 3): x, y, heading."""
     pose = np.asarray(pose, dtype=np.float64)
     relative = np.asarray(relative, dtype=np.float64)
     position = pose[..., :2] + rotate(relative[..., :2], pose[..., 2])
@@ -41,7 +41,7 @@ def compose(pose: ArrayLike, relative: ArrayLike) -> Array:
 
 
 def between(pose: ArrayLike, target: ArrayLike) -> Array:
-    """Returns the pose `target` as seen from `pose`; `compose(pose, result) == target`."""
+    """Returns `target` in the frame of `pose`, (..., 3); `compose(pose, result) == target`."""
     pose = np.asarray(pose, dtype=np.float64)
     target = np.asarray(target, dtype=np.float64)
     position = rotate(target[..., :2] - pose[..., :2], -pose[..., 2])
@@ -77,7 +77,7 @@ def log(relative: ArrayLike) -> Array:
 
 
 def east_and_north(longitude: Array, latitude: Array) -> tuple[Array, Array]:
-    """Projects positions of WGS 84 [rad] onto the tangent plane at the first of them [m].
+    """Projects WGS 84 positions [rad] onto the tangent plane at the first position [m].
 
     The error is below a centimetre within 10 km.
     """
@@ -89,7 +89,7 @@ def east_and_north(longitude: Array, latitude: Array) -> tuple[Array, Array]:
 
 
 def has_crossing_edges(corners: Array) -> bool:
-    """True if edges of a closed outline (K, 2) touch or cross edges other than their neighbours."""
+    """Returns True if an edge of a closed outline (K, 2) touches or crosses a non-neighbour."""
     start = corners
     end = np.roll(corners, -1, axis=0)
     edge = end - start
@@ -97,7 +97,7 @@ def has_crossing_edges(corners: Array) -> bool:
         return True
 
     def find_sides(points: Array) -> Array:
-        """Returns the side (K, K) of each edge on which each point lies: 1 is left, -1 right."""
+        """Returns on which side of each edge each point lies (K, K): 1 left, -1 right, 0 on it."""
         to_point = points[None] - start[:, None]
         along = edge[:, None]
         cross = along[..., 0] * to_point[..., 1] - along[..., 1] * to_point[..., 0]
@@ -141,10 +141,10 @@ def compute_depths(points: Array, corners: Array) -> Array:
 
 @dataclass(frozen=True)
 class Bicycle:
-    """Geometry of a steered robot whose `base_link` is the middle of the unsteered axle."""
+    """Geometry of a steered robot with `base_link` in the middle of the unsteered axle."""
 
     wheelbase: float  # [m]
-    # True: speeds are those of the steered wheel, along its own direction
+    # True: speeds are those of the steered wheel, along its rolling direction
     front_drive: bool = False
 
     def twist(self, speed: Array, angle: Array) -> Array:
@@ -158,9 +158,9 @@ class Bicycle:
         return np.stack([forward, np.zeros_like(forward), yaw_rate], axis=-1)
 
     def command(self, twist: Array) -> tuple[Array, Array]:
-        """Returns speeds and steering angles (...) of twists (..., 3); zeros to turn in place."""
+        """Returns speeds, steering angles (...) for twists (..., 3); zeros for turns in place."""
         forward = twist[..., 0]
-        # of the front wheel, to the left
+        # lateral velocity of the front wheel, positive to the left
         sideways = self.wheelbase * twist[..., 2]
         sign = np.sign(forward)
         angle = np.arctan2(sideways * sign, np.abs(forward))

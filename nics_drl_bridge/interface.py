@@ -1,4 +1,4 @@
-"""Interfaces of what learns: RobotView, and Backend for whatever moves the robot."""
+"""The interface to a robot: RobotView for its data, Backend for whatever moves it."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,7 +14,7 @@ S_PER_NS = 1e-9
 
 @dataclass(frozen=True)
 class RobotView:
-    """All that a task or a policy may know about a robot, or about a batch of robots.
+    """Everything that a task or a policy may know about a robot or a batch of robots.
 
     The leading dimensions `...` are empty for one robot and (N, M) in a vector simulator. The stamp
     is that of the newest data; ages are at the time of the view. NaN is an unknown range.
@@ -27,7 +27,7 @@ class RobotView:
     stamp_s: float
     scan_age_s: float
     odom_age_s: float
-    # name of an additional sensor -> (..., S) its reading, see `lidar.sensor`
+    # name of an additional sensor -> reading (..., S), see `lidar.sensor`
     sensed: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
     sensed_age_s: float = 0.0  # maximum age of these readings
 
@@ -48,35 +48,35 @@ def stack_views(views: Sequence[RobotView]) -> RobotView:
 
 @dataclass(frozen=True)
 class Start:
-    """Start of an episode, whose scene and noise a simulator draws from its seed."""
+    """Start of an episode; a simulator draws its scene and noise from the seed."""
 
     seed: int
     pose: Array  # (3,) x [m], y [m], heading [rad] in `map`; (M, 3) for a team
 
 
 class BackendFacts(TypedDict, total=False):
-    """Facts that a backend alone knows; those that it does not know are left out."""
+    """Facts that only a backend knows; a backend leaves out those that it does not know."""
 
-    true_pose: Array  # (3,) x [m], y [m], heading [rad] in `map` now; (M, 3) of a team
-    true_collision: bool | NDArray[np.bool_]  # True after a contact; (M,) of a team
-    bodies: Array  # (K, 7) obstacles where they are now, see `sim.scenes.Scene`
+    true_pose: Array  # (3,) x [m], y [m], heading [rad] in `map` now; (M, 3) for a team
+    true_collision: bool | NDArray[np.bool_]  # True after a contact; (M,) for a team
+    bodies: Array  # (K, 7) obstacles at their present places, see `sim.scenes.Scene`
     randomisation: dict[str, Any]  # name -> value drawn for the episode, if any
-    # draws scenes for seeds (n,), where the world alone can't
+    # draws scenes for seeds (n,), if the world alone can't
     scenes: Callable[[ArrayLike], Any]
 
 
 @runtime_checkable
 class Backend(Protocol):
-    """Access to a robot: a simulator in process, or whatever is behind ROS 2 topics."""
+    """Access to a robot: an in-process simulator, or whatever is behind ROS 2 topics."""
 
     def reset(self, start: Start) -> RobotView:
         """Starts an episode and returns its first view."""
 
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
-        """Applies a command (C,) for one period; returns the view at its end, and `info`."""
+        """Applies a command (C,) for one period; returns the view at its end and `info`."""
 
     def facts(self) -> BackendFacts:
-        """Returns what only this backend knows at present; may be called at any time."""
+        """Returns what only this backend currently knows; may be called at any time."""
 
     def halt(self) -> None:
         """Stops the robot and ends the episode; may be called at any time, even when closed."""

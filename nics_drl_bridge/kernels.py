@@ -1,8 +1,8 @@
 """`@kernel`: compiles functions, caches their machine code on disk, and keeps it up to date.
 
-numba itself checks only the file that defines a function. Here, cached code is valid until its
-module, or any module that this one imports, directly or not, changes. Modules of this package
-count, and those in the folder of a user's own kernel.
+numba itself checks only the file that defines a function. Here, cached code is valid until that
+module changes, or any module that it imports, directly or not, from this package or from the
+folder of a user's own kernel.
 """
 
 import gc
@@ -33,16 +33,16 @@ from numba.np.arrayobj import make_array
 from nics_drl_bridge.status import REPEATED_S, STATUS
 
 PACKAGE = Path(__file__).parent
-PATIENCE_S = 2.0  # compiling that takes longer is announced on standard error
+PATIENCE_S = 2.0  # longer compiling is announced on standard error
 SECONDS_EACH = 0.5  # typical time to compile a kernel with its helpers [s]
-TRUSTED_AFTER = 5  # kernels after which this process's own pace counts as much
-KERNELS: list[Any] = []  # numba's dispatchers of all kernels imported so far
+TRUSTED_AFTER = 5  # kernels after which the measured pace weighs as much
+KERNELS: list[Any] = []  # numba dispatchers of all kernels imported so far
 _IMPORT = re.compile(
     r"^[ \t]*(?:from[ \t]+([.\w]+)[ \t]+import[ \t]+(\([^)]*\)|[^\n]*)|import[ \t]+([^\n]*))",
     re.MULTILINE,
 )
 _DEFAULTS = {name: option.default for name, option in Flags.options.items()}
-# numba calls it half a million times, 5 % of the compile time; this runs in C.
+# numba calls this half a million times, 5 % of the compile time; this version runs in C.
 Flags.values = lambda flags: _DEFAULTS | flags._values
 _ALIAS = re.compile(r"\bas\s+\w+")
 
@@ -57,13 +57,13 @@ def kernel(
 ) -> Callable[..., Any]:
     """Compiles a function with numba at its first call, or loads it from the cache.
 
-    It runs without the interpreter's lock; a division by zero gives inf or NaN.
+    It runs without the interpreter lock; a division by zero gives inf or NaN.
 
     Args:
         function: the function.
-        allocates: True if it, or a kernel that it calls, makes arrays or other objects.
-        contracts: True to fuse products and sums, with one rounding.
-        inline: True to inline the machine code into all callers, where measurements favour it.
+        allocates: True if it or a kernel that it calls allocates arrays or other objects.
+        contracts: True to fuse multiplications and additions, with one rounding.
+        inline: True to inline the machine code into all callers, if measured to be faster.
         view: True if it returns parts of its arguments' arrays; its source is inlined.
     """
     if function is None:
@@ -102,11 +102,11 @@ def prefetch(_typing: Any, array: Any, index: Any) -> Any:
 
 
 class _InnerLibrary(JITCodeLibrary):  # type: ignore[misc]
-    """Code that only kernels call; it is optimised and compiled as a part of theirs."""
+    """Code that only kernels call; it is optimised and compiled as part of its callers."""
 
     @property
     def codegen(self) -> Any:
-        """Keeps no environments, as nothing runs."""
+        """Returns the library itself, which keeps no environments because its code never runs."""
         return self
 
     def set_env(self, name: str, env: Any) -> None:
@@ -161,7 +161,7 @@ class _Compiler(Compiler):  # type: ignore[misc]
 
 
 class _Kernel(CPUDispatcher):  # type: ignore[misc]
-    """numba's dispatcher; makes the wrapper for Python, a third of compiling, only if needed."""
+    """numba's dispatcher; makes the Python wrapper, a third of compile time, only if needed."""
 
     def __init__(
         self, function: Callable[..., Any], targetoptions: dict[str, Any]
@@ -179,7 +179,7 @@ class _Kernel(CPUDispatcher):  # type: ignore[misc]
         return any(cache.is_warm for cache in (self._cache, self._inner_cache))
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
-        """Is called by numba when it compiles a kernel that calls this one."""
+        """Called by numba when it compiles a kernel that calls this one."""
         before = self._inner, self._cache
         self._inner = True
         self._cache = self._inner_cache
@@ -199,7 +199,7 @@ class _Kernel(CPUDispatcher):  # type: ignore[misc]
             return super().compile(sig)
 
     def add_overload(self, cres: Any) -> None:
-        if not self._inner:  # Python never sees what only kernels call
+        if not self._inner:  # Python may call it
             super().add_overload(cres)
             for env in cres._find_referenced_environments():
                 cres.library.codegen.set_env(env.env_name, env)
@@ -213,14 +213,14 @@ class _Index(IndexDataCacheFile):  # type: ignore[misc]
     def _load_index(self) -> dict[Any, Any]:
         try:
             return dict(super()._load_index())
-        except (AttributeError, ImportError):  # the class of an argument is gone
+        except (AttributeError, ImportError):  # an argument's class no longer exists
             return {}
 
     def save(self, key: Any, data: Any) -> None:
-        """Saves data with their version and key.
+        """Saves data with its version and key.
 
-        numba first enters a number into its index. Two processes may choose the same number, and a
-        process that is killed in between leaves the number pointing to older data.
+        numba first enters a file number into its index. Two processes may choose the same number,
+        and a process killed before it writes the file leaves the number pointing to older data.
         """
         super().save(key, (self._version, key, data))
 
@@ -229,7 +229,7 @@ class _Index(IndexDataCacheFile):  # type: ignore[misc]
         try:
             version, owner, data = super().load(key)
         except (AttributeError, ImportError, TypeError, ValueError):
-            return None  # there are none, or another version wrote them
+            return None  # nothing is cached, or another version wrote it
         return data if (version, owner) == (self._version, key) else None
 
 
@@ -238,11 +238,11 @@ class _Cache(FunctionCache):  # type: ignore[misc]
 
     def __init__(self, function: Callable[..., Any], kind: str = "") -> None:
         super().__init__(function)
-        # Without its line number, a function that moved replaces its old file.
+        # Without the line number in the name, a function that moved overwrites its old file.
         name = re.sub(r"-\d+(\.py\d+\w*)$", rf"{kind}\1", self._impl.filename_base)
         stamp = compute_digest(Path(function.__code__.co_filename))
         self._cache_file = _Index(self._cache_path, name, stamp)
-        # It is compared before the types are unpickled: their classes may have been renamed.
+        # The version is compared before types are unpickled: their classes may have been renamed.
         self._cache_file._version += stamp
 
     @property
@@ -256,7 +256,7 @@ class _InnerCache(_Cache):
 
 @cache
 def compute_digest(module: Path) -> str:
-    """Returns the SHA-256 of a module and of all its own imports, direct or not, no libraries."""
+    """Returns the SHA-256 of a module and its imports, direct or not, without libraries."""
     files = set[Path]()
     left = [module]
     while left:
@@ -275,7 +275,7 @@ def _read(file: Path) -> str:
 
 @cache
 def imports_of(file: Path) -> tuple[Path, ...]:
-    """Returns the modules of this package, or of its own folders, that a file imports."""
+    """Returns the modules that a file imports from this package or its own folder."""
     is_own = file.is_relative_to(PACKAGE)
     top = next(
         folder for folder in file.parents if not (folder / "__init__.py").is_file()
@@ -305,14 +305,14 @@ def imports_of(file: Path) -> tuple[Path, ...]:
 
 
 def measure_pace_s(compiled: int, spent_s: float) -> float:
-    """Returns the time per kernel [s], from those that were compiled so far."""
+    """Returns the time per kernel [s], estimated from the kernels compiled so far."""
     return (TRUSTED_AFTER * SECONDS_EACH + spent_s) / (TRUSTED_AFTER + compiled)
 
 
 def estimate(left: int, compiled: int, spent_s: float) -> str:
     """Describes how long compiling will take: up to `left` kernels, because some may be unused."""
     what = "compiling, once on this machine"
-    if left < 1:  # kernels that were compiled before, but for other types of arguments
+    if left < 1:  # only kernels that were already compiled for other argument types
         return f"{what}: the last kernels"
     seconds = max(1, round(left * measure_pace_s(compiled, spent_s)))
     kernels = "1 kernel" if left == 1 else f"{left} kernels"
@@ -323,9 +323,9 @@ class _Compiling(event.Listener):  # type: ignore[misc]
     """Counts what this process compiles, and tells the user how long it will take."""
 
     def __init__(self) -> None:
-        self.count = 0  # compiled functions, one for each set of argument types
+        self.count = 0  # compiled functions, one per set of argument types
         self.cpu_s = 0.0  # CPU time that compiling took
-        self.quiet = False  # True: nothing is to be said
+        self.quiet = False  # True: report nothing
         self.patience_s = PATIENCE_S
         self.tell: Callable[[str], None] = STATUS.show
         self._told = -math.inf
@@ -339,7 +339,7 @@ class _Compiling(event.Listener):  # type: ignore[misc]
             if self._depth == 0:
                 self._begun, self._begun_cpu = time.monotonic(), time.thread_time()
                 self._collects = gc.isenabled()
-                gc.disable()  # it would take a tenth of the time, for next to no garbage
+                gc.disable()  # It would take a tenth of the time and free almost nothing.
             self._depth += 1
             spent = self._spent + time.monotonic() - self._begun
             silent = time.monotonic() - self._told

@@ -3,8 +3,8 @@
 No state is kept, so a world draws the same numbers in any batch and thread. SplitMix64 (Steele,
 Lea, Flood 2014) mixes the counters; Box-Muller makes normals. Each purpose has a stream of its own.
 
-Thousands of draws at once, as for the beams of a scan, share one `key`. A uniform draw then takes
-`bits`, and `RUN` normal draws take one `run`. Neither branches, so that LLVM vectorises them.
+Thousands of draws at once, as for the beams of a scan, share one `key`. A uniform draw then uses
+`bits`, and `RUN` normal draws use one `run`. Neither branches, so LLVM can vectorise them.
 """
 
 import math
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from nics_drl_bridge.kernels import kernel
 
 Array = NDArray[np.float64]
-# signs of a run's draws, and the offsets of their two numbers in the pool
+# signs of a run's draws, and the two offsets of their numbers in the pool
 Run = tuple[np.uint32, np.uintp, np.uintp]
 
 (
@@ -47,7 +47,7 @@ def _mix(z: np.uint64) -> np.uint64:
 
 
 def _pool() -> NDArray[np.int16]:
-    """Returns normally distributed integers in mixed order; PER_STD times two of them is a draw."""
+    """Returns normal integers, shuffled; PER_STD times the sum of two is about standard normal."""
     maximum = math.ceil(3.3 / PER_STD)
     values = np.arange(-maximum, maximum + 1)
     cumulative = [0.5 + 0.5 * math.erf((k + 0.5) * PER_STD) for k in values[:-1]]
@@ -63,7 +63,7 @@ POOL = _pool()
 
 @kernel(allocates=True)
 def uniform(seed: int, stream: int, counter: int) -> float:
-    """A draw from the uniform distribution over [0, 1)."""
+    """Returns a draw from the uniform distribution over [0, 1)."""
     return float(uniform_of(source(seed, stream), counter))
 
 
@@ -76,21 +76,21 @@ def source(seed: int, stream: int) -> np.uint64:
 
 @kernel(allocates=True)
 def uniform_of(source: np.uint64, counter: int) -> float:
-    """Makes the same draw as `uniform`, from the `source` of its seed and stream."""
+    """Returns the same draw as `uniform`, from the `source` of its seed and stream."""
     z = _mix(source + (np.uint64(counter) + np.uint64(1)) * GOLDEN)
     return float(z >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
 
 @kernel(allocates=True)
 def normal(seed: int, stream: int, counter: int) -> float:
-    """A draw from the standard normal distribution."""
+    """Returns a draw from the standard normal distribution."""
     radius = math.sqrt(-2.0 * math.log(1.0 - uniform(seed, stream, 2 * counter)))
     return radius * math.cos(2.0 * math.pi * uniform(seed, stream, 2 * counter + 1))
 
 
 @kernel(allocates=True)
 def key(seed: int, stream: int, counter: int) -> np.uint64:
-    """Returns the 64-bit key of many draws."""
+    """Returns a 64-bit key for many draws."""
     z = source(seed, stream) + (np.uint64(counter) + np.uint64(1)) * GOLDEN
     return np.uint64(_mix(z))
 
@@ -115,7 +115,7 @@ def share_of(random_bits: np.uint32) -> np.float32:
 
 @kernel(inline=True)
 def run(key: np.uint64, k: int) -> Run:
-    """Returns the k-th run of normal draws of a key: their signs, and two offsets in the pool."""
+    """Returns the k-th run of normal draws of a key: their signs and two offsets in the pool."""
     z = _mix(key + np.uint64(k) * GOLDEN)
     offset = (z >> np.uint64(32)) & np.uint64(POOL_SIZE - 1)
     second_offset = z >> np.uint64(48)
@@ -126,8 +126,8 @@ def run(key: np.uint64, k: int) -> Run:
 def normal_of(run: Run, j: int) -> np.float32:
     """Returns the j-th draw of a run; times PER_STD it is standard normal, and below 6.2.
 
-    The sum of two normal numbers from a pool (Wallace 1996) is normal. Each draw has a sign of its
-    own, so that no two are correlated.
+    The sum of two normal numbers from a pool (Wallace 1996) is normal. Each draw has its own sign,
+    so that no two draws are correlated.
     """
     signs, offset, second_offset = run
     first = POOL[offset + np.uintp(j)]
@@ -139,7 +139,7 @@ def normal_of(run: Run, j: int) -> np.float32:
 
 @kernel(allocates=True)
 def episode_seed(seed: int, number: int) -> np.int64:
-    """Returns the seed of an env's episode: first the env's own seed, then one below 2**53."""
+    """Returns the seed of an env's episode: the env's own seed, later draws below 2**53."""
     if number == 0:
         return np.int64(seed)
     return np.int64(uniform(seed, EPISODE_STREAM, number) * 9007199254740992.0)
@@ -155,7 +155,10 @@ def uniform_between(
     first: int,
     stride: int,
 ) -> None:
-    """Draws out (n, M, Q) in [low, high) (Q,), by seeds (n,) and counters first + m stride + q."""
+    """Fills out (n, M, Q) with draws in [low, high) (Q,), by seeds (n,) and counters.
+
+    The counters are first + m stride + q.
+    """
     for n in range(out.shape[0]):
         for m in range(out.shape[1]):
             for q in range(out.shape[2]):

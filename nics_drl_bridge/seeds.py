@@ -16,7 +16,7 @@ _SHORT.maxlong = _SHORT.maxstring = _SHORT.maxother = 40
 def check_seeds(
     seeds: ArrayLike | Any, maximum: int = GREATEST_SEED
 ) -> NDArray[np.int64]:
-    """Returns seeds as (n,); ConfigError if one is negative, too large or not an integer."""
+    """Returns seeds (n,). Raises ConfigError if one is negative, too large or not an integer."""
     if (
         isinstance(seeds, np.ndarray)
         and seeds.dtype == np.int64

@@ -1,11 +1,11 @@
-"""The status line, which reports long work; on a terminal, each text replaces the last."""
+"""The status line for long work; on a terminal, each text replaces the previous one."""
 
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-UPDATED_S = 0.5  # time between two texts where they replace each other [s]
-REPEATED_S = 20.0  # time between two texts where each is a line of its own [s]
+UPDATED_S = 0.5  # time between two texts that replace each other [s]
+REPEATED_S = 20.0  # time between two texts on lines of their own [s]
 CLEAR_LINE = "\r\x1b[K"
 
 
@@ -13,12 +13,12 @@ class StatusLine:
     """A line on standard error, or in a progress bar that shows it instead."""
 
     def __init__(self) -> None:
-        self._bars: list[Callable[[str], None]] = []  # the innermost is the last
+        self._bars: list[Callable[[str], None]] = []  # innermost last
         self._is_shown = False  # True while a text stands on the terminal's last line
 
     @property
     def in_place(self) -> bool:
-        """True if a text replaces the one before."""
+        """True if each text replaces the previous one."""
         return bool(self._bars) or sys.stderr.isatty()
 
     @property
@@ -27,7 +27,7 @@ class StatusLine:
         return UPDATED_S if self.in_place else REPEATED_S
 
     def show(self, text: str) -> None:
-        """Shows a text in place of the last one, or as a line where nothing can be replaced."""
+        """Shows a text in place of the previous one, or on a new line if it can't be replaced."""
         if self._bars:
             self._bars[-1](text)
         elif sys.stderr.isatty():
@@ -46,7 +46,7 @@ class StatusLine:
 
     @contextmanager
     def shown_by(self, bar: Callable[[str], None]) -> Iterator[None]:
-        """Makes a progress bar, which owns the terminal's line, show the texts of a block."""
+        """Lets a progress bar, which owns the terminal's line, show the texts of a block."""
         self._bars.append(bar)
         try:
             yield

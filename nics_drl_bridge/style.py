@@ -25,7 +25,7 @@ GOAL = ORANGE
 OTHER = "#8d99ae"
 DARK = "#333333"
 EDGE = "#c5cbd3"
-# markers of `SERIES`, for pictures without colours
+# markers for `SERIES`, for prints without colours
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 RC: dict[Any, Any] = {
     "axes.axisbelow": True,
@@ -49,19 +49,19 @@ RC: dict[Any, Any] = {
     "ytick.color": DARK,
     "ytick.labelsize": 9.0,
 }
-LETTERS_PER_IN = 10.5  # of a title
-LINE_IN = 0.19  # height of a line of a title or a legend [inch]
-# around a panel of a fixed size [inch]: ticks and label of y
+LETTERS_PER_IN = 10.5  # in a title
+LINE_IN = 0.19  # line height in titles and legends [inch]
+# margins around a panel of a fixed size [inch]; left: ticks and label of y
 LEFT_IN = 0.85
 RIGHT_IN = 0.2
-BELOW_IN = 0.55  # the same: ticks and label of x
+BELOW_IN = 0.55  # ticks and label of x
 ABOVE_IN = 0.14  # between the title and the panel
-TITLE_LINES = 2  # for which there is room above a panel of a fixed size
+TITLE_LINES = 2  # minimum number of lines reserved above a panel of a fixed size
 LegendPlace = Literal["outside upper center", "upper center"]
 
 
 class Panel(NamedTuple):
-    """Size of axes without what is written around them [inch]."""
+    """Size of axes without the text around them [inch]."""
 
     width: float
     height: float
@@ -70,7 +70,7 @@ class Panel(NamedTuple):
 
 @contextmanager
 def apply_style() -> Iterator[None]:
-    """Applies the style to what is drawn in a block, or in a function as its decorator."""
+    """Applies the style to everything drawn in a block, or in a decorated function."""
     with mpl.rc_context(RC):
         yield
 
@@ -79,9 +79,9 @@ def apply_style() -> Iterator[None]:
 def make_panels(
     rows: int, columns: int, size: tuple[float, float] | None = None, **options: Any
 ) -> tuple[Figure, list[Axes]]:
-    """Returns a figure of a size [inch], and its axes in rows.
+    """Returns a figure of a size [inch] and its axes, row by row.
 
-    Without a size, `render_png` gives it that of its panels.
+    Without a size, `render_png` sizes it to fit its panels.
     """
     figure = Figure(figsize=size, layout="constrained")
     return figure, list(
@@ -102,7 +102,7 @@ def count_legend_rows(labels: Sequence[str], width: float) -> int:
 
 
 def compute_width(panel: Panel, columns: int = 1) -> float:
-    """Returns the width of a figure of panels of a fixed size [inch]."""
+    """Returns the width [inch] of a figure whose panels have a fixed size."""
     return columns * (panel.left + panel.width + RIGHT_IN)
 
 
@@ -113,17 +113,17 @@ def render_png(
     panel: Panel | None = None,
     least_rows: int = 0,
 ) -> bytes:
-    """Renders a figure as a PNG, without empty axes, with the legend of one of them above.
+    """Renders a figure as a PNG, with empty axes hidden and the legend of one of the axes on top.
 
-    Titles are broken into lines that fit above their axes.
+    Titles are wrapped to the width of their axes.
 
     Args:
         figure: the figure.
         legend: axes whose legend is shown.
-        panel: size of each of the axes in a grid [inch], whatever is written around them; the size
-            of the figure follows. By default the axes fill the figure.
-        least_rows: number of rows of a legend for which there is room beside such panels, even if
-            the figure has fewer: it keeps figures side by side alike.
+        panel: size of each of the axes in a grid [inch], without the text around them; determines
+            the size of the figure. By default the axes fill the figure.
+        least_rows: minimum number of legend rows to reserve above such panels, so that figures
+            placed side by side get the same height.
     """
     if panel is not None:
         _, columns = _count_grid(figure)
@@ -142,7 +142,7 @@ def render_png(
     if legend is not None:
         handles, labels = legend.get_legend_handles_labels()
         width = figure.get_figwidth()
-        fills = panel is None  # then the axes make way for the legend
+        fills = panel is None  # then the axes make room for the legend
         place: LegendPlace = "outside upper center" if fills else "upper center"
         if labels:
             figure.legend(
@@ -165,7 +165,7 @@ def _count_grid(figure: Figure) -> tuple[int, int]:
 
 
 def _place_panels(figure: Figure, panel: Panel, rows_of_legend: int) -> None:
-    """Gives a figure its height, and each of its axes the size of a panel [inch]."""
+    """Gives a figure its size, and each of its axes the size of a panel [inch]."""
     rows, columns = _count_grid(figure)
     lines = [len(axes.get_title().splitlines()) for axes in figure.axes]
     above = ABOVE_IN + LINE_IN * max(TITLE_LINES, *lines)

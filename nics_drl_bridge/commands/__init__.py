@@ -1,1 +1,1 @@
-"""Commands of `nics`; each imports what it needs when it runs, so that the others start fast."""
+"""Commands of `nics`; each imports its libraries only when it runs, so that others start fast."""

@@ -41,10 +41,10 @@ from nics_drl_bridge.errors import LONGEST, shorten
 
 
 class OneWordForARobot(TyperGroup):
-    """Commands whose `--robot` and `--model` are one option: two values for it are refused."""
+    """Commands for which `--robot` and `--model` are the same option: giving both is refused."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parses the words of a command line; UsageError for two robots by two words."""
+        """Parses the words of a command line. Raises UsageError if both options are given."""
         robots = [value for word in ROBOT_OPTIONS for value in read_option(word, args)]
         if len(set(robots)) > 1:
             names = " and ".join(map(repr, robots))
@@ -65,7 +65,7 @@ app = typer.Typer(
     help="From a recording of a robot to a fast simulator, and back to the robot over ROS 2.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    rich_markup_mode=None,  # which takes units such as [m/s] for markup
+    rich_markup_mode=None,  # would read units such as [m/s] as markup
 )
 
 
@@ -123,7 +123,7 @@ for command in (
     install,
 ):
     app.command(command.__name__.rstrip("_"))(command)
-# Their arguments may begin with a minus sign.
+# The arguments of these two may begin with a minus sign.
 app.command(context_settings={"ignore_unknown_options": True})(up)
 app.command(context_settings={"ignore_unknown_options": True})(goal)
 app.add_typer(policy, name="policy")
@@ -134,7 +134,7 @@ complete(app)
 
 
 def main() -> None:
-    """Entry point of the executable; a wrong option also gives one sentence and exit code 2."""
+    """Runs the command line; a wrong option, too, gives one sentence and exit code 2."""
     try:
         code = app(prog_name="nics", standalone_mode=False)
     except typer.Abort as abort:
@@ -149,11 +149,13 @@ def main() -> None:
         )  # stdout is flushed at exit
         raise SystemExit(1) from None
     except Exception as error:
-        if not hasattr(error, "format_message"):  # no option error of click or typer
+        if not hasattr(
+            error, "format_message"
+        ):  # not an option error of click or typer
             raise
         if (
             message := error.format_message().strip()
-        ):  # otherwise its help has been shown
+        ):  # empty if the help has been shown
             message = shorten(
                 message.rstrip(".?").replace("Value error, ", ""), LONGEST
             )

@@ -1,4 +1,4 @@
-"""Conditions under which the episodes of an evaluation are driven, alike in every place."""
+"""Conditions of the episodes of an evaluation, the same in every place."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -11,30 +11,30 @@ from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
 
 @dataclass(frozen=True)
 class Conditions:
-    """Conditions of an evaluation; None leaves the model's lidar, or randomisation and gate out."""
+    """Conditions of an evaluation; by default the model's lidar, no randomisation and no gate."""
 
-    lidar: str | None = None  # shipped lidar or file, instead of the model's
-    # shipped one or file, which draws each episode's numbers
+    lidar: str | None = None  # shipped lidar or YAML file; None: the model's
+    # shipped randomisation or YAML file, drawn for each episode
     randomisation: str | None = None
-    # limits, shipped or a file, of a gate between policy and robot
+    # limits of a gate between policy and robot: shipped, or a YAML file
     gate: str | None = None
-    # time limit of an episode; None: that of policies, robot and world
+    # time limit of an episode [steps]; None: from policies, robot and world
     steps: int | None = None
     task: Mapping[str, Any] = field(
         default_factory=dict
-    )  # options, instead of the policy's own
-    # path/to/file.py:ClassName of a policy's task, if it is not shipped
+    )  # overrides the policy's task options
+    # path/to/file.py:ClassName of the policy's task, if it is not shipped
     kind: str | None = None
 
     @property
     def ranges(self) -> Randomisation | None:
-        """The ranges that each episode draws from. Raises ConfigError."""
+        """Ranges that each episode draws from. Raises ConfigError."""
         if self.randomisation is None:
             return None
         return load_randomisation(self.randomisation)
 
     def model(self, name: str, folder: Path) -> tuple[SimulatorModel, str]:
-        """Opens a model and returns its name; with another lidar, it is saved below a folder."""
+        """Opens a model; returns it and its name. Saves it below a folder if the lidar differs."""
         model = open_model(name, self.lidar)
         if self.lidar is None:
             return model, name

@@ -24,20 +24,20 @@ from nics_drl_bridge.status import STATUS
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
 WIDEST = 10_000
-# silence before the first line about work, and between lines
+# time before the first progress line, and between lines [s]
 PATIENCE_S = 2.0
 REPEATED_S = 10.0
-# what is done, how much of it, and of how much (0: unknown)
+# what is being done, amount done, total (0: unknown)
 Tell = Callable[[str, int, int], None]
 
 
 def print_line(as_json: bool, text: str, **facts: Any) -> None:
-    """Prints a text, or its facts as one JSON object."""
+    """Prints a text or, as JSON, the facts behind it."""
     typer.echo(format_json(facts) if as_json else text)
 
 
 def complete_names(*kinds: str, also: Sequence[str] = ()) -> Callable[[str], list[str]]:
-    """Makes the shell completion of an option that takes a name in `config/KIND`, or a path."""
+    """Returns the shell completion of an option that takes a name in `config/KIND` or a path."""
 
     def complete(incomplete: str) -> list[str]:
         from nics_drl_bridge.config import list_shipped
@@ -59,7 +59,7 @@ WORLDS = complete_names("worlds", "world_sets", also=("barn",))
 POLICIES = complete_names(
     "policies", also=("dynamic_window", "mppi", "random", "straight")
 )
-ROBOT_OPTIONS = ("--robot", "--model")  # two words for one option, of every command
+ROBOT_OPTIONS = ("--robot", "--model")  # synonyms in every command
 RobotOption = Annotated[
     str,
     Option(
@@ -152,13 +152,13 @@ HARDWARE_OPTIONS = (
     "goal_frame",
     "confirm_beyond",
 )
-# command -> option -> options of which it needs one to have an effect
+# command -> option -> options, at least one of which it requires
 NEEDED: dict[str, dict[str, tuple[str, ...]]] = {
     "evaluate": dict.fromkeys(HARDWARE_OPTIONS, ("hardware",))
     | {"topic": ("shadow",), "ahead": ("shadow",), "goal": ("hardware", "shadow")},
     "watch": {"topic": ("bag",), "namespace": ("ros",), "episodes": ("record",)},
 }
-# command -> option -> options that have no effect beside it
+# command -> option -> options that can't be combined with it
 APART: dict[str, dict[str, tuple[str, ...]]] = {
     "evaluate": {
         "hardware": ("places", "shadow", "lidar", "randomisation", "gate"),
@@ -172,7 +172,7 @@ APART: dict[str, dict[str, tuple[str, ...]]] = {
 
 
 def check_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Makes a command refuse numbers that are not finite, and options that would do nothing.
+    """Makes a command refuse numbers that are not finite and options that would have no effect.
 
     Its user errors are reported by `report_in_one_sentence`.
     """
@@ -220,7 +220,7 @@ def _format_option(name: str) -> str:
 
 
 def parse_roles(options: Sequence[str]) -> dict[str, str]:
-    """Parses options ROLE=TOPIC for playing a bag into role -> topic. Raises ConfigError."""
+    """Parses the options ROLE=TOPIC of a bag; returns role -> topic. Raises ConfigError."""
     from nics_drl_bridge.middleware.playback import TYPES
 
     roles = {}
@@ -277,7 +277,7 @@ def tell_replaced(file: Path) -> None:
 
 @contextmanager
 def needs_ros(what: str) -> Iterator[None]:
-    """Turns an import of the nodes that fails without ROS 2 into a one-sentence error."""
+    """Turns the ImportError of the nodes without ROS 2 into a ConfigError of one sentence."""
     try:
         yield
     except ModuleNotFoundError as error:
@@ -287,7 +287,7 @@ def needs_ros(what: str) -> Iterator[None]:
 
 
 def format_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Formats a table; without a terminal no cell is cut or wrapped."""
+    """Formats a table; without a terminal, cells are neither cut nor wrapped."""
     from rich.box import SIMPLE
     from rich.console import Console
     from rich.table import Column, Table
@@ -295,7 +295,7 @@ def format_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
     table = Table(
         *(Column(Text(head)) for head in heads), box=SIMPLE, pad_edge=False
-    )  # no markup
+    )  # Text, not str: no markup
     for row in rows:
         table.add_row(*(Text(cell, overflow="fold") for cell in row))
     console = Console()
@@ -309,7 +309,7 @@ def format_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 @contextmanager
 def show_progress(begin: str = "starting") -> Iterator[Tell]:
-    """Yields a function that updates a progress bar, or, without a terminal, occasional lines."""
+    """Yields a function that updates a progress bar or, without a terminal, prints some lines."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 

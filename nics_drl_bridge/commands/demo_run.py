@@ -1,4 +1,4 @@
-"""The parts of the demo in sequence, and its report: one page with all results."""
+"""Runs the parts of the demo in sequence and writes its report, one page with all results."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -53,36 +53,34 @@ from nics_drl_bridge.sim.world_set import AnyWorld
 
 RECORDING_SEED = 1
 TRAINING_SEED = 0
-MANY = 500  # episodes of the evaluation in the fast simulator
+MANY = 500  # number of evaluation episodes in the fast simulator
 BASELINE = "dynamic_window"
 AS_IT_IS = "as it is"
 PERTURBED = "mild"
 LINES = 10  # number of progress reports of a training
-ARRIVE_S = 90.0  # time that the robot may take [s]; its policy may have to be compiled
-# of the demo's gate, from zero to greatest command, rate
+ARRIVE_S = 90.0  # time for the robot to arrive [s]; includes compiling
+# ramp times of the demo's gate [s]: from zero to the maximum command, to the maximum rate
 FULL_COMMAND_S = 0.3
 FULL_RATE_S = 0.05
-GOOD = 0.9  # share of successes below which the verdict doubts a policy
-PANELS = 9  # maximum number of episodes that are drawn
+GOOD = 0.9  # success rate below which the verdict doubts a policy
+PANELS = 9  # maximum number of drawn episodes
 R = TypeVar("R")
 
 
 @dataclass(frozen=True)
 class DemoPlan:
-    """Plan of a demo."""
+    """What a demo uses, and where it writes."""
 
     out: Path  # output folder
-    # name or YAML file, as the world; None: as the recording tells
+    # name or YAML file, as for the world; None: taken from the recording
     robot: str | None = None
     world: str = defaults.WORLD
-    # of a drive; None makes one with the robot's textbook kinematics
+    # file of a drive; None: record one with the robot's textbook kinematics
     recording: Path | None = None
-    episodes: int = (
-        defaults.DEMO_EPISODES
-    )  # number of episodes, in process and again over DDS
-    # a policy file or a name, to drive with instead of training one
+    episodes: int = defaults.DEMO_EPISODES  # in process, and as many over DDS
+    # policy file or name to use instead of training one
     policy: str | None = None
-    # environment steps of the training; None: as in `demo.yaml`
+    # environment steps of the training; None: from `demo.yaml`
     train_steps: int | None = None
 
     @property
@@ -93,7 +91,7 @@ class DemoPlan:
 
 @dataclass(frozen=True)
 class Learned:
-    """The policy of the demo by file or name, its origin in a sentence, and its training curve."""
+    """The demo's policy (file or name), its origin as a sentence, and its training curve."""
 
     policy: str
     how: str
@@ -102,23 +100,21 @@ class Learned:
 
 @dataclass(frozen=True)
 class DemoEpisodes:
-    """Episodes of the demo: of the evaluation, and the same ones in process and over DDS."""
+    """Results of the evaluation, and the same episodes driven in process and over DDS."""
 
-    summaries: Mapping[str, Summary]  # of the world as it is, and perturbed
+    summaries: Mapping[str, Summary]  # for the world as it is and perturbed
     here: Sequence[Episode]  # in process
     there: Sequence[Episode]  # over DDS
-    live: (
-        Episode | None
-    )  # deployed; None without ROS 2, with which `there` is empty, too
+    live: Episode | None  # deployed; without ROS 2 None, and `there` is empty
 
     @property
     def summary(self) -> Summary:
-        """Of the world as it is."""
+        """Summary for the world as it is."""
         return self.summaries[AS_IT_IS]
 
 
 def run(plan: DemoPlan, say: Say) -> str:
-    """Runs all parts, whose processes have then ended; returns the last line. BridgeError."""
+    """Runs all parts and ends their processes; returns the last line. Raises BridgeError."""
     if not (topics := find_spec("rclpy") is not None):
         say(f"in process alone: the world 'dds' {MISSING_ROS.format(module='rclpy')}")
     took: dict[str, float] = {}
@@ -141,9 +137,7 @@ def run(plan: DemoPlan, say: Say) -> str:
         plan.out / paths,
         pictures.draw_trajectories({LABELS[FAST]: here}, world, radius),
     )
-    say(
-        f"  the paths are drawn in {plan.out / paths}"
-    )  # while the report takes a while
+    say(f"  the paths are drawn in {plan.out / paths}")  # the report takes a while
     there = timed("driving over DDS", _drive, DDS, learned.policy) if topics else []
     deployment = (
         model,
@@ -173,7 +167,7 @@ def run(plan: DemoPlan, say: Say) -> str:
 
 
 def _record_or_read(plan: DemoPlan, say: Say) -> tuple[RobotSpec, Recording]:
-    """Reads the plan's drive with its robot, or records one of a textbook robot."""
+    """Reads the plan's drive and its robot, or records a drive of a textbook robot."""
     if plan.recording is not None:
         return read_robot_and_drive(plan.recording, plan.robot, TopicRoles(), None)
     robot = load_robot(plan.robot or DEFAULT_ROBOT)
@@ -186,7 +180,7 @@ def _record_or_read(plan: DemoPlan, say: Say) -> tuple[RobotSpec, Recording]:
 def _generate(plan: DemoPlan, say: Say) -> tuple[SimulatorModel, Identified]:
     world, (robot, recording) = load_world(plan.world), _record_or_read(plan, say)
     say(f"generating a simulator of the robot {robot.name!r} from {recording.source}")
-    # The demo has to steer even if the drive never did; the report names the assumptions.
+    # The demo must steer even if the drive did not; the report lists the assumptions.
     model, identified = generate(
         recording, robot, mount_lidar(robot), world.shapes, assume=True
     )
@@ -196,7 +190,7 @@ def _generate(plan: DemoPlan, say: Say) -> tuple[SimulatorModel, Identified]:
 
 
 def learn(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
-    """Trains a policy, unless one is named or a module is missing. Raises BridgeError."""
+    """Trains a policy, unless one is given or a module is missing. Raises BridgeError."""
     if plan.policy is not None:
         open_policy(plan.policy, model)
         return Learned(
@@ -211,7 +205,7 @@ def learn(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
         and find_spec("onnxruntime")
         and find_spec("onnx")
     ):
-        with suppress(PolicyError):  # a shipped one may not fit
+        with suppress(PolicyError):  # a shipped policy may not fit
             open_policy(model.robot.name, model)
             policy = model.robot.name
     say(
@@ -224,7 +218,7 @@ def learn(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
 
 
 def derive_settings(plan: DemoPlan, model: SimulatorModel) -> Fitted:
-    """Settings of the demo's training, in the plan's simulator and world."""
+    """Returns the demo's training settings, adapted to the plan's simulator and world."""
     chosen = load_training("demo")
     worlds = {plan.world: chosen.num_envs}
     steps = plan.train_steps or chosen.steps
@@ -336,7 +330,7 @@ def _deploy(
         "policy_node": {**model_parameter, "policy": policy, "goal": goal},
     }
     say(f"deploying {', '.join(nodes)} in real time")
-    # The policy stops where it believes the goal is; its odometry drifts.
+    # The policy stops where it believes the goal is, and its odometry drifts.
     near = Navigation(model.robot, model.lidar).goal_radius + 0.1
     arrived, path = _watch_episode(
         nodes, plan.out / "logs" / "realtime", goal, near, say
@@ -402,7 +396,7 @@ def make_sections(
     learned: Learned,
     episodes: DemoEpisodes,
 ) -> list[tuple[str, Sequence[str]]]:
-    """Sections of the report, the verdict first, each a heading and HTML blocks."""
+    """Returns the sections of the report, verdict first: a heading and HTML blocks each."""
     return [
         ("Verdict", _make_verdict(plan, learned, identified, episodes)),
         ("Paths in the world", _format_episodes(plan, model, episodes)),

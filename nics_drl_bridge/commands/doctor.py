@@ -1,4 +1,4 @@
-"""`nics doctor` and `nics explain`: what is wrong with a robot, and why its gate stopped it."""
+"""`nics doctor` and `nics explain`: find a robot's faults, and explain why its gate stopped it."""
 
 from dataclasses import asdict
 from pathlib import Path

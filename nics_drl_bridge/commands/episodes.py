@@ -1,4 +1,4 @@
-"""The same episodes in process, over DDS, in MuJoCo, and on the vehicle, compared as in Fig. 7."""
+"""Drives the same episodes in process, over DDS, in MuJoCo and on the vehicle, as in Fig. 7."""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -56,7 +56,7 @@ EVALUATION = "evaluation.json"
 GATE = "command_gate"
 RAW = "cmd_vel_raw"
 ARM_S = 60.0
-# time that a node may take to start [s]; its kernels may have to be compiled
+# time for a node to start [s]; it may have to compile its kernels
 START_S = 180.0
 PANELS = 6
 HEADS = (
@@ -88,7 +88,7 @@ def drive_in(
     say: Say = lambda _: None,
     conditions: Conditions = NO_CONDITIONS,
 ) -> list[Episode]:
-    """Drives episodes in one of `PLACES`, whose node, if any, has then ended. BridgeError."""
+    """Drives episodes in one of `PLACES` and ends its node, if any. Raises BridgeError."""
     model = open_model(name)
     drawn = conditions.ranges
     check_place(place, model.robot)
@@ -123,7 +123,7 @@ def drive_in(
                 touched = partial(witness.touched, node, START_S)
                 return drive_all(env, opened, seeds, on_episode, touched)
         except BackendError:
-            process.check()  # if the node has ended, its own error is more useful
+            process.check()  # If the node has ended, its own error is more useful.
             raise
 
 
@@ -135,7 +135,7 @@ def open_env(
     conditions: Conditions = NO_CONDITIONS,
     **options: Any,
 ) -> tuple[gymnasium.Env[Any, Any], Policy]:
-    """Makes the env of a policy's task with a backend, behind a gate if any; opens the policy."""
+    """Makes the env of a policy's task on a named backend; opens the policy."""
     field = load_worlds(world) if isinstance(world, str) else world
     given = {name: value for name, value in options.items() if value is not None}
     driven = make_backend(backend, model, field, **given)
@@ -166,7 +166,7 @@ def make_env(
 
 
 def check_place(place: str, robot: RobotSpec) -> None:
-    """Raises ConfigError if there is no such place, or it lacks a module or can't have a robot."""
+    """Raises ConfigError if a place is unknown, lacks a module or can't simulate a robot."""
     if place not in PLACES:
         raise ConfigError(
             f"--in {place!r}: there is no such simulator; {suggest(place, PLACES)}"
@@ -184,7 +184,7 @@ def check_place(place: str, robot: RobotSpec) -> None:
 
 
 def find_robot(policy: str, contract: Contract) -> str:
-    """The robot that a policy was trained for: its model's folder or file, or a shipped one."""
+    """Returns the robot that a policy was trained for: its model's path, or a shipped robot."""
     place = str(contract.provenance.get("model", ""))
     name = contract.robot.name
     if place and Path(place).exists():
@@ -201,11 +201,11 @@ def find_robot(policy: str, contract: Contract) -> str:
 def read_contracts(
     policies: Sequence[str], model: str | None = None
 ) -> dict[str, Contract]:
-    """The contracts of those policies that are files, by policy; baselines have none."""
+    """Returns policy -> contract for all policy files; baselines have no contract."""
     files = [policy for policy in policies if is_policy_file(policy)]
     if not files:
         return {}
-    from nics_drl_bridge.policy.foreign import load_any  # needs onnx, baselines do not
+    from nics_drl_bridge.policy.foreign import load_any  # needs onnx; baselines don't
 
     opened = None if model is None else open_model(model)
     return {policy: load_any(policy, opened).contract for policy in files}
@@ -213,23 +213,23 @@ def read_contracts(
 
 @dataclass(frozen=True)
 class EvaluationOrder:
-    """An order to evaluate policies; the seed is that of the first episode."""
+    """An order to evaluate policies; `seed` is the first episode's."""
 
-    policies: Sequence[str]  # files, or names of shipped policies or of baselines
+    policies: Sequence[str]  # files, or names of shipped policies or baselines
     out: Path  # output folder
-    # folder of a model or a shipped robot; None: the policies' own robot
+    # folder of a model, or a shipped robot; None: the robot of the policies
     model: str | None = None
-    world: str = defaults.EVALUATION_WORLD  # YAML file or name of the world
+    world: str = defaults.EVALUATION_WORLD  # name or YAML file
     episodes: int = defaults.EVALUATION_EPISODES
     seed: int = defaults.EVALUATION_SEED
     places: Sequence[
         str
-    ] = ()  # some of `PLACES`, compared with the first; none: all that work
+    ] = ()  # of `PLACES`, the first is the reference; empty: all that work
     conditions: Conditions = NO_CONDITIONS
 
     @property
     def seeds(self) -> range:
-        """Seeds of the episodes. Raises ConfigError if one is not a valid seed."""
+        """Seeds of the episodes. Raises ConfigError for an invalid seed."""
         seeds = range(self.seed, self.seed + self.episodes)
         check_seeds([seeds.start, seeds.stop - 1])
         return seeds
@@ -237,7 +237,7 @@ class EvaluationOrder:
 
 @dataclass(frozen=True)
 class Evaluated:
-    """Results of one policy: its episodes and figures in each place."""
+    """Results of one policy: its episodes and statistics in each place."""
 
     policy: str
     runs: Mapping[str, Sequence[Episode]]
@@ -245,7 +245,7 @@ class Evaluated:
 
 
 def evaluate(order: EvaluationOrder, say: Say, tell: Tell) -> list[Evaluated]:
-    """Drives all policies through the same episodes everywhere; writes results, pictures."""
+    """Drives all policies through the same episodes everywhere; writes results and pictures."""
     seeds = order.seeds
     logs = order.out / "logs"
     contracts = read_contracts(order.policies, order.model)
@@ -280,7 +280,7 @@ def limit_time(
     world: AnyWorld,
     say: Say,
 ) -> Conditions:
-    """Conditions with a time limit, the policies' own or one for robot and world; tells it."""
+    """Sets the time limit: the policies', or one for robot and world; says if it is short."""
     pace = pace_of(model, [world])
     limits = [
         contract.max_episode_steps
@@ -294,11 +294,9 @@ def limit_time(
 
 
 def _places(order: EvaluationOrder, robot: RobotSpec, say: Say) -> Sequence[str]:
-    """Returns the places of an order; without any those that work here, and why no more do."""
+    """Returns the places of an order, or else all that work here; says why others don't."""
     places = list[str]()
-    for place in (
-        order.places or PLACES
-    ):  # whatever one of `PLACES` lacks, the next lacks, too
+    for place in order.places or PLACES:  # what one place lacks, later ones lack, too
         try:
             check_place(place, robot)
         except ConfigError as error:
@@ -319,18 +317,18 @@ def judge_runs(
     panels: int | None = None,
     among: Sequence[str] = (),
 ) -> Evaluated:
-    """Judges the runs of a policy by place, and draws their first episodes into a folder."""
+    """Computes a policy's statistics by place, and draws the first episodes into a folder."""
     shown = {LABELS[place]: some[:panels] for place, some in runs.items()}
     picture = draw_trajectories(shown, world, model.robot.footprint_radius)
     write_bytes(out / f"trajectories_{shorten_name(policy, among)}.png", picture)
     return Evaluated(policy, runs, evaluation.tallies(runs, model.control_period))
 
 
-ENDS = r"\.(onnx|ya?ml)$"  # of a policy, or a mapping of one
+ENDS = r"\.(onnx|ya?ml)$"  # suffixes of a policy or a mapping
 
 
 def shorten_name(policy: str, among: Sequence[str]) -> str:
-    """Returns the stem of a policy's path; where others have the same, folders before it, too."""
+    """Returns the stem of a policy's path, with parent folders if another has the same stem."""
     own, *others = (
         [part.strip("/") for part in Path(re.sub(ENDS, "", one)).absolute().parts]
         for one in (policy, *({*among} - {policy}))
@@ -342,7 +340,7 @@ def shorten_name(policy: str, among: Sequence[str]) -> str:
 
 
 def model_name(model: str | None, contracts: Mapping[str, Contract]) -> str:
-    """The model to drive: the given one, or that of all policy files; baselines drive any."""
+    """Returns the model to drive: the given one, or that of the policy files; else the default."""
     if model is not None:
         return model
     robots = {
@@ -363,7 +361,7 @@ def model_name(model: str | None, contracts: Mapping[str, Contract]) -> str:
 def write_evaluation(
     order: EvaluationOrder, name: str, model: SimulatorModel, evaluated: list[Evaluated]
 ) -> None:
-    """Writes `evaluation.json` of an order, driven with a model of a name."""
+    """Writes the `evaluation.json` of an order, driven with a model called `name`."""
     policies = {
         result.policy: {
             place: {
@@ -387,7 +385,7 @@ def write_evaluation(
 
 
 def format_rows(evaluated: Sequence[Evaluated]) -> list[tuple[str, ...]]:
-    """Rows of the table with the columns `HEADS`, as text."""
+    """Returns the rows of the table with the columns `HEADS`, as text."""
     return [
         (
             result.policy,
@@ -436,13 +434,14 @@ def drive_vehicle(
     confirm_beyond_m: float = defaults.CONFIRMED_BEYOND_M,
     **options: Any,
 ) -> Evaluated:
-    """Drives episodes on the vehicle by `cmd_vel_raw`, so through an armed gate, and compares.
+    """Drives episodes on the vehicle and in the fast simulator, and compares them.
 
-    Then the fast simulator drives them from the actual starting poses. `ask` gets each start, and
-    returns when it may begin; `confirm` gets each goal that is farther away than a limit, and
-    returns if it may be driven to: without it such a goal is refused. A goal is seen from where the
-    robot starts, or in `map`, see `GoalOrder`. Raises BackendError if the vehicle does not fit its
-    model or answer, ConfigError if a goal is refused.
+    Commands go to `cmd_vel_raw`, and so through an armed gate. The fast simulator starts at the
+    vehicle's actual starting poses. `ask` gets each start and returns when the episode may begin.
+    `confirm` gets each goal beyond a distance limit and returns if the vehicle may drive there;
+    without `confirm`, such a goal is refused. Goals are relative to the start or in `map`, see
+    `GoalOrder`. Raises BackendError if the vehicle does not answer or does not fit its model,
+    ConfigError if a goal is refused.
     """
     policy = order.policies[0]
     contracts = read_contracts(order.policies, order.model)
@@ -454,13 +453,13 @@ def drive_vehicle(
     start = options.get("start", defaults.VEHICLE_START)
     wanted = GoalOrder(goal, goal_frame, start, localised, confirm_beyond_m)
     radius = model.robot.footprint_radius
-    if not wanted.needs_pose:  # refused before anybody waits for anything
+    if not wanted.needs_pose:  # refuse far goals before anybody has to wait
         planned = [
             wanted.episode(sample_scene(world, radius, seed)) for seed in order.seeds
         ]
         max(planned, key=lambda one: one.distance).confirm(confirm)
     under = limit_time(order.conditions, contracts, model, world, say)
-    # A misfit is an error before anything moves.
+    # A policy that does not fit must fail before anything moves.
     open_policy(policy, model, order.conditions.kind)
     from nics_drl_bridge.nodes.listen import listen
 
@@ -497,7 +496,7 @@ def drive_vehicle(
                 episode.confirm(confirm)
             last = "" if arm else f"; arm {GATE}"
             ask(f"episode {count} of {order.episodes}: {episode.sentence()}{last}")
-            if wanted.needs_pose:  # it may have been moved meanwhile
+            if wanted.needs_pose:  # the vehicle may have been moved meanwhile
                 confirmed = episode.distance
                 episode = wanted.episode(
                     sample_scene(world, radius, seed), backend.present_pose()
@@ -507,7 +506,7 @@ def drive_vehicle(
             driven = drive(
                 env, driver, seed, episode.options, partial(_arm, arm, namespace, say)
             )
-            # The vehicle's own estimate is all that is known of its path.
+            # Only the vehicle's own estimate of its path is known.
             episodes.append(replace(driven, path=driven.estimate))
             say(f"  {report_end(episodes[-1])}")
     env, driver = open_env(policy, model, order.world, "sim", under, estimator=True)
@@ -516,7 +515,7 @@ def drive_vehicle(
     with closing(env):
         try:
             runs[FAST] = [drive(env, driver, *each) for each in starts]
-        except ConfigError as error:  # by its map the vehicle may have stood in a wall
+        except ConfigError as error:  # the start may be inside a wall of the map
             say(f"  not driven again in process: {error}")
     made = judge_runs(policy, runs, model, world, order.out)
     write_evaluation(replace(order, conditions=under), name, model, [made])
@@ -527,7 +526,7 @@ ENDS_BELIEVED = {"success": "reached", "collision": "touched"}
 
 
 def report_end(episode: Episode) -> str:
-    """Tells the end of an episode on a vehicle: as it believes, for nothing else is known."""
+    """Describes the end of an episode on a vehicle, by its own estimate: the truth is unknown."""
     end = ENDS_BELIEVED.get(episode.result, episode.result)
     end = f"{end}, as believed"
     if episode.uncertain is not None:

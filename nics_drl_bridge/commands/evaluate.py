@@ -1,4 +1,4 @@
-"""`nics evaluate`: in simulators, on a vehicle, or against what was driven in a bag."""
+"""`nics evaluate`: in simulators, on a vehicle, or against the commands in a bag."""
 
 from functools import partial
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""An example or two at the end of each command's help."""
+"""Examples at the end of each command's help."""
 
 import typer
 
@@ -62,12 +62,12 @@ EXAMPLES = {
 
 
 def complete(app: typer.Typer, group: str = "") -> None:
-    """Ends the help of each command of an app and its groups with examples; see also `checked`."""
+    """Adds `check_options` and examples in the help to each command of an app and its groups."""
     for command in app.registered_commands:
         command.callback = check_options(command.callback) if command.callback else None
         name = command.name or str(getattr(command.callback, "__name__", ""))
         if examples := EXAMPLES.get(f"{group}{name}"):
-            # A line with this character alone keeps the lines below as they are.
+            # click does not rewrap a paragraph whose first line is just this character.
             command.epilog = "\b\nExamples:\n" + "\n".join(
                 f"  {line}" for line in examples
             )

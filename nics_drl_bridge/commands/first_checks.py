@@ -1,4 +1,4 @@
-"""Checks of a command's names and files that load no heavy library, so that a refusal is quick."""
+"""Quick checks of a command's names and files, which load no heavy library."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,7 +7,7 @@ from typing import Any
 
 from nics_drl_bridge.errors import ConfigError, ModelError, suggest
 
-# Of numpy's global generator, from which Stable-Baselines3 draws.
+# Limit of numpy's global generator, which Stable-Baselines3 uses.
 GREATEST_TRAINING_SEED = 2**32 - 1
 
 
@@ -28,7 +28,7 @@ def check_writable(path: Path) -> None:
 
 
 def check_robot(name: str) -> None:
-    """Raises ConfigError or ModelError unless a robot, or the folder of a model, can be opened."""
+    """Raises ConfigError or ModelError unless a robot or a model's folder can be opened."""
     from nics_drl_bridge.config import list_shipped
     from nics_drl_bridge.robot.spec import load_robot
 
@@ -49,7 +49,7 @@ def check_robot(name: str) -> None:
 
 
 def check_task(name: str) -> None:
-    """Raises ConfigError unless a task exists, shipped or in the user's own file."""
+    """Raises ConfigError unless a task is shipped or exists in the user's own file."""
     file = Path(name.rpartition(":")[0] or name)
     if file.suffix == ".py" and not file.is_file():
         raise ConfigError(
@@ -91,7 +91,7 @@ def check_training(
 
 
 def check_settings(task: str, settings: str | None, changes: dict[str, Any]) -> None:
-    """Raises ConfigError unless settings of a training can be read and take the changes."""
+    """Raises ConfigError unless training settings can be read and accept the changes."""
     from nics_drl_bridge.config import find_config
 
     if (
@@ -105,7 +105,7 @@ def check_settings(task: str, settings: str | None, changes: dict[str, Any]) -> 
 
 
 def check_drive(parameters: dict[str, Any]) -> None:
-    """Raises BridgeError for a name, place or number with which `nics record` could not drive."""
+    """Raises BridgeError for parameters with which `nics record` could not drive."""
     from nics_drl_bridge.recording.excite import DrivePlan
     from nics_drl_bridge.recording.topic_roles import load_topic_roles
     from nics_drl_bridge.recording.write import check_out

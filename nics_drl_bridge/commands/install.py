@@ -106,7 +106,7 @@ def find_source(name: str) -> "Source":
 
 
 def check_prefix(prefix: Path) -> Path:
-    """Makes a folder to install into, and returns it. Raises ConfigError if that fails."""
+    """Creates a folder to install into and returns it. Raises ConfigError if that fails."""
     try:
         prefix.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -122,7 +122,7 @@ def check_prefix(prefix: Path) -> Path:
 
 
 def is_installed(name: str) -> bool:
-    """True if a message package is there and works; a broken build is built again."""
+    """Returns True if a message package is installed and can be imported."""
     if find_spec(name) is None:
         return False
     try:

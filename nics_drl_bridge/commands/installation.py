@@ -12,7 +12,7 @@ from nics_drl_bridge.errors import MISSING_ROS
 from nics_drl_bridge.extensions import PACKAGE, TRAINING, find_lacking
 from nics_drl_bridge.nodes.message_packages import how_to_install
 
-EXTRAS = {  # what each brings, by the modules that it needs
+EXTRAS = {  # extra -> purpose, modules that it installs
     "bags": ("reading and writing rosbags", ("rosbags", "mcap")),
     "deploy": ("driving by policy files", ("onnx", "onnxruntime")),
     "train": ("training", TRAINING),
@@ -22,7 +22,7 @@ EXTRAS = {  # what each brings, by the modules that it needs
     "mujoco": ("robots with real wheels, in MuJoCo", ("mujoco",)),
     "distributed": ("training on a Ray cluster", ("ray",)),
 }
-MESSAGES = {  # message packages that have no wheels, and what is left out without them
+MESSAGES = {  # message package without a wheel -> what does not work without it
     "tf2_msgs": "/tf and /tf_static",
     "ackermann_msgs": "recordings of AckermannDrive",
     "simulation_interfaces": "the standard services of simulators",
@@ -37,7 +37,7 @@ COMPILED = (
 
 
 class Check(NamedTuple):
-    """A part of an installation."""
+    """Result of the check of one part of an installation."""
 
     part: str
     works: bool
@@ -46,7 +46,7 @@ class Check(NamedTuple):
 
 
 def checks() -> list[Check]:
-    """Checks all parts; compiles nothing and starts nothing."""
+    """Checks all parts without compiling or starting anything."""
     usable = os.cpu_count()
     if hasattr(os, "sched_getaffinity"):
         usable = len(os.sched_getaffinity(0))

@@ -1,4 +1,4 @@
-"""`nics list`: what comes with the package, by the names that commands take."""
+"""`nics list`: shipped robots, worlds, lidars and policies, by the names that commands take."""
 
 from collections.abc import Callable
 from enum import Enum
@@ -13,7 +13,7 @@ Row = dict[str, Any]
 
 
 class Listed(str, Enum):
-    """Things of which several come with the package."""
+    """Kinds of shipped things."""
 
     ROBOTS = "robots"
     WORLDS = "worlds"
@@ -31,7 +31,7 @@ def list_(
 
 
 def robots() -> list[Row]:
-    """The shipped robots: name, commands with their ranges, lidar, and what they are."""
+    """Returns the shipped robots: name, commands with their ranges, lidar, description."""
     from nics_drl_bridge.generator import mount_lidar
     from nics_drl_bridge.robot.spec import load_robot
 
@@ -49,7 +49,7 @@ def robots() -> list[Row]:
 
 
 def worlds() -> list[Row]:
-    """The shipped worlds, and sets of worlds: name, size, distance of goals, obstacles."""
+    """Returns the shipped worlds and world sets: name, size, goal distance, obstacles."""
     from nics_drl_bridge.sim.barn import barn_numbers
     from nics_drl_bridge.sim.world import load_world
     from nics_drl_bridge.sim.world_set import BARN
@@ -91,7 +91,7 @@ def _describe_world(
 
 
 def lidars() -> list[Row]:
-    """The shipped lidars: name, beams, view and range."""
+    """Returns the shipped lidars: name, beams, field of view, range."""
     from math import degrees
 
     from nics_drl_bridge.lidar.spec import load_lidar
@@ -109,7 +109,7 @@ def lidars() -> list[Row]:
 
 
 def policies() -> list[Row]:
-    """The shipped policy files, and the baselines that need none."""
+    """Returns the shipped policy files and the baselines."""
     from nics_drl_bridge.policy.policies import POLICIES, shipped_policies
 
     trained = [{"name": name, "kind": "policy file"} for name in shipped_policies()]

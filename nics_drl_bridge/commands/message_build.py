@@ -1,8 +1,8 @@
-"""Builds message packages that have no wheels, on top of the wheels of ROS 2.
+"""Builds message packages that have no wheels, on top of ROS 2's wheels.
 
-The code generators are wheels, too. They need older libraries than the rest, so they get a
-temporary environment of their own; cmake and a C++ compiler compile what they write. Python's
-messages need only the C code, so the C++ code, most of the work, is left out.
+The code generators are wheels, too. They need older libraries than the rest, so they run in a
+temporary environment; cmake and a C++ compiler compile their output. Python's messages need only
+the C code, so the C++ code, which takes longest to compile, is left out.
 """
 
 import os
@@ -24,7 +24,7 @@ from nics_drl_bridge.config import read_text
 from nics_drl_bridge.errors import ConfigError, shorten
 from nics_drl_bridge.nodes.message_packages import Wheels
 
-# Newer ones have another interface than the generators call.
+# The generators use an interface that newer versions no longer have.
 EMPY = "empy==3.3.4"
 LIBRARIES = ("catkin_pkg", "numpy", "setuptools<80")
 ROS_TOOLS = (
@@ -48,16 +48,16 @@ COMPILERS = ("c++", "g++", "clang++")
 PROGRAMS = {
     "cmake": "cmake",
     "make": "make",
-}  # and the wheel, or Debian's package, of each
+}  # program -> the wheel or Debian package that has it
 FOLDERS = ("msg", "srv", "action")
 NAME_ELEMENT = re.compile(r"<name>\s*([^<]*?)\s*</name>")
 PACKAGE_NAME = re.compile(r"[a-z][a-z0-9_]*")
 USED_PACKAGE = re.compile(r"^([a-z][a-z0-9_]*)/", re.MULTILINE)
-# a type of the same package, at the start of a line, with or without its package
+# a type at the start of a line, with or without its package
 USED_TYPE = re.compile(r"^(?:([a-z][a-z0-9_]*)/(?:msg/)?)?([A-Z]\w*)", re.MULTILINE)
 BUILT_ON = re.compile(r"/opt/python/[^;\"]*?/(site-packages|include/python[0-9.]*)")
-REASON_LINES = 3  # last lines of a failed command that are told
-# What the wheels' bootstrapper leaves to children, where the generators' libraries must be found.
+REASON_LINES = 3  # last lines of a failed command that are reported
+# Set by the wheels' bootstrapper; in child processes they would hide the generators' libraries.
 UNSET = (
     "LD_LIBRARY_PATH",
     "_ROS_WHEELS_BOOTSTRAP_COMPLETE",
@@ -97,27 +97,27 @@ class Source(NamedTuple):
     """A message package to build."""
 
     name: str
-    folder: Path  # with its msg, srv and action
+    folder: Path  # with subfolders msg, srv and action
 
     def list_files(self) -> list[Path]:
-        """Return the files of its messages, services and actions."""
+        """Returns the files of its messages, services and actions."""
         return sorted(
             file for kind in FOLDERS for file in self.folder.glob(f"{kind}/*.{kind}")
         )
 
     def find_used_packages(self, file: Path) -> set[str]:
-        """Return the other packages whose messages a file uses."""
+        """Returns the other packages whose messages a file uses."""
         used = set(USED_PACKAGE.findall(file.read_text(encoding="utf-8")))
         return used - {self.name}
 
     def find_used_types(self, file: Path) -> set[str]:
-        """Return the messages of this package that a file uses."""
+        """Returns the messages of this package that a file uses."""
         types = USED_TYPE.findall(file.read_text(encoding="utf-8"))
         return {name for package, name in types if package in ("", self.name)}
 
 
 def read_source(folder: Path) -> Source:
-    """Return the package in a folder, named by its package.xml, if any. Raises ConfigError."""
+    """Returns the package in a folder, named as in any package.xml. Raises ConfigError."""
     manifest = folder / "package.xml"
     name = folder.name
     if manifest.is_file():
@@ -130,7 +130,7 @@ def read_source(folder: Path) -> Source:
 
 
 def sort_by_use(sources: Sequence[Source]) -> list[Source]:
-    """Return packages with each after those that it uses. Raises ConfigError for a circle."""
+    """Sorts packages so that each follows those it uses. Raises ConfigError for a cycle."""
     by_name = {source.name: source for source in sources}
     uses = {
         source.name: {
@@ -150,18 +150,18 @@ def sort_by_use(sources: Sequence[Source]) -> list[Source]:
 
 @dataclass(frozen=True)
 class Interfaces:
-    """The files of a message package that can be built."""
+    """The files of a message package, divided into those that can be built and the rest."""
 
     name: str
     files: Sequence[Path]  # absolute
     needed: Sequence[str]  # other message packages
     left_out: Mapping[
         str, str
-    ]  # file -> missing package that it needs, maybe indirectly
+    ]  # file that can't be built -> the missing package that it needs, maybe indirectly
 
 
 def check_programs() -> None:
-    """Raises ConfigError if the programs that compile are missing."""
+    """Raises ConfigError if cmake, make or a C++ compiler is missing."""
     missing = [name for name in PROGRAMS if shutil.which(name) is None]
     packages = [PROGRAMS[name] for name in missing]
     if not any(shutil.which(name) for name in COMPILERS):
@@ -174,7 +174,7 @@ def check_programs() -> None:
 
 
 def find_modules_folder(prefix: Path) -> Path:
-    """Returns the folder of Python's modules below a prefix."""
+    """Returns the folder of Python modules below a prefix."""
     return (
         prefix
         / "lib"
@@ -184,7 +184,7 @@ def find_modules_folder(prefix: Path) -> Path:
 
 
 class Generators(AbstractContextManager["Generators", None]):
-    """An environment with the generators of ROS 2's code, until the block ends."""
+    """A temporary environment with ROS 2's code generators; the end of the block removes it."""
 
     def __init__(self, wheels: Wheels, say: Say) -> None:
         check_programs()
@@ -211,7 +211,7 @@ class Generators(AbstractContextManager["Generators", None]):
         )
         pins = self._work / "pins.txt"
         lines = [f"{name}=={number}" for name, number in wheels.versions.items()]
-        lines.append(f"numpy=={version('numpy')}")  # whose headers are compiled against
+        lines.append(f"numpy=={version('numpy')}")  # compiled against its headers
         pins.write_text("\n".join(lines), encoding="utf-8")
         tools = [EMPY, *LIBRARIES, *(f"{wheels.prefix}{name}" for name in ROS_TOOLS)]
         python = str(self._prefix / "bin" / "python")
@@ -225,7 +225,7 @@ class Generators(AbstractContextManager["Generators", None]):
         self._environment["PATH"] = f"{self._prefix / 'bin'}{os.pathsep}{path}"
 
     def _name_own_folders(self) -> None:
-        """Replaces the folders of the machine that the wheels were built on."""
+        """Replaces paths of the machine that built the wheels by this environment's paths."""
         include = f"{sys.base_prefix}/include/python{sys.version_info[0]}.{sys.version_info[1]}"
 
         def here(match: re.Match[str]) -> str:
@@ -241,7 +241,7 @@ class Generators(AbstractContextManager["Generators", None]):
                 file.write_text(BUILT_ON.sub(here, text), encoding="utf-8")
 
     def find_interfaces(self, source: Source) -> Interfaces:
-        """Return what can be built of a message package. Raises ConfigError."""
+        """Returns which files of a message package can be built. Raises ConfigError if none."""
         files = source.list_files()
         left_out = dict[Path, str]()
         for file in files:
@@ -250,7 +250,7 @@ class Generators(AbstractContextManager["Generators", None]):
             if missing is not None:
                 left_out[file] = missing
         is_complete = False
-        while not is_complete:  # a file that uses a message that is left out
+        while not is_complete:  # leave out files that use a left-out message
             is_complete = True
             types = {file.stem: missing for file, missing in left_out.items()}
             for file in files:
@@ -276,7 +276,7 @@ class Generators(AbstractContextManager["Generators", None]):
         return (self._prefix / "share" / package).is_dir()
 
     def build(self, interfaces: Interfaces, prefix: Path) -> None:
-        """Builds a message package and installs it below a prefix. Raises ConfigError."""
+        """Builds a message package and installs it below a prefix. Raises ConfigError on failure."""
         place = self._work / interfaces.name
         names = []
         for file in interfaces.files:
@@ -311,7 +311,7 @@ class Generators(AbstractContextManager["Generators", None]):
         self._built.add(interfaces.name)
         for variable in ("AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH"):
             folders = self._environment[variable].split(os.pathsep)
-            if str(prefix) not in folders:  # last: the generators' own packages win
+            if str(prefix) not in folders:  # appended: the generators' own packages win
                 folders.append(str(prefix))
                 self._environment[variable] = os.pathsep.join(folders)
 
@@ -335,7 +335,7 @@ class Generators(AbstractContextManager["Generators", None]):
 
 
 def write_setup(prefix: Path) -> Path:
-    """Write a file to be sourced, for a prefix outside of this environment; return its path."""
+    """Writes a `setup.bash` for a prefix outside this environment, and returns its path."""
     file = prefix / "setup.bash"
     text = SETUP.format(
         modules=shlex.quote(str(find_modules_folder(prefix))),

@@ -77,7 +77,7 @@ def record(
     } | ({} if stamped is None else {"stamped": stamped})
     check_drive(parameters)
     if not preview:
-        # First: with ROS 2 from wheels it restarts Python.
+        # This comes first because ROS 2 from wheels restarts Python.
         with console.needs_ros("nics record"):
             from nics_drl_bridge.nodes.record_node import record as drive
     lines = draw_preview(parameters)
@@ -105,7 +105,7 @@ def record(
 
 
 def make_node_arguments(namespace: str, remap: Sequence[str]) -> list[str]:
-    """Returns the command line for `record_node`; ConfigError for a malformed remapping rule."""
+    """Returns `record_node`'s command line. Raises ConfigError for a malformed remapping rule."""
     rules = [f"__ns:={space}"] if (space := parse_namespace(namespace)) else []
     for rule in remap:
         if not all(rule.partition(":=")):
@@ -118,7 +118,7 @@ def make_node_arguments(namespace: str, remap: Sequence[str]) -> list[str]:
 
 
 def draw_preview(parameters: dict[str, Any]) -> tuple[str, ...]:
-    """Draws the drive that `record_node` would make of its parameters; returns lines."""
+    """Draws the drive that `record_node` would make with its parameters; returns text lines."""
     from nics_drl_bridge.files import write_bytes
     from nics_drl_bridge.recording.excite import DrivePlan
     from nics_drl_bridge.recording.topic_roles import load_topic_roles
@@ -130,7 +130,7 @@ def draw_preview(parameters: dict[str, Any]) -> tuple[str, ...]:
     out = check_out(Path(parameters["out"]))
     load_topic_roles(
         parameters["topics"] or None
-    )  # reports a wrong file before the robot moves
+    )  # a wrong file fails before the robot moves
     plan = DrivePlan(
         robot, *(parameters[name] for name in ("bound", "duration", "speed", "seed"))
     )
@@ -141,7 +141,7 @@ def draw_preview(parameters: dict[str, Any]) -> tuple[str, ...]:
 
 
 def drive_summary(recording: Any, parameters: dict[str, Any]) -> tuple[str, ...]:
-    """Returns lines about the robot's path, the coverage of each command, and the next step."""
+    """Returns text lines on the robot's path, the coverage of each command, and the next step."""
     import numpy as np
 
     from nics_drl_bridge.identify.excitation import coverage
@@ -178,7 +178,7 @@ def inspect(
     with open_source(source) as opened, console.show_progress(f"reading {source}"):
         tables = inspect_tables(opened)
     why = explain_no_mapping(source)
-    is_own = is_recording(source)  # its arrays are no columns that a mapping could name
+    is_own = is_recording(source)  # a mapping can't name its arrays
     text = "" if is_own else propose_mapping(tables)
     written = None if is_own else mapping
     if written is not None:
@@ -259,7 +259,7 @@ def import_(
 
 
 def stream_facts(drive: "Recording") -> list[dict[str, Any]]:
-    """Returns name, number of rows, rate, first and last time, and clock of each stream."""
+    """Returns each stream's name, number of rows, rate, first and last time, and clock."""
     return [
         {
             "stream": name,
@@ -335,7 +335,7 @@ def generate(
     check_place(out)
     threshold = parse_alpha(alpha)
     terms = parse_order(order)
-    if lidar is not None:  # a wrong name is told before the drive is read
+    if lidar is not None:  # a wrong name fails before the drive is read
         load_lidar(lidar)
     sensors = tuple(load_sensor(file) for file in sensor or ())
     shapes = load_world(world).shapes
@@ -380,7 +380,7 @@ def generate(
 
 
 def names_of_sources(recordings: Sequence[Path]) -> list[str]:
-    """Returns what to call recordings in a report: the path of one, short names of several."""
+    """Returns the names of recordings in a report: the path of a single one, else short names."""
     if len(recordings) == 1:
         return [str(recordings[0])]
     names = [path.name for path in recordings]

@@ -1,4 +1,4 @@
-"""`nics arm`, `nics stop` and `nics goal`: a running robot without ROS 2's command line."""
+"""`nics arm`, `nics stop` and `nics goal`: operate a robot without ROS 2's command line."""
 
 from functools import partial
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""Entry point of `nics`: one sentence, not a traceback, where a library is missing or too old."""
+"""Entry point of `nics`: a missing or outdated library gives one sentence, not a traceback."""
 
 import atexit
 import contextlib
@@ -13,23 +13,23 @@ from typing import NoReturn
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
 ENDING = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
-_interrupts: list[int] = []  # the times [ns] at which Ctrl-C came
+_interrupts: list[int] = []  # times [ns] of Ctrl-C
 
 
 def take_signals() -> None:
-    """Lets SIGINT and SIGTERM end the command, unless somebody wants them ignored."""
+    """Lets SIGINT and SIGTERM end the command, unless they are ignored or handled already."""
     if threading.current_thread() is not threading.main_thread():
-        return  # Python sets handlers in the main thread only
+        return  # Python can set handlers only in the main thread
     for number, usual in ENDING.items():
         if signal.getsignal(number) is usual:
             signal.signal(number, _note_and_end)
 
 
 def was_interrupted(error: BaseException | None) -> bool:
-    """True if an error came of Ctrl-C, whatever the library that it went through made of it.
+    """Returns True if Ctrl-C caused an error, even if a library turned it into another one.
 
-    A compiled function makes a SystemError of it, a prompt an Abort, and an interrupt between two
-    statements of a library leaves an error of its own behind.
+    A compiled function turns it into a SystemError, a prompt into an Abort, and an interrupt
+    between two statements of a library can cause an unrelated error.
     """
     if _interrupts:
         return True
@@ -58,7 +58,7 @@ def _end(number: int, frame: FrameType | None) -> None:
         frame = frame.f_back
     if (
         frame is not None
-    ):  # llvmlite's callback, out of which no exception comes: a little later
+    ):  # No exception leaves this callback of llvmlite: try again later.
         threading.Timer(0.01, signal.raise_signal, (number,)).start()
     elif number == signal.SIGINT:
         raise KeyboardInterrupt
@@ -67,7 +67,7 @@ def _end(number: int, frame: FrameType | None) -> None:
 
 
 def main() -> None:
-    """Runs a command, which imports what it needs as it runs."""
+    """Runs a command; everything it needs is imported only now."""
     _interrupts.clear()
     take_signals()
     try:
@@ -76,7 +76,7 @@ def main() -> None:
         if _interrupts and end.code not in (
             0,
             None,
-        ):  # unless the command has dealt with it
+        ):  # the command did not handle it
             _leave_interrupted()
         raise
 
@@ -88,29 +88,27 @@ def _run() -> None:
         run()
     except SystemExit:
         raise
-    except BaseException as error:  # noqa: BLE001  (what it can't explain it raises)
+    except BaseException as error:  # noqa: BLE001  (_explain raises what it can't explain)
         _explain(error)
 
 
 def _leave_interrupted() -> NoReturn:
-    """Ends the process with the code of an interrupt, whatever became of that on its way.
+    """Ends the process with the exit code of an interrupt, whatever the pending error.
 
-    Python would end it by the signal instead, where Ctrl-C came while the text of a function was
-    run (as dataclasses make them), and with other codes where libraries end beside their threads.
+    Otherwise Python ends by the signal if Ctrl-C came inside `exec` (dataclasses use it), and with
+    other exit codes if libraries shut down while their threads still run.
     """
-    signal.signal(
-        signal.SIGINT, signal.SIG_IGN
-    )  # a second one changes nothing any more
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # ignore further Ctrl-C
     with contextlib.suppress(Exception):
-        atexit._run_exitfuncs()  # zero commands, files and processes of the command
+        atexit._run_exitfuncs()  # sends zero commands, removes files, ends processes
     for stream in (sys.stdout, sys.stderr):
-        with contextlib.suppress(Exception):  # whoever read it has gone
+        with contextlib.suppress(Exception):  # the reader is gone
             stream.flush()
     os._exit(EXIT_INTERRUPTED)
 
 
 def _explain(error: BaseException) -> NoReturn:
-    """Ends the process by a sentence about an error outside of a command, or raises it."""
+    """Exits with a sentence about an error outside of any command, or raises the error."""
     if was_interrupted(error):
         sys.stderr.write("nics: interrupted; nothing was started.\n")
         raise SystemExit(EXIT_INTERRUPTED) from None
@@ -122,7 +120,7 @@ def _explain(error: BaseException) -> NoReturn:
         sys.stderr.write(f"nics: {clause}\n")
         raise SystemExit(EXIT_BAD_INPUT) from None
     if isinstance(error, RuntimeError) and "no locator available" in str(error):
-        # It is numba's, as kernels are imported.
+        # numba raises this when kernels are imported.
         reason = "neither the package's folder nor your home can be written to, to keep kernels in"
         sys.stderr.write(f"nics: {reason}; set NUMBA_CACHE_DIR to a folder that can.\n")
         raise SystemExit(EXIT_BAD_INPUT) from None

@@ -25,7 +25,7 @@ DEFAULT_EPISODES = 500
 OWN = (
     "lean",
     "sb3",
-)  # the engines of PPO in this process, see `training_settings.PpoSettings`
+)  # PPO engines of this process, see `training_settings.PpoSettings`
 
 
 def train(
@@ -141,19 +141,19 @@ def train(
 
 @dataclass(frozen=True)
 class ResumeCommand:
-    """All that the command line which resumes a training has to say again."""
+    """Everything that the command line must repeat to resume a training."""
 
     out: Path
     seeds: Sequence[int]
     episodes: int
-    task: str | None  # the user's own; a shipped one is in the settings of the run
+    task: str | None  # the user's own; a shipped task is in the run's settings
     engine: str | None
     address: str | None
     env_runners: int | None
 
     @property
     def line(self) -> str:
-        """The command, as it can be pasted into a shell."""
+        """The command, ready to paste into a shell."""
         words = ["nics", "train", "--resume", "--out", str(self.out)]
         words += ["--seeds", *map(str, self.seeds)]
         if self.episodes != DEFAULT_EPISODES:
@@ -173,7 +173,7 @@ class ResumeCommand:
 def report_interruption(
     again: ResumeCommand, seeds_of: Callable[[Path], list[int]]
 ) -> Iterator[None]:
-    """Tells the command that resumes a training, where Ctrl-C or SIGTERM ends the block."""
+    """Prints the command that resumes a training if Ctrl-C or SIGTERM ends the block."""
     try:
         yield
     except BaseException as error:
@@ -188,7 +188,7 @@ def report_interruption(
 
 
 def seeds_of_words(words: Sequence[str], after_seeds: bool) -> list[int]:
-    """Returns the further seeds of `--seeds 0 1 2`; ConfigError for a word that is none."""
+    """Returns the seeds after the first in `--seeds 0 1 2`. Raises ConfigError for other words."""
     for word in words:
         if not after_seeds or not word.isdecimal():
             fix = f"a task is given as --task {word}, seeds as --seeds 0 1 2"
@@ -208,7 +208,7 @@ def _to_plain(result: Any) -> dict[str, Any]:
 
 
 def _load_settings(task: str, settings: str | None, named: dict[str, Any]) -> Any:
-    """The settings of a training, after telling what was adapted to the robot."""
+    """Returns the settings of a training; prints what was adapted to the robot."""
     from nics_drl_bridge.policy.pace import settings_for
 
     chosen = settings_for(task, settings, named)
@@ -218,7 +218,7 @@ def _load_settings(task: str, settings: str | None, named: dict[str, Any]) -> An
 
 
 def check_engine(engine: str | None, of_clusters: dict[str, Any]) -> None:
-    """Raises ConfigError for an unknown engine, or an option that this one does not have."""
+    """Raises ConfigError for an unknown engine or an option that the engine does not have."""
     engines = (*OWN, *extensions.find_extensions("engines"))
     if engine is not None and engine not in engines:
         raise ConfigError(f"unknown engine {engine!r}; {suggest(engine, engines)}")
@@ -244,7 +244,7 @@ def _open_learner(
 
 
 def _run_watched(train_run: Any, order: Any, learn: Any, as_json: bool) -> None:
-    """The same with a page, which costs nothing while it is closed."""
+    """Like `_run`, with a live page, which costs nothing while it is closed."""
     from nics_drl_bridge.watch.server import PageServer
     from nics_drl_bridge.watch.show import open_page
     from nics_drl_bridge.watch.training import TrainingView
@@ -252,7 +252,7 @@ def _run_watched(train_run: Any, order: Any, learn: Any, as_json: bool) -> None:
     with closing(PageServer(port=0)) as server:
         open_page(server.url)
 
-        views: list[TrainingView] = []  # of the seeds so far
+        views: list[TrainingView] = []  # one per seed started so far
 
         def on_env(env: Any) -> None:
             views.append(TrainingView(server, env))

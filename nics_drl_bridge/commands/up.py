@@ -1,4 +1,4 @@
-"""`nics up`: the nodes of a launch as processes, until Ctrl-C, without ROS 2's `launch`."""
+"""`nics up`: runs the nodes of a launch file until Ctrl-C, without ROS 2's `launch`."""
 
 import signal
 import time
@@ -67,7 +67,7 @@ def up(
 
 
 def parse_values(words: Sequence[str]) -> dict[str, str]:
-    """Returns the values of arguments `name:=value` by name. Raises ConfigError."""
+    """Parses arguments `name:=value`; returns name -> value. Raises ConfigError."""
     values: dict[str, str] = {}
     for word in words:
         name, sign, value = word.partition(":=")
@@ -96,7 +96,7 @@ def format_arguments(launch: Launch) -> str:
 
 
 def run(nodes: Sequence[NodeStart]) -> None:
-    """Runs nodes until a signal comes or one of them ends; then all of them have ended."""
+    """Runs nodes until a signal comes or one of this package's nodes ends; then ends them all."""
     processes: list[ChildProcess] = []
     with TemporaryDirectory(prefix="nics_up_") as folder, end_nodes_by_signals():
         commands = [command_of(node, Path(folder)) for node in nodes]
@@ -120,12 +120,12 @@ def run(nodes: Sequence[NodeStart]) -> None:
 
 
 def name_of(node: NodeStart) -> str:
-    """Returns the name of a node with its namespace, as its log lines show it."""
+    """Returns a node's name with its namespace, as shown in its log lines."""
     return f"{node.namespace}/{node.executable}".lstrip("/")
 
 
 def describe_next_step(nodes: Sequence[NodeStart]) -> str:
-    """Return what to do once the nodes run; empty if they neither drive nor simulate a robot."""
+    """Returns the user's next step, or "" if the nodes neither drive nor simulate a robot."""
     gates = [node for node in nodes if node.executable == "command_gate"]
     if not gates and not any(node.executable in SIMULATORS for node in nodes):
         return ""
@@ -139,9 +139,9 @@ def describe_next_step(nodes: Sequence[NodeStart]) -> str:
 def wait_for_end(
     nodes: Sequence[NodeStart], processes: Sequence[ChildProcess]
 ) -> tuple[str, int]:
-    """Waits until a node of this package has ended; returns its name and exit code.
+    """Waits until a node of this package, or every node, ends; returns its name and exit code.
 
-    Others, as RViz, may be closed.
+    Other nodes, such as RViz, may end earlier.
     """
     while True:
         for node, process in zip(nodes, processes, strict=True):
@@ -154,7 +154,7 @@ def wait_for_end(
 
 
 def end_all(processes: Sequence[ChildProcess]) -> None:
-    """Ends all processes, together; no further signal disturbs that."""
+    """Ends all processes at once; ignores further signals meanwhile."""
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     for process in processes:
@@ -165,10 +165,12 @@ def end_all(processes: Sequence[ChildProcess]) -> None:
 
 @contextmanager
 def end_nodes_by_signals() -> Iterator[None]:
-    """Lets a lost terminal end the nodes in order, too; afterwards signals act as before."""
+    """Lets SIGHUP and the like end the nodes properly; restores the handlers afterwards."""
     before = {number: signal.getsignal(number) for number in SIGNALS}
     for number, handler in before.items():
-        if handler is signal.SIG_DFL:  # not SIGHUP if it was started by nohup
+        if (
+            handler is signal.SIG_DFL
+        ):  # ignored signals stay ignored: SIGHUP under nohup
             signal.signal(number, _leave)
     try:
         yield

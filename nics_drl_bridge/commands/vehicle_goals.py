@@ -1,4 +1,4 @@
-"""Where a vehicle is to drive: starts and goals of its episodes, and how far that is."""
+"""Starts and goals of a vehicle's episodes, and confirmation of far goals."""
 
 import sys
 from collections.abc import Callable
@@ -13,15 +13,17 @@ from nics_drl_bridge.sim.scenes import Scene
 from nics_drl_bridge.sim.world import World
 from nics_drl_bridge.sim.world_set import AnyWorld
 
-# frames of a goal
+# frames of goals
 ROBOT = "robot"
 MAP = "map"
 GOAL_FRAMES = (ROBOT, MAP)
-# where episodes start: see `RealtimeOptions.start`
+# where episodes start, see `RealtimeOptions.start`
 WAIT = "wait"
 PRESENT = "present"
-NEAR_M = 0.5  # a vehicle that was moved by less since it was asked for is not asked about again [m]
-MARGIN_M = 10.0  # of the open ground beyond a goal [m]
+NEAR_M = (
+    0.5  # extra goal distance allowed after a confirmation without asking again [m]
+)
+MARGIN_M = 10.0  # open ground beyond a goal [m]
 Say = Callable[[str], None]
 Point = tuple[float, float]
 
@@ -30,16 +32,15 @@ Point = tuple[float, float]
 class GoalOrder:
     """A goal as the user asks for it.
 
-    In the frame `robot`, x is ahead of the place where the robot starts, and y is left of it; in
-    `map`, both are coordinates of the estimate, which begin where odometry does unless there is a
-    pose sensor.
+    In the frame `robot`, x points ahead and y left from the start. In `map`, both are coordinates
+    of the estimate, whose origin is that of odometry unless there is a pose sensor.
     """
 
-    point: Point | None = None  # x, y [m]; None: the world's own, of each episode
-    # None: `robot` where the start is the present place, else `map`
+    point: Point | None = None  # x, y [m]; None: each episode's goal in the world
+    # None: `robot` if episodes start at the present place, else `map`
     frame: str | None = None
-    start: str = defaults.VEHICLE_START  # or PRESENT
-    localised: bool = False  # a pose sensor tells where the robot is in `map`
+    start: str = defaults.VEHICLE_START  # WAIT or PRESENT
+    localised: bool = False  # True: a pose sensor locates the robot in `map`
     confirm_beyond_m: float = defaults.CONFIRMED_BEYOND_M
 
     def __post_init__(self) -> None:
@@ -57,21 +58,21 @@ class GoalOrder:
 
     @property
     def relative(self) -> bool:
-        """True if goals are seen from the place where the robot starts."""
+        """True if goals are relative to the start."""
         return (self.frame or (ROBOT if self.start == PRESENT else MAP)) == ROBOT
 
     @property
     def lays_map(self) -> bool:
-        """True if `map` is laid so that the robot stands at the start of each episode."""
+        """True if `map` is shifted so that the robot stands at the start of each episode."""
         return self.start == PRESENT and self.relative and not self.localised
 
     @property
     def needs_pose(self) -> bool:
-        """True if the present pose has to be known to tell how far the goal is."""
+        """True if the distance of the goal depends on the present pose."""
         return self.start == PRESENT and not self.lays_map
 
     def ground(self, world: AnyWorld) -> AnyWorld:
-        """Returns the world of the episodes: open ground where its obstacles mean nothing."""
+        """Returns the episodes' world, or open ground if its obstacles can't be placed."""
         if not self.lays_map or self.point is None:
             return world
         reach = float(np.hypot(*self.point)) + MARGIN_M
@@ -82,7 +83,7 @@ class GoalOrder:
         )
 
     def episode(self, scene: Scene, present: Array | None = None) -> "VehicleEpisode":
-        """Returns start and goal of an episode, for a robot at a pose (3,) in `map`, if known."""
+        """Returns start and goal of an episode; `present` is the robot's pose (3,) in `map`."""
         start = np.array(scene.starts[0])
         scene_goal = geometry.between(start, (*scene.goals[0][:2], 0.0))[:2]
         if self.start == PRESENT and present is not None:
@@ -105,16 +106,16 @@ class VehicleEpisode:
     order: GoalOrder
     start: Array  # (3,) x, y [m], heading [rad] in `map`
     goal: Array  # (2,) x, y in `map` [m]
-    seen: Array  # (2,) the goal from the start: ahead, left [m]
+    seen: Array  # (2,) goal relative to the start: ahead, left [m]
 
     @property
     def distance(self) -> float:
-        """Straight from the start to the goal [m]."""
+        """Straight-line distance from the start to the goal [m]."""
         return float(np.hypot(*self.seen))
 
     @property
     def options(self) -> dict[str, Array]:
-        """Options of the env's reset."""
+        """Options for the env's reset."""
         if self.order.point is None and not self.order.needs_pose:
             given = {}
         else:
@@ -124,7 +125,7 @@ class VehicleEpisode:
         return given
 
     def sentence(self) -> str:
-        """Returns where it will drive, and where the vehicle has to stand."""
+        """Describes where the vehicle has to stand and where it will drive."""
         ahead, left = self.seen
         sides = f"{abs(ahead):.2f} m {'ahead' if ahead >= 0.0 else 'back'}"
         sides += f" and {abs(left):.2f} m to the {'left' if left >= 0.0 else 'right'}"
@@ -140,7 +141,7 @@ class VehicleEpisode:
         return f"{stand}; it will drive to {place}, {self.distance:.2f} m from there"
 
     def confirm(self, confirm: Say | None) -> None:
-        """Asks before a far drive. Raises ConfigError if nobody can be asked."""
+        """Asks before a far drive. Raises ConfigError if `confirm` is None."""
         limit = self.order.confirm_beyond_m
         if self.distance <= limit:
             return
@@ -156,7 +157,7 @@ UNATTENDED = (
 
 
 def confirm_at_terminal(question: str) -> None:
-    """Asks at the terminal. Raises ConfigError without one, and if the answer is no."""
+    """Asks at the terminal. Raises ConfigError without a terminal or if the answer is no."""
     import typer
 
     if not sys.stdin.isatty():

@@ -1,4 +1,4 @@
-"""`nics warmup`: compiles the kernels ahead, on two cores."""
+"""`nics warmup`: compiles the kernels in advance, on two cores."""
 
 import signal
 import time
@@ -17,7 +17,7 @@ def warmup(as_json: JsonOption = False) -> None:
     """Compiles all kernels in advance, once per machine, on two cores."""
     begin = time.monotonic()
     typer.echo("compiling the kernels: a minute or two, once on this machine", err=True)
-    # Fresh processes: what a fork shares with its parent's threads may be locked for ever.
+    # Spawned, not forked: a fork could inherit a lock that is never released.
     with (
         show_progress("compiling"),
         get_context("spawn").Pool(

@@ -1,4 +1,4 @@
-"""`nics watch`: a page that shows episodes, live topics, or a bag; or a video of them."""
+"""`nics watch`: shows episodes, live topics or a bag on a page, or records a video."""
 
 from collections.abc import Iterator
 from contextlib import closing
@@ -72,7 +72,7 @@ def watch(
         "gate": gate,
         "task": task,
     }
-    if record is None:  # before the source is opened, which may take a while
+    if record is None:  # first, because opening the source may take a while
         extensions.require("the page", "websockets")
     else:
         from nics_drl_bridge.watch.record import check_file
@@ -155,7 +155,7 @@ def _watch_ros(name: str | None, worlds: list[str] | None, namespace: str) -> An
 
 
 def _make_only_world(worlds: list[str] | None) -> Any:
-    """The world of a robot that others drive, if it is given."""
+    """Returns the only world given for a robot driven by others, if any."""
     if worlds is None:
         return None
     if len(worlds) > 1:

@@ -1,4 +1,4 @@
-"""`nics world`: imports worlds made by other tools, draws worlds, and writes their maps."""
+"""`nics world`: imports worlds from other tools, draws worlds, and writes their maps."""
 
 import math
 import os
@@ -24,16 +24,18 @@ world = typer.Typer(
 SDF = (".world", ".sdf")
 MAPS = (".yaml", ".yml")
 PICTURES = (".png", ".pgm", ".bmp")
-HEIGHT = 0.2  # default of the height that counts [m]: TurtleBot3's lidar is at 0.18 m
-CLEARANCE = 0.1  # default [m]: fields of others are often narrow
-NEAREST = 2.0  # default of the least distance from start to goal [m]
+HEIGHT = (
+    0.2  # default height of the plane to import [m]: TurtleBot3's lidar is at 0.18 m
+)
+CLEARANCE = 0.1  # default [m]: imported worlds are often narrow
+NEAREST = 2.0  # default of the minimum distance from start to goal [m]
 NAV2 = {
     "origin": [0.0, 0.0, 0.0],
     "negate": 0,
     "occupied_thresh": 0.65,
     "free_thresh": 0.25,
 }
-Keys = dict[str, Any]  # of a YAML file
+Keys = dict[str, Any]  # keys of a YAML file
 Shown = Annotated[
     str,
     Argument(
@@ -49,7 +51,7 @@ class Written(NamedTuple):
 
     path: Path
     text: str
-    line: str  # what it holds
+    line: str  # describes its content
 
 
 @world.command("import")
@@ -155,7 +157,7 @@ def import_(
 
 
 def _places(files: list[Path], out: Path | None, name: str | None) -> dict[Path, Path]:
-    """The file to write for each one to read."""
+    """Returns the file to write for each file to read. Raises ConfigError."""
     is_file = out is not None and out.suffix in MAPS
     if len(files) > 1 and (is_file or name is not None):
         option = f"--out {out}" if is_file else f"--name {name}"
@@ -178,7 +180,7 @@ def _places(files: list[Path], out: Path | None, name: str | None) -> dict[Path,
 def _read_standing(
     file: Path, place: Path, standing: "Standing", keys: Keys, height: float
 ) -> Written:
-    """The world of what stands in an SDF file."""
+    """Returns the world of the obstacles in an SDF file."""
     at = [keys[key]["at"][0] for key in ("starts", "goals") if key in keys]
     x1, y1, x2, y2 = field = keys.get("bounds") or standing.bounds(*at)
     groups = [
@@ -198,7 +200,7 @@ def _read_standing(
 def _read_mapped(
     file: Path, place: Path, keys: Keys, resolution: float | None
 ) -> list[Written]:
-    """The world of a map; and of a picture without one, the map's own file before it."""
+    """Returns the world of a map, preceded by a new map file for a picture with a resolution."""
     from nics_drl_bridge.config import dump_yaml, validate
     from nics_drl_bridge.lidar.maps import MapFile, load_map, read_image
 
@@ -235,9 +237,9 @@ def _locate_from(place: Path, file: Path) -> str:
 def _format_world(
     file: Path, head: list[str], values: Keys, size: tuple[float, float]
 ) -> str:
-    """Returns the text of a world file, which is read back to see that it is one.
+    """Returns the text of a world file, after reading it back as a check.
 
-    Raises ConfigError, with the file that was imported: the one to be written does not exist.
+    Raises ConfigError that names the imported file, because the new one does not exist yet.
     """
     from nics_drl_bridge.config import dump_yaml, parse_yaml, validate
     from nics_drl_bridge.sim.world import World, check_places
@@ -279,7 +281,7 @@ def _format_world(
 
 
 def _format_flow(value: Any) -> str:
-    """Numbers, words, lists and mappings as YAML on one line."""
+    """Formats numbers, words, lists and mappings as YAML on one line."""
     if isinstance(value, dict):
         return (
             "{"
@@ -333,7 +335,7 @@ def draw(
 
 
 def _check_overwrite(worlds: Any, given: Path, *written: Path) -> None:
-    """Raises ConfigError for a file that would replace one of which a world is made."""
+    """Raises ConfigError if a file to write would replace one of the world's own files."""
     from nics_drl_bridge.lidar.maps import files_of
 
     for member in worlds.members:
