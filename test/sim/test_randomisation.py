@@ -223,7 +223,7 @@ def test_a_range_that_the_model_cannot_take_is_one_sentence(kinematics, sentence
     [
         (
             {"kinematics": {"scale": [1.1, 0.9]}},
-            "key 'kinematics.scale': a range is [least",
+            "key 'kinematics.scale': a range is [minimum",
         ),
         ({"kinematics": {"scale": [0.0, 0.9]}}, "key 'kinematics.scale.0': input"),
         ({"kinematics": {"dofs": {"wz": [-1.0, 0.9]}}}, "key 'kinematics.dofs.wz.0'"),
