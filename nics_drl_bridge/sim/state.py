@@ -120,7 +120,7 @@ class Surroundings(NamedTuple):
 class WorldSetArrays(NamedTuple):
     """The surroundings of the P members of a world set, stacked.
 
-    `step_kernels.surroundings_of` returns those of one world.
+    `step_kernels.get_surroundings` returns those of one world.
     """
 
     fixtures: Fixtures
