@@ -456,7 +456,8 @@ def fit_bound(stops: Stops, radius: float, turns_count: bool) -> Braking:
     if not straight.any():
         straight = np.ones_like(straight)
     worst = _compute_envelope(whole[straight], distance[straight])
-    orders = _list_orders(np.abs(twist[:, :2]).min(axis=1) > MINOR * speed)
+    slower_component = np.abs(twist[:, :2]).min(axis=1)
+    orders = _list_orders(slower_component > MINOR * speed)
     bounds = [
         Braking(0.0, 1.0, lever * radius, order=order)
         for lever in LEVERS

@@ -305,7 +305,8 @@ def _combine_ends(spec: RobotSpec) -> Array:
     """
     low = spec.command_low
     high = spec.command_high
-    ends = np.stack([low, np.clip(np.zeros(len(low)), low, high), high])
+    rest = np.clip(np.zeros(len(low)), low, high)
+    ends = np.stack([low, rest, high])
     if ends.shape[1] > MAX_VARIED:
         return ends
     return np.array(list(product(*ends.T)))

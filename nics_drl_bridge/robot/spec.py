@@ -386,7 +386,8 @@ class RobotSpec(Schema):
         if not self.takes_turn_rate:
             return self.from_fields(twist)
         speed, angle = self.bicycle.command(twist)
-        command = self.from_fields(np.stack([speed, twist[..., 1], angle], axis=-1))
+        fields = np.stack([speed, twist[..., 1], angle], axis=-1)
+        command = self.from_fields(fields)
         limits = np.array(
             [(c.min, c.max) if c.steers else (-np.inf, np.inf) for c in self.command]
         )
@@ -429,7 +430,8 @@ def _add_circumradius(data: dict[str, Any]) -> dict[str, Any]:
 
 
 def _reach(outline: ArrayLike) -> float:
-    return float(np.hypot(*np.array(outline, dtype=np.float64).T).max())
+    corners = np.array(outline, dtype=np.float64)
+    return float(np.hypot(corners[:, 0], corners[:, 1]).max())
 
 
 def load_robot(name: str | Path) -> RobotSpec:

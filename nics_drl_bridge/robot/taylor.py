@@ -108,7 +108,8 @@ class TaylorModel:
     def drivers(self) -> NDArray[np.intp]:
         """Index (S,) of the command that moves each state most, over the recorded range of X."""
         largest = np.maximum(np.abs(self.low), np.abs(self.high))
-        effect = np.abs(self.coefficients[3:]) * np.prod(largest**self.powers, axis=1)
+        largest_features = np.prod(largest**self.powers, axis=1)
+        effect = np.abs(self.coefficients[3:]) * largest_features
         has_command = self.powers[:, self.state_size :] > 0
         return np.asarray(np.argmax(effect @ has_command, axis=1))
 
@@ -130,7 +131,8 @@ class TaylorModel:
         """Returns dQ/dt (..., D) from the terms and the back-EMF."""
         dq = evaluate(x, self.powers) @ self.coefficients.T
         states = self.state_size
-        dq[..., 3:] -= np.abs(x[..., states:]) @ self.back_emf.T * x[..., :states]
+        damping = np.abs(x[..., states:]) @ self.back_emf.T
+        dq[..., 3:] -= damping * x[..., :states]
         return dq
 
     def _move_states(self, state: Array, change: Array) -> Array:

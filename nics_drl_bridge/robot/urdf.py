@@ -63,7 +63,9 @@ def _add_collision(parent: Element, spec: RobotSpec) -> None:
         return
     x, y = zip(*spec.footprint, strict=True)
     size = (max(x) - min(x), max(y) - min(y), BODY_HEIGHT)
-    middle = (0.5 * (min(x) + max(x)), 0.5 * (min(y) + max(y)), BODY_HEIGHT)
+    middle_x = 0.5 * (min(x) + max(x))
+    middle_y = 0.5 * (min(y) + max(y))
+    middle = (middle_x, middle_y, BODY_HEIGHT)
     _add_geometry(parent, size, middle)
 
 
