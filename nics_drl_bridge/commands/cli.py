@@ -149,9 +149,8 @@ def main() -> None:
         )  # stdout is flushed at exit
         raise SystemExit(1) from None
     except Exception as error:
-        if not hasattr(
-            error, "format_message"
-        ):  # not an option error of click or typer
+        # Anything else is not an option error of click or typer.
+        if not hasattr(error, "format_message"):
             raise
         if (
             message := error.format_message().strip()

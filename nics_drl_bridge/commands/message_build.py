@@ -276,7 +276,7 @@ class Generators(AbstractContextManager["Generators", None]):
         return (self._prefix / "share" / package).is_dir()
 
     def build(self, interfaces: Interfaces, prefix: Path) -> None:
-        """Builds a message package and installs it below a prefix. Raises ConfigError on failure."""
+        """Builds a message package, and installs it below a prefix. Raises ConfigError."""
         place = self._work / interfaces.name
         names = []
         for file in interfaces.files:
