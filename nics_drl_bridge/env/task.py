@@ -175,7 +175,7 @@ class Task(ABC):
         """Updates the memory in place after a step, before it is used."""
 
     def command(self, action: ArrayLike) -> Array:
-        """Returns commands (..., C) of discrete actions, or of actions (..., C) clamped to [-1, 1]."""
+        """Returns the command (..., C) of actions: discrete, or (..., C) and clamped to [-1, 1]."""
         if self.actions == "discrete":
             return np.asarray(self.discrete_commands[np.asarray(action)])
         given = np.ascontiguousarray(action)
