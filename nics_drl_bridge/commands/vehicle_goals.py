@@ -29,7 +29,7 @@ Point = tuple[float, float]
 
 @dataclass(frozen=True)
 class GoalOrder:
-    """A goal as the user asks for it.
+    """A goal as requested by the user.
 
     In the frame `robot`, x points ahead and y left from the start. In `map`, both are coordinates
     of the estimate, whose origin is that of odometry unless there is a pose sensor.
