@@ -38,7 +38,7 @@ Rows = NDArray[np.float32]
 
 
 def shipped() -> Path:
-    """The folder of the policy files that ship with the package."""
+    """Returns the folder of the shipped policy files."""
     return share_folder() / "config" / "policies"
 
 

@@ -102,7 +102,7 @@ class StraightToGoal:
     model: SimulatorModel | None = None
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Choose the action; see `Policy`."""
+        """Chooses the action; see `Policy`."""
         robot = self.task.robot
         first = self.task.scan_parts + 1
         cosine, sine = np.moveaxis(
@@ -186,7 +186,7 @@ class DynamicWindow:
         _ = self._search
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Choose the action; see `Policy`."""
+        """Chooses the action; see `Policy`."""
         parts = self.task.scan_parts
         seen = np.atleast_2d(observation).astype(np.float64)
         goals = seen[:, parts : parts + 1] * seen[:, parts + 1 : parts + 3]
@@ -284,7 +284,7 @@ POLICIES: dict[str, Callable[[Navigation, SimulatorModel | None], Policy]] = {
 
 
 def shipped_policies() -> list[str]:
-    """Returns the names of the policy files that ship with the package."""
+    """Returns the names of the shipped policy files."""
     return sorted(file.stem for file in shipped().glob(f"*{SUFFIX}"))
 
 
@@ -345,7 +345,7 @@ def open_policy(
 
 
 def _acting(policy: "PolicyFile") -> Policy:
-    """The policy of a file, wrapped to keep its state if it has one."""
+    """Returns the policy of a file, wrapped to keep its state if it has one."""
     kept = policy.contract.state
     if kept is None:
         return policy

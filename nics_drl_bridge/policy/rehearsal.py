@@ -36,9 +36,8 @@ WALL_S = 60.0  # limit of wall time, generous for a busy machine
 MOST_REMEMBERED = 10_000
 EXIT_MEMORY = 3
 _CODE = "import sys; sys.path[:] = {path!r}; import {module} as one; one.main()"
-_remembered: dict[
-    str, None
-] = {}  # digests of content that opened without a fault, oldest first
+# digests of content that opened without a fault, oldest first
+_remembered: dict[str, None] = {}
 
 
 def rehearse_policy(data: bytes, needs: GraphNeeds, seen: Rows, source: str) -> None:

@@ -24,9 +24,8 @@ Count = Annotated[int, Field(ge=1, le=10**12)]
 MOST_WORLDS = 65_536  # maximum number of copies of all worlds together
 MOST_LAYERS = 16
 MOST_WIDE = 8_192
-MOST_KEPT = (
-    2**26
-)  # maximum stored transitions: a rollout in all worlds, or SAC's buffer
+# maximum number of stored transitions: a rollout in all worlds, or SAC's buffer
+MOST_KEPT = 2**26
 Width = Annotated[int, Field(ge=1, le=MOST_WIDE)]
 
 
