@@ -158,9 +158,8 @@ def _on(
     (dx, dy), (c, s), reach = (x, y) - body[:2], body[[COS, SIN]], body[RADIUS]
     if reach <= 0.0 or dx * dx + dy * dy >= (radius + reach) ** 2:
         return False
-    shape = shapes[
-        int(body[SHAPE]) % len(shapes)
-    ]  # each shape may occur in several sizes
+    # Each shape may occur in several sizes.
+    shape = shapes[int(body[SHAPE]) % len(shapes)]
     corners = shape.outline * (reach / shape.radius)
     at = (c * dx + s * dy, c * dy - s * dx)
     return (

@@ -34,7 +34,7 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
 
     ## Spaces, Rewards, Starting State, Episode End
 
-    Those of one robot in the docstring of the task's class, see `CooperativeReaching` and
+    Each agent has those of one robot, documented in the task's class, see `CooperativeReaching` and
     `PursuitEvasion`. `infos[agent]` has its `reward_terms`, `pose`, `is_success`, `collision`.
     `truncations` are all True after `max_episode_steps`.
 

@@ -60,12 +60,12 @@ class CooperativeReaching(Task):
 
     ## Starting State
 
-    Obstacles, starts and goals are drawn by the world. Memory: `goal` (M, 2) [m], `reached` (M,).
+    The world draws obstacles, starts and goals. Memory: `goal` (M, 2) [m], `reached` (M,).
 
     ## Episode End
 
-    For a robot when it touches something; it then stands still as another obstacle. For all robots
-    when the last goal is reached, which means that a robot is within `goal_radius` [m] of it.
+    A robot ends when it touches something; it then stands still as another obstacle. All robots end
+    when the last goal is reached, that is, when a robot is within `goal_radius` [m] of it.
     """
 
     keeps_last_scan: ClassVar[bool] = False
@@ -204,12 +204,12 @@ class PursuitEvasion(Task):
 
     ## Starting State
 
-    Obstacles and starts are drawn by the world. Memory: `out` (M,), `caught` (M,), `newly` (M,).
+    The world draws obstacles and starts. Memory: `out` (M,), `caught` (M,), `newly` (M,).
 
     ## Episode End
 
-    For an evader when the free space between it and a pursuer is below `capture_gap` [m]; for any
-    robot when it touches something else, after which it stands still as another obstacle. For all
+    An evader ends when the free space between it and a pursuer is below `capture_gap` [m]. Any
+    robot ends when it touches something else; it then stands still as another obstacle. All end
     when all evaders, or all pursuers, are out. The pursuers succeed when every evader is caught.
     """
 
