@@ -32,9 +32,8 @@ class BagTopic:
     gaps: int = 0  # number of silences of more than three median periods
     longest_gap_s: float | None = None
     clock: str = UNKNOWN  # clock of the header stamps, or why there are none
-    delay_s: float | None = (
-        None  # median of receive time minus stamp; None without stamps
-    )
+    # median of receive time minus stamp; None without stamps
+    delay_s: float | None = None
     jitter_s: float | None = None  # 95 % minus 5 % quantile of that delay
     backwards: int = 0  # number of stamps earlier than the previous one
 

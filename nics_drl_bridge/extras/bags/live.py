@@ -336,9 +336,8 @@ def play_bag(
         sent = player.play(timed)
         while loop and not stopping.is_set():
             sent += player.play(timed)
-        for (
-            each
-        ) in player.publishers.values():  # the node's end drops undelivered messages
+        # Destroying the node would drop undelivered messages.
+        for each in player.publishers.values():
             each.wait_for_all_acked(Duration(seconds=DELIVERY_S))
         return sent
     finally:

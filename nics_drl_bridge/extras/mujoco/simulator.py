@@ -157,9 +157,8 @@ class MujocoRobot:
         self._rig = Rig(spec, self.machine, self._model)
         self.timestep = float(self._model.opt.timestep)
         self._advance(SETTLING_S)
-        self.rest = (
-            self._data.qpos.copy()
-        )  # (nq,) MuJoCo positions at rest at the origin
+        # (nq,) MuJoCo positions at rest at the origin
+        self.rest = self._data.qpos.copy()
         self.reset(np.zeros(3))
 
     def reset(self, pose: ArrayLike) -> Reading:
