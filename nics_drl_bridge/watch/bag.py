@@ -88,7 +88,7 @@ class BagSource:
         return False
 
     def unfinished(self, _: int) -> bool:
-        """True until the end has been shown."""
+        """Returns True until the end has been shown."""
         return self._now < len(self._shots) - 1
 
     def close(self) -> None:
