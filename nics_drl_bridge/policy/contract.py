@@ -94,7 +94,7 @@ class Contract(Schema):
     lidar: LidarSpec
     # sectors of the observed scan; None: the beams of this very lidar
     scan: ScanLayout | None
-    sensors: tuple[AnySensor, ...] = ()  # further sensors that the policy observes
+    sensors: tuple[AnySensor, ...] = ()  # additional sensors that the policy observes
     task: TaskEntry
     observation: ObservationEntry
     # None: the policy has no state

@@ -1,4 +1,4 @@
-"""Evaluation: run episodes, judge them by the ground truth, and tally the results."""
+"""Evaluation: runs episodes, judges them by the ground truth, and tallies the results."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -175,7 +175,7 @@ def successes(episodes: Iterable[Episode]) -> int:
 
 
 def deviation(one: Episode, other: Episode) -> float:
-    """Returns the maximum distance between two paths at the same step, over common steps [m]."""
+    """Returns the maximum distance [m] between two paths at the same step, over common steps."""
     steps = min(len(one.path), len(other.path))
     return float(
         np.linalg.norm(one.path[:steps, :2] - other.path[:steps, :2], axis=1).max()

@@ -63,7 +63,7 @@ class InputPart(Scaled):
     # number of time steps, including the current one
     history: int = Field(default=1, ge=1, le=MOST_SCANS)
     newest_first: bool = False  # reverse the order of a history
-    # the output whose previous value `last.output` means
+    # the output whose previous value is `last.output`
     output: str | None = None
     value: Numbers | None = None  # numbers of a `constant`
 

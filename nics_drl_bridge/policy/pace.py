@@ -97,7 +97,7 @@ class Fitted(NamedTuple):
 
 
 def settings_for(task: str, name: str | None, changes: dict[str, Any]) -> Fitted:
-    """Loads settings like `chosen_settings`; robots without settings get those of a similar robot.
+    """Loads settings like `chosen_settings`; a robot without settings gets a similar robot's.
 
     Raises ConfigError, and ModelError if there is no such robot.
     """

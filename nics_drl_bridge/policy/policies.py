@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from nics_drl_bridge.policy.policy_file import PolicyFile
 
 
-# margin wider than that of `Mppi`, because the dynamic window chooses from few twists
+# The margin is wider than in `Mppi`, because the dynamic window chooses from few twists.
 CLEARANCE = Clearance(margin=0.1, soft=0.4)
 FULL_TURN_RAD = 0.8  # bearing of the goal above which a robot turns at full rate
 SETTLED_S = 5.0  # time to the steady twist of a held command
