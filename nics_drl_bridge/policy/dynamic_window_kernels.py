@@ -72,7 +72,7 @@ def choose(around, twist, candidates, ahead, weights):  # type: ignore[no-untype
 
 @kernel
 def cost_of(around, aimed, twist, ahead, weights):  # type: ignore[no-untyped-def]
-    """Returns the cost of holding a twist (3,), inadmissible if the robot hits before it can stop.
+    """Returns the cost of holding a twist (3,), inadmissible if it hits something before stopping.
 
     If braking takes time, the robot starts from its present twist (3,), which may be faster.
     """

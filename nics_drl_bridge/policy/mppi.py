@@ -102,7 +102,7 @@ class Mppi:
 
     @cached_property
     def _free(self) -> list[tuple[MapScratch, kernels.RollOuts]]:
-        return []  # memory not in use by any thread
+        return []  # memory that no thread is using
 
     def _memory(self) -> tuple[MapScratch, kernels.RollOuts]:
         robot, (_, outline, clearance) = self.task.robot, self._sense

@@ -21,7 +21,7 @@ MOST_PARTS = 50_000
 MOST_NESTED = 16  # maximum nesting of messages; an exported graph needs six levels
 # maximum size of packed integers in one field, such as a shape [bytes]
 MOST_PACKED = 2**20
-MOST_NODES = 1000  # maximum number of nodes; an exported network has some dozens
+MOST_NODES = 1000  # maximum number of nodes; an exported network has a few dozen
 MOST_DIMENSIONS = 8  # maximum number of dimensions of an array of weights
 # maximum size of the contract [bytes], mostly golden observations
 CONTRACT_LIMIT = 4 * 2**20
@@ -112,7 +112,7 @@ OPERATORS = RECURRENT | frozenset(
 """Operators of networks: no loops, branches, random numbers or data-dependent sizes."""
 FLOATS = frozenset({TensorProto.FLOAT, TensorProto.DOUBLE, TensorProto.FLOAT16})
 INTEGERS = frozenset({TensorProto.INT64, TensorProto.INT32})
-# types that take as much memory as space in the file
+# types whose size in memory equals their size in the file
 NUMBERS = FLOATS | INTEGERS | {TensorProto.BOOL}
 # For integers, division by zero, or of the minimum by -1, crashes the process.
 DIVIDING = frozenset({"Div", "ReduceMean"})

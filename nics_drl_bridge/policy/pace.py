@@ -39,7 +39,7 @@ class Pace:
         )
 
     def shortfall(self, steps: int) -> str | None:
-        """Warns if some goals can't be reached in time. Raises ConfigError if none can."""
+        """Returns a warning if time is too short for some goals. Raises ConfigError if for all."""
         limit = steps * self.period
         if self.far <= limit * self.speed:
             return None
