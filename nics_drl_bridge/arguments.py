@@ -44,7 +44,7 @@ def format_value(value: Any) -> str:
 
 
 def check_kind(what: str, value: Any, annotation: Any) -> None:
-    """Raises ConfigError unless a value fits its annotation: bool, int or float, also `| None`.
+    """Raises ConfigError unless a value fits its annotation: bool, int or float, or with `| None`.
 
     Other annotations are not checked. A bool is not a number, and numbers must be finite.
     """

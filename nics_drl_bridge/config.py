@@ -27,7 +27,7 @@ _LONGEST_PROBLEM = 200
 
 
 def parse_namespace(name: str) -> str:
-    """Returns a ROS 2 namespace as `/robot_1`, or empty. Raises ConfigError if it is invalid."""
+    """Returns a ROS 2 namespace like `/robot_1`, or "". Raises ConfigError if it is invalid."""
     namespace = name.strip("/")
     if namespace and not re.fullmatch(
         r"[A-Za-z_]\w*(/[A-Za-z_]\w*)*", namespace, re.ASCII
@@ -147,7 +147,7 @@ def _explain_error(error: ValidationError, schema: type[BaseModel]) -> str:
 def _locate_fields(
     schema: type[BaseModel], location: tuple[int | str, ...]
 ) -> list[str]:
-    """Returns the field names at a location, which names the `kind` chosen in a union of models."""
+    """Returns the field names at a location, in which the `kind` selects a model of a union."""
     current: Any = schema
     candidates: list[type] = []
     for part in location:
@@ -382,7 +382,7 @@ def parse_yaml(text: str, source: str) -> dict[str, Any]:
 
 
 class _QuotingDumper(_Dumper):
-    """Dumper that quotes every string, for readers that would read other strings as numbers."""
+    """Dumper that quotes every string, for parsers that would read some strings as numbers."""
 
 
 def _quote(dumper: _QuotingDumper, text: str) -> Any:

@@ -18,11 +18,11 @@ EVALUATION_SEED: Final = 1_000_000  # first episode; far from training seeds
 DEMO_EPISODES: Final = 5  # in process, and as many over DDS
 SHADOW_AHEAD_S: Final = 4.0  # default goal: the robot's position this much later
 CONFIRMED_BEYOND_M: Final = 5.0  # farther goals of a vehicle need confirmation
-VEHICLE_START: Final = "wait"  # until it stands at the start; alternative: `present`
+VEHICLE_START: Final = "wait"  # until it is at the start; alternative: `present`
 
 # recording and identification
 DRIVE_S: Final = 60.0  # duration of an identification drive
-DRIVE_BOUND_M: Final = 2.0  # radius of the circle around the start that holds the robot
+DRIVE_BOUND_M: Final = 2.0  # radius around the start that the robot stays within
 BAG_STORAGE: Final = "mcap"
 TAYLOR_ORDER: Final = "auto"  # order of Eq. 1 that predicts best
 PRUNING: Final = "auto"  # alpha of Eq. 2 at the knee of the accuracy

@@ -23,7 +23,7 @@ except ImportError:  # Windows
 
 _AT_FDCWD = -100
 _RENAME_EXCHANGE = 2
-_POSIX = hasattr(os, "O_DIRECTORY")  # Windows opens no folders
+_POSIX = hasattr(os, "O_DIRECTORY")  # Windows can't open folders
 _BINARY = getattr(os, "O_BINARY", 0)  # only on Windows
 
 
@@ -56,7 +56,7 @@ def write_parts(path: str | Path, parts: Iterable[bytes]) -> None:
                 os.fsync(file.fileno())
                 if _POSIX:  # while the lock still shows that the writer is alive
                     os.replace(temporary, path)
-            if not _POSIX:  # Windows renames no open file
+            if not _POSIX:  # Windows can't rename an open file
                 os.replace(temporary, path)
         except BaseException:
             temporary.unlink(missing_ok=True)

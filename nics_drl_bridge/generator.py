@@ -308,9 +308,8 @@ def open_model(
         return replace(model, lidar=spec, table=bake(spec, model.table.shapes))
     if isinstance(name, SimulatorModel):
         return name
-    if Path(name).is_dir() and name not in list_shipped(
-        "robots"
-    ):  # A Path never equals a name.
+    # A Path never equals the name of a shipped robot.
+    if Path(name).is_dir() and name not in list_shipped("robots"):
         return load_model(name)
     if "/" in (name := str(name)) and not name.endswith((".yaml", ".yml")):
         raise ModelError(f"{name}: no such folder; make one with `nics generate`.")

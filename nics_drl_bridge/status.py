@@ -14,7 +14,7 @@ class StatusLine:
 
     def __init__(self) -> None:
         self._bars: list[Callable[[str], None]] = []  # innermost last
-        self._is_shown = False  # True while a text stands on the terminal's last line
+        self._is_shown = False  # True while the terminal's last line shows a text
 
     @property
     def in_place(self) -> bool:

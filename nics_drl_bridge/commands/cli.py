@@ -144,18 +144,15 @@ def main() -> None:
         typer.echo("Aborted.", err=True)
         raise SystemExit(1) from None
     except BrokenPipeError:
-        os.dup2(
-            os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
-        )  # stdout is flushed at exit
+        # Python flushes stdout at exit, which must not raise again.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(1) from None
     except Exception as error:
-        if not hasattr(
-            error, "format_message"
-        ):  # not an option error of click or typer
+        # Anything else is not an option error of click or typer.
+        if not hasattr(error, "format_message"):
             raise
-        if (
-            message := error.format_message().strip()
-        ):  # empty if the help has been shown
+        # The message is empty if the help has been shown.
+        if message := error.format_message().strip():
             message = shorten(
                 message.rstrip(".?").replace("Value error, ", ""), LONGEST
             )

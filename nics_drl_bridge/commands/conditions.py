@@ -20,9 +20,8 @@ class Conditions:
     gate: str | None = None
     # time limit of an episode [steps]; None: from policies, robot and world
     steps: int | None = None
-    task: Mapping[str, Any] = field(
-        default_factory=dict
-    )  # overrides the policy's task options
+    # overrides of the policy's task options
+    task: Mapping[str, Any] = field(default_factory=dict)
     # path/to/file.py:ClassName of the policy's task, if it is not shipped
     kind: str | None = None
 

@@ -268,7 +268,7 @@ def report_in_one_sentence() -> Iterator[None]:
 
 
 def tell_replaced(file: Path) -> None:
-    """Tells the user if an existing file will be replaced."""
+    """Warns the user if an existing file will be replaced."""
     if file.exists():
         typer.echo(
             f"{file.parent}: the {file.name} that is there will be replaced", err=True
@@ -293,9 +293,8 @@ def format_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     from rich.table import Column, Table
     from rich.text import Text
 
-    table = Table(
-        *(Column(Text(head)) for head in heads), box=SIMPLE, pad_edge=False
-    )  # Text, not str: no markup
+    # Text, unlike str, has no markup.
+    table = Table(*(Column(Text(head)) for head in heads), box=SIMPLE, pad_edge=False)
     for row in rows:
         table.add_row(*(Text(cell, overflow="fold") for cell in row))
     console = Console()

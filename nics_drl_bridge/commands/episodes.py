@@ -222,9 +222,8 @@ class EvaluationOrder:
     world: str = defaults.EVALUATION_WORLD  # name or YAML file
     episodes: int = defaults.EVALUATION_EPISODES
     seed: int = defaults.EVALUATION_SEED
-    places: Sequence[
-        str
-    ] = ()  # of `PLACES`, the first is the reference; empty: all that work
+    # some of `PLACES`, the first of which is the reference; empty: all that work
+    places: Sequence[str] = ()
     conditions: Conditions = NO_CONDITIONS
 
     @property

@@ -45,10 +45,11 @@ ROS_TOOLS = (
     "fastrtps-cmake-module",
 )
 COMPILERS = ("c++", "g++", "clang++")
+# program -> the wheel or Debian package that has it
 PROGRAMS = {
     "cmake": "cmake",
     "make": "make",
-}  # program -> the wheel or Debian package that has it
+}
 FOLDERS = ("msg", "srv", "action")
 NAME_ELEMENT = re.compile(r"<name>\s*([^<]*?)\s*</name>")
 PACKAGE_NAME = re.compile(r"[a-z][a-z0-9_]*")
@@ -155,9 +156,8 @@ class Interfaces:
     name: str
     files: Sequence[Path]  # absolute
     needed: Sequence[str]  # other message packages
-    left_out: Mapping[
-        str, str
-    ]  # file that can't be built -> the missing package that it needs, maybe indirectly
+    # file that can't be built -> the missing package that it needs, maybe indirectly
+    left_out: Mapping[str, str]
 
 
 def check_programs() -> None:
@@ -276,7 +276,7 @@ class Generators(AbstractContextManager["Generators", None]):
         return (self._prefix / "share" / package).is_dir()
 
     def build(self, interfaces: Interfaces, prefix: Path) -> None:
-        """Builds a message package and installs it below a prefix. Raises ConfigError."""
+        """Builds a message package, and installs it below a prefix. Raises ConfigError."""
         place = self._work / interfaces.name
         names = []
         for file in interfaces.files:

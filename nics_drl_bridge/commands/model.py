@@ -128,9 +128,8 @@ def draw_preview(parameters: dict[str, Any]) -> tuple[str, ...]:
 
     robot = load_robot(parameters["robot"])
     out = check_out(Path(parameters["out"]))
-    load_topic_roles(
-        parameters["topics"] or None
-    )  # a wrong file fails before the robot moves
+    # A wrong file must fail before the robot moves.
+    load_topic_roles(parameters["topics"] or None)
     plan = DrivePlan(
         robot, *(parameters[name] for name in ("bound", "duration", "speed", "seed"))
     )

@@ -91,9 +91,8 @@ def import_(
             f"--out {out}: a policy file ends with {SUFFIX!r}; change the name."
         )
     data = import_policy(source, None if robot is None else open_model(robot))
-    contract = policy_of(
-        data, out
-    ).contract  # raises before an unusable file is written
+    # Raises before an unusable file is written.
+    contract = policy_of(data, out).contract
     write_bytes(out, data)
     name = contract.robot.name
     line = f"wrote {out}, a policy of {name!r}; see nics policy info {out}"

@@ -56,9 +56,8 @@ def _end(number: int, frame: FrameType | None) -> None:
         "_raw_object_cache"
     ):
         frame = frame.f_back
-    if (
-        frame is not None
-    ):  # No exception leaves this callback of llvmlite: try again later.
+    # No exception can leave this callback of llvmlite: try again later.
+    if frame is not None:
         threading.Timer(0.01, signal.raise_signal, (number,)).start()
     elif number == signal.SIGINT:
         raise KeyboardInterrupt
@@ -73,10 +72,8 @@ def main() -> None:
     try:
         _run()
     except SystemExit as end:
-        if _interrupts and end.code not in (
-            0,
-            None,
-        ):  # the command did not handle it
+        # With code 0 the command has handled the interrupt.
+        if _interrupts and end.code not in (0, None):
             _leave_interrupted()
         raise
 

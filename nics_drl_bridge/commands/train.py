@@ -22,10 +22,8 @@ from nics_drl_bridge.files import format_json
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 DEFAULT_EPISODES = 500
-OWN = (
-    "lean",
-    "sb3",
-)  # PPO engines of this process, see `training_settings.PpoSettings`
+# PPO engines in this process, see `training_settings.PpoSettings`
+OWN = ("lean", "sb3")
 
 
 def train(

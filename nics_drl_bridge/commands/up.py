@@ -168,9 +168,8 @@ def end_nodes_by_signals() -> Iterator[None]:
     """Lets SIGHUP and the like end the nodes properly; restores the handlers afterwards."""
     before = {number: signal.getsignal(number) for number in SIGNALS}
     for number, handler in before.items():
-        if (
-            handler is signal.SIG_DFL
-        ):  # ignored signals stay ignored: SIGHUP under nohup
+        # Ignored signals stay ignored: SIGHUP under nohup.
+        if handler is signal.SIG_DFL:
             signal.signal(number, _leave)
     try:
         yield

@@ -20,9 +20,8 @@ GOAL_FRAMES = (ROBOT, MAP)
 # where episodes start, see `RealtimeOptions.start`
 WAIT = "wait"
 PRESENT = "present"
-NEAR_M = (
-    0.5  # extra goal distance allowed after a confirmation without asking again [m]
-)
+# increase of a confirmed distance below which nobody is asked again [m]
+NEAR_M = 0.5
 MARGIN_M = 10.0  # open ground beyond a goal [m]
 Say = Callable[[str], None]
 Point = tuple[float, float]
@@ -30,7 +29,7 @@ Point = tuple[float, float]
 
 @dataclass(frozen=True)
 class GoalOrder:
-    """A goal as the user asks for it.
+    """A goal as requested by the user.
 
     In the frame `robot`, x points ahead and y left from the start. In `map`, both are coordinates
     of the estimate, whose origin is that of odometry unless there is a pose sensor.

@@ -24,9 +24,8 @@ world = typer.Typer(
 SDF = (".world", ".sdf")
 MAPS = (".yaml", ".yml")
 PICTURES = (".png", ".pgm", ".bmp")
-HEIGHT = (
-    0.2  # default height of the plane to import [m]: TurtleBot3's lidar is at 0.18 m
-)
+# default height of the plane to import [m]: TurtleBot3's lidar is at 0.18 m
+HEIGHT = 0.2
 CLEARANCE = 0.1  # default [m]: imported worlds are often narrow
 NEAREST = 2.0  # default of the minimum distance from start to goal [m]
 NAV2 = {

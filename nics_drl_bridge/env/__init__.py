@@ -1,1 +1,1 @@
-"""Gymnasium environments: tasks written once, over any backend."""
+"""Gymnasium environments: tasks written once, for any backend."""

@@ -42,40 +42,40 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
 
     ## Description
 
-    A robot with a lidar stands in a walled field among obstacles and has a task, whose class
+    A robot with a lidar stands among obstacles in a walled field and has a task, whose class
     documents observation, reward and end: `Navigation` (`NicsBridge/Navigation-v0`),
     `CooperativeReaching` and `PursuitEvasion` for teams, or your own (`NicsBridge/Task-v0`). The
     robot is either simulated in this process (`backend="sim"`) or whatever is behind the ROS 2
     topics `cmd_vel`, `scan` and `odom` (`backend="dds"` or `"ros"`): a simulator node or the
-    vehicle. Task, spaces and numbers are the same.
+    vehicle. Task, spaces and units are the same.
 
     ## Action Space
 
     For one robot, `Box(-1, 1, (C,), float32)`: each command of the robot, scaled between its
-    limits, for the Ackermann robot speed [m/s] and steering angle [rad]; or `Discrete` with
-    `task_options={"actions": "discrete"}`, see `env.task.DRIVES`. For M robots, concatenated,
-    `Box(-1, 1, (M C,), float32)` or `MultiDiscrete`.
+    limits; for the Ackermann robot, speed [m/s] and steering angle [rad]. With
+    `task_options={"actions": "discrete"}` it is `Discrete`, see `env.task.DRIVES`. For M robots
+    the actions are concatenated: `Box(-1, 1, (M C,), float32)` or `MultiDiscrete`.
 
     ## Observation Space
 
-    The task's `Box((O,), float32)`, or `Box((M O,), float32)` for a team, robot by robot, which
-    `observation.reshape(M, O)` separates.
+    The task's `Box((O,), float32)`, or `Box((M O,), float32)` for a team, robot by robot;
+    `observation.reshape(M, O)` separates the robots.
 
     ## Rewards
 
-    The sum of the terms in `info["reward_terms"]`, and over the robots of a team, whose terms are
-    arrays (M,).
+    The sum of the terms in `info["reward_terms"]`. For a team, terms are arrays (M,), and the
+    reward also sums over the robots.
 
     ## Starting State
 
-    The seed fixes obstacles, start poses, goals and noise; the robots stand still. `reset` takes
-    `options={"start": (x, y, heading), "goal": (x, y)}` to override them, or any other entry of the
-    task's memory by name.
+    The seed determines obstacles, start poses, goals and noise; the robots stand still. `reset`
+    takes `options={"start": (x, y, heading), "goal": (x, y)}` to override start and goal, or any
+    other entry of the task's memory by name.
 
     ## Episode End
 
-    Terminated when the task has ended for every robot; a robot of a team that ended earlier stands
-    still. Truncated after 300 steps, unless `gymnasium.make` is given another `max_episode_steps`.
+    Terminated when the task has ended for every robot; robots of a team that end earlier stand
+    still. Truncated after 300 steps, unless `gymnasium.make` gets another `max_episode_steps`.
 
     ## Arguments
 
@@ -87,17 +87,16 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         world: a World, its YAML file, the name of a shipped one, or a list of these (a world set).
         task: a name, `path/to/file.py:ClassName`, a class, or a Task; see `env.registry.make_task`.
         task_options: further arguments of the task's class.
-        estimator: True puts the robot's middleware (cache and EKF) between the simulator and the
-            task. Without it, the default of `sim`, pose and twist are those of odometry and
-            bit-identical to the vector env. With it, one robot in process and one over `dds`,
-            which always has it, give the same numbers.
-        backend_options: passed to a backend by name, see `SimBackend` and `DdsBackend`; so are
-            `estimator`, `randomisation` and the number of robots if they are given.
+        estimator: True puts the robot's middleware (cache and EKF) between simulator and task, so
+            that `sim` gives the same numbers as `dds`, which always has it. False, the default of
+            `sim`, takes pose and twist from odometry, bit-identical to the vector env.
+        backend_options: arguments of a backend by name, see `SimBackend` and `DdsBackend`; it also
+            gets `estimator`, `randomisation` and the number of robots if they are given.
         randomisation: quantities drawn in each episode: the name of a shipped one, a YAML file, or
             a Randomisation; the drawn values are in `info["randomisation"]` of a reset.
         render_mode: `rgb_array`, `human` (a page in the browser, see `watch`) or None.
-        simulator: name of the node behind `dds`; `simulation_interfaces` for any simulator that
-            serves these, such as Gazebo or Isaac, see `docs/dds_backend.md`.
+        simulator: name of the node behind `dds`, or `simulation_interfaces` for any simulator that
+            provides these services, such as Gazebo or Isaac, see `docs/dds_backend.md`.
 
     Raises:
         ConfigError, ModelError: an unknown name or a wrong file.
@@ -144,7 +143,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         self._episode = -1
         self._rehearsed = False
         self._picture: Any = None
-        # From the last step, for pictures; and the number of steps in the episode.
+        # of the last step, for pictures
         self._command = self._rest
         self._facts = dict[str, Any]()
         self._steps = 0
@@ -211,13 +210,13 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         return observation.reshape(-1), self._info(self._view, facts)
 
     def _rehearse(self, episodes: Episodes) -> None:
-        """Runs the task once before moving: compiling takes too long while a robot drives."""
+        """Runs the task once before the robot moves: it is too slow to compile while driving."""
         free = np.full((1, self.robots, self.model.lidar.beams), np.inf, np.float32)
         sensed = unread(self.model.sensors, 1, self.robots)
         starts = episodes.starts
         view = RobotView(starts.copy(), 0.0 * starts, free, 0.0, 0.0, 0.0, sensed)
         memory = self.task.begun(episodes)
-        with suppress(ConfigError):  # the view is made up, so the task may refuse it
+        with suppress(ConfigError):  # the task may refuse the made-up view
             self.task.step_into(np.empty(self._shape, np.float32), view, view, memory)
         self._rehearsed = True
 
@@ -229,7 +228,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         """Applies an action for one control period; see Gymnasium."""
         observation, terms, info = self.advance(action)
         values = {name: term.tolist() for name, term in terms.items()}
-        # Summed in the vector env's order, for the same bits.
+        # Sum in the vector env's order, for bit-identical rewards.
         each = [reduce(add, own, 0.0) for own in zip(*values.values(), strict=True)]
         alone = self.robots == 1
         info["reward_terms"] = (
@@ -283,7 +282,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         return out[0], terms, self._info(view, facts)
 
     def halt(self) -> None:
-        """Stops the robot until the next reset; any exception has already done so."""
+        """Stops the robot until the next reset; any exception does this, too."""
         self._view = None
         self._backend.halt()
 
@@ -333,7 +332,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         return WorldPicture(self.model, self.world)
 
     def snapshot(self) -> Snapshot:
-        """The current state of the world for a picture. Raises ResetNeeded before an episode."""
+        """Returns the world's state for a picture. Raises ResetNeeded before the first episode."""
         if self._view is None or self.scene is None:
             raise gymnasium.error.ResetNeeded("call reset() before render().")
         facts = self._backend.facts()

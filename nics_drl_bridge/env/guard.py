@@ -29,7 +29,7 @@ T = TypeVar("T")
 def halts_on_error(
     method: Callable[Concatenate[Any, P], T],
 ) -> Callable[Concatenate[Any, P], T]:
-    """Makes a method `halt` its robot if any exception leaves it, including Ctrl-C."""
+    """Makes a method `halt` its robot if it raises any exception, including KeyboardInterrupt."""
 
     @wraps(method)
     def guarded(self: Any, /, *args: P.args, **kwargs: P.kwargs) -> T:
@@ -64,9 +64,9 @@ def refused_after_close(
 
 @contextlib.contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Defers Ctrl-C to the end of the block, so it can't interrupt the stopping of a robot."""
+    """Defers Ctrl-C to the end of the block, so that it can't interrupt the stopping of a robot."""
     if threading.current_thread() is not threading.main_thread():
-        yield  # other threads are never interrupted
+        yield  # Ctrl-C never interrupts other threads
         return
     came: list[int] = []
     before = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
@@ -79,7 +79,7 @@ def uninterrupted() -> Iterator[None]:
 
 
 def check_reset(seed: Any, options: Any, worlds: int = 1) -> None:
-    """Raises ConfigError for a wrong seed (one for all worlds, or one each), or wrong options."""
+    """Raises ConfigError for wrong options, or a wrong seed (one for all worlds, or one each)."""
     several = isinstance(seed, list | tuple | np.ndarray)
     given = [one for one in (seed if several else [seed]) if one is not None]
     check_seeds(given, GREATEST_SEED if several else GREATEST_SEED + 1 - worlds)
@@ -93,7 +93,7 @@ def override(
 ) -> None:
     """Writes values of `reset(options=...)` into all rows of the memory arrays they name.
 
-    Options `of_env` are the env's own, even if a task's memory has an entry of the same name.
+    Options in `of_env` belong to the env, even if the task's memory has an entry of that name.
     """
     for name, value in (options or {}).items():
         if name in of_env:
@@ -107,7 +107,7 @@ def override(
 
 
 def give(rows: NDArray[Any], name: str, value: Any) -> None:
-    """Writes the value of a `reset(options=...)` entry into rows (n, ...)."""
+    """Writes a value of `reset(options=...)` into rows (n, ...). Raises ConfigError."""
     try:
         given = np.asarray(value)
     except ValueError:  # a ragged list
@@ -129,9 +129,9 @@ def check_places(
     world: AnyWorld,
     radius: float = 0.0,
 ) -> None:
-    """Raises ConfigError for starts of a footprint, or goals, (n, ..., 2 or 3) off the field.
+    """Raises ConfigError for starts or goals (n, ..., 2 or 3) off the field or in a wall.
 
-    The same applies in a wall, and to starts on an obstacle in the scenes of the n episodes.
+    Starts (`radius` > 0) may not overlap an obstacle of the n scenes either.
     """
     free = not radius
     for scene, rows in zip(scenes, places, strict=True):
@@ -154,11 +154,12 @@ def check_places(
 def _on(
     x: float, y: float, radius: float, body: NDArray[Any], shapes: Sequence[Shape]
 ) -> bool:
-    """True if a disc overlaps a body."""
+    """Returns True if a disc overlaps a body."""
     (dx, dy), (c, s), reach = (x, y) - body[:2], body[[COS, SIN]], body[RADIUS]
     if reach <= 0.0 or dx * dx + dy * dy >= (radius + reach) ** 2:
         return False
-    shape = shapes[int(body[SHAPE]) % len(shapes)]  # a shape comes in several sizes
+    # Each shape may occur in several sizes.
+    shape = shapes[int(body[SHAPE]) % len(shapes)]
     corners = shape.outline * (reach / shape.radius)
     at = (c * dx + s * dy, c * dy - s * dx)
     return (
@@ -182,7 +183,7 @@ def check_action(action: Any, space: gymnasium.Space[Any], name: str) -> NDArray
         raise gymnasium.error.InvalidAction(f"{name} of shape {given.shape}: {needed}")
     if isinstance(space, gymnasium.spaces.Box) and space.dtype == np.float32:
         if given.dtype.char not in "fd":
-            # the kernels are compiled only for float32 and float64
+            # The kernels are compiled only for float32 and float64.
             given = given.astype(np.float64)
         if not kernels.finite(given.reshape(1, -1)):
             raise gymnasium.error.InvalidAction(
@@ -194,7 +195,7 @@ def check_action(action: Any, space: gymnasium.Space[Any], name: str) -> NDArray
 
 
 def check_command(command: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Returns a task's command as an array. Raises ConfigError unless finite and of this shape."""
+    """Returns a task's command as an array. Raises ConfigError unless finite, of this shape."""
     made = np.asarray(command, np.float64)
     if made.shape != shape or not kernels.finite(made.reshape(1, -1)):
         needed = f"must be finite and of shape {shape}; check its `command`."

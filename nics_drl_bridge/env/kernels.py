@@ -1,8 +1,8 @@
 """Compiled inner loops of the tasks: actions, observations, and the navigation task.
 
-The batched loops call a scalar function per robot, for bearings as well: numpy's vectorised
-functions round the remainder of a batch differently from its body. Shapes: R robots in all
-worlds, B beams, C commands, P parts of a scan in an observation.
+The batched loops call a scalar function per robot, even for bearings, because numpy's vectorised
+functions round the remainder of a batch differently from its body. Shapes: R robots in all worlds,
+B beams, C commands, P scan parts of an observation.
 """
 
 import math
@@ -19,18 +19,18 @@ from nics_drl_bridge.random_kernels import episode_seed
 LIMIT = 1000.0
 ONE = np.float32(1.0).view(np.int32)
 BLOCK = 64  # number of beams checked together
-# maximum contribution of a beam for or against a contact [m]
+# maximum magnitude of a beam's contribution to a contact [m]
 FURTHEST = np.float32(0.04)
 
 
 class ScanScale(NamedTuple):
-    """Conversion of a scan to parts of an observation, and to contacts."""
+    """Conversion of a scan to observation parts and contacts."""
 
-    # 1 / the range that a fraction of 1 stands for [1/m], float32
+    # inverse of the range that a fraction of 1 stands for [1/m], float32
     per_metre: np.float32
     # (B,) float32 range at which each beam leaves the footprint [m]
     leaves: NDArray[np.float32]
-    # number of neighbouring beams on either side that a contact is judged by, too
+    # number of neighbouring beams on either side that also decide on a contact
     beside: int
     sectors: int  # number of observed sectors; 0 if beams are observed
     plan: SectorPlan  # mapping of beams to sectors
@@ -54,7 +54,7 @@ def commands(out, actions, low, high):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def finite(values):  # type: ignore[no-untyped-def]
-    """True if all values (R, C) are finite."""
+    """Returns True if all values (R, C) are finite."""
     for i in range(values.shape[0]):
         for c in range(values.shape[1]):
             if not math.isfinite(values[i, c]):
@@ -64,7 +64,7 @@ def finite(values):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def look(shares, ranges, scale):  # type: ignore[no-untyped-def]
-    """Writes a scan (B,) as fractions (P,), 1 free, 0 too close; True if it shows a contact."""
+    """Writes a scan (B,) as fractions (P,), 1 free, 0 too close; returns True for a contact."""
     if scale.sectors > 0:
         resample(shares, ranges, scale.plan)
         for s in range(shares.shape[0]):
@@ -79,7 +79,7 @@ def look(shares, ranges, scale):  # type: ignore[no-untyped-def]
 
 @kernel(inline=True)
 def _share(value, scale):  # type: ignore[no-untyped-def]
-    # A comparison with NaN (unknown) is False; -inf (too close) is below every range.
+    # NaN (unknown) compares False, so it becomes 0, as does -inf (too close).
     share = value * scale.per_metre
     share = share if share > np.float32(0.0) else np.float32(0.0)
     # Compare as integers, which keeps the order: LLVM turns two float limits into masks.
@@ -88,9 +88,9 @@ def _share(value, scale):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def contact(ranges, scale):  # type: ignore[no-untyped-def]
-    """True if a beam of a scan (B,) and the mean of its neighbours end within the footprint.
+    """Returns True if a beam of a scan (B,) and its neighbours' mean end within the footprint.
 
-    A single beam is too noisy: among hundreds, one nearly always errs by three standard deviations.
+    A single beam is too noisy: of hundreds, one is nearly always off by three standard deviations.
     """
     count = ranges.shape[0]
     for begin in range(0, count, BLOCK):
@@ -126,7 +126,7 @@ def looks(shares, touched, ranges, scale):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def bearing(dx, dy, heading):  # type: ignore[no-untyped-def]
-    """Distance [m] to a point at (dx, dy), and cosine and sine of its bearing from a heading."""
+    """Returns the distance [m] to a point at (dx, dy), and cosine and sine of its bearing."""
     distance = math.sqrt(dx * dx + dy * dy)
     if distance == 0.0:
         return 0.0, 1.0, 0.0

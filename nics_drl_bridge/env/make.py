@@ -1,4 +1,4 @@
-"""Makes environments of a task, with the arguments of their classes."""
+"""Makes environments of a task, with their classes' arguments."""
 
 from typing import Any
 

@@ -22,7 +22,7 @@ from nics_drl_bridge.interface import Array, RobotView
 
 
 class GoalProgress(NamedTuple):
-    """Outcome of a step."""
+    """Progress of robots towards their goals in a step."""
 
     approach: Array  # (...,) decrease of the distance to the goal [m]
     reached: Flags  # (...,) True at the goal
@@ -32,11 +32,11 @@ class GoalProgress(NamedTuple):
 
 @dataclass(frozen=True)
 class Navigation(Task):
-    """A robot in a walled field among obstacles has to reach a goal without touching anything.
+    """A robot in a walled field with obstacles has to reach a goal without touching anything.
 
     ## Observation Space
 
-    `Box((B + 6,), float32)` for B beams, counter-clockwise, or sectors if `scan` says so:
+    `Box((B + 6,), float32)` for B beams, or B sectors with `scan`, counter-clockwise:
 
     | Num | Observation | Min | Max | Unit |
     |---|---|---|---|---|
@@ -45,12 +45,12 @@ class Navigation(Task):
     | B + 1, B + 2 | cosine, sine of the bearing of the goal | -1 | 1 | - |
     | B + 3, B + 4 | estimated velocity forward, left | -1000 | 1000 | m/s |
     | B + 5 | estimated turn rate | -1000 | 1000 | rad/s |
-    | B + 6 on | fractions of the further `sensors`, if there are any | 0 | 1 | - |
+    | from B + 6 | fractions of additional `sensors`, if any | 0 | 1 | - |
 
     ## Action Space
 
-    `Box(-1, 1, (C,), float32)`: each command between its limits; or `Discrete(7)`, the paper's
-    motion commands (`task.DRIVES`; 9 for a robot that moves sideways).
+    `Box(-1, 1, (C,), float32)`: each command, scaled between its limits; or `Discrete(7)`, the
+    paper's motion commands (`task.DRIVES`; 9 for a robot that moves sideways).
 
     ## Rewards
 
@@ -59,12 +59,12 @@ class Navigation(Task):
 
     ## Starting State
 
-    Obstacles, start and goal are drawn by the world. Memory: `goal` (2,) [m].
+    The world draws obstacles, start and goal. Memory: `goal` (2,) [m].
 
     ## Episode End
 
-    The robot is within 0.3 m of the goal, or something touches its footprint; both are judged from
-    the robot's own estimate and scan. A contact at the goal is not a success.
+    The robot is within 0.3 m of the goal, or something touches its footprint, judged by the robot's
+    own estimate and scan. A contact at the goal is not a success.
     """
 
     keeps_last_scan: ClassVar[bool] = False
@@ -93,7 +93,7 @@ class Navigation(Task):
         return {"goal": episodes.goals.copy()}
 
     def observation(self, view: RobotView, memory: Memory) -> Observation:
-        """The observation (..., B + 6) of a view, for goals (..., 2) in `map`."""
+        """Returns the observation (..., B + 6) of a view, for goals (..., 2) in `map`."""
         out = np.empty(
             (*view.pose.shape[:-1], *self.observation_space.shape), np.float32
         )
@@ -103,7 +103,7 @@ class Navigation(Task):
     def judge(
         self, view: RobotView, memory: Memory, before: RobotView | None = None
     ) -> GoalProgress:
-        """Determines which robots are at their goals, and which touch something."""
+        """Determines which robots are at their goals and which touch something."""
         out = np.empty(
             (*view.pose.shape[:-1], *self.observation_space.shape), np.float32
         )
@@ -112,7 +112,7 @@ class Navigation(Task):
     def reward(
         self, before: RobotView, after: RobotView, memory: Memory
     ) -> dict[str, Array]:
-        """The terms (...,) of the reward for a step, whose sum is the reward."""
+        """Returns the terms (...,) whose sum is the reward of a step."""
         return self._terms(self.judge(after, memory, before))
 
     def end(self, view: RobotView, memory: Memory) -> Flags:
@@ -121,7 +121,7 @@ class Navigation(Task):
         return progress.reached | progress.touched
 
     def info(self, view: RobotView, memory: Memory) -> dict[str, NDArray[Any]]:
-        """Success and contact of each robot."""
+        """Returns success and contact of each robot."""
         return self._facts(self.judge(view, memory))
 
     def step_into(

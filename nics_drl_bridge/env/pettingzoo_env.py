@@ -1,4 +1,4 @@
-"""BridgeParallelEnv: a task of several robots, each an agent, as a PettingZoo environment."""
+"""BridgeParallelEnv: a task of a team as a PettingZoo environment; each robot is an agent."""
 
 from copy import deepcopy
 from typing import Any
@@ -34,7 +34,7 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
 
     ## Spaces, Rewards, Starting State, Episode End
 
-    Those of one robot in the docstring of the task's class, see `CooperativeReaching` and
+    Each agent has those of one robot, documented in the task's class, see `CooperativeReaching` and
     `PursuitEvasion`. `infos[agent]` has its `reward_terms`, `pose`, `is_success`, `collision`.
     `truncations` are all True after `max_episode_steps`.
 
@@ -77,7 +77,7 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         self.possible_agents = [f"robot_{m}" for m in range(self.env.robots)]
         self.agents: list[str] = []
         of = self.env.task
-        # One space per agent, because each space has its own random generator.
+        # Each agent has its own space, because a space contains a random generator.
         agents = self.possible_agents
         self.observation_spaces = {
             name: deepcopy(of.observation_space) for name in agents
@@ -85,11 +85,11 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         self.action_spaces = {name: deepcopy(of.action_space) for name in agents}
 
     def observation_space(self, agent: str) -> gymnasium.Space[Any]:
-        """Space of an agent, always the same object."""
+        """Returns the observation space of an agent, always the same object."""
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> gymnasium.Space[Any]:
-        """Space of an agent, always the same object."""
+        """Returns the action space of an agent, always the same object."""
         return self.action_spaces[agent]
 
     @halts_on_error
@@ -97,7 +97,7 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, dict[str, Any]]]:
         """Starts an episode with all agents; see PettingZoo."""
-        # PettingZoo's checker resets with an option "options"
+        # PettingZoo's checker passes an option "options".
         if isinstance(options, dict):
             options = {
                 name: value for name, value in options.items() if name != "options"
@@ -131,7 +131,7 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
             )
         space = self.env.task.action_space
         rest: Any = np.zeros(space.shape or (), space.dtype)
-        # The env stops the robots of agents that left, so their action does not matter.
+        # The env stops the robots of agents that have left, so their action does not matter.
         joint = [actions[n] if n in self.agents else rest for n in self.possible_agents]
         if self.env.robots == 1:
             action = joint[0]
@@ -156,11 +156,11 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         return seen, rewards, ended, cut, infos
 
     def halt(self) -> None:
-        """Stops every robot until the next reset. Any exception has already done so."""
+        """Stops every robot until the next reset; any exception does this, too."""
         self.env.halt()
 
     def _of(self, value: Any, m: int) -> Any:
-        """Robot m's row of a fact, or of each fact in a dict; a fact of the world unchanged."""
+        """Returns robot m's row of a fact or a dict of facts; keeps facts about the world."""
         if isinstance(value, dict):
             of_world = ("goal", "bodies")
             return {

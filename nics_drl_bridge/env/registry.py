@@ -1,4 +1,4 @@
-"""Tasks by name or by the path of a user's file; ids of environments, for Gymnasium."""
+"""Finds tasks by name or by path of a user's file, and registers ids with Gymnasium."""
 
 from collections.abc import Iterable
 from inspect import Parameter, signature
@@ -27,10 +27,10 @@ def make_task(
     model: SimulatorModel,
     options: dict[str, Any] | None = None,
 ) -> Task:
-    """Makes a task for the robot of a model. Raises ConfigError if it does not fit.
+    """Makes a task for a model's robot. Raises ConfigError if it does not fit.
 
-    `task` is the name of a shipped one (`navigation`), `path/to/file.py:ClassName`, a class, or a
-    Task. Options are arguments of the class: `scan` as in `sectors.layout_of`, `sensors` as names.
+    `task` is a shipped task's name (`navigation`), `path/to/file.py:ClassName`, a class, or a Task.
+    Options are arguments of the class: `scan` as in `sectors.layout_of`, `sensors` as names.
     """
     if isinstance(task, Task):
         return _checked(task, model, options)
@@ -66,7 +66,7 @@ def _sensor(name: Any, model: SimulatorModel) -> Sensor:
 
 
 def class_for(task: str | type[Task], options: dict[str, Any]) -> type[Task]:
-    """Returns a task's class. Raises ConfigError if there is none, or it lacks an option."""
+    """Returns a task's class. Raises ConfigError if it does not exist or lacks an option."""
     found = task if isinstance(task, type) else _class_of(task)
     if not issubclass(found, Task):
         raise ConfigError(
@@ -137,7 +137,7 @@ def _tasks_in(module: Any) -> list[str]:
 
 
 def _missing_class(file: Path) -> str:
-    """What to give instead of a file without a class name."""
+    """Returns advice on what to write instead of a file without a class name."""
     if not file.is_file():
         return "the file does not exist; give path/to/file.py:ClassName."
     tasks = _tasks_in(extensions.load_module(str(file), "task"))
@@ -159,7 +159,7 @@ ENVIRONMENTS = {  # id -> arguments that define the environment
 
 
 def register_envs() -> None:
-    """Registers every environment; importing this module also does so."""
+    """Registers all environments; importing this module does the same."""
     for name, arguments in ENVIRONMENTS.items():
         if name not in gymnasium.registry:
             gymnasium.register(

@@ -1,4 +1,4 @@
-"""Pictures of a world from above, for `render_mode="rgb_array"` and for videos."""
+"""Top-view pictures of a world, for `render_mode="rgb_array"` and videos."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -47,7 +47,7 @@ class WorldPicture:
         self._axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
 
     def draw(self, shot: Snapshot, trails: Sequence[Array] = ()) -> NDArray[np.uint8]:
-        """Returns the pixels (H, W, 3) of a snapshot, with its robots' paths (T, 2) so far."""
+        """Returns a snapshot's pixels (H, W, 3), with the robots' paths (T, 2) so far."""
         axes = self._axes
         axes.clear()
         axes.set_axis_off()
@@ -92,7 +92,7 @@ def draw_robot(
     zorder: float,
     **look: Any,
 ) -> None:
-    """Draws a round robot, or one with an outline (V, 2) [m], and a line to its front."""
+    """Draws a robot, round or with an outline (V, 2) [m], and a line to its front."""
     if outline is None:
         axes.add_patch(Disc((pose[0], pose[1]), radius, zorder=zorder, **look))
     else:

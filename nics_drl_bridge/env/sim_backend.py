@@ -1,4 +1,4 @@
-"""Backends of an env: the fast simulator in this process, registered ones, user-defined ones."""
+"""Backends of an env: the fast simulator in this process, and registered or user-defined ones."""
 
 import math
 from inspect import signature
@@ -26,7 +26,7 @@ from nics_drl_bridge.sim.world_set import AnyWorld
 
 
 def _sent(pose: Array) -> Array:
-    """Returns a pose (3,) as decoded from a message, whose quaternion rounds the heading."""
+    """Returns a pose (3,) as decoded from a message: the quaternion rounds the heading."""
     z = math.sin(float(pose[2]) / 2.0)
     w = math.cos(float(pose[2]) / 2.0)
     return np.array([pose[0], pose[1], math.atan2(2.0 * (w * z), 1.0 - 2.0 * (z * z))])
@@ -35,8 +35,8 @@ def _sent(pose: Array) -> Array:
 class SimBackend:
     """One world of the fast simulator, in this process.
 
-    With `estimator`, each robot's scan and odometry pass its middleware, as in the nodes, so that
-    this backend and the DDS backend return the same numbers. Without it, the pose is that of the
+    With `estimator`, each robot's scan and odometry pass through its middleware, as in the nodes,
+    so that this backend and the DDS backend return the same numbers. Without it, poses come from
     odometry: bit-identical to a world of the vector env, and several times as fast. Views and
     commands have a leading (M,) for M > 1 `robots`; `simulation` is passed to the FastSimulator.
     """
@@ -76,7 +76,7 @@ class SimBackend:
         """Moves the robots by one control period; see `interface.Backend`."""
         data = self.simulator.data
         if self._middlewares:
-            # rounded like a message, so that both backends agree
+            # Round like a message, so that both backends agree.
             command = self._robot.pass_through_cmd_vel(command)
         commands = command.reshape(data.pose.shape[1], -1)
         for middleware, one in zip(self._middlewares, commands, strict=False):
@@ -85,7 +85,7 @@ class SimBackend:
         self._now_ns += self._period_ns
         told = {"stamp_ns": self._now_ns, **self._truth()}
         view = self._measure()
-        if self._middlewares:  # at the time of this view
+        if self._middlewares:  # covariance at the time of this view
             every = np.array(
                 [each.estimator.covariance[:3, :3] for each in self._middlewares]
             )
@@ -148,7 +148,7 @@ class SimBackend:
         """Does nothing: robots only move in `step`."""
 
     def close(self) -> None:
-        """Does nothing: there is nothing to free."""
+        """Does nothing: there are no resources to free."""
 
 
 class CompletedBackend:
@@ -159,7 +159,7 @@ class CompletedBackend:
         self._still = still
         self._moved = False
         self._known = BackendFacts()
-        for name in ("halt", "facts"):  # the backend's own method, if it has one
+        for name in ("halt", "facts"):  # prefer the backend's own method
             if callable(method := getattr(backend, name, None)):
                 setattr(self, name, method)
 
@@ -177,7 +177,7 @@ class CompletedBackend:
         return view, facts
 
     def halt(self) -> None:
-        """Steps with the standstill command if there was a step since the last halt."""
+        """Steps with the standstill command unless there was no step since the last halt."""
         if self._moved:
             self._backend.step(self._still.copy())
             self._moved = False
@@ -219,7 +219,7 @@ def make_backend(
         raise ConfigError(f"backend {name!r}: {error}; check its arguments.") from None
     try:
         return make(model, world, **options)
-    except TypeError as error:  # raised further inside, for arguments that it passes on
+    except TypeError as error:  # raised deeper inside, for arguments passed on
         if not any(f"argument '{name}'" in str(error) for name in options):
             raise
         raise ConfigError(f"backend {name!r}: {error}; check its arguments.") from None

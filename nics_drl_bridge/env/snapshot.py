@@ -1,4 +1,4 @@
-"""Snapshot: everything that a picture of one world shows at one time."""
+"""Snapshot: everything that a picture of one world shows."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,14 +14,14 @@ from nics_drl_bridge.lidar.spec import LidarSpec
 
 @dataclass(frozen=True)
 class Snapshot:
-    """One world with its M robots; unknown values are None."""
+    """One world with its M robots at one time; unknown values are None."""
 
     poses: Array  # (M, 3) x [m], y [m], heading [rad] in `map`; the truth if known
     ranges: NDArray[np.float32]  # (M, B) [m], REP-117
     bodies: Array  # (K, 7) obstacles, see `sim.scenes.Scene`
     goals: Array  # (G, 2) [m]
     member: int = 0  # member of a world set
-    step: int = 0  # number of control periods since the episode began
+    step: int = 0  # control periods since the start of the episode
     estimates: Array | None = None  # (M, 3) poses that the robots estimate
     covariance: Array | None = None  # (M, 3, 3) of the estimates [m, rad]
     commands: Array | None = None  # (M, C) commands that the robots follow
@@ -30,19 +30,19 @@ class Snapshot:
 
 
 def goals_of(memory: Mapping[str, NDArray[Any]]) -> Array:
-    """The goals (G, 2) in the memory of a task; possibly none."""
+    """Returns the goals (G, 2) in a task's memory, possibly none."""
     return np.reshape(memory.get("goal", np.zeros((0, 2))), (-1, 2))
 
 
 def gate_of(info: Mapping[str, Any]) -> str | None:
-    """State of the gate from the `info` of a step, see `Snapshot.gate`; None without a gate."""
+    """Returns `Snapshot.gate` from the `info` of a step; None without a gate."""
     if "stopped_by" not in info:
         return None
     return str(info["stopped_by"]) or ("shield" if info["shielded"] else "")
 
 
 def hits_of(lidar: LidarSpec, pose: Array, ranges: NDArray[np.float32]) -> Array:
-    """Points (n, 2) that a scan (B,) hits, taken at a robot's pose (3,), in `map` [m]."""
+    """Returns the points (n, 2) in `map` [m] that a scan (B,) hits from a robot's pose (3,)."""
     mount = geometry.compose(pose, lidar.mount)
     there = np.isfinite(ranges)
     angles = mount[2] + lidar.angles[there]

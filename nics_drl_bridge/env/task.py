@@ -1,4 +1,4 @@
-"""Task: what a robot does, written once for one robot over ROS 2 and thousands in arrays."""
+"""Task: what a robot does, written once for one robot over ROS 2 and for thousands in arrays."""
 
 import math
 from abc import ABC, abstractmethod
@@ -36,22 +36,23 @@ DRIVES = (
     (-1, 0, 1),
     (-1, 0, -1),
 )
-"""Stop; ahead, to the left, to the right; and back: signs of linear.x, linear.y, angular.z, as in
-the authors' code (efc-robot/MultiVehicleEnv). A robot that can't reverse only turns, if it can."""
+"""Signs of linear.x, linear.y, angular.z: stop, then forward and backward, each straight, left and
+right, as in the paper's code (efc-robot/MultiVehicleEnv). A robot that can't reverse turns in place
+instead if it can."""
 SIDEWAYS = ((0, 1, 0), (0, -1, 0))  # two more for a robot that moves sideways
 PARTS = ("update", "observation", "judge", "reward", "end", "info")
-"""Methods of a step; if a class overrides one, its base's one-pass step is not used."""
+"""Methods of a step; a class that overrides one does not use its base's one-pass step."""
 CONTACT_ANGLE = math.radians(4.0)  # 2 cm at a distance of 0.3 m
 
 
 @dataclass(frozen=True)
 class Episodes:
-    """Episodes at their start, in n worlds with M robots."""
+    """Starting episodes in n worlds with M robots."""
 
-    # (n,) seeds, the only source of randomness, used with `random_kernels.uniform`
+    # (n,) seeds, the only source of randomness, for `random_kernels.uniform`
     seeds: NDArray[np.int64]
     starts: Array  # (n, M, 3) poses of the robots: x [m], y [m], heading [rad] in `map`
-    goals: Array  # (n, M, 2) free points that the world drew, one per robot [m]
+    goals: Array  # (n, M, 2) free points drawn by the world, one per robot [m]
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Sight:
-    """Directions (P,) [rad] and origin (2,) [m] of the scan parts, range of a fraction of 1 [m]."""
+    """Scan parts: directions (P,) [rad], origin (2,) [m], and the range of a fraction of 1 [m]."""
 
     angles: Array
     origin: Array
@@ -83,9 +84,9 @@ class Task(ABC):
     `bearing` and `distance` instead of numpy's trigonometric functions.
     """
 
-    # True if a method uses `before.ranges`; if False they may be the new ranges, which saves a copy
+    # True if a method uses `before.ranges`; if False, they may be the new ranges, to save a copy
     keeps_last_scan: ClassVar[bool] = True
-    # True if the task observes the further `sensors`
+    # True if the task observes the additional `sensors`
     observes_sensors: ClassVar[bool] = False
     # names of memory arrays that `info` always contains
     shown: ClassVar[tuple[str, ...]] = ()
@@ -94,20 +95,20 @@ class Task(ABC):
     lidar: LidarSpec  # lidar of the scan
     # a Box, or `discrete`: the paper's motion commands, see `DRIVES`
     actions: Actions = "continuous"
-    # returns this close to the footprint count as a contact [m], averaged over `CONTACT_ANGLE`
+    # hits this close to the footprint, averaged over `CONTACT_ANGLE`, count as a contact [m]
     contact_margin: float = 0.02
-    # limit of commands in m/s, if the robot's own limits are higher [m/s]
+    # additional limit of the commands with unit m/s [m/s]
     top_speed: float | None = None
     # sectors instead of beams, the same for any lidar; contacts are judged from the beams
     scan: ScanLayout | None = None
-    # further sensors, whose fractions end each observation
+    # additional sensors, whose fractions end each observation
     sensors: tuple[Sensor, ...] = ()
 
     def __init_subclass__(cls, **given: Any) -> None:
         super().__init_subclass__(**given)
         own = takewhile(lambda each: "step_into" not in vars(each), cls.__mro__)
         if any(part in vars(each) for each in own for part in PARTS):
-            cls.step_into = Task.step_into  # type: ignore[method-assign]  # that one lacks them
+            cls.step_into = Task.step_into  # type: ignore[method-assign]  # without the overrides
             if "keeps_last_scan" not in vars(cls):
                 cls.keeps_last_scan = True
 
@@ -124,10 +125,10 @@ class Task(ABC):
             raise ConfigError(
                 f"task option sensors: {name} does not observe further sensors."
             )
-        _ = self.plan  # refuses a lidar that can't fill the layout
+        _ = self.plan  # raises if the lidar can't fill the layout
 
     def check_above_zero(self, option: str, metres: float) -> None:
-        """Raises ConfigError unless the length option is above 0 m."""
+        """Raises ConfigError unless a length option is above 0 m."""
         if not metres > 0.0:
             raise ConfigError(f"task option {option}={metres!r}: must be above 0 m.")
 
@@ -164,17 +165,17 @@ class Task(ABC):
 
     @abstractmethod
     def end(self, view: RobotView, memory: Memory) -> Flags:
-        """Returns True where a robot's episode is over, (...); a team ends with its last robot."""
+        """Returns True for robots (...) whose episode is over; a team ends with its last robot."""
 
     def info(self, view: RobotView, memory: Memory) -> dict[str, NDArray[Any]]:
         """Returns facts for `info`; an evaluation reads `is_success` and `collision`."""
         return {}
 
     def update(self, before: RobotView, after: RobotView, memory: Memory) -> None:  # noqa: B027
-        """Updates the memory in place after a step, before anything is computed from it."""
+        """Updates the memory in place after a step, before it is used."""
 
     def command(self, action: ArrayLike) -> Array:
-        """Returns the command (..., C) of a discrete action, or one (..., C) clamped to [-1, 1]."""
+        """Returns the command (..., C) of actions: discrete, or (..., C) and clamped to [-1, 1]."""
         if self.actions == "discrete":
             return np.asarray(self.discrete_commands[np.asarray(action)])
         given = np.ascontiguousarray(action)
@@ -182,7 +183,7 @@ class Task(ABC):
         rows = given.reshape(-1, given.shape[-1])
         low, high = self.command_limits
         kernels.commands(out.reshape(rows.shape), rows, low, high)
-        # Do not teach what a vehicle can't do: a car driven by turn rates can't steer at rest.
+        # Don't teach what a vehicle can't do: a car driven by turn rates can't steer at rest.
         return (
             self.robot.pass_through_cmd_vel(out) if self.robot.takes_turn_rate else out
         )
@@ -197,7 +198,7 @@ class Task(ABC):
             raise self._wrong(
                 f"memory {sorted(memory)}", f"must keep {sorted(given)} from `reset`"
             )
-        # Copy rebound arrays into the env's rows, all read first, because they may be aliases.
+        # Copy rebound arrays into the env's rows. Read all first, because they may alias.
         anew = {
             n: np.array(memory[n]) for n, rows in given.items() if memory[n] is not rows
         }
@@ -263,7 +264,7 @@ class Task(ABC):
 
     @cached_property
     def command_limits(self) -> tuple[Array, Array]:
-        """Commands (C,) of the minimum and of the maximum action."""
+        """Commands (C,) of the minimum and the maximum action."""
         low = self.robot.command_low
         high = self.robot.command_high
         if self.top_speed is None:
@@ -280,7 +281,7 @@ class Task(ABC):
     # Building blocks of tasks.
 
     def box(self, low: ArrayLike, high: ArrayLike) -> gymnasium.spaces.Box:
-        """Space of scan fractions (P), parts with these limits, and fractions of `sensors` (Q)."""
+        """Returns the space of P scan fractions, parts with these limits, Q sensor fractions."""
         parts = self.scan_parts
         further = sum(sensor.parts for sensor in self.sensors)
         low = np.asarray(low, np.float32)
@@ -320,12 +321,12 @@ class Task(ABC):
 
     @property
     def scan_parts(self) -> int:
-        """P, the number of scan parts of an observation: sectors of `scan`, or beams."""
+        """P, the number of scan parts in an observation: sectors of `scan`, or beams."""
         return self.lidar.beams if self.scan is None else self.scan.sectors
 
     @cached_property
     def sight(self) -> Sight:
-        """Meaning of the scan parts."""
+        """Directions, origin and range of the scan parts."""
         if (layout := self.scan) is not None:
             return Sight(layout.angles, np.array(layout.viewpoint), layout.range_max)
         x, y, heading = self.lidar.mount
@@ -335,7 +336,7 @@ class Task(ABC):
 
     @cached_property
     def plan(self) -> SectorPlan:
-        """Mapping of the lidar's beams to the sectors of `scan`; without it, no sectors."""
+        """Mapping of the lidar's beams to the sectors of `scan`; empty without `scan`."""
         return NO_PLAN if self.scan is None else plan_of(self.lidar, self.scan)
 
     @cached_property
@@ -349,13 +350,13 @@ class Task(ABC):
 
 
 def _finite(given: Any) -> bool:
-    """True if all entries are finite numbers."""
+    """Returns True if all entries are finite numbers."""
     values = np.asarray(given)
     return values.dtype.kind in "fiub" and bool(np.isfinite(values).all())
 
 
 def discrete_commands(robot: RobotSpec) -> Array:
-    """(A, C) commands of the discrete actions, at limits: `DRIVES`, or each command by itself."""
+    """Returns the discrete actions' commands (A, C): `DRIVES`, or each command alone, at limits."""
     drives = np.array((*DRIVES, *SIDEWAYS) if robot.moves_sideways else DRIVES)
     if robot.takes_cmd_vel:
         signs = robot.from_fields(drives)
@@ -376,7 +377,7 @@ def still(robot: RobotSpec) -> Array:
 
 
 def team_space(space: gymnasium.Space[Any], robots: int) -> gymnasium.Space[Any]:
-    """Joint space of M robots: Box (L,) becomes Box (M L,), Discrete becomes MultiDiscrete (M,)."""
+    """Returns M robots' joint space: Box (M L,) of a Box (L,), MultiDiscrete of a Discrete."""
     if robots == 1:
         return space
     several = gymnasium.vector.utils.batch_space(space, robots)
@@ -412,7 +413,7 @@ def limited(twist: Array) -> Array:
 
 
 def total(values: Array) -> Array:
-    """Sums over the last axis to (...), in order: bit-identical for every batch size."""
+    """Sums over the last axis in order, so that results are bit-identical for any batch size."""
     summed = values[..., 0].copy()
     for k in range(1, values.shape[-1]):
         summed += values[..., k]
@@ -422,7 +423,7 @@ def total(values: Array) -> Array:
 def contact_ranges(
     robot: RobotSpec, lidar: LidarSpec, margin: float
 ) -> NDArray[np.float32]:
-    """Ranges (B,) at which beams leave the footprint plus a margin [m]; -inf if they never do."""
+    """Returns ranges (B,) at which beams leave the footprint plus a margin [m]; -inf if never."""
     x, y, heading = lidar.mount
     angles = lidar.angles + heading
     ray = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
@@ -438,10 +439,10 @@ def contact_ranges(
 
 
 def _leaves_outline(ray: Array, corners: Array) -> Array:
-    """Distances (B,) at which rays (B, 2) from the origin last cross an outline (V, 2)."""
+    """Returns distances (B,) at which rays (B, 2) from the origin last cross an outline (V, 2)."""
     edge = np.roll(corners, -1, axis=0) - corners
     turned = np.stack([-edge[:, 1], edge[:, 0]], axis=-1)
-    steep = ray @ turned.T  # (B, V) for each ray and side
+    steep = ray @ turned.T  # (B, V): each ray and side
     with np.errstate(divide="ignore", invalid="ignore"):
         away = np.sum(corners * turned, axis=-1) / steep
         where = (away[..., None] * ray[:, None] - corners) * edge

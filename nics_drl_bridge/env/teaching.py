@@ -1,4 +1,4 @@
-"""Teaching in addition to the task: rewards from the ground truth, and repeated failed episodes."""
+"""Training aids: rewards from the ground truth, and repetition of failed episodes."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,20 +13,20 @@ from nics_drl_bridge.sim.simulator import FastSimulator
 
 
 class Teaching(Schema):
-    """Rewards from what only the simulator knows, and repeated episodes; off by default."""
+    """Rewards from the ground truth, and repetition of failed episodes; off by default."""
 
     # reward for a contact that the task does not detect; such a contact ends the episode
     contact: float | None = None
-    # reward per metre by which the path to the goal around obstacles gets shorter
+    # reward per metre by which the path around obstacles to the goal gets shorter
     path: float = 0.0
     # maximum number of repetitions of a failed episode
     retries: int = Field(default=0, ge=0, le=1000)
-    # margin by which robots are larger while they learn [m], to keep away from obstacles
+    # margin added to robots during training, so that they learn to keep a distance [m]
     margin: float = Field(default=0.0, ge=0.0, le=1.0)
 
 
 class Teacher:
-    """Teaches in the worlds of a simulator."""
+    """Applies teaching in the worlds of a simulator."""
 
     def __init__(self, given: Teaching, simulator: FastSimulator) -> None:
         self._given = given
@@ -34,7 +34,7 @@ class Teacher:
         self._guide: Guide | None = None
         # (N, M) remaining path lengths [m]
         self._left = np.zeros(simulator.data.pose.shape[:2])
-        # (N,) repetitions so far of the current episode
+        # (N,) repetitions of the current episode so far
         self._tries = np.zeros(len(self._left), np.int64)
         if given.path:
             footprint = footprint_shape(simulator.model.robot)
@@ -42,20 +42,20 @@ class Teacher:
 
     @property
     def changing(self) -> dict[str, NDArray[np.generic]]:
-        """The arrays that change from step to step, by name."""
+        """Arrays that change from step to step, by name."""
         known: dict[str, NDArray[np.generic]] = {"tries": self._tries}
         if self._guide is not None:
             known |= {"guide": self._guide.fields, "left": self._left}
         return known
 
     def begin(self, worlds: NDArray[np.intp], scenes: Scenes) -> None:
-        """Starts episodes in some worlds (n,) with scenes that contain the robots."""
+        """Starts episodes in worlds (n,), whose scenes contain the robots."""
         if self._guide is not None:
             self._guide.begin(worlds, scenes)
             self._left[worlds] = self._guide.lengths(worlds, self._data)
 
     def judge(self, part: slice, outcome: Outcome) -> Outcome:
-        """Adds the teaching rewards to the outcome of a part of the worlds."""
+        """Adds teaching rewards to the outcome of a part of the worlds."""
         terms = outcome.terms
         ended = outcome.ended
         info = outcome.info
@@ -73,7 +73,7 @@ class Teacher:
     def again(
         self, over: NDArray[np.bool_], success: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Chooses the worlds (N,) that repeat the episode that has just ended."""
+        """Returns True for worlds (N,) that repeat the episode that just ended."""
         again: NDArray[np.bool_] = over & ~success & (self._tries < self._given.retries)
         self._tries[over] = np.where(again, self._tries + 1, 0)[over]
         return again

@@ -1,4 +1,4 @@
-"""Tasks of several robots: reach goals together, and pursuit and evasion."""
+"""Tasks of several robots: cooperative reaching, and pursuit and evasion."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,9 +21,9 @@ def pairs(pose: Array, points: Array) -> tuple[Array, Array]:
 
 
 def others(of_all: Array) -> Array:
-    """Drops the diagonal of (..., M, M, F): each robot's row of the others, (..., M, M - 1, F)."""
+    """Drops the diagonal of (..., M, M, F), which leaves rows of the others, (..., M, M - 1, F)."""
     *lead, count, _, width = of_all.shape
-    # Without its first entry, the flat row of pairs has a diagonal one after every `count` others.
+    # Without its first entry, the flat row of pairs has a diagonal entry after each `count` others.
     flat = of_all.reshape(*lead, count * count, width)[..., 1:, :]
     kept = flat.reshape(*lead, count - 1, count + 1, width)[..., :-1, :]
     return np.asarray(kept.reshape(*lead, count, count - 1, width))
@@ -60,12 +60,12 @@ class CooperativeReaching(Task):
 
     ## Starting State
 
-    Obstacles, starts and goals are drawn by the world. Memory: `goal` (M, 2) [m], `reached` (M,).
+    The world draws obstacles, starts and goals. Memory: `goal` (M, 2) [m], `reached` (M,).
 
     ## Episode End
 
-    For a robot when it touches something; it then stands still as another obstacle. For all robots
-    when the last goal is reached, which means that a robot is within `goal_radius` [m] of it.
+    A robot ends when it touches something; it then stands still as another obstacle. All robots end
+    when the last goal is reached, that is, when a robot is within `goal_radius` [m] of it.
     """
 
     keeps_last_scan: ClassVar[bool] = False
@@ -112,7 +112,7 @@ class CooperativeReaching(Task):
         memory["reached"] |= there
 
     def observation(self, view: RobotView, memory: Memory) -> Observation:
-        """The observation (..., M, O) of views (..., M)."""
+        """Returns the observation (..., M, O) of views (..., M)."""
         goals = task.bearing(*pairs(view.pose, memory["goal"]))
         reached = np.broadcast_to(
             memory["reached"][..., None, :, None], (*goals.shape[:-1], 1)
@@ -131,7 +131,7 @@ class CooperativeReaching(Task):
     def reward(
         self, before: RobotView, after: RobotView, memory: Memory
     ) -> dict[str, Array]:
-        """Reward terms (..., M)."""
+        """Returns the reward terms (..., M)."""
         lead = after.pose.shape[:-1]
         ways = (
             task.distance(*pairs(view.pose, memory["goal"])) for view in (before, after)
@@ -158,7 +158,7 @@ class CooperativeReaching(Task):
         )
 
     def info(self, view: RobotView, memory: Memory) -> dict[str, NDArray[Any]]:
-        """Success of the team, contacts, and the goals reached so far (..., M)."""
+        """Returns success of the team, contacts, and goals reached so far (..., M)."""
         return {
             "is_success": np.full(
                 view.pose.shape[:-1], memory["reached"].all(-1, keepdims=True)
@@ -170,7 +170,7 @@ class CooperativeReaching(Task):
 
 @dataclass(frozen=True)
 class PursuitEvasion(Task):
-    """P pursuers have to get close to E evaders, who have to keep away; all robots are alike.
+    """P pursuers have to get close to E evaders, which have to keep away; all robots are equal.
 
     The first P of the M = P + E robots pursue.
 
@@ -204,12 +204,12 @@ class PursuitEvasion(Task):
 
     ## Starting State
 
-    Obstacles and starts are drawn by the world. Memory: `out` (M,), `caught` (M,), `newly` (M,).
+    The world draws obstacles and starts. Memory: `out` (M,), `caught` (M,), `newly` (M,).
 
     ## Episode End
 
-    For an evader when the free space between it and a pursuer is below `capture_gap` [m]; for any
-    robot when it touches something else, after which it stands still as another obstacle. For all
+    An evader ends when the free space between it and a pursuer is below `capture_gap` [m]. Any
+    robot ends when it touches something else; it then stands still as another obstacle. All end
     when all evaders, or all pursuers, are out. The pursuers succeed when every evader is caught.
     """
 
@@ -264,13 +264,13 @@ class PursuitEvasion(Task):
         memory["out"] |= caught | self._collided(after, memory)
 
     def _gaps(self, view: RobotView, memory: Memory) -> Array:
-        """Distances (..., M) [m] to the nearest active robot of the other side; inf if none."""
+        """Returns distances (..., M) [m] to the nearest active robot of the other side, or inf."""
         between = task.distance(*pairs(view.pose, view.pose[..., :2]))
         foe = (self.pursues[:, None] != self.pursues) & ~memory["out"][..., None, :]
         return np.asarray(np.where(foe, between, np.inf).min(axis=-1))
 
     def observation(self, view: RobotView, memory: Memory) -> Observation:
-        """The observation (..., M, O) of views (..., M)."""
+        """Returns the observation (..., M, O) of views (..., M)."""
         lead = view.pose.shape[:-1]
         mates = np.broadcast_to(
             self.pursues[:, None] == self.pursues, (*lead, self.robots)
@@ -289,8 +289,8 @@ class PursuitEvasion(Task):
     def reward(
         self, before: RobotView, after: RobotView, memory: Memory
     ) -> dict[str, Array]:
-        """Reward terms (..., M)."""
-        # Evaders caught in this step still count in this step.
+        """Returns the reward terms (..., M)."""
+        # Evaders caught in this step still count in it.
         known = {**memory, "out": memory["out"] & ~memory["newly"]}
         gap = [self._gaps(view, known) for view in (before, after)]
         free = np.isfinite(gap[0]) & np.isfinite(gap[1])
@@ -313,7 +313,7 @@ class PursuitEvasion(Task):
         return np.asarray(self.touches(view.ranges) & ~memory["newly"])
 
     def end(self, view: RobotView, memory: Memory) -> Flags:
-        """Returns the robots that are out; all robots once a side has none left."""
+        """Returns True for robots that are out, or for all once a side has none left."""
         out = memory["out"]
         over = [
             out[..., side].all(-1, keepdims=True)
@@ -322,7 +322,7 @@ class PursuitEvasion(Task):
         return np.asarray(out | over[0] | over[1])
 
     def info(self, view: RobotView, memory: Memory) -> dict[str, NDArray[Any]]:
-        """Success of each robot's side, contacts, and captures (..., M)."""
+        """Returns success of each robot's side, contacts, and captures (..., M)."""
         won = memory["caught"][..., ~self.pursues].all(-1, keepdims=True)
         return {
             "is_success": np.asarray(won == self.pursues),

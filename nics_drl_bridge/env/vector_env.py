@@ -1,4 +1,4 @@
-"""The vector environment: many worlds of the fast simulator in one set of arrays."""
+"""The vector environment: many worlds of the fast simulator in the same arrays."""
 
 import math
 import mmap
@@ -39,10 +39,10 @@ from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
 Observation = NDArray[np.float32]
 Flags = NDArray[np.bool_]
-# name -> array whose first dimension is the world, or such a mapping
+# name -> array whose first dimension is the world, or a nested mapping
 Facts = Mapping[str, Any]
 Rows = slice | NDArray[np.intp] | Flags
-LARGE = 2**20  # size above which zeros come fresh from the operating system [bytes]
+LARGE = 2**20  # size from which `zeros` asks the operating system for new pages [bytes]
 MODES = {
     mode.value: mode for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)
 }
@@ -56,13 +56,13 @@ class BridgeVectorEnv(
     ## Description
 
     Task, spaces, rewards and ends are those of `BridgeEnv` with `backend="sim"`, and so are the
-    results: world i of `reset(seed=s)` is bit-identical to the single env of `reset(seed=s + i)`,
-    in later episodes too, for any `num_envs` and number of threads.
+    results: world i after `reset(seed=s)` is bit-identical to a single env after
+    `reset(seed=s + i)`, even in later episodes, for any `num_envs` and number of threads.
 
     ## Spaces, Rewards, Starting State, Episode End
 
-    Those of `BridgeEnv` with a leading (N,). `info` is what Gymnasium's `SyncVectorEnv` makes of
-    the single envs: each entry an array (N, ...) with its mask `_name`. `reset` takes
+    Those of `BridgeEnv` with a leading (N,). `info` is like that of Gymnasium's `SyncVectorEnv`:
+    each entry is an array (N, ...) with a mask `_name`. `reset` takes
     `options={"start": ..., "goal": ...}` for all worlds that it resets, and with
     `options={"reset_mask": (N,) bool}` it resets only those.
 
@@ -152,16 +152,16 @@ class BridgeVectorEnv(
         self._starts: Array = np.zeros((count, robots, 3))
         self._bodies: Array = np.zeros((count, self.simulator.sampler.count, BODY))
         self.memory: Memory = {}
-        # also False after an exception, which leaves worlds between two steps
+        # False also after an exception, which may leave some worlds a step behind
         self.ready = False
 
     def teach(self, given: Teaching) -> None:
-        """Adds teaching rewards from the next reset on, and repetitions in `SameStep`."""
+        """Adds teaching rewards, and repetitions in `SameStep`, from the next reset on."""
         self._teacher = Teacher(given, self.simulator)
 
     @property
     def changing(self) -> dict[str, NDArray[Any]]:
-        """The arrays that change from step to step, by name; see `policy.train_checkpoint`."""
+        """Arrays that change from step to step, by name; see `policy.train_checkpoint`."""
         own = {
             "ended": self.ended,
             "over": self._over,
@@ -268,7 +268,7 @@ class BridgeVectorEnv(
         )
         self.ready = False
         out = np.empty_like(self._out) if self.copy else self._out
-        begun = self._over.copy()  # these worlds ignore their action and are reset
+        begun = self._over.copy()  # these worlds are reset and ignore their action
         run = self.simulator.run_parts
         outcome = joined(run(lambda part: self._advance(part, given[part], out, begun)))
         terminated = self.ended.all(axis=1) & ~begun
@@ -335,7 +335,7 @@ class BridgeVectorEnv(
         """Resets ended worlds in `SameStep`; `infos` gets their last observation and info."""
         if over.any():
             shown = np.full(self.num_envs, None, dtype=object)
-            # only ended worlds, because each needs its own object
+            # Only for ended worlds, because each needs its own object.
             for n in np.flatnonzero(over):
                 shown[n] = flat(out)[n].copy()
             infos |= masked({"final_obs": shown}, over)
@@ -400,7 +400,7 @@ class BridgeVectorEnv(
         )
 
     def snapshot(self, n: int) -> Snapshot:
-        """The current state of world n for a picture; `step` does not change its arrays."""
+        """Returns the current state of world n for a picture; `step` does not change its arrays."""
         data = self.simulator.data
         bodies = self.simulator.obstacles_of(np.array([n]))[0]
         goals = goals_of(
@@ -413,7 +413,7 @@ class BridgeVectorEnv(
 
 
 def flat(observations: Observation) -> Observation:
-    """Concatenates the observations of each world's robots to (N, M O), without a copy."""
+    """Concatenates observations of each world's robots to (N, M O), without a copy."""
     return observations.reshape(len(observations), -1)
 
 
@@ -433,7 +433,7 @@ def joined(parts: Sequence[Outcome]) -> Outcome:
 
 
 def chosen_worlds(options: dict[str, Any] | None, count: int) -> Flags:
-    """Mask (N,) of the worlds to reset. Raises ConfigError for a wrong `reset_mask`."""
+    """Returns the mask (N,) of worlds to reset. Raises ConfigError for a wrong `reset_mask`."""
     if not options or "reset_mask" not in options:
         return np.ones(count, np.bool_)
     chosen = np.asarray(options["reset_mask"])
@@ -449,10 +449,10 @@ def named_seeds(
     unnamed: Flags,
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.int64], Flags]:
-    """Seeds (N,) that a reset gives to worlds, and a mask (N,) of those that restart with them.
+    """Returns the seeds (N,) of a reset, and the mask (N,) of worlds that restart with them.
 
-    The seed is that of the first world, or one per world (None keeps its present one), or None for
-    all. For `chosen` worlds that are `unnamed`, having never had a seed, one is drawn if needed.
+    `seed` is the first world's, or one per world (None keeps its present one), or None for all. For
+    `chosen` worlds that are `unnamed`, having never had a seed, seeds are drawn if needed.
     """
     count = len(chosen)
     if isinstance(seed, Sequence | np.ndarray):
@@ -470,10 +470,10 @@ def named_seeds(
 
 
 def zeros(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Returns zeros; pages of large arrays that are never written cost neither time nor memory.
+    """Returns zeros; pages of large arrays cost neither time nor memory unless written.
 
-    `numpy.zeros` is as good until the C library reuses such memory: it then writes all of it, which
-    for many obstacles took a fifth of a step.
+    `numpy.zeros` does the same until the C library reuses such memory and has to clear all of it,
+    which took a fifth of a step with many obstacles.
     """
     size = math.prod(shape) * dtype.itemsize
     if size < LARGE or not hasattr(mmap, "MAP_PRIVATE"):  # Windows

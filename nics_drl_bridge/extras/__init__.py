@@ -1,1 +1,1 @@
-"""Tools that need an optional library or serve few; reached by entry points only."""
+"""Tools that need an optional library or few people use; loaded only by entry points."""

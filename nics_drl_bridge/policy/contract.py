@@ -28,7 +28,7 @@ SUFFIX = ".onnx"
 MAPPINGS = (".yaml", ".yml")  # suffixes of the files that map a foreign policy
 GOLDEN = 16
 GOLDEN_SEED = 0
-# spread of golden observations around zero where their limits are wider
+# maximum magnitude of golden observations, if their limits are wider
 GOLDEN_SPREAD = 3.0
 GAP_PERIODS = 5  # control periods without an observation after which the state is reset
 MOST_ENTRIES = 20_000
@@ -38,7 +38,7 @@ Rows = NDArray[np.float32]
 
 
 def shipped() -> Path:
-    """The folder of the policy files that ship with the package."""
+    """Returns the folder of the shipped policy files."""
     return share_folder() / "config" / "policies"
 
 
@@ -66,7 +66,7 @@ class StateEntry(Schema):
     size: int = Field(ge=1, le=200_000)
     # value of each element at the start of an episode
     start: float = Field(ge=-1e6, le=1e6)
-    # longest time between two observations [s]; a longer gap resets the state
+    # maximum time between two observations [s]; a longer gap resets the state
     longest_gap: float = Field(gt=0.0)
 
 
@@ -81,7 +81,7 @@ class GoldenEntry(Schema):
     commands: str  # (16, C) commands in SI units
 
     def rows(self, name: str) -> Rows:
-        """One of the arrays, as (16, ...). Raises ValueError if it is damaged."""
+        """Returns one of the arrays, (16, ...). Raises ValueError if it is damaged."""
         data = base64.b64decode(getattr(self, name), validate=True)
         return np.frombuffer(data, "<f4").reshape(GOLDEN, -1)
 
@@ -92,9 +92,9 @@ class Contract(Schema):
     format: Literal["nics_drl_bridge/policy/1"]
     robot: RobotSpec
     lidar: LidarSpec
-    # sectors of the observed scan; None: the beams of exactly this lidar
+    # sectors of the observed scan; None: the beams of this very lidar
     scan: ScanLayout | None
-    sensors: tuple[AnySensor, ...] = ()  # further sensors that the policy observes
+    sensors: tuple[AnySensor, ...] = ()  # additional sensors that the policy observes
     task: TaskEntry
     observation: ObservationEntry
     # None: the policy has no state
@@ -107,7 +107,7 @@ class Contract(Schema):
     max_episode_steps: int | None = Field(default=None, ge=1)
     model_fingerprint: str = Field(pattern="^[0-9a-f]{16}$")
     provenance: dict[str, Any]  # command, seed and versions that produced the file
-    # of the graph, including the weights
+    # hash of the graph, including the weights
     graph_sha256: str = Field(pattern="^[0-9a-f]{64}$")
     golden: GoldenEntry  # pairs that the graph must reproduce
     checksums: dict[str, str]  # checksum of each entry above, by its path
@@ -133,7 +133,7 @@ def contract_of(
     batch: Literal[1] | None = None,
     max_episode_steps: int | None = None,
 ) -> str:
-    """Writes the contract of a policy as JSON; `state` is the size and start value of the state.
+    """Returns a policy's contract as JSON; `state` is the size and start value of its state.
 
     Raises ConfigError if an entry has a wrong type.
     """
@@ -171,7 +171,7 @@ def contract_of(
 
 
 def golden_observations(task: Task) -> Rows:
-    """The fixed set of observations (16, O) within the limits of the task's observation space."""
+    """Returns a fixed set of observations (16, O) within the task's observation space."""
     space = task.observation_space
     low = np.maximum(space.low, -GOLDEN_SPREAD)
     high = np.minimum(space.high, GOLDEN_SPREAD)
@@ -180,7 +180,7 @@ def golden_observations(task: Task) -> Rows:
 
 
 def task_entry(task: Task) -> dict[str, Any]:
-    """Name and options of a task."""
+    """Returns the name, options and hash of a task."""
     kind = type(task)
     path = f"{kind.__module__}:{kind.__name__}"
     name = next((name for name, place in TASKS.items() if place == path), kind.__name__)
@@ -193,7 +193,7 @@ def task_entry(task: Task) -> dict[str, Any]:
 
 
 def observation_entry(task: Task) -> dict[str, Any]:
-    """Observation space of a task as the fields of `ObservationEntry`."""
+    """Returns a task's observation space as the fields of `ObservationEntry`."""
     space = task.observation_space
     parts = task.scan_parts
     return {
@@ -223,7 +223,7 @@ def leaves(data: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def checksums(data: Mapping[str, Any]) -> dict[str, str]:
-    """Checksum of each entry by path, leaving out `checksums` itself."""
+    """Returns path -> checksum of each entry, leaving out `checksums` itself."""
     known = {name: value for name, value in data.items() if name != "checksums"}
     return {
         path: hash_bytes(json.dumps(v).encode())[:CHECKSUM] for path, v in leaves(known)

@@ -24,7 +24,7 @@ class LookAhead(NamedTuple):
     # reaction time of a turn that brakes independently of the speed, else 0 [s]
     turn_reaction: float
     turn_slowness: float  # inverse of the turn's deceleration [s^2/rad]
-    far: float  # distance along an axis beyond which the map knows nothing [m]
+    far: float  # distance along an axis beyond which the map is unknown [m]
 
 
 class TwistWeights(NamedTuple):
@@ -61,7 +61,7 @@ def choose(around, twist, candidates, ahead, weights):  # type: ignore[no-untype
             moves |= candidates[k, i] != 0.0
             far |= abs(candidates[k, i] - twist[i]) > ahead.reach[i]
         cost = cost_of(around, candidates[k], twist, ahead, weights)
-        # If braking takes time, a twist is judged from the present one, however different it is.
+        # If braking takes time, `cost_of` starts from the present twist, so every twist is allowed.
         cost += 1e6 if far and ahead.slowness == 0.0 else 0.0
         cost += 1e6 if late and moves else 0.0
         if cost < least:
@@ -72,9 +72,9 @@ def choose(around, twist, candidates, ahead, weights):  # type: ignore[no-untype
 
 @kernel
 def cost_of(around, aimed, twist, ahead, weights):  # type: ignore[no-untyped-def]
-    """Cost of holding a twist (3,); a twist that hits before the robot can stop is inadmissible.
+    """Returns the cost of holding a twist (3,), inadmissible if it hits something before stopping.
 
-    Where braking takes time, the robot starts from its present twist (3,), which may be faster.
+    If braking takes time, the robot starts from its present twist (3,), which may be faster.
     """
     period = ahead.period
     steps = ahead.steps

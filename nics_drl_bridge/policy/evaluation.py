@@ -1,4 +1,4 @@
-"""Evaluation: run episodes, judge them by the ground truth, and tally the results."""
+"""Evaluation: runs episodes, judges them by the ground truth, and tallies the results."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -34,7 +34,7 @@ CONFIDENCE = 0.95
 
 @dataclass(frozen=True)
 class Episode:
-    """Record of an episode; `result`, by the truth: success, collision, time-out or elsewhere."""
+    """Record of an episode; the true `result` is success, collision, time-out or elsewhere."""
 
     seed: int
     result: str
@@ -44,7 +44,7 @@ class Episode:
     bodies: Array  # (K, 7) obstacles at the start, see `sim.scenes.Scene`
     reward: float  # sum over the episode
     believed: str | None = None  # the robot's own result; `result` is the truth
-    # uncertainty of the estimate gained since the start, if known
+    # increase of the estimate's uncertainty since the start, if known
     uncertain: Uncertainty | None = None
 
     @property
@@ -68,7 +68,7 @@ class Episode:
         return float(np.linalg.norm(np.diff(self.path[:, :2], axis=0), axis=1).sum())
 
     def plain(self) -> dict[str, Any]:
-        """The episode as plain data."""
+        """Returns the episode as plain data."""
         return {
             "seed": self.seed,
             "result": self.result,
@@ -119,7 +119,7 @@ def drive(
         if "true_pose" not in info:
             return Episode(seed, believed, *driven, uncertain=uncertain)
         known = info.get("true_collision")
-        # without the truth, `touched` decides if given, otherwise the robot itself
+        # Without the truth, `touched` decides if given, otherwise the robot itself.
         if known is None:
             known = believed == "collision" if touched is None else touched()
         hit = bool(np.any(known))
@@ -130,7 +130,7 @@ def drive(
         true = ELSEWHERE if wrong else believed
         return Episode(seed, "collision" if hit else true, *driven, believed)
     except BaseException:
-        # the env does not see errors raised by the policy
+        # The env does not see errors raised by the policy.
         if isinstance(env.unwrapped, BridgeEnv):
             with uninterrupted():
                 env.unwrapped.halt()
@@ -147,7 +147,7 @@ def _answer(act: Act, observation: NDArray[np.float32], step: int) -> NDArray[An
 
 
 def truly_near(task: Any, poses: Array, goals: Array) -> Flags:
-    """True where poses (..., 3) are within `DRIFT_M` of goals (..., 2), or there are none."""
+    """Returns True if poses (..., 3) are within `DRIFT_M` of goals (..., 2), or without goals."""
     if not isinstance(task, Navigation):
         return np.ones(np.shape(poses)[:-1], np.bool_)
     gaps = np.hypot(*np.moveaxis(poses[..., :2] - goals, -1, 0))
@@ -170,12 +170,12 @@ def drive_all(
 
 
 def successes(episodes: Iterable[Episode]) -> int:
-    """Number of episodes that reached their goal."""
+    """Returns the number of episodes that reached their goal."""
     return sum(episode.result == "success" for episode in episodes)
 
 
 def deviation(one: Episode, other: Episode) -> float:
-    """Maximum distance between two paths at the same step, over their common length [m]."""
+    """Returns the maximum distance [m] between two paths at the same step, over common steps."""
     steps = min(len(one.path), len(other.path))
     return float(
         np.linalg.norm(one.path[:steps, :2] - other.path[:steps, :2], axis=1).max()
@@ -196,14 +196,14 @@ class Outcomes:
 
     @property
     def time_out(self) -> Flags:
-        """Flags of episodes with neither success nor collision."""
+        """(E,) True for episodes with neither success nor collision."""
         return ~(self.success | self.collision)
 
 
 def drive_worlds(env: BridgeVectorEnv, act: Act, seeds: Sequence[int]) -> Outcomes:
     """Runs an episode per seed, bit-identical to `BridgeEnv.reset(seed=...)` without an estimator.
 
-    Pass the method `act` of a policy with a state, so that its state can be reset.
+    For a policy with a state, pass its method `act`, so that the state can be reset.
     """
     width = env.num_envs
     given = check_seeds(seeds)
@@ -252,21 +252,21 @@ def _drive_once(
 
 
 def _robots(info: dict[str, Any], name: str) -> Flags:
-    """Flags (N, M) of an entry in `info`; (1, 1) False if the entry is missing."""
+    """Returns the flags (N, M) of an entry in `info`; (1, 1) False if it is missing."""
     values = np.asarray(info.get(name, [False]), np.bool_)
     return values.reshape(len(values), -1)
 
 
 @dataclass(frozen=True)
 class ConfidenceInterval:
-    """A statistic with its 95 % interval: NaN without observations, infinite interval for one."""
+    """A statistic and its 95 % interval: NaN without observations, infinite with only one."""
 
     value: float
     low: float
     high: float
 
     def text(self, unit: str) -> str:
-        """Format the statistic with its interval, or whichever part is known."""
+        """Formats the statistic with its interval, or whichever part is known."""
         if math.isnan(self.value):
             return "unknown"
         known = f"{self.value:.2f} {unit}"
@@ -276,7 +276,7 @@ class ConfidenceInterval:
 
 
 def rate(hits: int, trials: int) -> ConfidenceInterval:
-    """Fraction of trials with Wilson's score interval (1927), which is valid for few trials too."""
+    """Returns the fraction of hits, with Wilson's interval (1927), valid even for few trials."""
     if trials < 1:
         return ConfidenceInterval(math.nan, 0.0, 1.0)
     share = hits / trials
@@ -294,7 +294,7 @@ def rate(hits: int, trials: int) -> ConfidenceInterval:
 
 
 def mean(values: ArrayLike) -> ConfidenceInterval:
-    """The mean of observations (n,) with the interval of Student's t."""
+    """Returns the mean of observations (n,) with the interval of Student's t."""
     seen = np.asarray(values, np.float64)
     middle = float(seen.mean()) if len(seen) else math.nan
     if len(seen) < 2:
@@ -306,7 +306,7 @@ def mean(values: ArrayLike) -> ConfidenceInterval:
 
 @dataclass(frozen=True)
 class Summary:
-    """Success rates of episodes; mean path [m] and duration [s] of the successful ones."""
+    """Success rates of episodes; mean path length [m] and duration [s] of successful ones."""
 
     episodes: int
     success: ConfidenceInterval
@@ -336,14 +336,14 @@ def summarise(outcomes: Outcomes, control_period: float) -> Summary:
 
 @dataclass(frozen=True)
 class Tally(Summary):
-    """Statistics of the episodes in one world; `deviation` [m] is the mean from the first world."""
+    """Statistics of one world; `deviation` is the mean deviation from the first world [m]."""
 
     same: float  # fraction of episodes that ended as in the first world
     deviation: ConfidenceInterval
     greatest_deviation: float  # maximum over all episodes [m]
 
     def figures(self) -> dict[str, Any]:
-        """The tally as plain data, with intervals as lists and non-finite values as null."""
+        """Returns the tally as plain data: intervals as lists, non-finite values as null."""
         figures: dict[str, Any] = {}
         for name, value in vars(self).items():
             ends = [value]
@@ -357,7 +357,7 @@ class Tally(Summary):
 def tallies(
     runs: Mapping[str, Sequence[Episode]], control_period: float
 ) -> dict[str, Tally]:
-    """Computes the statistics of each world, compared with the same seeds in the first."""
+    """Computes the statistics of each world, compared with the first world's by seed."""
     first = next(iter(runs.values()))
     found = {}
     for place, episodes in runs.items():

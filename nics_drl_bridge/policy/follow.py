@@ -23,9 +23,9 @@ class GoalCheck:
     xy_goal_tolerance: float = 0.25  # [m]
     # tolerance of the heading [rad]; ignored for robots that steer
     yaw_goal_tolerance: float = 0.25
-    # once the position was reached it counts as reached while the robot turns
+    # True: a position once reached counts as reached while the robot turns
     stateful: bool = True
-    # maximum path length that may remain [m]
+    # maximum remaining path length [m]
     path_length_tolerance: float = 1.0
 
 
@@ -35,7 +35,7 @@ class ProgressCheck:
 
     required_movement_radius: float = 0.5  # distance that the robot must move [m]
     movement_time_allowance: float = 10.0  # time within which it must do so [s]
-    # turn that counts as progress as well [rad]
+    # turn that also counts as progress [rad]
     required_movement_angle: float = math.inf
 
 
@@ -44,14 +44,14 @@ class Place(NamedTuple):
 
     ahead: Array  # (2,) sub-goal [m]
     nearest: int  # index of the nearest original pose of the path
-    remaining: float  # path length that remains [m]
+    remaining: float  # remaining path length [m]
     distance: float  # straight-line distance to the end [m]
     left: float  # offset to the left of the path, negative to its right [m]
     turned: float  # angle from the robot's heading to the path's direction [rad]
 
 
 class PlannedPath:
-    """A path (P, 3) or (P, 2), and the robot's progress along it. Raises ConfigError if invalid.
+    """A path (P, 3) or (P, 2) and the robot's progress along it. Raises ConfigError if invalid.
 
     Points already passed are not considered again, so a path may cross itself.
     """
@@ -143,9 +143,9 @@ class ProgressChecker:
         self._base: tuple[float, Array] | None = None
 
     def stuck(self, time_s: float, pose: Array) -> bool:
-        """True if a robot at a pose (3,) has not moved enough for too long."""
+        """Returns True if a robot at a pose (3,) has not moved enough for too long."""
         check = self.check
-        # no starting point yet; a start later than now means that the clock was set back
+        # Restart without a starting point, or if it is later than now: the clock was set back.
         since, place = self._base or (
             math.inf,
             pose,

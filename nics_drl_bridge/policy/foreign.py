@@ -1,4 +1,4 @@
-"""Foreign policies: turns a network with a mapping, or a bundle, into a policy file."""
+"""Foreign policies: turns a network with a mapping, or a LEAPP bundle, into a policy file."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,13 +34,13 @@ class Order:
     mapping: ForeignPolicy
     network: Network
     path: Path
-    sha256: str  # of the network's files
+    sha256: str  # hash of the network's files
 
 
 def load_any(
     path: str | Path, model: SimulatorModel | None = None
 ) -> policy_file.PolicyFile:
-    """Loads a policy file, see `load_policy`, or builds one from the YAML file of a foreign policy.
+    """Loads a policy file, see `load_policy`, or builds one from a foreign policy's YAML file.
 
     `model` is the robot to drive; None uses the robot that the mapping names. Raises ConfigError
     for a wrong mapping, PolicyError for a network that does not fit it.
@@ -53,9 +53,9 @@ def load_any(
 
 
 def import_policy(source: str | Path, model: SimulatorModel | None = None) -> bytes:
-    """Converts a LEAPP bundle or a mapping to a policy file; restores what we exported.
+    """Converts a LEAPP bundle or a mapping to a policy file; restores our own exports exactly.
 
-    Raises ConfigError or PolicyError, which says what can't be expressed.
+    Raises ConfigError, or PolicyError, which says what can't be expressed.
     """
     path = leapp_bundle.description_of(Path(source))
     if path is None:
@@ -138,7 +138,7 @@ def _golden(graph: Any, seen: Rows, size: int, source: str) -> dict[str, Rows]:
     content = graph.SerializeToString()
     widths: dict[str, int | None] = {STATE_IN: size} if size else {}
     needs = GraphNeeds(widths, batch=1, graph_sha256="", start=0.0 if size else None)
-    # the composed graph is as untrusted as the network in it
+    # The composed graph is as untrusted as the network in it.
     rehearsal.rehearse_graph(content, needs, seen, source)
     onnx_graph.rows_at_once(graph, source, 1)
     session = open_session(content, source)

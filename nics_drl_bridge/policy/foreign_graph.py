@@ -25,7 +25,7 @@ FIELDS = dict(
 
 @dataclass(frozen=True)
 class Network:
-    """A foreign network, and its states as far as its own files describe them."""
+    """A foreign network, and its states if its own files describe them."""
 
     model: Any  # onnx.ModelProto
     # states by input name
@@ -59,8 +59,8 @@ class Composer:
         self._source = source
         self._states = {**network.states, **mapping.states}
         self._build = Builder()
-        self._past: dict[str, str] = {}  # rows of the current state, by what they store
-        self._next: dict[str, str] = {}  # rows of the next state
+        self._past: dict[str, str] = {}  # content -> row of the current state
+        self._next: dict[str, str] = {}  # content -> row of the next state
         self._check_names()
 
     def compose(self) -> tuple[Any, int]:
@@ -130,10 +130,10 @@ class Composer:
                 fix = suggest(name, given)
                 raise self._fault(place, f"the network has no output {name!r}; {fix}")
 
-    # Shapes. There is one observation at a time, so an open first dimension is 1.
+    # Shapes: the graph takes one observation at a time, so an open first dimension is 1.
 
     def _theirs(self) -> Any:
-        """The foreign graph with prefixed names, fixed shapes, and inputs that are fed here."""
+        """Returns the foreign graph with prefixed names, fixed shapes, and inputs to feed here."""
         model = onnx.ModelProto()
         model.CopyFrom(self._network.model)
         versions = [
@@ -163,7 +163,7 @@ class Composer:
         return model
 
     def _shape(self, name: str) -> tuple[int, ...]:
-        """The shape of an input; an open first dimension is 1, another fits the parts."""
+        """Returns the shape of an input: an open first dimension is 1, others fit the parts."""
         one = self._network.inputs[name].type.tensor_type
         sizes = [d.dim_value if d.HasField("dim_value") else 0 for d in one.shape.dim]
         if sizes and sizes[0] == 0:
@@ -182,7 +182,7 @@ class Composer:
         return tuple(sizes)
 
     def _given_size(self, name: str) -> int | None:
-        """Number of elements that the parts of an input supply; None for a state."""
+        """Returns the number of elements that an input's parts supply; None for a state."""
         if name not in self._mapping.inputs:
             return None
         return sum(map(self._part_size, self._mapping.inputs[name].parts))
@@ -198,7 +198,7 @@ class Composer:
         return size * part.history
 
     def _output_size(self, name: str) -> int:
-        """Number of elements of an output, counting open dimensions as 1."""
+        """Returns the number of elements of an output, counting open dimensions as 1."""
         if hasattr(self, "_made"):
             sizes: Sequence[int] = self._made[THEIRS + name]
         else:
@@ -209,7 +209,7 @@ class Composer:
         return math.prod(size or 1 for size in sizes)
 
     def _state_sizes(self) -> dict[str, int]:
-        """Number of elements of each entry in the state."""
+        """Returns the number of elements of each entry in the state."""
         sizes = {f"state {name}": math.prod(self._shape(name)) for name in self._states}
         for name, one in self._mapping.inputs.items():
             for k, part in enumerate(one.parts):
@@ -220,7 +220,7 @@ class Composer:
                 if part.history > 1:
                     kept = self._part_size(part) // part.history * (part.history - 1)
                     sizes[f"history {name} {k}"] = kept
-        # "begun" flag: 0 in the first step, then 1
+        # The flag "begun" is 0 in the first step, then 1.
         return {"begun": 1, **sizes} if sizes else {}
 
     # Inputs.
@@ -288,7 +288,7 @@ class Composer:
         return rows
 
     def _quantity(self, name: str, part: foreign_mapping.InputPart) -> str:
-        """A quantity as a row, in SI units."""
+        """Returns a quantity as a row, in SI units."""
         build = self._build
         scan = self._task.scan_parts
         of, _, which = part.of.partition(".")
@@ -327,7 +327,7 @@ class Composer:
     # Outputs.
 
     def _flat(self, name: str) -> str:
-        """An output as a row of float32."""
+        """Returns an output as a row of float32."""
         made = self._made[THEIRS + name]
         if not all(made):
             reason = (
@@ -340,7 +340,7 @@ class Composer:
         return self._build.add("Cast", flat, to=TensorProto.FLOAT)
 
     def _command(self) -> str:
-        """The row of the robot's command (1, C)."""
+        """Returns the row of the robot's command (1, C)."""
         if self._mapping.choices is not None:
             return self._chosen(self._mapping.choices)
         outputs = self._mapping.outputs
@@ -358,7 +358,7 @@ class Composer:
         return self._of_twist(rows, robot)
 
     def _names(self, given: Mapping[str, Any], place: str) -> tuple[str, ...]:
-        """The command names to map, which `given` must match: a twist's, or the robot's own."""
+        """Returns the names that `given` must have: a twist's, or those of the robot's commands."""
         robot = self._task.robot
         own = tuple(command.name for command in robot.command)
         if all(name in foreign_mapping.TWIST for name in given):
@@ -407,7 +407,7 @@ class Composer:
         return build.cut(build.affine(row, command.multiply, command.add), command.clip)
 
     def _of_twist(self, twist: Sequence[str], robot: RobotSpec) -> str:
-        """Converts forward, left and turn to commands; see `geometry.Bicycle.command`."""
+        """Converts forward, left and turn to a row of commands, see `geometry.Bicycle.command`."""
         build = self._build
         rows = dict(zip(FIELDS.values(), twist, strict=True))
         if robot.steers:
@@ -424,7 +424,7 @@ class Composer:
         return build.join([rows[str(command.cmd_vel)] for command in robot.command])
 
     def _chosen(self, choices: foreign_mapping.Choices) -> str:
-        """The command selected by the maximum of an output, or by an integer output."""
+        """Returns the command selected by the maximum of an output, or by an integer output."""
         build = self._build
         robot = self._task.robot
         names = self._names(

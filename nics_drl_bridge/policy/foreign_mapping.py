@@ -34,9 +34,9 @@ class Scaled(Schema):
 
     # minimum and maximum before scaling; None: no clamping
     limits: Limits | None = None
-    # subtracted first: one number for all elements, or one per element
+    # subtracted after that: one number for all elements, or one per element
     subtract: Numbers = 0.0
-    # divisor after that: one number for all elements, or one per element
+    # divisor of the result: one number for all elements, or one per element
     divide: Numbers = 1.0
     clip: Limits | None = None  # minimum and maximum after scaling; None: no clamping
 
@@ -60,10 +60,10 @@ class InputPart(Scaled):
 
     of: Quantity  # the quantity; the guide lists all quantities with their units
     clockwise: bool = False  # reverse the order of a scan
-    # number of time steps, this one and earlier ones
+    # number of time steps, including the current one
     history: int = Field(default=1, ge=1, le=MOST_SCANS)
     newest_first: bool = False  # reverse the order of a history
-    # output of the network whose previous value `last.output` means
+    # the output whose previous value is `last.output`
     output: str | None = None
     value: Numbers | None = None  # numbers of a `constant`
 
@@ -133,7 +133,7 @@ class ForeignPolicy(Schema):
     states: dict[str, ForeignState] = Field(default_factory=dict)
     # the commands, by name
     outputs: dict[str, OutputCommand] = Field(default_factory=dict)
-    # instead of `outputs`: fixed commands, one of which the network chooses
+    # instead of `outputs`: fixed commands that the network chooses from
     choices: Choices | None = None
 
     @model_validator(mode="after")

@@ -1,4 +1,4 @@
-"""Builds an ONNX graph node by node, around the network in a policy file."""
+"""Builds the ONNX graph of a policy file, node by node, around a network."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -40,7 +40,7 @@ class Builder:
         return self.add("Gather", row, self.constant(places, np.int64), axis=1)
 
     def join(self, rows: Sequence[str], name: str = "") -> str:
-        """Concatenates rows to one."""
+        """Concatenates rows."""
         return self.add("Concat", *rows, name=name, axis=1)
 
     def cut(self, row: str, limits: Limits | tuple[Array, Array] | None) -> str:
@@ -57,7 +57,7 @@ class Builder:
         return self.add("Add", row, self.constant(offset)) if np.any(offset) else row
 
     def scale(self, row: str, scaled: Scaled) -> str:
-        """Scales a row as `Scaled` says."""
+        """Scales a row as described by `Scaled`."""
         row = self.cut(row, scaled.limits)
         if np.any(scaled.subtract):
             row = self.add("Sub", row, self.constant(scaled.subtract))
@@ -66,18 +66,18 @@ class Builder:
         return self.cut(row, scaled.clip)
 
     def blend(self, share: str, row: str, start: str) -> str:
-        """Selects the row where `share` (1, 1) is 1, and `start` where it is 0."""
+        """Selects `row` if `share` (1, 1) is 1, `start` if it is 0."""
         rest = self.affine(share, -1.0, 1.0)
         kept = self.add("Mul", share, row)
         begun = self.add("Mul", rest, start)
         return self.add("Add", kept, begun)
 
     def is_negative(self, row: str) -> str:
-        """Gives 1 where a row is negative, else 0."""
+        """Computes 1 where a row is negative, else 0."""
         return self.cut(self.affine(row, -STEP, 0.0), (0.0, 1.0))
 
     def angle(self, cosine: str, sine: str) -> str:
-        """Computes the angle [rad] of a direction; exact up to rounding in all four quadrants."""
+        """Computes the angle [rad] of a direction, exact up to rounding in all four quadrants."""
         across = self.add("Abs", sine)
         along = self.add("Abs", cosine)
         half = self.add("Atan", self.add("Div", across, self.affine(along, 1.0, 1.0)))

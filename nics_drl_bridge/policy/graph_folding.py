@@ -1,4 +1,4 @@
-"""Replaces what a foreign network computes from its own array shapes by constants."""
+"""Folds what a foreign network computes from its own array shapes into constants."""
 
 import math
 from typing import Any
@@ -25,11 +25,11 @@ FOLDED = (
     "Sub",
     "Unsqueeze",
 )
-"""Operators on sizes; each costs no more than its inputs and output, which are small here."""
+"""Operators on sizes; their cost is bounded by their inputs and outputs, which are small here."""
 
 
 def fold_shapes(graph: Any, opset: int) -> dict[str, Shape]:
-    """Folds small integers that are known; returns shapes of outputs, with 0 for unknown sizes."""
+    """Folds known small integers; returns the outputs' shapes, with 0 for unknown sizes."""
     weights = {one.name: one for one in graph.initializer}
     nodes = list(graph.node)
     imports = [helper.make_opsetid("", opset)]
@@ -39,7 +39,7 @@ def fold_shapes(graph: Any, opset: int) -> dict[str, Shape]:
     known = {name: one for name, one in weights.items() if _is_small(types[name])}
     del graph.node[:], graph.initializer[:]
     for node in nodes:
-        node.ClearField("domain")  # "ai.onnx" means the same domain
+        node.ClearField("domain")  # "" and "ai.onnx" are the same domain
         schema = defs.get_schema(node.op_type, opset)
         given = {name: types[name] for name in node.input if name}
         made = infer_node_outputs(schema, node, given, known, opset_imports=imports)
@@ -85,7 +85,7 @@ def _value(node: Any, types: dict[str, Any], known: dict[str, Any], opset: int) 
     if node.op_type == "Div" and any(
         numpy_helper.to_array(one).min() <= 0 for one in given
     ):
-        # division by zero, or a sign for which ONNX and numpy round differently
+        # Division by zero, or signs for which ONNX and numpy round differently.
         return None
     graph = helper.make_graph([node], "", [], [ValueInfoProto(name=name)], given)
     (value,) = ReferenceEvaluator(graph, opsets={"": opset}).run(None, {})

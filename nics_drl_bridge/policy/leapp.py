@@ -1,7 +1,8 @@
 """Policy files as LEAPP bundles, Isaac's deployment format: a network and a YAML file.
 
-Bundles are written without the package `leapp`, which only runs them. The single node has separate
-inputs for scan, goal and velocities, and outputs action and command; a state is fed back.
+Bundles are written without the package `leapp`, which is needed only to run them. The single node
+has separate inputs for scan, goal and velocities, and outputs action and command; a state is fed
+back.
 """
 
 import base64
@@ -42,7 +43,7 @@ Data = dict[str, Any]
 
 
 class Piece(NamedTuple):
-    """An input of a bundle, and the elements of the observation that it holds."""
+    """An input of a bundle, and its elements of the observation."""
 
     name: str
     width: int
@@ -51,7 +52,7 @@ class Piece(NamedTuple):
 
 
 def export_bundle(policy: PolicyFile, folder: str | Path) -> Path:
-    """Write a policy file as a bundle; return its YAML file. Errors: see `write_whole_folder`."""
+    """Writes a policy file as a bundle; returns its YAML file. Errors: see `write_whole_folder`."""
     content = policy.path.read_bytes()
     place = Path(folder)
     marker = f"{place.resolve().name}.yaml"
@@ -79,7 +80,7 @@ def export_bundle(policy: PolicyFile, folder: str | Path) -> Path:
 
 
 def _pieces(policy: PolicyFile) -> list[Piece]:
-    """Inputs of a bundle, in the order of the observation."""
+    """Returns the inputs of a bundle, in the order of the observation."""
     contract = policy.contract
     parts = contract.observation.scan_parts
     rest = len(contract.observation.rest_low)
@@ -224,7 +225,7 @@ def _described(
 
 
 def _outputs(contract: Contract) -> list[Data]:
-    """The action, and the resulting command in the robot's units."""
+    """Describes the action, and the resulting command in the robot's units."""
     commands = contract.robot.command
     limits = [[command.min, command.max] for command in commands]
     discrete = contract.actions == "discrete"

@@ -1,4 +1,4 @@
-"""Reads LEAPP bundles, ours and foreign: joins their networks, and derives what they mean."""
+"""Reads LEAPP bundles, ours and foreign: joins their networks, and derives their mapping."""
 
 import json
 import math
@@ -21,7 +21,7 @@ from nics_drl_bridge.policy.foreign_graph import Network
 from nics_drl_bridge.policy.foreign_mapping import ForeignState
 from nics_drl_bridge.policy.leapp import BEAMS, SECTORS, Data, restored
 
-ZERO = "constant"  # quantity for what a planar robot does not have
+ZERO = "constant"  # quantity for components that a planar robot does not have
 LINEAR = {"x": "velocity.forward", "y": "velocity.left", "z": ZERO}
 ANGULAR = {"x": ZERO, "y": ZERO, "z": "velocity.turn"}
 BOTH = {f"linear.{k}": v for k, v in LINEAR.items()}
@@ -30,7 +30,7 @@ GOAL = {
     f"goal.{name}": f"goal.{name}"
     for name in ("distance", "bearing", "cosine", "sine", "x", "y")
 }
-SEEN = {  # meaning of elements by kind and name; unnamed elements are in this order
+SEEN = {  # kind -> name of an element -> quantity; unnamed elements are in this order
     "state/body/linear_velocity": LINEAR,
     "state/body/angular_velocity": ANGULAR,
     "state/body/velocity": BOTH,
@@ -38,7 +38,7 @@ SEEN = {  # meaning of elements by kind and name; unnamed elements are in this o
     "command/goal": GOAL,
     "command/body/pose": {"x": "goal.x", "y": "goal.y", "z": ZERO},
 }
-DONE = {  # likewise for outputs
+DONE = {  # the same for outputs
     "target/body/linear_velocity": LINEAR,
     "target/body/angular_velocity": ANGULAR,
     "target/body/velocity": BOTH,
@@ -105,12 +105,12 @@ class Description(Open):
 
 @dataclass(frozen=True)
 class Bundle:
-    """A bundle as read; names are those of inputs and outputs, with their node if ambiguous."""
+    """A bundle as read; inputs and outputs are named with their node only if ambiguous."""
 
-    path: Path  # of the YAML file
+    path: Path  # the YAML file
     description: Description
     models: dict[str, Any]  # onnx.ModelProto of each node
-    sha256: str  # of all networks together
+    sha256: str  # hash of all networks together
 
     @cached_property
     def ours(self) -> bytes | None:
@@ -120,7 +120,7 @@ class Bundle:
 
     @cached_property
     def network(self) -> Network:
-        """The networks joined to one. Raises PolicyError if they do not fit together."""
+        """All networks joined into one. Raises PolicyError if they do not fit together."""
         return Network(_merged(self), self._states())
 
     @cached_property
@@ -134,7 +134,7 @@ class Bundle:
         return self._entries("outputs", self.description.pipeline.outputs)
 
     def name_of(self, end: str) -> str:
-        """The name of `node/output` or `node/input` in the joined network."""
+        """Returns the name of `node/output` or `node/input` in the joined network."""
         pipeline = self.description.pipeline
         ends = [
             f"{node}/{name}"
@@ -183,7 +183,7 @@ class Bundle:
         }
 
     def _initial(self, name: str) -> dict[str, tuple[float, ...]]:
-        """Arrays of a safetensors file, flattened, by `node/input`."""
+        """Returns the flattened arrays of a safetensors file, by `node/input`."""
         data = _read(self, name, "pipeline.initial_values")
         try:
             (size,) = struct.unpack_from("<Q", data)
@@ -210,9 +210,9 @@ class Bundle:
 
 
 def description_of(place: Path) -> Path | None:
-    """The YAML file of a bundle, given the file or its folder; None for another YAML file.
+    """Returns the YAML file of a bundle, given that file or its folder; None for other YAML files.
 
-    Raises PolicyError if a folder holds none or several, ConfigError if the file can't be read.
+    Raises PolicyError unless a folder has exactly one, ConfigError if the file can't be read.
     """
     if place.is_file() and place.suffix not in (".yaml", ".yml"):
         reason = "is not a YAML file; give a LEAPP bundle, or the mapping of a foreign policy."
@@ -277,7 +277,7 @@ def _read(bundle: Bundle, name: str, place: str) -> bytes:
 
 
 def _merged(bundle: Bundle) -> Any:
-    """Joins all nodes in order to one graph, turning connections into copying nodes."""
+    """Joins all nodes in order into one graph, with Identity nodes as connections."""
     description = bundle.description
     pipeline = bundle.description.pipeline
     graph = onnx.GraphProto(name="bundle")
@@ -342,7 +342,7 @@ def _merged(bundle: Bundle) -> Any:
     )
 
 
-# The meaning of a foreign bundle, as far as the bundle states it.
+# The mapping of a foreign bundle, as far as the bundle states it.
 
 
 def mapping_of(bundle: Bundle, model: SimulatorModel) -> Data:
@@ -395,7 +395,7 @@ def _parts(bundle: Bundle, name: str, entry: Tensor, data: Data) -> list[Data]:
     size = math.prod(entry.shape) if isinstance(entry.shape, list) else 0
     meanings = SEEN.get(kind, {})
     names = entry.names
-    # that may have a heading
+    # A pose without names is ambiguous: it may include a heading.
     if not names and len(meanings) == size and "pose" not in kind:
         names = list(meanings)
     if not names or len(names) != size or not all(one in meanings for one in names):

@@ -13,20 +13,20 @@ from nics_drl_bridge.robot.spec import RobotSpec
 CELL_M = 0.05  # side of the cells of distances
 MOST_M = 4.0  # maximum extent of a map to each side [m]
 FINE_M, DEEP_M, BORDER_M = 0.02, 0.03, 0.08
-"""Lattice of the discs, depth from which they cover everything, spacing of border points [m]."""
+"""Spacing of the lattice, depth from which discs cover all of it, spacing of border points [m]."""
 MOST_POINTS = 5000  # maximum number of lattice points; beyond it the lattice is coarser
-ROWS = 64  # rows of distances between points that are computed at a time
+ROWS = 64  # number of rows of the distance matrix computed at a time
 
 
 def rays_of(task: Navigation) -> kernels.ScanRays:
-    """The rays of a task's scan parts."""
+    """Returns the rays of a task's scan parts."""
     sight = task.sight
     directions = np.stack([np.cos(sight.angles), np.sin(sight.angles)], axis=-1)
     return kernels.ScanRays(directions, sight.origin, float(sight.range_max))
 
 
 def outline_of(robot: RobotSpec) -> kernels.FootprintDiscs:
-    """The footprint of a robot as discs: some that fill it, and points along its border."""
+    """Returns a robot's footprint as discs that fill it, and points along its border."""
     if robot.footprint is None:
         radius = robot.footprint_radius
         return kernels.FootprintDiscs(np.zeros((0, 3)), np.zeros(2), radius, radius)
@@ -56,7 +56,8 @@ def outline_of(robot: RobotSpec) -> kernels.FootprintDiscs:
 def _cover(lattice: Array, depth: Array) -> list[Array]:
     """Returns discs (3,) at points (N, 2) that cover all points deep within a footprint.
 
-    Greedy: each disc covers the maximum number of remaining points; its radius is its depth (N,).
+    Greedy: each disc covers as many of the remaining points as possible. The radius of a disc is
+    the depth (N,) of its point.
     """
     left = depth > DEEP_M
     covered = _count_covered(lattice, depth, lattice[left])

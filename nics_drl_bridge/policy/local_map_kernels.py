@@ -15,15 +15,15 @@ from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.sim.guide_kernels import sweep
 
 Grid = NDArray[np.float32]
-# distance at which a robot has arrived: nothing behind the goal matters
+# distance to the goal at which a robot has arrived
 ARRIVED_M = 0.15
 APART_M = 0.02  # hits closer than this to the previous one are left out
-COARSE = 2  # cells of `distances` along a side of a cell of `ways`
+COARSE = 2  # side of a cell of `ways`, in cells of `distances`
 BLOCKED, NEAR = 30.0, 3.0
-"""Cost of a metre where the robot can't stand, and next to such cells, minus the usual 1."""
+"""Extra cost per metre where the robot can't stand, and next to such cells."""
 AHEAD_M = 0.3  # distance ahead at which a heading is judged
 ROUNDS, SETTLED_M = 6, 0.02
-"""Maximum number of sweep rounds, and change of a path length that counts as converged [m]."""
+"""Maximum number of sweep rounds, and change of a path length below which it has converged [m]."""
 
 
 class ScanRays(NamedTuple):
@@ -35,10 +35,10 @@ class ScanRays(NamedTuple):
 
 
 class FootprintDiscs(NamedTuple):
-    """Footprint of a robot in `base_link`, as inner discs that leave hardly anything uncovered."""
+    """Footprint of a robot in `base_link` as discs inside it, which cover nearly all of it."""
 
     discs: Array  # (D, 3) x, y, radius [m]
-    centre: Array  # (2,) of the bounding circle [m]
+    centre: Array  # (2,) centre of the bounding circle [m]
     inner: float  # radius of the largest disc [m]
     outer: float  # radius of the bounding circle [m]
 
@@ -89,9 +89,9 @@ def look(shares, goal, rays, outline, clearance, scratch):  # type: ignore[no-un
 
 @kernel
 def hits_of(hits, shares, rays):  # type: ignore[no-untyped-def]
-    """Writes a scan's end points, by range fractions (P,), into hits (P, 2) [m]; returns the count.
+    """Writes end points of range fractions (P,) into hits (P, 2) [m]; returns their number.
 
-    Fractions of 0 are left out: unknown, or too close to distinguish from the robot itself.
+    Fractions of 0 are left out: they are unknown, or too close to tell from the robot itself.
     """
     count = 0
     for p in range(shares.shape[0]):
@@ -142,7 +142,7 @@ def put_distances(seen, hits):  # type: ignore[no-untyped-def]
 
 @kernel
 def _span(middle, reach, cell, size):  # type: ignore[no-untyped-def]
-    """Returns the first and one past the last of the cells within `reach` of a coordinate [m]."""
+    """Returns the range (first, last + 1) of cells within `reach` of a coordinate [m]."""
     low = min(max(int((middle - reach) / cell), 0), size)
     return low, max(min(int((middle + reach) / cell) + 1, size), low)
 
@@ -173,9 +173,9 @@ def between(grid, u, v):  # type: ignore[no-untyped-def]
 
 @kernel
 def put_ways(around, prices):  # type: ignore[no-untyped-def]
-    """Writes the path lengths of a map to the goal; prices (G / COARSE, G / COARSE) are scratch.
+    """Writes a map's path lengths to the goal; prices (G / COARSE, G / COARSE) are scratch.
 
-    Solves the eikonal equation by fast sweeping (Zhao 2005); beyond the map, paths are straight.
+    Solves the eikonal equation by fast sweeping (Zhao 2005). Beyond the map, paths are straight.
     """
     seen = around.map
     goal = around.goal
@@ -219,7 +219,7 @@ def way_at(x, y, around):  # type: ignore[no-untyped-def]
 def room_at(x, y, c, s, around):  # type: ignore[no-untyped-def]
     """Returns the clearance at a pose [m]; c and s are the cosine and sine of its heading.
 
-    Negative where the footprint overlaps a hit; far away, it is a lower bound.
+    It is negative if the footprint overlaps a hit. Far from all hits it is a lower bound.
     """
     seen = around.map
     outline = around.outline
@@ -250,12 +250,12 @@ def room_at(x, y, c, s, around):  # type: ignore[no-untyped-def]
 
 @kernel
 def astray(x, y, c, s, way, around):  # type: ignore[no-untyped-def]
-    """Returns how far a heading misses the path to the goal: 0 along it, 1 away from it."""
+    """Returns how far a heading is off the path to the goal: 0 along it, 1 away from it."""
     ahead = way_at(x + AHEAD_M * c, y + AHEAD_M * s, around)
     return min(max(0.5 + 0.5 * (ahead - way) / AHEAD_M, 0.0), 1.0)
 
 
 @kernel
 def touching(around):  # type: ignore[no-untyped-def]
-    """Returns the clearance that counts as a contact [m]; lower if the robot is in one already."""
+    """Returns the clearance that counts as a contact [m]; lower if the robot already touches."""
     return min(around.clearance.margin, room_at(0.0, 0.0, 1.0, 0.0, around) - 1e-3)

@@ -30,7 +30,7 @@ from nics_drl_bridge.robot.kinds import compute_steady_twist
 from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.threads import run_parts
 
-SETTLED_S = 3.0  # time after which a held command has led to its steady state
+SETTLED_S = 3.0  # time to the steady state of a held command
 FINEST = 0.25  # maximum rollout step as a fraction of a lag
 FEWEST = 8  # minimum number of robots per thread
 CLEARANCE = Clearance(margin=0.08, soft=0.4)
@@ -39,14 +39,15 @@ WORTH = kernels.Worth(near=4.0, early=0.3, change=0.02, astray=0.2)
 
 @dataclass(frozen=True)
 class Mppi:
-    """Planner that samples rollouts in the robot's model, with its true outline and without a map.
+    """Planner that samples rollouts in the robot's model, with its true outline.
 
-    Without a model it uses a textbook one; ConfigError if there is none for the robot.
+    It maps only the current scan. Without a model it uses the robot's textbook model; raises
+    ConfigError if there is none.
     """
 
     task: Navigation
     model: SimulatorModel | None = None
-    samples: int = 256  # rollouts of each round
+    samples: int = 256  # rollouts per round
     horizon: float = 2.0  # [s]
     knots: int = 4  # actions along a rollout, interpolated linearly
     # standard deviation of the noise in the rounds after the first
@@ -64,7 +65,7 @@ class Mppi:
         _ = self._halt
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Plan the actions; see `Policy`."""
+        """Plans the actions; see `Policy`."""
         given = self._seen(observation)
         out = np.empty((len(given[0]), len(self.task.robot.command)))
         self._plan(out, *given)
@@ -72,7 +73,7 @@ class Mppi:
         return actions[0] if observation.ndim == 1 else actions
 
     def _seen(self, observation: NDArray[np.float32]) -> tuple[Array, Array, Array]:
-        """Scans (N, P) as fractions, goals (N, 2) in `base_link` [m], and twists (N, 3)."""
+        """Returns scans (N, P) as fractions, goals (N, 2) in `base_link` [m], and twists (N, 3)."""
         parts = self.task.scan_parts
         rows = np.atleast_2d(observation).astype(np.float64)
         goals = rows[:, parts : parts + 1] * rows[:, parts + 1 : parts + 3]
@@ -155,7 +156,7 @@ class Mppi:
 
     @cached_property
     def _top_twists(self) -> Array:
-        """Twists (K, 3) to which the extreme commands lead."""
+        """(K, 3) steady twists of the extreme commands."""
         robot = self.task.robot
         ends = np.array(list(product(*zip(*self.task.command_limits, strict=True))))
         if robot.takes_cmd_vel:
@@ -166,7 +167,7 @@ class Mppi:
 
     @cached_property
     def _halt(self) -> kernels.Halt:
-        """The stop at the end of a rollout; none if half a rollout is long enough to stop in."""
+        """The stop at the end of a rollout; empty if the robot can stop within half a rollout."""
         robot = self.task.robot
         angles = np.array([each.unit == "rad" for each in robot.command])
         braking = find_braking(robot, self._kinematics, *self.task.command_limits)
@@ -180,7 +181,7 @@ class Mppi:
 
     @property
     def _reach(self) -> float:
-        """Distance covered by a rollout at full speed and the stop that follows [m]."""
+        """Distance covered by a rollout at full speed and the following stop [m]."""
         fastest = np.hypot(*np.abs(self._top_twists)[:, :2].max(axis=0))
         braking = find_braking(
             self.task.robot, self._kinematics, *self.task.command_limits

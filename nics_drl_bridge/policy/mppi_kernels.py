@@ -17,7 +17,7 @@ from nics_drl_bridge.random_kernels import PLANNER_STREAM, normal, uniform
 from nics_drl_bridge.robot.kernels import Terms, advance, apply_curve, rates, run
 
 HIT = 1e3  # cost of an immediate contact; later ones cost less
-# proposals are drawn over this multiple of the range and clamped, so many lie at its ends
+# multiple of the range from which proposals are drawn before clamping, so many lie at its ends
 BEYOND = 1.3
 # passes over the commands when fitting them to a twist
 PASSES = 12
@@ -32,7 +32,7 @@ class Plant(NamedTuple):
     series: Array
     dt: float  # [s]
     substeps: int  # integration steps per period
-    latency: float  # time until a command takes effect [s]
+    latency: float  # delay before a command takes effect [s]
     settled: Array  # (S, C) steady state per unit of a held command
     low: Array  # (C,) minimum of each command
     high: Array
@@ -45,7 +45,7 @@ class Halt(NamedTuple):
     holds: NDArray[np.bool_]
     rest: Array  # (C,) value of the other commands
     most: int  # maximum number of periods for the stop
-    far: float  # distance along an axis beyond which the map knows nothing [m]
+    far: float  # distance along an axis beyond which the map is unknown [m]
 
 
 class Sampling(NamedTuple):
@@ -64,39 +64,39 @@ class Worth(NamedTuple):
     """Weights of the terms in the cost of a rollout."""
 
     near: float  # weight of driving a whole rollout at the margin [m]
-    # weight of the mean path length to the goal; its final value has the rest of 1
+    # weight of the mean path length to the goal; the final one has weight 1 - early
     early: float
-    change: float  # weight of the squared change of action from knot to knot [m]
+    change: float  # weight of the squared change of actions between knots [m]
     astray: float  # weight of a final heading that leads away from the goal [m]
 
 
 class RollOuts(NamedTuple):
-    """Scratch memory of one robot's plan."""
+    """Scratch memory of one robot's plan; a lane is one of the K rollouts."""
 
     pose: Array  # (6, K) see `robot.kernels.run`
     x: Array  # (S + C + 1, K)
     dq: Array  # (3 + S, K)
     actions: Array  # (K, Q, C)
     nominal: Array  # (Q, C)
-    held: Array  # (C,) command behind the present twist
+    held: Array  # (C,) held command that explains the present twist
     one: Array  # (S + C + 1,)
     rate: Array  # (3 + S,)
     start: Array  # (3,)
     cost: Array  # (K,)
     way: Array  # (K,)
-    # (K,) period of a contact or an arrival, negative if neither
+    # (K,) period of the contact or arrival; negative: neither
     ended: NDArray[np.int64]
 
 
 @kernel(allocates=True)
 def draw(offers, noise, rest, seed):  # type: ignore[no-untyped-def]
-    """Draws `Sampling.offers`, the first of which is rest (C,), and `Sampling.noise`, by a seed."""
+    """Draws `Sampling.offers`, the first of them rest (C,), and `Sampling.noise`, by seed."""
     for k in range(offers.shape[0]):
         for q in range(offers.shape[1]):
             for c in range(offers.shape[2]):
                 i = (k * offers.shape[1] + q) * offers.shape[2] + c
                 drawn = BEYOND * (2.0 * uniform(seed, PLANNER_STREAM, 3 * i) - 1.0)
-                # half of the proposals hold one action
+                # Half of the proposals hold one action.
                 held = k < offers.shape[0] // 2 and q > 0
                 offers[k, q, c] = (
                     offers[k, 0, c] if held else min(max(drawn, -1.0), 1.0)
@@ -119,7 +119,7 @@ def _plan(out, twist, around, plant, sampling, worth, lanes):  # type: ignore[no
     """Writes the first action (C,) of the plan.
 
     Instead of warm-starting from the previous plan, the first round proposes actions from the whole
-    range. The planner therefore has no memory: an action depends on the observation alone.
+    range. The planner therefore has no memory: its actions depend only on the observation.
     """
     _wait(twist, plant, lanes)
     lanes.actions[:] = sampling.offers
@@ -140,7 +140,7 @@ def _plan(out, twist, around, plant, sampling, worth, lanes):  # type: ignore[no
 
 @kernel
 def _wait(twist, plant, lanes):  # type: ignore[no-untyped-def]
-    """Writes pose and state of a robot with a twist (3,) at the time when commands take effect."""
+    """Writes pose and state, when commands take effect, of a robot that has a twist (3,) now."""
     follow(twist, plant, lanes)
     lanes.start[:] = 0.0
     if plant.latency > 0.0:
@@ -165,7 +165,7 @@ def _average(best, temperature, lanes):  # type: ignore[no-untyped-def]
 
 @kernel
 def follow(twist, plant, lanes):  # type: ignore[no-untyped-def]
-    """Writes the held command that leads to a twist (3,), and the state that it has led to.
+    """Writes the held command whose steady twist is nearest to a twist (3,), and its state.
 
     Coordinate descent on the squared difference.
     """
@@ -202,7 +202,7 @@ def follow(twist, plant, lanes):  # type: ignore[no-untyped-def]
 
 @kernel
 def _settle(command, plant, lanes):  # type: ignore[no-untyped-def]
-    """Writes the steady state of a command (C,), and its effect, into `one`."""
+    """Writes the steady state of a command (C,) and its effect into `one`."""
     states, count = plant.settled.shape
     x = lanes.one
     for s in range(states):
@@ -255,7 +255,7 @@ def _roll(around, plant, sampling, worth, lanes):  # type: ignore[no-untyped-def
 
 @kernel
 def _halt(around, plant, halt, limit, lanes):  # type: ignore[no-untyped-def]
-    """Stops all lanes at the end of their rollouts, and adds the cost of contacts on the way."""
+    """Stops all lanes at the end of their rollouts; adds the cost of contacts while stopping."""
     states = plant.settled.shape[0]
     for t in range(halt.most):
         for c in range(plant.low.shape[0]):
@@ -284,7 +284,7 @@ def _halt(around, plant, halt, limit, lanes):  # type: ignore[no-untyped-def]
 
 @kernel
 def _begin(around, plant, worth, lanes):  # type: ignore[no-untyped-def]
-    """Initialises all lanes at the start, with the cost of changing actions between knots."""
+    """Initialises all lanes, and their costs with the changes of action between knots."""
     states, count = plant.settled.shape
     _put(lanes, states)
     for k in range(lanes.cost.shape[0]):
@@ -304,7 +304,7 @@ def _begin(around, plant, worth, lanes):  # type: ignore[no-untyped-def]
 
 @kernel
 def _put(lanes, states):  # type: ignore[no-untyped-def]
-    """Initialises all lanes at the start."""
+    """Puts all lanes at the start pose and state."""
     x = lanes.start[0]
     y = lanes.start[1]
     heading = lanes.start[2]

@@ -1,4 +1,4 @@
-"""Checks a policy file's graph before any of it runs: raw size, form, operators, work."""
+"""Checks a policy file's graph before any of it runs: size, form, operators, amount of work."""
 
 import itertools
 import math
@@ -21,16 +21,16 @@ MOST_PARTS = 50_000
 MOST_NESTED = 16  # maximum nesting of messages; an exported graph needs six levels
 # maximum size of packed integers in one field, such as a shape [bytes]
 MOST_PACKED = 2**20
-MOST_NODES = 1000  # maximum number of nodes; an exported network has some dozens
+MOST_NODES = 1000  # maximum number of nodes; an exported network has a few dozen
 MOST_DIMENSIONS = 8  # maximum number of dimensions of an array of weights
 # maximum size of the contract [bytes], mostly golden observations
 CONTRACT_LIMIT = 4 * 2**20
-MOST_NUMBERS = 1_000_000  # maximum output of all nodes together for one observation
+MOST_NUMBERS = 1_000_000  # maximum size of all nodes' outputs for one observation
 # maximum number of multiplications, or of numbers read and written, per observation
 MOST_WORK = 20_000_000
-# maximum of all nodes' outputs in one run: 256 MB of float32
+# maximum size of all nodes' outputs in one run: 256 MB of float32
 MOST_AT_ONCE = 64 * MOST_NUMBERS
-# number of observations for which sizes are computed, equal to the golden ones
+# number of observations for which sizes are computed; equals the number of golden ones
 ROWS = 16
 # maximum length of an integer array that may be a shape, an axis or an index
 SMALL = 1024
@@ -40,7 +40,7 @@ MOST_AXES = 256
 INPUT = "observation"
 ACTION = "action"
 COMMAND = "command"
-# graph ends of a policy with a state
+# additional input and output of a policy with a state
 STATE_IN = "state_in"
 STATE_OUT = "state_out"
 # recurrent operators over sequences whose length the graph fixes
@@ -112,9 +112,9 @@ OPERATORS = RECURRENT | frozenset(
 """Operators of networks: no loops, branches, random numbers or data-dependent sizes."""
 FLOATS = frozenset({TensorProto.FLOAT, TensorProto.DOUBLE, TensorProto.FLOAT16})
 INTEGERS = frozenset({TensorProto.INT64, TensorProto.INT32})
-# types as large in memory as in the file
+# types whose size in memory equals their size in the file
 NUMBERS = FLOATS | INTEGERS | {TensorProto.BOOL}
-# integer division by zero, or of the minimum by -1, crashes the process
+# For integers, division by zero, or of the minimum by -1, crashes the process.
 DIVIDING = frozenset({"Div", "ReduceMean"})
 OTHER_FORMATS = (
     (b"PK", "a zip archive, written by Stable-Baselines3 and torch"),
@@ -123,8 +123,8 @@ OTHER_FORMATS = (
     (b"\x89HDF", "an HDF5 file"),
     (b"\x1f\x8b", "a gzip file"),
 )
-"""First bytes of trainers' files, which are never opened here."""
-# wire types of fields
+"""First bytes of training frameworks' files, which are never opened here."""
+# protobuf wire types
 _VARINT = 0
 _BYTES = 2
 _FIXED = {1: 8, 5: 4}  # fixed-size wire types and their sizes [bytes]
@@ -154,7 +154,7 @@ def parsed(data: bytes, source: str) -> Any:
 
 
 def _check_form(data: bytes, source: str) -> None:
-    """Raises PolicyError for another format, or for bytes that are not a message of few fields."""
+    """Raises PolicyError for another format, or for bytes that fail `check_wire`."""
     for start, kind in OTHER_FORMATS:
         if data.startswith(start):
             reason = f"is {kind}, which is not a policy; export the policy with `export_policy`."
@@ -170,7 +170,7 @@ def _no_policy(source: str, what: str) -> PolicyError:
 
 
 def metadata_in(data: bytes, source: str) -> str:
-    """The text of the contract in a file, without parsing the rest. Raises PolicyError."""
+    """Returns the text of the contract in a file, without parsing the rest. Raises PolicyError."""
     _check_form(data, source)
     bare = onnx.ModelProto()
     field = onnx.ModelProto.DESCRIPTOR.fields_by_name["metadata_props"]
@@ -197,7 +197,7 @@ def metadata_in(data: bytes, source: str) -> str:
 
 
 def metadata(model: Any, source: str) -> str:
-    """The text of the contract. Raises PolicyError unless the model has exactly one."""
+    """Returns the text of the contract. Raises PolicyError unless the model has exactly one."""
     found = [entry.value for entry in model.metadata_props if entry.key == KEY]
     if len(found) != 1:
         reason = (
@@ -213,7 +213,7 @@ def metadata(model: Any, source: str) -> str:
 
 
 def graph_hash(model: Any) -> str:
-    """SHA-256 of a model without its metadata."""
+    """Returns the SHA-256 of a model without its metadata."""
     bare = onnx.ModelProto()
     bare.CopyFrom(model)
     del bare.metadata_props[:]
@@ -299,7 +299,7 @@ def _varint(view: memoryview, start: int, end: int) -> tuple[int, int]:
 
 
 def check_graph(model: Any, source: str) -> None:
-    """Raises PolicyError for a graph that is not self-contained or uses other operators."""
+    """Raises PolicyError for a graph that is not self-contained or uses a forbidden operator."""
     for field, reason in itertools.chain(
         _graph_faults(model), _weight_faults(model.graph)
     ):
@@ -383,7 +383,7 @@ def _tensors(graph: Any) -> Iterator[Any]:
 def check_ends(
     model: Any, widths: dict[str, int | None], source: str, batch: int | None = None
 ) -> None:
-    """Raises PolicyError unless inputs and outputs have these widths; None: integers (n,).
+    """Raises PolicyError unless inputs and outputs have these widths; None means integers (n,).
 
     Their first dimension is the number of observations, `batch`; None: any number.
     """
@@ -471,7 +471,7 @@ def _setting_faults(graph: Any) -> Iterator[Fault]:
 
 
 def _integer_faults(model: Any, rows: int, source: str) -> Iterator[Fault]:
-    """Yields integers that are divided, or that grow while shapes are inferred."""
+    """Yields integers that are divided, or that grow during shape inference."""
     kinds, shapes = _sizes(model, rows, source, values=False)
     for node in model.graph.node:
         if node.op_type in DIVIDING and kinds.get(node.input[0]) not in FLOATS:
@@ -496,7 +496,7 @@ def _costs(model: Any, rows: int, source: str) -> tuple[int, int]:
     numbers = work = 0
     for node in model.graph.node:
         try:
-            # without optional inputs that are left out
+            # omitted optional inputs have an empty name
             given = [shapes[name] for name in node.input if name]
             made = [shapes[name] for name in node.output if name]
         except KeyError:
@@ -509,7 +509,7 @@ def _costs(model: Any, rows: int, source: str) -> tuple[int, int]:
 
 
 def _work(node: Any, given: list[Shape], made: list[Shape]) -> tuple[int, int]:
-    """Counts the numbers that the runtime allocates besides the output, and the multiplications."""
+    """Counts the numbers that the runtime allocates besides the output, and multiplications."""
     settings = {attribute.name: attribute for attribute in node.attribute}
     if node.op_type in ("MatMul", "Gemm"):
         turned = (
@@ -522,7 +522,7 @@ def _work(node: Any, given: list[Shape], made: list[Shape]) -> tuple[int, int]:
         return math.prod(made[0][2:]) * kernel * max(groups, 1), math.prod(
             made[0]
         ) * kernel
-    # inputs: a sequence (T, n, I), weights (D, G H, I) and (D, G H, H)
+    # Inputs: a sequence (T, n, I), weights (D, G H, I) and (D, G H, H).
     if node.op_type in RECURRENT:
         steps = math.prod(given[0][:2])
         return steps * math.prod(given[1][:2]), steps * sum(map(math.prod, given[1:3]))
@@ -534,7 +534,10 @@ def _work(node: Any, given: list[Shape], made: list[Shape]) -> tuple[int, int]:
 def _sizes(
     model: Any, rows: int, source: str, values: bool
 ) -> tuple[dict[str, int], dict[str, Shape]]:
-    """Type and known shape of every tensor for `rows` observations; `values` uses integers, too."""
+    """Returns types and known shapes of all tensors for `rows` observations.
+
+    `values` also uses the values of integers.
+    """
     bare = _without_weights(model, rows)
     try:
         graph = onnx.shape_inference.infer_shapes(
@@ -559,7 +562,7 @@ def _sizes(
 
 
 def _without_weights(model: Any, rows: int) -> Any:
-    """The graph for `rows` observations, with weights and constants as inputs of their shape."""
+    """Returns the graph for `rows` observations, with weights and constants as inputs."""
     bare = onnx.ModelProto(ir_version=model.ir_version, opset_import=model.opset_import)
     graph = bare.graph
     graph.name = "sizes"
@@ -575,14 +578,14 @@ def _without_weights(model: Any, rows: int) -> Any:
     for value in (one for one in model.graph.input if one.name not in held):
         graph.input.append(value)
         graph.input[-1].type.tensor_type.shape.dim[0].dim_value = rows
-    for value in model.graph.output:  # output shapes are to be inferred, not trusted
+    for value in model.graph.output:  # infer output shapes instead of trusting them
         kind = value.type.tensor_type.elem_type
         graph.output.append(onnx.helper.make_tensor_value_info(value.name, kind, None))
     return bare
 
 
 def _add_tensor(graph: Any, tensor: Any, name: str) -> None:
-    """Adds a small integer array, possibly a shape, with its values; of others only the shape."""
+    """Adds small integer arrays, which may be shapes, with their values; others only by shape."""
     if math.prod(tensor.dims) <= SMALL and tensor.data_type in INTEGERS:
         graph.initializer.append(tensor)
         graph.initializer[-1].name = name

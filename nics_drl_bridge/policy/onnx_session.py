@@ -1,4 +1,4 @@
-"""Opens a policy's graph in onnxruntime after all checks; imports little, for `rehearsal`."""
+"""Opens a policy's graph in onnxruntime after all checks; imports little, see `rehearsal`."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -39,7 +39,7 @@ def check_policy_graph(data: bytes, needs: GraphNeeds, source: str) -> int:
 
 
 def open_session(data: bytes, source: str) -> Any:
-    """Opens an onnxruntime session on one thread. Raises ConfigError without it, or PolicyError."""
+    """Opens a session on one thread. Raises ConfigError without onnxruntime, or PolicyError."""
     try:
         import onnxruntime
     except ImportError:
@@ -60,7 +60,7 @@ def open_session(data: bytes, source: str) -> Any:
 
 
 def cannot_run(source: str, error: Exception) -> PolicyError:
-    """Makes the error for a graph that the runtime refuses."""
+    """Returns the error for a graph that the runtime refuses."""
     words = " ".join(str(error).split())[:120]
     return PolicyError(source, "graph", f"onnxruntime can't run it ({words}).")
 
@@ -68,7 +68,7 @@ def cannot_run(source: str, error: Exception) -> PolicyError:
 def in_turn(
     run: Callable[..., Sequence[NDArray[Any]]], seen: Rows, start: Rows | None
 ) -> list[NDArray[Any]]:
-    """Computes actions and commands for observations (T, O), in sequence given a state (S,)."""
+    """Computes actions and commands for observations (T, O), step by step if given a state (S,)."""
     if start is None:
         return list(run(seen))
     state = start[None]

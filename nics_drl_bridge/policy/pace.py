@@ -1,4 +1,4 @@
-"""Time limits of episodes, and per-step rewards and discounts adapted to slower robots."""
+"""Time limits of episodes, and rewards and discounts adapted to longer episodes."""
 
 import math
 from collections.abc import Iterable
@@ -16,9 +16,9 @@ from nics_drl_bridge.robot.kinds import has_textbook, reach
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
-OWN_TASK = "navigation"  # task for which user-defined robots inherit settings
+OWN_TASK = "navigation"  # task whose settings user-defined robots inherit
 LEAST_S = 30.0  # minimum time limit [s]
-ROOM = 1.8  # factor on the straight-line time, for detours, turns and slow stretches
+ROOM = 1.8  # factor on the straight-line time, for detours, turns and slow sections
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Pace:
         )
 
     def shortfall(self, steps: int) -> str | None:
-        """A sentence if some goals can't be reached in time; ConfigError if no goal can."""
+        """Returns a warning if time is too short for some goals. Raises ConfigError if for all."""
         limit = steps * self.period
         if self.far <= limit * self.speed:
             return None
@@ -56,7 +56,7 @@ class Pace:
 def pace_of(
     model: SimulatorModel, worlds: Iterable[AnyWorld], top: float | None = None
 ) -> Pace:
-    """The pace of a robot in worlds; `top` limits its speed [m/s]."""
+    """Returns the pace of a robot in worlds; `top` limits its speed [m/s]."""
     members = [member for world in worlds for member in world.members]
     far, name = max(
         (min(one.goal_distance[1], math.dist(one.extent[:2], one.extent[2:])), one.name)
@@ -73,7 +73,7 @@ def pace_of(
 
 
 def top_speed(robot: RobotSpec) -> float:
-    """Maximum speed of a robot along one axis [m/s]; inf if neither kind nor commands limit it."""
+    """Returns a robot's maximum speed along one axis [m/s]; inf if nothing limits it."""
     if has_textbook(robot):
         return float(reach(robot)[:2].max())
     told = [
@@ -83,7 +83,7 @@ def top_speed(robot: RobotSpec) -> float:
 
 
 def kin(robot: RobotSpec) -> str:
-    """Name of the shipped robot that moves most like a robot."""
+    """Returns the name of the shipped robot that moves most like this one."""
     if robot.steers:
         return "ackermann"
     return "mecanum" if robot.moves_sideways else "differential"
@@ -97,7 +97,7 @@ class Fitted(NamedTuple):
 
 
 def settings_for(task: str, name: str | None, changes: dict[str, Any]) -> Fitted:
-    """Loads settings as `chosen_settings`; a robot without its own gets those of the nearest one.
+    """Loads settings like `chosen_settings`; a robot without settings gets a similar robot's.
 
     Raises ConfigError, and ModelError if there is no such robot.
     """
@@ -119,10 +119,10 @@ def settings_for(task: str, name: str | None, changes: dict[str, Any]) -> Fitted
 def fitted(
     settings: recordings.TrainingSettings, model: SimulatorModel, inherited: bool
 ) -> Fitted:
-    """Adds a time limit for robot and worlds if there is none. Raises ConfigError if too short.
+    """Adds a time limit if there is none. Raises ConfigError if the limit is too short.
 
-    Settings inherited from another robot also get its lidar's scan layout, and a time reward and
-    discount that amount to the same over an episode.
+    Settings inherited from another robot also get a scan layout that this robot's lidar covers, and
+    a time reward and discount that amount to the same over an episode.
     """
     options = dict(settings.task_options)
     told = list[str]()
@@ -161,7 +161,7 @@ def _stretched(
     factor: float,
     told: list[str],
 ) -> dict[str, Any]:
-    """Returns the changes for episodes longer by a factor; changes `options` in place."""
+    """Returns the settings to change for episodes `factor` times as long; updates `options`."""
     if reward := options.get("time_reward"):
         options["time_reward"] = round(reward / factor, 6)
         told.append(f"time_reward {options['time_reward']:g}, was {reward:g}")

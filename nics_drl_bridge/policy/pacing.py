@@ -1,17 +1,17 @@
-"""Pacing of a policy's actions, and detection of slow inference; times on a steady clock [s]."""
+"""Paces a policy's actions and detects slow inference; times are on a steady clock [s]."""
 
 from enum import Enum
 
 
 class ActionPace:
-    """Allows at most one action per period, as soon as there are data; a period of 0 allows all."""
+    """Allows at most one action per period, as soon as data arrive; a period of 0 allows all."""
 
     def __init__(self, period_s: float) -> None:
         self._period_s = period_s
         self._due_s = -float("inf")
 
     def due(self, now_s: float) -> bool:
-        """True if an action is due."""
+        """Returns True if an action is due."""
         return now_s >= self._due_s
 
     def acted(self, now_s: float) -> None:
@@ -30,7 +30,7 @@ class Answer(Enum):
 
 
 class Deadline:
-    """Judges each inference time; after `patience` late ones in a row the verdict is to stop."""
+    """Judges inference times: after `patience` late ones in a row, the robot must stop."""
 
     def __init__(self, limit_s: float, patience: int) -> None:
         self._limit_s = limit_s

@@ -39,13 +39,13 @@ if TYPE_CHECKING:
     from nics_drl_bridge.policy.policy_file import PolicyFile
 
 
-# of the dynamic window, whose twists are few
+# The margin is wider than in `Mppi`, because the dynamic window chooses from few twists.
 CLEARANCE = Clearance(margin=0.1, soft=0.4)
 FULL_TURN_RAD = 0.8  # bearing of the goal above which a robot turns at full rate
-SETTLED_S = 5.0  # time after which a held command has led to its steady twist
+SETTLED_S = 5.0  # time to the steady twist of a held command
 # minimum of a twist component that counts as controllable [m/s, rad/s]
 LEAST_REACH = 1e-3
-# fraction of the speed while a robot that can't turn in place has its goal behind it
+# fraction of the speed if the goal is behind a robot that can't turn in place
 CREEP = 0.3
 
 
@@ -68,8 +68,8 @@ def _grid(robot: RobotSpec) -> Array:
 def _settled(task: Navigation, commands: Array, model: SimulatorModel | None) -> Array:
     """Returns the steady body twists (K, 3) of held commands (K, C).
 
-    Uses the model if the robot does not take `cmd_vel`, because its kind is then only approximate,
-    or if its motors distort commands, which its kind does not describe.
+    Uses the model if the robot does not take `cmd_vel`, whose kind is only approximate, or if its
+    motors distort commands, which no kind describes.
     """
     if model is None or (task.robot.takes_cmd_vel and model.kinematics.is_plain):
         return compute_steady_twist(task.robot, commands)
@@ -95,14 +95,14 @@ def actions_of(task: Navigation, commands: Array) -> NDArray[np.float32]:
 
 @dataclass(frozen=True)
 class StraightToGoal:
-    """Turns to the goal and drives there, ignoring obstacles; ConfigError: see `command_for`."""
+    """Turns to the goal and drives there, ignoring obstacles."""
 
     task: Navigation
-    # gives the twists of a robot whose kind does not define them
+    # provides the twists of a robot whose kind does not define them
     model: SimulatorModel | None = None
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Choose the action; see `Policy`."""
+        """Chooses the action; see `Policy`."""
         robot = self.task.robot
         first = self.task.scan_parts + 1
         cosine, sine = np.moveaxis(
@@ -152,7 +152,7 @@ class RandomActions:
     seed: int = 0
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Draw the action; see `Policy`."""
+        """Draws the action; see `Policy`."""
         shape = (*observation.shape[:-1], len(self.task.robot.command))
         return self._rng.uniform(-1.0, 1.0, shape).astype(np.float32)
 
@@ -163,9 +163,10 @@ class RandomActions:
 
 @dataclass(frozen=True)
 class DynamicWindow:
-    """The dynamic-window approach (Fox, Burgard, Thrun 1997); ConfigError: see `steady_twist`.
+    """The dynamic-window approach (Fox, Burgard, Thrun 1997).
 
-    The path length to the goal leads around visible obstacles (Brock, Khatib 1999).
+    Path lengths to the goal lead around visible obstacles (Brock, Khatib 1999). Raises ConfigError
+    if the robot's twists are unknown, see `compute_steady_twist`.
     """
 
     task: Navigation
@@ -179,13 +180,13 @@ class DynamicWindow:
         0.3,
         1.5,
     )
-    model: SimulatorModel | None = None  # gives the twists of a robot without `cmd_vel`
+    model: SimulatorModel | None = None  # provides twists without `cmd_vel`
 
     def __post_init__(self) -> None:
         _ = self._search
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Choose the action; see `Policy`."""
+        """Chooses the action; see `Policy`."""
         parts = self.task.scan_parts
         seen = np.atleast_2d(observation).astype(np.float64)
         goals = seen[:, parts : parts + 1] * seen[:, parts + 1 : parts + 3]
@@ -213,14 +214,14 @@ class DynamicWindow:
         steps = [
             np.diff(np.unique(speeds.round(6))).max(initial=0.0) for speeds in twists.T
         ]
-        # at least one step
+        # The window includes at least one step of the grid.
         reach = np.maximum(share * np.ptp(twists, axis=0), steps) + 1e-6
         if self.model is None:
             late = 0.0
         else:
             late = max(0.0, self.model.calibration.command_latency_s)
-        # A twist is held for a period and judged a period later; then the robot reacts. This
-        # reaction time is known only to the step of the robot's model.
+        # A twist is held for a period and judged a period later; then the robot reacts. The
+        # reaction time is known only to within a step of the robot's model, so it is rounded.
         held = 2.0 * self.period + late
         reaction = held + round(braking.reaction_s, 2)
         turn_reaction = 0.0
@@ -233,7 +234,7 @@ class DynamicWindow:
         needed = math.ceil((reaction + slowest) / step)
         far = math.inf
         count = self.steps
-        # looks ahead for as long as the robot needs to stop, over ground that it sees
+        # Look ahead for as long as the robot needs to stop, but only over ground that it sees.
         if needed > count:
             count = needed
             fastest = float(np.hypot(twists[:, 0], twists[:, 1]).max())
@@ -283,14 +284,14 @@ POLICIES: dict[str, Callable[[Navigation, SimulatorModel | None], Policy]] = {
 
 
 def shipped_policies() -> list[str]:
-    """Names of the policy files that ship with the package."""
+    """Returns the names of the shipped policy files."""
     return sorted(file.stem for file in shipped().glob(f"*{SUFFIX}"))
 
 
 def is_policy_file(name: str) -> bool:
-    """True for a policy file, the name of a shipped one, or the mapping of a foreign policy.
+    """Returns True for a policy file, the name of a shipped one, or a foreign policy's mapping.
 
-    Raises ConfigError if unknown.
+    Returns False for a baseline or planner. Raises ConfigError for an unknown name.
     """
     files = shipped_policies()
     if (
@@ -310,7 +311,7 @@ def make_policy(
     """Makes a policy from a name or the path of a file. Raises ConfigError, PolicyError."""
     if not is_policy_file(name):
         return POLICIES[name](task, model)
-    # the others need no onnxruntime
+    # Only policy files need onnxruntime.
     from nics_drl_bridge.policy.foreign import (
         load_any,
     )
@@ -344,7 +345,7 @@ def open_policy(
 
 
 def _acting(policy: "PolicyFile") -> Policy:
-    """The policy of a file, wrapped to keep its state if it has one."""
+    """Returns the policy of a file, wrapped to keep its state if it has one."""
     kept = policy.contract.state
     if kept is None:
         return policy

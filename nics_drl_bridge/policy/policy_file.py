@@ -1,4 +1,4 @@
-"""Policy files: one `.onnx` with network, normaliser, commands and contract; never a pickle."""
+"""Policy files: an `.onnx` with network, normaliser, commands and contract; never a pickle."""
 
 from collections.abc import Mapping
 from functools import cached_property
@@ -113,7 +113,7 @@ class PolicyFile:
     def make_task(
         self, model: SimulatorModel, kind: str | type[Task] | None = None
     ) -> Task:
-        """Makes the policy's task for a robot; PolicyError names a field that does not fit."""
+        """Makes the policy's task for a robot. Raises PolicyError if a field does not fit."""
         name = self.contract.task.name
         if kind is None and name not in TASKS:
             place = f"path/to/file.py:{name if name.isidentifier() else 'ClassName'}"
@@ -168,7 +168,7 @@ class PolicyFile:
         self._compare(theirs)
 
     def _compare(self, theirs: Mapping[str, Any]) -> None:
-        """Raises PolicyError for the first entry that differs from the contract's."""
+        """Raises PolicyError for the first entry that differs from the contract."""
         for name, entry in theirs.items():
             only: Any = {name: set(entry) if isinstance(entry, dict) else True}
             ours = dict(leaves(self.contract.model_dump(mode="json", include=only)))
@@ -183,7 +183,7 @@ class PolicyFile:
 
 
 def load_policy(path: str | Path) -> PolicyFile:
-    """Loads and checks a policy file, by path or shipped name; PolicyError names the field."""
+    """Loads and checks a policy file, by path or shipped name. Raises PolicyError."""
     check_path("policy", path)
     file = Path(path)
     suffix = contracts.SUFFIX
@@ -221,11 +221,11 @@ def policy_of(data: bytes, path: Path) -> PolicyFile:
     """Makes a policy from a file's content; see `load_policy`."""
     source = str(path)
     contract = contracts.read_contract(onnx_graph.metadata_in(data, source), source)
-    # last, because the checks above give a more specific reason for a changed file
+    # Last, because the checks above give a more specific reason for a changed file.
     onnx_graph.check_seal(data, source)
     needs = _needs_of(contract)
     seen = contract.golden.rows("observations")
-    # shipped policies are as trusted as the package's code
+    # Shipped policies are trusted like the package's code.
     if path.parent != contracts.shipped():
         rehearsal.rehearse_policy(data, needs, seen, source)
     rows = check_policy_graph(data, needs, source)
@@ -268,6 +268,6 @@ def _check_golden(policy: PolicyFile, source: str) -> None:
 
 
 def summary(policy: PolicyFile) -> dict[str, Any]:
-    """The contract as plain data, without arrays and checksums."""
+    """Returns the contract as plain data, without arrays and checksums."""
     data = policy.contract.model_dump(mode="json", exclude={"golden", "checksums"})
     return {"file": str(policy.path), "bytes": policy.path.stat().st_size, **data}

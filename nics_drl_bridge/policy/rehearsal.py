@@ -1,9 +1,9 @@
-"""Opens a policy's network first in a separate process with little memory and time.
+"""Opens a policy's network first in a separate process with limited memory and time.
 
-The cost of parsing a graph, inferring its shapes and preparing it is only known by doing so: a
-few hundred kilobytes can ask for gigabytes. So foreign content is first opened where it can do no
-harm, and opened here only if that went well. Files are remembered by their content, so each costs
-a fraction of a second once per process.
+The cost of parsing a graph, inferring its shapes and preparing it can't be predicted: a few
+hundred kilobytes can request gigabytes. So foreign content is first opened where it can do no
+harm, and opened here only if that succeeds. Files are remembered by content, so each costs a
+fraction of a second once per process.
 """
 
 import base64
@@ -28,15 +28,16 @@ from nics_drl_bridge.policy.onnx_session import (
     run_once,
 )
 
-MEMORY = 512 * 2**20  # limit beyond what the libraries use [bytes]
-# additional limit per byte of the file: a network is held several times
+MEMORY = 512 * 2**20  # limit, in addition to what the libraries use [bytes]
+# additional limit per byte of the file: a network is in memory several times
 MEMORY_OF_SIZE = 8
-CPU_S = 10  # limit of processor time; a network of 32 MB needs a tenth of it
-WALL_S = 60.0  # limit of wall time, generous for a busy computer
+CPU_S = 10  # limit of CPU time; a network of 32 MB needs a tenth of it
+WALL_S = 60.0  # limit of wall time, generous for a busy machine
 MOST_REMEMBERED = 10_000
 EXIT_MEMORY = 3
 _CODE = "import sys; sys.path[:] = {path!r}; import {module} as one; one.main()"
-_remembered: dict[str, None] = {}  # digests of what opened well, oldest first
+# digests of content that opened without a fault, oldest first
+_remembered: dict[str, None] = {}
 
 
 def rehearse_policy(data: bytes, needs: GraphNeeds, seen: Rows, source: str) -> None:
@@ -55,7 +56,7 @@ def rehearse_folding(data: bytes, opset: int, source: str) -> None:
 
 
 def rehearse_graph(data: bytes, needs: GraphNeeds, seen: Rows, source: str) -> None:
-    """Opens and runs a graph composed around a foreign network elsewhere. Raises PolicyError."""
+    """Opens and runs a composed graph in another process. Raises PolicyError."""
     _rehearse("graph", data, source, needs=_plain(needs), seen=_text(seen))
 
 
@@ -82,8 +83,8 @@ def _rehearse(step: str, data: bytes, source: str, **told: Any) -> None:
 
 
 def _answer_of(request: bytes) -> tuple[str, str] | None:
-    """The field and the reason why the other process refused a request; None if it accepted."""
-    # Pass on the import path: `python -c` alone would also look in the working folder.
+    """Returns the faulty field and the reason if the other process refuses a request, else None."""
+    # Pass on the import path: `python -c` would also look in the working folder.
     code = _CODE.format(path=sys.path, module=__name__)
     single = dict.fromkeys(
         ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"
@@ -104,7 +105,7 @@ def _answer_of(request: bytes) -> tuple[str, str] | None:
     if done.returncode == 0:
         answer = json.loads(done.stdout)
         return None if answer is None else (str(answer[0]), str(answer[1]))
-    # negative: ended by a signal, out of time or crashed
+    # A negative code means ended by a signal: out of time, or crashed.
     if done.returncode == EXIT_MEMORY or done.returncode < 0:
         most = f"{MEMORY // 2**20} MB of memory or {CPU_S} s"
         return (
@@ -126,12 +127,12 @@ def _text(seen: Rows) -> list[Any]:
     return [*rows.shape, base64.b64encode(rows.tobytes()).decode()]
 
 
-# In the other process.
+# The rest runs in the other process.
 
 
 def main() -> None:
-    """Does what standard input requests, within the limits; prints the fault, or null."""
-    import onnxruntime  # noqa: F401 - before the limits: what the libraries take is not counted
+    """Handles the request on standard input within the limits; prints the fault, or null."""
+    import onnxruntime  # noqa: F401 - before the limits, so that libraries don't count
 
     request = sys.stdin.buffer.read()
     head, _, data = request.partition(b"\n")
@@ -151,7 +152,7 @@ def main() -> None:
         answer = error.field, error.reason
     sys.stdout.write(json.dumps(answer))
     sys.stdout.flush()
-    os._exit(0)  # skip the teardown of the session, which takes time for nothing
+    os._exit(0)  # skip the slow and needless teardown of the session
 
 
 def _do(told: dict[str, Any], data: bytes) -> None:
@@ -183,7 +184,7 @@ def _do(told: dict[str, Any], data: bytes) -> None:
 
 
 def _limit(memory: int) -> None:
-    """Limits the resources of this process; where the system can't, only the time limit applies."""
+    """Limits this process's resources; if the system can't, only the wall-time limit applies."""
     try:
         import resource
     except ImportError:  # Windows

@@ -18,10 +18,10 @@ STEPS = ((0, 1, 1.0), (1, 0, 1.0), (1, 1, math.sqrt(2.0)), (1, -1, math.sqrt(2.0
 
 
 def route(grid: GridMap, start: ArrayLike, goal: ArrayLike, radius: float) -> Array:
-    """Returns a path (P, 2) from start to goal (2,) [m] that stays a radius [m] off occupied cells.
+    """Returns a path (P, 2) [m] from start to goal that keeps a radius [m] off occupied cells.
 
-    It stays further away where there is space. Unknown cells are free. Raises ConfigError for a
-    start or goal off the map, and if there is no path.
+    It keeps a greater distance where there is space. Unknown cells count as free. Raises
+    ConfigError if start or goal is off the map, or if there is no path.
     """
     coarse = _coarse(grid, max(1, math.ceil(CELL / grid.resolution - 1e-6)))
     room = coarse.distance_field
@@ -30,7 +30,7 @@ def route(grid: GridMap, start: ArrayLike, goal: ArrayLike, radius: float) -> Ar
         if not all(0 <= i < n for i, n in zip(cell, room.shape, strict=True)):
             raise ConfigError(f"the {name} of the path is off the map; give one on it.")
     passable = room > radius
-    for cell in ends:  # free by assumption: the robot stands there, or is asked to
+    for cell in ends:  # free by assumption: the robot is or will be there
         passable[cell] = True
     dear = 1.0 + DEARER * np.clip(1.0 - (room - radius) / COMFORT, 0.0, 1.0)
     number = np.arange(room.size).reshape(room.shape)
@@ -63,7 +63,7 @@ def route(grid: GridMap, start: ArrayLike, goal: ArrayLike, radius: float) -> Ar
 
 
 def _coarse(grid: GridMap, parts: int) -> GridMap:
-    """Returns the map with cells `parts` times as large, occupied if any part of them is."""
+    """Returns the map with cells `parts` times as large; they are occupied if any part is."""
     rows, columns = (math.ceil(count / parts) * parts for count in grid.cells.shape)
     cells = np.full((rows, columns), FREE, np.int8)
     cells[: grid.cells.shape[0], : grid.cells.shape[1]] = np.where(

@@ -1,4 +1,4 @@
-"""Shadow mode: compares the commands of a policy with those of a recorded drive."""
+"""Shadow mode: compares a policy's commands with those of a recorded drive."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -20,9 +20,9 @@ from nics_drl_bridge.policy.stateful import resume
 from nics_drl_bridge.recording.bag_file import Message
 from nics_drl_bridge.recording.messages import read_robot_command
 
-JITTER = 0.25  # how early a scan may be, in control periods
+JITTER = 0.25  # maximum earliness of a scan, in control periods
 HELD_S = 1.0  # age at which a command no longer applies to the robot
-DEAD_BAND = 0.05  # commands below this fraction of their maximum have no sign
+DEAD_BAND = 0.05  # fraction of the maximum below which a command's sign is ignored
 PERCENTILES = (50, 90, 99)
 
 
@@ -30,9 +30,9 @@ PERCENTILES = (50, 90, 99)
 class Shadow:
     """A policy compared with a recorded drive, at the T times when it would have acted."""
 
-    names: tuple[str, ...]  # (C,) of the commands
+    names: tuple[str, ...]  # (C,) names of the commands
     units: tuple[str, ...]
-    time: Array  # (T,) since the first of these times [s]
+    time: Array  # (T,) time since the first of these [s]
     pose: Array  # (T, 3) estimated poses in `map`
     goal: Array  # (T, 2) goals given to the policy [m]
     policy: Array  # (T, C) commands of the policy
@@ -42,7 +42,7 @@ class Shadow:
     resets: int = 0  # gaps after which the policy's state was reset
 
     def differences(self) -> dict[str, dict[str, float]]:
-        """Per command: mean of policy minus drive, its magnitude, fraction of opposite signs."""
+        """Returns per command statistics of policy minus drive, and the rate of opposite signs."""
         found = {}
         for c, name in enumerate(self.names):
             one = self.policy[:, c]
@@ -84,7 +84,7 @@ def shadow(
     """Runs a policy on a recorded drive, in process and deterministically.
 
     The goal (2,) [m] is in `map`; None uses the robot's position `ahead_s` later. Raises
-    RecordingError if the bag can't be used, BridgeError if the policy can't, or does not fit.
+    RecordingError if the bag can't be used, another BridgeError if the policy can't.
     """
     if goal is None and not ahead_s > 0.0:
         raise ConfigError(f"--ahead {ahead_s:g}: must be more than 0 s.")
@@ -161,7 +161,7 @@ def _answered(
     skipped = {"no command was driven": 0, "at the goal": 0, "touching something": 0}
     for moment, goal in zip(moments, goals, strict=True):
         verdict = task.judge(moment.view, memory := {"goal": goal})
-        # its state needs the observations that are not compared, too
+        # A state also needs the observations that are not compared.
         if not (verdict.touched or verdict.reached):
             resets += bool(resume(policy, moment.stamp_ns * S_PER_NS))
             command = task.command(policy.act(task.observation(moment.view, memory)))

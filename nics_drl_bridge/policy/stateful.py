@@ -15,21 +15,21 @@ Step = Callable[[Rows, Rows], tuple[NDArray[Any], Rows]]
 
 
 class Policy(Protocol):
-    """Maps observations to actions; the same in every world."""
+    """Maps observations to actions; the interface is the same in every world."""
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """Returns the action (C,) in [-1, 1] for an observation (O,); or (N, C) for (N, O)."""
 
 
 class Stateful:
-    """Policy that keeps a state from step to step of an episode, one row per world."""
+    """Policy that keeps a state between the steps of an episode, one row per world."""
 
     def __init__(
         self, step: Step, size: int, start: float, longest_gap: float = math.inf
     ) -> None:
         self._step = step
         self._start = np.full(size, start, np.float32)
-        self._longest_gap = longest_gap  # longest gap between two observations [s]
+        self._longest_gap = longest_gap  # maximum time between observations [s]
         self._state: Rows | None = None
         self._time = math.inf  # time of the last observation [s]
 
@@ -42,7 +42,10 @@ class Stateful:
             self._state[worlds] = self._start
 
     def resume(self, time_s: float) -> str:
-        """Resets the state if an observation at this time [s] follows a gap; returns why, or ''."""
+        """Resets the state if there was a gap before an observation at this time [s].
+
+        Returns the reason, or '' if it was not reset.
+        """
         gap = time_s - self._time
         self._time = time_s
         if gap <= self._longest_gap:
@@ -55,7 +58,7 @@ class Stateful:
         )
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Choose the action; see `Policy`. Raises ConfigError if the number of worlds changed."""
+        """Chooses the action; see `Policy`. Raises ConfigError if the number of worlds changed."""
         lead = observation.shape[:-1]
         if self._state is None:
             self._state = np.tile(self._start, (*lead, 1))
@@ -74,6 +77,6 @@ def begin(policy: Any, *worlds: Any) -> None:
 
 
 def resume(policy: Policy, time_s: float) -> str:
-    """See `Stateful.resume`; '' for a policy without a state."""
+    """Resumes a policy, see `Stateful.resume`; returns '' for a policy without a state."""
     told = getattr(policy, "resume", None)
     return "" if told is None else str(told(time_s))

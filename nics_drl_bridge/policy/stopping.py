@@ -11,10 +11,10 @@ from nics_drl_bridge.robot.braking import Braking, find_braking
 
 
 def braking_for(task: Navigation, model: SimulatorModel | None) -> Braking:
-    """Returns the bound on a robot's stops from any command that its task allows.
+    """Returns a bound on a robot's stops from any command that its task allows.
 
     Without a model it uses the slowest lag of the robot's kind. Raises ConfigError for a model that
-    does not come to rest.
+    never comes to rest.
     """
     robot = task.robot
     if model is None:
@@ -26,5 +26,5 @@ def braking_for(task: Navigation, model: SimulatorModel | None) -> Braking:
 
 
 def longest_stop_s(braking: Braking, twists: Array) -> float:
-    """Returns the longest time to rest from any of the twists (K, 3) [s]."""
+    """Returns the maximum time to stop from any of the twists (K, 3) [s]."""
     return float(np.max(braking.time_s(twists), initial=0.0))

@@ -50,17 +50,17 @@ EVALUATION = "evaluation.json"
 POLICY = "policy.onnx"
 SEEDS = 2**40
 MOST_WEIGHT = 80.0  # largest log standard deviation whose exponential is finite
-TRIED = 8  # worlds, and steps in each, of the trial run of a task
-# range of seeds of numpy's global generator, from which Stable-Baselines3 draws
+TRIED = 8  # number of worlds, and of steps, in the trial run of a task
+# maximum seed of numpy's global generator, which Stable-Baselines3 uses
 GREATEST_SEED = 2**32 - 1
 Tell = checkpoints.Tell
 
 
 @dataclass(frozen=True)
 class Trained:
-    """A finished training."""
+    """The result of a training."""
 
-    algorithm: BaseAlgorithm | Actor  # with its policy, or only the actor
+    algorithm: BaseAlgorithm | Actor  # the trained algorithm, or only its actor
     steps: int  # environment steps of all worlds together
     wall_s: float  # wall time of this process [s]
     stepping_s: float  # part of it spent in the simulator [s]
@@ -74,7 +74,7 @@ def train(
     resumed: bool = False,
     on_env: Callable[[TrainVecEnv], None] = lambda _: None,
 ) -> Trained:
-    """Trains a policy, resumed bit-identically from `folder`. Raises ConfigError if it can't.
+    """Trains a policy, or resumes its training in `folder` bit-identically. Raises ConfigError.
 
     `on_env` gets the worlds before the first step, for example to set their `on_step`.
     """
@@ -89,7 +89,7 @@ def train(
         rng = np.random.default_rng(seed)
         env.seed(int(rng.integers(SEEDS)))
         training = engine(settings, env, seed, algorithms.observed(env, rng))
-        # overrides the algorithm's seeds, which would overlap those of other runs
+        # Overrides the algorithm's seeds, which would overlap those of other runs.
         env.seed(int(rng.integers(SEEDS)))
     else:
         check_same(content["about"], about, path)
@@ -99,7 +99,7 @@ def train(
     busy = env.stepping_s
 
     def save() -> None:
-        # check before replacing a checkpoint that can still be resumed
+        # Check before replacing a checkpoint that can still be resumed.
         refuse_diverged(training)
         checkpoints.save_checkpoint(path, training.state() | stop.state(), env, about)
 
@@ -132,7 +132,7 @@ def make_train_env(
     model: SimulatorModel | None = None,
     scenes: Mapping[str, AnyWorld] | None = None,
 ) -> TrainVecEnv:
-    """Makes the worlds of the settings in one env; model and worlds may already be loaded."""
+    """Makes one env of all worlds of the settings; model and worlds may be passed if loaded."""
     model = model or open_model(settings.robot, settings.lidar)
     if margin := settings.teaching.margin:
         model = replace(model, robot=model.robot.grow_footprint(margin))
@@ -177,7 +177,7 @@ def _restore(
 
 
 def check_same(old: dict[str, Any], new: dict[str, Any], path: Path) -> None:
-    """Raises ConfigError unless a checkpoint has the settings and seed of the training."""
+    """Raises ConfigError unless a checkpoint has the same settings and seed as the training."""
     if (
         not isinstance(old, dict)
         or not isinstance(old.get("settings"), dict)
@@ -205,7 +205,7 @@ def evaluate(
     episodes: int,
     model: SimulatorModel | None = None,
 ) -> Outcomes:
-    """Runs the episodes of the evaluation protocol in a world with an algorithm's policy."""
+    """Runs the evaluation protocol's episodes in a world with an algorithm's policy."""
     env = _env_of(
         settings, world, episodes, model or open_model(settings.robot, settings.lidar)
     )
@@ -215,7 +215,7 @@ def evaluate(
 
 
 def _stop_of(settings: TrainingSettings) -> Stop:
-    """Makes the early stop of a training, with its own worlds."""
+    """Makes the early stop of a training, with separate worlds."""
     if (given := settings.stop) is None:
         return Stop(None, {})
     model = open_model(settings.robot, settings.lidar)
@@ -229,7 +229,7 @@ def _stop_of(settings: TrainingSettings) -> Stop:
 def _env_of(
     settings: TrainingSettings, world: str, episodes: int, model: SimulatorModel
 ) -> BridgeVectorEnv:
-    """Copies of a world for an evaluation, one per episode, without teaching."""
+    """Makes copies of a world for an evaluation, one per episode, without teaching."""
     return BridgeVectorEnv(
         episodes,
         model,
@@ -241,13 +241,13 @@ def _env_of(
     )
 
 
-# a function like `train`
+# signature of `train`
 Learn = Callable[[TrainingSettings, int, Path, Tell, bool], Trained]
 
 
 @dataclass(frozen=True)
 class SeedResult:
-    """A finished training of one seed, and the evaluation of its policy by world."""
+    """The training of one seed, and the evaluation of its policy by world."""
 
     seed: int
     trained: Trained
@@ -258,12 +258,12 @@ class SeedResult:
 class TrainOrder:
     """A request for a training run."""
 
-    # what to learn; for a resumed run its saved settings, see `settings_of`
+    # for a resumed run, its saved settings, see `settings_of`
     settings: TrainingSettings
     seeds: Sequence[int]
-    out: Path  # folder of the run; each seed gets one below it
-    episodes: int  # number of episodes of the evaluation in each world
-    resumed: bool = False  # True continues from the existing checkpoints
+    out: Path  # folder of the run; each seed gets a subfolder
+    episodes: int  # evaluation episodes per world
+    resumed: bool = False  # True: continue from existing checkpoints
     command: str = ""  # the user's command line, for the policy files
 
 
@@ -274,14 +274,17 @@ def run(
     learn: Learn = train,
     evaluating: Callable[[str], None] = lambda _: None,
 ) -> list[SeedResult]:
-    """Trains and evaluates seed after seed. Raises ConfigError if a run exists, or none does."""
+    """Trains and evaluates seed after seed.
+
+    Raises ConfigError if a run already exists in the folder or, to resume, if there is none.
+    """
     _check(order.settings, order.seeds, order.out, order.resumed)
     settings = order.settings
     model = open_model(order.settings.robot, order.settings.lidar)
     trial = _env_of(settings, next(iter(settings.worlds)), TRIED, model)
     algorithms.check_serves(settings, trial)
     trial.reset(seed=FIRST_SEED)
-    # refuses a task that returns no finite numbers before creating a folder
+    # Refuse a task that returns non-finite numbers before creating a folder.
     for _ in range(TRIED):
         trial.step(trial.action_space.sample())
     del trial
@@ -313,7 +316,7 @@ def run(
 
 @contextmanager
 def _alone(out: Path) -> Iterator[None]:
-    """Keeps other trainings out of the folder of a run. Raises ConfigError if one is there."""
+    """Locks the folder of a run against other trainings. Raises ConfigError if it is locked."""
     out.mkdir(parents=True, exist_ok=True)
     try:
         with filelock.FileLock(out / LOCK, timeout=0.0):
@@ -321,7 +324,7 @@ def _alone(out: Path) -> Iterator[None]:
             try:
                 yield
             except ConfigError:
-                # unreadable settings block no other training
+                # Unreadable settings must not block other trainings.
                 if not known and not seeds_of(out):
                     (out / SETTINGS).unlink(missing_ok=True)
                 raise
@@ -346,7 +349,7 @@ def export(
         "steps": result.trained.steps,
         **rates,
     }
-    # the path relative to which an evaluation finds the robot
+    # An evaluation finds the robot by this path.
     if settings.robot not in list_shipped("robots"):
         provenance["model"] = str(Path(settings.robot).resolve())
     limit = settings.max_episode_steps
@@ -378,7 +381,7 @@ def _check(
 
 
 def seeds_of(out: Path) -> list[int]:
-    """Returns the seeds whose training has begun in the folder of a run."""
+    """Returns the seeds whose training has started in the folder of a run."""
     begun = (
         path.parent.name.removeprefix("seed_")
         for path in out.glob(f"seed_*/{CHECKPOINT}")
@@ -399,7 +402,7 @@ def settings_of(out: Path, task: str | None = None) -> TrainingSettings:
 
 
 def line_of(summary: Summary) -> str:
-    """Formats a summary as text, with the 95 % interval of every figure."""
+    """Formats a summary as text, with the 95 % interval of every statistic."""
     rates = ", ".join(
         f"{name} {100 * share.value:.1f} % ({100 * share.low:.1f} to {100 * share.high:.1f})"
         for name, share in summary.shares.items()

@@ -29,7 +29,7 @@ from nics_drl_bridge.policy.train_checkpoint import RECENT, Watch, tensors
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 
-LEAST_RATE = 0.02  # fraction of PPO's learning rate that is left at the end
+LEAST_RATE = 0.02  # final fraction of PPO's learning rate
 LEAST_STD = 0.05
 LIMIT = 5.0
 NEAR = 0.1  # fraction of the range that is mapped to one half, see `bend`
@@ -38,7 +38,7 @@ LEAST_SHARE = 0.25
 OBSERVED_STEPS = 32
 OBSERVED_WORLDS = 256
 GAIN = 2.0**0.5
-# initial gain of an actor's last layer, which puts all its actions near zero
+# initial gain of an actor's last layer: all actions start near zero
 ACTION_GAIN = 0.01
 # rollouts or episodes between two TensorBoard entries
 LOG_EVERY = {
@@ -63,7 +63,7 @@ REPLAYED = (
 
 
 def check_serves(settings: TrainingSettings, env: BridgeVectorEnv) -> None:
-    """Raises ConfigError if the algorithm does not suit the task, or the task is for a team."""
+    """Raises ConfigError if the algorithm does not suit task and settings, or for a team's task."""
     if env.robots > 1:
         fix = (
             "train a single-robot task, or use your own learner (docs/environments.md)"
@@ -95,8 +95,8 @@ def act_of(algorithm: BaseAlgorithm | Actor) -> Act:
 class Normaliser(BaseFeaturesExtractor):
     """First layer of actor and critic: (bent - mean) / std (O,), clamped to +-5; not trained.
 
-    Observations from 0 to 1 are bent, see `bend`, because small fractions of a range matter most;
-    the others are not.
+    Only observations from 0 to 1 are bent, see `bend`, because small fractions of a range matter
+    most.
     """
 
     mean: torch.Tensor
@@ -117,15 +117,15 @@ class Normaliser(BaseFeaturesExtractor):
 
 
 def shares_of(space: gymnasium.spaces.Box) -> NDArray[np.float32]:
-    """Gives 1 for the observations (O,) of a space that lie between 0 and 1, else 0."""
+    """Returns 1 for the observations (O,) of a space that lie between 0 and 1, else 0."""
     shares: NDArray[np.bool_] = (space.low == 0.0) & (space.high == 1.0)
     return shares.astype(np.float32)
 
 
 def bend(observations: Any, shares: Any) -> Any:
-    """Maps fractions x to (1 + k) x / (k + x), again from 0 to 1; k = `NEAR` maps to about 1/2.
+    """Maps fractions x to (1 + k) x / (k + x), also from 0 to 1; k = `NEAR` maps to about 1/2.
 
-    Observations are (N, O); `shares` (O,) is 1 for those to be bent, and 0 for the others.
+    Observations are (N, O); `shares` (O,) is 1 for those to bend, and 0 for the others.
     """
     grown = 1.0 + NEAR * shares
     least = 1.0 + (NEAR - 1.0) * shares
@@ -133,14 +133,15 @@ def bend(observations: Any, shares: Any) -> Any:
 
 
 def observed(env: VecEnv, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Mean and standard deviation (O,) of bent observations under random actions.
+    """Returns mean and standard deviation (O,) of bent observations under random actions.
 
-    The deviation is at least 0.05, and a quarter of the span or of the mean, whichever is smaller.
+    The deviation is at least 0.05 and at least a quarter of the span or the mean, whichever is
+    smaller.
     """
     some = slice(None, None, max(1, env.num_envs // OBSERVED_WORLDS))
     seen = [np.array(env.reset()[some])]
     for k in range(OBSERVED_STEPS):
-        if k % 8 == 0:  # hold each action, or a robot with inertia would hardly move
+        if k % 8 == 0:  # otherwise a robot with inertia would hardly move
             space: Any = env.action_space
             if isinstance(space, gymnasium.spaces.Discrete):
                 actions: NDArray[Any] = rng.integers(space.n, size=env.num_envs)
@@ -183,11 +184,11 @@ class Actor(torch.nn.Module):
         self.layers = layers_of(widths, ACTION_GAIN, activation)
 
     def forward(self, observations: torch.Tensor) -> Any:
-        """Parameters of the action distribution: the mode if continuous, else logits."""
+        """Returns parameters of the action distribution: the mode if continuous, else logits."""
         return self.layers(self.normaliser(observations))
 
     def best(self, observations: torch.Tensor) -> torch.Tensor:
-        """The most likely actions (n, C), or (n,) discrete."""
+        """Returns the most likely actions (n, C), or (n,) if discrete."""
         raw = self(observations)
         return raw.argmax(dim=1) if self.discrete else raw
 
@@ -197,7 +198,7 @@ def layers_of(
     gain: float,
     activation: type[torch.nn.Module] = torch.nn.Tanh,
 ) -> torch.nn.Sequential:
-    """Linear layers, initialised as in Stable-Baselines3, the last one with `gain`."""
+    """Returns linear layers, initialised as in Stable-Baselines3, the last one with `gain`."""
     layers: list[torch.nn.Module] = []
     for ins, outs in itertools.pairwise(widths):
         layers += [torch.nn.Linear(ins, outs), activation()]
@@ -225,7 +226,7 @@ class Sb3Training:
 
     @property
     def steps(self) -> int:
-        """Environment steps done in all worlds together."""
+        """Environment steps done, over all worlds."""
         return int(self.policy.num_timesteps)
 
     def learn(self, watch: Watch, logger: Logger) -> None:
@@ -236,7 +237,7 @@ class Sb3Training:
         self.policy.learn(left, companion, self._log_every, reset_num_timesteps=False)
 
     def state(self) -> dict[str, Any]:
-        """Everything that changes, for a checkpoint."""
+        """Returns everything that changes, for a checkpoint."""
         algorithm = self.policy
         replay: dict[str, Any] = {}
         if isinstance(algorithm, OffPolicyAlgorithm):
@@ -245,7 +246,7 @@ class Sb3Training:
             replay = {"pos": buffer.pos, "full": buffer.full, **tensors(rows)}
         return {
             "parameters": algorithm.get_parameters(),
-            "variables": {  # besides the networks: the temperature of SAC
+            "variables": {  # not in the networks: SAC's temperature
                 name: getattr(algorithm, name).detach().clone()
                 for name in algorithm._get_torch_save_params()[1]
             },
@@ -285,7 +286,7 @@ def make_algorithm(
     seed: int,
     normaliser: tuple[Array, Array],
 ) -> BaseAlgorithm:
-    """Makes an untrained algorithm; `normaliser` is mean and deviation (O,). See `check_serves`."""
+    """Makes an untrained algorithm from mean and deviation (O,). Raises: see `check_serves`."""
     check_serves(settings, env.envs[0])
     torch.set_num_threads(settings.threads)
     shared: dict[str, Any] = {
@@ -333,7 +334,7 @@ def make_algorithm(
 
 
 def _random_state(algorithm: BaseAlgorithm) -> dict[str, Any]:
-    shared = np.random.get_state(legacy=False)  # noqa: NPY002 - Stable-Baselines3 draws from it
+    shared = np.random.get_state(legacy=False)  # noqa: NPY002 - Stable-Baselines3 uses it
     spaces = algorithm.action_space.np_random.bit_generator.state
     return {
         "torch": torch.get_rng_state(),
@@ -375,7 +376,7 @@ class Companion(BaseCallback):
             self._watch.collisions.append(
                 bool(self.locals["infos"][n].get("collision", False))
             )
-        # Stable-Baselines3 can't stop before the first step of a rollout
+        # Stable-Baselines3 can't stop before the first step of a rollout.
         if self._ends:
             self._on_rollout_end()
         return not self._ends

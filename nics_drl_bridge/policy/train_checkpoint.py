@@ -1,4 +1,4 @@
-"""Training checkpoints, with all that bit-identical resumption needs; they are never deployed."""
+"""Training checkpoints with everything needed to resume bit-identically; never deployed."""
 
 import io
 import json
@@ -25,7 +25,7 @@ from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 
 FORMAT = "nics_drl_bridge/checkpoint/3"
-MOST_BYTES = 4 * 2**30  # maximum size of a file, which includes all of SAC's buffer
+MOST_BYTES = 4 * 2**30  # maximum size of a file, which includes SAC's whole buffer
 
 
 def save_checkpoint(
@@ -46,7 +46,7 @@ def write_content(path: Path, content: dict[str, Any]) -> None:
 
 
 def read_checkpoint(path: Path, kind: str = FORMAT) -> dict[str, Any]:
-    """Reads a checkpoint of a format. Raises ConfigError if missing, damaged or another."""
+    """Reads a checkpoint. Raises ConfigError if it is missing, damaged or of another format."""
     if not path.is_file():
         raise ConfigError(
             f"{path}: no such checkpoint; leave out --resume to start again."
@@ -61,7 +61,7 @@ def read_checkpoint(path: Path, kind: str = FORMAT) -> dict[str, Any]:
                 if any(member.compress_type for member in archive.infolist()):
                     raise ValueError("torch never compresses")
             file.seek(0)
-            # weights_only blocks what else a pickle could do; torch before 2.6 had gaps there.
+            # weights_only blocks code in pickles; before torch 2.6 it had gaps.
             content: Any = torch.load(file, map_location="cpu", weights_only=True)
         _check_tensors(content, size)
         found = str(content["format"])
@@ -97,7 +97,7 @@ def restore_envs(content: dict[str, Any], env: TrainVecEnv) -> None:
 
 
 def tensors(arrays: dict[str, NDArray[Any]]) -> dict[str, torch.Tensor]:
-    """Arrays by name as tensors."""
+    """Converts arrays by name to tensors."""
     return {
         name: torch.from_numpy(np.ascontiguousarray(rows))
         for name, rows in arrays.items()
@@ -105,7 +105,7 @@ def tensors(arrays: dict[str, NDArray[Any]]) -> dict[str, torch.Tensor]:
 
 
 RECENT = 1000  # number of recent episodes over which the progress reports rates
-TOLD_S = 0.2  # minimum time between two reports of the progress [s]
+TOLD_S = 0.2  # minimum time between two progress reports [s]
 
 
 @dataclass(frozen=True)
@@ -115,17 +115,17 @@ class Progress:
     seed: int
     steps: int  # environment steps done
     total: int
-    # fractions over the last 1000 episodes; NaN before the first has ended
+    # fractions over the last 1000 episodes; NaN before the first one ends
     success: float
     collision: float
-    steps_per_s: float  # since this process started or resumed the training
+    steps_per_s: float  # since this process started
     env_share: float  # fraction of the wall time spent in the simulator
     # minimum success over the worlds in the latest evaluation of `stop`
     held_out: float = math.nan
 
     @property
     def line(self) -> str:
-        """Formats success, if known, and speed for people."""
+        """Success rate, if known, and speed, as readable text."""
         unknown = math.isnan(self.success)
         if unknown:
             known = "no episode has ended yet"
@@ -139,7 +139,7 @@ Tell = Callable[[Progress], None]
 
 
 class Watch:
-    """Follows a training: reports its progress, and saves it at intervals, between two rollouts."""
+    """Reports the progress of a training and saves it at intervals, between two rollouts."""
 
     def __init__(
         self,
@@ -157,7 +157,7 @@ class Watch:
         self._stop = stop
         self._total = settings.steps
         self._every = settings.checkpoint_every
-        self.collisions: deque[bool] = deque(maxlen=RECENT)  # of the last episodes
+        self.collisions: deque[bool] = deque(maxlen=RECENT)  # latest episodes
 
     def begin(self, steps: int) -> None:
         """Starts the clock of a training that has already done `steps`."""
@@ -166,13 +166,13 @@ class Watch:
         self._first = self._saved = steps
 
     def keep(self, steps: int) -> None:
-        """Saves the training if it is time to."""
+        """Saves the training if it is due."""
         if steps // self._every > self._saved // self._every:
             self._save()
             self._saved = steps
 
     def ends(self, steps: int, act: Act, logger: Logger) -> bool:
-        """Evaluates on held-out episodes if it is time to; True if the training should end."""
+        """Evaluates on held-out episodes if due; returns True if the training should end."""
         if self._stop.judge(steps, act):
             for world, share in self._stop.shares.items():
                 logger.record(f"held_out/{world}", share)
@@ -180,7 +180,7 @@ class Watch:
         return self._stop.over
 
     def report(self, steps: int, successes: Sequence[bool], logger: Logger) -> bool:
-        """Reports and logs the progress if it is time to; True if it did."""
+        """Reports and logs the progress if due; returns True if it did."""
         now = time.perf_counter()
         if now - self._told < TOLD_S and steps < self._total and not self._stop.over:
             return False
@@ -219,7 +219,7 @@ def snapshot(env: BridgeVectorEnv) -> Arrays:
 
 
 def restore(env: BridgeVectorEnv, state: Mapping[str, NDArray[Any]]) -> None:
-    """Restores a snapshot into a vector env; ConfigError for other worlds, robots or tasks."""
+    """Restores a snapshot. Raises ConfigError if worlds, robots or task of the env differ."""
     parts: dict[str, Arrays] = {"": {}, MEMORY: {}, DRAWN: {}}
     for name, rows in state.items():
         prefix = next((p for p in (MEMORY, DRAWN) if name.startswith(p)), "")

@@ -34,7 +34,7 @@ OPSET = 17
 
 
 class Deployed(torch.nn.Module):  # type: ignore[misc]
-    """Graph of a policy file; Stable-Baselines3's own recipe omits clipping, scale, normaliser."""
+    """Graph of a policy file, with the normaliser, clipping and scaling that SB3's recipe omits."""
 
     def __init__(
         self, actor: torch.nn.Module, task: Task, normaliser: Normaliser | None
@@ -62,9 +62,9 @@ class Deployed(torch.nn.Module):  # type: ignore[misc]
     def forward(
         self, observation: torch.Tensor, *state: torch.Tensor
     ) -> tuple[torch.Tensor, ...]:
-        """Actions (n, C) in [-1, 1] or (n,), and commands (n, C) in SI units; observations (n, O).
+        """Maps observations (n, O) to actions (n, C) in [-1, 1] or (n,), and SI commands (n, C).
 
-        An actor with a state also takes one (n, S), and returns the next.
+        An actor with a state also takes the state (n, S) and returns the next one.
         """
         seen = observation
         if self.limit is not None:
@@ -83,7 +83,7 @@ class Deployed(torch.nn.Module):  # type: ignore[misc]
 
 
 def actor_of(model: Any) -> torch.nn.Module:
-    """Returns the actor of a PPO, A2C or SAC, or a module like `Actor`, else ConfigError.
+    """Returns the actor of a PPO, A2C or SAC, or a module like `Actor`. Raises ConfigError.
 
     A module with a state takes it (n, S) after the observations, and also returns the next one. Its
     attribute `state_size` is S; `state_start` is the initial value of each element, 0 by default.
@@ -113,7 +113,7 @@ def export_policy(
     provenance: Mapping[str, Any] | None = None,
     max_episode_steps: int | None = None,
 ) -> policy_file.PolicyFile:
-    """Exports a trained model as a policy file, and loads it as a robot would.
+    """Exports a trained model as a policy file, and loads it as a robot does.
 
     The normaliser is mean (O,), deviation (O,) and limit, or None. Raises ConfigError if the model
     can't be exported, PolicyError if the file does not reproduce its outputs.

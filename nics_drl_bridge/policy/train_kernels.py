@@ -1,8 +1,8 @@
-"""Compiled inner loops of the lean engine: the gradients of PPO's loss.
+"""Compiled inner loops of the lean engine: gradients of PPO's loss.
 
-The loss is that of Stable-Baselines3. The kernels release the interpreter's lock, for which
-autograd's many small steps would compete with the collecting thread. Shapes: n transitions, O
-observations, C outputs of the actor, W weights of a network.
+The loss is that of Stable-Baselines3. The kernels release the interpreter lock; autograd's many
+small steps would compete for it with the collecting thread. Shapes: n transitions, O observations,
+C outputs of the actor, W weights of a network.
 """
 
 from typing import NamedTuple
@@ -24,7 +24,7 @@ class Net(NamedTuple):
     # (W,) layer after layer: weights (outs, ins), then biases (outs,)
     weights: NDArray[np.float32]
     gradients: NDArray[np.float32]  # (W,)
-    # (L + 1,) number of inputs, then of the outputs of each layer
+    # (L + 1,) number of inputs, then the number of outputs of each layer
     widths: NDArray[np.int64]
     # (L, at least n times the maximum width) outputs of each layer
     kept: NDArray[np.float32]
@@ -43,7 +43,7 @@ class Batch(NamedTuple):
 
 @kernel(allocates=True)
 def forward(net, seen):  # type: ignore[no-untyped-def]
-    """Outputs (n, C) of a network for inputs (n, O); keeps the outputs of all layers."""
+    """Returns the outputs (n, C) of a network for inputs (n, O); keeps all layers' outputs."""
     n = seen.shape[0]
     at = 0
     rows = seen
@@ -65,7 +65,7 @@ def forward(net, seen):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def backward(net, seen, gradient):  # type: ignore[no-untyped-def]
-    """Writes the gradients of the weights, given those (n, C) of the outputs; follows `forward`.
+    """Writes the gradients of the weights, given the outputs' gradients (n, C), after `forward`.
 
     `gradient` must be the first of the spare arrays.
     """
@@ -92,7 +92,7 @@ def backward(net, seen, gradient):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def critic_gradients(net, batch, weight):  # type: ignore[no-untyped-def]
-    """Writes the gradients of the critic; returns its weighted term of the loss."""
+    """Writes the gradients of the critic; returns its weighted loss."""
     values = forward(net, batch.seen)
     n = values.shape[0]
     out = net.spare[0, :n].reshape(n, 1)
@@ -108,7 +108,7 @@ def critic_gradients(net, batch, weight):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def actor_gradients(net, batch, log_std, spread, clip, entropy):  # type: ignore[no-untyped-def]
-    """Writes the gradients of actor and `log_std` (C,); returns their term of the loss.
+    """Writes the gradients of the actor and `log_std` (C,); returns their loss.
 
     With discrete actions, `log_std` has no gradient.
     """
@@ -151,7 +151,7 @@ def actor_gradients(net, batch, log_std, spread, clip, entropy):  # type: ignore
 
 @kernel(allocates=True)
 def _density(parts, raw, action, log_std):  # type: ignore[no-untyped-def]
-    """Log density of an action (C,), and entropy; writes the deviations (C,) into `parts`."""
+    """Returns an action's (C,) log density and the entropy; writes deviations (C,) to `parts`."""
     log_prob = mixed = NONE
     for j in range(raw.shape[0]):
         parts[j] = (action[j] - raw[j]) * np.exp(-log_std[j])
@@ -162,7 +162,7 @@ def _density(parts, raw, action, log_std):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def _probability(parts, raw, action):  # type: ignore[no-untyped-def]
-    """Log probability of an action, and entropy; writes the probabilities (C,) into `parts`."""
+    """Returns an action's log probability and the entropy; writes probabilities (C,) to `parts`."""
     greatest = raw.max()
     total = NONE
     mixed = NONE

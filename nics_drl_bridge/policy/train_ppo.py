@@ -1,10 +1,10 @@
 """The lean engine: PPO that collects on one core while it learns on another.
 
 Proximal policy optimisation (Schulman and others 2017) with the loss of Stable-Baselines3. The
-learner's data were collected with weights one update older; PPO's ratio accounts for that, because
+learner's data are collected with weights one update older; PPO's ratio accounts for that, because
 the probabilities at the time of drawing are kept. Collecting and learning synchronise after each
-rollout, so results do not depend on which of them is faster. Once everything is collected, actor
-and critic are trained on one core each.
+rollout, so results do not depend on which of them is faster. If collecting finishes first, actor
+and critic learn on one core each for the rest of the update.
 """
 
 import copy
@@ -58,7 +58,7 @@ class Networks(torch.nn.Module):
         return torch.normal(raw, self.log_std.exp().expand_as(raw), generator=generator)
 
     def log_probs(self, raw: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
-        """Log probability, or log density, (n,) of actions (n, C) or (n,)."""
+        """Returns the log probability or log density (n,) of actions (n, C) or (n,)."""
         if self.actor.discrete:
             return raw.log_softmax(1).gather(1, actions[:, None]).squeeze(1)
         apart = (actions - raw) * torch.exp(-self.log_std)
@@ -66,9 +66,9 @@ class Networks(torch.nn.Module):
 
 
 def flattened(networks: Networks) -> torch.nn.Parameter:
-    """Moves all weights into one vector, with the networks' weights as views; gradients likewise.
+    """Moves all weights and gradients into one vector each; the networks' weights become views.
 
-    An optimiser step over one vector takes a fifth of the time it takes over many arrays.
+    An optimiser step takes a fifth of the time it takes over many arrays.
     """
     every = list(networks.parameters())
     flat = torch.nn.Parameter(torch.nn.utils.parameters_to_vector(every).detach())
@@ -84,7 +84,7 @@ def flattened(networks: Networks) -> torch.nn.Parameter:
 
 
 def net_of(layers: torch.nn.Sequential, rows: int) -> Net:
-    """The layers of one of the `flattened` networks for the kernels, with memory for `rows`."""
+    """Returns the layers of a `flattened` network for the kernels, with memory for `rows`."""
     every = list(layers.parameters())
     whole = (sum(one.numel() for one in every),)
     weights, gradients = (
@@ -105,9 +105,10 @@ def advantages_of(
     discount: float,
     decay: float,
 ) -> torch.Tensor:
-    """Generalised advantage estimates (T, N) (Schulman and others 2016); `decay` is lambda.
+    """Returns generalised advantage estimates (T, N) (Schulman and others 2016).
 
-    Inputs: rewards (T, N), values (T + 1, N), and `done` (T, N), which is 1 at ends of episodes.
+    Inputs are rewards (T, N), values (T + 1, N), and `done` (T, N), which is 1 at the ends of
+    episodes; `decay` is lambda.
     """
     going = 1.0 - done
     errors = rewards + discount * going * values[1:] - values[:-1]
@@ -134,16 +135,16 @@ class Learner:
         self._nets = [
             net_of(p, ppo.batch) for p in (networks.actor.layers, networks.critic)
         ]
-        self.core_is_free = threading.Event()  # set once no thread collects any more
+        self.core_is_free = threading.Event()  # set when the collecting thread is done
 
     def judge(self, driven: Driven) -> Transitions:
-        """Advantages and returns of a rollout, by the current critic."""
+        """Computes advantages and returns of a rollout, with the current critic."""
         networks = self.networks
         ppo = self.ppo
         with torch.no_grad():
             values = networks.critic(driven.seen).squeeze(-1)
             rewards = driven.rewards.clone()
-            # Bootstrap where a time limit truncated the episode:
+            # Bootstrap where a time limit truncated the episode.
             rewards.view(-1)[driven.cut] += ppo.discount * networks.critic(
                 driven.final
             ).squeeze(-1)
@@ -243,7 +244,7 @@ class Collector:
             return Driven(seen, drawn, log_probs, rewards, done, *beyond), ended
 
     def _see(self, observations: NDArray[np.float32]) -> torch.Tensor:
-        """Normalised observations (n, O) for the networks."""
+        """Returns normalised observations (n, O) for the networks."""
         seen: torch.Tensor = self.networks.actor.normaliser(
             torch.from_numpy(observations)
         )
@@ -251,7 +252,7 @@ class Collector:
 
 
 class LeanPpo:
-    """A training with PPO; `normaliser` is mean and deviation (O,). See `check_serves`."""
+    """A training with PPO; `normaliser` is mean, deviation (O,). Raises: see `check_serves`."""
 
     def __init__(
         self,
@@ -274,7 +275,7 @@ class LeanPpo:
         self.learner = Learner(self.networks, self._ppo, int(seeds[1]))
         self.policy = actor
         self._settings = settings
-        self.steps = 0  # steps of all worlds together that have been learnt from
+        self.steps = 0  # number of steps learnt from, over all worlds
         self._rollout: Driven | None = None  # the next rollout to learn from
         self._successes: deque[bool] = deque(maxlen=RECENT)
 
@@ -316,7 +317,7 @@ class LeanPpo:
         return float(loss)
 
     def _collect(self) -> tuple[Driven, Ended]:
-        torch.set_num_threads(self._settings.threads)  # a setting of each thread
+        torch.set_num_threads(self._settings.threads)  # a per-thread setting
         try:
             return self.collector.collect()
         finally:
@@ -328,7 +329,7 @@ class LeanPpo:
         watch.collisions.extend(collision for _, collision in ended)
 
     def state(self) -> dict[str, Any]:
-        """Everything that changes, for a checkpoint."""
+        """Returns everything that changes, for a checkpoint."""
         return {
             "weights": self.networks.state_dict(),
             "optimiser": self.learner.optimiser.state_dict(),

@@ -1,4 +1,4 @@
-"""Transitions of a rollout, from which the lean engine learns, and their batches."""
+"""Transitions of a rollout for the lean engine, and their batches."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ class Driven(NamedTuple):
     rewards: torch.Tensor  # (T, N)
     done: torch.Tensor  # (T, N) 1 at ends of episodes
     cut: torch.Tensor  # (K,) indices t N + n of the truncated episodes
-    final: torch.Tensor  # (K, O) last observations of these
+    final: torch.Tensor  # (K, O) last observations of these episodes
 
 
 class Transitions(NamedTuple):
-    """R transitions: T steps of N worlds, in the order of the steps."""
+    """R = T N transitions: T steps of N worlds, step by step."""
 
     seen: torch.Tensor  # (R, O) normalised observations
     actions: torch.Tensor  # (R, C), or (R,) discrete

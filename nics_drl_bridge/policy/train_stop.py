@@ -1,8 +1,8 @@
-"""Early stop: ends a training once held-out success passes the threshold twice in a row.
+"""Early stop: ends a training when held-out success passes the threshold twice in a row.
 
-Each evaluation has its own episodes, so luck in one says nothing about the next: a true success
-rate of 95 % shows as 97 % of 200 episodes about once in eight evaluations, but in two consecutive
-ones about once in sixty. The weights of the second one are kept.
+Each evaluation has its own episodes, so luck in one does not carry over to the next: a true
+success rate of 95 % appears as 97 % of 200 episodes in about one of eight evaluations, but in both
+of two consecutive ones only about once in sixty. The weights of the second one are kept.
 """
 
 from collections.abc import Mapping
@@ -12,17 +12,17 @@ from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.policy.evaluation import Act, drive_worlds
 from nics_drl_bridge.policy.training_settings import StopSettings
 
-# first seed of these episodes, beyond those of trainings and of the protocol
+# first seed of these episodes, beyond the seeds of training and of the protocol
 HELD_OUT_SEED = 2**41
 IN_A_ROW = 2
 
 
 class Stop:
-    """Decides when a training ends early; without settings, never.
+    """Decides when a training ends early; without settings, it never does.
 
     Args:
         given: the settings.
-        envs: by world name, each with as many copies as an evaluation has episodes.
+        envs: vector envs by world name, each with one world per episode of an evaluation.
     """
 
     def __init__(
@@ -46,7 +46,7 @@ class Stop:
         return min(self.shares.values(), default=float("nan"))
 
     def judge(self, steps: int, act: Act) -> bool:
-        """Evaluates the policy `act` if it is time to after `steps`; True if it did."""
+        """Evaluates the policy `act` if due after `steps`; returns True if it did."""
         given = self._given
         if given is None or steps // given.every <= self._due:
             return False
@@ -63,13 +63,13 @@ class Stop:
         return True
 
     def state(self) -> dict[str, Any]:
-        """Everything that changes, for a checkpoint."""
+        """Returns everything that changes, for a checkpoint."""
         return {
             "stop": {"due": self._due, "reached": self._reached, "shares": self.shares}
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Continues from another state, or afresh if the checkpoint is older than this feature."""
+        """Continues from a saved state; starts afresh if the checkpoint has none."""
         if known := state.get("stop"):
             self._due = known["due"]
             self._reached = known["reached"]

@@ -1,4 +1,4 @@
-"""The vector env as Stable-Baselines3's VecEnv, without copying each world."""
+"""Adapts the vector env to Stable-Baselines3's VecEnv, without copying each world."""
 
 import itertools
 import time
@@ -71,7 +71,7 @@ class TrainVecEnv(VecEnv):
     ) -> tuple[Observation, NDArray[np.float32], NDArray[np.bool_], list[Any]]:
         """Advances every world by one control period; see Stable-Baselines3."""
         begin = time.perf_counter()
-        for n in self._ended:  # new dicts: an algorithm may still refer to the old ones
+        for n in self._ended:  # new dicts, because an algorithm may keep the old ones
             self._infos[n] = {}
         self._ended = []
         parts = [
@@ -89,7 +89,7 @@ class TrainVecEnv(VecEnv):
     def _step_env(
         self, env: BridgeVectorEnv, rows: slice
     ) -> tuple[Observation, NDArray[np.float64], NDArray[np.bool_]]:
-        """Steps one of the envs and fills in the infos of its ended worlds."""
+        """Steps one of the envs, and fills in the infos of its ended worlds."""
         observation, reward, terminated, truncated, info = env.step(self._actions[rows])
         done = terminated | truncated
         if over := np.flatnonzero(done).tolist():
@@ -139,7 +139,7 @@ class TrainVecEnv(VecEnv):
         wrapper_class: type[gymnasium.Wrapper[Any, Any, Any, Any]],
         indices: Any = None,
     ) -> list[bool]:
-        """Always False: no world is wrapped."""
+        """Returns False for every world: none is wrapped."""
         return [False] * len(list(self._get_indices(indices)))
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:

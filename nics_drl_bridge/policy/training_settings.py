@@ -24,7 +24,8 @@ Count = Annotated[int, Field(ge=1, le=10**12)]
 MOST_WORLDS = 65_536  # maximum number of copies of all worlds together
 MOST_LAYERS = 16
 MOST_WIDE = 8_192
-MOST_KEPT = 2**26  # stored transitions: of a rollout in all worlds, or of SAC's buffer
+# maximum number of stored transitions: a rollout in all worlds, or SAC's buffer
+MOST_KEPT = 2**26
 Width = Annotated[int, Field(ge=1, le=MOST_WIDE)]
 
 
@@ -34,8 +35,8 @@ class PpoSettings(Schema):
     The engine `lean` learns on one core while it collects on another; `sb3` is Stable-Baselines3's.
     """
 
-    engine: Literal["lean", "sb3"] = "lean"  # implementation, see above
-    # at the start; falls linearly to a fiftieth
+    engine: Literal["lean", "sb3"] = "lean"  # see above
+    # initial learning rate; falls linearly to a fiftieth of it
     learning_rate: float = Field(default=1e-3, gt=0.0)
     rollout: Count = 32  # steps in each world between two updates
     batch: Count = 2048  # transitions of one gradient step
@@ -62,11 +63,11 @@ class SacSettings(Schema):
 
 
 class StopSettings(Schema):
-    """Early stop, once held-out success has passed the threshold in two consecutive evaluations."""
+    """Early stop, when held-out success passes the threshold in two consecutive evaluations."""
 
     success: Share  # minimum success rate in each world
     every: Count = 200_000  # environment steps between two evaluations
-    # number of episodes in each world, different ones each time
+    # number of episodes in each world; they differ each time
     episodes: int = Field(default=200, ge=1, le=10_000)
 
 
@@ -78,10 +79,10 @@ class TrainingSettings(Schema):
     # arguments of the task's class
     task_options: dict[str, Any] = Field(default_factory=dict)
     robot: str = DEFAULT_ROBOT  # a shipped robot, or the folder of a model
-    lidar: str | None = None  # a shipped lidar or a file, instead of the model's own
+    lidar: str | None = None  # shipped lidar or file; None: the model's
     # number of copies of each world
     worlds: dict[str, Count] = Field(default={"circles": 256}, min_length=1)
-    # quantities drawn in each episode: a shipped set or a file
+    # shipped randomisation or file, drawn for each episode
     randomisation: str | None = None
     # rewards from the simulator's ground truth, and repeated episodes
     teaching: Teaching = Teaching()
@@ -91,13 +92,13 @@ class TrainingSettings(Schema):
     # time limit of an episode [steps]; by default `nics train` sets 30 s, or 1.8 times what the
     # longest straight path to a goal in the worlds takes at top speed, if that is longer
     max_episode_steps: Count = defaults.EPISODE_STEPS
-    # learning algorithm; its settings are in the section of its name
+    # learning algorithm; its settings are in the section of that name
     algorithm: Literal["ppo", "sac"] = "ppo"
     # sizes of the hidden layers, the same for actor and critic
     hidden: tuple[Width, ...] = Field(
         default=(64, 64), min_length=1, max_length=MOST_LAYERS
     )
-    # threads of PyTorch; results depend slightly on it
+    # threads of PyTorch; results depend slightly on their number
     threads: Annotated[int, Field(ge=1, le=1024)] = 1
     checkpoint_every: Count = 200_000  # environment steps between two checkpoints
     ppo: PpoSettings = PpoSettings()  # used if `algorithm` is `ppo`
@@ -131,7 +132,7 @@ class TrainingSettings(Schema):
 
     @property
     def title(self) -> str:
-        """Suitable name for the folder of its runs."""
+        """Suitable name for the folder of a run."""
         task = self.task.rpartition(":")[2]
         return f"{task}_{Path(self.robot).stem}_{self.algorithm}"
 
@@ -149,7 +150,7 @@ class TrainingSettings(Schema):
 def load_training(name: str | Path, task: str | None = None) -> TrainingSettings:
     """Loads settings by the name of a shipped file, or by path. Raises ConfigError.
 
-    A user's task is a program. A file may say which one it is for, but only a `task` named by the
+    A user's task is a program. A file may name the task it is for, but only a `task` named by the
     caller is run; it replaces the file's.
     """
     return read_settings(find_config(name, "training"), task)
@@ -166,14 +167,14 @@ def read_settings(path: Path, task: str | None = None) -> TrainingSettings:
 
 
 def is_code(task: str) -> bool:
-    """True for a user's task, `path/to/file.py:ClassName`, or a file without its class."""
+    """Returns True for a user's task: `path/to/file.py:ClassName`, or a file without a class."""
     return ":" in task or task.endswith(".py")
 
 
 def chosen_settings(
     task: str, name: str | None, changes: dict[str, Any]
 ) -> TrainingSettings:
-    """Loads settings by name or file, else the shipped ones for task and robot; applies changes."""
+    """Loads settings by name or file, or else those shipped for task and robot; applies changes."""
     robot = str(changes.get("robot", DEFAULT_ROBOT))
     if name is None and f"{task}_{robot}" not in list_shipped("training"):
         base = TrainingSettings(task=task, robot=robot)

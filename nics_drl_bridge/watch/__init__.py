@@ -1,1 +1,1 @@
-"""The page that shows a policy driving, live: what it shows, its server, and files of it."""
+"""The page that shows a policy driving live: its content, its server, and video files."""

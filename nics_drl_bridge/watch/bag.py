@@ -1,4 +1,4 @@
-"""A recorded drive, with time to scrub: what the robot's middleware made of a bag."""
+"""Shows a recorded drive as estimated by the middleware, with a time slider."""
 
 from bisect import bisect_right
 from collections.abc import Mapping
@@ -22,15 +22,15 @@ from nics_drl_bridge.watch.frame import Frame, Stage, Track, WorldFrame
 from nics_drl_bridge.watch.server import Request
 
 CAN = frozenset({"pause", "speed", "step", "seek", "restart"})
-MARGIN_M = 1.0  # around the path and the hits of the lidar, if no world is given
-WITHIN = 98.0  # percentage of the hits that belong to the place that is shown
+MARGIN_M = 1.0  # margin around the path and the lidar's hits, if no world is given
+WITHIN = 98.0  # percentile of the hits that the shown area includes
 
 
 class BagSource:
-    """Plays a bag at the pace of its stamps, a frame for each scan, or odometry without scans.
+    """Plays a bag at the pace of its stamps, with a frame per scan or, without scans, per odometry.
 
-    `topics` are by role, see `playback.choose_topics`. Without a world the place is what was seen.
-    Raises RecordingError if the bag can't be used.
+    `topics` are by role, see `playback.choose_topics`. Without a world, the area follows from the
+    path and the scans. Raises RecordingError if the bag can't be used.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class BagSource:
         return Frame(float(self._times[self._now]), (world,))
 
     def advance(self) -> bool:
-        """Goes on to the next frame; at the end it stays."""
+        """Moves on to the next frame; stays at the last one."""
         self._now = min(self._now + 1, len(self._shots) - 1)
         return False
 
@@ -88,17 +88,17 @@ class BagSource:
         return False
 
     def unfinished(self, _: int) -> bool:
-        """True until the end has been shown."""
+        """Returns True until the end has been shown."""
         return self._now < len(self._shots) - 1
 
     def close(self) -> None:
-        """Does nothing: the bag has been read."""
+        """Does nothing: the bag was read completely."""
 
 
 def _read(
     path: str | Path, model: SimulatorModel, topics: Mapping[str, str]
 ) -> tuple[list[float], list[Snapshot], Any]:
-    """Returns times since the first [s], shots, and the lidar of the bag."""
+    """Returns times since the first one [s], shots, and the lidar of the bag."""
     messages = read_messages(path, topics, model.gyro)
     playback = Playback(model, POSE in messages, any_lidar=True)
     stamps = list[int]()
@@ -133,7 +133,7 @@ def _read(
 
 
 def place_of(model: SimulatorModel, shots: list[Snapshot]) -> World:
-    """Returns a field without walls that holds the path and most of what the lidar hit."""
+    """Returns a field without walls that contains the path and most of the lidar's hits."""
     poses = np.concatenate([shot.poses[:, :2] for shot in shots])
     samples = shots[:: max(1, len(shots) // 50)]
     hits = [hits_of(model.lidar, shot.poses[0], shot.ranges[0]) for shot in samples]

@@ -1,4 +1,4 @@
-"""Episodes in process: a policy, or a person at the keyboard, drives one world or several."""
+"""Episodes in process: a policy or a person at the keyboard drives in one or several worlds."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -25,10 +25,10 @@ from nics_drl_bridge.watch.frame import Frame, Stage, Track, WorldFrame
 from nics_drl_bridge.watch.server import Request
 
 Env = gymnasium.Env[Any, Any]
-# for a policy and a world, see `open_env`
+# makes the env and the policy, given the policy's name and a world; see `open_env`
 Make = Callable[[str, AnyWorld], tuple[Env, Policy]]
-HELD_S = 0.5  # the robot stops after this time without a request of the keyboard [s]
-LINGER_S = 1.0  # of simulated time between the end of an episode and the next one [s]
+HELD_S = 0.5  # the robot stops after this time without a keyboard request [s]
+LINGER_S = 1.0  # simulated time between two episodes [s]
 CAN = frozenset(
     {
         "goal",
@@ -46,7 +46,7 @@ CAN = frozenset(
 
 
 class Lane:
-    """One world in which episodes are driven, one after the other."""
+    """One world, in which episodes are driven one after another."""
 
     def __init__(self, make: Make, policy: str, world: AnyWorld, seed: int) -> None:
         self._make = make
@@ -74,18 +74,18 @@ class Lane:
         return self._over_s >= LINGER_S
 
     def begin(self, **options: Any) -> None:
-        """Begins the episode of the seed, with options of `reset`."""
+        """Starts the episode of the seed, with options of `reset`."""
         self._observation, _ = self._env.reset(seed=self.seed, options=options)
         begin(self._driver)
         self.state = ""
         self._over_s = 0.0
-        if not options:  # otherwise the path so far belongs to this episode
+        if not options:  # with options, the episode continues
             self.time_s = 0.0
             self.trail = Track()
         self.trail.add(self.env.snapshot().poses, 1)
 
     def advance(self, command: NDArray[np.float64] | None) -> bool:
-        """Advances one period by a command (C,) or by the policy; returns True in a new env."""
+        """Advances one period by a command (C,) or the policy; returns True if the env is new."""
         if self.over:
             return self.anew(self.seed + 1)
         if self.state:
@@ -115,7 +115,7 @@ class Lane:
         return actions_of(self.task, command)
 
     def anew(self, seed: float) -> bool:
-        """Begins the episode of a seed in the original world; returns True in a new env.
+        """Starts the episode of a seed in the original world; returns True if the env is new.
 
         Raises ConfigError for a bad seed.
         """
@@ -127,25 +127,25 @@ class Lane:
         return changed
 
     def enter(self, world: AnyWorld) -> None:
-        """Begins the episode of the seed in another world."""
+        """Starts the episode of the seed in another world."""
         self.close()
         self._open(self._policy, world)
         self._native = world
         self.begin()
 
     def follow(self, policy: str) -> None:
-        """Goes on from here with another policy."""
+        """Continues from here with another policy."""
         self._rebuild(policy)
 
     def aim(self, x: float, y: float) -> None:
-        """Moves the goal [m]; after a success it goes on from here. ConfigError off the field."""
+        """Moves the goal [m]; continues after a success. Raises ConfigError off the field."""
         check_place("goal", self.env.world.members[self.env.snapshot().member], x, y)
         self.env.memory["goal"][...] = x, y
         if self.state == "success":
             self._rebuild(self._policy)
 
     def add(self, shape: Shape, x: float, y: float) -> None:
-        """Adds an obstacle [m]. Raises ConfigError where there is a robot, or no world."""
+        """Adds an obstacle [m]. Raises ConfigError if it touches a robot or is off the field."""
         reach = shape.radius + self.env.model.robot.footprint_radius
         distances = np.linalg.norm(self.env.snapshot().poses[:, :2] - (x, y), axis=1)
         if distances.min() <= reach:
@@ -159,7 +159,7 @@ class Lane:
         self._rebuild(self._policy, emptied=True)
 
     def _rebuild(self, policy: str, *more: Obstacles, emptied: bool = False) -> None:
-        """Goes on from here in a new env: with another policy, or other obstacles."""
+        """Continues from here in a new env, with another policy or other obstacles."""
         shot = self.env.snapshot()
         kept = dict(vars(self))
         world = standing(self.env, *more, emptied=emptied)
@@ -172,7 +172,7 @@ class Lane:
         kept["_env"].close()
 
     def frame(self, place: int) -> WorldFrame:
-        """Returns the present frame; `place` is that of the world's first member."""
+        """Returns the present frame; `place` is the place of the world's first member."""
         shot = self.env.snapshot()
         name = f"{self.world.name}, episode {self.seed}"
         return WorldFrame(
@@ -185,7 +185,7 @@ class Lane:
 
 
 def standing(env: BridgeEnv, *more: Obstacles, emptied: bool = False) -> World:
-    """Returns the world of an env with its obstacles where they are now, or none, and more."""
+    """Returns an env's world with `more` obstacles, and its own where they are unless `emptied`."""
     shot = env.snapshot()
     world = env.world.members[shot.member]
     shapes = env.world.shapes
@@ -298,14 +298,14 @@ class EpisodeSource:
         return True
 
     def unfinished(self, episodes: int) -> bool:
-        """True until so many episodes have been driven and shown to their ends in every world."""
+        """Returns True until this many episodes have been driven and shown in every world."""
         return any(
             lane.seed < self._first + episodes - 1 or not lane.over
             for lane in self.lanes
         )
 
     def _drive(self, request: Request) -> None:
-        """Takes fractions of the maximum speeds forward, to the left, and turning left."""
+        """Converts fractions of the maximum speeds forward, left, and turning left to a command."""
         robot = self.model.robot
         if not self._drives:
             raise ConfigError(

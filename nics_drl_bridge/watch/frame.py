@@ -1,4 +1,4 @@
-"""What the page shows: a stage once, and frames over time, as plain data for JSON."""
+"""What the page shows: one stage, and frames over time, as plain data for JSON."""
 
 import base64
 import math
@@ -19,24 +19,24 @@ from nics_drl_bridge.sim.world import World
 from nics_drl_bridge.sim.world_set import AnyWorld
 from nics_drl_bridge.watch.motion import MotionMeter, Velocities
 
-MM = 1000.0  # lengths and angles go over the wire in thousandths, as whole numbers
+MM = 1000.0  # lengths and angles are sent as integer thousandths
 NO_RETURN = -1
 
 
 @dataclass(frozen=True)
 class Stage:
-    """All that stays the same from frame to frame."""
+    """Everything that stays the same from frame to frame."""
 
     title: str
     model: SimulatorModel
-    # The places of the frames are the members of these worlds, one after the other.
+    # The members of these worlds, one after another, are the places of frames.
     worlds: tuple[AnyWorld, ...]
-    # requests that the source takes, see `server.Request`
+    # requests that the source accepts, see `server.Request`
     can: frozenset[str] = frozenset()
-    # of policies and worlds
+    # names of policies and worlds to choose from
     choices: Mapping[str, Sequence[str]] = field(default_factory=dict)
     chosen: Mapping[str, str] = field(default_factory=dict)
-    span_s: tuple[float, float] | None = None  # of a bag [s]
+    span_s: tuple[float, float] | None = None  # first and last time of a bag [s]
     # name of the model on the page; if empty, the robot's name
     model_name: str = ""
 
@@ -109,17 +109,17 @@ def _describe_map(grid: GridMap) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class WorldFrame:
-    """One world at one time."""
+    """What is shown of one world at one time."""
 
     shot: Snapshot
     name: str = ""
-    place: int = 0  # in the `worlds` of the stage, member by member
+    place: int = 0  # index among the members of `Stage.worlds`
     trails: tuple[Array, ...] = ()  # (T, 2) path of each robot in this episode [m]
-    state: str = ""  # how the episode stands, in a word or two
-    time_s: float | None = None  # since its episode began [s]; None: that of the frame
+    state: str = ""  # state of the episode, in a word or two
+    time_s: float | None = None  # since the start of its episode [s]; None: the frame's
 
     def plain(self, velocities: Velocities | None = None) -> dict[str, Any]:
-        """Returns the world as plain data, with the velocities in it."""
+        """Returns the world as plain data, with velocities if given."""
         shot = self.shot
         exists = shot.bodies[:, RADIUS] > 0.0
         bodies = shot.bodies[exists]
@@ -153,7 +153,7 @@ class WorldFrame:
 
 
 def _compute_ellipse(covariance: Array) -> list[float]:
-    """Returns half axes [m] and rotation [rad] of the ellipse of 95 % confidence."""
+    """Returns semi-axes [m] and rotation [rad] of the 95 % confidence ellipse."""
     values, vectors = np.linalg.eigh(covariance[:2, :2])
     scale = -2.0 * math.log(0.05)  # quantile of chi squared with two degrees of freedom
     small, large = np.sqrt(np.maximum(values, 0.0) * scale).tolist()
@@ -165,18 +165,18 @@ def _compute_ellipse(covariance: Array) -> list[float]:
 
 
 def round_to_thousandths(values: ArrayLike) -> Any:
-    """Returns numbers as whole thousandths in lists, with 0 for those that are not finite."""
+    """Returns numbers as lists of integer thousandths, with 0 for non-finite ones."""
     scaled = np.nan_to_num(np.asarray(values, np.float64) * MM, posinf=0.0, neginf=0.0)
     return np.rint(scaled).astype(np.int64).tolist()
 
 
 @dataclass(frozen=True)
 class Frame:
-    """All worlds at one time."""
+    """What is shown of all worlds at one time."""
 
     time_s: float
     worlds: tuple[WorldFrame, ...]
-    note: str = ""  # a line about all of them, such as the progress of a training
+    note: str = ""  # a line about all worlds, such as training progress
 
     def plain(self, meter: MotionMeter | None = None) -> dict[str, Any]:
         """Returns the frame as plain data, with velocities if a meter measures them."""
@@ -193,7 +193,7 @@ class Frame:
         }
 
     def measured_by(self, meter: MotionMeter) -> list[Velocities]:
-        """Returns the velocities in each world, since the frame that a meter measured before."""
+        """Returns the velocities in each world since the meter's previous frame."""
         times_s = [
             self.time_s if world.time_s is None else world.time_s
             for world in self.worlds
@@ -202,7 +202,7 @@ class Frame:
 
 
 class Track:
-    """The paths of M robots in an episode, at most `MOST` points of each."""
+    """Paths of M robots in an episode, with at most `MOST` points each."""
 
     MOST = 600
 
@@ -210,12 +210,13 @@ class Track:
         self._points: list[Array] = []
 
     def add(self, poses: Array, step: int) -> None:
-        """Adds where the robots are, (M, 3), after a step of the episode; 0 begins anew."""
+        """Adds the robots' poses (M, 3) after a step of the episode; step 0 restarts the paths."""
         if step == 0:
             self._points = []
         self._points.append(poses[:, :2].copy())
         if len(self._points) > self.MOST:
-            del self._points[::2]  # every other point: the whole path stays visible
+            # Drop every other point, so that the whole path stays visible.
+            del self._points[::2]
 
     @property
     def ways(self) -> tuple[Array, ...]:

@@ -9,9 +9,9 @@ from nics_drl_bridge.watch.show import PACE, Tempo, open_page
 
 
 class HumanView:
-    """Shows each shot on a page, which may pause the program that steps the env, or pace it.
+    """Shows each shot on a page, which may pause or pace the program that steps the env.
 
-    Raises ConfigError if the library of the page is missing.
+    Raises ConfigError if the page's library is missing.
     """
 
     def __init__(self, model: SimulatorModel, world: AnyWorld, fps: int) -> None:
@@ -24,7 +24,7 @@ class HumanView:
         open_page(self._server.url)
 
     def draw(self, shot: Snapshot) -> None:
-        """Shows a shot, and returns when the next one is due."""
+        """Shows a shot, and returns once the next one is due."""
         self._trail.add(shot.poses, shot.step)
         self._frames += 1
         worlds = (WorldFrame(shot, place=shot.member, trails=self._trail.ways),)

@@ -1,4 +1,4 @@
-"""Velocities of all that moves on the page, from the frames of any source."""
+"""Velocities of everything that moves on the page, from the frames of any source."""
 
 import math
 from collections.abc import Sequence
@@ -11,19 +11,20 @@ from nics_drl_bridge.env.snapshot import Snapshot
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.exact_kernels import X, Y
 
-LONGEST_S = 1.0  # between two frames; a mean over a longer time says little about now
-FASTEST_M_S = 30.0  # what seems faster was moved by hand or reset
+# maximum time between frames [s]: a mean over more says little about now
+LONGEST_S = 1.0
+FASTEST_M_S = 30.0  # anything faster was moved by hand or reset [m/s]
 
 
 class Velocities(NamedTuple):
-    """Velocities in one world, along the axes of `map`; zero where they are unknown."""
+    """Velocities in one world, along the axes of `map`; zero if unknown."""
 
     robots: Array  # (M, 2) [m/s]
-    bodies: Array  # (K, 2) [m/s], of the obstacles
+    bodies: Array  # (K, 2) obstacles [m/s]
 
     @staticmethod
     def unknown(shot: Snapshot) -> "Velocities":
-        """Returns zeros for each robot and each obstacle of a shot."""
+        """Returns zeros for each robot and obstacle of a shot."""
         return Velocities(
             np.zeros((len(shot.poses), 2)), np.zeros((len(shot.bodies), 2))
         )
@@ -31,7 +32,7 @@ class Velocities(NamedTuple):
 
 @dataclass(frozen=True)
 class _Measurement:
-    """One world at its last frame, with velocities."""
+    """The latest frame of one world, with velocities."""
 
     time_s: float
     shot: Snapshot
@@ -39,7 +40,7 @@ class _Measurement:
 
 
 class MotionMeter:
-    """Measures velocities as the displacement between two frames over the time between them."""
+    """Measures velocities as displacement over time between two frames."""
 
     def __init__(self) -> None:
         self._last: list[_Measurement] = []
@@ -47,7 +48,7 @@ class MotionMeter:
     def measure(
         self, times_s: Sequence[float], shots: Sequence[Snapshot]
     ) -> list[Velocities]:
-        """Returns the velocities in each world, whose times are those of its own episode [s]."""
+        """Returns the velocities in each world; times are since the start of its episode [s]."""
         if len(shots) != len(self._last):
             self._last = [
                 _Measurement(math.inf, shot, Velocities.unknown(shot)) for shot in shots
@@ -82,7 +83,7 @@ def _measure_velocities(
 
 
 def _compute_rates(before: Array, now: Array, passed_s: float, last: Array) -> Array:
-    """Returns velocities (n, 2) by points (n, 2); the last ones (n, 2) if no time has passed."""
+    """Returns velocities (n, 2) from points (n, 2); `last` (n, 2) if no time has passed."""
     if before.shape != now.shape:
         return np.zeros_like(now)
     if passed_s == 0.0:

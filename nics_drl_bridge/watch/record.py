@@ -1,4 +1,4 @@
-"""Files of what the page shows: MP4 and GIF."""
+"""Writes what the page shows as MP4 or GIF."""
 
 import io
 from collections.abc import Callable, Iterable, Iterator
@@ -17,13 +17,13 @@ from nics_drl_bridge.files import check_above, write_bytes, write_whole_file
 from nics_drl_bridge.watch.frame import Frame, Stage
 
 Pixels = NDArray[np.uint8]  # (H, W, 3)
-COLOURS = 128  # of a GIF, whose size grows with them
-ALIKE = 12  # difference of two colours of which a GIF has one
-SAMPLES = 12  # frames that its colours are taken from
+COLOURS = 128  # maximum number of colours of a GIF, which limits its size
+ALIKE = 12  # difference up to which two colours become one
+SAMPLES = 12  # number of frames that colours are taken from
 
 
 def draw_frames(stage: Stage, frames: Iterable[Frame]) -> Iterator[Pixels]:
-    """Draws frames, their worlds side by side."""
+    """Draws frames, with worlds side by side."""
     drawn: dict[int, WorldPicture] = {}
     first = np.cumsum([0, *(len(world.members) for world in stage.worlds)])
     for frame in frames:
@@ -37,7 +37,7 @@ def draw_frames(stage: Stage, frames: Iterable[Frame]) -> Iterator[Pixels]:
 
 
 def join_side_by_side(row: list[Pixels]) -> Pixels:
-    """Joins pictures side by side, with an even height and width, as videos need."""
+    """Joins pictures side by side, to an even height and width as required by videos."""
     height = -(-max(len(picture) for picture in row) // 2) * 2
     width = -(-sum(picture.shape[1] for picture in row) // 2) * 2
     joined = np.full((height, width, 3), 255, np.uint8)
@@ -52,7 +52,7 @@ def join_side_by_side(row: list[Pixels]) -> Pixels:
 def write_gif(path: Path, shown: Iterable[Pixels], fps: float) -> None:
     """Writes a GIF that repeats for ever."""
     pictures = list(shown)
-    # All frames have one palette, or colours would flicker.
+    # All frames share one palette, or colours would flicker.
     palette = choose_palette(pictures[:: -(-len(pictures) // SAMPLES)])
     first, *rest = [
         Image.fromarray(pixels).quantize(palette=palette, dither=Image.Dither.NONE)
@@ -69,7 +69,7 @@ def write_gif(path: Path, shown: Iterable[Pixels], fps: float) -> None:
 def choose_palette(samples: list[Pixels]) -> Image.Image:
     """Returns a palette of the most frequent distinct colours.
 
-    Means of colours would lose those of small things.
+    Averaged colours would lose those of small objects.
     """
     pixels = np.concatenate([sample.reshape(-1, 3) for sample in samples])
     colours, counts = np.unique(
@@ -120,7 +120,7 @@ WRITERS: dict[str, Callable[[Path, Stage, Iterable[Frame], float], None]] = {
 
 
 def check_file(path: Path) -> None:
-    """Raises ConfigError for a kind that is unknown or lacks its library, or a bad folder."""
+    """Raises ConfigError for an unknown suffix, a missing library, or a bad folder."""
     if path.suffix not in WRITERS:
         raise ConfigError(f"--record {str(path)!r}: {suggest(path.suffix, WRITERS)}")
     require(str(path), *LIBRARIES.get(path.suffix, ()))
@@ -128,7 +128,7 @@ def check_file(path: Path) -> None:
 
 
 def write(path: Path, stage: Stage, frames: Iterable[Frame], fps: float) -> None:
-    """Writes frames to a file of the kind that its suffix names. Raises ConfigError."""
+    """Writes frames to an MP4 or a GIF, by suffix. Raises ConfigError."""
     check_file(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     WRITERS[path.suffix](path, stage, frames, fps)

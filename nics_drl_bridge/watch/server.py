@@ -1,4 +1,4 @@
-"""Server of the page on this machine alone: frames to the browsers, requests from them."""
+"""Serves the page to this machine only: sends frames to browsers, receives their requests."""
 
 import json
 import logging
@@ -23,7 +23,7 @@ HOST = "127.0.0.1"
 PORT = 8765
 MOST_REQUESTS = 256
 MOST_BYTES = 4096
-# Pages that sleep or fail are not logged.
+# Sleeping or failing pages are not logged.
 QUIET = logging.Logger("pages", logging.CRITICAL + 1)
 # The page loads nothing from other hosts, and sends nothing to them.
 POLICY = "; ".join(
@@ -41,7 +41,7 @@ POLICY = "; ".join(
 
 
 class Request(Schema):
-    """A request of a page."""
+    """A request from a page."""
 
     kind: Literal[
         "goal",
@@ -59,15 +59,15 @@ class Request(Schema):
     ]
     # index of the world in the frame
     world: int = Field(default=0, ge=0, le=10_000)
-    x: float = Field(default=0.0, ge=-1e8, le=1e8)  # place of a goal or an obstacle [m]
+    x: float = Field(default=0.0, ge=-1e8, le=1e8)  # place of a goal or obstacle [m]
     y: float = Field(default=0.0, ge=-1e8, le=1e8)
-    # radius, or half side of a box [m]
+    # radius, or half the side of a box [m]
     size: float = Field(default=0.2, ge=0.01, le=10.0)
     shape: Literal["circle", "box"] = "circle"
-    name: str = Field(default="", max_length=500)  # of a policy or a world
+    name: str = Field(default="", max_length=500)  # name of a policy or world
     # speed, seed, or time [s]
     value: int | float = Field(default=0.0, ge=-GREATEST_SEED, le=GREATEST_SEED)
-    on: bool = True  # of a pause, or of driving by hand
+    on: bool = True  # False ends a pause or driving by hand
     # fractions of the maximum speeds forward, to the left, and turning left
     twist: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
@@ -75,7 +75,7 @@ class Request(Schema):
 class PageServer:
     """Serves the page at `url` in its own threads; slow browsers skip frames.
 
-    Port 0 takes any free one. Raises ConfigError if the port or the library is
+    Port 0 stands for any free port. Raises ConfigError if the port is taken or the library is
     missing.
     """
 
@@ -122,17 +122,17 @@ class PageServer:
         return bool(self._pages)
 
     def set_stage(self, stage: Stage) -> None:
-        """Shows another stage."""
+        """Changes the stage."""
         self._set(0, json.dumps(stage.plain(), separators=(",", ":")))
 
     def publish(self, frame: Frame, **about: Any) -> None:
-        """Shows a frame, and further facts beside it."""
+        """Shows a frame with additional facts."""
         self._set(
             2, json.dumps(frame.plain(self._meter) | about, separators=(",", ":"))
         )
 
     def measure(self, frame: Frame) -> None:
-        """Measures a frame without showing it, so that the next one has velocities."""
+        """Measures a frame without showing it, so that the next frame has velocities."""
         frame.measured_by(self._meter)
 
     def tell(self, sentence: str) -> None:
@@ -146,24 +146,24 @@ class PageServer:
             self._news.notify_all()
 
     def request(self, seconds: float) -> Request | None:
-        """Returns the next request of a page, waiting for it for at most some time [s]."""
+        """Returns the next request of a page, or None after some time [s]."""
         try:
             return self._requests.get(seconds > 0.0, max(seconds, 0.0))
         except queue.Empty:
             return None
 
     def _answer(self, connection: Any, request: Any) -> Any:
-        """Returns the page; None lets this page, or a program, open its socket."""
+        """Returns an HTTP response; None lets our page, or a program, open the socket."""
         from websockets.datastructures import Headers
         from websockets.http11 import Response
 
         host = ", ".join(request.headers.get_all("Host"))
-        if host not in self._hosts:  # a foreign name may point to this machine
+        if host not in self._hosts:  # a foreign host name may point to this machine
             return connection.respond(
                 403, "This page is served to this machine only.\n"
             )
         if request.path == "/socket":
-            origins = request.headers.get_all("Origin")  # programs send none
+            origins = request.headers.get_all("Origin")  # empty for programs
             if all(origin.removeprefix("http://") in self._hosts for origin in origins):
                 return None
             return connection.respond(
@@ -183,7 +183,7 @@ class PageServer:
         return Response(200, "OK", Headers(about), body)
 
     def _serve_page(self, page: Any) -> None:
-        """Serves one page: a thread of its own sends, this one receives."""
+        """Serves one page: this thread receives, another one sends."""
         from websockets.exceptions import ConnectionClosed
 
         with self._news:
@@ -203,7 +203,7 @@ class PageServer:
 
     def _take(self, text: str | bytes) -> None:
         try:
-            with suppress(queue.Full):  # requests are dropped if nobody takes them
+            with suppress(queue.Full):  # drop requests that nobody handles
                 self._requests.put_nowait(Request.model_validate_json(text))
         except ValidationError as error:
             first = error.errors()[0]
@@ -222,7 +222,7 @@ class PageServer:
                     page.send(text)
 
     def _wait_for_news(self, page: Any, sent: list[int]) -> list[str]:
-        """Waits for texts newer than the numbers `sent`, which it updates; none once closed."""
+        """Waits for texts newer than the numbers `sent`, and updates them; empty once closed."""
         with self._news:
             while page in self._pages and self._numbers == sent:
                 self._news.wait()
@@ -234,10 +234,10 @@ class PageServer:
         return texts
 
     def close(self) -> None:
-        """Closes all pages and frees the port; threads that wait for a frame end, too."""
+        """Closes all pages and frees the port; this also ends threads that wait for a frame."""
         self.closed = True
         for page in tuple(self._pages):
-            # A page that reads nothing would not answer a closing handshake.
+            # A page that does not read would not answer a closing handshake.
             with suppress(OSError):
                 page.socket.shutdown(socket.SHUT_RDWR)
         self._server.shutdown()

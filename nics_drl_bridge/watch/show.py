@@ -1,4 +1,4 @@
-"""Shows a source on the page, at a pace that the page may change."""
+"""Shows a source on the page, at a pace that the page can change."""
 
 import os
 import sys
@@ -21,28 +21,28 @@ Handle = Callable[[Request], None]
 
 
 class FrameSource(Protocol):
-    """A source of frames that takes requests."""
+    """A source of frames that handles requests."""
 
-    period_s: float  # from one frame to the next, at a speed of 1 [s]
+    period_s: float  # time between two frames at speed 1 [s]
 
     def stage(self) -> Stage:
-        """Returns all that stays the same from frame to frame."""
+        """Returns everything that stays the same from frame to frame."""
 
     def frame(self) -> Frame:
         """Returns the present frame."""
 
     def advance(self) -> bool:
-        """Goes on to the next frame; returns True if the stage changed. Raises BridgeError."""
+        """Moves on to the next frame; returns True if the stage changed. Raises BridgeError."""
 
     def take(self, request: Request) -> bool:
-        """Serves a request of a page; returns True if the stage changed. Raises BridgeError."""
+        """Handles a page's request; returns True if the stage changed. Raises BridgeError."""
 
     def close(self) -> None:
         """Frees all resources."""
 
 
 class Tempo:
-    """Determines when the next frame is due: at a speed, after a pause, or one by one."""
+    """Determines when the next frame is due, given the speed, pauses and single steps."""
 
     def __init__(self) -> None:
         self.speed = 1.0
@@ -51,7 +51,7 @@ class Tempo:
         self._due = 0.0
 
     def take(self, request: Request) -> None:
-        """Changes the pace, if a request asks for it."""
+        """Changes the pace if the request asks for it."""
         if request.kind == "speed":
             self.speed = min(max(request.value, SLOWEST), FASTEST)
         elif request.kind in ("pause", "step"):
@@ -80,10 +80,10 @@ class Tempo:
 
 
 def check_listed(request: Request, stage: Stage) -> None:
-    """Raises ConfigError for a policy or a world that the page does not offer.
+    """Raises ConfigError for a policy or world that the page does not offer.
 
-    Any program on this machine may write to the page's socket. So a request may only choose from
-    the lists that the page shows, and opens no other file.
+    Any program on this machine can write to the page's socket. So a request may only choose from
+    the lists shown on the page, and can't open any other file.
     """
     if request.kind in stage.choices:
         offered = stage.choices[request.kind]

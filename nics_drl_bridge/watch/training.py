@@ -1,4 +1,4 @@
-"""Shows some of the worlds of a training now and then, at no cost while no page is open."""
+"""Shows some worlds of a training from time to time, at no cost while no page is open."""
 
 import time
 from typing import Protocol
@@ -12,20 +12,20 @@ PERIOD_S = 0.1  # between two frames [s]
 
 
 class Envs(Protocol):
-    """Vector envs that are stepped together, as `TrainVecEnv`."""
+    """Vector envs that are stepped together, like `TrainVecEnv`."""
 
     envs: tuple[BridgeVectorEnv, ...]
 
 
 class TrainingView:
-    """Shows the first worlds of each vector env; to be called after each step of them all."""
+    """Shows the first worlds of each vector env; call it after each step of all envs."""
 
     def __init__(self, server: PageServer, training: Envs) -> None:
         self._server = server
         envs = training.envs
         worlds_per_env = max(1, MOST_WORLDS // len(envs))
         sizes = [len(env.world.members) for env in envs]
-        self._worlds = [  # with the place of the first member of their world set
+        self._worlds = [  # each with the place of the first member of its world set
             (env, n, sum(sizes[:k]), Track())
             for k, env in enumerate(envs[:MOST_WORLDS])
             for n in range(min(worlds_per_env, env.num_envs))
@@ -33,13 +33,13 @@ class TrainingView:
         self._shown_s = 0.0
         self._steps = 0
         self.note = ""
-        self._measured = 0  # the last step from which velocities can be measured
+        self._measured = 0  # the last measured step
         names = ", ".join(env.world.name for env in envs)
         places = tuple(env.world for env in envs)
         server.set_stage(Stage(f"training in {names}", envs[0].model, places))
 
     def __call__(self) -> None:
-        """Takes a step into account, and shows a frame if it is time to and a page is open."""
+        """Counts a step, and shows a frame if one is due and a page is open."""
         self._steps += 1
         if not self._server.watched:
             return
@@ -53,7 +53,7 @@ class TrainingView:
             self._shown_s = now
             self._server.publish(self._make_frame())
         else:
-            # Velocities are known after the next step.
+            # Velocities will be known after the next step.
             self._server.measure(self._make_frame())
         self._measured = self._steps
 

@@ -1,4 +1,4 @@
-"""Any bag as MCAP that Foxglove shows at once: with its types' definitions, and with transforms."""
+"""Converts any bag to MCAP for Foxglove, including type definitions and transforms."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,16 +18,16 @@ MOVING = "/tf"
 FIXED = "/tf_static"
 OFFERS = {FIXED: (Offer(1, transient_local=True),)}
 Row = tuple[str, int, bytes]
-"""Topic, time of receipt [ns] and bytes of a message."""
+"""Topic, receive time [ns] and bytes of a message."""
 
 
 def convert(
     path: str | Path, out: str | Path, model: SimulatorModel | None = None
 ) -> list[str]:
-    """Writes a bag of ROS 2 or 1 as MCAP, and returns the topics that were added to it.
+    """Writes a bag of ROS 2 or 1 as MCAP, and returns the added topics.
 
-    A bag without transforms gets those of its odometry and, with a model, of the lidar's mount:
-    without them a viewer can't tell where a scan lies. Raises RecordingError.
+    A viewer needs transforms to place scans. A bag without transforms gets those of its odometry
+    and, with a model, of the lidar's mount. Raises RecordingError.
     """
     with open_bag(path) as bag, open_bag_sink(out) as sink:
         rows = list[Row]()

@@ -9,7 +9,7 @@ from nics_drl_bridge.interface import S_PER_NS
 from nics_drl_bridge.recording.bag_file import BagFile, open_bag, read_times
 from nics_drl_bridge.recording.stamping import MAX_WANDER_S, SAME_CLOCK_S, Nanoseconds
 
-GAP = 3.0  # a silence longer than this many usual periods is a gap
+GAP = 3.0  # a longer silence, in median periods, is a gap
 NO_HEADER = "no header"
 UNSTAMPED = "never stamped"
 UNKNOWN = "unknown type"
@@ -25,16 +25,17 @@ class BagTopic:
     topic: str
     type: str
     count: int  # number of messages
-    rate_hz: float | None = None  # from the median time between receipts
-    # receipt of the first message, from the start of the bag
+    rate_hz: float | None = None  # inverse of the median period
+    # receive time of the first message, since the start of the bag
     first_s: float | None = None
     last_s: float | None = None
-    gaps: int = 0  # number of silences of more than three usual periods
+    gaps: int = 0  # number of silences of more than three median periods
     longest_gap_s: float | None = None
-    clock: str = UNKNOWN  # of the header stamps, or why there are none
-    delay_s: float | None = None  # median of receipt minus stamp; None without stamps
-    jitter_s: float | None = None  # from the 5 % to the 95 % quantile of that delay
-    backwards: int = 0  # number of stamps earlier than their predecessor
+    clock: str = UNKNOWN  # clock of the header stamps, or why there are none
+    # median of receive time minus stamp; None without stamps
+    delay_s: float | None = None
+    jitter_s: float | None = None  # 95 % minus 5 % quantile of that delay
+    backwards: int = 0  # number of stamps earlier than the previous one
 
 
 @dataclass(frozen=True)
@@ -42,15 +43,15 @@ class BagInfo:
     """Contents of a bag."""
 
     path: str
-    size_bytes: int  # of all its files
-    start_ns: int  # receipt of the first message, on the recorder's clock
-    duration_s: float  # from that to the receipt of the last message
+    size_bytes: int  # total size of its files
+    start_ns: int  # first receive time, on the recorder's clock
+    duration_s: float  # from the first to the last receive time
     messages: int  # number of messages
     topics: tuple[BagTopic, ...]
 
 
 def read_bag_info(path: str | Path) -> BagInfo:
-    """Reads a whole bag and describes its contents; a damaged one raises RecordingError."""
+    """Reads a whole bag and describes its contents. Raises RecordingError if it is damaged."""
     path = Path(path)
     with open_bag(path) as bag:
         received = {topic: _read_receipt(bag, topic) for topic in sorted(bag.types)}

@@ -1,4 +1,4 @@
-"""Bags over ROS 2: what a robot publishes is recorded as sent, and played back as recorded."""
+"""Bags over ROS 2: records a robot's messages as sent, and plays them back as recorded."""
 
 import signal
 import threading
@@ -51,17 +51,17 @@ ROBOT = (  # topics of a robot, in its namespace
 )
 SHARED = ("/tf", "/tf_static", "/clock", "/diagnostics")
 LOOK_S = 0.25  # period of the search for new topics [s]
-FLUSH_S = 1.0  # greatest span that is lost if the process is killed [s]
+FLUSH_S = 1.0  # maximum time lost if the process is killed [s]
 QUEUE = 1000
 CLOCK = "/clock"
-# of wall time between messages; `/clock` also precedes each
+# wall time between `/clock` messages while waiting for the next message of the bag
 CLOCK_PERIOD_NS = 10_000_000
-USUAL_DEPTH = 100  # for a topic whose publishers' quality of service is not in the bag
+USUAL_DEPTH = 100  # queue depth of a topic whose quality of service is not in the bag
 NAP_S = 0.05
 PATIENCE_S = 60.0
 # time for subscribers to discover the topics before the first message [s]
 DISCOVERY_S = 1.0
-ALONE_S = 5.0  # longest wait for a first subscriber; after it, the bag is played without one [s]
+ALONE_S = 5.0  # maximum wait for a subscriber before playing without one [s]
 
 
 @dataclass(frozen=True)
@@ -69,16 +69,16 @@ class BagOrder:
     """Topics to record, and options."""
 
     out: Path  # folder of the bag
-    topics: tuple[str, ...] = ()  # their names; those of `ROBOT` and `SHARED` if empty
-    # records every topic; with a namespace, all of it and `SHARED`
+    topics: tuple[str, ...] = ()  # names; empty: `ROBOT` and `SHARED`
+    # True: record every topic or, with a namespace, all of its topics and `SHARED`
     everything: bool = False
-    namespace: str = ""  # of the robot; prefix of topic names without a leading slash
-    duration: float | None = None  # stops after this time [s]; None for never
-    storage: Storage = defaults.BAG_STORAGE  # format of the file
-    use_sim_time: bool = False  # takes times of receipt from `/clock`
+    namespace: str = ""  # prefix of topic names without a leading slash
+    duration: float | None = None  # stop after this time [s]; None: never
+    storage: Storage = defaults.BAG_STORAGE  # file format
+    use_sim_time: bool = False  # True: take receive times from `/clock`
 
     def wants(self, topic: str) -> bool:
-        """True if a topic is to be recorded."""
+        """Returns True if a topic is to be recorded."""
         space = parse_namespace(self.namespace)
         if self.everything:
             return not space or topic.startswith(f"{space}/") or topic in SHARED
@@ -89,7 +89,7 @@ class BagOrder:
 
 
 class BagRecorder(QosWatch):
-    """Writes wanted topics into a bag as received; `say` hears of each that begins or can't be."""
+    """Writes wanted topics to a bag; `say` gets each topic that starts or can't be recorded."""
 
     def __init__(
         self,
@@ -108,7 +108,7 @@ class BagRecorder(QosWatch):
         self._order = order
         self._sink = sink
         self._say = say
-        self.skipped: dict[str, str] = {}  # a sentence by topic
+        self.skipped: dict[str, str] = {}  # topic -> sentence with the reason
         self._heard: dict[str, tuple[Offer, Subscription[Any]]] = {}
         self._began = self._flushed = time.monotonic()
         steadily(self, LOOK_S, self._look)
@@ -168,7 +168,10 @@ class BagRecorder(QosWatch):
 
 
 def record_bag(order: BagOrder, say: Callable[[str], None]) -> dict[str, int]:
-    """Records until the duration or a signal; counts by topic. BackendError, RecordingError."""
+    """Records until the duration ends or a signal comes; returns message counts by topic.
+
+    Raises BackendError if nothing was received, and RecordingError.
+    """
     with open_bag_sink(order.out, order.storage, keep=True) as sink:
         node = run_node(
             lambda context: BagRecorder(context, order, sink, say), ["nics"]
@@ -183,7 +186,7 @@ def record_bag(order: BagOrder, say: Callable[[str], None]) -> dict[str, int]:
     return sink.counts
 
 
-Timed = tuple[int, str, bytes]  # receipt [ns], topic, data
+Timed = tuple[int, str, bytes]  # receive time [ns], topic, data
 
 
 class _Player:
@@ -218,7 +221,7 @@ class _Player:
             name = topic
         else:
             name = f"{self._space}{topic}"
-        best = Offer(  # matches any subscriber of one of the publishers
+        best = Offer(  # compatible with every subscriber of any original publisher
             max((offer.depth for offer in offers), default=USUAL_DEPTH),
             not offers or any(offer.reliable for offer in offers),
             any(offer.transient_local for offer in offers),
@@ -235,7 +238,7 @@ class _Player:
         self._wait(
             lambda: any(each.get_subscription_count() for each in publishers), ALONE_S
         )
-        self._wait(  # for all known subscribers to find their topic
+        self._wait(  # until all known subscribers are connected
             lambda: all(
                 p.get_subscription_count() >= count_subscribers(p.topic_name)
                 for p in publishers
@@ -276,7 +279,7 @@ class _Player:
             self._clock.publish(ClockMessage(clock=stamp_to_ros(now_ns)))
 
     def _wait_for_peer(self) -> None:
-        """Waits for the peer's answer: a node takes messages before requests that arrive later."""
+        """Waits for the peer's answer: a node handles messages before later requests."""
         if self._barrier is None:
             return
         future = self._barrier.call_async(GetParameters.Request(names=["use_sim_time"]))
@@ -298,9 +301,9 @@ def play_bag(
 ) -> int:
     """Publishes a bag until its end, SIGINT or SIGTERM; returns the number of published messages.
 
-    The rate is in seconds of the bag per second; `clock` publishes the times of receipt on `/clock`
-    instead of the bag's own. Raises RecordingError if the bag is damaged, lacks a topic, or none of
-    its types is installed, BackendError if the peer does not answer.
+    The rate is in seconds of the bag per second. `clock` publishes receive times on `/clock`
+    instead of the bag's own clock. Raises RecordingError if the bag is damaged, lacks a topic, or
+    none of its types is installed, BackendError if the peer does not answer.
     """
     stopping = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -320,7 +323,7 @@ def play_bag(
             say(
                 f"left out: {topic} is of {kinds[topic]}, whose package is not installed."
             )
-        # In the order of receipt, at equal times in that of their topics.
+        # Sort by receive time, then by topic.
         timed = [
             (ns, topic, data)
             for topic, rows in sorted(played.items())
@@ -333,7 +336,8 @@ def play_bag(
         sent = player.play(timed)
         while loop and not stopping.is_set():
             sent += player.play(timed)
-        for each in player.publishers.values():  # undelivered messages are lost with it
+        # Destroying the node would drop undelivered messages.
+        for each in player.publishers.values():
             each.wait_for_all_acked(Duration(seconds=DELIVERY_S))
         return sent
     finally:

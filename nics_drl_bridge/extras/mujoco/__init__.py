@@ -1,1 +1,1 @@
-"""High-precision robots in MuJoCo: wheels with contact, friction and motors."""
+"""Detailed robots in MuJoCo: wheels with contact, friction and motors."""

@@ -1,4 +1,4 @@
-"""Robots in MuJoCo as MJCF; tyres are ellipsoids, which neither jump nor scrub."""
+"""Robots as MJCF for MuJoCo; tyres are ellipsoids, which neither jump nor scrub."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,59 +15,54 @@ from nics_drl_bridge.robot.spec import RobotSpec
 
 Parameters = dict[str, float]
 
-# torque limit of a motor, relative to that for the maximum acceleration
+# torque limit of a motor, relative to the torque of the maximum acceleration
 TORQUE_RESERVE = 1.5
 SERVO_LAG_S = 0.005  # lag of a motor behind its set point
-# the same, of one that keeps its speed though its tyres are dragged
+# the same for a motor that keeps its speed although its tyres are dragged sideways
 STIFF_SERVO_LAG_S = 0.001
-ROTOR = 0.25  # inertia of a geared motor, relative to its share of the robot's
-# Resistance of tyres to skidding relative to that to being pressed in, MuJoCo's `impratio`: at 1,
-# its convex contacts lift what slides so far that wheels hop off the floor.
+ROTOR = 0.25  # inertia of a geared motor, relative to its share of the robot's inertia
+# MuJoCo's `impratio`: stiffness of tyres against skidding relative to that against compression.
+# At 1, MuJoCo's convex contacts lift sliding wheels so far that they hop off the floor.
 SKIDDING = 0.01
 STEERING_STIFFNESS = 1.0  # torque of a steering servo per error [N m/rad]
-MISFIT = 0.01  # greatest error of the angle to which a tie rod leads a wheel [rad]
-# torque limit of a steering servo [N m], that of a small hobby servo
+MISFIT = 0.01  # maximum error of a wheel's angle due to the tie rod [rad]
+# torque limit of a steering servo, as of a small hobby servo [N m]
 STEERING_TORQUE = 1.0
-# radius of a roller at its middle, relative to the radius of the wheel
+# maximum radius of a roller, relative to the radius of the wheel
 THICKNESS = 0.25
 ROLLER_MASS = 0.005
-ROLLED = 1.0, 0.9884, 1.0  # by rollers under load, as drives sideways show
+ROLLED = 1.0, 0.9884, 1.0  # measured on rollers under load, in sideways drives
 
 
 @dataclass(frozen=True)
 class Physics:
-    """Parameters of a machine that a RobotSpec does not have; the mass is that of a small robot."""
+    """Parameters of a machine that a RobotSpec does not have; defaults are for a small robot."""
 
-    timestep: float = 0.001  # of MuJoCo [s]
-    mass: float = 4.0  # of the chassis with its load, without wheels [kg]
-    wheel_mass: float = 0.15  # of a wheel [kg]
+    timestep: float = 0.001  # MuJoCo's time step [s]
+    mass: float = 4.0  # chassis with load, without wheels [kg]
+    wheel_mass: float = 0.15  # one wheel [kg]
     friction: float = 1.0  # between tyre and floor
-    # of the robot after the maximum step of a command [m/s^2]
+    # acceleration of the robot after the maximum step of a command [m/s^2]
     acceleration: float = 5.0
-    # time constant of a tyre that was pressed into the floor [s]
+    # time constant of a tyre pressed into the floor [s]
     softness: float = 0.005
     bearing: float = 1e-6  # viscous friction of free wheels and rollers [N m s/rad]
-    rollers: int = 12  # of a mecanum wheel
+    rollers: int = 12  # per mecanum wheel
 
 
 @dataclass(frozen=True)
 class Machine:
-    """A robot in MuJoCo's form."""
+    """A robot for MuJoCo."""
 
     xml: str  # the MJCF model; its body `base_link` has the only free joint
-    joints: tuple[str, ...]  # J names of the joints with encoders
-    controls: Callable[
-        [Array], Array
-    ]  # maps a wanted state (S,) to the actuators' inputs (U,)
-    state: Callable[
-        [Array, Array], Array
-    ]  # positions [rad] and speeds [rad/s] (J,) to state (S,)
-    calibrated: tuple[float, float, float] = (
-        1.0,
-        1.0,
-        1.0,
-    )  # driven twist, by that of the wheels
-    gyro: bool = False  # tells odometry how the robot turns, instead of the wheels
+    joints: tuple[str, ...]  # names of the J joints with encoders
+    # maps a wanted state (S,) to the actuators' inputs (U,)
+    controls: Callable[[Array], Array]
+    # maps joint positions [rad] and speeds [rad/s] (J,) to the state (S,)
+    state: Callable[[Array, Array], Array]
+    # actual twist relative to the wheels' twist
+    calibrated: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    gyro: bool = False  # True: odometry gets the turn rate from a gyro, not from wheels
 
 
 def _make_motor(
@@ -158,7 +153,7 @@ def load_mujoco() -> Any:
 
 
 def build_machine(spec: RobotSpec, physics: Physics | None = None) -> Machine:
-    """Builds the machine of a robot; ConfigError without one of its kind, or a parameter."""
+    """Builds a robot's machine. Raises ConfigError for an unknown kind or a missing parameter."""
     kind = require_textbook(spec)
     if kind not in _BUILDERS:
         fix = f"take one of {', '.join(_BUILDERS)}, or the fast simulator."
@@ -185,8 +180,8 @@ def build_machine(spec: RobotSpec, physics: Physics | None = None) -> Machine:
 
 
 def _make_ackermann(p: Parameters, step: float, physics: Physics) -> Machine:
-    # One motor turns both rear wheels through a tendon that averages their speeds, which shares its
-    # torque as a differential does.
+    # One motor turns both rear wheels through a tendon that averages their speeds, which splits
+    # its torque like a differential.
     wheelbase = p["wheelbase"]
     track, radius = track_and_radius(p)
     total = physics.mass + 4 * physics.wheel_mass
@@ -207,9 +202,8 @@ def _make_ackermann(p: Parameters, step: float, physics: Physics) -> Machine:
 
     def controls(state: Array) -> Array:
         speed, steering = state
-        t = np.tan(
-            steering
-        )  # of a virtual wheel in the middle; both turn about one centre
+        # `steering` is the angle of a virtual middle wheel; all wheels turn about one centre.
+        t = np.tan(steering)
         left = t / (1.0 - half_ratio * t)
         right = t / (1.0 + half_ratio * t)
         return np.array([speed / radius, np.arctan(left), np.arctan(right)])
@@ -253,7 +247,7 @@ def _make_car_wheels(
 
 
 def _make_tie_rod(half_ratio: float, steepest: float) -> str:
-    # Servos that are not joined pass through angles at which the wheels scrub.
+    # Without a tie rod, the servos pass through angles at which the wheels scrub.
     middle = np.tan(np.linspace(-steepest, steepest, 101))
     left, right = (
         np.arctan2(middle, 1.0 + side * half_ratio * middle) for side in (-1.0, 1.0)
@@ -296,8 +290,8 @@ def _make_differential(p: Parameters, step: float, physics: Physics) -> Machine:
       </body>"""
         for side, y in (("left", 0.5 * track), ("right", -0.5 * track))
     )
-    # Low and just behind the axle: braking must not tip the robot over its wheels, and a mass far
-    # behind would push it further into every turn.
+    # The centre of mass is low and just behind the axle: braking must not tip the robot over, and
+    # a mass far behind would push it further into every turn.
     centre = (-0.06 * track, 0.0, -0.55 * radius)
     size = (track, 0.7 * track, 0.03)
     robot = f"""{_make_chassis(physics.mass, centre, size)}
@@ -313,8 +307,8 @@ def _make_differential(p: Parameters, step: float, physics: Physics) -> Machine:
 
 
 def _make_mecanum(p: Parameters, step: float, physics: Physics) -> Machine:
-    # MuJoCo can't align a friction that differs by direction with the roller at the bottom of a
-    # turning wheel; free rollers are robust, and reproduce the slight vibration of real ones.
+    # MuJoCo can't align anisotropic friction with the roller at the bottom of a turning wheel. Free
+    # rollers are robust, and reproduce the slight vibration of real wheels.
     radius = p["wheel_radius"]
     total = physics.mass + 4 * physics.wheel_mass
     rotor = ROTOR * 0.25 * physics.mass * radius**2
@@ -328,15 +322,15 @@ def _make_mecanum(p: Parameters, step: float, physics: Physics) -> Machine:
         body += _make_roller_wheel(name, (px, py), lean, radius, physics, rotor)
     motors = _make_motors(names, inertia, p["wheel_lag"], radius, step, physics)
     xml = _make_document("mecanum", physics, radius, body, motors)
-    # On a diagonal two wheels stand, each on a roller that it meets anywhere along its length: they
-    # turn the robot by up to 0.03 rad/s. Only a gyro can tell.
+    # In diagonal drives two wheels stand still, each on a roller touching the floor anywhere along
+    # its length. They turn the robot by up to 0.03 rad/s, which only a gyro measures.
     return Machine(
         xml, names, lambda state: state, lambda _, speed: speed, ROLLED, gyro=True
     )
 
 
 def _make_skid_steer(p: Parameters, step: float, physics: Physics) -> Machine:
-    # A point of contact for each wheel: how far a turn skids follows from where the wheels stand.
+    # Each wheel has one contact point, so the skidding in a turn follows from the wheels' places.
     radius = p["wheel_radius"]
     places = places_of_four(p)
     x, y = places["front_left"]
@@ -356,7 +350,7 @@ def _make_skid_steer(p: Parameters, step: float, physics: Physics) -> Machine:
     )
     xml = _make_document("skid_steer", physics, radius, body, motors, SKIDDING)
     measure_sides = lambda _, speed: 0.5 * (speed[:2] + speed[2:])  # noqa: E731
-    # How far it skids differs with speed and curve; such robots' odometry turns by their gyro.
+    # Skidding varies with speed and curvature, so such robots take the turn rate from a gyro.
     return Machine(
         xml, names, lambda state: np.tile(state, 2), measure_sides, gyro=True
     )
@@ -378,7 +372,7 @@ _BUILDERS: dict[str, Callable[[Parameters, float, Physics], Machine]] = {
 
 
 def fit_roller(radius: float, rollers: int) -> tuple[float, float]:
-    """Semi-axes [m], thickness and length, of ellipsoidal rollers that best outline a circle."""
+    """Returns semi-axes [m], across and along, of ellipsoidal rollers that best form a circle."""
     a = THICKNESS * radius
     q = np.pi / rollers
     reach = radius - (radius - a) * np.cos(q)
@@ -393,7 +387,7 @@ def _make_roller_wheel(
     physics: Physics,
     rotor: float,
 ) -> str:
-    # It leans by +1 if the axle of the roller on the floor points forward and left, else by -1.
+    # `lean` is 1 if the axle of the roller on the floor points forward and left, else -1.
     a, b = fit_roller(radius, physics.rollers)
     hub = physics.wheel_mass - physics.rollers * ROLLER_MASS
     rows = ""

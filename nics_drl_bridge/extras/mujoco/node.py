@@ -1,4 +1,4 @@
-"""mujoco_node: robots in MuJoCo behind the topics of the hardware."""
+"""mujoco_node: robots in MuJoCo behind the same topics as hardware."""
 
 from dataclasses import replace
 from functools import partial
@@ -19,7 +19,7 @@ from nics_drl_bridge.sim.world_set import AnyWorld
 
 
 def check(robot: RobotSpec) -> None:
-    """Raises ConfigError without MuJoCo, or for a robot of which it has no machine."""
+    """Raises ConfigError without MuJoCo, or for a robot without a machine."""
     load_mujoco()
     build_machine(robot)
 
@@ -27,7 +27,7 @@ def check(robot: RobotSpec) -> None:
 def mujoco_simulator(
     node: Node, model: SimulatorModel, world: AnyWorld, robots: int
 ) -> MujocoSimulator:
-    """Makes robots in MuJoCo, with the lidar and the floor that the parameters name."""
+    """Makes robots in MuJoCo, with the lidar and floor of the node's parameters."""
     renderer = declare_renderer(node, defaults.MUJOCO_RENDERER)
     physics = replace(Physics(), friction=declare_row(node, FRICTION))
     return MujocoSimulator(model, world, robots, renderer, physics, randomisation(node))

@@ -1,4 +1,4 @@
-"""A scene in MuJoCo: robots with bumpers, walls, map and obstacles, cut into convex parts."""
+"""A MuJoCo scene: robots with bumpers, walls, map and obstacles, cut into convex parts."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -15,16 +15,16 @@ from nics_drl_bridge.sim.obstacles import Motion
 from nics_drl_bridge.sim.world import World
 
 HEIGHT = 0.5  # height of walls and obstacles [m]
-THICKNESS = 0.002  # thickness of walls, which have none for the lidar [m]
-BUMPER = 4  # bit of MuJoCo's `contype` and `conaffinity` for contacts of bumpers
+THICKNESS = 0.002  # thickness of walls [m]; for the lidar they have none
+BUMPER = 4  # bit for bumper contacts in MuJoCo's `contype` and `conaffinity`
 BUMPER_FRICTION = 0.3
 BUMPER_NAME = "bumper_"
 OBSTACLE_NAME = "obstacle_"
-SLIVER = 1e-9  # triangles of less area, relative to the square of the outline's size, are omitted
+SLIVER = 1e-9  # minimum area of a triangle, relative to the outline's size squared
 
 
 def make_prefix(robot: int) -> str:
-    """Prefix of the names of a robot's parts."""
+    """Returns the prefix of the names of a robot's parts."""
     return f"robot_{robot}/" if robot else ""
 
 
@@ -39,7 +39,7 @@ def compile_scene(
     shapes: Sequence[Shape],
     bodies: Array,
 ) -> Any:
-    """Compiles robots of one kind in a world; those of its bodies (K, 7) that move are mocaps."""
+    """Compiles robots of one kind in a world; moving bodies among the (K, 7) are mocap bodies."""
     spec = mujoco.MjSpec.from_string(machine.xml)
     maker = _Maker(mujoco, spec, physics)
     maker.bumper(spec.body("base_link"), footprint)
@@ -61,7 +61,7 @@ def compile_scene(
 
 
 def find_bumpers(model: Any, robots: int) -> NDArray[np.int64]:
-    """(geoms,) index of the robot whose bumper each geom of a scene belongs to; -1 for none."""
+    """Returns (geoms,) the robot whose bumper each geom of a scene belongs to; -1 if none."""
     names = [model.geom(i).name for i in range(model.ngeom)]
     heads = [f"{make_prefix(m)}{BUMPER_NAME}" for m in range(robots)]
     owners = [
@@ -78,11 +78,11 @@ class _Maker:
         self._solref = [physics.softness, 1.0]
 
     def bumper(self, base: Any, footprint: Shape) -> None:
-        # Without mass, which belongs to the chassis.
+        # The bumper has no mass: the chassis has it.
         half = 0.5 * float(base.pos[2])
         contact = {"contype": BUMPER, "mass": 0.0}
         if isinstance(footprint, Circle):
-            # Its round edge touches a wall in one point, at the height of the axles.
+            # The round edge touches a wall in one point, at the height of the axles.
             size = [footprint.radius, footprint.radius, half]
             kind = self._kinds.mjGEOM_ELLIPSOID
             self._add(base, type=kind, size=size, name=f"{BUMPER_NAME}0", **contact)
@@ -165,12 +165,12 @@ class _Maker:
 
 
 def make_quaternion(heading: float) -> list[float]:
-    """Quaternion w, x, y, z of a rotation about the vertical [rad]."""
+    """Returns the quaternion w, x, y, z of a rotation about the vertical [rad]."""
     return [float(np.cos(0.5 * heading)), 0.0, 0.0, float(np.sin(0.5 * heading))]
 
 
 def split_convex(outline: Array) -> list[Array]:
-    """Splits an outline (V, 2) into convex ones, if need be by ear clipping (Meisters 1975)."""
+    """Splits an outline (V, 2) into convex ones; uses ear clipping (Meisters 1975) if needed."""
     if len(convex_hull(outline)) == len(outline):
         return [outline]
     rest = list(range(len(outline)))
@@ -206,7 +206,7 @@ def _is_ear(outline: Array, rest: list[int], i: int) -> bool:
 
 
 def merge_into_rectangles(blocked: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Rectangles (R, 4) of blocked cells: first row, first column, and those after the last."""
+    """Returns rectangles (R, 4) of blocked cells: first row, first column, last ones + 1."""
     done: list[tuple[int, int, int, int]] = []
     open_runs: dict[tuple[int, int], int] = {}
     for row, cells in enumerate(np.pad(blocked, ((0, 1), (1, 1)))):

@@ -1,4 +1,4 @@
-"""Robots in MuJoCo: one on an infinite floor, or several in a world as in FastSimulator."""
+"""Robots in MuJoCo: one on an infinite floor, or several in a world, like FastSimulator."""
 
 import math
 from collections.abc import Sequence
@@ -42,14 +42,14 @@ MOTION = ("pose", "twist", "state")
 class Reading:
     """State of a robot at one time."""
 
-    time: float  # since the reset [s]
+    time: float  # time since the reset [s]
     pose: Array  # (3,) of `base_link`: x [m], y [m], heading [rad]
     twist: Array  # (3,) vx [m/s], vy [m/s], wz [rad/s] in `base_link`
-    state: Array  # (S,) by the encoders, in the order of the RobotSpec
+    state: Array  # (S,) measured by encoders, in the order of the RobotSpec
 
 
 class Rig:
-    """Access to one machine, of a number, in the arrays of a MuJoCo model."""
+    """Access to machine `number` in the arrays of a MuJoCo model."""
 
     def __init__(
         self, spec: RobotSpec, machine: Machine, model: Any, number: int = 0
@@ -68,7 +68,7 @@ class Rig:
         self._controls = slice(number * count, (number + 1) * count)
 
     def put(self, data: Any, rest: Array, pose: ArrayLike) -> None:
-        """Places the robot at a pose (3,), with its parts as at rest (nq,) on the floor."""
+        """Places the robot at a pose (3,) on the floor, with its parts at rest (nq,)."""
         x, y, heading = np.asarray(pose, dtype=np.float64)
         positions = data.qpos[self._place : self._place + len(rest)]
         positions[:] = rest
@@ -76,7 +76,7 @@ class Rig:
         positions[3:7] = np.cos(0.5 * heading), 0.0, 0.0, np.sin(0.5 * heading)
 
     def launch(self, data: Any, rest: Array, twist: Array, heading: float) -> None:
-        """Gives the body a twist (3,), and all its parts no speed of their own."""
+        """Gives the body a twist (3,), and its parts no speed relative to the body."""
         speeds = data.qvel[self._drift : self._drift + len(rest) - 1]
         speeds[:] = 0.0
         speeds[:2], speeds[5] = geometry.rotate(twist[:2], heading), twist[2]
@@ -89,13 +89,13 @@ class Rig:
         ].copy()
 
     def resume(self, data: Any, motion: tuple[Array, Array]) -> None:
-        """Goes on with the motion that another rig of this machine had."""
+        """Continues with the motion of another rig of this machine."""
         positions, speeds = motion
         data.qpos[self._place : self._place + len(positions)] = positions
         data.qvel[self._drift : self._drift + len(speeds)] = speeds
 
     def command(self, data: Any, command: ArrayLike) -> None:
-        """Gives the motors a command (C,), clipped to its limits. Raises BackendError for NaN."""
+        """Sets the motors to a command (C,), clipped to its limits. Raises BackendError for NaN."""
         command = np.asarray(command, dtype=np.float64)
         count = len(self.spec.command)
         if command.shape != (count,) or not np.isfinite(command).all():
@@ -131,7 +131,7 @@ class Rig:
         )
 
     def encoders(self, data: Any) -> Array:
-        """(J,) positions of the joints that have encoders [rad]."""
+        """Returns the positions (J,) of the joints with encoders [rad]."""
         return np.array(data.qpos[self._positions])
 
     def require_upright(self, data: Any) -> None:
@@ -146,7 +146,7 @@ class Rig:
 
 
 class MujocoRobot:
-    """A robot on an infinite floor, moved by its motors and by contact; see `build_machine`."""
+    """A robot on an infinite floor, moved by motors and contact; see `build_machine`."""
 
     def __init__(self, spec: RobotSpec, physics: Physics | None = None) -> None:
         self._mujoco = load_mujoco()
@@ -157,9 +157,8 @@ class MujocoRobot:
         self._rig = Rig(spec, self.machine, self._model)
         self.timestep = float(self._model.opt.timestep)
         self._advance(SETTLING_S)
-        self.rest = (
-            self._data.qpos.copy()
-        )  # (nq,) positions in MuJoCo at rest at the origin
+        # (nq,) MuJoCo positions at rest at the origin
+        self.rest = self._data.qpos.copy()
         self.reset(np.zeros(3))
 
     def reset(self, pose: ArrayLike) -> Reading:
@@ -170,7 +169,10 @@ class MujocoRobot:
         return self.read()
 
     def step(self, command: ArrayLike, duration: float) -> Reading:
-        """Drives with a command (C,), clipped, for so many whole time steps [s]; BackendError."""
+        """Drives with a command (C,), clipped, for a duration [s] in whole time steps.
+
+        Raises BackendError.
+        """
         self._rig.command(self._data, command)
         self._advance(duration)
         self._rig.require_upright(self._data)
@@ -187,11 +189,11 @@ class MujocoRobot:
 
 
 class MujocoSimulator(DrivenSimulator):
-    """One world of robots in MuJoCo, with motors, wheels and contact, as seeded for FastSimulator.
+    """One world of robots in MuJoCo with motors, wheels and contact, seeded like FastSimulator.
 
-    A command acts on motors with their own lag: the model's latency is not added, that of a
-    randomisation is; its factors on the model's kinematics mean nothing here. ConfigError if
-    MuJoCo, textbook kinematics, a parameter of the machine or free space in the world is missing.
+    Commands act on motors with their own lag, so the model's latency is not added. A randomisation
+    adds its latency, but its factors on the model's kinematics have no effect. Raises ConfigError
+    if MuJoCo, textbook kinematics, a parameter of the machine or free space is missing.
     """
 
     def __init__(
@@ -220,7 +222,7 @@ class MujocoSimulator(DrivenSimulator):
     def reset(
         self, seeds: ArrayLike, worlds: ArrayLike | None = None, starts: Starts = None
     ) -> Scenes:
-        """Begins the episode of a seed (1,), at poses (1, M, 3); see `FastSimulator.reset`."""
+        """Starts the episode of a seed (1,) at poses (1, M, 3); see `FastSimulator.reset`."""
         scenes = super().reset(seeds, worlds, starts)
         self._compile(scenes.bodies[0])
         for rig, pose in zip(self._rigs, self.data.pose[0], strict=True):
@@ -229,14 +231,14 @@ class MujocoSimulator(DrivenSimulator):
         return scenes
 
     def put_bodies(self, bodies: Array) -> None:
-        """Puts the obstacles, see `FastSimulator.put_bodies`, and compiles the scene anew."""
+        """Puts the obstacles, see `FastSimulator.put_bodies`, and recompiles the scene."""
         super().put_bodies(bodies)
         motions = [rig.motion(self._data, self._rest) for rig in self._rigs]
         self._compile(bodies)
         self._resume(motions)
 
     def put_robot(self, robot: int, pose: Array, state: Array) -> None:
-        """Puts a robot, see `FastSimulator.put_robot`; its wheels follow from their motors."""
+        """Puts a robot, see `FastSimulator.put_robot`; the motors bring its wheels up to speed."""
         super().put_robot(robot, pose, state)
         rig = self._rigs[robot]
         rig.put(self._data, self._rest, pose)
@@ -246,7 +248,7 @@ class MujocoSimulator(DrivenSimulator):
     def take_over(
         self, other: FastSimulator, robots: Indices, obstacles: Indices
     ) -> None:
-        """Goes on with another's episode; see `FastSimulator.take_over`."""
+        """Continues the episode of another simulator; see `FastSimulator.take_over`."""
         super().take_over(other, robots, obstacles)
         if isinstance(other, MujocoSimulator):
             self.wheels[: len(robots)] = other.wheels[robots]
@@ -260,7 +262,7 @@ class MujocoSimulator(DrivenSimulator):
         self._mujoco.mj_forward(self._simulation, self._data)
 
     def _compile(self, bodies: Array) -> None:
-        """Compiles the scene with obstacles (K, 7), whose robots are then to be put."""
+        """Compiles the scene with obstacles (K, 7); the robots must be placed afterwards."""
         spec = self.model.robot
         robots = self.data.pose.shape[1]
         member = int(self.data.member[0])
@@ -285,7 +287,10 @@ class MujocoSimulator(DrivenSimulator):
         self._bumper_of = scenery.find_bumpers(compiled, robots)
 
     def step(self, commands: ArrayLike) -> None:
-        """Moves one control period by commands (1, M, C), clipped. ConfigError, BackendError."""
+        """Moves by one control period with commands (1, M, C), clipped to their limits.
+
+        Raises ConfigError, BackendError.
+        """
         commands = np.asarray(commands, dtype=np.float64)
         shape = (1, len(self._rigs), len(self.model.robot.command))
         if commands.shape != shape:
@@ -346,7 +351,7 @@ class MujocoSimulator(DrivenSimulator):
 
 
 def divide(period: float, longest: float) -> tuple[int, int, float]:
-    """Returns parts of a period of about `ENCODER_PERIOD_S`, steps per part, and the step [s]."""
+    """Divides a period: returns parts of about `ENCODER_PERIOD_S`, steps per part, step [s]."""
     parts = max(1, round(period / ENCODER_PERIOD_S))
     steps = max(1, math.ceil(period / parts / longest - 1e-6))
     return parts, steps, period / parts / steps
@@ -359,7 +364,10 @@ def record(
     dt: float = ROW_S,
     hold: float = HOLD_S,
 ) -> Recording:
-    """Drives at random, a new command each `hold` [s], and records each `dt` [s]; BackendError."""
+    """Drives at random, with a new command every `hold` [s], and records every `dt` [s].
+
+    Raises BackendError.
+    """
     spec = robot.spec
     per_hold = round(hold / dt)
     holds = int(np.ceil(duration / hold))

@@ -1,4 +1,4 @@
-"""Training on a Ray cluster, or on one of this machine: RLlib's PPO, with the worlds spread out."""
+"""Training with RLlib's PPO on a Ray cluster or on this machine, with distributed worlds."""
 
 import copy
 import functools
@@ -46,12 +46,12 @@ from nics_drl_bridge.policy.training_settings import TrainingSettings
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
 FORMAT = "nics_drl_bridge/ray_checkpoint/1"
-# parameters of the loss, as in Stable-Baselines3
+# loss parameters, as in Stable-Baselines3
 VALUE_WEIGHT = 0.5
 GRADIENT_LIMIT = 0.5
-SILENCE_S = 600.0  # without a step from any env runner, after which a run ends; it can be resumed
-TRIED_S = 5.0  # timeout of an attempt to connect to an address [s]
-# time that a roll-out waits for a lost env runner [s]; later ones try again
+SILENCE_S = 600.0  # a run ends after this time without a step; it can be resumed
+TRIED_S = 5.0  # timeout for connecting to an address [s]
+# time that a rollout waits for a lost env runner [s]; later rollouts try again
 PROBE_S = 1.0
 ENDED, SUCCESS, COLLISION, STEPPING = "ended", "success", "collision", "stepping_s"
 """Names of a runner's metrics: numbers of episodes, and time in the simulator [s]."""
@@ -61,19 +61,18 @@ ENDED, SUCCESS, COLLISION, STEPPING = "ended", "success", "collision", "stepping
 class Rollout:
     """T steps of N worlds."""
 
-    seen: NDArray[
-        np.float32
-    ]  # (T + 1, N, O); after an episode, the first of the next one
+    # (T + 1, N, O) observations; after an episode, the first of the next one
+    seen: NDArray[np.float32]
     actions: NDArray[Any]  # (T, N, ...)
-    logits: NDArray[np.float32]  # (T, N, ...) parameters of the distribution of actions
+    logits: NDArray[np.float32]  # (T, N, ...) parameters of the action distribution
     logp: NDArray[np.float32]  # (T, N) log probabilities of the actions
     rewards: NDArray[np.float32]  # (T, N)
     final: dict[tuple[int, int], tuple[NDArray[np.float32], bool]]
     """(t, n) -> last observation (O,) of the episode that ended in step t of world n, and True if
-    it only ran out of time."""
+    the time limit truncated it."""
 
     def episodes(self) -> Iterator[SingleAgentEpisode]:
-        """Yields the pieces of episodes in the roll-out, each of one world."""
+        """Yields the (parts of) episodes in the rollout, world by world."""
         steps, worlds = self.rewards.shape
         cuts: list[list[int]] = [[] for _ in range(worlds)]
         for t, n in sorted(self.final):
@@ -101,13 +100,13 @@ class Rollout:
 
 
 class WorldsRunner(SingleAgentEnvRunner):
-    """Steps its share of the worlds of a training; `env_config` is made by `_build_algorithm`."""
+    """Steps its share of a training's worlds; `_build_algorithm` makes its `env_config`."""
 
     def make_env(self) -> None:
         """Makes the worlds of this runner; each runner draws different episodes."""
         chosen = self.config.env_config
         torch.set_num_threads(chosen["threads"])
-        # Arrays shared by Ray are read-only; the kernels would be compiled again for them.
+        # Copy, because arrays shared by Ray are read-only and would need kernels of their own.
         make = copy.deepcopy(ray.get(chosen["make"]))
         self.env: TrainVecEnv = make(self.worker_index - 1, self.num_workers)
         self.num_envs = self.env.num_envs
@@ -116,14 +115,14 @@ class WorldsRunner(SingleAgentEnvRunner):
         self._seen = self.env.reset()
 
     def get_spaces(self) -> dict[str, Any]:
-        """Spaces of observations and actions, as RLlib names them."""
+        """Returns the observation and action spaces under RLlib's names."""
         pair = self.config.observation_space, self.config.action_space
         return dict.fromkeys(
             (INPUT_ENV_SPACES, INPUT_ENV_SINGLE_SPACES, DEFAULT_MODULE_ID), pair
         )
 
     def _sample(self, **kwargs: Any) -> list[SingleAgentEpisode]:
-        """Runs one roll-out; its length is fixed, whatever RLlib requests."""
+        """Runs one rollout, whose length is fixed, whatever RLlib requests."""
         steps = int(self.config.env_config["rollout"])
         busy = self.env.stepping_s
         *arrays, finals = zip(*(self._step(t) for t in range(steps)), strict=True)
@@ -166,7 +165,7 @@ Batch = dict[str, Any]
 
 
 class ActorCritic(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
-    """`Actor` and a critic alike; `model_config` holds `hidden`, `normaliser` and `log_std`."""
+    """`Actor` and a similar critic; `model_config` has `hidden`, `normaliser` and `log_std`."""
 
     def setup(self) -> None:
         """Builds the layers."""
@@ -181,7 +180,7 @@ class ActorCritic(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
             self.log_std = torch.nn.Parameter(spread)
 
     def get_non_inference_attributes(self) -> list[str]:
-        """Names of the attributes that env runners do not need."""
+        """Returns the names of attributes that env runners do not need."""
         return ["critic"]
 
     def _forward(self, batch: Batch, **kwargs: Any) -> Batch:
@@ -191,7 +190,7 @@ class ActorCritic(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
         return {Columns.ACTION_DIST_INPUTS: raw}
 
     def compute_values(self, batch: Batch, embeddings: Any = None) -> torch.Tensor:
-        """Values (n,) of observations (n, O)."""
+        """Returns the values (n,) of observations (n, O)."""
         values: torch.Tensor = self.critic(self.actor.normaliser(batch[Columns.OBS]))
         return values.squeeze(-1)
 
@@ -200,21 +199,24 @@ class ActorCritic(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
 def learner(
     address: str | None, env_runners: int | None, worlds: int
 ) -> Iterator[Callable[..., train.Trained]]:
-    """Connects with a cluster, see `connect`; gives the function that trains one policy on it."""
+    """Connects to a cluster, see `connect`; yields the function that trains one policy on it."""
     with connect(address, env_runners, worlds) as runners:
         yield functools.partial(train_on_ray, runners=runners)
 
 
 @contextmanager
 def connect(address: str | None, runners: int | None, worlds: int) -> Iterator[int]:
-    """Connects with `auto`, `HOST:PORT` or an own cluster, and yields its runners. ConfigError."""
+    """Connects to `auto`, `HOST:PORT` or, for None, a new local cluster.
+
+    Yields the number of env runners. Raises ConfigError.
+    """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    # A lost worker is no error here, and Ray's messages about it would disturb the progress bar.
+    # A lost worker is not an error here, and Ray's messages about it would break the progress bar.
     os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")
     logging.getLogger("ray.rllib").setLevel(logging.CRITICAL)
     local = {"include_dashboard": False} if address is None else {}
     try:
-        if address not in (None, "auto"):  # Ray itself would try for minutes
+        if address not in (None, "auto"):  # check first: Ray would try for minutes
             host, _, port = str(address).rpartition(":")
             socket.create_connection((host, int(port)), TRIED_S).close()
         ray.init(
@@ -258,7 +260,10 @@ def train_on_ray(
     resumed: bool = False,
     runners: int = 1,
 ) -> train.Trained:
-    """`policy.train.train` on the connected cluster; ConfigError also if no runner answers."""
+    """Trains like `policy.train.train`, on the connected cluster.
+
+    Raises ConfigError, also if no runner answers.
+    """
     if settings.algorithm != "ppo":
         algorithm_name = settings.algorithm
         raise ConfigError(
@@ -292,7 +297,7 @@ def train_on_ray(
 
 @dataclass
 class Learning:
-    """A training in progress, with the path of its checkpoint and the number of env runners."""
+    """A training in progress; `path` is its checkpoint, `runners` the number of env runners."""
 
     algorithm: PPO
     settings: TrainingSettings
@@ -300,9 +305,9 @@ class Learning:
     path: Path
     runners: int
     steps: int = 0
-    stepping_s: float = 0.0  # in the simulator, averaged over the env runners
+    stepping_s: float = 0.0  # time in the simulator, averaged over env runners [s]
     recent: deque[tuple[int, int, int]] = field(default_factory=deque)
-    """Per roll-out, for the last ones: episodes ended, successes, collisions."""
+    """Per rollout, for the latest ones: ended episodes, successes, collisions."""
 
     @property
     def learner(self) -> Any:
@@ -317,7 +322,7 @@ class Learning:
         return network
 
     def run(self, tell: train.Tell, about: dict[str, Any]) -> None:
-        """Learns until all steps are done, and saves checkpoints."""
+        """Learns until all steps are done; saves checkpoints."""
         logger = configure(str(self.path.parent), ["tensorboard"])
         begin = heard = time.perf_counter()
         first = saved = self.steps
@@ -367,14 +372,14 @@ class Learning:
         )
 
     def save(self, about: dict[str, Any]) -> None:
-        """Saves network and optimiser."""
+        """Saves the network and the optimiser."""
         content = {"format": FORMAT, "about": json.dumps(about), "steps": self.steps}
         optimiser = self.learner.get_optimizer().state_dict()
         states = {"network": self.module.state_dict(), "optimiser": optimiser}
         write_content(self.path, content | states)
 
     def resume(self, content: dict[str, Any]) -> None:
-        """Continues with network and optimiser of a checkpoint; the worlds start afresh."""
+        """Continues with a checkpoint's network and optimiser; the worlds start afresh."""
         self.steps = int(content["steps"])
         self.module.load_state_dict(content["network"])
         self.learner.get_optimizer().load_state_dict(content["optimiser"])
@@ -418,7 +423,7 @@ def select_worlds(
     runner: int,
     runners: int,
 ) -> TrainVecEnv:
-    """The worlds of env runner number `runner`: every `runners`-th."""
+    """Makes the worlds of env runner number `runner`: every `runners`-th."""
     names = [name for name, count in settings.worlds.items() for _ in range(count)]
     counts = dict(Counter(names[runner::runners]))
     return train.make_train_env(
