@@ -1,1 +1,1 @@
-"""The middleware between a robot's topics and the users of its view. Independent of ROS."""
+"""Middleware between a robot's topics and the consumers of its view, independent of ROS."""

@@ -1,4 +1,4 @@
-"""State of the filter at a time, and bounds on motion that no data showed."""
+"""The filter's state at a time, and bounds on unobserved motion."""
 
 from itertools import product
 from typing import NamedTuple
@@ -11,11 +11,10 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.middleware.kernels import Clone
 from nics_drl_bridge.middleware.turning import Gyro
 
-# Uncertainty of the time that was not observed: transmission sometimes takes longer [s]
+# Margin on the length of an unobserved time, because transmission delays vary [s]
 JITTER_S = 0.2
-SPEED_MARGIN = (
-    1.2  # factor by which noise or slip may exceed the model's maximum speeds
-)
+# Factor by which noise or slip may exceed the model's maximum speeds
+SPEED_MARGIN = 1.2
 SPEED_LEVELS = 3  # values tried per variable to find the maximum speeds
 MAX_COMBINATIONS = 4096
 
@@ -26,17 +25,14 @@ class Belief(NamedTuple):
     time_ns: int
     mean: Array  # (3 + S,) x [m], y [m], heading [rad] in `map`, then the state of the RobotSpec
     covariance: Array
-    outliers: tuple[int, ...]  # consecutive ones, by kind
+    outliers: tuple[int, ...]  # number of consecutive outliers, by kind
     clone: Clone | None  # None before the first odometry that was used
-    lost: bool  # True if the robot may have moved unobserved since
-    # (3 + S, S) Jacobian of the last prediction with respect to an error of the state's rates
+    lost: bool  # True after a gap too long to predict, until an odometry or a pose
+    # (3 + S, S) Jacobian of the last prediction with respect to an error in the state's rates
     rates_jacobian: Array
-    noise_scale: tuple[float, ...] = (
-        1.0,
-        1.0,
-        1.0,
-    )  # (3,) factors of variances, by kind
-    innovations: Array = np.zeros((3, 3))  # (3, 3) the newest innovation, by kind
+    # (3,) factors on the noise variances, by kind
+    noise_scale: tuple[float, ...] = (1.0, 1.0, 1.0)
+    innovations: Array = np.zeros((3, 3))  # (3, 3) newest innovation of each kind
     gyro: Gyro | None = None  # None before the first yaw rate
 
 
@@ -69,10 +65,11 @@ def find_max_speeds(model: SimulatorModel) -> tuple[float, float]:
 
 
 class UnobservedMotion:
-    """Bounds the motion of a robot while it sends no data, and bridges that time by odometry.
+    """Bounds the motion of a robot while it sends no data, and bridges that time with odometry.
 
-    The covariance grows by `process` (3 + S, 3 + S) per second; `noise` (3, 3) is that of a
-    measured twist, `stuck_variance` (3 + S,) that of the state if the robot may be stuck or pushed.
+    The covariance grows by `process` (3 + S, 3 + S) per second. A measured twist has covariance
+    `noise` (3, 3). The state of a robot that may be stuck or pushed has variance `stuck_variance`
+    (3 + S,).
     """
 
     def __init__(
@@ -84,18 +81,18 @@ class UnobservedMotion:
     ) -> None:
         self._stuck_variance = stuck_variance
         self.max_speeds = find_max_speeds(model)  # [m/s], [rad/s]
-        # Variance (3,) that a pose by odometry gains in a second [m^2, m^2, rad^2]: it integrates
-        # twists, so their noise is a random walk with a step each period.
+        # Variance (3,) that an odometry pose gains per second [m^2, m^2, rad^2]. It integrates
+        # twists, so their noise is a random walk with one step per period.
         self._random_walk = np.diag(process)[:3] + np.diag(noise) * model.control_period
 
     def bound_motion(self, seconds: float) -> tuple[float, float]:
-        """Returns the maximum distance [m] and turn [rad] in a time."""
+        """Returns the maximum distance [m] and turn [rad] within a number of seconds."""
         speed, rate = self.max_speeds
         longest = max(seconds, 0.0) + JITTER_S
         return speed * longest, min(rate * longest, np.pi)
 
     def widen(self, covariance: Array, seconds: float) -> Array:
-        """Returns a covariance (3 + S, 3 + S) by which the robot may be anywhere within reach."""
+        """Returns a covariance (3 + S, 3 + S) that lets the robot be anywhere within reach."""
         widened = decorrelate_pose(covariance)
         distance, turn = self.bound_motion(seconds)
         variance = np.maximum(self._stuck_variance, np.diag(widened))
@@ -107,7 +104,7 @@ class UnobservedMotion:
     def bridge(
         self, clone: Clone, odom: Array, seconds: float
     ) -> tuple[Array, Array] | None:
-        """Returns pose (3,) and covariance where odometry has `odom`; None if beyond reach."""
+        """Returns pose (3,) and covariance (3, 3) at odometry pose `odom`; None if out of reach."""
         moved = geometry.between(clone.odometry.pose, odom)
         distance, turn = self.bound_motion(seconds)
         near = np.hypot(*moved[:2]) <= SPEED_MARGIN * distance
@@ -122,11 +119,12 @@ class UnobservedMotion:
         return pose, covariance + self._compute_drift(lever, distance, seconds)
 
     def _compute_drift(self, lever: Array, distance: float, seconds: float) -> Array:
-        """Returns the covariance (3, 3) that a pose by odometry gains on a path with `lever` (2,).
+        """Returns the covariance (3, 3) that an odometry pose gains on a path.
 
-        A heading error that grows along the path rotates the rest of it: on a straight path with a
-        third of its variance at the end. A path that was not straight may have led aside, at most
-        as far as the maximum `distance` allows; Thrun et al., Probabilistic Robotics, Sec. 5.4.
+        `lever` (2,) is the path's displacement [m], rotated by 90 degrees. A heading error that
+        grows along the path rotates the rest of the path. On a straight path, a third of the final
+        heading variance acts on the position. Other paths may deviate sideways, at most as far as
+        the maximum `distance` [m] allows. See Thrun et al., Probabilistic Robotics, Sec. 5.4.
         """
         seconds = max(seconds, 0.0)
         position = max(self._random_walk[:2]) * seconds

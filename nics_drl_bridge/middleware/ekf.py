@@ -7,17 +7,17 @@ How it works:
 2. **Absolute measurements.** A pose corrects by the usual update, which filterpy computes. A yaw
    rate corrects nothing by itself: the next odometry's turn is fused with it, see `turning`.
 3. **Odometry** is two measurements. The twist is a snapshot and corrects by the usual update. The
-   pose relative to the odometry before integrates the wheels' motion in between: it measures the
+   pose relative to the previous odometry integrates the wheels' motion in between: it measures the
    difference of two states, the present one and an earlier one. The filter therefore keeps a
    `Clone` of the state at the newest odometry used, and its covariance with the present state
    (stochastic cloning; Roumeliotis and Burdick 2002). Predictions and other measurements keep the
    clone up to date; the next relative pose corrects the present state, and a new clone is made.
    `kernels.correct_by_odometry` computes both updates at once.
 4. **Gates.** A measurement whose normalised innovation squared (NIS) is too large is an outlier,
-   unless it is news (the robot is stuck or pushed), or the last one of a row that is believed (a
-   jump).
-5. **Late measurements** are not handled here: `timeline` sets the filter back to the `Belief`
-   before them, and replays everything since.
+   unless it is plausible for a robot that is stuck or pushed (news), or follows so many outliers
+   that it is believed (a jump).
+5. **Late measurements** are not handled here: `timeline` resets the filter to the `Belief` before
+   them, and replays everything since.
 """
 
 from typing import TypeVar
@@ -56,8 +56,8 @@ from nics_drl_bridge.middleware.turning import (
 )
 from nics_drl_bridge.robot.kernels import SERIES, make_terms, wrap
 
-# Lower bounds on the model's error after a second: of the pose [m or rad / sqrt(s)], and of the
-# state as a fraction of its range [1 / sqrt(s)]
+# Lower bounds on the model's error after a second: pose [m or rad / sqrt(s)], and state as a
+# fraction of its range [1 / sqrt(s)]
 MIN_POSE_DRIFT = 1e-2
 MIN_STATE_DRIFT = 2e-2
 MIN_SLIP = 5e-3  # lower bound on the motion that wheels miss [m or rad / sqrt(s)]
@@ -65,22 +65,22 @@ MIN_SLIP = 5e-3  # lower bound on the motion that wheels miss [m or rad / sqrt(s
 MIN_TWIST_STD = 1e-3
 MIN_POSE_STD = 1e-3
 START_STD = 1e-3  # standard deviation of the pose at a reset [m, rad]
-# Standard deviations of a pose in a pose sensor's map before the first such pose [m, m, rad]
+# Standard deviations of the pose before the first one of a pose sensor [m, m, rad]
 ANYWHERE = (100.0, 100.0, np.pi)
 GATE = 16.27  # 99.9 % of chi-squared with 3 degrees of freedom
 MEDIAN_NIS = 2.37  # median of chi-squared with 3 degrees of freedom
-# Consecutive outliers after which they are believed
+# Number of consecutive outliers after which they are believed
 PATIENCE = {Kind.TWIST: 3, Kind.POSE: 5}
-# The noise may be larger than stated, and nearly all measurements would then be outliers. Factors
-# on its variance: after each outlier, after each measurement that fits well, and their upper bound
+# Noise larger than stated would turn nearly all measurements into outliers. Its variance is
+# therefore scaled up after noisy outliers, and down again after measurements that fit well.
 NOISE_GROWTH = 4.0
 NOISE_DECAY = 0.93
 MAX_NOISE_SCALE = 100.0
 # Possible error of the state of a stuck or pushed robot, as a fraction of its range
 STUCK_DEVIATION = 0.5
 RANGE_FACTOR = 2.0  # states and commands are clipped to this multiple of their range
-MAX_INNOVATION = 1e8  # larger ones [m, rad, m/s, rad/s] are never believed
-# Maximum speeds [m/s, rad/s] of a robot at rest: by the model, and by odometry
+MAX_INNOVATION = 1e8  # no larger innovation is ever believed [m, rad, m/s, rad/s]
+# A robot counts as at rest below these speeds [m/s, rad/s], by the model and by odometry.
 REST_EXPECTED = 0.01
 REST_MEASURED = 0.05
 # Longest gap that is predicted [s]; after a longer one, the robot may be anywhere within reach
@@ -89,10 +89,11 @@ T = TypeVar("T")
 
 
 class Estimator:
-    """Pose and state of one robot, predicted by the fitted model, corrected by measurements.
+    """Pose and state of one robot, predicted by the fitted model and corrected by measurements.
 
-    The model's drift is Q, its sensors' noise R, its latency delays the commands. Time is in whole
-    nanoseconds, for identical bits. Measurements apply now; `Timeline` inserts late ones.
+    The model's drift is Q, its sensor noise is R, and its latency delays the commands. Time is in
+    integer nanoseconds, so that results are bit-identical. Measurements apply at the present time;
+    `Timeline` inserts late ones.
     """
 
     def __init__(self, model: SimulatorModel) -> None:
@@ -124,7 +125,7 @@ class Estimator:
             Kind.TWIST: np.diag([linear, linear, angular]) ** 2,
             Kind.POSE: np.diag(np.maximum(model.noise.pose, MIN_POSE_STD) ** 2),
         }
-        # Measured drift is motion that the model misses, but not the wheels. Assumed drift may be
+        # Measured drift is motion that the model misses but the wheels see. Assumed drift may be
         # slip.
         assumed = drift**2 - model.noise.simulated_drift(model.robot) ** 2
         self._odometry_model = OdometryModel(
@@ -138,16 +139,16 @@ class Estimator:
             model, self._process, self._noise[Kind.TWIST], self._stuck_variance
         )
         self._pose_jacobian = np.eye(3, 3 + size)
-        # Of a prediction over no time: an error of the rates moved the state, and not yet the pose.
+        # Rates Jacobian of a zero-length prediction: errors moved the state, but not yet the pose.
         self._start_jacobian = np.eye(3 + size, size, -3)
         self._filter = ExtendedKalmanFilter(3 + size, 3)
         self._clone: Clone | None = None
-        # Predicted twist and its Jacobian, if belief and commands have not changed since
+        # Predicted twist and its Jacobian; None once belief or commands have changed
         self._twist: tuple[Array, Array] | None = None
         self.reset(0, np.zeros(3))
 
     def reset(self, time_ns: int, pose: ArrayLike, std: ArrayLike = START_STD) -> None:
-        """Starts at a time [ns], at rest at a pose (3,) in `map` with a deviation [m, rad]."""
+        """Starts at a time [ns], at rest at a pose (3,) in `map` with deviations `std` [m, rad]."""
         mean = np.zeros(self._filter.dim_x)
         deviation = np.full(self._filter.dim_x, START_STD)
         mean[:3] = pose
@@ -164,10 +165,10 @@ class Estimator:
         self._log = make_log(np.zeros(len(self._command_limits[0])))
 
     def restart(self, time_ns: int, seconds: float, command: Array) -> None:
-        """Starts again at the last pose, at a time [ns] to which the clock was set.
+        """Restarts at the last pose after the clock was set to a time [ns].
 
-        The robot may be anywhere that it reaches in the seconds since the last odometry. The
-        command (C,) is in effect.
+        The robot may be anywhere it can reach in the seconds since the last odometry. The command
+        (C,) is in effect.
         """
         gyro = self._gyro
         if gyro is not None:
@@ -186,7 +187,7 @@ class Estimator:
 
     @property
     def belief(self) -> Belief:
-        """State of the filter; set to an earlier one when the past has changed."""
+        """State of the filter. `Timeline` sets it back when the past has changed."""
         return Belief(
             self.time_ns,
             self._filter.x,
@@ -216,18 +217,18 @@ class Estimator:
 
     @property
     def covariance(self) -> Array:
-        """(3 + S, 3 + S) of pose and state."""
+        """Covariance (3 + S, 3 + S) of pose and state."""
         return np.array(self._filter.P)
 
     @property
     def twist_covariance(self) -> Array:
-        """(3, 3) of the body twist that follows from pose and state."""
+        """Covariance (3, 3) of the body twist that follows from pose and state."""
         _, jacobian = self._predict_measurement(Kind.TWIST)
         covariance: Array = jacobian @ self._filter.P @ jacobian.T
         return covariance + MIN_TWIST_STD**2 * np.eye(3)
 
     def clone_state(self, odom: Array, twist: Array) -> None:
-        """Clones the present state, for an odometry with a pose (3,) and a body twist (3,)."""
+        """Clones the present state for an odometry with pose (3,) and body twist (3,)."""
         covariance = self._filter.P
         odometry = Odometry(self.time_ns, odom, twist)
         cross = covariance[:, :3].copy()
@@ -240,9 +241,9 @@ class Estimator:
     def add_command(
         self, stamp_ns: int, command: ArrayLike, needed_ns: int | None = None
     ) -> bool:
-        """Adds a command (C,) sent at a time [ns]; False if there is one of that time.
+        """Adds a command (C,) sent at a time [ns]; returns False if that time already has one.
 
-        The estimate may be set back as far as `needed_ns`, by default not at all.
+        Keeps the commands in effect from `needed_ns` on, by default from the present estimate on.
         """
         if needed_ns is None:
             needed_ns = self.time_ns
@@ -299,7 +300,7 @@ class Estimator:
     def update(
         self, kind: Kind, value: ArrayLike, std: ArrayLike | None = None
     ) -> Judgement:
-        """Corrects by a measured value (n,), with its standard deviations or the model's."""
+        """Corrects by a measured value (n,) with deviations `std` (n,), by default the model's."""
         noise = None
         if std is not None:
             noise = np.diag(np.atleast_1d(std) ** 2.0)
@@ -307,7 +308,7 @@ class Estimator:
         return self.correct(Measurement(kind, measured, noise))
 
     def take_yaw_rate(self, time_ns: int, measurement: Measurement) -> Judgement:
-        """Takes a yaw rate measured at a time; the next odometry turns by it, see `turning`."""
+        """Takes a yaw rate measured at a time [ns]; the next odometry fuses it, see `turning`."""
         variance = None
         if measurement.noise is not None:
             variance = float(measurement.noise[0, 0])
@@ -321,7 +322,7 @@ class Estimator:
         return Judgement(nis, Acceptance.OUTLIER)
 
     def correct(self, measurement: Measurement) -> Judgement:
-        """Corrects by a measurement at this time, after bridging unobserved motion."""
+        """Corrects by a measurement at the present time, after bridging unobserved motion."""
         if measurement.kind is Kind.YAW_RATE:
             return self.take_yaw_rate(self.time_ns, measurement)
         fused = self._fuse_gyro(measurement)
@@ -330,9 +331,8 @@ class Estimator:
         bridged = self._bridge(measurement)
         judgement = self._correct(measurement, not bridged)
         if judgement.outcome is Acceptance.OUTLIER and not bridged:
-            return (
-                judgement  # the relative pose of the next odometry then spans this one
-            )
+            # The relative pose of the next odometry then spans this one.
+            return judgement
         if fused is not None:
             self._gyro = fused.gyro
             if fused.heading_variance > 0.0:
@@ -346,7 +346,7 @@ class Estimator:
         return judgement
 
     def _fuse_gyro(self, measurement: Measurement) -> FusedOdometry | None:
-        """Fuses the turn of an odometry with the gyro's; None if there is no gyro."""
+        """Fuses an odometry's turn with the gyro's; returns None if that is not possible."""
         if self._gyro is None or self._clone is None or measurement.odom is None:
             return None
         variance = check_variance(measurement.turn_variance)
@@ -372,7 +372,7 @@ class Estimator:
         return measurement._replace(value=fused.twist, odom=fused.odom, noise=noise)
 
     def _is_at_rest(self, twist: Array) -> bool:
-        """Returns True if the model expects a robot at rest, and odometry does not disagree."""
+        """Returns True if model and odometry agree that the robot is at rest."""
         expected, _ = self._predict_measurement(Kind.TWIST)
         return bool(
             (np.abs(expected) < REST_EXPECTED).all()
@@ -380,7 +380,7 @@ class Estimator:
         )
 
     def _bridge(self, measurement: Measurement) -> bool:
-        """Moves the estimate by odometry over a time without data; False if there was none."""
+        """Bridges a time without data by odometry; returns False if there was no such time."""
         if not self._lost or measurement.odom is None:
             return False
         self._lost = False
@@ -419,8 +419,8 @@ class Estimator:
         else:
             self._correct_alone(measurement, outcome, innovation, jacobian, noise)
             if has_relative_pose:
-                # The twist has been used: with a Jacobian of zeros only the relative pose corrects.
-                # The same kernel serves, so that none has to be compiled while the robot moves.
+                # The twist has been used; a zero Jacobian leaves only the relative pose to correct.
+                # Reusing this kernel avoids compiling another one while the robot moves.
                 zeros = np.zeros_like(jacobian)
                 self._correct_by_odometry(measurement, np.zeros(3), zeros, noise)
         if outcome is not Acceptance.JUMP or kind is not Kind.TWIST:
@@ -467,7 +467,7 @@ class Estimator:
         if measurement.kind is Kind.POSE and outcome is Acceptance.JUMP:
             self._set_pose(measurement.value, noise)
         else:
-            # The innovation is known, so that filterpy subtracts an expected value of zero from it.
+            # The innovation is known, so filterpy gets an expected measurement of zero.
             self._filter.update(
                 innovation, lambda _: jacobian, lambda _: np.zeros(3), R=noise
             )
@@ -481,18 +481,18 @@ class Estimator:
         noise: Array,
         alternates: bool,
     ) -> Acceptance:
-        """Decides on a measurement beyond its gate; prepares the filter to use it."""
+        """Decides on a measurement beyond its gate, and prepares the filter to use it."""
         if not (np.abs(innovation) < MAX_INNOVATION).all():
             return Acceptance.OUTLIER
         covariance = self._filter.P
         max_noise = noise * (MAX_NOISE_SCALE / self._noise_scale[kind])
         nis = kernels.compute_nis(innovation, jacobian, covariance, max_noise)
-        # Errors that point to alternate sides are noise; larger ones are a glitch.
+        # Innovations that alternate in direction are noise, up to the maximum scale of the noise.
         is_noise = alternates and not nis > GATE
         is_believed = self._outliers[kind] + 1 >= PATIENCE[kind] and not is_noise
         if kind is Kind.TWIST:
             doubt = np.maximum(self._stuck_variance - np.diag(covariance), 0.0)
-            # What moved the state also moved the pose, since the prediction began.
+            # Whatever changed the state since the prediction began also moved the pose.
             moved = self._rates_jacobian @ np.linalg.inv(self._rates_jacobian[3:])
             doubted = covariance + (moved * doubt[3:]) @ moved.T
             if kernels.compute_nis(innovation, jacobian, doubted, noise) <= GATE:
@@ -517,14 +517,14 @@ class Estimator:
         return twist, jacobian
 
     def _is_alternating(self, kind: Kind, innovation: Array) -> bool:
-        """Returns True if an innovation points away from the one before, as noise makes it do."""
+        """Records an innovation; returns True if it opposes the last one, which suggests noise."""
         before = self._innovations[kind]
         self._innovations = self._innovations.copy()
         self._innovations[kind] = np.clip(innovation, -MAX_INNOVATION, MAX_INNOVATION)
         return bool(self._innovations[kind] @ before < 0.0)
 
     def _scale_noise(self, kind: Kind, noise: Array | None) -> Array:
-        """Returns the noise (n, n) of a measurement, by default the model's, as scaled by now."""
+        """Returns the scaled noise (n, n) of a measurement, by default the model's."""
         if noise is None:
             noise = self._noise[kind]
         return self._noise_scale[kind] * noise

@@ -2,8 +2,8 @@
 
 Shared arguments: `mean` is (3 + S,), `covariance` (3 + S, 3 + S); `begin`, `end` and `now` are
 times [ns]; `motion` is the `MotionModel`, `log` the `CommandLog`. A `transition` (3 + S, 3 + 2 S)
-is the Jacobian of a predicted mean with respect to the mean before and to a constant error of the S
-rates of the state in between. See `ekf` for how the parts work together.
+is the Jacobian of a predicted mean with respect to the mean before and to a constant error in the
+state's S rates. See `ekf` for how the parts work together.
 """
 
 import math
@@ -19,7 +19,7 @@ from nics_drl_bridge.robot import kernels as robot
 DIVERGED = 1e9  # bound on means and Jacobians; beyond, the model has diverged
 # Longest time between two odometries over which the mean of their twists gives the displacement [s]
 MAX_ARC_S = 0.25
-# Lower bound on a variable's variance given the variables before it, as a fraction of its variance
+# Lower bound on a variable's variance given the preceding ones, as a fraction of its variance
 MIN_PIVOT = 1e-12
 MIN_VARIANCE = 1e-18  # absolute lower bound on that variance
 
@@ -35,8 +35,8 @@ class Odometry(NamedTuple):
 class Clone(NamedTuple):
     """Copy of the state at the newest odometry used (stochastic cloning).
 
-    Measurements since then correct the copy, too. It is no longer `correlated` once the pose has
-    been set anew since: its covariance with the present state is then unknown.
+    Later measurements correct the copy as well. It is no longer `correlated` once the pose has been
+    set directly, because its covariance with the present state is then unknown.
     """
 
     odometry: Odometry
@@ -47,11 +47,11 @@ class Clone(NamedTuple):
 
 
 class OdometryModel(NamedTuple):
-    """What odometry's relative poses can be trusted with."""
+    """Error model of odometry's relative poses."""
 
     random_walk: Array  # (3, 3) covariance that wheel noise adds in a second
     slip: Array  # (3, 3) covariance of motion that wheels miss in a second
-    gate: float  # largest normalised innovation squared (NIS) of a relative pose
+    gate: float  # maximum normalised innovation squared (NIS) of a relative pose
     state_low: Array  # (S,) limits of the state
     state_high: Array
 
@@ -66,7 +66,7 @@ class MotionModel(NamedTuple):
 
 
 class CommandLog(NamedTuple):
-    """Commands in the order in which they take effect; the first one also holds before that."""
+    """Commands in the order in which they take effect; the first one also holds before its time."""
 
     effective: NDArray[np.int64]  # (K,) times without individual delays [ns]
     commands: Array  # (K, C)
@@ -80,7 +80,7 @@ def make_log(command: ArrayLike) -> CommandLog:
 
 @kernel(allocates=True)
 def compute_rates_jacobian(jacobian: Array, x: Array, terms: robot.Terms) -> None:
-    """Computes the Jacobian (3 + S, V) of `robot.kernels.rates` with respect to X."""
+    """Writes the Jacobian (3 + S, S + C) of `robot.kernels.rates` by state and command."""
     jacobian[:] = 0.0
     for k in range(terms.dof.shape[0]):
         for f in range(terms.degree[k]):
@@ -95,7 +95,7 @@ def compute_rates_jacobian(jacobian: Array, x: Array, terms: robot.Terms) -> Non
 
 @kernel
 def compute_drag_slope(value: float, dt: float, drag: float) -> float:
-    """Returns the derivative of a state after a step's drag with respect to it before."""
+    """Returns the derivative of a state after a step's drag with respect to the state before."""
     return 1.0 / (1.0 + dt * drag * abs(value)) ** 2
 
 
@@ -194,7 +194,7 @@ def insert_command(
 def read_commands(
     command: Array, time: int, motion: MotionModel, log: CommandLog
 ) -> int:
-    """Writes the commands (C,) in effect just before a time; returns when the next one is [ns]."""
+    """Writes the commands (C,) in effect just before a time; returns when they change next [ns]."""
     following = np.iinfo(np.int64).max
     for c in range(command.shape[0]):
         delay = motion.terms.late[c] * motion.step_ns
@@ -225,7 +225,7 @@ def propagate_mean(
     motion: MotionModel,
     log: CommandLog,
 ) -> None:
-    """Moves a mean and its transition in place between two times, command by command.
+    """Moves a mean and its transition in place from `begin` to `end`, command by command.
 
     After a gap that is too long, or if the model diverges, the pose is kept and the state is zero.
     """
@@ -282,13 +282,13 @@ def predict_estimate(
     motion: MotionModel,
     log: CommandLog,
 ) -> tuple[Array, Array, tuple[Array, Array], Array, Array]:
-    """Predicts an estimate between two times; `process` (3 + S, 3 + S) is its noise per second.
+    """Predicts an estimate from `begin` to `end`; `process` (3 + S, 3 + S) is its noise per second.
 
-    Returns mean, covariance, `predict_twist` there, and the Jacobians of the mean with respect to
-    an error of the state's rates (3 + S, S) and to the mean before (3 + S, 3 + S).
+    Returns mean, covariance, the result of `predict_twist`, and the Jacobians of the mean with
+    respect to an error in the state's rates (3 + S, S) and to the mean before (3 + S, 3 + S).
     """
-    # A model that is wrong stays wrong for a while: the error of the state's rates is constant in
-    # between, so that it moves the pose, too. A correction of the state then corrects the pose.
+    # A wrong model stays wrong for a while, so the error in the state's rates is taken as constant.
+    # It then moves the pose too, and a correction of the state also corrects the pose.
     moved = mean.copy()
     width = mean.shape[0]
     time = (end - begin) / NS_PER_S
@@ -310,7 +310,7 @@ def predict_estimate(
 def look_ahead(
     mean: Array, begin: int, end: int, motion: MotionModel, log: CommandLog
 ) -> tuple[Array, Array]:
-    """Predicts mean and body twist (3,) at a time; the present ones if that is earlier."""
+    """Predicts mean and body twist (3,) at `end`; returns the present ones if that is earlier."""
     moved = mean.copy()
     if end > begin:
         transition = make_transition(mean.shape[0], 0.0)
@@ -331,7 +331,7 @@ def compute_nis(
 def compute_update(
     covariance: Array, jacobian: Array, noise: Array
 ) -> tuple[NDArray[np.floating[Any]], Array]:
-    """Returns a measurement's Kalman gain (3 + S, n) and the covariance after it, as filterpy."""
+    """Returns the Kalman gain (3 + S, n) and the updated covariance, computed as in filterpy."""
     shared: Array = covariance @ jacobian.T
     gain = np.linalg.solve(jacobian @ shared + noise, shared.T).T.copy()
     left = np.eye(covariance.shape[0]) - gain @ jacobian
@@ -342,9 +342,9 @@ def compute_update(
 def correct_clone(
     clone: Clone, innovation: Array, jacobian: Array, covariance: Array, noise: Array
 ) -> Clone:
-    """Returns the clone after a measurement of the present state, whose `covariance` is given.
+    """Returns the clone after a measurement of the present state, which has the `covariance`.
 
-    The measurement has an innovation (n,), a Jacobian (n, 3 + S) and a noise (n, n).
+    The measurement has innovation (n,), Jacobian (n, 3 + S) and noise (n, n).
     """
     seen = jacobian @ clone.cross
     gain = np.linalg.solve(jacobian @ covariance @ jacobian.T + noise, seen)
@@ -358,7 +358,7 @@ def correct_clone(
 
 @kernel
 def compute_displacement(start: Array, end: Array) -> tuple[float, float]:
-    """Returns how far ahead and left of a pose another one lies [m]."""
+    """Returns how far `end` lies ahead of `start` and to its left [m]."""
     c = math.cos(start[2])
     s = math.sin(start[2])
     x = end[0] - start[0]
@@ -374,9 +374,9 @@ def agrees_with_twists(
     odometry: Odometry,
     model: OdometryModel,
 ) -> bool:
-    """Returns True if a relative pose (3,) is the arc of the twists at its ends.
+    """Returns True if a relative pose (3,) matches the arc given by the twists at its ends.
 
-    `slack` (3, 3) is the variance of the relative pose if the robot had either twist all the time.
+    `slack` (3, 3) is its variance because the robot may have had either twist in between.
     """
     seconds = (odometry.time_ns - clone.odometry.time_ns) / NS_PER_S
     if seconds > MAX_ARC_S:
@@ -387,7 +387,7 @@ def agrees_with_twists(
     arc = np.array([ahead + 0.5 * turn * left, left - 0.5 * turn * ahead, turn])
     residual = arc - 0.5 * seconds * (odometry.twist + clone.odometry.twist)
     spread = model.random_walk * seconds + 0.25 * slack
-    # Nobody knows where on its path the robot turned.
+    # It is unknown where along the path the robot turned.
     spread += np.diag((0.25 * turn * np.array([left, ahead, 0.0])) ** 2)
     return bool(residual @ np.linalg.solve(spread, residual) <= model.gate)
 
@@ -432,7 +432,7 @@ def correct_by_relative_pose(
 ) -> tuple[Array, Array]:
     """Corrects an estimate by odometry's pose relative to the clone's.
 
-    An unlikely relative pose is ignored, unless the twists at its ends confirm it: then the
+    Ignores an unlikely relative pose, unless the twists at its ends confirm it. In that case the
     prediction is wrong, and the relative pose replaces it.
     """
     seconds = (odometry.time_ns - clone.odometry.time_ns) / NS_PER_S
@@ -464,7 +464,7 @@ def correct_by_relative_pose(
     clone_shared = clone.cross.T @ jacobian.T + clone_covariance @ clone_jacobian.T
     random_walk = model.random_walk * seconds
     spread = jacobian @ shared + clone_jacobian @ clone_shared + random_walk
-    # Between two odometries the robot may have had the twist of either.
+    # Between two odometries the robot may have had either twist.
     slack = np.diag((0.5 * seconds * (odometry.twist - clone.odometry.twist)) ** 2)
     if innovation @ np.linalg.solve(spread + slack, innovation) <= model.gate:
         gain = np.linalg.solve(spread, shared.T)
@@ -493,8 +493,8 @@ def correct_by_odometry(
 ) -> tuple[Array, Array]:
     """Corrects an estimate by odometry's twist, then by its pose relative to the clone's.
 
-    The twist has an innovation (3,), a Jacobian (3, 3 + S) and a noise (3, 3); with a Jacobian of
-    zeros only the relative pose corrects.
+    The twist has innovation (3,), Jacobian (3, 3 + S) and noise (3, 3). With a zero Jacobian, only
+    the relative pose corrects.
     """
     corrected_clone = correct_clone(clone, innovation, jacobian, covariance, noise)
     gain, corrected = compute_update(covariance, jacobian, noise)
@@ -508,9 +508,10 @@ def correct_by_odometry(
 
 @kernel(allocates=True)
 def repair_estimate(mean: Array, covariance: Array, low: Array, high: Array) -> None:
-    """Wraps the heading, clips the state to [low, high] (S,), repairs the covariance's rounding.
+    """Wraps the heading, clips the state to [low, high] (S,) and repairs the covariance in place.
 
-    The covariance becomes symmetric, and each pivot of its Cholesky factor at least `MIN_PIVOT`.
+    Rounding errors are removed: the covariance becomes symmetric, and each pivot of its Cholesky
+    factorisation at least `MIN_PIVOT` of its variance.
     """
     size = mean.shape[0]
     mean[2] = robot.wrap(mean[2])

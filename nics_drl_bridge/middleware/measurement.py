@@ -1,4 +1,4 @@
-"""Measurements of a robot's sensors, their outcomes in the estimator, and health of the topics."""
+"""Measurements by a robot's sensors, their outcomes in the estimator, and health of the topics."""
 
 import math
 from dataclasses import dataclass, field
@@ -18,7 +18,7 @@ IMU = "imu"
 
 
 class Kind(IntEnum):
-    """Kind of measurement; of measurements with equal stamps, the lower kind is applied first."""
+    """Kind of measurement. At equal stamps, the lower kind is applied first."""
 
     TWIST = 0
     YAW_RATE = 1
@@ -35,23 +35,23 @@ class Measurement(NamedTuple):
 
     kind: Kind
     value: Array
-    noise: Array | None = None  # covariance of the value; None: the model's
-    odom: Array | None = None  # (3,) pose in `odom` that came with a twist
-    # Stated variance of a twist's yaw rate; None: the model's
+    noise: Array | None = None  # covariance of the value, by default the model's
+    odom: Array | None = None  # (3,) odometry pose that came with the twist
+    # Variance of the twist's yaw rate as reported, by default the model's
     turn_variance: float | None = None
 
 
 class Acceptance(IntEnum):
     """What the estimator did with a measurement."""
 
-    USED = 0  # within its gate, used
-    NEWS = 1  # beyond it, but plausible for a robot that is stuck or pushed, used
-    JUMP = 2  # beyond it too many times in a row to be an outlier, used
+    USED = 0  # used, within its gate
+    NEWS = 1  # used, beyond its gate, but plausible for a robot that is stuck or pushed
+    JUMP = 2  # used, beyond its gate too many times in a row to be an outlier
     OUTLIER = 3  # rejected
 
 
 class Judgement(NamedTuple):
-    """What the estimator made of a measurement."""
+    """The estimator's verdict on a measurement."""
 
     nis: float  # normalised innovation squared
     outcome: Acceptance
@@ -60,9 +60,9 @@ class Judgement(NamedTuple):
 def check_covariance(
     covariance: ArrayLike | None, size: int, min_std: float
 ) -> Array | None:
-    """Returns a covariance (size, size) with at least `min_std` in any direction.
+    """Returns a covariance (size, size) with a deviation of at least `min_std` in any direction.
 
-    None if it is unknown (or zeros). Raises ValueError if it is not a covariance.
+    Returns None if it is unknown (None or all zeros). Raises ValueError if it is not a covariance.
     """
     if covariance is None:
         return None
@@ -82,11 +82,11 @@ def check_covariance(
 
 @dataclass(frozen=True)
 class TopicHealth:
-    """Accepted data of a topic."""
+    """Statistics of a topic's accepted data."""
 
     received: int
-    rate_hz: float  # of arrival; 0 before the second
-    age_s: float  # since arrival
+    rate_hz: float  # of arrivals; 0 before the second
+    age_s: float  # since the latest arrival
     innovation: float = math.nan  # NIS of the newest `Judgement`; NaN without one
 
 
@@ -95,7 +95,8 @@ class Health:
     """Health of all topics of a robot that have data."""
 
     topics: dict[str, TopicHealth] = field(default_factory=dict)
-    # Counts by reason, which begins with the topic
+    # Counts by reason; each reason starts with the topic
     rejected: dict[str, int] = field(default_factory=dict)
-    noticed: dict[str, int] = field(default_factory=dict)  # used (`odom: news`)
-    replayed: int = 0  # late data, inserted at their stamps
+    # used, but unusual (`odom: news`)
+    noticed: dict[str, int] = field(default_factory=dict)
+    replayed: int = 0  # number of late data, inserted at their stamps

@@ -37,7 +37,7 @@ RATE_WINDOW = 32  # number of arrivals over which rates are computed
 
 
 class Datum(NamedTuple):
-    """A message with its stamp, arrival on the receiver's clock, and number of earlier ones."""
+    """A message with its stamp, arrival on the receiver's clock, and the number of earlier ones."""
 
     stamp_ns: int
     arrival_ns: int
@@ -47,7 +47,7 @@ class Datum(NamedTuple):
 
 @dataclass
 class TopicCache:
-    """The newest datum, number and latest arrivals [ns] by topic; rejected data by reason."""
+    """Newest datum, number and latest arrivals [ns] of data by topic; rejected data by reason."""
 
     newest: dict[str, Datum] = field(default_factory=dict)
     rejected: Counter[str] = field(default_factory=Counter)
@@ -55,7 +55,7 @@ class TopicCache:
     arrivals: dict[str, deque[int]] = field(default_factory=dict)
 
     def put(self, topic: str, stamp_ns: int, arrival_ns: int, value: Any) -> bool:
-        """Stores a datum unless it is older than the cached one, or a duplicate; True if stored."""
+        """Stores a datum unless it is older than the cached one or a duplicate; True if stored."""
         newest = self.newest.get(topic)
         if newest is not None and stamp_ns < newest.stamp_ns:
             return self.reject(f"{topic}: out of order")
@@ -102,9 +102,9 @@ class TopicCache:
 class Middleware:
     """Caches the newest datum of a robot's topics and estimates its state.
 
-    Simulator, nodes and vehicle all feed this class: the same data give the same view. Times are
-    stamps [ns]; arrivals are on the receiver's clock, which may differ from the stamps' clock. Data
-    that are refused are counted by reason, see `health`, and change nothing else.
+    Simulator, nodes and vehicle all feed this class, so the same data give the same view. Times are
+    stamps [ns]; arrivals are on the receiver's clock, which may differ from the stamps' clock.
+    Refused data are counted by reason, see `health`, and do not change the estimate.
     """
 
     def __init__(self, model: SimulatorModel) -> None:
@@ -117,7 +117,7 @@ class Middleware:
         self.reset(0, np.zeros(3))
 
     def reset(self, time_ns: int, pose: ArrayLike, std: ArrayLike = START_STD) -> None:
-        """Forgets everything; the robot is at rest at a pose (3,) in `map`, with a deviation."""
+        """Forgets everything; the robot is at rest at a pose (3,) in `map`, with deviations."""
         self.cache = TopicCache()
         self._clock_jumps = 0
         self._commanded = np.zeros(self._width)
@@ -127,7 +127,7 @@ class Middleware:
     def place(self, pose: ArrayLike, covariance: ArrayLike) -> None:
         """Moves the estimate to a pose (3,) in `map`, with a covariance (3, 3).
 
-        The robot's state, its odometry and all topics go on.
+        The robot's state, its odometry and all topics are kept.
         """
         belief = self.estimator.belief
         mean = belief.mean.copy()
@@ -149,7 +149,7 @@ class Middleware:
         self._timeline.reset()
 
     def expect_beams(self, beams: int) -> None:
-        """Sets the number of beams of the scans to come; the newest scan is forgotten."""
+        """Sets the number of beams of future scans, and forgets the newest scan."""
         self._beams = beams
         self.cache.newest.pop(SCAN, None)
 
@@ -158,7 +158,8 @@ class Middleware:
     ) -> bool:
         """Takes a command (C,) that was sent to the robot; True if it was used.
 
-        Without a stamp it counts as sent with the newest datum. Own commands have no arrival.
+        Without a stamp, it counts as sent with the newest datum. A node's own commands have no
+        arrival.
         """
         if stamp_ns is None:
             stamp_ns = max(self.newest_ns or self._start_ns, self._unstamped_ns + 1)
@@ -169,7 +170,7 @@ class Middleware:
             return self.cache.reject(f"{CMD_VEL}: {reason}")
         if not np.isfinite(value).all():
             return self.cache.reject(f"{CMD_VEL}: {NOT_FINITE}")
-        # The robot follows it whatever its stamp: the clock may have been set meanwhile.
+        # The robot follows it whatever its stamp, because the clock may have been set meanwhile.
         self._commanded = value
         refusal = self._stamps.find_fault(stamp_ns, arrival_ns)
         if refusal is None:
@@ -215,9 +216,9 @@ class Middleware:
     ) -> bool:
         """Takes an odometry: pose (3,) in `odom`, body twist (3,); True if it was accepted.
 
-        The twist corrects the estimate, and so does the pose relative to the odometry before; the
-        pose itself, which drifts, bridges motion without other data. The gyro's turn counts the
-        more, the larger the variance of the twist's yaw rate is, by default the model's.
+        The twist and the pose relative to the previous odometry correct the estimate. The pose
+        itself drifts, so it only bridges motion without other data. The larger the variance of the
+        twist's yaw rate, by default the model's, the more the gyro's turn counts.
         """
         value = np.array((pose, twist), dtype=np.float64)
         if not np.isfinite(value).all():
@@ -226,7 +227,7 @@ class Middleware:
         if refusal is not None:
             return self.cache.reject(f"{ODOM}: {refusal.reason}")
         if stamp_ns == self._start_ns and ODOM not in self.cache.newest:
-            # At a reset the pose is known: the odometry of that time adds nothing.
+            # The pose is known at a reset, so the odometry of that time adds nothing.
             self._timeline.clone_start(value[0])
             self._stamps.accept(stamp_ns, arrival_ns)
             self.cache.take(ODOM, stamp_ns, arrival_ns, value)
@@ -260,7 +261,7 @@ class Middleware:
     ) -> bool:
         """Takes a yaw rate [rad/s], by default with a cheap gyro's variance; True if used.
 
-        Odometry then turns by it, see `turning`.
+        The next odometry's turn is fused with it, see `turning`.
         """
         covariance = None if variance is None else [[variance]]
         return self._take_optional(
@@ -303,7 +304,7 @@ class Middleware:
     def _follow_clock(
         self, stamp_ns: int, arrival_ns: int, odometry: Measurement
     ) -> None:
-        """Starts again at the last pose, at the stamp of an odometry after the clock was set."""
+        """Restarts at the last pose and at the stamp of an odometry, after the clock was set."""
         seconds = 0.0
         if ODOM in self.cache.newest:
             last_ns = self.cache.newest[ODOM].arrival_ns
@@ -316,7 +317,7 @@ class Middleware:
 
     @property
     def commanded(self) -> Array:
-        """(C,) the latest command, whatever its stamp."""
+        """Latest command (C,), whatever its stamp."""
         return self._commanded
 
     @property
@@ -327,7 +328,7 @@ class Middleware:
         )
 
     def view(self, now_ns: int) -> RobotView:
-        """Returns the view of the robot at a time; NaN ranges before the first scan."""
+        """Returns the view of the robot at a time; its ranges are NaN before the first scan."""
         newest = self.cache.newest
         newest_ns = self.newest_ns
         if newest_ns is None:
@@ -366,7 +367,8 @@ class Middleware:
         rejected = dict(cache.rejected)
         noticed = dict[str, int]()
         for (kind, outcome), count in self._timeline.outcomes.items():
-            if outcome is Acceptance.USED or not count:  # a replay may have changed it
+            # A replay may have reset the count to 0.
+            if outcome is Acceptance.USED or not count:
                 continue
             counts = rejected if outcome is Acceptance.OUTLIER else noticed
             counts[f"{kind.topic}: {outcome.name.lower()}"] = count
@@ -376,7 +378,7 @@ class Middleware:
 
 
 def rehearse(model: SimulatorModel) -> RobotView:
-    """Compiles all kernels by two periods at rest; compiling while a robot moves takes seconds."""
+    """Compiles all kernels in two periods at rest, because compiling takes seconds."""
     middleware = Middleware(model)
     period_ns = round(model.control_period * 1e9)
     middleware.reset(0, np.zeros(3))

@@ -1,4 +1,4 @@
-"""Runs a recorded drive through the middleware in the order of receipt, with identical bits."""
+"""Runs a recorded drive through the middleware in order of receipt, bit for bit reproducible."""
 
 import io
 from collections.abc import Iterator, Mapping
@@ -38,21 +38,21 @@ TYPES: Mapping[str, tuple[str, ...]] = {
     POSE: (topic_roles.POSE, topic_roles.POSE_COVARIANCE),
     IMU: (topic_roles.IMU,),
 }
-# Roles that are played if the bag has them; the others are played on request only
+# Roles that are played if the bag has them; others are played only on request
 DEFAULT_ROLES = (SCAN, ODOM, CMD_VEL)
-MAX_OFFSET_S = 1.0  # between stamps of one clock at the same time of receipt [s]
+MAX_OFFSET_S = 1.0  # between stamps of one clock that are received at the same time
 COLUMNS = ("x", "y", "heading", "vx", "vy", "wz")
 
 
 @dataclass(frozen=True)
 class EstimatedDrive:
-    """Estimates of the middleware over a drive, after each of T odometries that were the newest."""
+    """Estimates over a drive, one after each of T odometries that were used and not late."""
 
     stamp_ns: NDArray[np.int64]  # (T,)
     pose: Array  # (T, 3) x [m], y [m], heading [rad] in `map`
     twist: Array  # (T, 3) vx, vy [m/s], wz [rad/s]
     covariance: Array  # (T, 3, 3) of the pose
-    rejected: Mapping[str, int]  # data by reason
+    rejected: Mapping[str, int]  # number of data by reason
 
     @cached_property
     def digest(self) -> str:
@@ -68,8 +68,9 @@ def estimate(
 ) -> EstimatedDrive:
     """Runs a bag through the middleware, with `topics` by role, see `choose_topics`.
 
-    The estimate is identical on every machine with the same versions. Raises RecordingError if the
-    bag is damaged, a topic missing or of a wrong type, or the data are stamped by several clocks.
+    The estimate is bit-identical on every machine with the same versions. Raises RecordingError if
+    the bag is damaged, a topic is missing or of a wrong type, no odometry can be used, or the data
+    are stamped by several clocks.
     """
     messages = read_messages(path, topics, model.gyro)
     playback = Playback(model, POSE in messages)
@@ -96,7 +97,7 @@ def estimate(
 
 
 def add_gyro_topic(path: str | Path, topics: Mapping[str, str]) -> Mapping[str, str]:
-    """Returns topics by role, with the gyro's topic of a usual name if none is given."""
+    """Returns topics by role; adds a gyro topic of a usual name if none is given."""
     if IMU in topics:
         if topics[IMU].strip("/") != topic_roles.NONE:
             return topics
@@ -123,10 +124,11 @@ def read_messages(
 
 
 def choose_topics(bag: BagFile, topics: Mapping[str, str]) -> dict[str, str]:
-    """Returns the topic of each role that is played; RecordingError if it is missing or wrong.
+    """Returns the topic of each role that is played.
 
-    `DEFAULT_ROLES` are played from topics of their names, unless `topics` names others; the other
-    roles are played only if `topics` names them.
+    `DEFAULT_ROLES` are played from topics of the same names, unless `topics` names others. Other
+    roles are played only if `topics` names them. Raises RecordingError if a topic is missing, empty
+    or of a wrong type.
     """
     roles = {}
     for role, kinds in TYPES.items():
@@ -190,8 +192,8 @@ def _check_clocks(
 class Playback:
     """Feeds the middleware as the nodes do.
 
-    With `has_pose`, a pose sensor gives the start; with `any_lidar`, the first scan determines the
-    `lidar`.
+    With `has_pose`, a pose sensor determines the start. With `any_lidar`, the first scan determines
+    the `lidar`.
     """
 
     def __init__(
@@ -274,11 +276,12 @@ def merge_messages(
     merged = [
         (role, message) for role in sorted(messages) for message in messages[role]
     ]
-    yield from sorted(merged, key=lambda entry: entry[1].receive_ns)  # a stable sort
+    # The sort is stable, so equal times keep the order of the roles.
+    yield from sorted(merged, key=lambda entry: entry[1].receive_ns)
 
 
 def write_estimate(drive: EstimatedDrive, path: str | Path) -> None:
-    """Writes an estimate as `.npz`, or otherwise as CSV with numbers in full precision."""
+    """Writes an estimate as `.npz` or, with any other suffix, as CSV in full precision."""
     if Path(path).suffix == ".npz":
         buffer = io.BytesIO()
         np.savez_compressed(

@@ -1,4 +1,4 @@
-"""Order of a robot's data in time: late data are replayed, implausible time stamps found."""
+"""Orders a robot's data in time: replays late data and finds implausible time stamps."""
 
 from bisect import bisect_left, bisect_right
 from collections import Counter, deque
@@ -19,10 +19,10 @@ from nics_drl_bridge.middleware.measurement import (
     Measurement,
 )
 
-HISTORY_NS = NS_PER_S  # late data may be so old [ns]
+HISTORY_NS = NS_PER_S  # maximum age of late data [ns]
 # A stamp may be ahead by this [ns], or by two control periods if these are longer
 FUTURE_NS = NS_PER_S
-# Consecutive odometries rejected for their stamps that show that a clock was set
+# Number of consecutive odometries with rejected stamps that shows that a clock was set
 CLOCK_JUMP = 10
 
 
@@ -30,14 +30,14 @@ class Refusal(NamedTuple):
     """Why a datum is not used."""
 
     reason: str
-    may_be_clock: bool = False  # True if a clock that was set explains it
+    may_be_clock: bool = False  # True if a clock that was set would explain it
 
 
 BEFORE_START = Refusal("not after the reset", may_be_clock=True)
 TOO_OLD = Refusal(f"older than {HISTORY_NS / NS_PER_S:g} s", may_be_clock=True)
 DUPLICATE = Refusal("duplicate")
 NO_INTEGER = Refusal("stamp is not an integer")
-# Stamp [ns] and kind: measurements are ordered by both, no matter in which order they arrive.
+# Stamp [ns] and kind. Measurements are ordered by both, whatever their order of arrival.
 Moment = tuple[int, int]
 
 
@@ -50,11 +50,11 @@ class _Entry:
 
 
 class Timeline:
-    """Feeds the estimator with measurements and commands by their stamps; nothing else may.
+    """Feeds the estimator with measurements and commands in the order of their stamps.
 
-    Late data are inserted at their stamps, and everything since is replayed from the filter's state
-    before, like robot_localization's `smooth_lagged_data`. The estimate is bit-identical no matter
-    in which order data arrive, unless they are older than `HISTORY_NS`.
+    Late data are inserted at their stamps, and everything since is replayed from the filter's
+    earlier state, like robot_localization's `smooth_lagged_data`. The estimate is bit-identical no
+    matter in which order data arrive, unless they are older than `HISTORY_NS`.
     """
 
     def __init__(self, estimator: Estimator) -> None:
@@ -76,7 +76,7 @@ class Timeline:
         return self._entries[-1].moment[0]
 
     def clone_start(self, odom: NDArray[np.float64]) -> None:
-        """Clones the start for its pose (3,) in `odom`, if nothing was measured since."""
+        """Clones the start for its odometry pose (3,), unless something was measured since."""
         if len(self._entries) == 1:
             self._estimator.clone_state(odom, np.zeros(3))
             self._entries[0].belief = self._estimator.belief
@@ -92,7 +92,7 @@ class Timeline:
         if place == len(self._entries):
             self._entries.append(self._run(moment, measurement))
             while self._entries[1].moment[0] < stamp_ns - HISTORY_NS:
-                self._entries.popleft()  # nothing before it can arrive any more
+                self._entries.popleft()  # earlier data would be refused
         elif self._entries[place].moment == moment:
             return DUPLICATE
         else:
@@ -130,7 +130,7 @@ class Timeline:
         return _Entry(moment, self._estimator.belief, measurement, judgement)
 
     def _replay(self, place: int) -> None:
-        """Runs all measurements again from a place on."""
+        """Reruns all measurements from index `place` on."""
         self._estimator.belief = self._entries[place - 1].belief
         for k in range(place, len(self._entries)):
             entry = self._entries[k]
@@ -145,9 +145,9 @@ class Timeline:
 class Stamps:
     """Compares the progress of time stamps with that of the receiver's clock.
 
-    Only differences count: a clock may be off, and a simulation may be slower, or faster within the
-    tolerance, which grows with the control period [ns]. The first datum after a reset gives the
-    offset.
+    Only differences count, so a clock may be off. A simulation may run slower than real time, or
+    ahead of it by at most a tolerance, which grows with the control period [ns]. The first datum
+    after a reset gives the offset.
     """
 
     def __init__(self, period_ns: int = 0) -> None:
@@ -163,7 +163,7 @@ class Stamps:
         self._rejected = 0
 
     def find_fault(self, stamp_ns: int, arrival_ns: int | None) -> Refusal | None:
-        """Returns what is wrong with a stamp, or None; only its type is checked without arrival."""
+        """Returns what is wrong with a stamp, or None; without arrival, checks only its type."""
         try:
             index(stamp_ns)
         except TypeError:

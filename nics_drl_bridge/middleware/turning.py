@@ -1,9 +1,9 @@
-"""Fuses the turns of odometry and of a gyro by their variances, as stated and as observed.
+"""Fuses the turns of odometry and a gyro, weighted by their stated and observed variances.
 
-Wheels slip where a robot turns: those of a skid-steer may report a third more than there was. A
-gyro does not slip, but has noise and a bias that changes slowly. The bias is estimated while the
-wheels stand and, with less weight, while they roll. The fused turn replaces odometry's own, in its
-twist and in its relative pose; the wheels' displacements stay as they are.
+Wheels slip when a robot turns: those of a skid-steer may overstate the turn by a third. A gyro does
+not slip, but has noise and a bias that changes slowly. The bias is estimated while the wheels stand
+still and, with less weight, while they roll. The fused turn replaces odometry's own, in its twist
+and in its relative pose; the wheels' displacements stay as they are.
 """
 
 import math
@@ -18,65 +18,64 @@ from nics_drl_bridge.interface import NS_PER_S
 # Gyro
 GYRO_STD = 0.02  # of a yaw rate without a plausible variance [rad/s]
 MIN_GYRO_STD = 1e-4  # [rad/s]
-MAX_VARIANCE = 1.0  # a larger one says that the rate is unknown [rad^2/s^2]
+MAX_VARIANCE = 1.0  # a larger one means that the rate is unknown [rad^2/s^2]
 BIAS_STD = 0.1  # of a gyro that was never at rest [rad/s]
 BIAS_WALK = 1e-4  # random walk of a bias [rad/s / sqrt(s)]
-REST_BIAS_STD = 3e-4  # difference of the rate of standing wheels from the bias [rad/s]
+REST_BIAS_STD = 3e-4  # deviation of a standing robot's yaw rate from the bias [rad/s]
 VARIANCE_RATIO = 25.0  # factor by which stated and observed variance may differ
 MIN_SAMPLES = 30  # yaw rates after which the observed variance counts
 SMOOTHING = 0.05  # weight of a new yaw rate in running means
-MAX_GAP_NS = 250_000_000  # between two yaw rates; beyond, the wheels turn the robot
-# A gyro is stuck if so many yaw rates are equal while the wheels' yaw rate changes by [rad/s]:
+MAX_GAP_NS = 250_000_000  # maximum time between two yaw rates over which they are used
+# A gyro is stuck if this many yaw rates are equal while the wheels' rate changes by this [rad/s].
 FROZEN_COUNT = 25
 FROZEN_CHANGE = 0.1
 MAX_ACCELERATION = 40.0  # angular acceleration that no robot exceeds [rad/s^2]
 MIN_STEP = 0.3  # change from one yaw rate to the next that is always accepted [rad/s]
-# A robot may be turned by this factor faster than it can turn, or at least at this rate [rad/s].
+# A push may turn a robot at its maximum rate times this factor, plus this rate [rad/s].
 RATE_FACTOR = 2.0
 PUSH_RATE = 1.0
-MAX_REJECTED = 5  # sudden changes in a row; the last of them is believed
+MAX_REJECTED = 5  # number of sudden changes in a row, the last of which is believed
 MAX_REJECTED_FRACTION = 0.2  # of the latest yaw rates
 # Wheels
-ASSUMED_SLIP = 0.1  # fraction of their turns, until more is known
-ASSUMED_SLIP_WEIGHT = (
-    1e-3  # weight of that assumption, as a sum of squared turns [rad^2]
-)
+ASSUMED_SLIP = 0.1  # fraction of a turn, until more is known
+# Weight of that assumption, as a sum of squared turns [rad^2]
+ASSUMED_SLIP_WEIGHT = 1e-3
 MIN_SLIP_FRACTION = 0.05
-MEMORY_S = 30.0  # of slip and scatter
-MIN_COMPARED_TURN = 0.5  # by the wheels, before they judge the gyro [rad]
-# Slope of the gyro's turns over the wheels'; beyond, the gyro's axis or unit is wrong.
+MEMORY_S = 30.0  # time constant of slip and scatter
+MIN_COMPARED_TURN = 0.5  # by the wheels, before they can judge the gyro [rad]
+# Bounds on the slope of gyro turns over wheel turns; beyond them, the gyro's axis or unit is wrong
 MIN_SLOPE = -0.3
 MAX_SLOPE = 3.0
-CONTRADICTION_MARGIN = 0.005  # between two odometries [rad]
-TURNING_RATE = 0.1  # slower turns of the wheels do not show their slip [rad/s]
+CONTRADICTION_MARGIN = 0.005  # of the turn between two odometries [rad]
+TURNING_RATE = 0.1  # slower turns of the wheels do not reveal slip [rad/s]
 MIN_COMPARED_S = 5.0  # after which the wheels' scatter is known
 WHEELS_BIAS = 0.004  # constant error of rolling wheels [rad/s]
-# Other errors of rolling wheels last so long; until then, they are no independent information.
+# Other errors of rolling wheels persist this long, so samples within it are not independent.
 ERROR_DURATION_S = 3.0
 REST_RATE = 0.005  # yaw rate, averaged over a second, of a robot that is roughly at rest [rad/s]
-SIGMAS = 4.0  # standard deviations beyond which a turn differs from the bias
+SIGMAS = 4.0  # standard deviations beyond which a difference is significant
 NEVER_NS = 2**62
 
 
 class Gyro(NamedTuple):
-    """Estimates of a gyro's errors, and of those of the wheels."""
+    """Estimated errors of a gyro and of the wheels."""
 
     stamp_ns: int  # of the newest yaw rate
     rate: float  # that rate [rad/s]
     integral: float  # of all rates until then [rad]
-    since_ns: int  # first yaw rate after the last gap
-    period_s: float  # between two yaw rates
+    since_ns: int  # stamp of the first yaw rate after the last gap
+    period_s: float  # mean time between two yaw rates
     noise: float  # variance of a yaw rate, as stated or assumed
     observed: float = 0.0  # variance of yaw rates, from their second differences
     samples: int = 0
     change: float = 0.0  # between the two newest yaw rates [rad/s]
     repeats: int = 0  # consecutive yaw rates that did not change
-    rejected: int = 0  # consecutive ones
+    rejected: int = 0  # number of consecutive rejected yaw rates
     rejected_fraction: float = 0.0  # of the latest yaw rates
     bias: float = 0.0
     bias_variance: float = BIAS_STD**2
     cross: float = 0.0  # covariance of the robot's heading with the bias
-    # Sums over turns between odometries, which fade: wheels^2, wheels * gyro, (gyro - wheels)^2
+    # Fading sums over turns between odometries: wheels^2, wheels * gyro, (gyro - wheels)^2
     wheels_square: float = 0.0
     product: float = 0.0
     difference_square: float = 0.0
@@ -84,17 +83,17 @@ class Gyro(NamedTuple):
     # Mean squared difference of both rates while going straight [rad^2/s^2]
     scatter: float = 0.0
     compared_s: float = 0.0
-    # The newest odometry that was used; None before
-    odom: Array | None = None  # (3,) its pose, as it was received
+    # The newest odometry that was used
+    odom: Array | None = None  # (3,) its pose as received; None before the first
     odom_ns: int = 0
     odom_integral: float = 0.0  # of all rates until then [rad]
     wheels_rate: float = 0.0  # yaw rate of its twist [rad/s]
-    # Yaw rate of the wheels before the gyro repeated itself `FROZEN_COUNT` times
+    # Yaw rate of the wheels before the gyro repeated itself `FROZEN_COUNT` times [rad/s]
     wheels_rate_before: float = 0.0
 
     @property
     def variance(self) -> float:
-        """Variance of a yaw rate: the stated one, unless the observed one is far from it."""
+        """Variance of a yaw rate: the stated one, unless it is far from the observed one."""
         if self.samples < MIN_SAMPLES:
             return max(self.noise, GYRO_STD**2)
         observed = max(self.observed, MIN_GYRO_STD**2)
@@ -104,14 +103,14 @@ class Gyro(NamedTuple):
 
     @property
     def slip(self) -> float:
-        """Usual error of the wheels' turns, as a fraction of these."""
+        """Typical error of a wheel turn, as a fraction of the turn."""
         square = self.difference_square + ASSUMED_SLIP**2 * ASSUMED_SLIP_WEIGHT
         ratio = square / (self.wheels_square + ASSUMED_SLIP_WEIGHT)
         return max(MIN_SLIP_FRACTION, math.sqrt(ratio))
 
     @property
     def is_plausible(self) -> bool:
-        """False if it is mere noise, or turns unlike the wheels in a way only a fault explains."""
+        """False if the gyro shows only noise, or differs from the wheels by more than slip."""
         if self.observed > MAX_VARIANCE:
             return False
         if self.rejected_fraction > MAX_REJECTED_FRACTION:
@@ -123,10 +122,10 @@ class Gyro(NamedTuple):
     def has_contradiction(
         self, unbiased: float, by_wheels: float, variance: float
     ) -> bool:
-        """Returns True for a turn of an unproven gyro that is not believed.
+        """Returns True if the turn of an unproven gyro contradicts the wheels' turn.
 
-        It has the opposite sign of the wheels' turn or is several times as large, beyond what the
-        `variance` [rad^2] explains. Once the gyro is proven, the wheels may have slipped that much.
+        It then has the opposite sign or is several times as large, beyond what the `variance`
+        [rad^2] explains. Once the gyro is proven, the wheels may have slipped that much.
         """
         if self.wheels_turned >= MIN_COMPARED_TURN:
             return False
@@ -142,29 +141,29 @@ class Gyro(NamedTuple):
         return self.integral + self.rate * (time_ns - self.stamp_ns) / NS_PER_S
 
     def reject(self) -> "Gyro":
-        """Returns the estimates after a yaw rate that was rejected."""
+        """Returns the estimates after a rejected yaw rate."""
         fraction = self.rejected_fraction + SMOOTHING * (1.0 - self.rejected_fraction)
         return self._replace(rejected=self.rejected + 1, rejected_fraction=fraction)
 
     def restart(self) -> "Gyro":
-        """Returns what remains known after the clock was set: bias, noise and slip."""
+        """Returns what is still known after the clock was set: bias, noise and slip."""
         return self._replace(since_ns=NEVER_NS, rejected=0)
 
 
 class FusedOdometry(NamedTuple):
     """An odometry whose turn is fused with the gyro's."""
 
-    odom: Array  # (3,) pose on a path of the same displacements
+    odom: Array  # (3,) pose from the wheels' displacements and the fused turns
     twist: Array  # (3,)
     gyro: Gyro
-    # Variance of the heading that the bias adds, on top of the filter's own [rad^2]
+    # Heading variance that the bias adds to the filter's own [rad^2]
     heading_variance: float = 0.0
-    # Variance of the twist's yaw rate, as far as it is the gyro's [rad^2/s^2]
+    # The gyro's part of the variance of the twist's yaw rate [rad^2/s^2]
     rate_variance: float = 0.0
 
 
 def check_variance(variance: float | None) -> float | None:
-    """Returns the variance of a yaw rate, or None if it is not plausible."""
+    """Returns the variance of a yaw rate, or None if it is implausible."""
     if variance is None or not 0.0 < variance <= MAX_VARIANCE:
         return None
     return max(variance, MIN_GYRO_STD**2)
@@ -179,8 +178,8 @@ def take_rate(
 ) -> tuple[Gyro | None, float, bool]:
     """Takes a yaw rate [rad/s] of a robot that can turn at `max_rate` [rad/s].
 
-    Returns the estimates after it, its normalised innovation squared with respect to the wheels'
-    yaw rate, and True if it was used.
+    Returns the updated estimates, the normalised innovation squared with respect to the wheels' yaw
+    rate, and True if the yaw rate was used.
     """
     limit = RATE_FACTOR * max_rate + PUSH_RATE
     noise = check_variance(variance) or GYRO_STD**2
@@ -245,11 +244,11 @@ def fuse_odometry(
     rate_variance: float,
     is_at_rest: bool = False,
 ) -> FusedOdometry:
-    """Fuses the turn since the last odometry, by wheels and by gyro.
+    """Fuses the turn since the last odometry, as measured by wheels and gyro.
 
-    The odometry has a pose (3,) and a twist (3,), whose yaw rate has a variance; `before` (3,) is
-    the pose that was returned for the last one; `is_at_rest` says that the robot stands by all
-    other data. Without a gyro in between, or with a faulty one, the wheels' turn is kept.
+    The odometry has pose (3,), body twist (3,) and a variance of its yaw rate; `before` (3,) is the
+    fused pose of the last one. `is_at_rest` means that all other data show a robot at rest. Without
+    a gyro in between, or with a faulty one, the wheels' turn is kept.
     """
     last = before if gyro.odom is None else gyro.odom
     step = geometry.log(geometry.between(last, odom))
@@ -279,7 +278,7 @@ def fuse_odometry(
     if contradicts or wheels_change > FROZEN_CHANGE or not updated.is_plausible:
         moved = geometry.compose(before, geometry.exp(step))
         return FusedOdometry(moved, twist, updated)
-    # Wheels may err less than stated: their scatter relative to the gyro shows how much.
+    # The wheels may err less than stated; their scatter relative to the gyro shows how much.
     if updated.compared_s > MIN_COMPARED_S:
         rate_variance = min(rate_variance, updated.scatter)
     wheels_variance = rate_variance * seconds**2 + (updated.slip * by_wheels) ** 2
@@ -311,7 +310,7 @@ def fuse_odometry(
 
 
 def _covers_odometry(gyro: Gyro, now_ns: int) -> bool:
-    """Returns True if there were yaw rates from the last odometry until now."""
+    """Returns True if yaw rates cover the time from the last odometry until now."""
     if gyro.odom is None or gyro.since_ns > gyro.odom_ns:
         return False
     return 0 <= now_ns - gyro.stamp_ns <= MAX_GAP_NS
@@ -320,7 +319,7 @@ def _covers_odometry(gyro: Gyro, now_ns: int) -> bool:
 def _compare_turns(
     gyro: Gyro, by_gyro: float, by_wheels: float, seconds: float
 ) -> Gyro:
-    """Updates the estimates of the wheels' slip and scatter by the turns of both."""
+    """Updates the estimates of the wheels' slip and scatter from both turns [rad]."""
     decay = math.exp(-seconds / MEMORY_S)
     difference = by_gyro - by_wheels
     is_turning = abs(by_wheels) > TURNING_RATE * seconds
@@ -341,7 +340,7 @@ def _compare_turns(
 def _learn_bias_at_rest(
     gyro: Gyro, by_gyro: float, seconds: float, noise: float, wheels_stand: bool
 ) -> Gyro:
-    """Corrects the bias by the gyro's turn while the robot stood, or was roughly at rest."""
+    """Corrects the bias by the gyro's turn [rad] while the robot stood still, or nearly so."""
     rest_variance = REST_BIAS_STD**2 if wheels_stand else REST_RATE**2 / seconds
     variance = gyro.bias_variance + BIAS_WALK**2 * seconds
     measured_variance = noise / seconds**2 + rest_variance
@@ -351,9 +350,9 @@ def _learn_bias_at_rest(
 def _learn_bias(
     gyro: Gyro, difference: float, seconds: float, noise: float, wheels_variance: float
 ) -> Gyro:
-    """Corrects the bias a little while the wheels roll, by the difference of both turns [rad]."""
+    """Corrects the bias slightly while the wheels roll, by the difference of both turns [rad]."""
     variance = gyro.bias_variance + BIAS_WALK**2 * seconds
-    if variance < WHEELS_BIAS**2:  # wheels of unequal size also turn a robot that much
+    if variance < WHEELS_BIAS**2:  # unequal wheel sizes also turn a robot that fast
         return gyro._replace(bias_variance=variance)
     repeated = max(1.0, ERROR_DURATION_S / seconds)
     measured_variance = noise / seconds**2 + repeated * wheels_variance / seconds**2
@@ -363,7 +362,7 @@ def _learn_bias(
 def _correct_bias(
     gyro: Gyro, measured: float, variance: float, measured_variance: float
 ) -> Gyro:
-    """Corrects a bias of a `variance` by a measured one."""
+    """Corrects the bias, which has the `variance`, by a measured one [rad/s]."""
     innovation = measured - gyro.bias
     total = variance + measured_variance
     if innovation**2 > SIGMAS**2 * total:  # the robot was pushed, or its wheels spin

@@ -1,4 +1,4 @@
-"""How much less certain a pose estimate has become over a time."""
+"""How much less certain a pose estimate has become over time."""
 
 import math
 from typing import NamedTuple
