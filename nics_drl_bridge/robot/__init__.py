@@ -1,3 +1,3 @@
-"""The robot: its specification, its Taylor model, its noise and delays."""
+"""The robot: its specification, Taylor model, noise and delays."""
 
-DEFAULT_ROBOT = "differential"  # the shipped robot wherever none is named or told
+DEFAULT_ROBOT = "differential"  # the shipped robot that is used if none is given

@@ -1,9 +1,9 @@
 """A car: the rear axle drives, the front wheels steer; `base_link` is the middle of the rear axle.
 
-Its commands are the rear axle's speed [m/s] and the steering angle [rad] of a virtual middle wheel;
-those of `ackermann_throttle` are throttle and steering in [-1, 1]. Its speed goes to `speed_gain`
-[m/s] times the throttle, its steering angle to `greatest_steering` [rad] times the steering; drag,
-a dead zone and slip can only come from a recording.
+Its commands are the rear axle's speed [m/s] and the steering angle [rad] of a virtual middle wheel.
+The commands of `ackermann_throttle` are throttle and steering in [-1, 1]: its speed tends to
+`speed_gain` [m/s] times the throttle, its steering angle to `greatest_steering` [rad] times the
+steering. Only a recording can add drag, a dead zone or slip.
 """
 
 from nics_drl_bridge.geometry import Bicycle
@@ -29,7 +29,7 @@ THROTTLE = (
     make_command("throttle", "1", RATIO_RANGE),
     make_command("steering", "1", RATIO_RANGE),
 )
-# The lag of the speed is long, because the car rolls on.
+# The lag of the speed is long because a car coasts.
 GAINS = {
     "speed_gain": 3.0,
     "greatest_steering": 0.4,
@@ -39,14 +39,14 @@ GAINS = {
 
 
 def derive_kinematics(spec: RobotSpec) -> kinds.Textbook:
-    """Curvature tan(angle) / wheelbase."""
+    """Returns kinematics whose curvature is tan(angle) / wheelbase."""
     return kinds.make_steered(
         spec, Bicycle(spec.parameters["wheelbase"]), list_names(STEERED)
     )
 
 
 def derive_throttle_kinematics(spec: RobotSpec) -> kinds.Textbook:
-    """The same for throttle and steering, in fractions of maximum speed and steering angle."""
+    """Returns the same kinematics for throttle and steering, as fractions of their maxima."""
     bicycle = Bicycle(spec.parameters["wheelbase"])
     gain = (spec.parameters["speed_gain"], spec.parameters["greatest_steering"])
     return kinds.make_steered(spec, bicycle, list_names(THROTTLE), gain)
@@ -61,7 +61,7 @@ def track_and_radius(parameters: dict[str, float]) -> tuple[float, float]:
 
 
 def draw(spec: RobotSpec) -> kinds.Drawing:
-    """A box on four wheels; the right front wheel follows the left one."""
+    """Draws a box on four wheels; the right front wheel follows the left one."""
     wheelbase = spec.parameters["wheelbase"]
     angle = kinds.find_steering_angle(spec)
     track, radius = track_and_radius(spec.parameters)

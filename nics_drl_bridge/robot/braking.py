@@ -1,9 +1,9 @@
-"""Braking: how far a robot still moves after the command to stop, by simulating its model.
+"""Braking: how far a robot still moves after the command to stop, found by simulating its model.
 
 The model is brought to the steady motion of many commands over their range: forwards, backwards,
 sideways, turning, and mixtures. Each motion is then stopped. The stops yield a reaction time and a
-deceleration that bound each of them from above. A turn that does not end together with the speed,
-because the turn rate lags more, has a bound of its own: `TurnBraking`.
+deceleration that bound all of them from above. If a turn outlasts the speed, because the turn rate
+lags more, it gets a separate bound, `TurnBraking`.
 """
 
 import math
@@ -21,23 +21,21 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import STATE_MARGIN, TaylorModel
 
-MAX_STOP_S = 60.0  # a robot that still moves after this time does not stop [s]
-MAX_START_S = 30.0  # time in which a held command reaches its steady motion [s]
+MAX_STOP_S = 60.0  # a robot that still moves after this time counts as not stopping
+MAX_START_S = 30.0  # time in which a held command reaches its steady motion
 # A robot is at rest if no point of its footprint moves faster [m/s].
 CREEP = 0.05
-# A model may creep at rest by a bias of its fit, at this fraction of its maximum speed; polynomials
-# are less exact with steered wheels.
+# A bias of its fit may make a model creep at rest, up to this fraction of its maximum speed.
+# Polynomials are less accurate with steered wheels.
 BIAS = 0.05
 BIAS_STEERED = 0.15
 # A state has settled if it changes by less in a step, as a fraction of the largest state.
 SETTLED = 1e-9
-DEVIATIONS = (
-    2.0  # standard errors of the coefficients by which a model may respond slower
-)
-MIN_RESPONSE = (
-    0.5  # lower bound on the factor on a model's response by its standard errors
-)
-SLACK_M = 0.15  # stopping distances need not be bounded tightly relative to this length
+# Standard errors of the coefficients by which a model may respond more slowly
+DEVIATIONS = 2.0
+MIN_RESPONSE = 0.5  # lower bound on the factor by which they slow a model's response
+# Added to stopping distances before the excess of a bound is divided by them
+SLACK_M = 0.15
 # A motion is straight if its turn moves the footprint by at most this fraction of its speed.
 STRAIGHT = 0.1
 MINOR = 0.1  # smaller fractions of the largest component of a twist do not count
@@ -45,33 +43,35 @@ ALIKE = 0.1  # components whose braking times differ by less stop together
 # Candidates of `Braking.lever_m`, in footprint radii, and of `Braking.order`
 LEVERS = (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 3.0, 4.0, 6.0, 9.0)
 ORDERS = (2.0, math.inf, 1.0)
-NEGLIGIBLE = 0.02  # a bound may be less tight than the best one by this slack
+NEGLIGIBLE = 0.02  # a bound may exceed the tightest one by this slack
 MIN_FRACTION = 0.05  # lower bound on `TurnBraking.least_turn` and `least_path`
-MAX_MISSED_M = 0.01  # separate bounds may miss a motion that creeps by this length
+MAX_MISSED_M = 0.01  # by which separate bounds may underestimate a creeping motion
 MAX_MOTIONS = 2500
 INSTANT = 1e-6  # 1/(2a) [s^2/m] below which the deceleration counts as infinite
-# By the number of commands: fractions of each range whose mixtures are stopped
+# Fractions of each command's range whose mixtures are stopped, by the number of commands
 LEVELS: dict[int, tuple[float, ...]] = {
     1: (0.5, 1.0),
     2: (0.1, 0.25, 0.5, 0.75, 1.0),
     3: (0.15, 0.4, 0.7, 1.0),
 }
-SINGLE_LEVELS = tuple(k / 20 for k in range(1, 21))  # likewise, of one command alone
+SINGLE_LEVELS = tuple(k / 20 for k in range(1, 21))  # likewise, for one command alone
 CACHE_SIZE = 32
 _CACHE: "OrderedDict[Any, Braking]" = OrderedDict()  # least recently used first
 
 
 @dataclass(frozen=True)
 class Drift:
-    """How a robot leaves its arc while it brakes, because parts of its motion end before the rest.
+    """How a braking robot leaves its arc, because parts of its motion end before the rest.
 
-    The components of a twist are compared as speeds, a turn as that of the whole footprint. While
-    the largest one is braked, a smaller one moves the robot by a factor more than along the arc.
+    The components of a twist are compared as speeds, a turn as the speed of the footprint's edge.
+    While the largest component is braked, a smaller one moves the robot by a factor times its
+    motion along the arc.
     """
 
     least: float = 1.0  # minimum factor
     greatest: float = 1.0  # maximum factor
-    share: float = 1.0  # maximum ratio of a smaller component to the largest one
+    # maximum ratio of a smaller component's motion to the largest one's, at least 1
+    share: float = 1.0
 
     @property
     def is_none(self) -> bool:
@@ -87,16 +87,16 @@ class TurnBraking:
     """How a turn ends that brakes independently of the speed.
 
     The robot turns no further than if it kept its turn rate for the reaction time, and then braked
-    it evenly by the deceleration. It may stop a little sooner, see the minimum fractions.
+    with the constant deceleration. It may stop sooner, see `least_turn` and `least_path`.
     """
 
-    reaction_s: float  # until the braking of the turn counts, lags included
-    deceleration: float  # of the turn that follows; infinite for lags alone [rad/s^2]
-    least_turn: float = 1.0  # fraction of this bound by which the robot turns at least
-    least_path: float = 1.0  # fraction of its path's bound that it moves at least
+    reaction_s: float  # until the turn starts to brake, lags included
+    deceleration: float  # of the turn after that; infinite for lags alone [rad/s^2]
+    least_turn: float = 1.0  # minimum fraction of this bound that the robot turns
+    least_path: float = 1.0  # minimum fraction of its path's bound that the robot moves
 
     def mean_time_s(self, rate: Array) -> Array:
-        """Returns the times (...) at full turn rates (...) in which the robot turns as far."""
+        """Returns times (...) [s] in which constant rates (...) turn as far as the bound."""
         return np.asarray(self.reaction_s + np.abs(rate) / (2.0 * self.deceleration))
 
 
@@ -104,27 +104,27 @@ class TurnBraking:
 class Braking:
     """An upper bound on a robot's stops.
 
-    A robot that moves at a pace p when it is told to stop moves no further than if it kept its
-    twist for the reaction time, and then braked evenly by the deceleration.
+    After the command to stop, a robot moves no further than if it kept its twist for the reaction
+    time, and then braked its `pace` with the constant deceleration.
     """
 
     reaction_s: float  # from the command to stop until braking counts, lags included
     deceleration: float  # of the braking that follows; infinite for lags alone [m/s^2]
-    # Factor of the turn rate in the pace [m]: wheels that also turn the robot brake both
+    # Factor of the turn rate in the pace [m]; wheels that also turn the robot brake both motions
     lever_m: float = 0.0
     drift: Drift = NO_DRIFT  # off its arc while it brakes
-    # Order of the norm of ahead and sideways: infinite if the slower of both stops as if it were
-    # alone, 1 if the brakes have to take away the sum, 2 otherwise
+    # Order of the norm of forward and sideways speed: infinite if each stops as if it were alone,
+    # 1 if the brakes have to remove the sum, 2 otherwise
     order: float = 2.0
-    turn: TurnBraking | None = None  # None if the turn brakes as the speed does
+    turn: TurnBraking | None = None  # None if the turn brakes together with the speed
 
     def pace(self, twist: Array) -> Array:
-        """Returns the speed that the brakes take away (...) from twists (..., 3) [m/s]."""
+        """Returns the speeds (...) that the brakes have to remove from twists (..., 3) [m/s]."""
         speed = np.linalg.norm(twist[..., :2], ord=self.order, axis=-1)
         return np.asarray(speed + self.lever_m * np.abs(twist[..., 2]))
 
     def time_s(self, twist: Array) -> Array:
-        """Returns the times to rest (...) from twists (..., 3)."""
+        """Returns the times to rest (...) from twists (..., 3) [s]."""
         times = self.reaction_s + self.pace(twist) / self.deceleration
         if self.turn is None:
             return np.asarray(times)
@@ -133,7 +133,7 @@ class Braking:
         return np.asarray(np.maximum(times, np.where(rate == 0.0, 0.0, turn_times)))
 
     def mean_time_s(self, twist: Array) -> Array:
-        """Returns the times (...) at full twists (..., 3) in which the robot moves as far."""
+        """Returns times (...) [s] in which constant twists (..., 3) move as far as the bound."""
         times = self.reaction_s + self.pace(twist) / (2.0 * self.deceleration)
         if self.turn is None:
             return np.asarray(times)
@@ -151,7 +151,7 @@ class Stops(NamedTuple):
 
     twist: Array  # (K, 3) at the command to stop: vx, vy [m/s], wz [rad/s]
     path: Array  # (K,) length of the path to rest [m]
-    travel: Array  # (K, 3) the same of each component: |vx|, |vy| [m], |wz| [rad]
+    travel: Array  # (K, 3) path of each component: |vx|, |vy| [m], |wz| [rad]
     last_twist: Array  # (K, 3) at the end of the simulation
     holds_angle: NDArray[np.bool_]  # (K,) True where steering angles were held
 
@@ -163,11 +163,11 @@ def find_braking(
     high: Array | None = None,
     ramp: Array | None = None,
 ) -> Braking:
-    """Returns the bound of all stops of a model; the last `CACHE_SIZE` results are cached.
+    """Returns the bound on all stops of a model; the last `CACHE_SIZE` results are cached.
 
     Args:
         robot: the robot of the model.
-        model: its kinematics, with all that its motors do.
+        model: its kinematics, including the effects of its motors.
         low: minimum commands (C,), by default the robot's.
         high: maximum commands (C,), likewise.
         ramp: (C,) maximum change of each command per second on the way to rest; infinite for
@@ -235,7 +235,7 @@ def _bound(
 
 
 def list_motions(low: Array, high: Array) -> Array:
-    """Returns commands (K, C) over the whole range of each, and all mixtures of them."""
+    """Returns commands (K, C) over the whole range of each, and mixtures of them."""
     count = len(low)
     fractions = LEVELS.get(count, (1.0,))
     levels = (*(-fraction for fraction in fractions), 0.0, *fractions)
@@ -254,7 +254,7 @@ def list_motions(low: Array, high: Array) -> Array:
 
 
 def _combine_pairs(count: int) -> Array:
-    """Returns the fractions (K, C) of any two of many commands at the ends of their ranges."""
+    """Returns fractions (K, C) that put any two commands at the ends of their ranges."""
     rows = []
     for i, j in combinations(range(count), 2):
         for first, second in product((-1.0, 1.0), repeat=2):
@@ -268,8 +268,8 @@ def _combine_pairs(count: int) -> Array:
 def derive_slowest_model(model: TaylorModel) -> TaylorModel | None:
     """Returns the model as slow as its standard errors allow; None if they do not matter.
 
-    Each state responds slower by the relative error of the term that draws it to rest. The steady
-    motion of a held command stays the same.
+    Each state responds more slowly by the relative error of the term that draws it to rest. The
+    steady motion of a held command stays the same.
     """
     if not model.std_errors.size:
         return None
@@ -305,7 +305,7 @@ def simulate_stops(
     ramp: Array,
 ) -> Stops:
     """Stops the steady motions of commands (K, C), with steering angles held and released."""
-    # A model that diverges is refused later.
+    # Models that diverge are refused later.
     with np.errstate(over="ignore", invalid="ignore"):
         state = _find_steady_states(robot, model, commands)
         rest = np.clip(0.0, robot.command_low, robot.command_high)
@@ -330,7 +330,7 @@ def _join_inputs(model: TaylorModel, state: Array, command: Array) -> Array:
 
 def _find_steady_states(robot: RobotSpec, model: TaylorModel, commands: Array) -> Array:
     """Returns the states (K, S) to which held commands lead, within the robot's own range."""
-    # Only the end counts, which is reached soon without limits of rates.
+    # Only the final state matters, which is reached sooner without rate limits.
     unlimited = replace(model, limits=np.zeros((0, 2)))
     low, high = _find_state_range(robot, model)
     state = np.zeros((len(commands), model.state_size))
@@ -353,7 +353,7 @@ def _find_state_range(robot: RobotSpec, model: TaylorModel) -> tuple[Array, Arra
     high = np.array([variable.max for variable in robot.state])
     if robot.takes_cmd_vel:  # the commands bound its speeds
         return np.minimum(low, recorded_low), np.maximum(high, recorded_high)
-    # A throttle that is held may lead to speeds that the robot never had.
+    # A held throttle may lead to speeds that the robot never had.
     margin = STATE_MARGIN * (recorded_high - recorded_low)
     low = np.maximum(low, recorded_low - margin)
     high = np.minimum(high, recorded_high + margin)
@@ -375,12 +375,12 @@ def _simulate_stop(
     rest: Array,
     ramp: Array,
 ) -> Stops:
-    """Simulates stops: each command goes to rest (K, C) by its ramp, after its own delay."""
+    """Simulates stops: each command goes to rest (K, C) by its ramp, after its delay."""
     dt = model.dt
     delays = model.delays
     gap = rest - commands
     low, high = model.state_box
-    # By a bias of its fit, a model may creep at rest.
+    # A bias of its fit may make a model creep at rest.
     rest_state = _find_steady_states(robot, model, rest)
     creep = model.rates(_join_inputs(model, rest_state, rest))[:, :3]
     creep_speed = np.hypot(creep[:, 0], creep[:, 1])
@@ -440,7 +440,7 @@ def fit_bound(stops: Stops, radius: float, turns_count: bool) -> Braking:
     Args:
         stops: motions of all kinds.
         radius: of the circle around the footprint [m].
-        turns_count: True if a turn alone sweeps ground, because the footprint has corners.
+        turns_count: True if a turn alone sweeps new ground, because the footprint has corners.
     """
     speed = np.hypot(stops.twist[:, 0], stops.twist[:, 1])
     turn_speed = radius * np.abs(stops.twist[:, 2])
@@ -474,14 +474,14 @@ def fit_bound(stops: Stops, radius: float, turns_count: bool) -> Braking:
 
 
 def _list_orders(sideways: NDArray[np.bool_]) -> tuple[float, ...]:
-    """Returns the candidates of `Braking.order`: of no account if nothing moves diagonally."""
+    """Returns the candidates of `Braking.order`; they do not matter if nothing moves diagonally."""
     if sideways.any():
         return ORDERS
     return (2.0,)
 
 
 class _Fit(NamedTuple):
-    """Tightest bound for one candidate."""
+    """Tightest bound for one candidate of order and lever."""
 
     slack: float
     reaction_s: float
@@ -489,7 +489,7 @@ class _Fit(NamedTuple):
 
 
 def _round_bound(bound: Braking, fit: _Fit) -> Braking:
-    """Returns a bound in whole milliseconds and three digits of the deceleration."""
+    """Returns a bound rounded to whole milliseconds and three digits of the deceleration."""
     reaction_s = math.ceil(1e3 * fit.reaction_s - 1e-3) / 1e3
     if fit.inverse < INSTANT:
         return replace(bound, reaction_s=reaction_s, deceleration=math.inf)
@@ -501,7 +501,7 @@ def _round_bound(bound: Braking, fit: _Fit) -> Braking:
 
 
 def _compute_envelope(speed: Array, distance: Array) -> Array:
-    """Returns, for each motion, the maximum distance (K,) of all that are no faster."""
+    """Returns, for each motion, the maximum distance (K,) of all motions that are no faster."""
     order = np.argsort(speed, kind="stable")
     envelope = np.empty_like(distance)
     envelope[order] = np.maximum.accumulate(distance[order])
@@ -515,9 +515,9 @@ def _fit_tightest(
     straight: NDArray[np.bool_],
     worst: Array,
 ) -> _Fit:
-    """Fits the bound of every motion, distance <= whole (reaction + pace inverse).
+    """Fits distance <= whole * (reaction + pace * inverse) for all motions, with minimum slack.
 
-    It has the minimum slack: the mean excess over the worst of the straight motions, as a fraction.
+    The slack is the mean excess over the `worst` distances of the straight motions, as a fraction.
     """
     weight = 1.0 / (worst + SLACK_M)
     ahead = whole[straight] * weight
@@ -542,7 +542,7 @@ def _fit_tightest(
 
 
 def fit_separate_bounds(stops: Stops, radius: float) -> Braking | None:
-    """Returns the tightest separate bounds of the path and of the turn; None if none holds.
+    """Returns the tightest separate bounds on path and turn; None if there are no such bounds.
 
     Args:
         stops: motions of all kinds.
@@ -583,7 +583,7 @@ def fit_separate_bounds(stops: Stops, radius: float) -> Braking | None:
 
 
 def _find_min_fraction(distance: Array, bound: Array) -> float:
-    """Returns the minimum fraction of its bound that a distance (K,) comes to.
+    """Returns the minimum ratio of distances (K,) to their bounds (K,).
 
     It is at least `MIN_FRACTION`, and 1 if all bounds are 0.
     """
@@ -594,12 +594,12 @@ def _find_min_fraction(distance: Array, bound: Array) -> float:
 
 
 def _fit_alone(speed: Array, pace: Array, distance: Array) -> _Fit:
-    """Does what `_fit_tightest` does for one component alone, which counts at all speeds."""
+    """Does the same as `_fit_tightest` for one component, which counts at all speeds."""
     return _fit_tightest(speed, pace, distance, np.ones(len(speed), np.bool_), distance)
 
 
 def _bound_path(bound: Braking, twist: Array) -> Array:
-    """Returns the bound of the paths (K,) of twists (K, 3), as far as the speed brakes [m]."""
+    """Returns the bounds (K,) on the paths of twists (K, 3) while the speed brakes [m]."""
     speed = np.hypot(twist[:, 0], twist[:, 1])
     return speed * (bound.reaction_s + bound.pace(twist) / (2.0 * bound.deceleration))
 

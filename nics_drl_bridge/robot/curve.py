@@ -1,4 +1,4 @@
-"""InputCurve: what a motor makes of a command, and when, before the kinematics."""
+"""InputCurve: the effect of a command, through its motor's curve and after its delay."""
 
 from collections.abc import Sequence
 from typing import Annotated
@@ -10,7 +10,7 @@ from pydantic import AllowInfNan, Field
 from nics_drl_bridge.config import Schema
 from nics_drl_bridge.geometry import Array
 
-LONGEST_DELAY_S = 60.0  # simulators and estimators keep the commands of this time
+LONGEST_DELAY_S = 60.0  # simulators and estimators keep commands for this long
 End = Annotated[float, AllowInfNan(), Field(ge=-np.inf)]  # may be infinite, but not NaN
 
 
@@ -18,12 +18,14 @@ class InputCurve(Schema):
     """A dead zone about zero, unequal gains, and saturation: a monotone curve of one command."""
 
     command: str
-    # Smaller commands have no effect, in the command's unit; if negative, all have this much more
+    # dead zone in the command's unit: smaller commands have no effect; if negative, every effect is
+    # larger by its size
     dead: float = Field(default=0.0, allow_inf_nan=False)
-    least: End = -np.inf  # commands saturate here, in their unit; the effect of 0 is 0
-    most: End = np.inf
+    # commands saturate at this minimum, in their unit; the effect of 0 is 0
+    least: End = -np.inf
+    most: End = np.inf  # commands saturate at this maximum
     back: float = Field(default=1.0, ge=0.0)  # gain of negative commands
-    # On top of the latency of all commands [s]
+    # in addition to the latency of all commands [s]
     delay: float = Field(default=0.0, ge=0.0, le=LONGEST_DELAY_S)
 
     @property
@@ -68,7 +70,7 @@ class InputCurve(Schema):
 
 
 def ends(least: float, most: float, name: str = "") -> str:
-    """Describes the finite ones of two ends: `, throttle at most 0.8`."""
+    """Describes two bounds without the infinite ones: `, throttle at most 0.8`."""
     prefix = ", "
     if name:
         prefix += f"{name} "
@@ -85,7 +87,7 @@ def apply_curves(
     names: Sequence[str],
     curves: tuple[InputCurve, ...],
 ) -> Array:
-    """Returns the commands in effect (..., C) of commands with C names."""
+    """Returns the effects (..., C) of commands (..., C) with these names."""
     values = np.array(command, dtype=np.float64)
     for curve in curves:
         column = names.index(curve.command)
@@ -94,6 +96,6 @@ def apply_curves(
 
 
 def delays(names: Sequence[str], curves: tuple[InputCurve, ...]) -> Array:
-    """Returns the delays (C,) of commands with C names beyond their common latency [s]."""
+    """Returns the delays (C,) of commands with these names beyond their common latency [s]."""
     by_name = {curve.command: curve.delay for curve in curves}
     return np.array([by_name.get(name, 0.0) for name in names])

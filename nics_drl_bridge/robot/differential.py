@@ -1,7 +1,7 @@
 """A robot with two driven wheels on one axle, left and right; `base_link` is the axle's middle.
 
-Its commands are the base's forward speed [m/s] and turn rate [rad/s]; of `differential_wheels` the
-speeds of both wheels [rad/s].
+Its commands are the base's forward speed [m/s] and turn rate [rad/s]. The commands of
+`differential_wheels` are the speeds of both wheels [rad/s].
 """
 
 import numpy as np
@@ -32,7 +32,7 @@ BY_WHEELS = Template(
 
 
 def derive_kinematics(spec: RobotSpec, slip: float = 1.0) -> Textbook:
-    """The wheels' mean drives; their difference over the track turns, times the factor `slip`."""
+    """Returns differential kinematics, with the turn rate scaled by `slip`."""
     half = spec.parameters["track"] / 2
     inverse = np.array([[1, -half], [1, half]]) / spec.parameters["wheel_radius"]
     forward = np.zeros((3, 2))
@@ -41,7 +41,7 @@ def derive_kinematics(spec: RobotSpec, slip: float = 1.0) -> Textbook:
 
 
 def draw(spec: RobotSpec) -> Drawing:
-    """A disc between two wheels."""
+    """Draws a disc between two wheels."""
     track = spec.parameters["track"]
     radius = spec.parameters["wheel_radius"]
     places = ((0.0, 0.5 * track), (0.0, -0.5 * track))

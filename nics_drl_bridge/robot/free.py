@@ -1,4 +1,4 @@
-"""Any robot: only its recording shows where its commands lead."""
+"""Any robot: only a recording shows what its commands do."""
 
 from nics_drl_bridge.robot.kinds import RobotKind, draw_disc
 from nics_drl_bridge.robot.spec import POSE_RATES

@@ -1,8 +1,8 @@
 """Compiled motion: the pruned model's rates, and the exact arc of a body twist.
 
 A step of one robot is `rates`, then `move`; `run` does the same for a batch, term by term, so that
-vector instructions process several robots at a time. Both give the same bits for every batch size.
-Shared arguments: `x` is (S + C + 1,): the state, the commands in effect, and a last entry of 1;
+vector instructions process several robots at a time. Results are bit-identical for all batch sizes.
+Shared arguments: `x` (S + C + 1,) holds the state, the commands in effect, and a last entry of 1;
 `dq` (3 + S,) are the rates; `series` is `SERIES` in the type of the other arrays, which may be
 float32 or float64.
 """
@@ -18,7 +18,7 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.robot.taylor import TaylorModel
 
-# Coefficients of sin(t) / t and (1 - cos(t)) / t, which are exact to 1e-14 for turns below 0.1 rad,
+# Series coefficients of sin(t) / t and (1 - cos(t)) / t, accurate to 1e-14 for turns below 0.1 rad
 # and to 1e-8 below WIDE_TURN
 SERIES: Array = np.array([1 / 6, 1 / 120, 1 / 5040, 1 / 2, 1 / 24, 1 / 720])
 WIDE_TURN = 0.5  # larger turns per step use sine and cosine, not the series [rad]
@@ -32,25 +32,23 @@ Moved = tuple[float, float, float, float]  # x, y [m], cosine and sine of the he
 
 
 class Terms(NamedTuple):
-    """The kept terms of a model, and what motors do around them."""
+    """The kept terms of a model, and the effects of motors around them."""
 
     dof: NDArray[np.int64]  # (T,) degree of freedom of each term
-    coefficient: Array  # (T,), or (T, n) of n robots
-    factors: NDArray[
-        np.int64
-    ]  # (T, order) indices into `x`; unused ones of its last entry
+    coefficient: Array  # (T,), or (T, n) for n robots
+    # (T, order) indices into `x`; unused ones point to its last entry
+    factors: NDArray[np.int64]
     degree: NDArray[np.int64]  # (T,) number of factors
-    low: Array  # (S,) minimum state, at which it is held
+    low: Array  # (S,) minimum state, to which it is clipped
     high: Array  # (S,) maximum state, likewise
     fall: Array  # (S,) minimum rate of a state
     rise: Array  # (S,) maximum rate of a state
-    friction: Array  # (S,) draws a state to zero [unit / s]
-    drag: Array  # (S,) times the square of a state, draws it to zero [1 / (unit s)]
-    curves: Array  # (C, 4) of the commands
-    late: NDArray[
-        np.int64
-    ]  # (C,) delays of commands after their common latency [steps]
-    emf: Array  # (S, C) times a state and the size of a command; (0, 0) if all are 0
+    friction: Array  # (S,) dry friction, which draws a state to zero [unit / s]
+    drag: Array  # (S,) drag, which slows a state by its square [1 / (unit s)]
+    curves: Array  # (C, 4) input curves of the commands
+    # (C,) delays of commands beyond their common latency [steps]
+    late: NDArray[np.int64]
+    emf: Array  # (S, C) back-EMF per state and size of a command; (0, 0) if all are 0
 
 
 class Bounds(NamedTuple):
@@ -65,7 +63,7 @@ class Bounds(NamedTuple):
 
 
 def make_terms(model: TaylorModel) -> Terms:
-    """Returns the kept terms of a model. Raises ModelError if the order of one is too high."""
+    """Returns the kept terms of a model. Raises ModelError if a term's order is too high."""
     order = max(1, int(model.powers.sum(axis=1).max(initial=1)))
     if order > MAX_ORDER:
         fix = f"the maximum is {MAX_ORDER}: generate the model anew."
@@ -117,7 +115,7 @@ def allocate_scratch(model: TaylorModel) -> tuple[Array, Array]:
 
 @kernel
 def apply_curve(command: float, curve: Array) -> float:
-    """Returns the effect of a command by its curve (4,); see `InputCurve`."""
+    """Returns the effect of a command through its curve (4,); see `InputCurve`."""
     held: float = min(max(command, curve[LOW]), curve[HIGH])
     dead: float = curve[DEAD]
     back: float = curve[BACK]
@@ -151,9 +149,9 @@ def get_bounds(terms: Terms, i: int) -> Bounds:
 
 @kernel
 def advance_state(value: float, rate: float, dt: float, bounds: Bounds) -> float:
-    """Returns a state variable after dt [s]: rate limited, drag, dry friction, then clipped."""
-    # These conditions depend on the bounds alone, so that the compiler moves them out of a loop
-    # over robots.
+    """Returns a state variable after dt [s] of limited rate, drag and dry friction, clipped."""
+    # These conditions depend only on the bounds, so the compiler can move them out of a loop over
+    # robots.
     if bounds.fall > -math.inf or bounds.rise < math.inf:
         rate = min(max(rate, bounds.fall), bounds.rise)
     value += dt * rate
@@ -167,7 +165,7 @@ def advance_state(value: float, rate: float, dt: float, bounds: Bounds) -> float
 
 @kernel
 def replace_coefficients(terms: Terms, coefficient: Array) -> Terms:
-    """Returns terms with other coefficients, (T,) of a robot or (T, n) of several."""
+    """Returns terms with other coefficients, (T,) for one robot or (T, n) for several."""
     return Terms(
         terms.dof,
         coefficient,
@@ -244,7 +242,7 @@ def _move_by_series(
     dt: float,
     series: Array,
 ) -> Moved:
-    """Does what `move` does, for a turn below WIDE_TURN."""
+    """Does the same as `move`, for turns up to WIDE_TURN."""
     square = turn * turn
     sinc = series[0] - square * (series[1] - square * series[2])
     sinc = (series[3] + series[3]) - square * sinc
@@ -262,7 +260,7 @@ def _compute_chord(
     cosc: float,
     dt: float,
 ) -> tuple[float, float]:
-    """Returns the chord of an arc, ahead and left [m], by sin(t) / t and (1 - cos(t)) / t."""
+    """Returns the chord of an arc, ahead and left [m], from sin(t) / t and (1 - cos(t)) / t."""
     return (sinc * vx - cosc * vy) * dt, (cosc * vx + sinc * vy) * dt
 
 
@@ -277,7 +275,7 @@ def _turn_and_shift(
     sine: float,
     versine: float,
 ) -> Moved:
-    """Returns the place after a shift, and the heading after a turn by its sine and 1 - cosine."""
+    """Shifts a place, and turns its heading by an angle with this sine and 1 - cosine."""
     x = x + (c * ahead - s * left)
     y = y + (s * ahead + c * left)
     return x, y, c - (c * versine + s * sine), s - (s * versine - c * sine)
@@ -311,10 +309,11 @@ def run(
     dt: float,
     steps: int,
 ) -> None:
-    """Moves n robots in place by the same number of steps of dt [s], commands in effect constant.
+    """Moves n robots in place by the same number of steps of dt [s] under constant commands.
 
     `pose` (6, n) is x, y [m], cosine, sine, unwrapped heading, and an upper bound on the path
-    length [m]; `x` is (S + C + 1, n), `dq` (3 + S, n) the last step's rates, coefficients (T, n).
+    length [m]. `x` is (S + C + 1, n). `dq` (3 + S, n) receives the last step's rates. Coefficients
+    are (T, n).
     """
     for _ in range(steps):
         _compute_all_rates(dq, x, terms)
@@ -386,7 +385,7 @@ def _move_all(pose: Array, dq: Array, dt: float, series: Array) -> None:
     wide = np.int32(0)
     for i in range(n):
         wide |= np.int32(abs(wz[i] * dt) > WIDE_TURN)
-    # Two loops, because the one with sine and cosine is slower.
+    # There are two loops because the one with sine and cosine is slower.
     if wide:
         for i in range(n):
             turn = wz[i] * dt
@@ -413,9 +412,9 @@ def simulate_rollouts(
     series: Array,
     dt: float,
 ) -> None:
-    """Simulates W robots from the first of their poses (W, T + 1, 3) and states (W, T + 1, S).
+    """Simulates W robots from their first poses and states, and fills in the following ones.
 
-    `commands` (W, T, C) are those in effect.
+    `poses` is (W, T + 1, 3), `states` is (W, T + 1, S). `commands` (W, T, C) are those in effect.
     """
     size = states.shape[2]
     width = commands.shape[2]

@@ -1,10 +1,10 @@
 """Kinds of robots: textbook kinematics and a drawing for each; `spec` finds them by name.
 
 Commands are identified by their field of `cmd_vel`; if there is none, by name, else by order. Speed
-and steering angle in the state are identified by unit. An actuator is of first order (parameters
+and steering angle in the state are identified by unit. An actuator is first-order (parameters
 `wheel_lag`, `speed_lag`, `steering_lag` [s]) or rate-limited (`wheel_rate`, `speed_rate`,
-`steering_rate` [its unit/s]). Siegwart, Nourbakhsh, Scaramuzza: Introduction to Autonomous Mobile
-Robots, ch. 3; the paper's reference for Table I.
+`steering_rate` [its unit/s]). See Siegwart, Nourbakhsh, Scaramuzza: Introduction to Autonomous
+Mobile Robots, ch. 3, which the paper cites for Table I.
 """
 
 import difflib
@@ -28,11 +28,11 @@ from nics_drl_bridge.robot.spec import (
 )
 from nics_drl_bridge.robot.template import Template
 
-LIMIT_TOLERANCE = 0.01  # fraction by which rounded figures may exceed a limit
+LIMIT_TOLERANCE = 0.01  # fraction by which rounded values may exceed a limit
 # Minimum similarity of a misspelt parameter; names of different parameters are less similar
 MISSPELT_NAME = 0.8
-MAX_VARIED = 6  # commands whose ends are combined
-NO_LAG_S = 1e-9  # lag of actuators that do at once what is commanded
+MAX_VARIED = 6  # maximum number of commands whose ends are combined
+NO_LAG_S = 1e-9  # lag of actuators that respond at once
 T = TypeVar("T")
 
 
@@ -43,10 +43,10 @@ class Textbook:
     twist: Callable[[Array], Array]  # body twist (..., 3) for a state (..., S)
     target: Callable[[Array], Array]  # state (..., S) that a command (..., C) requests
     lag: Array  # (S,) time constants of first-order actuators [s]
-    rate: Array  # (S,) of rate-limited actuators [its unit/s]; inf for first-order ones
-    # Possible products of states, by component of the twist
+    rate: Array  # (S,) maximum rates of actuators [their unit/s]; inf for first-order ones
+    # Terms that may occur (products of states), by component of the twist
     structure: dict[str, tuple[str, ...]]
-    # Command (..., C), maybe out of range, that leads to a twist (..., 3), if known
+    # Command (..., C), possibly out of range, that leads to a twist (..., 3); None if unknown
     command: Callable[[Array], Array] | None = None
 
     def compute_twist(self, command: Array) -> Array:
@@ -77,7 +77,7 @@ class Pivot:
 
 @dataclass(frozen=True)
 class Wheel:
-    """A wheel that stands on the ground; its joint `turns` by the state variable of its name."""
+    """A wheel on the ground; if it `turns`, its joint follows the state variable of its name."""
 
     name: str
     place: tuple[float, float]  # x, y in `base_link` [m]
@@ -88,15 +88,16 @@ class Wheel:
 
 @dataclass(frozen=True)
 class Drawing:
-    """Looks of a robot: wheels, a box (length, width) or cylinder (radius), its x and height."""
+    """Looks of a robot: its body and its wheels."""
 
+    # length and width of a box, or radius of a cylinder [m]
     body: tuple[float, float] | float
-    centre: tuple[float, float]
+    centre: tuple[float, float]  # x and height of the body's centre [m]
     wheels: tuple[Wheel, ...]
 
 
 def draw_disc(spec: RobotSpec) -> Drawing:
-    """Draws a robot of an unknown kind."""
+    """Draws a disc without wheels."""
     return Drawing(spec.footprint_radius, (0.0, 0.02), ())
 
 
@@ -106,7 +107,7 @@ def place_wheels(
     radius: float,
     names: tuple[str, ...],
 ) -> tuple[Wheel, ...]:
-    """Returns wheels at places; if the state is the wheels' speeds, they turn by its variables."""
+    """Returns wheels at places [m]; if the state is the wheel speeds, they turn accordingly."""
     turns = bool(spec.state) and all(
         v.unit == "rad/s" and v.twist is None for v in spec.state
     )
@@ -119,9 +120,10 @@ def place_wheels(
 
 
 def places_of_four(parameters: Mapping[str, float]) -> dict[str, tuple[float, float]]:
-    """Returns x, y in `base_link` [m] of a robot's four wheels by name; KeyError without lengths.
+    """Returns x, y [m] in `base_link` of a robot's four wheels by name.
 
-    They stand at `half_length` and `half_width`, each half a `track` where it is not given.
+    They stand at `half_length` and `half_width`, each by default half a `track`. Raises KeyError if
+    these are unknown.
     """
     x = _read_half(parameters, "half_length")
     y = _read_half(parameters, "half_width")
@@ -143,17 +145,21 @@ def _read_half(parameters: Mapping[str, float], name: str) -> float:
 class RobotKind:
     """A kind of robot. Its functions raise KeyError for a parameter that the spec lacks."""
 
-    kinematics: Callable[[RobotSpec], Textbook] | None  # of its actuators, if known
+    # of its actuators; None if unknown
+    kinematics: Callable[[RobotSpec], Textbook] | None
     drawing: Callable[[RobotSpec], Drawing]
     template: Template = field(default_factory=Template)
-    # True if commands other than a twist's drive it sideways
+    # True if it moves sideways although no command has a field of `cmd_vel`
     sideways: bool = False
     slips: bool = False  # True if its twist differs from the commanded one
-    front_drive: bool = False  # True if the speed is that of the steered wheel
+    front_drive: bool = False  # True if its commanded speed is the steered wheel's
 
 
 def textbook(spec: RobotSpec) -> Textbook:
-    """Returns a robot's textbook kinematics; ConfigError if its spec names none or does not fit."""
+    """Returns a robot's textbook kinematics.
+
+    Raises ConfigError if its spec names none or does not fit them.
+    """
     book = find_actuator_kinematics(spec)
     if spec.state and all(v.twist is not None for v in spec.state):
         return _add_lags(spec, book)
@@ -170,7 +176,7 @@ def textbook(spec: RobotSpec) -> Textbook:
 
 
 def find_actuator_kinematics(spec: RobotSpec) -> Textbook:
-    """Returns the textbook kinematics of a robot's actuators; ConfigError like `textbook`."""
+    """Returns the textbook kinematics of the actuators. Raises ConfigError like `textbook`."""
 
     def make(kind: RobotKind) -> Textbook:
         if kind.kinematics is None:
@@ -183,12 +189,12 @@ def find_actuator_kinematics(spec: RobotSpec) -> Textbook:
 
 
 def has_textbook(spec: RobotSpec) -> bool:
-    """True if a robot's textbook kinematics are known; parameters may still be missing."""
+    """Returns True if a robot's textbook kinematics are known; parameters may still be missing."""
     return getattr(find_kind(spec.textbook or ""), "kinematics", None) is not None
 
 
 def _add_lags(spec: RobotSpec, book: Textbook) -> Textbook:
-    """Returns the kinematics of a robot whose state is its twist, behind lags of its actuators."""
+    """Returns the kinematics of a robot whose state is its twist, which lags like its actuators."""
     dofs = [POSE_RATES.index(v.twist) for v in spec.state if v.twist is not None]
     if book.limited.any():
         fault = "a rate limit of an actuator needs the actuators as state"
@@ -197,7 +203,7 @@ def _add_lags(spec: RobotSpec, book: Textbook) -> Textbook:
         )
     lag = np.zeros(len(dofs))
     for i, v in enumerate(spec.state):
-        # Speeds have the lag of the first actuator, turn rates that of the last one (steering).
+        # Speeds take the lag of the first actuator, turn rates the lag of the last one (steering).
         actuator = -1 if dofs[i] == 2 else 0
         lag[i] = spec.parameters.get(f"{v.name}_lag", book.lag[actuator])
     structure: dict[str, tuple[str, ...]] = dict.fromkeys(POSE_RATES, ())
@@ -225,7 +231,7 @@ def draw_robot(spec: RobotSpec) -> Drawing:
 
 
 def _apply_to_kind(spec: RobotSpec, function: Callable[[RobotKind], T]) -> T:
-    """Applies a function to a robot's kind; ConfigError if the kind or a parameter is unknown."""
+    """Applies a function to a robot's kind. Raises ConfigError if kind or parameter is unknown."""
     kind = find_kind(require_textbook(spec))
     if kind is None:
         raise ConfigError(
@@ -254,7 +260,7 @@ def require_textbook(spec: RobotSpec) -> str:
 def compute_steady_twist(spec: RobotSpec, command: ArrayLike) -> Array:
     """Returns the body twist (..., 3) to which held commands (..., C) lead.
 
-    Raises ConfigError if kinematics or wheelbase are needed and unknown.
+    Raises ConfigError if kinematics or wheelbase are needed but unknown.
     """
     if is_twist_commanded(spec):
         return spec.to_cmd_vel(command)
@@ -267,7 +273,8 @@ def compute_steady_twist(spec: RobotSpec, command: ArrayLike) -> Array:
 def find_command(spec: RobotSpec, twist: ArrayLike) -> Array:
     """Returns the command (..., C) within its limits that leads to a body twist (..., 3), if any.
 
-    A car that is asked to turn on the spot stands. Raises ConfigError like `compute_steady_twist`.
+    A car that is asked to turn on the spot stands still. Raises ConfigError like
+    `compute_steady_twist`.
     """
     twist = np.asarray(twist, dtype=np.float64)
     if is_twist_commanded(spec):
@@ -286,13 +293,16 @@ def find_command(spec: RobotSpec, twist: ArrayLike) -> Array:
 
 
 def reach(spec: RobotSpec) -> Array:
-    """Returns the maximum steady twist (3,) of a robot; ConfigError like `compute_steady_twist`."""
+    """Returns the maximum steady twist (3,). Raises ConfigError like `compute_steady_twist`."""
     twists = compute_steady_twist(spec, _combine_ends(spec))
     return np.asarray(np.abs(twists).max(axis=0))
 
 
 def _combine_ends(spec: RobotSpec) -> Array:
-    """Returns all combinations (K, C) of minimum, rest (or nearest to it) and maximum commands."""
+    """Returns combinations (K, C) of minimum, rest (or nearest to it) and maximum commands.
+
+    More than `MAX_VARIED` commands are not combined: all are at the same end.
+    """
     low = spec.command_low
     high = spec.command_high
     ends = np.stack([low, np.clip(np.zeros(len(low)), low, high), high])
@@ -322,12 +332,12 @@ def _use_turn_rate(spec: RobotSpec) -> RobotSpec:
 
 
 def is_twist_commanded(spec: RobotSpec) -> bool:
-    """True if a robot's commands are the components of its body twist, apart from lags."""
+    """Returns True if a robot's commands are components of its body twist, except for lags."""
     return all(command.is_twist for command in spec.command) and not slips(spec)
 
 
 def slips(spec: RobotSpec) -> bool:
-    """True if the twist of a robot's kind differs from the commanded one."""
+    """Returns True if the twist of a robot's kind differs from the commanded one."""
     return bool(getattr(find_kind(spec.textbook or ""), "slips", False))
 
 
@@ -339,8 +349,8 @@ def make_steered(
 ) -> Textbook:
     """Returns the kinematics of a robot that is driven by a speed and a steering angle.
 
-    Both are its actuators, and the `gain` times its commands, in any order; its turn rate is, to
-    second order, a multiple of their product. `names` are the usual names of the commands.
+    Both are its actuators, which follow its commands, in any order, times the `gain`. To second
+    order, its turn rate is a multiple of their product. `names` are the commands' usual names.
     """
     places = _find_state_places(spec)
     speed, angle = places
@@ -366,7 +376,7 @@ def make_steered(
 
 
 def find_steering_angle(spec: RobotSpec) -> StateVariable | None:
-    """Returns the state variable of the steering angle of a steered robot, if any."""
+    """Returns the state variable of a steered robot's steering angle, if any."""
     if not _has_actuator_state(spec):
         return None
     return spec.state[_find_state_places(spec)[1]]
@@ -382,9 +392,9 @@ def make_wheeled(
 ) -> Textbook:
     """Returns the kinematics of a robot whose twist is linear in its wheel speeds, its actuators.
 
-    `inverse` (W, M) gives wheel speeds per component of the twist that the wheels can move, by name
-    in `moves`; `forward` (3, W) the body twist per wheel speed, whose turn rate slips by a factor.
-    It is commanded by its twist, else by its wheel speeds, with the usual names `wheels`.
+    `inverse` (W, M) gives the wheel speeds per component of the twist in `moves`, and `forward`
+    (3, W) the body twist per wheel speed. `slip` scales the turn rate. The robot is commanded by
+    its twist, or by its wheel speeds with the usual names `wheels`.
     """
     if _has_actuator_state(spec) and len(spec.state) != len(inverse):
         needed = f"have {len(inverse)} wheels as state, not {len(spec.state)} variables"
@@ -420,7 +430,7 @@ def make_wheeled(
 
 
 def _has_actuator_state(spec: RobotSpec) -> bool:
-    """True if the state consists of actuators."""
+    """Returns True if the state consists of actuators."""
     return any(v.twist is None for v in spec.state)
 
 
@@ -430,7 +440,7 @@ def _find_columns(
     names: tuple[str, ...],
     count: int,
 ) -> list[int]:
-    """Returns which commands have these fields of `cmd_vel`, or these names if none has a field."""
+    """Returns the indices of commands by field of `cmd_vel`, or by name if none has a field."""
     command_fields = [c.cmd_vel for c in spec.command]
     if not any(command_fields):
         if len(command_fields) != count:
@@ -458,7 +468,7 @@ def _make_error(spec: RobotSpec, reason: str) -> ConfigError:
 
 
 def _find_state_places(spec: RobotSpec) -> tuple[int, int]:
-    """Returns the places of speed and steering angle in the state."""
+    """Returns the indices of speed and steering angle in the state."""
     if not _has_actuator_state(spec):
         return 0, 1
     units = [v.unit for v in spec.state]
@@ -472,7 +482,7 @@ def _read_actuators(
     parameters: dict[str, float],
     parts: tuple[str, ...],
 ) -> tuple[Array, Array]:
-    """Returns lags and rate limits of actuators; each has one or the other."""
+    """Returns lags [s] and rate limits of actuators; each has one or the other."""
     lag = np.ones(len(parts))
     rate = np.full(len(parts), np.inf)
     for i, part in enumerate(parts):

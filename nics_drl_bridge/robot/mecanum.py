@@ -32,7 +32,7 @@ TEMPLATE = Template(
 
 
 def derive_kinematics(spec: RobotSpec) -> Textbook:
-    """The least-squares twist of four wheels for three degrees of freedom."""
+    """Returns kinematics whose twist is the least-squares solution for four wheel speeds."""
     p = spec.parameters
     arm = p["half_length"] + p["half_width"]
     inverse = (
@@ -44,7 +44,7 @@ def derive_kinematics(spec: RobotSpec) -> Textbook:
 
 
 def draw(spec: RobotSpec) -> Drawing:
-    """A box on four wheels."""
+    """Draws a box on four wheels."""
     p = spec.parameters
     length = p["half_length"]
     width = p["half_width"]

@@ -1,4 +1,4 @@
-"""Noise of a robot, drawn by the simulator and expected by the estimator, and its latency."""
+"""A robot's noise, which the simulator draws and the estimator expects, and its latency."""
 
 from typing import Literal
 
@@ -34,11 +34,11 @@ def assume_level(std: float, unit: str) -> Level:
 
 
 class Noise(Schema):
-    """Noise of a robot's odometry and pose sensor, and drift of its pose and its state by name.
+    """Noise of a robot's odometry and pose sensor, and drift of its pose and of each state.
 
     Drift is motion that the model does not explain; it grows with the square root of time. The
-    simulator draws the odometry noise, and measured drift; assumed drift is only a margin for the
-    estimator, which takes its R from odometry and pose, its Q from the drift.
+    simulator draws odometry noise and measured drift; assumed drift is only a margin for the
+    estimator. The estimator takes R from the noise of odometry and pose, and Q from the drift.
     """
 
     odom_linear: Level = assume_level(0.01, "m/s")
@@ -59,7 +59,7 @@ class Noise(Schema):
 
     @property
     def odometry(self) -> tuple[float, float]:
-        """Standard deviations, linear [m/s] and angular [rad/s]."""
+        """Standard deviations of a measured twist: linear [m/s], angular [rad/s]."""
         return self.odom_linear.std, self.odom_angular.std
 
     @property
@@ -68,7 +68,7 @@ class Noise(Schema):
         return self.pose_position.std, self.pose_position.std, self.pose_heading.std
 
     def drift(self, spec: RobotSpec) -> NDArray[np.float64]:
-        """Returns the drift (3 + S,) of pose and state that the estimator expects in a second."""
+        """Returns the drift (3 + S,) of pose and state in a second that the estimator expects."""
         return np.array([level.std for level in self._list_drift(spec)])
 
     def simulated_drift(self, spec: RobotSpec) -> NDArray[np.float64]:
@@ -113,7 +113,7 @@ class Delay(Schema):
 
 
 class Latency(Schema):
-    """Delays until receipt: of a scan since its last beam, of odometry since its stamp."""
+    """Delays until receipt: of a scan after its last beam, of odometry after its stamp."""
 
     scan: Delay | None = None
     odom: Delay | None = None

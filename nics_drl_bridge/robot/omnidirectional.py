@@ -1,4 +1,4 @@
-"""A robot that moves in every direction, on any wheels; its commands are its body twist."""
+"""A robot that moves in all directions, on any wheels; its commands are its body twist."""
 
 import numpy as np
 
@@ -17,7 +17,7 @@ TEMPLATE = Template(
 
 
 def derive_kinematics(spec: RobotSpec) -> Textbook:
-    """Its twist follows its commands, with the lag of its wheels."""
+    """Returns kinematics whose twist follows the commands with the lag of the wheels."""
     return make_wheeled(spec, np.eye(3), np.eye(3), POSE_RATES, POSE_RATES)
 
 

@@ -1,9 +1,10 @@
 """A robot whose wheels or tracks on each side turn together, so that it skids when it turns.
 
-Its commands are its body twist, or the speeds of both sides [rad/s]. Its drive converts a turn rate
-to wheel speeds by its `track` [m]; it turns by its `effective_track` [m], the distance between the
-centres about which its sides turn, which is no less (Mandow et al. 2007). Its four wheels stand at
-`half_length` and `half_width` [m] from `base_link`, by default half a track.
+Its commands are its body twist, or the speeds of both sides [rad/s]. Its drive converts turn rates
+to wheel speeds by the `track` [m]. Its actual turn rate follows from the `effective_track` [m]: the
+distance between the centres about which its sides turn, which is at least the track (Mandow et al.
+2007). Its four wheels stand at `half_length` and `half_width` [m] from `base_link`, by default half
+a track.
 """
 
 from nics_drl_bridge.robot import differential
@@ -26,13 +27,13 @@ TEMPLATE = Template(
 
 
 def derive_kinematics(spec: RobotSpec) -> Textbook:
-    """A differential robot's kinematics, whose turn rate the effective track reduces."""
+    """Returns a differential robot's kinematics with a turn rate reduced by the effective track."""
     slip = spec.parameters["track"] / spec.parameters["effective_track"]
     return differential.derive_kinematics(spec, slip)
 
 
 def draw(spec: RobotSpec) -> Drawing:
-    """A box on four wheels, which do not turn."""
+    """Draws a box on four wheels, which do not roll."""
     places = places_of_four(spec.parameters)
     radius = spec.parameters["wheel_radius"]
     x, y = places["front_left"]

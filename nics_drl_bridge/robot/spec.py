@@ -1,8 +1,8 @@
 """RobotSpec: the single definition of a robot's state and command: order, units and limits.
 
-A module of this folder that defines `KIND`, a `kinds.RobotKind`, adds a kind of its own name for
-`textbook:` in YAML files; its `VARIANTS` are kinds of longer names. Other packages add kinds by
-entry points of the group `nics_drl_bridge.kinds`.
+A module of this folder that defines `KIND`, a `kinds.RobotKind`, adds a kind with the module's name
+for `textbook:` in YAML files. Its `VARIANTS` are kinds with longer names. Other packages add kinds
+through entry points of the group `nics_drl_bridge.kinds`.
 """
 
 import math
@@ -57,10 +57,10 @@ LENGTH_PARAMETERS = {
     "half_width",
 }
 MAX_LENGTH = 20.0  # of these parameters, in radii of the footprint
-FARTHEST_STEERED = 3.2  # angle of a wheel [rad]
+FARTHEST_STEERED = 3.2  # maximum angle of a steered wheel [rad]
 # 1 + cosine at a corner; at sharper corners, a grown outline does not keep its edges parallel
 MIN_CORNER = 0.2
-MAX_VALUE = 1e6  # absolute value of a variable, in its unit
+MAX_VALUE = 1e6  # maximum absolute value of a variable, in its unit
 
 
 def list_kinds() -> list[str]:
@@ -72,7 +72,7 @@ def list_kinds() -> list[str]:
 
 
 def find_kind(name: str) -> Any | None:
-    """Returns a `kinds.RobotKind`; None if there is none of that name."""
+    """Returns a `kinds.RobotKind`; None if no kind has that name."""
     if name in extensions.find_extensions("kinds"):
         return extensions.load("kinds", name)
     return (_load_kinds(name) or _load_kinds(name.rpartition("_")[0])).get(name)
@@ -92,9 +92,9 @@ def _load_kinds(module: str) -> dict[str, Any]:
 class Variable(Schema):
     """A component of the state or of the command."""
 
-    # unique; small letters, digits and _
+    # unique; lowercase letters, digits and _
     name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
-    unit: Unit  # of its values, in SI; 1 is a ratio or a count
+    unit: Unit  # SI unit of its values; 1 for a ratio or a count
     min: float = Field(ge=-MAX_VALUE, le=MAX_VALUE)  # minimum, in this unit
     max: float = Field(ge=-MAX_VALUE, le=MAX_VALUE)  # maximum, in this unit
 
@@ -106,10 +106,10 @@ class Variable(Schema):
 
 
 class StateVariable(Variable):
-    """A component of the state: measured, or `follows` a command with a lag, or of the `twist`."""
+    """A component of the state. It is measured, `follows` a command, or is part of the `twist`."""
 
     follows: str | None = None  # name of the command that it follows with a lag
-    # the component of the body twist that it is: taken from the pose where nothing measures it
+    # the component of the body twist that it is; taken from the pose if nothing measures it
     twist: PoseRate | None = None
 
     @property
@@ -119,14 +119,14 @@ class StateVariable(Variable):
 
 
 class CommandVariable(Variable):
-    """A component of the command, with its field of `cmd_vel` if that drives the robot."""
+    """A component of the command, with its field of `cmd_vel` if it has one."""
 
-    # field of `cmd_vel` that carries it; None: in process only
+    # field of `cmd_vel` that carries it; None: driven in process only
     cmd_vel: CmdVelField | None = None
 
     @property
     def turns(self) -> bool:
-        """True for a turn rate, and for a steering angle."""
+        """True for a turn rate or a steering angle."""
         return self.cmd_vel == "angular.z"
 
     @property
@@ -145,28 +145,28 @@ class RobotSpec(Schema):
 
     name: str  # used in messages and in names of files
     description: str = ""  # one sentence for people who read the file
-    # its kind: textbook kinematics, to make recordings, or to assume what a drive did not show
+    # its kind, whose textbook kinematics make recordings and fill in what a drive did not show
     textbook: str | None = None
-    # [m, s], see the module of its kind
+    # parameters of its kind [m, s], see the kind's module
     parameters: dict[str, float] = Field(default_factory=dict)
-    # parameters that its kind assumed, lengths in proportion to the footprint
+    # names of parameters that its kind assumed; lengths are in proportion to the footprint
     assumed: tuple[str, ...] = ()
     # meaning of `angular.z` for a robot that steers: a turn rate [rad/s], as in any Twist, or the
     # steering angle [rad] itself
     angular_is: Literal["turn_rate", "steering"] = "turn_rate"
-    # of a circle around `base_link` [m], 10 at most; optional with a `footprint`, then around that
+    # of a circle around `base_link` [m], at most 10; by default the circle around the `footprint`
     footprint_radius: float = Field(ge=1e-3)
-    # corners of a polygon instead, in `base_link` [m], in either direction
+    # corners of a polygon instead of the circle, in `base_link` [m], in either direction
     footprint: tuple[tuple[float, float], ...] | None = Field(
         default=None, min_length=3, max_length=MAX_CORNERS
     )
-    # its usual lidar, a shipped one or a YAML file, where none is given; None: that of the paper
+    # default lidar, a shipped one or a YAML file; None: the paper's
     lidar: str | None = Field(default=None, min_length=1)
-    # where that is, x, y [m] and heading [rad] in `base_link`; None: as the lidar's own file says
+    # mount of that lidar: x, y [m] and heading [rad] in `base_link`; None: as in the lidar's file
     lidar_mount: Mount | None = None
-    # what follows commands with a lag, or is measured, in the order of every state vector
+    # variables that follow commands with a lag or are measured, in the order of every state vector
     state: tuple[StateVariable, ...] = Field(default=(), max_length=MAX_VARIABLES)
-    # what drives it, in the order of every command vector
+    # variables that drive the robot, in the order of every command vector
     command: tuple[CommandVariable, ...] = Field(min_length=1, max_length=MAX_VARIABLES)
 
     @field_validator("textbook")
@@ -186,7 +186,7 @@ class RobotSpec(Schema):
         self,
         dump: pydantic.SerializerFunctionWrapHandler,
     ) -> dict[str, Any]:
-        # Models and policies are identified by their content: an empty key must not change it.
+        # Models and policies are identified by their content, so an empty key must not change it.
         data: dict[str, Any] = dump(self)
         for name in ("lidar", "lidar_mount"):
             if getattr(self, name) is None:
@@ -255,8 +255,8 @@ class RobotSpec(Schema):
     def grow_footprint(self, margin: float) -> "RobotSpec":
         """Returns the robot with a footprint that is larger all around by a margin [m].
 
-        With an outline, `footprint_radius` stays the same, because worlds place robots by it: this
-        robot fits wherever the original fits, apart from the margin.
+        With a polygon, `footprint_radius` stays the same because worlds place robots by it. The
+        grown robot is therefore placed wherever the original would be.
         """
         if self.footprint is None:
             radius = self.footprint_radius + margin
@@ -310,12 +310,12 @@ class RobotSpec(Schema):
 
     @property
     def takes_cmd_vel(self) -> bool:
-        """True if every command is a field of `cmd_vel`, which nodes need."""
+        """True if every command has a field of `cmd_vel`, which nodes need."""
         return all(command.cmd_vel is not None for command in self.command)
 
     @property
     def takes_turn_rate(self) -> bool:
-        """True if `angular.z` is a turn rate for a robot that is commanded a steering angle."""
+        """True if `angular.z` is a turn rate for a robot that is commanded by a steering angle."""
         return self.angular_is == "turn_rate" and self.steers
 
     @property
@@ -358,7 +358,7 @@ class RobotSpec(Schema):
 
     @property
     def cmd_vel_places(self) -> tuple[int, ...]:
-        """Places (C,) of the commands in linear.x, linear.y, angular.z; ConfigError without."""
+        """Indices (C,) of the commands in `CMD_VEL_FIELDS`. Raises ConfigError if one has none."""
         return tuple(self._cmd_vel_index.tolist())
 
     @cached_property
@@ -370,7 +370,7 @@ class RobotSpec(Schema):
     def to_cmd_vel(self, command: ArrayLike) -> NDArray[np.float64]:
         """Converts a command (..., C) to `cmd_vel` (..., 3): linear.x, linear.y, angular.z.
 
-        Raises ConfigError if a command has no field, or a robot steers with an unknown wheelbase.
+        Raises ConfigError if a command has no field, or if a wheelbase is needed but unknown.
         """
         values = self.to_fields(command)
         if self.takes_turn_rate:
@@ -406,7 +406,7 @@ class RobotSpec(Schema):
         self.to_cmd_vel(self.command_low)
 
     def to_fields(self, command: ArrayLike) -> NDArray[np.float64]:
-        """Returns commands (..., C) by field of `cmd_vel` (..., 3), a steering angle as it is."""
+        """Returns commands (..., C) by field of `cmd_vel` (..., 3); steering angles stay as is."""
         command = np.asarray(command, dtype=np.float64)
         values = np.zeros((*command.shape[:-1], 3))
         values[..., self._cmd_vel_index] = command
@@ -421,7 +421,7 @@ def _add_circumradius(data: dict[str, Any]) -> dict[str, Any]:
     outline = data.get("footprint")
     if outline is None or "footprint_radius" in data:
         return data
-    # The field's own check reports a fault.
+    # Validation of the field reports faults.
     with suppress(OverflowError, TypeError, ValueError):
         if len(outline) <= MAX_CORNERS:
             data = data | {"footprint_radius": _reach(outline)}
@@ -443,9 +443,9 @@ def build_robot(
 ) -> RobotSpec:
     """Builds a robot from a shipped robot's name, the path of a YAML file, or its content.
 
-    With a `kind` instead of `textbook`, all that the kind knows may be left out: names, units and
-    ranges of commands, state and parameters. `ranges` (minimum, maximum) of recorded commands, by
-    name, are the default of their ranges. Raises ConfigError.
+    With a `kind` instead of `textbook`, everything that the kind knows may be left out: names,
+    units and ranges of commands, state and parameters. `ranges` (minimum, maximum) of recorded
+    commands, by name, are the defaults of their ranges. Raises ConfigError for a faulty definition.
     """
     ranges = ranges or {}
     data = read_definition(definition)
@@ -457,7 +457,7 @@ def build_robot(
     spec = validate(data, RobotSpec, source)
     for c in spec.command:
         end = max(c.min, c.max, key=abs)
-        is_recorded = end in ranges.get(c.name, ())  # then its mapping is to blame
+        is_recorded = end in ranges.get(c.name, ())  # then the mapping is at fault
         if c.steers and abs(end) > FARTHEST_STEERED and not is_recorded:
             fault = f"key 'command': {c.name} reaches {end:g} rad, and no wheel steers so far"
             raise ConfigError(f"{source}: {fault}; angles are in radians.")

@@ -15,17 +15,16 @@ from nics_drl_bridge.errors import ModelError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.robot.curve import InputCurve, apply_curves, delays, ends
 
-STATE_MARGIN = (
-    0.25  # fraction of its range by which a bounded state may leave it, on both ends
-)
+# Fraction of its range by which a bounded state may leave it at either end
+STATE_MARGIN = 0.25
 
 
 @dataclass(frozen=True)
 class TaylorModel:
-    """`dQ/dt = A chi(X)` without the pruned terms (Eq. 1, 2), and what motors do around them.
+    """`dQ/dt = A chi(X)` without the pruned terms (Eq. 1, 2), and the effects of motors around it.
 
     The commands in X are those in effect, after the input curves. Back-EMF weakens a motor as it
-    turns faster. The rate of a state is clipped to its limits; then drag by its square slows it,
+    turns faster. The rate of a state is clipped to its limits; then quadratic drag slows the state,
     and dry friction draws it to zero, where it sticks.
     """
 
@@ -44,13 +43,13 @@ class TaylorModel:
     # (D, K); NaN for a kept coefficient that was assumed or defined; (0, 0) if all are unknown
     std_errors: Array = field(default_factory=lambda: np.zeros((0, 0)))
     quality: "Quality | None" = None
-    bounded: bool = False  # True if the state is held in the recording's box, widened
-    inputs: tuple[InputCurve, ...] = ()  # of the commands that have one
+    bounded: bool = False  # True if the state is clipped to `state_box`
+    inputs: tuple[InputCurve, ...] = ()  # curves of the commands that have one
     # (S,) [unit of the state / s]
     friction: Array = field(default_factory=lambda: np.zeros(0))
     # (S,) [1 / (unit of the state s)]
     drag: Array = field(default_factory=lambda: np.zeros(0))
-    # (S, C) by which each command in effect, of either sign, brakes [1 / (its unit s)]
+    # (S, C) rate at which a command in effect brakes a state, by its size [1 / (its unit s)]
     back_emf: Array = field(default_factory=lambda: np.zeros((0, 0)))
     # (S, 2) minimum and maximum of each state's rate [unit of the state / s]
     limits: Array = field(default_factory=lambda: np.zeros((0, 2)))
@@ -75,7 +74,7 @@ class TaylorModel:
 
     @property
     def state_box(self) -> tuple[Array, Array]:
-        """Minimum and maximum state (S,), at which it is held; infinite unless `bounded`."""
+        """Minimum and maximum state (S,) to which it is clipped; infinite unless `bounded`."""
         low = self.low[: self.state_size]
         high = self.high[: self.state_size]
         margin = np.full_like(low, np.inf)
@@ -90,12 +89,12 @@ class TaylorModel:
 
     @property
     def is_plain(self) -> bool:
-        """True if there are only the terms."""
+        """True if the model consists of its terms only."""
         return not self.inputs and self.is_free
 
     @property
     def is_free(self) -> bool:
-        """True if the rates of the state are those of the terms."""
+        """True if the terms alone give the rates of the state."""
         has_limits = np.isfinite(self.limits).any()
         has_losses = self.friction.any() or self.drag.any() or self.back_emf.any()
         return not (has_limits or has_losses)
@@ -107,14 +106,14 @@ class TaylorModel:
 
     @property
     def drivers(self) -> NDArray[np.intp]:
-        """Index (S,) of the command that moves each state most, over the box of X."""
+        """Index (S,) of the command that moves each state most, over the recorded range of X."""
         largest = np.maximum(np.abs(self.low), np.abs(self.high))
         effect = np.abs(self.coefficients[3:]) * np.prod(largest**self.powers, axis=1)
         has_command = self.powers[:, self.state_size :] > 0
         return np.asarray(np.argmax(effect @ has_command, axis=1))
 
     def apply_curves(self, command: ArrayLike) -> Array:
-        """Returns the commands in effect (..., C) of delayed commands, by the input curves."""
+        """Returns the effects (..., C) of delayed commands (..., C) through the input curves."""
         return apply_curves(command, self.variables[self.state_size :], self.inputs)
 
     def rates(self, x: ArrayLike) -> Array:
@@ -128,7 +127,7 @@ class TaylorModel:
         return dq
 
     def _evaluate_terms(self, x: Array) -> Array:
-        """Returns dQ/dt (..., D) by the terms and the back-EMF."""
+        """Returns dQ/dt (..., D) from the terms and the back-EMF."""
         dq = evaluate(x, self.powers) @ self.coefficients.T
         states = self.state_size
         dq[..., 3:] -= np.abs(x[..., states:]) @ self.back_emf.T * x[..., :states]
@@ -161,12 +160,12 @@ class TaylorModel:
 
     @property
     def shown_terms(self) -> tuple[str, ...]:
-        """Names of the K terms, those of commands in effect primed: `throttle'`."""
+        """Names of the K terms; commands with a curve are primed: `throttle'`."""
         return tuple(format_term(row, self.shown_names) for row in self.powers)
 
     @property
     def shown_names(self) -> tuple[str, ...]:
-        """Names of the variables, those of commands in effect primed."""
+        """Names of the variables; commands with a curve are primed."""
         curved = [curve.command for curve in self.inputs]
         return tuple(f"{name}'" if name in curved else name for name in self.variables)
 
@@ -202,7 +201,7 @@ class TaylorModel:
         return errors
 
     def add_errors(self, errors: Mapping[str, Mapping[str, float]]) -> "TaylorModel":
-        """Returns the model with standard errors by dof and term; NaN for kept terms without."""
+        """Returns the model with standard errors by dof and term; NaN for other kept terms."""
         if not errors:
             return replace(self, std_errors=np.zeros((0, 0)))
         names = self.term_names
@@ -271,15 +270,16 @@ class TaylorModel:
 
 
 def _name_positive(names: tuple[str, ...], values: Array) -> dict[str, float]:
-    """Returns the positive ones of values by name."""
+    """Returns the positive values by name."""
     pairs = zip(names, values.tolist(), strict=True)
     return {name: value for name, value in pairs if value > 0.0}
 
 
 def list_exponents(variables: int, order: int) -> NDArray[np.int64]:
-    """Exponents (K, V) of the distinct products of up to `order` of V variables, constant first.
+    """Returns exponents (K, V) of the distinct products of up to `order` of V variables.
 
-    `chi = vec([1, X] (x) [1, X])` of Eq. 1 contains every mixed product twice; here it occurs once.
+    The constant comes first. `chi = vec([1, X] (x) [1, X])` of Eq. 1 contains every mixed product
+    twice; here it occurs once.
     """
     rows = []
     for degree in range(order + 1):
@@ -313,7 +313,7 @@ def make_sort_key(row: NDArray[np.int64]) -> tuple[int, ...]:
 
 
 def parse_term(text: str, names: tuple[str, ...]) -> NDArray[np.int64]:
-    """Parses a term written by `format_term` to exponents (V,). Raises ValueError otherwise."""
+    """Parses a term written by `format_term` into exponents (V,). Raises ValueError otherwise."""
     row = np.zeros(len(names), dtype=np.int64)
     if text == "1":
         return row
@@ -347,7 +347,7 @@ class HorizonErrors:
     path_m: float  # mean length of the measured path
     model: EndErrors
     kept_twist: EndErrors  # of a robot that keeps its initial twist
-    # Of the textbook, fitted to the same data; None: not fitted
+    # Of the textbook model, fitted to the same data; None: not fitted
     textbook: EndErrors | None = None
     band_m: float | None = None  # distance within which 95 % of the ends are expected
     coverage: float | None = None  # fraction of the ends within it
@@ -356,7 +356,7 @@ class HorizonErrors:
     textbook_noise_m: float | None = None
     # Of a robot that never moves; None in older files
     standing: EndErrors | None = None
-    standing_noise_m: float | None = None  # of the difference to it [m]
+    standing_noise_m: float | None = None  # noise of the difference to it [m]
 
 
 @dataclass(frozen=True)
@@ -372,7 +372,7 @@ class Quality:
     r2: dict[str, float]
     held_out_rmse: dict[str, float]  # the same on held-out data; empty without
     held_out_r2: dict[str, float]
-    # Of open-loop predictions on held-out data, 0 without: mean errors at the ends, mean path
+    # Open-loop predictions on held-out data: mean errors at their ends, mean path; 0 without data
     open_loop_horizon_s: float = 0.0
     open_loop_position_error_m: float = 0.0
     open_loop_heading_error_rad: float = 0.0
@@ -403,7 +403,7 @@ class NamedTaylorModel(Schema):
     limits: dict[str, tuple[Fall, Rise]] | None = None  # by state
 
     def model(self) -> TaylorModel:
-        """Returns the model as arrays. Raises ModelError if the names do not fit each other."""
+        """Returns the model as arrays. Raises ModelError if its names are inconsistent."""
         variables = tuple(self.valid)
         dofs = tuple(self.terms)
         try:

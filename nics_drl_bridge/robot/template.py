@@ -1,4 +1,4 @@
-"""Templates: what a kind of robot knows by itself, so that a robot's file may leave it out."""
+"""Templates: the defaults of a kind of robot, which a robot's file may leave out."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -40,7 +40,7 @@ STEERED = (
     make_command("speed_command", "m/s", 1.0, "linear.x"),
     make_command("steering_command", "rad", 0.5, "angular.z"),
 )
-# Each follows the command of this field, whatever its name is.
+# Each follows the command with this field, whatever the command's name.
 STEERED_STATE = (
     {"name": "speed", "unit": "m/s", "cmd_vel": "linear.x"},
     {"name": "steering", "unit": "rad", "cmd_vel": "angular.z"},
@@ -66,20 +66,20 @@ def list_names(commands: Sequence[Part]) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Template:
-    """Parts of a robot of one kind, in the form of its file."""
+    """Default parts of a robot of one kind, in the form of its file."""
 
-    # Sets of commands for such a robot, the usual set first; none: any commands
+    # Sets of commands for such a robot, the usual set first; empty if it may have any commands
     commands: tuple[tuple[Part, ...], ...] = ()
-    moves: tuple[str, ...] = ()  # components of the body twist that are its state, or
-    state: tuple[Part, ...] = ()  # a state that follows the commands
+    moves: tuple[str, ...] = ()  # components of the body twist that are states
+    state: tuple[Part, ...] = ()  # states that follow commands
     parameters: Mapping[str, float] = field(default_factory=dict)
     # Further parameters, in radii of the footprint
     lengths: Mapping[str, float] = field(default_factory=dict)
-    # Its commands by other words for them, from which `nics inspect` guesses the kind
+    # Names of its commands by synonym, from which `nics inspect` guesses the kind
     words: Mapping[str, str] = field(default_factory=dict)
 
     def fill(self, robot: Part, ranges: Ranges) -> dict[str, Any]:
-        """Returns a robot's whole file; ConfigError if the names of its commands do not fit."""
+        """Returns a robot's complete file. Raises ConfigError if it has unknown names."""
         kind = robot["kind"]
         data = {"name": kind, **robot, "textbook": kind}
         del data["kind"]
@@ -94,7 +94,7 @@ class Template:
         defaults = {name: round(k * radius, 4) for name, k in self.lengths.items()}
         defaults |= self.parameters
         missing = defaults.keys() - parameters.keys()
-        for name in parameters:  # it may have any name that does not look misspelt
+        for name in parameters:  # any name is allowed that does not look misspelt
             if get_close_matches(str(name), missing, 1, MISSPELT_PARAMETER):
                 fault = f"unknown parameter {name!r}; {suggest(name, defaults)}"
                 raise ConfigError(f"robot {data['name']!r}: {fault}")
@@ -106,7 +106,7 @@ class Template:
         kind = robot["kind"]
         command = robot.get("command")
         if command is not None and not _is_mappings(command):
-            return command  # the check of the whole file reports it
+            return command  # validation of the whole file reports it
         if command is None:
             names: list[Any] = list(ranges)
         else:
@@ -140,14 +140,14 @@ class Template:
             )
         matches = [by_name.get(part.get("name")) for part in command]
         if None in matches and len(command) == len(usual):
-            matches = list(usual)  # names of the user's own, in the usual order
+            matches = list(usual)  # the user's own names, in the usual order
         return [
             _complete_command(match or {}, part, ranges)
             for match, part in zip(matches, command, strict=True)
         ]
 
     def _fill_state(self, state: Any, command: Sequence[Part]) -> Any:
-        """Returns the state: the user's, completed by the usual one, which it is by default."""
+        """Returns the user's state, completed from the usual one; by default the usual one."""
         taken = [part.get("name") for part in command]
         by_field = {part.get("cmd_vel"): part.get("name") for part in command}
         usual = []
@@ -172,7 +172,7 @@ class Template:
 
 
 def _is_mappings(parts: Any) -> bool:
-    """True for mappings whose values are plain."""
+    """Returns True for a sequence of mappings that contain no lists or mappings."""
     return isinstance(parts, list | tuple) and all(
         isinstance(part, Mapping)
         and not any(isinstance(value, list | dict) for value in part.values())
@@ -185,7 +185,7 @@ def _count_matches(
     names: Sequence[Any],
     given: Sequence[Part],
 ) -> int:
-    """Counts the commands that are given by name or unit."""
+    """Counts the commands that are given by name or by unit."""
     units = [part.get("unit") for part in given]
     return sum(
         command["name"] in names or command["unit"] in units for command in commands
@@ -210,7 +210,7 @@ def _complete_command(usual: Part, command: Part, ranges: Ranges) -> dict[str, A
 
 
 def _complete_state(state: Part, command: Sequence[Part]) -> dict[str, Any]:
-    """Returns a state with its unit and range, by the command that it follows or by the twist."""
+    """Returns a state with its unit and range, taken from the command it follows or the twist."""
     unit, limit = TWIST_RANGES.get(state.get("twist", ""), (None, None))
     unit = state.get("unit", unit)
     follows = state.get("follows")

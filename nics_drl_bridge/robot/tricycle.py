@@ -24,13 +24,13 @@ TEMPLATE = Template(
 
 
 def derive_kinematics(spec: RobotSpec) -> kinds.Textbook:
-    """The front wheel pulls forward by its cosine, and turns the base by its sine."""
+    """Returns the kinematics of a bicycle that its front wheel drives."""
     bicycle = Bicycle(spec.parameters["wheelbase"], front_drive=True)
     return kinds.make_steered(spec, bicycle, list_names(STEERED))
 
 
 def draw(spec: RobotSpec) -> kinds.Drawing:
-    """A box on three wheels of one size."""
+    """Draws a box on three wheels of one size."""
     wheelbase = spec.parameters["wheelbase"]
     track = spec.parameters["track"]
     radius = spec.parameters["wheel_radius"]

@@ -24,8 +24,9 @@ def make_urdf(
 
     `base_link` and wheels stand on the ground; `laser` is at the height of `base_link`, because the
     package's world is flat. Moving joints have the names of the state variables in `joint_states`.
-    A robot without textbook kinematics has no wheels here. Mounts are x [m], y [m], heading [rad]
-    in `base`, of the lidar's frame `laser` and of `further` sensors by frame.
+    A robot without textbook kinematics gets no wheels. `mount` is the pose of the lidar's frame
+    `laser` in `base`: x [m], y [m], heading [rad]. `further` are the mounts of other sensors by
+    frame.
     """
     robot = Element("robot", name=spec.name)
     for name, colour in COLOURS.items():
@@ -67,7 +68,7 @@ def _add_collision(parent: Element, spec: RobotSpec) -> None:
 
 
 def _add_wheel(robot: Element, parent: str, wheel: Wheel) -> None:
-    """Adds a wheel, which may turn forwards about y, and be steered by a pivot about z."""
+    """Adds a wheel, which may roll about y and be steered by a pivot about z."""
     place: Place = (*wheel.place, wheel.radius)
     if wheel.pivot is not None:
         pivot = wheel.pivot
