@@ -89,7 +89,7 @@ T = TypeVar("T")
 
 
 class Estimator:
-    """Pose and state of one robot, predicted by the fitted model, corrected by measurements.
+    """Pose and state of one robot, predicted by the fitted model and corrected by measurements.
 
     The model's drift is Q, its sensor noise is R, and its latency delays the commands. Time is in
     integer nanoseconds, so that results are bit-identical. Measurements apply at the present time;
@@ -481,7 +481,7 @@ class Estimator:
         noise: Array,
         alternates: bool,
     ) -> Acceptance:
-        """Decides on a measurement beyond its gate; prepares the filter to use it."""
+        """Decides on a measurement beyond its gate, and prepares the filter to use it."""
         if not (np.abs(innovation) < MAX_INNOVATION).all():
             return Acceptance.OUTLIER
         covariance = self._filter.P

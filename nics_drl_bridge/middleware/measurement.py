@@ -97,7 +97,6 @@ class Health:
     topics: dict[str, TopicHealth] = field(default_factory=dict)
     # Counts by reason; each reason starts with the topic
     rejected: dict[str, int] = field(default_factory=dict)
-    noticed: dict[str, int] = field(
-        default_factory=dict
-    )  # used, but unusual (`odom: news`)
+    # used, but unusual (`odom: news`)
+    noticed: dict[str, int] = field(default_factory=dict)
     replayed: int = 0  # number of late data, inserted at their stamps

@@ -158,7 +158,8 @@ class Middleware:
     ) -> bool:
         """Takes a command (C,) that was sent to the robot; True if it was used.
 
-        Without a stamp, it counts as sent with the newest datum. Own commands have no arrival.
+        Without a stamp, it counts as sent with the newest datum. A node's own commands have no
+        arrival.
         """
         if stamp_ns is None:
             stamp_ns = max(self.newest_ns or self._start_ns, self._unstamped_ns + 1)
@@ -366,9 +367,8 @@ class Middleware:
         rejected = dict(cache.rejected)
         noticed = dict[str, int]()
         for (kind, outcome), count in self._timeline.outcomes.items():
-            if (
-                outcome is Acceptance.USED or not count
-            ):  # a replay may have reset it to 0
+            # A replay may have reset the count to 0.
+            if outcome is Acceptance.USED or not count:
                 continue
             counts = rejected if outcome is Acceptance.OUTLIER else noticed
             counts[f"{kind.topic}: {outcome.name.lower()}"] = count
@@ -378,7 +378,7 @@ class Middleware:
 
 
 def rehearse(model: SimulatorModel) -> RobotView:
-    """Compiles all kernels by two periods at rest, so that none compiles while a robot moves."""
+    """Compiles all kernels in two periods at rest, because compiling takes seconds."""
     middleware = Middleware(model)
     period_ns = round(model.control_period * 1e9)
     middleware.reset(0, np.zeros(3))

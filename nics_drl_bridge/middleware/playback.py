@@ -46,7 +46,7 @@ COLUMNS = ("x", "y", "heading", "vx", "vy", "wz")
 
 @dataclass(frozen=True)
 class EstimatedDrive:
-    """Estimates over a drive, one after each of T odometries that were used and the newest."""
+    """Estimates over a drive, one after each of T odometries that were used and not late."""
 
     stamp_ns: NDArray[np.int64]  # (T,)
     pose: Array  # (T, 3) x [m], y [m], heading [rad] in `map`

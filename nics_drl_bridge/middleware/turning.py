@@ -2,8 +2,8 @@
 
 Wheels slip when a robot turns: those of a skid-steer may overstate the turn by a third. A gyro does
 not slip, but has noise and a bias that changes slowly. The bias is estimated while the wheels stand
-and, with less weight, while they roll. The fused turn replaces odometry's own, in its twist and in
-its relative pose; the wheels' displacements stay as they are.
+still and, with less weight, while they roll. The fused turn replaces odometry's own, in its twist
+and in its relative pose; the wheels' displacements stay as they are.
 """
 
 import math
@@ -21,14 +21,12 @@ MIN_GYRO_STD = 1e-4  # [rad/s]
 MAX_VARIANCE = 1.0  # a larger one means that the rate is unknown [rad^2/s^2]
 BIAS_STD = 0.1  # of a gyro that was never at rest [rad/s]
 BIAS_WALK = 1e-4  # random walk of a bias [rad/s / sqrt(s)]
-REST_BIAS_STD = (
-    3e-4  # deviation of the yaw rate from the bias on standing wheels [rad/s]
-)
+REST_BIAS_STD = 3e-4  # deviation of a standing robot's yaw rate from the bias [rad/s]
 VARIANCE_RATIO = 25.0  # factor by which stated and observed variance may differ
 MIN_SAMPLES = 30  # yaw rates after which the observed variance counts
 SMOOTHING = 0.05  # weight of a new yaw rate in running means
 MAX_GAP_NS = 250_000_000  # maximum time between two yaw rates over which they are used
-# A gyro is stuck if this many yaw rates are equal while the wheels' one changes this much [rad/s].
+# A gyro is stuck if this many yaw rates are equal while the wheels' rate changes by this [rad/s].
 FROZEN_COUNT = 25
 FROZEN_CHANGE = 0.1
 MAX_ACCELERATION = 40.0  # angular acceleration that no robot exceeds [rad/s^2]
@@ -155,12 +153,9 @@ class Gyro(NamedTuple):
 class FusedOdometry(NamedTuple):
     """An odometry whose turn is fused with the gyro's."""
 
-    odom: (
-        Array  # (3,) pose on the path of the wheels' displacements and the fused turns
-    )
+    odom: Array  # (3,) pose from the wheels' displacements and the fused turns
     twist: Array  # (3,)
     gyro: Gyro
-    # Variance of the heading that the bias adds, on top of the filter's own [rad^2]
     # Heading variance that the bias adds to the filter's own [rad^2]
     heading_variance: float = 0.0
     # The gyro's part of the variance of the twist's yaw rate [rad^2/s^2]
@@ -345,7 +340,7 @@ def _compare_turns(
 def _learn_bias_at_rest(
     gyro: Gyro, by_gyro: float, seconds: float, noise: float, wheels_stand: bool
 ) -> Gyro:
-    """Corrects the bias by the gyro's turn while the robot stood, exactly or roughly."""
+    """Corrects the bias by the gyro's turn [rad] while the robot stood still, or nearly so."""
     rest_variance = REST_BIAS_STD**2 if wheels_stand else REST_RATE**2 / seconds
     variance = gyro.bias_variance + BIAS_WALK**2 * seconds
     measured_variance = noise / seconds**2 + rest_variance
@@ -357,7 +352,7 @@ def _learn_bias(
 ) -> Gyro:
     """Corrects the bias slightly while the wheels roll, by the difference of both turns [rad]."""
     variance = gyro.bias_variance + BIAS_WALK**2 * seconds
-    if variance < WHEELS_BIAS**2:  # wheels of unequal size turn a robot that much, too
+    if variance < WHEELS_BIAS**2:  # unequal wheel sizes also turn a robot that fast
         return gyro._replace(bias_variance=variance)
     repeated = max(1.0, ERROR_DURATION_S / seconds)
     measured_variance = noise / seconds**2 + repeated * wheels_variance / seconds**2

@@ -1,1 +1,1 @@
-"""A drive as data: recordings, readers of every format, and how to excite a robot."""
+"""Drives as data: recordings, readers of every format, and how to excite a robot."""

@@ -1,4 +1,4 @@
-"""Opens a bag of ROS 2 or 1, and verifies that it is complete: readers are silent about damage."""
+"""Opens a bag of ROS 2 or 1 and verifies that it is complete, because readers ignore damage."""
 
 import sqlite3
 from collections import Counter
@@ -36,7 +36,7 @@ SUFFIXES = (".mcap", DATABASE)
 ROS_1 = ".bag"
 COMPRESSED = (".zst", ".zstd")
 URI_SIGNS = "?#%"
-# of a topic or type, and of a fault [characters]
+# Maximum length of the name of a topic or type, and of a fault [characters]
 LONGEST_NAME = 60
 LONGEST_REASON = 260
 
@@ -66,7 +66,10 @@ def is_storage(path: Path) -> bool:
 
 @contextmanager
 def open_bag(path: str | Path) -> "Iterator[BagFile]":
-    """Opens a bag (folder or only file); RecordingError: missing, damaged, empty, no library."""
+    """Opens a bag, given by its folder or its only file.
+
+    Raises RecordingError if the bag is missing, damaged or empty, or if a library is missing.
+    """
     path = Path(path)
     check_libraries(path, "reading")
     try:
@@ -107,14 +110,14 @@ def _open_ros_2(path: Path) -> "Iterator[BagFile]":
     files = [place]
     if place.is_dir():
         files += place.iterdir()
-    # rosbags opens databases by URI, which these characters cut.
+    # rosbags opens databases by URI, which these characters truncate.
     sign = next((sign for sign in URI_SIGNS if sign in str(place)), None)
     if sign and any(DATABASE in file.suffixes for file in files):
         fault = f"SQLite can't open what has {sign!r} in its path"
         raise RecordingError(f"{place}: {fault}; rename the folder.")
     for file in files:
         check_no_device(file)
-    # Before rosbags, which unpacks chunks of any size.
+    # Checked before rosbags reads it, because rosbags unpacks chunks of any size.
     if place.is_dir():
         with TemporaryDirectory() as room:
             for file in _list_files(place, Path(room)):
@@ -127,7 +130,7 @@ def _open_ros_2(path: Path) -> "Iterator[BagFile]":
 
 
 def _find_place(path: Path) -> Path:
-    """Returns what to open: the folder if it has metadata, which give the expected counts."""
+    """Returns the path to open: the folder if it has metadata, which give the expected counts."""
     if not path.exists():
         raise RecordingError(f"{path}: no such bag; check the path.")
     folder = path
@@ -149,7 +152,7 @@ def _find_place(path: Path) -> Path:
 
 
 def read_metadata(folder: Path) -> dict[str, Any]:
-    """Returns a bag's metadata within `parse_yaml`'s limits; ValueError if they are not whole."""
+    """Returns a bag's metadata, read within `parse_yaml`'s limits. Raises ValueError if broken."""
     try:
         metadata = parse_yaml(read_text(folder / METADATA), METADATA).get(METADATA_KEY)
     except BridgeError as error:
@@ -160,7 +163,7 @@ def read_metadata(folder: Path) -> dict[str, Any]:
 
 
 def _list_files(folder: Path, room: Path) -> list[Path]:
-    """Returns the files of a bag; those compressed as a whole are unpacked to another folder."""
+    """Returns the files of a bag; files compressed as a whole are unpacked to `room`."""
     metadata = read_metadata(folder)
     names = metadata.get("relative_file_paths") or ()
     files = [folder / Path(str(name)).name for name in names]
@@ -228,7 +231,7 @@ def _count_messages(reader: Any) -> Counter[tuple[str, str]]:
 
 
 def read_times(messages: Sequence[Message]) -> tuple[Nanoseconds, Nanoseconds | None]:
-    """Returns times of receipt and header stamps (T,) [ns]; None if there are no headers."""
+    """Returns times of receipt and header stamps (T,) [ns]; these are None without headers."""
     receive = np.array([m.receive_ns for m in messages], dtype=np.int64)
     if not messages or not hasattr(messages[0].content, "header"):
         return receive, None
@@ -236,7 +239,7 @@ def read_times(messages: Sequence[Message]) -> tuple[Nanoseconds, Nanoseconds | 
 
 
 class BagFile:
-    """A bag in `open_bag`; ValueError if a topic's messages are not all there and whole."""
+    """A bag opened by `open_bag`; raises ValueError if messages of a topic are lost or damaged."""
 
     def __init__(self, reader: "AnyBag", place: str, is_ros_1: bool = False) -> None:
         if not reader.message_count:
@@ -281,7 +284,7 @@ class BagFile:
         return self.types[topic] in self._store.fielddefs
 
     def get_definition(self, topic: str) -> str:
-        """Returns the definition of a topic's type as ROS 2 has it, with all that it contains."""
+        """Returns the ROS 2 definition of a topic's type, with all types that it contains."""
         if self.can_decode(topic):
             return str(self._store.generate_msgdef(self.types[topic], ros_version=2)[0])
         return str(self._connections[topic][0].msgdef.data)
@@ -302,7 +305,7 @@ class BagFile:
         return messages
 
     def read_serialized(self, topic: str) -> list[tuple[int, bytes]]:
-        """Returns the same messages undecoded, as ROS 2 sends them: receipt [ns] and bytes."""
+        """Returns all messages of a topic as ROS 2 serializes them: receipt [ns] and bytes."""
         raw = self._read_raw(topic)
         if self._is_ros_1:
             convert = collect_types(self._connections[topic], header=False).ros1_to_cdr

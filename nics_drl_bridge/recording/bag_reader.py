@@ -31,13 +31,16 @@ QUATERNION_TOLERANCE = 0.05
 SCAN = "sensor_msgs/msg/LaserScan"
 FEWEST_MESSAGES = 20
 PERCENTILES = (5.0, 50.0, 95.0)
-SPANNED = 0.9  # part of a uniform distribution between the first and last of these percentiles
+SPANNED = 0.9  # fraction of a uniform distribution between the outer percentiles
 
 
 def load_bag(
     path: str | Path, spec: RobotSpec | None, mapping: TopicRoles
 ) -> Recording:
-    """Reads a robot's drive from a bag, guessing missing roles of topics; RecordingError if bad."""
+    """Reads a robot's drive from a bag, and guesses missing roles of topics.
+
+    Raises RecordingError if the bag is damaged or does not fit the robot.
+    """
     if spec is None:
         raise RecordingError(f"{path}: is a bag; say of which robot, with a RobotSpec.")
     with open_bag(path) as bag:
@@ -147,7 +150,10 @@ def select_transforms(
     frame: str | None,
     child: str | None,
 ) -> list[Message]:
-    """Returns the transforms between two frames, or the only two frames; else RecordingError."""
+    """Returns the transforms between two frames, by default between the only two.
+
+    Raises RecordingError if no pair of frames fits, or several do.
+    """
     transforms: dict[tuple[str, str], list[Message]] = {}
     for message in messages:
         for transform in getattr(message.content, "transforms", (message.content,)):
@@ -181,7 +187,7 @@ def read_joint_streams(
     mapping: TopicRoles,
     place: str,
 ) -> dict[str, TopicData]:
-    """Returns state and wheels, each if the joints show it; for errors see `extract_state`."""
+    """Returns `state` and `wheels`, each if the joints show it. Raises like `extract_state`."""
     joints = gather_joints(topic, messages)
     streams = {
         "state": extract_state(joints, spec, mapping, place),
@@ -191,7 +197,7 @@ def read_joint_streams(
 
 
 class Joints(NamedTuple):
-    """Messages about J joints, in one table; NaN if missing in a message."""
+    """Messages about J joints as one table, with NaN where a message lacks a joint."""
 
     topic: str
     receive_ns: Nanoseconds  # (T,)
@@ -220,7 +226,10 @@ def gather_joints(topic: str, messages: Sequence[Message]) -> Joints:
 def extract_state(
     joints: Joints, spec: RobotSpec, mapping: TopicRoles, place: str
 ) -> TopicData | None:
-    """Returns the measured state (T, S), or None without joints; RecordingError if it is needed."""
+    """Returns the measured state (T, S), or None without joints.
+
+    Raises RecordingError if a joint is missing that is needed, or a state is unknown.
+    """
     names = [variable.name for variable in spec.state]
     for name in sorted(mapping.state.keys() - set(names)):
         fault = f"robot {spec.name!r} has no state {name!r}"
@@ -319,7 +328,7 @@ def _select_complete(
 
 
 def measure_latency(bag: BagFile, odom: str | None = None) -> Latency:
-    """Measures delays of scan and odometry by the recorder's own clock, as far as a bag shows."""
+    """Measures the delays of scan and odometry on the recorder's own clock, if a bag shows them."""
     odom = odom or _find_topic(bag, roles.ODOMETRY, "odom")
     return Latency(
         scan=_measure_delay(bag, _find_topic(bag, SCAN, "scan")),
@@ -350,7 +359,7 @@ def _measure_delay(bag: BagFile, topic: str | None) -> Delay | None:
         return None
     delay = (receive_ns - stamps_ns) * S_PER_NS
     if hasattr(messages[0].content, "ranges"):
-        # A scan's stamp is that of its first beam.
+        # A scan's stamp is the time of its first beam.
         for k, message in enumerate(messages):
             scan = message.content
             increment = max(0.0, float(scan.time_increment))

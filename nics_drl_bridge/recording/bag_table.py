@@ -23,8 +23,8 @@ from nics_drl_bridge.recording.stamping import (
 from nics_drl_bridge.recording.table import Column, Source, Table
 from nics_drl_bridge.robot.noise import Latency
 
-LONGEST_ARRAY = 64  # of which each element is listed
-# of no single numbers
+LONGEST_ARRAY = 64  # elements of longer arrays are not listed
+# Message types that are not read as columns of numbers
 SCENES = re.compile(r"/(Compressed)?Image$|/PointCloud2?$|/LaserScan$")
 PART = re.compile(r"[^.\[\]]+")
 STAMPS: dict[str, roles.Stamps] = {
@@ -36,7 +36,7 @@ NAMES = "name"  # field of JointState with a name for each element of the other 
 
 
 def list_fields(message: Any, path: str = "") -> Iterator[str]:
-    """Yields the paths of all numbers and texts in a message, as `pose.position.x`, `data[0]`."""
+    """Yields the paths of all numbers and texts in a message: `pose.position.x`, `data[0]`."""
     if isinstance(message, (bool, int, float, str, np.generic)) or hasattr(
         message, "nanosec"
     ):
@@ -88,7 +88,10 @@ def make_field_reader(path: str) -> Callable[[Any], Any]:
 def read_column(
     place: str, names: Sequence[str], messages: Sequence[Message], which: str | int
 ) -> Column:
-    """Returns a field of all messages (T,); RecordingError if they have none of that name."""
+    """Returns a field of all messages (T,).
+
+    Raises RecordingError if there is no such field, or if it is not a single number or text.
+    """
     if isinstance(which, int):
         which = names[which]
     path = which
@@ -113,7 +116,7 @@ def read_column(
 
 
 class Bag(Source):
-    """The topics of an opened bag as tables, of transforms those between two frames."""
+    """The topics of an open bag as tables; of transforms, only those between two frames."""
 
     def __init__(self, bag: BagFile, mapping: mapped.Mapping | None = None) -> None:
         topics = [
@@ -124,7 +127,7 @@ class Bag(Source):
         super().__init__(bag.place, [t for t in topics if bag.can_decode(t)])
         self._bag = bag
         self._frames: tuple[str | None, str | None] = (None, None)
-        # topics that are read, and whether they come from the robot's computer, for common stamps
+        # topics that are stamped together, and whether they come from the robot's computer
         self._used: dict[str, bool] = {}
         if mapping is not None:
             self._frames = mapping.pose.frames
@@ -158,7 +161,7 @@ class Bag(Source):
         return self._messages[topic]
 
     def _stamp_rows(self, topic: str, which: str) -> Stream:
-        """Stamps a topic with all that are used: only together do they show their clocks."""
+        """Stamps a topic with all topics in use: only together do they show their clocks."""
         topics = tuple(self._used) or (topic,)
         key = (which, topic, *topics)
         if key not in self._stamps:
@@ -171,7 +174,7 @@ class Bag(Source):
             messages = self._read_messages(name)
             rows = np.arange(len(messages), dtype=np.float64)[:, None]
             data[name] = TopicData(name, *read_times(messages), rows)
-        # Without headers in other topics, these are compared with the arrival, as if nobody asked.
+        # If other topics lack headers, these are compared with the arrival, as by default.
         bare = [name for name, part in data.items() if not np.any(part.header_ns)]
         stamps = STAMPS[which]
         if which == mapped.HEADER and bare and topic not in bare:
@@ -194,7 +197,7 @@ class Bag(Source):
 
 
 def list_topics_used(mapping: mapped.Mapping, topics: Sequence[str]) -> dict[str, bool]:
-    """Returns the topics that a mapping names, and whether commands or the robot's sensors do."""
+    """Returns the topics that a mapping names, and whether `ROBOT_STREAMS` use them."""
     found: dict[str, bool] = {}
 
     def walk(part: Any, own: bool) -> None:

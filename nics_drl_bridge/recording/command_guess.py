@@ -1,7 +1,7 @@
 """Guesses which columns of a recording were sent to the robot, by names, units and types.
 
-A column is taken for a command only if its name, or the name and type of its topic, says so. What
-only may be one is listed as a candidate. Measurements are neither.
+A column counts as a command only if its name, or the name and type of its topic, says so. A column
+that may be a command is listed as a candidate. Measurements are neither.
 """
 
 import re
@@ -19,13 +19,13 @@ from nics_drl_bridge.recording.table import Column
 from nics_drl_bridge.robot.spec import find_kind, list_kinds
 from nics_drl_bridge.robot.template import list_names
 
-# Words that say that something was sent to the robot: beyond doubt, and of a goal of a controller.
+# Words that show that something was sent to the robot: for certain, or as a controller's goal
 COMMANDING = word_set("cmd command commanded commands cmdvel ctrl control controls")
 WISHING = word_set("""
     ref reference setpoint target desired des input inputs set u req request
     requested demand
 """)
-# Words that say that something was measured or computed from measurements.
+# Words that show that something was measured or computed from measurements
 MEASURING = word_set("""
     odom odometry imu measured measurement meas encoder enc feedback fb model
     actual act state states real true truth gt est groundtruth estimated
@@ -33,7 +33,7 @@ MEASURING = word_set("""
     filtered predicted pred joint core telemetry status current voltage battery
     temp temperature
 """)
-# Words of columns that no robot is driven by.
+# Words of columns that never drive a robot
 NEVER = word_set("""
     header stamp seq index id row frame time timestamp layout range ranges scan
     laser lidar beam beams intensity intensities depth image pixel sonar
@@ -47,7 +47,7 @@ NEVER = word_set("""
 NOT_COMMANDED = NEVER | NO_COMMANDS | MEASURING
 TICKS = word_set("tick ticks encoder enc encoders count counts")
 WHEEL_WORDS = TICKS | word_set("wheel wheels rpm")
-# Words that say what a column holds.
+# Words that show what a column holds
 EXPLAINED = NOT_COMMANDED | WHEEL_WORDS | word_set("x y z")
 NO_SPEED = word_set("""
     pos position angle current force torque slip distance dist pressure load
@@ -68,8 +68,8 @@ STEERING = word_set("steering steer delta servo")
 THROTTLE = word_set("throttle gas accelerator pedal pwm duty")
 TURNING = word_set("angular ang omega yawrate wz w turn rot rotational")
 SPEED = word_set("speed velocity vel v vx linear lin forward trans cmdvel")
-# Kinds of robots by the meaning of their commands, and their names for them; kinds that a file of
-# its own describes have theirs in `words`.
+# Kinds of robots, with the names of their commands by meaning; other kinds have them in the `words`
+# of their templates.
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 KINDS: tuple[tuple[str, dict[str, str]], ...] = (
     ("mecanum", {wheel: f"{wheel}_wheel" for wheel in WHEELS}),
@@ -79,7 +79,7 @@ KINDS: tuple[tuple[str, dict[str, str]], ...] = (
     ("differential", {"speed": "forward_command", "turn": "turn_command"}),
     ("differential_wheels", {"left": "left_wheel", "right": "right_wheel"}),
 )
-# Types of messages that are commands, those that may be, and those that hold measurements.
+# Message types that are commands, types that may be commands, and packages of measurements
 ACKERMANN_KINDS = (topic_roles.ACKERMANN, topic_roles.ACKERMANN_STAMPED)
 TWIST_KINDS = (topic_roles.TWIST, topic_roles.TWIST_STAMPED)
 STANDARD_PACKAGES = re.compile(
@@ -101,7 +101,7 @@ class Candidate(NamedTuple):
 
     table: TableSurvey
     column: Survey
-    meaning: str | None  # as `speed` or `front_left`; None: its name does not say it
+    meaning: str | None  # such as `speed` or `front_left`; None if it is unclear
     strength: int  # CERTAIN, LIKELY or POSSIBLE
     rank: int = 0  # among those of the same strength
 
@@ -112,7 +112,7 @@ class Candidate(NamedTuple):
 
     @property
     def merit(self) -> tuple[bool, int, int]:
-        """What decides between columns of one meaning."""
+        """Key that ranks columns of the same meaning."""
         return not self.is_still, self.strength, self.rank
 
     @property
@@ -122,25 +122,25 @@ class Candidate(NamedTuple):
 
 
 class CommandGuess(NamedTuple):
-    """The kind of a robot and its commands, or what they may be."""
+    """The kind of a robot with its commands or candidates for them."""
 
-    kind: str | None  # None: nothing says it
+    kind: str | None  # None if nothing shows it
     commands: dict[str, Candidate]  # by the robot's names; empty if none is certain
     # by the robot's names, for the user to choose from
     candidates: dict[str, Candidate]
-    # True: no command was recorded, the wheels' own motion stands in
+    # True if no command was recorded and the motion of the wheels stands in for it
     of_wheels: bool = False
 
     @property
     def listed(self) -> dict[str, Candidate]:
-        """The commands, or without them the candidates."""
+        """The commands, or the candidates if there are no commands."""
         return self.commands or self.candidates
 
 
 def guess_command(
     tables: Sequence[TableSurvey], pose: PoseGuess | None
 ) -> CommandGuess:
-    """Finds the columns that drive a robot of a known kind, or what may be its commands."""
+    """Finds the columns that drive a robot of a known kind, or candidates for its commands."""
     candidates = [
         candidate
         for table in tables
@@ -175,7 +175,7 @@ def _find_candidates(
     if STANDARD_PACKAGES.match(table.kind) and table.kind not in TWIST_KINDS:
         return
     has_pose = pose is not None and pose.table is table
-    # A file's name says what it holds only where there are others, and if the pose is elsewhere.
+    # A file's name shows what it holds only if there are others and the pose is in one of them.
     context: set[str] = set()
     if table.kind or (has_others and not has_pose):
         context = {*split_words(table.name)}
@@ -199,9 +199,9 @@ def _find_candidates(
 def _find_unexplained(
     table: TableSurvey, pose: PoseGuess | None
 ) -> Iterator[Candidate]:
-    """Yields the columns of a file whose names say nothing, as in other languages.
+    """Yields the columns of a file with unknown names, as in other languages.
 
-    None of them was certainly sent to the robot, but none was certainly measured either.
+    Each may have been sent to the robot, or measured.
     """
     if table.kind:
         return
@@ -230,7 +230,7 @@ def _estimate_strength(
 
 
 def _rank_topic(table: TableSurvey, context: set[str]) -> int:
-    """Returns how near to the robot a topic is: `cmd_vel` itself before what a mux gets."""
+    """Ranks a topic by its distance to the robot: `cmd_vel` itself before the inputs of a mux."""
     if not table.kind:
         return 0
     if context & ROUNDABOUT:
@@ -239,7 +239,7 @@ def _rank_topic(table: TableSurvey, context: set[str]) -> int:
 
 
 def guess_meaning(words: set[str]) -> str | None:
-    """Returns what a command with these words in its name means; None if they do not say it."""
+    """Returns the meaning of a command with these words in its name; None if it is unclear."""
     is_speed = bool(words & {"velocity", "vel", "rate", "speed"})
     is_left = bool(words & LEFT)
     is_right = bool(words & RIGHT)
@@ -275,7 +275,7 @@ def guess_meaning(words: set[str]) -> str | None:
 
 
 def _accept_steering(candidates: Sequence[Candidate]) -> list[Candidate]:
-    """Takes a plain `steering` for a command where a throttle is recorded beside it."""
+    """Counts a plain `steering` as a command if a throttle was also recorded."""
     has_throttle = any(
         each.meaning == "throttle" and each.strength >= LIKELY for each in candidates
     )
@@ -292,7 +292,7 @@ def _accept_steering(candidates: Sequence[Candidate]) -> list[Candidate]:
 def _choose_kind(
     candidates: Sequence[Candidate],
 ) -> tuple[str | None, dict[str, Candidate]]:
-    """Returns the kind of robot that these columns drive best, and its commands by its names."""
+    """Returns the kind of robot that these columns drive best, and its commands by name."""
     kinds = [
         (name, kind.template.words)
         for name in list_kinds()
@@ -330,7 +330,7 @@ def _match_commands(
 
 
 def _find_wheels(tables: Sequence[TableSurvey]) -> Iterator[Candidate]:
-    """Yields the measured ticks or speeds of wheels, which stand in where no command was sent."""
+    """Yields the measured ticks or speeds of wheels, which stand in for missing commands."""
     for table in tables:
         if STANDARD_PACKAGES.match(table.kind):
             continue

@@ -1,4 +1,4 @@
-"""Guesses by names which column of a recording numbers its episodes."""
+"""Guesses by name which column of a recording numbers its episodes."""
 
 from collections.abc import Iterator, Sequence
 
@@ -13,7 +13,7 @@ FEWEST_ROWS = 20  # of each episode, on average
 
 
 def guess_episode(tables: Sequence[TableSurvey]) -> tuple[TableSurvey, Survey] | None:
-    """Finds the only column that numbers episodes; None without one, or with several."""
+    """Finds the only column that numbers episodes; None if there is none, or several."""
     columns = [
         (table, column) for table in tables for column in _find_episode_columns(table)
     ]
@@ -23,7 +23,7 @@ def guess_episode(tables: Sequence[TableSurvey]) -> tuple[TableSurvey, Survey] |
 
 
 def _find_episode_columns(table: TableSurvey) -> Iterator[Survey]:
-    """Yields the columns called an episode that keep each of their values for many rows."""
+    """Yields the columns named like an episode that keep each of their values for many rows."""
     for column in table.columns:
         words = table.list_words(column.name)
         if EPISODES.isdisjoint(words) or column.name in table.stamp_columns:
@@ -33,7 +33,7 @@ def _find_episode_columns(table: TableSurvey) -> Iterator[Survey]:
         changes = np.flatnonzero(values[1:] != values[:-1])
         if not 1 < count == len(changes) + 1 <= len(values) / FEWEST_ROWS:
             continue
-        # `run` with two values may be a switch, unless the stamps begin anew with it.
+        # `run` with two values may be a switch, unless the stamps restart with it.
         may_be_switch = "run" in words and count == 2
         if not may_be_switch or _begins_anew(table, int(changes[0])):
             yield column

@@ -18,7 +18,7 @@ FEWEST_ROWS = 3  # of an episode; shorter ones are left out
 
 
 class EpisodeOfTable(Source):
-    """The rows of one episode in a table that holds all that a mapping reads."""
+    """The rows of one episode in a table that holds everything that a mapping reads."""
 
     def __init__(
         self,
@@ -48,7 +48,10 @@ class EpisodeOfTable(Source):
 
 
 def split_table(source: Source, mapping: Mapping) -> list[EpisodeOfTable]:
-    """Returns the episodes of a table with rows of its own stamps; empty for several tables."""
+    """Returns the episodes of a table; empty for several tables, or rows that come with stamps.
+
+    Raises ConfigError if no episode is long enough.
+    """
     reader = MappedReader(source, mapping)
     table, reference = reader.locate(mapping.episode or 0)
     if len(source.names) > 1 and any(
@@ -56,7 +59,7 @@ def split_table(source: Source, mapping: Mapping) -> list[EpisodeOfTable]:
     ):
         return []
     if table.stamps("") is not None:
-        return []  # stamps that come with the rows go on from one episode to the next
+        return []  # such stamps continue from one episode to the next
     values, first, group = np.unique(
         table.column(reference), return_index=True, return_inverse=True
     )
@@ -77,7 +80,11 @@ def split_table(source: Source, mapping: Mapping) -> list[EpisodeOfTable]:
 def split_by_time(
     source: Source, mapping: Mapping, recording: Recording, since: float
 ) -> Recording:
-    """Splits a recording, whose stamps began at `since` [s], where the column changes its value."""
+    """Splits a recording where its episode column changes.
+
+    `since` [s] was subtracted from its stamps. Raises ConfigError if pose and commands have
+    different clocks.
+    """
     if recording.pose.clock != recording.command.clock:
         fault = f"{source.place}: episode: pose and commands have clocks of their own"
         raise ConfigError(f"{fault}; give each episode as a recording of its own.")
@@ -102,7 +109,7 @@ def _find_name(source: Source, table: Table) -> str:
 
 
 def _list_tables_used(source: Source, mapping: Mapping) -> Iterator[str]:
-    """Yields the tables that the values of a mapping are of."""
+    """Yields the tables from which a mapping reads its values."""
     reader = MappedReader(source, mapping)
     references: list[tuple[Any, str | None]] = [
         (v.from_, None) for v in mapping.command.values()

@@ -1,6 +1,7 @@
 """Excitation: random drives within a circle that show a robot's whole motion."""
 # Segments reach new levels smoothly and hold them for a random time (Nelles: Nonlinear System
-# Identification, ch. 21). Accepted is one that stays in the circle, and can turn back from its end.
+# Identification, ch. 21). A segment is accepted if it stays in the circle and the robot can turn
+# back from its end.
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,26 +20,26 @@ from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.seeds import check_seeds
 
 PERIOD_S = 0.05
-STILL_S = 1.0  # standstill at both ends of a drive [s]
+STILL_S = 1.0  # standstill at both ends of a drive
 RAMP_S = 0.25
 SEGMENT_S = (0.4, 1.6)
 CANDIDATES = 12
-ALONE = 0.5  # probability to change a single command
-REDRAWN = 0.6  # else, each further one
+ALONE = 0.5  # probability of changing a single command
+REDRAWN = 0.6  # otherwise, probability of changing each further one
 BINS = 4
 # weight of the distance from the centre against the familiarity of a command
 CENTRED = 2.0
-# The path stays inside the circle by a margin plus the way of a reaction at top speed.
+# The path keeps this margin to the circle, plus the distance of a reaction at top speed.
 MARGIN_M = 0.05
 REACTION_S = 0.2
 TOLERANCE_M = 0.005
-# Turning back uses fractions of the maximum commands, as a reserve for a robot that turns worse.
+# Turning back uses fractions of the maximum commands, as a reserve for a robot that turns less.
 TURNING_SPEED = 0.5
 TURNING = 0.8
 WAY_S = (3.0, 20.0)
 WAY_STEP_S = 0.1
 # A path back starts within a fraction of the circle's radius, or reaches a fraction of its initial
-# distance from the centre, or turns by half a turn.
+# distance from the centre, or makes half a turn.
 NEAR = 0.25
 NEARER = 0.6
 LOST = 8
@@ -51,7 +52,7 @@ ATTEMPTS = 8
 
 
 class Exploration:
-    """Commands, one per period, that keep a robot in its plan's circle; it rests at both ends."""
+    """Commands, one per period, that keep a robot in its plan's circle, at rest at both ends."""
 
     def __init__(self, plan: "DrivePlan", rng: np.random.Generator) -> None:
         spec = plan.robot
@@ -113,7 +114,7 @@ class Exploration:
         return command
 
     def simulate(self) -> "Pattern | None":
-        """Drives to the end; None if it finds no way back, or shows too little of a command."""
+        """Drives to the end; None if it finds no way back, or if the commands vary too little."""
         poses = [self.pose]
         commands = []
         while not self.done:
@@ -142,7 +143,7 @@ class Exploration:
         )
 
     def _limit(self) -> float:
-        """Returns the largest allowed distance from the start, at least the present one [m]."""
+        """Returns the maximum allowed distance from the start, at least the present one [m]."""
         return max(self.keep_within, float(_compute_distance(self.pose))) + TOLERANCE_M
 
     def _predict(
@@ -214,7 +215,7 @@ class Exploration:
         )
 
     def _list_ways_back(self, factor: Array) -> Array:
-        """Returns constant commands (E, T, C) for turning back: half a turn by the fastest one."""
+        """Returns constant commands (E, T, C) for turning back; the fastest makes half a turn."""
         low = np.minimum(factor * self.low, self.rest)
         high = np.maximum(factor * self.high, self.rest)
         ends = [sorted(set(three)) for three in zip(low, self.rest, high, strict=True)]
@@ -228,7 +229,7 @@ class Exploration:
         return np.repeat(ways, round(needed / WAY_STEP_S), axis=1)
 
     def _measure_way_to_centre(self, pose: Array, state: Array, limit: float) -> Array:
-        """Returns how near to the centre ways back lead, over the radius; inf: nowhere."""
+        """Returns how near to the centre ways back lead, over the radius; inf if there is none."""
         count = len(self._ways)
         start = np.repeat(pose, count, 0), np.repeat(state, count, 0)
         poses, _ = self._motion.predict(
@@ -252,7 +253,7 @@ class Exploration:
         return np.where(useful, reached / self._outermost, np.inf)
 
     def _return_to_circle(self, length: int) -> Array:
-        """Returns commands (T, C) towards the path back that leaves the circle least."""
+        """Returns commands (T, C) for the way back that leaves the circle least."""
         away = _compute_distance(self._predict(self._emergency, WAY_STEP_S)[0])
         outside = np.maximum(away.max(axis=1) - self._outermost, 0.0)
         best = np.lexsort((away.min(axis=1), np.round(outside, 2)))[0]
@@ -272,9 +273,8 @@ class Pattern:
     period: float  # time for which each command is held [s]
     command: Array  # (T, C)
     pose: Array  # (T + 1, 3) at the start of each period, and at the end
-    bound: (
-        float  # radius of the circle around the start that contains the whole robot [m]
-    )
+    # radius of the circle around the start that contains the whole robot [m]
+    bound: float
     footprint: float  # radius of the robot [m]
 
     @property
@@ -292,7 +292,7 @@ class Pattern:
 
     @property
     def reach(self) -> float:
-        """Greatest distance of the robot's body from the start [m]."""
+        """Maximum distance of the robot's body from the start [m]."""
         return float(np.hypot(*self.pose[:, :2].T).max()) + self.footprint
 
     @property
@@ -324,7 +324,7 @@ class Pattern:
 class ExpectedMotion:
     """Expected motion of a robot."""
 
-    size: int  # S, of the state
+    size: int  # size of the state, S
     # state, command, time held [s] -> state
     respond: Callable[[Array, Array, float], Array]
     twist: Callable[[Array, Array], Array]  # state, command -> body twist
@@ -332,7 +332,7 @@ class ExpectedMotion:
     def predict(
         self, pose: Array, state: Array, command: Array, period: float
     ) -> tuple[Array, Array]:
-        """Rolls commands (K, T, C) out to poses (K, T + 1, 3) and states; one arc a period [s]."""
+        """Predicts poses (K, T + 1, 3) and states from commands (K, T, C), one arc a period [s]."""
         poses = [pose]
         states = [state]
         for n in range(command.shape[1]):
@@ -348,7 +348,7 @@ class ExpectedMotion:
 
 
 def predict_motion(spec: RobotSpec) -> ExpectedMotion:
-    """Returns the motion of the robot's textbook, else of `cmd_vel`; ConfigError: has neither."""
+    """Returns the motion by textbook, else by `cmd_vel`. Raises ConfigError if there is neither."""
     if has_textbook(spec):
         book = textbook(spec)
         return ExpectedMotion(
@@ -370,7 +370,7 @@ def predict_motion(spec: RobotSpec) -> ExpectedMotion:
 
 @dataclass(frozen=True)
 class DrivePlan:
-    """Options of a drive; a value out of its range raises ConfigError."""
+    """Options of a drive. Raises ConfigError if a value is out of its range."""
 
     robot: RobotSpec  # the robot that drives
     # radius of the circle around the start that contains the whole robot [m]
@@ -392,11 +392,11 @@ class DrivePlan:
                 )
 
     def begin(self) -> Exploration:
-        """Returns the previewed drive, at its start; raises ConfigError as `preview` does."""
+        """Returns the previewed drive, at its start. Raises ConfigError like `preview`."""
         return self._start_attempt(self._accepted[0])
 
     def preview(self) -> Pattern:
-        """Returns the pattern by the expected motion; ConfigError if the circle is too small."""
+        """Returns the expected pattern. Raises ConfigError if the circle is too small."""
         return self._accepted[1]
 
     def _start_attempt(self, number: int) -> Exploration:

@@ -1,4 +1,4 @@
-"""Drafts the mapping of a recording by its names, units and types, with blanks for the rest."""
+"""Drafts a recording's mapping from its names, units and types, with blanks for the rest."""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -40,22 +40,22 @@ NO_COMMAND = (
     "geometry_msgs/Twist on cmd_vel; record it together with the pose"
 )
 NO_POSE = "# no pose was found: give x, y, and heading or quaternion, or `pose: /tf`"
-NO_RADIUS = 0.2  # of a robot [m], unless it is as large as a car, since
-FAST_CAR = 10.0  # it is faster [m/s],
-FAR_AWAY = 1e4  # or so far from 0 [m]
+NO_RADIUS = 0.2  # radius of a robot, unless it is taken for a car [m]
+FAST_CAR = 10.0  # a faster robot is taken for a car [m/s]
+FAR_AWAY = 1e4  # so is a robot farther than this from both axes, as on a map [m]
 CAR_RADIUS = 2.0
-USUAL_WHEEL = 5.0  # [rad/s], by which the ticks of a turn are guessed
-LARGEST_ANGLE = 1.6  # of a steering [rad]
-MOST_LISTED = 20  # unused columns of a table
+USUAL_WHEEL = 5.0  # speed of a wheel from which the ticks of a turn are guessed [rad/s]
+LARGEST_ANGLE = 1.6  # maximum steering angle [rad]
+MOST_LISTED = 20  # maximum number of unused columns listed per table
 STILL = "; it is 0"
 NO_VALUES = {"header", "stamp", "seq", "covariance", "index", "id", "row"}
-# shares from which on a draft turns a heading round
+# Thresholds from which a draft mirrors a heading, see `find_clockwise_keys`
 MIRRORED = 0.6
 MIRRORED_BETTER = 0.3
 
 
 class _Draft(NamedTuple):
-    """What a draft of a mapping is written from."""
+    """The guesses from which a mapping is drafted."""
 
     tables: Sequence[TableSurvey]
     pose: PoseGuess | None
@@ -67,12 +67,12 @@ class _Draft(NamedTuple):
 
     @property
     def is_single(self) -> bool:
-        """True if there is one table, which references need not name."""
+        """True if there is only one table, so that references need not name it."""
         return len(self.tables) == 1
 
 
 def propose_mapping(tables: Sequence[TableSurvey]) -> str:
-    """Drafts a mapping in YAML; guesses are marked, and what is not certain is left blank."""
+    """Drafts a mapping in YAML; guesses are marked, and uncertain parts are left blank."""
     pose = guess_pose(tables)
     guess = guess_command(tables, pose)
     times = [table.time for table in tables if table.time is not None]
@@ -150,12 +150,12 @@ def _write_commands(draft: _Draft, backwards: Sequence[Candidate]) -> Iterator[s
 
 
 def _write_value(name: str, candidate: Candidate, when: str, draft: _Draft) -> str:
-    """Returns a command as a mapping has it: a column, or a column with more keys."""
+    """Returns a command as written in a mapping: a column, or a column with more keys."""
     table = candidate.table
     column = candidate.column
     reference = table.refer_to(column.name, draft.is_single)
     keys = [*_write_unit_keys(name, table, column)]
-    # A switch cuts the motor; the steering stays as it is.
+    # A switch cuts off the motor; the steering stays as it is.
     if when and "steer" not in name:
         keys.append(when)
     if table.time not in (draft.common_time, None):
@@ -182,7 +182,7 @@ def _write_unit_keys(name: str, table: TableSurvey, column: Survey) -> Iterator[
 
 
 def _guess_ticks_per_turn(table: TableSurvey) -> int:
-    """Returns the power of 2 by which the wheels turn at a usual rate; 0 if they stand."""
+    """Guesses the ticks per turn, a power of 2, by a usual wheel speed; 0 for standing wheels."""
     counters = [
         table.data[column.name].astype(np.float64)
         for column in table.numbers
@@ -234,7 +234,7 @@ def _find_free_yaw_rate(
 
 
 def _list_unused(draft: _Draft) -> Iterator[str]:
-    """Yields a comment for each table that names the columns of values that the draft lacks."""
+    """Yields a comment for each table with the columns of values that the draft does not use."""
     used = {
         (id(candidate.table), candidate.column.name)
         for candidate in draft.guess.listed.values()
@@ -289,7 +289,7 @@ def _write_pose(pose: PoseGuess, is_single: bool, common_time: str | None) -> li
 
 
 def _guess_pose_units(pose: PoseGuess) -> list[str]:
-    """Returns the lines on the units of a pose, by its names, or by what is plausible."""
+    """Returns the lines for the units of a pose, from its names or from what is plausible."""
     units = {
         "unit": split_unit(pose.x)[1],
         "heading_unit": split_unit(pose.heading or "")[1],
@@ -318,7 +318,7 @@ def _guess_pose_units(pose: PoseGuess) -> list[str]:
 
 
 def _correct_heading(line: str, pose: PoseGuess, units: Sequence[str]) -> str:
-    """Returns the heading's line as that of a compass, if the path only leads along such a one."""
+    """Returns the heading's line, mirrored as for a compass if only then it fits the path."""
     if not line.startswith("  heading: "):
         return line
     poses = _compute_poses(pose, units)
@@ -342,7 +342,8 @@ def _compute_poses(pose: PoseGuess, lines: Sequence[str]) -> tuple[Array, Array]
     if table.t is None:
         return None
     columns = [table.data[name].astype(np.float64) for name in pose.columns]
-    if any(len(column) != len(table.t) for column in columns):  # of several streams
+    # The columns may be of several streams.
+    if any(len(column) != len(table.t) for column in columns):
         return None
     x, y, *orientation = columns
     heading = orientation[0]
@@ -372,7 +373,7 @@ def _compute_poses(pose: PoseGuess, lines: Sequence[str]) -> tuple[Array, Array]
 def _guess_radius(
     poses: tuple[Array, Array] | None, fastest: float = FAR_AWAY
 ) -> float:
-    """Returns the radius of a robot [m]: of a car if it is as fast, or on a map of the land."""
+    """Returns the radius of a robot [m]: a car's if it is that fast or far out on a map."""
     if poses is None:
         return NO_RADIUS
     t, values = poses

@@ -1,7 +1,7 @@
-"""Compares how a robot turned by odometry and by its gyro, and lets the gyro turn the poses.
+"""Compares a robot's turns by odometry and by gyro, and turns poses by the gyro.
 
-Wheels slip where a robot turns, so odometry may report more or less turning than there was. A gyro
-does not slip, but has a bias, which shows while the wheels stand.
+Wheels slip when a robot turns, so odometry may report too much or too little turning. A gyro does
+not slip, but has a bias, which shows while the wheels stand still.
 """
 
 from dataclasses import dataclass
@@ -13,47 +13,47 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.geometry import Array
 
 BLOCK_S = 0.5  # length of the pieces in which both turns are compared
-WINDOW_S = 5.0  # over which the disagreement is told
+WINDOW_S = 5.0  # over which the disagreement is reported
 LONGEST_GAP_S = 0.25  # between two yaw rates that are joined
 LONGEST_PAUSE_S = 1.0  # between two poses of one drive
 FEWEST_BLOCKS = 6
 FEWEST_TO_DRIFT = 10
 STANDING_MPS = 0.005  # wheels that roll more slowly in a whole block are at rest
 STANDING_RADPS = 0.005
-FEWEST_AT_REST = 2  # blocks; of fewer, the bias is taken from the drive instead
-LEAST_BIAS_STD = 1e-5  # rad/s
-# deviations of a bias [rad/s], of a factor of turns from 1
+FEWEST_AT_REST = 2  # blocks; with fewer, the bias comes from the drive instead
+LEAST_BIAS_STD = 1e-5  # [rad/s]
+# Prior deviations of a bias from 0 [rad/s], and of the scale of turns from 1
 USUAL_BIAS = 0.01
 USUAL_FACTOR = 0.5
 LEAST_RATE_NOISE = 1e-3  # of a block's mean rate [rad/s]
-# factor of errors, as blocks of a drive are not independent of each other
+# Factor on errors, because the blocks of a drive are not independent of each other
 UNLIKE_BLOCKS = 2.0
-DRIFTS = 4.0  # standard errors of its slope beyond which a bias drifts
-DRIFT_SPAN_S = 20.0  # a drift of the bias shows only between rests so far apart
-LEAST_TURN_RAD = 1.0  # sum of all turns, below which a drive does not show a scale
+DRIFTS = 4.0  # standard errors beyond which the slope of a bias counts
+DRIFT_SPAN_S = 20.0  # a drift of the bias shows only if the rests span this time
+LEAST_TURN_RAD = 1.0  # sum of all turns below which a drive does not show a scale
 ALIKE = 0.7  # minimum correlation of two sources that measure the same motion
 PLAUSIBLE_SCALES = (0.33, 5.0)  # of odometry's turns, relative to those of the gyro
 IN_DEGREES = (40.0, 80.0)  # ratio of a rate in degrees to one in radians
 LEAST_APART_RAD = 0.02  # a smaller disagreement in `WINDOW_S` is not worth a correction
-GYRO_SCALE_STD = 0.015  # of the scale of a usual gyro, as a fraction
+GYRO_SCALE_STD = 0.015  # of a typical gyro's scale, as a fraction
 CLEARLY = 3.0  # standard errors
 
 
 @dataclass(frozen=True)
 class Turning:
-    """How odometry and a gyro say that a robot turned."""
+    """Comparison of a robot's turns by odometry and by gyro."""
 
     bias: float  # of the gyro, at the middle of its rests or of the drive [rad/s]
     bias_std: float  # [rad/s]
     bias_slope: float  # its change [rad/s^2]; 0 if none shows
     bias_time: float  # time to which `bias` belongs [s]
-    rest_s: float  # time at rest that shows the bias; 0 if it is from the drive itself
-    scale: float  # odometry's turn for a turn of 1 rad by the gyro; NaN if it turned too little
+    rest_s: float  # time at rest that shows the bias; 0 if the drive shows it
+    scale: float  # odometry's turn per turn of the gyro; NaN if the robot turned too little
     scale_std: float
-    alike: float  # correlation of both rates; NaN if it turned too little
+    alike: float  # correlation of both rates; NaN if the robot turned too little
     window_s: float
     apart: float  # root mean square disagreement after `window_s` [rad]; NaN if the drive is short
-    apart_std: float  # what bias and scale of the gyro may contribute to that [rad]
+    apart_std: float  # what the gyro's bias and scale may contribute to that [rad]
 
     def compute_bias(self, t: Array) -> Array:
         """Returns the bias (T,) at times (T,) [s]."""
@@ -66,7 +66,7 @@ class Turning:
 
     @property
     def mirrored(self) -> bool:
-        """True if both turn opposite ways."""
+        """True if the two turn in opposite directions."""
         return self.compared and self.alike < -ALIKE
 
     @property
@@ -128,9 +128,10 @@ def compare_turning(
 def turn_by_gyro(
     t: Array, pose: Array, gyro_t: Array, yaw_rate: Array, turning: Turning
 ) -> tuple[Array, float]:
-    """Returns poses (T, 3) of the same wheels' displacements along the heading of the gyro.
+    """Returns poses (T, 3) from the wheels' displacements along the heading of the gyro.
 
-    Also returns the fraction of the time with a gyro; otherwise the wheels turn the robot.
+    Also returns the fraction of the driving time that the gyro covers; elsewhere the wheels turn
+    the robot.
     """
     gyro_turn, covered = _integrate_gyro(
         t, gyro_t, yaw_rate - turning.compute_bias(gyro_t)
@@ -147,14 +148,14 @@ def turn_by_gyro(
     )
     turned = np.concatenate([position, geometry.wrap_angle(heading)[:, None]], axis=1)
     span = np.diff(t)
-    driven = span < LONGEST_PAUSE_S  # between two recordings there is no drive
+    driven = span < LONGEST_PAUSE_S  # a longer span separates two recordings
     driven_s = max(float(span[driven].sum()), 1e-9)
     return turned, float(span[covered & driven].sum()) / driven_s
 
 
 @dataclass(frozen=True)
 class _Blocks:
-    """Pieces of a drive for which there are both sources."""
+    """The n pieces of a drive that both sources cover."""
 
     middle: Array  # (n,) time [s]
     span: Array  # (n,) [s]
@@ -166,13 +167,13 @@ class _Blocks:
 def _integrate_gyro(
     t: Array, gyro_t: Array, yaw_rate: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Returns the gyro's turns (T - 1,) between times (T,) [s], and whether it covers them."""
+    """Returns the gyro's turns (T - 1,) [rad] between times (T,), and whether it covers them."""
     span = np.diff(gyro_t)
     total = np.concatenate(
         [[0.0], np.cumsum(0.5 * (yaw_rate[1:] + yaw_rate[:-1]) * span)]
     )
     turn = np.diff(np.interp(t, gyro_t, total))
-    # Time without a gyro up to each moment; none may pass within an interval that it covers.
+    # Time without a gyro up to each moment; an interval that contains any is not covered.
     lost = np.concatenate([[0.0], np.cumsum(np.where(span > LONGEST_GAP_S, span, 0.0))])
     without = np.diff(np.interp(t, gyro_t, lost))
     inside = (t[:-1] >= gyro_t[0] - 1e-9) & (t[1:] <= gyro_t[-1] + 1e-9)
@@ -208,7 +209,7 @@ def _estimate_bias(blocks: _Blocks) -> tuple[float, float, float, float, float]:
     rest_s = float(blocks.span[rest].sum())
     usual = float(np.median(rate))
     scatter = 1.4826 * float(np.median(np.abs(rate - usual)))
-    # not where somebody turned it
+    # Blocks in which somebody turned the robot do not count.
     near = np.abs(rate - usual) <= max(5.0 * scatter, 1e-3)
     rate = rate[near]
     when = when[near]
@@ -231,8 +232,8 @@ def _estimate_bias(blocks: _Blocks) -> tuple[float, float, float, float, float]:
 def _estimate_bias_while_driving(
     blocks: _Blocks,
 ) -> tuple[float, float, float, float, float]:
-    """Returns the bias that is left if odometry's turns are too large or small by a factor."""
-    # A robot that turns at one rate only does not show both: the usual bias and factor then count.
+    """Fits the bias together with a factor on odometry's turns; returns like `_estimate_bias`."""
+    # A robot that turns at only one rate does not show both, so both have priors.
     chi = np.stack([np.ones_like(blocks.odom_rate), blocks.odom_rate], axis=1)
     found, *_ = np.linalg.lstsq(chi, blocks.gyro_rate, rcond=None)
     left = blocks.gyro_rate - chi @ found
@@ -270,7 +271,7 @@ def _compute_rms(blocks: _Blocks, rate: Array, window_s: float) -> float:
         return np.nan
     total = np.concatenate([[0.0], np.cumsum(turn)])
     sums = total[count:] - total[:-count]
-    # Windows across a gap would compare less time than they say.
+    # A window across a gap contains less time than its length suggests.
     end = blocks.middle + 0.5 * blocks.span
     begin = blocks.middle - 0.5 * blocks.span
     is_whole = end[count - 1 :] - begin[: len(sums)] < 1.5 * window_s

@@ -1,4 +1,4 @@
-"""Which axis of an IMU points up, by gravity: it may be mounted on its side, or upside down."""
+"""Finds by gravity which axis of an IMU points up: it may be mounted on its side or upside down."""
 
 from typing import Any, NamedTuple
 
@@ -7,25 +7,22 @@ import numpy as np
 from nics_drl_bridge.geometry import Array
 
 AXES = "xyz"
-# an acceleration at rest [m/s^2]; others have gravity removed, or are none
-GRAVITY = (
-    7.0,
-    13.0,
-)
+# Accelerations at rest [m/s^2]; beyond, gravity was removed or nothing was measured
+GRAVITY = (7.0, 13.0)
 UPRIGHT = 0.85  # minimum fraction of gravity along the axis that points up
-# messages over which the acceleration is averaged while a robot drives
+# number of messages over which the acceleration is averaged while a robot drives
 REMEMBERED = 200
 
 
 class UpAxis(NamedTuple):
-    """The axis of an IMU that points up, or with the sign -1 down."""
+    """The axis of an IMU that points up, or down if the sign is -1."""
 
-    place: int = 2  # among x, y, z
+    place: int = 2  # index among x, y, z
     sign: float = 1.0
 
     @property
     def name(self) -> str:
-        """The axis as in `-y`."""
+        """Name of the axis, such as `-y`."""
         return f"{'-' if self.sign < 0.0 else ''}{AXES[self.place]}"
 
     @property
@@ -35,7 +32,7 @@ class UpAxis(NamedTuple):
 
 
 def find_up_axis(acceleration: Array) -> UpAxis:
-    """Returns the axis that points up by a mean acceleration (3,) [m/s^2]; z if none shows."""
+    """Returns the axis that points up by a mean acceleration (3,) [m/s^2]; z if it is unclear."""
     size = float(np.linalg.norm(acceleration))
     if not GRAVITY[0] < size < GRAVITY[1]:
         return UpAxis()
@@ -51,7 +48,7 @@ def to_array(vector: Any) -> Array:
 
 
 class GyroReader:
-    """Reads yaw rates of the messages of an IMU, however it is mounted."""
+    """Reads yaw rates from the messages of an IMU, however it is mounted."""
 
     def __init__(self) -> None:
         self._acceleration = np.zeros(3)

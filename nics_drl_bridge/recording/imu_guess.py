@@ -1,4 +1,4 @@
-"""Guesses by names which column of a recording is the yaw rate of a gyro."""
+"""Guesses by name which column of a recording is the yaw rate of a gyro."""
 
 from collections.abc import Iterator, Sequence
 
@@ -20,12 +20,12 @@ TURNING = (
 TURNING_OF_IMU = (*TURNING, {"w"}, {"wz"}, {"omega"}, {"angular", "z"}, {"z", "rate"})
 NOT_MEASURED = word_set("cmd command commanded ref setpoint target desired covariance")
 NOT_OF_GYRO = word_set("odom odometry vicon mocap gt truth")
-USUAL_NAMES = ("/imu", "/imu/data")  # of topics; the first that is there is chosen
-FASTEST_RADPS = 20.0  # a robot that seems to turn faster does so in degrees
+USUAL_NAMES = ("/imu", "/imu/data")  # of topics; the first one found is chosen
+FASTEST_RADPS = 20.0  # faster rates are in degrees per second
 
 
 def guess_yaw_rate(tables: Sequence[TableSurvey]) -> tuple[TableSurvey, Survey] | None:
-    """Finds the yaw rate of a gyro; None if no column is called one."""
+    """Finds the yaw rate of a gyro; None if no column is named like one."""
     found = [*_find_in_messages(tables)] or [*_find_in_columns(tables)]
     usual = [each for each in found if each[0].name in USUAL_NAMES]
     return next(iter(usual or found), None)
@@ -34,7 +34,7 @@ def guess_yaw_rate(tables: Sequence[TableSurvey]) -> tuple[TableSurvey, Survey] 
 def write_imu_line(
     table: TableSurvey, column: Survey, alone: bool, common: str | None
 ) -> str:
-    """Returns the line of a mapping for a yaw rate, beside the stamps that are common to all."""
+    """Returns a mapping's line for a yaw rate; `common` are the stamps of the whole mapping."""
     keys = [f"from: {table.refer_to(column.name, alone)}"]
     if (
         column.name.startswith("angular_velocity.")

@@ -1,7 +1,7 @@
 """Joins recordings of one robot into one, as episodes on one time axis that no window crosses.
 
-Each recording is split: its first part is to learn from, the rest is held out. All parts to learn
-from come first, so that one time separates them from those that are held out.
+Each recording is split: its first part is learnt from, the rest is held out. All parts to learn
+from come first, so that one time separates them from the held-out parts.
 """
 
 from collections.abc import Sequence
@@ -17,12 +17,12 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording.recording import STREAMS, Episode, Recording, Stream
 
 LEARNT_SHARE = 2.0 / 3.0  # fraction of each recording
-# between two episodes: longer than any prediction and any search for a delay
+# Time between two episodes, longer than any prediction and any search for a delay
 APART_S = 30.0
-LEAD_S = 2.0  # of commands before an episode, for states to follow them
-SETTLE_S = 5.0  # for which the first of these commands counts before them
+LEAD_S = 2.0  # of commands before an episode, so that states can follow them
+SETTLE_S = 5.0  # for which the first of these commands is held before them
 AFTER_S = 5.0  # of commands after an episode, for searches of a delay
-SHORTEST_SPLIT_S = 6.0  # shorter recordings are learnt from whole
+SHORTEST_SPLIT_S = 6.0  # shorter recordings are learnt from as a whole
 
 
 @dataclass(frozen=True)
@@ -30,17 +30,17 @@ class _Part:
     """A part of a recording that becomes an episode."""
 
     recording: Recording
-    start_s: float  # first and last pose [s]
+    start_s: float  # time of the first pose, and of the last [s]
     end_s: float
     is_learnt: bool
     source: str
 
 
 def join(recordings: Sequence[Recording], offsets: Sequence[float] = ()) -> Recording:
-    """Joins recordings of one robot; RecordingError if their variables differ.
+    """Joins recordings of one robot. Raises RecordingError if their variables differ.
 
-    `offsets` are added to the stamps of each pose to give those of its commands [s], where the two
-    have clocks of their own; by default none.
+    `offsets` [s], by default 0, are added to the pose stamps of recordings whose pose and commands
+    have different clocks.
     """
     offsets = offsets or [0.0] * len(recordings)
     aligned = [_align_clocks(*pair) for pair in zip(recordings, offsets, strict=True)]
@@ -54,7 +54,7 @@ def join(recordings: Sequence[Recording], offsets: Sequence[float] = ()) -> Reco
 def split_at(
     recording: Recording, starts: Sequence[float], names: Sequence[str]
 ) -> Recording:
-    """Makes episodes of a recording that start at times [s] of the clock that its streams share."""
+    """Splits a recording into episodes that start at times [s] on the clock of its streams."""
     ends = [*starts[1:], np.inf]
     parts = []
     for start, end, name in zip(starts, ends, names, strict=True):
@@ -78,7 +78,7 @@ def _align_clocks(recording: Recording, offset: float) -> Recording:
 
 
 def _check_alike(recordings: Sequence[Recording]) -> None:
-    """Refuses recordings of different robots."""
+    """Refuses recordings of different robots (RecordingError)."""
     first = recordings[0]
     for other in recordings[1:]:
         shapes = [each.command.values.shape[1] for each in (first, other)]
@@ -120,7 +120,7 @@ def _split_recording(recording: Recording) -> list[_Part]:
 def _place_parts(
     recordings: Sequence[Recording], learnt: Sequence[_Part], held_out: Sequence[_Part]
 ) -> Recording:
-    """Lays parts out on one time axis, each pose beginning where the one before ended."""
+    """Lays parts out on one time axis; each pose begins where the one before ended."""
     shared = [
         name for name in STREAMS if all(name in each.streams for each in recordings)
     ]
@@ -158,7 +158,7 @@ def _place_parts(
 
 
 def _cut_part(part: _Part, names: Sequence[str]) -> dict[str, Stream]:
-    """Returns the streams of a part: the commands with those before and after it."""
+    """Returns the streams of a part, with further commands before and after it."""
     cut = {}
     for name in names:
         stream = part.recording.streams[name]
@@ -175,7 +175,7 @@ def _cut_part(part: _Part, names: Sequence[str]) -> dict[str, Stream]:
 
 
 def _cut_commands(command: Stream, part: _Part) -> Stream:
-    """Returns the commands of a part, and before them the one in effect, for states to settle."""
+    """Returns a part's commands, and before them the one in effect, so that states can settle."""
     lead = part.start_s - LEAD_S
     first = max(int(np.searchsorted(command.t, lead, side="right")) - 1, 0)
     last = int(np.searchsorted(command.t, part.end_s + AFTER_S, side="right"))
@@ -190,9 +190,10 @@ def _cut_commands(command: Stream, part: _Part) -> Stream:
 
 
 def _move_pose(pose: Stream, first: Array, place: Array) -> Stream:
-    """Moves poses (T, 3) rigidly so that the first lies at a place: a robot moves alike anywhere.
+    """Moves poses (T, 3) rigidly so that the first lies at a place (3,).
 
-    Between two episodes the pose is then at rest, whatever their frames are.
+    The robot's motion does not depend on its place. Between two episodes the pose is then at rest,
+    whatever their frames are.
     """
     values = geometry.compose(place, geometry.between(first, pose.values))
     if pose.sigma is None:
@@ -207,7 +208,7 @@ def _move_pose(pose: Stream, first: Array, place: Array) -> Stream:
 
 
 def _append_streams(name: str, parts: Sequence[Stream]) -> Stream:
-    """Appends streams; a deviation counts only if all of them have one."""
+    """Appends streams; deviations are kept only if all of them have some."""
     for before, after in pairwise(parts):
         if after.t[0] < before.t[-1]:
             raise RecordingError(

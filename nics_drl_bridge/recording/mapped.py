@@ -1,4 +1,4 @@
-"""Reads the streams of a recording of any form as its mapping says."""
+"""Reads the streams of a recording in any format according to its mapping."""
 
 from collections.abc import Mapping as Names
 from collections.abc import Sequence
@@ -42,16 +42,16 @@ from nics_drl_bridge.recording.values import (
 )
 
 QUATERNION_TOLERANCE = 0.05
-MOST_TILT_DEG = 40.0  # median, of a robot that drives on wheels
-# fraction of poses whose quaternion is zero: the tracker had lost the body
+MOST_TILT_DEG = 40.0  # maximum median tilt of a robot that drives on wheels
+# Maximum fraction of zero quaternions, where the tracker lost the body
 MOST_UNTRACKED = 0.05
 NO_LENGTH = 1e-9
 SHORTEST_S = 1.0
-MOST_RATIO = 100.0  # of durations of two streams of a drive
+MOST_RATIO = 100.0  # maximum ratio of the durations of two streams of a drive
 
 
 def read_mapped(source: Source, mapping: Mapping) -> Recording:
-    """Reads the streams of a mapping; ConfigError, RecordingError: what is missing or wrong."""
+    """Reads a recording by its mapping. Raises ConfigError or RecordingError if they do not fit."""
     if mapping.episode is None:
         return _read_drive(source, mapping)[0]
     plain = mapping.model_copy(update={"episode": None})
@@ -69,7 +69,7 @@ def read_mapped(source: Source, mapping: Mapping) -> Recording:
 
 
 def _read_drive(source: Source, mapping: Mapping) -> tuple[Recording, float]:
-    """Reads a drive, and the time that was subtracted from the stamps of its pose [s]."""
+    """Returns a drive, and the time that was subtracted from the stamps of its pose [s]."""
     reader = MappedReader(source, mapping)
     _check_commands(reader, mapping.command)
     streams = {
@@ -113,7 +113,7 @@ def _read_values(
 
 
 def _check_commands(reader: MappedReader, commands: Names[str, Value]) -> None:
-    """Refuses a column as a command whose name or values say that it was measured."""
+    """Refuses a column as a command if its name or values show that it was measured."""
     for name, value in commands.items():
         table, reference = reader.locate(value.from_)
         column = str(reference)
@@ -132,7 +132,7 @@ def _check_commands(reader: MappedReader, commands: Names[str, Value]) -> None:
 
 
 def _guess_pose_source(source: Source, mapping: Mapping) -> MeasuredBy:
-    """Returns what measured the pose, by the names of its topic or file, columns and frames."""
+    """Returns what measured the pose, guessed from names of topic or file, columns and frames."""
     pose = mapping.pose
     values = (pose.x, pose.y, pose.heading)
     references = [value.from_ for value in values if value is not None]
@@ -160,7 +160,7 @@ def _read_turn_rate(reader: MappedReader, imu: ImuSource, heading: Value) -> Str
 
 
 def _check_kind(name: str, value: Value, kinds: Sequence[str]) -> None:
-    """Refuses a value whose unit is of no kind that is needed (ConfigError)."""
+    """Refuses a value whose unit is not of the needed kind (ConfigError)."""
     si = get_unit(value).si
     if si not in kinds:
         raise ConfigError(
@@ -169,7 +169,7 @@ def _check_kind(name: str, value: Value, kinds: Sequence[str]) -> None:
 
 
 def _check_units(reader: MappedReader, pose: Stream) -> None:
-    """Refuses poses, as they were recorded, that only a wrong unit explains."""
+    """Refuses poses that only a wrong unit explains (RecordingError)."""
     mapping = reader.mapping
     radius = 0.0
     if isinstance(mapping.robot, dict):
@@ -188,7 +188,7 @@ def _check_units(reader: MappedReader, pose: Stream) -> None:
 
 
 def _read_measured(reader: MappedReader, name: str, stream: Measured) -> Stream:
-    """Reads a stream of measurements; values that it lacks are zero."""
+    """Reads a stream of measurements; values that are not mapped are zero."""
     parts: dict[int, Series] = {}
     for column, (key, kinds) in enumerate(schema.SI[name].items()):
         value: Value | None = getattr(stream, key)
@@ -204,7 +204,7 @@ def _read_measured(reader: MappedReader, name: str, stream: Measured) -> Stream:
 
 
 def read_pose(reader: MappedReader, pose: PoseSource) -> Stream:
-    """Reads poses, with their deviations where a covariance is mapped."""
+    """Reads poses, with their deviations if a covariance is mapped."""
     if pose.x is None:
         pose = _complete_pose(reader, pose)
     values = {"x": pose.x, "y": pose.y, "heading": pose.heading}
@@ -225,12 +225,12 @@ def read_pose(reader: MappedReader, pose: PoseSource) -> Stream:
         parts.append(reader.read_series(f"pose.{key}", value, pose, held=False))
         factors.append(abs(unit.factor * value.scale))
         if key == "y" and unit.si == "rad":
-            # Longitude and latitude; covariances are in m.
+            # Longitude and latitude; their covariances are in m.
             east, north = east_and_north(parts[0].values, parts[1].values)
             parts = [parts[0]._replace(values=east), parts[1]._replace(values=north)]
             factors = [1.0, 1.0]
     _check_units(reader, combine_series("pose", parts, held=False))
-    # A heading can be interpolated only without its jumps.
+    # A heading can be interpolated only once it is unwrapped.
     parts[2] = parts[2]._replace(values=np.unwrap(parts[2].values))
     stream = combine_series("pose", parts, held=False)
     stream.values[:, 2] = wrap_angle(stream.values[:, 2])
@@ -245,7 +245,7 @@ def read_pose(reader: MappedReader, pose: PoseSource) -> Stream:
 def _read_heading(
     reader: MappedReader, pose: PoseSource, references: str | Sequence[Reference]
 ) -> Series:
-    """Returns the heading of quaternions; those of length 0 are left out."""
+    """Returns the headings of quaternions, without quaternions of length 0."""
     if isinstance(references, str):
         references = [f"{references}.{axis}" for axis in "xyzw"]
     values = [Value.model_validate({"from": reference}) for reference in references]
@@ -290,7 +290,7 @@ POSES = (
 
 
 def _complete_pose(reader: MappedReader, pose: PoseSource) -> PoseSource:
-    """Completes a pose of which only the topic is given."""
+    """Completes a pose that is given by its topic only."""
     table, _ = reader.locate("", pose.in_)
     for position, orientation, covariance in POSES:
         keys = {"x": position.format("x"), "y": position.format("y")}
@@ -348,7 +348,7 @@ def _read_deviations(
 def _shift_to_zero(
     streams: dict[str, Stream], main_clock: str, reader: MappedReader
 ) -> dict[str, Stream]:
-    """Shifts stamps to begin near 0: by one origin, but for clocks whose spans do not overlap."""
+    """Shifts stamps to start near 0; clocks whose spans overlap share one origin."""
     spans = _find_spans(streams, reader.source.place)
     _check_durations(streams, reader.source.place)
     start, stop = spans.get(main_clock) or next(iter(spans.values()))
@@ -374,7 +374,7 @@ def _shift_to_zero(
 def _find_spans(
     streams: dict[str, Stream], place: str
 ) -> dict[str, tuple[float, float]]:
-    """Returns first and last stamp of each clock [s]; streams of one clock have to overlap."""
+    """Returns first and last stamp of each clock [s]; streams of one clock must overlap."""
     spans: dict[str, tuple[float, float]] = {}
     for name, stream in streams.items():
         first = float(stream.t[0])
@@ -392,7 +392,7 @@ def _find_spans(
 
 
 def _check_durations(streams: dict[str, Stream], place: str) -> None:
-    """Refuses streams that last far longer or shorter than the pose, as in a wrong unit."""
+    """Refuses streams that last far longer or shorter than the pose, as with a wrong unit."""
     pose_s = float(np.ptp(streams["pose"].t))
     if pose_s < SHORTEST_S:
         advice = "give the `unit:` of its `time:`, as s, min or h"

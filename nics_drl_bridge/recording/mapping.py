@@ -74,7 +74,7 @@ RATES = {
 
 
 def check_unit(name: str) -> str:
-    """Returns the name of a unit; ValueError names the nearest known one."""
+    """Returns the name of a unit. Raises ValueError with a suggestion if it is unknown."""
     if str(name) not in UNITS:
         raise ValueError(f"is no known unit ({suggest(str(name), UNITS)})")
     return str(name)
@@ -88,10 +88,10 @@ def to_si(unit: str, ticks_per_turn: float | None = None) -> UnitOfData:
     return UNITS[unit]
 
 
-# Words of columns that can't have been sent to a robot: where it is, and how uncertain that is.
+# Words of columns that can't have been sent to a robot: its place on Earth, and uncertainties
 PLACES_ON_EARTH = word_set("latitude longitude altitude")
 SHORT_OF_EARTH = word_set("lat lon lng long")
-NEAR_DEG = 1.0  # a drive is within so much of its latitude and longitude
+NEAR_DEG = 1.0  # a drive stays within this range of latitude and longitude
 NO_COMMANDS = PLACES_ON_EARTH | word_set("covariance covariances cov variance")
 
 NO_COMMAND_NAMED = (
@@ -103,7 +103,7 @@ NO_COMMAND_NAMED = (
 ARRIVAL = "arrival"
 HEADER = "header"
 ROBOT_CLOCK = "robot"
-# Where the variances of x, y and heading stand: alone, and in a 3 x 3 or 6 x 6 matrix by rows.
+# Indices of the variances of x, y and heading: alone, or in a 3 x 3 or 6 x 6 matrix by rows
 COVARIANCES = {3: (0, 1, 2), 9: (0, 4, 8), 36: (0, 7, 35)}
 
 # A column by name or by number from 0; FILE:COLUMN in a folder, /topic:message.field in a bag.
@@ -122,7 +122,7 @@ def _expand_reference(key: str) -> Any:
 
 
 def _check_kind(kinds: tuple[str, ...]) -> Any:
-    """Refuses units of another kind than `kinds`, which are in SI."""
+    """Returns a validator that refuses units whose SI unit is not one of `kinds`."""
 
     def check(unit: str | None) -> str | None:
         if unit is not None and UNITS[check_unit(unit)].si not in kinds:
@@ -134,7 +134,7 @@ def _check_kind(kinds: tuple[str, ...]) -> Any:
 
 
 def explain_no_command(column: str) -> str:
-    """Says why a column was not sent to the robot, by the words in its name; empty if it may be."""
+    """Returns why a column, by its name, was not sent to the robot; empty if it may have been."""
     words = NO_COMMANDS.intersection(split_words(column))
     if not words:
         return ""
@@ -150,15 +150,15 @@ def may_be_place_on_earth(column: str) -> bool:
 
 
 def is_place_on_earth(column: str, low: float, high: float) -> bool:
-    """True for `lat` or `lon` whose values stay within a degree, as those of a drive do."""
+    """True for `lat` or `lon` whose values stay within a degree, as in a drive."""
     is_near = high - low < NEAR_DEG <= max(abs(low), abs(high))
     return is_near and may_be_place_on_earth(column)
 
 
 class Time(Schema):
-    """Stamps of rows: of a column, of two that hold seconds and nanoseconds, or at a rate."""
+    """Stamps of rows: from a column, from two for seconds and nanoseconds, or at a rate."""
 
-    # also `header` or `arrival` of the messages of a bag
+    # column or columns; of a bag's messages also `header` or `arrival`
     from_: Reference | tuple[Reference, Reference] | None = Field(
         default=None, alias="from"
     )
@@ -178,25 +178,25 @@ class Time(Schema):
 
 
 class Value(Schema):
-    """A number in each row: SI value = unit x scale x what stands there + offset."""
+    """A number in each row: SI value = unit x scale x number + offset."""
 
     # column by name or number, TABLE:COLUMN or /topic:field
     from_: Reference = Field(alias="from")
-    unit: str | None = None  # by default that of the stream, or SI
-    maximum: float | None = None  # value in SI of a full share
-    scale: float = 1.0  # -1 turns the sign
+    unit: str | None = None  # by default the stream's, or SI
+    maximum: float | None = None  # SI value of a full share
+    scale: float = 1.0  # -1 reverses the sign
     offset: float = 0.0  # in SI
-    # of an encoder, makes ticks angles
+    # of an encoder; turns ticks into angles
     ticks_per_turn: float | None = Field(default=None, gt=0.0)
     differentiate: bool | None = None  # by default true for `ticks`, which are counters
-    # where a counter overflows; found if left out
+    # value at which a counter overflows; by default found from the data
     wrap: float | None = Field(default=None, gt=0.0)
-    # other columns, flags, and the values at which this one counts; `otherwise` stands in its place
+    # flags: other columns, with the values at which this one counts; else `otherwise` counts
     when: dict[str, Condition] = Field(default_factory=dict)
-    otherwise: float = 0.0  # in SI, where a flag is not as `when` needs it
-    # stamps of this value; None: of its stream
+    otherwise: float = 0.0  # in SI, for rows whose flags do not match `when`
+    # stamps of this value; None: the stream's
     time: Annotated[Time | None, _expand_reference("from")] = None
-    clock: str | None = None  # name of the clock of these stamps; None: of its stream
+    clock: str | None = None  # name of the clock of these stamps; None: the stream's
 
     @field_validator("unit")
     @classmethod
@@ -224,7 +224,7 @@ AValue = Annotated[Value, _expand_reference("from")]
 class Measured(Schema):
     """Keys of all streams: table of their columns, stamps, clock."""
 
-    # file or topic of columns that name none
+    # file or topic of columns that do not name one
     in_: str | None = Field(default=None, alias="in")
     # stamps; None: those of the whole mapping
     time: Annotated[Time | None, _expand_reference("from")] = None
@@ -240,16 +240,16 @@ class PoseSource(Measured):
     heading: AValue | None = None  # direction of the body, counter-clockwise from x
     # instead of the heading: x, y, z, w, or the field of a message
     quaternion: str | tuple[Reference, Reference, Reference, Reference] | None = None
-    # of x and y, and in the covariance; an angle if they are longitude and latitude
+    # of x and y and their variances; an angle if they are longitude and latitude
     unit: Annotated[str, _check_kind(("m", "rad"))] = "m"
     # of the heading and its variance
     heading_unit: Annotated[str, _check_kind(("rad",))] = "rad"
     # variances of x, y, heading; or all of a 3 x 3 or 6 x 6 matrix, by rows; or a message's field
     covariance: str | list[Reference] | None = None
-    # what measured it: `odometry`, which drifts, or a `tracker`, as motion capture or a localiser;
-    # None: as the names of topic, file and columns tell
+    # what measured it: `odometry`, which drifts, or a `tracker` such as motion capture or a
+    # localiser; None: guessed from the names of topic, file and columns
     measured_by: Literal["odometry", "tracker"] | None = None
-    frame: str | None = None  # parent of the transforms to use, of a topic like /tf
+    frame: str | None = None  # parent of the transforms to use, for a topic like /tf
     child_frame: str | None = None  # their child, the tracked body
 
     @property
@@ -288,7 +288,7 @@ class ImuSource(Measured):
     ax: AValue | None = None  # acceleration along x, forward [m/s^2]; None: 0
     ay: AValue | None = None  # acceleration along y, to the left [m/s^2]; None: 0
     yaw_rate: AValue | None = None  # turn rate, counter-clockwise [rad/s]
-    # instead of the turn rate: a second heading, as of a compass, counter-clockwise [rad]
+    # instead of the turn rate: a second heading, such as a compass's, counter-clockwise [rad]
     heading: AValue | None = None
 
     @model_validator(mode="after")
@@ -307,11 +307,11 @@ class OdometrySource(Measured):
 
 
 class Mapping(Schema):
-    """A recording of any form as the streams of a Recording."""
+    """How a recording in any format maps to the streams of a Recording."""
 
     # a shipped robot's name, a path, or its definition
     robot: str | dict[str, Any] | None = None
-    # file or topic of streams that name none
+    # file or topic of streams that do not name one
     in_: str | None = Field(default=None, alias="in")
     # stamps of all streams; None: a bag's own
     time: Annotated[Time | None, _expand_reference("from")] = None
@@ -319,9 +319,9 @@ class Mapping(Schema):
     clock: str | None = None
     # column whose value changes from one episode to the next; None: one drive
     episode: Reference | None = None
-    # of the tracked body; a topic alone means its `in`
+    # pose of the tracked body; a topic alone stands for its `in`
     pose: Annotated[PoseSource, _expand_reference("in")]
-    command: dict[str, AValue]  # by the names of the robot's commands
+    command: dict[str, AValue]  # commands, by the robot's names for them
     # measured states, by their names
     state: dict[str, AValue] = Field(default_factory=dict)
     wheels: WheelSource | None = None  # wheel speeds, if they were recorded
@@ -355,7 +355,7 @@ SI: dict[str, dict[str, tuple[str, ...]]] = {
     "imu": {"ax": ("m/s^2",), "ay": ("m/s^2",), "yaw_rate": ("rad/s",)},
     "odometry": {"vx": ("m/s",), "vy": ("m/s",), "wz": ("rad/s",)},
 }
-"""Values of each stream, in order, with the units that they may have in SI."""
+"""Values of each stream, in order, with their possible SI units."""
 
 
 def load_mapping(path: str | Path) -> Mapping:

@@ -1,4 +1,4 @@
-"""MCAP files: records parsed by the library `mcap`, and the checks that its readers leave out."""
+"""MCAP files: records parsed by the library `mcap`, and the checks that its readers omit."""
 
 import struct
 from collections.abc import Iterator
@@ -22,7 +22,7 @@ COMPRESSIONS = ("", "lz4", "zstd")
 INSIDE = (kinds.Schema, kinds.Channel, kinds.Message)
 # maximum size of one chunk or message, decompressed [bytes]
 MOST_UNPACKED = 256 * 2**20
-# compression ratio of a file that decompresses to more than that
+# maximum compression ratio of a file that decompresses to more than that
 MOST_PACKED_SHARE = 1000
 _PART = 2**20
 
@@ -45,7 +45,7 @@ class Record(NamedTuple):
 
 
 class _View:
-    """Bytes for the library, without copies; reading beyond their end fails, as in no file."""
+    """Bytes for the library, without copies; unlike in a file, reading past their end fails."""
 
     def __init__(self, data: memoryview, place: int) -> None:
         self._data = data
@@ -60,7 +60,7 @@ class _View:
 
 
 def read_records(data: memoryview, place: int = 0) -> Iterator[Record]:
-    """Yields the records from an offset until a footer or the end; DamageError at a broken one."""
+    """Yields records from an offset to a footer or the end. Raises DamageError at a broken one."""
     stream = _View(data, place)
     source = cast("IO[bytes]", stream)
     parsed = StreamReader(
@@ -93,7 +93,7 @@ def read_records(data: memoryview, place: int = 0) -> Iterator[Record]:
 
 
 def unpack_chunk(record: Record) -> memoryview:
-    """Decompresses the records of a chunk and verifies size and checksum (DamageError)."""
+    """Decompresses the records of a chunk. Raises DamageError if size or checksum is wrong."""
     chunk: kinds.Chunk = record.content
     if chunk.compression not in COMPRESSIONS:
         raise DamageError(
@@ -140,9 +140,9 @@ def write_checksums(path: Path) -> None:
 
 
 def check_mcap(path: Path) -> None:
-    """Checks records, chunks and checksums from first byte to last, before a reader (DamageError).
+    """Checks all records, chunks and checksums of a file. Raises DamageError at the first fault.
 
-    Index and statistics are not held against the messages; `BagFile` compares counts and times.
+    Index and statistics are not compared with the messages; `BagFile` compares counts and times.
     """
     if path.stat().st_size < len(MAGIC):
         raise DamageError(0, "the file is empty or ends at once")
@@ -153,7 +153,7 @@ def check_mcap(path: Path) -> None:
     if end <= len(MAGIC) or data[end:] != MAGIC:
         fault = "it does not end as an MCAP file: it is cut off or was not closed"
         raise DamageError(len(data), fault)
-    data_end = 0  # offset of the summary; 0 within the data
+    data_end = 0  # offset of the summary; 0 until the end of the data
     for record in read_records(data[:end], len(MAGIC)):
         content = record.content
         if record.offset == len(MAGIC) and not isinstance(content, kinds.Header):
@@ -180,7 +180,7 @@ def _check_crc(record: Record, data: memoryview, crc: int, name: str) -> None:
 
 
 def _check_chunk(record: Record) -> None:
-    """Walks through a chunk, which holds nothing but schemas, channels and messages."""
+    """Checks a chunk, which may hold only schemas, channels and messages (DamageError)."""
     try:
         for inner in read_records(unpack_chunk(record)):
             if not isinstance(inner.content, INSIDE):
@@ -196,12 +196,12 @@ def _import_zstd() -> Any:
     try:
         return import_module("compression.zstd")
     except ImportError:
-        # a dependency of rosbags before Python 3.14
+        # A dependency of rosbags before Python 3.14.
         return import_module("backports.zstd")
 
 
 def unpack(data: bytes, compression: str, most: int = MOST_UNPACKED) -> bytes:
-    """Unpacks `lz4` or `zstd`; ValueError: cut off, or above `most` bytes (may be terabytes)."""
+    """Unpacks `lz4` or `zstd`. Raises ValueError if cut off, or above `most` bytes unpacked."""
     if compression == "zstd":
         unpacker = _import_zstd().ZstdDecompressor()
     else:
@@ -216,7 +216,7 @@ def unpack(data: bytes, compression: str, most: int = MOST_UNPACKED) -> bytes:
 
 
 def unpack_file(path: Path, out: Path) -> Path:
-    """Decompresses a file. Raises ValueError if it becomes far larger than it was."""
+    """Decompresses a file to `out`. Raises ValueError if it becomes implausibly large."""
     most = max(MOST_UNPACKED, MOST_PACKED_SHARE * path.stat().st_size)
     length = 0
     with _import_zstd().open(path, "rb") as file, out.open("wb") as plain:

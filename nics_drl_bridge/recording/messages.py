@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 Row = tuple[float, float, float]
-QUATERNION_TOLERANCE = 0.1  # tolerance of the squared length of a quaternion about 1
+QUATERNION_TOLERANCE = 0.1  # maximum difference of a quaternion's squared length from 1
 
 ACKERMANN_DEFINITION = (
     "float32 steering_angle\nfloat32 steering_angle_velocity\nfloat32 speed\n"
@@ -48,7 +48,7 @@ def check_libraries(path: Path, what: str, instead: str = "") -> None:
 
 
 def make_typestore() -> "Typestore":
-    """Returns the message types of ROS 2, and those of Ackermann drives."""
+    """Returns the message types of ROS 2, and of Ackermann drives."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS2_JAZZY)
@@ -62,9 +62,10 @@ def make_typestore() -> "Typestore":
 def collect_types(
     connections: "Sequence[Connection]", header: bool = True
 ) -> "Typestore":
-    """Returns the message types of `make_typestore`, and before these those that a bag defines.
+    """Returns the message types that a bag defines, and those of `make_typestore` otherwise.
 
-    That of ROS 1 for headers decodes messages, that of ROS 2 (`header` is false) converts them.
+    With `header`, the bag's own type of headers is used, which decodes messages of ROS 1; without,
+    the type of ROS 2, which converts them.
     """
     from rosbags.interfaces import MessageDefinitionFormat
     from rosbags.typesys import (
@@ -78,9 +79,8 @@ def collect_types(
     store = make_typestore()
     for connection in connections:
         form, text = connection.msgdef
-        with suppress(
-            Exception
-        ):  # a definition that can't be parsed leaves its type unknown
+        # A definition that can't be parsed leaves its type unknown.
+        with suppress(Exception):
             if form == MessageDefinitionFormat.MSG:
                 defined |= get_types_from_msg(text, connection.msgtype)
             elif form == MessageDefinitionFormat.IDL:
@@ -115,7 +115,7 @@ def get_stamp(message: Any) -> int:
 
 
 def read_command(message: Any) -> Row:
-    """Returns linear.x, linear.y, angular.z; of an Ackermann drive speed, 0, steering angle."""
+    """Returns linear.x, linear.y, angular.z; for an Ackermann drive speed, 0, steering angle."""
     drive = getattr(message, "drive", message)
     if hasattr(drive, "steering_angle"):
         return drive.speed, 0.0, drive.steering_angle
@@ -145,12 +145,12 @@ def read_quaternion(message: Any) -> tuple[float, float, float, float]:
 
 
 def is_rotation(x: float, y: float, z: float, w: float) -> bool:
-    """True if a quaternion has about unit length; one of zeros was never filled in."""
+    """True if a quaternion has about unit length; a zero quaternion was never filled in."""
     return abs(w * w + x * x + y * y + z * z - 1.0) < QUATERNION_TOLERANCE
 
 
 def read_whole_pose(message: Any) -> Row:
-    """Returns the pose of a message; NaN where its orientation was never filled in."""
+    """Returns the pose of a message; NaN if its orientation was never filled in."""
     return (
         read_pose(message)
         if is_rotation(*read_quaternion(message))
@@ -174,7 +174,7 @@ def read_twist(message: Any) -> Row:
 
 
 def read_turn_variance(message: Any) -> float | None:
-    """Returns the variance of an Odometry's yaw rate [rad^2/s^2]; None if it says nothing."""
+    """Returns the variance of an Odometry's yaw rate [rad^2/s^2]; None if it is not stated."""
     variance = float(message.twist.covariance[35])
     if not math.isfinite(variance) or variance <= 0.0:
         return None
@@ -189,7 +189,7 @@ def read_imu(message: Any) -> Row:
 
 @dataclass(frozen=True)
 class Offer:
-    """Quality of service that a publisher offers, as far as it decides which subscribers match."""
+    """Quality of service that a publisher offers, as far as matching with subscribers needs it."""
 
     depth: int = 10  # of its history
     reliable: bool = True  # False for best effort
@@ -198,7 +198,7 @@ class Offer:
 
 
 def convert_offers(profiles: "Sequence[Qos]") -> tuple[Offer, ...]:
-    """Converts profiles of rosbags to offers."""
+    """Converts rosbags profiles to offers."""
     from rosbags.interfaces import QosDurability, QosReliability
 
     return tuple(
@@ -212,7 +212,7 @@ def convert_offers(profiles: "Sequence[Qos]") -> tuple[Offer, ...]:
 
 
 def make_profile(offer: Offer) -> "Qos":
-    """Converts an offer to a profile of rosbags; the other policies keep their defaults."""
+    """Converts an offer to a rosbags profile; the other policies keep their defaults."""
     from rosbags import interfaces as rosbags
 
     forever = rosbags.QosTime(9223372036, 854775807)

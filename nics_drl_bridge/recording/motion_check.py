@@ -1,4 +1,4 @@
-"""Checks guessed commands against the motion: whether they go with it, and how late it follows."""
+"""Checks guessed commands against the motion: whether it follows them, and how late."""
 
 from collections.abc import Iterator
 
@@ -10,19 +10,19 @@ from nics_drl_bridge.recording.names import split_words
 
 STEP_S = 0.1
 SMOOTHED = 3  # steps over which measured rates are averaged
-LONGEST_LATENCY_S = 3.0  # searched
-EARLIEST_S = -1.0
+LONGEST_LATENCY_S = 3.0  # maximum delay of the motion that is tried
+EARLIEST_S = -1.0  # minimum delay that is tried
 IMPLAUSIBLE_LATENCY_S = 1.0
-PRECEDES_S = -0.3  # a motion this early before its command
+PRECEDES_S = -0.3  # a motion this early precedes its command
 LEAST_CORRELATION = 0.3
-CLEAR_CORRELATION = 0.6  # from which on a latency is told
+CLEAR_CORRELATION = 0.6  # minimum at which a latency is reported
 FEWEST = 100  # steps
 
 
 def find_doubts(guess: CommandGuess, pose: tuple[Array, Array] | None) -> Iterator[str]:
-    """Yields sentences on commands that do not go with the motion, or long before or after it.
+    """Yields sentences on commands that the motion ignores, or follows much too early or late.
 
-    `pose` are its stamps (T,) [s] and poses (T, 3).
+    `pose` holds stamps (T,) [s] and poses (T, 3).
     """
     if pose is None or guess.of_wheels:
         return
@@ -56,10 +56,10 @@ def find_doubts(guess: CommandGuess, pose: tuple[Array, Array] | None) -> Iterat
 def find_reversed_wheels(
     guess: CommandGuess, pose: tuple[Array, Array] | None
 ) -> list[Candidate]:
-    """Returns the measured wheel, left or right, that counts backwards, as the motion shows.
+    """Returns the measured wheel, left or right, that counts backwards according to the motion.
 
-    Both have to turn the same way when the robot moves, and the right one faster when it turns
-    counter-clockwise.
+    Both wheels turn the same way when the robot drives, and the right one turns faster when the
+    robot turns counter-clockwise.
     """
     sides = {wheel.meaning: wheel for wheel in guess.commands.values()}
     if pose is None or not guess.of_wheels or sides.keys() != {"left", "right"}:
@@ -81,7 +81,7 @@ def find_reversed_wheels(
 
 
 def _compute_wheel_rate(wheel: Candidate, t: Array) -> Array | None:
-    """Returns the rate (K,) of a wheel at times t (K,) [s]; None if it is not known, or still."""
+    """Returns the rate (K,) of a wheel at times t (K,) [s]; None if it is unknown or constant."""
     values = wheel.table.data[wheel.column.name].astype(np.float64)
     if wheel.table.t is None or len(wheel.table.t) != len(values):
         return None
@@ -124,7 +124,7 @@ def _compute_rates(t: Array, pose: Array) -> tuple[Array, Array, Array] | None:
 def _compute_likeness(
     candidate: Candidate, t: Array, signal: Array, lags: Array
 ) -> Array | None:
-    """Returns the correlation of a signal (K,) at t (K,) with a command, by lags (L,) [s]."""
+    """Returns the correlation of a signal (K,) at t (K,) with a command, for each lag (L,) [s]."""
     table = candidate.table
     column = candidate.column
     values = table.data[column.name].astype(np.float64)

@@ -4,7 +4,7 @@ import re
 
 
 def word_set(text: str) -> frozenset[str]:
-    """Returns the words of a text that white space separates."""
+    """Returns the words of a text, split at white space."""
     return frozenset(text.split())
 
 
@@ -15,7 +15,7 @@ def split_words(name: str) -> list[str]:
 
 
 def write_reference(reference: str) -> str:
-    """Returns a reference as YAML, within a list too."""
+    """Returns a reference as YAML that is also valid within a list."""
     plain = re.fullmatch(r"[A-Za-z/][\w/. -]*(:[\w. -]+)?|\d+", reference)
     is_word = reference.lower() not in ("true", "false", "null")
     return reference if plain and is_word else f'"{reference}"'

@@ -14,7 +14,7 @@ from nics_drl_bridge.recording.names import split_words, word_set
 from nics_drl_bridge.recording.recording import measure_alignment
 from nics_drl_bridge.recording.survey import TableSurvey, split_unit
 
-# Words of the first coordinate, and of the second beside it.
+# Words of the first coordinate, with the matching word of the second
 AXES = {
     "x": "y",
     "px": "py",
@@ -36,7 +36,7 @@ HEADINGS = (
     "angle",
     "phi",
 )
-# Words of columns that are places of something else, and of motions, sensors and deviations.
+# Words of columns that hold places of something else, motions, sensor data or deviations
 OTHERS = word_set("""
     goal target waypoint waypoints ref reference setpoint desired initialpose
     marker markers obstacle obstacles landmark landmarks person people leg
@@ -49,22 +49,22 @@ NOT_PLACES = OTHERS | word_set("""
     std stddev sigma var variance cov covariance
 """)
 TURNS = word_set("q quat quaternion rotation orientation")
-# The source of a pose by its name: a tracker before a localiser before odometry.
+# Words for the source of a pose: trackers rank before localisers, localisers before odometry.
 TRACKERS = word_set("vicon mocap vrpn optitrack qualisys gt truth groundtruth tracker")
 LOCALISERS = word_set("pose amcl pf slam cartographer rtabmap filtered fused ekf")
 SENSORS = word_set("odom odometry imu gyro measured encoder wheel feedback model")
 SOURCES = TRACKERS | LOCALISERS | SENSORS | {"ground"}
-# Types of messages that hold positions of something else, or of a goal.
+# Message types that hold positions of something else, or of a goal
 OTHER_PLACES = re.compile(
     r"^(visualization|actionlib|action|move_base|map)_msgs/"
     r"|/(Path|OccupancyGrid|MapMetaData|PoseArray|GridCells|Imu|Joy|LaserScan|MagneticField)$"
 )
-UNIT_LENGTH = 0.01  # by which a quaternion may differ from length 1
-ALONG = 0.9  # fraction to which columns without names lead along their heading
-CONFIRMED = 0.7  # fraction to which a place leads along the quaternion that follows it
-NEARLY_A_TURN = 5.5  # [rad] from one row to the next
-PIECES = 30  # of the extent of a path, in which it is compared with a heading
-MOST_COMPARED = 200  # poses, about
+UNIT_LENGTH = 0.01  # maximum difference of a quaternion's length from 1
+ALONG = 0.9  # minimum alignment of the path of columns without names with their heading
+CONFIRMED = 0.7  # minimum alignment of a path with the quaternion that follows it
+NEARLY_A_TURN = 5.5  # minimum change between two rows where an angle wraps [rad]
+PIECES = 30  # number of steps over the extent of a path
+MOST_COMPARED = 200  # approximate number of poses
 ELEMENT = re.compile(r"\[\d+\]")
 
 
@@ -94,8 +94,8 @@ def list_used_columns(table: TableSurvey, pose: PoseGuess | None) -> set[str]:
 
 
 def guess_pose(tables: Sequence[TableSurvey]) -> PoseGuess | None:
-    """Finds x, y and heading, or a quaternion, by their names, or where the motion shows them."""
-    if len(tables) > 1:  # then the names of tables say what they hold
+    """Finds x, y and heading or quaternion by their names, or by the motion."""
+    if len(tables) > 1:  # then the names of tables show what they hold
         tables = [each for each in tables if OTHERS.isdisjoint(split_words(each.name))]
     poses = [pose for table in tables for pose in _find_named_poses(table)]
     if not poses:
@@ -104,9 +104,9 @@ def guess_pose(tables: Sequence[TableSurvey]) -> PoseGuess | None:
 
 
 def _rank_pose(pose: PoseGuess) -> float:
-    """Returns how far a pose is to be preferred to others, by what its names say."""
+    """Ranks a pose by what its names say about its source."""
     words = {*split_words(pose.x)}
-    # A column whose name says its source says more than the name of its file.
+    # A column's name that states its source outweighs the file's name.
     if pose.table.kind or not words & SOURCES:
         words |= {*split_words(pose.table.name)}
     rank = 0.0
@@ -122,7 +122,7 @@ def _rank_pose(pose: PoseGuess) -> float:
 
 
 def _find_named_poses(table: TableSurvey) -> Iterator[PoseGuess]:
-    """Yields the poses whose x, y and heading say so by their names."""
+    """Yields the poses whose names show x, y and heading."""
     if OTHER_PLACES.search(table.kind):
         return
     names = _name_by_words(table)
@@ -145,7 +145,7 @@ def _find_named_poses(table: TableSurvey) -> Iterator[PoseGuess]:
 
 
 def _name_by_words(table: TableSurvey) -> dict[tuple[str, ...], str]:
-    """Returns the names of columns of numbers by their words, without elements of arrays."""
+    """Returns the names of numeric columns by their words, without elements of arrays."""
     names: dict[tuple[str, ...], str] = {}
     for column in table.numbers:
         if not ELEMENT.search(column.name):
@@ -154,7 +154,7 @@ def _name_by_words(table: TableSurvey) -> dict[tuple[str, ...], str]:
 
 
 def _is_in(name: str, kinds: Sequence[str]) -> bool:
-    """True if a name has no unit, or one of these kinds."""
+    """True if a name has no unit, or a unit of one of these kinds."""
     unit = split_unit(name)[1]
     return unit is None or UNITS[unit].si in kinds
 
@@ -162,12 +162,12 @@ def _is_in(name: str, kinds: Sequence[str]) -> bool:
 def _find_orientation(
     place: tuple[str, ...], names: dict[tuple[str, ...], str]
 ) -> dict[str, Any]:
-    """Returns the quaternion, or else the heading, that shares most words with a place."""
+    """Returns the quaternion, else the heading, that shares the most words with a place."""
     quaternions: list[tuple[int, tuple[str, ...]]] = []
     headings: list[tuple[float, str]] = []
     for words, name in names.items():
         if not words or {*words} & SENSORS - {*place}:
-            continue  # of another source than the place
+            continue  # from another source than the place
         *first, last = words
         shared = len({*words} & {*place})
         if last in ("w", "qw"):
@@ -186,7 +186,7 @@ def _find_orientation(
 def _find_heading_called_z(
     table: TableSurvey, place: tuple[str, ...], names: dict[tuple[str, ...], str]
 ) -> str | None:
-    """Returns the column z beside x and y if it is a heading and no height, as the path shows."""
+    """Returns the column z next to x and y if the path shows that it is a heading, not a height."""
     if place[-1] != "x" or "position" in place:
         return None
     z = names.get((*place[:-1], "z"))
@@ -219,7 +219,7 @@ def _stack_finite(columns: Sequence[Array]) -> Array | None:
 
 
 def select_apart(pose: Array) -> Array:
-    """Returns the poses (of T, 3) that are a thirtieth of the path's extent from the one before."""
+    """Returns poses of (T, 3) that are at least 1 / `PIECES` of the path's extent apart."""
     distance = np.ptp(pose[:, :2], axis=0).max() / PIECES
     kept = [0]
     for k in range(1, len(pose)):
@@ -229,7 +229,7 @@ def select_apart(pose: Array) -> Array:
 
 
 def _find_unnamed_poses(table: TableSurvey) -> Iterator[PoseGuess]:
-    """Yields a quaternion after a place, or x, y, heading, side by side, that the motion shows."""
+    """Yields poses that the motion shows: x, y before a quaternion, or adjacent x, y, heading."""
     if table.kind:
         return  # the fields of messages have names
     names = [c.name for c in table.numbers if c.name not in table.stamp_columns]
@@ -255,7 +255,7 @@ def _find_unnamed_poses(table: TableSurvey) -> Iterator[PoseGuess]:
 def _match_quaternion(
     table: TableSurvey, names: Sequence[str], columns: Sequence[Array], k: int
 ) -> PoseGuess | None:
-    """Returns the pose whose quaternion stands in four columns from k on, if they are one."""
+    """Returns the pose whose quaternion is in four columns from `k` on; None if it is not one."""
     turn = list(names[k : k + 4])
     if not all(name.isdecimal() or {*split_words(name)} & TURNS for name in turn):
         return None

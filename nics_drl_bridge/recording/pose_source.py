@@ -1,4 +1,4 @@
-"""Tells by names what measured a pose: odometry, which drifts, or something that does not."""
+"""Guesses by name what measured a pose: odometry, which drifts, or something that does not."""
 
 import re
 from collections.abc import Iterable
@@ -13,17 +13,17 @@ TRACKED = re.compile(
     re.IGNORECASE,
 )
 ODOMETRY = re.compile(r"odom|wheel|encoder|dead_?reckon", re.IGNORECASE)
-# Poses that no odometry is sent as, unless their name says so.
+# Message types that odometry does not use, unless its name says so
 TRACKERS_TYPES = (roles.POSE, roles.POSE_COVARIANCE, roles.TRANSFORM)
 
 
 def guess_pose_source(name: str, kind: str = "") -> MeasuredBy:
-    """Returns what measured the poses of a topic or table by its name, and by its type if any."""
+    """Guesses what measured the poses of a topic or table by its name, and its type if any."""
     return guess_source_by_names((name,), kind)
 
 
 def guess_source_by_names(names: Iterable[str], kind: str = "") -> MeasuredBy:
-    """Returns what measured poses, by all names that belong to them; empty if none says it."""
+    """Guesses what measured poses by all names that belong to them; empty if it is unclear."""
     names = [*names]
     if any(TRACKED.search(name) for name in names):
         return "tracker"

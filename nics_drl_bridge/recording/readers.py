@@ -29,11 +29,12 @@ from nics_drl_bridge.recording.values import get_unit
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 from nics_drl_bridge.robot.spec import RobotSpec, build_robot, read_definition
 
-FOLDER = "xtark_folder"  # the mapping of a folder that is read without one,
-# what it has, may have
+FOLDER = "xtark_folder"  # shipped mapping of a folder that is read without a mapping
+# Files that such a folder must have, and may have
 FILES = ("cmd.csv", "vrpn.csv")
 WHEELS = ("L_wheel.csv", "R_wheel.csv")
-MOST_BYTES = 64 * 2**20  # of each of these; by --map tables may be larger
+# Maximum size of each of these; with --map, tables may be larger
+MOST_BYTES = 64 * 2**20
 
 
 class Format(NamedTuple):
@@ -50,7 +51,7 @@ def _holds(path: Path, files: tuple[str, ...]) -> bool:
 
 
 def _load_folder(path: Path, *_: object) -> Recording:
-    """Reads a folder by its shipped mapping: wheels may be missing, its robot may be any."""
+    """Reads a folder by its shipped mapping; wheels may be missing, and its robot may be any."""
     file = find_config(FOLDER, "recordings")
     mapping = load_mapping(file)
     if not (wheels := _holds(path, WHEELS)):
@@ -82,7 +83,7 @@ FORMATS = (
         lambda path, *_: load_recording(path),
     ),
 )
-"""The first that recognises a path reads it."""
+"""The first format that recognises a path reads it."""
 
 
 def read_recording(
@@ -91,9 +92,10 @@ def read_recording(
     topics: TopicRoles | None = None,
     mapping: Mapping | str | Path | None = None,
 ) -> Recording:
-    """Reads any recording by a mapping or its file, else one of `FORMATS`, a bag with its robot.
+    """Reads a recording by a mapping or its file, else in one of `FORMATS`; a bag needs its robot.
 
-    RecordingError, ConfigError: it is missing or unreadable, or does not fit robot or mapping.
+    Raises RecordingError or ConfigError if the recording is missing or unreadable, or does not fit
+    robot or mapping.
     """
     check_path("recording", path)
     path = Path(path)
@@ -115,7 +117,7 @@ def read_recording(
 
 
 def explain_no_mapping(path: Path) -> str:
-    """Says why a recording is read without a mapping; empty if it needs one."""
+    """Returns why a recording is read without a mapping; empty if it needs one."""
     if is_recording(path):
         return "was written by this package"
     if _holds(path, FILES):
@@ -155,12 +157,12 @@ def _read_by_mapping(
 
 
 def _check_units(mapping: Mapping, spec: RobotSpec) -> None:
-    """Refuses units of commands and states of another kind than the robot's (ConfigError)."""
+    """Refuses commands and states whose units are not of the robot's kind (ConfigError)."""
     for stream, values in (("command", spec.command), ("state", spec.state)):
         for variable in values:
             value = getattr(mapping, stream).get(variable.name)
             if value is None or value.scale != 1.0 or value.maximum is not None:
-                continue  # what is scaled may have become what is needed
+                continue  # a scaled value may be in the robot's unit
             si = get_unit(value).si
             if si and si != variable.unit != "1":
                 turns = si.startswith("ticks") and variable.unit.startswith("rad")
@@ -182,7 +184,7 @@ def read_robot_and_drive(
     topics: TopicRoles,
     mapping: Mapping | str | Path | None,
 ) -> tuple[RobotSpec, Recording]:
-    """Reads a drive with its robot: the named one, else its mapping's or own, or the default."""
+    """Reads a drive with its robot: the named one, the mapping's, the drive's, or the default."""
     if mapping is not None:
         mapping = _load_if_path(mapping)
         if robot is not None:
@@ -193,9 +195,8 @@ def read_robot_and_drive(
         return spec, reorder_variables(drive, spec)
     if not is_recording(path):
         own: str | dict[str, Any] | None = robot
-        if (
-            not robot and _holds(path, FILES) and not is_bag(path)
-        ):  # read by its shipped mapping
+        # It may be a folder that is read by its shipped mapping.
+        if not robot and _holds(path, FILES) and not is_bag(path):
             own = load_mapping(find_config(FOLDER, "recordings")).robot
         spec = build_robot(own or DEFAULT_ROBOT)
         return spec, read_recording(path, spec, topics)
@@ -212,7 +213,7 @@ def read_robot_and_drives(
     topics: TopicRoles,
     mapping: Mapping | str | Path | None,
 ) -> tuple[RobotSpec, list[Recording]]:
-    """Reads drives of one robot; its commands reach as far as in any of them."""
+    """Reads drives of one robot, whose ranges cover all of them."""
     read = [read_robot_and_drive(path, robot, topics, mapping) for path in paths]
     first, *others = [spec for spec, _ in read]
     for path, spec in zip(paths[1:], others, strict=True):
@@ -235,7 +236,7 @@ def read_robot_and_drives(
 
 
 def _merge_ranges(variables: Sequence[Any]) -> Any:
-    """Returns a variable that reaches as far as any of these."""
+    """Returns a variable whose range covers all of these."""
     low = min(each.min for each in variables)
     high = max(each.max for each in variables)
     return variables[0].model_copy(update={"min": low, "max": high})
@@ -244,7 +245,7 @@ def _merge_ranges(variables: Sequence[Any]) -> Any:
 def build_mapped_robot(
     mapping: Mapping | str | Path, recording: Recording
 ) -> RobotSpec:
-    """Returns the robot of a mapping, whose commands reach as far as in its recording."""
+    """Returns the robot of a mapping; command ranges that it omits are as recorded."""
     mapping = _load_if_path(mapping)
     robot = mapping.robot or recording.robot
     if robot is None:
@@ -258,7 +259,7 @@ def build_mapped_robot(
 def _build_with_ranges(
     robot: str | dict[str, Any], recording: Recording, variables: tuple[str, ...]
 ) -> RobotSpec:
-    """Returns a robot; ranges of commands that it leaves out are those that were recorded."""
+    """Returns a robot; command ranges that it omits are as recorded."""
     low, high = (f(recording.command.values, axis=0).tolist() for f in (np.min, np.max))
     names = variables[-len(low) :]
     return build_robot(
@@ -267,7 +268,7 @@ def _build_with_ranges(
 
 
 def reorder_variables(recording: Recording, spec: RobotSpec) -> Recording:
-    """Returns a recording in the order of a robot's variables; ConfigError if they differ."""
+    """Orders a recording's columns like a robot's variables. Raises ConfigError if they differ."""
     if not recording.variables:
         return check(recording, spec)
     count = recording.command.values.shape[1]
@@ -294,7 +295,7 @@ def reorder_variables(recording: Recording, spec: RobotSpec) -> Recording:
 
 @contextmanager
 def open_source(path: Path, mapping: Mapping | None = None) -> Iterator[Source]:
-    """Opens a recording of any format; RecordingError if there is nothing to read."""
+    """Opens a recording in any format. Raises RecordingError if there is nothing to read."""
     if not check_no_device(path).exists():
         raise RecordingError(f"{path}: no such file or folder; check the path.")
     if not is_bag(path):

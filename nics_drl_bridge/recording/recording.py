@@ -1,4 +1,4 @@
-"""Recording: separately stamped streams of a drive; Samples: these on one time axis (Sec. IV-A)."""
+"""Recording: separately stamped streams of a drive; Samples: all on one time axis (Sec. IV-A)."""
 
 import io
 import json
@@ -23,47 +23,48 @@ FORMAT = "nics_drl_bridge/recording/4"
 STREAMS = ("command", "pose", "state", "wheels", "imu", "odometry")
 MeasuredBy = Literal["", "odometry", "tracker", "truth"]
 """What measured a pose: odometry, which drifts; motion capture or a localiser; a simulation."""
-# fraction of the median by which a step differs if it is a gap or a repetition
+# A step that differs from the median by this fraction is a gap or a repetition.
 IRREGULAR = 0.5
-# steps that differ by less are equally long, except for rounding
+# Steps that differ by less count as equally long, except for rounding.
 JITTER = 1e-4
 ROUNDING_S = 1e-6
 
-LARGEST_TURN = 1.5  # a larger turn between neighbouring samples [rad] is implausible,
-TOO_FAST = 20.0  # and so is a speed of more than this many times the maximum command
+LARGEST_TURN = 1.5  # a larger turn between neighbouring samples is implausible [rad]
+TOO_FAST = 20.0  # a speed above this multiple of the maximum command is implausible
 SPEED_OVER_S = 0.5
 SLOWEST_SAMPLING_S = 2.0
-# Acceleration that no wheeled robot reaches for a quarter of the time [m/s^2]: one whose radius is
-# below 1 m; and any, as race cars press themselves to the ground.
+# Accelerations that no wheeled robot exceeds for a quarter of the time [m/s^2]: one with a radius
+# below 1 m; and any robot, with the downforce of race cars
 HARDEST = 14.0
 HARDEST_OF_CARS = 60.0
 SMALL_M = 1.0
-# speed from which on millimetres are likelier than centimetres [m/s]
+# Speed above which millimetres are likelier than centimetres [m/s]
 SLOWEST_IN_CM = 300.0
-FASTEST_TURN = 15.0  # a robot that turns faster for long [rad/s] does so in degrees
+FASTEST_TURN = 15.0  # a heading that turns faster for long is in degrees [rad/s]
 FULL_TURN_DEG = 360.0
-# A heading in degrees leads along the path to this fraction: better than the same in radians, and
-# than a fixed one, by the next two.
+# Minimum alignment of a path with a heading in degrees, and margins by which it exceeds the
+# alignment with the same heading in radians and with a fixed one
 ALONG = 0.9
 LESS_ALONG = 0.2
 ALONG_BY_CHANCE = 0.05
-# A reversed axis shows in a path of so many pieces that turns by so much [rad].
+# Minimum number of pieces, and turn [rad], of a path that shows a reversed axis
 MIN_DIRECTIONS = 30
 MIN_TURN = 1.0
-# It leads along mirrored headings to this fraction, which is by so much more than unmirrored.
+# Minimum alignment of the path with mirrored headings, and its margin over unmirrored ones
 MIRRORED = 0.9
 BETTER = 0.15
-# Mean squares of x and y, which are 0 in the quaternions of a level body, if read as x, y, z, w.
+# Quaternions w, x, y, z of a level body, read as x, y, z, w: the mean squares of x and y add up to
+# more than TILTED, those of y and z to less than LEVEL.
 TILTED = 0.05
 LEVEL = 0.01
 W_FIRST = "its quaternions look like w, x, y, z of a level body; list them in the order x, y, z, w"
-WEIGHTS = 0.01, 100.0  # bounds of what variances may weigh
+WEIGHTS = 0.01, 100.0  # bounds on weights by variance
 UNITS_OF_STEP = {"ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 
 
 @dataclass(frozen=True)
 class Stream:
-    """Values with stamps of a named clock; between two clocks there is an unknown offset."""
+    """Values with stamps of a named clock; two clocks differ by an unknown offset."""
 
     t: Array  # (T,) stamps [s], never decreasing
     values: Array  # (T, D)
@@ -73,7 +74,7 @@ class Stream:
 
     @property
     def weights(self) -> Array:
-        """Weights (T, D) by the variances, 1 for a usual one or where none is known."""
+        """Weights (T, D) by inverse variance: 1 for the median deviation, or if it is unknown."""
         weights = np.ones_like(self.values)
         if self.sigma is None:
             return weights
@@ -96,15 +97,16 @@ class Stream:
 
 @dataclass(frozen=True)
 class Episode:
-    """A part of a recording that nothing leads to from the part before: another drive, a reset."""
+    """A part of a recording that does not continue the part before, as after a reset."""
 
-    source: str  # the recording that it is of, for the report
-    start_s: float  # first and last pose, on the clock that pose and commands share [s]
+    source: str  # the recording that it comes from, for the report
+    # time of the first pose, and of the last, on the clock that pose and commands share [s]
+    start_s: float
     end_s: float
 
     @property
     def duration_s(self) -> float:
-        """Time that it lasts [s]."""
+        """Duration [s]."""
         return self.end_s - self.start_s
 
 
@@ -119,38 +121,36 @@ class Recording:
     wheels: Stream | None = None
     # (T, 3) acceleration along x, y [m/s^2], yaw rate [rad/s]
     imu: Stream | None = None
-    # (T, 3) vx, vy [m/s], yaw rate [rad/s] of the wheels
+    # (T, 3) vx, vy [m/s], yaw rate [rad/s] by the wheels
     odometry: Stream | None = None
     source: str = "recording"  # its origin, for reports and errors
-    variables: tuple[
-        str, ...
-    ] = ()  # names of X = [state, command] of the recorded robot, if known
-    # its definition as in its YAML file, if a mapping says it
+    # names of X = [state, command] of the recorded robot, if known
+    variables: tuple[str, ...] = ()
+    # the robot's definition as in its YAML file, if a mapping gives it
     robot: dict[str, Any] | None = None
-    # of scan and odometry, if it shows
+    # of scan and odometry, if known
     latency: Latency = field(default_factory=Latency)
-    repairs: tuple[
-        str, ...
-    ] = ()  # a sentence on each thing that reading mended, as of its clocks
-    measured_by: MeasuredBy = ""  # what measured the pose; empty if nothing says it
-    # How odometry and gyro turned, if the heading is from the gyro or confirmed by it
+    # a sentence on each repair made while reading, such as of clocks
+    repairs: tuple[str, ...] = ()
+    measured_by: MeasuredBy = ""  # what measured the pose; empty if unknown
+    # how odometry and gyro turned, if the heading is from the gyro or confirmed by it
     gyro: Turning | None = None
-    episodes: tuple[Episode, ...] = ()  # in order; empty for a drive in one go
-    # end of the episodes to learn from, which come first, from the first pose on [s]; None: no
-    # episodes, or the fit chooses
+    episodes: tuple[Episode, ...] = ()  # in order; empty for a single drive
+    # end of the episodes to learn from, which come first [s after the first pose]; None if there
+    # are no episodes, or if the fit chooses
     learn_until_s: float | None = None
 
     def episode_at(self, t: ArrayLike) -> NDArray[np.intp]:
-        """Returns the number of the episode in which each time (...,) [s] lies, 0 for the first.
+        """Returns the index of the episode of each time (...) [s].
 
-        A gap between two episodes counts in halves.
+        A gap between two episodes is split in the middle.
         """
         ends = np.array([each.end_s for each in self.episodes[:-1]])
         starts = np.array([each.start_s for each in self.episodes[1:]])
         return np.asarray(np.searchsorted((ends + starts) / 2.0, t))
 
     def without_gaps(self, t: Array) -> Array:
-        """Returns times (T,) [s] with a usual step in place of the gaps between episodes."""
+        """Returns times (T,) [s] with gaps between episodes replaced by the usual step."""
         if not self.episodes or len(t) < 2:
             return t
         step = np.diff(t)
@@ -159,9 +159,9 @@ class Recording:
         return np.asarray(t[0] + np.append(0.0, np.cumsum(step)))
 
     def driven_s(self, until_s: float = np.inf) -> float:
-        """Returns how long the robot drove until a time from the first pose on [s], all gaps out.
+        """Returns how long the robot drove until a time after the first pose [s], without gaps.
 
-        An episode counts whole if it begins before that time.
+        An episode counts in full if it begins before that time.
         """
         first = float(self.pose.t[0])
         if not self.episodes:
@@ -195,7 +195,7 @@ class Samples:
 def samples_on_one_clock(
     t: Array, pose: Array, state: Array, command: Array
 ) -> Samples:
-    """Builds Samples of shared stamps [s], a row per regular step, without gaps and repetitions."""
+    """Builds Samples from shared stamps [s]: a row per regular step, no gaps or repetitions."""
     span = np.diff(t)
     dt = compute_usual_step(t)
     is_regular = np.abs(span - dt) < IRREGULAR * dt
@@ -215,7 +215,7 @@ def samples_on_one_clock(
 
 
 def check(recording: Recording, spec: RobotSpec) -> Recording:
-    """Returns a recording that a robot can use; else RecordingError names place and fault."""
+    """Returns a recording that fits a robot. Raises RecordingError with place and fault if not."""
     names = spec.variable_names
     recorded = recording.variables
     if recording.state is None:  # then only the order of the commands matters
@@ -241,7 +241,7 @@ def check(recording: Recording, spec: RobotSpec) -> Recording:
 
 
 def check_streams(recording: Recording, width: dict[str, int]) -> None:
-    """Refuses streams of other than `width` columns (3 by default), with NaN, or out of order."""
+    """Refuses streams without `width` (by default 3) columns, with NaN, or out of order."""
     for name, stream in recording.streams.items():
         if fault := _find_fault(stream, width.get(name, 3)):
             raise RecordingError(f"{recording.source}: {name}: {fault}.")
@@ -271,7 +271,7 @@ def _find_fault(stream: Stream, width: int) -> str:
 
 
 def save_recording(recording: Recording, path: str | Path) -> None:
-    """Writes `.npz`: `NAME_t`, `NAME`, `NAME_sigma` per stream, JSON `meta`; then a checksum."""
+    """Writes `.npz`: `NAME_t`, `NAME`, `NAME_sigma` per stream, JSON `meta`; adds a checksum."""
     streams = recording.streams
     arrays: dict[str, NDArray[Any]] = {}
     for name, stream in streams.items():
@@ -300,7 +300,7 @@ def save_recording(recording: Recording, path: str | Path) -> None:
 
 
 def load_recording(path: str | Path) -> Recording:
-    """Reads a recording of `save_recording`; RecordingError if it is missing or not a whole one."""
+    """Reads a file of `save_recording`. Raises RecordingError if it is missing or damaged."""
     try:
         data = files.read_file(check_no_device(Path(path)))
         arrays = _read_arrays(data)
@@ -359,7 +359,7 @@ def _read_stream(arrays: dict[str, NDArray[Any]], name: str, clock: str) -> Stre
 
 
 def _read_arrays(data: bytes) -> dict[str, NDArray[Any]]:
-    """Returns the arrays of an `.npz` file; ValueError if it is damaged or too large."""
+    """Returns the arrays of an `.npz` file. Raises ValueError if it is damaged or too large."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             size = sum(member.file_size for member in archive.infolist())
@@ -373,11 +373,11 @@ def _read_arrays(data: bytes) -> dict[str, NDArray[Any]]:
 
 
 class Implausible(NamedTuple):
-    """A fault of poses, and what explains it."""
+    """A fault of poses and what explains it."""
 
     reason: str
     cause: str
-    line: str  # for the mapping, as `heading_unit: deg`
+    line: str  # for the mapping, such as `heading_unit: deg`
 
 
 def find_implausible_pose(
@@ -385,8 +385,8 @@ def find_implausible_pose(
 ) -> Implausible | None:
     """Finds poses (T, 3) at t (T,) [s] that degrees, centimetres or milliseconds explain.
 
-    `fastest` is the greatest speed that is commanded [m/s], inf if it is not known; `radius` [m]
-    that of the robot.
+    `fastest` is the maximum commanded speed [m/s], inf if it is unknown; `radius` [m] is the
+    robot's.
     """
     if len(t) < 3:
         return None
@@ -430,19 +430,19 @@ def _find_radians(pose: Array) -> Implausible | None:
 
 
 def _is_only_along(pose: Array, scale: float) -> bool:
-    """True if poses (T, 3) lead along headings x scale, and not along them as they are."""
+    """True if the path of poses (T, 3) follows headings x scale, but not the unscaled ones."""
     scaled, unscaled, fixed = (measure_alignment(pose, k) for k in (scale, 1.0, 0.0))
     return scaled > max(ALONG, unscaled + LESS_ALONG, fixed + ALONG_BY_CHANCE)
 
 
 def select_along_path(pose: Array, apart: float) -> NDArray[np.intp]:
-    """Returns the poses (of T, 3) that are about as far `apart` [m] on their path."""
+    """Returns the indices of poses (of (T, 3)) that are about `apart` [m] on their path."""
     path = np.append(0.0, np.cumsum(np.hypot(*np.diff(pose[:, :2], axis=0).T)))
     return np.unique(np.searchsorted(path, np.arange(0.0, path[-1], apart)))
 
 
 def has_visible_axes(pose: Array) -> bool:
-    """True if poses (T, 3), apart on their path, turn far enough to show a reversed axis."""
+    """True if poses (T, 3), spaced on their path, turn far enough to show a reversed axis."""
     if len(pose) < MIN_DIRECTIONS:
         return False
     return float(np.ptp(np.unwrap(pose[:, 2]))) >= MIN_TURN
@@ -451,10 +451,10 @@ def has_visible_axes(pose: Array) -> bool:
 def find_clockwise_keys(
     pose: Array, minimum: float = MIRRORED, margin: float = BETTER
 ) -> str:
-    """Returns the keys that turn the heading of poses (T, 3), apart on their path, round.
+    """Returns the mapping's keys that mirror the heading of poses (T, 3), spaced on their path.
 
-    As in `scale: -1`; empty unless the path leads along the mirrored headings alone: at least to
-    the fraction `minimum`, and by `margin` better than along the recorded ones.
+    For example `scale: -1`; empty unless the path is aligned with the mirrored headings by at least
+    `minimum`, and by `margin` more than with the recorded ones.
     """
     if not has_visible_axes(pose):
         return ""
@@ -467,15 +467,15 @@ def find_clockwise_keys(
 
 
 def measure_alignment(pose: Array, scale: float) -> float:
-    """Returns the fraction to which poses (T, 3) lead along headings x scale, ahead or back."""
+    """Returns the alignment, 0 to 1, of the path of poses (T, 3) with headings x scale, or back."""
     return abs(_compute_course(pose, scale))
 
 
 def _compute_course(pose: Array, scale: float) -> complex:
-    """Returns the mean of exp(2i x direction of travel), as seen from the headings x scale."""
+    """Returns the mean of exp(2i x direction of travel), relative to the headings x scale."""
     x, y = np.diff(pose[:, :2], axis=0).T
     ahead = np.exp(1j * scale * pose[:, 2])
-    middle = ahead[1:] + ahead[:-1]  # of two headings, whose angle is between them
+    middle = ahead[1:] + ahead[:-1]  # its angle lies between the two headings
     middle = middle / np.maximum(np.abs(middle), 1e-9)
     step = np.hypot(x, y)
     course = (x + 1j * y) / np.maximum(step, 1e-9)
@@ -483,7 +483,7 @@ def _compute_course(pose: Array, scale: float) -> complex:
 
 
 def _select_spaced(t: Array) -> NDArray[np.intp]:
-    """Returns the samples that are about half a second apart."""
+    """Returns the indices of samples that are about half a second apart."""
     return np.unique(np.floor((t - t[0]) / SPEED_OVER_S), return_index=True)[1]
 
 

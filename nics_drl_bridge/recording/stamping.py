@@ -20,18 +20,18 @@ Nanoseconds = NDArray[np.int64]
 
 RECEIVE = "receive"
 HEADER = "header"
-# Median delay from header to receipt on the recorder's own clock: a localiser may take its time,
-# but nothing is received before it was stamped.
+# Range of the median delay from header to receipt on the recorder's own clock: a localiser may take
+# its time, but nothing is received before it was stamped.
 SAME_CLOCK_S = (-0.001, 1.0)
-# the delay from headers of one clock to their receipt varies by less
+# The delay from headers of one clock to their receipt varies by less.
 MAX_WANDER_S = 1.0
-# A stalled recorder may receive this percentage of messages even later, by so much.
+# A stalled recorder may receive this percentage of messages even later, by up to this time.
 STALLED = 2.0
 MAX_STALL_S = 30.0
 MAX_LATE = 0.01  # fraction of messages that may arrive after one with a later stamp
-# fraction that may lack a stamp at the start: a simulation has no time yet
+# fraction that may lack a stamp at the start, because a simulation has no time yet
 MAX_UNSTAMPED = 0.05
-# of one computer, and so of one clock
+# Streams from one computer, and so on one clock
 ROBOT_STREAMS = ("command", "state", "wheels", "imu")
 
 SPLIT = (
@@ -41,30 +41,29 @@ SPLIT = (
     ("sec", "nsec"),
     ("sec", "nsecs"),
 )
-ROWS_A_SECOND = (
-    5  # stamps in whole seconds, of so many rows each, have lost their fraction
-)
+# Stamps in whole seconds with this many rows each have lost their fraction.
+ROWS_A_SECOND = 5
 # A counter takes more than COUNTING usual steps from one overflow to the next, loses at most LOST
-# steps at each, and reaches all of PARTS parts of its range.
+# steps at each, and reaches each of PARTS parts of its range.
 COUNTING = 16.0
 LOST = 2.0
 PARTS = 10
-# Or it grows by GROWN counts, which are this fraction of the sum of its steps.
+# Or it grows by more than GROWN counts, and by more than this fraction of the sum of its steps.
 GROWN = 2000.0
 ONE_WAY = 0.95
-# A speed goes back by this fraction of its steps, in a range of fewer than so many steps.
+# A speed goes back by more than this fraction of its steps, within a range of fewer usual steps.
 BACK = 0.2
 WITHIN = 25.0
-TREMBLING = 4.0  # ticks of a wheel that stands
+TREMBLING = 4.0  # range of the ticks of a wheel that stands still
 BITS = (8, 16, 24, 31, 32)  # of registers that overflow
 STAMP_BITS = (16, 24, 31, 32)
-# rows that come too late do so by less
+# Late rows come in runs of at most this length, late by at most this time.
 LATE_ROWS = 50
 LATE_S = 1.0
-MOST_BACK = 0.9  # fraction of steps back in rows that begin with the last
-MOST_STRAY = 0.01  # fraction of stamps that fit none beside them
-LONGEST_PAUSE_S = 86_400.0  # of a drive; a longer one is a clock that was set
-USUAL = 10.0  # an overflow goes on with a step of less than this many usual ones
+MOST_BACK = 0.9  # minimum fraction of backward steps in rows that begin with the last
+MOST_STRAY = 0.01  # maximum fraction of stamps that fit neither neighbour
+LONGEST_PAUSE_S = 86_400.0  # of a drive; after a longer one, the clock was set
+USUAL = 10.0  # maximum step across an overflow, in usual steps
 
 
 @dataclass(frozen=True)
@@ -93,11 +92,11 @@ def stamp_streams(
     place: str,
     of_robot: Collection[str] = ROBOT_STREAMS,
 ) -> dict[str, Stream]:
-    """Stamps each stream, from near 0 on; RecordingError: headers are missing or unusable."""
-    # With `auto`, by headers if there are any. Those less than 1 s before their receipt are of the
-    # recorder's clock, others of a foreign one: shifted by the median delay, they leave a small
-    # offset for calibration. Command, state, wheels and IMU share one clock, by receipt if need be.
-    # Late messages are sorted; those before a simulation's first time are dropped.
+    """Stamps each stream, starting near 0. Raises RecordingError if headers can't be used."""
+    # `auto` uses headers if there are any. Headers less than 1 s before their receipt are on the
+    # recorder's clock. Others are on a foreign clock; shifted by the median delay, they leave a
+    # small offset for calibration. Command, state, wheels and IMU share one clock, by receipt if
+    # necessary. Late messages are sorted; messages before a simulation's first time are dropped.
     if stamps != "receive":
         data = {name: _sort_by_stamp(part, place) for name, part in data.items()}
     origin = min(int(part.receive_ns.min()) for part in data.values())
@@ -123,7 +122,7 @@ def stamp_streams(
 
 
 def has_continuous_headers(parts: Iterable[TopicData]) -> bool:
-    """True if the headers of all, in the order of their receipt, go on without a leap."""
+    """True if all headers, in order of receipt, continue without a leap."""
     parts = list(parts)
     receive_ns = np.concatenate([part.receive_ns for part in parts])
     headers = [part.header_ns for part in parts]
@@ -219,7 +218,7 @@ def _stamp_by_receipt(part: TopicData, origin: int) -> Stream:
 
 
 def join_stamps(seconds: NDArray[Any], nanoseconds: NDArray[Any]) -> Array:
-    """Joins stamps that were split into seconds and nanoseconds [s]."""
+    """Joins stamps that are split into seconds and nanoseconds [s]."""
     return np.asarray(seconds + nanoseconds * S_PER_NS, dtype=np.float64)
 
 
@@ -228,8 +227,8 @@ def find_overflow(
 ) -> float | None:
     """Returns the range of a register that overflows in values (T,), which are counts x scale.
 
-    An overflow leaves a jump of more than half of the range, after which the values go on as before
-    once the range is added. None if no range explains the jumps.
+    An overflow is a jump of more than half the range, across which the values continue as usual
+    once the range is added. Returns None if no range explains the jumps.
     """
     step = np.diff(values)
     if not len(step):
@@ -251,14 +250,14 @@ def find_overflow(
 
 
 def unwrap_counter(values: Array, size: float) -> tuple[Array, int]:
-    """Continues values (T,) over the overflows of a register; returns them and their number."""
+    """Continues values (T,) across the overflows of a register; returns them and their number."""
     step = np.diff(values)
     turns = -np.round(step / size) * (np.abs(step) > size / 2.0)
     return values + size * np.append(0.0, np.cumsum(turns)), int(np.abs(turns).sum())
 
 
 def describe_counter(values: Array) -> str:
-    """Says what only a counter does, if whole numbers (T,) do it: overflow, or go on and on."""
+    """Describes what shows that integers (T,) are a counter; empty if nothing does."""
     if not (values == np.round(values)).all():
         return ""
     step = np.abs(np.diff(values))
@@ -277,7 +276,7 @@ def describe_counter(values: Array) -> str:
 
 
 def is_oscillating(values: Array) -> bool:
-    """True for values (T,) that go up and down within few of their steps, as no counter's do."""
+    """True for values (T,) that go up and down within a few of their steps, unlike a counter's."""
     step = np.diff(values)
     step = step[step != 0.0]
     size = np.abs(step)
@@ -287,7 +286,7 @@ def is_oscillating(values: Array) -> bool:
 
 
 def count_rows_a_second(t: Array) -> int:
-    """Returns how many stamps (T,) in whole seconds repeat, as if their rest were lost; else 0."""
+    """Returns the rows per second of stamps (T,) that have lost their fraction; else 0."""
     seconds = np.unique(t)
     if len(t) < ROWS_A_SECOND * len(seconds) or (t != np.round(t)).any():
         return 0
@@ -297,7 +296,7 @@ def count_rows_a_second(t: Array) -> int:
 
 
 def remove_overflow(t: Array, name: str) -> tuple[Array, str]:
-    """Continues stamps (T,) of a clock of 32 bits or less that began anew."""
+    """Continues stamps (T,) of a clock of 32 bits or less across its overflows; returns a note."""
     size = None
     if (np.diff(t) < 0.0).any():
         size = find_overflow(t, (1.0, 1e-3, 1e-6, 1e-9), STAMP_BITS)
@@ -311,7 +310,7 @@ def remove_overflow(t: Array, name: str) -> tuple[Array, str]:
 def repair_order(t: Array, name: str) -> tuple[Array, NDArray[np.intp], str]:
     """Sorts the few late rows; joins parts between which the clock was set.
 
-    Returns stamps (T,) [s] that never decrease, and the row of each.
+    Returns stamps (T,) [s] that never decrease, the row of each, and a note.
     """
     rows = np.arange(len(t))
     notes = []
@@ -327,7 +326,7 @@ def repair_order(t: Array, name: str) -> tuple[Array, NDArray[np.intp], str]:
         t = t[~stray]
         rows = rows[~stray]
     late = np.maximum.accumulate(t) - t
-    # How many rows in a row are older than one before them.
+    # Longest run of rows that are older than a row before them
     on_time = np.flatnonzero(np.concatenate([[True], late <= 0.0, [True]]))
     longest = int(np.diff(on_time).max()) - 1
     if 0 < longest <= LATE_ROWS and late.max() <= LATE_S:
@@ -357,7 +356,7 @@ def repair_order(t: Array, name: str) -> tuple[Array, NDArray[np.intp], str]:
 
 
 def _find_stray(t: Array) -> NDArray[np.bool_]:
-    """Selects few stamps (T,) that break the order and are far from those on both sides."""
+    """Selects the few stamps (T,) that break the order and are far from their neighbours."""
     if len(t) < 5:
         return np.zeros(len(t), dtype=np.bool_)
     is_backward = np.diff(t) < 0.0
@@ -368,7 +367,7 @@ def _find_stray(t: Array) -> NDArray[np.bool_]:
 
 
 def format_times(count: int) -> str:
-    """Says how often: once, or so many times."""
+    """Returns `once`, or how many times."""
     if count == 1:
         return "once"
     return f"{count} times"
@@ -377,7 +376,7 @@ def format_times(count: int) -> str:
 def select_new_rows(
     t: Array, values: Array, name: str
 ) -> tuple[NDArray[np.bool_], str]:
-    """Selects rows (T,) that do not repeat the one before them, stamp and values (T, D)."""
+    """Selects rows (T,) that do not repeat stamp and values (T, D) of the row before."""
     is_repeated = (np.diff(t) == 0.0) & (np.diff(values, axis=0) == 0.0).all(axis=1)
     note = ""
     if is_repeated.any():

@@ -1,4 +1,4 @@
-"""Surveys a recording of any form: tables, their stamps and what is odd in them, columns."""
+"""Surveys a recording in any format: its tables, their columns, stamps and irregularities."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -23,15 +23,15 @@ from nics_drl_bridge.recording.values import parse_dates
 
 GAP = 5.0  # a gap is longer than this many usual steps
 MOST_COLUMNS = 200  # of a table
-# stamps that would be closer are not in the unit that their name says
+# Stamps that would be closer are not in the unit that their name states.
 SHORTEST_STEP_S = 1e-4
-LEAST_SCORE = 0.25  # of a column of stamps
-MOST_BACK = 0.05  # fraction of steps of a column of stamps that may go back
+LEAST_SCORE = 0.25  # minimum score of a column of stamps
+MOST_BACK = 0.05  # maximum fraction of backward steps of a column of stamps
 TIMES = word_set("""
     time times stamp timestamp t s sec secs seconds elapsed ms us ns millis
     micros nanos date datetime
 """)
-# Units as they end a name (`yaw_deg`, `v_m_s`), the longest first.
+# Units at the end of a name (`yaw_deg`, `v_m_s`), the longest first
 ENDINGS = {
     "m per s": "m/s",
     "rad per s": "rad/s",
@@ -63,7 +63,7 @@ ENDINGS = {
     "pct": "%",
     "percent": "%",
 }
-# Units as they stand in brackets, `x(m)` or `omega [rad s^-1]`, in addition to those of a mapping.
+# Units in brackets, `x(m)` or `omega [rad s^-1]`, in addition to those of a mapping
 IN_BRACKETS = {
     "meter": "m",
     "meters": "m",
@@ -96,7 +96,7 @@ NO_UNIT = ("", "-", "1", "none", "unitless")
 
 
 def split_unit(name: str) -> tuple[list[str], str | None]:
-    """Returns the words of a name, and the unit that it ends with: `x(m)`, `x [mm]`, `yaw_deg`."""
+    """Returns the words of a name, and the unit at its end: `x(m)`, `x [mm]`, `yaw_deg`."""
     if bracket := re.search(r"[\[(]\s*([^\[\]()]*?)\s*[\])]\s*$", name):
         text = bracket[1]
         words = split_words(name[: bracket.start()])
@@ -116,7 +116,7 @@ def split_unit(name: str) -> tuple[list[str], str | None]:
 
 
 class Survey(NamedTuple):
-    """A column: its range, and what it may be."""
+    """A column: its name and its range."""
 
     name: str  # as a mapping refers to it within its table
     low: float  # NaN for text
@@ -124,7 +124,7 @@ class Survey(NamedTuple):
 
     @property
     def is_place_on_earth(self) -> bool:
-        """True if it seems to be a latitude or longitude."""
+        """True if it looks like a latitude or longitude."""
         return is_place_on_earth(self.name, self.low, self.high)
 
 
@@ -136,7 +136,7 @@ class TableSurvey:
     rows: int
     columns: list[Survey]
     stamps: str | None = None  # column of the stamps; None if they come with the rows
-    unit: str | None = None  # of these, other than seconds
+    unit: str | None = None  # of these, unless seconds
     findings: list[str] = field(default_factory=list)
     t: Array | None = None  # (T,) [s]
     data: dict[str, Column] = field(default_factory=dict)
@@ -144,7 +144,7 @@ class TableSurvey:
 
     @property
     def time(self) -> str | None:
-        """The stamps for a mapping, as `t`, `[s, ns]` or `{from: t, unit: ms}`."""
+        """The stamps for a mapping, such as `t`, `[s, ns]` or `{from: t, unit: ms}`."""
         columns = [write_reference(column) for column in self.stamp_columns]
         if not columns:
             return None
@@ -177,21 +177,21 @@ class TableSurvey:
         return list(_describe_regularity(self.t, _select_numbers(self.data)))
 
     def list_words(self, column: str) -> list[str]:
-        """Returns the words of a column, of `data` those of the table."""
+        """Returns the words of a column's name; for `data`, the words of the table's name."""
         words = split_unit(column)[0]
         if words == ["data"]:
             return split_words(self.name)
         return words
 
     def refer_to(self, column: str, is_single: bool) -> str:
-        """Returns how a mapping refers to a column, in a single table by its name alone."""
+        """Returns how a mapping refers to a column; in a single table, its name suffices."""
         if is_single:
             return write_reference(column)
         return write_reference(f"{self.name}:{column}")
 
 
 def inspect_tables(source: Source) -> list[TableSurvey]:
-    """Surveys every table of a source; RecordingError if none is readable."""
+    """Surveys every table of a source. Raises RecordingError if none is readable."""
     tables = []
     first_error = None
     for name in source.names:
@@ -207,7 +207,7 @@ def inspect_tables(source: Source) -> list[TableSurvey]:
 
 
 def _correct_units(tables: Sequence[TableSurvey]) -> None:
-    """Chooses units of stamps by which all tables last about as long as those in seconds."""
+    """Chooses units of stamps with which all tables last about as long as those in seconds."""
     durations = [
         float(np.ptp(table.t))
         for table in tables
@@ -250,7 +250,7 @@ def _inspect_table(name: str, table: Table) -> TableSurvey:
 
 
 def _guess_unit_by_name(name: str, raw: Array) -> str | None:
-    """Returns the unit below a second that a name says of its stamps, as `time_ms`."""
+    """Returns the unit below a second that the name of stamps states, as in `time_ms`."""
     words, unit = split_unit(name)
     if unit is None:
         unit = (words or [""])[-1]
@@ -279,7 +279,7 @@ def _select_numbers(data: dict[str, Column]) -> dict[str, Array]:
 
 
 def _guess_stamps(data: dict[str, Column]) -> tuple[str | None, Array | None]:
-    """Guesses the column of stamps: by its name, and by how steadily it rises."""
+    """Guesses the column of stamps by its name and by how steadily it rises."""
     values = _select_numbers(data)
     for seconds, fraction in stamping.SPLIT:
         if {seconds, fraction} <= values.keys():
@@ -306,7 +306,7 @@ def _score_stamps(name: str, values: Array) -> float:
 
 
 def _describe_regularity(t: Array, numbers: dict[str, Array]) -> Iterator[str]:
-    """Yields sentences on rate, gaps, stamps that run backwards, and rows that lack or repeat."""
+    """Yields sentences on rate, gaps, backward stamps, repeated rows and missing values."""
     step = np.diff(t)
     usual = compute_usual_step(t) or np.nan
     yield f"{1.0 / usual:.4g} Hz, {float(np.ptp(t)):.1f} s"

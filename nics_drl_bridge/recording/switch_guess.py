@@ -1,4 +1,4 @@
-"""Finds the switch of a recording: a column of two values, of which one lets commands count."""
+"""Finds the switch of a recording: a column of two values, one of which enables the commands."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -19,19 +19,19 @@ DISABLING = word_set("estop emergency kill stop stopped disabled manual fault")
 ON_WORDS = word_set("auto autonomous autonomy enabled on armed active offboard run")
 MODES = ENABLING | word_set("mode state status safety switch")
 NO_VALUES = np.zeros(0)
-FASTER = 2.0  # the robot moves so much faster while the switch is on
-FEWEST = 20  # rows of each value of the switch that the motion needs to deny it
+FASTER = 2.0  # factor by which the robot moves faster while the switch is on
+FEWEST = 20  # rows of each value that are needed to rule a switch out
 
 
 class Switch(NamedTuple):
-    """A column that has to have a value for the commands to count."""
+    """A column that must have a certain value for the commands to count."""
 
     table: TableSurvey
     column: str
-    on: str  # the value, as a mapping has it
+    on: str  # the value, as written in a mapping
 
     def refer_to(self, is_single: bool) -> str:
-        """Returns how a mapping refers to the column in a key."""
+        """Returns how a mapping refers to the column as a key."""
         text = self.table.refer_to(self.column, is_single)
         if ":" in text and not text.startswith('"'):
             return f'"{text}"'
@@ -41,7 +41,7 @@ class Switch(NamedTuple):
 def guess_switch(
     tables: Sequence[TableSurvey], poses: tuple[Array, Array] | None
 ) -> Switch | None:
-    """Finds the only switch, by its name; `poses`, stamps (T,) and poses (T, 3), may deny it."""
+    """Finds the only switch by its name; `poses`, stamps (T,) and poses (T, 3), may rule it out."""
     switches = []
     for table in tables:
         for column in table.columns:
@@ -56,7 +56,7 @@ def guess_switch(
 
 
 def _find_on_value(words: set[str], values: Column) -> str | None:
-    """Returns the value at which the commands count, by the names of column and values."""
+    """Returns the value at which the commands count, from the names of column and values."""
     if is_text(values):
         texts = {str(value) for value in np.unique(values)}
         on = [text for text in texts if text.lower() in ON_WORDS]

@@ -23,11 +23,11 @@ class Table:
 
     place: str  # path, and topic, for errors
     names: tuple[str, ...]  # "" for a column without one
-    # by name, or number from 0; RecordingError: no such
+    # by name, or number from 0; raises RecordingError if there is none
     column: Callable[[str | int], Column]
-    row: Callable[[int], str]  # names a row for errors
-    notes: Sequence[str] = ()  # a sentence on each thing that reading mended
-    # stamps that come with the rows, and in `values` (T, 1) these rows, if any
+    row: Callable[[int], str]  # returns a row's name for errors
+    notes: Sequence[str] = ()  # a sentence on each repair made while reading
+    # stamps that come with the rows, if any; their `values` (T, 1) are the row numbers
     stamps: Callable[[str], Stream | None] = lambda _: None
     kind: str = ""  # message type, of a topic
 
@@ -36,10 +36,10 @@ def make_table(
     place: str,
     names: tuple[str, ...],
     data: Sequence[Column],
-    lines: NDArray[np.intp] | None = None,  # (T,) of the file, in which the rows stand
+    lines: NDArray[np.intp] | None = None,  # (T,) line number of each row in the file
     notes: Sequence[str] = (),
 ) -> Table:
-    """Makes a table of columns in memory."""
+    """Makes a table from columns in memory."""
 
     def name_row(k: int) -> str:
         return f"row {k}" if lines is None else f"line {lines[k]}"
@@ -54,7 +54,7 @@ def make_table(
 
 
 class Source:
-    """A recording of any format, as tables."""
+    """A recording in any format, as tables."""
 
     def __init__(self, place: str, names: Sequence[str]) -> None:
         self.place = place  # path, for errors
@@ -63,11 +63,11 @@ class Source:
 
     @property
     def latency(self) -> Latency:
-        """Delays of scan and odometry, if they show."""
+        """Delays of scan and odometry, if known."""
         return Latency()
 
     def get_table(self, name: str) -> Table:
-        """Returns a table; RecordingError if it is unreadable."""
+        """Returns a table. Raises RecordingError if it is unreadable."""
         if name not in self._read:
             self._read[name] = self.read(name)
         return self._read[name]
@@ -101,12 +101,12 @@ def _find_column(place: str, names: Sequence[str], which: str | int) -> int:
 
 
 def is_text(column: Column) -> bool:
-    """True if a column holds text, and no numbers."""
+    """True if a column holds text, not numbers."""
     return column.dtype.kind in "US"
 
 
 def read_numbers(table: Table, which: str | int) -> Array:
-    """Returns a column of numbers (T,), NaN where there is none; RecordingError for text."""
+    """Returns a column of numbers (T,), NaN where empty. Raises RecordingError for text."""
     column = table.column(which)
     if column.dtype.kind not in "USO":
         return column.astype(np.float64)
@@ -123,7 +123,7 @@ def read_numbers(table: Table, which: str | int) -> Array:
 
 
 def flatten_arrays(arrays: Mapping[str, Column]) -> Iterator[tuple[str, Column]]:
-    """Yields columns of arrays: 1-D as they are, `name[k]` of 2-D, the fields of records."""
+    """Yields columns of arrays: 1-D as they are, others as `name[k]`, records by field."""
     for name, array in arrays.items():
         if array.dtype.names:
             inner = {

@@ -1,4 +1,4 @@
-"""Tables of files: text with any separator and what loggers leave in it, numpy's, Parquet."""
+"""Tables from files: text with any separator and the quirks of loggers, numpy, Parquet."""
 
 import csv
 import re
@@ -27,12 +27,12 @@ MOST_FILES = 500  # of a folder
 SEPARATORS = (",", ";", "\t", "|", None)  # None: any white space
 NO_SEPARATOR = re.compile(r"[\w\s.,;|+\"'#-]")
 MOST_BYTES = 256 * 2**20
-# longest in characters
+# Maximum number of rows, and of characters in one
 MOST_ROWS = 2_000_000
 LONGEST_ROW = 20_000
 TRIED = 400  # lines from which separator and header are found
 MOST_SAMPLED = 50_000  # rows from which their usual width is found
-MOST_BROKEN = 0.01  # fraction of rows with another number of fields that are left out
+MOST_BROKEN = 0.01  # maximum fraction of rows that are left out for their width
 COMMENTS = ("#", "//", "%")
 UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 TUM = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
@@ -43,7 +43,7 @@ WORDS = {"true": "1", "false": "0", **dict.fromkeys(MISSING, "nan")}
 
 
 def read_text_table(path: Path) -> Table:
-    """Reads a table; RecordingError names the file, the line and the fix."""
+    """Reads a table. Raises RecordingError with the file, the line and the fix."""
     lines, comments = _read_lines(path)
     separator = _find_separator([text for _, text in lines[:TRIED]])
     line_numbers = np.array([line for line, _ in lines], dtype=np.intp)
@@ -54,7 +54,7 @@ def read_text_table(path: Path) -> Table:
         path, rows[first:], line_numbers[first:], above, width
     )
     columns = [list(column) for column in zip(*rows, strict=True)]
-    # The last title that has most names: one of units, below it, repeats some.
+    # The last title with the most distinct names: a row of units below it repeats some.
     titles = [row for row in above if len(row) > 1 or width == 1]
     head = max(reversed(titles), key=lambda row: len(set(row)), default=None)
     if head is None and comments:
@@ -71,7 +71,7 @@ def read_text_table(path: Path) -> Table:
 
 
 def _read_lines(path: Path) -> tuple[list[tuple[int, str]], list[str]]:
-    """Returns the lines with their numbers, from 1, without empty ones, and those of comments."""
+    """Returns the non-empty lines with their numbers from 1, and separately the comments."""
     check_no_device(path)
     try:
         if path.stat().st_size > MOST_BYTES:
@@ -86,7 +86,7 @@ def _read_lines(path: Path) -> tuple[list[tuple[int, str]], list[str]]:
     try:
         text = data.decode(encoding)
     except UnicodeDecodeError:
-        # As old tools write it: a degree sign in a header.
+        # Old tools write Latin-1, such as a degree sign in a header.
         text = data.decode("latin-1")
     if "\0" in text:
         raise RecordingError(f"{path}: is not text; save it as CSV in UTF-8.")
@@ -128,7 +128,7 @@ def _find_title(comment: str, separator: str | None, width: int) -> list[str] | 
 
 
 def _is_value(text: str) -> bool:
-    """True for numbers, with decimal commas too, flags and dates."""
+    """True for numbers, also with decimal commas, flags and dates."""
     try:
         float(text.replace(",", "."))
     except ValueError:
@@ -137,7 +137,7 @@ def _is_value(text: str) -> bool:
 
 
 def _find_separator(lines: Sequence[str]) -> str | None:
-    """Returns the separator that leaves most numbers, and fewest fields that are none."""
+    """Returns the separator that leaves the most numbers and the fewest other fields."""
 
     def score(separator: str | None) -> int:
         fields = [field for line in lines for field in _split(line, separator) if field]
@@ -151,7 +151,7 @@ def _find_separator(lines: Sequence[str]) -> str | None:
 
 
 def _find_first_row(path: Path, rows: list[list[str]]) -> tuple[int, int]:
-    """Returns the first row of numbers, and how many fields the rows from there on have."""
+    """Returns the index of the first row of numbers, and the usual number of fields."""
 
     def is_numeric(row: Sequence[str]) -> bool:
         full = [field for field in row if field]
@@ -176,7 +176,7 @@ def _keep_one_width(
     above: list[list[str]],
     width: int,
 ) -> tuple[list[list[str]], NDArray[np.intp], list[str]]:
-    """Leaves out headers that are repeated, and the few rows that were cut short."""
+    """Leaves out repeated headers and the few rows of another length."""
     notes = []
     is_data = np.array([row not in above for row in rows], dtype=np.bool_)
     if not is_data.all():
@@ -195,13 +195,13 @@ def _keep_one_width(
     kept = np.flatnonzero(is_data & is_whole)
     kept_rows = [rows[k] for k in kept]
     while width > 1 and not any(row[width - 1] for row in kept_rows):
-        width -= 1  # after a separator at the end of each line
+        width -= 1  # lines may end with a separator
         kept_rows = [row[:width] for row in kept_rows]
     return kept_rows, line_numbers[kept], notes
 
 
 def _is_tum(columns: Sequence[Sequence[str]]) -> bool:
-    """True for stamps that rise, and unit quaternions at the end."""
+    """True for rising stamps with unit quaternions at the end."""
     if len(columns) != len(TUM):
         return False
     try:
@@ -217,7 +217,7 @@ def _is_tum(columns: Sequence[Sequence[str]]) -> bool:
 def _split_labels(
     columns: Sequence[list[str]],
 ) -> tuple[list[list[str]], list[str]] | None:
-    """Names columns by labels that stand in each row, as in `time: 1.2 ticks: 3 4`."""
+    """Names columns by labels that are in each row, as in `time: 1.2 ticks: 3 4`."""
     labelled: dict[str, list[list[str]]] = {}
     label = None
     for column in columns:
@@ -239,7 +239,7 @@ def _split_labels(
 
 
 def _replace_commas(column: list[str]) -> list[str]:
-    """Writes decimal commas as points."""
+    """Replaces decimal commas by points if that leaves only values."""
     if not any("," in field for field in column):
         return column
     with_points = [field.replace(",", ".") for field in column]
@@ -249,7 +249,7 @@ def _replace_commas(column: list[str]) -> list[str]:
 
 
 def _convert_column(column: Sequence[str]) -> Column:
-    """Returns numbers if all fields are, of true and false too, and else text."""
+    """Returns numbers if all fields are numbers, flags or missing values, else text."""
     for words in ({}, WORDS):
         try:
             return np.array([words.get(f.lower(), f) for f in column], dtype=np.float64)
@@ -259,7 +259,7 @@ def _convert_column(column: Sequence[str]) -> Column:
 
 
 def read_arrays(path: Path) -> Table:
-    """Reads an .npz or .npy file, of records too; RecordingError if it holds objects or damage."""
+    """Reads an .npz or .npy file, also of records. Raises RecordingError for objects or damage."""
     try:
         with check_no_device(path).open("rb") as file:
             loaded = np.load(file, allow_pickle=False)
@@ -281,7 +281,7 @@ def read_arrays(path: Path) -> Table:
 
 
 def read_parquet(path: Path) -> Table:
-    """Reads a Parquet file; RecordingError if it is damaged, or pyarrow is missing."""
+    """Reads a Parquet file. Raises RecordingError if it is damaged or pyarrow is missing."""
     if find_spec("pyarrow") is None:
         raise RecordingError(
             f"{path}: Parquet needs the library pyarrow; pip install pyarrow."
@@ -310,7 +310,7 @@ READERS: dict[str, Callable[[Path], Table]] = {
 
 
 class Files(Source):
-    """A file, or the files of a folder; RecordingError if it holds none of a known format."""
+    """A file, or the files of a folder. Raises RecordingError if no format is known."""
 
     def __init__(self, path: Path) -> None:
         self._files = {path.name: path}

@@ -17,7 +17,7 @@ def _integrate_substep(
     book: Textbook, state: Array, goal: Array, since: Array | float, h: float
 ) -> Array:
     """Returns body twist x duration (..., 3) of a substep that begins `since` [s] after `state`."""
-    # By the Magnus expansion of fourth order (Iserles, Norsett 1999).
+    # Fourth-order Magnus expansion (Iserles, Norsett 1999).
     early, late = (
         book.twist(
             book.respond(state, goal, since + (0.5 + sign * np.sqrt(3.0) / 6.0) * h)
@@ -56,7 +56,7 @@ def record(
         states.append(book.respond(now, goal, since))
         arcs.append(_integrate_substep(book, now, goal, since, h))
         now = book.respond(now, goal, per_hold * inner * h)
-    # Relative poses (T, 3) are chained to the poses (T, 3) at their starts, from the origin on.
+    # Relative poses (T, 3) are chained to poses (T, 3) at their starts, from the origin on.
     state = np.concatenate(states)
     relative = geometry.exp(np.concatenate(arcs))
     heading = np.concatenate([[0.0], np.cumsum(relative[:-1, 2])])

@@ -61,8 +61,8 @@ class TopicRoles(Schema):
 
     # the commands: Twist, TwistStamped, AckermannDrive or AckermannDriveStamped
     cmd_vel: str | None = None
-    # of motion capture or localisation: PoseStamped, PoseWithCovarianceStamped, TransformStamped;
-    # or TFMessage and Odometry if named here. Has priority over `odom`.
+    # pose by motion capture or localisation: PoseStamped, PoseWithCovarianceStamped or
+    # TransformStamped, or if named here TFMessage or Odometry; has priority over `odom`
     pose: str | None = None
     # Odometry; its pose is used if there is no `pose`. If named in addition to a `pose`, its twist
     # shows the noise of the odometry.
@@ -82,9 +82,10 @@ class TopicRoles(Schema):
 
 
 def list_imu_topics(wanted: str, by_default: bool) -> tuple[str, ...]:
-    """Returns the topics on which a gyro may speak: the wanted one, of `auto` the usual ones.
+    """Returns the topics of a gyro: the wanted one, or the usual ones for `auto`.
 
-    `auto` is none unless `by_default`, as for a model that was made with a gyro; so is `none`.
+    `none` gives no topics, and `auto` gives them only `by_default`, as for a model that was made
+    with a gyro.
     """
     if wanted in (NONE, "") or (wanted == "auto" and not by_default):
         return ()
@@ -124,7 +125,7 @@ def load_topic_roles(
 def assign(
     roles: TopicRoles, types: Mapping[str, str], empty: Collection[str], place: str
 ) -> dict[str, str]:
-    """Assigns topics to roles, named or guessed; RecordingError lists them if that is unclear."""
+    """Assigns topics, named or guessed, to roles. Raises RecordingError if that is unclear."""
     table = _Topics(types, empty, place)
     assigned = {}
     for role in ROLES:
@@ -146,7 +147,7 @@ class _Topics:
     place: str  # of the bag, for errors
 
     def choose(self, role: str, wanted: str | None) -> str | None:
-        """Returns the topic of a role: the wanted one; or the only one with the usual name."""
+        """Returns the topic of a role: the wanted one, or the only one with the usual name."""
         if wanted == NONE:
             return None
         if wanted is None:
@@ -173,7 +174,7 @@ class _Topics:
         """Returns the only topic with the most reliable usual name; None if no name matches."""
         fitting = self._find_fitting(role)
         for pattern in USUAL[role]:
-            # A simulator tells the true pose as odometry; other odometry is no pose by itself.
+            # A simulator publishes the true pose as odometry; other odometry is not guessed.
             never: tuple[str, ...] = (TRANSFORMS,)
             if pattern != GROUND_TRUTH:
                 never = NEVER_GUESSED.get(role, ())
@@ -196,7 +197,7 @@ class _Topics:
         return None
 
     def describe_missing(self, roles: Sequence[str], words: str) -> str:
-        """Says that no topic has any of the roles, with the fix."""
+        """Returns that no topic has any of the roles, and the fix."""
         kinds = dict.fromkeys(kind for role in roles for kind in TYPES[role])
         advice = f"record one of type {', '.join(kinds)}"
         if roles == ("cmd_vel",):

@@ -1,4 +1,4 @@
-"""Values of a recording in SI, with their stamps, as its mapping says."""
+"""Values of a recording in SI, with their stamps, according to its mapping."""
 
 import re
 from collections.abc import Sequence
@@ -31,13 +31,13 @@ from nics_drl_bridge.recording.table import (
 
 ZONE = re.compile(r"(Z|[+-]\d\d:?\d\d)$")
 CLOCK = re.compile(r"\d\d:\d\d:\d\d")  # a time of day
-AT_ONCE = 0.25  # rows so much closer than usual come at once
-MOST_LISTED = 20  # tables in an error
-CLOSE = 1e-9  # a flag equals a number within this
+AT_ONCE = 0.25  # rows closer than this fraction of the mean step come at once
+MOST_LISTED = 20  # maximum number of tables listed in an error
+CLOSE = 1e-9  # maximum difference of a flag from the number that it equals
 
 
 class Series(NamedTuple):
-    """A value in SI, where it is known."""
+    """A value in SI at the times at which it is known."""
 
     t: Array  # (T,) [s]
     values: Array  # (T,)
@@ -49,13 +49,13 @@ class StampedRows(NamedTuple):
 
     t: Array  # (T,) [s]
     rows: NDArray[np.intp]  # (T,)
-    clock: str  # empty if nothing says it
-    total: int  # rows of the table, before those without a stamp were left out
+    clock: str  # empty if unknown
+    total: int  # number of rows of the table, including those without a stamp
 
 
 @dataclass
 class MappedReader:
-    """Reads values of a source; collects what was mended in `notes`."""
+    """Reads values of a source, and collects sentences on repairs in `notes`."""
 
     source: Source
     mapping: Mapping
@@ -71,7 +71,10 @@ class MappedReader:
     def locate(
         self, reference: Reference, within: str | None = None
     ) -> tuple[Table, Reference]:
-        """Returns the table and the column of a reference; RecordingError: no such table."""
+        """Returns the table and the column of a reference.
+
+        Raises RecordingError if there is no such table, ConfigError if none is named.
+        """
         names = self.source.names
         text = str(reference)
         colons = [k for k, sign in enumerate(text) if sign == ":"]
@@ -124,7 +127,7 @@ class MappedReader:
         return stamped
 
     def _take_stamps(self, table: Table, time: schema.Time | None) -> StampedRows:
-        """Returns the stamps that come with the rows of a table, as with messages."""
+        """Returns the stamps that come with the rows of a table, as with a bag's messages."""
         stream = table.stamps("" if time is None else str(time.from_))
         if stream is None:
             example = "as in `time: t`, `time: [s, ns]`, or `time: {rate: 50}` if there is none"
@@ -142,7 +145,7 @@ class MappedReader:
         return StampedRows(stream.t, rows, clock, len(table.column(0)))
 
     def _read_stamps(self, table: Table, time: schema.Time) -> StampedRows:
-        """Reads stamps from columns of a table, and mends what loggers do to them."""
+        """Reads stamps from columns of a table, and repairs what loggers did to them."""
         raw = self._read_raw_stamps(table, time)
         rows = np.flatnonzero(np.isfinite(raw))
         t = raw[rows]
@@ -177,7 +180,7 @@ class MappedReader:
     def _locate_beside(
         self, table: Table, reference: Reference
     ) -> tuple[Table, Reference]:
-        """Returns table and column of a reference, which is of this table if it names none."""
+        """Returns table and column of a reference; without a table it refers to this one."""
         if ":" in str(reference) and reference not in table.names:
             return self.locate(reference)
         return table, reference
@@ -190,10 +193,10 @@ class MappedReader:
         held: bool,
         allow_infinite: bool = False,
     ) -> Series:
-        """Returns a value in SI, and the rate of a counter.
+        """Returns a value in SI, or the rate of a counter.
 
-        A value that is `held` counts from its stamp to the next; others are interpolated. Infinite
-        numbers are refused, or with `allow_infinite` left out.
+        A `held` value counts from its stamp to the next; others are interpolated. Infinite numbers
+        are refused, or left out with `allow_infinite`.
         """
         stream = stream or Measured()
         table, column_name = self.locate(value.from_, stream.in_)
@@ -246,7 +249,7 @@ class MappedReader:
         return series._replace(values=series.values * factor + value.offset)
 
     def _unwrap(self, name: str, value: Value, series: Series) -> Series:
-        """Continues a counter over its overflows; an absolute angle begins near zero."""
+        """Continues a counter across its overflows; an absolute angle starts near zero."""
         size = value.wrap
         origin = ""
         if size is None:
@@ -267,7 +270,7 @@ class MappedReader:
     def _apply_flags(
         self, value: Value, series: Series, table: Table, time: schema.Time | None
     ) -> Series:
-        """Replaces the value by `otherwise` in rows whose flags are not as `when` needs them."""
+        """Replaces the value by `otherwise` in rows whose flags do not match `when`."""
         counts = np.ones(len(series.t), dtype=np.bool_)
         for reference, wanted in value.when.items():
             flag_table, flag = self._locate_beside(table, reference)
@@ -292,7 +295,7 @@ class MappedReader:
 
 
 def _check_whole_seconds(table: Table, time: schema.Time, t: Array) -> None:
-    """Refuses stamps (T,) in whole seconds that several rows share: their fraction was lost."""
+    """Refuses stamps (T,) in whole seconds that several rows share, having lost their fraction."""
     column = time.columns[0]
     if len(time.columns) > 1 or time.unit not in (None, "s"):
         return
@@ -311,7 +314,7 @@ def _check_whole_seconds(table: Table, time: schema.Time, t: Array) -> None:
 
 
 def get_unit(value: Value) -> UnitOfData:
-    """Returns the SI unit and the factor of a value, of a counter those of its rate."""
+    """Returns the SI unit and the factor of a value; for a counter, of its rate."""
     unit = value.unit
     if unit is None and value.ticks_per_turn:
         unit = "ticks"
@@ -342,14 +345,14 @@ def parse_dates(column: Column) -> Array | None:
         ns = np.array(text, dtype="datetime64[ns]").astype(np.int64)
     except ValueError:
         return None
-    # Exact to a quarter of a microsecond.
+    # This is exact to a quarter of a microsecond.
     return stamping.join_stamps(ns // NS_PER_S, ns % NS_PER_S)
 
 
 def _derive_rate(counter: Series, held: bool) -> Series:
-    """Differentiates a counter: exact between two stamps, so that its integral stays.
+    """Differentiates a counter between stamps, so that the rate's integral is exact.
 
-    Of rows that come at once only the last is used: the ticks between them would take no time.
+    Of rows that come at once, only the last is used: ticks between them would take no time.
     """
     is_last = np.ones(len(counter.t), dtype=np.bool_)
     if len(counter.t) > 1:
@@ -376,7 +379,7 @@ def match_values(column: Column, wanted: schema.Condition) -> NDArray[np.bool_]:
 
 
 def combine_series(name: str, parts: Sequence[Series], held: bool) -> Stream:
-    """Joins values to a stream: commands hold, others are interpolated at the first's rows."""
+    """Joins values into a stream: commands are held, others interpolated at the first's stamps."""
     clocks = sorted({part.clock for part in parts})
     if len(clocks) > 1:
         fault = f"{name}: its values are of the clocks {' and '.join(clocks)}"

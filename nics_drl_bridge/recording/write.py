@@ -37,16 +37,19 @@ Storage = Literal["mcap", "sqlite3"]
 
 NPZ = ".npz"
 START_NS = 1_700_000_000 * NS_PER_S  # time stamp of second 0 of the commands' clock
-# by which other clocks lag behind: no delay, to whoever reads them
+# Lag of other clocks, too long for a reader to take it for a delay
 APART_NS = 3600 * NS_PER_S
 FRAMES = ("odom", "base_link")
-NO_HASH = f"RIHS01_{'0' * 64}"  # of a type that is known only by its text
-# damage costs a whole chunk, since each checksum covers a whole chunk
+NO_HASH = f"RIHS01_{'0' * 64}"  # of a type that is known only by its definition
+# Damage costs a whole chunk, because a checksum covers a whole chunk.
 CHUNK_BYTES = 1 << 16
 
 
 def check_out(path: str | Path) -> Path:
-    """Checks an output; ConfigError: it exists, or wrong suffix; RecordingError: no library."""
+    """Checks the path of an output.
+
+    Raises ConfigError if it exists or has a wrong suffix, RecordingError if a library is missing.
+    """
     path = Path(path)
     if path.exists():
         raise ConfigError(f"{path}: is there already; give another name, or remove it.")
@@ -75,15 +78,15 @@ def write_bag(
     storage: Storage = defaults.BAG_STORAGE,
 ) -> None:
     """Writes a recording as a bag that `load_bag` reads back; for errors see `open_bag_sink`."""
-    # Commands become `/cmd_vel`, state or wheels `/joint_states`, the IMU `/imu`, the pose `/odom`;
-    # or `/pose` on its own clock or next to odometry.
+    # Commands become `/cmd_vel`, state or wheels `/joint_states`, the IMU `/imu`. The pose becomes
+    # `/odom`, or `/pose` if it has its own clock or odometry was recorded as well.
     with open_bag_sink(path, storage) as sink:
         messages = _Messages(store := sink.store)
         command = recording.command
         for topic, kind, stream, make in _list_topics(recording, spec, messages):
             sink.add_topic(topic, kind)
             stamps = np.round(stream.t * NS_PER_S).astype(np.int64) + START_NS
-            # By their receipt, streams of other clocks start together with the commands.
+            # Streams of other clocks are received from the first command's time on.
             receive = stamps
             if stream.clock != command.clock:
                 receive = stamps + round(float(command.t[0] - stream.t[0]) * NS_PER_S)
@@ -174,7 +177,7 @@ class _Messages:
         return self._make("geometry_msgs/PoseStamped", header, self._make_pose(row))
 
     def make_odometry(self, header: Any, row: Array, pose_known: bool = True) -> Any:
-        """Makes an odometry message of which only the pose or only the twist was recorded."""
+        """Makes an odometry message if only its pose or only its twist was recorded."""
         pose, twist = (row, np.zeros(3)) if pose_known else (np.zeros(3), row)
         covariance = np.append(0.0 if pose_known else -1.0, np.zeros(35))
         where = self._make(
@@ -208,12 +211,11 @@ class BagSink:
     """An open bag, created by `open_bag_sink` with an open writer of rosbags."""
 
     def __init__(self, writer: "Writer") -> None:
-        # the known message types
         self._writer = writer
-        self.store = msgs.make_typestore()
+        self.store = msgs.make_typestore()  # the known message types
         self._connections: dict[str, Connection] = {}
         self.counts: dict[str, int] = {}  # number of messages by topic
-        # the first one of the file or the database
+        # the first fault of the file or the database
         self.fault: BaseException | None = None
 
     def add_topic(
@@ -259,7 +261,7 @@ class BagSink:
                 storage.close_chunk()
 
     def flush(self) -> None:
-        """Flushes written messages to the file, so that a crash of this process can't lose them."""
+        """Flushes written messages to the file, so that they survive a crash of this process."""
         storage: Any = self._writer.storage
         with self._record_fault():
             if hasattr(storage, "close_chunk"):
@@ -271,7 +273,7 @@ class BagSink:
 
     @contextmanager
     def _record_fault(self) -> Iterator[None]:
-        """Notes that the storage failed; a full disk is an error of SQLite, or of the system."""
+        """Records a fault of the storage: SQLite's or the system's, such as a full disk."""
         try:
             yield
         except Exception as error:
@@ -283,14 +285,16 @@ class BagSink:
 def open_bag_sink(
     path: str | Path, storage: Storage = defaults.BAG_STORAGE, keep: bool = False
 ) -> Iterator[BagSink]:
-    """Yields a bag, a folder at the end; RecordingError: it exists, can't be made, no library.
+    """Yields a bag, which becomes a folder at the end.
 
-    Until then it is in a hidden folder `.NAME.*` beside it. If the storage fails, as on a full
+    Until then it is in a hidden folder `.NAME.*` next to it. If the storage fails, as on a full
     disk, what was written stays in such a folder.
 
-    `keep` is for what can't be had again, a recording: if the block raises, the bag is finished
-    with what was written, and what a killed process leaves stays there, too. Without it, the former
-    leaves nothing, and the latter is removed at the next write.
+    `keep` is for data that can't be had again, such as a recording. If the block raises, the bag is
+    finished with what was written. What a killed process leaves also stays. Without `keep`, the
+    block leaves nothing if it raises, and the next write removes what a killed process left.
+
+    Raises RecordingError if the path exists or can't be made, or if a library is missing.
     """
     path = Path(path)
     msgs.check_libraries(path, "writing")
@@ -318,9 +322,8 @@ def open_bag_sink(
             except BaseException as error:
                 keepable = keep and sink.fault is None and any(sink.counts.values())
                 if not keepable:
-                    with suppress(
-                        Exception
-                    ):  # the writer takes back what was not flushed
+                    # The writer discards what was not flushed.
+                    with suppress(Exception):
                         sink.flush()
                     raise
                 raised = error
@@ -363,7 +366,7 @@ def _set_apart(unfinished: Path, path: Path) -> Path:
 
 
 def _finish(unfinished: Path, path: Path, storage: Storage) -> None:
-    """Makes a closed bag safe on the disk, and gives it its name."""
+    """Makes a closed bag safe on the disk and gives it its name."""
     from nics_drl_bridge.recording.mcap import write_checksums
 
     if storage == "mcap":

@@ -1,4 +1,4 @@
-"""Checks of data received from a robot against a model; each yields a finding for each fault."""
+"""Checks data received from a robot against a model, and yields a finding for each fault."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -27,20 +27,20 @@ from nics_drl_bridge.robot.spec import RobotSpec
 Mismatch = doctor_facts.Mismatch
 Findings = Iterator[Mismatch]
 
-# a drive with less motion does not determine scales
+# A drive with less motion does not determine scales.
 LEAST_PATH_M = 0.3
 LEAST_TURN_RAD = 0.3
-TOLERANCE = 1.4  # differences of the pose and the twist must agree within this factor
-# Below this correlation a ratio of pose and twist is meaningless; the same for commands, which the
-# robot follows with delay and within its limits.
+TOLERANCE = 1.4  # maximum factor between the pose's differences and the twist
+# Below this correlation a ratio of pose and twist is meaningless; the second one is for commands,
+# which the robot follows with a delay and within its limits.
 ALIKE = 0.8
 LEAST_ALIKE = 0.3
-# a step is a jump beyond this multiple of the top speed's, and this length
+# A step is a jump beyond this multiple of the top speed's, and beyond this length.
 JUMP = 5.0
 JUMP_M = 0.2
 QUATERNION_TOLERANCE = 0.05
 LEAST_STEPS = 10
-# over which turns are compared if the robot was heard for a few seconds only
+# Window in which turns are compared if the robot was heard for a few seconds only
 SHORT_WINDOW_S = 2.0
 UNITS = (
     (1000.0, "mm/s"),
@@ -49,15 +49,15 @@ UNITS = (
     (180.0 / np.pi, "degrees per second"),
 )
 RATE_TOLERANCE = 0.2
-# Stamps are from the future if this much after their arrival; too old for the command gate if this
-# much before it; and so far before it that the clocks must differ.
+# Stamps this much after their arrival are from the future. Stamps this much before it are too old
+# for the command gate, and even older ones show that the clocks differ.
 FUTURE_S = 0.005
 LATE_S = 0.35
 OFFSET_S = 5.0
 STALE_CLOCK_S = 1.0
 BODY_FRAMES = ("base_link", "base_footprint")
 ANGLE_TOLERANCE = 0.5  # tolerance of a beam's direction, in increments
-# a value in more than this fraction of the beams is intended by the lidar
+# A value in more than this fraction of the beams is intended by the lidar.
 ODD_FRACTION = 0.01
 
 error = partial(Mismatch, "error")
@@ -91,7 +91,7 @@ def examine(facts: Facts, expected: Expected) -> list[Mismatch]:
 
 
 def check_presence(facts: Facts, _: Expected) -> Findings:
-    """Finds missing and silent topics, and wrong types."""
+    """Finds missing topics, silent topics and wrong types."""
     for role in (SCAN, ODOM, CMD_VEL):
         ends = facts.topics.get(facts.names[role])
         types = () if ends is None else ends.types
@@ -126,7 +126,7 @@ def check_presence(facts: Facts, _: Expected) -> Findings:
 
 
 def check_quality_of_service(facts: Facts, _: Expected) -> Findings:
-    """Finds pairs of publisher and subscriber with incompatible quality of service."""
+    """Finds publishers and subscribers whose qualities of service are incompatible."""
     for role, name in facts.names.items():
         ends = facts.topics.get(name)
         if ends is None:
@@ -143,7 +143,7 @@ def check_quality_of_service(facts: Facts, _: Expected) -> Findings:
 
 
 def check_publishers(facts: Facts, _: Expected) -> Findings:
-    """Finds several publishers on topics that must have a single one."""
+    """Finds several publishers on topics that must have only one."""
     for role in (CMD_VEL, ODOM, SCAN, CLOCK):
         ends = facts.topics.get(facts.names[role])
         if ends is not None and len(ends.offers) > 1:
@@ -162,7 +162,7 @@ def check_frames(facts: Facts, expected: Expected) -> Findings:
     for role, attribute, good, place in fields:
         for frame in sorted(getattr(facts.heard.get(role), attribute, ())):
             if frame.rpartition("/")[2] in good and not frame.startswith("/"):
-                continue  # robots of a fleet have prefixes
+                continue  # the frames of a fleet's robots have prefixes
             fix = f"call it {good[0]!r} (REP-105), without a leading slash"
             if role == SCAN and frame not in ("", "map", "odom", *BODY_FRAMES):
                 fix = f"call it {good[0]!r} in the driver, or set `frame: {frame}` in the lidar"
@@ -171,7 +171,7 @@ def check_frames(facts: Facts, expected: Expected) -> Findings:
 
 
 def check_rates(facts: Facts, expected: Expected) -> Findings:
-    """Checks rates: the scan's as declared, odometry at least one message per command."""
+    """Checks rates: the scan's as declared, and at least one odometry message per command."""
     for role, wanted in ((SCAN, expected.lidar.rate), (ODOM, 1.0 / expected.period_s)):
         rate = _measure_rate(facts, role)
         if rate is None:
@@ -194,13 +194,13 @@ def _measure_rate(facts: Facts, role: str) -> float | None:
     stamps = heard.stamps_ns
     times = heard.arrivals_ns
     if facts.clock_ns and len(stamps) > 2 and stamps[-1] > stamps[0]:
-        times = stamps  # a simulation may run at another speed
+        times = stamps  # a simulation may run faster or slower than real time
     span = times[-1] - times[0]
     return (len(times) - 1) / (span * S_PER_NS) if span else None
 
 
 def check_latency(facts: Facts, _: Expected) -> Findings:
-    """Checks arrival minus stamp, by `/clock` if there is one."""
+    """Checks that messages are stamped, in order, and arrive in time, by `/clock` if present."""
     for role in (SCAN, ODOM):
         if (heard := facts.heard.get(role)) is None:
             continue
@@ -235,7 +235,7 @@ def _select_present(facts: Facts, arrivals: Sequence[int]) -> NDArray[np.int64]:
     if not facts.clock_ns:
         return times
     ticks = np.array(facts.heard[CLOCK].arrivals_ns, dtype=np.int64)
-    # The tick of a message is sent with it, and may arrive after it.
+    # The clock tick of a message is sent with it, and may arrive after it.
     place = np.searchsorted(ticks, times, side="right").clip(0, len(ticks) - 1)
     return np.asarray(np.array(facts.clock_ns, dtype=np.int64)[place])
 
@@ -261,7 +261,7 @@ def check_clock(facts: Facts, _: Expected) -> Findings:
 
 
 def check_motion(facts: Facts, expected: Expected) -> Findings:
-    """Checks odometry and commands: numbers, units and signs."""
+    """Checks odometry and commands for NaN, wrong units and wrong signs."""
     yield from _check_odometry(facts, expected.robot)
     ratio = _estimate_scale(facts)
     if ratio is not None and ratio < 0.0:
@@ -270,7 +270,7 @@ def check_motion(facts: Facts, expected: Expected) -> Findings:
 
 
 def check_turning(facts: Facts, expected: Expected) -> Findings:
-    """Compares how odometry and the gyro turn, and checks that a gyro is there if one is needed."""
+    """Compares the turns of odometry and gyro, and checks that a gyro is there if needed."""
     if GYRO not in facts.names:
         return
     if GYRO not in facts.heard:
@@ -309,7 +309,7 @@ def check_turning(facts: Facts, expected: Expected) -> Findings:
 
 
 def _compare_turns(facts: Facts) -> Turning | None:
-    """Compares the turns of both; None if the robot turned too little."""
+    """Compares the turns of odometry and gyro; returns None if the data do not suffice."""
     stamps = facts.heard[ODOM].stamps_ns if ODOM in facts.heard else []
     if not facts.poses or len(stamps) != len(facts.poses):
         return None
@@ -450,7 +450,7 @@ def _estimate_scale(facts: Facts) -> float | None:
 
 
 def check_layout(facts: Facts, expected: Expected) -> Findings:
-    """Checks number and directions of the beams, and the limits of their ranges."""
+    """Checks the number and directions of the beams, and the limits of their ranges."""
     if len(facts.layouts) > 1:
         counts = ", ".join(map(str, sorted({layout.beams for layout in facts.layouts})))
         fix = "use the driver's mode of fixed angles (such as `angle_compensate`), or resample"
@@ -506,7 +506,7 @@ def _check_beams(layout: doctor_facts.Layout, expected: Expected) -> Findings:
 
 
 def check_ranges(facts: Facts, expected: Expected) -> Findings:
-    """Checks the lidar's values for no return, and the unit of its ranges."""
+    """Checks the lidar's values for no return and the unit of its ranges."""
     if not facts.ranges:
         return
     spec = expected.lidar

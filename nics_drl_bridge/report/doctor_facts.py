@@ -1,4 +1,4 @@
-"""Facts about a robot, live or from a bag; expectations of the doctor, and its findings."""
+"""Facts about a robot, live or from a bag, and the doctor's expectations and findings."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -37,22 +37,22 @@ KINDS: dict[str, Sequence[str]] = {  # message types of each role; others are no
     CLOCK: ("rosgraph_msgs/msg/Clock",),
     GYRO: (IMU,),
 }
-MOST_SCANS = 200  # maximum number of scans whose ranges are kept; of the others only the times are
-MOST_RAD = 7.0
+MOST_SCANS = 200  # maximum number of scans whose ranges are kept
+MOST_RAD = 7.0  # larger angles are in degrees [rad]
 
 
 @dataclass(frozen=True)
 class Endpoints:
     """Publishers and subscribers of a topic, without the doctor's own."""
 
-    types: tuple[str, ...]  # of the messages, as the publishers declare them
+    types: tuple[str, ...]  # message types that the publishers declare
     offers: tuple[Offer, ...] = ()  # quality of service of each publisher
-    asks: tuple[Offer, ...] = ()  # and of each subscriber
+    asks: tuple[Offer, ...] = ()  # quality of service of each subscriber
 
 
 @dataclass
 class TopicFacts:
-    """Times of arrival, stamps and frames of the messages of a topic."""
+    """Arrival times, stamps and frames of a topic's messages."""
 
     arrivals_ns: list[int] = field(default_factory=list)
     stamps_ns: list[int] = field(default_factory=list)
@@ -61,14 +61,14 @@ class TopicFacts:
 
 
 class Layout(NamedTuple):
-    """The beams of a scan according to its header, whose times are left out."""
+    """The beams of a scan according to its header, without its times."""
 
     beams: int
     header: ScanHeader
 
     @property
     def last(self) -> float:
-        """Angle of the last beam, by the increment."""
+        """Angle of the last beam according to the increment [rad]."""
         return self.header.angle_min + (self.beams - 1) * self.header.angle_increment
 
     @property
@@ -79,7 +79,7 @@ class Layout(NamedTuple):
 
 @dataclass
 class Facts:
-    """All facts that were collected; a role is `scan`, `odom`, `cmd_vel`, `imu` or `/clock`."""
+    """All collected facts; a role is `scan`, `odom`, `cmd_vel`, `imu` or `/clock`."""
 
     source: str
     live: bool  # True over DDS, False from a bag
@@ -88,7 +88,7 @@ class Facts:
     heard: dict[str, TopicFacts] = field(default_factory=dict)  # by role
     end_ns: int = 0  # end of listening, on the clock of arrivals [ns]
     layouts: list[Layout] = field(default_factory=list)  # distinct layouts of the scans
-    # of up to 200 scans [m]
+    # of up to `MOST_SCANS` scans [m]
     ranges: list[NDArray[np.float32]] = field(default_factory=list)
     # of odometry: x, y [m], heading [rad]
     poses: list[Row] = field(default_factory=list)
@@ -104,7 +104,7 @@ class Facts:
     yaw_rates: list[tuple[int, float]] = field(default_factory=list)
 
     def take(self, role: str, arrival_ns: int, message: Any) -> None:
-        """Records a message from ROS or from a bag, which have the same fields."""
+        """Records a message from ROS or from a bag; both have the same fields."""
         heard = self.heard.setdefault(role, TopicFacts())
         heard.arrivals_ns.append(arrival_ns)
         if hasattr(message, "header"):
@@ -139,7 +139,7 @@ class Facts:
 
 
 def names_in(namespace: str, imu: str = defaults.IMU_TOPIC) -> dict[str, str]:
-    """Role -> topic of a robot in a namespace; none of a gyro if `imu` is none."""
+    """Returns the topics of a robot in a namespace by role; without a gyro if `imu` is none."""
     space = parse_namespace(namespace)
     names = {role: f"{space}/{role}" for role in (SCAN, ODOM, CMD_VEL)} | {CLOCK: CLOCK}
     if gyros := list_imu_topics(imu, by_default=True):
@@ -150,7 +150,7 @@ def names_in(namespace: str, imu: str = defaults.IMU_TOPIC) -> dict[str, str]:
 def name_of_gyro(
     names: Mapping[str, str], imu: str, types: Mapping[str, Sequence[str]]
 ) -> str:
-    """Returns the topic of the gyro: the wanted one, or that which is there, by its type."""
+    """Returns the gyro's topic: the wanted one, else one of its type, else the usual one."""
     usual = names[GYRO]
     if imu != defaults.IMU_TOPIC or IMU in types.get(usual, ()):
         return usual
@@ -184,7 +184,7 @@ def collect_facts_of_bag(
 
 @dataclass(frozen=True)
 class Mismatch:
-    """A mismatch with its remedy; an `error` makes a policy misbehave, a `warning` may."""
+    """A mismatch with its fix; an `error` makes a policy misbehave, a `warning` may do so."""
 
     severity: Literal["error", "warning"]
     check: str
@@ -195,26 +195,26 @@ class Mismatch:
 
 @dataclass(frozen=True)
 class Expected:
-    """Expectations of a robot."""
+    """What is expected of a robot."""
 
     robot: RobotSpec
     lidar: LidarSpec
     period_s: float  # between commands
-    # that any lidar may fill; None: the beams of exactly this one
+    # layout that any lidar may fill; None: the beams must be exactly those of `lidar`
     scan: ScanLayout | None = None
-    gyro: bool = False  # the model was made with one
+    gyro: bool = False  # True if the model was made with one
 
 
 def derive_expected(
     source: SimulatorModel | Contract, scan: ScanLayout | None = None
 ) -> Expected:
-    """Expectations of a model, or of a policy file with the sectors of its scan."""
+    """Returns the expectations of a model, or of a policy file with the sectors of its scan."""
     gyro = getattr(source, "gyro", False)
     return Expected(source.robot, source.lidar, source.control_period, scan, gyro)
 
 
 def expect_present_lidar(facts: Facts, expected: Expected) -> Expected:
-    """Replaces the expected lidar by the present one if that fills the required sectors."""
+    """Replaces the expected lidar by the present one if this fills the required sectors."""
     if expected.scan is None or not facts.layouts:
         return expected
     try:
@@ -227,7 +227,7 @@ def expect_present_lidar(facts: Facts, expected: Expected) -> Expected:
 def fit_lidar_to_header(
     layout: Layout, mounted: LidarSpec, scan: ScanLayout
 ) -> LidarSpec:
-    """Returns the lidar of a scan header, mounted like another one.
+    """Returns the lidar of a scan header, mounted like `mounted`.
 
     Raises ConfigError if it does not fill the sectors of the scan.
     """

@@ -1,4 +1,4 @@
-"""Blocks of a page on a fit: the conclusion first, then paths and yardsticks, and all figures."""
+"""Blocks of a page on a fit: first the conclusion, then paths and yardsticks, then all figures."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,7 +22,7 @@ Tile = tuple[str, str, bool]
 
 
 def fit_tile(identified: Identified) -> Tile:
-    """Returns the accuracy of a fit as a figure, its meaning, and false if it is doubtful."""
+    """Returns the accuracy of a fit as a figure, its meaning, and False if it is doubtful."""
     for at in usual(identified.judgement):
         errors = {
             "": at.model,
@@ -42,7 +42,7 @@ def fit_tile(identified: Identified) -> Tile:
 def make_verdict_blocks(
     tiles: Sequence[Tile], conclusion: Conclusion, *commands: str
 ) -> Blocks:
-    """Returns figures in large type, doubts, what could not be learnt, and what to do next."""
+    """Returns figures in large type, doubts, gaps in what was learnt, and what to do next."""
     blocks = [
         html.make_paragraph(f"This model is: {conclusion.verdict}."),
         html.make_tiles(tiles),
@@ -63,7 +63,7 @@ def make_verdict_blocks(
 
 
 def make_path_blocks(identified: Identified) -> Blocks:
-    """Compares predicted with measured paths, and errors with those of the yardsticks."""
+    """Compares predicted with measured paths, and the model's errors with the yardsticks'."""
     if identified.held_out is None or not identified.judgement:
         return [html.make_paragraph("The drive is too short to hold data out.")]
     paths = fit_pictures.draw_unseen_paths(identified.trial, PATHS_SHOWN)
@@ -97,10 +97,10 @@ def model_blocks(spec: RobotSpec, identified: Identified, report: str) -> Blocks
 def write_fit_page(
     file: Path, source: str, spec: RobotSpec, identified: Identified, report: str
 ) -> None:
-    """Writes the page of a fit to a recording from a source, with the fit report as text."""
+    """Writes the page of a fit to a recording from `source`, with the fit report as text."""
     conclusion = conclude(identified)
     folder = file.parent
-    # A textbook that was written may have another state.
+    # The spec may be of a textbook robot with another state.
     spec = identified.drive.spec
     tile = fit_tile(identified)
     model = identified.model

@@ -1,4 +1,4 @@
-"""Pictures of a fit (its data, predictions and terms) and of its calibration, each a PNG."""
+"""Pictures of a fit (its data, predictions and terms) and of its calibration, as PNG."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -41,7 +41,7 @@ from nics_drl_bridge.style import (
 SHOWN_S = 8.0
 PATHS = 6
 POINTS = 40
-UNSEEN_PANEL = Panel(3.4, 3.4)  # of one of them on a page
+UNSEEN_PANEL = Panel(3.4, 3.4)  # of one unseen path on a page
 SETTLED_S = 1.0
 LEAST_ERROR = 1e-12
 LEAST_RATE = 1e-6
@@ -65,8 +65,8 @@ CAPTIONS = {
 def write_pictures(
     spec: RobotSpec, identified: Identified, folder: str | Path
 ) -> tuple[Path, ...]:
-    """Writes the pictures of a fit and of its calibration as PNG files, and returns these."""
-    # A textbook that was written may have another state.
+    """Writes the pictures of a fit and of its calibration as PNG files, and returns their paths."""
+    # The spec may be of a textbook robot with another state.
     spec = identified.drive.spec
     drawn = {**fit_pictures(spec, identified), **draw_calibration(spec, identified)}
     files = {Path(folder) / f"{name}.png": picture for name, picture in drawn.items()}
@@ -78,11 +78,11 @@ def write_pictures(
 def fit_pictures(
     spec: RobotSpec, identified: Identified, paths: bool = True
 ) -> dict[str, bytes]:
-    """Returns the pictures of a fit that the recording allows, by name, each a PNG."""
-    by_motion = identified.findings.motion_width_s is not None or bool(
-        identified.findings.replacement
+    """Returns the pictures of a fit that the recording allows, as PNG by name."""
+    by_motion = identified.findings.width is not None or bool(
+        identified.findings.replaced
     )
-    # then pruning did not choose its terms
+    # If motion chose the terms, pruning did not, and there is no curve.
     pictures = {} if by_motion else {"accuracy": draw_accuracy(identified)}
     if paths and identified.held_out is not None:
         pictures["paths"] = draw_held_out_paths(identified.trial)
@@ -97,7 +97,7 @@ def fit_pictures(
 
 
 def draw_accuracy(identified: Identified) -> bytes:
-    """Draws the cross-validated error over the number of terms, a line per degree of freedom."""
+    """Draws the cross-validated error over the number of terms, one line per degree of freedom."""
     figure, (axes,) = make_panels(1, 1, (7.5, 4.5))
     circle: dict[str, Any] = {"markersize": 10, "fillstyle": "none"}
     for n, curve in enumerate(identified.fit.curves):
@@ -120,7 +120,7 @@ def draw_accuracy(identified: Identified) -> bytes:
 
 
 def draw_held_out_paths(identified: Identified) -> bytes:
-    """Draws open-loop predictions on unseen data and the measured paths, from the same start."""
+    """Draws open-loop predictions on unseen data and the measured paths from the same starts."""
     paths = _collect_unseen_paths(identified)
     rows = -(-len(paths) // 3)
     columns = min(len(paths), 3)
@@ -131,7 +131,7 @@ def draw_held_out_paths(identified: Identified) -> bytes:
 
 
 def draw_unseen_paths(identified: Identified, most: int) -> list[bytes]:
-    """Draws some of the panels of `draw_held_out_paths`, each as a PNG of its own."""
+    """Draws up to `most` panels of `draw_held_out_paths`, each as its own PNG."""
     drawn = []
     for path in _collect_unseen_paths(identified)[:most]:
         figure, (axes,) = make_panels(1, 1)
@@ -141,7 +141,7 @@ def draw_unseen_paths(identified: Identified, most: int) -> list[bytes]:
 
 
 def _collect_unseen_paths(identified: Identified) -> list[tuple[Array, Array, float]]:
-    """Returns measured and predicted paths, and the distance between their ends [m]."""
+    """Returns measured and predicted paths with the distance between their ends [m]."""
     drive = identified.drive
     calibration = identified.calibration
     pose = identified.recording.pose
@@ -174,7 +174,7 @@ def _draw_unseen_path(axes: Axes, paths: tuple[Array, Array, float]) -> None:
 
 
 def draw_yardsticks(identified: Identified) -> bytes:
-    """Draws mean errors on unseen data over the horizon, beside those of the yardsticks."""
+    """Draws mean errors on unseen data over the horizon, for the model and the yardsticks."""
     figure, (axes,) = make_panels(1, 1, (5.0, 3.6))
     judgement = identified.judgement
     for name, label, colour, line in (
@@ -214,7 +214,7 @@ def draw_yardsticks(identified: Identified) -> bytes:
 
 
 def draw_residuals(identified: Identified, unseen: Samples) -> bytes:
-    """Draws rates on unseen data, those of the model, and the residuals, over time."""
+    """Draws measured rates, predicted rates and residuals on unseen data over time."""
     model = identified.model
     predicted = model.rates(unseen.x)
     t = unseen.t - unseen.t[0]
@@ -240,7 +240,7 @@ def draw_residuals(identified: Identified, unseen: Samples) -> bytes:
 
 
 def draw_alignment(spec: RobotSpec, identified: Identified) -> bytes:
-    """Draws each changing command, as stamped and as it takes effect, with its main response."""
+    """Draws each changing command, as stamped and as it takes effect, with the main response."""
     samples = identified.samples
     calibration = identified.calibration
     command = identified.recording.command
@@ -311,7 +311,7 @@ def _predict_rates(identified: Identified, chosen: Windows) -> Array:
 
 
 def draw_calibration(spec: RobotSpec, identified: Identified) -> dict[str, bytes]:
-    """Returns the pictures of a calibration that the recording allows, by name, each a PNG."""
+    """Returns the pictures of a calibration that the recording allows, as PNG by name."""
     drawn = {
         "mounting": draw_mounting(identified, collect_estimates(identified)),
         "inputs": draw_inputs(spec, identified),
@@ -323,7 +323,7 @@ def draw_calibration(spec: RobotSpec, identified: Identified) -> dict[str, bytes
 def draw_mounting(
     identified: Identified, values: dict[str, CalibratedValue]
 ) -> bytes | None:
-    """Draws velocities of the tracked body and of `base_link`: rotation and lever arm as slopes."""
+    """Draws velocities of the tracked body and of `base_link`; None without a rotation."""
     rotation = values["rotation_rad"]
     lever_x = values["lever_arm_x_m"]
     lever_y = values["lever_arm_y_m"]
@@ -357,7 +357,7 @@ def _draw_points(axes: Axes, tracked: Sequence[Array], base: Sequence[Array]) ->
 
 
 def draw_inputs(spec: RobotSpec, identified: Identified) -> bytes | None:
-    """Draws the curve of each command that has one, and what becomes of the rates of states."""
+    """Draws the input curves, and how limits, drag and friction change the rates of states."""
     model = identified.model
     curves = [curve for curve in model.inputs if curve.bends]
     restrained = [dof for dof in model.dofs if model.describe_limits(dof)]
@@ -391,7 +391,7 @@ def draw_inputs(spec: RobotSpec, identified: Identified) -> bytes | None:
 
 
 def _draw_restraint(axes: Axes, identified: Identified, dof: str) -> None:
-    """Draws the rates of a state as measured, and as limits, drag and friction let them be."""
+    """Draws the rates of a state as measured and as its limits, drag and friction allow them."""
     model = identified.model
     samples = identified.samples
     d = identified.model.dofs.index(dof)
@@ -422,7 +422,7 @@ def _finish(axes: Axes, title: str) -> None:
 
 
 def draw_noise(identified: Identified) -> bytes | None:
-    """Draws histograms of the residuals, and the growth of the drift; None if free of noise."""
+    """Draws histograms of the residuals and the growth of the drift; None without noise."""
     levels = identified.noise
     histograms = []
     drive = identified.drive

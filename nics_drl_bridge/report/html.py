@@ -1,4 +1,4 @@
-"""HTML pages in one file: light and dark, from a phone's width on, and whole in print."""
+"""HTML pages in one file: light and dark, from a phone's width up, and complete in print."""
 
 import base64
 from collections.abc import Sequence
@@ -69,12 +69,12 @@ def make_code(text: str) -> str:
 
 
 def make_bullets(sentences: Sequence[str]) -> str:
-    """Returns a list of sentences."""
+    """Returns sentences as a list."""
     return "<ul>" + "".join(f"<li>{escape(text)}</li>" for text in sentences) + "</ul>"
 
 
 def make_tiles(figures: Sequence[tuple[str, str, bool]]) -> str:
-    """Returns figures in large type, each with its meaning, and False if it raises a doubt."""
+    """Returns figures in large type, each with its meaning and False if it raises a doubt."""
     tiles = (
         f'<div class="tile{"" if good else " doubtful"}"><b>{"" if good else "⚠ "}{escape(figure)}'
         f"</b><span>{escape(meaning)}</span></div>"
@@ -100,7 +100,7 @@ def _read_width(png: bytes) -> int:
 
 
 def make_gallery(pictures: Sequence[tuple[bytes, str]]) -> str:
-    """Returns pictures with captions side by side, or in a column on a phone or if wide."""
+    """Returns pictures with captions side by side, or in one column on a phone or if wide."""
     wide = any(_read_width(png) > WIDE for png, _ in pictures)
     kind = "gallery wide" if wide else "gallery"
     figures = "".join(make_picture(png, caption) for png, caption in pictures)
@@ -108,7 +108,7 @@ def make_gallery(pictures: Sequence[tuple[bytes, str]]) -> str:
 
 
 def make_details(summary: str, blocks: Sequence[str]) -> str:
-    """Returns blocks that are folded below a summary, and open in print."""
+    """Returns blocks folded below a summary, which are open in print."""
     return f"<details><summary>{escape(summary)}</summary>{''.join(blocks)}</details>"
 
 

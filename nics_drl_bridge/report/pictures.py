@@ -1,4 +1,4 @@
-"""Pictures of trajectories, drives, trainings, policies and worlds, each a PNG."""
+"""Pictures of trajectories, drives, trainings, policies and worlds, as PNG."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import astuple
@@ -42,28 +42,28 @@ LINES: tuple[dict[str, Any], ...] = (
     {"color": MODEL, "linewidth": 1.4, "linestyle": "--"},
     {"color": GREEN, "linewidth": 1.4, "linestyle": ":"},
 )
-# of the pictures of a square world, and of an episode [inch]
+# Sides of the pictures of a square world, and of an episode [inch]
 WORLD_SIDE = 7.0
 EPISODE_SIDE = 4.0
-# of the picture of any world [inch]
+# Bounds of the size of any world's picture [inch]
 LEAST_WIDTH = 2.4
 GREATEST_WIDTH = 12.5
 LEAST_HEIGHT = 1.2
 GREATEST_HEIGHT = 9.0
-WORLD_MARGIN = 0.03  # around a world, as a share of its longer side
-CURVE_PANEL = Panel(4.0, 3.0, left=1.1)  # of the curves on the page of a demo
-NAME_LETTERS = 11  # of a line of the name of what was perturbed
+WORLD_MARGIN = 0.03  # around a world, as a fraction of its longer side
+CURVE_PANEL = Panel(4.0, 3.0, left=1.1)  # for the curves on the page of a demo
+NAME_LETTERS = 11  # maximum line length in names of perturbations
 
 
 class View(NamedTuple):
-    """The part of a plane that a panel shows, and the size of the panel."""
+    """The part of a plane that a panel shows, and the panel's size."""
 
-    low: Array  # (2,) least x and y [m]
-    high: Array  # (2,) greatest x and y [m]
-    panel: Panel  # of the same proportion
+    low: Array  # (2,) minimum x and y [m]
+    high: Array  # (2,) maximum x and y [m]
+    panel: Panel  # with the same proportions
 
     def show(self, axes: Axes) -> None:
-        """Shows this part in axes, with equal scales."""
+        """Shows this part in axes with equal scales."""
         axes.set(xlim=(self.low[0], self.high[0]), ylim=(self.low[1], self.high[1]))
         axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
 
@@ -71,9 +71,9 @@ class View(NamedTuple):
 def make_view(low: Array, high: Array, side: float) -> View:
     """Returns the view of a field between two corners (2,) [m].
 
-    The panel has the proportion of the field and the area of a square of a side [inch], so that a
-    corridor is flat and a shaft is tall. Where that would exceed the bounds of a picture, the panel
-    is smaller; and where it would then be too thin, it shows more than the field.
+    The panel has the field's proportions and the area of a square with side `side` [inch], so a
+    corridor is flat and a shaft is tall. A panel that would exceed the bounds of a picture is
+    smaller. If it would then be too thin, it shows more than the field.
     """
     margin = WORLD_MARGIN * (high - low).max()
     size = high - low + 2.0 * margin
@@ -87,7 +87,7 @@ def make_view(low: Array, high: Array, side: float) -> View:
 
 
 def _make_view_of_episodes(world: AnyWorld, episodes: Iterable[Episode]) -> View:
-    """Returns the view of a world that holds the paths of some episodes, too."""
+    """Returns the view of a world that also contains the paths of some episodes."""
     corners = np.reshape(world.extent, (2, 2))
     paths = [episode.path[:, :2] for episode in episodes]
     points = np.concatenate([corners, *paths])
@@ -97,7 +97,7 @@ def _make_view_of_episodes(world: AnyWorld, episodes: Iterable[Episode]) -> View
 def draw_trajectories(
     runs: Mapping[str, Sequence[Episode]], world: AnyWorld, footprint: float
 ) -> bytes:
-    """Draws a panel per episode with its path in each run, of equal seeds (the paper's Fig. 7)."""
+    """Draws a panel per seed with the path of each run (the paper's Fig. 7)."""
     view = _make_view_of_episodes(world, chain.from_iterable(runs.values()))
     by_seed = [
         {
@@ -117,7 +117,7 @@ def draw_trajectories(
 def draw_trajectory_gallery(
     shown: Sequence[Mapping[str, Episode]], world: AnyWorld, footprint: float
 ) -> list[bytes]:
-    """Draws a picture per seed with the path of each run, all with panels of the same size."""
+    """Draws a picture per seed with the path of each run; all panels have the same size."""
     view = _make_view_of_episodes(
         world, [each for episodes in shown for each in episodes.values()]
     )
@@ -188,7 +188,7 @@ def drive_picture(pattern: Pattern, spec: RobotSpec) -> bytes:
 
 
 class Point(NamedTuple):
-    """Progress of a training: shares of the last 1000 episodes, NaN before the first has ended."""
+    """Progress of a training: fractions of the last 1000 episodes, NaN before the first ended."""
 
     steps: int
     success: float
@@ -213,7 +213,7 @@ def draw_training_curve(points: Sequence[Point]) -> bytes:
 
 
 def draw_robustness(shares: Mapping[str, ConfidenceInterval]) -> bytes:
-    """Draws success [%] with its interval, by what was perturbed."""
+    """Draws success [%] with its confidence interval for each perturbation."""
     figure, (axes,) = make_panels(1, 1)
     value, low, high = 100.0 * np.array([astuple(share) for share in shares.values()]).T
     names = [fill(name.replace("_", " "), NAME_LETTERS) for name in shares]
@@ -262,13 +262,13 @@ def draw_seeded_world(
     seed: int,
     outline: Sequence[tuple[float, float]] | None = None,
 ) -> bytes:
-    """Draws a world as the episode of a seed finds it.
+    """Draws a world at the start of the episode with a seed.
 
     Args:
         world: the world.
         footprint: radius of the robot [m].
         seed: of the scene.
-        outline: corners (V, 2) of the robot [m], if it is not round.
+        outline: corners (V, 2) of the robot [m] if it is not round.
 
     Raises:
         ConfigError: the world has no room for the robot, or for the scene.
@@ -314,7 +314,7 @@ def draw_seeded_world(
 
 
 def _draw_movers(axes: Axes, motions: Sequence[Motion | None], scene: Scene) -> None:
-    """Draws rings around obstacles that move, and the ways of those that patrol."""
+    """Draws rings around moving obstacles, and the paths of those that patrol."""
     moving = [
         k
         for k, motion in enumerate(motions)

@@ -96,7 +96,7 @@ class TurnBraking:
     least_path: float = 1.0  # minimum fraction of its path's bound that the robot moves
 
     def mean_time_s(self, rate: Array) -> Array:
-        """Returns the times (...) [s] in which constant rates (...) turn as far as the bound."""
+        """Returns times (...) [s] in which constant rates (...) turn as far as the bound."""
         return np.asarray(self.reaction_s + np.abs(rate) / (2.0 * self.deceleration))
 
 
@@ -104,8 +104,8 @@ class TurnBraking:
 class Braking:
     """An upper bound on a robot's stops.
 
-    A robot that moves at a pace p at the command to stop moves no further than if it kept its twist
-    for the reaction time, and then braked with the constant deceleration.
+    After the command to stop, a robot moves no further than if it kept its twist for the reaction
+    time, and then braked its `pace` with the constant deceleration.
     """
 
     reaction_s: float  # from the command to stop until braking counts, lags included
@@ -133,7 +133,7 @@ class Braking:
         return np.asarray(np.maximum(times, np.where(rate == 0.0, 0.0, turn_times)))
 
     def mean_time_s(self, twist: Array) -> Array:
-        """Returns the times (...) [s] in which constant twists (..., 3) move as far as `self`."""
+        """Returns times (...) [s] in which constant twists (..., 3) move as far as the bound."""
         times = self.reaction_s + self.pace(twist) / (2.0 * self.deceleration)
         if self.turn is None:
             return np.asarray(times)

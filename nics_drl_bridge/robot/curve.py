@@ -18,13 +18,14 @@ class InputCurve(Schema):
     """A dead zone about zero, unequal gains, and saturation: a monotone curve of one command."""
 
     command: str
-    # Smaller commands have no effect, in the command's unit; a negative one adds to every effect
+    # dead zone in the command's unit: smaller commands have no effect; if negative, every effect is
+    # larger by its size
     dead: float = Field(default=0.0, allow_inf_nan=False)
     # commands saturate at this minimum, in their unit; the effect of 0 is 0
     least: End = -np.inf
     most: End = np.inf  # commands saturate at this maximum
     back: float = Field(default=1.0, ge=0.0)  # gain of negative commands
-    # In addition to the latency of all commands [s]
+    # in addition to the latency of all commands [s]
     delay: float = Field(default=0.0, ge=0.0, le=LONGEST_DELAY_S)
 
     @property

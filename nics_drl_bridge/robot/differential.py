@@ -32,7 +32,7 @@ BY_WHEELS = Template(
 
 
 def derive_kinematics(spec: RobotSpec, slip: float = 1.0) -> Textbook:
-    """Returns kinematics whose turn rate, the wheels' difference by the track, `slip` scales."""
+    """Returns differential kinematics, with the turn rate scaled by `slip`."""
     half = spec.parameters["track"] / 2
     inverse = np.array([[1, -half], [1, half]]) / spec.parameters["wheel_radius"]
     forward = np.zeros((3, 2))

@@ -32,7 +32,7 @@ Moved = tuple[float, float, float, float]  # x, y [m], cosine and sine of the he
 
 
 class Terms(NamedTuple):
-    """The kept terms of a model, and what motors do around them."""
+    """The kept terms of a model, and the effects of motors around them."""
 
     dof: NDArray[np.int64]  # (T,) degree of freedom of each term
     coefficient: Array  # (T,), or (T, n) for n robots

@@ -301,7 +301,7 @@ def reach(spec: RobotSpec) -> Array:
 def _combine_ends(spec: RobotSpec) -> Array:
     """Returns combinations (K, C) of minimum, rest (or nearest to it) and maximum commands.
 
-    All are combined, unless there are more than `MAX_VARIED`: those share the same end.
+    More than `MAX_VARIED` commands are not combined: all are at the same end.
     """
     low = spec.command_low
     high = spec.command_high

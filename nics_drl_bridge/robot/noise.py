@@ -68,7 +68,7 @@ class Noise(Schema):
         return self.pose_position.std, self.pose_position.std, self.pose_heading.std
 
     def drift(self, spec: RobotSpec) -> NDArray[np.float64]:
-        """Returns the drift (3 + S,) of pose and state that the estimator expects in a second."""
+        """Returns the drift (3 + S,) of pose and state in a second that the estimator expects."""
         return np.array([level.std for level in self._list_drift(spec)])
 
     def simulated_drift(self, spec: RobotSpec) -> NDArray[np.float64]:

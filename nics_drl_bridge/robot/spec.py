@@ -162,11 +162,11 @@ class RobotSpec(Schema):
     )
     # default lidar, a shipped one or a YAML file; None: the paper's
     lidar: str | None = Field(default=None, min_length=1)
-    # its mount: x, y [m] and heading [rad] in `base_link`; None: as in the lidar's own file
+    # mount of that lidar: x, y [m] and heading [rad] in `base_link`; None: as in the lidar's file
     lidar_mount: Mount | None = None
-    # follow commands with a lag, or are measured, in the order of every state vector
+    # variables that follow commands with a lag or are measured, in the order of every state vector
     state: tuple[StateVariable, ...] = Field(default=(), max_length=MAX_VARIABLES)
-    # drive the robot, in the order of every command vector
+    # variables that drive the robot, in the order of every command vector
     command: tuple[CommandVariable, ...] = Field(min_length=1, max_length=MAX_VARIABLES)
 
     @field_validator("textbook")
@@ -255,8 +255,8 @@ class RobotSpec(Schema):
     def grow_footprint(self, margin: float) -> "RobotSpec":
         """Returns the robot with a footprint that is larger all around by a margin [m].
 
-        With a polygon, `footprint_radius` stays the same because worlds place robots by it: this
-        robot is placed wherever the original would be.
+        With a polygon, `footprint_radius` stays the same because worlds place robots by it. The
+        grown robot is therefore placed wherever the original would be.
         """
         if self.footprint is None:
             radius = self.footprint_radius + margin

@@ -24,7 +24,7 @@ TEMPLATE = Template(
 
 
 def derive_kinematics(spec: RobotSpec) -> kinds.Textbook:
-    """Returns kinematics: the steering angle's cosine moves the base, its sine turns it."""
+    """Returns the kinematics of a bicycle that its front wheel drives."""
     bicycle = Bicycle(spec.parameters["wheelbase"], front_drive=True)
     return kinds.make_steered(spec, bicycle, list_names(STEERED))
 
