@@ -107,7 +107,9 @@ def settings_for(task: str, name: str | None, changes: dict[str, Any]) -> Fitted
     own = f"{task}_{robot}" in shipped
     if name is None and robot is not None and not own and task == OWN_TASK:
         name = f"own_{kin(open_model(robot).robot)}"
-        told.append(f"settings {name!r}because the robot {robot!r} has none of its own")
+        told.append(
+            f"settings {name!r}, because the robot {robot!r} has none of its own"
+        )
     settings = recordings.chosen_settings(task, name, changes)
     inherited = (
         name in shipped and recordings.load_training(str(name)).robot != settings.robot
