@@ -79,8 +79,8 @@ def fit_pictures(
     spec: RobotSpec, identified: Identified, paths: bool = True
 ) -> dict[str, bytes]:
     """Returns the pictures of a fit that the recording allows, as PNG by name."""
-    by_motion = identified.findings.width is not None or bool(
-        identified.findings.replaced
+    by_motion = identified.findings.motion_width_s is not None or bool(
+        identified.findings.replacement
     )
     # If motion chose the terms, pruning did not, and there is no curve.
     pictures = {} if by_motion else {"accuracy": draw_accuracy(identified)}
