@@ -66,7 +66,7 @@ def zero_thresholds() -> None:
         min_change=0.0,
         min_deviations=0.0,
         min_sectors=1,
-        min_agreeing=0.0,
+        min_contradicting=0.0,
         sector_share=np.inf,
         held_share=np.inf,
         confirmed_s=0.0,

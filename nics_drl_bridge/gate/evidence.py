@@ -1,4 +1,4 @@
-"""What counts as an obstacle: returns of the newest scan, and where the lidar shows nothing.
+"""What counts as an obstacle: what the newest scan hits, and where the lidar can't see.
 
 Obstacles are rows (P, 3): x, y [m] in the robot's frame, and the speed [m/s] at which each may
 approach. `find_obstacles` collects them in these steps:
@@ -32,9 +32,9 @@ from nics_drl_bridge.interface import S_PER_NS, Array
 
 Flags = NDArray[np.bool_]
 MEMORY_S = 0.45  # maximum age of a scan that the newest one is compared with [s]
-SPACING_S = 0.09  # minimum time between two such scans [s]
-# A beam ends in space that was free if it ends this far [m], plus this many standard deviations of
-# its range, before the end of an old beam.
+SPACING_S = 0.09  # minimum time between two such scans that are kept [s]
+# A beam ends in space that was free if it is shorter than an old beam by this [m], plus this many
+# standard deviations of its range.
 TOLERANCE = 0.03
 DEVIATIONS = 3.0
 

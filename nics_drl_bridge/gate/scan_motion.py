@@ -3,12 +3,14 @@
 `watch_scan` judges each new scan while the robot is commanded to move:
 
 1. Reduce it to the median ranges in a few directions.
-2. Choose an earlier scan as the reference, since which odometry shows enough motion.
+2. Choose an earlier scan as the reference: the oldest since which the robot has not turned far. If
+   odometry shows too little motion since then, nothing is decided.
 3. Predict the new scan from the reference and that motion.
 4. Compare it sector by sector. Where the prediction differs clearly from the reference, the new
-   scan must have changed. If it has not in most sectors, the scans contradict odometry: the wheels
-   spin but the body stands. A scene that looks the same after the motion, such as a long corridor,
-   decides nothing.
+   scan must have changed. The scans contradict odometry if most sectors show little of the motion,
+   their median hardly any, and in the median sector few ranges changed visibly: the wheels spin but
+   the body stands. A scene that looks the same after the motion, such as a long corridor, decides
+   nothing.
 5. Report a held body (rule `body_held`) once scans have contradicted odometry for some time.
 """
 
@@ -46,24 +48,24 @@ TINY = 1e-9  # instead of a minimum motion that is set to zero
 class Settings:
     """When scans contradict odometry.
 
-    A skid-steer robot whose odometry turns 30 % too far shows a share of 0.77 of its motion, and
-    one on ice 0.5. One that begins to turn in DART shows a tenth of the turn for half a second, but
-    is not held: its ranges change because it also drives.
+    Usual shares of the motion: 0.77 for a skid-steer robot whose odometry turns 30 % too far, 0.5
+    on ice. Tyres that break loose may show a tenth of a turn for half a second; such a robot is not
+    held, because it also drives and so its ranges change.
 
     Attributes:
         spacing: angle between the directions of a reduced scan [rad].
         window: angle on each side of a direction over which the median is taken [rad].
         sector: angle of a sector [rad]. A person nearby fills one or two of them.
-        longest_s: time for which scans are kept as references [s].
+        longest_s: time for which scans are kept as references, and the longest over which odometry
+            is extrapolated to a scan's stamp [s].
         slow_periods: periods of a slow lidar that should fit into that time.
         slow_factor: maximum factor by which the time is prolonged for them.
         min_periods: periods that must fit, whatever the factor.
         kept_every_s: minimum time between scans that are kept [s].
         min_path: minimum path by odometry since the reference [m], unless the turn suffices.
         min_turn: minimum turn by odometry since the reference [rad], unless the path suffices.
-        min_half: minimum fraction of the motion in either half of that time. With less, a robot
-            that has just started would look held if its scans were up to a quarter of a second
-            older than their stamps.
+        min_half: minimum fraction of the motion in either half of that time. Otherwise a robot that
+            has just started would look held if its scans were stamped up to 0.25 s too late.
         usual_turn: a younger reference is preferred if the robot turned further than this [rad].
         max_turn: no reference is used if it turned further: a room may repeat itself [rad].
         min_change: root mean square of the predicted changes of a sector that is compared [m].
@@ -72,13 +74,12 @@ class Settings:
         visible_deviations: the same, in standard deviations of the lidar's noise.
         gap: neighbours are on two surfaces if their ranges differ by more than this fraction.
         min_sectors: minimum number of compared sectors.
-        min_agreeing: minimum fraction of them that show less than `sector_share` of the motion.
-        sector_share: share of the motion below which a sector contradicts odometry.
-        held_share: share of the motion below which the median of the sectors does so.
-        max_changed: fraction of its ranges that changed visibly, below which a sector contradicts
-            odometry; the median of the sectors counts.
+        min_contradicting: minimum fraction of them that show less than `sector_share`.
+        sector_share: magnitude of a share below which a sector contradicts odometry.
+        held_share: magnitude below which the median share of the sectors does so.
+        max_changed: in the median sector, less than this fraction of the ranges changed visibly.
         confirmed_s: time for which scans must contradict odometry, without one that agrees [s].
-        forgotten_s: time after which an unconfirmed contradiction is forgotten [s].
+        forgotten_s: time after which the first contradiction is forgotten [s].
     """
 
     spacing: float = math.radians(2.0)
@@ -100,7 +101,7 @@ class Settings:
     visible_deviations: float = 3.0
     gap: float = 0.25
     min_sectors: int = 5
-    min_agreeing: float = 0.6
+    min_contradicting: float = 0.6
     sector_share: float = 0.45
     held_share: float = 0.2
     max_changed: float = 0.5
@@ -149,8 +150,8 @@ def watch_scan(
     verdict = UNDECIDED
     held_since_ns = None
     push_s = None
-    # Only a robot that is commanded to move can be held. Each push is judged alone: tyres that
-    # slip whenever the robot starts say nothing about the time in between.
+    # Only a robot that is commanded to move can be held. Each push (motion commanded without a
+    # pause) is judged alone: tyres that slip at each start say nothing about the time in between.
     if state.push is not None:
         push_s = state.push.since_s
         verdict = judge_motion(config, kept, newest, settings)
@@ -181,7 +182,7 @@ def extrapolate_pose(odometry: Odometry, stamp_ns: int, longest_s: float) -> Arr
 
 
 def _can_judge(config: GateConfig) -> bool:
-    """True if the rule is on, and the lidar has the two beams at least that give directions."""
+    """True if the rule is on, and the lidar has at least two beams."""
     return config.stop_when_held and len(config.beam_angles) >= 2
 
 
@@ -197,7 +198,7 @@ def _compute_memory_s(config: GateConfig, settings: Settings) -> float:
 def _update_held_since(
     before_ns: int | None, verdict: Verdict, now_ns: int, settings: Settings
 ) -> int | None:
-    """Returns the stamp of the first contradiction that is neither outdated nor refuted."""
+    """Returns the stamp since which scans have contradicted odometry; None if they do not."""
     if before_ns is not None and (now_ns - before_ns) * S_PER_NS > settings.forgotten_s:
         before_ns = None
     if math.isnan(verdict.share):
@@ -257,9 +258,11 @@ def judge_motion(
     if sectors < max(settings.min_sectors, 1):
         return UNDECIDED._replace(sectors=sectors)
     share = float(np.median(observed[is_compared]))
-    agreeing = np.count_nonzero(np.abs(observed[is_compared]) < settings.sector_share)
+    contradicting = np.count_nonzero(
+        np.abs(observed[is_compared]) < settings.sector_share
+    )
     held = (
-        agreeing >= settings.min_agreeing * sectors
+        contradicting >= settings.min_contradicting * sectors
         and abs(share) < settings.held_share
         and np.median(changed[is_compared]) < settings.max_changed
     )

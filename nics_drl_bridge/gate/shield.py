@@ -3,16 +3,17 @@
 `shield` decides on each command, after limits of value, rate and jerk:
 
 1. A command from which the robot can stop passes.
-2. Any other is scaled down, along the path it commands, until the robot can stop (dynamic window of
-   Fox, Burgard and Thrun, 1997).
+2. Any other is reduced until the robot can stop (dynamic window of Fox, Burgard and Thrun, 1997):
+   only its speed, or speed and turn alike, or its turn is left out.
 
 Whether it can stop is found by sweeping its footprint along arcs until it rests, twice:
 
-- in a calm stop, at half the deceleration, before obstacles that stand still: so that an approach
+- in a calm stop, at half the deceleration, as if all obstacles stood still: so that an approach
   ends smoothly;
 - in a sudden stop, as hard as it can brake, before obstacles that may approach. The robot keeps
-  its twist for as long as the scan is old, the next decision takes and it reacts. That twist is
-  anything between its odometry, the present command and those that the scan does not show yet.
+  its twist for the age of the scan, the wait for the next decision and its own reaction. That
+  twist is anything between its odometry, the new command, the last one and those before it that the
+  scan does not show yet.
 
 What an obstacle is, see `evidence`.
 """
@@ -41,12 +42,12 @@ from nics_drl_bridge.interface import Array
 
 TimedCommand = tuple[float, Array]  # time of its publication [s], and its values (C,)
 BISECTIONS = 6  # of the scale by which a motion is reduced
-# A robot that turns on the spot does not approach an obstacle slower than this [m/s]: it would use
-# up the space that a turn on the spot needs.
+# While it turns, a robot drives at least this fast [m/s] towards an obstacle, or not at all:
+# creeping on, it would lose the room that it needs to turn.
 CREEP_SPEED = 0.1
 STEP = 0.02  # distance between two places at which the footprint is checked [m]
 CALM_BRAKING = 0.5  # fraction of the deceleration that a calm stop needs
-# A stop that is shorter than its bound gets a sweep of its own below this fraction of the bound.
+# If a stop may end below this fraction of its bound, the shorter stop is swept, too.
 SHORT_STOP = 0.9
 # Grid of twists that are swept: speeds along each axis, turn rates, and curvatures of a car.
 SPEED_COUNT = 3
@@ -72,13 +73,15 @@ def shield(config: GateConfig, state: GateState, motion: Motion, now: float) -> 
     - If the turn without any speed is safe, the turn rate stays and only the speed is reduced: an
       obstacle ahead must not keep the robot from turning away.
     - If it is not, speed and turn rate are scaled alike, which keeps the robot on its path. If that
-      leaves a creep, but straight on the robot could drive faster, the turn is left out instead: an
-      obstacle at its side must not keep the robot from leaving straight.
+      leaves a creep, but straight on the robot could stop from `CREEP_SPEED`, the turn is left out
+      instead: an obstacle at its side must not keep the robot from leaving straight.
 
-    A creep is a speed below `CREEP_SPEED` of a robot that can turn on the spot. It would end so
-    near to an obstacle that the robot could not turn any more. So a commanded creep only passes
-    where the robot could also stop from `CREEP_SPEED`, and beside a full turn it becomes zero.
+    A creep is a speed below `CREEP_SPEED` with a turn, of a robot that can turn on the spot. It
+    would end so near to an obstacle that the robot could not turn any more. So a commanded creep
+    passes at once only where the robot could also stop from `CREEP_SPEED`, and it becomes zero
+    where the turn alone is safe.
     """
+    # Without a scan, the gate stops before it comes here.
     if config.shield is None or config.limits is None or state.obstacles is None:
         return motion
     is_speed = config.limits.linear

@@ -1,10 +1,11 @@
 """Compiled step of the simulator: the worlds of a part, by one control period.
 
-`step_worlds` queues the commands, then takes as many worlds at a time as its lanes hold robots:
+`step_worlds` queues the commands, then takes the worlds in blocks, one lane for each robot:
 
-1. `_begin_period_of_block` keeps the robots' poses, and chooses the velocities of the obstacles.
+1. `_begin_period_of_block` saves the robots' poses, and chooses the velocities of the obstacles.
 2. `move_freely` moves all robots of the block side by side, as if nothing stood in their way.
-3. `_move_world` moves the obstacles; robots that may meet something are moved once more, carefully.
+3. `_move_world` moves the obstacles. A robot that may meet something is moved carefully instead,
+   from where it stood. All robots then drift.
 4. `_measure_world` measures the odometry.
 5. Each robot scans, and its lidar's faults are applied, see `sensing_kernels`.
 
@@ -65,8 +66,8 @@ from nics_drl_bridge.sim.state import (
     WorldSetArrays,
 )
 
-# Number of robots that are scanned, and whose scans are then distorted: the scans stay in the L2
-# cache in between.
+# At least so many robots are scanned before their scans are distorted. So few scans stay in the L2
+# cache.
 SCANNED_TOGETHER = 48
 
 
@@ -185,8 +186,8 @@ def _step_unpacked(
     """Step some worlds, see `step_worlds`.
 
     Scans of several worlds are made together, because one lidar's scan is too short to keep the
-    processor busy. A separate function from `step_worlds`, where numba would count references to
-    the part's arrays, which took longer than the step.
+    processor busy. This is not done in `step_worlds` itself: there numba would count references to
+    the part's arrays, which takes longer than the step.
     """
     robots = data.pose.shape[1]
     end_world = first_world + commands.shape[0]
@@ -342,7 +343,7 @@ def _apply_commands(
 ) -> int:
     """Put the commands that take effect at a substep into the lanes; return the next such substep.
 
-    It is the end of the period if no command of any lane changes before.
+    If no command changes any more, that is the end of the period.
     """
     robots = data.pose.shape[1]
     size = data.state.shape[2]
@@ -384,8 +385,9 @@ def _move_world(
     robots = data.pose.shape[1]
     period = motion.dt * motion.substeps
     for m in range(robots):
-        drift_std = data.noise[n, m, DRIFT_X] + data.noise[n, m, DRIFT_Y]
-        longest_drift = math.sqrt(3.0 * period) * drift_std
+        # Each component is uniform, so at most sqrt(3) of its standard deviations.
+        sum_of_deviations = data.noise[n, m, DRIFT_X] + data.noise[n, m, DRIFT_Y]
+        longest_drift = math.sqrt(3.0 * period) * sum_of_deviations
         nearby.path[m] = lanes.pose[LANE_PATH, first_lane + m] + longest_drift
     longest_path, obstacles_move = contacts.compute_reaches(
         n, data, scene, nearby, period
@@ -465,7 +467,7 @@ def _sort_bodies(n: int, data: State, scene: Surroundings, scratch: Scratch) -> 
 
 @kernel(view=True)
 def get_surroundings(n: int, world_set: WorldSetArrays) -> Surroundings:
-    """Return all that stands in world n, by the member of the world set that it is a copy of."""
+    """Return the walls, map and movers of world n: those of the world of the set that it copies."""
     member = world_set.fixtures.member[n]
     frame = world_set.fixtures.frames[member]
     distances = cells_of(world_set.distances, world_set.map_places[member])
