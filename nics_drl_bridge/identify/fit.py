@@ -5,7 +5,8 @@ For each degree of freedom d and features chi(X), products of state and commands
     Eq. 1   dQ_d/dt = sum_k A_dk chi_k(X)            least squares over the rows of a drive
     Eq. 2   keep the fewest, largest terms with  sum |beta_kept| >= alpha sum |beta|
 
-beta is A in units of the features' standard deviations, so that the sizes of terms can be compared.
+beta is A for features that are divided by their standard deviations (their means stay), so that the
+sizes of terms can be compared.
 `regress` is Eq. 1 on all features; `prune_and_refit` is Eq. 2, and Eq. 1 again on the kept terms.
 """
 
@@ -68,11 +69,11 @@ class Regression:
         samples: the T rows, without implausible ones.
         powers: (K, V) exponents of the independent features of the variables that moved.
         chi: (T, K) features.
-        beta: (D, K) standardised coefficients; zero for a term that is not allowed or significant.
+        beta: (D, K) standardised coefficients; zero for a term that is not allowed or was dropped.
         inliers: (D, T) rows that are not outliers.
-        moving: degrees of freedom that move; the others have no terms.
+        moving: degrees of freedom that are fitted: all but a vx or vy that hardly moves.
         excitation: of the variables by the drive.
-        dependent: terms that are multiples of others on this drive.
+        dependent: terms that are linear combinations of others on this drive.
         terms_total: number of coefficients before any selection.
         left_out: fraction of the rows that were implausible.
     """
@@ -111,7 +112,7 @@ class Fit:
         regression: on all features.
         rmse: (D,) root mean square residual of dQ/dt without outliers, in units of dQ/dt.
         r2: (D,) fraction of the variance that the model explains.
-        alpha: threshold used for pruning.
+        alpha: threshold used for pruning, or `auto`.
         outliers: (D,) fraction of the rows left out, as implausible or as outliers.
         condition: (D,) condition number of the kept standardised features.
     """
@@ -173,11 +174,11 @@ def regress(
         order: maximum order of a feature, 1 to 4.
         noisy: leave out terms that are not significant. Without a `term_filter`, the twist of a
             robot with a state then has terms of the state only, and no constant if a speed changed:
-            within a step a command acts through the state, and noise hides any direct effect.
+            a command acts through the state; noise hides any direct effect within a step.
         term_filter: selects the terms of each degree of freedom.
 
     Raises:
-        FitError: too few samples, or no command changed.
+        FitError: too few samples, or no variable changed.
     """
     plausible = excitation.plausible(samples.x, spec)
     samples = samples.rows(plausible)
@@ -207,6 +208,7 @@ def regress(
         terms = np.flatnonzero(allowed[d])
         features = chi[:, terms]
         target = samples.dq[:, d]
+        # The spreads change when outliers are left out.
         inliers[d] = excitation.inliers(
             features / _spreads(features), target, float(usual_ranges[d])
         )
@@ -242,27 +244,27 @@ def _spreads(features: Array) -> Array:
     return np.where(spread > 0.0, spread, 1.0)
 
 
-def rank(beta: Array, noise_floor: float = 0.0) -> NDArray[np.intp]:
+def sort_by_size(beta: Array, noise_floor: float = 0.0) -> NDArray[np.intp]:
     """Returns the indices of standardised coefficients (K,), largest first.
 
-    Those up to `noise_floor` are left out.
+    Leaves out coefficients that are not above `noise_floor`.
     """
     size = np.where(np.abs(beta) > noise_floor, np.abs(beta), 0.0)
-    ranking = np.argsort(-size, kind="stable")
-    return np.asarray(ranking[size[ranking] > 0.0])
+    by_size = np.argsort(-size, kind="stable")
+    return np.asarray(by_size[size[by_size] > 0.0])
 
 
 def prune(beta: Array, alpha: float, noise_floor: float = 0.0) -> NDArray[np.bool_]:
     """Returns a mask (K,) of the standardised coefficients that are kept (Eq. 2).
 
-    These are the fewest, largest ones whose sum reaches `alpha` of the total: the term that crosses
-    the threshold is kept, else a robot with two wheels could lose one of them. Coefficients up to
+    Keeps the largest until their sum reaches `alpha` times the total, including the term that
+    crosses it: to stop before that term would drop one of two equal wheels. Coefficients up to
     `noise_floor` never count.
     """
-    ranking = rank(beta, noise_floor)
-    size = np.abs(beta[ranking])
+    by_size = sort_by_size(beta, noise_floor)
+    size = np.abs(beta[by_size])
     sum_of_larger = np.cumsum(size) - size
-    kept = ranking[sum_of_larger < alpha * size.sum()]
+    kept = by_size[sum_of_larger < alpha * size.sum()]
     return np.isin(np.arange(len(beta)), kept)
 
 
@@ -271,14 +273,14 @@ def prune_and_refit(
 ) -> Fit:
     """Prunes a regression (Eq. 2) and fits the terms that are kept again (Eq. 1).
 
-    With `auto` in place of a threshold, terms are taken in the order of their size, as many as
-    lower the cross-validated error.
+    With `auto` in place of a threshold, terms are taken in the order of their size, the fewest
+    whose cross-validated error is within one standard error of the minimum.
     """
     samples = regression.samples
     coefficients = np.zeros(regression.beta.shape)
     errors = np.zeros(regression.beta.shape)
     conditions = np.ones(len(regression.beta))
-    noisy_states = excitation.states_are_noisy(samples, spec)
+    needs_instruments = excitation.states_are_noisy(samples, spec)
     for d in regression.moving:
         features, target = regression.rows(d)
         spreads = _spreads(features)
@@ -290,7 +292,7 @@ def prune_and_refit(
             beta_errors = statistics.standard_errors(standardised[:, kept], residual)
             coefficients[d, kept] = beta / spreads[kept]
             errors[d, kept] = beta_errors / spreads[kept]
-        if noisy_states and d >= TWIST_ROWS.stop:
+        if needs_instruments and d >= TWIST_ROWS.stop:
             found = _fit_by_instruments(regression, d, coefficients[d], len(spec.state))
             if found is not None:
                 terms = np.flatnonzero(coefficients[d])
@@ -328,7 +330,7 @@ def _select_terms(
     if alpha != "auto":
         return prune(beta, alpha, noise_floor)
     curve = _cross_validate(regression, d, spec.dof_names, spec.variable_names)
-    kept = rank(beta, noise_floor)[: curve.kept]
+    kept = sort_by_size(beta, noise_floor)[: curve.kept]
     return np.isin(np.arange(len(beta)), kept)
 
 
@@ -336,20 +338,21 @@ def _cross_validate(
     regression: Regression, d: int, dofs: tuple[str, ...], variables: tuple[str, ...]
 ) -> statistics.Curve:
     """Returns the error of a degree of freedom by its number of terms; `kept` is at the knee."""
-    ranking = rank(regression.beta[d], regression.noise_floor(d))
+    by_size = sort_by_size(regression.beta[d], regression.noise_floor(d))
     features, target = regression.rows(d)
     standardised = features / _spreads(features)
-    names = [taylor.format_term(row, variables) for row in regression.powers[ranking]]
-    return statistics.curve(dofs[d], tuple(names), standardised[:, ranking], target)
+    names = [taylor.format_term(row, variables) for row in regression.powers[by_size]]
+    return statistics.curve(dofs[d], tuple(names), standardised[:, by_size], target)
 
 
 def _fit_by_instruments(
     regression: Regression, d: int, coefficients: Array, state_count: int
 ) -> tuple[Array, Array] | None:
-    """Returns coefficients (n,) and errors of a state's nonzero terms; None if they stay uncertain.
+    """Returns coefficients (n,) and errors of a state's nonzero terms; None if data are too few.
 
-    The noise of a state is in both X and its rate, which least squares would mistake for a fast
-    decay. The noise one step earlier is independent, so the earlier state is an instrument for X.
+    A state's noise appears in X and, with the opposite sign, in its rate; least squares would take
+    that for a fast decay. The noise one step earlier is independent, so the earlier state is an
+    instrument for X. Returns None also if the instruments are too weak.
     """
     samples = regression.samples
     inside = regression.inliers[d]

@@ -8,15 +8,16 @@ phi = heading - b. A beam at the angle a has the range
 
 where R(d, phi, .) is the scan of the shape straight ahead at the distance d, rotated by phi. The
 table holds R at grid distances d_i and grid rotations phi_j as rows of points at the angles c_p. A
-look-up takes the nearest grid rotation phi_j, with i and p such that d_i <= d < d_(i+1) and
-c_p <= a - b < c_(p+1), and blends distances and points linearly:
+look-up takes the nearest grid rotation phi_j. It finds i and p with d_i <= d < d_(i+1) and
+c_p <= a - b < c_(p+1), where c_p is p fractions of a beam away from the bearing, and blends
+linearly over distance and angle:
 
     r_i(a) = (1 - v) R(d_i, phi_j, c_p) + v R(d_i, phi_j, c_(p+1))    v: weight of the next point
     r(a)   = (1 - w) r_i(a) + w r_(i+1)(a)                            w: weight of the far row
 
 Rotations are not blended. Instead, the exact silhouettes of the body, its outermost directions to
-the right and to the left, decide which beams hit: an edge on the wrong side of a beam is by far the
-largest error of a plain look-up. Beams between the silhouettes have the range r(a), others `inf`.
+the right and to the left, decide which beams hit: a plain look-up errs most where it puts an edge
+on the wrong side of a beam. Beams between the silhouettes have the range r(a), others `inf`.
 
 Eq. 4: a beam's range in the scan is the minimum of r(a) over all bodies.
 

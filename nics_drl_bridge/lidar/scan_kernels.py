@@ -3,20 +3,22 @@
     scan[b] = min over the bodies m of r_m(a_b)     Eq. 4, for the beam b at the angle a_b
 
 Each r_m is a look-up of one body, Eq. 3. `baked_kernels` states it as a formula and has its steps
-for one body. Here each step runs over all waiting bodies in a loop without branches, which LLVM
-vectorises: the time of a look-up goes into cache misses, mispredicted branches and latencies.
+for one body. Here each step is a loop over all waiting bodies. Most of these loops have no
+branches, so LLVM vectorises them: the time of a look-up goes into cache misses, mispredicted
+branches and latencies.
 
 `scan_worlds` selects the bodies that are visible (step 1) and puts each of them into a lane. When
 the lanes are full, `look_up` takes all of them through the passes:
 
 2. `find_polars`: distance and bearing of each body.
 3. `find_cells`, `fetch_cells`: its cell in the table, and what the cell holds.
-4. `find_silhouettes`, `climb_to_silhouettes`: its silhouettes,
-5. and the beams that hit it.
-6. `find_all_points`: its points in the table.
+4. `find_silhouettes`, `climb_to_silhouettes`: its silhouettes.
+5. `find_all_points`: the beams that hit it,
+6. and its points in the table.
 7. `fuse_body`: blends the range of each beam, and takes the minimum with the scan.
 
-Then come the bodies that are scanned exactly, the walls and the maps.
+Bodies that are scanned exactly, and walls, are fused into each scan when its bodies are selected;
+the maps come last. The minimum is the same in any order.
 
 The passes hand on their results in lanes: one array for each type of number, with `LANES` places
 for each quantity, so that LLVM can prove that quantities do not overlap. A quantity is named by its

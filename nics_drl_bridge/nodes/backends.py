@@ -1,4 +1,4 @@
-"""Backends over ROS 2 in lock-step: a simulator moves one control period for each command.
+"""Backends over ROS 2 in lock-step: a simulator moves by one control period for each step.
 
 A step of `DdsBackend` is `send` and `receive`. With t, the simulated time at the end of the last
 step:
@@ -7,13 +7,15 @@ step:
    period to t.
 2. The simulator takes the command, simulates one control period, and publishes odometry and scan
    with the stamp t.
-3. The executor's thread puts each message into the `Inbox`. As soon as the odometry of t is there,
-   it updates the estimator.
-4. `receive` waits until all messages of t are in the inbox, hands the scan to the middleware, and
-   returns the middleware's view of the robot at t.
+3. The executor's thread puts each message into the `Inbox`.
+4. `receive` waits until all messages of t are in the inbox. The odometry of t updates the estimator
+   as soon as it is there, in the executor's thread while `receive` waits; so only one thread at a
+   time uses the estimator.
+5. `receive` hands the scan to the middleware, and returns the middleware's view of the robot at t.
 
-A message that is lost on the way is requested again. `reset` begins an episode by the simulator's
-services, and ends like a step.
+A simulator of this package moves once each of its robots has a command, and sends a message again
+that was lost on the way. One with the standard services is moved by a service instead.
+`reset` begins an episode by the simulator's services, and ends like a step.
 """
 
 import time
