@@ -356,8 +356,8 @@ def test_the_jump_of_a_real_localiser_is_found_and_told():
 def test_an_exact_fit_survives_jumps_in_five_per_cent_of_the_rows(name):
     spec = load_robot(name)
     plain = drive(spec, duration=40.0)
-    clean = identify(plain, spec)
-    faulty = identify(with_jumps(plain), spec)
+    clean = identify(plain, spec, alpha=0.99)
+    faulty = identify(with_jumps(plain), spec, alpha=0.99)
     assert any("jump away" in note for note in faulty.notes)
     same_motion(faulty, clean, 0.02)
     assert (

@@ -196,7 +196,7 @@ def test_a_kind_in_a_file_of_a_users_own_is_simulated_and_observed(sonar, tmp_pa
         ({"kind": "sonar", "name": "a"}, "unknown sensor 'sonar'.*lidar"),
         ({"name": "a"}, "needs a 'kind'"),
         ({"kind": "lidar", "name": "a"}, "lidar"),
-        ({"kind": "json:JSONDecoder", "name": "a"}, "no subclass"),
+        ({"kind": "json:JSONDecoder", "name": "a"}, "not a subclass"),
         ({"kind": "nowhere.py:Sonar", "name": "a"}, "no such file"),
     ],
 )

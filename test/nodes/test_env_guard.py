@@ -18,7 +18,7 @@ from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.registry import COOPERATIVE_REACHING, NAVIGATION
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.interface import Start
-from nics_drl_bridge.nodes import link, qos
+from nics_drl_bridge.nodes import link, qos, realtime_backend
 from nics_drl_bridge.nodes.backends import DdsBackend
 from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
 from nics_drl_bridge.sim.world import load_world
@@ -315,9 +315,8 @@ def test_what_a_user_is_told_by_may_raise(simulators, listeners, monkeypatch):
         peer.until(
             lambda: env.step(AHEAD) and heard and heard[-1].linear.x > 0.0, "driving"
         )
-        monkeypatch.setattr(
-            env._backend, "_missing", lambda _: "nothing, but somebody says so"
-        )
+        hindrance = realtime_backend.Hindrance("nothing, but somebody says so", "")
+        monkeypatch.setattr(env._backend, "_find_hindrance", lambda _: hindrance)
         raising.append(True)
         with pytest.raises(ValueError, match="of the user"):
             env.reset(seed=0)

@@ -63,7 +63,7 @@ def test_an_episode_begins_as_in_the_fast_simulator(name):
     model = builtin_model("differential")
     world = load_world(name)
     ours = MujocoSimulator(model, world)
-    theirs = FastSimulator(model, world)
+    theirs = FastSimulator(model, world, renderer="exact")
     ours.reset([7])
     theirs.reset([7])
     for known in ("pose", "bodies", "ranges", "odom", "steps"):
@@ -135,7 +135,10 @@ def test_what_the_lidar_sees_is_what_stands_in_mujoco(name):
 def test_each_episode_stands_in_its_world_of_a_set():
     model = builtin_model("differential")
     worlds = load_worlds(["room", "crowd", "corridor"])
-    both = MujocoSimulator(model, worlds), FastSimulator(model, worlds)
+    both = (
+        MujocoSimulator(model, worlds),
+        FastSimulator(model, worlds, renderer="exact"),
+    )
     seen = set()
     for seed in range(6):
         for simulator in both:
