@@ -141,5 +141,5 @@ def test_the_end_of_a_silence_may_come_in_any_order():
         assert_same(found[0], other)
 
 
-def test_the_find_max_speeds_is_that_of_the_fastest_command():
+def test_the_maximum_speeds_are_those_of_the_fastest_command():
     assert find_max_speeds(direct_model()) == pytest.approx((np.hypot(2.0, 2.0), 2.0))
