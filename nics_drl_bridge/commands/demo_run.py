@@ -63,7 +63,7 @@ ARRIVE_S = 90.0  # time for the robot to arrive [s]; includes compiling
 FULL_COMMAND_S = 0.3
 FULL_RATE_S = 0.05
 GOOD = 0.9  # success rate below which the verdict doubts a policy
-PANELS = 9  # maximum number of drawn episodes
+DEMO_PANELS = 9  # maximum number of drawn episodes
 R = TypeVar("R")
 
 
@@ -499,7 +499,7 @@ def _format_episodes(
     radius = model.robot.footprint_radius
     if live is None:
         text = f"{successes(here)} of {len(here)} episodes reached the goal in process."
-        alone = [{labels[0]: episode} for episode in here[:PANELS]]
+        alone = [{labels[0]: episode} for episode in here[:DEMO_PANELS]]
         return [html.make_paragraph(text), _draw_paths(alone, world, radius)]
     rows = [
         (
@@ -515,7 +515,7 @@ def _format_episodes(
         for a, b in zip(here, there, strict=True)
     ]
     shown = []
-    for a, b in list(zip(here, there, strict=True))[:PANELS]:
+    for a, b in list(zip(here, there, strict=True))[:DEMO_PANELS]:
         runs = {labels[0]: a, labels[1]: b}
         if a.seed == live.seed:
             runs["deployed"] = live

@@ -58,7 +58,7 @@ RAW = "cmd_vel_raw"
 ARM_S = 60.0
 # time for a node to start [s]; it may have to compile its kernels
 START_S = 180.0
-PANELS = 6
+EPISODE_PANELS = 6
 HEADS = (
     "policy",
     "world",
@@ -266,7 +266,9 @@ def evaluate(order: EvaluationOrder, say: Say, tell: Tell) -> list[Evaluated]:
             given = place, policy, name, order.world, seeds, logs
             runs[place] = drive_in(*given, on_episode, say, under)
         evaluated.append(
-            judge_runs(policy, runs, model, world, order.out, PANELS, order.policies)
+            judge_runs(
+                policy, runs, model, world, order.out, EPISODE_PANELS, order.policies
+            )
         )
         write_evaluation(replace(order, conditions=under), name, model, evaluated)
     return evaluated

@@ -60,7 +60,7 @@ def watch_pictures(
     must_change = must_differ(config, picture.ranges, moved)
     unchanged = (picture.ranges == ranges) & must_change
     is_frozen = _match_but_for_one(unchanged, must_change, FROZEN_FRACTION)
-    if np.count_nonzero(must_change) >= MIN_BEAMS and is_frozen:
+    if np.count_nonzero(must_change) >= MIN_CHANGED_BEAMS and is_frozen:
         fault = (
             f"{picture.count} scans are the same over a motion of {path:.2f} m or rad"
         )
@@ -144,7 +144,7 @@ CHANGE = 0.02  # minimum change of a beam that must have changed [m]
 HEADING_ERRORS = (-0.03, 0.0, 0.03)
 # an old beam is compared with beams at most this many beam spacings away
 NEIGHBOURS = 1.5
-MIN_BEAMS = 3
+MIN_CHANGED_BEAMS = 3
 
 
 def is_same_scan(old: Ranges, new: Ranges) -> bool:

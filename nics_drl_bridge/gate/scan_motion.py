@@ -38,7 +38,7 @@ from nics_drl_bridge.geometry import between, compose, exp
 from nics_drl_bridge.interface import S_PER_NS, Array
 
 FULL_CIRCLE = 2.0 * np.pi
-ROUNDING = 1e-6  # tolerance of a number of beams
+BEAM_COUNT_TOLERANCE = 1e-6  # tolerance of a number of beams
 # standard deviation of the median of n normal numbers, times sqrt(n): about sqrt(pi / 2)
 MEDIAN_FACTOR = 1.25
 TINY = 1e-9  # instead of a minimum motion that is set to zero
@@ -337,7 +337,7 @@ def _make_directions(
     size = min(beams, max(1, round(beams * step / spacing)))
     beams_per_direction = beams / size
     half_window = min(
-        int(window / step + ROUNDING),
+        int(window / step + BEAM_COUNT_TOLERANCE),
         (kernels.LARGEST_WINDOW - 1) // 2,
         (beams - 1) // 2,
     )

@@ -26,7 +26,7 @@ SHIELD_SPANS = {  # beyond them the robot could never move
     "obstacle_speed": (0, 100),
 }
 HARDEST = SHIELD_SPANS["deceleration"][1]
-MIN_BEAMS = 2  # minimum number of beams that show the width of an obstacle
+MIN_SHIELD_BEAMS = 2  # minimum number of beams that show the width of an obstacle
 # minimum number of data that must arrive while the gate settles, for a rate to be known
 MIN_DATA = 2
 
@@ -71,8 +71,8 @@ def shield_config(
     Values are from `shield` in the file of limits, else derived from model and limits; `given`
     values override them.
     """
-    if model.lidar.beams < MIN_BEAMS:
-        fault = f"the shield needs a lidar of {MIN_BEAMS} beams or more"
+    if model.lidar.beams < MIN_SHIELD_BEAMS:
+        fault = f"the shield needs a lidar of {MIN_SHIELD_BEAMS} beams or more"
         advice = "use another one, or drive without a shield by `shield: false`"
         raise ConfigError(
             f"robot {model.robot.name!r}: {fault}, and this one has "

@@ -605,7 +605,7 @@ def check_axes(drive: Drive) -> None:
         as_given, mirrored = (
             _explained(some.t, p, state) for p in (some.values, other)
         )
-        least = max(recordings.MIRRORED, recordings.BETTER + as_given)
+        least = max(recordings.MIN_MIRRORED, recordings.BETTER + as_given)
         line = "scale: -1" if mirrored > least else ""
     if line:
         fault = (

@@ -9,7 +9,7 @@ from nics_drl_bridge.recording.survey import Survey, TableSurvey
 
 EPISODES = word_set("episode ep trial traj trajectory rollout run")
 NO_VALUES = np.zeros(0)
-FEWEST_ROWS = 20  # of each episode, on average
+MIN_MEAN_EPISODE_ROWS = 20  # of each episode, on average
 
 
 def guess_episode(tables: Sequence[TableSurvey]) -> tuple[TableSurvey, Survey] | None:
@@ -31,7 +31,7 @@ def _find_episode_columns(table: TableSurvey) -> Iterator[Survey]:
         values = table.data.get(column.name, NO_VALUES)
         count = len(np.unique(values))
         changes = np.flatnonzero(values[1:] != values[:-1])
-        if not 1 < count == len(changes) + 1 <= len(values) / FEWEST_ROWS:
+        if not 1 < count == len(changes) + 1 <= len(values) / MIN_MEAN_EPISODE_ROWS:
             continue
         # `run` with two values may be a switch, unless the stamps restart with it.
         may_be_switch = "run" in words and count == 2

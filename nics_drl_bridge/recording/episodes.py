@@ -14,7 +14,7 @@ from nics_drl_bridge.recording.recording import Recording
 from nics_drl_bridge.recording.table import Column, Source, Table
 from nics_drl_bridge.recording.values import MappedReader
 
-FEWEST_ROWS = 3  # of an episode; shorter ones are left out
+MIN_EPISODE_ROWS = 3  # of an episode; shorter ones are left out
 
 
 class EpisodeOfTable(Source):
@@ -67,11 +67,13 @@ def split_table(source: Source, mapping: Mapping) -> list[EpisodeOfTable]:
     episodes = []
     for k in np.argsort(first):
         rows = np.flatnonzero(group == k)
-        if len(rows) >= FEWEST_ROWS:
+        if len(rows) >= MIN_EPISODE_ROWS:
             label = _format_label(values[k])
             episodes.append(EpisodeOfTable(source, table, name, rows, label))
     if not episodes:
-        fault = f"no value of the column {reference!r} lasts for {FEWEST_ROWS} rows"
+        fault = (
+            f"no value of the column {reference!r} lasts for {MIN_EPISODE_ROWS} rows"
+        )
         advice = "name the column that numbers the episodes"
         raise ConfigError(f"{table.place}: {fault}; {advice}.")
     return episodes

@@ -42,12 +42,12 @@ WAY_STEP_S = 0.1
 # distance from the centre, or makes half a turn.
 NEAR = 0.25
 NEARER = 0.6
-LOST = 8
-SHORTEST_S = 20.0
+MAX_FAILURES = 8
+MIN_DRIVE_S = 20.0
 LONGEST_S = 3600.0
 # minimum standard deviation of a command, as a fraction of its range (0.29 if uniform)
 SPREAD = 0.17
-ALIKE = 0.6  # maximum correlation of two commands
+MAX_COMMAND_CORRELATION = 0.6  # maximum correlation of two commands
 ATTEMPTS = 8
 
 
@@ -120,7 +120,7 @@ class Exploration:
         while not self.done:
             commands.append(self.choose_command())
             poses.append(self.pose)
-            if self._failures >= LOST:
+            if self._failures >= MAX_FAILURES:
                 return None
         command = np.array(commands)
         plan = self._plan
@@ -129,7 +129,7 @@ class Exploration:
         footprint = plan.robot.footprint_radius
         pattern = Pattern(PERIOD_S, command, np.array(poses), plan.bound, footprint)
         alike = np.corrcoef(command, rowvar=False).reshape(len(self.low), -1)
-        varied = (np.abs(alike - np.eye(len(alike))) < ALIKE).all()
+        varied = (np.abs(alike - np.eye(len(alike))) < MAX_COMMAND_CORRELATION).all()
         return pattern if varied and pattern.reach <= plan.bound else None
 
     def _is_astray(self) -> bool:
@@ -383,7 +383,7 @@ class DrivePlan:
         check_seeds(self.seed)
         for name, value, low, high, unit in (
             ("bound", self.bound, self.robot.footprint_radius, 1000.0, " m"),
-            ("duration", self.duration, SHORTEST_S, LONGEST_S, " s"),
+            ("duration", self.duration, MIN_DRIVE_S, LONGEST_S, " s"),
             ("speed", self.speed, 0.05, 1.0, ""),
         ):
             if not low <= value <= high:

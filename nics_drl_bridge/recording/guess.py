@@ -50,7 +50,7 @@ MOST_LISTED = 20  # maximum number of unused columns listed per table
 STILL = "; it is 0"
 NO_VALUES = {"header", "stamp", "seq", "covariance", "index", "id", "row"}
 # Thresholds from which a draft mirrors a heading, see `find_clockwise_keys`
-MIRRORED = 0.6
+MIN_MIRRORED_GUESS = 0.6
 MIRRORED_BETTER = 0.3
 
 
@@ -327,7 +327,7 @@ def _correct_heading(line: str, pose: PoseGuess, units: Sequence[str]) -> str:
     _, values = poses
     spaced = values[select_along_path(values, _guess_radius(poses))]
     keys = find_clockwise_keys(spaced) or find_clockwise_keys(
-        select_apart(values), MIRRORED, MIRRORED_BETTER
+        select_apart(values), MIN_MIRRORED_GUESS, MIRRORED_BETTER
     )
     if not keys:
         return line

@@ -15,7 +15,7 @@ from nics_drl_bridge.geometry import Array
 BLOCK_S = 0.5  # length of the pieces in which both turns are compared
 WINDOW_S = 5.0  # over which the disagreement is reported
 LONGEST_GAP_S = 0.25  # between two yaw rates that are joined
-LONGEST_PAUSE_S = 1.0  # between two poses of one drive
+MAX_POSE_PAUSE_S = 1.0  # between two poses of one drive
 FEWEST_BLOCKS = 6
 FEWEST_TO_DRIFT = 10
 STANDING_MPS = 0.005  # wheels that roll more slowly in a whole block are at rest
@@ -31,7 +31,9 @@ UNLIKE_BLOCKS = 2.0
 DRIFTS = 4.0  # standard errors beyond which the slope of a bias counts
 DRIFT_SPAN_S = 20.0  # a drift of the bias shows only if the rests span this time
 LEAST_TURN_RAD = 1.0  # sum of all turns below which a drive does not show a scale
-ALIKE = 0.7  # minimum correlation of two sources that measure the same motion
+MIN_SAME_MOTION_CORRELATION = (
+    0.7  # minimum correlation of two sources that measure the same motion
+)
 PLAUSIBLE_SCALES = (0.33, 5.0)  # of odometry's turns, relative to those of the gyro
 IN_DEGREES = (40.0, 80.0)  # ratio of a rate in degrees to one in radians
 LEAST_APART_RAD = 0.02  # a smaller disagreement in `WINDOW_S` is not worth a correction
@@ -67,7 +69,7 @@ class Turning:
     @property
     def mirrored(self) -> bool:
         """True if the two turn in opposite directions."""
-        return self.compared and self.alike < -ALIKE
+        return self.compared and self.alike < -MIN_SAME_MOTION_CORRELATION
 
     @property
     def in_degrees(self) -> bool:
@@ -75,7 +77,7 @@ class Turning:
         low, high = IN_DEGREES
         return (
             self.compared
-            and self.alike > ALIKE
+            and self.alike > MIN_SAME_MOTION_CORRELATION
             and low < 1.0 / max(self.scale, 1e-9) < high
         )
 
@@ -83,7 +85,11 @@ class Turning:
     def plausible(self) -> bool:
         """True if both measure the same motion, in the same unit and direction."""
         low, high = PLAUSIBLE_SCALES
-        return self.compared and self.alike > ALIKE and low < self.scale < high
+        return (
+            self.compared
+            and self.alike > MIN_SAME_MOTION_CORRELATION
+            and low < self.scale < high
+        )
 
     @property
     def contradicts(self) -> bool:
@@ -148,7 +154,7 @@ def turn_by_gyro(
     )
     turned = np.concatenate([position, geometry.wrap_angle(heading)[:, None]], axis=1)
     span = np.diff(t)
-    driven = span < LONGEST_PAUSE_S  # a longer span separates two recordings
+    driven = span < MAX_POSE_PAUSE_S  # a longer span separates two recordings
     driven_s = max(float(span[driven].sum()), 1e-9)
     return turned, float(span[covered & driven].sum()) / driven_s
 

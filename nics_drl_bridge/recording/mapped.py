@@ -46,7 +46,7 @@ MOST_TILT_DEG = 40.0  # maximum median tilt of a robot that drives on wheels
 # Maximum fraction of zero quaternions, where the tracker lost the body
 MOST_UNTRACKED = 0.05
 NO_LENGTH = 1e-9
-SHORTEST_S = 1.0
+MIN_POSE_S = 1.0
 MOST_RATIO = 100.0  # maximum ratio of the durations of two streams of a drive
 
 
@@ -394,7 +394,7 @@ def _find_spans(
 def _check_durations(streams: dict[str, Stream], place: str) -> None:
     """Refuses streams that last far longer or shorter than the pose, as with a wrong unit."""
     pose_s = float(np.ptp(streams["pose"].t))
-    if pose_s < SHORTEST_S:
+    if pose_s < MIN_POSE_S:
         advice = "give the `unit:` of its `time:`, as s, min or h"
         raise RecordingError(f"{place}: the pose lasts {pose_s:.3g} s; {advice}.")
     for name, stream in streams.items():

@@ -22,7 +22,9 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 Row = tuple[float, float, float]
-QUATERNION_TOLERANCE = 0.1  # maximum difference of a quaternion's squared length from 1
+LOOSE_QUATERNION_TOLERANCE = (
+    0.1  # maximum difference of a quaternion's squared length from 1
+)
 
 ACKERMANN_DEFINITION = (
     "float32 steering_angle\nfloat32 steering_angle_velocity\nfloat32 speed\n"
@@ -146,7 +148,7 @@ def read_quaternion(message: Any) -> tuple[float, float, float, float]:
 
 def is_rotation(x: float, y: float, z: float, w: float) -> bool:
     """True if a quaternion has about unit length; a zero quaternion was never filled in."""
-    return abs(w * w + x * x + y * y + z * z - 1.0) < QUATERNION_TOLERANCE
+    return abs(w * w + x * x + y * y + z * z - 1.0) < LOOSE_QUATERNION_TOLERANCE
 
 
 def read_whole_pose(message: Any) -> Row:

@@ -16,7 +16,7 @@ IMPLAUSIBLE_LATENCY_S = 1.0
 PRECEDES_S = -0.3  # a motion this early precedes its command
 LEAST_CORRELATION = 0.3
 CLEAR_CORRELATION = 0.6  # minimum at which a latency is reported
-FEWEST = 100  # steps
+MIN_STEPS = 100  # steps
 
 
 def find_doubts(guess: CommandGuess, pose: tuple[Array, Array] | None) -> Iterator[str]:
@@ -104,7 +104,7 @@ def _compute_rates(t: Array, pose: Array) -> tuple[Array, Array, Array] | None:
     t = t[order]
     pose = pose[order]
     grid = np.arange(t[0], t[-1], STEP_S)
-    if len(grid) < FEWEST or len(grid) > 10 * len(t) + FEWEST:
+    if len(grid) < MIN_STEPS or len(grid) > 10 * len(t) + MIN_STEPS:
         return None
     heading = np.unwrap(pose[:, 2])
     x, y, turned = (np.interp(grid, t, column) for column in (*pose[:, :2].T, heading))
@@ -141,7 +141,7 @@ def _compute_likeness(
         known = row >= 0
         command = values[np.clip(row, 0, None)]
         if (
-            known.sum() < FEWEST
+            known.sum() < MIN_STEPS
             or command[known].std() < 1e-9
             or signal[known].std() < 1e-9
         ):

@@ -34,7 +34,7 @@ FOLDER = "xtark_folder"  # shipped mapping of a folder that is read without a ma
 FILES = ("cmd.csv", "vrpn.csv")
 WHEELS = ("L_wheel.csv", "R_wheel.csv")
 # Maximum size of each of these; with --map, tables may be larger
-MOST_BYTES = 64 * 2**20
+MAX_FILE_BYTES = 64 * 2**20
 
 
 class Format(NamedTuple):
@@ -57,8 +57,8 @@ def _load_folder(path: Path, *_: object) -> Recording:
     if not (wheels := _holds(path, WHEELS)):
         mapping = mapping.model_copy(update={"wheels": None})
     for name in FILES + WHEELS * wheels:
-        if (path / name).stat().st_size > MOST_BYTES:
-            size = f"{MOST_BYTES // 2**20} MB, which few drives are"
+        if (path / name).stat().st_size > MAX_FILE_BYTES:
+            size = f"{MAX_FILE_BYTES // 2**20} MB, which few drives are"
             raise RecordingError(
                 f"{path / name}: is larger than {size}; cut it, or give --map {file}."
             )

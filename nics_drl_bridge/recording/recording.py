@@ -51,7 +51,7 @@ ALONG_BY_CHANCE = 0.05
 MIN_DIRECTIONS = 30
 MIN_TURN = 1.0
 # Minimum alignment of the path with mirrored headings, and its margin over unmirrored ones
-MIRRORED = 0.9
+MIN_MIRRORED = 0.9
 BETTER = 0.15
 # Quaternions w, x, y, z of a level body, read as x, y, z, w: the mean squares of x and y add up to
 # more than TILTED, those of y and z to less than LEVEL.
@@ -449,7 +449,7 @@ def has_visible_axes(pose: Array) -> bool:
 
 
 def find_clockwise_keys(
-    pose: Array, minimum: float = MIRRORED, margin: float = BETTER
+    pose: Array, minimum: float = MIN_MIRRORED, margin: float = BETTER
 ) -> str:
     """Returns the mapping's keys that mirror the heading of poses (T, 3), spaced on their path.
 

@@ -43,10 +43,10 @@ SPLIT = (
 )
 # Stamps in whole seconds with this many rows each have lost their fraction.
 ROWS_A_SECOND = 5
-# A counter takes more than COUNTING usual steps from one overflow to the next, loses at most LOST
-# steps at each, and reaches each of PARTS parts of its range.
+# A counter takes more than COUNTING usual steps from one overflow to the next, loses at most
+# MAX_LOST_STEPS at each, and reaches each of PARTS parts of its range.
 COUNTING = 16.0
-LOST = 2.0
+MAX_LOST_STEPS = 2.0
 PARTS = 10
 # Or it grows by more than GROWN counts, and by more than this fraction of the sum of its steps.
 GROWN = 2000.0
@@ -60,9 +60,11 @@ STAMP_BITS = (16, 24, 31, 32)
 # Late rows come in runs of at most this length, late by at most this time.
 LATE_ROWS = 50
 LATE_S = 1.0
-MOST_BACK = 0.9  # minimum fraction of backward steps in rows that begin with the last
+MIN_BACKWARD_FRACTION = (
+    0.9  # minimum fraction of backward steps in rows that begin with the last
+)
 MOST_STRAY = 0.01  # maximum fraction of stamps that fit neither neighbour
-LONGEST_PAUSE_S = 86_400.0  # of a drive; after a longer one, the clock was set
+MAX_CLOCK_PAUSE_S = 86_400.0  # of a drive; after a longer one, the clock was set
 USUAL = 10.0  # maximum step across an overflow, in usual steps
 
 
@@ -269,7 +271,7 @@ def describe_counter(values: Array) -> str:
         return ""
     usual = float(np.percentile(step, 95))
     lost = size - step[step > size / 2.0]
-    is_calm = COUNTING * usual < size and (np.abs(lost) <= LOST * usual).all()
+    is_calm = COUNTING * usual < size and (np.abs(lost) <= MAX_LOST_STEPS * usual).all()
     if is_calm and np.histogram(values, PARTS)[0].all():
         return f"overflows at {size:.10g}"
     return ""
@@ -314,7 +316,7 @@ def repair_order(t: Array, name: str) -> tuple[Array, NDArray[np.intp], str]:
     """
     rows = np.arange(len(t))
     notes = []
-    if len(t) > 1 and np.mean(np.diff(t) < 0.0) > MOST_BACK:
+    if len(t) > 1 and np.mean(np.diff(t) < 0.0) > MIN_BACKWARD_FRACTION:
         t = t[::-1]
         rows = rows[::-1]
         notes.append(f"{name}: its rows began with the last, and were turned round.")
@@ -338,7 +340,7 @@ def repair_order(t: Array, name: str) -> tuple[Array, NDArray[np.intp], str]:
         t = t[order]
         rows = rows[order]
     step = np.diff(t)
-    is_jump = (step < 0.0) | (step > LONGEST_PAUSE_S)
+    is_jump = (step < 0.0) | (step > MAX_CLOCK_PAUSE_S)
     if is_jump.any() and not is_jump.all():
         usual = float(np.median(step[~is_jump]))
         k = int(np.argmax(is_jump))

@@ -26,7 +26,7 @@ MOST_COLUMNS = 200  # of a table
 # Stamps that would be closer are not in the unit that their name states.
 SHORTEST_STEP_S = 1e-4
 LEAST_SCORE = 0.25  # minimum score of a column of stamps
-MOST_BACK = 0.05  # maximum fraction of backward steps of a column of stamps
+MAX_BACKWARD_FRACTION = 0.05  # maximum fraction of backward steps of a column of stamps
 TIMES = word_set("""
     time times stamp timestamp t s sec secs seconds elapsed ms us ns millis
     micros nanos date datetime
@@ -297,7 +297,11 @@ def _guess_stamps(data: dict[str, Column]) -> tuple[str | None, Array | None]:
 
 def _score_stamps(name: str, values: Array) -> float:
     step = np.diff(values[np.isfinite(values)])
-    if not len(step) or np.mean(step < 0.0) > MOST_BACK or not (step > 0.0).any():
+    if (
+        not len(step)
+        or np.mean(step < 0.0) > MAX_BACKWARD_FRACTION
+        or not (step > 0.0).any()
+    ):
         return 0.0
     has_name_of_time = not TIMES.isdisjoint(split_unit(name)[0])
     is_index = bool((step == 1.0).all())  # unless its name says otherwise

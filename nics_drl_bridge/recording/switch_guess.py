@@ -20,7 +20,7 @@ ON_WORDS = word_set("auto autonomous autonomy enabled on armed active offboard r
 MODES = ENABLING | word_set("mode state status safety switch")
 NO_VALUES = np.zeros(0)
 FASTER = 2.0  # factor by which the robot moves faster while the switch is on
-FEWEST = 20  # rows of each value that are needed to rule a switch out
+MIN_ROWS_PER_VALUE = 20  # rows of each value that are needed to rule a switch out
 
 
 class Switch(NamedTuple):
@@ -92,7 +92,7 @@ def _is_denied(
     is_usable = is_known[1:] & is_known[:-1] & (span > 0.0)
     while_on = is_usable & is_on[1:] & is_on[:-1]
     while_off = is_usable & ~is_on[1:] & ~is_on[:-1]
-    if while_on.sum() < FEWEST or while_off.sum() < FEWEST:
+    if while_on.sum() < MIN_ROWS_PER_VALUE or while_off.sum() < MIN_ROWS_PER_VALUE:
         return False
     speed_on = float(step[while_on].sum() / span[while_on].sum())
     speed_off = float(step[while_off].sum() / span[while_off].sum())

@@ -26,7 +26,7 @@ TEXTS = (".csv", ".tsv", ".txt", ".dat", ".tum", ".log", ".data", ".asc")
 MOST_FILES = 500  # of a folder
 SEPARATORS = (",", ";", "\t", "|", None)  # None: any white space
 NO_SEPARATOR = re.compile(r"[\w\s.,;|+\"'#-]")
-MOST_BYTES = 256 * 2**20
+MAX_TABLE_BYTES = 256 * 2**20
 # Maximum number of rows, and of characters in one
 MOST_ROWS = 2_000_000
 LONGEST_ROW = 20_000
@@ -74,8 +74,8 @@ def _read_lines(path: Path) -> tuple[list[tuple[int, str]], list[str]]:
     """Returns the non-empty lines with their numbers from 1, and separately the comments."""
     check_no_device(path)
     try:
-        if path.stat().st_size > MOST_BYTES:
-            fault = f"is larger than {MOST_BYTES // 2**20} MB"
+        if path.stat().st_size > MAX_TABLE_BYTES:
+            fault = f"is larger than {MAX_TABLE_BYTES // 2**20} MB"
             raise RecordingError(f"{path}: {fault}; cut it, or keep fewer columns.")
         data = path.read_bytes()
     except OSError as error:

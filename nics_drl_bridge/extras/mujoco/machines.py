@@ -29,7 +29,7 @@ MISFIT = 0.01  # maximum error of a wheel's angle due to the tie rod [rad]
 # torque limit of a steering servo, as of a small hobby servo [N m]
 STEERING_TORQUE = 1.0
 # maximum radius of a roller, relative to the radius of the wheel
-THICKNESS = 0.25
+MAX_ROLLER_RADIUS = 0.25
 ROLLER_MASS = 0.005
 ROLLED = 1.0, 0.9884, 1.0  # measured on rollers under load, in sideways drives
 
@@ -373,7 +373,7 @@ _BUILDERS: dict[str, Callable[[Parameters, float, Physics], Machine]] = {
 
 def fit_roller(radius: float, rollers: int) -> tuple[float, float]:
     """Returns semi-axes [m], across and along, of ellipsoidal rollers that best form a circle."""
-    a = THICKNESS * radius
+    a = MAX_ROLLER_RADIUS * radius
     q = np.pi / rollers
     reach = radius - (radius - a) * np.cos(q)
     return float(a), float(np.sqrt(a**2 + 2.0 * (reach**2 - a**2) / np.sin(q) ** 2))

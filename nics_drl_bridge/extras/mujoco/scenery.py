@@ -15,7 +15,7 @@ from nics_drl_bridge.sim.obstacles import Motion
 from nics_drl_bridge.sim.world import World
 
 HEIGHT = 0.5  # height of walls and obstacles [m]
-THICKNESS = 0.002  # thickness of walls [m]; for the lidar they have none
+WALL_THICKNESS = 0.002  # thickness of walls [m]; for the lidar they have none
 BUMPER = 4  # bit for bumper contacts in MuJoCo's `contype` and `conaffinity`
 BUMPER_FRICTION = 0.3
 BUMPER_NAME = "bumper_"
@@ -95,7 +95,7 @@ class _Maker:
     def wall(self, body: Any, start: Array, end: Array) -> None:
         middle = 0.5 * (start + end)
         along = end - start
-        size = [0.5 * float(np.hypot(*along)), 0.5 * THICKNESS, 0.5 * HEIGHT]
+        size = [0.5 * float(np.hypot(*along)), 0.5 * WALL_THICKNESS, 0.5 * HEIGHT]
         self._box(body, middle, float(np.arctan2(along[1], along[0])), size)
 
     def map(self, grid: GridMap) -> None:
