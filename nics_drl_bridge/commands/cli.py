@@ -11,7 +11,6 @@ from typer.core import TyperGroup
 
 from nics_drl_bridge import __version__, extensions
 from nics_drl_bridge.commands.console import (
-    EXIT_BAD_INPUT,
     ROBOT_OPTIONS,
     report_in_one_sentence,
 )
@@ -20,6 +19,7 @@ from nics_drl_bridge.commands.doctor import doctor, explain
 from nics_drl_bridge.commands.evaluate import evaluate
 from nics_drl_bridge.commands.examples import complete
 from nics_drl_bridge.commands.install import install
+from nics_drl_bridge.commands.interrupts import was_interrupted
 from nics_drl_bridge.commands.listing import list_
 from nics_drl_bridge.commands.model import (
     drive,
@@ -31,13 +31,13 @@ from nics_drl_bridge.commands.model import (
 )
 from nics_drl_bridge.commands.operate import arm, goal, stop
 from nics_drl_bridge.commands.policy import policy
-from nics_drl_bridge.commands.start import EXIT_INTERRUPTED, was_interrupted
 from nics_drl_bridge.commands.train import train
 from nics_drl_bridge.commands.up import up
 from nics_drl_bridge.commands.warmup import warmup
 from nics_drl_bridge.commands.watch import watch
 from nics_drl_bridge.commands.world import world
 from nics_drl_bridge.errors import LONGEST, shorten
+from nics_drl_bridge.exit_codes import EXIT_BAD_INPUT, EXIT_INTERRUPTED
 
 
 class OneWordForARobot(TyperGroup):

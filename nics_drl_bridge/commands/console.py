@@ -15,14 +15,13 @@ import typer
 from typer import Option
 
 from nics_drl_bridge import extensions
-from nics_drl_bridge.commands.start import was_interrupted
+from nics_drl_bridge.commands.interrupts import was_interrupted
 from nics_drl_bridge.errors import MISSING_ROS, BridgeError, ConfigError, suggest
+from nics_drl_bridge.exit_codes import EXIT_BAD_INPUT, EXIT_INTERRUPTED
 from nics_drl_bridge.files import format_json
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 from nics_drl_bridge.status import STATUS
 
-EXIT_BAD_INPUT = 2
-EXIT_INTERRUPTED = 130
 WIDEST = 10_000
 # time before the first progress line, and between lines [s]
 PATIENCE_S = 2.0

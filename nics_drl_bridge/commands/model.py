@@ -13,6 +13,7 @@ from nics_drl_bridge.commands import console
 from nics_drl_bridge.commands.first_checks import check_drive
 from nics_drl_bridge.config import parse_namespace
 from nics_drl_bridge.errors import BackendError, ConfigError
+from nics_drl_bridge.exit_codes import EXIT_INTERRUPTED
 from nics_drl_bridge.files import format_json
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
@@ -101,7 +102,7 @@ def record(
     facts |= {"recorded": recording is not None, "complete": driven.complete}
     console.print_line(as_json, "\n".join(lines), **facts, told=lines)
     if not driven.complete:
-        raise typer.Exit(console.EXIT_INTERRUPTED)
+        raise typer.Exit(EXIT_INTERRUPTED)
 
 
 def make_node_arguments(namespace: str, remap: Sequence[str]) -> list[str]:

@@ -16,7 +16,7 @@ from typer import Argument, Option
 from nics_drl_bridge import defaults, extensions
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.commands.first_checks import check_settings, check_training
-from nics_drl_bridge.commands.start import was_interrupted
+from nics_drl_bridge.commands.interrupts import was_interrupted
 from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.files import format_json
 from nics_drl_bridge.robot import DEFAULT_ROBOT

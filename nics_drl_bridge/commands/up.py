@@ -14,6 +14,7 @@ from typer import Argument, Option
 
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.errors import MISSING_ROS, ConfigError, suggest
+from nics_drl_bridge.exit_codes import EXIT_BAD_INPUT
 from nics_drl_bridge.nodes.node_process import ChildProcess, command_of
 from nics_drl_bridge.nodes.starting import LAUNCHES, Launch, NodeStart, complete
 
@@ -114,9 +115,7 @@ def run(nodes: Sequence[NodeStart]) -> None:
     typer.echo(
         f"nics: {name} ended with code {code}, so everything was ended.", err=True
     )
-    raise typer.Exit(
-        console.EXIT_BAD_INPUT if code == console.EXIT_BAD_INPUT else EXIT_NODE_ENDED
-    )
+    raise typer.Exit(EXIT_BAD_INPUT if code == EXIT_BAD_INPUT else EXIT_NODE_ENDED)
 
 
 def name_of(node: NodeStart) -> str:

@@ -21,6 +21,7 @@ from sensor_msgs.msg import Imu, JointState
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BackendError, BridgeError, RecordingError
+from nics_drl_bridge.exit_codes import EXIT_BAD_INPUT
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.nodes import conversions, qos, runner
 from nics_drl_bridge.nodes.command_types import deaf_subscribers, heard_stamped
@@ -415,4 +416,4 @@ def main(args: list[str] | None = None) -> None:
     outcome = record(args=args)
     sys.stderr.write(f"record_node: {outcome.line}\n")
     if outcome.failure is not None:
-        raise SystemExit(runner.EXIT_BAD_INPUT)
+        raise SystemExit(EXIT_BAD_INPUT)

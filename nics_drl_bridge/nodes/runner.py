@@ -27,6 +27,7 @@ from rclpy.timer import Timer
 from std_srvs.srv import Trigger
 
 from nics_drl_bridge.errors import BackendError, BridgeError, suggest
+from nics_drl_bridge.exit_codes import EXIT_BAD_INPUT
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.nodes import qos
 from nics_drl_bridge.nodes.ending import at_once, ending_signals
@@ -42,7 +43,6 @@ INACTIVE = "inactive"
 ACTIVE = "active"
 DELIVERY_S = 0.5
 GREATEST_DOMAIN_ID = 232  # above it, DDS has no ports
-EXIT_BAD_INPUT = 2
 # time until the graph shows all nodes [s]
 SETTLE_S = 0.3
 POLL_S = 0.02

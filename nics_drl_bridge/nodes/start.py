@@ -9,7 +9,7 @@ import traceback
 from functools import partial
 from typing import Any
 
-EXIT_BAD_INPUT = 2
+from nics_drl_bridge.exit_codes import EXIT_BAD_INPUT
 
 
 def start(node: str, args: list[str] | None = None) -> None:

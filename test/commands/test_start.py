@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import typer
 
-from nics_drl_bridge.commands import console, start
+from nics_drl_bridge.commands import console, interrupts
 
 NICS = [sys.executable, "-m", "nics_drl_bridge.commands.start"]
 DEADLINE_S = 60.0
@@ -19,7 +19,7 @@ DEADLINE_S = 60.0
 
 @pytest.fixture
 def handled():
-    before = signal.signal(signal.SIGINT, start._end)
+    before = signal.signal(signal.SIGINT, interrupts._end)
     yield
     signal.signal(signal.SIGINT, before)
 
