@@ -73,7 +73,8 @@ def __getattr__(name: str) -> Any:
     except ImportError as error:
         from nics_drl_bridge.extensions import explain_unmet
 
-        if (clause := explain_unmet(error)) is None:
+        clause = explain_unmet(error)
+        if clause is None:
             raise
         raise type(error)(f"{__name__}.{name} {clause}", name=error.name) from error
 

@@ -131,7 +131,8 @@ def require(user: str, *modules: str) -> None:
 
     Call it before long work, and before an import that would fail.
     """
-    if (module := find_lacking(modules)) is not None:
+    module = find_lacking(modules)
+    if module is not None:
         raise ConfigError(f"{user} {explain_missing(module)}")
 
 
@@ -144,7 +145,8 @@ def explain_unmet(error: ImportError) -> str | None:
         error, ModuleNotFoundError
     ):
         return None
-    if unmet := dict(_find_wrong()):
+    unmet = dict(_find_wrong())
+    if unmet:
         requirements = ", ".join(
             f"{needed} ({installed or 'missing'})"
             for needed, installed in unmet.items()

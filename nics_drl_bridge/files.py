@@ -286,7 +286,8 @@ def _swap(new: Path, path: Path) -> None:
 def _exchange(first: Path, second: Path) -> bool:
     """Exchanges two paths atomically; returns False if the system can't (only Linux can)."""
     library = ctypes.CDLL(None, use_errno=True) if _POSIX else None
-    if (rename := getattr(library, "renameat2", None)) is None:
+    rename = getattr(library, "renameat2", None)
+    if rename is None:
         return False
     source = (_AT_FDCWD, os.fsencode(first))
     target = (_AT_FDCWD, os.fsencode(second))

@@ -206,7 +206,8 @@ def generate(
     identified = identify(
         recording, robot, order=order, alpha=alpha, assume=assume, strict=strict
     )
-    if (reason := explain_uselessness(identified)) and not anyway:
+    reason = explain_uselessness(identified)
+    if reason and not anyway:
         raise FitError(reason)
     # Its state may differ, if the fit fell back to the textbook model.
     robot = identified.drive.spec

@@ -132,9 +132,11 @@ def render_png(
     for axes in figure.axes:
         if not axes.has_data():
             axes.set_axis_off()
-        if (frame_legend := axes.get_legend()) is not None:
+        frame_legend = axes.get_legend()
+        if frame_legend is not None:
             frame_legend.set_frame_on(False)
-        if (place_in_grid := axes.get_subplotspec()) is not None:
+        place_in_grid = axes.get_subplotspec()
+        if place_in_grid is not None:
             fraction = len(place_in_grid.colspan) / place_in_grid.get_gridspec().ncols
             letters = int(LETTERS_PER_IN * fraction * figure.get_figwidth())
             title = (fill(line, letters) for line in axes.get_title().splitlines())

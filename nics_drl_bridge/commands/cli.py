@@ -152,7 +152,8 @@ def main() -> None:
         if not hasattr(error, "format_message"):
             raise
         # The message is empty if the help has been shown.
-        if message := error.format_message().strip():
+        message = error.format_message().strip()
+        if message:
             message = shorten(
                 message.rstrip(".?").replace("Value error, ", ""), LONGEST
             )

@@ -115,7 +115,8 @@ class DemoEpisodes:
 
 def run(plan: DemoPlan, say: Say) -> str:
     """Runs all parts and ends their processes; returns the last line. Raises BridgeError."""
-    if not (topics := find_spec("rclpy") is not None):
+    topics = find_spec("rclpy") is not None
+    if not topics:
         say(f"in process alone: the world 'dds' {MISSING_ROS.format(module='rclpy')}")
     took: dict[str, float] = {}
 

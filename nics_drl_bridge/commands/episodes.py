@@ -289,7 +289,8 @@ def limit_time(
         if contract.max_episode_steps
     ]
     steps = conditions.steps or max(limits, default=pace.steps)
-    if (short := pace.shortfall(steps)) is not None:
+    short = pace.shortfall(steps)
+    if short is not None:
         say(short)
     return replace(conditions, steps=steps)
 

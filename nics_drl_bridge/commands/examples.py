@@ -66,7 +66,8 @@ def complete(app: typer.Typer, group: str = "") -> None:
     for command in app.registered_commands:
         command.callback = check_options(command.callback) if command.callback else None
         name = command.name or str(getattr(command.callback, "__name__", ""))
-        if examples := EXAMPLES.get(f"{group}{name}"):
+        examples = EXAMPLES.get(f"{group}{name}")
+        if examples:
             # click does not rewrap a paragraph whose first line is just this character.
             command.epilog = "\b\nExamples:\n" + "\n".join(
                 f"  {line}" for line in examples

@@ -61,7 +61,8 @@ def _explain(error: BaseException) -> NoReturn:
     if isinstance(error, ImportError):
         from nics_drl_bridge import extensions
 
-        if (clause := extensions.explain_unmet(error)) is None:
+        clause = extensions.explain_unmet(error)
+        if clause is None:
             raise error
         sys.stderr.write(f"nics: {clause}\n")
         raise SystemExit(EXIT_BAD_INPUT) from None

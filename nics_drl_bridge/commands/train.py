@@ -123,7 +123,8 @@ def train(
     chosen = resumed or _load_settings(task, settings, named)
     folder = out or Path("runs") / chosen.title
     command = shlex.join(["nics", *sys.argv[1:]])
-    if started := train_run.seeds_of(folder) if resume and not seeds else []:
+    started = train_run.seeds_of(folder) if resume and not seeds else []
+    if started:
         typer.echo(f"seeds that were begun: {started}; --seeds names others", err=True)
     all_seeds = [*(seeds or started or [0]), *further_seeds]
     order = train_run.TrainOrder(chosen, all_seeds, folder, episodes, resume, command)

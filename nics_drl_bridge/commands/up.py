@@ -104,7 +104,8 @@ def run(nodes: Sequence[NodeStart]) -> None:
         typer.echo(
             f"starting {', '.join(map(name_of, nodes))}; Ctrl-C ends all of them"
         )
-        if next_step := describe_next_step(nodes):
+        next_step = describe_next_step(nodes)
+        if next_step:
             typer.echo(next_step)
         try:
             for node, command in zip(nodes, commands, strict=True):

@@ -169,7 +169,8 @@ def _places(files: list[Path], out: Path | None, name: str | None) -> dict[Path,
         (out or Path()) / f"{file.stem}{end}"
         for file, end in zip(files, ends, strict=True)
     ]
-    if twice := {str(place) for place in places if places.count(place) > 1}:
+    twice = {str(place) for place in places if places.count(place) > 1}
+    if twice:
         raise ConfigError(
             f"{min(twice)}: two files would be written there; import them in turn."
         )

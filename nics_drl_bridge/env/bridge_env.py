@@ -202,7 +202,8 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         self.ended = np.zeros(self.robots, np.bool_)
         facts: dict[str, Any] = {"episode_seed": episode, "start": self._row(starts)}
         facts["bodies"] = self.scene.bodies.copy()
-        if drawn := self._backend.facts().get("randomisation"):
+        drawn = self._backend.facts().get("randomisation")
+        if drawn:
             facts["randomisation"] = drawn
         observation = self.task.observation(self._view, self.memory)[0]
         if self.render_mode == "human":

@@ -125,7 +125,8 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         if not isinstance(given, dict):
             needed = "must be a dict with an action per agent"
             raise ConfigError(f"actions of type {type(given).__name__}: {needed}.")
-        if missing := sorted(set(self.agents) - set(actions)):
+        missing = sorted(set(self.agents) - set(actions))
+        if missing:
             raise ConfigError(
                 f"no action for {', '.join(missing)}; each remaining agent must act."
             )

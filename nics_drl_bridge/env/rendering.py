@@ -110,7 +110,8 @@ def draw_world(
 ) -> None:
     """Draws map, walls and obstacles (K, 7), see `sim.scenes.Scene`; x and y in `map` [m]."""
     place = world.members[member]
-    if (grid := place.grid) is not None:
+    grid = place.grid
+    if grid is not None:
         edges = np.indices((grid.cells.shape[0] + 1, grid.cells.shape[1] + 1)) - 0.5
         x, y = np.moveaxis(grid.cell_to_world(np.moveaxis(edges, 0, -1)), -1, 0)
         shade = np.where(grid.free, 1.0, np.where(grid.blocked, 0.2, 0.8))

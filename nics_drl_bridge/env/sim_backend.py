@@ -100,7 +100,8 @@ class SimBackend:
             "bodies": simulator.obstacles[0],
             "scenes": simulator.scenes,
         }
-        if drawn := simulator.drawn:
+        drawn = simulator.drawn
+        if drawn:
             known["randomisation"] = {
                 name: self._of_episode(each) for name, each in drawn.items()
             }
@@ -197,9 +198,8 @@ def completed(backend: Any, still: Array) -> Backend:
     if isinstance(backend, Backend):
         return backend
     needed = ("reset", "step", "close")
-    if missing := [
-        name for name in needed if not callable(getattr(backend, name, None))
-    ]:
+    missing = [name for name in needed if not callable(getattr(backend, name, None))]
+    if missing:
         kind = type(backend).__name__
         lacks = ", no ".join(missing)
         raise ConfigError(

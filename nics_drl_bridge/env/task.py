@@ -327,7 +327,8 @@ class Task(ABC):
     @cached_property
     def sight(self) -> Sight:
         """Directions, origin and range of the scan parts."""
-        if (layout := self.scan) is not None:
+        layout = self.scan
+        if layout is not None:
             return Sight(layout.angles, np.array(layout.viewpoint), layout.range_max)
         x, y, heading = self.lidar.mount
         return Sight(

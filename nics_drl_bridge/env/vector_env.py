@@ -351,7 +351,8 @@ class BridgeVectorEnv(
 
     def _tell(self, infos: dict[str, Any], facts: dict[str, Any], begun: Flags) -> None:
         infos |= masked(self._known(), np.ones_like(begun))
-        if some := bool(begun.any()):
+        some = bool(begun.any())
+        if some:
             infos |= masked(self._beginnings(), begun, True)
         if not begun.all():
             infos |= masked(facts, ~begun, some)

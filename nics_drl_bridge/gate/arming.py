@@ -144,7 +144,8 @@ def _check_estimator(
         return ""
     if estimate is None or now - state.estimate_s > config.estimate_silence_s:
         return "odometry/filtered is silent, start the middleware_node"
-    if doubt := estimates.explain_unsteadiness(config, state, now):
+    doubt = estimates.explain_unsteadiness(config, state, now)
+    if doubt:
         return doubt
     if frozen.is_at_rest(config, estimate.twist):
         return ""

@@ -104,7 +104,8 @@ class _Completion:
     @property
     def source(self) -> str:
         """States where the textbook's parameters come from."""
-        if not (assumed := ", ".join(self.spec.assumed)):
+        assumed = ", ".join(self.spec.assumed)
+        if not assumed:
             return "from the parameters in the robot's YAML file"
         return f"by default, because the robot's YAML file gives no {assumed}"
 

@@ -209,14 +209,17 @@ def base_of(
     if len(calibration.inputs) > len(clear):
         plain = fitted(forms.Form(clear))
         # the drive is too short to judge
-        if (other := error_of(plain)) < error or np.isinf(other):
+        other = error_of(plain)
+        if other < error or np.isinf(other):
             best = plain
             error = other
     for change, worth in changes(drive, calibration, samples):
-        if (form := change(best.draft.form)) == best.draft.form:
+        form = change(best.draft.form)
+        if form == best.draft.form:
             continue
         base = fitted(form, best)
-        if (other := error_of(base)) < worth * error:
+        other = error_of(base)
+        if other < worth * error:
             best = base
             error = other
     return best
@@ -242,11 +245,13 @@ def changes(
     if speeds:
         yield lambda form: forms.with_dead(form, drive, samples), WORTH
         yield lambda form: replace(form, limits=speeds), WORTH
-        if others := tuple(
+        others = tuple(
             v.name for v in drive.spec.state if v.twist and not drive.spec.steers
-        ):
+        )
+        if others:
             yield lambda form: replace(form, limits=others), WORTH
-        if backwards := forms.two_way(drive, samples):
+        backwards = forms.two_way(drive, samples)
+        if backwards:
             yield lambda form: forms.with_back(form, backwards), WORTH
 
 

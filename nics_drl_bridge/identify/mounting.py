@@ -358,11 +358,13 @@ def jackknifed(
     for begin, end in pairwise(edges):
         rows = (twists.end <= begin) | (twists.start >= end)
         rest = drive
-        if (state := drive.recording.state) is not None:
+        state = drive.recording.state
+        if state is not None:
             outside = (state.t < begin + offset) | (state.t > end + offset)
             rest = drive.part(replace(drive.recording, state=state.rows(outside)))
         kept = TwistIntervals(twists.start[rows], twists.end[rows], twists.twist[rows])
-        if (part := estimate(rest, kept)) is not None:
+        part = estimate(rest, kept)
+        if part is not None:
             found.append(part)
     if len(found) < BLOCKS:
         return whole

@@ -122,7 +122,8 @@ def _errors(
     )
     if len(chosen.start_t) < MIN_WINDOWS:
         return None
-    if (state := drive.recording.state) is None:
+    state = drive.recording.state
+    if state is None:
         ends = open_loop.predict(model, calibration, drive, chosen)
     else:  # restart from the measured state, so that its drift is not counted twice
         course = open_loop.course_of(model, calibration, drive, chosen)
@@ -139,7 +140,8 @@ def _pose_drift(
     sensor: Noise, drive: Drive, calibration: Calibration, model: TaylorModel
 ) -> dict[str, Level]:
     """Returns the drift of position and heading; none if too short or the model diverges."""
-    if (found := _errors(drive, calibration, model, HORIZON_S)) is None:
+    found = _errors(drive, calibration, model, HORIZON_S)
+    if found is None:
         return {}
     chosen, error = found
     size = np.hypot(error[:, 0], error[:, 1])
@@ -165,7 +167,8 @@ def drift_growth(
     """Returns horizons [s], errors per axis [m] and of heading [rad]; None if it is too short."""
     rows = []
     for horizon in GROWTH_S:
-        if (found := _errors(drive, calibration, model, horizon)) is None:
+        found = _errors(drive, calibration, model, horizon)
+        if found is None:
             break
         square = np.mean(found[1] ** 2, axis=0)
         rows.append(

@@ -76,5 +76,6 @@ def _explain_replacement(drive: Drive, findings: Findings) -> Iterator[str]:
         return
     whole = findings.whole
     unmoved = require_fit(findings).unmoved
-    if coarse := verdict.describe_coarsest_state(whole.recording, whole.spec, unmoved):
+    coarse = verdict.describe_coarsest_state(whole.recording, whole.spec, unmoved)
+    if coarse:
         yield verdict.Gap(f"{coarse}.")

@@ -41,7 +41,8 @@ def format_report(source: str, identified: Identified) -> str:
         ),
         _describe_size(identified): format_equations(model),
     }
-    if motor_effects := list(list_motor_effects(identified)):
+    motor_effects = list(list_motor_effects(identified))
+    if motor_effects:
         sections["Effect of the motors (standard uncertainties):"] = motor_effects
     sections |= _describe_fit(identified)
     apart = f"after {identified.train_until_s:.1f} s"
@@ -56,7 +57,8 @@ def format_report(source: str, identified: Identified) -> str:
     )
     noise = "Noise that the simulator and the estimator use (standard deviations):"
     sections[noise] = identified.noise.sentences()
-    if latency := identified.recording.latency.sentences():
+    latency = identified.recording.latency.sentences()
+    if latency:
         sections["Latency of the device, also used by simulator_node:"] = latency
     notes = identified.notes or ("Nothing had to be corrected.",)
     sections["Findings, and what was not learnt:"] = _list_items(notes)
@@ -386,7 +388,8 @@ def collect_estimates(identified: Identified) -> dict[str, CalibratedValue]:
             values[key] = CalibratedValue(
                 name, value, None, unit, "by the fitted textbook"
             )
-    if (period := found.burst_period_s) > 0.0:
+    period = found.burst_period_s
+    if period > 0.0:
         values["burst_period_s"] = CalibratedValue(
             "period of bursts", period, None, "s"
         )
@@ -434,9 +437,11 @@ def _name_suspect(identified: Identified, spec: RobotSpec) -> str:
     unmoved = identified.trial.fit.unmoved
     rows = recording.pose if recording.state is None else recording.state
     apart = f"{np.median(np.diff(rows.t)):.2g} s apart"
-    if coarse := describe_coarsest_state(recording, spec, unmoved):
+    coarse = describe_coarsest_state(recording, spec, unmoved)
+    if coarse:
         return coarse
-    if still := ", ".join(c.name for c in spec.command if c.name in unmoved):
+    still = ", ".join(c.name for c in spec.command if c.name in unmoved)
+    if still:
         reason = f"{still} never moved in its first {identified.train_until_s:.0f} s"
         return f"{reason}, which the fit learns from, so change it from the start"
     if identified.alpha != "auto" or identified.drive.settings.order == 1:

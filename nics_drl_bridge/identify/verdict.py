@@ -63,7 +63,8 @@ class Mistake(str):
 
 def describe_stamps(drive: Drive) -> Iterator[str]:
     """Yields sentences on the stamps and the noise of the poses."""
-    if (bursts := drive.bursts) is not None:
+    bursts = drive.bursts
+    if bursts is not None:
         finding = f"Poses arrive in bursts of about {bursts.size:.0f} every {bursts.period_s:.3f} s"
         spread = "the samples of a burst were spread over the time since the one before"
         yield f"{finding}: their stamps are arrival times; {spread}."
@@ -263,7 +264,8 @@ def refuse_unexcited(excitation: Excitation, spec: RobotSpec) -> None:
         (still, "never moved", "changing over the whole range"),
         (excitation.together, "always moved together", "each changing on its own"),
     ):
-        if told := _list(names):
+        told = _list(names)
+        if told:
             raise FitError(
                 f"{told} {fault}; drive with {told} {way}, or allow a model without."
             )
@@ -298,13 +300,16 @@ def describe_unlearnt(
     """
     already = {name for r in calibration.responses for name in (r.command, r.state)}
     excitation = linear.regression.excitation
-    if unmoved := ", ".join(list_missed(linear, spec)):
+    unmoved = ", ".join(list_missed(linear, spec))
+    if unmoved:
         finding = f"The model has no terms of {unmoved}, which never moved"
         yield Gap(f"{finding}: it is only valid for this drive's constant value.")
     still = _commands(excitation.unmoved, spec)
-    if missing := ", ".join(name for name in still if name not in already):
+    missing = ", ".join(name for name in still if name not in already)
+    if missing:
         yield Gap(f"Drive with {missing} changing over the whole range to learn them.")
-    if together := _list(excitation.together):
+    together = _list(excitation.together)
+    if together:
         units = {c.unit for c in spec.command if c.name in excitation.together}
         if len(units) == 1:
             shares = "all have a share of what they did"
@@ -313,9 +318,10 @@ def describe_unlearnt(
         told = f"{shares}, and the model holds where they move so; drive each on its own to learn"
         why = "always moved together, so their effects can't be separated"
         yield Gap(f"{together} {why}: {told}.")
-    if copies := _list(
+    copies = _list(
         [v.name for v in spec.state if v.name in linear.regression.dependent]
-    ):
+    )
+    if copies:
         why = "always depended on the other variables, so their effects can't be separated"
         yield Gap(
             f"{copies} {why}: the model omits them, and is valid only while that is so."
@@ -323,7 +329,8 @@ def describe_unlearnt(
     moved = {
         name: count for name, count in levels.items() if name not in excitation.unmoved
     }
-    if coarse := _list([name for name, count in moved.items() if count == FEW_LEVELS]):
+    coarse = _list([name for name, count in moved.items() if count == FEW_LEVELS])
+    if coarse:
         finding = "between them the model is a straight line, whatever the robot does"
         yield Gap(
             f"{coarse} took only two values: {finding}; drive with values in between."
@@ -345,9 +352,10 @@ def list_doubts_of_fit(linear: Fit, exact: bool) -> Iterator[str]:
             yield f"The terms of {dof} are {alike}: {useless}; {advice}."
     fitted = {dofs[d] for d in linear.regression.moving} - {"vy"} if exact else set()
     explained = zip(dofs, linear.r2, strict=True)
-    if lost := _list(
+    lost = _list(
         [dof for dof, share in explained if share < UNEXPLAINED and dof in fitted]
-    ):
+    )
+    if lost:
         why = "the robot did not follow its commands in a way that a polynomial can describe"
         yield f"The model explains less than half of {lost}: {why}; do not trust its predictions."
 

@@ -270,7 +270,8 @@ def structure_of(spec: RobotSpec) -> tuple[Array, BicycleGeometry] | None:
     except ConfigError:
         return None
     cosine = float(together[0] / forward)
-    if front := cosine < 1.0 - 1e-6:
+    front = cosine < 1.0 - 1e-6
+    if front:
         angle = float(np.arccos(cosine))
     else:  # the tangent of half an angle, from that of the angle
         share = 1.0 - 2.0 * float(slower[2] / together[2])
@@ -345,7 +346,8 @@ def _regressed(
     for i in np.flatnonzero(moves.any(axis=1)):
         given = np.column_stack([u[:, moves[i]], np.full(len(u), float(offsets))])
         rows = np.column_stack([given, -change[:, i]])
-        if angle := bicycle.used and i == 2:
+        angle = bicycle.used and i == 2
+        if angle:
             rows = given = given * twist[:, :1] / bicycle.wheelbase
         beta = np.linalg.lstsq(rows, twist[:, i], rcond=None)[0]
         if not angle and beta[-1] > LAG_RANGE_S[0]:

@@ -89,7 +89,8 @@ def declare_gate(node: Node, model: SimulatorModel) -> GateConfig:
     )
     node.add_on_set_parameters_callback(partial(_keep_clock, config.simulated))
     require_possible(config)
-    if doubt := warn_of_age_limit(config, model.control_period):
+    doubt = warn_of_age_limit(config, model.control_period)
+    if doubt:
         node.get_logger().warning(doubt)
     return config
 
@@ -247,9 +248,10 @@ class CommandGate(qos.QosWatch):
         self._stamped = bool(runner.declare_row(self, parameters.stamped("cmd_vel")))
         runner.declare_row(self, parameters.FOREIGN)
         self._frame = str(runner.declare_row(self, parameters.ROBOT_FRAME))
-        if fault := parameters.frame_fault(
+        fault = parameters.frame_fault(
             self._parameters.values(), parameters.ROBOT_FRAME.name
-        ):
+        )
+        if fault:
             raise ConfigError(fault)
         kind = TwistStamped if self._stamped else Twist
         self._out = self.create_publisher(kind, "cmd_vel", qos.COMMAND)
@@ -258,7 +260,8 @@ class CommandGate(qos.QosWatch):
         runner.steadily(self, PERIOD_S, self._tick)
         runner.diagnose(self, "gate", self._look)
         priority = runner.declare_row(self, parameters.PRIORITY)
-        if refused := take_priority(priority):  # once all threads exist
+        refused = take_priority(priority)
+        if refused:  # once all threads exist
             logger.warning(refused)
 
     def _listen(self) -> None:

@@ -72,7 +72,8 @@ def declare_device(node: Node, laser_frame: str) -> None:
         if row.name == GIVEN:
             row = row._replace(default=START in given_values(node))
         declare_row(node, row)
-    if fault := frame_fault(node._parameters.values()):
+    fault = frame_fault(node._parameters.values())
+    if fault:
         raise ConfigError(fault)
 
 
@@ -120,7 +121,8 @@ def timed_model(
     """Return the model with the step of the world and the requested latency."""
     if time.lockstep:
         return model
-    if (latency := number(node, "command_latency")) >= 0.0:
+    latency = number(node, "command_latency")
+    if latency >= 0.0:
         model = replace(
             model, calibration=replace(model.calibration, command_latency_s=latency)
         )

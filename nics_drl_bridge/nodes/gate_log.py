@@ -113,12 +113,14 @@ class GateLog:
 
     def refuse(self, reason: str) -> None:
         """Count a rejected input by the part of the reason before the colon, and log it."""
-        if (more := self._counted(f"refused, {reason.partition(':')[0]}")) is not None:
+        more = self._counted(f"refused, {reason.partition(':')[0]}")
+        if more is not None:
             self._logger.warning(f"refused: {reason}{more}")
 
     def no_number(self, twist: Sequence[float]) -> None:
         """Count and log a decision that is not finite; that must never happen."""
-        if (more := self._counted("not finite, sent as zero")) is not None:
+        more = self._counted("not finite, sent as zero")
+        if more is not None:
             then = f"zero is sent, and the e-stop is pressed{more}"
             self._logger.error(f"decided on {list(twist)}, which is not finite: {then}")
 

@@ -31,7 +31,8 @@ class ManagedNode(QosWatch, LifecycleNode):
         self.fixed: set[str] = set()
         self.undo = ExitStack()
         values = [declare_row(self, row) for row in (*managed(), *sensors(), *rows)]
-        if fault := frame_fault(self._parameters.values()):
+        fault = frame_fault(self._parameters.values())
+        if fault:
             raise ConfigError(fault)
         self._autostart = bool(values[0])
         # the last primary state

@@ -87,7 +87,8 @@ class MiddlewareNode(ManagedNode):
         if self.state == UNCONFIGURED:
             return runner.Condition(self.state, warns=False, facts={})
         health = self._topics.middleware.health(self._topics.now_ns())
-        if new := sorted(health.rejected.keys() - self._rejected.keys()):
+        new = sorted(health.rejected.keys() - self._rejected.keys())
+        if new:
             told = shorten("; ".join(new), LONGEST)
             self.get_logger().warning(f"rejected data, counted in /diagnostics: {told}")
         awaited = self._topics.expected
@@ -119,9 +120,8 @@ def silence(health: Health, expected: Sequence[str], before: Mapping[str, int]) 
         counts = {
             r: n for r, n in health.rejected.items() if r.startswith(f"{topic}: ")
         }
-        if grown := [
-            reason for reason, n in counts.items() if n > before.get(reason, 0)
-        ]:
+        grown = [reason for reason, n in counts.items() if n > before.get(reason, 0)]
+        if grown:
             silent.remove(topic)
             reason = grown[-1].removeprefix(f"{topic}: ")
             told.append(f"{topic}: {sum(counts.values())} refused, the last: {reason}")

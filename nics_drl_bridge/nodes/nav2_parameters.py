@@ -40,11 +40,13 @@ class ControllerParameters:
         self._node = node
         values = {row.name: declare_row(node, row) for row in nav2()}
         self.names = {kind: tuple(values[f"{kind}_plugins"] or ()) for kind in KINDS}
-        if empty := [kind for kind, names in self.names.items() if not names]:
+        empty = [kind for kind, names in self.names.items() if not names]
+        if empty:
             raise ConfigError(
                 f"parameter '{empty[0]}_plugins' is empty; give one name or more."
             )
-        if one := values["progress_checker_plugin"]:
+        one = values["progress_checker_plugin"]
+        if one:
             self.names["progress_checker"] = (one,)
         for row in checkers(self.names["goal_checker"], self.names["progress_checker"]):
             declare_row(node, row)

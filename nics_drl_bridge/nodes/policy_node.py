@@ -209,7 +209,8 @@ class PolicyNode(ManagedNode):
 
     def _toward(self, goal: Array) -> Wish:
         view = self._topics.view()
-        if told := resume(self._policy, self._acted_ns * S_PER_NS):
+        told = resume(self._policy, self._acted_ns * S_PER_NS)
+        if told:
             self.get_logger().warning(told, throttle_duration_sec=5.0)
         return Wish(
             self._asked(view, goal),

@@ -176,7 +176,8 @@ class QosWatch(Node):
         options: dict[str, Any] = {
             "event_callbacks": PublisherEventCallbacks(incompatible_qos=warn)
         }
-        if policies := overridden_policies(self, topic, "publisher"):
+        policies = overridden_policies(self, topic, "publisher")
+        if policies:
             options["qos_overriding_options"] = QoSOverridingOptions(policies)
         return options
 
@@ -188,7 +189,8 @@ class QosWatch(Node):
         chosen: dict[str, Any] = {
             "event_callbacks": self._subscription_events(topic, profile)
         }
-        if policies := overridden_policies(self, topic, "subscription"):
+        policies = overridden_policies(self, topic, "subscription")
+        if policies:
             chosen["qos_overriding_options"] = QoSOverridingOptions(policies)
         return super().create_subscription(
             kind, topic, callback, profile, **chosen | options

@@ -303,7 +303,8 @@ class RobotTopics:
         self._imu_topic = self._imu_topic or topic
         if topic != self._imu_topic:
             return
-        if (measured := self._gyro.read(message)) is None:
+        measured = self._gyro.read(message)
+        if measured is None:
             self.middleware.cache.reject(f"{measurement.IMU}: no angular velocity")
         else:
             self.middleware.imu(messages.get_stamp(message), self.now_ns(), *measured)

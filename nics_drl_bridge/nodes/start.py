@@ -22,7 +22,8 @@ def start(node: str, args: list[str] | None = None) -> None:
     if any(word in usage.HELP for word in words):
         sys.stdout.write(usage.help_of(node))
         ending.leave(0)
-    if sentence := usage.wrong_with(node, words):
+    sentence = usage.wrong_with(node, words)
+    if sentence:
         sys.stderr.write(f"{sentence}\n")
         ending.leave(EXIT_BAD_INPUT)
     output.forward_output(output.log_file(node, words))
@@ -63,7 +64,8 @@ def _main_of(node: str) -> Any:
     except (ConfigError, ImportError) as error:
         sentence = str(error)
         if isinstance(error, ImportError):
-            if (clause := extensions.explain_unmet(error)) is None:
+            clause = extensions.explain_unmet(error)
+            if clause is None:
                 raise
             sentence = f"{node}: {clause}"
         sys.stderr.write(f"{sentence}\n")

@@ -61,7 +61,8 @@ def import_policy(source: str | Path, model: SimulatorModel | None = None) -> by
     if path is None:
         return _content(_ordered(Path(source), model), model)
     bundle = leapp_bundle.read_bundle(path)
-    if (ours := bundle.ours) is not None:
+    ours = bundle.ours
+    if ours is not None:
         return ours
     if model is None:
         raise ConfigError(

@@ -46,7 +46,8 @@ def fold_shapes(graph: Any, opset: int) -> dict[str, Shape]:
         if any(len(_shape(one)) > MOST_AXES for one in made.values()):
             raise ValueError(f"{node.op_type} returns more than {MOST_AXES} dimensions")
         types |= made
-        if (value := _value(node, types, known, opset)) is None:
+        value = _value(node, types, known, opset)
+        if value is None:
             graph.node.append(node)
         else:
             known[value.name] = value

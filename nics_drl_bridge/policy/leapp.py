@@ -203,7 +203,8 @@ def _described(
         "inputs": {NODE: [piece.name for piece in pieces]},
         "outputs": {NODE: [onnx_graph.ACTION, onnx_graph.COMMAND]},
     }
-    if (state := contract.state) is not None:
+    state = contract.state
+    if state is not None:
         one, other = (
             f"{NODE}/{end}" for end in (onnx_graph.STATE_OUT, onnx_graph.STATE_IN)
         )

@@ -164,7 +164,8 @@ def _stretched(
     told: list[str],
 ) -> dict[str, Any]:
     """Returns the settings to change for episodes `factor` times as long; updates `options`."""
-    if reward := options.get("time_reward"):
+    reward = options.get("time_reward")
+    if reward:
         options["time_reward"] = round(reward / factor, 6)
         told.append(f"time_reward {options['time_reward']:g}, was {reward:g}")
     name = settings.algorithm

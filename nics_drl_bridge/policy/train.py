@@ -134,7 +134,8 @@ def make_train_env(
 ) -> TrainVecEnv:
     """Makes one env of all worlds of the settings; model and worlds may be passed if loaded."""
     model = model or open_model(settings.robot, settings.lidar)
-    if margin := settings.teaching.margin:
+    margin = settings.teaching.margin
+    if margin:
         model = replace(model, robot=model.robot.grow_footprint(margin))
     envs = [
         BridgeVectorEnv(
@@ -187,7 +188,8 @@ def check_same(old: dict[str, Any], new: dict[str, Any], path: Path) -> None:
             f"{path}: does not say which training it belongs to; train again."
         )
     for key, value in new["settings"].items():
-        if (then := old["settings"].get(key)) != value:
+        then = old["settings"].get(key)
+        if then != value:
             reason = f"was trained with {key} {then!r}, not {value!r}"
             raise ConfigError(
                 f"{path}: {reason}; resume with the same settings, or train in another folder."
@@ -216,7 +218,8 @@ def evaluate(
 
 def _stop_of(settings: TrainingSettings) -> Stop:
     """Makes the early stop of a training, with separate worlds."""
-    if (given := settings.stop) is None:
+    given = settings.stop
+    if given is None:
         return Stop(None, {})
     model = open_model(settings.robot, settings.lidar)
     envs = {

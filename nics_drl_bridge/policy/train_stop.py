@@ -70,7 +70,8 @@ class Stop:
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continues from a saved state; starts afresh if the checkpoint has none."""
-        if known := state.get("stop"):
+        known = state.get("stop")
+        if known:
             self._due = known["due"]
             self._reached = known["reached"]
             self.shares = dict(known["shares"])

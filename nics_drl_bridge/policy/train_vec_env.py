@@ -92,7 +92,8 @@ class TrainVecEnv(VecEnv):
         """Steps one of the envs, and fills in the infos of its ended worlds."""
         observation, reward, terminated, truncated, info = env.step(self._actions[rows])
         done = terminated | truncated
-        if over := np.flatnonzero(done).tolist():
+        over = np.flatnonzero(done).tolist()
+        if over:
             flags = {"TimeLimit.truncated": truncated & ~terminated}
             for name in {"is_success", "collision"} & info["final_info"].keys():
                 flags[name] = (

@@ -107,7 +107,8 @@ class TrainingSettings(Schema):
     @field_validator("task_options")
     @classmethod
     def _named(cls, options: dict[str, Any]) -> dict[str, Any]:
-        if taken := sorted({"robot", "lidar"} & set(options)):
+        taken = sorted({"robot", "lidar"} & set(options))
+        if taken:
             raise ValueError(
                 f"task_options can't hold {taken[0]!r}, which the model defines"
             )
@@ -181,9 +182,11 @@ def chosen_settings(
     else:
         base = load_training(name or f"{task}_{robot}", task if is_code(task) else None)
     changed = base.model_dump(mode="json", exclude_unset=True) | changes
-    if worlds := changed.pop("world", None):
+    worlds = changed.pop("world", None)
+    if worlds:
         changed["worlds"] = dict.fromkeys(worlds, max(1, base.num_envs // len(worlds)))
-    if engine := changed.pop("engine", None):
+    engine = changed.pop("engine", None)
+    if engine:
         given = changed.get("algorithm", base.algorithm)
         if engine == "lean" and given != "ppo":
             raise ConfigError(

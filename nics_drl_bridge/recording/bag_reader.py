@@ -52,7 +52,8 @@ def load_bag(
         }
         if "pose" in topics and "odom" in topics:
             data["odometry"] = _read_rows(bag, topics["odom"], msgs.read_twist)
-        if topic := topics.get("joint_states"):
+        topic = topics.get("joint_states")
+        if topic:
             data |= read_joint_streams(
                 topic, bag.read_messages(topic), spec, mapping, bag.place
             )

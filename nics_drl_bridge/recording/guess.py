@@ -171,7 +171,8 @@ def _write_unit_keys(name: str, table: TableSurvey, column: Survey) -> Iterator[
         yield "unit: ticks"
         if "steer" in name:
             yield "differentiate: false"
-        if ticks := _guess_ticks_per_turn(table):
+        ticks = _guess_ticks_per_turn(table)
+        if ticks:
             yield f"ticks_per_turn: {ticks}"
     elif unit == "%":
         yield 'unit: "%"'

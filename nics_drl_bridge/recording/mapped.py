@@ -180,7 +180,8 @@ def _check_units(reader: MappedReader, pose: Stream) -> None:
     if fault is None:
         return
     column = "t"
-    if time := mapping.pose.time or mapping.time:
+    time = mapping.pose.time or mapping.time
+    if time:
         column = str(time.columns[0])
     line = fault.line.replace("...", column)
     said = f"{reader.source.place}: pose: {fault.reason}; {fault.cause}"

@@ -344,7 +344,8 @@ class Mapping(Schema):
     @model_validator(mode="after")
     def _check_commands(self) -> "Mapping":
         for name, value in self.command.items():
-            if why := explain_no_command(str(value.from_)):
+            why = explain_no_command(str(value.from_))
+            if why:
                 raise ValueError(f"command.{name}: {why}")
         return self
 

@@ -138,7 +138,8 @@ def _find_named_poses(table: TableSurvey) -> Iterator[PoseGuess]:
             kinds = ["m"] + ["rad"] * (first in GLOBE)
             if y is None or not {x, y} & moving or not _is_in(x, kinds):
                 continue
-            if orientation := _find_orientation(words, names):
+            orientation = _find_orientation(words, names)
+            if orientation:
                 yield PoseGuess(table, x, y, **orientation)
             elif heading := _find_heading_called_z(table, words, names):
                 yield PoseGuess(table, x, y, heading)

@@ -54,7 +54,8 @@ def _load_folder(path: Path, *_: object) -> Recording:
     """Reads a folder by its shipped mapping; wheels may be missing, and its robot may be any."""
     file = find_config(FOLDER, "recordings")
     mapping = load_mapping(file)
-    if not (wheels := _holds(path, WHEELS)):
+    wheels = _holds(path, WHEELS)
+    if not wheels:
         mapping = mapping.model_copy(update={"wheels": None})
     for name in FILES + WHEELS * wheels:
         if (path / name).stat().st_size > MAX_FILE_BYTES:
@@ -280,7 +281,8 @@ def reorder_variables(recording: Recording, spec: RobotSpec) -> Recording:
     for part, (place, variables) in parts.items():
         known = recording.variables[place]
         names = [v.name for v in variables]
-        if (stream := recording.streams.get(part)) is None:
+        stream = recording.streams.get(part)
+        if stream is None:
             continue
         if set(known) != set(names):
             fault = f"{recording.source}: the {part} is {', '.join(known)}"

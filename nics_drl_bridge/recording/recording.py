@@ -233,7 +233,8 @@ def check(recording: Recording, spec: RobotSpec) -> Recording:
     fastest = max((max(abs(v.min), abs(v.max)) for v in speeds), default=np.inf)
     pose = recording.pose
     radius = spec.footprint_radius
-    if fault := find_implausible_pose(pose.t, pose.values, fastest, radius):
+    fault = find_implausible_pose(pose.t, pose.values, fastest, radius)
+    if fault:
         raise RecordingError(
             f"{recording.source}: pose: {fault.reason}; {fault.cause}."
         )
@@ -243,7 +244,8 @@ def check(recording: Recording, spec: RobotSpec) -> Recording:
 def check_streams(recording: Recording, width: dict[str, int]) -> None:
     """Refuses streams without `width` (by default 3) columns, with NaN, or out of order."""
     for name, stream in recording.streams.items():
-        if fault := _find_fault(stream, width.get(name, 3)):
+        fault = _find_fault(stream, width.get(name, 3))
+        if fault:
             raise RecordingError(f"{recording.source}: {name}: {fault}.")
 
 

@@ -97,7 +97,8 @@ NO_UNIT = ("", "-", "1", "none", "unitless")
 
 def split_unit(name: str) -> tuple[list[str], str | None]:
     """Returns the words of a name, and the unit at its end: `x(m)`, `x [mm]`, `yaw_deg`."""
-    if bracket := re.search(r"[\[(]\s*([^\[\]()]*?)\s*[\])]\s*$", name):
+    bracket = re.search(r"[\[(]\s*([^\[\]()]*?)\s*[\])]\s*$", name)
+    if bracket:
         text = bracket[1]
         words = split_words(name[: bracket.start()])
         if text in UNITS and text != "1":
@@ -165,7 +166,8 @@ class TableSurvey:
         """The columns of the stamps."""
         if self.stamps is None:
             return []
-        if split := re.fullmatch(r"\[(.+), (.+)\]", self.stamps):
+        split = re.fullmatch(r"\[(.+), (.+)\]", self.stamps)
+        if split:
             return [split[1], split[2]]
         return [self.stamps]
 
@@ -314,14 +316,17 @@ def _describe_regularity(t: Array, numbers: dict[str, Array]) -> Iterator[str]:
     step = np.diff(t)
     usual = compute_usual_step(t) or np.nan
     yield f"{1.0 / usual:.4g} Hz, {float(np.ptp(t)):.1f} s"
-    if gaps := int((step > GAP * usual).sum()):
+    gaps = int((step > GAP * usual).sum())
+    if gaps:
         where = float(t[int(np.argmax(step))] - t[0])
         yield f"gaps: {gaps}, the longest of {step.max():.3g} s after {where:.1f} s"
-    if backward := int((step < 0.0).sum()):
+    backward = int((step < 0.0).sum())
+    if backward:
         yield f"stamps that run backwards: {backward}"
     whole = [column for column in numbers.values() if len(column) == len(t)]
     is_same = np.all([c[1:] == c[:-1] for c in whole], axis=0) & (step == 0.0)
-    if repeated := int((step == 0.0).sum()):
+    repeated = int((step == 0.0).sum())
+    if repeated:
         same = f"in rows that repeat all of it: {is_same.sum()}"
         yield f"stamps like the one before: {repeated}, {same}"
     if (np.abs(step - usual) > IRREGULAR * usual).mean() > IRREGULAR:

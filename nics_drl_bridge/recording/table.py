@@ -80,7 +80,8 @@ class Source:
 def _find_column(place: str, names: Sequence[str], which: str | int) -> int:
     """Returns the number of a column that is given by name or number."""
     if isinstance(which, str) and which in names:
-        if (count := Counter(names)[which]) > 1:
+        count = Counter(names)[which]
+        if count > 1:
             numbers = [str(k) for k, name in enumerate(names) if name == which]
             advice = f"give the number of the one you mean: {' or '.join(numbers)}"
             raise RecordingError(

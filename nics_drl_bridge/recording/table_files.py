@@ -91,7 +91,8 @@ def _read_lines(path: Path) -> tuple[list[tuple[int, str]], list[str]]:
     if "\0" in text:
         raise RecordingError(f"{path}: is not text; save it as CSV in UTF-8.")
     text = text.replace("\r\n", "\n").replace("\r", "\n")
-    if (count := text.count("\n")) > MOST_ROWS:
+    count = text.count("\n")
+    if count > MOST_ROWS:
         raise RecordingError(
             f"{path}: has {count} rows; cut it to at most {MOST_ROWS}."
         )

@@ -79,7 +79,8 @@ class MappedReader:
         text = str(reference)
         colons = [k for k, sign in enumerate(text) if sign == ":"]
         for k in colons:
-            if (name := _match_table(text[:k], names)) is not None:
+            name = _match_table(text[:k], names)
+            if name is not None:
                 return self._read_table(name), text[k + 1 :]
         default = within or self.mapping.in_
         if default is None and len(names) == 1:

@@ -189,7 +189,8 @@ def check_rates(facts: Facts, expected: Expected) -> Findings:
 
 
 def _measure_rate(facts: Facts, role: str) -> float | None:
-    if (heard := facts.heard.get(role)) is None or len(heard.arrivals_ns) <= 2:
+    heard = facts.heard.get(role)
+    if heard is None or len(heard.arrivals_ns) <= 2:
         return None
     stamps = heard.stamps_ns
     times = heard.arrivals_ns
@@ -202,14 +203,17 @@ def _measure_rate(facts: Facts, role: str) -> float | None:
 def check_latency(facts: Facts, _: Expected) -> Findings:
     """Checks that messages are stamped, in order, and arrive in time, by `/clock` if present."""
     for role in (SCAN, ODOM):
-        if (heard := facts.heard.get(role)) is None:
+        heard = facts.heard.get(role)
+        if heard is None:
             continue
         stamps = np.array(heard.stamps_ns, dtype=np.int64)
-        if missing := int((stamps == 0).sum()):
+        missing = int((stamps == 0).sum())
+        if missing:
             what = f"{missing} of {len(stamps)} messages are not stamped"
             yield error("stamp", role, what, "let the driver stamp its messages")
             continue
-        if back := int((np.diff(stamps) < 0).sum()):
+        back = int((np.diff(stamps) < 0).sum())
+        if back:
             what = f"{back} stamps are before the one before them"
             fix = (
                 "look for a second publisher, or for a clock that is set while it runs"
@@ -339,7 +343,8 @@ def _check_odometry(facts: Facts, robot: RobotSpec) -> Findings:
     if not (np.isfinite(poses).all() and np.isfinite(twists).all()):
         yield odometry_error("holds NaN or inf", "find out why its driver sends them")
         return
-    if off := int((np.abs(length - 1.0) > QUATERNION_TOLERANCE).sum()):
+    off = int((np.abs(length - 1.0) > QUATERNION_TOLERANCE).sum())
+    if off:
         what = f"{off} quaternions are not of length 1 but of up to {length.max():.3g}"
         yield odometry_error(
             what, "send a quaternion, not a heading in its z, nor zeros"

@@ -130,7 +130,8 @@ class Facts:
         elif role == CMD_VEL:
             self.commands.append(messages.read_command(message))
         elif role == GYRO:
-            if (measured := self.gyro.read(message)) is not None:
+            measured = self.gyro.read(message)
+            if measured is not None:
                 self.yaw_rates.append((messages.get_stamp(message), measured[0]))
         else:
             self.clock_ns.append(
@@ -142,7 +143,8 @@ def names_in(namespace: str, imu: str = defaults.IMU_TOPIC) -> dict[str, str]:
     """Returns the topics of a robot in a namespace by role; without a gyro if `imu` is none."""
     space = parse_namespace(namespace)
     names = {role: f"{space}/{role}" for role in (SCAN, ODOM, CMD_VEL)} | {CLOCK: CLOCK}
-    if gyros := list_imu_topics(imu, by_default=True):
+    gyros = list_imu_topics(imu, by_default=True)
+    if gyros:
         names[GYRO] = gyros[0] if gyros[0].startswith("/") else f"{space}/{gyros[0]}"
     return names
 

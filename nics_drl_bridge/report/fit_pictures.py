@@ -361,7 +361,8 @@ def draw_inputs(spec: RobotSpec, identified: Identified) -> bytes | None:
     model = identified.model
     curves = [curve for curve in model.inputs if curve.bends]
     restrained = [dof for dof in model.dofs if model.describe_limits(dof)]
-    if not (count := len(curves) + len(restrained)):
+    count = len(curves) + len(restrained)
+    if not count:
         return None
     figure, grid = make_panels(1, count, (4.2 * count, 3.8))
     for axes, dof in zip(grid[len(curves) :], restrained, strict=True):

@@ -74,7 +74,8 @@ def model_of_sdf(text: str, z: float, source: str = TEXT) -> Model:
         raise ConfigError(
             f"{source}: holds {len(models)} models; give one <model>, no <world>."
         )
-    if (pose := models[0].find("pose")) is not None:
+    pose = models[0].find("pose")
+    if pose is not None:
         models[0].remove(pose)  # it is spawned where the request says
     with file_of(ElementTree.tostring(root, encoding="unicode"), source) as file:
         try:

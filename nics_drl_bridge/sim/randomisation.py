@@ -373,13 +373,15 @@ def _term(d: int, name: str, model: TaylorModel, where: str) -> int:
 
 
 def _check_stable(model: TaylorModel, spans: Array, where: str) -> None:
-    if not (size := model.state_size):
+    size = model.state_size
+    if not size:
         return
     linear = np.zeros((size, size))
     low = np.ones((size, size))
     high = np.ones((size, size))
     for k in np.flatnonzero(model.powers.sum(axis=1) == 1):
-        if (v := int(np.argmax(model.powers[k]))) < size:
+        v = int(np.argmax(model.powers[k]))
+        if v < size:
             linear[:, v] = model.coefficients[3:, k]
             low[:, v], high[:, v] = spans[3:, k].T
     mixed = np.random.default_rng(0).integers(0, 2, (CORNERS, size, size)).astype(bool)
@@ -411,7 +413,8 @@ def _levels(ranges: Randomisation, model: SimulatorModel, where: str) -> Bounds:
     low = base.copy()
     high = base.copy()
     for key, (part, (one, other)) in SCALED.items():
-        if (factor := getattr(odometry, key)) is None:
+        factor = getattr(odometry, key)
+        if factor is None:
             continue
         if not base[part].any():
             lacks = f"the model of {model.robot.name!r} has no measured {key} to scale"

@@ -133,7 +133,8 @@ class World(Schema):
                 "bounds must be [least x, least y, greatest x, greatest y] in metres"
             )
         field = self.size or (x2 - x1, y2 - y1)
-        if (across := math.hypot(*field)) > MOST_ACROSS_M:
+        across = math.hypot(*field)
+        if across > MOST_ACROSS_M:
             fix = f"a field may be {MOST_ACROSS_M:g} m across, the largest distance in observations"
             sides = f"{field[0]:g} m x {field[1]:g} m"
             raise ValueError(f"the field of {sides} is {across:.0f} m across; {fix}")
@@ -251,7 +252,8 @@ def check_place(
 ) -> None:
     """Raise ConfigError for a place off a world's field, or in a wall within a radius [m]."""
     solid = 0.0 if world.grid is None else world.grid.resolution  # room in a full cell
-    if (room := room_at(world, x, y)) <= max(radius, solid):
+    room = room_at(world, x, y)
+    if room <= max(radius, solid):
         reason = "is in a wall" if room >= 0.0 else "lies outside the world"
         x1, y1, x2, y2 = world.extent
         field = f"the field is {x1:g} to {x2:g} m by {y1:g} to {y2:g} m"

@@ -100,7 +100,8 @@ def load_worlds(name: str | Path | Sequence[str | Path]) -> AnyWorld:
     text = str(name)
     sets = share_folder() / "config" / "world_sets"
     path = shipped if (shipped := sets / f"{name}.yaml").is_file() else Path(name)
-    if (content := _content(path, KEYS)) is not None:
+    content = _content(path, KEYS)
+    if content is not None:
         return _read_set(path, validate(content, SetFile, text))
     if (text and path.is_dir()) or any(sign in text for sign in SPECIAL):
         return _set_of(path.name if path.is_dir() else text, _members([text], Path()))
@@ -135,7 +136,8 @@ def _read_set(path: Path, file: SetFile) -> WorldSet:
             for one in _members(file.worlds, path.parent)
             if one.source not in without
         ]
-        if (given := file.generate) is not None:
+        given = file.generate
+        if given is not None:
             chosen += [grow(given, number) for number in range(given.worlds)]
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None

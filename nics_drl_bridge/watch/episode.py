@@ -120,7 +120,8 @@ class Lane:
         Raises ConfigError for a bad seed.
         """
         self.seed = int(check_seeds([seed])[0])
-        if changed := self.world is not self._native:
+        changed = self.world is not self._native
+        if changed:
             self.close()
             self._open(self._policy, self._native)
         self.begin()

@@ -129,7 +129,8 @@ class EntityServices:
         self._simulation.require_world()
         pattern = pattern_of(filters.filter)
         categories = {one.category for one in filters.categories}
-        if unknown := categories - CATEGORIES:
+        unknown = categories - CATEGORIES
+        if unknown:
             told = f"category {min(unknown)} is none of the standard"
             raise RefusalError(FAILED, f"{told}; give 0 to 5 but 3.")
         tags_match(filters.tags, ())

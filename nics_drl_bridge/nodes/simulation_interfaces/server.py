@@ -89,7 +89,8 @@ class Server:
         for name, handler in handlers.items():
             self._offer(name, served(handler, host))
         self._offer("GetSimulatorFeatures", self._tell)
-        if kind := conversions.message_type(f"{PACKAGE}/action/SimulateSteps"):
+        kind = conversions.message_type(f"{PACKAGE}/action/SimulateSteps")
+        if kind:
             self._action = ActionServer(
                 host,
                 kind,
