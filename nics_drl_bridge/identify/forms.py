@@ -78,7 +78,10 @@ def curve_of(samples: Samples, spec: RobotSpec, place: int) -> Candidate | None:
         if (f := _of_component(samples, spec, place, dof)) is not None
     ]
     best = max(found, key=lambda each: each.gain, default=None)
-    return best if best and best.gain >= (WORTH if best.drives else CLEAR) else None
+    if best is None:
+        return None
+    needed = WORTH if best.drives else CLEAR
+    return best if best.gain >= needed else None
 
 
 def _of_component(

@@ -235,8 +235,10 @@ def _jump(flat, here, limit, lanes):  # type: ignore[no-untyped-def]
         x_new = max(np.int32(singles[k + U] + singles[k + DU] * ahead), x)
         y_new = max(np.int32(singles[k + V] + singles[k + DV] * ahead), y)
         goes = (side > np.int32(0)) & (t < limit)
-        wholes[k + COLUMN] = (x_side if sideways else x_new) if goes else x
-        wholes[k + ROW] = (y_new if sideways else y_side) if goes else y
+        column = x_side if sideways else x_new
+        row = y_new if sideways else y_side
+        wholes[k + COLUMN] = column if goes else x
+        wholes[k + ROW] = row if goes else y
         singles[k + T] = ahead if goes else t
         moved |= np.int32(goes)
     return moved > 0

@@ -67,9 +67,12 @@ class PolicyNode(ManagedNode):
             )
         period = model.control_period
         self._deadline = Deadline(0.5 * period if np.isnan(limit) else limit, patience)
-        self._pace = ActionPace(
-            period if np.isnan(rate) else 1.0 / rate if rate > 0.0 else 0.0
-        )
+        pace_s = 0.0
+        if np.isnan(rate):
+            pace_s = period
+        elif rate > 0.0:
+            pace_s = 1.0 / rate
+        self._pace = ActionPace(pace_s)
         self._acted_ns = 0
         self._answer = None
         self._raw = self.create_lifecycle_publisher(

@@ -42,7 +42,9 @@ def start(node: str, args: list[str] | None = None) -> None:
     except BaseException:  # noqa: BLE001  (it is printed, and the process ends)
         traceback.print_exc()
         code = 1
-    ending.leave(code if isinstance(code, int) else 0 if code is None else 1)
+    if code is None:
+        code = 0
+    ending.leave(code if isinstance(code, int) else 1)
 
 
 def _main_of(node: str) -> Any:

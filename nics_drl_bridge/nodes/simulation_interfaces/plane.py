@@ -102,7 +102,13 @@ class Region:
             )
         self._sphere, count = kind == Bounds.TYPE_SPHERE, len(self._points)
         hull = kind == Bounds.TYPE_CONVEX_HULL
-        if not (count == 0 if self.empty else count >= 3 if hull else count == 2):
+        if self.empty:
+            fits = count == 0
+        elif hull:
+            fits = count >= 3
+        else:
+            fits = count == 2
+        if not fits:
             needed = SIZES.get(kind, "no") + (" points or more" if hull else " points")
             raise RefusalError(
                 Result.RESULT_OPERATION_FAILED,
