@@ -4,12 +4,16 @@ Obstacles are rows (P, 3): x, y [m] in the robot's frame, and the speed [m/s] at
 approach. `find_obstacles` collects them in these steps:
 
 1. Compare the newest scan with earlier ones: a beam that ends where an earlier one saw free space
-   ends on a mover, which may approach. All other obstacles are static.
+   ends on a mover, which may approach. All other obstacles are static. The motion in between is
+   that of odometry, but with the turn that fits both scans best: the wheels of a skid-steer slip
+   when it turns, and by their odometry all that stands would seem to move.
 2. Place an obstacle at the end of each beam that returns.
 3. Place one at the minimum range of each beam that was too close to measure.
 4. Place a wall on the footprint wherever too many beams are unknown.
 5. Add the border of known ground, for a lidar that does not look all around; see `ground`.
 """
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +31,7 @@ from nics_drl_bridge.gate.state import (
     ShieldConfig,
     View,
 )
-from nics_drl_bridge.geometry import between
+from nics_drl_bridge.geometry import between, exp, log
 from nics_drl_bridge.interface import S_PER_NS, Array
 
 Flags = NDArray[np.bool_]
@@ -37,6 +41,17 @@ SPACING_S = 0.09  # minimum time between two such scans that are kept [s]
 # standard deviations of its range.
 TOLERANCE = 0.03
 DEVIATIONS = 3.0
+MIN_SLIP_TURN = (
+    0.02  # odometry is believed in turns up to this one between two scans [rad]
+)
+# True turns that are compared with both scans, as fractions of the turn by odometry
+TURN_FRACTIONS = np.linspace(0.0, 1.3, 14)
+COMPARED_BEAMS = 200  # number of beams that suffice for that
+# A turn other than odometry's must let at least this fraction of the beams agree. A person who
+# walks around the robot fills less, and must not pass for a turn.
+MIN_AGREEING = 0.3
+# It must also let more beams agree than odometry does, by this fraction of the beams.
+MIN_GAIN = 0.05
 
 
 def find_obstacles(
@@ -82,7 +97,7 @@ def find_movers(
             newest.ranges,
             view.ranges,
             lidar,
-            between(view.pose, newest.pose),
+            estimate_motion(view, newest, lidar, tolerance),
             shield.range_max,
             tolerance,
         )
@@ -90,6 +105,39 @@ def find_movers(
     neighbour_entered[1:] |= entered[:-1]
     neighbour_entered[:-1] |= entered[1:]
     return entered & neighbour_entered
+
+
+def estimate_motion(
+    old: View, new: View, lidar: MountedBeams, tolerance: Tolerance
+) -> Array:
+    """Returns the robot's motion (3,) between two views, by odometry with the turn of the scans.
+
+    Of several turns between none and somewhat more than odometry's, it is the one by which most
+    beams of the new scan end where the old scan ended. Odometry's own turn is taken if it is as
+    good, or if no turn lets enough beams agree, as in the open.
+    """
+    by_odometry = between(old.pose, new.pose)
+    if abs(by_odometry[2]) <= MIN_SLIP_TURN:
+        return by_odometry
+    stride = max(1, len(new.ranges) // COMPARED_BEAMS)
+
+    def count_agreeing(motion: Array) -> int:
+        count: int = evidence_kernels.count_agreeing(
+            new.ranges, old.ranges, lidar, motion, tolerance, stride
+        )
+        return count
+
+    arcs = np.tile(log(by_odometry), (len(TURN_FRACTIONS), 1))
+    arcs[:, 2] *= TURN_FRACTIONS
+    motions = exp(arcs)
+    counts = [count_agreeing(motion) for motion in motions]
+    best = int(np.argmax(counts))
+    compared = math.ceil(len(new.ranges) / stride)
+    needed = count_agreeing(by_odometry) + MIN_GAIN * compared
+    if counts[best] >= max(needed, MIN_AGREEING * compared):
+        by_scans: Array = motions[best]
+        return by_scans
+    return by_odometry
 
 
 def place_returns(

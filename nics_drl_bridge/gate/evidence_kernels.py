@@ -1,4 +1,8 @@
-"""Compiled: marks what has moved into space that an earlier scan showed to be free."""
+"""Compiled: compares the ends of a scan's beams with what an earlier scan saw there.
+
+- `count_agreeing` counts the beams that end where the old scan ended, too.
+- `mark_entered` marks those that end in space that the old scan showed to be free.
+"""
 
 import math
 from typing import NamedTuple
@@ -64,23 +68,12 @@ def mark_entered(
         tolerance: by which a beam must end before the old ones.
     """
     beams = len(ranges)
-    circle = 2.0 * math.pi / abs(lidar.step)  # in beams
-    whole_circle = round(circle)
+    whole_circle = round(2.0 * math.pi / abs(lidar.step))
     neighbours = math.ceil(COMPARED_ANGLE / abs(lidar.step))
-    cosine = math.cos(moved[2])
-    sine = math.sin(moved[2])
     for b in range(beams):
         if entered[b] or not np.isfinite(ranges[b]):
             continue
-        # The end of the beam, as seen from the lidar at the old scan.
-        angle = lidar.first + b * lidar.step + lidar.heading
-        x = lidar.x + ranges[b] * math.cos(angle)
-        y = lidar.y + ranges[b] * math.sin(angle)
-        dx = moved[0] + cosine * x - sine * y - lidar.x
-        dy = moved[1] + sine * x + cosine * y - lidar.y
-        distance = math.hypot(dx, dy)
-        bearing = (math.atan2(dy, dx) - lidar.heading - lidar.first) / lidar.step
-        middle = round(bearing - circle * math.floor(bearing / circle))
+        distance, middle = find_in_old_scan(ranges[b], b, lidar, moved)
         free = range_max
         for i in range(middle - neighbours, middle + neighbours + 1):
             index = i % whole_circle
@@ -88,6 +81,70 @@ def mark_entered(
             free = take_shorter(free, old_range)
         if distance < free - tolerance.constant - tolerance.proportional * distance:
             entered[b] = True
+
+
+@kernel
+def count_agreeing(
+    ranges: Ranges,
+    old_ranges: Ranges,
+    lidar: MountedBeams,
+    moved: Array,
+    tolerance: Tolerance,
+    stride: int,
+) -> int:
+    """Returns how many of every `stride`-th beam end where the old scan ended, too.
+
+    Args:
+        ranges: (B,) of the scan [m].
+        old_ranges: (B,) of the old scan [m].
+        lidar: its beams.
+        moved: (3,) motion of the robot since the old scan: x, y [m], heading [rad].
+        tolerance: by which the ends may differ.
+        stride: number of beams from one that is compared to the next.
+    """
+    beams = len(ranges)
+    whole_circle = round(2.0 * math.pi / abs(lidar.step))
+    count = 0
+    for b in range(0, beams, stride):
+        if not np.isfinite(ranges[b]):
+            continue
+        distance, middle = find_in_old_scan(ranges[b], b, lidar, moved)
+        index = middle % whole_circle
+        if index >= beams:
+            continue
+        allowed = tolerance.constant + tolerance.proportional * distance
+        if abs(distance - old_ranges[index]) <= allowed:
+            count += 1
+    return count
+
+
+@kernel
+def find_in_old_scan(
+    length: float, beam: int, lidar: MountedBeams, moved: Array
+) -> tuple[float, int]:
+    """Returns the place where a beam ends, as the lidar saw it at the old scan.
+
+    Args:
+        length: range of the beam [m].
+        beam: its index.
+        lidar: its beams.
+        moved: (3,) motion of the robot since the old scan: x, y [m], heading [rad].
+
+    Returns:
+        distance: from the lidar at the old scan [m].
+        index: of the beam that points there, as if the beams went all around.
+    """
+    angle = lidar.first + beam * lidar.step + lidar.heading
+    x = lidar.x + length * math.cos(angle)
+    y = lidar.y + length * math.sin(angle)
+    cosine = math.cos(moved[2])
+    sine = math.sin(moved[2])
+    dx = moved[0] + cosine * x - sine * y - lidar.x
+    dy = moved[1] + sine * x + cosine * y - lidar.y
+    circle = 2.0 * math.pi / abs(lidar.step)  # in beams
+    bearing = (math.atan2(dy, dx) - lidar.heading - lidar.first) / lidar.step
+    index = round(bearing - circle * math.floor(bearing / circle))
+    return math.hypot(dx, dy), index
 
 
 @kernel

@@ -341,15 +341,11 @@ def warm_up() -> None:
     shield_kernels.is_free(np.zeros((1, 3)), np.zeros((1, 3)), body, 0.0, 1.0, STEP)
     lidar = MountedBeams(0.0, 0.1, 0.0, 0.0, 0.0)
     ranges = np.ones(1, np.float32)
-    evidence_kernels.mark_entered(
-        np.zeros(1, np.bool_),
-        ranges,
-        ranges,
-        lidar,
-        np.zeros(3),
-        1.0,
-        Tolerance(0.0, 0.0),
-    )
+    tolerance = Tolerance(0.0, 0.0)
+    entered = np.zeros(1, np.bool_)
+    still = np.zeros(3)
+    evidence_kernels.count_agreeing(ranges, ranges, lidar, still, tolerance, 1)
+    evidence_kernels.mark_entered(entered, ranges, ranges, lidar, still, 1.0, tolerance)
     view = View(0, np.zeros(3), ranges)
     before: Ground | None = None
     for _ in range(2):

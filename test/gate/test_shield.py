@@ -394,6 +394,50 @@ def test_what_stands_does_not_move_however_the_robot_does(twist):
     assert not find_movers(GIVEN, SHIELD, drive(twist, lambda _: discs)).any()
 
 
+def by_slipping_odometry(views, factor):
+    """The same views, with poses of an odometry whose turns are too large by a factor."""
+    first = views[0].pose
+    scale = np.array([1.0, 1.0, factor])
+    return tuple(
+        replace(
+            view,
+            pose=geometry.exp(geometry.log(geometry.between(first, view.pose)) * scale),
+        )
+        for view in views
+    )
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.35, 1.7, 2.5])
+@pytest.mark.parametrize("twist", [(0.0, 0.0, 1.0), (0.5, 0.0, -0.8)])
+def test_what_stands_does_not_move_where_wheels_slip_in_a_turn(twist, factor):
+    discs = [(1.5, 0.4, 0.2), (1.0, -0.9, 0.15), (-0.8, 0.3, 0.25), (2.4, -0.2, 0.2)]
+    views = by_slipping_odometry(drive(twist, lambda _: discs), factor)
+    assert not find_movers(GIVEN, SHIELD, views).any()
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.35, 1.7])
+def test_somebody_who_crosses_moves_where_wheels_slip_in_a_turn(factor):
+    def discs_at(t):
+        return [(1.2, 0.6 - 1.2 * t, 0.2), (-0.8, 0.3, 0.25)]
+
+    views = by_slipping_odometry(drive((0.3, 0.0, 0.8), discs_at), factor)
+    true_pose = geometry.exp(0.3 * np.array([0.3, 0.0, 0.8]))
+    x, y, _ = geometry.between(true_pose, np.array([1.2, 0.6 - 0.36, 0.0]))
+    leading_edge = np.arctan2(y, x) - 0.17
+    assert find_movers(GIVEN, SHIELD, views)[facing(views, leading_edge)].any()
+
+
+def test_somebody_who_walks_around_a_turning_robot_in_the_open_does_not_pass_for_a_turn():
+    beyond_the_wall = 2.0 * LIDAR.range_max
+    twist = np.array([0.0, 0.0, 1.2])
+    views = []
+    for t in (0.0, 0.1, 0.2, 0.3):
+        pose = geometry.exp(t * twist) - (0.0, beyond_the_wall, 0.0)
+        walker = (np.cos(0.6 * t), np.sin(0.6 * t) - beyond_the_wall, 0.25)
+        views.append(View(round(t * NS_PER_S), pose, seen(pose, [walker])))
+    assert find_movers(GIVEN, SHIELD, tuple(views)).any()
+
+
 @pytest.mark.parametrize("speed", [0.3, 0.5, 1.0, 1.6])
 @pytest.mark.parametrize("twist", [(0.0, 0.0, 0.0), (0.5, 0.0, 1.0)])
 def test_somebody_who_comes_on_moves(speed, twist):
