@@ -95,8 +95,9 @@ class Spawning:
                 )
             except ConfigError as error:
                 held = f"robots here are {self._host.model.robot.name!r}"
-                told = str(error).replace("entitie ", "entity ")
-                raise RefusalError(Result.RESULT_NOT_FOUND, f"{told} {held}.") from None
+                raise RefusalError(
+                    Result.RESULT_NOT_FOUND, f"{error} {held}."
+                ) from None
         try:
             if found.form == resources.SDF:
                 z = request.initial_pose.pose.position.z

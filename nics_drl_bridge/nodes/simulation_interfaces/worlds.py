@@ -9,8 +9,14 @@ from scipy import ndimage
 from simulation_interfaces.msg import Resource, Result, WorldResource
 from simulation_interfaces.srv import GetCurrentWorld, LoadWorld, UnloadWorld
 
+from nics_drl_bridge import defaults
 from nics_drl_bridge.config import parse_yaml, share_folder, validate
-from nics_drl_bridge.errors import BridgeError, ConfigError
+from nics_drl_bridge.errors import (
+    BridgeError,
+    ConfigError,
+    MissingFileError,
+    UnknownNameError,
+)
 from nics_drl_bridge.lidar.maps import FREE
 from nics_drl_bridge.nodes.simulation_interfaces import resources
 from nics_drl_bridge.nodes.simulation_interfaces.entities import tags_match
@@ -22,15 +28,12 @@ from nics_drl_bridge.nodes.simulation_interfaces.state import (
 )
 from nics_drl_bridge.sim.models import HEIGHT, file_of
 from nics_drl_bridge.sim.occupancy import occupancy
-from nics_drl_bridge.sim.sdf import ABSENT, AssetsError, read_sdf, root_of
+from nics_drl_bridge.sim.sdf import AssetsError, read_sdf, root_of
 from nics_drl_bridge.sim.sections import Standing
 from nics_drl_bridge.sim.world import Region, World, check_places
 from nics_drl_bridge.sim.world_set import BARN, AnyWorld, load_worlds
 
 CODES = LoadWorld.Response
-# of worlds of SDF, as with `nics world import` [m]
-CLEARANCE = 0.1
-NEAREST = 2.0
 EMPTY = (
     (-4.0, -4.0),
     (4.0, 4.0),
@@ -135,13 +138,13 @@ class Worlds:
         except AssetsError as error:
             code = codes.missing_assets if error.missing else codes.unsupported_assets
             raise RefusalError(code, str(error)) from None
+        except MissingFileError as error:
+            raise RefusalError(codes.missing_assets, str(error)) from None
         except ConfigError as error:
-            if not found.form and "unknown world" in str(error):
-                raise RefusalError(Result.RESULT_NOT_FOUND, str(error)) from None
-            if "no such file" in str(error):
-                code = codes.missing_assets
-            else:
-                code = codes.parse_error
+            unknown = isinstance(error, UnknownNameError) and error.kind == "worlds"
+            code = codes.parse_error
+            if unknown and not found.form:
+                code = Result.RESULT_NOT_FOUND
             raise RefusalError(code, str(error)) from None
 
     def _standing(self, file: Path, name: str, request: Any) -> World:
@@ -155,8 +158,7 @@ class Worlds:
             raise RefusalError(CODES.UNSUPPORTED_ELEMENTS, f"{told}; {fix}.")
         standing = read_sdf(file, HEIGHT, skip_unknown=True, may_be_empty=True)
         if standing.left_out and not skip:
-            missing = any(ABSENT in each for each in standing.left_out)
-            if missing:
+            if standing.missing:
                 code = self._codes.missing_assets
             else:
                 code = self._codes.unsupported_assets
@@ -272,8 +274,11 @@ def _in_field(standing: Standing, name: str, bounds: Region) -> World:
         "name": name,
         "bounds": bounds,
         "obstacles": standing.obstacles,
-        "clearance": CLEARANCE,
-        "goal_distance": (min(NEAREST, round(far / 4.0, 3)), far),
+        "clearance": defaults.IMPORT_CLEARANCE_M,
+        "goal_distance": (
+            min(defaults.IMPORT_GOAL_DISTANCE_M, round(far / 4.0, 3)),
+            far,
+        ),
     }
     return validate(content, World, name)
 
@@ -281,12 +286,9 @@ def _in_field(standing: Standing, name: str, bounds: Region) -> World:
 def _encloses(standing: Standing, tight: Region, wide: Region) -> bool:
     """True if most of what is free within a field can't be reached from around it."""
     made = occupancy(_in_field(standing, "field", wide), standing.placed, CELL)
-    free = (
-        ndimage.distance_transform_edt(made.cells == FREE) * made.resolution > CLEARANCE
-    )
-    area, _ = ndimage.label(free)
+    room = ndimage.distance_transform_edt(made.cells == FREE) * made.resolution
+    area, _ = ndimage.label(room > defaults.IMPORT_CLEARANCE_M)
     first, last = made.world_to_cell(np.reshape(tight, (2, 2)))
     within = area[first[0] : last[0], first[1] : last[1]]
-    return bool(
-        (within > 0).any() and np.mean(within[within > 0] == area[2, 2]) < MOST_OPEN
-    )
+    free = within[within > 0]
+    return bool(free.size and np.mean(free == area[2, 2]) < MOST_OPEN)
