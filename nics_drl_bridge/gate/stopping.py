@@ -13,6 +13,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.gate.limits import SPEED, TURN, Limits, LimitsFile, Stopping
 from nics_drl_bridge.gate.state import GateConfig, ShieldConfig
 from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.robot.braking import Braking, TurnBraking, find_braking
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -54,10 +55,15 @@ def make_gate_config(
         scan_rate=lidar.rate,
         sensors=tuple(sensor.name for sensor in model.sensors),
         odom_std=model.noise.odometry,
-        range_noise=(lidar.noise_std, lidar.faults.noise_proportional),
+        range_noise=_get_range_noise(lidar),
         shield=shield,
         **rules,
     )
+
+
+def _get_range_noise(lidar: LidarSpec) -> tuple[float, float]:
+    """Returns the standard deviation of ranges, in metres and as a fraction of the range."""
+    return lidar.noise_std, lidar.faults.noise_proportional
 
 
 def shield_config(
@@ -109,7 +115,7 @@ def shield_config(
         wheelbase=get_wheelbase(model.robot),
         obstacle_speed=values.obstacle_speed,
         range_max=lidar.range_max,
-        range_noise=(lidar.noise_std, lidar.faults.noise_proportional),
+        range_noise=_get_range_noise(lidar),
         outline=model.robot.footprint or (),
         lever=braking.lever_m,
         order=braking.order,

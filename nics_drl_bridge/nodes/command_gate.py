@@ -41,6 +41,7 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.lidar.sensor import Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec, from_device
+from nics_drl_bridge.middleware.measurement import CMD_VEL, ODOM, SCAN
 from nics_drl_bridge.nodes import (
     command_types,
     device_parameters,
@@ -245,7 +246,7 @@ class CommandGate(qos.QosWatch):
         if self._config.shield is not None:
             shield.warm_up()
         scan_motion.warm_up(self._config)
-        self._stamped = bool(runner.declare_row(self, parameters.stamped("cmd_vel")))
+        self._stamped = bool(runner.declare_row(self, parameters.stamped()))
         runner.declare_row(self, parameters.FOREIGN)
         self._frame = str(runner.declare_row(self, parameters.ROBOT_FRAME))
         fault = parameters.frame_fault(
@@ -254,7 +255,7 @@ class CommandGate(qos.QosWatch):
         if fault:
             raise ConfigError(fault)
         kind = TwistStamped if self._stamped else Twist
-        self._out = self.create_publisher(kind, "cmd_vel", qos.COMMAND)
+        self._out = self.create_publisher(kind, CMD_VEL, qos.COMMAND)
         self._queue = EStopQueue()
         self._listen()
         runner.steadily(self, PERIOD_S, self._tick)
@@ -268,12 +269,12 @@ class CommandGate(qos.QosWatch):
         kinds = ("none", TWIST, TWIST_STAMPED)
         raw = device_parameters.choice(self, parameters.FOREIGN.name, kinds)
         self._raw_kind = command_types.name_of(stamped=raw != TWIST)
-        self._raw_types = command_types.TypeWatch(self, "cmd_vel_raw", FOREIGN_SETTINGS)
+        self._raw_types = command_types.TypeWatch(self, inputs.RAW, FOREIGN_SETTINGS)
         given = command if raw == "none" else partial(self._foreign, raw)
         readers: tuple[tuple[Any, str, Callable[[bytes], inputs.Input], Any], ...] = (
-            (LaserScan, "scan", partial(scan, self._lidar), qos.SENSOR),
-            (Odometry, "odom", self._read_odometry, qos.SENSOR),
-            (Odometry, "odometry/filtered", estimate, qos.SENSOR),
+            (LaserScan, SCAN, partial(scan, self._lidar), qos.SENSOR),
+            (Odometry, ODOM, self._read_odometry, qos.SENSOR),
+            (Odometry, inputs.ESTIMATE, estimate, qos.SENSOR),
             *(
                 (sensor_type(each), each.name, partial(reading, each), qos.SENSOR)
                 for each in self._sensors
@@ -285,11 +286,11 @@ class CommandGate(qos.QosWatch):
         kind = Twist if raw == TWIST else TwistStamped
         command_taker = partial(self._take_command, given)
         commands = self.create_subscription(
-            kind, "cmd_vel_raw", command_taker, qos.EVERY_POLICY, raw=True
+            kind, inputs.RAW, command_taker, qos.EVERY_POLICY, raw=True
         )
         self._sources = Sources(self, commands.topic_name)
         self._button = self.create_lossless_subscription(
-            Bool, "e_stop", self._take_e_stop, qos.E_STOP, lost=self._miss_e_stop
+            Bool, inputs.E_STOP, self._take_e_stop, qos.E_STOP, lost=self._miss_e_stop
         )
         runner.serve(self, "~/arm", self._arm)
         runner.serve(self, "~/reset", lambda: self._answer(inputs.Reset()))
@@ -301,7 +302,7 @@ class CommandGate(qos.QosWatch):
         try:
             given = read(content)
         except wire.UNREADABLE as error:  # the middleware uses another encoding
-            self._log.refuse(f"{topic}: {error}")
+            self._log.refuse(topic, f"{topic}: {error}")
         else:
             self._decide(given)
 
@@ -317,7 +318,7 @@ class CommandGate(qos.QosWatch):
         def read_with_source(content: bytes) -> inputs.Command:
             return replace(read(content), source=source, publishers=publishers)
 
-        self._take("cmd_vel_raw", read_with_source, content)
+        self._take(inputs.RAW, read_with_source, content)
 
     def _take_e_stop(self, content: bytes) -> None:
         """Decide on all waiting messages; a press comes first, so that it waits for no other."""
@@ -328,7 +329,7 @@ class CommandGate(qos.QosWatch):
             try:
                 messages.append(e_stop(each))
             except wire.UNREADABLE as error:
-                self._log.refuse(f"e_stop: {error}")
+                self._log.refuse(inputs.E_STOP, f"{inputs.E_STOP}: {error}")
                 self._decide(
                     inputs.Press("a message could not be read, and may be a press")
                 )

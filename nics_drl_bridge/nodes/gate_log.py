@@ -13,6 +13,7 @@ from pathlib import Path
 from rclpy.impl.rcutils_logger import RcutilsLogger
 
 from nics_drl_bridge.gate.black_box import Entry, format_entry, format_head
+from nics_drl_bridge.gate.inputs import get_topic
 from nics_drl_bridge.gate.state import Cause, GateConfig, GateState
 from nics_drl_bridge.nodes import black_box_writer
 from nics_drl_bridge.nodes.black_box_writer import (
@@ -78,7 +79,7 @@ class GateLog:
         cause = entry.decision.cause
         self._now = entry.now
         if decision.refused:
-            self.refuse(decision.refused)
+            self.refuse(get_topic(entry.given), decision.refused)
         if decision.shielded:
             self.counters["cut by the shield"] += 1
         rule = "" if cause is None else cause.rule
@@ -88,7 +89,8 @@ class GateLog:
         # a rule that persists is always logged
         lasts = entry.now - self._since >= LINE_S
         # otherwise the line follows later
-        if self._owed and (more := self._due(rule, lasts)) is not None:
+        more = self._due(rule, lasts) if self._owed else None
+        if more is not None:
             self._owed = False
             if cause is None:
                 self._logger.info(f"commands pass{more}")
@@ -111,11 +113,11 @@ class GateLog:
         self._writer.entry(format_entry(entry))
         self._entries += 1
 
-    def refuse(self, reason: str) -> None:
-        """Count a rejected input by the part of the reason before the colon, and log it."""
-        more = self._counted(f"refused, {reason.partition(':')[0]}")
+    def refuse(self, topic: str, fault: str) -> None:
+        """Count an input that is refused by its topic, and log what is wrong with it."""
+        more = self._counted(f"refused, {topic}")
         if more is not None:
-            self._logger.warning(f"refused: {reason}{more}")
+            self._logger.warning(f"refused: {fault}{more}")
 
     def no_number(self, twist: Sequence[float]) -> None:
         """Count and log a decision that is not finite; that must never happen."""

@@ -32,6 +32,7 @@ from nics_drl_bridge.env.guard import uninterrupted
 from nics_drl_bridge.errors import BackendError, ModelError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import Start
+from nics_drl_bridge.middleware.measurement import CMD_VEL
 from nics_drl_bridge.nodes import qos
 from nics_drl_bridge.nodes.command_types import deaf_subscribers, heard_stamped
 from nics_drl_bridge.nodes.ending import ENDING
@@ -63,7 +64,7 @@ class Link:
         self,
         namespace: str = "",
         domain_id: int | None = None,
-        command_topic: str = "cmd_vel",
+        command_topic: str = CMD_VEL,
         stamped: bool | None = None,
         parameters: Mapping[str, Any] | None = None,
         command_timeout_s: float = math.inf,

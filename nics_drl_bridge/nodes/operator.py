@@ -24,7 +24,7 @@ POLICY = ": policy"  # how the name of a policy node's status ends
 POLL_S = 0.02
 ASK_AGAIN_S = 1.0  # between two requests to a gate that refuses [s]
 SEND_AGAIN_S = 1.0  # between two goals to a policy node that refuses [s]
-ANSWER_S = 5.0  # that a gate may take to answer [s]
+GATE_ANSWER_S = 5.0  # that a gate may take to answer [s]
 CALL_S = 10.0  # the same with the time to find its service [s]
 SETTLE_S = 1.0  # in which all gates are seen, once one of them is [s]
 Tell = Callable[[str], None]
@@ -146,7 +146,7 @@ class Operator(AbstractContextManager["Operator", None]):
             time.sleep(POLL_S)
         if not calls:
             raise BackendError(f"{self._nobody(GATE, seconds)}; nothing was stopped.")
-        deadline = time.monotonic() + ANSWER_S
+        deadline = time.monotonic() + GATE_ANSWER_S
         return [
             call.wait_for_answer(deadline - time.monotonic()) for call in calls.values()
         ]

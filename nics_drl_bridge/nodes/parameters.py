@@ -47,10 +47,10 @@ def _is_wheel(name: str) -> bool:
         return False
 
 
-def stamped(what: str) -> Row:
+def stamped() -> Row:
     """Return the parameter that selects the type of `cmd_vel`."""
     about = (
-        f"Use TwistStamped for {what}, the default on Kilted and newer; false: Twist."
+        "Use TwistStamped for cmd_vel, the default on Kilted and newer; false: Twist."
     )
     return Row(STAMPED, stamped_by_default(), about)
 
@@ -64,6 +64,9 @@ MODEL = Row(
     "model", DEFAULT_ROBOT, "Name of a shipped robot, or folder of a SimulatorModel."
 )
 BASE_FRAME = Row("base_frame", "base_link", "Frame id of the robot.", fixed=False)
+MAP_FRAME = Row(
+    "map_frame", "map", "Frame id of the estimate and of goals.", fixed=False
+)
 ROBOT_FRAME = Row(
     BASE_FRAME.name,
     "",
@@ -88,16 +91,10 @@ def frame_fault(parameters: Iterable[Any], *may_be_empty: str) -> str:
         ):
             needed = "must be 1 to 255 characters, without blanks or a leading /"
             return f"parameter {name!r}: {needed}, not {shorten(frame, 80)!r}."
-    base = frames.get("base_frame", "")
-    taken = [
-        name
-        for name in ("map_frame", "odom_frame")
-        if frames.get(name, "") == base != ""
-    ]
-    if taken:
-        return (
-            f"parameter 'base_frame': is {base!r}, like {taken[0]!r}; they must differ."
-        )
+    base = frames.get(BASE_FRAME.name, "")
+    for name in (MAP_FRAME.name, "odom_frame"):
+        if base and frames.get(name, "") == base:
+            return f"parameter {BASE_FRAME.name!r}: is {base!r}, like {name!r}; they must differ."
     return ""
 
 
@@ -121,14 +118,14 @@ def sensors() -> list[Row]:
         ),
         Row("lidar_upside_down", False, upside_down),
         Row(IMU, defaults.IMU_TOPIC, ABOUT_IMU),
-        stamped("cmd_vel"),
+        stamped(),
     ]
 
 
 def middleware() -> list[Row]:
     """Return the parameters that only `middleware_node` has."""
     return [
-        Row("map_frame", "map", "Frame id of the estimate.", fixed=False),
+        MAP_FRAME,
         BASE_FRAME,
         Row(
             "publish_map_to_odom",
@@ -148,12 +145,7 @@ def policy() -> list[Row]:
     """Return the parameters that only `policy_node` has."""
     return [
         BASE_FRAME,
-        Row(
-            "map_frame",
-            "map",
-            "Frame id of the estimate and of goals.",
-            fixed=False,
-        ),
+        MAP_FRAME,
         Row(
             "policy",
             "dynamic_window",
@@ -315,15 +307,15 @@ def device(laser_frame: str = "") -> list[Row]:
             "Randomisation of each episode: mild, strong or a file; empty: none.",
         ),
         Row("mode", MODES[0], f"How time runs: {', '.join(MODES)}."),
-        stamped("cmd_vel"),
+        stamped(),
         Row(
             "frame_prefix",
             "",
             "Prefix of the robot's frames; in a fleet, the namespace follows it.",
         ),
-        Row("map_frame", "map", "Frame id of map."),
+        MAP_FRAME._replace(about="Frame id of map.", fixed=True),
         Row("odom_frame", "odom", "Frame id of odom."),
-        Row("base_frame", "base_link", "Frame id of base_link."),
+        BASE_FRAME._replace(about="Frame id of base_link.", fixed=True),
         Row(
             "laser_frame",
             laser_frame,
@@ -380,7 +372,7 @@ def device(laser_frame: str = "") -> list[Row]:
         ),
         Row(
             "command_timeout",
-            0.5,
+            defaults.COMMAND_SILENCE_S,
             "Stop after this silence of cmd_vel [simulated s]; not used in lockstep.",
             (0.0, 3600.0),
             fixed=False,
@@ -463,9 +455,6 @@ def gate_rules(odom_rate: float = math.nan, scan_age: float = math.nan) -> list[
     from nics_drl_bridge.gate.state import GateConfig as Default
 
     seconds = (0.01, 10.0)
-    heard = (
-        "Require e_stop to be received before arming; set false only in simulations."
-    )
     return [
         Row(
             "odom_rate",
@@ -496,18 +485,26 @@ def gate_rules(odom_rate: float = math.nan, scan_age: float = math.nan) -> list[
         ),
         Row(
             "clock_rate",
-            1.0,
+            Default.clock_rate,
             "Rate of stamps: simulated seconds per real second.",
             (0.01, 100.0),
         ),
-        Row("e_stop_required", True, heard),
+        Row(
+            "e_stop_required",
+            Default.e_stop_required,
+            "Require e_stop to be received before arming; set false only in simulations.",
+        ),
         Row(
             "e_stop_silence",
             Default.e_stop_silence_s,
             "Maximum silence of e_stop [s].",
             seconds,
         ),
-        Row("estimate_required", True, "Require odometry/filtered for arming."),
+        Row(
+            "estimate_required",
+            Default.estimate_required,
+            "Require odometry/filtered for arming.",
+        ),
         Row(
             "estimate_position",
             Default.estimate_position,
@@ -551,7 +548,7 @@ def gate() -> list[Row]:
         LIMITS,
         *shield,
         *gate_rules(),
-        stamped("cmd_vel"),
+        stamped(),
         ROBOT_FRAME,
         FOREIGN,
         BLACK_BOX,
@@ -582,8 +579,13 @@ def drive() -> list[Row]:
             defaults.IMU_TOPIC,
             "IMU topic to record. auto: imu or imu/data; none: no IMU.",
         ),
-        Row("odom_timeout", 0.5, "Stop after this silence of odom [s].", (0.05, 10.0)),
-        stamped("cmd_vel")._replace(name="stamped"),
+        Row(
+            "odom_timeout",
+            defaults.DATA_SILENCE_S,
+            "Stop after this silence of odom [s].",
+            (0.05, 10.0),
+        ),
+        stamped()._replace(name="stamped"),
     ]
 
 

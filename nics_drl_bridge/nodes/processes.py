@@ -27,7 +27,7 @@ from nics_drl_bridge.nodes.transport import domains_in_use
 LAST_DOMAIN_ID = 101  # above it DDS ports may collide with Linux's ephemeral ports
 LOG_LINES = 5
 ASK_AGAIN_S = 0.2
-ANSWER_S = 2.0
+REPLY_S = 2.0  # longest wait for one answer before asking again [s]
 POLL_S = 0.005
 
 
@@ -146,7 +146,7 @@ class Witness(AbstractContextManager["Witness", None]):
         while time.monotonic() < deadline and not answer.success:
             if client.wait_for_service(timeout_sec=ASK_AGAIN_S):
                 future = client.call_async(Trigger.Request())
-                if holds(future.done, ANSWER_S, POLL_S):
+                if holds(future.done, REPLY_S, POLL_S):
                     answer = future.result()
             if not answer.success:
                 time.sleep(ASK_AGAIN_S)

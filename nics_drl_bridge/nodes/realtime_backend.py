@@ -31,8 +31,7 @@ POLL_S = 0.01
 SAY_EVERY_S = 2.0
 # A peer without services this long after its topics appeared is a vehicle [s].
 SERVICES_S = 0.5
-# A command ends after this time [s] and this number of periods: a zero command follows.
-COMMAND_S = 0.5
+# A command also lasts for this number of periods before a zero command follows.
 COMMAND_PERIODS = 2
 # A robot below these speeds is at rest.
 REST_SPEED = 0.02  # [m/s]
@@ -53,7 +52,8 @@ class RealtimeOptions(Schema):
     vehicle: bool | None = None  # a vehicle has no services; None: detected
     # duration of a step; the model's control period by default
     period_s: PositiveFloat | None = None
-    stale_after_s: PositiveFloat = 0.5  # age above which data are too old for a view
+    # age above which data are too old for a view
+    stale_after_s: PositiveFloat = defaults.DATA_SILENCE_S
     # On a vehicle, wait until it stands at the requested pose, or start at the present one.
     start: Literal["wait", "present"] = defaults.VEHICLE_START
     # Lay `map` so that the robot's present pose is the start; with `present` and without a pose
@@ -66,7 +66,7 @@ class RealtimeOptions(Schema):
     say: Callable[[str], None] | None = None
     # With `cmd_vel_raw`, commands pass `command_gate`: each is a TwistStamped with the stamp of the
     # scan that it answers.
-    command_topic: str = Field("cmd_vel", min_length=1)
+    command_topic: str = Field(CMD_VEL, min_length=1)
     # use TwistStamped for `cmd_vel`; None: the type to which the robot subscribes
     stamped: bool | None = None
     pose_type: str = (
@@ -125,7 +125,9 @@ class RealtimeBackend:
         self._misses = 0  # deadlines missed in this episode
         self._scan_ns = 0  # stamp of the scan in the newest view [ns]
         self._has_seen_services = False  # those of a simulator
-        command_timeout_s = max(COMMAND_S, COMMAND_PERIODS * self._period_ns / NS_PER_S)
+        command_timeout_s = max(
+            defaults.COMMAND_SILENCE_S, COMMAND_PERIODS * self._period_ns / NS_PER_S
+        )
         if chosen.gated:
             command_timeout_s = math.inf  # a gate has its own timeout
         rehearse(model)

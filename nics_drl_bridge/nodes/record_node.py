@@ -23,6 +23,7 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BackendError, BridgeError, RecordingError
 from nics_drl_bridge.exit_codes import EXIT_BAD_INPUT
 from nics_drl_bridge.interface import NS_PER_S, Array
+from nics_drl_bridge.middleware.measurement import CMD_VEL
 from nics_drl_bridge.nodes import conversions, qos, runner
 from nics_drl_bridge.nodes.command_types import deaf_subscribers, heard_stamped
 from nics_drl_bridge.nodes.parameters import IMU, drive
@@ -101,7 +102,7 @@ class DriveLog:
     @property
     def seconds(self) -> float:
         """Time over which commands were sent [s]."""
-        return (self.rows["cmd_vel"][-1][0] - self.rows["cmd_vel"][0][0]) / NS_PER_S
+        return (self.rows[CMD_VEL][-1][0] - self.rows[CMD_VEL][0][0]) / NS_PER_S
 
     def add(self, topic: str, header_ns: int, values: ArrayLike) -> bool:
         """Add a message; return False if it is not finite or not newer than the last one."""
@@ -148,7 +149,7 @@ class DriveLog:
 
     def recording(self) -> Recording:
         """Return all streams on their clocks. Raises RecordingError if too little was received."""
-        topics = {"command": "cmd_vel", "pose": "odom", "imu": "imu"}
+        topics = {"command": CMD_VEL, "pose": "odom", "imu": "imu"}
         if len(self.rows["pose"]) >= FEWEST:
             # for the noise of the odometry
             topics |= {"pose": "pose", "odometry": "odom twist"}
@@ -243,7 +244,7 @@ class RecordNode(qos.QosWatch):
     def _speak(self, stamped: bool) -> None:
         self._stamped = stamped
         command = TwistStamped if stamped else Twist
-        self._topic = self.create_publisher(command, "cmd_vel", qos.COMMAND)
+        self._topic = self.create_publisher(command, CMD_VEL, qos.COMMAND)
 
     def _now_ns(self) -> int:
         if self._sim_time:
@@ -287,9 +288,9 @@ class RecordNode(qos.QosWatch):
                 self._end(None, complete=True)
 
     def _ready(self) -> bool:
-        topic = self.resolve_topic_name("cmd_vel")
+        topic = self.resolve_topic_name(CMD_VEL)
         if self._topic is None and self.count_subscribers(topic):
-            heard = heard_stamped(self, "cmd_vel")
+            heard = heard_stamped(self, CMD_VEL)
             self._speak(self._order.stamped if heard is None else heard)
         listened = self._topic is not None and self._topic.get_subscription_count() > 0
         if listened and self._pose is not None and self._now_ns() > 0:
@@ -304,12 +305,12 @@ class RecordNode(qos.QosWatch):
             return True
         if time.monotonic() - self._began > PATIENCE_S:
             odom = ("odom", "nothing arrived")
-            command = ("cmd_vel", "nobody listened")
+            command = (CMD_VEL, "nobody listened")
             name, missing = odom if self._pose is None else command
             fix = "start the robot, or correct namespace, ROS_DOMAIN_ID or remapping."
             reason = f"{missing} within {PATIENCE_S:g} s"
             if self._pose is not None and self._topic is not None:
-                deaf = deaf_subscribers(self, "cmd_vel", self._stamped)
+                deaf = deaf_subscribers(self, CMD_VEL, self._stamped)
                 if deaf:
                     fix = f"set stamped:={str(not self._stamped).lower()}, or leave it out."
                     raise BackendError(f"topic {self._place(name)}: {deaf}; {fix}")
@@ -357,7 +358,7 @@ class RecordNode(qos.QosWatch):
         robot = self._order.plan.robot
         if self._topic is not None:
             self._topic.publish(self._message(robot.to_cmd_vel(command)))
-        self._log.add("cmd_vel", 0, robot.pass_through_cmd_vel(command))
+        self._log.add(CMD_VEL, 0, robot.pass_through_cmd_vel(command))
 
     def _message(self, twist: Array) -> Twist | TwistStamped:
         stamped = conversions.stamped_to_ros(twist, self._now_ns(), self._frame)

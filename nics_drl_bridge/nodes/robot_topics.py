@@ -236,7 +236,7 @@ class RobotTopics:
             return
         reader = self._reader_for(message)
         if reader is None:
-            self.middleware.cache.reject(f"{measurement.SCAN}: another lidar")
+            self.middleware.cache.reject(measurement.SCAN, "another lidar")
             return
         ordered = reader.ordered(np.asarray(message.ranges, np.float32))
         ranges = from_device(np.ascontiguousarray(ordered), reader.lidar)
@@ -305,7 +305,7 @@ class RobotTopics:
             return
         measured = self._gyro.read(message)
         if measured is None:
-            self.middleware.cache.reject(f"{measurement.IMU}: no angular velocity")
+            self.middleware.cache.reject(measurement.IMU, "no angular velocity")
         else:
             self.middleware.imu(messages.get_stamp(message), self.now_ns(), *measured)
 
@@ -313,7 +313,7 @@ class RobotTopics:
         try:
             reading = sensor.read(message)
         except ValueError as error:
-            self.middleware.cache.reject(f"{sensor.name}: {error}")
+            self.middleware.cache.reject(sensor.name, str(error))
         else:
             self.middleware.sense(
                 sensor.name, messages.get_stamp(message), self.now_ns(), reading

@@ -46,7 +46,8 @@ GREATEST_DOMAIN_ID = 232  # above it, DDS has no ports
 # time until the graph shows all nodes [s]
 SETTLE_S = 0.3
 POLL_S = 0.02
-ANSWER_S = 1.5  # a silent node counts as dead, though the graph shows it for 20 s more
+# a node silent for this long counts as dead, though the graph shows it for 20 s more [s]
+LIVENESS_S = 1.5
 DIAGNOSTICS_S = 1.0
 RANGES = {
     int: (IntegerRange, "integer_range"),
@@ -210,9 +211,9 @@ def _lives(probe: Node, whole: str) -> bool:
     client = probe.create_client(GetParameters, f"{whole}/get_parameters")
     executor = SingleThreadedExecutor(context=probe.context)
     executor.add_node(probe)
-    deadline = time.monotonic() + ANSWER_S
+    deadline = time.monotonic() + LIVENESS_S
     try:
-        holds(client.service_is_ready, ANSWER_S, POLL_S)
+        holds(client.service_is_ready, LIVENESS_S, POLL_S)
         answer = client.call_async(GetParameters.Request())
         executor.spin_until_future_complete(
             answer, max(0.1, deadline - time.monotonic())

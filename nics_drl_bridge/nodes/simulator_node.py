@@ -28,6 +28,7 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.lidar.scanner import RENDERERS, Renderer
 from nics_drl_bridge.lidar.spec import to_device
+from nics_drl_bridge.middleware.measurement import CMD_VEL
 from nics_drl_bridge.nodes import (
     conversions,
     device_parameters,
@@ -228,11 +229,11 @@ class CommandInlet:
         kind = TwistStamped if stamped else Twist
         hear = partial(self._on_bytes, stamped)
         heard = node.create_subscription(
-            kind, f"{namespace}cmd_vel", hear, quality, raw=True
+            kind, f"{namespace}{CMD_VEL}", hear, quality, raw=True
         )
         self._topic = heard.topic_name
         self.heard = [heard]
-        self._types = TypeWatch(node, f"{namespace}cmd_vel")
+        self._types = TypeWatch(node, f"{namespace}{CMD_VEL}")
         kind = conversions.message_type("ackermann_msgs/msg/AckermannDriveStamped")
         if robot.steers and kind is not None:  # its package is optional
             given = kind, f"{namespace}ackermann_cmd", self._on_ackermann, quality

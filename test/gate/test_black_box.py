@@ -39,7 +39,7 @@ class Recorded(Rig):
 
 
 def stopped(path, kept_s=30.0):
-    shield = ShieldConfig(0.2, 1.0, 0.05, 0.02, 0.15, 0.2)
+    shield = ShieldConfig(0.2, 1.0, 0.05, 0.02, 0.15, 0.2, obstacle_speed=0.0)
     rig = Recorded(config(shield=shield), kept_s).drive()
     rig.command([np.nan, 1.0, -0.0])
     rig.run(0.3)
@@ -50,7 +50,9 @@ def stopped(path, kept_s=30.0):
 
 
 def test_a_robot_that_leaves_its_arc_while_it_brakes_is_replayed(tmp_path):
-    shield = ShieldConfig(0.2, 1.0, 0.05, 0.02, 0.15, lever=0.2, order=np.inf)
+    shield = ShieldConfig(
+        0.2, 1.0, 0.05, 0.02, 0.15, obstacle_speed=0.0, lever=0.2, order=np.inf
+    )
     shield = replace(shield, drift=Drift(0.9, 2.0, 1.1))
     rig = Recorded(config(shield=shield), 30.0).drive()
     rig.command([np.nan, 1.0, -0.0])
@@ -61,7 +63,13 @@ def test_a_robot_that_leaves_its_arc_while_it_brakes_is_replayed(tmp_path):
 
 def test_a_robot_whose_turn_brakes_apart_from_its_speed_is_replayed(tmp_path):
     shield = ShieldConfig(
-        0.2, 1.0, 0.05, 0.02, 0.15, turn=TurnBraking(0.4, 3.0, 0.6, 0.5)
+        0.2,
+        1.0,
+        0.05,
+        0.02,
+        0.15,
+        obstacle_speed=0.0,
+        turn=TurnBraking(0.4, 3.0, 0.6, 0.5),
     )
     rig = Recorded(config(shield=shield), 30.0).drive()
     rig.command([np.nan, 1.0, -0.0])
