@@ -91,8 +91,8 @@ def shield_config(
         braking = derive_braking(model, limits)
     except ConfigError as error:
         if measured is None and not given.keys() >= {"latency", "deceleration"}:
-            advice = "or give it: `shield: {latency: .., deceleration: ..}` in the file of limits"
-            raise ConfigError(f"{str(error).removesuffix('.')}, {advice}.") from None
+            advice = "The file of limits may give it: `shield: {latency: .., deceleration: ..}`."
+            raise ConfigError(f"{error} {advice}") from None
         braking = Braking(0.0, math.inf)
     stopping = measured
     if stopping is None:

@@ -116,9 +116,9 @@ def _check_fleet(mode: str, robots: int, namespaces: Sequence[str]) -> None:
     if mode == LOCKSTEP and len(namespaces) == robots:
         return
     needed = f"in mode 'lockstep' alone, with {robots} namespaces"
-    given = f"not in {mode!r} with {list(namespaces)!r}"
+    value = f"not in {mode!r} with {list(namespaces)!r}"
     raise ConfigError(
-        f"backend_options: a team of {robots} robots is driven {needed}, {given}."
+        f"backend_options: a team of {robots} robots is driven {needed}, {value}."
     )
 
 
@@ -215,7 +215,7 @@ class DdsBackend:
     def _subscribe(self) -> None:
         kinds = dict.fromkeys(self._topics, Odometry)
         kinds[SCAN] = LaserScan
-        kinds |= {name: sensor_type(each) for name, each in self._sensors.items()}
+        kinds |= {name: sensor_type(sensor) for name, sensor in self._sensors.items()}
         for topic, kind in kinds.items():
             put = partial(_put, self._inbox, topic)
             self._link.node.create_subscription(kind, topic, put, qos.SENSOR, raw=True)
@@ -450,6 +450,6 @@ class FleetBackend:
 
 def stack_facts(facts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Merge the facts of M robots into arrays (M, ...); `SHARED_FACTS` stay as they are."""
-    stacked = {name: np.stack([each[name] for each in facts]) for name in facts[0]}
+    stacked = {name: np.stack([values[name] for values in facts]) for name in facts[0]}
     shared = {name: facts[0][name] for name in SHARED_FACTS if name in facts[0]}
     return stacked | shared

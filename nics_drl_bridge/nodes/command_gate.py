@@ -121,10 +121,10 @@ def _declare_rules(node: Node, model: SimulatorModel) -> dict[str, Any]:
 
 def declare_black_box(node: Node) -> Path:
     """Declare the folder for recordings of stops; return its subfolder for the node's namespace."""
-    given = str(runner.declare_row(node, parameters.BLACK_BOX))
+    folder = str(runner.declare_row(node, parameters.BLACK_BOX))
     home = Path(os.environ.get("ROS_HOME") or Path.home() / ".ros")
     # A gate in another namespace must not remove its files.
-    return (Path(given) if given else home / "black_box") / str(
+    return (Path(folder) if folder else home / "black_box") / str(
         node.get_namespace()
     ).strip("/")
 
@@ -234,7 +234,8 @@ class CommandGate(qos.QosWatch):
         super().__init__("command_gate", context=context)
         model = runner.declare_model(self)
         logger = self.get_logger()
-        self._lidar, self._config = model.lidar, declare_gate(self, model)
+        self._lidar = model.lidar
+        self._config = declare_gate(self, model)
         self._sensors = model.sensors
         self._state = begin(self._config)
         self._log = GateLog(
@@ -270,21 +271,21 @@ class CommandGate(qos.QosWatch):
         raw = device_parameters.choice(self, parameters.FOREIGN.name, kinds)
         self._raw_kind = command_types.name_of(stamped=raw != TWIST)
         self._raw_types = command_types.TypeWatch(self, inputs.RAW, FOREIGN_SETTINGS)
-        given = command if raw == "none" else partial(self._foreign, raw)
+        reader = command if raw == "none" else partial(self._foreign, raw)
         readers: tuple[tuple[Any, str, Callable[[bytes], inputs.Input], Any], ...] = (
             (LaserScan, SCAN, partial(scan, self._lidar), qos.SENSOR),
             (Odometry, ODOM, self._read_odometry, qos.SENSOR),
             (Odometry, inputs.ESTIMATE, estimate, qos.SENSOR),
             *(
-                (sensor_type(each), each.name, partial(reading, each), qos.SENSOR)
-                for each in self._sensors
+                (sensor_type(sensor), sensor.name, partial(reading, sensor), qos.SENSOR)
+                for sensor in self._sensors
             ),
         )
         for kind, topic, read, profile in readers:
             taker = partial(self._take, topic, read)
             self.create_subscription(kind, topic, taker, profile, raw=True)
         kind = Twist if raw == TWIST else TwistStamped
-        command_taker = partial(self._take_command, given)
+        command_taker = partial(self._take_command, reader)
         commands = self.create_subscription(
             kind, inputs.RAW, command_taker, qos.EVERY_POLICY, raw=True
         )
@@ -300,11 +301,11 @@ class CommandGate(qos.QosWatch):
         self, topic: str, read: Callable[[bytes], inputs.Input], content: bytes
     ) -> None:
         try:
-            given = read(content)
+            event = read(content)
         except wire.UNREADABLE as error:  # the middleware uses another encoding
             self._log.refuse(topic, f"{topic}: {error}")
         else:
-            self._decide(given)
+            self._decide(event)
 
     def _take_command(
         self,
@@ -325,9 +326,9 @@ class CommandGate(qos.QosWatch):
         contents = [content, *qos.take_waiting(self._button)]
         self._queue.hear(time.monotonic(), len(contents))
         messages = []
-        for each in contents:
+        for part in contents:
             try:
-                messages.append(e_stop(each))
+                messages.append(e_stop(part))
             except wire.UNREADABLE as error:
                 self._log.refuse(inputs.E_STOP, f"{inputs.E_STOP}: {error}")
                 self._decide(
@@ -349,10 +350,10 @@ class CommandGate(qos.QosWatch):
         self._decide(inputs.Tick())
 
     def _read_odometry(self, content: bytes) -> inputs.Odometry:
-        given = odometry(content)
+        event = odometry(content)
         if not self._frame:  # no parameter names it
             self._frame = wire.frames_of(content)[1]
-        return given
+        return event
 
     def _foreign(self, kind: str, content: bytes) -> inputs.Command:
         age_ns = round(self._config.command_age_s * NS_PER_S)
@@ -366,19 +367,19 @@ class CommandGate(qos.QosWatch):
         self._decide(inputs.Press())
         return True, "the e-stop is pressed; ~/reset releases it"
 
-    def _answer(self, given: inputs.Input) -> tuple[bool, str]:
-        decision = self._decide(given)
-        self.get_logger().info(f"{type(given).__name__.lower()}: {decision.answer}")
+    def _answer(self, event: inputs.Input) -> tuple[bool, str]:
+        decision = self._decide(event)
+        self.get_logger().info(f"{type(event).__name__.lower()}: {decision.answer}")
         return decision.granted, decision.answer
 
-    def _decide(self, given: inputs.Input) -> Decision:
+    def _decide(self, event: inputs.Input) -> Decision:
         now = time.monotonic()
         before = self._state
-        self._state, decision = decide(self._config, before, given, now)
+        self._state, decision = decide(self._config, before, event, now)
         # Publish first: the rest is not urgent.
         instead = self._say(decision, now) if decision.publish else None
-        self._log.note(Entry(now, given, before, decision))
-        if instead is not None and not isinstance(given, inputs.Press):
+        self._log.note(Entry(now, event, before, decision))
+        if instead is not None and not isinstance(event, inputs.Press):
             self._decide(instead)
         return decision
 
@@ -403,14 +404,14 @@ class CommandGate(qos.QosWatch):
 
     def _look(self) -> runner.Condition:
         self._sources.count_publishers()
-        found = self._log.finding(self._state)
+        condition = self._log.finding(self._state)
         self._raw_types.look(self._raw_kind)
         others = self.count_publishers(self._out.topic_name) - 1
         if others < 1:
-            return found
+            return condition
         warning = f"others publish on cmd_vel too ({others}) and bypass this gate"
         self.get_logger().warning(warning, throttle_duration_sec=10.0)
-        return found._replace(message=f"{found.message}; {warning}", warns=True)
+        return condition._replace(message=f"{condition.message}; {warning}", warns=True)
 
     def stop(self) -> None:
         """Leave a zero command behind."""

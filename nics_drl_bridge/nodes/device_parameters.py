@@ -181,7 +181,7 @@ def frames(node: Node, namespace: str) -> Frames:
         f"{namespace}/" if namespace else ""
     )
     world, *own = (
-        str(node.get_parameter(f"{each}_frame").value) for each in Frames._fields[:-1]
+        str(node.get_parameter(f"{frame}_frame").value) for frame in Frames._fields[:-1]
     )
     odom, base, laser, footprint = (name and prefix + name for name in own)
     return Frames(world, odom, base, laser, footprint, prefix)
@@ -194,10 +194,10 @@ def _check_episode(node: Node, parameters: list[Parameter]) -> SetParametersResu
             values = np.array(parameter.value, dtype=np.float64)
             if not values.size or values.size % 3 or not np.isfinite(values).all():
                 reason = "episode_start must be three finite numbers per robot: x, y, heading."
-            elif node.has_parameter(GIVEN) and values.size != (
-                needed := 3 * len(namespaces(node))
-            ):
-                reason = f"episode_start has {values.size} numbers; give {needed}, 3 per robot."
+            elif node.has_parameter(GIVEN):
+                needed = 3 * len(namespaces(node))
+                if values.size != needed:
+                    reason = f"episode_start has {values.size} numbers; give {needed}, 3 per robot."
         elif parameter.name == "episode_seed" and parameter.value < 0:
             reason = "episode_seed must be 0 or more."
     names = {parameter.name for parameter in parameters}

@@ -219,7 +219,7 @@ class PathActions:
             if (name, space) != own:
                 with contextlib.suppress(NodeNameNonExistentError):  # it has just ended
                     served = self._node.get_service_names_and_types_by_node(name, space)
-                    if any(each == wanted for each, _ in served):
+                    if any(service == wanted for service, _ in served):
                         return True
         return False
 
@@ -228,8 +228,8 @@ class PathActions:
             self._run is None or self._run.goal.name == FOLLOW
         )
         if own and self.led:
-            told = f"another node serves {NAVIGATE}, so this one no longer does"
-            self._node.get_logger().info(told)
+            reason = f"another node serves {NAVIGATE}, so this one no longer does"
+            self._node.get_logger().info(reason)
             self._servers.pop(NAVIGATE).destroy()
 
     def _take_map(self, message: OccupancyGrid) -> None:
@@ -281,9 +281,9 @@ class PathActions:
                 code = "INVALID_CONTROLLER" if what == "controller" else "UNKNOWN"
                 raise Refusal(code, f"{FOLLOW}: {wrong}")
             names.append(name)
-        poses = np.array([read_pose(each) for each in asked.path.poses]).reshape(-1, 3)
-        headers = [asked.path.header, *(each.header for each in asked.path.poses[:1])]
-        frame = next((each.frame_id for each in headers if each.frame_id), "")
+        poses = np.array([read_pose(pose) for pose in asked.path.poses]).reshape(-1, 3)
+        headers = [asked.path.header, *(pose.header for pose in asked.path.poses[:1])]
+        frame = next((header.frame_id for header in headers if header.frame_id), "")
         return self._begin(goal, frame, poses, names[1:3])
 
     def _navigate(self, goal: Goal) -> Run:
@@ -391,8 +391,8 @@ class PathActions:
         ]
         if silent and time.monotonic() - run.valid_s > longest:
             self._run = None
-            told = f"nothing on {' and '.join(silent)} for {longest:g} s."
-            self._end(run.goal, ABORT, "CONTROLLER_TIMED_OUT", told)
+            sentence = f"nothing on {' and '.join(silent)} for {longest:g} s."
+            self._end(run.goal, ABORT, "CONTROLLER_TIMED_OUT", sentence)
             return True
         return False
 
@@ -452,7 +452,7 @@ class PathActions:
         speed = float(np.hypot(*twist[:2]))
         pose = conversions.pose_to_ros(robot, self._topics.newest_ns, run.frame)
         times = time.monotonic() - run.started_s, place.remaining / max(speed, SLOWEST)
-        told = {
+        values = {
             "distance_to_goal": place.distance,
             "speed": speed,
             "robot_pose": pose,
@@ -469,9 +469,10 @@ class PathActions:
         feedback = run.goal.kind.Feedback()
         for part in (feedback, getattr(feedback, "tracking_feedback", None)):
             for name in (
-                told.keys() & getattr(part, "get_fields_and_field_types", dict)().keys()
+                values.keys()
+                & getattr(part, "get_fields_and_field_types", dict)().keys()
             ):
-                setattr(part, name, told[name])
+                setattr(part, name, values[name])
         run.goal.handle.publish_feedback(feedback)
 
     def stop(self, why: str) -> None:

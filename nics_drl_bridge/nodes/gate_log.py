@@ -8,6 +8,7 @@ import subprocess
 import time
 from collections import Counter
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from rclpy.impl.rcutils_logger import RcutilsLogger
@@ -57,7 +58,8 @@ class GateLog:
         self._folder = folder
         self._hardware = robot
         self._cause: Cause | None = None
-        self._now = self._since = float("-inf")
+        self._now = float("-inf")
+        self._since = float("-inf")
         # the rule that stops the robot; "" while commands pass, None at first
         self._rule: str | None = None
         # rules whose stop was recorded in the present burst
@@ -269,7 +271,7 @@ class BoxWriter:
 
     def _hear(self) -> None:
         with contextlib.suppress(OSError):  # there is nothing more
-            while part := os.read(self._exit, MOST_TOLD):
+            for part in iter(partial(os.read, self._exit, MOST_TOLD), b""):
                 self._answers += part
         *lines, self._answers = self._answers.split(b"\n")
         for line in lines:

@@ -74,8 +74,8 @@ class GoalFrames:
         """Return x, y (2,) of a goal in the map, given the robot's pose now. Raises ConfigError."""
         place = np.array([goal.pose.position.x, goal.pose.position.y, 0.0])
         if not np.isfinite(place).all():
-            told = f"({place[0]:g}, {place[1]:g})"
-            raise ConfigError(f"goal_pose: {told}: x and y must be finite numbers.")
+            position = f"({place[0]:g}, {place[1]:g})"
+            raise ConfigError(f"goal_pose: {position}: x and y must be finite numbers.")
         try:
             frame, place = self.fixed(goal.header.frame_id, place)
         except ConfigError as error:
@@ -85,10 +85,12 @@ class GoalFrames:
             robot = None if self._odom is None else self.robot_in(self._map)
             if robot is None:
                 return place[:2]
-        elif (robot := self._topics.in_odom()) is None:
-            raise ConfigError(
-                "goal_pose: its place is unknown until odometry arrives; wait for it."
-            )
+        else:
+            robot = self._topics.in_odom()
+            if robot is None:
+                raise ConfigError(
+                    "goal_pose: its place is unknown until odometry arrives; wait for it."
+                )
         there: Array = geometry.compose(
             self._topics.view().pose, geometry.between(robot, place)
         )
@@ -101,7 +103,7 @@ class GoalFrames:
         ConfigError for an unknown frame, and while the robot's pose is unknown.
         """
         asked = frame = frame.strip("/")
-        odom, robot = (each.strip("/") for each in self._topics.frames)
+        odom, robot = (frame.strip("/") for frame in self._topics.frames)
         bases = {str(self._node.get_parameter("base_frame").value), robot} - {""}
         for _ in range(len(self._mounted) + 1):
             if frame in ("", self._map):
@@ -122,7 +124,7 @@ class GoalFrames:
             frame, mount = self._mounted[frame]
             places = geometry.compose(mount, places)
         names = ", ".join(
-            repr(each) for each in sorted({self._map, odom, *bases} - {""})
+            repr(frame) for frame in sorted({self._map, odom, *bases} - {""})
         )
         heard = "one that /tf_static joins to them"
         if self._transforms is None:

@@ -117,9 +117,11 @@ class Link:
     def begin(self) -> None:
         """Start the executor's thread; call it once all subscriptions exist."""
         gc.collect()  # now, because later it may take 0.1 s while the robot moves
-        given = (self._context, self.node, self._timeout)
         thread = threading.Thread(
-            target=_spin, args=given, daemon=True, name="dds_backend"
+            target=_spin,
+            args=(self._context, self.node, self._timeout),
+            daemon=True,
+            name="dds_backend",
         )
         thread.start()
         self._resources.thread = thread
@@ -175,7 +177,7 @@ class Link:
             return
         topic = self._topic
         ends = self.node.get_publishers_info_by_topic(topic)
-        names = sorted(name for end in ends if (name := qos.owner(end)) is not None)
+        names = sorted(qos.owners(ends))
         with contextlib.suppress(ValueError):
             names.remove(self.node.get_fully_qualified_name())
         raise BackendError(
@@ -399,10 +401,10 @@ class EpisodeServices:
             "episode_start": pose,
             "episode_start_given": True,
         }
-        given = [
+        settings = [
             Parameter(name, value=it).to_parameter_msg() for name, it in chosen.items()
         ]
-        request = SetParametersAtomically.Request(parameters=given)
+        request = SetParametersAtomically.Request(parameters=settings)
         result = self._link.call(self._parameters, request, timeout_s).result
         if not result.successful:
             raise BackendError(f"the simulator refused the episode: {result.reason}")

@@ -67,8 +67,8 @@ class ControllerParameters:
 
     def _filled(self, kind: Any, name: str) -> Any:
         known = {
-            each.name: self._node.get_parameter(f"{name}.{each.name}").value
-            for each in fields(kind)
+            field.name: self._node.get_parameter(f"{name}.{field.name}").value
+            for field in fields(kind)
         }
         return kind(**known)
 

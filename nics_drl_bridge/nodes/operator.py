@@ -1,6 +1,5 @@
 """What a person does with a running robot: arm its gate, stop it, give it a goal."""
 
-import threading
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -17,7 +16,7 @@ from nics_drl_bridge.config import parse_namespace
 from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.goal_answer import GoalAnswer, answer_from_values
-from nics_drl_bridge.nodes.runner import holds, open_context, spin
+from nics_drl_bridge.nodes.runner import holds, open_context, spin_in_thread
 
 GATE = "command_gate"
 POLICY = ": policy"  # how the name of a policy node's status ends
@@ -73,8 +72,8 @@ class _Call:
             if self._future is None:
                 return GateAnswer(self._gate, False, "it has ended")
             if not self._future.done():
-                told = "it did not answer in time; the request may still take effect"
-                return GateAnswer(self._gate, False, told)
+                reason = "it did not answer in time; the request may still take effect"
+                return GateAnswer(self._gate, False, reason)
             answer = self._future.result()
             return GateAnswer(self._gate, bool(answer.success), str(answer.message))
         finally:
@@ -102,13 +101,7 @@ class Operator(AbstractContextManager["Operator", None]):
         self._node.create_subscription(
             DiagnosticArray, "/diagnostics", self._take_diagnostics, qos.DIAGNOSTICS
         )
-        self._thread = threading.Thread(
-            target=spin,
-            args=(self._node, threading.Event()),
-            daemon=True,
-            name="operator",
-        )
-        self._thread.start()
+        self._thread = spin_in_thread(self._node)
 
     def arm(
         self, namespace: str, seconds: float, reset: bool, tell: Tell
@@ -215,7 +208,7 @@ class Operator(AbstractContextManager["Operator", None]):
         space = parse_namespace(namespace)
         gate = f"{space}/{GATE}"
         if not holds(lambda: gate in self._gates(), seconds, POLL_S):
-            spaces = {each.rpartition("/")[0] for each in self._gates()}
+            spaces = {gate.rpartition("/")[0] for gate in self._gates()}
             raise BackendError(f"{self._nobody(GATE, seconds, space, spaces)}.")
         return gate
 
@@ -236,13 +229,13 @@ class Operator(AbstractContextManager["Operator", None]):
         where = (
             f"in namespace {space or '/'} of ROS domain {self._context.get_domain_id()}"
         )
-        told = f"no {what} was seen {where} within {seconds:g} s"
+        fault = f"no {what} was seen {where} within {seconds:g} s"
         if not spaces:
-            return f"{told}; start one, as by `nics up simulation`, in the same ROS_DOMAIN_ID"
-        names = sorted(each.strip("/") for each in spaces)
+            return f"{fault}; start one, as by `nics up simulation`, in the same ROS_DOMAIN_ID"
+        names = sorted(space.strip("/") for space in spaces)
         fix = f"say --namespace {names[0]}" if names[0] else "leave --namespace out"
         return (
-            f"{told}; there is one in {', '.join(f'/{name}' for name in names)}: {fix}"
+            f"{fault}; there is one in {', '.join(f'/{name}' for name in names)}: {fix}"
         )
 
     def _call(self, gate: str, service: str, deadline: float) -> GateAnswer:

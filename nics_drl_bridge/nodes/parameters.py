@@ -37,7 +37,9 @@ class Row(NamedTuple):
 def stamped_by_default() -> bool:
     """True if this ROS 2 distribution uses TwistStamped for commands: Kilted and newer."""
     named = os.environ.get("ROS_DISTRO", "")
-    return not any(named == each if named else _is_wheel(each) for each in PLAIN_TWISTS)
+    if named:
+        return named not in PLAIN_TWISTS
+    return not any(map(_is_wheel, PLAIN_TWISTS))
 
 
 def _is_wheel(name: str) -> bool:
@@ -81,9 +83,9 @@ def frame_fault(parameters: Iterable[Any], *may_be_empty: str) -> str:
     If a name occurs twice, its last value counts.
     """
     frames = {
-        each.name: str(each.value)
-        for each in parameters
-        if each.name.endswith("_frame")
+        parameter.name: str(parameter.value)
+        for parameter in parameters
+        if parameter.name.endswith("_frame")
     }
     for name, frame in frames.items():
         if not FRAME.fullmatch(frame) and (
@@ -237,54 +239,74 @@ def nav2() -> list[Row]:
 
 def checkers(goals: Sequence[str], progress: Sequence[str]) -> list[Row]:
     """Return the parameters of the named checks; they are those of Nav2's checkers."""
+    from nics_drl_bridge.policy.follow import GoalCheck, ProgressCheck
+
     span = (0.0, 1e6)
-    plugin = "Nav2 checker to imitate."
-    rows: tuple[list[tuple[str, Any, str, tuple[float, float] | None]], ...] = (
-        [
-            ("xy_goal_tolerance", 0.25, "Maximum distance from the goal [m].", span),
-            (
-                "yaw_goal_tolerance",
-                0.25,
-                "Heading tolerance [rad]; ignored for robots that steer.",
-                span,
-            ),
-            (
-                "stateful",
-                True,
-                "A position once reached counts as reached from then on.",
-                None,
-            ),
-            (
-                "path_length_tolerance",
-                1.0,
-                "Maximum remaining path length at the goal [m].",
-                span,
-            ),
-            ("plugin", "nav2_controller::SimpleGoalChecker", plugin, None),
-        ],
-        [
-            ("plugin", "nav2_controller::SimpleProgressChecker", plugin, None),
-            (
-                "required_movement_radius",
-                0.5,
-                "Distance that counts as progress [m].",
-                span,
-            ),
-            (
-                "required_movement_angle",
-                0.5,
-                "Rotation that also counts as progress [rad], for a PoseProgressChecker.",
-                span,
-            ),
-            ("movement_time_allowance", 10.0, "Time limit for progress [s].", span),
-        ],
+    plugin = Row(
+        "plugin",
+        "nav2_controller::SimpleGoalChecker",
+        "Nav2 checker to imitate.",
+        fixed=False,
     )
-    return [
-        Row(f"{name}.{key}", default, about, limits, fixed=False)
-        for names, those in zip((goals, progress), rows, strict=True)
-        for name in names
-        for key, default, about, limits in those
+    goal_rows = [
+        Row(
+            "xy_goal_tolerance",
+            GoalCheck.xy_goal_tolerance,
+            "Maximum distance from the goal [m].",
+            span,
+            False,
+        ),
+        Row(
+            "yaw_goal_tolerance",
+            GoalCheck.yaw_goal_tolerance,
+            "Heading tolerance [rad]; ignored for robots that steer.",
+            span,
+            False,
+        ),
+        Row(
+            "stateful",
+            GoalCheck.stateful,
+            "A position once reached counts as reached from then on.",
+            fixed=False,
+        ),
+        Row(
+            "path_length_tolerance",
+            GoalCheck.path_length_tolerance,
+            "Maximum remaining path length at the goal [m].",
+            span,
+            False,
+        ),
+        plugin,
     ]
+    progress_rows = [
+        plugin._replace(default="nav2_controller::SimpleProgressChecker"),
+        Row(
+            "required_movement_radius",
+            ProgressCheck.required_movement_radius,
+            "Distance that counts as progress [m].",
+            span,
+            False,
+        ),
+        Row(
+            "required_movement_angle",
+            0.5,
+            "Rotation that also counts as progress [rad], for a PoseProgressChecker.",
+            span,
+            False,
+        ),
+        Row(
+            "movement_time_allowance",
+            ProgressCheck.movement_time_allowance,
+            "Time limit for progress [s].",
+            span,
+            False,
+        ),
+    ]
+    rows = []
+    for names, check in ((goals, goal_rows), (progress, progress_rows)):
+        for name in names:
+            rows += [row._replace(name=f"{name}.{row.name}") for row in check]
+    return rows
 
 
 # This service exists since simulation_interfaces 2.1, the oldest supported version.

@@ -61,9 +61,9 @@ class PolicyNode(ManagedNode):
         names = ("rate", "deadline", "late_limit")
         rate, limit, patience = (self.get_parameter(name).value for name in names)
         if rate < 0.0 or limit <= 0.0 or patience < 1:
-            told = f"parameters rate {rate}, deadline {limit}, late_limit {patience}"
+            values = f"parameters rate {rate}, deadline {limit}, late_limit {patience}"
             raise ConfigError(
-                f"{told}: must be at least 0, more than 0, and at least 1."
+                f"{values}: must be at least 0, more than 0, and at least 1."
             )
         period = model.control_period
         self._deadline = Deadline(0.5 * period if np.isnan(limit) else limit, patience)
@@ -89,9 +89,14 @@ class PolicyNode(ManagedNode):
         self._topics.hear_initial_pose()
         self._frames = GoalFrames(self, self._topics)
         self.undo.callback(self._frames.close)
-        given = self._topics, self._frames, model, self._nav2
         self._actions = PathActions(
-            self, *given, self._toward, lambda: begin(self._policy)
+            self,
+            self._topics,
+            self._frames,
+            model,
+            self._nav2,
+            self._toward,
+            lambda: begin(self._policy),
         )
         self.undo.callback(self._actions.close)
         timer = runner.steadily(self, POLLS * model.control_period, self._act)
@@ -124,9 +129,9 @@ class PolicyNode(ManagedNode):
     def _on_goal(self, message: PoseStamped) -> None:
         stamp_ns = conversions.stamp_from_ros(message.header.stamp)
         if self._actions.active or self._actions.led:
-            told = "a goal_pose is ignored while an action leads the robot"
-            self.get_logger().info(told, throttle_duration_sec=5.0)
-            self._answer = GoalAnswer(stamp_ns, False, told)
+            reason = "a goal_pose is ignored while an action leads the robot"
+            self.get_logger().info(reason, throttle_duration_sec=5.0)
+            self._answer = GoalAnswer(stamp_ns, False, reason)
             return
         try:
             goal = self._frames.in_map(message)
@@ -164,8 +169,8 @@ class PolicyNode(ManagedNode):
         twist = self._twist()
         answer = self._deadline.judge(time.monotonic() - begin_s)
         if answer is not Answer.SEND:
-            told = f"inference was late ({self._deadline.late} so far); its command is dropped"
-            self.get_logger().warning(told, throttle_duration_sec=5.0)
+            fault = f"inference was late ({self._deadline.late} so far); its command is dropped"
+            self.get_logger().warning(fault, throttle_duration_sec=5.0)
         if answer is not Answer.DROP:
             if answer is Answer.SEND and np.isfinite(twist).all():
                 sent = twist
@@ -212,9 +217,9 @@ class PolicyNode(ManagedNode):
 
     def _toward(self, goal: Array) -> Wish:
         view = self._topics.view()
-        told = resume(self._policy, self._acted_ns * S_PER_NS)
-        if told:
-            self.get_logger().warning(told, throttle_duration_sec=5.0)
+        warning = resume(self._policy, self._acted_ns * S_PER_NS)
+        if warning:
+            self.get_logger().warning(warning, throttle_duration_sec=5.0)
         return Wish(
             self._asked(view, goal),
             bool(self._task.judge(view, {"goal": goal}).touched),

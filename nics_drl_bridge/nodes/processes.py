@@ -3,7 +3,6 @@
 import json
 import os
 import random
-import threading
 import time
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
@@ -20,7 +19,12 @@ from nics_drl_bridge.config import PACKAGE
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.node_process import ChildProcess, command_of
-from nics_drl_bridge.nodes.runner import GREATEST_DOMAIN_ID, holds, open_context, spin
+from nics_drl_bridge.nodes.runner import (
+    GREATEST_DOMAIN_ID,
+    holds,
+    open_context,
+    spin_in_thread,
+)
 from nics_drl_bridge.nodes.starting import NodeStart
 from nics_drl_bridge.nodes.transport import domains_in_use
 
@@ -33,16 +37,18 @@ POLL_S = 0.005
 
 def free_domain_id() -> int:
     """Return the environment's domain id, or a random unused one. ConfigError if it is invalid."""
-    given = os.environ.get("ROS_DOMAIN_ID")
-    if not given:
+    variable = os.environ.get("ROS_DOMAIN_ID")
+    if not variable:
         every = range(1, LAST_DOMAIN_ID + 1)
         return random.SystemRandom().choice(
             sorted(set(every) - domains_in_use()) or every
         )
-    if not given.isdecimal() or int(given) > GREATEST_DOMAIN_ID:
+    if not variable.isdecimal() or int(variable) > GREATEST_DOMAIN_ID:
         fix = f"it must be a number from 0 to {GREATEST_DOMAIN_ID}, or unset."
-        raise ConfigError(f"the environment variable ROS_DOMAIN_ID is {given!r}; {fix}")
-    return int(given)
+        raise ConfigError(
+            f"the environment variable ROS_DOMAIN_ID is {variable!r}; {fix}"
+        )
+    return int(variable)
 
 
 class NodeProcess(ChildProcess):
@@ -80,8 +86,8 @@ class NodeProcess(ChildProcess):
                 .strip()
                 .splitlines()
             )
-            told = [line for line in lines if not line.startswith("[INFO]")] or lines
-            last = " | ".join(told[-LOG_LINES:]) or "no output"
+            shown = [line for line in lines if not line.startswith("[INFO]")] or lines
+            last = " | ".join(shown[-LOG_LINES:]) or "no output"
             reason = f"ended with code {code}: {last} (its log is {self.log})."
             raise BackendError(f"{self.node} {reason}")
 
@@ -98,11 +104,7 @@ class Witness(AbstractContextManager["Witness", None]):
             "witness", context=self._context, start_parameter_services=False
         )
         self._node.create_subscription(Odometry, topic, self._take, qos.SENSOR_RELIABLE)
-        given = self._node, threading.Event()
-        self._thread = threading.Thread(
-            target=spin, args=given, daemon=True, name="witness"
-        )
-        self._thread.start()
+        self._thread = spin_in_thread(self._node)
 
     def _take(self, message: Odometry) -> None:
         self._poses.append(conversions.odometry_from_ros(message)[0])

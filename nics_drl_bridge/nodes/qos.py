@@ -5,7 +5,7 @@ best effort wherever a lost message does no harm. Late joiners get no old data, 
 """
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
 
@@ -114,16 +114,16 @@ def overridden_policies(node: Node, topic: str, end: str) -> list[QoSPolicyKind]
     is fixed, and for a policy or value that does not exist.
     """
     prefix = f"{OVERRIDES}{node.resolve_topic_name(topic)}.{end}."
-    given: dict[str, Any] = getattr(node, "_parameter_overrides", {})
+    values: dict[str, Any] = getattr(node, "_parameter_overrides", {})
     policies = []
-    for name in sorted(given):
+    for name in sorted(values):
         if not name.startswith(prefix):
             continue
         if topic.rsplit("/", 1)[-1] in FIXED_TOPICS:
             reason = "can't be overridden, because the robot's stop depends on it"
             raise ConfigError(f"parameter {name!r}: {reason}; leave it out.")
         policy = name.removeprefix(prefix)
-        _check_override(name, policy, given[name].value)
+        _check_override(name, policy, values[name].value)
         policies.append(QoSPolicyKind[policy.upper()])
     return policies
 
@@ -285,3 +285,9 @@ def owner(end: Any) -> str | None:
     """Return the full name of an endpoint's node, or None until it is discovered."""
     name = f"{end.node_namespace.rstrip('/')}/{end.node_name}"
     return None if UNKNOWN in name else name
+
+
+def owners(ends: Iterable[Any]) -> list[str]:
+    """Return the full names of the nodes of endpoints, as far as they are discovered."""
+    names = map(owner, ends)
+    return [name for name in names if name is not None]

@@ -197,8 +197,10 @@ class RealtimeBackend:
             missed = late_ns // self._period_ns + 1
             self._misses += missed
             self._deadline_ns += missed * self._period_ns
-        while (left_ns := self._deadline_ns - time.monotonic_ns()) > 0:
+        left_ns = self._deadline_ns - time.monotonic_ns()
+        while left_ns > 0:
             time.sleep(left_ns / NS_PER_S)
+            left_ns = self._deadline_ns - time.monotonic_ns()
         self._deadline_ns += self._period_ns
 
     def _take_view(self) -> tuple[RobotView, dict[str, Any]]:

@@ -234,7 +234,9 @@ class RecordNode(qos.QosWatch):
             )
         self._began = time.monotonic()
         self._heard = -np.inf
-        self._ticks = self._origin_ns = self._stamp_ns = 0
+        self._ticks = 0
+        self._origin_ns = 0
+        self._stamp_ns = 0
         self._pose: Array | None = None
         self._frame = ""  # of the robot, by its odometry
         self._start: Array = np.zeros(3)
@@ -269,7 +271,8 @@ class RecordNode(qos.QosWatch):
         pose = self._log.odometry(message)
         if pose is None:
             return
-        self._pose, self._heard = pose, time.monotonic()
+        self._pose = pose
+        self._heard = time.monotonic()
         self._frame = message.child_frame_id
         if self._ticks:
             self._drive.observe(geometry.between(self._start, pose))
@@ -301,7 +304,8 @@ class RecordNode(qos.QosWatch):
             if not self._sim_time and self.count_publishers("/clock"):
                 fix = "--use-sim-time takes the time of a simulator"
                 self.get_logger().warning(f"/clock is published, but not used; {fix}")
-            self._start, self._origin_ns = self._pose, self._now_ns()
+            self._start = self._pose
+            self._origin_ns = self._now_ns()
             return True
         if time.monotonic() - self._began > PATIENCE_S:
             odom = ("odom", "nothing arrived")
@@ -372,14 +376,14 @@ class RecordNode(qos.QosWatch):
     def _end(self, failure: BridgeError | None, complete: bool = False) -> None:
         self.outcome = DriveResult(complete, failure, None, "")
         recording = None
-        told = "the robot was not moved; nothing is recorded"
+        result = "the robot was not moved; nothing is recorded"
         if self._ticks:
             self._halt()
-            recording, told = self._save()
+            recording, result = self._save()
         if not complete:
             stopped = "the robot was told to stop; " if self._ticks else ""
-            told = f"{failure or 'interrupted:'} {stopped}{told}"
-        self.outcome = DriveResult(complete, failure, recording, told)
+            result = f"{failure or 'interrupted:'} {stopped}{result}"
+        self.outcome = DriveResult(complete, failure, recording, result)
         self.context.try_shutdown()
 
     def _halt(self) -> None:

@@ -42,7 +42,7 @@ from nics_drl_bridge.recording.imu_axis import GyroReader
 from nics_drl_bridge.recording.topic_roles import IMU_NAMES, list_imu_topics
 
 KINDS_OF_POSE = {
-    each.__name__: each for each in (PoseStamped, PoseWithCovarianceStamped)
+    kind.__name__: kind for kind in (PoseStamped, PoseWithCovarianceStamped)
 }
 
 
@@ -188,23 +188,27 @@ class RobotTopics:
             pose = initial_pose(
                 message, str(self._node.get_parameter("map_frame").value)
             )
-            # without any correction, this pose defines the map
-            spread = START_STD**2 * np.eye(3)
-            if self._posed:
-                covariance = conversions.pose_from_ros(message)[1]
-                given = measurement.check_covariance(covariance, 3, START_STD)
-                spread = spread if given is None else given
-        except (ConfigError, ValueError) as error:
-            logger.error(
-                f"{str(error).removesuffix('.')}. The estimate stays as it is."
-            )
+            self._placed = pose, self._initial_covariance(message)
+        except ConfigError as error:
+            logger.error(f"{error} The estimate stays as it is.")
             return
-        self._placed = pose, spread
         if self._started:
             self.middleware.place(*self._placed)
         logger.info(
             f"the robot is at ({pose[0]:.2f}, {pose[1]:.2f}) m, {pose[2]:.2f} rad"
         )
+
+    def _initial_covariance(self, message: PoseWithCovarianceStamped) -> Array:
+        """Return the covariance (3, 3) of `initialpose`. Raises ConfigError if it is none."""
+        covariance = None
+        if self._posed:  # otherwise nothing corrects this pose: it defines the map
+            _, reported = conversions.pose_from_ros(message)
+            try:
+                covariance = measurement.check_covariance(reported, 3, START_STD)
+            except ValueError as error:
+                fix = "give a valid one, or zeros."
+                raise ConfigError(f"{INITIAL_POSE}: {error}; {fix}") from None
+        return START_STD**2 * np.eye(3) if covariance is None else covariance
 
     def in_odom(self) -> Array | None:
         """Return the robot's odometry pose (3,) at the newest datum; None before any."""

@@ -100,7 +100,8 @@ def run_node(
     sole_name: str = "",
 ) -> Any:
     """Run a node until a signal (`ENDING`), then stop and destroy it cleanly; return it."""
-    stopping, started = threading.Event(), threading.Event()
+    stopping = threading.Event()
+    started = threading.Event()
 
     def end(*_: Any) -> None:
         stopping.set()
@@ -171,6 +172,18 @@ def spin(node: Node, stopping: threading.Event) -> None:
     executor.shutdown(timeout_sec=1.0)
 
 
+def spin_in_thread(node: Node) -> threading.Thread:
+    """Spin a node in a thread until its context has been shut down."""
+    thread = threading.Thread(
+        target=spin,
+        args=(node, threading.Event()),
+        daemon=True,
+        name=node.get_name(),
+    )
+    thread.start()
+    return thread
+
+
 @contextlib.contextmanager
 def sole(context: Context, name: str) -> Iterator[None]:
     """Ensure a single instance while a node runs. Raises BackendError if another is running."""
@@ -180,7 +193,8 @@ def sole(context: Context, name: str) -> Iterator[None]:
     )
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as claim:
         try:
-            whole, domain = probe.get_fully_qualified_name(), context.get_domain_id()
+            whole = probe.get_fully_qualified_name()
+            domain = context.get_domain_id()
             key = hashlib.sha256(f"{domain} {whole}".encode()).hexdigest().encode()
             taken = False
             try:
@@ -271,15 +285,15 @@ def declare(
     if span is not None:
         kind, field = RANGES[type(default)]
         setattr(descriptor, field, [kind(from_value=span[0], to_value=span[1])])
-    given = given_values(node)
+    values = given_values(node)
     many = isinstance(default, list)
     # rclpy refuses an integer, as in `rate:=2`, for a floating-point parameter.
-    if name in given and isinstance(default[0] if many else default, float):
+    if name in values and isinstance(default[0] if many else default, float):
         types = Parameter.Type
-        value = given[name].value
-        if given[name].type_ == (types.INTEGER_ARRAY if many else types.INTEGER):
-            value = [float(each) for each in value] if many else float(value)
-            given[name] = Parameter(
+        value = values[name].value
+        if values[name].type_ == (types.INTEGER_ARRAY if many else types.INTEGER):
+            value = [float(number) for number in value] if many else float(value)
+            values[name] = Parameter(
                 name, types.DOUBLE_ARRAY if many else types.DOUBLE, value
             )
     return node.declare_parameter(name, default, descriptor).value
@@ -287,8 +301,8 @@ def declare(
 
 def given_values(node: Node) -> dict[str, Parameter]:
     """Return the node's own dictionary of initial values, which rclpy does not expose publicly."""
-    found: dict[str, Parameter] = getattr(node, "_parameter_overrides", {})
-    return found
+    values: dict[str, Parameter] = getattr(node, "_parameter_overrides", {})
+    return values
 
 
 def unknown(node: Node) -> list[str]:
@@ -312,9 +326,13 @@ def unused_overrides(node: Node) -> list[str]:
     """
     if getattr(node, "state", ACTIVE) == UNCONFIGURED:
         return []
-    ends = [f"{qos.OVERRIDES}{each.topic_name}.publisher" for each in node.publishers]
+    ends = [
+        f"{qos.OVERRIDES}{publisher.topic_name}.publisher"
+        for publisher in node.publishers
+    ]
     ends += [
-        f"{qos.OVERRIDES}{each.topic_name}.subscription" for each in node.subscriptions
+        f"{qos.OVERRIDES}{subscription.topic_name}.subscription"
+        for subscription in node.subscriptions
     ]
     return [
         f"parameter {name!r} is ignored: the node has no such publisher or subscription; "
@@ -339,15 +357,16 @@ def diagnose(node: Node, part: str, look: Callable[[], Condition]) -> None:
     name = f"{node.get_fully_qualified_name()}: {part}"
 
     def publish() -> None:
-        found = look()
-        level = DiagnosticStatus.WARN if found.warns else DiagnosticStatus.OK
+        condition = look()
+        level = DiagnosticStatus.WARN if condition.warns else DiagnosticStatus.OK
         values = [
-            KeyValue(key=key, value=str(value)) for key, value in found.facts.items()
+            KeyValue(key=key, value=str(value))
+            for key, value in condition.facts.items()
         ]
         status = DiagnosticStatus(
-            level=level, name=name, message=found.message, values=values
+            level=level, name=name, message=condition.message, values=values
         )
-        status.hardware_id = found.hardware
+        status.hardware_id = condition.hardware
         message = DiagnosticArray(status=[status])
         message.header.stamp = node.get_clock().now().to_msg()
         topic.publish(message)

@@ -10,6 +10,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -124,12 +125,12 @@ class Setup:
 
     def _of_file(self, name: str, node: str) -> Any:
         """Return a value from the parameter file, for a node in any namespace."""
-        found = None
+        value = None
         for key in ("/**", f"/**/{node}", node, f"/{node}") if node else ("/**",):
-            found = (
-                (self._file.get(key) or {}).get("ros__parameters", {}).get(name, found)
+            value = (
+                (self._file.get(key) or {}).get("ros__parameters", {}).get(name, value)
             )
-        return found
+        return value
 
     def limits(self) -> str:
         """Return the gate's limits; by default the shipped limits of the given model, if any."""
@@ -205,22 +206,22 @@ class Launch:
     arguments: Sequence[Argument]
     simulated: bool = False
 
-    def nodes(self, given: Values) -> list[NodeStart]:
+    def nodes(self, values: Values) -> list[NodeStart]:
         """Return the nodes for the given arguments. Raises BridgeError."""
-        setup = Setup(complete(self.arguments, given))
-        return [node for part in self.parts for node in part(setup)]
+        setup = Setup(complete(self.arguments, values))
+        return list(chain.from_iterable(part(setup) for part in self.parts))
 
 
-def complete(arguments: Sequence[Argument], given: Values) -> dict[str, str]:
+def complete(arguments: Sequence[Argument], chosen: Values) -> dict[str, str]:
     """Return the values of all arguments. Raises ConfigError for an unknown name or choice."""
     known = {argument.name for argument in arguments}
-    for name in given:
+    for name in chosen:
         if name not in known:
             raise ConfigError(f"unknown argument {name!r}; {suggest(name, known)}")
     values: dict[str, str] = {}
     for argument in arguments:  # an argument comes after the one that is its default
         default = values[argument.same_as] if argument.same_as else argument.default
-        value = given.get(argument.name, default)
+        value = chosen.get(argument.name, default)
         if argument.choices and value not in argument.choices:
             hint = suggest(value, argument.choices)
             raise ConfigError(f"launch argument {argument.name!r} is {value!r}; {hint}")
@@ -235,17 +236,17 @@ def opened(model: str) -> Any:
     return open_model(model)
 
 
-def flag_of(name: str, given: str) -> str:
+def flag_of(name: str, word: str) -> str:
     """Return `true`, `false` or "" for an empty argument. Raises ConfigError for other words."""
-    if given.lower() not in FLAG_WORDS:  # refused here, before any node is started
-        raise ConfigError(f"launch argument {name!r} is {given!r}; give true or false.")
-    return FLAG_WORDS[given.lower()]
+    if word.lower() not in FLAG_WORDS:  # refused here, before any node is started
+        raise ConfigError(f"launch argument {name!r} is {word!r}; give true or false.")
+    return FLAG_WORDS[word.lower()]
 
 
 def names_of(robots: Any) -> tuple[str, ...]:
     """Return the namespaces of a fleet from a count or a list; none for one robot."""
     if isinstance(robots, list):
-        words = [str(each) for each in robots]
+        words = [str(name) for name in robots]
     else:
         words = re.findall(r"[^\s,\[\]'\"]+", str(robots))
     if len(words) == 1 and words[0].isdecimal():
@@ -266,15 +267,15 @@ def numbers_of(start: str) -> list[float] | None:
     """Return x, y, heading of each robot; None if left empty. Raises ConfigError."""
     words = re.findall(r"[^\s,\[\]]+", start)
     try:
-        found = [float(word) for word in words]
+        numbers = [float(word) for word in words]
     except ValueError:
-        found = [0.0]
-    if len(found) % 3:
+        numbers = [0.0]
+    if len(numbers) % 3:
         fix = (
             "give x, y, heading [m, rad] of each robot, as in start:='[1.0, 0.0, 1.57]'"
         )
         raise ConfigError(f"launch argument 'start' is {start!r}; {fix}.")
-    return found or None
+    return numbers or None
 
 
 def simulator(setup: Setup) -> Iterator[NodeStart]:

@@ -1,6 +1,5 @@
 """A live robot for the page of `nics watch`; it listens to topics and sends only goals."""
 
-import threading
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +17,7 @@ from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.parameters import MAP_FRAME
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, declare_sensors
-from nics_drl_bridge.nodes.runner import open_context, spin
+from nics_drl_bridge.nodes.runner import open_context, spin_in_thread
 from nics_drl_bridge.sim.world import World, check_place
 from nics_drl_bridge.sim.world_set import AnyWorld
 from nics_drl_bridge.watch.frame import Frame, Stage, Track, WorldFrame
@@ -78,9 +77,7 @@ class RosSource:
             (DiagnosticArray, "/diagnostics", self._take_diagnostics, qos.DIAGNOSTICS),
         ):
             self._node.create_subscription(kind, topic, take, quality)
-        given = (self._node, threading.Event())
-        self._thread = threading.Thread(target=spin, args=given, daemon=True)
-        self._thread.start()
+        self._thread = spin_in_thread(self._node)
 
     def _take_lidar(self, lidar: LidarSpec) -> None:
         self._new_lidar = lidar

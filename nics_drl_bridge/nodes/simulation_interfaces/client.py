@@ -1,5 +1,6 @@
 """The client: episodes and steps of any simulator that serves simulation_interfaces."""
 
+import re
 import time
 from importlib import import_module
 from typing import Any
@@ -52,9 +53,7 @@ class StandardOptions(Schema):
 
 def snake_case(name: str) -> str:
     """Returns the name of a service as all simulators write it: `get_entities`."""
-    return "".join(f"_{c.lower()}" if c.isupper() else c for c in name).removeprefix(
-        "_"
-    )
+    return re.sub("(?<!^)(?=[A-Z])", "_", name).lower()
 
 
 def module(kind: str) -> Any:
@@ -123,16 +122,16 @@ class StandardEpisodes:
             self._services[name], kind.Request(**fields), timeout_s
         )
         if response.result.result not in (self._messages.Result.RESULT_OK, *fine):
-            told = response.result.error_message or f"result {response.result.result}"
-            raise BackendError(f"the simulator refused {name}: {told}")
+            reason = response.result.error_message or f"result {response.result.result}"
+            raise BackendError(f"the simulator refused {name}: {reason}")
         return response
 
     def open(self, timeout_s: float) -> None:
         """Checks the features, and measures a step. Raises BackendError naming what is missing."""
         request = self._types.GetSimulatorFeatures.Request()
         kinds = self._messages
-        told = self._link.call(self._features, request, timeout_s).features
-        self._known = frozenset(told.features)
+        answer = self._link.call(self._features, request, timeout_s).features
+        self._known = frozenset(answer.features)
         for feature, service in NEEDED.items():
             self._require(feature, f", which {service} serves" if service else "")
         self.clients += self._services.values()
@@ -171,8 +170,10 @@ class StandardEpisodes:
             self._clock.clear()
             self._call("StepSimulation", timeout_s, steps=1)
             if not holds(lambda: self._clock, timeout_s, POLL_S):
-                told = f"no message on /clock within {timeout_s:g} s, which tells how long a step"
-                raise BackendError(f"{told} is; give its seconds as the option step_s.")
+                fault = f"no message on /clock within {timeout_s:g} s, which tells how long a step"
+                raise BackendError(
+                    f"{fault} is; give its seconds as the option step_s."
+                )
             time.sleep(POLL_S)  # of several that a step publishes the last
             stamps.append(conversions.stamp_from_ros(self._clock[-1].clock))
         self._link.node.destroy_subscription(self._listening)
@@ -186,7 +187,7 @@ class StandardEpisodes:
         """Begins an episode; returns the stamp of its first data [ns]. Raises BackendError."""
         if not self._steps:
             self.open(timeout_s)
-        holds(lambda: all(each.done() for each in self._pending), timeout_s, POLL_S)
+        holds(lambda: all(future.done() for future in self._pending), timeout_s, POLL_S)
         self._pending.clear()
         self._pause(timeout_s)
         scopes = self._types.ResetSimulation.Request
@@ -197,8 +198,8 @@ class StandardEpisodes:
         self._pause(timeout_s)  # some play on after a reset
         self._put_obstacles(start, timeout_s)
         self._put(self._entity, start.pose.reshape(3), timeout_s)
-        found = self._call("GetEntityState", timeout_s, entity=self._entity)
-        time_ns = conversions.stamp_from_ros(found.state.header.stamp)
+        answer = self._call("GetEntityState", timeout_s, entity=self._entity)
+        time_ns = conversions.stamp_from_ros(answer.state.header.stamp)
         self._link.halt()
         self._inbox.clear()  # of what is from before a reset that put time back
         self.advance()
@@ -249,10 +250,12 @@ class StandardEpisodes:
         self._look()
 
     def _look(self) -> None:
-        for future in [each for each in self._pending if each.done()]:
+        for future in tuple(self._pending):
+            if not future.done():
+                continue
             self._pending.remove(future)
             result = future.result().result
             if result.result != self._messages.Result.RESULT_OK:
                 self._pending.clear()
-                told = result.error_message or f"result {result.result}"
-                raise BackendError(f"the simulator refused StepSimulation: {told}")
+                reason = result.error_message or f"result {result.result}"
+                raise BackendError(f"the simulator refused StepSimulation: {reason}")

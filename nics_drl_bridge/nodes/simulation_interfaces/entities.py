@@ -64,22 +64,25 @@ def pattern_of(expression: str) -> re.Pattern[str]:
             raise re.error(TOO_LONG)
         return re.compile(BRACKET.sub(_bracket, expression))
     except (re.error, OverflowError, RecursionError) as error:
-        told = f"the filter {expression!r} is no regular expression for names ({error}); mend it."
-        raise RefusalError(FAILED, told) from None
+        fault = f"the filter {expression!r} is no regular expression for names ({error}); mend it."
+        raise RefusalError(FAILED, fault) from None
 
 
-def _bracket(found: re.Match[str]) -> str:
-    if found[3]:
+def _bracket(match: re.Match[str]) -> str:
+    if match[3]:
         raise re.error("a '[' has no end, or holds [. or [= or an unknown class")
     held = HELD.sub(
-        lambda one: CLASSES[one[1]] if one[1] else f"\\{one[0]}", found[2] or ""
+        lambda one: CLASSES[one[1]] if one[1] else f"\\{one[0]}", match[2] or ""
     )
-    return found[0] if found[2] is None else f"[{found[1]}{held}]"
+    return match[0] if match[2] is None else f"[{match[1]}{held}]"
 
 
 def _runs_away(plain: str) -> bool:
     """True for many repeats, or groups that repeat with repeats or like branches in them."""
-    while group := re.search(r"\(([^()]*)\)([*+{]?)", plain):
+    while True:
+        group = re.search(r"\(([^()]*)\)([*+{]?)", plain)
+        if group is None:
+            break
         heads = [branch[:1] for branch in group[1].split("|")]
         alike = len(heads) > 1 and len({"", ".", *heads}) < len(heads) + 2
         if group[2] and (alike or re.search(r"[*+?{]", group[1])):
@@ -95,8 +98,8 @@ def tags_match(wanted: Any, tags: Any) -> bool:
         TagsFilter.FILTER_MODE_ANY,
         TagsFilter.FILTER_MODE_ALL,
     ):
-        told = f"filter_mode {wanted.filter_mode} of the tags is none; give 0 (any) or 1 (all)."
-        raise RefusalError(FAILED, told)
+        fault = f"filter_mode {wanted.filter_mode} of the tags is none; give 0 (any) or 1 (all)."
+        raise RefusalError(FAILED, fault)
     if not wanted.tags:
         return True
     match = any if wanted.filter_mode == TagsFilter.FILTER_MODE_ANY else all
@@ -131,12 +134,12 @@ class EntityServices:
         categories = {one.category for one in filters.categories}
         unknown = categories - CATEGORIES
         if unknown:
-            told = f"category {min(unknown)} is none of the standard"
-            raise RefusalError(FAILED, f"{told}; give 0 to 5 but 3.")
+            fault = f"category {min(unknown)} is none of the standard"
+            raise RefusalError(FAILED, f"{fault}; give 0 to 5 but 3.")
         tags_match(filters.tags, ())
         region = plane.Region(filters.bounds)
         entities = self._simulation.entities
-        found = []
+        matching = []
         for entity in entities:
             info = self.info(entity)
             pose = entities.pose(entity)
@@ -150,8 +153,8 @@ class EntityServices:
                 and tags_match(filters.tags, info.tags)
                 and (region.empty or any(map(region.touches, outlines)))
             ):
-                found.append(entity)
-        return found
+                matching.append(entity)
+        return matching
 
     def state(self, entity: Entity) -> EntityState:
         """Returns where an entity is and how it moves, in the frame of the map."""
@@ -171,9 +174,9 @@ class EntityServices:
 
     def list_states(self, request: Any, response: Any) -> None:
         """Answers GetEntitiesStates."""
-        found = self._matching(request.filters)
-        response.entities = [entity.name for entity in found]
-        response.states = [self.state(entity) for entity in found]
+        entities = self._matching(request.filters)
+        response.entities = [entity.name for entity in entities]
+        response.states = [self.state(entity) for entity in entities]
 
     def find(self, name: str) -> Entity:
         """Returns the entity of a name. Raises RefusalError, UnknownEntityError."""
@@ -189,8 +192,8 @@ class EntityServices:
         name = self.find(request.entity).name
         kind = request.info.category.category
         if kind not in CATEGORIES:
-            told = f"category {kind} is none of the standard; give 0 to 5 but 3."
-            raise RefusalError(FAILED, told)
+            fault = f"category {kind} is none of the standard; give 0 to 5 but 3."
+            raise RefusalError(FAILED, fault)
         self._simulation.told[name] = request.info
 
     def get_state(self, request: Any, response: Any) -> None:
@@ -218,8 +221,8 @@ class EntityServices:
         pushed = request.set_acceleration and asked.acceleration != Accel()
         if still and (pushed or (request.set_twist and asked.twist != Twist())):
             what = "acceleration" if pushed else "twist"
-            told = f"{entity.name!r} stands still and takes no {what}; leave it out."
-            raise RefusalError(FAILED, told)
+            fault = f"{entity.name!r} stands still and takes no {what}; leave it out."
+            raise RefusalError(FAILED, fault)
         try:
             entities.move(entity, pose, twist)
         except OutsideError as error:

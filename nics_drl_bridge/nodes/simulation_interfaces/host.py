@@ -94,9 +94,9 @@ def outcome(act: Callable[[], object], host: Host) -> tuple[int, str]:
             return Result.RESULT_NOT_FOUND, str(
                 BridgeError(f"{error}; check the path.")
             )
-        told = f"the simulator failed: {type(error).__name__}: {error}"
-        host.get_logger().error(told)
-        return Result.RESULT_OPERATION_FAILED, " ".join(told.split())
+        fault = f"the simulator failed: {type(error).__name__}: {error}"
+        host.get_logger().error(fault)
+        return Result.RESULT_OPERATION_FAILED, " ".join(fault.split())
     return Result.RESULT_OK, ""
 
 

@@ -78,12 +78,12 @@ def find(resource: Any, codes: Codes) -> Found:
         return _of_uri(resource.uri, codes)
     text = resource.resource_string
     if not text.strip():
-        told = "both uri and resource_string are empty; give one of them."
-        raise RefusalError(codes.no_resource, told)
+        fault = "both uri and resource_string are empty; give one of them."
+        raise RefusalError(codes.no_resource, fault)
     if text.lstrip("\ufeff \t\r\n").startswith(("<", "#usda")):
         if "<sdf" not in text:
-            told = "the resource_string is XML or USD, but no SDF; give SDF or YAML."
-            raise RefusalError(codes.unsupported_format, told)
+            fault = "the resource_string is XML or USD, but no SDF; give SDF or YAML."
+            raise RefusalError(codes.unsupported_format, fault)
         return Found(SDF, text, "resource_string")
     return Found(YAML, text, "resource_string")
 
@@ -91,8 +91,8 @@ def find(resource: Any, codes: Codes) -> Found:
 def _of_uri(uri: str, codes: Codes) -> Found:
     path = local(uri)
     if path is None:
-        told = f"uri {uri!r}: is not on this machine; give file:// or a path."
-        raise RefusalError(codes.unsupported_format, told)
+        fault = f"uri {uri!r}: is not on this machine; give file:// or a path."
+        raise RefusalError(codes.unsupported_format, fault)
     suffix = path.suffix.lower()
     named = path.is_dir() or (
         any(sign in uri for sign in SPECIAL) and not path.is_file()
@@ -100,11 +100,11 @@ def _of_uri(uri: str, codes: Codes) -> Found:
     if named or not suffix:
         return Found("", "", str(path), path)
     if suffix not in SUFFIXES:
-        told = f"uri {uri!r}: is none of {', '.join(SUFFIXES)}; convert it."
-        raise RefusalError(codes.unsupported_format, told)
+        fault = f"uri {uri!r}: is none of {', '.join(SUFFIXES)}; convert it."
+        raise RefusalError(codes.unsupported_format, fault)
     if not path.is_file():
-        told = f"uri {uri!r}: no such file; check the path on the simulator's machine."
-        raise RefusalError(Result.RESULT_NOT_FOUND, told)
+        fault = f"uri {uri!r}: no such file; check the path on the simulator's machine."
+        raise RefusalError(Result.RESULT_NOT_FOUND, fault)
     try:
         return Found(SUFFIXES[suffix], read_text(path, MOST_BYTES), str(path), path)
     except ConfigError as error:

@@ -90,9 +90,9 @@ class Simulation:
             raise RefusalError(codes.ALREADY_IN_TARGET_STATE, already)
         if wanted not in NAMES:
             known = ", ".join(f"{value} ({name})" for value, name in NAMES.items())
-            told = f"state {wanted} can't be set; choose one of {known}"
+            fault = f"state {wanted} can't be set; choose one of {known}"
             raise RefusalError(
-                codes.INCORRECT_TRANSITION, f"{told}, or load or unload a world."
+                codes.INCORRECT_TRANSITION, f"{fault}, or load or unload a world."
             )
         if wanted == QUITTING:
             self.halt(QUITTING)
@@ -105,8 +105,8 @@ class Simulation:
                 self._reset_all()
             except BridgeError as error:
                 self.halt(PAUSED)
-                told = f"it did not stop: {error}"
-                raise RefusalError(codes.STATE_TRANSITION_ERROR, told) from None
+                fault = f"it did not stop: {error}"
+                raise RefusalError(codes.STATE_TRANSITION_ERROR, fault) from None
         self._stepping = False
         if wanted == PLAYING:
             self._host.pause(False)
@@ -129,11 +129,11 @@ class Simulation:
         """Answers StepSimulation."""
         self.require_paused(request.steps)
         if request.steps > MOST_STEPS:
-            told = (
+            fault = (
                 f"steps is {request.steps}, and {MOST_STEPS} are the most of one call"
             )
             raise RefusalError(
-                Result.RESULT_OPERATION_FAILED, f"{told}; use simulate_steps."
+                Result.RESULT_OPERATION_FAILED, f"{fault}; use simulate_steps."
             )
         for _ in range(request.steps):
             self._host.step()
@@ -153,9 +153,10 @@ class Simulation:
         done = 0
         why = ""
         try:
-            while done < steps and not (
-                why := why or outcome(self._host.step, self._host)[1]
-            ):
+            while done < steps and not why:
+                _, why = outcome(self._host.step, self._host)
+                if why:
+                    break
                 done += 1
                 goal.publish_feedback(
                     SimulateSteps.Feedback(
@@ -169,7 +170,8 @@ class Simulation:
             self._stepping = False
         result.result.error_message = why
         if done == steps:
-            result.result.result, result.result.error_message = Result.RESULT_OK, ""
+            result.result.result = Result.RESULT_OK
+            result.result.error_message = ""
             goal.succeed()
         elif goal.is_cancel_requested:
             goal.canceled()
@@ -194,16 +196,16 @@ class Simulation:
             scope & ~EVERY_SCOPE and scope != SCOPES.SCOPE_ALL
         ):
             known = "1 (time), 2 (state) and 4 (spawned)"
-            told = f"scope {scope} has bits that mean nothing; add up {known}, or give 0 for all."
-            raise RefusalError(Result.RESULT_FEATURE_UNSUPPORTED, told)
+            fault = f"scope {scope} has bits that mean nothing; add up {known}, or give 0 for all."
+            raise RefusalError(Result.RESULT_FEATURE_UNSUPPORTED, fault)
         self._stepping = False
         if scope & EVERY_SCOPE == EVERY_SCOPE:
             self._reset_all()
             return
         if scope & SCOPES.SCOPE_SPAWNED:
             if set(self.entities.robot_names) <= self.entities.spawned.keys():
-                told = "a simulator needs a robot, and all were spawned; reset all, by scope 0."
-                raise RefusalError(Result.RESULT_OPERATION_FAILED, told)
+                fault = "a simulator needs a robot, and all were spawned; reset all, by scope 0."
+                raise RefusalError(Result.RESULT_OPERATION_FAILED, fault)
             self.remove(*self.entities.spawned)
         if scope & SCOPES.SCOPE_STATE:
             self._host.begin(rewind=bool(scope & SCOPES.SCOPE_TIME))
@@ -213,7 +215,7 @@ class Simulation:
     def restore(self) -> None:
         """Removes what was spawned, and brings back what was deleted."""
         # A robot that was spawned may have the name of one that was deleted.
-        changed = any(each.robot >= 0 for each in self.entities.spawned.values())
+        changed = any(entity.robot >= 0 for entity in self.entities.spawned.values())
         changed |= self.entities.robot_names != list(self._host.robot_names)
         self.told.clear()
         self.entities.restore()

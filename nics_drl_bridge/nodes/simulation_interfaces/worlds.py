@@ -1,6 +1,7 @@
 """Worlds: the one that is loaded, those that may be, loading and unloading."""
 
 import math
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -92,15 +93,15 @@ class Worlds:
     def current(self, _: Any, response: Any) -> None:
         """Answers GetCurrentWorld."""
         if self._simulation.state == WITHOUT_WORLD:
-            told = "no world is loaded; load one by load_world."
-            raise RefusalError(GetCurrentWorld.Response.NO_WORLD_LOADED, told)
+            reason = "no world is loaded; load one by load_world."
+            raise RefusalError(GetCurrentWorld.Response.NO_WORLD_LOADED, reason)
         response.world = told_of(self._host.world, self._resource)
 
     def unload(self, _: Any, __: Any) -> None:
         """Answers UnloadWorld."""
         if self._simulation.state == WITHOUT_WORLD:
-            told = "no world is loaded, so that none can be unloaded."
-            raise RefusalError(UnloadWorld.Response.NO_WORLD_LOADED, told)
+            reason = "no world is loaded, so that none can be unloaded."
+            raise RefusalError(UnloadWorld.Response.NO_WORLD_LOADED, reason)
         self._unload()
 
     def _unload(self) -> None:
@@ -109,9 +110,9 @@ class Worlds:
 
     def load(self, request: Any, response: Any) -> None:
         """Answers LoadWorld: the present world is unloaded, even if the other can't be read."""
-        found = resources.find(request.world_resource, self._codes)
+        resource = resources.find(request.world_resource, self._codes)
         self._unload()
-        world = self._read(found, request)
+        world = self._read(resource, request)
         host = self._host
         simulation = self._simulation
         host.use_world(world)
@@ -121,17 +122,19 @@ class Worlds:
         self._resource = request.world_resource
         response.world = told_of(world, self._resource)
 
-    def _read(self, found: resources.Found, request: Any) -> AnyWorld:
+    def _read(self, resource: resources.Found, request: Any) -> AnyWorld:
         codes = self._codes
         try:
-            if found.form == resources.SDF:
-                if found.path is not None:
-                    return self._standing(found.path, found.path.stem, request)
-                with file_of(found.text) as file:
+            if resource.form == resources.SDF:
+                if resource.path is not None:
+                    return self._standing(resource.path, resource.path.stem, request)
+                with file_of(resource.text) as file:
                     return self._standing(file, "resource_string", request)
-            if found.path is not None:
-                return load_worlds(str(found.path))
-            world = validate(parse_yaml(found.text, found.source), World, found.source)
+            if resource.path is not None:
+                return load_worlds(str(resource.path))
+            world = validate(
+                parse_yaml(resource.text, resource.source), World, resource.source
+            )
             check_places(world)
             _ = world.grid
             return world
@@ -143,28 +146,29 @@ class Worlds:
         except ConfigError as error:
             unknown = isinstance(error, UnknownNameError) and error.kind == "worlds"
             code = codes.parse_error
-            if unknown and not found.form:
+            if unknown and not resource.form:
                 code = Result.RESULT_NOT_FOUND
             raise RefusalError(code, str(error)) from None
 
     def _standing(self, file: Path, name: str, request: Any) -> World:
         skip = bool(request.ignore_missing_or_unsupported_assets)
         strange = sorted(
-            {each.tag for each in root_of(file).iter() if ":" not in each.tag} - READ
+            {element.tag for element in root_of(file).iter() if ":" not in element.tag}
+            - READ
         )
         if request.fail_on_unsupported_element and strange:
-            told = f"{name}: holds <{strange[0]}>, which is not simulated"
+            fault = f"{name}: holds <{strange[0]}>, which is not simulated"
             fix = "remove it, or do not ask for fail_on_unsupported_element"
-            raise RefusalError(CODES.UNSUPPORTED_ELEMENTS, f"{told}; {fix}.")
+            raise RefusalError(CODES.UNSUPPORTED_ELEMENTS, f"{fault}; {fix}.")
         standing = read_sdf(file, HEIGHT, skip_unknown=True, may_be_empty=True)
         if standing.left_out and not skip:
             if standing.missing:
                 code = self._codes.missing_assets
             else:
                 code = self._codes.unsupported_assets
-            told = f"{name}: {standing.left_out[0]}, which is no shape of a world"
+            fault = f"{name}: {standing.left_out[0]}, which is no shape of a world"
             raise RefusalError(
-                code, f"{told}; put a box in its place, or ignore such assets."
+                code, f"{fault}; put a box in its place, or ignore such assets."
             )
         return world_of(standing, name)
 
@@ -174,13 +178,13 @@ class Worlds:
         folder = share_folder() / "config"
         failed = list[str]()
         skipped = list[str]()
-        names = [each.stem for each in sorted((folder / "worlds").glob("*.yaml"))]
-        found = [(name, load_worlds(name)) for name in names]
+        names = [file.stem for file in sorted((folder / "worlds").glob("*.yaml"))]
+        worlds = [(name, load_worlds(name)) for name in names]
         for source in request.additional_sources:
             if source and request.offline_only and resources.local(source) is None:
                 continue
             try:
-                found += _in_source(source, skipped)
+                worlds += _in_source(source, skipped)
             except (BridgeError, OSError) as error:
                 failed.append(f"{source!r}: {error}")
         if failed and not request.continue_on_error:
@@ -189,15 +193,15 @@ class Worlds:
             )
         sets = [
             BARN,
-            *(each.stem for each in sorted((folder / "world_sets").glob("*.yaml"))),
+            *(file.stem for file in sorted((folder / "world_sets").glob("*.yaml"))),
         ]
-        told = [told_of(world, Resource(uri=uri)) for uri, world in found]
+        answers = [told_of(world, Resource(uri=uri)) for uri, world in worlds]
         for name in sets:  # whose many worlds would take long to read
             about = f"the worlds of {name}, of which every episode draws one"
-            told.append(WorldResource(name=name, description=about, tags=["set"]))
-            told[-1].world_resource = Resource(uri=name)
+            answers.append(WorldResource(name=name, description=about, tags=["set"]))
+            answers[-1].world_resource = Resource(uri=name)
         response.worlds = [
-            each for each in told if tags_match(request.filter, each.tags)
+            answer for answer in answers if tags_match(request.filter, answer.tags)
         ]
         if failed or skipped:
             response.result.result = Result.RESULT_OK
@@ -209,7 +213,7 @@ class Worlds:
 def _in_source(source: str, skipped: list[str]) -> list[tuple[str, AnyWorld]]:
     """Worlds of a file, or of those in a folder that can be read. Raises BridgeError, OSError."""
     path = resources.local(source)
-    found = list[tuple[str, AnyWorld]]()
+    worlds = list[tuple[str, AnyWorld]]()
     if path is None:
         raise ConfigError("is not on this machine; give a folder or file.")
     for file in sorted(path.iterdir()) if path.is_dir() else [path]:
@@ -219,20 +223,20 @@ def _in_source(source: str, skipped: list[str]) -> list[tuple[str, AnyWorld]]:
                 root_of(file).find("world") is not None or file == path
             ):
                 standing = read_sdf(file, HEIGHT, skip_unknown=True, may_be_empty=True)
-                found.append((str(file), world_of(standing, file.stem)))
+                worlds.append((str(file), world_of(standing, file.stem)))
             elif form == resources.YAML or file == path:
-                found.append((str(file), load_worlds(file)))
+                worlds.append((str(file), load_worlds(file)))
         except (BridgeError, OSError) as error:
             if file == path:
                 raise
             skipped.append(str(error))
-    return found
+    return worlds
 
 
 def told_of(world: AnyWorld, resource: Resource) -> WorldResource:
     """Returns a world as the standard tells of it, with tags of what is in it."""
     members = world.members
-    groups = [group for member in members for group in member.obstacles]
+    groups = list(chain.from_iterable(member.obstacles for member in members))
     about = {
         "set": len(members) > 1,
         "map": any(member.map is not None for member in members),
@@ -244,12 +248,12 @@ def told_of(world: AnyWorld, resource: Resource) -> WorldResource:
     x1, y1, x2, y2 = world.extent
     size = f"{x2 - x1:.3g} m x {y2 - y1:.3g} m"
     if len(members) > 1:
-        told = f"{len(members)} worlds in {size}"
+        description = f"{len(members)} worlds in {size}"
     else:
-        told = f"a field of {size}"
+        description = f"a field of {size}"
     tags = [tag for tag, holds in about.items() if holds]
     return WorldResource(
-        name=world.name, world_resource=resource, description=told, tags=tags
+        name=world.name, world_resource=resource, description=description, tags=tags
     )
 
 
