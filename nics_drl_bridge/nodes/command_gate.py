@@ -77,7 +77,7 @@ REFUSED = (
 
 def declare_gate(node: Node, model: SimulatorModel) -> GateConfig:
     """Declare and read a gate's parameters, and log doubts. Raises ConfigError for a bad value."""
-    for name in sorted(parameters.SPLIT.keys() & runner.given_values(node).keys()):
+    for name in sorted(parameters.SPLIT.keys() & qos.given_values(node).keys()):
         raise ConfigError(f"parameter {name!r}: is now {parameters.SPLIT[name]}.")
     file = str(runner.declare_row(node, parameters.LIMITS))
     limits = load_limits(file, model.robot) if file else None
@@ -111,7 +111,7 @@ def _keep_clock(simulated: bool, parameters: list[Parameter]) -> SetParametersRe
 def _declare_rules(node: Node, model: SimulatorModel) -> dict[str, Any]:
     scan_age = max(GateConfig.scan_age_s, SCAN_PERIODS / model.lidar.rate)
     rules: dict[str, Any] = {
-        "odom_rate_declared": "odom_rate" in runner.given_values(node)
+        "odom_rate_declared": "odom_rate" in qos.given_values(node)
     }
     for row in parameters.gate_rules(1.0 / model.control_period, scan_age):
         field = f"{row.name}_s" if row.name in parameters.RULES_IN_SECONDS else row.name

@@ -27,6 +27,7 @@ from nics_drl_bridge.lidar.sectors import Reader, reader_beside
 from nics_drl_bridge.lidar.sensor import Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec, ScanHeader, to_device
 from nics_drl_bridge.recording import messages
+from nics_drl_bridge.recording.topic_roles import TRANSFORMS
 from nics_drl_bridge.robot.spec import RobotSpec
 
 # x, y and heading in the 6 x 6 covariance of a message
@@ -261,6 +262,11 @@ def _has_interfaces(package: str, interface: str) -> bool:
     spec = find_spec(package)
     folders = (spec.submodule_search_locations if spec is not None else None) or ()
     return any(Path(folder, interface, "__init__.py").is_file() for folder in folders)
+
+
+def transforms_type() -> Any | None:
+    """Return the class of the messages on `/tf`; None if its package is not installed."""
+    return message_type(TRANSFORMS)
 
 
 def sensor_type(sensor: Sensor) -> Any:

@@ -8,15 +8,15 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from builtin_interfaces.msg import Duration
 from nav_msgs.msg import OccupancyGrid
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.duration import Duration
 from rclpy.node import Node, NodeNameNonExistentError
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import NS_PER_S, S_PER_NS, Array
+from nics_drl_bridge.interface import S_PER_NS, Array
 from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 from nics_drl_bridge.nodes import conversions, qos, runner
@@ -463,8 +463,8 @@ class PathActions:
             "current_pose": pose,
             "distance_remaining": place.remaining,
             "header": pose.header,
-            "navigation_time": duration_to_ros(times[0]),
-            "estimated_time_remaining": duration_to_ros(times[1]),
+            "navigation_time": Duration(seconds=times[0]).to_msg(),
+            "estimated_time_remaining": Duration(seconds=times[1]).to_msg(),
         }
         feedback = run.goal.kind.Feedback()
         for part in (feedback, getattr(feedback, "tracking_feedback", None)):
@@ -492,12 +492,6 @@ class PathActions:
                 "goal reached" if end == SUCCEED else "goal cancelled"
             )
         goal.server.finish(goal.handle, end, result_of(goal.kind, code, sentence))
-
-
-def duration_to_ros(seconds: float) -> Duration:
-    """Return seconds as a Duration."""
-    whole = int(seconds)
-    return Duration(sec=whole, nanosec=int((seconds - whole) * NS_PER_S))
 
 
 def result_of(kind: Any, code: str, sentence: str = "") -> Any:

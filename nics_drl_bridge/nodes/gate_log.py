@@ -1,7 +1,6 @@
 """Reports of `command_gate`: log lines, counters and the black box. Never waits for a disk."""
 
 import contextlib
-import fcntl
 import json
 import os
 import subprocess
@@ -25,6 +24,7 @@ from nics_drl_bridge.nodes.black_box_writer import (
     WRITE,
 )
 from nics_drl_bridge.nodes.child_python import module_command
+from nics_drl_bridge.nodes.output import widen_pipe
 from nics_drl_bridge.nodes.runner import Condition
 
 BURST_S = (
@@ -43,7 +43,6 @@ STATE_S = 10.0  # time between two states of the gate in the black box [s]
 MOST_ENTRIES = 5_000  # between two states
 MOST_BACKLOG = 4 * 2**20  # bytes that wait for the writer; a minute of driving
 MOST_TOLD = 65_536  # largest read of answers [bytes]
-PIPE_BYTES = 2**20  # Linux's maximum for an unprivileged process
 
 
 class GateLog:
@@ -305,10 +304,8 @@ class BoxWriter:
         self._started_s = time.monotonic()
         source, self._entrance = os.pipe()
         self._exit, target = os.pipe()
-        os.set_blocking(self._entrance, False)
+        widen_pipe(self._entrance)
         os.set_blocking(self._exit, False)
-        with contextlib.suppress(AttributeError, OSError):  # the default size will do
-            fcntl.fcntl(self._entrance, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
         try:
             self._process = subprocess.Popen(
                 module_command(black_box_writer.__name__),

@@ -28,7 +28,7 @@ class GoalFrames:
         # frame -> its parent, and its pose in the parent
         self._mounted: dict[str, tuple[str, Array]] = {}
         self._odom: Array | None = None  # pose of `odom` in `map`, by a localiser
-        self._transforms = conversions.message_type("tf2_msgs/msg/TFMessage")
+        self._transforms = conversions.transforms_type()
         self._heard = []
         if self._transforms is not None:
             for topic, take, quality in (

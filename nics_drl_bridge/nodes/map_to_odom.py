@@ -54,7 +54,7 @@ class MapToOdom:
         self._own: deque[Any] = deque(maxlen=KEPT)  # transforms
         self._frames = ("", "")
         self._heard_s = -math.inf
-        self._kind: Any = conversions.message_type("tf2_msgs/msg/TFMessage")
+        self._kind: Any = conversions.transforms_type()
         if self._kind is None:
             reason = (
                 "the package tf2_msgs is not installed, so map -> odom is not published"

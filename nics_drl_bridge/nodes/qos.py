@@ -12,6 +12,7 @@ from typing import Any
 from rclpy import qos as rclpy_qos
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSPolicyKind, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -107,6 +108,12 @@ CHOICES: dict[str, Any] = {
 FLAG = "avoid_ros_namespace_conventions"
 
 
+def given_values(node: Node) -> dict[str, Parameter]:
+    """Return the node's own dictionary of initial values, which rclpy does not expose publicly."""
+    values: dict[str, Parameter] = getattr(node, "_parameter_overrides", {})
+    return values
+
+
 def overridden_policies(node: Node, topic: str, end: str) -> list[QoSPolicyKind]:
     """Return the policies that a user's parameters set for the `end` of a topic, if any.
 
@@ -114,7 +121,7 @@ def overridden_policies(node: Node, topic: str, end: str) -> list[QoSPolicyKind]
     is fixed, and for a policy or value that does not exist.
     """
     prefix = f"{OVERRIDES}{node.resolve_topic_name(topic)}.{end}."
-    values: dict[str, Any] = getattr(node, "_parameter_overrides", {})
+    values = given_values(node)
     policies = []
     for name in sorted(values):
         if not name.startswith(prefix):

@@ -216,7 +216,7 @@ class RecordNode(qos.QosWatch):
         self._sim_time = bool(self.get_parameter("use_sim_time").value)
         self._steady_origin_ns = time.time_ns() - time.monotonic_ns()
         self._log = DriveLog(self._order.plan.robot, self._order.roles, self._now_ns)
-        self._chosen = "stamped" in runner.given_values(self)
+        self._chosen = "stamped" in qos.given_values(self)
         self._topic: Publisher | None = None
         if self._chosen:
             self._speak(self._order.stamped)

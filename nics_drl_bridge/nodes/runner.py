@@ -265,44 +265,33 @@ def declare_row(node: Node, row: Row) -> Any:
     """Declare a parameter unless the node has it, and return its value."""
     if node.has_parameter(row.name):
         return node.get_parameter(row.name).value
-    return declare(node, row.name, row.default, row.about, row.span, row.fixed)
-
-
-def declare(
-    node: Node,
-    name: str,
-    default: Any,
-    description: str,
-    span: tuple[float, float] | None = None,
-    read_only: bool = False,
-) -> Any:
-    """Declare a parameter of the default's type, limited to a span, and return its value."""
     # a managed node fixes it only from configure to cleanup
-    if read_only and hasattr(node, "fixed"):
-        node.fixed.add(name)
-        read_only = False
-    descriptor = ParameterDescriptor(description=description, read_only=read_only)
-    if span is not None:
-        kind, field = RANGES[type(default)]
-        setattr(descriptor, field, [kind(from_value=span[0], to_value=span[1])])
-    values = given_values(node)
-    many = isinstance(default, list)
-    # rclpy refuses an integer, as in `rate:=2`, for a floating-point parameter.
-    if name in values and isinstance(default[0] if many else default, float):
-        types = Parameter.Type
-        value = values[name].value
-        if values[name].type_ == (types.INTEGER_ARRAY if many else types.INTEGER):
-            value = [float(number) for number in value] if many else float(value)
-            values[name] = Parameter(
-                name, types.DOUBLE_ARRAY if many else types.DOUBLE, value
-            )
-    return node.declare_parameter(name, default, descriptor).value
+    if row.fixed and hasattr(node, "fixed"):
+        node.fixed.add(row.name)
+        row = row._replace(fixed=False)
+    descriptor = ParameterDescriptor(description=row.about, read_only=row.fixed)
+    if row.span is not None:
+        low, high = row.span
+        kind, field = RANGES[type(row.default)]
+        setattr(descriptor, field, [kind(from_value=low, to_value=high)])
+    _accept_integers(node, row)
+    return node.declare_parameter(row.name, row.default, descriptor).value
 
 
-def given_values(node: Node) -> dict[str, Parameter]:
-    """Return the node's own dictionary of initial values, which rclpy does not expose publicly."""
-    values: dict[str, Parameter] = getattr(node, "_parameter_overrides", {})
-    return values
+def _accept_integers(node: Node, row: Row) -> None:
+    """Make the given integers of a floating-point parameter floats; rclpy refuses `rate:=2`."""
+    values = qos.given_values(node)
+    many = isinstance(row.default, list)
+    types = Parameter.Type
+    if row.name not in values:
+        return
+    given_type = values[row.name].type_
+    value = values[row.name].value
+    if many and isinstance(row.default[0], float) and given_type == types.INTEGER_ARRAY:
+        floats = list(map(float, value))
+        values[row.name] = Parameter(row.name, types.DOUBLE_ARRAY, floats)
+    if isinstance(row.default, float) and given_type == types.INTEGER:
+        values[row.name] = Parameter(row.name, types.DOUBLE, float(value))
 
 
 def unknown(node: Node) -> list[str]:
@@ -311,7 +300,7 @@ def unknown(node: Node) -> list[str]:
     ignores = getattr(node, "ignores", lambda _: False)
     sentences = [
         f"there is no parameter {name!r}, its value is ignored; {suggest(name, known)}"
-        for name in sorted(given_values(node))
+        for name in sorted(qos.given_values(node))
         if name not in (*known, SHARED)
         and not name.startswith(qos.OVERRIDES)
         and not ignores(name)
@@ -337,7 +326,7 @@ def unused_overrides(node: Node) -> list[str]:
     return [
         f"parameter {name!r} is ignored: the node has no such publisher or subscription; "
         f"{suggest(name.rpartition('.')[0], ends)}"
-        for name in sorted(given_values(node))
+        for name in sorted(qos.given_values(node))
         if name.startswith(qos.OVERRIDES) and not node.has_parameter(name)
     ]
 

@@ -427,7 +427,7 @@ class DeviceNode(qos.QosWatch):
         self._complete.trigger()  # not here: more robots may be about to leave
 
     def _open_transforms(self) -> None:
-        self._transforms: Any = conversions.message_type("tf2_msgs/msg/TFMessage")
+        self._transforms: Any = conversions.transforms_type()
         if self._transforms is None:
             silent = "so neither /tf nor /tf_static is published"
             fix = how_to_install("tf2_msgs")
