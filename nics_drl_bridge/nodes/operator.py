@@ -16,7 +16,7 @@ from nics_drl_bridge.config import parse_namespace
 from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.goal_answer import GoalAnswer, answer_from_values
-from nics_drl_bridge.nodes.runner import holds, open_context, spin_in_thread
+from nics_drl_bridge.nodes.runner import Listener, holds
 
 GATE = "command_gate"
 POLICY = ": policy"  # how the name of a policy node's status ends
@@ -90,18 +90,11 @@ class Operator(AbstractContextManager["Operator", None]):
     def __init__(self, domain_id: int | None = None) -> None:
         # policy node -> its condition, and the values of its diagnostics; written by the thread
         self._policies: dict[str, tuple[str, dict[str, str]]] = {}
-        self._context = open_context([], domain_id)
-        try:
-            self._node = Node(
-                "nics_operator", context=self._context, start_parameter_services=False
-            )
-        except BaseException:
-            self._context.try_shutdown()
-            raise
+        self._node = Listener("nics_operator", domain_id)
         self._node.create_subscription(
             DiagnosticArray, "/diagnostics", self._take_diagnostics, qos.DIAGNOSTICS
         )
-        self._thread = spin_in_thread(self._node)
+        self._node.start()
 
     def arm(
         self, namespace: str, seconds: float, reset: bool, tell: Tell
@@ -226,9 +219,7 @@ class Operator(AbstractContextManager["Operator", None]):
         self, what: str, seconds: float, space: str = "", spaces: set[str] | None = None
     ) -> str:
         """Returns a clause that says where nobody answers, and where somebody does."""
-        where = (
-            f"in namespace {space or '/'} of ROS domain {self._context.get_domain_id()}"
-        )
+        where = f"in namespace {space or '/'} of ROS domain {self._node.context.get_domain_id()}"
         fault = f"no {what} was seen {where} within {seconds:g} s"
         if not spaces:
             return f"{fault}; start one, as by `nics up simulation`, in the same ROS_DOMAIN_ID"
@@ -253,6 +244,4 @@ class Operator(AbstractContextManager["Operator", None]):
                 )
 
     def __exit__(self, *_: object) -> None:
-        self._context.try_shutdown()
-        self._thread.join(timeout=2.0)
-        self._node.destroy_node()
+        self._node.close()

@@ -12,19 +12,13 @@ from typing import Any
 import numpy as np
 from nav_msgs.msg import Odometry
 from numpy.typing import ArrayLike, NDArray
-from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from nics_drl_bridge.config import PACKAGE
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.node_process import ChildProcess, command_of
-from nics_drl_bridge.nodes.runner import (
-    GREATEST_DOMAIN_ID,
-    holds,
-    open_context,
-    spin_in_thread,
-)
+from nics_drl_bridge.nodes.runner import GREATEST_DOMAIN_ID, Listener, holds
 from nics_drl_bridge.nodes.starting import NodeStart
 from nics_drl_bridge.nodes.transport import domains_in_use
 
@@ -95,16 +89,13 @@ class NodeProcess(ChildProcess):
 class Witness(AbstractContextManager["Witness", None]):
     """Context manager that observes a simulated robot's true motion in its own thread."""
 
-    def __init__(
-        self, domain_id: int | None = None, topic: str = "ground_truth"
-    ) -> None:
+    def __init__(self, domain_id: int | None = None) -> None:
         self._poses: list[NDArray[np.float64]] = []
-        self._context = open_context(domain_id=domain_id)
-        self._node = Node(
-            "witness", context=self._context, start_parameter_services=False
+        self._node = Listener("witness", domain_id)
+        self._node.create_subscription(
+            Odometry, "ground_truth", self._take, qos.SENSOR_RELIABLE
         )
-        self._node.create_subscription(Odometry, topic, self._take, qos.SENSOR_RELIABLE)
-        self._thread = spin_in_thread(self._node)
+        self._node.start()
 
     def _take(self, message: Odometry) -> None:
         self._poses.append(conversions.odometry_from_ros(message)[0])
@@ -156,6 +147,4 @@ class Witness(AbstractContextManager["Witness", None]):
         return answer
 
     def __exit__(self, *_: object) -> None:
-        self._context.try_shutdown()
-        self._thread.join(timeout=2.0)
-        self._node.destroy_node()
+        self._node.close()

@@ -72,18 +72,23 @@ class DriveParameters:
 
 def declare_drive(node: Node) -> DriveParameters:
     """Declare the parameters of a drive, and read them. Raises ConfigError."""
-    get = {row.name: partial(runner.declare_row, node, row) for row in drive()}
-    robot = load_robot(get["robot"]())
+    values = {row.name: runner.declare_row(node, row) for row in drive()}
+    robot = load_robot(values["robot"])
     robot.require_cmd_vel()
-    out = check_out(Path(get["out"]()))
-    plan = DrivePlan(
-        robot, *(get[name]() for name in ("bound", "duration", "speed", "seed"))
+    return DriveParameters(
+        out=check_out(Path(values["out"])),
+        plan=DrivePlan(
+            robot,
+            values["bound"],
+            values["duration"],
+            values["speed"],
+            values["seed"],
+        ),
+        odom_timeout=values["odom_timeout"],
+        stamped=values["stamped"],
+        roles=load_topic_roles(values["topics"] or None),
+        imu=values[IMU],
     )
-    topics, silence, stamped = (
-        get[name]() for name in ("topics", "odom_timeout", "stamped")
-    )
-    roles = load_topic_roles(topics or None)
-    return DriveParameters(plan, out, silence, stamped, roles, get[IMU]())
 
 
 class DriveLog:

@@ -172,16 +172,40 @@ def spin(node: Node, stopping: threading.Event) -> None:
     executor.shutdown(timeout_sec=1.0)
 
 
-def spin_in_thread(node: Node) -> threading.Thread:
-    """Spin a node in a thread until its context has been shut down."""
-    thread = threading.Thread(
-        target=spin,
-        args=(node, threading.Event()),
-        daemon=True,
-        name=node.get_name(),
-    )
-    thread.start()
-    return thread
+class Listener(Node):
+    """A node in a context of its own, which spins in a thread from `start` to `close`."""
+
+    def __init__(
+        self,
+        name: str,
+        domain_id: int | None = None,
+        namespace: str = "",
+        has_parameters: bool = False,
+    ) -> None:
+        context = open_context([], domain_id)
+        self._thread = threading.Thread(
+            target=spin, args=(self, threading.Event()), daemon=True, name=name
+        )
+        try:
+            super().__init__(
+                name,
+                context=context,
+                namespace=namespace,
+                start_parameter_services=has_parameters,
+            )
+        except BaseException:
+            context.try_shutdown()
+            raise
+
+    def start(self) -> None:
+        """Start the thread, once all subscriptions exist."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the thread, the node and its context."""
+        self.context.try_shutdown()
+        self._thread.join(timeout=2.0)
+        self.destroy_node()
 
 
 @contextlib.contextmanager

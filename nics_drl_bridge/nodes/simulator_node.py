@@ -571,19 +571,19 @@ class DeviceNode(qos.QosWatch):
         self.device.begin(seed, start if is_given else None)
         if rewind:
             self.now_ns = self._first_ns
-        self._outbox.clear()
         self._heard[:] = False
         self.now_ns += self._time.step_ns
-        self._odom_pace.begin(self.now_ns)
-        self._scan_pace.begin(self.now_ns)
-        self._go_on()
-        self._publish()
+        self._publish_anew()
 
     def rewind(self) -> None:
         """Set the time back to its start; nothing moves."""
         # keep the age of the commands
         self._command_ns += self._first_ns - self.now_ns
         self.now_ns = self._first_ns
+        self._publish_anew()
+
+    def _publish_anew(self) -> None:
+        """Publish all topics after the time or the world has jumped."""
         self._outbox.clear()
         self._odom_pace.begin(self.now_ns)
         self._scan_pace.begin(self.now_ns)

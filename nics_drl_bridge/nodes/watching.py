@@ -6,7 +6,6 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
-from rclpy.node import Node
 
 from nics_drl_bridge.config import parse_namespace
 from nics_drl_bridge.env.snapshot import Snapshot
@@ -17,7 +16,7 @@ from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.parameters import MAP_FRAME
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, declare_sensors
-from nics_drl_bridge.nodes.runner import open_context, spin_in_thread
+from nics_drl_bridge.nodes.runner import Listener
 from nics_drl_bridge.sim.world import World, check_place
 from nics_drl_bridge.sim.world_set import AnyWorld
 from nics_drl_bridge.watch.frame import Frame, Stage, Track, WorldFrame
@@ -63,9 +62,8 @@ class RosSource:
         self._map_frame = MAP_FRAME.default
         self._new_lidar: LidarSpec | None = None
         self._drawn_ns = 0
-        self._context = open_context([], domain_id)
-        self._node = Node(
-            NAME, context=self._context, namespace=parse_namespace(namespace)
+        self._node = Listener(
+            NAME, domain_id, parse_namespace(namespace), has_parameters=True
         )
         declare_sensors(self._node)
         self._topics = RobotTopics(self._node, model, on_lidar=self._take_lidar)
@@ -77,7 +75,7 @@ class RosSource:
             (DiagnosticArray, "/diagnostics", self._take_diagnostics, qos.DIAGNOSTICS),
         ):
             self._node.create_subscription(kind, topic, take, quality)
-        self._thread = spin_in_thread(self._node)
+        self._node.start()
 
     def _take_lidar(self, lidar: LidarSpec) -> None:
         self._new_lidar = lidar
@@ -162,6 +160,4 @@ class RosSource:
 
     def close(self) -> None:
         """Close the node and its context."""
-        self._context.try_shutdown()
-        self._thread.join()
-        self._node.destroy_node()
+        self._node.close()

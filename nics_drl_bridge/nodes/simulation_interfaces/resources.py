@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import unquote, urlsplit
@@ -10,8 +11,9 @@ from urllib.parse import unquote, urlsplit
 from simulation_interfaces.msg import Result
 
 from nics_drl_bridge.config import read_text
-from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.errors import ConfigError, MissingFileError
 from nics_drl_bridge.nodes.simulation_interfaces.host import RefusalError
+from nics_drl_bridge.sim.sdf import AssetsError
 from nics_drl_bridge.sim.world_set import SPECIAL
 
 SDF = "sdf"
@@ -39,6 +41,20 @@ class Codes(NamedTuple):
             response.MISSING_ASSETS,
             response.UNSUPPORTED_ASSETS,
         )
+
+
+@contextmanager
+def refused(codes: Codes) -> Iterator[None]:
+    """Within this context, a resource that can't be used raises RefusalError with its code."""
+    try:
+        yield
+    except AssetsError as error:
+        code = codes.missing_assets if error.missing else codes.unsupported_assets
+        raise RefusalError(code, str(error)) from None
+    except MissingFileError as error:
+        raise RefusalError(codes.missing_assets, str(error)) from None
+    except ConfigError as error:
+        raise RefusalError(codes.parse_error, str(error)) from None
 
 
 class Found(NamedTuple):

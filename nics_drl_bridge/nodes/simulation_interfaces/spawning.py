@@ -25,7 +25,6 @@ from nics_drl_bridge.nodes.simulation_interfaces.host import Host, RefusalError,
 from nics_drl_bridge.nodes.simulation_interfaces.state import Simulation
 from nics_drl_bridge.sim.entities import NAME, OutsideError, hull_of
 from nics_drl_bridge.sim.models import Model, model_of_sdf, model_of_yaml
-from nics_drl_bridge.sim.sdf import AssetsError
 
 # With room for the names of topics, which may have 255 characters in all.
 NAMESPACE = re.compile(
@@ -84,7 +83,6 @@ class Spawning:
 
     def _model(self, request: Any) -> Model | None:
         """The entity of a request; None for a robot. Raises RefusalError."""
-        codes = self._codes
         resource = resources.find(request.entity_resource, self._codes)
         if not resource.form:
             if resource.source == self._host.model.robot.name:
@@ -99,7 +97,7 @@ class Spawning:
                 raise RefusalError(
                     Result.RESULT_NOT_FOUND, f"{error} {held}."
                 ) from None
-        try:
+        with resources.refused(self._codes):
             if resource.form == resources.SDF:
                 z = request.initial_pose.pose.position.z
                 return model_of_sdf(
@@ -109,11 +107,6 @@ class Spawning:
             if resource.path is None or model.name:
                 return model
             return model._replace(name=resource.path.stem)
-        except AssetsError as error:
-            code = codes.missing_assets if error.missing else codes.unsupported_assets
-            raise RefusalError(code, str(error)) from None
-        except ConfigError as error:
-            raise RefusalError(codes.parse_error, str(error)) from None
 
     def _name(self, wanted: str, may_rename: bool) -> str:
         entities = self._simulation.entities
@@ -199,16 +192,12 @@ class Spawning:
             )
 
     def _list(self, file: Path, uri: str, response: Any) -> None:
-        if resources.SUFFIXES[file.suffix.lower()] == resources.SDF:
-            read = model_of_sdf
-        else:
-            read = None
         try:
             text = read_text(file, resources.MOST_BYTES)
-            if read is None:
-                model = model_of_yaml(text, str(file))
+            if resources.SUFFIXES[file.suffix.lower()] == resources.SDF:
+                model = model_of_sdf(text, 0.0, str(file))
             else:
-                model = read(text, 0.0, str(file))
+                model = model_of_yaml(text, str(file))
         except (BridgeError, OSError):
             return  # a world, or something else that is no entity
         hulls = [

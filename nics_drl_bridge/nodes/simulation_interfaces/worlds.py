@@ -15,7 +15,6 @@ from nics_drl_bridge.config import parse_yaml, share_folder, validate
 from nics_drl_bridge.errors import (
     BridgeError,
     ConfigError,
-    MissingFileError,
     UnknownNameError,
 )
 from nics_drl_bridge.lidar.maps import FREE
@@ -29,7 +28,7 @@ from nics_drl_bridge.nodes.simulation_interfaces.state import (
 )
 from nics_drl_bridge.sim.models import HEIGHT, file_of
 from nics_drl_bridge.sim.occupancy import occupancy
-from nics_drl_bridge.sim.sdf import AssetsError, read_sdf, root_of
+from nics_drl_bridge.sim.sdf import read_sdf, root_of
 from nics_drl_bridge.sim.sections import Standing
 from nics_drl_bridge.sim.world import Region, World, check_places
 from nics_drl_bridge.sim.world_set import BARN, AnyWorld, load_worlds
@@ -123,32 +122,19 @@ class Worlds:
         response.world = told_of(world, self._resource)
 
     def _read(self, resource: resources.Found, request: Any) -> AnyWorld:
-        codes = self._codes
-        try:
+        with resources.refused(self._codes):
             if resource.form == resources.SDF:
                 if resource.path is not None:
                     return self._standing(resource.path, resource.path.stem, request)
                 with file_of(resource.text) as file:
                     return self._standing(file, "resource_string", request)
             if resource.path is not None:
-                return load_worlds(str(resource.path))
-            world = validate(
-                parse_yaml(resource.text, resource.source), World, resource.source
-            )
+                return _load(resource.path, named=not resource.form)
+            content = parse_yaml(resource.text, resource.source)
+            world = validate(content, World, resource.source)
             check_places(world)
             _ = world.grid
             return world
-        except AssetsError as error:
-            code = codes.missing_assets if error.missing else codes.unsupported_assets
-            raise RefusalError(code, str(error)) from None
-        except MissingFileError as error:
-            raise RefusalError(codes.missing_assets, str(error)) from None
-        except ConfigError as error:
-            unknown = isinstance(error, UnknownNameError) and error.kind == "worlds"
-            code = codes.parse_error
-            if unknown and not resource.form:
-                code = Result.RESULT_NOT_FOUND
-            raise RefusalError(code, str(error)) from None
 
     def _standing(self, file: Path, name: str, request: Any) -> World:
         skip = bool(request.ignore_missing_or_unsupported_assets)
@@ -208,6 +194,16 @@ class Worlds:
             response.result.error_message = (
                 f"left out: {'; '.join([*failed, *skipped])}"
             )
+
+
+def _load(path: Path, named: bool) -> AnyWorld:
+    """Loads worlds from a path, or by a name. Raises ConfigError, RefusalError for no such name."""
+    try:
+        return load_worlds(str(path))
+    except UnknownNameError as error:
+        if named and error.kind == "worlds":
+            raise RefusalError(Result.RESULT_NOT_FOUND, str(error)) from None
+        raise
 
 
 def _in_source(source: str, skipped: list[str]) -> list[tuple[str, AnyWorld]]:
