@@ -132,9 +132,9 @@ class Run:
 class PathActions:
     """Serves both actions while a node is active; a new goal replaces the present one.
 
-    `drive` asks the policy to drive to a goal (2,) in the map of the estimate; `anew` empties its
-    memory. Without nav2_msgs nothing is served. If another node, such as Nav2's bt_navigator,
-    serves `navigate_to_pose`, this one does not.
+    `drive` asks the policy to drive to a goal (2,) in the map of the estimate, and `reset_policy`
+    empties its memory. Without nav2_msgs nothing is served. If another node, such as Nav2's
+    bt_navigator, serves `navigate_to_pose`, this one does not.
     """
 
     def __init__(
@@ -145,7 +145,7 @@ class PathActions:
         model: SimulatorModel,
         parameters: ControllerParameters,
         drive: Callable[[Array], Wish],
-        anew: Callable[[], None],
+        reset_policy: Callable[[], None],
     ) -> None:
         self._node = node
         self._topics = topics
@@ -153,7 +153,7 @@ class PathActions:
         self._robot = model.robot
         self._parameters = parameters
         self._drive = drive
-        self._anew = anew
+        self._reset_policy = reset_policy
         self._run: Run | None = None
         self._map: tuple[str, GridMap] | None = None  # and its frame
         self._limit = math.inf  # of the speed [m/s]
@@ -264,7 +264,7 @@ class PathActions:
                 if before.progress.check == run.progress.check:
                     run.progress = before.progress
             if before is None or not np.array_equal(before.path.end, run.path.end):
-                self._anew()  # not if the same path was replanned
+                self._reset_policy()  # not if the same path was replanned
         except Refusal as refusal:
             self._end(goal, ABORT, refusal.code, str(refusal))
         if before is not None:

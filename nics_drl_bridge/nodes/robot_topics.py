@@ -160,7 +160,7 @@ class RobotTopics:
             self._node.destroy_subscription(self._subscriptions.pop())
 
     def restart(self) -> None:
-        """Clear all state; the next odometry starts anew."""
+        """Clear all state; the next odometry starts again."""
         self._started = False
         self._since_ns = 0
         self._placed = None

@@ -573,16 +573,16 @@ class DeviceNode(qos.QosWatch):
             self.now_ns = self._first_ns
         self._heard[:] = False
         self.now_ns += self._time.step_ns
-        self._publish_anew()
+        self._publish_after_jump()
 
     def rewind(self) -> None:
         """Set the time back to its start; nothing moves."""
         # keep the age of the commands
         self._command_ns += self._first_ns - self.now_ns
         self.now_ns = self._first_ns
-        self._publish_anew()
+        self._publish_after_jump()
 
-    def _publish_anew(self) -> None:
+    def _publish_after_jump(self) -> None:
         """Publish all topics after the time or the world has jumped."""
         self._outbox.clear()
         self._odom_pace.begin(self.now_ns)

@@ -170,10 +170,8 @@ class StandardEpisodes:
             self._clock.clear()
             self._call("StepSimulation", timeout_s, steps=1)
             if not holds(lambda: self._clock, timeout_s, POLL_S):
-                fault = f"no message on /clock within {timeout_s:g} s, which tells how long a step"
-                raise BackendError(
-                    f"{fault} is; give its seconds as the option step_s."
-                )
+                fault = f"no message on /clock within {timeout_s:g} s, so the length of a step"
+                raise BackendError(f"{fault} is unknown; give it as the option step_s.")
             time.sleep(POLL_S)  # of several that a step publishes the last
             stamps.append(conversions.stamp_from_ros(self._clock[-1].clock))
         self._link.node.destroy_subscription(self._listening)
@@ -240,7 +238,7 @@ class StandardEpisodes:
         self._call("SetEntityState", timeout_s, entity=entity, state=state, **flags)
 
     def advance(self) -> None:
-        """Asks for the steps of one control period, without waiting: the data tell of them."""
+        """Requests the steps of one control period without waiting for them."""
         self._look()
         request = self._types.StepSimulation.Request(steps=self._steps)
         self._pending.append(self._services["StepSimulation"].call_async(request))

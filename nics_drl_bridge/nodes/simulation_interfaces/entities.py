@@ -115,8 +115,8 @@ class EntityServices:
 
     def info(self, entity: Entity) -> EntityInfo:
         """Returns what an entity is."""
-        if entity.name in self._simulation.told:
-            return self._simulation.told[entity.name]
+        if entity.name in self._simulation.infos:
+            return self._simulation.infos[entity.name]
         kinds = EntityCategory
         if entity.robot >= 0:
             spec = self._host.model.robot
@@ -194,7 +194,7 @@ class EntityServices:
         if kind not in CATEGORIES:
             fault = f"category {kind} is none of the standard; give 0 to 5 but 3."
             raise RefusalError(FAILED, fault)
-        self._simulation.told[name] = request.info
+        self._simulation.infos[name] = request.info
 
     def get_state(self, request: Any, response: Any) -> None:
         """Answers GetEntityState."""

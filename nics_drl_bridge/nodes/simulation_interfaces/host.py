@@ -105,7 +105,7 @@ def served(handler: Handler, host: Host) -> Callable[[Any, Any], Any]:
 
     def reply(request: Any, response: Any) -> Any:
         code, sentence = outcome(lambda: handler(request, response), host)
-        # A handler that succeeds in part has told of it itself.
+        # A handler that succeeds in part has set the result itself.
         if code != Result.RESULT_OK or not response.result.result:
             response.result.result = code
         if sentence:

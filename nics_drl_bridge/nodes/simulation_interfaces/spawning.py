@@ -79,7 +79,7 @@ class Spawning:
         tags = list(dict.fromkeys((*info.tags, *model.tags)))
         entity_info = EntityInfo(category=info.category, tags=tags)
         entity_info.description = model.description or info.description
-        self._simulation.told[name] = entity_info
+        self._simulation.infos[name] = entity_info
 
     def _model(self, request: Any) -> Model | None:
         """The entity of a request; None for a robot. Raises RefusalError."""

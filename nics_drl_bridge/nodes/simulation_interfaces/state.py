@@ -42,14 +42,14 @@ class Simulation:
     def __init__(self, host: Host) -> None:
         self._host = host
         self._stepping = False
-        self.told: dict[str, EntityInfo] = {}  # of the names whose information was set
+        self.infos: dict[str, EntityInfo] = {}  # by name, where a client set it
         # or paused, or without a world, while the host is paused
         self._halted = STOPPED
         self._turn: Any = host.create_guard_condition(lambda: None)  # type: ignore[attr-defined]
         self.renew()
 
     def renew(self) -> None:
-        """Lists the entities of a world that the host simulates anew."""
+        """Lists the entities of a world that the host begins to simulate."""
         host = self._host
         self.entities = Entities(
             host.device, host.world, host.robot_names, host.make_simulator
@@ -217,7 +217,7 @@ class Simulation:
         # A robot that was spawned may have the name of one that was deleted.
         changed = any(entity.robot >= 0 for entity in self.entities.spawned.values())
         changed |= self.entities.robot_names != list(self._host.robot_names)
-        self.told.clear()
+        self.infos.clear()
         self.entities.restore()
         if changed:
             self._host.reopen_robots()
@@ -231,6 +231,6 @@ class Simulation:
         for name in names:
             entity = self.entities.find(name)
             self.entities.delete(entity)
-            self.told.pop(name, None)
+            self.infos.pop(name, None)
             if entity.robot >= 0:
                 self._host.remove_robots([entity.robot])

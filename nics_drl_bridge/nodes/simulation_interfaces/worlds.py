@@ -40,7 +40,7 @@ EMPTY = (
 )  # places in the field of a world without walls around it [m]
 CELL = 0.05  # [m]
 MOST_OPEN = 0.5  # fraction of what is free in a field that may be open to all around
-# Tags of SDF that are read, or say nothing of what stands in a plane.
+# Tags of SDF that are read, or that do not affect what stands in a plane.
 READ = {
     "sdf",
     "world",
@@ -94,7 +94,7 @@ class Worlds:
         if self._simulation.state == WITHOUT_WORLD:
             reason = "no world is loaded; load one by load_world."
             raise RefusalError(GetCurrentWorld.Response.NO_WORLD_LOADED, reason)
-        response.world = told_of(self._host.world, self._resource)
+        response.world = describe_world(self._host.world, self._resource)
 
     def unload(self, _: Any, __: Any) -> None:
         """Answers UnloadWorld."""
@@ -119,7 +119,7 @@ class Worlds:
         host.begin(rewind=True)
         simulation.halt(STOPPED)
         self._resource = request.world_resource
-        response.world = told_of(world, self._resource)
+        response.world = describe_world(world, self._resource)
 
     def _read(self, resource: resources.Found, request: Any) -> AnyWorld:
         with resources.refused(self._codes):
@@ -181,9 +181,9 @@ class Worlds:
             BARN,
             *(file.stem for file in sorted((folder / "world_sets").glob("*.yaml"))),
         ]
-        answers = [told_of(world, Resource(uri=uri)) for uri, world in worlds]
+        answers = [describe_world(world, Resource(uri=uri)) for uri, world in worlds]
         for name in sets:  # whose many worlds would take long to read
-            about = f"the worlds of {name}, of which every episode draws one"
+            about = f"the worlds of {name}; every episode draws one of them"
             answers.append(WorldResource(name=name, description=about, tags=["set"]))
             answers[-1].world_resource = Resource(uri=name)
         response.worlds = [
@@ -229,8 +229,8 @@ def _in_source(source: str, skipped: list[str]) -> list[tuple[str, AnyWorld]]:
     return worlds
 
 
-def told_of(world: AnyWorld, resource: Resource) -> WorldResource:
-    """Returns a world as the standard tells of it, with tags of what is in it."""
+def describe_world(world: AnyWorld, resource: Resource) -> WorldResource:
+    """Returns the description of a world, with tags for what it contains."""
     members = world.members
     groups = list(chain.from_iterable(member.obstacles for member in members))
     about = {
