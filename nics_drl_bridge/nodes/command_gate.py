@@ -85,7 +85,7 @@ def declare_gate(node: Node, model: SimulatorModel) -> GateConfig:
         model,
         limits,
         _declare_shield(node, model, limits, file),
-        simulated=bool(node.get_parameter(SIM_TIME).value),
+        simulated=runner.get_flag(node, SIM_TIME),
         **_declare_rules(node, model),
     )
     node.add_on_set_parameters_callback(partial(_keep_clock, config.simulated))

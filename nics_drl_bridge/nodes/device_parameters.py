@@ -17,7 +17,7 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes.parameters import MODES, ROBOTS, device, frame_fault
 from nics_drl_bridge.nodes.qos import given_values
-from nics_drl_bridge.nodes.runner import declare_row
+from nics_drl_bridge.nodes.runner import declare_row, get_number, get_text
 from nics_drl_bridge.robot.noise import Delay
 from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
 
@@ -78,14 +78,9 @@ def declare_device(node: Node, laser_frame: str) -> None:
         raise ConfigError(fault)
 
 
-def number(node: Node, name: str) -> float:
-    """Return the value of a numeric parameter."""
-    return float(node.get_parameter(name).value or 0.0)
-
-
 def randomisation(node: Node) -> Randomisation | None:
     """Return the randomisation of each episode, if any. Raises ConfigError."""
-    name = str(node.get_parameter("randomisation").value)
+    name = get_text(node, "randomisation")
     return load_randomisation(name) if name else None
 
 
@@ -95,10 +90,10 @@ def timing(node: Node, model: SimulatorModel) -> DeviceTiming:
     if mode == LOCKSTEP:
         period = round(model.control_period * NS_PER_S)
         return DeviceTiming(mode, 1.0, period, period, period, (0, 0), (0, 0))
-    rate = number(node, "odom_rate")
+    rate = get_number(node, "odom_rate")
     dt = model.timing.dt
     odom = 1.0 / rate if rate else model.control_period
-    scan = 1.0 / (number(node, "scan_rate") or model.lidar.rate)
+    scan = 1.0 / (get_number(node, "scan_rate") or model.lidar.rate)
     step = common_step(dt, (odom, scan)) * dt
     step_ns, odom_ns, scan_ns = (
         round(seconds * NS_PER_S) for seconds in (step, odom, scan)
@@ -106,14 +101,16 @@ def timing(node: Node, model: SimulatorModel) -> DeviceTiming:
     late = []
     for topic in ("scan", "odom"):
         own = model.latency.measured.get(topic, Delay(least=0.0, jitter=0.0))
-        least = number(node, f"{topic}_latency")
-        jitter = number(node, "latency_jitter")
+        least = get_number(node, f"{topic}_latency")
+        jitter = get_number(node, "latency_jitter")
         chosen = (
             least if least >= 0.0 else own.least,
             jitter if jitter >= 0.0 else own.jitter,
         )
         late.append((round(chosen[0] * NS_PER_S), round(chosen[1] * NS_PER_S)))
-    return DeviceTiming(mode, number(node, "rate"), step_ns, odom_ns, scan_ns, *late)
+    return DeviceTiming(
+        mode, get_number(node, "rate"), step_ns, odom_ns, scan_ns, *late
+    )
 
 
 def timed_model(
@@ -122,7 +119,7 @@ def timed_model(
     """Return the model with the step of the world and the requested latency."""
     if time.lockstep:
         return model
-    latency = number(node, "command_latency")
+    latency = get_number(node, "command_latency")
     if latency >= 0.0:
         model = replace(
             model, calibration=replace(model.calibration, command_latency_s=latency)
@@ -136,7 +133,7 @@ def timed_model(
 
 def choice(node: Node, name: str, valid: tuple[str, ...]) -> str:
     """Return a parameter that must be one of `valid`. Raises ConfigError with the nearest word."""
-    value = str(node.get_parameter(name).value)
+    value = get_text(node, name)
     if value not in valid:
         raise ConfigError(
             f"parameter {name!r}: unknown value {value!r}; {suggest(value, valid)}"
@@ -178,12 +175,8 @@ def default_namespaces(robots: int) -> tuple[str, ...]:
 
 def frames(node: Node, namespace: str) -> Frames:
     """Return the frames of a robot; in a fleet all but the map begin with its namespace."""
-    prefix = str(node.get_parameter("frame_prefix").value) + (
-        f"{namespace}/" if namespace else ""
-    )
-    world, *own = (
-        str(node.get_parameter(f"{frame}_frame").value) for frame in Frames._fields[:-1]
-    )
+    prefix = get_text(node, "frame_prefix") + (f"{namespace}/" if namespace else "")
+    world, *own = (get_text(node, f"{frame}_frame") for frame in Frames._fields[:-1])
     odom, base, laser, footprint = (name and prefix + name for name in own)
     return Frames(world, odom, base, laser, footprint, prefix)
 

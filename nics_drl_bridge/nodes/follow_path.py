@@ -20,7 +20,6 @@ from nics_drl_bridge.interface import S_PER_NS, Array
 from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 from nics_drl_bridge.nodes import conversions, qos, runner
-from nics_drl_bridge.nodes.device_parameters import number
 from nics_drl_bridge.nodes.goal_frames import GoalFrames
 from nics_drl_bridge.nodes.nav2_parameters import ControllerParameters, chosen
 from nics_drl_bridge.nodes.robot_topics import RobotTopics
@@ -175,7 +174,7 @@ class PathActions:
             timer = runner.steadily(node, LOOK_S, self._look)
             self._undo.append(lambda: node.destroy_timer(timer))
         self._listen(OccupancyGrid, "map", self._take_map, qos.LATCHED)
-        topic = str(node.get_parameter("speed_limit_topic").value)
+        topic = runner.get_text(node, "speed_limit_topic")
         self._listen(
             conversions.message_type(SPEED_LIMIT), topic, self._take_limit, qos.COMMAND
         )
@@ -379,7 +378,7 @@ class PathActions:
             self._run = None
             self._end(run.goal, CANCELED, "NONE")
             return True
-        longest = number(self._node, "costmap_update_timeout")
+        longest = runner.get_number(self._node, "costmap_update_timeout")
         longest = max(longest, PATIENT_PERIODS * self._period_s)
         newest = self._topics.middleware.cache.newest
         now_ns = self._topics.now_ns()
@@ -409,7 +408,7 @@ class PathActions:
 
     def _steer(self, run: Run) -> Array:
         robot = self._robot_in("the path", run.frame)
-        place = run.path.locate(robot, number(self._node, "lookahead"))
+        place = run.path.locate(robot, runner.get_number(self._node, "lookahead"))
         turn = run.arrival.turn_left(place, robot, run.path.end)
         if turn == 0.0:
             self._run = None
@@ -427,7 +426,7 @@ class PathActions:
         )
         drive = self._drive(ahead[:2])
         if drive.touched:
-            patience = number(self._node, "failure_tolerance")
+            patience = runner.get_number(self._node, "failure_tolerance")
             # the robot has waited long enough
             if 0.0 <= patience < time.monotonic() - run.valid_s:
                 code = "PATIENCE_EXCEEDED" if patience else "NO_VALID_CONTROL"

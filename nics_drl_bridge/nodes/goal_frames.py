@@ -13,6 +13,7 @@ from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.map_to_odom import transform_from_ros
 from nics_drl_bridge.nodes.message_packages import how_to_install
 from nics_drl_bridge.nodes.robot_topics import RobotTopics
+from nics_drl_bridge.nodes.runner import get_text
 
 
 class GoalFrames:
@@ -57,7 +58,7 @@ class GoalFrames:
 
     @property
     def _map(self) -> str:
-        return str(self._node.get_parameter("map_frame").value)
+        return get_text(self._node, "map_frame")
 
     def robot_in(self, frame: str) -> Array | None:
         """Return the robot's pose (3,) in the map or `odom`; None while it is unknown."""
@@ -104,7 +105,7 @@ class GoalFrames:
         """
         asked = frame = frame.strip("/")
         odom, robot = (frame.strip("/") for frame in self._topics.frames)
-        bases = {str(self._node.get_parameter("base_frame").value), robot} - {""}
+        bases = {get_text(self._node, "base_frame"), robot} - {""}
         for _ in range(len(self._mounted) + 1):
             if frame in ("", self._map):
                 return self._map, places

@@ -32,7 +32,7 @@ class MiddlewareNode(ManagedNode):
 
     def configure(self) -> None:
         """Open the model and subscribe."""
-        model = open_model(str(self.get_parameter("model").value))
+        model = open_model(runner.get_text(self, "model"))
         self._hardware = model.robot.name
         rehearse(model)
         topic = "odometry/filtered"
@@ -44,7 +44,7 @@ class MiddlewareNode(ManagedNode):
         self._topics.hear_initial_pose()
         self._map_to_odom: MapToOdom | None = None
         if self.get_parameter("publish_map_to_odom").value:
-            tolerance = float(self.get_parameter("transform_tolerance").value or 0.0)
+            tolerance = runner.get_number(self, "transform_tolerance")
             self._map_to_odom = MapToOdom(self, tolerance)
             self.undo.callback(self._map_to_odom.close)
 
@@ -55,8 +55,8 @@ class MiddlewareNode(ManagedNode):
         # a pose or a yaw rate may be newer
         stamp_ns = max(stamp_ns, estimator.time_ns)
         view = self._topics.middleware.view(stamp_ns)
-        map_frame = str(self.get_parameter(MAP_FRAME.name).value)
-        base_frame = str(self.get_parameter(BASE_FRAME.name).value)
+        map_frame = runner.get_text(self, MAP_FRAME.name)
+        base_frame = runner.get_text(self, BASE_FRAME.name)
         message = conversions.odometry_to_ros(
             view.pose, view.twist, stamp_ns, (map_frame, base_frame), (0.0,) * 4
         )

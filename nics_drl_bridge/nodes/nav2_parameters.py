@@ -10,7 +10,7 @@ from rclpy.node import Node
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.nodes.parameters import checkers, nav2
-from nics_drl_bridge.nodes.runner import declare_row
+from nics_drl_bridge.nodes.runner import declare_row, get_text
 from nics_drl_bridge.policy.follow import GoalCheck, ProgressCheck
 
 # Parameters for Nav2's own plugins, or for a control loop; a policy answers scans instead.
@@ -55,10 +55,7 @@ class ControllerParameters:
         """Return the checks of two names; they act like Nav2's checkers of the chosen plugins."""
         arrives = self._filled(GoalCheck, goal)
         gets_on = self._filled(ProgressCheck, progress)
-        kinds = [
-            str(self._node.get_parameter(f"{name}.plugin").value)
-            for name in (goal, progress)
-        ]
+        kinds = [get_text(self._node, f"{name}.plugin") for name in (goal, progress)]
         if kinds[0].endswith(("PositionGoalChecker", "AxisGoalChecker")):
             arrives = replace(arrives, yaw_goal_tolerance=math.inf)
         if not kinds[1].endswith("PoseProgressChecker"):

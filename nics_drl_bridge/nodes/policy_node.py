@@ -50,7 +50,7 @@ class PolicyNode(ManagedNode):
 
     def configure(self) -> None:
         """Open model and policy, and subscribe."""
-        model = self._model = open_model(str(self.get_parameter("model").value))
+        model = self._model = open_model(runner.get_text(self, "model"))
         self._open_policy(model)
         self._goal: Array = np.array(self.get_parameter("goal").value, dtype=np.float64)
         if len(self._goal) != 2 or not (
@@ -112,7 +112,7 @@ class PolicyNode(ManagedNode):
         runner.last_word(self._raw, self._message(np.zeros(3), self._acted_ns))
 
     def _open_policy(self, model: SimulatorModel) -> None:
-        name = str(self.get_parameter("policy").value)
+        name = runner.get_text(self, "policy")
         self._policy, self._task = open_policy(name, model)
         view = rehearse(model)  # compiles everything now
         self._task.judge(view, {"goal": np.zeros(2)})
@@ -243,7 +243,7 @@ class PolicyNode(ManagedNode):
             ) from error
 
     def _message(self, twist: Array, stamp_ns: int) -> TwistStamped:
-        frame = str(self.get_parameter("base_frame").value)
+        frame = runner.get_text(self, "base_frame")
         return conversions.stamped_to_ros(twist, stamp_ns, frame)
 
 

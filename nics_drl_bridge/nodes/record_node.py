@@ -218,7 +218,7 @@ class RecordNode(qos.QosWatch):
         self.outcome: DriveResult | None = None
         self._order = declare_drive(self)
         self._drive = self._order.plan.begin()
-        self._sim_time = bool(self.get_parameter("use_sim_time").value)
+        self._sim_time = runner.get_flag(self, "use_sim_time")
         self._steady_origin_ns = time.time_ns() - time.monotonic_ns()
         self._log = DriveLog(self._order.plan.robot, self._order.roles, self._now_ns)
         self._chosen = "stamped" in qos.given_values(self)

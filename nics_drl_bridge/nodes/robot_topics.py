@@ -36,7 +36,7 @@ from nics_drl_bridge.nodes.parameters import (
     STAMPED,
     sensors,
 )
-from nics_drl_bridge.nodes.runner import declare_row
+from nics_drl_bridge.nodes.runner import declare_row, get_flag, get_text
 from nics_drl_bridge.recording import messages
 from nics_drl_bridge.recording.imu_axis import GyroReader
 from nics_drl_bridge.recording.topic_roles import IMU_NAMES, list_imu_topics
@@ -93,14 +93,14 @@ class RobotTopics:
         self._commands = CommandListener(
             node,
             measurement.CMD_VEL,
-            bool(node.get_parameter(STAMPED).value),
+            get_flag(node, STAMPED),
             self._locked(self._take_command),
         )
         heard: dict[str, tuple[Any, Callable[[Any], None]]] = {
             measurement.SCAN: (LaserScan, self._take_scan),
             measurement.ODOM: (Odometry, self._take_odometry),
         }
-        pose_type = str(node.get_parameter("pose_type").value)
+        pose_type = get_text(node, "pose_type")
         self._posed = pose_type != NO_POSE
         if self._posed:
             if pose_type not in POSE_TYPES:
@@ -140,7 +140,7 @@ class RobotTopics:
 
     def _hear_imu(self) -> None:
         """Subscribe to the gyro if one is named or the model was made with one."""
-        wanted = str(self._node.get_parameter(IMU).value)
+        wanted = get_text(self._node, IMU)
         topics = list_imu_topics(wanted, self._model.gyro)
         self._imu_topic = ""  # the first topic that is heard
         self._gyro = GyroReader()
@@ -185,9 +185,7 @@ class RobotTopics:
     def _take_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
         logger = self._node.get_logger()
         try:
-            pose = initial_pose(
-                message, str(self._node.get_parameter("map_frame").value)
-            )
+            pose = initial_pose(message, get_text(self._node, "map_frame"))
             self._placed = pose, self._initial_covariance(message)
         except ConfigError as error:
             logger.error(f"{error} The estimate stays as it is.")
@@ -262,7 +260,7 @@ class RobotTopics:
             return self._reader
         self._header = header
         self._reader = None
-        upside_down = bool(self._node.get_parameter("lidar_upside_down").value)
+        upside_down = get_flag(self._node, "lidar_upside_down")
         try:
             reader = conversions.reader_from_ros(
                 message, self._model.lidar, upside_down

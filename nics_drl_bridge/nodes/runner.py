@@ -285,6 +285,21 @@ def declare_model(node: Node) -> SimulatorModel:
     return model
 
 
+def get_text(node: Node, name: str) -> str:
+    """Return the value of a text parameter."""
+    return str(node.get_parameter(name).value)
+
+
+def get_number(node: Node, name: str) -> float:
+    """Return the value of a numeric parameter."""
+    return float(node.get_parameter(name).value or 0.0)
+
+
+def get_flag(node: Node, name: str) -> bool:
+    """Return the value of a parameter that is true or false."""
+    return bool(node.get_parameter(name).value)
+
+
 def declare_row(node: Node, row: Row) -> Any:
     """Declare a parameter unless the node has it, and return its value."""
     if node.has_parameter(row.name):

@@ -158,7 +158,7 @@ class RobotPort:
         at_rest = partial(conversions.odometry_to_ros, np.zeros(3), np.zeros(3), 0)
         self._odom = wire.OdometryWriter(at_rest((frames.odom, frames.base), odom))
         self._truth = wire.OdometryWriter(at_rest((frames.map, frames.base), truth))
-        self._locates = bool(node.get_parameter("publish_map_to_odom").value)
+        self._locates = runner.get_flag(node, "publish_map_to_odom")
 
     def close(self) -> None:
         """End its topics."""
@@ -225,7 +225,7 @@ class CommandInlet:
         self._robot = robot
         self._take = take
         self._too_old = too_old
-        stamped = bool(node.get_parameter("enable_stamped_cmd_vel").value)
+        stamped = runner.get_flag(node, "enable_stamped_cmd_vel")
         self._kind = name_of(stamped)
         kind = TwistStamped if stamped else Twist
         hear = partial(self._on_bytes, stamped)
@@ -312,7 +312,7 @@ class DeviceNode(qos.QosWatch):
         self._heard = np.zeros(0, np.bool_)
         self.model = device_parameters.timed_model(self, model, self._time)
         self._make = make
-        self.use_world(load_worlds(str(self.get_parameter("world").value)))
+        self.use_world(load_worlds(runner.get_text(self, "world")))
         self.paused = False
         self._lags = 0
         self._hardware = model.robot.name
@@ -360,7 +360,7 @@ class DeviceNode(qos.QosWatch):
     @property
     def map_frame(self) -> str:
         """Frame of the world."""
-        return str(self.get_parameter("map_frame").value)
+        return runner.get_text(self, "map_frame")
 
     @property
     def frames(self) -> list[device_parameters.Frames]:
@@ -491,7 +491,7 @@ class DeviceNode(qos.QosWatch):
         return runner.Condition(message, False, facts, self._hardware)
 
     def _timeout_ns(self) -> int:
-        return int(device_parameters.number(self, "command_timeout") * NS_PER_S)
+        return int(runner.get_number(self, "command_timeout") * NS_PER_S)
 
     def _too_old(self, stamp_ns: int) -> bool:
         return not self._time.lockstep and self.now_ns - stamp_ns > self._timeout_ns()
@@ -564,9 +564,9 @@ class DeviceNode(qos.QosWatch):
 
     def begin(self, rewind: bool = False) -> None:
         """Begin the episode of the parameters; if `rewind`, set time back to its start."""
-        is_given = bool(self.get_parameter("episode_start_given").value)
+        is_given = runner.get_flag(self, "episode_start_given")
         start = np.array(self.get_parameter("episode_start").value, dtype=np.float64)
-        seed = int(device_parameters.number(self, "episode_seed"))
+        seed = int(runner.get_number(self, "episode_seed"))
         # comes first: if it raises, the present episode goes on
         self.device.begin(seed, start if is_given else None)
         if rewind:

@@ -18,6 +18,7 @@ from nics_drl_bridge.errors import (
     UnknownNameError,
 )
 from nics_drl_bridge.lidar.maps import FREE
+from nics_drl_bridge.nodes.runner import get_text
 from nics_drl_bridge.nodes.simulation_interfaces import resources
 from nics_drl_bridge.nodes.simulation_interfaces.entities import tags_match
 from nics_drl_bridge.nodes.simulation_interfaces.host import RefusalError
@@ -86,7 +87,7 @@ class Worlds:
     def __init__(self, host: Any, simulation: Simulation) -> None:
         self._host = host
         self._simulation = simulation
-        self._resource = Resource(uri=str(host.get_parameter("world").value))
+        self._resource = Resource(uri=get_text(host, "world"))
         self._codes = resources.Codes.of(CODES)
 
     def current(self, _: Any, response: Any) -> None:
