@@ -70,12 +70,12 @@ def shield_config(
     model: SimulatorModel,
     limits: Limits | None,
     file: str | Path = "",
-    given: Mapping[str, float] | None = None,
+    overrides: Mapping[str, float] | None = None,
 ) -> tuple[ShieldConfig, str]:
     """Returns a robot's shield, and a sentence on its values; ConfigError if one can't be used.
 
-    Values are from `shield` in the file of limits, else derived from model and limits; `given`
-    values override them.
+    Values are from `shield` in the file of limits, else derived from model and limits; `overrides`
+    come first.
     """
     if model.lidar.beams < MIN_SHIELD_BEAMS:
         fault = f"the shield needs a lidar of {MIN_SHIELD_BEAMS} beams or more"
@@ -86,11 +86,11 @@ def shield_config(
         )
     path = find_config(file, "limits") if file else None
     measured = load_yaml(path, LimitsFile).shield if path else None
-    given = given or {}
+    overrides = overrides or {}
     try:
         braking = derive_braking(model, limits)
     except ConfigError as error:
-        if measured is None and not given.keys() >= {"latency", "deceleration"}:
+        if measured is None and not overrides.keys() >= {"latency", "deceleration"}:
             advice = "The file of limits may give it: `shield: {latency: .., deceleration: ..}`."
             raise ConfigError(f"{error} {advice}") from None
         braking = Braking(0.0, math.inf)
@@ -99,7 +99,7 @@ def shield_config(
         stopping = Stopping(
             latency=braking.reaction_s, deceleration=min(braking.deceleration, HARDEST)
         )
-    values = stopping.model_copy(update=dict(given))
+    values = stopping.model_copy(update=dict(overrides))
     for name, value in values.model_dump().items():
         low, high = SHIELD_SPANS[name]
         if not low <= value <= high:
@@ -123,8 +123,8 @@ def shield_config(
         turn=_adapt_turn(braking, values),
     )
     source = f"by {path}" if measured is not None else "derived from model and limits"
-    if given:
-        source += f", but {', '.join(sorted(given))} by parameter"
+    if overrides:
+        source += f", but {', '.join(sorted(overrides))} by parameter"
     listed = ", ".join(
         f"{name} {value:g}" for name, value in values.model_dump().items()
     )

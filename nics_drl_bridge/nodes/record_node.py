@@ -209,10 +209,10 @@ class RecordNode(qos.QosWatch):
     """Sends `cmd_vel` at 20 Hz, and zeros at the end or on a fault; records what it hears."""
 
     def __init__(
-        self, context: Context, given: Mapping[str, Any] | None = None
+        self, context: Context, values: Mapping[str, Any] | None = None
     ) -> None:
         overrides = [
-            Parameter(name, value=value) for name, value in (given or {}).items()
+            Parameter(name, value=value) for name, value in (values or {}).items()
         ]
         super().__init__("record_node", context=context, parameter_overrides=overrides)
         self.outcome: DriveResult | None = None
@@ -410,11 +410,11 @@ class RecordNode(qos.QosWatch):
 
 
 def record(
-    given: dict[str, Any] | None = None, args: Sequence[str] | None = None
+    values: dict[str, Any] | None = None, args: Sequence[str] | None = None
 ) -> DriveResult:
     """Drive and record until the end, an error or a signal; parameters may also come in `args`."""
     node: RecordNode = runner.run_node(
-        partial(RecordNode, given=given), args, "record_node"
+        partial(RecordNode, values=values), args, "record_node"
     )
     return node.outcome or DriveResult(
         False, None, None, "interrupted: nothing was saved"

@@ -57,7 +57,7 @@ def refused(codes: Codes) -> Iterator[None]:
         raise RefusalError(codes.parse_error, str(error)) from None
 
 
-class Found(NamedTuple):
+class Content(NamedTuple):
     """A resource that is there."""
 
     form: str  # SDF or YAML; empty for a name
@@ -88,7 +88,7 @@ def files_of(source: str) -> list[Path] | None:
     return None
 
 
-def find(resource: Any, codes: Codes) -> Found:
+def find(resource: Any, codes: Codes) -> Content:
     """Returns a resource, whose URI goes before its text. Raises RefusalError."""
     if resource.uri:
         return _of_uri(resource.uri, codes)
@@ -100,11 +100,11 @@ def find(resource: Any, codes: Codes) -> Found:
         if "<sdf" not in text:
             fault = "the resource_string is XML or USD, but no SDF; give SDF or YAML."
             raise RefusalError(codes.unsupported_format, fault)
-        return Found(SDF, text, "resource_string")
-    return Found(YAML, text, "resource_string")
+        return Content(SDF, text, "resource_string")
+    return Content(YAML, text, "resource_string")
 
 
-def _of_uri(uri: str, codes: Codes) -> Found:
+def _of_uri(uri: str, codes: Codes) -> Content:
     path = local(uri)
     if path is None:
         fault = f"uri {uri!r}: is not on this machine; give file:// or a path."
@@ -114,7 +114,7 @@ def _of_uri(uri: str, codes: Codes) -> Found:
         any(sign in uri for sign in SPECIAL) and not path.is_file()
     )
     if named or not suffix:
-        return Found("", "", str(path), path)
+        return Content("", "", str(path), path)
     if suffix not in SUFFIXES:
         fault = f"uri {uri!r}: is none of {', '.join(SUFFIXES)}; convert it."
         raise RefusalError(codes.unsupported_format, fault)
@@ -122,6 +122,6 @@ def _of_uri(uri: str, codes: Codes) -> Found:
         fault = f"uri {uri!r}: no such file; check the path on the simulator's machine."
         raise RefusalError(Result.RESULT_NOT_FOUND, fault)
     try:
-        return Found(SUFFIXES[suffix], read_text(path, MOST_BYTES), str(path), path)
+        return Content(SUFFIXES[suffix], read_text(path, MOST_BYTES), str(path), path)
     except ConfigError as error:
         raise RefusalError(codes.parse_error, str(error)) from None

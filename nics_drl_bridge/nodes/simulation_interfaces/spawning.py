@@ -89,7 +89,7 @@ class Spawning:
                 return None
             try:
                 path = find_config(resource.source, FOLDER)
-                resource = resources.Found(
+                resource = resources.Content(
                     resources.YAML, read_text(path), path.stem, path
                 )
             except ConfigError as error:

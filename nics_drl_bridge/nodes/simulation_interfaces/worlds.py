@@ -122,7 +122,7 @@ class Worlds:
         self._resource = request.world_resource
         response.world = describe_world(world, self._resource)
 
-    def _read(self, resource: resources.Found, request: Any) -> AnyWorld:
+    def _read(self, resource: resources.Content, request: Any) -> AnyWorld:
         with resources.refused(self._codes):
             if resource.form == resources.SDF:
                 if resource.path is not None:
