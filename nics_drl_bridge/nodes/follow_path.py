@@ -450,7 +450,8 @@ class PathActions:
     def _report(self, run: Run, robot: Array, place: Place, twist: Array) -> None:
         speed = float(np.hypot(*twist[:2]))
         pose = conversions.pose_to_ros(robot, self._topics.newest_ns, run.frame)
-        times = time.monotonic() - run.started_s, place.remaining / max(speed, SLOWEST)
+        driven_s = time.monotonic() - run.started_s
+        remaining_s = place.remaining / max(speed, SLOWEST)
         values = {
             "distance_to_goal": place.distance,
             "speed": speed,
@@ -462,8 +463,8 @@ class PathActions:
             "current_pose": pose,
             "distance_remaining": place.remaining,
             "header": pose.header,
-            "navigation_time": Duration(seconds=times[0]).to_msg(),
-            "estimated_time_remaining": Duration(seconds=times[1]).to_msg(),
+            "navigation_time": Duration(seconds=driven_s).to_msg(),
+            "estimated_time_remaining": Duration(seconds=remaining_s).to_msg(),
         }
         feedback = run.goal.kind.Feedback()
         for part in (feedback, getattr(feedback, "tracking_feedback", None)):

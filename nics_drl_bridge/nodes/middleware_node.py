@@ -8,6 +8,7 @@ from nav_msgs.msg import Odometry
 from rclpy.context import Context
 
 from nics_drl_bridge.errors import LONGEST, shorten
+from nics_drl_bridge.gate import inputs
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.middleware.measurement import Health, Rejection
 from nics_drl_bridge.middleware.middleware import rehearse
@@ -35,9 +36,8 @@ class MiddlewareNode(ManagedNode):
         model = open_model(runner.get_text(self, "model"))
         self._hardware = model.robot.name
         rehearse(model)
-        topic = "odometry/filtered"
         self._filtered = self.create_lifecycle_publisher(
-            Odometry, topic, qos.SENSOR_RELIABLE
+            Odometry, inputs.ESTIMATE, qos.SENSOR_RELIABLE
         )
         self._topics = RobotTopics(self, model, on_odometry=self._publish)
         self.undo.callback(self._topics.close)

@@ -10,6 +10,7 @@ from geometry_msgs.msg import PoseStamped, TwistStamped
 from rclpy.context import Context
 
 from nics_drl_bridge.errors import BridgeError, ConfigError, shorten
+from nics_drl_bridge.gate import inputs
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import S_PER_NS, Array, RobotView
 from nics_drl_bridge.lidar.spec import LidarSpec
@@ -76,7 +77,7 @@ class PolicyNode(ManagedNode):
         self._acted_ns = 0
         self._answer = None
         self._raw = self.create_lifecycle_publisher(
-            TwistStamped, "cmd_vel_raw", qos.COMMAND
+            TwistStamped, inputs.RAW, qos.COMMAND
         )
         goals = self.create_subscription(
             PoseStamped, "goal_pose", self._on_goal, qos.COMMAND

@@ -19,6 +19,8 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 
 from nics_drl_bridge.errors import ConfigError, suggest
+from nics_drl_bridge.gate import inputs
+from nics_drl_bridge.middleware.measurement import CMD_VEL
 from nics_drl_bridge.recording.messages import Offer
 
 try:
@@ -98,7 +100,7 @@ MOST_WAITING = 10_000  # most messages taken at once, in case a publisher never 
 # prefix of the parameters that override a topic's quality of service
 OVERRIDES = "qos_overrides."
 # Topics (names before remapping) whose quality of service decides whether a robot stops.
-FIXED_TOPICS = ("cmd_vel", "cmd_vel_raw", "e_stop", "ackermann_cmd")
+FIXED_TOPICS = (CMD_VEL, inputs.RAW, inputs.E_STOP, "ackermann_cmd")
 CHOICES: dict[str, Any] = {
     "history": rclpy_qos.HistoryPolicy,
     "reliability": rclpy_qos.ReliabilityPolicy,

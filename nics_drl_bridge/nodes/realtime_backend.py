@@ -16,6 +16,7 @@ from nics_drl_bridge import defaults, geometry
 from nics_drl_bridge.config import Schema, validate
 from nics_drl_bridge.env.guard import halts_on_error
 from nics_drl_bridge.errors import BackendError, StaleDataError
+from nics_drl_bridge.gate import inputs
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Array, BackendFacts, RobotView, Start
 from nics_drl_bridge.middleware.measurement import CMD_VEL, SCAN
@@ -88,7 +89,7 @@ class RealtimeOptions(Schema):
     @property
     def gated(self) -> bool:
         """True if commands pass a `command_gate`."""
-        return self.command_topic.rsplit("/", 1)[-1] == "cmd_vel_raw"
+        return self.command_topic.rsplit("/", 1)[-1] == inputs.RAW
 
 
 class Hindrance(NamedTuple):

@@ -9,6 +9,7 @@ from nav_msgs.msg import Odometry
 
 from nics_drl_bridge.config import parse_namespace
 from nics_drl_bridge.env.snapshot import Snapshot
+from nics_drl_bridge.gate import inputs
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.lidar.shapes import BODY
@@ -71,7 +72,7 @@ class RosSource:
         for kind, topic, take, quality in (
             (PoseStamped, "goal_pose", self._take_goal, qos.COMMAND),
             (Odometry, "ground_truth", self._take_truth, qos.SENSOR),
-            (Odometry, "odometry/filtered", self._take_map_frame, qos.SENSOR),
+            (Odometry, inputs.ESTIMATE, self._take_map_frame, qos.SENSOR),
             (DiagnosticArray, "/diagnostics", self._take_diagnostics, qos.DIAGNOSTICS),
         ):
             self._node.create_subscription(kind, topic, take, quality)
