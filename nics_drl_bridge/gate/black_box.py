@@ -96,7 +96,8 @@ def replay(path: str | Path) -> Replay:
     """Decides again on every input in a file; ConfigError if it is no whole black box."""
     head, *lines = _read_records(path)
     try:
-        config, state = from_plain(head["config"]), from_plain(head["state"])
+        config = from_plain(head["config"])
+        state = from_plain(head["state"])
         events = [
             (line["now"], from_plain(line["given"]), line["decision"]) for line in lines
         ]
@@ -175,8 +176,7 @@ def _read_records(path: str | Path) -> list[dict[str, Any]]:
 KIND = "kind"
 KINDS: dict[str, type] = {
     name: kind
-    for module in (inputs, limits, state)
-    for name, kind in vars(module).items()
+    for name, kind in (vars(inputs) | vars(limits) | vars(state)).items()
     if isinstance(kind, type) and is_dataclass(kind)
 }
 

@@ -42,7 +42,7 @@ from nics_drl_bridge.nodes.conversions import sensor_from_ros, sensor_type
 from nics_drl_bridge.nodes.device_parameters import default_namespaces
 from nics_drl_bridge.nodes.link import EpisodeServices, Link
 from nics_drl_bridge.nodes.lockstep_inbox import Inbox, Message, read_message
-from nics_drl_bridge.nodes.parameters import STANDARD
+from nics_drl_bridge.nodes.parameters import LOCKSTEP, REALTIME, STANDARD
 from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
 from nics_drl_bridge.nodes.robot_topics import data_facts
 from nics_drl_bridge.nodes.simulation_interfaces import client
@@ -50,8 +50,6 @@ from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
 from nics_drl_bridge.sim.simulator import EpisodeSampler
 from nics_drl_bridge.sim.world_set import AnyWorld
 
-LOCKSTEP = "lockstep"
-REALTIME = "realtime"
 TRUTH = "ground_truth"
 # The simulator is asked to repeat data that do not arrive within this time [s].
 REPEAT_S = 0.05
@@ -450,6 +448,10 @@ class FleetBackend:
 
 def stack_facts(facts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Merge the facts of M robots into arrays (M, ...); `SHARED_FACTS` stay as they are."""
-    stacked = {name: np.stack([values[name] for values in facts]) for name in facts[0]}
-    shared = {name: facts[0][name] for name in SHARED_FACTS if name in facts[0]}
-    return stacked | shared
+    stacked = {}
+    for name, value in facts[0].items():
+        if name in SHARED_FACTS:
+            stacked[name] = value
+        else:
+            stacked[name] = np.stack([robot[name] for robot in facts])
+    return stacked

@@ -15,13 +15,18 @@ from rclpy.parameter import Parameter
 from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S
-from nics_drl_bridge.nodes.parameters import MODES, ROBOTS, device, frame_fault
+from nics_drl_bridge.nodes.parameters import (
+    LOCKSTEP,
+    MODES,
+    ROBOTS,
+    device,
+    frame_fault,
+)
 from nics_drl_bridge.nodes.qos import given_values
 from nics_drl_bridge.nodes.runner import declare_row, get_number, get_text
 from nics_drl_bridge.robot.noise import Delay
 from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
 
-LOCKSTEP = "lockstep"
 START = "episode_start"
 GIVEN = "episode_start_given"
 GREATEST_FLEET = 256

@@ -11,7 +11,9 @@ from nics_drl_bridge import defaults
 from nics_drl_bridge.errors import shorten
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
-MODES = ("realtime", "lockstep", "as_fast_as_possible")
+REALTIME = "realtime"
+LOCKSTEP = "lockstep"
+MODES = (REALTIME, LOCKSTEP, "as_fast_as_possible")
 NO_POSE = defaults.POSE_TYPE
 POSE_TYPES = ("PoseStamped", "PoseWithCovarianceStamped")
 OWN = -1.0  # value of a delay: take the model's
@@ -328,7 +330,7 @@ def device(laser_frame: str = "") -> list[Row]:
             "",
             "Randomisation of each episode: mild, strong or a file; empty: none.",
         ),
-        Row("mode", MODES[0], f"How time runs: {', '.join(MODES)}."),
+        Row("mode", REALTIME, f"How time runs: {', '.join(MODES)}."),
         stamped(),
         Row(
             "frame_prefix",

@@ -456,7 +456,7 @@ class DeviceNode(qos.QosWatch):
         self._timer = None
         self._soon = self.create_guard_condition(self._on_time)
         self._complete = self.create_guard_condition(self._advance_if_complete)
-        if self._time.mode == "realtime":
+        if self._time.mode == parameters.REALTIME:
             period = step_ns / NS_PER_S / self._time.rate
             # If data are published later than measured, use a tick that divides the step.
             late = any((*self._time.scan_late_ns, *self._time.odom_late_ns))
