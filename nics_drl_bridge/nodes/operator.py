@@ -47,7 +47,7 @@ class GoalRequest:
     frame: str = ""  # empty: the map, whatever the policy node calls it
 
     def to_ros(self, stamp_ns: int) -> PoseStamped:
-        """Returns the goal as a message."""
+        """Return the goal as a message."""
         return conversions.pose_to_ros([self.x, self.y, self.yaw], stamp_ns, self.frame)
 
 
@@ -61,12 +61,12 @@ class _Call:
         self._future: Any = None
 
     def send_when_ready(self) -> None:
-        """Sends the request, unless it was sent or the service is not there yet."""
+        """Send the request, unless it was sent or the service is not there yet."""
         if self._future is None and self._client.service_is_ready():
             self._future = self._client.call_async(Trigger.Request())
 
     def wait_for_answer(self, seconds: float) -> GateAnswer:
-        """Returns the answer, or why there is none after so long; ends the call."""
+        """Return the answer, or why there is none after so long; end the call."""
         try:
             holds(self._is_answered, max(seconds, 0.0), POLL_S)
             if self._future is None:
@@ -99,7 +99,7 @@ class Operator(AbstractContextManager["Operator", None]):
     def arm(
         self, namespace: str, seconds: float, reset: bool, tell: Tell
     ) -> GateAnswer:
-        """Arms a gate, and asks again while it refuses; a reset before that releases its stop."""
+        """Arm a gate, and ask again while it refuses; a reset before that releases its stop."""
         deadline = time.monotonic() + seconds
         gate = self._wait_for_gate(namespace, seconds)
         if reset:
@@ -116,7 +116,7 @@ class Operator(AbstractContextManager["Operator", None]):
         return answer
 
     def stop(self, namespace: str | None, seconds: float) -> list[GateAnswer]:
-        """Presses the e-stop of one gate, or of every one that is seen if no namespace is given."""
+        """Press the e-stop of one gate, or of every one that is seen if no namespace is given."""
         if namespace is not None:
             gate = self._wait_for_gate(namespace, seconds)
             return [self._call(gate, "e_stop", time.monotonic() + CALL_S)]
@@ -140,7 +140,7 @@ class Operator(AbstractContextManager["Operator", None]):
     def send_goal(
         self, namespace: str, goal: GoalRequest, seconds: float, tell: Tell
     ) -> GoalAnswer:
-        """Sends a goal, again while it is refused; returns the last answer of the policy node."""
+        """Send a goal, again while it is refused; return the last answer of the policy node."""
         space = parse_namespace(namespace)
         deadline = time.monotonic() + seconds
         topic = self._node.create_publisher(
@@ -176,7 +176,7 @@ class Operator(AbstractContextManager["Operator", None]):
         )
 
     def _wait_for_policy(self, topic: Publisher, space: str, seconds: float) -> str:
-        """Waits for the policy node of a namespace, and returns its name."""
+        """Wait for the policy node of a namespace, and return its name."""
 
         def found() -> list[str]:
             names = list(self._policies)
@@ -197,7 +197,7 @@ class Operator(AbstractContextManager["Operator", None]):
         return names[0]
 
     def _wait_for_gate(self, namespace: str, seconds: float) -> str:
-        """Waits for the gate of a namespace, and returns its name."""
+        """Wait for the gate of a namespace, and return its name."""
         space = parse_namespace(namespace)
         gate = f"{space}/{GATE}"
         if not holds(lambda: gate in self._gates(), seconds, POLL_S):
@@ -206,7 +206,7 @@ class Operator(AbstractContextManager["Operator", None]):
         return gate
 
     def _gates(self) -> set[str]:
-        """Returns the names of all gates that are seen."""
+        """Return the names of all gates that are seen."""
         services = self._node.get_service_names_and_types()
         ends = [
             name.removesuffix("/arm")
@@ -218,7 +218,7 @@ class Operator(AbstractContextManager["Operator", None]):
     def _nobody(
         self, what: str, seconds: float, space: str = "", spaces: set[str] | None = None
     ) -> str:
-        """Returns a clause that says where nobody answers, and where somebody does."""
+        """Return a clause that says where nobody answers, and where somebody does."""
         where = f"in namespace {space or '/'} of ROS domain {self._node.context.get_domain_id()}"
         fault = f"no {what} was seen {where} within {seconds:g} s"
         if not spaces:
@@ -230,7 +230,7 @@ class Operator(AbstractContextManager["Operator", None]):
         )
 
     def _call(self, gate: str, service: str, deadline: float) -> GateAnswer:
-        """Calls a service of a gate; waits for its answer until a deadline, at most `CALL_S`."""
+        """Call a service of a gate; wait for its answer until a deadline, at most `CALL_S`."""
         wait_s = min(deadline - time.monotonic(), CALL_S)
         return _Call(self._node, gate, service).wait_for_answer(wait_s)
 

@@ -52,12 +52,12 @@ class StandardOptions(Schema):
 
 
 def snake_case(name: str) -> str:
-    """Returns the name of a service as all simulators write it: `get_entities`."""
+    """Return the name of a service as all simulators write it: `get_entities`."""
     return re.sub("(?<!^)(?=[A-Z])", "_", name).lower()
 
 
 def module(kind: str) -> Any:
-    """Returns the module `srv` or `msg` of the messages. ConfigError if missing or too old."""
+    """Return the module `srv` or `msg` of the messages. ConfigError if missing or too old."""
     if conversions.message_type(NEWEST) is None:
         fix = f"install {PACKAGE} 2.1 or newer with your ROS 2 distribution, and source it"
         raise ConfigError(
@@ -116,7 +116,7 @@ class StandardEpisodes:
         return self._link.node.create_client(kind, f"{prefix}{snake_case(name)}")
 
     def _call(self, name: str, timeout_s: float, *fine: int, **fields: Any) -> Any:
-        """Calls a service. Raises BackendError for a result that is neither OK nor `fine`."""
+        """Call a service. Raises BackendError for a result that is neither OK nor `fine`."""
         kind = getattr(self._types, name)
         response = self._link.call(
             self._services[name], kind.Request(**fields), timeout_s
@@ -127,7 +127,7 @@ class StandardEpisodes:
         return response
 
     def open(self, timeout_s: float) -> None:
-        """Checks the features, and measures a step. Raises BackendError naming what is missing."""
+        """Check the features, and measure a step. Raises BackendError naming what is missing."""
         request = self._types.GetSimulatorFeatures.Request()
         kinds = self._messages
         answer = self._link.call(self._features, request, timeout_s).features
@@ -182,7 +182,7 @@ class StandardEpisodes:
         return stamps[1] - stamps[0]
 
     def begin(self, start: Start, timeout_s: float) -> int:
-        """Begins an episode; returns the stamp of its first data [ns]. Raises BackendError."""
+        """Begin an episode; return the stamp of its first data [ns]. Raises BackendError."""
         if not self._steps:
             self.open(timeout_s)
         holds(lambda: all(future.done() for future in self._pending), timeout_s, POLL_S)
@@ -238,13 +238,13 @@ class StandardEpisodes:
         self._call("SetEntityState", timeout_s, entity=entity, state=state, **flags)
 
     def advance(self) -> None:
-        """Requests the steps of one control period without waiting for them."""
+        """Request the steps of one control period without waiting for them."""
         self._look()
         request = self._types.StepSimulation.Request(steps=self._steps)
         self._pending.append(self._services["StepSimulation"].call_async(request))
 
     def repeat(self) -> None:
-        """Raises BackendError if the steps were refused; the standard can't repeat data."""
+        """Raise BackendError if the steps were refused; the standard can't repeat data."""
         self._look()
 
     def _look(self) -> None:

@@ -56,7 +56,7 @@ TOO_LONG = "it repeats what repeats or branches, or more than 3 times, or has ov
 
 
 def pattern_of(expression: str) -> re.Pattern[str]:
-    """Compiles a POSIX extended regular expression. Raises RefusalError for none."""
+    """Compile a POSIX extended regular expression. Raises RefusalError for none."""
     try:
         if len(expression) > MOST_CHARACTERS or _runs_away(
             BRACKET.sub(".", expression)
@@ -114,7 +114,7 @@ class EntityServices:
         self._simulation = simulation
 
     def info(self, entity: Entity) -> EntityInfo:
-        """Returns what an entity is."""
+        """Return what an entity is."""
         if entity.name in self._simulation.infos:
             return self._simulation.infos[entity.name]
         kinds = EntityCategory
@@ -157,7 +157,7 @@ class EntityServices:
         return matching
 
     def state(self, entity: Entity) -> EntityState:
-        """Returns where an entity is and how it moves, in the frame of the map."""
+        """Return where an entity is and how it moves, in the frame of the map."""
         entities = self._simulation.entities
         state = EntityState()
         x, y, heading = entities.pose(entity).tolist()
@@ -169,26 +169,26 @@ class EntityServices:
         return state
 
     def list_names(self, request: Any, response: Any) -> None:
-        """Answers GetEntities."""
+        """Answer GetEntities."""
         response.entities = [entity.name for entity in self._matching(request.filters)]
 
     def list_states(self, request: Any, response: Any) -> None:
-        """Answers GetEntitiesStates."""
+        """Answer GetEntitiesStates."""
         entities = self._matching(request.filters)
         response.entities = [entity.name for entity in entities]
         response.states = [self.state(entity) for entity in entities]
 
     def find(self, name: str) -> Entity:
-        """Returns the entity of a name. Raises RefusalError, UnknownEntityError."""
+        """Return the entity of a name. Raises RefusalError, UnknownEntityError."""
         self._simulation.require_world()
         return self._simulation.entities.find(name)
 
     def get_info(self, request: Any, response: Any) -> None:
-        """Answers GetEntityInfo."""
+        """Answer GetEntityInfo."""
         response.info = self.info(self.find(request.entity))
 
     def set_info(self, request: Any, _: Any) -> None:
-        """Answers SetEntityInfo."""
+        """Answer SetEntityInfo."""
         name = self.find(request.entity).name
         kind = request.info.category.category
         if kind not in CATEGORIES:
@@ -197,16 +197,16 @@ class EntityServices:
         self._simulation.infos[name] = request.info
 
     def get_state(self, request: Any, response: Any) -> None:
-        """Answers GetEntityState."""
+        """Answer GetEntityState."""
         response.state = self.state(self.find(request.entity))
 
     def get_bounds(self, request: Any, response: Any) -> None:
-        """Answers GetEntityBounds."""
+        """Answer GetEntityBounds."""
         entity = self.find(request.entity)
         response.bounds = plane.box_to_ros(self._simulation.entities.outlines(entity))
 
     def set_state(self, request: Any, _: Any) -> None:
-        """Answers SetEntityState."""
+        """Answer SetEntityState."""
         entity = self.find(request.entity)
         asked = request.state
         entities = self._simulation.entities
@@ -229,7 +229,7 @@ class EntityServices:
             raise RefusalError(INVALID_POSE, str(error)) from None
 
     def delete(self, request: Any, _: Any) -> None:
-        """Answers DeleteEntity."""
+        """Answer DeleteEntity."""
         self._simulation.remove(self.find(request.entity).name)
 
 

@@ -26,7 +26,7 @@ SIZES = {
 
 
 def pose_from_ros(pose: Any, base: Array, code: int) -> Array:
-    """Returns x, y, heading (3,) in `map` of a pose in a frame that has a pose (3,) there.
+    """Return x, y, heading (3,) in `map` of a pose in a frame that has a pose (3,) there.
 
     Raises RefusalError with a code for what is no pose in the plane; z is not looked at.
     """
@@ -52,7 +52,7 @@ def pose_from_ros(pose: Any, base: Array, code: int) -> Array:
 def frame_pose(
     frame: str, entities: Entities, frames: Sequence[Any], code: int
 ) -> Array:
-    """Returns the pose (3,) of a frame in `map`: itself, or an entity's; RefusalError."""
+    """Return the pose (3,) of a frame in `map`: itself, or an entity's; RefusalError."""
     known = {"", "world", *(robot.map for robot in frames)}
     if frame in known:
         return np.zeros(3)
@@ -69,7 +69,7 @@ def frame_pose(
 
 
 def twist_from_ros(twist: Any, heading: float, code: int) -> Array:
-    """Returns vx, vy, wz (3,) along the axes of `map`, of a twist in a frame of a heading there."""
+    """Return vx, vy, wz (3,) along the axes of `map`, of a twist in a frame of a heading there."""
     values = np.array([twist.linear.x, twist.linear.y, twist.angular.z])
     if not np.isfinite(values).all():
         raise RefusalError(code, "the twist holds NaN or inf; give finite numbers.")
@@ -77,7 +77,7 @@ def twist_from_ros(twist: Any, heading: float, code: int) -> Array:
 
 
 def box_to_ros(outlines: Sequence[Array]) -> Bounds:
-    """Returns the box around outlines (V, 2): its upper right corner, then its lower left one."""
+    """Return the box around outlines (V, 2): its upper right corner, then its lower left one."""
     points = np.concatenate([np.zeros((0, 2)), *outlines])
     high = points.max(axis=0).tolist()
     low = points.min(axis=0).tolist()

@@ -33,7 +33,7 @@ class Codes(NamedTuple):
 
     @classmethod
     def of(cls, response: Any) -> Codes:
-        """Returns the codes that are constants of a response's class."""
+        """Return the codes that are constants of a response's class."""
         return cls(
             response.UNSUPPORTED_FORMAT,
             response.NO_RESOURCE,
@@ -67,7 +67,7 @@ class Content(NamedTuple):
 
 
 def local(uri: str) -> Path | None:
-    """Returns the path that a URI or a plain path means; None if it is elsewhere."""
+    """Return the path that a URI or a plain path means; None if it is elsewhere."""
     try:
         parts = urlsplit(uri)
     except ValueError:  # of a host that is none
@@ -78,7 +78,7 @@ def local(uri: str) -> Path | None:
 
 
 def files_of(source: str) -> list[Path] | None:
-    """Returns the files of a folder, or a file with a known suffix; None for any other source."""
+    """Return the files of a folder, or a file with a known suffix; None for any other source."""
     path = local(source)
     with suppress(OSError):
         if path and (
@@ -89,7 +89,7 @@ def files_of(source: str) -> list[Path] | None:
 
 
 def find(resource: Any, codes: Codes) -> Content:
-    """Returns a resource, whose URI goes before its text. Raises RefusalError."""
+    """Return a resource, whose URI goes before its text. Raises RefusalError."""
     if resource.uri:
         return _of_uri(resource.uri, codes)
     text = resource.resource_string

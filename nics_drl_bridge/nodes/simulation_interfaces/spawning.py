@@ -46,7 +46,7 @@ class Spawning:
         self._codes = resources.Codes.of(SpawnResult)
 
     def spawn(self, request: Any, response: Any) -> None:
-        """Answers SpawnEntity, and one part of SpawnEntities. Raises RefusalError, BridgeError."""
+        """Answer SpawnEntity, and one part of SpawnEntities. Raises RefusalError, BridgeError."""
         self._simulation.require_world()
         model = self._model(request)
         wanted = request.name or ("" if model is None else model.name)
@@ -150,7 +150,7 @@ class Spawning:
         return space
 
     def spawn_all(self, request: Any, response: Any) -> None:
-        """Answers SpawnEntities."""
+        """Answer SpawnEntities."""
         failed = []
         for k, spawn_request in enumerate(request.spawn_requests):
             answer = SpawnResult()
@@ -167,7 +167,7 @@ class Spawning:
             raise RefusalError(code, f"{more}; {failed[0]}")
 
     def list_spawnables(self, request: Any, response: Any) -> None:
-        """Answers GetSpawnables."""
+        """Answer GetSpawnables."""
         robot = self._host.model.robot
         unknown = list[str]()
         hull = hull_of(self._simulation.entities.simulator.footprint)

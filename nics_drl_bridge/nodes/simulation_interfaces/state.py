@@ -49,7 +49,7 @@ class Simulation:
         self.renew()
 
     def renew(self) -> None:
-        """Lists the entities of a world that the host begins to simulate."""
+        """List the entities of a world that the host begins to simulate."""
         host = self._host
         self.entities = Entities(
             host.device, host.world, host.robot_names, host.make_simulator
@@ -64,22 +64,22 @@ class Simulation:
         return int(self._halted)
 
     def halt(self, state: int) -> None:
-        """Holds the simulation in a state other than playing."""
+        """Hold the simulation in a state other than playing."""
         self._host.pause(True)
         self._halted = state
         self._stepping = False
 
     def require_world(self) -> None:
-        """Raises RefusalError if no world is loaded."""
+        """Raise RefusalError if no world is loaded."""
         if self.state in (WITHOUT_WORLD, QUITTING):
             raise RefusalError(Result.RESULT_INCORRECT_STATE, NO_WORLD)
 
     def get_state(self, _: Any, response: Any) -> None:
-        """Answers GetSimulationState."""
+        """Answer GetSimulationState."""
         response.state.state = self.state
 
     def set_state(self, request: Any, _: Any) -> None:
-        """Answers SetSimulationState."""
+        """Answer SetSimulationState."""
         codes = SetSimulationState.Response
         wanted = request.state.state
         state = self.state
@@ -114,7 +114,7 @@ class Simulation:
             self.halt(wanted)
 
     def require_paused(self, steps: int) -> None:
-        """Raises RefusalError unless so many steps can be made now."""
+        """Raise RefusalError unless so many steps can be made now."""
         problem = ""
         if self.state != PAUSED:
             problem = "the simulation is not paused; set its state to paused first."
@@ -126,7 +126,7 @@ class Simulation:
             raise RefusalError(Result.RESULT_OPERATION_FAILED, problem)
 
     def step(self, request: Any, _: Any) -> None:
-        """Answers StepSimulation."""
+        """Answer StepSimulation."""
         self.require_paused(request.steps)
         if request.steps > MOST_STEPS:
             fault = (
@@ -139,7 +139,7 @@ class Simulation:
             self._host.step()
 
     async def simulate(self, goal: Any) -> Any:
-        """Executes SimulateSteps: one step at a turn, so that all else is answered meanwhile."""
+        """Execute SimulateSteps: one step at a turn, so that all else is answered meanwhile."""
         steps = goal.request.steps
         result = SimulateSteps.Result()
         result.result.result = Result.RESULT_OPERATION_FAILED
@@ -189,7 +189,7 @@ class Simulation:
         return ""
 
     def reset(self, request: Any, _: Any) -> None:
-        """Answers ResetSimulation."""
+        """Answer ResetSimulation."""
         self.require_world()
         scope = request.scope or SCOPES.SCOPE_ALL
         if not scope & EVERY_SCOPE or (
@@ -213,7 +213,7 @@ class Simulation:
             self._host.rewind()
 
     def restore(self) -> None:
-        """Removes what was spawned, and brings back what was deleted."""
+        """Remove what was spawned, and bring back what was deleted."""
         # A robot that was spawned may have the name of one that was deleted.
         changed = any(entity.robot >= 0 for entity in self.entities.spawned.values())
         changed |= self.entities.robot_names != list(self._host.robot_names)
@@ -227,7 +227,7 @@ class Simulation:
         self._host.begin(rewind=True)
 
     def remove(self, *names: str) -> None:
-        """Removes entities, and the topics of robots among them."""
+        """Remove entities, and the topics of robots among them."""
         for name in names:
             entity = self.entities.find(name)
             self.entities.delete(entity)

@@ -91,14 +91,14 @@ class Worlds:
         self._codes = resources.Codes.of(CODES)
 
     def current(self, _: Any, response: Any) -> None:
-        """Answers GetCurrentWorld."""
+        """Answer GetCurrentWorld."""
         if self._simulation.state == WITHOUT_WORLD:
             reason = "no world is loaded; load one by load_world."
             raise RefusalError(GetCurrentWorld.Response.NO_WORLD_LOADED, reason)
         response.world = describe_world(self._host.world, self._resource)
 
     def unload(self, _: Any, __: Any) -> None:
-        """Answers UnloadWorld."""
+        """Answer UnloadWorld."""
         if self._simulation.state == WITHOUT_WORLD:
             reason = "no world is loaded, so that none can be unloaded."
             raise RefusalError(UnloadWorld.Response.NO_WORLD_LOADED, reason)
@@ -109,7 +109,7 @@ class Worlds:
         self._simulation.halt(WITHOUT_WORLD)
 
     def load(self, request: Any, response: Any) -> None:
-        """Answers LoadWorld: the present world is unloaded, even if the other can't be read."""
+        """Answer LoadWorld: the present world is unloaded, even if the other can't be read."""
         resource = resources.find(request.world_resource, self._codes)
         self._unload()
         world = self._read(resource, request)
@@ -160,7 +160,7 @@ class Worlds:
         return world_of(standing, name)
 
     def available(self, request: Any, response: Any) -> None:
-        """Answers GetAvailableWorlds."""
+        """Answer GetAvailableWorlds."""
         tags_match(request.filter, ())
         folder = share_folder() / "config"
         failed = list[str]()
@@ -198,7 +198,7 @@ class Worlds:
 
 
 def _load(path: Path, named: bool) -> AnyWorld:
-    """Loads worlds from a path, or by a name. Raises ConfigError, RefusalError for no such name."""
+    """Load worlds from a path, or by a name. Raises ConfigError, RefusalError for no such name."""
     try:
         return load_worlds(str(path))
     except UnknownNameError as error:
@@ -231,7 +231,7 @@ def _in_source(source: str, skipped: list[str]) -> list[tuple[str, AnyWorld]]:
 
 
 def describe_world(world: AnyWorld, resource: Resource) -> WorldResource:
-    """Returns the description of a world, with tags for what it contains."""
+    """Return the description of a world, with tags for what it contains."""
     members = world.members
     groups = list(chain.from_iterable(member.obstacles for member in members))
     about = {
@@ -255,7 +255,7 @@ def describe_world(world: AnyWorld, resource: Resource) -> WorldResource:
 
 
 def world_of(standing: Standing, name: str) -> World:
-    """Returns the world of what stands in an SDF file. Raises ConfigError.
+    """Return the world of what stands in an SDF file. Raises ConfigError.
 
     What encloses most of its field bounds it; else 2 m around it do, and 5 m around the origin.
     """
