@@ -160,8 +160,10 @@ def pose_from_ros(
     message: geometry.PoseStamped | geometry.PoseWithCovarianceStamped,
 ) -> tuple[Array, Array | None]:
     """Return the pose (3,) of a message and its covariance (3, 3), or None without one."""
-    known = isinstance(message, geometry.PoseWithCovarianceStamped)
-    covariance = np.reshape(message.pose.covariance, (6, 6))[PLANAR] if known else None
+    has_covariance = isinstance(message, geometry.PoseWithCovarianceStamped)
+    covariance = (
+        np.reshape(message.pose.covariance, (6, 6))[PLANAR] if has_covariance else None
+    )
     return np.array(messages.read_whole_pose(message)), covariance
 
 

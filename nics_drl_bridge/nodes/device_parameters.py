@@ -105,12 +105,12 @@ def timing(node: Node, model: SimulatorModel) -> DeviceTiming:
     )
     late = []
     for topic in ("scan", "odom"):
-        own = model.latency.measured.get(topic, Delay(least=0.0, jitter=0.0))
+        delay = model.latency.measured.get(topic, Delay(least=0.0, jitter=0.0))
         least = get_number(node, f"{topic}_latency")
         jitter = get_number(node, "latency_jitter")
         chosen = (
-            least if least >= 0.0 else own.least,
-            jitter if jitter >= 0.0 else own.jitter,
+            least if least >= 0.0 else delay.least,
+            jitter if jitter >= 0.0 else delay.jitter,
         )
         late.append((round(chosen[0] * NS_PER_S), round(chosen[1] * NS_PER_S)))
     return DeviceTiming(
@@ -181,8 +181,8 @@ def default_namespaces(robots: int) -> tuple[str, ...]:
 def frames(node: Node, namespace: str) -> Frames:
     """Return the frames of a robot; in a fleet all but the map begin with its namespace."""
     prefix = get_text(node, "frame_prefix") + (f"{namespace}/" if namespace else "")
-    world, *own = (get_text(node, f"{frame}_frame") for frame in Frames._fields[:-1])
-    odom, base, laser, footprint = (name and prefix + name for name in own)
+    world, *names = (get_text(node, f"{frame}_frame") for frame in Frames._fields[:-1])
+    odom, base, laser, footprint = (name and prefix + name for name in names)
     return Frames(world, odom, base, laser, footprint, prefix)
 
 

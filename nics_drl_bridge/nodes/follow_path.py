@@ -213,9 +213,9 @@ class PathActions:
     def led(self) -> bool:
         """True if another node serves `navigate_to_pose` and thereby handles `goal_pose`."""
         wanted = f"{self._node.resolve_topic_name(NAVIGATE)}/_action/send_goal"
-        own = self._node.get_name(), self._node.get_namespace()
+        this_node = self._node.get_name(), self._node.get_namespace()
         for name, space in self._node.get_node_names_and_namespaces():
-            if (name, space) != own:
+            if (name, space) != this_node:
                 with contextlib.suppress(NodeNameNonExistentError):  # it has just ended
                     served = self._node.get_service_names_and_types_by_node(name, space)
                     if any(service == wanted for service, _ in served):
@@ -223,10 +223,10 @@ class PathActions:
         return False
 
     def _look(self) -> None:
-        own = NAVIGATE in self._servers and (
+        may_give_way = NAVIGATE in self._servers and (
             self._run is None or self._run.goal.name == FOLLOW
         )
-        if own and self.led:
+        if may_give_way and self.led:
             reason = f"another node serves {NAVIGATE}, so this one no longer does"
             self._node.get_logger().info(reason)
             self._servers.pop(NAVIGATE).destroy()
@@ -272,12 +272,12 @@ class PathActions:
     def _follow(self, goal: Goal) -> Run:
         asked = goal.handle.request
         names = []
-        for what, those in self._parameters.names.items():
+        for kind, names_of_kind in self._parameters.names.items():
             name, wrong = chosen(
-                what.replace("_", " "), getattr(asked, f"{what}_id", ""), those
+                kind.replace("_", " "), getattr(asked, f"{kind}_id", ""), names_of_kind
             )
             if wrong:  # the code of Nav2's own server
-                code = "INVALID_CONTROLLER" if what == "controller" else "UNKNOWN"
+                code = "INVALID_CONTROLLER" if kind == "controller" else "UNKNOWN"
                 raise Refusal(code, f"{FOLLOW}: {wrong}")
             names.append(name)
         poses = np.array([read_pose(pose) for pose in asked.path.poses]).reshape(-1, 3)
@@ -299,8 +299,8 @@ class PathActions:
         except ConfigError as error:
             raise Refusal(goal.code, f"{NAVIGATE}: {error}") from None
         checks = [
-            self._parameters.names[f"{what}_checker"][0]
-            for what in ("goal", "progress")
+            self._parameters.names[f"{kind}_checker"][0]
+            for kind in ("goal", "progress")
         ]
         return self._begin(goal, frame, way, checks)
 

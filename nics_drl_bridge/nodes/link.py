@@ -79,7 +79,8 @@ class Link:
         self._closing = weakref.finalize(self, _shut_down, self._resources)
         try:
             overrides = [
-                Parameter(name, value=it) for name, it in (parameters or {}).items()
+                Parameter(name, value=value)
+                for name, value in (parameters or {}).items()
             ]
             self.node = qos.QosWatch(
                 "bridge_env",
@@ -402,7 +403,8 @@ class EpisodeServices:
             "episode_start_given": True,
         }
         settings = [
-            Parameter(name, value=it).to_parameter_msg() for name, it in chosen.items()
+            Parameter(name, value=value).to_parameter_msg()
+            for name, value in chosen.items()
         ]
         request = SetParametersAtomically.Request(parameters=settings)
         result = self._link.call(self._parameters, request, timeout_s).result

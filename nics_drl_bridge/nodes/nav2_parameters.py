@@ -45,9 +45,9 @@ class ControllerParameters:
             raise ConfigError(
                 f"parameter '{empty[0]}_plugins' is empty; give one name or more."
             )
-        one = values["progress_checker_plugin"]
-        if one:
-            self.names["progress_checker"] = (one,)
+        checker = values["progress_checker_plugin"]
+        if checker:
+            self.names["progress_checker"] = (checker,)
         for row in checkers(self.names["goal_checker"], self.names["progress_checker"]):
             declare_row(node, row)
 
@@ -63,11 +63,11 @@ class ControllerParameters:
         return arrives, gets_on
 
     def _filled(self, kind: Any, name: str) -> Any:
-        known = {
+        values = {
             field.name: self._node.get_parameter(f"{name}.{field.name}").value
             for field in fields(kind)
         }
-        return kind(**known)
+        return kind(**values)
 
     def ignores(self, name: str) -> bool:
         """True for a parameter of Nav2's own controller that means nothing to a policy."""

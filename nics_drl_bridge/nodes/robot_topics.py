@@ -225,8 +225,8 @@ class RobotTopics:
     @property
     def located(self) -> bool:
         """True if the robot's position in the map is known."""
-        known = self._placed is not None or not self._posed
-        return known or measurement.POSE in self.middleware.cache.newest
+        is_placed = self._placed is not None or not self._posed
+        return is_placed or measurement.POSE in self.middleware.cache.newest
 
     def view(self) -> RobotView:
         """Return the view at the stamp of the newest datum."""

@@ -335,12 +335,12 @@ def _accept_integers(node: Node, row: Row) -> None:
 
 def unknown(node: Node) -> list[str]:
     """Return a sentence for each value whose parameter the node does not have."""
-    known = [name for name in node._parameters if not name.startswith(qos.OVERRIDES)]
+    names = [name for name in node._parameters if not name.startswith(qos.OVERRIDES)]
     ignores = getattr(node, "ignores", lambda _: False)
     sentences = [
-        f"there is no parameter {name!r}, its value is ignored; {suggest(name, known)}"
+        f"there is no parameter {name!r}, its value is ignored; {suggest(name, names)}"
         for name in sorted(qos.given_values(node))
-        if name not in (*known, SHARED)
+        if name not in (*names, SHARED)
         and not name.startswith(qos.OVERRIDES)
         and not ignores(name)
     ]

@@ -348,9 +348,9 @@ class DeviceNode(qos.QosWatch):
         self._command_ns = np.zeros(count, np.int64)
         # in lock-step: the robots that have a command
         self._heard = np.zeros(count, np.bool_)
-        known = [k for k in kept if k < len(command_ns_before)]
-        self._command_ns[: len(known)] = command_ns_before[known]
-        self._heard[: len(known)] = heard_before[known]
+        present = [k for k in kept if k < len(command_ns_before)]
+        self._command_ns[: len(present)] = command_ns_before[present]
+        self._heard[: len(present)] = heard_before[present]
 
     @property
     def robot_names(self) -> tuple[str, ...]:

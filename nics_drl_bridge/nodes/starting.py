@@ -214,10 +214,10 @@ class Launch:
 
 def complete(arguments: Sequence[Argument], chosen: Values) -> dict[str, str]:
     """Return the values of all arguments. Raises ConfigError for an unknown name or choice."""
-    known = {argument.name for argument in arguments}
+    names = {argument.name for argument in arguments}
     for name in chosen:
-        if name not in known:
-            raise ConfigError(f"unknown argument {name!r}; {suggest(name, known)}")
+        if name not in names:
+            raise ConfigError(f"unknown argument {name!r}; {suggest(name, names)}")
     values: dict[str, str] = {}
     for argument in arguments:  # an argument comes after the one that is its default
         default = values[argument.same_as] if argument.same_as else argument.default
@@ -310,13 +310,13 @@ def bridge(setup: Setup) -> Iterator[NodeStart]:
     }
     managed = {"autostart": setup.flag("autostart"), IMU: setup.text(IMU)}
     of_policy = {"policy": setup.text("policy")}
-    own: dict[str, dict[str, Any]] = {
+    nodes: dict[str, dict[str, Any]] = {
         "command_gate": of_gate,
         "middleware_node": managed,
         "policy_node": {**managed, **of_policy},
     }
     for robot in setup.robots:
-        for node, parameters in own.items():
+        for node, parameters in nodes.items():
             frame = {BASE_FRAME.name: setup.frame(node, robot)}
             yield setup.node(PACKAGE, node, robot, {**shared, **parameters, **frame})
 

@@ -89,7 +89,10 @@ def _runs_away(plain: str) -> bool:
             return True
         inner = group[1].replace("|", "." if group[2] else ".|.")
         plain = plain.replace(group[0], inner + group[2], 1)
-    return max(sum(map(one.count, "*+?{")) for one in plain.split("|")) > MOST_REPEATS
+    return (
+        max(sum(map(branch.count, "*+?{")) for branch in plain.split("|"))
+        > MOST_REPEATS
+    )
 
 
 def tags_match(wanted: Any, tags: Any) -> bool:
@@ -131,7 +134,7 @@ class EntityServices:
     def _matching(self, filters: Any) -> list[Entity]:
         self._simulation.require_world()
         pattern = pattern_of(filters.filter)
-        categories = {one.category for one in filters.categories}
+        categories = {category.category for category in filters.categories}
         unknown = categories - CATEGORIES
         if unknown:
             fault = f"category {min(unknown)} is none of the standard"
@@ -144,8 +147,8 @@ class EntityServices:
             info = self.info(entity)
             pose = entities.pose(entity)
             outlines = (
-                planar.rotate(one, pose[2]) + pose[:2]
-                for one in entities.outlines(entity)
+                planar.rotate(outline, pose[2]) + pose[:2]
+                for outline in entities.outlines(entity)
             )
             if (
                 pattern.search(entity.name)

@@ -53,8 +53,8 @@ def frame_pose(
     frame: str, entities: Entities, frames: Sequence[Any], code: int
 ) -> Array:
     """Return the pose (3,) of a frame in `map`: itself, or an entity's; RefusalError."""
-    known = {"", "world", *(robot.map for robot in frames)}
-    if frame in known:
+    map_frames = {"", "world", *(robot.map for robot in frames)}
+    if frame in map_frames:
         return np.zeros(3)
     bases = {
         robot.base: name

@@ -89,8 +89,8 @@ class Simulation:
             )
             raise RefusalError(codes.ALREADY_IN_TARGET_STATE, already)
         if wanted not in NAMES:
-            known = ", ".join(f"{value} ({name})" for value, name in NAMES.items())
-            fault = f"state {wanted} can't be set; choose one of {known}"
+            states = ", ".join(f"{value} ({name})" for value, name in NAMES.items())
+            fault = f"state {wanted} can't be set; choose one of {states}"
             raise RefusalError(
                 codes.INCORRECT_TRANSITION, f"{fault}, or load or unload a world."
             )
@@ -195,8 +195,8 @@ class Simulation:
         if not scope & EVERY_SCOPE or (
             scope & ~EVERY_SCOPE and scope != SCOPES.SCOPE_ALL
         ):
-            known = "1 (time), 2 (state) and 4 (spawned)"
-            fault = f"scope {scope} has bits that mean nothing; add up {known}, or give 0 for all."
+            bits = "1 (time), 2 (state) and 4 (spawned)"
+            fault = f"scope {scope} has bits that mean nothing; add up {bits}, or give 0 for all."
             raise RefusalError(Result.RESULT_FEATURE_UNSUPPORTED, fault)
         self._stepping = False
         if scope & EVERY_SCOPE == EVERY_SCOPE:
