@@ -39,10 +39,14 @@ from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.nodes import qos, wire
 from nics_drl_bridge.nodes.conversions import sensor_from_ros, sensor_type
-from nics_drl_bridge.nodes.device_parameters import default_namespaces
 from nics_drl_bridge.nodes.link import EpisodeServices, Link
 from nics_drl_bridge.nodes.lockstep_inbox import Inbox, Message, read_message
-from nics_drl_bridge.nodes.parameters import LOCKSTEP, REALTIME, STANDARD
+from nics_drl_bridge.nodes.parameters import (
+    LOCKSTEP,
+    REALTIME,
+    STANDARD,
+    default_namespaces,
+)
 from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
 from nics_drl_bridge.nodes.robot_topics import data_facts
 from nics_drl_bridge.nodes.simulation_interfaces import client

@@ -19,6 +19,7 @@ from nics_drl_bridge.nodes.parameters import (
     LOCKSTEP,
     MODES,
     ROBOTS,
+    default_namespaces,
     device,
     frame_fault,
 )
@@ -171,11 +172,6 @@ def namespaces(node: Node) -> tuple[str, ...]:
             f"parameter 'robots' is {value!r}; {fix}, as in [robot1, robot2]."
         )
     return names
-
-
-def default_namespaces(robots: int) -> tuple[str, ...]:
-    """Return the default namespaces of several robots: robot1, robot2, ..."""
-    return tuple(f"robot{k + 1}" for k in range(robots))
 
 
 def frames(node: Node, namespace: str) -> Frames:

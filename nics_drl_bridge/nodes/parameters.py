@@ -422,6 +422,13 @@ ROBOTS = Row(
     1,
     "Number of robots, named robot1, robot2, ..., or their namespaces; one has none.",
 )
+
+
+def default_namespaces(robots: int) -> tuple[str, ...]:
+    """Return the default namespaces of several robots: robot1, robot2, ..."""
+    return tuple(f"robot{k + 1}" for k in range(robots))
+
+
 FRICTION = Row(
     "friction",
     1.0,

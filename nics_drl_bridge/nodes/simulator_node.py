@@ -248,9 +248,10 @@ class CommandInlet:
             self._node.destroy_subscription(subscription)
 
     def _on_bytes(self, stamped: bool, content: bytes) -> None:
+        stamp_ns = 0
         try:
-            stamp_ns = wire.stamp_of(content) if stamped else 0
             if stamped:
+                stamp_ns = wire.stamp_of(content)
                 twist = wire.stamped_twist_of(content)
             else:
                 twist = wire.twist_of(content)

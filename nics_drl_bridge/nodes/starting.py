@@ -17,12 +17,19 @@ from typing import Any, NamedTuple
 from nics_drl_bridge.config import (
     PACKAGE,
     find_config,
+    list_shipped,
     parse_yaml,
     read_text,
     share_folder,
 )
 from nics_drl_bridge.errors import ConfigError, suggest
-from nics_drl_bridge.nodes.parameters import BASE_FRAME, IMU, MODEL, STAMPED
+from nics_drl_bridge.nodes.parameters import (
+    BASE_FRAME,
+    IMU,
+    MODEL,
+    STAMPED,
+    default_namespaces,
+)
 
 STATE_PUBLISHER = "robot_state_publisher"
 RVIZ = "rviz2"
@@ -126,10 +133,9 @@ class Setup:
     def _of_file(self, name: str, node: str) -> Any:
         """Return a value from the parameter file, for a node in any namespace."""
         value = None
-        for key in ("/**", f"/**/{node}", node, f"/{node}") if node else ("/**",):
-            value = (
-                (self._file.get(key) or {}).get("ros__parameters", {}).get(name, value)
-            )
+        for key in ("/**", f"/**/{node}", node, f"/{node}"):
+            section = self._file.get(key) or {}
+            value = section.get("ros__parameters", {}).get(name, value)
         return value
 
     def limits(self) -> str:
@@ -137,11 +143,7 @@ class Setup:
         if self["limits"] or not self["model"]:
             return self["limits"]
         robot = self.model if self._opened is None else self._opened.robot.name
-        return (
-            robot
-            if (share_folder() / "config" / "limits" / f"{robot}.yaml").is_file()
-            else ""
-        )
+        return robot if robot in list_shipped("limits") else ""
 
     def frame(self, node: str, robot: Robot) -> str | None:
         """Return a frame of a robot in a fleet; None for a single robot, whose file names it."""
@@ -254,7 +256,7 @@ def names_of(robots: Any) -> tuple[str, ...]:
         if count < 1:
             fix = "give a count from 1, or namespaces, as in robots:='[ant, bee]'"
             raise ConfigError(f"launch argument 'robots' is {count}; {fix}.")
-        return tuple(f"robot{k + 1}" for k in range(count)) if count > 1 else ()
+        return default_namespaces(count) if count > 1 else ()
     twice = {word for word in words if words.count(word) > 1}
     if twice:
         raise ConfigError(
