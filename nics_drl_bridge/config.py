@@ -16,7 +16,13 @@ import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
 from yaml.composer import Composer
 
-from nics_drl_bridge.errors import ConfigError, shorten, suggest
+from nics_drl_bridge.errors import (
+    ConfigError,
+    MissingFileError,
+    UnknownNameError,
+    shorten,
+    suggest,
+)
 
 PACKAGE = "nics_drl_bridge"
 MAX_DEPTH = 32
@@ -203,7 +209,7 @@ def read_text(path: str | Path, limit: int = MAX_BYTES) -> str:
             raise ConfigError(f"{path}: {reason}; give another.")
         return path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file; check the path.") from None
+        raise MissingFileError(f"{path}: no such file; check the path.") from None
     except IsADirectoryError:
         raise ConfigError(f"{path}: is a folder, not a file.") from None
     except UnicodeDecodeError:
@@ -244,11 +250,11 @@ def find_config(name: str | Path, kind: str, extra_names: Iterable[str] = ()) ->
     if path.is_file():
         return path
     hint = suggest(name, (*list_shipped(kind), *extra_names))
-    word = {"training": "settings", "limits": "limits"}.get(
-        kind, kind.removesuffix("s")
+    words = {"training": "settings", "limits": "limits", "entities": "entity"}
+    unknown = f"unknown {words.get(kind, kind.removesuffix('s'))} {name!r}"
+    raise UnknownNameError(
+        f"{unknown}; {hint} (or give the path of a YAML file).", kind
     )
-    unknown = f"unknown {word} {name!r}"
-    raise ConfigError(f"{unknown}; {hint} (or give the path of a YAML file).")
 
 
 # libyaml's parser is four times as fast; nodes are composed in Python either way.

@@ -20,6 +20,12 @@ SHADOW_AHEAD_S: Final = 4.0  # default goal: the robot's position this much late
 CONFIRMED_BEYOND_M: Final = 5.0  # farther goals of a vehicle need confirmation
 VEHICLE_START: Final = "wait"  # until it is at the start; alternative: `present`
 
+# importing worlds
+IMPORT_CLEARANCE_M: Final = (
+    0.1  # around the footprint: imported worlds are often narrow
+)
+IMPORT_GOAL_DISTANCE_M: Final = 2.0  # minimum distance from start to goal
+
 # recording and identification
 DRIVE_S: Final = 60.0  # duration of an identification drive
 DRIVE_BOUND_M: Final = 2.0  # radius around the start that the robot stays within
@@ -30,6 +36,8 @@ PRUNING: Final = "auto"  # alpha of Eq. 2 at the knee of the accuracy
 # a robot behind its topics
 SIMULATOR_NODE: Final = "simulator_node"
 ANSWER_S: Final = 30.0  # longest wait for a peer or an answer
+COMMAND_SILENCE_S: Final = 0.5  # after it a robot that got no new command stops
+DATA_SILENCE_S: Final = 0.5  # after it whoever drives a robot without new data stops it
 LISTEN_S: Final = 5.0  # to check a robot against a model
 IMU_TOPIC: Final = "auto"  # `imu` or `imu/data`, if the model was made with a gyro
 POSE_TYPE: Final = "none"  # no pose sensor

@@ -26,9 +26,25 @@ class BridgeError(Exception):
     def __init__(self, sentence: str = "") -> None:
         super().__init__(shorten(sentence, LONGEST))
 
+    def reword(self, sentence: str) -> None:
+        """Sets another sentence; the fields of the error stay."""
+        self.args = (shorten(sentence, LONGEST),)
+
 
 class ConfigError(BridgeError):
     """A YAML file, key, name or option is wrong."""
+
+
+class MissingFileError(ConfigError):
+    """A file does not exist."""
+
+
+class UnknownNameError(ConfigError):
+    """A name is none of the files in `config/KIND`."""
+
+    def __init__(self, sentence: str = "", kind: str = "") -> None:
+        self.kind = kind
+        super().__init__(sentence)
 
 
 class RecordingError(BridgeError):

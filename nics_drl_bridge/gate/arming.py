@@ -15,8 +15,9 @@ from nics_drl_bridge.gate.state import (
     ScanMotion,
     replace,
 )
-from nics_drl_bridge.gate.stops import ODOM, SCAN, reset_envelope
+from nics_drl_bridge.gate.stops import reset_envelope
 from nics_drl_bridge.interface import S_PER_NS
+from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 
 Check = Callable[[GateConfig, GateState, inputs.Arm, float], str]
 """What is wrong at a request to arm; empty if nothing is."""
@@ -32,11 +33,11 @@ def arm(
     config: GateConfig, state: GateState, request: inputs.Arm, now: float
 ) -> tuple[GateState, str, bool]:
     """Arms the gate if all checks pass; returns also the answer, and whether it was granted."""
-    faults = [
-        f"{name}: {fault}"
-        for name, check in CHECKS
-        if (fault := check(config, state, request, now))
-    ]
+    faults = []
+    for name, check in CHECKS:
+        fault = check(config, state, request, now)
+        if fault:
+            faults.append(f"{name}: {fault}")
     if faults:
         return state, "; ".join(faults), False
     return _begin_drive(config, state), "armed", True
@@ -143,13 +144,13 @@ def _check_estimator(
     if not config.estimate_required:
         return ""
     if estimate is None or now - state.estimate_s > config.estimate_silence_s:
-        return "odometry/filtered is silent, start the middleware_node"
+        return f"{inputs.ESTIMATE} is silent, start the middleware_node"
     doubt = estimates.explain_unsteadiness(config, state, now)
     if doubt:
         return doubt
     if frozen.is_at_rest(config, estimate.twist):
         return ""
-    return "odometry/filtered shows motion"
+    return f"{inputs.ESTIMATE} shows motion"
 
 
 def _check_publishers(

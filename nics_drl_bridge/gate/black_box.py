@@ -2,8 +2,6 @@
 
 import base64
 import json
-from collections import deque
-from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 from itertools import chain
 from pathlib import Path
@@ -21,7 +19,6 @@ from nics_drl_bridge.gate.seal import SEAL, append_checksum
 from nics_drl_bridge.gate.state import Decision, GateConfig, GateState
 
 FORMAT = "nics_drl_bridge/black_box/4"
-KEPT_S = 30.0
 LATEST_S = 1e12
 MOST_BYTES = 64 * 2**20  # greatest size of a file that is replayed
 # greatest number of values in such a file; 30 s of a gate have 100,000
@@ -39,35 +36,10 @@ class Entry(NamedTuple):
     decision: Decision
 
 
-class BlackBox:
-    """Keeps the latest entries over some time [s]; their states share data, so memory is small."""
-
-    def __init__(self, config: GateConfig, kept_s: float = KEPT_S) -> None:
-        self.config = config
-        self._kept_s = kept_s
-        self._entries: deque[Entry] = deque()
-
-    def note(self, entry: Entry) -> None:
-        """Adds an entry and drops those that are too old."""
-        self._entries.append(entry)
-        while entry.now - self._entries[0].now > self._kept_s:
-            self._entries.popleft()
-
-    def copy(self) -> tuple[Entry, ...]:
-        """Returns the present entries, oldest first."""
-        return tuple(self._entries)
-
-
 def write(config: GateConfig, entries: tuple[Entry, ...], path: str | Path) -> None:
     """Writes entries (at least one) to a file, completely or not at all."""
-    write_parts(path, generate_lines(config, entries))
-
-
-def generate_lines(config: GateConfig, entries: tuple[Entry, ...]) -> Iterator[bytes]:
-    """Yields the lines one by one: memory must not grow at a stop."""
-    yield from append_checksum(
-        chain([format_head(config, entries[0].before)], map(format_entry, entries))
-    )
+    head = format_head(config, entries[0].before)
+    write_parts(path, append_checksum(chain([head], map(format_entry, entries))))
 
 
 def format_head(config: GateConfig, state: GateState) -> bytes:
@@ -124,7 +96,8 @@ def replay(path: str | Path) -> Replay:
     """Decides again on every input in a file; ConfigError if it is no whole black box."""
     head, *lines = _read_records(path)
     try:
-        config, state = from_plain(head["config"]), from_plain(head["state"])
+        config = from_plain(head["config"])
+        state = from_plain(head["state"])
         events = [
             (line["now"], from_plain(line["given"]), line["decision"]) for line in lines
         ]
@@ -203,8 +176,7 @@ def _read_records(path: str | Path) -> list[dict[str, Any]]:
 KIND = "kind"
 KINDS: dict[str, type] = {
     name: kind
-    for module in (inputs, limits, state)
-    for name, kind in vars(module).items()
+    for name, kind in (vars(inputs) | vars(limits) | vars(state)).items()
     if isinstance(kind, type) and is_dataclass(kind)
 }
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nics_drl_bridge.gate.inputs import Estimate
+from nics_drl_bridge.gate.inputs import ESTIMATE, Estimate
 from nics_drl_bridge.gate.limits import get_maximum_speeds
 from nics_drl_bridge.gate.state import (
     Cause,
@@ -25,7 +25,6 @@ from nics_drl_bridge.geometry import between
 WINDOW_S = 10.0  # in which uncertainty is counted, but only since arming [s]
 ESTIMATE_MARK_S = 1.0  # time between two marks [s]
 SLIP = 2.0  # factor by which a robot may exceed its speeds
-TOPIC = "odometry/filtered"
 REMEDY = (
     "give the pose by `initialpose` or by the localiser, or call `middleware_node/~/reset`, then "
     "`~/reset` and `~/arm`"
@@ -116,7 +115,9 @@ def explain_unsteadiness(config: GateConfig, state: GateState, now: float) -> st
     track = state.estimates
     if not track.last_fault or now - track.marks[0].time_s >= config.settle_s:
         return ""
-    return f"{TOPIC}: {track.last_fault}; wait for {config.settle_s:g} s, or {REMEDY}"
+    return (
+        f"{ESTIMATE}: {track.last_fault}; wait for {config.settle_s:g} s, or {REMEDY}"
+    )
 
 
 def estimate_lost(config: GateConfig, state: GateState, now: float) -> Cause | None:
@@ -124,4 +125,4 @@ def estimate_lost(config: GateConfig, state: GateState, now: float) -> Cause | N
     fault = state.estimates.fault
     if not fault or not config.estimate_required:
         return None
-    return Cause("estimate_lost", TOPIC, f"{fault}; {REMEDY}")
+    return Cause("estimate_lost", ESTIMATE, f"{fault}; {REMEDY}")

@@ -14,9 +14,10 @@ from nics_drl_bridge.gate.state import (
     Sameness,
     replace,
 )
-from nics_drl_bridge.gate.stops import ODOM, SCAN, make_cause
+from nics_drl_bridge.gate.stops import make_cause
 from nics_drl_bridge.geometry import between, compose
 from nics_drl_bridge.interface import Array
+from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 
 Flags = NDArray[np.bool_]
 IDENTICAL = 3  # minimum number of scans that show a frozen picture

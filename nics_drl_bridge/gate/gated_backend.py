@@ -82,9 +82,9 @@ class GatedBackend:
         self._give(inputs.Scan(now, view.ranges.astype(np.float32, copy=True), angles))
         return view
 
-    def _give(self, given: inputs.Input) -> Decision:
+    def _give(self, event: inputs.Input) -> Decision:
         now = self._now_ns * interface.S_PER_NS
-        self._state, decision = decide(self._config, self._state, given, now)
+        self._state, decision = decide(self._config, self._state, event, now)
         return decision
 
     def facts(self) -> interface.BackendFacts:

@@ -6,6 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.interface import Array
+from nics_drl_bridge.middleware.measurement import ODOM, SCAN
+
+# topics of the inputs, besides those of further sensors
+ESTIMATE = "odometry/filtered"
+RAW = "cmd_vel_raw"
+E_STOP = "e_stop"
 
 
 @dataclass(frozen=True)
@@ -100,3 +106,18 @@ Input = (
     | Reset
     | Tick
 )
+
+TOPICS: dict[type, str] = {
+    Scan: SCAN,
+    Odometry: ODOM,
+    Estimate: ESTIMATE,
+    Command: RAW,
+    EStop: E_STOP,
+}
+
+
+def get_topic(event: Input) -> str:
+    """Returns the topic of an input; empty for a call of a service and for a tick."""
+    if isinstance(event, SensorReading):
+        return event.name
+    return TOPICS.get(type(event), "")

@@ -23,9 +23,9 @@ from nics_drl_bridge.gate.state import (
     SensorState,
     replace,
 )
-from nics_drl_bridge.gate.stops import ODOM, SCAN
 from nics_drl_bridge.geometry import between
 from nics_drl_bridge.interface import S_PER_NS
+from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 
 Taken = tuple[GateState, str]
 """The state after an input, and the reason why the input is refused, or ""."""
@@ -89,11 +89,11 @@ def _clear_faults(state: GateState) -> GateState:
 
 
 def _find_refusal(config: GateConfig, event: inputs.Input) -> str:
-    """Returns the first reason to refuse an input, or ""."""
+    """Returns the topic of an input and the first reason to refuse it, or ""."""
     for kind, judge in REFUSALS:
         reason = judge(config, event) if isinstance(event, kind) else ""
         if reason:
-            return reason
+            return f"{inputs.get_topic(event)}: {reason}"
     return ""
 
 
@@ -168,7 +168,7 @@ def _take_odometry(
             ground=None,
             scan_motion=ScanMotion(),
         )
-        return state, f"odom: {leap}"
+        return state, f"{ODOM}: {leap}"
     state = replace(state, odometries=arrivals, odometry=odometry)
     if not frozen.is_at_rest(config, odometry.twist):
         state = replace(state, restless_s=now)
@@ -233,31 +233,31 @@ def scan_malformed(config: GateConfig, scan: inputs.Scan) -> str:
     angles = config.beam_angles
     first, step = scan.angles
     if scan.ranges.shape != angles.shape:
-        return f"scan: {scan.ranges.size} beams, not {len(angles)}"
+        return f"{scan.ranges.size} beams, not {len(angles)}"
     increment = float(angles[1] - angles[0]) if len(angles) > 1 else step
     last_off = abs(first - angles[0]) + abs(step - increment) * (len(angles) - 1)
     if not last_off <= ANGLE_TOLERANCE:
-        return "scan: its angles are not those of the declared lidar"
+        return "its angles are not those of the declared lidar"
     if np.isnan(scan.ranges).all():
-        return "scan: every range is NaN"
+        return "every range is NaN"
     return ""
 
 
 def check_reading(config: GateConfig, reading: inputs.SensorReading) -> str:
     """The reading is of an unknown sensor, or not finite."""
     if reading.name not in config.sensors:
-        return f"{reading.name}: there is no such sensor"
+        return "there is no such sensor"
     if not np.isfinite(reading.points).all():
-        return f"{reading.name}: NaN or inf"
+        return "NaN or inf"
     return ""
 
 
 def check_odometry(config: GateConfig, odometry: inputs.Odometry) -> str:
     """The odometry is not finite, or too fast for a mobile robot."""
     if not (np.isfinite(odometry.pose).all() and np.isfinite(odometry.twist).all()):
-        return "odom: NaN, inf, or no rotation"
+        return "NaN, inf, or no rotation"
     if np.abs(odometry.twist).max() > MAX_SPEED:
-        return f"odom: faster than {MAX_SPEED:g} m/s or rad/s"
+        return f"faster than {MAX_SPEED:g} m/s or rad/s"
     return ""
 
 
@@ -265,16 +265,16 @@ def estimate_malformed(config: GateConfig, estimate: inputs.Estimate) -> str:
     """The estimate is not finite, or its covariance has a negative variance."""
     parts = (estimate.twist, estimate.pose, estimate.covariance)
     if not all(np.isfinite(part).all() for part in parts):
-        return "odometry/filtered: NaN or inf"
+        return "NaN or inf"
     if (np.diag(estimate.covariance) < 0.0).any():
-        return "odometry/filtered: a variance is negative"
+        return "a variance is negative"
     return ""
 
 
 def check_finite(config: GateConfig, command: inputs.Command) -> str:
     """The command is not finite."""
     if not np.isfinite(command.twist).all():
-        return "cmd_vel_raw: NaN or inf"
+        return "NaN or inf"
     return ""
 
 
@@ -284,7 +284,7 @@ def check_plausible(config: GateConfig, command: inputs.Command) -> str:
     twist = command.twist
     if bounds is None or not limits.is_implausible(config.command(twist), bounds):
         return ""
-    return f"cmd_vel_raw: {twist.tolist()} is far out of range"
+    return f"{twist.tolist()} is far out of range"
 
 
 REFUSALS: tuple[tuple[type, Callable[[GateConfig, Any], str]], ...] = (

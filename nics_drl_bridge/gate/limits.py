@@ -105,12 +105,16 @@ def load_limits(name: str | Path, robot: RobotSpec) -> Limits:
             file.commands[variable.name],
             variable,
         )
-    low, high, rate, jerk = (
-        np.array([getattr(file.commands[name], bound) for name in names])
-        for bound in ("min", "max", "rate", "jerk")
-    )
+    commands = [file.commands[name] for name in names]
     units = np.array([variable.unit for variable in robot.command])
-    limits = Limits(low, high, rate, jerk, linear=units == SPEED, turn=units == TURN)
+    limits = Limits(
+        low=np.array([command.min for command in commands]),
+        high=np.array([command.max for command in commands]),
+        rate=np.array([command.rate for command in commands]),
+        jerk=np.array([command.jerk for command in commands]),
+        linear=units == SPEED,
+        turn=units == TURN,
+    )
     speeds = limits.linear | limits.turn
     if (speeds.any() or robot.takes_cmd_vel) and get_maximum(
         limits, speeds

@@ -33,9 +33,10 @@ from nics_drl_bridge.gate.state import (
     ScanMotion,
     replace,
 )
-from nics_drl_bridge.gate.stops import SCAN, make_cause
+from nics_drl_bridge.gate.stops import make_cause
 from nics_drl_bridge.geometry import between, compose, exp
 from nics_drl_bridge.interface import S_PER_NS, Array
+from nics_drl_bridge.middleware.measurement import SCAN
 
 FULL_CIRCLE = 2.0 * np.pi
 BEAM_COUNT_TOLERANCE = 1e-6  # tolerance of a number of beams

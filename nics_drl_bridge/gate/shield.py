@@ -337,7 +337,9 @@ def _span_car_twists(
 def warm_up() -> None:
     """Compiles the kernels of the shield; a moving robot does not have the seconds it takes."""
     shield_kernels.fill_grid(np.zeros(3), np.zeros(3), np.ones(3, np.int64))
-    body = get_body(ShieldConfig(0.0, 1.0, 0.0, 0.0, footprint_radius=1.0))
+    body = get_body(
+        ShieldConfig(0.0, 1.0, 0.0, 0.0, footprint_radius=1.0, obstacle_speed=0.0)
+    )
     shield_kernels.is_free(np.zeros((1, 3)), np.zeros((1, 3)), body, 0.0, 1.0, STEP)
     lidar = MountedBeams(0.0, 0.1, 0.0, 0.0, 0.0)
     ranges = np.ones(1, np.float32)

@@ -17,6 +17,7 @@ Ranges = NDArray[np.float32]
 Record = TypeVar("Record")
 INF = float("inf")
 NAN = float("nan")
+NO_NOISE = (0.0, 0.0)  # of a lidar's ranges
 
 
 def replace(record: Record, **changes: Any) -> Record:
@@ -43,10 +44,10 @@ class ShieldConfig:
     # of a car, which is commanded by steering angle [m]; 0 for others
     wheelbase: float = 0.0
     # of moving obstacles that approach [m/s]; 0: all are static
-    obstacle_speed: float = 0.0
+    obstacle_speed: float = field(kw_only=True)
     range_max: float = INF  # of the lidar [m]
     # standard deviation, in metres and as a fraction of the range
-    range_noise: tuple[float, float] = (0.0, 0.0)
+    range_noise: tuple[float, float] = NO_NOISE
     # fraction of unknown beams from which a direction counts as blocked
     unknown_share: float = 0.5
     unknown_width: float = 0.35  # angle over which that fraction is taken [rad]
@@ -105,7 +106,7 @@ class GateConfig:
     stop_when_held: bool = True
     odom_std: tuple[float, float] = (0.0, 0.0)  # of odometry's twist [m/s, rad/s]
     # standard deviation, in metres and as a fraction of the range
-    range_noise: tuple[float, float] = (0.0, 0.0)
+    range_noise: tuple[float, float] = NO_NOISE
     shield: ShieldConfig | None = None
     sensors: tuple[str, ...] = ()  # further ones, which must be as fresh as the scan
     bicycle: Bicycle | None = None

@@ -13,6 +13,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.gate.limits import SPEED, TURN, Limits, LimitsFile, Stopping
 from nics_drl_bridge.gate.state import GateConfig, ShieldConfig
 from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.robot.braking import Braking, TurnBraking, find_braking
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -54,22 +55,27 @@ def make_gate_config(
         scan_rate=lidar.rate,
         sensors=tuple(sensor.name for sensor in model.sensors),
         odom_std=model.noise.odometry,
-        range_noise=(lidar.noise_std, lidar.faults.noise_proportional),
+        range_noise=_get_range_noise(lidar),
         shield=shield,
         **rules,
     )
+
+
+def _get_range_noise(lidar: LidarSpec) -> tuple[float, float]:
+    """Returns the standard deviation of ranges, in metres and as a fraction of the range."""
+    return lidar.noise_std, lidar.faults.noise_proportional
 
 
 def shield_config(
     model: SimulatorModel,
     limits: Limits | None,
     file: str | Path = "",
-    given: Mapping[str, float] | None = None,
+    overrides: Mapping[str, float] | None = None,
 ) -> tuple[ShieldConfig, str]:
     """Returns a robot's shield, and a sentence on its values; ConfigError if one can't be used.
 
-    Values are from `shield` in the file of limits, else derived from model and limits; `given`
-    values override them.
+    Values are from `shield` in the file of limits, else derived from model and limits; `overrides`
+    come first.
     """
     if model.lidar.beams < MIN_SHIELD_BEAMS:
         fault = f"the shield needs a lidar of {MIN_SHIELD_BEAMS} beams or more"
@@ -80,20 +86,20 @@ def shield_config(
         )
     path = find_config(file, "limits") if file else None
     measured = load_yaml(path, LimitsFile).shield if path else None
-    given = given or {}
+    overrides = overrides or {}
     try:
         braking = derive_braking(model, limits)
     except ConfigError as error:
-        if measured is None and not given.keys() >= {"latency", "deceleration"}:
-            advice = "or give it: `shield: {latency: .., deceleration: ..}` in the file of limits"
-            raise ConfigError(f"{str(error).removesuffix('.')}, {advice}.") from None
+        if measured is None and not overrides.keys() >= {"latency", "deceleration"}:
+            advice = "The file of limits may give it: `shield: {latency: .., deceleration: ..}`."
+            raise ConfigError(f"{error} {advice}") from None
         braking = Braking(0.0, math.inf)
     stopping = measured
     if stopping is None:
         stopping = Stopping(
             latency=braking.reaction_s, deceleration=min(braking.deceleration, HARDEST)
         )
-    values = stopping.model_copy(update=dict(given))
+    values = stopping.model_copy(update=dict(overrides))
     for name, value in values.model_dump().items():
         low, high = SHIELD_SPANS[name]
         if not low <= value <= high:
@@ -109,7 +115,7 @@ def shield_config(
         wheelbase=get_wheelbase(model.robot),
         obstacle_speed=values.obstacle_speed,
         range_max=lidar.range_max,
-        range_noise=(lidar.noise_std, lidar.faults.noise_proportional),
+        range_noise=_get_range_noise(lidar),
         outline=model.robot.footprint or (),
         lever=braking.lever_m,
         order=braking.order,
@@ -117,8 +123,8 @@ def shield_config(
         turn=_adapt_turn(braking, values),
     )
     source = f"by {path}" if measured is not None else "derived from model and limits"
-    if given:
-        source += f", but {', '.join(sorted(given))} by parameter"
+    if overrides:
+        source += f", but {', '.join(sorted(overrides))} by parameter"
     listed = ", ".join(
         f"{name} {value:g}" for name, value in values.model_dump().items()
     )

@@ -5,7 +5,7 @@
 
 import math
 
-from nics_drl_bridge.gate.inputs import Command, Input, Tick
+from nics_drl_bridge.gate.inputs import E_STOP, RAW, Command, Input, Tick
 from nics_drl_bridge.gate.state import (
     Arrivals,
     Cause,
@@ -15,11 +15,8 @@ from nics_drl_bridge.gate.state import (
     replace,
 )
 from nics_drl_bridge.interface import S_PER_NS
+from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 
-SCAN = "scan"
-ODOM = "odom"
-RAW = "cmd_vel_raw"
-E_STOP = "e_stop"
 # faults of a stamp
 REPEATED = "repeated"
 JUMPED = "jumped"

@@ -90,13 +90,22 @@ class TopicHealth:
     innovation: float = math.nan  # NIS of the newest `Judgement`; NaN without one
 
 
+class Rejection(NamedTuple):
+    """Why data of a topic are not used."""
+
+    topic: str
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{self.topic}: {self.reason}"
+
+
 @dataclass(frozen=True)
 class Health:
     """Health of all topics of a robot that have data."""
 
     topics: dict[str, TopicHealth] = field(default_factory=dict)
-    # Counts by reason; each reason starts with the topic
-    rejected: dict[str, int] = field(default_factory=dict)
+    rejected: dict[Rejection, int] = field(default_factory=dict)  # counts
     # used, but unusual (`odom: news`)
     noticed: dict[str, int] = field(default_factory=dict)
     replayed: int = 0  # number of late data, inserted at their stamps

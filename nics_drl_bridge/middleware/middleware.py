@@ -26,6 +26,7 @@ from nics_drl_bridge.middleware.measurement import (
     Health,
     Kind,
     Measurement,
+    Rejection,
     TopicHealth,
     check_covariance,
 )
@@ -47,10 +48,10 @@ class Datum(NamedTuple):
 
 @dataclass
 class TopicCache:
-    """Newest datum, number and latest arrivals [ns] of data by topic; rejected data by reason."""
+    """Newest datum, number and latest arrivals [ns] of each topic's data; counts of rejections."""
 
     newest: dict[str, Datum] = field(default_factory=dict)
-    rejected: Counter[str] = field(default_factory=Counter)
+    rejected: Counter[Rejection] = field(default_factory=Counter)
     received: Counter[str] = field(default_factory=Counter)
     arrivals: dict[str, deque[int]] = field(default_factory=dict)
 
@@ -58,9 +59,9 @@ class TopicCache:
         """Stores a datum unless it is older than the cached one or a duplicate; True if stored."""
         newest = self.newest.get(topic)
         if newest is not None and stamp_ns < newest.stamp_ns:
-            return self.reject(f"{topic}: out of order")
+            return self.reject(topic, "out of order")
         if newest is not None and stamp_ns == newest.stamp_ns:
-            return self.reject(f"{topic}: duplicate")
+            return self.reject(topic, "duplicate")
         self.take(topic, stamp_ns, arrival_ns, value)
         return True
 
@@ -74,9 +75,9 @@ class TopicCache:
         self.received[topic] += 1
         self.arrivals.setdefault(topic, deque(maxlen=RATE_WINDOW)).append(arrival_ns)
 
-    def reject(self, reason: str) -> bool:
+    def reject(self, topic: str, reason: str) -> bool:
         """Counts a rejected datum; returns False."""
-        self.rejected[reason] += 1
+        self.rejected[Rejection(topic, reason)] += 1
         return False
 
     def age_s(self, topic: str, now_ns: int) -> float:
@@ -167,15 +168,15 @@ class Middleware:
         value = np.array(command, dtype=np.float64)
         if value.shape != (self._width,):
             reason = f"shape {value.shape}, not ({self._width},)"
-            return self.cache.reject(f"{CMD_VEL}: {reason}")
+            return self.cache.reject(CMD_VEL, reason)
         if not np.isfinite(value).all():
-            return self.cache.reject(f"{CMD_VEL}: {NOT_FINITE}")
+            return self.cache.reject(CMD_VEL, NOT_FINITE)
         # The robot follows it whatever its stamp, because the clock may have been set meanwhile.
         self._commanded = value
         refusal = self._stamps.find_fault(stamp_ns, arrival_ns)
         if refusal is None:
             refusal = self._timeline.command(stamp_ns, value)
-        return refusal is None or self.cache.reject(f"{CMD_VEL}: {refusal.reason}")
+        return refusal is None or self.cache.reject(CMD_VEL, refusal.reason)
 
     def scan(self, stamp_ns: int, arrival_ns: int, ranges: NDArray[np.float32]) -> bool:
         """Takes a scan (B,); True if it was used. Only the newest scan is kept."""
@@ -200,10 +201,10 @@ class Middleware:
         size: int,
     ) -> bool:
         if values.shape != (size,):
-            return self.cache.reject(f"{topic}: shape {values.shape}, not ({size},)")
+            return self.cache.reject(topic, f"shape {values.shape}, not ({size},)")
         refusal = self._stamps.find_fault(stamp_ns, arrival_ns)
         if refusal is not None:
-            return self.cache.reject(f"{topic}: {refusal.reason}")
+            return self.cache.reject(topic, refusal.reason)
         return self.cache.put(topic, stamp_ns, arrival_ns, values)
 
     def odometry(
@@ -222,10 +223,10 @@ class Middleware:
         """
         value = np.array((pose, twist), dtype=np.float64)
         if not np.isfinite(value).all():
-            return self.cache.reject(f"{ODOM}: {NOT_FINITE}")
+            return self.cache.reject(ODOM, NOT_FINITE)
         refusal = self._stamps.find_fault(stamp_ns, None)
         if refusal is not None:
-            return self.cache.reject(f"{ODOM}: {refusal.reason}")
+            return self.cache.reject(ODOM, refusal.reason)
         if stamp_ns == self._start_ns and ODOM not in self.cache.newest:
             # The pose is known at a reset, so the odometry of that time adds nothing.
             self._timeline.clone_start(value[0])
@@ -278,11 +279,11 @@ class Middleware:
     ) -> bool:
         value = np.array(values, dtype=np.float64)
         if not np.isfinite(value).all():
-            return self.cache.reject(f"{kind.topic}: {NOT_FINITE}")
+            return self.cache.reject(kind.topic, NOT_FINITE)
         try:
             noise = check_covariance(covariance, len(value), MIN_STD[kind])
         except ValueError as error:
-            return self.cache.reject(f"{kind.topic}: {error}")
+            return self.cache.reject(kind.topic, str(error))
         measurement = Measurement(kind, value, noise)
         return self._measure(stamp_ns, arrival_ns, measurement, value) is None
 
@@ -295,7 +296,7 @@ class Middleware:
         if refusal is None:
             refusal = self._timeline.measure(stamp_ns, measurement)
         if refusal is not None:
-            self.cache.reject(f"{topic}: {refusal.reason}")
+            self.cache.reject(topic, refusal.reason)
         else:
             self._stamps.accept(stamp_ns, arrival_ns)
             self.cache.take(topic, stamp_ns, arrival_ns, datum)
@@ -370,8 +371,11 @@ class Middleware:
             # A replay may have reset the count to 0.
             if outcome is Acceptance.USED or not count:
                 continue
-            counts = rejected if outcome is Acceptance.OUTLIER else noticed
-            counts[f"{kind.topic}: {outcome.name.lower()}"] = count
+            verdict = outcome.name.lower()
+            if outcome is Acceptance.OUTLIER:
+                rejected[Rejection(kind.topic, verdict)] = count
+            else:
+                noticed[f"{kind.topic}: {verdict}"] = count
         if self._clock_jumps:
             noticed["clock: jump"] = self._clock_jumps
         return Health(topics, rejected, noticed, self._timeline.replayed)

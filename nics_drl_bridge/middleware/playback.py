@@ -92,7 +92,7 @@ def estimate(
         np.array(poses),
         np.array(twists),
         np.array(covariances),
-        dict(middleware.cache.rejected),
+        {str(why): count for why, count in middleware.cache.rejected.items()},
     )
 
 
@@ -234,7 +234,7 @@ class Playback:
         if self._reader is not None:
             values = self._reader.ordered(values)
             if len(values) != self.lidar.beams:
-                return self.middleware.cache.reject(f"{SCAN}: another lidar")
+                return self.middleware.cache.reject(SCAN, "another lidar")
         ranges = from_device(np.ascontiguousarray(values), self.lidar)
         return self.middleware.scan(get_stamp(message), arrival_ns, ranges)
 
@@ -265,7 +265,7 @@ class Playback:
     def _take_imu(self, arrival_ns: int, message: Any) -> bool:
         measured = self._gyro.read(message)
         if measured is None:
-            return self.middleware.cache.reject(f"{IMU}: no angular velocity")
+            return self.middleware.cache.reject(IMU, "no angular velocity")
         return self.middleware.imu(get_stamp(message), arrival_ns, *measured)
 
 

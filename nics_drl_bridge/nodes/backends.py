@@ -39,10 +39,14 @@ from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.nodes import qos, wire
 from nics_drl_bridge.nodes.conversions import sensor_from_ros, sensor_type
-from nics_drl_bridge.nodes.device_parameters import default_namespaces
 from nics_drl_bridge.nodes.link import EpisodeServices, Link
 from nics_drl_bridge.nodes.lockstep_inbox import Inbox, Message, read_message
-from nics_drl_bridge.nodes.parameters import STANDARD
+from nics_drl_bridge.nodes.parameters import (
+    LOCKSTEP,
+    REALTIME,
+    STANDARD,
+    default_namespaces,
+)
 from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
 from nics_drl_bridge.nodes.robot_topics import data_facts
 from nics_drl_bridge.nodes.simulation_interfaces import client
@@ -50,8 +54,6 @@ from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
 from nics_drl_bridge.sim.simulator import EpisodeSampler
 from nics_drl_bridge.sim.world_set import AnyWorld
 
-LOCKSTEP = "lockstep"
-REALTIME = "realtime"
 TRUTH = "ground_truth"
 # The simulator is asked to repeat data that do not arrive within this time [s].
 REPEAT_S = 0.05
@@ -116,9 +118,9 @@ def _check_fleet(mode: str, robots: int, namespaces: Sequence[str]) -> None:
     if mode == LOCKSTEP and len(namespaces) == robots:
         return
     needed = f"in mode 'lockstep' alone, with {robots} namespaces"
-    given = f"not in {mode!r} with {list(namespaces)!r}"
+    value = f"not in {mode!r} with {list(namespaces)!r}"
     raise ConfigError(
-        f"backend_options: a team of {robots} robots is driven {needed}, {given}."
+        f"backend_options: a team of {robots} robots is driven {needed}, {value}."
     )
 
 
@@ -215,7 +217,7 @@ class DdsBackend:
     def _subscribe(self) -> None:
         kinds = dict.fromkeys(self._topics, Odometry)
         kinds[SCAN] = LaserScan
-        kinds |= {name: sensor_type(each) for name, each in self._sensors.items()}
+        kinds |= {name: sensor_type(sensor) for name, sensor in self._sensors.items()}
         for topic, kind in kinds.items():
             put = partial(_put, self._inbox, topic)
             self._link.node.create_subscription(kind, topic, put, qos.SENSOR, raw=True)
@@ -450,6 +452,10 @@ class FleetBackend:
 
 def stack_facts(facts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Merge the facts of M robots into arrays (M, ...); `SHARED_FACTS` stay as they are."""
-    stacked = {name: np.stack([each[name] for each in facts]) for name in facts[0]}
-    shared = {name: facts[0][name] for name in SHARED_FACTS if name in facts[0]}
-    return stacked | shared
+    stacked = {}
+    for name, value in facts[0].items():
+        if name in SHARED_FACTS:
+            stacked[name] = value
+        else:
+            stacked[name] = np.stack([robot[name] for robot in facts])
+    return stacked

@@ -17,6 +17,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
 
@@ -74,14 +75,16 @@ class Ring:
             self._segments.popleft()
 
     def _is_full(self) -> bool:
-        lines = sum(len(each.lines) for each in self._segments)
-        size = sum(each.size for each in self._segments)
+        lines = sum(len(segment.lines) for segment in self._segments)
+        size = sum(segment.size for segment in self._segments)
         return lines > self._most_lines or size > MOST_BYTES
 
     def lines(self) -> list[bytes]:
         """Return the lines for a file: the oldest state, and all entries since."""
-        kept = [line for each in self._segments for line in each.lines[1:]]
-        return [self._segments[0].lines[0], *kept] if self._segments else []
+        kept: list[bytes] = []
+        for segment in self._segments:
+            kept += segment.lines[1:] if kept else segment.lines
+        return kept
 
 
 class Disk:
@@ -124,8 +127,7 @@ class Disk:
         return not self._thread.is_alive()
 
     def _work(self) -> None:
-        while (order := self._orders.get()) is not None:
-            path, own, lines = order
+        for path, own, lines in iter(self._orders.get, None):
             failed = ""
             try:
                 self._write(path, self._parts(lines))
@@ -155,7 +157,7 @@ def prune(folder: Path, own: Sequence[str]) -> None:
 def read_messages(descriptor: int) -> Iterator[tuple[bytes, bytes]]:
     """Yield the kind and the content of each message, until the gate has ended."""
     rest = b""
-    while chunk := os.read(descriptor, CHUNK_BYTES):
+    for chunk in iter(partial(os.read, descriptor, CHUNK_BYTES), b""):
         *lines, rest = (rest + chunk).split(b"\n")
         for line in lines:
             yield line[:1], line[1:] + b"\n"

@@ -41,6 +41,7 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.lidar.sensor import Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec, from_device
+from nics_drl_bridge.middleware.measurement import CMD_VEL, ODOM, SCAN
 from nics_drl_bridge.nodes import (
     command_types,
     device_parameters,
@@ -76,7 +77,7 @@ REFUSED = (
 
 def declare_gate(node: Node, model: SimulatorModel) -> GateConfig:
     """Declare and read a gate's parameters, and log doubts. Raises ConfigError for a bad value."""
-    for name in sorted(parameters.SPLIT.keys() & runner.given_values(node).keys()):
+    for name in sorted(parameters.SPLIT.keys() & qos.given_values(node).keys()):
         raise ConfigError(f"parameter {name!r}: is now {parameters.SPLIT[name]}.")
     file = str(runner.declare_row(node, parameters.LIMITS))
     limits = load_limits(file, model.robot) if file else None
@@ -84,7 +85,7 @@ def declare_gate(node: Node, model: SimulatorModel) -> GateConfig:
         model,
         limits,
         _declare_shield(node, model, limits, file),
-        simulated=bool(node.get_parameter(SIM_TIME).value),
+        simulated=runner.get_flag(node, SIM_TIME),
         **_declare_rules(node, model),
     )
     node.add_on_set_parameters_callback(partial(_keep_clock, config.simulated))
@@ -110,7 +111,7 @@ def _keep_clock(simulated: bool, parameters: list[Parameter]) -> SetParametersRe
 def _declare_rules(node: Node, model: SimulatorModel) -> dict[str, Any]:
     scan_age = max(GateConfig.scan_age_s, SCAN_PERIODS / model.lidar.rate)
     rules: dict[str, Any] = {
-        "odom_rate_declared": "odom_rate" in runner.given_values(node)
+        "odom_rate_declared": "odom_rate" in qos.given_values(node)
     }
     for row in parameters.gate_rules(1.0 / model.control_period, scan_age):
         field = f"{row.name}_s" if row.name in parameters.RULES_IN_SECONDS else row.name
@@ -120,10 +121,10 @@ def _declare_rules(node: Node, model: SimulatorModel) -> dict[str, Any]:
 
 def declare_black_box(node: Node) -> Path:
     """Declare the folder for recordings of stops; return its subfolder for the node's namespace."""
-    given = str(runner.declare_row(node, parameters.BLACK_BOX))
+    folder = str(runner.declare_row(node, parameters.BLACK_BOX))
     home = Path(os.environ.get("ROS_HOME") or Path.home() / ".ros")
     # A gate in another namespace must not remove its files.
-    return (Path(given) if given else home / "black_box") / str(
+    return (Path(folder) if folder else home / "black_box") / str(
         node.get_namespace()
     ).strip("/")
 
@@ -233,7 +234,8 @@ class CommandGate(qos.QosWatch):
         super().__init__("command_gate", context=context)
         model = runner.declare_model(self)
         logger = self.get_logger()
-        self._lidar, self._config = model.lidar, declare_gate(self, model)
+        self._lidar = model.lidar
+        self._config = declare_gate(self, model)
         self._sensors = model.sensors
         self._state = begin(self._config)
         self._log = GateLog(
@@ -245,7 +247,7 @@ class CommandGate(qos.QosWatch):
         if self._config.shield is not None:
             shield.warm_up()
         scan_motion.warm_up(self._config)
-        self._stamped = bool(runner.declare_row(self, parameters.stamped("cmd_vel")))
+        self._stamped = bool(runner.declare_row(self, parameters.stamped()))
         runner.declare_row(self, parameters.FOREIGN)
         self._frame = str(runner.declare_row(self, parameters.ROBOT_FRAME))
         fault = parameters.frame_fault(
@@ -254,7 +256,7 @@ class CommandGate(qos.QosWatch):
         if fault:
             raise ConfigError(fault)
         kind = TwistStamped if self._stamped else Twist
-        self._out = self.create_publisher(kind, "cmd_vel", qos.COMMAND)
+        self._out = self.create_publisher(kind, CMD_VEL, qos.COMMAND)
         self._queue = EStopQueue()
         self._listen()
         runner.steadily(self, PERIOD_S, self._tick)
@@ -268,28 +270,28 @@ class CommandGate(qos.QosWatch):
         kinds = ("none", TWIST, TWIST_STAMPED)
         raw = device_parameters.choice(self, parameters.FOREIGN.name, kinds)
         self._raw_kind = command_types.name_of(stamped=raw != TWIST)
-        self._raw_types = command_types.TypeWatch(self, "cmd_vel_raw", FOREIGN_SETTINGS)
-        given = command if raw == "none" else partial(self._foreign, raw)
+        self._raw_types = command_types.TypeWatch(self, inputs.RAW, FOREIGN_SETTINGS)
+        reader = command if raw == "none" else partial(self._foreign, raw)
         readers: tuple[tuple[Any, str, Callable[[bytes], inputs.Input], Any], ...] = (
-            (LaserScan, "scan", partial(scan, self._lidar), qos.SENSOR),
-            (Odometry, "odom", self._read_odometry, qos.SENSOR),
-            (Odometry, "odometry/filtered", estimate, qos.SENSOR),
+            (LaserScan, SCAN, partial(scan, self._lidar), qos.SENSOR),
+            (Odometry, ODOM, self._read_odometry, qos.SENSOR),
+            (Odometry, inputs.ESTIMATE, estimate, qos.SENSOR),
             *(
-                (sensor_type(each), each.name, partial(reading, each), qos.SENSOR)
-                for each in self._sensors
+                (sensor_type(sensor), sensor.name, partial(reading, sensor), qos.SENSOR)
+                for sensor in self._sensors
             ),
         )
         for kind, topic, read, profile in readers:
             taker = partial(self._take, topic, read)
             self.create_subscription(kind, topic, taker, profile, raw=True)
         kind = Twist if raw == TWIST else TwistStamped
-        command_taker = partial(self._take_command, given)
+        command_taker = partial(self._take_command, reader)
         commands = self.create_subscription(
-            kind, "cmd_vel_raw", command_taker, qos.EVERY_POLICY, raw=True
+            kind, inputs.RAW, command_taker, qos.EVERY_POLICY, raw=True
         )
         self._sources = Sources(self, commands.topic_name)
         self._button = self.create_lossless_subscription(
-            Bool, "e_stop", self._take_e_stop, qos.E_STOP, lost=self._miss_e_stop
+            Bool, inputs.E_STOP, self._take_e_stop, qos.E_STOP, lost=self._miss_e_stop
         )
         runner.serve(self, "~/arm", self._arm)
         runner.serve(self, "~/reset", lambda: self._answer(inputs.Reset()))
@@ -299,11 +301,11 @@ class CommandGate(qos.QosWatch):
         self, topic: str, read: Callable[[bytes], inputs.Input], content: bytes
     ) -> None:
         try:
-            given = read(content)
+            event = read(content)
         except wire.UNREADABLE as error:  # the middleware uses another encoding
-            self._log.refuse(f"{topic}: {error}")
+            self._log.refuse(topic, f"{topic}: {error}")
         else:
-            self._decide(given)
+            self._decide(event)
 
     def _take_command(
         self,
@@ -317,18 +319,18 @@ class CommandGate(qos.QosWatch):
         def read_with_source(content: bytes) -> inputs.Command:
             return replace(read(content), source=source, publishers=publishers)
 
-        self._take("cmd_vel_raw", read_with_source, content)
+        self._take(inputs.RAW, read_with_source, content)
 
     def _take_e_stop(self, content: bytes) -> None:
         """Decide on all waiting messages; a press comes first, so that it waits for no other."""
         contents = [content, *qos.take_waiting(self._button)]
         self._queue.hear(time.monotonic(), len(contents))
         messages = []
-        for each in contents:
+        for part in contents:
             try:
-                messages.append(e_stop(each))
+                messages.append(e_stop(part))
             except wire.UNREADABLE as error:
-                self._log.refuse(f"e_stop: {error}")
+                self._log.refuse(inputs.E_STOP, f"{inputs.E_STOP}: {error}")
                 self._decide(
                     inputs.Press("a message could not be read, and may be a press")
                 )
@@ -348,10 +350,10 @@ class CommandGate(qos.QosWatch):
         self._decide(inputs.Tick())
 
     def _read_odometry(self, content: bytes) -> inputs.Odometry:
-        given = odometry(content)
+        event = odometry(content)
         if not self._frame:  # no parameter names it
             self._frame = wire.frames_of(content)[1]
-        return given
+        return event
 
     def _foreign(self, kind: str, content: bytes) -> inputs.Command:
         age_ns = round(self._config.command_age_s * NS_PER_S)
@@ -365,19 +367,19 @@ class CommandGate(qos.QosWatch):
         self._decide(inputs.Press())
         return True, "the e-stop is pressed; ~/reset releases it"
 
-    def _answer(self, given: inputs.Input) -> tuple[bool, str]:
-        decision = self._decide(given)
-        self.get_logger().info(f"{type(given).__name__.lower()}: {decision.answer}")
+    def _answer(self, event: inputs.Input) -> tuple[bool, str]:
+        decision = self._decide(event)
+        self.get_logger().info(f"{type(event).__name__.lower()}: {decision.answer}")
         return decision.granted, decision.answer
 
-    def _decide(self, given: inputs.Input) -> Decision:
+    def _decide(self, event: inputs.Input) -> Decision:
         now = time.monotonic()
         before = self._state
-        self._state, decision = decide(self._config, before, given, now)
+        self._state, decision = decide(self._config, before, event, now)
         # Publish first: the rest is not urgent.
         instead = self._say(decision, now) if decision.publish else None
-        self._log.note(Entry(now, given, before, decision))
-        if instead is not None and not isinstance(given, inputs.Press):
+        self._log.note(Entry(now, event, before, decision))
+        if instead is not None and not isinstance(event, inputs.Press):
             self._decide(instead)
         return decision
 
@@ -402,14 +404,14 @@ class CommandGate(qos.QosWatch):
 
     def _look(self) -> runner.Condition:
         self._sources.count_publishers()
-        found = self._log.finding(self._state)
+        condition = self._log.finding(self._state)
         self._raw_types.look(self._raw_kind)
         others = self.count_publishers(self._out.topic_name) - 1
         if others < 1:
-            return found
+            return condition
         warning = f"others publish on cmd_vel too ({others}) and bypass this gate"
         self.get_logger().warning(warning, throttle_duration_sec=10.0)
-        return found._replace(message=f"{found.message}; {warning}", warns=True)
+        return condition._replace(message=f"{condition.message}; {warning}", warns=True)
 
     def stop(self) -> None:
         """Leave a zero command behind."""

@@ -18,6 +18,7 @@ from nav_msgs.msg import OccupancyGrid, Odometry
 from numpy.typing import ArrayLike, NDArray
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState, LaserScan
+from std_msgs.msg import Header
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import NS_PER_S, Array
@@ -26,6 +27,7 @@ from nics_drl_bridge.lidar.sectors import Reader, reader_beside
 from nics_drl_bridge.lidar.sensor import Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec, ScanHeader, to_device
 from nics_drl_bridge.recording import messages
+from nics_drl_bridge.recording.topic_roles import TRANSFORMS
 from nics_drl_bridge.robot.spec import RobotSpec
 
 # x, y and heading in the 6 x 6 covariance of a message
@@ -45,6 +47,11 @@ def stamp_to_ros(time_ns: int) -> Time:
 def stamp_from_ros(stamp: Time) -> int:
     """Return a stamp as nanoseconds."""
     return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
+
+
+def header_to_ros(time_ns: int, frame: str) -> Header:
+    """Return the header of a message: its time [ns] and frame."""
+    return Header(stamp=stamp_to_ros(time_ns), frame_id=frame)
 
 
 def heading_to_ros(heading: float) -> geometry.Quaternion:
@@ -84,9 +91,8 @@ def twist_to_ros(twist: ArrayLike) -> geometry.Twist:
 
 def stamped_to_ros(twist: ArrayLike, time_ns: int, frame: str) -> geometry.TwistStamped:
     """Return linear.x, linear.y, angular.z (3,) as a TwistStamped."""
-    message = geometry.TwistStamped(twist=twist_to_ros(twist))
-    message.header.stamp, message.header.frame_id = stamp_to_ros(time_ns), frame
-    return message
+    header = header_to_ros(time_ns, frame)
+    return geometry.TwistStamped(header=header, twist=twist_to_ros(twist))
 
 
 def twist_from_ros(message: geometry.Twist | geometry.TwistStamped) -> Array:
@@ -98,8 +104,7 @@ def scan_to_ros(
     spec: LidarSpec, ranges: NDArray[np.float32], now_ns: int, frame: str
 ) -> LaserScan:
     """Return ranges (B,) as the device's LaserScan; every header field follows from the spec."""
-    message = LaserScan()
-    message.header.stamp, message.header.frame_id = stamp_to_ros(now_ns), frame
+    message = LaserScan(header=header_to_ros(now_ns, frame))
     for field, value in spec.header._asdict().items():
         setattr(message, field, value)
     message.ranges = array.array("f", to_device(ranges, spec).tobytes())
@@ -124,8 +129,8 @@ def odometry_to_ros(
 ) -> Odometry:
     """Return a pose (3,) in a fixed frame and a body twist (3,) as an Odometry."""
     x, y, heading = np.asarray(pose, np.float64).tolist()
-    message = Odometry(child_frame_id=frames[1])
-    message.header.stamp, message.header.frame_id = stamp_to_ros(time_ns), frames[0]
+    header = header_to_ros(time_ns, frames[0])
+    message = Odometry(header=header, child_frame_id=frames[1])
     message.pose.pose.position.x, message.pose.pose.position.y = x, y
     message.pose.pose.orientation = heading_to_ros(heading)
     message.twist.twist = twist_to_ros(twist)
@@ -155,8 +160,10 @@ def pose_from_ros(
     message: geometry.PoseStamped | geometry.PoseWithCovarianceStamped,
 ) -> tuple[Array, Array | None]:
     """Return the pose (3,) of a message and its covariance (3, 3), or None without one."""
-    known = isinstance(message, geometry.PoseWithCovarianceStamped)
-    covariance = np.reshape(message.pose.covariance, (6, 6))[PLANAR] if known else None
+    has_covariance = isinstance(message, geometry.PoseWithCovarianceStamped)
+    covariance = (
+        np.reshape(message.pose.covariance, (6, 6))[PLANAR] if has_covariance else None
+    )
     return np.array(messages.read_whole_pose(message)), covariance
 
 
@@ -178,8 +185,7 @@ def initial_pose(message: geometry.PoseWithCovarianceStamped, map_frame: str) ->
 def pose_to_ros(pose: ArrayLike, time_ns: int, frame: str) -> geometry.PoseStamped:
     """Return a pose (3,) in a frame as a PoseStamped."""
     x, y, heading = np.asarray(pose, np.float64).tolist()
-    message = geometry.PoseStamped()
-    message.header.stamp, message.header.frame_id = stamp_to_ros(time_ns), frame
+    message = geometry.PoseStamped(header=header_to_ros(time_ns, frame))
     message.pose.position.x, message.pose.position.y = x, y
     message.pose.orientation = heading_to_ros(heading)
     return message
@@ -187,9 +193,10 @@ def pose_to_ros(pose: ArrayLike, time_ns: int, frame: str) -> geometry.PoseStamp
 
 def map_to_ros(grid: GridMap, time_ns: int, frame: str) -> OccupancyGrid:
     """Return a map as an OccupancyGrid, measured and valid from a time [ns]."""
-    message = OccupancyGrid(data=array.array("b", grid.cells.tobytes()))
-    message.header.stamp, message.header.frame_id = stamp_to_ros(time_ns), frame
-    info, (x, y, heading) = message.info, grid.origin
+    header = header_to_ros(time_ns, frame)
+    message = OccupancyGrid(header=header, data=array.array("b", grid.cells.tobytes()))
+    x, y, heading = grid.origin
+    info = message.info
     info.map_load_time = message.header.stamp
     info.resolution = grid.resolution
     info.height, info.width = grid.cells.shape
@@ -259,6 +266,11 @@ def _has_interfaces(package: str, interface: str) -> bool:
     return any(Path(folder, interface, "__init__.py").is_file() for folder in folders)
 
 
+def transforms_type() -> Any | None:
+    """Return the class of the messages on `/tf`; None if its package is not installed."""
+    return message_type(TRANSFORMS)
+
+
 def sensor_type(sensor: Sensor) -> Any:
     """Return the class of a further sensor's message. Raises ConfigError if it is missing."""
     kind = message_type(sensor.message)
@@ -274,8 +286,7 @@ def sensor_to_ros(
     sensor: Sensor, reading: NDArray[np.float32], time_ns: int, frame: str
 ) -> Any:
     """Return a reading (S,) of a further sensor as its message."""
-    message = sensor_type(sensor)()
-    message.header.stamp, message.header.frame_id = stamp_to_ros(time_ns), frame
+    message = sensor_type(sensor)(header=header_to_ros(time_ns, frame))
     sensor.write(message, reading)
     return message
 
@@ -295,16 +306,16 @@ def message_texts(kind: str) -> dict[str, str]:
     texts: dict[str, str] = {}
     waiting = [kind]
     while waiting:
-        each = waiting.pop()
-        if each in texts or (file := _message_file(each)) is None:
+        kind = waiting.pop()
+        file = _message_file(kind)
+        if kind in texts or file is None:
             continue
-        texts[each] = file.read_text(encoding="utf-8")
-        for name in filter(None, map(FIELD.match, texts[each].splitlines())):
-            package, _, inner = name[1].rpartition("/")
-            if package or inner[0].isupper():
-                waiting.append(
-                    f"{package.split('/')[0] or each.split('/')[0]}/msg/{inner}"
-                )
+        texts[kind] = file.read_text(encoding="utf-8")
+        for field in filter(None, map(FIELD.match, texts[kind].splitlines())):
+            package, _, name = field[1].rpartition("/")
+            if package or name[0].isupper():
+                folder = (package or kind).split("/")[0]
+                waiting.append(f"{folder}/msg/{name}")
     return texts
 
 

@@ -15,12 +15,19 @@ from rclpy.parameter import Parameter
 from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S
-from nics_drl_bridge.nodes.parameters import MODES, ROBOTS, device, frame_fault
-from nics_drl_bridge.nodes.runner import declare_row, given_values
+from nics_drl_bridge.nodes.parameters import (
+    LOCKSTEP,
+    MODES,
+    ROBOTS,
+    default_namespaces,
+    device,
+    frame_fault,
+)
+from nics_drl_bridge.nodes.qos import given_values
+from nics_drl_bridge.nodes.runner import declare_row, get_number, get_text
 from nics_drl_bridge.robot.noise import Delay
 from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
 
-LOCKSTEP = "lockstep"
 START = "episode_start"
 GIVEN = "episode_start_given"
 GREATEST_FLEET = 256
@@ -77,14 +84,9 @@ def declare_device(node: Node, laser_frame: str) -> None:
         raise ConfigError(fault)
 
 
-def number(node: Node, name: str) -> float:
-    """Return the value of a numeric parameter."""
-    return float(node.get_parameter(name).value or 0.0)
-
-
 def randomisation(node: Node) -> Randomisation | None:
     """Return the randomisation of each episode, if any. Raises ConfigError."""
-    name = str(node.get_parameter("randomisation").value)
+    name = get_text(node, "randomisation")
     return load_randomisation(name) if name else None
 
 
@@ -94,25 +96,27 @@ def timing(node: Node, model: SimulatorModel) -> DeviceTiming:
     if mode == LOCKSTEP:
         period = round(model.control_period * NS_PER_S)
         return DeviceTiming(mode, 1.0, period, period, period, (0, 0), (0, 0))
-    rate = number(node, "odom_rate")
+    rate = get_number(node, "odom_rate")
     dt = model.timing.dt
     odom = 1.0 / rate if rate else model.control_period
-    scan = 1.0 / (number(node, "scan_rate") or model.lidar.rate)
+    scan = 1.0 / (get_number(node, "scan_rate") or model.lidar.rate)
     step = common_step(dt, (odom, scan)) * dt
     step_ns, odom_ns, scan_ns = (
         round(seconds * NS_PER_S) for seconds in (step, odom, scan)
     )
     late = []
     for topic in ("scan", "odom"):
-        own = model.latency.measured.get(topic, Delay(least=0.0, jitter=0.0))
-        least = number(node, f"{topic}_latency")
-        jitter = number(node, "latency_jitter")
+        delay = model.latency.measured.get(topic, Delay(least=0.0, jitter=0.0))
+        least = get_number(node, f"{topic}_latency")
+        jitter = get_number(node, "latency_jitter")
         chosen = (
-            least if least >= 0.0 else own.least,
-            jitter if jitter >= 0.0 else own.jitter,
+            least if least >= 0.0 else delay.least,
+            jitter if jitter >= 0.0 else delay.jitter,
         )
         late.append((round(chosen[0] * NS_PER_S), round(chosen[1] * NS_PER_S)))
-    return DeviceTiming(mode, number(node, "rate"), step_ns, odom_ns, scan_ns, *late)
+    return DeviceTiming(
+        mode, get_number(node, "rate"), step_ns, odom_ns, scan_ns, *late
+    )
 
 
 def timed_model(
@@ -121,7 +125,7 @@ def timed_model(
     """Return the model with the step of the world and the requested latency."""
     if time.lockstep:
         return model
-    latency = number(node, "command_latency")
+    latency = get_number(node, "command_latency")
     if latency >= 0.0:
         model = replace(
             model, calibration=replace(model.calibration, command_latency_s=latency)
@@ -135,7 +139,7 @@ def timed_model(
 
 def choice(node: Node, name: str, valid: tuple[str, ...]) -> str:
     """Return a parameter that must be one of `valid`. Raises ConfigError with the nearest word."""
-    value = str(node.get_parameter(name).value)
+    value = get_text(node, name)
     if value not in valid:
         raise ConfigError(
             f"parameter {name!r}: unknown value {value!r}; {suggest(value, valid)}"
@@ -170,20 +174,11 @@ def namespaces(node: Node) -> tuple[str, ...]:
     return names
 
 
-def default_namespaces(robots: int) -> tuple[str, ...]:
-    """Return the default namespaces of several robots: robot1, robot2, ..."""
-    return tuple(f"robot{k + 1}" for k in range(robots))
-
-
 def frames(node: Node, namespace: str) -> Frames:
     """Return the frames of a robot; in a fleet all but the map begin with its namespace."""
-    prefix = str(node.get_parameter("frame_prefix").value) + (
-        f"{namespace}/" if namespace else ""
-    )
-    world, *own = (
-        str(node.get_parameter(f"{each}_frame").value) for each in Frames._fields[:-1]
-    )
-    odom, base, laser, footprint = (name and prefix + name for name in own)
+    prefix = get_text(node, "frame_prefix") + (f"{namespace}/" if namespace else "")
+    world, *names = (get_text(node, f"{frame}_frame") for frame in Frames._fields[:-1])
+    odom, base, laser, footprint = (name and prefix + name for name in names)
     return Frames(world, odom, base, laser, footprint, prefix)
 
 
@@ -194,10 +189,10 @@ def _check_episode(node: Node, parameters: list[Parameter]) -> SetParametersResu
             values = np.array(parameter.value, dtype=np.float64)
             if not values.size or values.size % 3 or not np.isfinite(values).all():
                 reason = "episode_start must be three finite numbers per robot: x, y, heading."
-            elif node.has_parameter(GIVEN) and values.size != (
-                needed := 3 * len(namespaces(node))
-            ):
-                reason = f"episode_start has {values.size} numbers; give {needed}, 3 per robot."
+            elif node.has_parameter(GIVEN):
+                needed = 3 * len(namespaces(node))
+                if values.size != needed:
+                    reason = f"episode_start has {values.size} numbers; give {needed}, 3 per robot."
         elif parameter.name == "episode_seed" and parameter.value < 0:
             reason = "episode_seed must be 0 or more."
     names = {parameter.name for parameter in parameters}

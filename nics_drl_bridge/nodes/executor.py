@@ -26,10 +26,11 @@ InvalidHandle = rclpy_implementation.InvalidHandle
 # raised if this version of rclpy has other internals
 PARTS_MISSING = (AttributeError, TypeError)
 Received = tuple[Callable[..., Any], tuple[Any, ...]]  # a callback and its arguments
-HANDED_OVER, REST, LONGEST_REST_S = object(), 0.4, 1e-3
+HANDED_OVER = object()
 """Returned by a callback that has woken another thread of this process. The executor then rests, to
-leave the processor to that thread, for a fraction of the time since it last rested, at most for
-LONGEST_REST_S."""
+leave the processor to that thread."""
+REST = 0.4  # length of a rest, as a fraction of the time since the last one
+LONGEST_REST_S = 1e-3
 # A timer without a period is always ready, but the thread has other work too.
 MOST_AT_ONCE = 32
 
@@ -68,11 +69,9 @@ class StandingExecutor(SingleThreadedExecutor):
                 woken, others = self._entities.others_ready(self._guard)
                 # the executor is also woken when an entity is added to a node
                 self._changed |= woken or others
+                due = self._entities.due()
                 # rclpy also wakes it after each callback; then there is nothing to handle.
-                due, left = (
-                    self._entities.due(),
-                    others or (woken and bool(self._tasks)),
-                )
+                left = others or (woken and bool(self._tasks))
         except PARTS_MISSING as error:
             self._fall_back(error)
         if asked:  # a message sent before a request must also be handled before it
@@ -171,25 +170,28 @@ class _Entities:
         self.all = _entities_of(nodes)
         subscriptions, others, timers, clients, services, self._waitables = self.all
         # A subscription's callback takes the message, or also its info.
-        self._subscriptions = [
-            (s, 1 if _takes(s.callback, None) else 2) for s in subscriptions
-        ]
-        self._clients = {one.handle.pointer: one for one in clients}
-        self._services, self._timers = (
-            {
-                e.handle.pointer: e
-                for e in each
-                if not inspect.iscoroutinefunction(e.callback)
-            }
-            for each in (services, [one for one in timers if _takes(one.callback)])
-        )
-        self._own = {*self._timers, *self._services, *self._clients}
-        kinds = subscriptions, (*guards, *others), timers, clients, services
+        self._subscriptions = []
+        for subscription in subscriptions:
+            count = 1 if _takes(subscription.callback, None) else 2
+            self._subscriptions.append((subscription, count))
+        self._clients = {client.handle.pointer: client for client in clients}
+        self._services = _index_plain(services)
+        self._timers = _index_plain(timer for timer in timers if _takes(timer.callback))
+        self._handled = {*self._timers, *self._services, *self._clients}
+        kinds = {
+            "subscription": subscriptions,
+            "guard_condition": (*guards, *others),
+            "timer": timers,
+            "client": clients,
+            "service": services,
+        }
         self.opened = ExitStack()
-        handles = (one.handle for one in itertools.chain(*kinds))
-        for held in (*handles, *self._waitables, context.handle):
-            self.opened.enter_context(held)
-        room = NumberOfEntities(*(len(each) for each in kinds))
+        for entity in itertools.chain(*kinds.values()):
+            self.opened.enter_context(entity.handle)
+        for waitable in self._waitables:
+            self.opened.enter_context(waitable)
+        self.opened.enter_context(context.handle)
+        room = NumberOfEntities(*map(len, kinds.values()))
         for waitable in self._waitables:
             room += waitable.get_num_entities()
         self._wait_set = rclpy_implementation.WaitSet(
@@ -201,12 +203,10 @@ class _Entities:
             room.num_events,
             context.handle,
         )
-        names = ("subscription", "guard_condition", "timer", "client", "service")
-        self._adding = [
-            (getattr(self._wait_set, f"add_{name}"), one.handle)
-            for name, each in zip(names, kinds, strict=True)
-            for one in each
-        ]
+        self._adding = []
+        for kind, entities in kinds.items():
+            add = getattr(self._wait_set, f"add_{kind}")
+            self._adding += [(add, entity.handle) for entity in entities]
 
     def wait(self, timeout_ns: int) -> None:
         self._wait_set.clear_entities()  # each wait drops those that were not ready
@@ -218,8 +218,8 @@ class _Entities:
 
     def taken(self) -> list[Received]:
         is_ready = self._wait_set.is_ready
-        found = enumerate(self._subscriptions)
-        return _take(entry for i, entry in found if is_ready("subscription", i))
+        entries = enumerate(self._subscriptions)
+        return _take(entry for i, entry in entries if is_ready("subscription", i))
 
     def come(self) -> list[Received]:
         return _take(self._subscriptions)
@@ -227,44 +227,49 @@ class _Entities:
     def asked(self) -> list[Callable[[], object]]:
         """Take requests to services and answers to clients; return how each is handled."""
         ready = self._wait_set.get_ready_entities
-        found = list[Callable[[], object]]()
+        answers = list[Callable[[], object]]()
         for service in _known(self._services, ready("service")):
             request, header = service.handle.service_take_request(
                 service.srv_type.Request
             )
             if header is not None:
-                found.append(partial(_serve, service, request, header))
+                answers.append(partial(_serve, service, request, header))
         for client in _known(self._clients, ready("client")):
             header, response = client.handle.take_response(client.srv_type.Response)
             if header is not None:
-                found.append(
-                    partial(
-                        _answer, client, header.request_id.sequence_number, response
-                    )
-                )
-        return found
+                number = header.request_id.sequence_number
+                answers.append(partial(_answer, client, number, response))
+        return answers
 
     def due(self) -> list[Any]:
         return _known(self._timers, self._wait_set.get_ready_entities("timer"))
 
-    def others_ready(self, own: Any) -> tuple[bool, bool]:
+    def others_ready(self, wake_up: Any) -> tuple[bool, bool]:
+        """Return whether the executor was woken, and whether rclpy has to handle something."""
         ready = self._wait_set.get_ready_entities
         triggered = list(ready("guard_condition"))
         for guard in self.all[1]:
             if guard.handle.pointer in triggered:
                 # Waiting has reset the flag; rclpy needs it.
                 guard._executor_triggered = True
-        woken = own is not None and own.handle.pointer in triggered
+        woken = wake_up is not None and wake_up.handle.pointer in triggered
         if woken:
-            triggered.remove(own.handle.pointer)
-        others = bool(triggered) or any(
-            one not in self._own
-            for kind in ("client", "service", "timer")
-            for one in ready(kind)
-        )
-        return woken, others or any(
-            each.is_ready(self._wait_set) for each in self._waitables
-        )
+            triggered.remove(wake_up.handle.pointer)
+        others = bool(triggered)
+        for kind in ("client", "service", "timer"):
+            others = others or not self._handled.issuperset(ready(kind))
+        for waitable in self._waitables:
+            others = others or waitable.is_ready(self._wait_set)
+        return woken, others
+
+
+def _index_plain(entities: Iterable[Any]) -> dict[int, Any]:
+    """Return entities by their pointers, without those whose callbacks are coroutines."""
+    return {
+        entity.handle.pointer: entity
+        for entity in entities
+        if not inspect.iscoroutinefunction(entity.callback)
+    }
 
 
 def _known(entities: Mapping[int, Any], pointers: Iterable[int]) -> list[Any]:
@@ -306,6 +311,8 @@ def _takes(callback: Any, *arguments: Any) -> bool:
 
 def _entities_of(nodes: Sequence[Node]) -> tuple[tuple[Any, ...], ...]:
     kinds = ("subscriptions", "guards", "timers", "clients", "services", "waitables")
-    return tuple(
-        tuple(one for node in nodes for one in getattr(node, kind)) for kind in kinds
-    )
+    entities = []
+    for kind in kinds:
+        of_nodes = (getattr(node, kind) for node in nodes)
+        entities.append(tuple(itertools.chain.from_iterable(of_nodes)))
+    return tuple(entities)

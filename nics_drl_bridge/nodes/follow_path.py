@@ -8,19 +8,18 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from builtin_interfaces.msg import Duration
 from nav_msgs.msg import OccupancyGrid
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.duration import Duration
 from rclpy.node import Node, NodeNameNonExistentError
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import NS_PER_S, S_PER_NS, Array
+from nics_drl_bridge.interface import S_PER_NS, Array
 from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 from nics_drl_bridge.nodes import conversions, qos, runner
-from nics_drl_bridge.nodes.device_parameters import number
 from nics_drl_bridge.nodes.goal_frames import GoalFrames
 from nics_drl_bridge.nodes.nav2_parameters import ControllerParameters, chosen
 from nics_drl_bridge.nodes.robot_topics import RobotTopics
@@ -132,9 +131,9 @@ class Run:
 class PathActions:
     """Serves both actions while a node is active; a new goal replaces the present one.
 
-    `drive` asks the policy to drive to a goal (2,) in the map of the estimate; `anew` empties its
-    memory. Without nav2_msgs nothing is served. If another node, such as Nav2's bt_navigator,
-    serves `navigate_to_pose`, this one does not.
+    `drive` asks the policy to drive to a goal (2,) in the map of the estimate, and `reset_policy`
+    empties its memory. Without nav2_msgs nothing is served. If another node, such as Nav2's
+    bt_navigator, serves `navigate_to_pose`, this one does not.
     """
 
     def __init__(
@@ -145,7 +144,7 @@ class PathActions:
         model: SimulatorModel,
         parameters: ControllerParameters,
         drive: Callable[[Array], Wish],
-        anew: Callable[[], None],
+        reset_policy: Callable[[], None],
     ) -> None:
         self._node = node
         self._topics = topics
@@ -153,7 +152,7 @@ class PathActions:
         self._robot = model.robot
         self._parameters = parameters
         self._drive = drive
-        self._anew = anew
+        self._reset_policy = reset_policy
         self._run: Run | None = None
         self._map: tuple[str, GridMap] | None = None  # and its frame
         self._limit = math.inf  # of the speed [m/s]
@@ -175,7 +174,7 @@ class PathActions:
             timer = runner.steadily(node, LOOK_S, self._look)
             self._undo.append(lambda: node.destroy_timer(timer))
         self._listen(OccupancyGrid, "map", self._take_map, qos.LATCHED)
-        topic = str(node.get_parameter("speed_limit_topic").value)
+        topic = runner.get_text(node, "speed_limit_topic")
         self._listen(
             conversions.message_type(SPEED_LIMIT), topic, self._take_limit, qos.COMMAND
         )
@@ -214,22 +213,22 @@ class PathActions:
     def led(self) -> bool:
         """True if another node serves `navigate_to_pose` and thereby handles `goal_pose`."""
         wanted = f"{self._node.resolve_topic_name(NAVIGATE)}/_action/send_goal"
-        own = self._node.get_name(), self._node.get_namespace()
+        this_node = self._node.get_name(), self._node.get_namespace()
         for name, space in self._node.get_node_names_and_namespaces():
-            if (name, space) != own:
+            if (name, space) != this_node:
                 with contextlib.suppress(NodeNameNonExistentError):  # it has just ended
                     served = self._node.get_service_names_and_types_by_node(name, space)
-                    if any(each == wanted for each, _ in served):
+                    if any(service == wanted for service, _ in served):
                         return True
         return False
 
     def _look(self) -> None:
-        own = NAVIGATE in self._servers and (
+        may_give_way = NAVIGATE in self._servers and (
             self._run is None or self._run.goal.name == FOLLOW
         )
-        if own and self.led:
-            told = f"another node serves {NAVIGATE}, so this one no longer does"
-            self._node.get_logger().info(told)
+        if may_give_way and self.led:
+            reason = f"another node serves {NAVIGATE}, so this one no longer does"
+            self._node.get_logger().info(reason)
             self._servers.pop(NAVIGATE).destroy()
 
     def _take_map(self, message: OccupancyGrid) -> None:
@@ -264,7 +263,7 @@ class PathActions:
                 if before.progress.check == run.progress.check:
                     run.progress = before.progress
             if before is None or not np.array_equal(before.path.end, run.path.end):
-                self._anew()  # not if the same path was replanned
+                self._reset_policy()  # not if the same path was replanned
         except Refusal as refusal:
             self._end(goal, ABORT, refusal.code, str(refusal))
         if before is not None:
@@ -273,17 +272,17 @@ class PathActions:
     def _follow(self, goal: Goal) -> Run:
         asked = goal.handle.request
         names = []
-        for what, those in self._parameters.names.items():
+        for kind, names_of_kind in self._parameters.names.items():
             name, wrong = chosen(
-                what.replace("_", " "), getattr(asked, f"{what}_id", ""), those
+                kind.replace("_", " "), getattr(asked, f"{kind}_id", ""), names_of_kind
             )
             if wrong:  # the code of Nav2's own server
-                code = "INVALID_CONTROLLER" if what == "controller" else "UNKNOWN"
+                code = "INVALID_CONTROLLER" if kind == "controller" else "UNKNOWN"
                 raise Refusal(code, f"{FOLLOW}: {wrong}")
             names.append(name)
-        poses = np.array([read_pose(each) for each in asked.path.poses]).reshape(-1, 3)
-        headers = [asked.path.header, *(each.header for each in asked.path.poses[:1])]
-        frame = next((each.frame_id for each in headers if each.frame_id), "")
+        poses = np.array([read_pose(pose) for pose in asked.path.poses]).reshape(-1, 3)
+        headers = [asked.path.header, *(pose.header for pose in asked.path.poses[:1])]
+        frame = next((header.frame_id for header in headers if header.frame_id), "")
         return self._begin(goal, frame, poses, names[1:3])
 
     def _navigate(self, goal: Goal) -> Run:
@@ -300,8 +299,8 @@ class PathActions:
         except ConfigError as error:
             raise Refusal(goal.code, f"{NAVIGATE}: {error}") from None
         checks = [
-            self._parameters.names[f"{what}_checker"][0]
-            for what in ("goal", "progress")
+            self._parameters.names[f"{kind}_checker"][0]
+            for kind in ("goal", "progress")
         ]
         return self._begin(goal, frame, way, checks)
 
@@ -379,7 +378,7 @@ class PathActions:
             self._run = None
             self._end(run.goal, CANCELED, "NONE")
             return True
-        longest = number(self._node, "costmap_update_timeout")
+        longest = runner.get_number(self._node, "costmap_update_timeout")
         longest = max(longest, PATIENT_PERIODS * self._period_s)
         newest = self._topics.middleware.cache.newest
         now_ns = self._topics.now_ns()
@@ -391,8 +390,8 @@ class PathActions:
         ]
         if silent and time.monotonic() - run.valid_s > longest:
             self._run = None
-            told = f"nothing on {' and '.join(silent)} for {longest:g} s."
-            self._end(run.goal, ABORT, "CONTROLLER_TIMED_OUT", told)
+            sentence = f"nothing on {' and '.join(silent)} for {longest:g} s."
+            self._end(run.goal, ABORT, "CONTROLLER_TIMED_OUT", sentence)
             return True
         return False
 
@@ -409,7 +408,7 @@ class PathActions:
 
     def _steer(self, run: Run) -> Array:
         robot = self._robot_in("the path", run.frame)
-        place = run.path.locate(robot, number(self._node, "lookahead"))
+        place = run.path.locate(robot, runner.get_number(self._node, "lookahead"))
         turn = run.arrival.turn_left(place, robot, run.path.end)
         if turn == 0.0:
             self._run = None
@@ -427,7 +426,7 @@ class PathActions:
         )
         drive = self._drive(ahead[:2])
         if drive.touched:
-            patience = number(self._node, "failure_tolerance")
+            patience = runner.get_number(self._node, "failure_tolerance")
             # the robot has waited long enough
             if 0.0 <= patience < time.monotonic() - run.valid_s:
                 code = "PATIENCE_EXCEEDED" if patience else "NO_VALID_CONTROL"
@@ -451,8 +450,9 @@ class PathActions:
     def _report(self, run: Run, robot: Array, place: Place, twist: Array) -> None:
         speed = float(np.hypot(*twist[:2]))
         pose = conversions.pose_to_ros(robot, self._topics.newest_ns, run.frame)
-        times = time.monotonic() - run.started_s, place.remaining / max(speed, SLOWEST)
-        told = {
+        driven_s = time.monotonic() - run.started_s
+        remaining_s = place.remaining / max(speed, SLOWEST)
+        values = {
             "distance_to_goal": place.distance,
             "speed": speed,
             "robot_pose": pose,
@@ -463,15 +463,16 @@ class PathActions:
             "current_pose": pose,
             "distance_remaining": place.remaining,
             "header": pose.header,
-            "navigation_time": duration_to_ros(times[0]),
-            "estimated_time_remaining": duration_to_ros(times[1]),
+            "navigation_time": Duration(seconds=driven_s).to_msg(),
+            "estimated_time_remaining": Duration(seconds=remaining_s).to_msg(),
         }
         feedback = run.goal.kind.Feedback()
         for part in (feedback, getattr(feedback, "tracking_feedback", None)):
             for name in (
-                told.keys() & getattr(part, "get_fields_and_field_types", dict)().keys()
+                values.keys()
+                & getattr(part, "get_fields_and_field_types", dict)().keys()
             ):
-                setattr(part, name, told[name])
+                setattr(part, name, values[name])
         run.goal.handle.publish_feedback(feedback)
 
     def stop(self, why: str) -> None:
@@ -491,12 +492,6 @@ class PathActions:
                 "goal reached" if end == SUCCEED else "goal cancelled"
             )
         goal.server.finish(goal.handle, end, result_of(goal.kind, code, sentence))
-
-
-def duration_to_ros(seconds: float) -> Duration:
-    """Return seconds as a Duration."""
-    whole = int(seconds)
-    return Duration(sec=whole, nanosec=int((seconds - whole) * NS_PER_S))
 
 
 def result_of(kind: Any, code: str, sentence: str = "") -> Any:

@@ -1,18 +1,19 @@
 """Reports of `command_gate`: log lines, counters and the black box. Never waits for a disk."""
 
 import contextlib
-import fcntl
 import json
 import os
 import subprocess
 import time
 from collections import Counter
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from rclpy.impl.rcutils_logger import RcutilsLogger
 
 from nics_drl_bridge.gate.black_box import Entry, format_entry, format_head
+from nics_drl_bridge.gate.inputs import get_topic
 from nics_drl_bridge.gate.state import Cause, GateConfig, GateState
 from nics_drl_bridge.nodes import black_box_writer
 from nics_drl_bridge.nodes.black_box_writer import (
@@ -23,6 +24,7 @@ from nics_drl_bridge.nodes.black_box_writer import (
     WRITE,
 )
 from nics_drl_bridge.nodes.child_python import module_command
+from nics_drl_bridge.nodes.output import widen_pipe
 from nics_drl_bridge.nodes.runner import Condition
 
 BURST_S = (
@@ -41,7 +43,6 @@ STATE_S = 10.0  # time between two states of the gate in the black box [s]
 MOST_ENTRIES = 5_000  # between two states
 MOST_BACKLOG = 4 * 2**20  # bytes that wait for the writer; a minute of driving
 MOST_TOLD = 65_536  # largest read of answers [bytes]
-PIPE_BYTES = 2**20  # Linux's maximum for an unprivileged process
 
 
 class GateLog:
@@ -56,7 +57,8 @@ class GateLog:
         self._folder = folder
         self._hardware = robot
         self._cause: Cause | None = None
-        self._now = self._since = float("-inf")
+        self._now = float("-inf")
+        self._since = float("-inf")
         # the rule that stops the robot; "" while commands pass, None at first
         self._rule: str | None = None
         # rules whose stop was recorded in the present burst
@@ -78,7 +80,7 @@ class GateLog:
         cause = entry.decision.cause
         self._now = entry.now
         if decision.refused:
-            self.refuse(decision.refused)
+            self.refuse(get_topic(entry.given), decision.refused)
         if decision.shielded:
             self.counters["cut by the shield"] += 1
         rule = "" if cause is None else cause.rule
@@ -88,7 +90,8 @@ class GateLog:
         # a rule that persists is always logged
         lasts = entry.now - self._since >= LINE_S
         # otherwise the line follows later
-        if self._owed and (more := self._due(rule, lasts)) is not None:
+        more = self._due(rule, lasts) if self._owed else None
+        if more is not None:
             self._owed = False
             if cause is None:
                 self._logger.info(f"commands pass{more}")
@@ -111,11 +114,11 @@ class GateLog:
         self._writer.entry(format_entry(entry))
         self._entries += 1
 
-    def refuse(self, reason: str) -> None:
-        """Count a rejected input by the part of the reason before the colon, and log it."""
-        more = self._counted(f"refused, {reason.partition(':')[0]}")
+    def refuse(self, topic: str, fault: str) -> None:
+        """Count an input that is refused by its topic, and log what is wrong with it."""
+        more = self._counted(f"refused, {topic}")
         if more is not None:
-            self._logger.warning(f"refused: {reason}{more}")
+            self._logger.warning(f"refused: {fault}{more}")
 
     def no_number(self, twist: Sequence[float]) -> None:
         """Count and log a decision that is not finite; that must never happen."""
@@ -267,7 +270,7 @@ class BoxWriter:
 
     def _hear(self) -> None:
         with contextlib.suppress(OSError):  # there is nothing more
-            while part := os.read(self._exit, MOST_TOLD):
+            for part in iter(partial(os.read, self._exit, MOST_TOLD), b""):
                 self._answers += part
         *lines, self._answers = self._answers.split(b"\n")
         for line in lines:
@@ -301,10 +304,8 @@ class BoxWriter:
         self._started_s = time.monotonic()
         source, self._entrance = os.pipe()
         self._exit, target = os.pipe()
-        os.set_blocking(self._entrance, False)
+        widen_pipe(self._entrance)
         os.set_blocking(self._exit, False)
-        with contextlib.suppress(AttributeError, OSError):  # the default size will do
-            fcntl.fcntl(self._entrance, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
         try:
             self._process = subprocess.Popen(
                 module_command(black_box_writer.__name__),

@@ -13,6 +13,7 @@ from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.map_to_odom import transform_from_ros
 from nics_drl_bridge.nodes.message_packages import how_to_install
 from nics_drl_bridge.nodes.robot_topics import RobotTopics
+from nics_drl_bridge.nodes.runner import get_text
 
 
 class GoalFrames:
@@ -28,7 +29,7 @@ class GoalFrames:
         # frame -> its parent, and its pose in the parent
         self._mounted: dict[str, tuple[str, Array]] = {}
         self._odom: Array | None = None  # pose of `odom` in `map`, by a localiser
-        self._transforms = conversions.message_type("tf2_msgs/msg/TFMessage")
+        self._transforms = conversions.transforms_type()
         self._heard = []
         if self._transforms is not None:
             for topic, take, quality in (
@@ -57,7 +58,7 @@ class GoalFrames:
 
     @property
     def _map(self) -> str:
-        return str(self._node.get_parameter("map_frame").value)
+        return get_text(self._node, "map_frame")
 
     def robot_in(self, frame: str) -> Array | None:
         """Return the robot's pose (3,) in the map or `odom`; None while it is unknown."""
@@ -74,8 +75,8 @@ class GoalFrames:
         """Return x, y (2,) of a goal in the map, given the robot's pose now. Raises ConfigError."""
         place = np.array([goal.pose.position.x, goal.pose.position.y, 0.0])
         if not np.isfinite(place).all():
-            told = f"({place[0]:g}, {place[1]:g})"
-            raise ConfigError(f"goal_pose: {told}: x and y must be finite numbers.")
+            position = f"({place[0]:g}, {place[1]:g})"
+            raise ConfigError(f"goal_pose: {position}: x and y must be finite numbers.")
         try:
             frame, place = self.fixed(goal.header.frame_id, place)
         except ConfigError as error:
@@ -85,10 +86,12 @@ class GoalFrames:
             robot = None if self._odom is None else self.robot_in(self._map)
             if robot is None:
                 return place[:2]
-        elif (robot := self._topics.in_odom()) is None:
-            raise ConfigError(
-                "goal_pose: its place is unknown until odometry arrives; wait for it."
-            )
+        else:
+            robot = self._topics.in_odom()
+            if robot is None:
+                raise ConfigError(
+                    "goal_pose: its place is unknown until odometry arrives; wait for it."
+                )
         there: Array = geometry.compose(
             self._topics.view().pose, geometry.between(robot, place)
         )
@@ -101,8 +104,8 @@ class GoalFrames:
         ConfigError for an unknown frame, and while the robot's pose is unknown.
         """
         asked = frame = frame.strip("/")
-        odom, robot = (each.strip("/") for each in self._topics.frames)
-        bases = {str(self._node.get_parameter("base_frame").value), robot} - {""}
+        odom, robot = (frame.strip("/") for frame in self._topics.frames)
+        bases = {get_text(self._node, "base_frame"), robot} - {""}
         for _ in range(len(self._mounted) + 1):
             if frame in ("", self._map):
                 return self._map, places
@@ -122,7 +125,7 @@ class GoalFrames:
             frame, mount = self._mounted[frame]
             places = geometry.compose(mount, places)
         names = ", ".join(
-            repr(each) for each in sorted({self._map, odom, *bases} - {""})
+            repr(frame) for frame in sorted({self._map, odom, *bases} - {""})
         )
         heard = "one that /tf_static joins to them"
         if self._transforms is None:

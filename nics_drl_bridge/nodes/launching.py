@@ -52,8 +52,8 @@ def describe(launch: Launch) -> Any:
 
     def start(context: Any) -> list[Any]:
         names = [argument.name for argument in launch.arguments]
-        given = {name: context.launch_configurations[name] for name in names}
-        return [action_of(node) for node in launch.nodes(given)]
+        values = {name: context.launch_configurations[name] for name in names}
+        return [action_of(node) for node in launch.nodes(values)]
 
     declared = [declaration_of(argument) for argument in launch.arguments]
     return LaunchDescription([*declared, OpaqueFunction(function=start)])
@@ -95,6 +95,6 @@ def parameter_of(value: Any) -> Any:
     """Return the value of a parameter; a string that looks like a number stays a string."""
     if isinstance(value, str):
         return ParameterValue(TextSubstitution(text=value), value_type=str)
-    if isinstance(value, list) and all(isinstance(each, str) for each in value):
+    if isinstance(value, list) and all(isinstance(part, str) for part in value):
         return ParameterValue(TextSubstitution(text=str(value)), value_type=list[str])
     return value

@@ -32,6 +32,7 @@ from nics_drl_bridge.env.guard import uninterrupted
 from nics_drl_bridge.errors import BackendError, ModelError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import Start
+from nics_drl_bridge.middleware.measurement import CMD_VEL
 from nics_drl_bridge.nodes import qos
 from nics_drl_bridge.nodes.command_types import deaf_subscribers, heard_stamped
 from nics_drl_bridge.nodes.ending import ENDING
@@ -63,7 +64,7 @@ class Link:
         self,
         namespace: str = "",
         domain_id: int | None = None,
-        command_topic: str = "cmd_vel",
+        command_topic: str = CMD_VEL,
         stamped: bool | None = None,
         parameters: Mapping[str, Any] | None = None,
         command_timeout_s: float = math.inf,
@@ -78,7 +79,8 @@ class Link:
         self._closing = weakref.finalize(self, _shut_down, self._resources)
         try:
             overrides = [
-                Parameter(name, value=it) for name, it in (parameters or {}).items()
+                Parameter(name, value=value)
+                for name, value in (parameters or {}).items()
             ]
             self.node = qos.QosWatch(
                 "bridge_env",
@@ -116,9 +118,11 @@ class Link:
     def begin(self) -> None:
         """Start the executor's thread; call it once all subscriptions exist."""
         gc.collect()  # now, because later it may take 0.1 s while the robot moves
-        given = (self._context, self.node, self._timeout)
         thread = threading.Thread(
-            target=_spin, args=given, daemon=True, name="dds_backend"
+            target=_spin,
+            args=(self._context, self.node, self._timeout),
+            daemon=True,
+            name="dds_backend",
         )
         thread.start()
         self._resources.thread = thread
@@ -174,7 +178,7 @@ class Link:
             return
         topic = self._topic
         ends = self.node.get_publishers_info_by_topic(topic)
-        names = sorted(name for end in ends if (name := qos.owner(end)) is not None)
+        names = sorted(qos.owners(ends))
         with contextlib.suppress(ValueError):
             names.remove(self.node.get_fully_qualified_name())
         raise BackendError(
@@ -398,10 +402,11 @@ class EpisodeServices:
             "episode_start": pose,
             "episode_start_given": True,
         }
-        given = [
-            Parameter(name, value=it).to_parameter_msg() for name, it in chosen.items()
+        settings = [
+            Parameter(name, value=value).to_parameter_msg()
+            for name, value in chosen.items()
         ]
-        request = SetParametersAtomically.Request(parameters=given)
+        request = SetParametersAtomically.Request(parameters=settings)
         result = self._link.call(self._parameters, request, timeout_s).result
         if not result.successful:
             raise BackendError(f"the simulator refused the episode: {result.reason}")

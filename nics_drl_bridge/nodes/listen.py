@@ -70,12 +70,12 @@ def _look(node: Node, facts: Facts, subscribed: set[str], imu: str) -> None:
             for i in node.get_subscriptions_info_by_topic(topic)
             if i.node_name != NAME
         ]
-        told = {info.topic_type for info in offers} or set(kinds)
-        both = (
-            tuple(offer_of(info.qos_profile) for info in some)
-            for some in (offers, asks)
+        offered = {info.topic_type for info in offers} or set(kinds)
+        facts.topics[topic] = Endpoints(
+            tuple(sorted(offered)),
+            tuple(offer_of(info.qos_profile) for info in offers),
+            tuple(offer_of(info.qos_profile) for info in asks),
         )
-        facts.topics[topic] = Endpoints(tuple(sorted(told)), *both)
     if GYRO in facts.names and GYRO not in subscribed:
         types = {
             topic: ends.types for topic, ends in facts.topics.items() if ends.offers

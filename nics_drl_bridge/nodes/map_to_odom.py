@@ -21,12 +21,12 @@ KEPT = 100  # recent own transforms, to recognise them on `/tf`
 
 
 def transform_to_ros(
-    parent: str, child: str, pose: ArrayLike, stamp: Any
+    parent: str, child: str, pose: ArrayLike, time_ns: int
 ) -> TransformStamped:
     """Return the pose (3,) of a child frame in its parent as a transform."""
     x, y, heading = np.asarray(pose, np.float64).tolist()
-    message = TransformStamped(child_frame_id=child)
-    message.header.frame_id, message.header.stamp = parent, stamp
+    header = conversions.header_to_ros(time_ns, parent)
+    message = TransformStamped(header=header, child_frame_id=child)
     message.transform.translation.x, message.transform.translation.y = x, y
     message.transform.rotation = conversions.heading_to_ros(heading)
     return message
@@ -54,16 +54,17 @@ class MapToOdom:
         self._own: deque[Any] = deque(maxlen=KEPT)  # transforms
         self._frames = ("", "")
         self._heard_s = -math.inf
-        self._kind: Any = conversions.message_type("tf2_msgs/msg/TFMessage")
+        self._kind: Any = conversions.transforms_type()
         if self._kind is None:
-            told = (
+            reason = (
                 "the package tf2_msgs is not installed, so map -> odom is not published"
             )
-            node.get_logger().warning(f"{told}; {how_to_install('tf2_msgs')}.")
+            node.get_logger().warning(f"{reason}; {how_to_install('tf2_msgs')}.")
             return
         self._publisher = node.create_publisher(self._kind, "/tf", qos.TRANSFORMS)
-        given = self._kind, "/tf", self._take, qos.TRANSFORMS
-        self._subscription = node.create_subscription(*given)
+        self._subscription = node.create_subscription(
+            self._kind, "/tf", self._take, qos.TRANSFORMS
+        )
 
     def close(self) -> None:
         """End its topics."""
@@ -80,17 +81,15 @@ class MapToOdom:
             or not all(frames)
         ):
             return
-        one = transform_to_ros(
-            *frames, odom, conversions.stamp_to_ros(stamp_ns + self._ahead_ns)
-        )
-        self._own.append(one)
-        self._publisher.publish(self._kind(transforms=[one]))
+        transform = transform_to_ros(*frames, odom, stamp_ns + self._ahead_ns)
+        self._own.append(transform)
+        self._publisher.publish(self._kind(transforms=[transform]))
 
     def _take(self, message: Any) -> None:
-        for each in message.transforms:
-            if messages.get_frames(each) != self._frames or each in self._own:
+        for transform in message.transforms:
+            if messages.get_frames(transform) != self._frames or transform in self._own:
                 continue
             if time.monotonic() - self._heard_s > QUIET_S:
-                told = f"another node publishes {' -> '.join(self._frames)}, so this one does not"
-                self._node.get_logger().info(told)
+                reason = f"another node publishes {' -> '.join(self._frames)}, so this one does not"
+                self._node.get_logger().info(reason)
             self._heard_s = time.monotonic()

@@ -18,10 +18,10 @@ class Wheels(NamedTuple):
 def wheels_here() -> Wheels | None:
     """Return the installed wheels of ROS 2; None if ROS 2 is missing or installed otherwise."""
     versions = {}
-    for each in distributions():
-        name = str(each.metadata["Name"] or "").lower().replace("_", "-")
+    for package in distributions():
+        name = str(package.metadata["Name"] or "").lower().replace("_", "-")
         if name.startswith("ros-"):
-            versions[name] = each.version
+            versions[name] = package.version
     for name in versions:
         if name.endswith("-rclpy"):
             return Wheels(name.removesuffix("rclpy"), versions)
@@ -31,7 +31,7 @@ def wheels_here() -> Wheels | None:
 def shipped_packages() -> dict[str, Path]:
     """Return the folders of the message packages shipped with this package, by name."""
     folder = share_folder() / "config" / "messages"
-    return {each.name: each for each in sorted(folder.iterdir()) if each.is_dir()}
+    return {path.name: path for path in sorted(folder.iterdir()) if path.is_dir()}
 
 
 def how_to_install(package: str) -> str:

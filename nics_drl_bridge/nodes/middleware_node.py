@@ -8,13 +8,14 @@ from nav_msgs.msg import Odometry
 from rclpy.context import Context
 
 from nics_drl_bridge.errors import LONGEST, shorten
+from nics_drl_bridge.gate import inputs
 from nics_drl_bridge.generator import open_model
-from nics_drl_bridge.middleware.measurement import Health
+from nics_drl_bridge.middleware.measurement import Health, Rejection
 from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes import conversions, qos, runner
 from nics_drl_bridge.nodes.lifecycle import ManagedNode
 from nics_drl_bridge.nodes.map_to_odom import MapToOdom, odom_in_map
-from nics_drl_bridge.nodes.parameters import middleware
+from nics_drl_bridge.nodes.parameters import BASE_FRAME, MAP_FRAME, middleware
 from nics_drl_bridge.nodes.robot_topics import RobotTopics
 from nics_drl_bridge.nodes.runner import ACTIVE, UNCONFIGURED
 
@@ -26,25 +27,24 @@ class MiddlewareNode(ManagedNode):
 
     def __init__(self, context: Context) -> None:
         super().__init__("middleware_node", context, middleware())
-        self._rejected: dict[str, int] = {}  # counts at the last look
+        self._rejected: dict[Rejection, int] = {}  # counts at the last look
         runner.serve(self, "~/reset", self._reset)
         runner.diagnose(self, "topics", self._look)
 
     def configure(self) -> None:
         """Open the model and subscribe."""
-        model = open_model(str(self.get_parameter("model").value))
+        model = open_model(runner.get_text(self, "model"))
         self._hardware = model.robot.name
         rehearse(model)
-        topic = "odometry/filtered"
         self._filtered = self.create_lifecycle_publisher(
-            Odometry, topic, qos.SENSOR_RELIABLE
+            Odometry, inputs.ESTIMATE, qos.SENSOR_RELIABLE
         )
         self._topics = RobotTopics(self, model, on_odometry=self._publish)
         self.undo.callback(self._topics.close)
         self._topics.hear_initial_pose()
         self._map_to_odom: MapToOdom | None = None
         if self.get_parameter("publish_map_to_odom").value:
-            tolerance = float(self.get_parameter("transform_tolerance").value or 0.0)
+            tolerance = runner.get_number(self, "transform_tolerance")
             self._map_to_odom = MapToOdom(self, tolerance)
             self.undo.callback(self._map_to_odom.close)
 
@@ -55,11 +55,10 @@ class MiddlewareNode(ManagedNode):
         # a pose or a yaw rate may be newer
         stamp_ns = max(stamp_ns, estimator.time_ns)
         view = self._topics.middleware.view(stamp_ns)
-        frames = [
-            str(self.get_parameter(f"{name}_frame").value) for name in ("map", "base")
-        ]
+        map_frame = runner.get_text(self, MAP_FRAME.name)
+        base_frame = runner.get_text(self, BASE_FRAME.name)
         message = conversions.odometry_to_ros(
-            view.pose, view.twist, stamp_ns, frames, (0.0,) * 4
+            view.pose, view.twist, stamp_ns, (map_frame, base_frame), (0.0,) * 4
         )
         message.pose.covariance = conversions.covariance_to_ros(
             estimator.covariance[:3, :3]
@@ -68,13 +67,11 @@ class MiddlewareNode(ManagedNode):
             estimator.twist_covariance
         )
         self._filtered.publish(message)
-        if (
-            self._map_to_odom is not None
-            and (reported := self._topics.in_odom()) is not None
-        ):
+        reported = self._topics.in_odom()
+        if self._map_to_odom is not None and reported is not None:
             home = odom_in_map(self._topics.view().pose, reported)
             self._map_to_odom.publish(
-                home, stamp_ns, (frames[0], self._topics.frames[0])
+                home, stamp_ns, (map_frame, self._topics.frames[0])
             )
 
     def _reset(self) -> tuple[bool, str]:
@@ -89,8 +86,10 @@ class MiddlewareNode(ManagedNode):
         health = self._topics.middleware.health(self._topics.now_ns())
         new = sorted(health.rejected.keys() - self._rejected.keys())
         if new:
-            told = shorten("; ".join(new), LONGEST)
-            self.get_logger().warning(f"rejected data, counted in /diagnostics: {told}")
+            listed = shorten("; ".join(map(str, new)), LONGEST)
+            self.get_logger().warning(
+                f"rejected data, counted in /diagnostics: {listed}"
+            )
         awaited = self._topics.expected
         missing = ""
         if self._topics.lacks_gyro:
@@ -105,47 +104,53 @@ class MiddlewareNode(ManagedNode):
         return runner.Condition(message, bool(trouble), shown, self._hardware)
 
 
-def silence(health: Health, expected: Sequence[str], before: Mapping[str, int]) -> str:
+def silence(
+    health: Health, expected: Sequence[str], before: Mapping[Rejection, int]
+) -> str:
     """Return a sentence about expected topics without usable data; empty if there are none.
 
     `before` holds earlier counts of `health.rejected`: a topic whose count grew is not silent.
     """
-    silent = [topic for topic in expected if topic not in health.topics]
+    unusable = [topic for topic in expected if topic not in health.topics]
     since = "yet"
-    told = []
-    if not silent:
-        silent = [topic for topic in expected if health.topics[topic].age_s > SILENCE_S]
+    if not unusable:
         since = f"for {SILENCE_S:g} s"
-    for topic in tuple(silent):
-        counts = {
-            r: n for r, n in health.rejected.items() if r.startswith(f"{topic}: ")
-        }
-        grown = [reason for reason, n in counts.items() if n > before.get(reason, 0)]
-        if grown:
-            silent.remove(topic)
-            reason = grown[-1].removeprefix(f"{topic}: ")
-            told.append(f"{topic}: {sum(counts.values())} refused, the last: {reason}")
-    return "; ".join(
-        [*([f"nothing on {', '.join(silent)} {since}"] if silent else ()), *told]
-    )
+        unusable = [
+            topic for topic in expected if health.topics[topic].age_s > SILENCE_S
+        ]
+    silent = []
+    refused = []
+    for topic in unusable:
+        count = 0
+        reason = ""  # the last one whose count grew
+        for rejection, number in health.rejected.items():
+            if rejection.topic == topic:
+                count += number
+                if number > before.get(rejection, 0):
+                    reason = rejection.reason
+        if reason:
+            refused.append(f"{topic}: {count} refused, the last: {reason}")
+        else:
+            silent.append(topic)
+    clauses = [f"nothing on {', '.join(silent)} {since}"] if silent else []
+    return "; ".join([*clauses, *refused])
 
 
 def facts(health: Health) -> dict[str, str]:
     """Return the health as readable keys and values."""
-    found = {}
-    for topic, each in health.topics.items():
-        found[f"{topic} received"] = str(each.received)
-        found[f"{topic} rate [Hz]"] = f"{each.rate_hz:.3g}"
-        found[f"{topic} age [s]"] = f"{each.age_s:.3f}"
-        if not math.isnan(each.innovation):
-            found[f"{topic} innovation"] = f"{each.innovation:.3g}"
-    found |= {
-        f"rejected, {reason}": str(count) for reason, count in health.rejected.items()
-    }
-    found |= {
-        f"noticed, {reason}": str(count) for reason, count in health.noticed.items()
-    }
-    return found | {"late and put in place": str(health.replayed)}
+    values = {}
+    for topic, data in health.topics.items():
+        values[f"{topic} received"] = str(data.received)
+        values[f"{topic} rate [Hz]"] = f"{data.rate_hz:.3g}"
+        values[f"{topic} age [s]"] = f"{data.age_s:.3f}"
+        if not math.isnan(data.innovation):
+            values[f"{topic} innovation"] = f"{data.innovation:.3g}"
+    for rejection, count in health.rejected.items():
+        values[f"rejected, {rejection}"] = str(count)
+    for event, count in health.noticed.items():
+        values[f"noticed, {event}"] = str(count)
+    values["late and put in place"] = str(health.replayed)
+    return values
 
 
 main = partial(runner.run_node, MiddlewareNode, sole_name="middleware_node")

@@ -10,7 +10,7 @@ from rclpy.node import Node
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.nodes.parameters import checkers, nav2
-from nics_drl_bridge.nodes.runner import declare_row
+from nics_drl_bridge.nodes.runner import declare_row, get_text
 from nics_drl_bridge.policy.follow import GoalCheck, ProgressCheck
 
 # Parameters for Nav2's own plugins, or for a control loop; a policy answers scans instead.
@@ -45,9 +45,9 @@ class ControllerParameters:
             raise ConfigError(
                 f"parameter '{empty[0]}_plugins' is empty; give one name or more."
             )
-        one = values["progress_checker_plugin"]
-        if one:
-            self.names["progress_checker"] = (one,)
+        checker = values["progress_checker_plugin"]
+        if checker:
+            self.names["progress_checker"] = (checker,)
         for row in checkers(self.names["goal_checker"], self.names["progress_checker"]):
             declare_row(node, row)
 
@@ -55,10 +55,7 @@ class ControllerParameters:
         """Return the checks of two names; they act like Nav2's checkers of the chosen plugins."""
         arrives = self._filled(GoalCheck, goal)
         gets_on = self._filled(ProgressCheck, progress)
-        kinds = [
-            str(self._node.get_parameter(f"{name}.plugin").value)
-            for name in (goal, progress)
-        ]
+        kinds = [get_text(self._node, f"{name}.plugin") for name in (goal, progress)]
         if kinds[0].endswith(("PositionGoalChecker", "AxisGoalChecker")):
             arrives = replace(arrives, yaw_goal_tolerance=math.inf)
         if not kinds[1].endswith("PoseProgressChecker"):
@@ -66,11 +63,11 @@ class ControllerParameters:
         return arrives, gets_on
 
     def _filled(self, kind: Any, name: str) -> Any:
-        known = {
-            each.name: self._node.get_parameter(f"{name}.{each.name}").value
-            for each in fields(kind)
+        values = {
+            field.name: self._node.get_parameter(f"{name}.{field.name}").value
+            for field in fields(kind)
         }
-        return kind(**known)
+        return kind(**values)
 
     def ignores(self, name: str) -> bool:
         """True for a parameter of Nav2's own controller that means nothing to a policy."""

@@ -1,6 +1,5 @@
 """What a person does with a running robot: arm its gate, stop it, give it a goal."""
 
-import threading
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -17,14 +16,14 @@ from nics_drl_bridge.config import parse_namespace
 from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.goal_answer import GoalAnswer, answer_from_values
-from nics_drl_bridge.nodes.runner import holds, open_context, spin
+from nics_drl_bridge.nodes.runner import Listener, holds
 
 GATE = "command_gate"
 POLICY = ": policy"  # how the name of a policy node's status ends
 POLL_S = 0.02
 ASK_AGAIN_S = 1.0  # between two requests to a gate that refuses [s]
 SEND_AGAIN_S = 1.0  # between two goals to a policy node that refuses [s]
-ANSWER_S = 5.0  # that a gate may take to answer [s]
+GATE_ANSWER_S = 5.0  # that a gate may take to answer [s]
 CALL_S = 10.0  # the same with the time to find its service [s]
 SETTLE_S = 1.0  # in which all gates are seen, once one of them is [s]
 Tell = Callable[[str], None]
@@ -48,7 +47,7 @@ class GoalRequest:
     frame: str = ""  # empty: the map, whatever the policy node calls it
 
     def to_ros(self, stamp_ns: int) -> PoseStamped:
-        """Returns the goal as a message."""
+        """Return the goal as a message."""
         return conversions.pose_to_ros([self.x, self.y, self.yaw], stamp_ns, self.frame)
 
 
@@ -62,19 +61,19 @@ class _Call:
         self._future: Any = None
 
     def send_when_ready(self) -> None:
-        """Sends the request, unless it was sent or the service is not there yet."""
+        """Send the request, unless it was sent or the service is not there yet."""
         if self._future is None and self._client.service_is_ready():
             self._future = self._client.call_async(Trigger.Request())
 
     def wait_for_answer(self, seconds: float) -> GateAnswer:
-        """Returns the answer, or why there is none after so long; ends the call."""
+        """Return the answer, or why there is none after so long; end the call."""
         try:
             holds(self._is_answered, max(seconds, 0.0), POLL_S)
             if self._future is None:
                 return GateAnswer(self._gate, False, "it has ended")
             if not self._future.done():
-                told = "it did not answer in time; the request may still take effect"
-                return GateAnswer(self._gate, False, told)
+                reason = "it did not answer in time; the request may still take effect"
+                return GateAnswer(self._gate, False, reason)
             answer = self._future.result()
             return GateAnswer(self._gate, bool(answer.success), str(answer.message))
         finally:
@@ -91,29 +90,16 @@ class Operator(AbstractContextManager["Operator", None]):
     def __init__(self, domain_id: int | None = None) -> None:
         # policy node -> its condition, and the values of its diagnostics; written by the thread
         self._policies: dict[str, tuple[str, dict[str, str]]] = {}
-        self._context = open_context([], domain_id)
-        try:
-            self._node = Node(
-                "nics_operator", context=self._context, start_parameter_services=False
-            )
-        except BaseException:
-            self._context.try_shutdown()
-            raise
+        self._node = Listener("nics_operator", domain_id)
         self._node.create_subscription(
             DiagnosticArray, "/diagnostics", self._take_diagnostics, qos.DIAGNOSTICS
         )
-        self._thread = threading.Thread(
-            target=spin,
-            args=(self._node, threading.Event()),
-            daemon=True,
-            name="operator",
-        )
-        self._thread.start()
+        self._node.start()
 
     def arm(
         self, namespace: str, seconds: float, reset: bool, tell: Tell
     ) -> GateAnswer:
-        """Arms a gate, and asks again while it refuses; a reset before that releases its stop."""
+        """Arm a gate, and ask again while it refuses; a reset before that releases its stop."""
         deadline = time.monotonic() + seconds
         gate = self._wait_for_gate(namespace, seconds)
         if reset:
@@ -130,7 +116,7 @@ class Operator(AbstractContextManager["Operator", None]):
         return answer
 
     def stop(self, namespace: str | None, seconds: float) -> list[GateAnswer]:
-        """Presses the e-stop of one gate, or of every one that is seen if no namespace is given."""
+        """Press the e-stop of one gate, or of every one that is seen if no namespace is given."""
         if namespace is not None:
             gate = self._wait_for_gate(namespace, seconds)
             return [self._call(gate, "e_stop", time.monotonic() + CALL_S)]
@@ -146,7 +132,7 @@ class Operator(AbstractContextManager["Operator", None]):
             time.sleep(POLL_S)
         if not calls:
             raise BackendError(f"{self._nobody(GATE, seconds)}; nothing was stopped.")
-        deadline = time.monotonic() + ANSWER_S
+        deadline = time.monotonic() + GATE_ANSWER_S
         return [
             call.wait_for_answer(deadline - time.monotonic()) for call in calls.values()
         ]
@@ -154,7 +140,7 @@ class Operator(AbstractContextManager["Operator", None]):
     def send_goal(
         self, namespace: str, goal: GoalRequest, seconds: float, tell: Tell
     ) -> GoalAnswer:
-        """Sends a goal, again while it is refused; returns the last answer of the policy node."""
+        """Send a goal, again while it is refused; return the last answer of the policy node."""
         space = parse_namespace(namespace)
         deadline = time.monotonic() + seconds
         topic = self._node.create_publisher(
@@ -190,7 +176,7 @@ class Operator(AbstractContextManager["Operator", None]):
         )
 
     def _wait_for_policy(self, topic: Publisher, space: str, seconds: float) -> str:
-        """Waits for the policy node of a namespace, and returns its name."""
+        """Wait for the policy node of a namespace, and return its name."""
 
         def found() -> list[str]:
             names = list(self._policies)
@@ -211,16 +197,16 @@ class Operator(AbstractContextManager["Operator", None]):
         return names[0]
 
     def _wait_for_gate(self, namespace: str, seconds: float) -> str:
-        """Waits for the gate of a namespace, and returns its name."""
+        """Wait for the gate of a namespace, and return its name."""
         space = parse_namespace(namespace)
         gate = f"{space}/{GATE}"
         if not holds(lambda: gate in self._gates(), seconds, POLL_S):
-            spaces = {each.rpartition("/")[0] for each in self._gates()}
+            spaces = {gate.rpartition("/")[0] for gate in self._gates()}
             raise BackendError(f"{self._nobody(GATE, seconds, space, spaces)}.")
         return gate
 
     def _gates(self) -> set[str]:
-        """Returns the names of all gates that are seen."""
+        """Return the names of all gates that are seen."""
         services = self._node.get_service_names_and_types()
         ends = [
             name.removesuffix("/arm")
@@ -232,21 +218,19 @@ class Operator(AbstractContextManager["Operator", None]):
     def _nobody(
         self, what: str, seconds: float, space: str = "", spaces: set[str] | None = None
     ) -> str:
-        """Returns a clause that says where nobody answers, and where somebody does."""
-        where = (
-            f"in namespace {space or '/'} of ROS domain {self._context.get_domain_id()}"
-        )
-        told = f"no {what} was seen {where} within {seconds:g} s"
+        """Return a clause that says where nobody answers, and where somebody does."""
+        where = f"in namespace {space or '/'} of ROS domain {self._node.context.get_domain_id()}"
+        fault = f"no {what} was seen {where} within {seconds:g} s"
         if not spaces:
-            return f"{told}; start one, as by `nics up simulation`, in the same ROS_DOMAIN_ID"
-        names = sorted(each.strip("/") for each in spaces)
+            return f"{fault}; start one, as by `nics up simulation`, in the same ROS_DOMAIN_ID"
+        names = sorted(space.strip("/") for space in spaces)
         fix = f"say --namespace {names[0]}" if names[0] else "leave --namespace out"
         return (
-            f"{told}; there is one in {', '.join(f'/{name}' for name in names)}: {fix}"
+            f"{fault}; there is one in {', '.join(f'/{name}' for name in names)}: {fix}"
         )
 
     def _call(self, gate: str, service: str, deadline: float) -> GateAnswer:
-        """Calls a service of a gate; waits for its answer until a deadline, at most `CALL_S`."""
+        """Call a service of a gate; wait for its answer until a deadline, at most `CALL_S`."""
         wait_s = min(deadline - time.monotonic(), CALL_S)
         return _Call(self._node, gate, service).wait_for_answer(wait_s)
 
@@ -260,6 +244,4 @@ class Operator(AbstractContextManager["Operator", None]):
                 )
 
     def __exit__(self, *_: object) -> None:
-        self._context.try_shutdown()
-        self._thread.join(timeout=2.0)
-        self._node.destroy_node()
+        self._node.close()

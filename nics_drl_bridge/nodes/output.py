@@ -143,8 +143,13 @@ def _start_forwarder(
 
 def _lead_into(entrance: int, descriptor: int) -> None:
     """Replace an output by the entrance of a pipe."""
+    widen_pipe(entrance)
+    os.dup2(entrance, descriptor)
+
+
+def widen_pipe(entrance: int) -> None:
+    """Let the entrance of a pipe hold as much as possible, and never block its writer."""
     os.set_blocking(entrance, False)
     # not available on every system; the default size will do
     with contextlib.suppress(AttributeError, OSError):
         fcntl.fcntl(entrance, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
-    os.dup2(entrance, descriptor)

@@ -103,7 +103,7 @@ def open_log(path: str) -> int:
 def copy_lines(source: int, outputs: Sequence[Output]) -> None:
     """Copy lines from a file descriptor to outputs until its end."""
     rest = b""
-    while chunk := os.read(source, CHUNK_BYTES):
+    for chunk in iter(partial(os.read, source, CHUNK_BYTES), b""):
         *lines, rest = (rest + chunk).split(b"\n")
         for line in lines:
             put_line(line + b"\n", outputs)

@@ -11,7 +11,9 @@ from nics_drl_bridge import defaults
 from nics_drl_bridge.errors import shorten
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
-MODES = ("realtime", "lockstep", "as_fast_as_possible")
+REALTIME = "realtime"
+LOCKSTEP = "lockstep"
+MODES = (REALTIME, LOCKSTEP, "as_fast_as_possible")
 NO_POSE = defaults.POSE_TYPE
 POSE_TYPES = ("PoseStamped", "PoseWithCovarianceStamped")
 OWN = -1.0  # value of a delay: take the model's
@@ -37,7 +39,9 @@ class Row(NamedTuple):
 def stamped_by_default() -> bool:
     """True if this ROS 2 distribution uses TwistStamped for commands: Kilted and newer."""
     named = os.environ.get("ROS_DISTRO", "")
-    return not any(named == each if named else _is_wheel(each) for each in PLAIN_TWISTS)
+    if named:
+        return named not in PLAIN_TWISTS
+    return not any(map(_is_wheel, PLAIN_TWISTS))
 
 
 def _is_wheel(name: str) -> bool:
@@ -47,10 +51,10 @@ def _is_wheel(name: str) -> bool:
         return False
 
 
-def stamped(what: str) -> Row:
+def stamped() -> Row:
     """Return the parameter that selects the type of `cmd_vel`."""
     about = (
-        f"Use TwistStamped for {what}, the default on Kilted and newer; false: Twist."
+        "Use TwistStamped for cmd_vel, the default on Kilted and newer; false: Twist."
     )
     return Row(STAMPED, stamped_by_default(), about)
 
@@ -64,6 +68,9 @@ MODEL = Row(
     "model", DEFAULT_ROBOT, "Name of a shipped robot, or folder of a SimulatorModel."
 )
 BASE_FRAME = Row("base_frame", "base_link", "Frame id of the robot.", fixed=False)
+MAP_FRAME = Row(
+    "map_frame", "map", "Frame id of the estimate and of goals.", fixed=False
+)
 ROBOT_FRAME = Row(
     BASE_FRAME.name,
     "",
@@ -78,9 +85,9 @@ def frame_fault(parameters: Iterable[Any], *may_be_empty: str) -> str:
     If a name occurs twice, its last value counts.
     """
     frames = {
-        each.name: str(each.value)
-        for each in parameters
-        if each.name.endswith("_frame")
+        parameter.name: str(parameter.value)
+        for parameter in parameters
+        if parameter.name.endswith("_frame")
     }
     for name, frame in frames.items():
         if not FRAME.fullmatch(frame) and (
@@ -88,16 +95,10 @@ def frame_fault(parameters: Iterable[Any], *may_be_empty: str) -> str:
         ):
             needed = "must be 1 to 255 characters, without blanks or a leading /"
             return f"parameter {name!r}: {needed}, not {shorten(frame, 80)!r}."
-    base = frames.get("base_frame", "")
-    taken = [
-        name
-        for name in ("map_frame", "odom_frame")
-        if frames.get(name, "") == base != ""
-    ]
-    if taken:
-        return (
-            f"parameter 'base_frame': is {base!r}, like {taken[0]!r}; they must differ."
-        )
+    base = frames.get(BASE_FRAME.name, "")
+    for name in (MAP_FRAME.name, "odom_frame"):
+        if base and frames.get(name, "") == base:
+            return f"parameter {BASE_FRAME.name!r}: is {base!r}, like {name!r}; they must differ."
     return ""
 
 
@@ -121,14 +122,14 @@ def sensors() -> list[Row]:
         ),
         Row("lidar_upside_down", False, upside_down),
         Row(IMU, defaults.IMU_TOPIC, ABOUT_IMU),
-        stamped("cmd_vel"),
+        stamped(),
     ]
 
 
 def middleware() -> list[Row]:
     """Return the parameters that only `middleware_node` has."""
     return [
-        Row("map_frame", "map", "Frame id of the estimate.", fixed=False),
+        MAP_FRAME,
         BASE_FRAME,
         Row(
             "publish_map_to_odom",
@@ -148,12 +149,7 @@ def policy() -> list[Row]:
     """Return the parameters that only `policy_node` has."""
     return [
         BASE_FRAME,
-        Row(
-            "map_frame",
-            "map",
-            "Frame id of the estimate and of goals.",
-            fixed=False,
-        ),
+        MAP_FRAME,
         Row(
             "policy",
             "dynamic_window",
@@ -245,54 +241,74 @@ def nav2() -> list[Row]:
 
 def checkers(goals: Sequence[str], progress: Sequence[str]) -> list[Row]:
     """Return the parameters of the named checks; they are those of Nav2's checkers."""
+    from nics_drl_bridge.policy.follow import GoalCheck, ProgressCheck
+
     span = (0.0, 1e6)
-    plugin = "Nav2 checker to imitate."
-    rows: tuple[list[tuple[str, Any, str, tuple[float, float] | None]], ...] = (
-        [
-            ("xy_goal_tolerance", 0.25, "Maximum distance from the goal [m].", span),
-            (
-                "yaw_goal_tolerance",
-                0.25,
-                "Heading tolerance [rad]; ignored for robots that steer.",
-                span,
-            ),
-            (
-                "stateful",
-                True,
-                "A position once reached counts as reached from then on.",
-                None,
-            ),
-            (
-                "path_length_tolerance",
-                1.0,
-                "Maximum remaining path length at the goal [m].",
-                span,
-            ),
-            ("plugin", "nav2_controller::SimpleGoalChecker", plugin, None),
-        ],
-        [
-            ("plugin", "nav2_controller::SimpleProgressChecker", plugin, None),
-            (
-                "required_movement_radius",
-                0.5,
-                "Distance that counts as progress [m].",
-                span,
-            ),
-            (
-                "required_movement_angle",
-                0.5,
-                "Rotation that also counts as progress [rad], for a PoseProgressChecker.",
-                span,
-            ),
-            ("movement_time_allowance", 10.0, "Time limit for progress [s].", span),
-        ],
+    plugin = Row(
+        "plugin",
+        "nav2_controller::SimpleGoalChecker",
+        "Nav2 checker to imitate.",
+        fixed=False,
     )
-    return [
-        Row(f"{name}.{key}", default, about, limits, fixed=False)
-        for names, those in zip((goals, progress), rows, strict=True)
-        for name in names
-        for key, default, about, limits in those
+    goal_rows = [
+        Row(
+            "xy_goal_tolerance",
+            GoalCheck.xy_goal_tolerance,
+            "Maximum distance from the goal [m].",
+            span,
+            False,
+        ),
+        Row(
+            "yaw_goal_tolerance",
+            GoalCheck.yaw_goal_tolerance,
+            "Heading tolerance [rad]; ignored for robots that steer.",
+            span,
+            False,
+        ),
+        Row(
+            "stateful",
+            GoalCheck.stateful,
+            "A position once reached counts as reached from then on.",
+            fixed=False,
+        ),
+        Row(
+            "path_length_tolerance",
+            GoalCheck.path_length_tolerance,
+            "Maximum remaining path length at the goal [m].",
+            span,
+            False,
+        ),
+        plugin,
     ]
+    progress_rows = [
+        plugin._replace(default="nav2_controller::SimpleProgressChecker"),
+        Row(
+            "required_movement_radius",
+            ProgressCheck.required_movement_radius,
+            "Distance that counts as progress [m].",
+            span,
+            False,
+        ),
+        Row(
+            "required_movement_angle",
+            0.5,
+            "Rotation that also counts as progress [rad], for a PoseProgressChecker.",
+            span,
+            False,
+        ),
+        Row(
+            "movement_time_allowance",
+            ProgressCheck.movement_time_allowance,
+            "Time limit for progress [s].",
+            span,
+            False,
+        ),
+    ]
+    rows = []
+    for names, check in ((goals, goal_rows), (progress, progress_rows)):
+        for name in names:
+            rows += [row._replace(name=f"{name}.{row.name}") for row in check]
+    return rows
 
 
 # This service exists since simulation_interfaces 2.1, the oldest supported version.
@@ -314,16 +330,16 @@ def device(laser_frame: str = "") -> list[Row]:
             "",
             "Randomisation of each episode: mild, strong or a file; empty: none.",
         ),
-        Row("mode", MODES[0], f"How time runs: {', '.join(MODES)}."),
-        stamped("cmd_vel"),
+        Row("mode", REALTIME, f"How time runs: {', '.join(MODES)}."),
+        stamped(),
         Row(
             "frame_prefix",
             "",
             "Prefix of the robot's frames; in a fleet, the namespace follows it.",
         ),
-        Row("map_frame", "map", "Frame id of map."),
+        MAP_FRAME._replace(about="Frame id of map.", fixed=True),
         Row("odom_frame", "odom", "Frame id of odom."),
-        Row("base_frame", "base_link", "Frame id of base_link."),
+        BASE_FRAME._replace(about="Frame id of base_link.", fixed=True),
         Row(
             "laser_frame",
             laser_frame,
@@ -380,7 +396,7 @@ def device(laser_frame: str = "") -> list[Row]:
         ),
         Row(
             "command_timeout",
-            0.5,
+            defaults.COMMAND_SILENCE_S,
             "Stop after this silence of cmd_vel [simulated s]; not used in lockstep.",
             (0.0, 3600.0),
             fixed=False,
@@ -406,6 +422,13 @@ ROBOTS = Row(
     1,
     "Number of robots, named robot1, robot2, ..., or their namespaces; one has none.",
 )
+
+
+def default_namespaces(robots: int) -> tuple[str, ...]:
+    """Return the default namespaces of several robots: robot1, robot2, ..."""
+    return tuple(f"robot{k + 1}" for k in range(robots))
+
+
 FRICTION = Row(
     "friction",
     1.0,
@@ -463,9 +486,6 @@ def gate_rules(odom_rate: float = math.nan, scan_age: float = math.nan) -> list[
     from nics_drl_bridge.gate.state import GateConfig as Default
 
     seconds = (0.01, 10.0)
-    heard = (
-        "Require e_stop to be received before arming; set false only in simulations."
-    )
     return [
         Row(
             "odom_rate",
@@ -496,18 +516,26 @@ def gate_rules(odom_rate: float = math.nan, scan_age: float = math.nan) -> list[
         ),
         Row(
             "clock_rate",
-            1.0,
+            Default.clock_rate,
             "Rate of stamps: simulated seconds per real second.",
             (0.01, 100.0),
         ),
-        Row("e_stop_required", True, heard),
+        Row(
+            "e_stop_required",
+            Default.e_stop_required,
+            "Require e_stop to be received before arming; set false only in simulations.",
+        ),
         Row(
             "e_stop_silence",
             Default.e_stop_silence_s,
             "Maximum silence of e_stop [s].",
             seconds,
         ),
-        Row("estimate_required", True, "Require odometry/filtered for arming."),
+        Row(
+            "estimate_required",
+            Default.estimate_required,
+            "Require odometry/filtered for arming.",
+        ),
         Row(
             "estimate_position",
             Default.estimate_position,
@@ -551,7 +579,7 @@ def gate() -> list[Row]:
         LIMITS,
         *shield,
         *gate_rules(),
-        stamped("cmd_vel"),
+        stamped(),
         ROBOT_FRAME,
         FOREIGN,
         BLACK_BOX,
@@ -582,8 +610,13 @@ def drive() -> list[Row]:
             defaults.IMU_TOPIC,
             "IMU topic to record. auto: imu or imu/data; none: no IMU.",
         ),
-        Row("odom_timeout", 0.5, "Stop after this silence of odom [s].", (0.05, 10.0)),
-        stamped("cmd_vel")._replace(name="stamped"),
+        Row(
+            "odom_timeout",
+            defaults.DATA_SILENCE_S,
+            "Stop after this silence of odom [s].",
+            (0.05, 10.0),
+        ),
+        stamped()._replace(name="stamped"),
     ]
 
 

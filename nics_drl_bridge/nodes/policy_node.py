@@ -10,6 +10,7 @@ from geometry_msgs.msg import PoseStamped, TwistStamped
 from rclpy.context import Context
 
 from nics_drl_bridge.errors import BridgeError, ConfigError, shorten
+from nics_drl_bridge.gate import inputs
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import S_PER_NS, Array, RobotView
 from nics_drl_bridge.lidar.spec import LidarSpec
@@ -50,7 +51,7 @@ class PolicyNode(ManagedNode):
 
     def configure(self) -> None:
         """Open model and policy, and subscribe."""
-        model = self._model = open_model(str(self.get_parameter("model").value))
+        model = self._model = open_model(runner.get_text(self, "model"))
         self._open_policy(model)
         self._goal: Array = np.array(self.get_parameter("goal").value, dtype=np.float64)
         if len(self._goal) != 2 or not (
@@ -61,9 +62,9 @@ class PolicyNode(ManagedNode):
         names = ("rate", "deadline", "late_limit")
         rate, limit, patience = (self.get_parameter(name).value for name in names)
         if rate < 0.0 or limit <= 0.0 or patience < 1:
-            told = f"parameters rate {rate}, deadline {limit}, late_limit {patience}"
+            values = f"parameters rate {rate}, deadline {limit}, late_limit {patience}"
             raise ConfigError(
-                f"{told}: must be at least 0, more than 0, and at least 1."
+                f"{values}: must be at least 0, more than 0, and at least 1."
             )
         period = model.control_period
         self._deadline = Deadline(0.5 * period if np.isnan(limit) else limit, patience)
@@ -76,7 +77,7 @@ class PolicyNode(ManagedNode):
         self._acted_ns = 0
         self._answer = None
         self._raw = self.create_lifecycle_publisher(
-            TwistStamped, "cmd_vel_raw", qos.COMMAND
+            TwistStamped, inputs.RAW, qos.COMMAND
         )
         goals = self.create_subscription(
             PoseStamped, "goal_pose", self._on_goal, qos.COMMAND
@@ -89,9 +90,14 @@ class PolicyNode(ManagedNode):
         self._topics.hear_initial_pose()
         self._frames = GoalFrames(self, self._topics)
         self.undo.callback(self._frames.close)
-        given = self._topics, self._frames, model, self._nav2
         self._actions = PathActions(
-            self, *given, self._toward, lambda: begin(self._policy)
+            self,
+            self._topics,
+            self._frames,
+            model,
+            self._nav2,
+            self._toward,
+            lambda: begin(self._policy),
         )
         self.undo.callback(self._actions.close)
         timer = runner.steadily(self, POLLS * model.control_period, self._act)
@@ -107,7 +113,7 @@ class PolicyNode(ManagedNode):
         runner.last_word(self._raw, self._message(np.zeros(3), self._acted_ns))
 
     def _open_policy(self, model: SimulatorModel) -> None:
-        name = str(self.get_parameter("policy").value)
+        name = runner.get_text(self, "policy")
         self._policy, self._task = open_policy(name, model)
         view = rehearse(model)  # compiles everything now
         self._task.judge(view, {"goal": np.zeros(2)})
@@ -124,9 +130,9 @@ class PolicyNode(ManagedNode):
     def _on_goal(self, message: PoseStamped) -> None:
         stamp_ns = conversions.stamp_from_ros(message.header.stamp)
         if self._actions.active or self._actions.led:
-            told = "a goal_pose is ignored while an action leads the robot"
-            self.get_logger().info(told, throttle_duration_sec=5.0)
-            self._answer = GoalAnswer(stamp_ns, False, told)
+            reason = "a goal_pose is ignored while an action leads the robot"
+            self.get_logger().info(reason, throttle_duration_sec=5.0)
+            self._answer = GoalAnswer(stamp_ns, False, reason)
             return
         try:
             goal = self._frames.in_map(message)
@@ -164,8 +170,8 @@ class PolicyNode(ManagedNode):
         twist = self._twist()
         answer = self._deadline.judge(time.monotonic() - begin_s)
         if answer is not Answer.SEND:
-            told = f"inference was late ({self._deadline.late} so far); its command is dropped"
-            self.get_logger().warning(told, throttle_duration_sec=5.0)
+            fault = f"inference was late ({self._deadline.late} so far); its command is dropped"
+            self.get_logger().warning(fault, throttle_duration_sec=5.0)
         if answer is not Answer.DROP:
             if answer is Answer.SEND and np.isfinite(twist).all():
                 sent = twist
@@ -212,9 +218,9 @@ class PolicyNode(ManagedNode):
 
     def _toward(self, goal: Array) -> Wish:
         view = self._topics.view()
-        told = resume(self._policy, self._acted_ns * S_PER_NS)
-        if told:
-            self.get_logger().warning(told, throttle_duration_sec=5.0)
+        warning = resume(self._policy, self._acted_ns * S_PER_NS)
+        if warning:
+            self.get_logger().warning(warning, throttle_duration_sec=5.0)
         return Wish(
             self._asked(view, goal),
             bool(self._task.judge(view, {"goal": goal}).touched),
@@ -238,7 +244,7 @@ class PolicyNode(ManagedNode):
             ) from error
 
     def _message(self, twist: Array, stamp_ns: int) -> TwistStamped:
-        frame = str(self.get_parameter("base_frame").value)
+        frame = runner.get_text(self, "base_frame")
         return conversions.stamped_to_ros(twist, stamp_ns, frame)
 
 

@@ -3,7 +3,6 @@
 import json
 import os
 import random
-import threading
 import time
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
@@ -13,36 +12,37 @@ from typing import Any
 import numpy as np
 from nav_msgs.msg import Odometry
 from numpy.typing import ArrayLike, NDArray
-from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from nics_drl_bridge.config import PACKAGE
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.node_process import ChildProcess, command_of
-from nics_drl_bridge.nodes.runner import GREATEST_DOMAIN_ID, holds, open_context, spin
+from nics_drl_bridge.nodes.runner import GREATEST_DOMAIN_ID, Listener, holds
 from nics_drl_bridge.nodes.starting import NodeStart
 from nics_drl_bridge.nodes.transport import domains_in_use
 
 LAST_DOMAIN_ID = 101  # above it DDS ports may collide with Linux's ephemeral ports
 LOG_LINES = 5
 ASK_AGAIN_S = 0.2
-ANSWER_S = 2.0
+REPLY_S = 2.0  # longest wait for one answer before asking again [s]
 POLL_S = 0.005
 
 
 def free_domain_id() -> int:
     """Return the environment's domain id, or a random unused one. ConfigError if it is invalid."""
-    given = os.environ.get("ROS_DOMAIN_ID")
-    if not given:
+    variable = os.environ.get("ROS_DOMAIN_ID")
+    if not variable:
         every = range(1, LAST_DOMAIN_ID + 1)
         return random.SystemRandom().choice(
             sorted(set(every) - domains_in_use()) or every
         )
-    if not given.isdecimal() or int(given) > GREATEST_DOMAIN_ID:
+    if not variable.isdecimal() or int(variable) > GREATEST_DOMAIN_ID:
         fix = f"it must be a number from 0 to {GREATEST_DOMAIN_ID}, or unset."
-        raise ConfigError(f"the environment variable ROS_DOMAIN_ID is {given!r}; {fix}")
-    return int(given)
+        raise ConfigError(
+            f"the environment variable ROS_DOMAIN_ID is {variable!r}; {fix}"
+        )
+    return int(variable)
 
 
 class NodeProcess(ChildProcess):
@@ -80,8 +80,8 @@ class NodeProcess(ChildProcess):
                 .strip()
                 .splitlines()
             )
-            told = [line for line in lines if not line.startswith("[INFO]")] or lines
-            last = " | ".join(told[-LOG_LINES:]) or "no output"
+            shown = [line for line in lines if not line.startswith("[INFO]")] or lines
+            last = " | ".join(shown[-LOG_LINES:]) or "no output"
             reason = f"ended with code {code}: {last} (its log is {self.log})."
             raise BackendError(f"{self.node} {reason}")
 
@@ -89,20 +89,13 @@ class NodeProcess(ChildProcess):
 class Witness(AbstractContextManager["Witness", None]):
     """Context manager that observes a simulated robot's true motion in its own thread."""
 
-    def __init__(
-        self, domain_id: int | None = None, topic: str = "ground_truth"
-    ) -> None:
+    def __init__(self, domain_id: int | None = None) -> None:
         self._poses: list[NDArray[np.float64]] = []
-        self._context = open_context(domain_id=domain_id)
-        self._node = Node(
-            "witness", context=self._context, start_parameter_services=False
+        self._node = Listener("witness", domain_id)
+        self._node.create_subscription(
+            Odometry, "ground_truth", self._take, qos.SENSOR_RELIABLE
         )
-        self._node.create_subscription(Odometry, topic, self._take, qos.SENSOR_RELIABLE)
-        given = self._node, threading.Event()
-        self._thread = threading.Thread(
-            target=spin, args=given, daemon=True, name="witness"
-        )
-        self._thread.start()
+        self._node.start()
 
     def _take(self, message: Odometry) -> None:
         self._poses.append(conversions.odometry_from_ros(message)[0])
@@ -146,7 +139,7 @@ class Witness(AbstractContextManager["Witness", None]):
         while time.monotonic() < deadline and not answer.success:
             if client.wait_for_service(timeout_sec=ASK_AGAIN_S):
                 future = client.call_async(Trigger.Request())
-                if holds(future.done, ANSWER_S, POLL_S):
+                if holds(future.done, REPLY_S, POLL_S):
                     answer = future.result()
             if not answer.success:
                 time.sleep(ASK_AGAIN_S)
@@ -154,6 +147,4 @@ class Witness(AbstractContextManager["Witness", None]):
         return answer
 
     def __exit__(self, *_: object) -> None:
-        self._context.try_shutdown()
-        self._thread.join(timeout=2.0)
-        self._node.destroy_node()
+        self._node.close()

@@ -5,19 +5,22 @@ best effort wherever a lost message does no harm. Late joiners get no old data, 
 """
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
 
 from rclpy import qos as rclpy_qos
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSPolicyKind, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 
 from nics_drl_bridge.errors import ConfigError, suggest
+from nics_drl_bridge.gate import inputs
+from nics_drl_bridge.middleware.measurement import CMD_VEL
 from nics_drl_bridge.recording.messages import Offer
 
 try:
@@ -97,7 +100,7 @@ MOST_WAITING = 10_000  # most messages taken at once, in case a publisher never 
 # prefix of the parameters that override a topic's quality of service
 OVERRIDES = "qos_overrides."
 # Topics (names before remapping) whose quality of service decides whether a robot stops.
-FIXED_TOPICS = ("cmd_vel", "cmd_vel_raw", "e_stop", "ackermann_cmd")
+FIXED_TOPICS = (CMD_VEL, inputs.RAW, inputs.E_STOP, "ackermann_cmd")
 CHOICES: dict[str, Any] = {
     "history": rclpy_qos.HistoryPolicy,
     "reliability": rclpy_qos.ReliabilityPolicy,
@@ -107,6 +110,12 @@ CHOICES: dict[str, Any] = {
 FLAG = "avoid_ros_namespace_conventions"
 
 
+def given_values(node: Node) -> dict[str, Parameter]:
+    """Return the node's own dictionary of initial values, which rclpy does not expose publicly."""
+    values: dict[str, Parameter] = getattr(node, "_parameter_overrides", {})
+    return values
+
+
 def overridden_policies(node: Node, topic: str, end: str) -> list[QoSPolicyKind]:
     """Return the policies that a user's parameters set for the `end` of a topic, if any.
 
@@ -114,16 +123,16 @@ def overridden_policies(node: Node, topic: str, end: str) -> list[QoSPolicyKind]
     is fixed, and for a policy or value that does not exist.
     """
     prefix = f"{OVERRIDES}{node.resolve_topic_name(topic)}.{end}."
-    given: dict[str, Any] = getattr(node, "_parameter_overrides", {})
+    values = given_values(node)
     policies = []
-    for name in sorted(given):
+    for name in sorted(values):
         if not name.startswith(prefix):
             continue
         if topic.rsplit("/", 1)[-1] in FIXED_TOPICS:
             reason = "can't be overridden, because the robot's stop depends on it"
             raise ConfigError(f"parameter {name!r}: {reason}; leave it out.")
         policy = name.removeprefix(prefix)
-        _check_override(name, policy, given[name].value)
+        _check_override(name, policy, values[name].value)
         policies.append(QoSPolicyKind[policy.upper()])
     return policies
 
@@ -285,3 +294,9 @@ def owner(end: Any) -> str | None:
     """Return the full name of an endpoint's node, or None until it is discovered."""
     name = f"{end.node_namespace.rstrip('/')}/{end.node_name}"
     return None if UNKNOWN in name else name
+
+
+def owners(ends: Iterable[Any]) -> list[str]:
+    """Return the full names of the nodes of endpoints, as far as they are discovered."""
+    names = map(owner, ends)
+    return [name for name in names if name is not None]

@@ -16,6 +16,7 @@ from nics_drl_bridge import defaults, geometry
 from nics_drl_bridge.config import Schema, validate
 from nics_drl_bridge.env.guard import halts_on_error
 from nics_drl_bridge.errors import BackendError, StaleDataError
+from nics_drl_bridge.gate import inputs
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Array, BackendFacts, RobotView, Start
 from nics_drl_bridge.middleware.measurement import CMD_VEL, SCAN
@@ -31,8 +32,7 @@ POLL_S = 0.01
 SAY_EVERY_S = 2.0
 # A peer without services this long after its topics appeared is a vehicle [s].
 SERVICES_S = 0.5
-# A command ends after this time [s] and this number of periods: a zero command follows.
-COMMAND_S = 0.5
+# A command also lasts for this number of periods before a zero command follows.
 COMMAND_PERIODS = 2
 # A robot below these speeds is at rest.
 REST_SPEED = 0.02  # [m/s]
@@ -53,7 +53,8 @@ class RealtimeOptions(Schema):
     vehicle: bool | None = None  # a vehicle has no services; None: detected
     # duration of a step; the model's control period by default
     period_s: PositiveFloat | None = None
-    stale_after_s: PositiveFloat = 0.5  # age above which data are too old for a view
+    # age above which data are too old for a view
+    stale_after_s: PositiveFloat = defaults.DATA_SILENCE_S
     # On a vehicle, wait until it stands at the requested pose, or start at the present one.
     start: Literal["wait", "present"] = defaults.VEHICLE_START
     # Lay `map` so that the robot's present pose is the start; with `present` and without a pose
@@ -66,7 +67,7 @@ class RealtimeOptions(Schema):
     say: Callable[[str], None] | None = None
     # With `cmd_vel_raw`, commands pass `command_gate`: each is a TwistStamped with the stamp of the
     # scan that it answers.
-    command_topic: str = Field("cmd_vel", min_length=1)
+    command_topic: str = Field(CMD_VEL, min_length=1)
     # use TwistStamped for `cmd_vel`; None: the type to which the robot subscribes
     stamped: bool | None = None
     pose_type: str = (
@@ -88,7 +89,7 @@ class RealtimeOptions(Schema):
     @property
     def gated(self) -> bool:
         """True if commands pass a `command_gate`."""
-        return self.command_topic.rsplit("/", 1)[-1] == "cmd_vel_raw"
+        return self.command_topic.rsplit("/", 1)[-1] == inputs.RAW
 
 
 class Hindrance(NamedTuple):
@@ -125,7 +126,9 @@ class RealtimeBackend:
         self._misses = 0  # deadlines missed in this episode
         self._scan_ns = 0  # stamp of the scan in the newest view [ns]
         self._has_seen_services = False  # those of a simulator
-        command_timeout_s = max(COMMAND_S, COMMAND_PERIODS * self._period_ns / NS_PER_S)
+        command_timeout_s = max(
+            defaults.COMMAND_SILENCE_S, COMMAND_PERIODS * self._period_ns / NS_PER_S
+        )
         if chosen.gated:
             command_timeout_s = math.inf  # a gate has its own timeout
         rehearse(model)
@@ -195,8 +198,10 @@ class RealtimeBackend:
             missed = late_ns // self._period_ns + 1
             self._misses += missed
             self._deadline_ns += missed * self._period_ns
-        while (left_ns := self._deadline_ns - time.monotonic_ns()) > 0:
+        left_ns = self._deadline_ns - time.monotonic_ns()
+        while left_ns > 0:
             time.sleep(left_ns / NS_PER_S)
+            left_ns = self._deadline_ns - time.monotonic_ns()
         self._deadline_ns += self._period_ns
 
     def _take_view(self) -> tuple[RobotView, dict[str, Any]]:

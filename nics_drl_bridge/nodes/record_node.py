@@ -23,6 +23,7 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BackendError, BridgeError, RecordingError
 from nics_drl_bridge.exit_codes import EXIT_BAD_INPUT
 from nics_drl_bridge.interface import NS_PER_S, Array
+from nics_drl_bridge.middleware.measurement import CMD_VEL
 from nics_drl_bridge.nodes import conversions, qos, runner
 from nics_drl_bridge.nodes.command_types import deaf_subscribers, heard_stamped
 from nics_drl_bridge.nodes.parameters import IMU, drive
@@ -71,18 +72,23 @@ class DriveParameters:
 
 def declare_drive(node: Node) -> DriveParameters:
     """Declare the parameters of a drive, and read them. Raises ConfigError."""
-    get = {row.name: partial(runner.declare_row, node, row) for row in drive()}
-    robot = load_robot(get["robot"]())
+    values = {row.name: runner.declare_row(node, row) for row in drive()}
+    robot = load_robot(values["robot"])
     robot.require_cmd_vel()
-    out = check_out(Path(get["out"]()))
-    plan = DrivePlan(
-        robot, *(get[name]() for name in ("bound", "duration", "speed", "seed"))
+    return DriveParameters(
+        out=check_out(Path(values["out"])),
+        plan=DrivePlan(
+            robot,
+            values["bound"],
+            values["duration"],
+            values["speed"],
+            values["seed"],
+        ),
+        odom_timeout=values["odom_timeout"],
+        stamped=values["stamped"],
+        roles=load_topic_roles(values["topics"] or None),
+        imu=values[IMU],
     )
-    topics, silence, stamped = (
-        get[name]() for name in ("topics", "odom_timeout", "stamped")
-    )
-    roles = load_topic_roles(topics or None)
-    return DriveParameters(plan, out, silence, stamped, roles, get[IMU]())
 
 
 class DriveLog:
@@ -101,7 +107,7 @@ class DriveLog:
     @property
     def seconds(self) -> float:
         """Time over which commands were sent [s]."""
-        return (self.rows["cmd_vel"][-1][0] - self.rows["cmd_vel"][0][0]) / NS_PER_S
+        return (self.rows[CMD_VEL][-1][0] - self.rows[CMD_VEL][0][0]) / NS_PER_S
 
     def add(self, topic: str, header_ns: int, values: ArrayLike) -> bool:
         """Add a message; return False if it is not finite or not newer than the last one."""
@@ -148,7 +154,7 @@ class DriveLog:
 
     def recording(self) -> Recording:
         """Return all streams on their clocks. Raises RecordingError if too little was received."""
-        topics = {"command": "cmd_vel", "pose": "odom", "imu": "imu"}
+        topics = {"command": CMD_VEL, "pose": "odom", "imu": "imu"}
         if len(self.rows["pose"]) >= FEWEST:
             # for the noise of the odometry
             topics |= {"pose": "pose", "odometry": "odom twist"}
@@ -203,19 +209,19 @@ class RecordNode(qos.QosWatch):
     """Sends `cmd_vel` at 20 Hz, and zeros at the end or on a fault; records what it hears."""
 
     def __init__(
-        self, context: Context, given: Mapping[str, Any] | None = None
+        self, context: Context, values: Mapping[str, Any] | None = None
     ) -> None:
         overrides = [
-            Parameter(name, value=value) for name, value in (given or {}).items()
+            Parameter(name, value=value) for name, value in (values or {}).items()
         ]
         super().__init__("record_node", context=context, parameter_overrides=overrides)
         self.outcome: DriveResult | None = None
         self._order = declare_drive(self)
         self._drive = self._order.plan.begin()
-        self._sim_time = bool(self.get_parameter("use_sim_time").value)
+        self._sim_time = runner.get_flag(self, "use_sim_time")
         self._steady_origin_ns = time.time_ns() - time.monotonic_ns()
         self._log = DriveLog(self._order.plan.robot, self._order.roles, self._now_ns)
-        self._chosen = "stamped" in runner.given_values(self)
+        self._chosen = "stamped" in qos.given_values(self)
         self._topic: Publisher | None = None
         if self._chosen:
             self._speak(self._order.stamped)
@@ -233,7 +239,9 @@ class RecordNode(qos.QosWatch):
             )
         self._began = time.monotonic()
         self._heard = -np.inf
-        self._ticks = self._origin_ns = self._stamp_ns = 0
+        self._ticks = 0
+        self._origin_ns = 0
+        self._stamp_ns = 0
         self._pose: Array | None = None
         self._frame = ""  # of the robot, by its odometry
         self._start: Array = np.zeros(3)
@@ -243,7 +251,7 @@ class RecordNode(qos.QosWatch):
     def _speak(self, stamped: bool) -> None:
         self._stamped = stamped
         command = TwistStamped if stamped else Twist
-        self._topic = self.create_publisher(command, "cmd_vel", qos.COMMAND)
+        self._topic = self.create_publisher(command, CMD_VEL, qos.COMMAND)
 
     def _now_ns(self) -> int:
         if self._sim_time:
@@ -268,7 +276,8 @@ class RecordNode(qos.QosWatch):
         pose = self._log.odometry(message)
         if pose is None:
             return
-        self._pose, self._heard = pose, time.monotonic()
+        self._pose = pose
+        self._heard = time.monotonic()
         self._frame = message.child_frame_id
         if self._ticks:
             self._drive.observe(geometry.between(self._start, pose))
@@ -287,9 +296,9 @@ class RecordNode(qos.QosWatch):
                 self._end(None, complete=True)
 
     def _ready(self) -> bool:
-        topic = self.resolve_topic_name("cmd_vel")
+        topic = self.resolve_topic_name(CMD_VEL)
         if self._topic is None and self.count_subscribers(topic):
-            heard = heard_stamped(self, "cmd_vel")
+            heard = heard_stamped(self, CMD_VEL)
             self._speak(self._order.stamped if heard is None else heard)
         listened = self._topic is not None and self._topic.get_subscription_count() > 0
         if listened and self._pose is not None and self._now_ns() > 0:
@@ -300,16 +309,17 @@ class RecordNode(qos.QosWatch):
             if not self._sim_time and self.count_publishers("/clock"):
                 fix = "--use-sim-time takes the time of a simulator"
                 self.get_logger().warning(f"/clock is published, but not used; {fix}")
-            self._start, self._origin_ns = self._pose, self._now_ns()
+            self._start = self._pose
+            self._origin_ns = self._now_ns()
             return True
         if time.monotonic() - self._began > PATIENCE_S:
             odom = ("odom", "nothing arrived")
-            command = ("cmd_vel", "nobody listened")
+            command = (CMD_VEL, "nobody listened")
             name, missing = odom if self._pose is None else command
             fix = "start the robot, or correct namespace, ROS_DOMAIN_ID or remapping."
             reason = f"{missing} within {PATIENCE_S:g} s"
             if self._pose is not None and self._topic is not None:
-                deaf = deaf_subscribers(self, "cmd_vel", self._stamped)
+                deaf = deaf_subscribers(self, CMD_VEL, self._stamped)
                 if deaf:
                     fix = f"set stamped:={str(not self._stamped).lower()}, or leave it out."
                     raise BackendError(f"topic {self._place(name)}: {deaf}; {fix}")
@@ -357,7 +367,7 @@ class RecordNode(qos.QosWatch):
         robot = self._order.plan.robot
         if self._topic is not None:
             self._topic.publish(self._message(robot.to_cmd_vel(command)))
-        self._log.add("cmd_vel", 0, robot.pass_through_cmd_vel(command))
+        self._log.add(CMD_VEL, 0, robot.pass_through_cmd_vel(command))
 
     def _message(self, twist: Array) -> Twist | TwistStamped:
         stamped = conversions.stamped_to_ros(twist, self._now_ns(), self._frame)
@@ -371,14 +381,14 @@ class RecordNode(qos.QosWatch):
     def _end(self, failure: BridgeError | None, complete: bool = False) -> None:
         self.outcome = DriveResult(complete, failure, None, "")
         recording = None
-        told = "the robot was not moved; nothing is recorded"
+        result = "the robot was not moved; nothing is recorded"
         if self._ticks:
             self._halt()
-            recording, told = self._save()
+            recording, result = self._save()
         if not complete:
             stopped = "the robot was told to stop; " if self._ticks else ""
-            told = f"{failure or 'interrupted:'} {stopped}{told}"
-        self.outcome = DriveResult(complete, failure, recording, told)
+            result = f"{failure or 'interrupted:'} {stopped}{result}"
+        self.outcome = DriveResult(complete, failure, recording, result)
         self.context.try_shutdown()
 
     def _halt(self) -> None:
@@ -400,11 +410,11 @@ class RecordNode(qos.QosWatch):
 
 
 def record(
-    given: dict[str, Any] | None = None, args: Sequence[str] | None = None
+    values: dict[str, Any] | None = None, args: Sequence[str] | None = None
 ) -> DriveResult:
     """Drive and record until the end, an error or a signal; parameters may also come in `args`."""
     node: RecordNode = runner.run_node(
-        partial(RecordNode, given=given), args, "record_node"
+        partial(RecordNode, values=values), args, "record_node"
     )
     return node.outcome or DriveResult(
         False, None, None, "interrupted: nothing was saved"

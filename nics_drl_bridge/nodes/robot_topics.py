@@ -36,13 +36,13 @@ from nics_drl_bridge.nodes.parameters import (
     STAMPED,
     sensors,
 )
-from nics_drl_bridge.nodes.runner import declare_row
+from nics_drl_bridge.nodes.runner import declare_row, get_flag, get_text
 from nics_drl_bridge.recording import messages
 from nics_drl_bridge.recording.imu_axis import GyroReader
 from nics_drl_bridge.recording.topic_roles import IMU_NAMES, list_imu_topics
 
 KINDS_OF_POSE = {
-    each.__name__: each for each in (PoseStamped, PoseWithCovarianceStamped)
+    kind.__name__: kind for kind in (PoseStamped, PoseWithCovarianceStamped)
 }
 
 
@@ -93,14 +93,14 @@ class RobotTopics:
         self._commands = CommandListener(
             node,
             measurement.CMD_VEL,
-            bool(node.get_parameter(STAMPED).value),
+            get_flag(node, STAMPED),
             self._locked(self._take_command),
         )
         heard: dict[str, tuple[Any, Callable[[Any], None]]] = {
             measurement.SCAN: (LaserScan, self._take_scan),
             measurement.ODOM: (Odometry, self._take_odometry),
         }
-        pose_type = str(node.get_parameter("pose_type").value)
+        pose_type = get_text(node, "pose_type")
         self._posed = pose_type != NO_POSE
         if self._posed:
             if pose_type not in POSE_TYPES:
@@ -140,7 +140,7 @@ class RobotTopics:
 
     def _hear_imu(self) -> None:
         """Subscribe to the gyro if one is named or the model was made with one."""
-        wanted = str(self._node.get_parameter(IMU).value)
+        wanted = get_text(self._node, IMU)
         topics = list_imu_topics(wanted, self._model.gyro)
         self._imu_topic = ""  # the first topic that is heard
         self._gyro = GyroReader()
@@ -160,7 +160,7 @@ class RobotTopics:
             self._node.destroy_subscription(self._subscriptions.pop())
 
     def restart(self) -> None:
-        """Clear all state; the next odometry starts anew."""
+        """Clear all state; the next odometry starts again."""
         self._started = False
         self._since_ns = 0
         self._placed = None
@@ -185,26 +185,28 @@ class RobotTopics:
     def _take_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
         logger = self._node.get_logger()
         try:
-            pose = initial_pose(
-                message, str(self._node.get_parameter("map_frame").value)
-            )
-            # without any correction, this pose defines the map
-            spread = START_STD**2 * np.eye(3)
-            if self._posed:
-                covariance = conversions.pose_from_ros(message)[1]
-                given = measurement.check_covariance(covariance, 3, START_STD)
-                spread = spread if given is None else given
-        except (ConfigError, ValueError) as error:
-            logger.error(
-                f"{str(error).removesuffix('.')}. The estimate stays as it is."
-            )
+            pose = initial_pose(message, get_text(self._node, "map_frame"))
+            self._placed = pose, self._initial_covariance(message)
+        except ConfigError as error:
+            logger.error(f"{error} The estimate stays as it is.")
             return
-        self._placed = pose, spread
         if self._started:
             self.middleware.place(*self._placed)
         logger.info(
             f"the robot is at ({pose[0]:.2f}, {pose[1]:.2f}) m, {pose[2]:.2f} rad"
         )
+
+    def _initial_covariance(self, message: PoseWithCovarianceStamped) -> Array:
+        """Return the covariance (3, 3) of `initialpose`. Raises ConfigError if it is none."""
+        covariance = None
+        if self._posed:  # otherwise nothing corrects this pose: it defines the map
+            _, reported = conversions.pose_from_ros(message)
+            try:
+                covariance = measurement.check_covariance(reported, 3, START_STD)
+            except ValueError as error:
+                fix = "give a valid one, or zeros."
+                raise ConfigError(f"{INITIAL_POSE}: {error}; {fix}") from None
+        return START_STD**2 * np.eye(3) if covariance is None else covariance
 
     def in_odom(self) -> Array | None:
         """Return the robot's odometry pose (3,) at the newest datum; None before any."""
@@ -223,8 +225,8 @@ class RobotTopics:
     @property
     def located(self) -> bool:
         """True if the robot's position in the map is known."""
-        known = self._placed is not None or not self._posed
-        return known or measurement.POSE in self.middleware.cache.newest
+        is_placed = self._placed is not None or not self._posed
+        return is_placed or measurement.POSE in self.middleware.cache.newest
 
     def view(self) -> RobotView:
         """Return the view at the stamp of the newest datum."""
@@ -236,7 +238,7 @@ class RobotTopics:
             return
         reader = self._reader_for(message)
         if reader is None:
-            self.middleware.cache.reject(f"{measurement.SCAN}: another lidar")
+            self.middleware.cache.reject(measurement.SCAN, "another lidar")
             return
         ordered = reader.ordered(np.asarray(message.ranges, np.float32))
         ranges = from_device(np.ascontiguousarray(ordered), reader.lidar)
@@ -258,7 +260,7 @@ class RobotTopics:
             return self._reader
         self._header = header
         self._reader = None
-        upside_down = bool(self._node.get_parameter("lidar_upside_down").value)
+        upside_down = get_flag(self._node, "lidar_upside_down")
         try:
             reader = conversions.reader_from_ros(
                 message, self._model.lidar, upside_down
@@ -305,7 +307,7 @@ class RobotTopics:
             return
         measured = self._gyro.read(message)
         if measured is None:
-            self.middleware.cache.reject(f"{measurement.IMU}: no angular velocity")
+            self.middleware.cache.reject(measurement.IMU, "no angular velocity")
         else:
             self.middleware.imu(messages.get_stamp(message), self.now_ns(), *measured)
 
@@ -313,7 +315,7 @@ class RobotTopics:
         try:
             reading = sensor.read(message)
         except ValueError as error:
-            self.middleware.cache.reject(f"{sensor.name}: {error}")
+            self.middleware.cache.reject(sensor.name, str(error))
         else:
             self.middleware.sense(
                 sensor.name, messages.get_stamp(message), self.now_ns(), reading

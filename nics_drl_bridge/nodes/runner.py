@@ -46,7 +46,8 @@ GREATEST_DOMAIN_ID = 232  # above it, DDS has no ports
 # time until the graph shows all nodes [s]
 SETTLE_S = 0.3
 POLL_S = 0.02
-ANSWER_S = 1.5  # a silent node counts as dead, though the graph shows it for 20 s more
+# a node silent for this long counts as dead, though the graph shows it for 20 s more [s]
+LIVENESS_S = 1.5
 DIAGNOSTICS_S = 1.0
 RANGES = {
     int: (IntegerRange, "integer_range"),
@@ -99,7 +100,8 @@ def run_node(
     sole_name: str = "",
 ) -> Any:
     """Run a node until a signal (`ENDING`), then stop and destroy it cleanly; return it."""
-    stopping, started = threading.Event(), threading.Event()
+    stopping = threading.Event()
+    started = threading.Event()
 
     def end(*_: Any) -> None:
         stopping.set()
@@ -170,6 +172,42 @@ def spin(node: Node, stopping: threading.Event) -> None:
     executor.shutdown(timeout_sec=1.0)
 
 
+class Listener(Node):
+    """A node in a context of its own, which spins in a thread from `start` to `close`."""
+
+    def __init__(
+        self,
+        name: str,
+        domain_id: int | None = None,
+        namespace: str = "",
+        has_parameters: bool = False,
+    ) -> None:
+        context = open_context([], domain_id)
+        self._thread = threading.Thread(
+            target=spin, args=(self, threading.Event()), daemon=True, name=name
+        )
+        try:
+            super().__init__(
+                name,
+                context=context,
+                namespace=namespace,
+                start_parameter_services=has_parameters,
+            )
+        except BaseException:
+            context.try_shutdown()
+            raise
+
+    def start(self) -> None:
+        """Start the thread, once all subscriptions exist."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the thread, the node and its context."""
+        self.context.try_shutdown()
+        self._thread.join(timeout=2.0)
+        self.destroy_node()
+
+
 @contextlib.contextmanager
 def sole(context: Context, name: str) -> Iterator[None]:
     """Ensure a single instance while a node runs. Raises BackendError if another is running."""
@@ -179,7 +217,8 @@ def sole(context: Context, name: str) -> Iterator[None]:
     )
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as claim:
         try:
-            whole, domain = probe.get_fully_qualified_name(), context.get_domain_id()
+            whole = probe.get_fully_qualified_name()
+            domain = context.get_domain_id()
             key = hashlib.sha256(f"{domain} {whole}".encode()).hexdigest().encode()
             taken = False
             try:
@@ -210,9 +249,9 @@ def _lives(probe: Node, whole: str) -> bool:
     client = probe.create_client(GetParameters, f"{whole}/get_parameters")
     executor = SingleThreadedExecutor(context=probe.context)
     executor.add_node(probe)
-    deadline = time.monotonic() + ANSWER_S
+    deadline = time.monotonic() + LIVENESS_S
     try:
-        holds(client.service_is_ready, ANSWER_S, POLL_S)
+        holds(client.service_is_ready, LIVENESS_S, POLL_S)
         answer = client.call_async(GetParameters.Request())
         executor.spin_until_future_complete(
             answer, max(0.1, deadline - time.monotonic())
@@ -246,58 +285,62 @@ def declare_model(node: Node) -> SimulatorModel:
     return model
 
 
+def get_text(node: Node, name: str) -> str:
+    """Return the value of a text parameter."""
+    return str(node.get_parameter(name).value)
+
+
+def get_number(node: Node, name: str) -> float:
+    """Return the value of a numeric parameter."""
+    return float(node.get_parameter(name).value or 0.0)
+
+
+def get_flag(node: Node, name: str) -> bool:
+    """Return the value of a parameter that is true or false."""
+    return bool(node.get_parameter(name).value)
+
+
 def declare_row(node: Node, row: Row) -> Any:
     """Declare a parameter unless the node has it, and return its value."""
     if node.has_parameter(row.name):
         return node.get_parameter(row.name).value
-    return declare(node, row.name, row.default, row.about, row.span, row.fixed)
-
-
-def declare(
-    node: Node,
-    name: str,
-    default: Any,
-    description: str,
-    span: tuple[float, float] | None = None,
-    read_only: bool = False,
-) -> Any:
-    """Declare a parameter of the default's type, limited to a span, and return its value."""
     # a managed node fixes it only from configure to cleanup
-    if read_only and hasattr(node, "fixed"):
-        node.fixed.add(name)
-        read_only = False
-    descriptor = ParameterDescriptor(description=description, read_only=read_only)
-    if span is not None:
-        kind, field = RANGES[type(default)]
-        setattr(descriptor, field, [kind(from_value=span[0], to_value=span[1])])
-    given = given_values(node)
-    many = isinstance(default, list)
-    # rclpy refuses an integer, as in `rate:=2`, for a floating-point parameter.
-    if name in given and isinstance(default[0] if many else default, float):
-        types = Parameter.Type
-        value = given[name].value
-        if given[name].type_ == (types.INTEGER_ARRAY if many else types.INTEGER):
-            value = [float(each) for each in value] if many else float(value)
-            given[name] = Parameter(
-                name, types.DOUBLE_ARRAY if many else types.DOUBLE, value
-            )
-    return node.declare_parameter(name, default, descriptor).value
+    if row.fixed and hasattr(node, "fixed"):
+        node.fixed.add(row.name)
+        row = row._replace(fixed=False)
+    descriptor = ParameterDescriptor(description=row.about, read_only=row.fixed)
+    if row.span is not None:
+        low, high = row.span
+        kind, field = RANGES[type(row.default)]
+        setattr(descriptor, field, [kind(from_value=low, to_value=high)])
+    _accept_integers(node, row)
+    return node.declare_parameter(row.name, row.default, descriptor).value
 
 
-def given_values(node: Node) -> dict[str, Parameter]:
-    """Return the node's own dictionary of initial values, which rclpy does not expose publicly."""
-    found: dict[str, Parameter] = getattr(node, "_parameter_overrides", {})
-    return found
+def _accept_integers(node: Node, row: Row) -> None:
+    """Make the given integers of a floating-point parameter floats; rclpy refuses `rate:=2`."""
+    values = qos.given_values(node)
+    many = isinstance(row.default, list)
+    types = Parameter.Type
+    if row.name not in values:
+        return
+    given_type = values[row.name].type_
+    value = values[row.name].value
+    if many and isinstance(row.default[0], float) and given_type == types.INTEGER_ARRAY:
+        floats = list(map(float, value))
+        values[row.name] = Parameter(row.name, types.DOUBLE_ARRAY, floats)
+    if isinstance(row.default, float) and given_type == types.INTEGER:
+        values[row.name] = Parameter(row.name, types.DOUBLE, float(value))
 
 
 def unknown(node: Node) -> list[str]:
     """Return a sentence for each value whose parameter the node does not have."""
-    known = [name for name in node._parameters if not name.startswith(qos.OVERRIDES)]
+    names = [name for name in node._parameters if not name.startswith(qos.OVERRIDES)]
     ignores = getattr(node, "ignores", lambda _: False)
     sentences = [
-        f"there is no parameter {name!r}, its value is ignored; {suggest(name, known)}"
-        for name in sorted(given_values(node))
-        if name not in (*known, SHARED)
+        f"there is no parameter {name!r}, its value is ignored; {suggest(name, names)}"
+        for name in sorted(qos.given_values(node))
+        if name not in (*names, SHARED)
         and not name.startswith(qos.OVERRIDES)
         and not ignores(name)
     ]
@@ -311,14 +354,18 @@ def unused_overrides(node: Node) -> list[str]:
     """
     if getattr(node, "state", ACTIVE) == UNCONFIGURED:
         return []
-    ends = [f"{qos.OVERRIDES}{each.topic_name}.publisher" for each in node.publishers]
+    ends = [
+        f"{qos.OVERRIDES}{publisher.topic_name}.publisher"
+        for publisher in node.publishers
+    ]
     ends += [
-        f"{qos.OVERRIDES}{each.topic_name}.subscription" for each in node.subscriptions
+        f"{qos.OVERRIDES}{subscription.topic_name}.subscription"
+        for subscription in node.subscriptions
     ]
     return [
         f"parameter {name!r} is ignored: the node has no such publisher or subscription; "
         f"{suggest(name.rpartition('.')[0], ends)}"
-        for name in sorted(given_values(node))
+        for name in sorted(qos.given_values(node))
         if name.startswith(qos.OVERRIDES) and not node.has_parameter(name)
     ]
 
@@ -338,15 +385,16 @@ def diagnose(node: Node, part: str, look: Callable[[], Condition]) -> None:
     name = f"{node.get_fully_qualified_name()}: {part}"
 
     def publish() -> None:
-        found = look()
-        level = DiagnosticStatus.WARN if found.warns else DiagnosticStatus.OK
+        condition = look()
+        level = DiagnosticStatus.WARN if condition.warns else DiagnosticStatus.OK
         values = [
-            KeyValue(key=key, value=str(value)) for key, value in found.facts.items()
+            KeyValue(key=key, value=str(value))
+            for key, value in condition.facts.items()
         ]
         status = DiagnosticStatus(
-            level=level, name=name, message=found.message, values=values
+            level=level, name=name, message=condition.message, values=values
         )
-        status.hardware_id = found.hardware
+        status.hardware_id = condition.hardware
         message = DiagnosticArray(status=[status])
         message.header.stamp = node.get_clock().now().to_msg()
         topic.publish(message)

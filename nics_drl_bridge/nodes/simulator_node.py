@@ -10,7 +10,6 @@ from functools import partial
 from typing import Any, cast
 
 import numpy as np
-from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TransformStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from rclpy.context import Context
@@ -28,6 +27,7 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.lidar.scanner import RENDERERS, Renderer
 from nics_drl_bridge.lidar.spec import to_device
+from nics_drl_bridge.middleware.measurement import CMD_VEL
 from nics_drl_bridge.nodes import (
     conversions,
     device_parameters,
@@ -138,8 +138,12 @@ class RobotPort:
         self._truths = publisher(Odometry, "ground_truth")
         self._joints = publisher(JointState, "joint_states")
         self._sensors = [
-            (each, frames.prefix + each.frame, publisher(sensor_type(each), each.name))
-            for each in model.sensors
+            (
+                sensor,
+                frames.prefix + sensor.frame,
+                publisher(sensor_type(sensor), sensor.name),
+            )
+            for sensor in model.sensors
         ]
         free = np.full(model.lidar.beams, np.inf, np.float32)
         scan = conversions.scan_to_ros(model.lidar, free, 0, frames.laser)
@@ -154,13 +158,13 @@ class RobotPort:
         at_rest = partial(conversions.odometry_to_ros, np.zeros(3), np.zeros(3), 0)
         self._odom = wire.OdometryWriter(at_rest((frames.odom, frames.base), odom))
         self._truth = wire.OdometryWriter(at_rest((frames.map, frames.base), truth))
-        self._locates = bool(node.get_parameter("publish_map_to_odom").value)
+        self._locates = runner.get_flag(node, "publish_map_to_odom")
 
     def close(self) -> None:
         """End its topics."""
         self._outbox.drop(self._publishers)
-        for each in self._publishers:
-            self._node.destroy_publisher(each)
+        for publisher in self._publishers:
+            self._node.destroy_publisher(publisher)
 
     def mounts(self) -> list[TransformStamped]:
         """Return the transforms base_link -> laser, to each further sensor, and footprint."""
@@ -169,17 +173,15 @@ class RobotPort:
         if self.frames.footprint:
             mounted.append((self.frames.footprint, (0.0, 0.0, 0.0)))
         base = self.frames.base
-        return [
-            transform_to_ros(base, frame, place, Time()) for frame, place in mounted
-        ]
+        return [transform_to_ros(base, frame, place, 0) for frame, place in mounted]
 
-    def moving(self, now: Time, sensed: Sensed) -> list[TransformStamped]:
+    def moving(self, now_ns: int, sensed: Sensed) -> list[TransformStamped]:
         """Return the transforms odom -> base_link, and map -> odom if requested."""
         frames = self.frames
-        moving = [transform_to_ros(frames.odom, frames.base, sensed.odom, now)]
+        moving = [transform_to_ros(frames.odom, frames.base, sensed.odom, now_ns)]
         if self._locates:
             home = odom_in_map(sensed.pose, sensed.odom)
-            moving.append(transform_to_ros(frames.map, frames.odom, home, now))
+            moving.append(transform_to_ros(frames.map, frames.odom, home, now_ns))
         return moving
 
     def publish_odometry(self, sensed: Sensed, now_ns: int) -> None:
@@ -223,30 +225,33 @@ class CommandInlet:
         self._robot = robot
         self._take = take
         self._too_old = too_old
-        stamped = bool(node.get_parameter("enable_stamped_cmd_vel").value)
+        stamped = runner.get_flag(node, "enable_stamped_cmd_vel")
         self._kind = name_of(stamped)
         kind = TwistStamped if stamped else Twist
         hear = partial(self._on_bytes, stamped)
         heard = node.create_subscription(
-            kind, f"{namespace}cmd_vel", hear, quality, raw=True
+            kind, f"{namespace}{CMD_VEL}", hear, quality, raw=True
         )
         self._topic = heard.topic_name
         self.heard = [heard]
-        self._types = TypeWatch(node, f"{namespace}cmd_vel")
+        self._types = TypeWatch(node, f"{namespace}{CMD_VEL}")
         kind = conversions.message_type("ackermann_msgs/msg/AckermannDriveStamped")
         if robot.steers and kind is not None:  # its package is optional
-            given = kind, f"{namespace}ackermann_cmd", self._on_ackermann, quality
-            self.heard.append(node.create_subscription(*given))
+            topic = f"{namespace}ackermann_cmd"
+            self.heard.append(
+                node.create_subscription(kind, topic, self._on_ackermann, quality)
+            )
 
     def close(self) -> None:
         """End the subscriptions."""
-        for each in self.heard:
-            self._node.destroy_subscription(each)
+        for subscription in self.heard:
+            self._node.destroy_subscription(subscription)
 
     def _on_bytes(self, stamped: bool, content: bytes) -> None:
+        stamp_ns = 0
         try:
-            stamp_ns = wire.stamp_of(content) if stamped else 0
             if stamped:
+                stamp_ns = wire.stamp_of(content)
                 twist = wire.stamped_twist_of(content)
             else:
                 twist = wire.twist_of(content)
@@ -308,7 +313,7 @@ class DeviceNode(qos.QosWatch):
         self._heard = np.zeros(0, np.bool_)
         self.model = device_parameters.timed_model(self, model, self._time)
         self._make = make
-        self.use_world(load_worlds(str(self.get_parameter("world").value)))
+        self.use_world(load_worlds(runner.get_text(self, "world")))
         self.paused = False
         self._lags = 0
         self._hardware = model.robot.name
@@ -325,10 +330,8 @@ class DeviceNode(qos.QosWatch):
     def use_world(self, world: AnyWorld) -> None:
         """Simulate a world with the robots of the start; call `begin` next."""
         simulator = self.make_simulator(world, len(self._names))
-        self.world, self.device = (
-            world,
-            DeviceWorld(simulator, self.model, len(self._names)),
-        )
+        self.world = world
+        self.device = DeviceWorld(simulator, self.model, len(self._names))
         self._identity = identity(
             self._given, world, device_parameters.randomisation(self)
         )
@@ -346,9 +349,9 @@ class DeviceNode(qos.QosWatch):
         self._command_ns = np.zeros(count, np.int64)
         # in lock-step: the robots that have a command
         self._heard = np.zeros(count, np.bool_)
-        known = [k for k in kept if k < len(command_ns_before)]
-        self._command_ns[: len(known)] = command_ns_before[known]
-        self._heard[: len(known)] = heard_before[known]
+        present = [k for k in kept if k < len(command_ns_before)]
+        self._command_ns[: len(present)] = command_ns_before[present]
+        self._heard[: len(present)] = heard_before[present]
 
     @property
     def robot_names(self) -> tuple[str, ...]:
@@ -358,7 +361,7 @@ class DeviceNode(qos.QosWatch):
     @property
     def map_frame(self) -> str:
         """Frame of the world."""
-        return str(self.get_parameter("map_frame").value)
+        return runner.get_text(self, "map_frame")
 
     @property
     def frames(self) -> list[device_parameters.Frames]:
@@ -385,14 +388,14 @@ class DeviceNode(qos.QosWatch):
         space = f"{name}/" if name else ""
         frames = device_parameters.frames(self, name.strip("/"))
         port = RobotPort(self, space, self.model, frames, self._time, self._outbox)
-        commands = qos.EVERY_COMMAND if self._time.lockstep else qos.COMMAND
-        given = (
+        inlet = CommandInlet(
+            self,
+            space,
             self.model.robot,
-            commands,
+            qos.EVERY_COMMAND if self._time.lockstep else qos.COMMAND,
             partial(self._on_command, port),
             self._too_old,
         )
-        inlet = CommandInlet(self, space, *given)
         inlet.heard.append(
             self._world_topics.hear(space, lambda: self._ports.index(port))
         )
@@ -425,7 +428,7 @@ class DeviceNode(qos.QosWatch):
         self._complete.trigger()  # not here: more robots may be about to leave
 
     def _open_transforms(self) -> None:
-        self._transforms: Any = conversions.message_type("tf2_msgs/msg/TFMessage")
+        self._transforms: Any = conversions.transforms_type()
         if self._transforms is None:
             silent = "so neither /tf nor /tf_static is published"
             fix = how_to_install("tf2_msgs")
@@ -439,8 +442,10 @@ class DeviceNode(qos.QosWatch):
 
     def _publish_mounts(self) -> None:
         if self._transforms is not None:
-            mounts = [each for port in self._ports for each in port.mounts()]
-            self._fixed.publish(self._transforms(transforms=mounts))
+            mounts = itertools.chain.from_iterable(
+                port.mounts() for port in self._ports
+            )
+            self._fixed.publish(self._transforms(transforms=list(mounts)))
 
     def _start_time(self) -> None:
         # On the steady clock: with use_sim_time the node's clock would wait for this very node.
@@ -452,7 +457,7 @@ class DeviceNode(qos.QosWatch):
         self._timer = None
         self._soon = self.create_guard_condition(self._on_time)
         self._complete = self.create_guard_condition(self._advance_if_complete)
-        if self._time.mode == "realtime":
+        if self._time.mode == parameters.REALTIME:
             period = step_ns / NS_PER_S / self._time.rate
             # If data are published later than measured, use a tick that divides the step.
             late = any((*self._time.scan_late_ns, *self._time.odom_late_ns))
@@ -466,8 +471,7 @@ class DeviceNode(qos.QosWatch):
     def _watch(self) -> None:
         for inlet in self._inlets:
             inlet.watch()
-        ends = self.get_publishers_info_by_topic(CLOCK)
-        names = {name for end in ends if (name := qos.owner(end)) is not None}
+        names = set(qos.owners(self.get_publishers_info_by_topic(CLOCK)))
         for name in names - self._clocks:
             self.get_logger().warning(
                 f"{name} publishes {CLOCK} too, and nodes with use_sim_time hear both; give each "
@@ -488,7 +492,7 @@ class DeviceNode(qos.QosWatch):
         return runner.Condition(message, False, facts, self._hardware)
 
     def _timeout_ns(self) -> int:
-        return int(device_parameters.number(self, "command_timeout") * NS_PER_S)
+        return int(runner.get_number(self, "command_timeout") * NS_PER_S)
 
     def _too_old(self, stamp_ns: int) -> bool:
         return not self._time.lockstep and self.now_ns - stamp_ns > self._timeout_ns()
@@ -520,8 +524,8 @@ class DeviceNode(qos.QosWatch):
         if self._real_time.lost(steady_ns, self.now_ns):
             self._lags += 1
             fix = "choose a lower rate, scan_rate or odom_rate, or fewer robots"
-            told = f"this machine does not keep up with real time; {fix}"
-            self.get_logger().warning(told, throttle_duration_sec=5.0)
+            warning = f"this machine does not keep up with real time; {fix}"
+            self.get_logger().warning(warning, throttle_duration_sec=5.0)
             self._real_time.begin(steady_ns, self.now_ns + self._time.step_ns)
         behind = self._real_time.behind(steady_ns, self.now_ns)
         if behind:
@@ -535,9 +539,8 @@ class DeviceNode(qos.QosWatch):
         if self.paused:
             return
         time_ns = self._real_time.time_at(time.monotonic_ns())
-        if self._told_ns < (
-            between_ns := min(time_ns, self.now_ns + self._time.step_ns - 1)
-        ):
+        between_ns = min(time_ns, self.now_ns + self._time.step_ns - 1)
+        if self._told_ns < between_ns:
             self._tell_time(between_ns)
 
     def _tell_time(self, time_ns: int) -> None:
@@ -562,26 +565,26 @@ class DeviceNode(qos.QosWatch):
 
     def begin(self, rewind: bool = False) -> None:
         """Begin the episode of the parameters; if `rewind`, set time back to its start."""
-        given = bool(self.get_parameter("episode_start_given").value)
+        is_given = runner.get_flag(self, "episode_start_given")
         start = np.array(self.get_parameter("episode_start").value, dtype=np.float64)
-        seed = int(device_parameters.number(self, "episode_seed"))
+        seed = int(runner.get_number(self, "episode_seed"))
         # comes first: if it raises, the present episode goes on
-        self.device.begin(seed, start if given else None)
+        self.device.begin(seed, start if is_given else None)
         if rewind:
             self.now_ns = self._first_ns
-        self._outbox.clear()
         self._heard[:] = False
         self.now_ns += self._time.step_ns
-        self._odom_pace.begin(self.now_ns)
-        self._scan_pace.begin(self.now_ns)
-        self._go_on()
-        self._publish()
+        self._publish_after_jump()
 
     def rewind(self) -> None:
         """Set the time back to its start; nothing moves."""
         # keep the age of the commands
         self._command_ns += self._first_ns - self.now_ns
         self.now_ns = self._first_ns
+        self._publish_after_jump()
+
+    def _publish_after_jump(self) -> None:
+        """Publish all topics after the time or the world has jumped."""
         self._outbox.clear()
         self._odom_pace.begin(self.now_ns)
         self._scan_pace.begin(self.now_ns)
@@ -621,7 +624,8 @@ class DeviceNode(qos.QosWatch):
             response.success = True
             response.message = "paused" if self.paused else "running"
         except BridgeError as error:
-            response.success, response.message = False, str(error)
+            response.success = False
+            response.message = str(error)
         return response
 
     def _require_world(self) -> None:
@@ -652,7 +656,7 @@ class DeviceNode(qos.QosWatch):
             if odom_due:
                 port.publish_odometry(sensed, now_ns)
                 if self._transforms is not None:
-                    moving += port.moving(conversions.stamp_to_ros(now_ns), sensed)
+                    moving += port.moving(now_ns, sensed)
             if scan_due:
                 port.publish_scan(sensed, now_ns)
         if moving:  # with the delay of the odometry behind it
@@ -673,8 +677,8 @@ def fast_simulator(
     renderer = declare_renderer(node, defaults.RENDERER)
     tell = node.get_logger().warning
     drawn = device_parameters.randomisation(node)
-    given: Any = {"renderer": renderer, "randomisation": drawn, "tell": tell}
-    return FastSimulator(model, world, robots=robots, **given)
+    options: Any = {"renderer": renderer, "randomisation": drawn, "tell": tell}
+    return FastSimulator(model, world, robots=robots, **options)
 
 
 def simulator_node(context: Context) -> DeviceNode:

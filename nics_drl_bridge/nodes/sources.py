@@ -5,6 +5,8 @@ from typing import Any
 
 from rclpy.node import Node
 
+from nics_drl_bridge.nodes import qos
+
 SHOWN = 4  # displayed bytes of a publisher's id
 
 
@@ -38,5 +40,5 @@ class Sources:
     def _node_of(self, gid: bytes) -> str:
         for endpoint in self._node.get_publishers_info_by_topic(self._topic):
             if bytes(endpoint.endpoint_gid) == gid:
-                return f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
+                return qos.owner(endpoint) or "a node"
         return "a node"

@@ -72,7 +72,8 @@ def _main_of(node: str) -> Any:
             sentence = f"{node}: {clause}"
         sys.stderr.write(f"{sentence}\n")
         raise SystemExit(EXIT_BAD_INPUT) from None
-    COMPILING.patience_s, COMPILING.tell = 0.0, get_logger(node).info
+    COMPILING.patience_s = 0.0
+    COMPILING.tell = get_logger(node).info
     return main
 
 

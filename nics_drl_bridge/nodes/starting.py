@@ -10,18 +10,26 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from nics_drl_bridge.config import (
     PACKAGE,
     find_config,
+    list_shipped,
     parse_yaml,
     read_text,
     share_folder,
 )
 from nics_drl_bridge.errors import ConfigError, suggest
-from nics_drl_bridge.nodes.parameters import BASE_FRAME, IMU, MODEL, STAMPED
+from nics_drl_bridge.nodes.parameters import (
+    BASE_FRAME,
+    IMU,
+    MODEL,
+    STAMPED,
+    default_namespaces,
+)
 
 STATE_PUBLISHER = "robot_state_publisher"
 RVIZ = "rviz2"
@@ -124,23 +132,18 @@ class Setup:
 
     def _of_file(self, name: str, node: str) -> Any:
         """Return a value from the parameter file, for a node in any namespace."""
-        found = None
-        for key in ("/**", f"/**/{node}", node, f"/{node}") if node else ("/**",):
-            found = (
-                (self._file.get(key) or {}).get("ros__parameters", {}).get(name, found)
-            )
-        return found
+        value = None
+        for key in ("/**", f"/**/{node}", node, f"/{node}"):
+            section = self._file.get(key) or {}
+            value = section.get("ros__parameters", {}).get(name, value)
+        return value
 
     def limits(self) -> str:
         """Return the gate's limits; by default the shipped limits of the given model, if any."""
         if self["limits"] or not self["model"]:
             return self["limits"]
         robot = self.model if self._opened is None else self._opened.robot.name
-        return (
-            robot
-            if (share_folder() / "config" / "limits" / f"{robot}.yaml").is_file()
-            else ""
-        )
+        return robot if robot in list_shipped("limits") else ""
 
     def frame(self, node: str, robot: Robot) -> str | None:
         """Return a frame of a robot in a fleet; None for a single robot, whose file names it."""
@@ -205,22 +208,22 @@ class Launch:
     arguments: Sequence[Argument]
     simulated: bool = False
 
-    def nodes(self, given: Values) -> list[NodeStart]:
+    def nodes(self, values: Values) -> list[NodeStart]:
         """Return the nodes for the given arguments. Raises BridgeError."""
-        setup = Setup(complete(self.arguments, given))
-        return [node for part in self.parts for node in part(setup)]
+        setup = Setup(complete(self.arguments, values))
+        return list(chain.from_iterable(part(setup) for part in self.parts))
 
 
-def complete(arguments: Sequence[Argument], given: Values) -> dict[str, str]:
+def complete(arguments: Sequence[Argument], chosen: Values) -> dict[str, str]:
     """Return the values of all arguments. Raises ConfigError for an unknown name or choice."""
-    known = {argument.name for argument in arguments}
-    for name in given:
-        if name not in known:
-            raise ConfigError(f"unknown argument {name!r}; {suggest(name, known)}")
+    names = {argument.name for argument in arguments}
+    for name in chosen:
+        if name not in names:
+            raise ConfigError(f"unknown argument {name!r}; {suggest(name, names)}")
     values: dict[str, str] = {}
     for argument in arguments:  # an argument comes after the one that is its default
         default = values[argument.same_as] if argument.same_as else argument.default
-        value = given.get(argument.name, default)
+        value = chosen.get(argument.name, default)
         if argument.choices and value not in argument.choices:
             hint = suggest(value, argument.choices)
             raise ConfigError(f"launch argument {argument.name!r} is {value!r}; {hint}")
@@ -235,17 +238,17 @@ def opened(model: str) -> Any:
     return open_model(model)
 
 
-def flag_of(name: str, given: str) -> str:
+def flag_of(name: str, word: str) -> str:
     """Return `true`, `false` or "" for an empty argument. Raises ConfigError for other words."""
-    if given.lower() not in FLAG_WORDS:  # refused here, before any node is started
-        raise ConfigError(f"launch argument {name!r} is {given!r}; give true or false.")
-    return FLAG_WORDS[given.lower()]
+    if word.lower() not in FLAG_WORDS:  # refused here, before any node is started
+        raise ConfigError(f"launch argument {name!r} is {word!r}; give true or false.")
+    return FLAG_WORDS[word.lower()]
 
 
 def names_of(robots: Any) -> tuple[str, ...]:
     """Return the namespaces of a fleet from a count or a list; none for one robot."""
     if isinstance(robots, list):
-        words = [str(each) for each in robots]
+        words = [str(name) for name in robots]
     else:
         words = re.findall(r"[^\s,\[\]'\"]+", str(robots))
     if len(words) == 1 and words[0].isdecimal():
@@ -253,7 +256,7 @@ def names_of(robots: Any) -> tuple[str, ...]:
         if count < 1:
             fix = "give a count from 1, or namespaces, as in robots:='[ant, bee]'"
             raise ConfigError(f"launch argument 'robots' is {count}; {fix}.")
-        return tuple(f"robot{k + 1}" for k in range(count)) if count > 1 else ()
+        return default_namespaces(count) if count > 1 else ()
     twice = {word for word in words if words.count(word) > 1}
     if twice:
         raise ConfigError(
@@ -266,15 +269,15 @@ def numbers_of(start: str) -> list[float] | None:
     """Return x, y, heading of each robot; None if left empty. Raises ConfigError."""
     words = re.findall(r"[^\s,\[\]]+", start)
     try:
-        found = [float(word) for word in words]
+        numbers = [float(word) for word in words]
     except ValueError:
-        found = [0.0]
-    if len(found) % 3:
+        numbers = [0.0]
+    if len(numbers) % 3:
         fix = (
             "give x, y, heading [m, rad] of each robot, as in start:='[1.0, 0.0, 1.57]'"
         )
         raise ConfigError(f"launch argument 'start' is {start!r}; {fix}.")
-    return found or None
+    return numbers or None
 
 
 def simulator(setup: Setup) -> Iterator[NodeStart]:
@@ -309,13 +312,13 @@ def bridge(setup: Setup) -> Iterator[NodeStart]:
     }
     managed = {"autostart": setup.flag("autostart"), IMU: setup.text(IMU)}
     of_policy = {"policy": setup.text("policy")}
-    own: dict[str, dict[str, Any]] = {
+    nodes: dict[str, dict[str, Any]] = {
         "command_gate": of_gate,
         "middleware_node": managed,
         "policy_node": {**managed, **of_policy},
     }
     for robot in setup.robots:
-        for node, parameters in own.items():
+        for node, parameters in nodes.items():
             frame = {BASE_FRAME.name: setup.frame(node, robot)}
             yield setup.node(PACKAGE, node, robot, {**shared, **parameters, **frame})
 

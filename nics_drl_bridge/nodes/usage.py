@@ -66,8 +66,8 @@ def wrong_with(node: str, words: Sequence[str]) -> str:
         if word in (ROS, END):
             ours = word == END
         elif ours:
-            given = f"-p {word}" if ":=" in word else "-p NAME:=VALUE"
-            fix = f"write parameters and remappings after {ROS}, as in `{node} {ROS} {given}`"
+            example = f"-p {word}" if ":=" in word else "-p NAME:=VALUE"
+            fix = f"write parameters and remappings after {ROS}, as in `{node} {ROS} {example}`"
             return (
                 f"{node}: there is no argument {word!r}; {fix}, or see `{node} --help`."
             )

@@ -1,23 +1,23 @@
 """A live robot for the page of `nics watch`; it listens to topics and sends only goals."""
 
-import threading
 from dataclasses import replace
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
-from rclpy.node import Node
 
 from nics_drl_bridge.config import parse_namespace
 from nics_drl_bridge.env.snapshot import Snapshot
+from nics_drl_bridge.gate import inputs
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.lidar.shapes import BODY
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.parameters import MAP_FRAME
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, declare_sensors
-from nics_drl_bridge.nodes.runner import open_context, spin
+from nics_drl_bridge.nodes.runner import Listener
 from nics_drl_bridge.sim.world import World, check_place
 from nics_drl_bridge.sim.world_set import AnyWorld
 from nics_drl_bridge.watch.frame import Frame, Stage, Track, WorldFrame
@@ -60,12 +60,11 @@ class RosSource:
         self._gate: str | None = None
         self._truth: Array | None = None
         # frame of goals, as named by the estimate or the simulator
-        self._map_frame = "map"
+        self._map_frame = MAP_FRAME.default
         self._new_lidar: LidarSpec | None = None
         self._drawn_ns = 0
-        self._context = open_context([], domain_id)
-        self._node = Node(
-            NAME, context=self._context, namespace=parse_namespace(namespace)
+        self._node = Listener(
+            NAME, domain_id, parse_namespace(namespace), has_parameters=True
         )
         declare_sensors(self._node)
         self._topics = RobotTopics(self._node, model, on_lidar=self._take_lidar)
@@ -73,13 +72,11 @@ class RosSource:
         for kind, topic, take, quality in (
             (PoseStamped, "goal_pose", self._take_goal, qos.COMMAND),
             (Odometry, "ground_truth", self._take_truth, qos.SENSOR),
-            (Odometry, "odometry/filtered", self._take_map_frame, qos.SENSOR),
+            (Odometry, inputs.ESTIMATE, self._take_map_frame, qos.SENSOR),
             (DiagnosticArray, "/diagnostics", self._take_diagnostics, qos.DIAGNOSTICS),
         ):
             self._node.create_subscription(kind, topic, take, quality)
-        given = (self._node, threading.Event())
-        self._thread = threading.Thread(target=spin, args=given, daemon=True)
-        self._thread.start()
+        self._node.start()
 
     def _take_lidar(self, lidar: LidarSpec) -> None:
         self._new_lidar = lidar
@@ -164,6 +161,4 @@ class RosSource:
 
     def close(self) -> None:
         """Close the node and its context."""
-        self._context.try_shutdown()
-        self._thread.join()
-        self._node.destroy_node()
+        self._node.close()

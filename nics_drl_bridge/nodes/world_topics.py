@@ -27,8 +27,8 @@ class WorldTopics:
     def __init__(self, node: Any, world: Callable[[], DeviceWorld]) -> None:
         self._node = node
         self._world = world
-        self._frame = str(node.get_parameter("map_frame").value)
-        self._cell = float(node.get_parameter("map_resolution").value or 0.0)
+        self._frame = runner.get_text(node, "map_frame")
+        self._cell = runner.get_number(node, "map_resolution")
         self._map = node.create_publisher(OccupancyGrid, "map", qos.LATCHED)
         self._shown: Any = None  # the world that was published, and what stood in it
         runner.steadily(node, LOOK_S, self._look)

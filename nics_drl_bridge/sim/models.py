@@ -98,4 +98,5 @@ def file_of(text: str, source: str = TEXT) -> Iterator[Path]:
         try:
             yield file
         except ConfigError as error:
-            raise type(error)(str(error).replace(str(file), source)) from None
+            error.reword(str(error).replace(str(file), source))
+            raise

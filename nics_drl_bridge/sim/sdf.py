@@ -34,7 +34,6 @@ MOST_MODELS = 20_000  # including included models
 OLDEST = (1, 4)
 NEWEST = (1, 12)
 PATHS = "GZ_SIM_RESOURCE_PATH", "IGN_GAZEBO_RESOURCE_PATH", "GAZEBO_MODEL_PATH"
-ABSENT = "which is neither"
 HARMLESS = "sun", "ground_plane"  # most worlds include them; they are no obstacles
 MOVING = {
     "actor": "an actor, which moves by a script",
@@ -47,10 +46,9 @@ NUMBERS = {"euler_rpy": 6, "quat_xyzw": 7}  # of a pose, by its rotation_format
 class AssetsError(ConfigError):
     """An SDF file contains something that is not a shape of a world, or a missing file."""
 
-    @property
-    def missing(self) -> bool:
-        """True if a file is missing."""
-        return ABSENT in str(self)
+    def __init__(self, sentence: str = "", missing: bool = False) -> None:
+        super().__init__(sentence)
+        self.missing = missing  # it is a file, and missing
 
 
 def read_sdf(
@@ -76,6 +74,7 @@ def read_sdf(
     path = Path(path)
     placed = list[Placed]()
     unknown = dict[str, list[str]]()
+    missing = set[str]()  # the models of these whose file is missing
     seen = 0
     try:
         for body in _bodies(_Scope(_world(path), path, "", _Order(without)), np.eye(4)):
@@ -84,6 +83,8 @@ def read_sdf(
                 found = _section_of(body, height)
             except ShapelessError as error:
                 unknown.setdefault(body.model, []).append(str(error))
+                if error.missing:
+                    missing.add(body.model)
                 continue
             if found is not None:
                 placed.append(found)
@@ -102,16 +103,19 @@ def read_sdf(
         more = f" (as {len(left_out) - 1} more models)" if len(left_out) > 1 else ""
         fix = "leave it out by --skip-unknown or --without MODEL, or put a box in its place"
         raise AssetsError(
-            f"{path}: {left_out[0]}{more}, which is no shape of a world; {fix}."
+            f"{path}: {left_out[0]}{more}, which is no shape of a world; {fix}.",
+            next(iter(unknown)) in missing,
         )
     shapes = seen - sum(map(len, unknown.values()))
     if left_out and not shapes and not may_be_empty:
         reason = f"holds nothing but what is no shape of a world ({left_out[0]})"
-        raise AssetsError(f"{path}: {reason}; put a box in its place.")
+        raise AssetsError(
+            f"{path}: {reason}; put a box in its place.", next(iter(unknown)) in missing
+        )
     if not placed and not may_be_empty:
         reason = f"none of its {shapes} collision geometries stands at a height of {height:g} m"
         raise ConfigError(f"{path}: {reason}; choose another --height.")
-    return Standing(tuple(placed), left_out)
+    return Standing(tuple(placed), left_out, bool(missing))
 
 
 def _section_of(body: "_Body", height: float) -> Placed | None:
@@ -173,7 +177,7 @@ class _Scope:
             self.placement = _text(include, "placement_frame")
         self.models: list[_Scope] = []
         # name of a model, and why it can't be read
-        self.strange: list[tuple[str, str]] = []
+        self.strange: list[tuple[str, ShapelessError]] = []
         states = element.iterfind("state/model")
         self._state = {one.get("name", ""): one.find("pose") for one in states}
         self._named: dict[str, Element | _Scope] = {}
@@ -195,7 +199,7 @@ class _Scope:
         elif child.tag == "model":
             self._add_model(child, self.file, name)
         elif child.tag in MOVING and self._order.takes(name):
-            self.strange.append((name, MOVING[child.tag]))
+            self.strange.append((name, ShapelessError(MOVING[child.tag])))
         elif child.tag == "include":
             uri = _text(child, "uri")
             name = name or uri.rstrip("/").rpartition("/")[2]
@@ -206,8 +210,8 @@ class _Scope:
                     called = _text(child, "name") or model.get("name", "")
                     self._add_model(model, file, called, child)
             elif name not in HARMLESS and self._order.takes(name):
-                folders = f"{uri!r}, {ABSENT} beside the file nor on {PATHS[0]}"
-                self.strange.append((name, folders))
+                body = f"{uri!r}, which is neither beside the file nor on {PATHS[0]}"
+                self.strange.append((name, ShapelessError(body, missing=True)))
 
     def _add_model(
         self, element: Element, file: Path, name: str, include: Element | None = None
@@ -275,17 +279,17 @@ class _Scope:
 
 
 class _Body(NamedTuple):
-    """A collision geometry, or the reason why there is none."""
+    """A collision geometry, or an error that says why there is none."""
 
     model: str
     where: str
-    geometry: Element | str
+    geometry: Element | ShapelessError
     pose: Array  # (4, 4) in the world
 
     def solid(self) -> Solid | None:
         """Return the body; None for the ground. Raises ShapelessError, ConfigError for sizes."""
-        if isinstance(self.geometry, str):
-            raise ShapelessError(self.geometry)
+        if isinstance(self.geometry, ShapelessError):
+            raise self.geometry
         shape = next(
             (child for child in self.geometry if ":" not in child.tag), Element("empty")
         )
@@ -342,8 +346,8 @@ class _Body(NamedTuple):
 
 def _bodies(scope: _Scope, pose: Array) -> Iterator[_Body]:
     """Yield all collision geometries of a scope that has a pose (4, 4) in the world."""
-    for name, reason in scope.strange:
-        yield _Body(name, scope.where, reason, pose)
+    for name, error in scope.strange:
+        yield _Body(name, scope.where, error, pose)
     for link in scope.element.iterfind("link"):
         of_link = scope.posed(link.find("pose"))
         for collision in link.iterfind("collision"):

@@ -60,6 +60,10 @@ class Prism(NamedTuple):
 class ShapelessError(ValueError):
     """A body whose section is not a shape of a world; the text names the body."""
 
+    def __init__(self, body: str, missing: bool = False) -> None:
+        super().__init__(body)
+        self.missing = missing  # its file is missing
+
 
 Solid = Box | Cylinder | Capsule | Sphere | Prism
 _Cut = tuple[Shape, float, float, float] | None  # with its pose, before rounding
@@ -71,6 +75,7 @@ class Standing(NamedTuple):
 
     placed: tuple[Placed, ...]
     left_out: tuple[str, ...]  # a clause for each model that is no shape of a world
+    missing: bool = False  # the file of one of these models is missing
 
     @property
     def obstacles(self) -> tuple[Obstacles, ...]:

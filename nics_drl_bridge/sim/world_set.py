@@ -140,7 +140,8 @@ def _read_set(path: Path, file: SetFile) -> WorldSet:
         if given is not None:
             chosen += [grow(given, number) for number in range(given.worlds)]
     except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from None
+        error.reword(f"{path}: {error}")
+        raise
     return _set_of(file.name, chosen, str(path))
 
 

@@ -20,7 +20,14 @@ from nics_drl_bridge.interface import NS_PER_S
 
 OUTLINE = ((0.25, 0.2), (-0.25, 0.2), (-0.25, -0.2), (0.25, -0.2))
 SHIELD = ShieldConfig(
-    0.1, 2.0, 0.05, 0.1, float(np.hypot(0.25, 0.2)), range_max=5.0, outline=OUTLINE
+    0.1,
+    2.0,
+    0.05,
+    0.1,
+    float(np.hypot(0.25, 0.2)),
+    range_max=5.0,
+    outline=OUTLINE,
+    obstacle_speed=0.0,
 )
 ANGLES = np.deg2rad(np.linspace(-135.0, 135.0, 541))
 BLIND = config(shield=SHIELD, beam_angles=ANGLES, mount=(0.12, 0.0, 0.0))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gate.rig import PERIOD_S, TICK_S, Rig, config
-from nics_drl_bridge.gate.black_box import BlackBox, Entry, replay, write
+from nics_drl_bridge.gate.black_box import Entry, replay, write
 from nics_drl_bridge.gate.inputs import Reset, Scan
 from nics_drl_bridge.gate.scan_motion import SETTINGS, get_directions, warm_up
 from nics_drl_bridge.gate.scan_motion_kernels import (
@@ -410,18 +410,18 @@ def test_a_lidar_of_very_few_beams_decides_nothing_and_breaks_nothing(beams):
 
 def test_a_stop_of_a_held_body_is_replayed_to_the_bit(tmp_path):
     scene = started()
-    box = BlackBox(scene.config)
+    entries = []
     give = scene.give
 
     def give_and_note(event, now=None):
         before = scene.state
         decision = give(event, now)
-        box.note(Entry(scene.now, event, before, decision))
+        entries.append(Entry(scene.now, event, before, decision))
         return decision
 
     scene.give = give_and_note
     scene.stops_after(1.0)
-    write(scene.config, box.copy(), tmp_path / "held.jsonl")
+    write(scene.config, tuple(entries), tmp_path / "held.jsonl")
     found = replay(tmp_path / "held.jsonl")
     assert found.differing == ()
     assert "stopped by body_held" in "".join(found.story)

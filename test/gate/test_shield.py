@@ -34,6 +34,7 @@ CAR = ShieldConfig(
     hold_s=0.02,
     footprint_radius=0.15,
     wheelbase=0.2,
+    obstacle_speed=0.0,
 )
 BRAKE = 1.0
 FAR = np.full(LIDAR.beams, 3.0, np.float32)

@@ -28,7 +28,11 @@ FORK = ((0.4, 0.2), (0.1, 0.15), (0.1, -0.15), (0.4, -0.2), (-0.2, -0.2), (-0.2,
 
 def body(outline, margin=MARGIN):
     radius = 0.2 if not outline else float(np.hypot(*np.array(outline).T).max())
-    return get_body(ShieldConfig(0.2, BRAKE, margin, 0.2, radius, outline=outline))
+    return get_body(
+        ShieldConfig(
+            0.2, BRAKE, margin, 0.2, radius, outline=outline, obstacle_speed=0.0
+        )
+    )
 
 
 def star(rng):
@@ -109,7 +113,9 @@ def test_a_robot_passes_where_its_outline_does_and_its_circle_does_not(outline, 
     beside = np.array(
         [[x, side, 0.0] for x in np.linspace(0.3, 2.0, 60) for side in (-0.26, 0.26)]
     )
-    round_ = get_body(ShieldConfig(0.2, BRAKE, MARGIN, 0.2, 0.32, outline=outline))
+    round_ = get_body(
+        ShieldConfig(0.2, BRAKE, MARGIN, 0.2, 0.32, outline=outline, obstacle_speed=0.0)
+    )
     assert is_free(beside, np.array([[0.5, 0.0, 0.0]]), round_, 0.5, BRAKE, STEP) == may
 
 
@@ -179,7 +185,9 @@ def test_a_margin_is_kept_around_the_outline():
 
 
 def test_a_body_is_kept_as_long_as_its_shield_is():
-    shield = ShieldConfig(0.2, BRAKE, MARGIN, 0.2, 0.32, outline=LONG)
+    shield = ShieldConfig(
+        0.2, BRAKE, MARGIN, 0.2, 0.32, outline=LONG, obstacle_speed=0.0
+    )
     assert get_body(shield) is get_body(replace(shield))
     assert get_body(shield).farthest_corner == pytest.approx(np.hypot(0.25, 0.2))
     assert get_body(replace(shield, outline=())).farthest_corner == 0.0

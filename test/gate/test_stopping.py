@@ -157,11 +157,11 @@ def test_a_robot_that_does_not_stop_by_its_model_needs_to_be_told_how_it_stops(
     rolling = limited(model, 1e-4)
     limits = load_limits("jackal", model.robot)
     with pytest.raises(
-        ConfigError, match=r"does not stop.* or give it: `shield: {lat.*limits"
+        ConfigError, match=r"does not stop.* file of limits may give it: `shield: {lat"
     ):
         shield_config(rolling, limits)
     told = {"latency": 0.5, "deceleration": 0.05}
-    assert shield_config(rolling, limits, given=told)[0].deceleration == 0.05
+    assert shield_config(rolling, limits, overrides=told)[0].deceleration == 0.05
     text = find_config("jackal", "limits").read_text()
     (tmp_path / "my.yaml").write_text(
         f"{text}shield: {{latency: 0.5, deceleration: 0.05}}\n"

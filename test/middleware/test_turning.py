@@ -73,7 +73,7 @@ def test_after_two_minutes_the_belief_is_close_to_the_truth(
     gyro = middleware.estimator.belief.gyro
     assert gyro.bias == pytest.approx(0.02, abs=3e-3)
     assert gyro.slip == pytest.approx(1.0 - 1.0 / OVER_REPORTED, abs=0.05)
-    assert middleware.health(0).rejected.get("imu: outlier", 0) < 5
+    assert middleware.health(0).rejected.get(("imu", "outlier"), 0) < 5
 
 
 @pytest.mark.slow
@@ -108,7 +108,7 @@ def test_neither_an_exact_nor_a_noisy_gyro_makes_odometry_an_outlier(noise):
     drive = drive_skid_steer(np.random.default_rng(3), duration=60.0, noise=noise)
     middleware, poses, truths = believed(drive)
     assert off(poses, truths)[1] < 0.1
-    assert middleware.health(0).rejected.get("odom: outlier", 0) < 5
+    assert middleware.health(0).rejected.get(("odom", "outlier"), 0) < 5
 
 
 def test_an_exact_gyro_that_turns_steadily_is_not_taken_for_stuck():
@@ -159,7 +159,7 @@ def test_single_far_off_rates_are_refused():
     rates = drive.gyro.copy()
     rates[100::37] += 2.5
     middleware, poses, truths = believed(drive, gyro=rates)
-    assert middleware.health(0).rejected["imu: outlier"] >= 40
+    assert middleware.health(0).rejected[("imu", "outlier")] >= 40
     assert off(poses, truths)[1] < 0.1
 
 

@@ -154,7 +154,7 @@ def by(**names):
 
 REFUSED = [
     (path(), CODES.INVALID_PATH, "the path is empty"),
-    (path((math.nan, 0.0)), CODES.INVALID_PATH, "no number"),
+    (path((math.nan, 0.0)), CODES.INVALID_PATH, "not a number"),
     (
         path((0.0, 0.0), (9.0, 0.0)),
         CODES.INVALID_PATH,

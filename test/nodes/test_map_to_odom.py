@@ -97,9 +97,10 @@ def test_map_to_odom_follows_from_the_estimate_until_another_node_publishes_it(p
     parent, child, home = transform_from_ros(one)
     assert (parent, child) == ("map", "odom")
     assert home == pytest.approx([5.0, -1.0, np.pi / 2], abs=0.15)
-    stamp = one.header.stamp  # as of a localiser that stamps as this one does
+    # as of a localiser that stamps as this one does
+    now_ns = conversions.stamp_from_ros(one.header.stamp)
     others.publish(
-        TFS(transforms=[transform_to_ros("map", "odom", [9.0, 0.0, 0.0], stamp)])
+        TFS(transforms=[transform_to_ros("map", "odom", [9.0, 0.0, 0.0], now_ns)])
     )
     told = "another node publishes map -> odom"
     peer.until(lambda: told in middleware.log.read_text(), "yielding")

@@ -21,7 +21,7 @@ from robots import open_field
 from sensor_msgs.msg import Imu, LaserScan
 from std_srvs.srv import Trigger
 
-from nics_drl_bridge.middleware.measurement import Health, TopicHealth
+from nics_drl_bridge.middleware.measurement import Health, Rejection, TopicHealth
 from nics_drl_bridge.nodes import conversions
 from nics_drl_bridge.nodes.middleware_node import silence
 from nodes.peer import stamp_ns
@@ -417,9 +417,9 @@ def test_a_pose_type_that_does_not_exist_is_refused_with_the_nearest(launch, dom
 
 def test_topics_whose_data_are_refused_are_told_apart_from_silent_ones():
     counts = {
-        "scan: duplicate": 1,
-        "scan: shape (7,), not (720,)": 40,
-        "scans: other": 9,
+        Rejection("scan", "duplicate"): 1,
+        Rejection("scan", "shape (7,), not (720,)"): 40,
+        Rejection("scans", "other"): 9,
     }
     expected = ("scan", "odom")
     heard = TopicHealth(1, 10.0, 0.1)
@@ -427,7 +427,7 @@ def test_topics_whose_data_are_refused_are_told_apart_from_silent_ones():
     first = Health({}, counts)
     assert silence(first, expected, {}) == f"nothing on odom yet; {told}"
     assert silence(first, expected, counts) == "nothing on scan, odom yet"
-    before = counts | {"scan: shape (7,), not (720,)": 30}
+    before = counts | {Rejection("scan", "shape (7,), not (720,)"): 30}
     assert silence(Health({"odom": heard}, counts), expected, before) == told
     stale = {"scan": replace(heard, age_s=6.0), "odom": heard}
     assert silence(Health(stale, counts), expected, before) == told

@@ -11,9 +11,15 @@ from std_msgs.msg import Bool
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.nodes.backends import DdsBackend
+from nics_drl_bridge.nodes.parameters import Row
 from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
 from nics_drl_bridge.nodes.record_node import declare_drive
-from nics_drl_bridge.nodes.runner import declare, declare_model, open_context, unknown
+from nics_drl_bridge.nodes.runner import (
+    declare_model,
+    declare_row,
+    open_context,
+    unknown,
+)
 from nics_drl_bridge.sim.world import load_world
 
 pytestmark = pytest.mark.ros
@@ -60,10 +66,14 @@ def test_what_speaks_to_topics_refuses_a_robot_without_cmd_vel(started, tmp_path
 
 def test_a_whole_number_is_taken_for_a_floating_point_parameter(started):
     node = started("rate:=2", "start:=[1, 2, 3]", "count:=3")
-    assert declare(node, "rate", 1.0, "Of time.", span=(0.1, 10.0)) == 2.0
+    assert declare_row(node, Row("rate", 1.0, "Of time.", span=(0.1, 10.0))) == 2.0
     assert isinstance(node.get_parameter("rate").value, float)
-    assert list(declare(node, "start", [0.0, 0.0, 0.0], "Pose.")) == [1.0, 2.0, 3.0]
-    assert declare(node, "count", 1, "Of robots.") == 3
+    assert list(declare_row(node, Row("start", [0.0, 0.0, 0.0], "Pose."))) == [
+        1.0,
+        2.0,
+        3.0,
+    ]
+    assert declare_row(node, Row("count", 1, "Of robots.")) == 3
 
 
 def test_an_argument_that_ros_does_not_know_is_one_sentence(domain_id):
@@ -81,18 +91,18 @@ def test_a_value_that_can_not_be_used_is_refused_with_the_parameters_name(
 ):
     node = started(f"rate:={value}")
     with pytest.raises(ParameterException, match="rate"):
-        declare(node, "rate", 1.0, "Of time.", span=(0.1, 10.0))
+        declare_row(node, Row("rate", 1.0, "Of time.", span=(0.1, 10.0)))
 
 
 def test_whole_numbers_have_ranges_too(started):
     node = started("robots:=0")
     with pytest.raises(ParameterException, match=r"robots.*1"):
-        declare(node, "robots", 1, "How many.", span=(1, 100))
+        declare_row(node, Row("robots", 1, "How many.", span=(1, 100)))
 
 
 def test_a_description_and_a_range_are_told_to_ros2_param_describe(started):
     node = started()
-    declare(node, "rate", 1.0, "Of time.", span=(0.1, 10.0), read_only=True)
+    declare_row(node, Row("rate", 1.0, "Of time.", span=(0.1, 10.0), fixed=True))
     told = node.describe_parameter("rate")
     assert (told.description, told.read_only) == ("Of time.", True)
     (span,) = told.floating_point_range
@@ -101,7 +111,7 @@ def test_a_description_and_a_range_are_told_to_ros2_param_describe(started):
 
 def test_a_misspelt_parameter_is_named_with_the_nearest_one(started):
     node = started("command_timout:=2.0")
-    declare(node, "command_timeout", 0.5, "Silence.")
+    declare_row(node, Row("command_timeout", 0.5, "Silence."))
     (line,) = unknown(node)
     assert "'command_timout'" in line
     assert "did you mean 'command_timeout'?" in line

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 def open_services(node: Any) -> "Server | None":
-    """Offers the standard services at a device node; None without its messages, or if unwanted."""
+    """Offer the standard services at a device node; None without its messages, or if unwanted."""
     if not runner.declare_row(node, STANDARD):
         return None
     if conversions.message_type(NEWEST) is None:

@@ -1,5 +1,6 @@
 """The client: episodes and steps of any simulator that serves simulation_interfaces."""
 
+import re
 import time
 from importlib import import_module
 from typing import Any
@@ -51,14 +52,12 @@ class StandardOptions(Schema):
 
 
 def snake_case(name: str) -> str:
-    """Returns the name of a service as all simulators write it: `get_entities`."""
-    return "".join(f"_{c.lower()}" if c.isupper() else c for c in name).removeprefix(
-        "_"
-    )
+    """Return the name of a service as all simulators write it: `get_entities`."""
+    return re.sub("(?<!^)(?=[A-Z])", "_", name).lower()
 
 
 def module(kind: str) -> Any:
-    """Returns the module `srv` or `msg` of the messages. ConfigError if missing or too old."""
+    """Return the module `srv` or `msg` of the messages. ConfigError if missing or too old."""
     if conversions.message_type(NEWEST) is None:
         fix = f"install {PACKAGE} 2.1 or newer with your ROS 2 distribution, and source it"
         raise ConfigError(
@@ -117,22 +116,22 @@ class StandardEpisodes:
         return self._link.node.create_client(kind, f"{prefix}{snake_case(name)}")
 
     def _call(self, name: str, timeout_s: float, *fine: int, **fields: Any) -> Any:
-        """Calls a service. Raises BackendError for a result that is neither OK nor `fine`."""
+        """Call a service. Raises BackendError for a result that is neither OK nor `fine`."""
         kind = getattr(self._types, name)
         response = self._link.call(
             self._services[name], kind.Request(**fields), timeout_s
         )
         if response.result.result not in (self._messages.Result.RESULT_OK, *fine):
-            told = response.result.error_message or f"result {response.result.result}"
-            raise BackendError(f"the simulator refused {name}: {told}")
+            reason = response.result.error_message or f"result {response.result.result}"
+            raise BackendError(f"the simulator refused {name}: {reason}")
         return response
 
     def open(self, timeout_s: float) -> None:
-        """Checks the features, and measures a step. Raises BackendError naming what is missing."""
+        """Check the features, and measure a step. Raises BackendError naming what is missing."""
         request = self._types.GetSimulatorFeatures.Request()
         kinds = self._messages
-        told = self._link.call(self._features, request, timeout_s).features
-        self._known = frozenset(told.features)
+        answer = self._link.call(self._features, request, timeout_s).features
+        self._known = frozenset(answer.features)
         for feature, service in NEEDED.items():
             self._require(feature, f", which {service} serves" if service else "")
         self.clients += self._services.values()
@@ -171,8 +170,8 @@ class StandardEpisodes:
             self._clock.clear()
             self._call("StepSimulation", timeout_s, steps=1)
             if not holds(lambda: self._clock, timeout_s, POLL_S):
-                told = f"no message on /clock within {timeout_s:g} s, which tells how long a step"
-                raise BackendError(f"{told} is; give its seconds as the option step_s.")
+                fault = f"no message on /clock within {timeout_s:g} s, so the length of a step"
+                raise BackendError(f"{fault} is unknown; give it as the option step_s.")
             time.sleep(POLL_S)  # of several that a step publishes the last
             stamps.append(conversions.stamp_from_ros(self._clock[-1].clock))
         self._link.node.destroy_subscription(self._listening)
@@ -183,10 +182,10 @@ class StandardEpisodes:
         return stamps[1] - stamps[0]
 
     def begin(self, start: Start, timeout_s: float) -> int:
-        """Begins an episode; returns the stamp of its first data [ns]. Raises BackendError."""
+        """Begin an episode; return the stamp of its first data [ns]. Raises BackendError."""
         if not self._steps:
             self.open(timeout_s)
-        holds(lambda: all(each.done() for each in self._pending), timeout_s, POLL_S)
+        holds(lambda: all(future.done() for future in self._pending), timeout_s, POLL_S)
         self._pending.clear()
         self._pause(timeout_s)
         scopes = self._types.ResetSimulation.Request
@@ -197,8 +196,8 @@ class StandardEpisodes:
         self._pause(timeout_s)  # some play on after a reset
         self._put_obstacles(start, timeout_s)
         self._put(self._entity, start.pose.reshape(3), timeout_s)
-        found = self._call("GetEntityState", timeout_s, entity=self._entity)
-        time_ns = conversions.stamp_from_ros(found.state.header.stamp)
+        answer = self._call("GetEntityState", timeout_s, entity=self._entity)
+        time_ns = conversions.stamp_from_ros(answer.state.header.stamp)
         self._link.halt()
         self._inbox.clear()  # of what is from before a reset that put time back
         self.advance()
@@ -239,20 +238,22 @@ class StandardEpisodes:
         self._call("SetEntityState", timeout_s, entity=entity, state=state, **flags)
 
     def advance(self) -> None:
-        """Asks for the steps of one control period, without waiting: the data tell of them."""
+        """Request the steps of one control period without waiting for them."""
         self._look()
         request = self._types.StepSimulation.Request(steps=self._steps)
         self._pending.append(self._services["StepSimulation"].call_async(request))
 
     def repeat(self) -> None:
-        """Raises BackendError if the steps were refused; the standard can't repeat data."""
+        """Raise BackendError if the steps were refused; the standard can't repeat data."""
         self._look()
 
     def _look(self) -> None:
-        for future in [each for each in self._pending if each.done()]:
+        for future in tuple(self._pending):
+            if not future.done():
+                continue
             self._pending.remove(future)
             result = future.result().result
             if result.result != self._messages.Result.RESULT_OK:
                 self._pending.clear()
-                told = result.error_message or f"result {result.result}"
-                raise BackendError(f"the simulator refused StepSimulation: {told}")
+                reason = result.error_message or f"result {result.result}"
+                raise BackendError(f"the simulator refused StepSimulation: {reason}")

@@ -56,7 +56,7 @@ TOO_LONG = "it repeats what repeats or branches, or more than 3 times, or has ov
 
 
 def pattern_of(expression: str) -> re.Pattern[str]:
-    """Compiles a POSIX extended regular expression. Raises RefusalError for none."""
+    """Compile a POSIX extended regular expression. Raises RefusalError for none."""
     try:
         if len(expression) > MOST_CHARACTERS or _runs_away(
             BRACKET.sub(".", expression)
@@ -64,29 +64,35 @@ def pattern_of(expression: str) -> re.Pattern[str]:
             raise re.error(TOO_LONG)
         return re.compile(BRACKET.sub(_bracket, expression))
     except (re.error, OverflowError, RecursionError) as error:
-        told = f"the filter {expression!r} is no regular expression for names ({error}); mend it."
-        raise RefusalError(FAILED, told) from None
+        fault = f"the filter {expression!r} is no regular expression for names ({error}); mend it."
+        raise RefusalError(FAILED, fault) from None
 
 
-def _bracket(found: re.Match[str]) -> str:
-    if found[3]:
+def _bracket(match: re.Match[str]) -> str:
+    if match[3]:
         raise re.error("a '[' has no end, or holds [. or [= or an unknown class")
     held = HELD.sub(
-        lambda one: CLASSES[one[1]] if one[1] else f"\\{one[0]}", found[2] or ""
+        lambda one: CLASSES[one[1]] if one[1] else f"\\{one[0]}", match[2] or ""
     )
-    return found[0] if found[2] is None else f"[{found[1]}{held}]"
+    return match[0] if match[2] is None else f"[{match[1]}{held}]"
 
 
 def _runs_away(plain: str) -> bool:
     """True for many repeats, or groups that repeat with repeats or like branches in them."""
-    while group := re.search(r"\(([^()]*)\)([*+{]?)", plain):
+    while True:
+        group = re.search(r"\(([^()]*)\)([*+{]?)", plain)
+        if group is None:
+            break
         heads = [branch[:1] for branch in group[1].split("|")]
         alike = len(heads) > 1 and len({"", ".", *heads}) < len(heads) + 2
         if group[2] and (alike or re.search(r"[*+?{]", group[1])):
             return True
         inner = group[1].replace("|", "." if group[2] else ".|.")
         plain = plain.replace(group[0], inner + group[2], 1)
-    return max(sum(map(one.count, "*+?{")) for one in plain.split("|")) > MOST_REPEATS
+    return (
+        max(sum(map(branch.count, "*+?{")) for branch in plain.split("|"))
+        > MOST_REPEATS
+    )
 
 
 def tags_match(wanted: Any, tags: Any) -> bool:
@@ -95,8 +101,8 @@ def tags_match(wanted: Any, tags: Any) -> bool:
         TagsFilter.FILTER_MODE_ANY,
         TagsFilter.FILTER_MODE_ALL,
     ):
-        told = f"filter_mode {wanted.filter_mode} of the tags is none; give 0 (any) or 1 (all)."
-        raise RefusalError(FAILED, told)
+        fault = f"filter_mode {wanted.filter_mode} of the tags is none; give 0 (any) or 1 (all)."
+        raise RefusalError(FAILED, fault)
     if not wanted.tags:
         return True
     match = any if wanted.filter_mode == TagsFilter.FILTER_MODE_ANY else all
@@ -111,9 +117,9 @@ class EntityServices:
         self._simulation = simulation
 
     def info(self, entity: Entity) -> EntityInfo:
-        """Returns what an entity is."""
-        if entity.name in self._simulation.told:
-            return self._simulation.told[entity.name]
+        """Return what an entity is."""
+        if entity.name in self._simulation.infos:
+            return self._simulation.infos[entity.name]
         kinds = EntityCategory
         if entity.robot >= 0:
             spec = self._host.model.robot
@@ -128,21 +134,21 @@ class EntityServices:
     def _matching(self, filters: Any) -> list[Entity]:
         self._simulation.require_world()
         pattern = pattern_of(filters.filter)
-        categories = {one.category for one in filters.categories}
+        categories = {category.category for category in filters.categories}
         unknown = categories - CATEGORIES
         if unknown:
-            told = f"category {min(unknown)} is none of the standard"
-            raise RefusalError(FAILED, f"{told}; give 0 to 5 but 3.")
+            fault = f"category {min(unknown)} is none of the standard"
+            raise RefusalError(FAILED, f"{fault}; give 0 to 5 but 3.")
         tags_match(filters.tags, ())
         region = plane.Region(filters.bounds)
         entities = self._simulation.entities
-        found = []
+        matching = []
         for entity in entities:
             info = self.info(entity)
             pose = entities.pose(entity)
             outlines = (
-                planar.rotate(one, pose[2]) + pose[:2]
-                for one in entities.outlines(entity)
+                planar.rotate(outline, pose[2]) + pose[:2]
+                for outline in entities.outlines(entity)
             )
             if (
                 pattern.search(entity.name)
@@ -150,11 +156,11 @@ class EntityServices:
                 and tags_match(filters.tags, info.tags)
                 and (region.empty or any(map(region.touches, outlines)))
             ):
-                found.append(entity)
-        return found
+                matching.append(entity)
+        return matching
 
     def state(self, entity: Entity) -> EntityState:
-        """Returns where an entity is and how it moves, in the frame of the map."""
+        """Return where an entity is and how it moves, in the frame of the map."""
         entities = self._simulation.entities
         state = EntityState()
         x, y, heading = entities.pose(entity).tolist()
@@ -166,44 +172,44 @@ class EntityServices:
         return state
 
     def list_names(self, request: Any, response: Any) -> None:
-        """Answers GetEntities."""
+        """Answer GetEntities."""
         response.entities = [entity.name for entity in self._matching(request.filters)]
 
     def list_states(self, request: Any, response: Any) -> None:
-        """Answers GetEntitiesStates."""
-        found = self._matching(request.filters)
-        response.entities = [entity.name for entity in found]
-        response.states = [self.state(entity) for entity in found]
+        """Answer GetEntitiesStates."""
+        entities = self._matching(request.filters)
+        response.entities = [entity.name for entity in entities]
+        response.states = [self.state(entity) for entity in entities]
 
     def find(self, name: str) -> Entity:
-        """Returns the entity of a name. Raises RefusalError, UnknownEntityError."""
+        """Return the entity of a name. Raises RefusalError, UnknownEntityError."""
         self._simulation.require_world()
         return self._simulation.entities.find(name)
 
     def get_info(self, request: Any, response: Any) -> None:
-        """Answers GetEntityInfo."""
+        """Answer GetEntityInfo."""
         response.info = self.info(self.find(request.entity))
 
     def set_info(self, request: Any, _: Any) -> None:
-        """Answers SetEntityInfo."""
+        """Answer SetEntityInfo."""
         name = self.find(request.entity).name
         kind = request.info.category.category
         if kind not in CATEGORIES:
-            told = f"category {kind} is none of the standard; give 0 to 5 but 3."
-            raise RefusalError(FAILED, told)
-        self._simulation.told[name] = request.info
+            fault = f"category {kind} is none of the standard; give 0 to 5 but 3."
+            raise RefusalError(FAILED, fault)
+        self._simulation.infos[name] = request.info
 
     def get_state(self, request: Any, response: Any) -> None:
-        """Answers GetEntityState."""
+        """Answer GetEntityState."""
         response.state = self.state(self.find(request.entity))
 
     def get_bounds(self, request: Any, response: Any) -> None:
-        """Answers GetEntityBounds."""
+        """Answer GetEntityBounds."""
         entity = self.find(request.entity)
         response.bounds = plane.box_to_ros(self._simulation.entities.outlines(entity))
 
     def set_state(self, request: Any, _: Any) -> None:
-        """Answers SetEntityState."""
+        """Answer SetEntityState."""
         entity = self.find(request.entity)
         asked = request.state
         entities = self._simulation.entities
@@ -218,15 +224,15 @@ class EntityServices:
         pushed = request.set_acceleration and asked.acceleration != Accel()
         if still and (pushed or (request.set_twist and asked.twist != Twist())):
             what = "acceleration" if pushed else "twist"
-            told = f"{entity.name!r} stands still and takes no {what}; leave it out."
-            raise RefusalError(FAILED, told)
+            fault = f"{entity.name!r} stands still and takes no {what}; leave it out."
+            raise RefusalError(FAILED, fault)
         try:
             entities.move(entity, pose, twist)
         except OutsideError as error:
             raise RefusalError(INVALID_POSE, str(error)) from None
 
     def delete(self, request: Any, _: Any) -> None:
-        """Answers DeleteEntity."""
+        """Answer DeleteEntity."""
         self._simulation.remove(self.find(request.entity).name)
 
 

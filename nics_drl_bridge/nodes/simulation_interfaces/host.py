@@ -30,34 +30,34 @@ class Host(Protocol):
     context: Any
 
     def make_simulator(self, world: AnyWorld, robots: int) -> FastSimulator:
-        """Makes a simulator of a world for M robots."""
+        """Make a simulator of a world for M robots."""
 
     def use_world(self, world: AnyWorld) -> None:
-        """Simulates a world, with the robots that the node was started with."""
+        """Simulate a world, with the robots that the node was started with."""
 
     def add_robot(self, namespace: str) -> None:
-        """Opens the topics of a further robot."""
+        """Open the topics of a further robot."""
 
     def remove_robots(self, gone: Sequence[int]) -> None:
-        """Closes the topics of robots."""
+        """Close the topics of robots."""
 
     def reopen_robots(self) -> None:
-        """Opens the topics of the robots that the node was started with, and of no other."""
+        """Open the topics of the robots that the node was started with, and of no other."""
 
     def begin(self, rewind: bool = False) -> None:
-        """Begins an episode."""
+        """Begin an episode."""
 
     def rewind(self) -> None:
-        """Puts the time back to its start."""
+        """Put the time back to its start."""
 
     def step(self) -> None:
-        """Moves the world by one step."""
+        """Move the world by one step."""
 
     def pause(self, paused: bool) -> None:
-        """Holds time, or lets it go on."""
+        """Hold time, or let it go on."""
 
     def get_logger(self) -> Any:
-        """Returns the node's logger."""
+        """Return the node's logger."""
 
 
 class RefusalError(BridgeError):
@@ -80,7 +80,7 @@ ABSENT = (
 
 
 def outcome(act: Callable[[], object], host: Host) -> tuple[int, str]:
-    """Does something; returns the standard's code of how it went, and a sentence if it failed."""
+    """Do something; return the standard's code of how it went, and a sentence if it failed."""
     try:
         act()
     except RefusalError as error:
@@ -94,18 +94,18 @@ def outcome(act: Callable[[], object], host: Host) -> tuple[int, str]:
             return Result.RESULT_NOT_FOUND, str(
                 BridgeError(f"{error}; check the path.")
             )
-        told = f"the simulator failed: {type(error).__name__}: {error}"
-        host.get_logger().error(told)
-        return Result.RESULT_OPERATION_FAILED, " ".join(told.split())
+        fault = f"the simulator failed: {type(error).__name__}: {error}"
+        host.get_logger().error(fault)
+        return Result.RESULT_OPERATION_FAILED, " ".join(fault.split())
     return Result.RESULT_OK, ""
 
 
 def served(handler: Handler, host: Host) -> Callable[[Any, Any], Any]:
-    """Returns a service's callback, which answers by a handler's result or refusal."""
+    """Return a service's callback, which answers by a handler's result or refusal."""
 
     def reply(request: Any, response: Any) -> Any:
         code, sentence = outcome(lambda: handler(request, response), host)
-        # A handler that succeeds in part has told of it itself.
+        # A handler that succeeds in part has set the result itself.
         if code != Result.RESULT_OK or not response.result.result:
             response.result.result = code
         if sentence:

@@ -26,50 +26,50 @@ SIZES = {
 
 
 def pose_from_ros(pose: Any, base: Array, code: int) -> Array:
-    """Returns x, y, heading (3,) in `map` of a pose in a frame that has a pose (3,) there.
+    """Return x, y, heading (3,) in `map` of a pose in a frame that has a pose (3,) there.
 
     Raises RefusalError with a code for what is no pose in the plane; z is not looked at.
     """
     place = pose.position
     turn = pose.orientation
     quaternion = turn.x, turn.y, turn.z, turn.w
-    given = f"quaternion x {turn.x:g}, y {turn.y:g}, z {turn.z:g}, w {turn.w:g}"
+    words = f"quaternion x {turn.x:g}, y {turn.y:g}, z {turn.z:g}, w {turn.w:g}"
     if not all(map(math.isfinite, (place.x, place.y, place.z, *quaternion))):
         raise RefusalError(code, "the pose holds NaN or inf; give finite numbers.")
     if not is_rotation(*quaternion):
         raise RefusalError(
-            code, f"the {given} is no rotation; give one of unit length."
+            code, f"the {words} is no rotation; give one of unit length."
         )
     if 1.0 - 2.0 * (turn.x**2 + turn.y**2) < math.cos(LEAN):
         raise RefusalError(
-            code, f"the {given} leans, but the world is flat; turn about z alone."
+            code, f"the {words} leans, but the world is flat; turn about z alone."
         )
     local = np.array([place.x, place.y, conversions.heading_of(*quaternion)])
-    found: Array = geometry.compose(base, local)
-    return found
+    pose_in_map: Array = geometry.compose(base, local)
+    return pose_in_map
 
 
 def frame_pose(
     frame: str, entities: Entities, frames: Sequence[Any], code: int
 ) -> Array:
-    """Returns the pose (3,) of a frame in `map`: itself, or an entity's; RefusalError."""
-    known = {"", "world", *(each.map for each in frames)}
-    if frame in known:
+    """Return the pose (3,) of a frame in `map`: itself, or an entity's; RefusalError."""
+    map_frames = {"", "world", *(robot.map for robot in frames)}
+    if frame in map_frames:
         return np.zeros(3)
     bases = {
-        each.base: name
-        for each, name in zip(frames, entities.robot_names, strict=False)
+        robot.base: name
+        for robot, name in zip(frames, entities.robot_names, strict=False)
     }
     name = bases.get(frame, frame)
-    found = next((entity for entity in entities if entity.name == name), None)
-    if found is None:
+    entity = next((entity for entity in entities if entity.name == name), None)
+    if entity is None:
         fix = "leave it empty for the world, or name an entity"
         raise RefusalError(code, f"the frame {frame!r} is not known here; {fix}.")
-    return entities.pose(found)
+    return entities.pose(entity)
 
 
 def twist_from_ros(twist: Any, heading: float, code: int) -> Array:
-    """Returns vx, vy, wz (3,) along the axes of `map`, of a twist in a frame of a heading there."""
+    """Return vx, vy, wz (3,) along the axes of `map`, of a twist in a frame of a heading there."""
     values = np.array([twist.linear.x, twist.linear.y, twist.angular.z])
     if not np.isfinite(values).all():
         raise RefusalError(code, "the twist holds NaN or inf; give finite numbers.")
@@ -77,7 +77,7 @@ def twist_from_ros(twist: Any, heading: float, code: int) -> Array:
 
 
 def box_to_ros(outlines: Sequence[Array]) -> Bounds:
-    """Returns the box around outlines (V, 2): its upper right corner, then its lower left one."""
+    """Return the box around outlines (V, 2): its upper right corner, then its lower left one."""
     points = np.concatenate([np.zeros((0, 2)), *outlines])
     high = points.max(axis=0).tolist()
     low = points.min(axis=0).tolist()
@@ -96,11 +96,12 @@ class Region:
         self._points = np.array([[p.x, p.y, p.z] for p in bounds.points]).reshape(-1, 3)
         self.empty = kind == Bounds.TYPE_EMPTY
         if kind not in (Bounds.TYPE_EMPTY, *SIZES):
-            told = f"bounds of type {kind} are none of the standard"
+            fault = f"bounds of type {kind} are none of the standard"
             raise RefusalError(
-                Result.RESULT_FEATURE_UNSUPPORTED, f"{told}; give 0 to 3."
+                Result.RESULT_FEATURE_UNSUPPORTED, f"{fault}; give 0 to 3."
             )
-        self._sphere, count = kind == Bounds.TYPE_SPHERE, len(self._points)
+        self._sphere = kind == Bounds.TYPE_SPHERE
+        count = len(self._points)
         hull = kind == Bounds.TYPE_CONVEX_HULL
         if self.empty:
             fits = count == 0
@@ -116,8 +117,10 @@ class Region:
             )
         radius = self._points[1, 0] if self._sphere else 1.0
         if not (np.isfinite(self._points).all() and radius > 0.0):
-            told = "bounds must have finite points, and a sphere a radius (x of the second) above 0"
-            raise RefusalError(Result.RESULT_OPERATION_FAILED, f"{told}; mend them.")
+            fault = "bounds must have finite points, and a sphere a radius (x of the second)"
+            raise RefusalError(
+                Result.RESULT_OPERATION_FAILED, f"{fault} above 0; mend them."
+            )
         self._corners = self._outline(kind)
 
     def _outline(self, kind: int) -> Array:
@@ -128,10 +131,10 @@ class Region:
         if kind == Bounds.TYPE_CONVEX_HULL:
             corners = convex_hull(flat)
             if len(corners) < 3:
-                told = (
+                fault = (
                     "the points of the convex hull lie on one line; give one beside it."
                 )
-                raise RefusalError(Result.RESULT_OPERATION_FAILED, told)
+                raise RefusalError(Result.RESULT_OPERATION_FAILED, fault)
             return corners
         return flat
 

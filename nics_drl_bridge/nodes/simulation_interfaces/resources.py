@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import unquote, urlsplit
@@ -10,8 +11,9 @@ from urllib.parse import unquote, urlsplit
 from simulation_interfaces.msg import Result
 
 from nics_drl_bridge.config import read_text
-from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.errors import ConfigError, MissingFileError
 from nics_drl_bridge.nodes.simulation_interfaces.host import RefusalError
+from nics_drl_bridge.sim.sdf import AssetsError
 from nics_drl_bridge.sim.world_set import SPECIAL
 
 SDF = "sdf"
@@ -31,7 +33,7 @@ class Codes(NamedTuple):
 
     @classmethod
     def of(cls, response: Any) -> Codes:
-        """Returns the codes that are constants of a response's class."""
+        """Return the codes that are constants of a response's class."""
         return cls(
             response.UNSUPPORTED_FORMAT,
             response.NO_RESOURCE,
@@ -41,7 +43,21 @@ class Codes(NamedTuple):
         )
 
 
-class Found(NamedTuple):
+@contextmanager
+def refused(codes: Codes) -> Iterator[None]:
+    """Within this context, a resource that can't be used raises RefusalError with its code."""
+    try:
+        yield
+    except AssetsError as error:
+        code = codes.missing_assets if error.missing else codes.unsupported_assets
+        raise RefusalError(code, str(error)) from None
+    except MissingFileError as error:
+        raise RefusalError(codes.missing_assets, str(error)) from None
+    except ConfigError as error:
+        raise RefusalError(codes.parse_error, str(error)) from None
+
+
+class Content(NamedTuple):
     """A resource that is there."""
 
     form: str  # SDF or YAML; empty for a name
@@ -51,7 +67,7 @@ class Found(NamedTuple):
 
 
 def local(uri: str) -> Path | None:
-    """Returns the path that a URI or a plain path means; None if it is elsewhere."""
+    """Return the path that a URI or a plain path means; None if it is elsewhere."""
     try:
         parts = urlsplit(uri)
     except ValueError:  # of a host that is none
@@ -62,7 +78,7 @@ def local(uri: str) -> Path | None:
 
 
 def files_of(source: str) -> list[Path] | None:
-    """Returns the files of a folder, or a file with a known suffix; None for any other source."""
+    """Return the files of a folder, or a file with a known suffix; None for any other source."""
     path = local(source)
     with suppress(OSError):
         if path and (
@@ -72,40 +88,40 @@ def files_of(source: str) -> list[Path] | None:
     return None
 
 
-def find(resource: Any, codes: Codes) -> Found:
-    """Returns a resource, whose URI goes before its text. Raises RefusalError."""
+def find(resource: Any, codes: Codes) -> Content:
+    """Return a resource, whose URI goes before its text. Raises RefusalError."""
     if resource.uri:
         return _of_uri(resource.uri, codes)
     text = resource.resource_string
     if not text.strip():
-        told = "both uri and resource_string are empty; give one of them."
-        raise RefusalError(codes.no_resource, told)
+        fault = "both uri and resource_string are empty; give one of them."
+        raise RefusalError(codes.no_resource, fault)
     if text.lstrip("\ufeff \t\r\n").startswith(("<", "#usda")):
         if "<sdf" not in text:
-            told = "the resource_string is XML or USD, but no SDF; give SDF or YAML."
-            raise RefusalError(codes.unsupported_format, told)
-        return Found(SDF, text, "resource_string")
-    return Found(YAML, text, "resource_string")
+            fault = "the resource_string is XML or USD, but no SDF; give SDF or YAML."
+            raise RefusalError(codes.unsupported_format, fault)
+        return Content(SDF, text, "resource_string")
+    return Content(YAML, text, "resource_string")
 
 
-def _of_uri(uri: str, codes: Codes) -> Found:
+def _of_uri(uri: str, codes: Codes) -> Content:
     path = local(uri)
     if path is None:
-        told = f"uri {uri!r}: is not on this machine; give file:// or a path."
-        raise RefusalError(codes.unsupported_format, told)
+        fault = f"uri {uri!r}: is not on this machine; give file:// or a path."
+        raise RefusalError(codes.unsupported_format, fault)
     suffix = path.suffix.lower()
     named = path.is_dir() or (
         any(sign in uri for sign in SPECIAL) and not path.is_file()
     )
     if named or not suffix:
-        return Found("", "", str(path), path)
+        return Content("", "", str(path), path)
     if suffix not in SUFFIXES:
-        told = f"uri {uri!r}: is none of {', '.join(SUFFIXES)}; convert it."
-        raise RefusalError(codes.unsupported_format, told)
+        fault = f"uri {uri!r}: is none of {', '.join(SUFFIXES)}; convert it."
+        raise RefusalError(codes.unsupported_format, fault)
     if not path.is_file():
-        told = f"uri {uri!r}: no such file; check the path on the simulator's machine."
-        raise RefusalError(Result.RESULT_NOT_FOUND, told)
+        fault = f"uri {uri!r}: no such file; check the path on the simulator's machine."
+        raise RefusalError(Result.RESULT_NOT_FOUND, fault)
     try:
-        return Found(SUFFIXES[suffix], read_text(path, MOST_BYTES), str(path), path)
+        return Content(SUFFIXES[suffix], read_text(path, MOST_BYTES), str(path), path)
     except ConfigError as error:
         raise RefusalError(codes.parse_error, str(error)) from None

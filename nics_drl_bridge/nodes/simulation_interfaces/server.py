@@ -111,15 +111,15 @@ class Server:
 
     @staticmethod
     def _tell(_: Any, response: Any) -> Any:
-        told: SimulatorFeatures = response.features
-        told.features = [
-            getattr(told, name) for name in FEATURES if hasattr(told, name)
+        features: SimulatorFeatures = response.features
+        features.features = [
+            getattr(features, name) for name in FEATURES if hasattr(features, name)
         ]
-        told.spawn_formats = FORMATS
-        told.custom_info = ABOUT
+        features.spawn_formats = FORMATS
+        features.custom_info = ABOUT
         return response
 
 
 def _no_named_poses(*_: Any) -> NoReturn:
-    told = "worlds have no named poses here; see get_simulator_features."
-    raise RefusalError(Result.RESULT_FEATURE_UNSUPPORTED, told)
+    reason = "worlds have no named poses here; see get_simulator_features."
+    raise RefusalError(Result.RESULT_FEATURE_UNSUPPORTED, reason)

@@ -1,6 +1,7 @@
 """Spawning: shapes of YAML and SDF, and robots of the simulator's kind."""
 
 import re
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,6 @@ from nics_drl_bridge.nodes.simulation_interfaces.host import Host, RefusalError,
 from nics_drl_bridge.nodes.simulation_interfaces.state import Simulation
 from nics_drl_bridge.sim.entities import NAME, OutsideError, hull_of
 from nics_drl_bridge.sim.models import Model, model_of_sdf, model_of_yaml
-from nics_drl_bridge.sim.sdf import AssetsError
 
 # With room for the names of topics, which may have 255 characters in all.
 NAMESPACE = re.compile(
@@ -46,7 +46,7 @@ class Spawning:
         self._codes = resources.Codes.of(SpawnResult)
 
     def spawn(self, request: Any, response: Any) -> None:
-        """Answers SpawnEntity, and one part of SpawnEntities. Raises RefusalError, BridgeError."""
+        """Answer SpawnEntity, and one part of SpawnEntities. Raises RefusalError, BridgeError."""
         self._simulation.require_world()
         model = self._model(request)
         wanted = request.name or ("" if model is None else model.name)
@@ -77,52 +77,47 @@ class Spawning:
     def _describe(self, name: str, model: Model) -> None:
         info = self._entities.info(self._entities.find(name))
         tags = list(dict.fromkeys((*info.tags, *model.tags)))
-        told = EntityInfo(category=info.category, tags=tags)
-        told.description = model.description or info.description
-        self._simulation.told[name] = told
+        entity_info = EntityInfo(category=info.category, tags=tags)
+        entity_info.description = model.description or info.description
+        self._simulation.infos[name] = entity_info
 
     def _model(self, request: Any) -> Model | None:
         """The entity of a request; None for a robot. Raises RefusalError."""
-        codes = self._codes
-        found = resources.find(request.entity_resource, self._codes)
-        if not found.form:
-            if found.source == self._host.model.robot.name:
+        resource = resources.find(request.entity_resource, self._codes)
+        if not resource.form:
+            if resource.source == self._host.model.robot.name:
                 return None
             try:
-                path = find_config(found.source, FOLDER)
-                found = resources.Found(
+                path = find_config(resource.source, FOLDER)
+                resource = resources.Content(
                     resources.YAML, read_text(path), path.stem, path
                 )
             except ConfigError as error:
                 held = f"robots here are {self._host.model.robot.name!r}"
-                told = str(error).replace("entitie ", "entity ")
-                raise RefusalError(Result.RESULT_NOT_FOUND, f"{told} {held}.") from None
-        try:
-            if found.form == resources.SDF:
+                raise RefusalError(
+                    Result.RESULT_NOT_FOUND, f"{error} {held}."
+                ) from None
+        with resources.refused(self._codes):
+            if resource.form == resources.SDF:
                 z = request.initial_pose.pose.position.z
                 return model_of_sdf(
-                    found.text, z if np.isfinite(z) else 0.0, found.source
+                    resource.text, z if np.isfinite(z) else 0.0, resource.source
                 )
-            model = model_of_yaml(found.text, found.source)
-            if found.path is None or model.name:
+            model = model_of_yaml(resource.text, resource.source)
+            if resource.path is None or model.name:
                 return model
-            return model._replace(name=found.path.stem)
-        except AssetsError as error:
-            code = codes.missing_assets if error.missing else codes.unsupported_assets
-            raise RefusalError(code, str(error)) from None
-        except ConfigError as error:
-            raise RefusalError(codes.parse_error, str(error)) from None
+            return model._replace(name=resource.path.stem)
 
     def _name(self, wanted: str, may_rename: bool) -> str:
         entities = self._simulation.entities
         if not wanted:
             if may_rename:
                 return entities.free_name("entity")
-            told = "the name is empty; give one, or set allow_renaming."
-            raise RefusalError(SpawnResult.NAME_INVALID, told)
+            fault = "the name is empty; give one, or set allow_renaming."
+            raise RefusalError(SpawnResult.NAME_INVALID, fault)
         if not NAME.fullmatch(wanted):
-            told = f"the name {wanted!r} is not valid; use up to 120 letters, digits, and _ . / -"
-            raise RefusalError(SpawnResult.NAME_INVALID, f"{told} between them.")
+            fault = f"the name {wanted!r} is not valid; use up to 120 letters, digits, and _ . / -"
+            raise RefusalError(SpawnResult.NAME_INVALID, f"{fault} between them.")
         free = entities.free_name(wanted)
         if free != wanted and not may_rename:
             fix = "give another, or set allow_renaming"
@@ -131,46 +126,48 @@ class Spawning:
             )
         return free
 
-    def _namespace(self, given: str, name: str, robot: bool) -> str:
-        """The given one, or a robot's by its name, which no other may have. RefusalError."""
+    def _namespace(self, wanted: str, name: str, robot: bool) -> str:
+        """The wanted one, or a robot's by its name, which no other may have. RefusalError."""
         host: Any = self._host
-        space = given or re.sub(r"\W", "_", name)
+        space = wanted or re.sub(r"\W", "_", name)
         code = SpawnResult.NAMESPACE_INVALID
-        if (robot or given) and not NAMESPACE.fullmatch(space):
-            if given:
-                told = f"entity_namespace {given!r} is"
+        if (robot or wanted) and not NAMESPACE.fullmatch(space):
+            if wanted:
+                fault = f"entity_namespace {wanted!r} is"
             else:
-                told = f"the name {name!r} makes"
-            code = code if given else SpawnResult.NAME_INVALID
+                fault = f"the name {name!r} makes"
+            code = code if wanted else SpawnResult.NAME_INVALID
             raise RefusalError(
-                code, f"{told} no namespace of ROS; write it as in 'robot_1'."
+                code, f"{fault} no namespace of ROS; write it as in 'robot_1'."
             )
         scan = robot and host.resolve_topic_name(f"{space}/scan")
-        taken = scan in [each.topic_name for each in host.publishers]
+        taken = scan in [publisher.topic_name for publisher in host.publishers]
         if robot and (
             taken or device_parameters.frames(host, space.strip("/")) in host.frames
         ):
-            told = f"the namespace {space!r} is that of another robot; give one as entity_namespace"
-            raise RefusalError(code, f"{told}.")
+            fault = f"the namespace {space!r} is that of another robot"
+            raise RefusalError(code, f"{fault}; give one as entity_namespace.")
         return space
 
     def spawn_all(self, request: Any, response: Any) -> None:
-        """Answers SpawnEntities."""
+        """Answer SpawnEntities."""
         failed = []
-        for k, each in enumerate(request.spawn_requests):
-            one = SpawnResult()
-            given = lambda each=each, one=one: self.spawn(each, one)  # noqa: E731
-            one.result.result, one.result.error_message = outcome(given, self._host)
-            response.results.append(one)
-            if one.result.result != Result.RESULT_OK:
-                failed.append(f"request {k}: {one.result.error_message}")
+        for k, spawn_request in enumerate(request.spawn_requests):
+            answer = SpawnResult()
+            spawn = partial(self.spawn, spawn_request, answer)
+            answer.result.result, answer.result.error_message = outcome(
+                spawn, self._host
+            )
+            response.results.append(answer)
+            if answer.result.result != Result.RESULT_OK:
+                failed.append(f"request {k}: {answer.result.error_message}")
         if failed:
             code = SpawnEntities.Response.ENTITIES_SPAWN_FAILED
             more = f"{len(failed)} of {len(request.spawn_requests)} failed"
             raise RefusalError(code, f"{more}; {failed[0]}")
 
     def list_spawnables(self, request: Any, response: Any) -> None:
-        """Answers GetSpawnables."""
+        """Answer GetSpawnables."""
         robot = self._host.model.robot
         unknown = list[str]()
         hull = hull_of(self._simulation.entities.simulator.footprint)
@@ -178,33 +175,29 @@ class Spawning:
             _spawnable(robot.name, f"another robot {robot.name}", [hull])
         )
         shipped = share_folder() / "config" / FOLDER
-        found = [(file.stem, file) for file in sorted(shipped.iterdir())]
+        spawnables = [(file.stem, file) for file in sorted(shipped.iterdir())]
         for source in request.sources:
             files = resources.files_of(source)
             if files is None:
                 unknown.append(source)
-            found += [(str(file), file) for file in files or ()]
-        for uri, file in found:
+            spawnables += [(str(file), file) for file in files or ()]
+        for uri, file in spawnables:
             if file.suffix.lower() in resources.SUFFIXES:
                 self._list(file, uri, response)
         if unknown:
             response.result.result = Result.RESULT_OK
-            told = f"sources that are not known: {', '.join(map(repr, unknown))}"
+            fault = f"sources that are not known: {', '.join(map(repr, unknown))}"
             response.result.error_message = (
-                f"{told}; give folders or files of this machine."
+                f"{fault}; give folders or files of this machine."
             )
 
     def _list(self, file: Path, uri: str, response: Any) -> None:
-        if resources.SUFFIXES[file.suffix.lower()] == resources.SDF:
-            read = model_of_sdf
-        else:
-            read = None
         try:
             text = read_text(file, resources.MOST_BYTES)
-            if read is None:
-                model = model_of_yaml(text, str(file))
+            if resources.SUFFIXES[file.suffix.lower()] == resources.SDF:
+                model = model_of_sdf(text, 0.0, str(file))
             else:
-                model = read(text, 0.0, str(file))
+                model = model_of_yaml(text, str(file))
         except (BridgeError, OSError):
             return  # a world, or something else that is no entity
         hulls = [

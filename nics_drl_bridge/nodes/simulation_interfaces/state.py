@@ -42,14 +42,14 @@ class Simulation:
     def __init__(self, host: Host) -> None:
         self._host = host
         self._stepping = False
-        self.told: dict[str, EntityInfo] = {}  # of the names whose information was set
+        self.infos: dict[str, EntityInfo] = {}  # by name, where a client set it
         # or paused, or without a world, while the host is paused
         self._halted = STOPPED
         self._turn: Any = host.create_guard_condition(lambda: None)  # type: ignore[attr-defined]
         self.renew()
 
     def renew(self) -> None:
-        """Lists the entities of a world that the host simulates anew."""
+        """List the entities of a world that the host begins to simulate."""
         host = self._host
         self.entities = Entities(
             host.device, host.world, host.robot_names, host.make_simulator
@@ -64,22 +64,22 @@ class Simulation:
         return int(self._halted)
 
     def halt(self, state: int) -> None:
-        """Holds the simulation in a state other than playing."""
+        """Hold the simulation in a state other than playing."""
         self._host.pause(True)
         self._halted = state
         self._stepping = False
 
     def require_world(self) -> None:
-        """Raises RefusalError if no world is loaded."""
+        """Raise RefusalError if no world is loaded."""
         if self.state in (WITHOUT_WORLD, QUITTING):
             raise RefusalError(Result.RESULT_INCORRECT_STATE, NO_WORLD)
 
     def get_state(self, _: Any, response: Any) -> None:
-        """Answers GetSimulationState."""
+        """Answer GetSimulationState."""
         response.state.state = self.state
 
     def set_state(self, request: Any, _: Any) -> None:
-        """Answers SetSimulationState."""
+        """Answer SetSimulationState."""
         codes = SetSimulationState.Response
         wanted = request.state.state
         state = self.state
@@ -89,10 +89,10 @@ class Simulation:
             )
             raise RefusalError(codes.ALREADY_IN_TARGET_STATE, already)
         if wanted not in NAMES:
-            known = ", ".join(f"{value} ({name})" for value, name in NAMES.items())
-            told = f"state {wanted} can't be set; choose one of {known}"
+            states = ", ".join(f"{value} ({name})" for value, name in NAMES.items())
+            fault = f"state {wanted} can't be set; choose one of {states}"
             raise RefusalError(
-                codes.INCORRECT_TRANSITION, f"{told}, or load or unload a world."
+                codes.INCORRECT_TRANSITION, f"{fault}, or load or unload a world."
             )
         if wanted == QUITTING:
             self.halt(QUITTING)
@@ -105,8 +105,8 @@ class Simulation:
                 self._reset_all()
             except BridgeError as error:
                 self.halt(PAUSED)
-                told = f"it did not stop: {error}"
-                raise RefusalError(codes.STATE_TRANSITION_ERROR, told) from None
+                fault = f"it did not stop: {error}"
+                raise RefusalError(codes.STATE_TRANSITION_ERROR, fault) from None
         self._stepping = False
         if wanted == PLAYING:
             self._host.pause(False)
@@ -114,7 +114,7 @@ class Simulation:
             self.halt(wanted)
 
     def require_paused(self, steps: int) -> None:
-        """Raises RefusalError unless so many steps can be made now."""
+        """Raise RefusalError unless so many steps can be made now."""
         problem = ""
         if self.state != PAUSED:
             problem = "the simulation is not paused; set its state to paused first."
@@ -126,20 +126,20 @@ class Simulation:
             raise RefusalError(Result.RESULT_OPERATION_FAILED, problem)
 
     def step(self, request: Any, _: Any) -> None:
-        """Answers StepSimulation."""
+        """Answer StepSimulation."""
         self.require_paused(request.steps)
         if request.steps > MOST_STEPS:
-            told = (
+            fault = (
                 f"steps is {request.steps}, and {MOST_STEPS} are the most of one call"
             )
             raise RefusalError(
-                Result.RESULT_OPERATION_FAILED, f"{told}; use simulate_steps."
+                Result.RESULT_OPERATION_FAILED, f"{fault}; use simulate_steps."
             )
         for _ in range(request.steps):
             self._host.step()
 
     async def simulate(self, goal: Any) -> Any:
-        """Executes SimulateSteps: one step at a turn, so that all else is answered meanwhile."""
+        """Execute SimulateSteps: one step at a turn, so that all else is answered meanwhile."""
         steps = goal.request.steps
         result = SimulateSteps.Result()
         result.result.result = Result.RESULT_OPERATION_FAILED
@@ -153,9 +153,10 @@ class Simulation:
         done = 0
         why = ""
         try:
-            while done < steps and not (
-                why := why or outcome(self._host.step, self._host)[1]
-            ):
+            while done < steps and not why:
+                _, why = outcome(self._host.step, self._host)
+                if why:
+                    break
                 done += 1
                 goal.publish_feedback(
                     SimulateSteps.Feedback(
@@ -169,7 +170,8 @@ class Simulation:
             self._stepping = False
         result.result.error_message = why
         if done == steps:
-            result.result.result, result.result.error_message = Result.RESULT_OK, ""
+            result.result.result = Result.RESULT_OK
+            result.result.error_message = ""
             goal.succeed()
         elif goal.is_cancel_requested:
             goal.canceled()
@@ -187,23 +189,23 @@ class Simulation:
         return ""
 
     def reset(self, request: Any, _: Any) -> None:
-        """Answers ResetSimulation."""
+        """Answer ResetSimulation."""
         self.require_world()
         scope = request.scope or SCOPES.SCOPE_ALL
         if not scope & EVERY_SCOPE or (
             scope & ~EVERY_SCOPE and scope != SCOPES.SCOPE_ALL
         ):
-            known = "1 (time), 2 (state) and 4 (spawned)"
-            told = f"scope {scope} has bits that mean nothing; add up {known}, or give 0 for all."
-            raise RefusalError(Result.RESULT_FEATURE_UNSUPPORTED, told)
+            bits = "1 (time), 2 (state) and 4 (spawned)"
+            fault = f"scope {scope} has bits that mean nothing; add up {bits}, or give 0 for all."
+            raise RefusalError(Result.RESULT_FEATURE_UNSUPPORTED, fault)
         self._stepping = False
         if scope & EVERY_SCOPE == EVERY_SCOPE:
             self._reset_all()
             return
         if scope & SCOPES.SCOPE_SPAWNED:
             if set(self.entities.robot_names) <= self.entities.spawned.keys():
-                told = "a simulator needs a robot, and all were spawned; reset all, by scope 0."
-                raise RefusalError(Result.RESULT_OPERATION_FAILED, told)
+                fault = "a simulator needs a robot, and all were spawned; reset all, by scope 0."
+                raise RefusalError(Result.RESULT_OPERATION_FAILED, fault)
             self.remove(*self.entities.spawned)
         if scope & SCOPES.SCOPE_STATE:
             self._host.begin(rewind=bool(scope & SCOPES.SCOPE_TIME))
@@ -211,11 +213,11 @@ class Simulation:
             self._host.rewind()
 
     def restore(self) -> None:
-        """Removes what was spawned, and brings back what was deleted."""
+        """Remove what was spawned, and bring back what was deleted."""
         # A robot that was spawned may have the name of one that was deleted.
-        changed = any(each.robot >= 0 for each in self.entities.spawned.values())
+        changed = any(entity.robot >= 0 for entity in self.entities.spawned.values())
         changed |= self.entities.robot_names != list(self._host.robot_names)
-        self.told.clear()
+        self.infos.clear()
         self.entities.restore()
         if changed:
             self._host.reopen_robots()
@@ -225,10 +227,10 @@ class Simulation:
         self._host.begin(rewind=True)
 
     def remove(self, *names: str) -> None:
-        """Removes entities, and the topics of robots among them."""
+        """Remove entities, and the topics of robots among them."""
         for name in names:
             entity = self.entities.find(name)
             self.entities.delete(entity)
-            self.told.pop(name, None)
+            self.infos.pop(name, None)
             if entity.robot >= 0:
                 self._host.remove_robots([entity.robot])

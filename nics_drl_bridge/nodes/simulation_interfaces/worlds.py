@@ -1,6 +1,7 @@
 """Worlds: the one that is loaded, those that may be, loading and unloading."""
 
 import math
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +10,15 @@ from scipy import ndimage
 from simulation_interfaces.msg import Resource, Result, WorldResource
 from simulation_interfaces.srv import GetCurrentWorld, LoadWorld, UnloadWorld
 
+from nics_drl_bridge import defaults
 from nics_drl_bridge.config import parse_yaml, share_folder, validate
-from nics_drl_bridge.errors import BridgeError, ConfigError
+from nics_drl_bridge.errors import (
+    BridgeError,
+    ConfigError,
+    UnknownNameError,
+)
 from nics_drl_bridge.lidar.maps import FREE
+from nics_drl_bridge.nodes.runner import get_text
 from nics_drl_bridge.nodes.simulation_interfaces import resources
 from nics_drl_bridge.nodes.simulation_interfaces.entities import tags_match
 from nics_drl_bridge.nodes.simulation_interfaces.host import RefusalError
@@ -22,22 +29,19 @@ from nics_drl_bridge.nodes.simulation_interfaces.state import (
 )
 from nics_drl_bridge.sim.models import HEIGHT, file_of
 from nics_drl_bridge.sim.occupancy import occupancy
-from nics_drl_bridge.sim.sdf import ABSENT, AssetsError, read_sdf, root_of
+from nics_drl_bridge.sim.sdf import read_sdf, root_of
 from nics_drl_bridge.sim.sections import Standing
 from nics_drl_bridge.sim.world import Region, World, check_places
 from nics_drl_bridge.sim.world_set import BARN, AnyWorld, load_worlds
 
 CODES = LoadWorld.Response
-# of worlds of SDF, as with `nics world import` [m]
-CLEARANCE = 0.1
-NEAREST = 2.0
 EMPTY = (
     (-4.0, -4.0),
     (4.0, 4.0),
 )  # places in the field of a world without walls around it [m]
 CELL = 0.05  # [m]
 MOST_OPEN = 0.5  # fraction of what is free in a field that may be open to all around
-# Tags of SDF that are read, or say nothing of what stands in a plane.
+# Tags of SDF that are read, or that do not affect what stands in a plane.
 READ = {
     "sdf",
     "world",
@@ -83,21 +87,21 @@ class Worlds:
     def __init__(self, host: Any, simulation: Simulation) -> None:
         self._host = host
         self._simulation = simulation
-        self._resource = Resource(uri=str(host.get_parameter("world").value))
+        self._resource = Resource(uri=get_text(host, "world"))
         self._codes = resources.Codes.of(CODES)
 
     def current(self, _: Any, response: Any) -> None:
-        """Answers GetCurrentWorld."""
+        """Answer GetCurrentWorld."""
         if self._simulation.state == WITHOUT_WORLD:
-            told = "no world is loaded; load one by load_world."
-            raise RefusalError(GetCurrentWorld.Response.NO_WORLD_LOADED, told)
-        response.world = told_of(self._host.world, self._resource)
+            reason = "no world is loaded; load one by load_world."
+            raise RefusalError(GetCurrentWorld.Response.NO_WORLD_LOADED, reason)
+        response.world = describe_world(self._host.world, self._resource)
 
     def unload(self, _: Any, __: Any) -> None:
-        """Answers UnloadWorld."""
+        """Answer UnloadWorld."""
         if self._simulation.state == WITHOUT_WORLD:
-            told = "no world is loaded, so that none can be unloaded."
-            raise RefusalError(UnloadWorld.Response.NO_WORLD_LOADED, told)
+            reason = "no world is loaded, so that none can be unloaded."
+            raise RefusalError(UnloadWorld.Response.NO_WORLD_LOADED, reason)
         self._unload()
 
     def _unload(self) -> None:
@@ -105,10 +109,10 @@ class Worlds:
         self._simulation.halt(WITHOUT_WORLD)
 
     def load(self, request: Any, response: Any) -> None:
-        """Answers LoadWorld: the present world is unloaded, even if the other can't be read."""
-        found = resources.find(request.world_resource, self._codes)
+        """Answer LoadWorld: the present world is unloaded, even if the other can't be read."""
+        resource = resources.find(request.world_resource, self._codes)
         self._unload()
-        world = self._read(found, request)
+        world = self._read(resource, request)
         host = self._host
         simulation = self._simulation
         host.use_world(world)
@@ -116,69 +120,58 @@ class Worlds:
         host.begin(rewind=True)
         simulation.halt(STOPPED)
         self._resource = request.world_resource
-        response.world = told_of(world, self._resource)
+        response.world = describe_world(world, self._resource)
 
-    def _read(self, found: resources.Found, request: Any) -> AnyWorld:
-        codes = self._codes
-        try:
-            if found.form == resources.SDF:
-                if found.path is not None:
-                    return self._standing(found.path, found.path.stem, request)
-                with file_of(found.text) as file:
+    def _read(self, resource: resources.Content, request: Any) -> AnyWorld:
+        with resources.refused(self._codes):
+            if resource.form == resources.SDF:
+                if resource.path is not None:
+                    return self._standing(resource.path, resource.path.stem, request)
+                with file_of(resource.text) as file:
                     return self._standing(file, "resource_string", request)
-            if found.path is not None:
-                return load_worlds(str(found.path))
-            world = validate(parse_yaml(found.text, found.source), World, found.source)
+            if resource.path is not None:
+                return _load(resource.path, named=not resource.form)
+            content = parse_yaml(resource.text, resource.source)
+            world = validate(content, World, resource.source)
             check_places(world)
             _ = world.grid
             return world
-        except AssetsError as error:
-            code = codes.missing_assets if error.missing else codes.unsupported_assets
-            raise RefusalError(code, str(error)) from None
-        except ConfigError as error:
-            if not found.form and "unknown world" in str(error):
-                raise RefusalError(Result.RESULT_NOT_FOUND, str(error)) from None
-            if "no such file" in str(error):
-                code = codes.missing_assets
-            else:
-                code = codes.parse_error
-            raise RefusalError(code, str(error)) from None
 
     def _standing(self, file: Path, name: str, request: Any) -> World:
         skip = bool(request.ignore_missing_or_unsupported_assets)
         strange = sorted(
-            {each.tag for each in root_of(file).iter() if ":" not in each.tag} - READ
+            {element.tag for element in root_of(file).iter() if ":" not in element.tag}
+            - READ
         )
         if request.fail_on_unsupported_element and strange:
-            told = f"{name}: holds <{strange[0]}>, which is not simulated"
+            fault = f"{name}: holds <{strange[0]}>, which is not simulated"
             fix = "remove it, or do not ask for fail_on_unsupported_element"
-            raise RefusalError(CODES.UNSUPPORTED_ELEMENTS, f"{told}; {fix}.")
+            raise RefusalError(CODES.UNSUPPORTED_ELEMENTS, f"{fault}; {fix}.")
         standing = read_sdf(file, HEIGHT, skip_unknown=True, may_be_empty=True)
         if standing.left_out and not skip:
-            missing = any(ABSENT in each for each in standing.left_out)
-            if missing:
+            if standing.missing:
                 code = self._codes.missing_assets
             else:
                 code = self._codes.unsupported_assets
-            told = f"{name}: {standing.left_out[0]}, which is no shape of a world"
+            fault = f"{name}: {standing.left_out[0]}, which is no shape of a world"
             raise RefusalError(
-                code, f"{told}; put a box in its place, or ignore such assets."
+                code, f"{fault}; put a box in its place, or ignore such assets."
             )
         return world_of(standing, name)
 
     def available(self, request: Any, response: Any) -> None:
-        """Answers GetAvailableWorlds."""
+        """Answer GetAvailableWorlds."""
         tags_match(request.filter, ())
         folder = share_folder() / "config"
         failed = list[str]()
         skipped = list[str]()
-        names = [each.stem for each in sorted((folder / "worlds").glob("*.yaml"))]
-        found = [(name, load_worlds(name)) for name in names]
+        names = [file.stem for file in sorted((folder / "worlds").glob("*.yaml"))]
+        worlds = [(name, load_worlds(name)) for name in names]
         for source in request.additional_sources:
             if source and request.offline_only and resources.local(source) is None:
                 continue
             try:
-                found += _in_source(source, skipped)
+                worlds += _in_source(source, skipped)
             except (BridgeError, OSError) as error:
                 failed.append(f"{source!r}: {error}")
         if failed and not request.continue_on_error:
@@ -187,15 +180,15 @@ class Worlds:
             )
         sets = [
             BARN,
-            *(each.stem for each in sorted((folder / "world_sets").glob("*.yaml"))),
+            *(file.stem for file in sorted((folder / "world_sets").glob("*.yaml"))),
         ]
-        told = [told_of(world, Resource(uri=uri)) for uri, world in found]
+        answers = [describe_world(world, Resource(uri=uri)) for uri, world in worlds]
         for name in sets:  # whose many worlds would take long to read
-            about = f"the worlds of {name}, of which every episode draws one"
-            told.append(WorldResource(name=name, description=about, tags=["set"]))
-            told[-1].world_resource = Resource(uri=name)
+            about = f"the worlds of {name}; every episode draws one of them"
+            answers.append(WorldResource(name=name, description=about, tags=["set"]))
+            answers[-1].world_resource = Resource(uri=name)
         response.worlds = [
-            each for each in told if tags_match(request.filter, each.tags)
+            answer for answer in answers if tags_match(request.filter, answer.tags)
         ]
         if failed or skipped:
             response.result.result = Result.RESULT_OK
@@ -204,10 +197,20 @@ class Worlds:
             )
 
 
+def _load(path: Path, named: bool) -> AnyWorld:
+    """Load worlds from a path, or by a name. Raises ConfigError, RefusalError for no such name."""
+    try:
+        return load_worlds(str(path))
+    except UnknownNameError as error:
+        if named and error.kind == "worlds":
+            raise RefusalError(Result.RESULT_NOT_FOUND, str(error)) from None
+        raise
+
+
 def _in_source(source: str, skipped: list[str]) -> list[tuple[str, AnyWorld]]:
     """Worlds of a file, or of those in a folder that can be read. Raises BridgeError, OSError."""
     path = resources.local(source)
-    found = list[tuple[str, AnyWorld]]()
+    worlds = list[tuple[str, AnyWorld]]()
     if path is None:
         raise ConfigError("is not on this machine; give a folder or file.")
     for file in sorted(path.iterdir()) if path.is_dir() else [path]:
@@ -217,20 +220,20 @@ def _in_source(source: str, skipped: list[str]) -> list[tuple[str, AnyWorld]]:
                 root_of(file).find("world") is not None or file == path
             ):
                 standing = read_sdf(file, HEIGHT, skip_unknown=True, may_be_empty=True)
-                found.append((str(file), world_of(standing, file.stem)))
+                worlds.append((str(file), world_of(standing, file.stem)))
             elif form == resources.YAML or file == path:
-                found.append((str(file), load_worlds(file)))
+                worlds.append((str(file), load_worlds(file)))
         except (BridgeError, OSError) as error:
             if file == path:
                 raise
             skipped.append(str(error))
-    return found
+    return worlds
 
 
-def told_of(world: AnyWorld, resource: Resource) -> WorldResource:
-    """Returns a world as the standard tells of it, with tags of what is in it."""
+def describe_world(world: AnyWorld, resource: Resource) -> WorldResource:
+    """Return the description of a world, with tags for what it contains."""
     members = world.members
-    groups = [group for member in members for group in member.obstacles]
+    groups = list(chain.from_iterable(member.obstacles for member in members))
     about = {
         "set": len(members) > 1,
         "map": any(member.map is not None for member in members),
@@ -242,17 +245,17 @@ def told_of(world: AnyWorld, resource: Resource) -> WorldResource:
     x1, y1, x2, y2 = world.extent
     size = f"{x2 - x1:.3g} m x {y2 - y1:.3g} m"
     if len(members) > 1:
-        told = f"{len(members)} worlds in {size}"
+        description = f"{len(members)} worlds in {size}"
     else:
-        told = f"a field of {size}"
+        description = f"a field of {size}"
     tags = [tag for tag, holds in about.items() if holds]
     return WorldResource(
-        name=world.name, world_resource=resource, description=told, tags=tags
+        name=world.name, world_resource=resource, description=description, tags=tags
     )
 
 
 def world_of(standing: Standing, name: str) -> World:
-    """Returns the world of what stands in an SDF file. Raises ConfigError.
+    """Return the world of what stands in an SDF file. Raises ConfigError.
 
     What encloses most of its field bounds it; else 2 m around it do, and 5 m around the origin.
     """
@@ -272,8 +275,11 @@ def _in_field(standing: Standing, name: str, bounds: Region) -> World:
         "name": name,
         "bounds": bounds,
         "obstacles": standing.obstacles,
-        "clearance": CLEARANCE,
-        "goal_distance": (min(NEAREST, round(far / 4.0, 3)), far),
+        "clearance": defaults.IMPORT_CLEARANCE_M,
+        "goal_distance": (
+            min(defaults.IMPORT_GOAL_DISTANCE_M, round(far / 4.0, 3)),
+            far,
+        ),
     }
     return validate(content, World, name)
 
@@ -281,12 +287,9 @@ def _in_field(standing: Standing, name: str, bounds: Region) -> World:
 def _encloses(standing: Standing, tight: Region, wide: Region) -> bool:
     """True if most of what is free within a field can't be reached from around it."""
     made = occupancy(_in_field(standing, "field", wide), standing.placed, CELL)
-    free = (
-        ndimage.distance_transform_edt(made.cells == FREE) * made.resolution > CLEARANCE
-    )
-    area, _ = ndimage.label(free)
+    room = ndimage.distance_transform_edt(made.cells == FREE) * made.resolution
+    area, _ = ndimage.label(room > defaults.IMPORT_CLEARANCE_M)
     first, last = made.world_to_cell(np.reshape(tight, (2, 2)))
     within = area[first[0] : last[0], first[1] : last[1]]
-    return bool(
-        (within > 0).any() and np.mean(within[within > 0] == area[2, 2]) < MOST_OPEN
-    )
+    free = within[within > 0]
+    return bool(free.size and np.mean(free == area[2, 2]) < MOST_OPEN)
