@@ -33,3 +33,6 @@ ANSWER_S: Final = 30.0  # longest wait for a peer or an answer
 LISTEN_S: Final = 5.0  # to check a robot against a model
 IMU_TOPIC: Final = "auto"  # `imu` or `imu/data`, if the model was made with a gyro
 POSE_TYPE: Final = "none"  # no pose sensor
+
+# the page of nics watch
+PAGE_PORT: Final = 8765

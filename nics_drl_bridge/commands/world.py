@@ -27,7 +27,7 @@ PICTURES = (".png", ".pgm", ".bmp")
 # default height of the plane to import [m]: TurtleBot3's lidar is at 0.18 m
 HEIGHT = 0.2
 CLEARANCE = 0.1  # default [m]: imported worlds are often narrow
-NEAREST = 2.0  # default of the minimum distance from start to goal [m]
+NEAREST = 2.0  # default minimum distance from start to goal [m]
 NAV2 = {
     "origin": [0.0, 0.0, 0.0],
     "negate": 0,
@@ -84,7 +84,8 @@ def import_(
     goal_distance: Annotated[
         tuple[float, float] | None,
         Option(
-            metavar="LEAST GREATEST", help="From start to goal [m]; else from 2 m on."
+            metavar="LEAST GREATEST",
+            help=f"From start to goal [m]; else from {NEAREST:g} m on.",
         ),
     ] = None,
     clearance: Annotated[
