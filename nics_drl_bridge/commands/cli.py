@@ -41,15 +41,15 @@ from nics_drl_bridge.exit_codes import EXIT_BAD_INPUT, EXIT_INTERRUPTED
 
 
 class OneWordForARobot(TyperGroup):
-    """Commands for which `--robot` and `--model` are the same option: giving both is refused."""
+    """Refuses `--robot` and `--model` with different values: they are the same option."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parses the words of a command line. Raises UsageError if both options are given."""
+        """Parses a command line. Raises UsageError if the two options differ."""
         robots = [value for word in ROBOT_OPTIONS for value in read_option(word, args)]
         if len(set(robots)) > 1:
             names = " and ".join(map(repr, robots))
             ctx.fail(
-                f"--robot and --model are one option, and name {names}; give one of them"
+                f"--robot and --model are the same option, but got {names}; give only one."
             )
         return super().parse_args(ctx, args)
 
@@ -89,8 +89,8 @@ def _declare_options(
     sensor_kind: Annotated[
         list[str] | None,
         Option(
-            help="Import a kind of sensor of your own, which files may then name: "
-            "path/to/file.py:ClassName; repeatable, before the command."
+            help="Import your own kind of sensor, path/to/file.py:ClassName, so that files can "
+            "name it. Repeatable; give it before the command."
         ),
     ] = None,
 ) -> None:
@@ -134,7 +134,7 @@ complete(app)
 
 
 def main() -> None:
-    """Runs the command line; a wrong option, too, gives one sentence and exit code 2."""
+    """Runs the command line; a wrong option prints one sentence and exits with code 2."""
     try:
         code = app(prog_name="nics", standalone_mode=False)
     except typer.Abort as abort:
@@ -154,10 +154,8 @@ def main() -> None:
         # The message is empty if the help has been shown.
         message = error.format_message().strip()
         if message:
-            message = shorten(
-                message.rstrip(".?").replace("Value error, ", ""), LONGEST
-            )
-            typer.echo(f"nics: {message}; see `nics --help`.", err=True)
+            message = shorten(message, LONGEST)
+            typer.echo(f"nics: {message} (see `nics --help`)", err=True)
         raise SystemExit(EXIT_BAD_INPUT) from None
     raise SystemExit(code if isinstance(code, int) else 0)
 

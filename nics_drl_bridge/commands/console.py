@@ -14,9 +14,9 @@ from typing import Annotated, Any
 import typer
 from typer import Option
 
-from nics_drl_bridge import extensions
+from nics_drl_bridge import defaults, extensions
 from nics_drl_bridge.commands.interrupts import was_interrupted
-from nics_drl_bridge.errors import MISSING_ROS, BridgeError, ConfigError, suggest
+from nics_drl_bridge.errors import BridgeError, ConfigError, suggest
 from nics_drl_bridge.exit_codes import EXIT_BAD_INPUT, EXIT_INTERRUPTED
 from nics_drl_bridge.files import format_json
 from nics_drl_bridge.robot import DEFAULT_ROBOT
@@ -99,7 +99,7 @@ WorldOption = Annotated[
         "--world",
         "--scene",
         autocompletion=WORLDS,
-        help="A shipped world (arena) or a YAML file.",
+        help=f"A shipped world ({defaults.WORLD}) or a YAML file.",
     ),
 ]
 JsonOption = Annotated[bool, Option("--json", help="Print one JSON object instead.")]
@@ -272,17 +272,6 @@ def tell_replaced(file: Path) -> None:
         typer.echo(
             f"{file.parent}: the {file.name} that is there will be replaced", err=True
         )
-
-
-@contextmanager
-def needs_ros(what: str) -> Iterator[None]:
-    """Turns the ImportError of the nodes without ROS 2 into a ConfigError of one sentence."""
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        if (error.name or "").startswith("nics_drl_bridge"):
-            raise
-        raise ConfigError(f"{what} {MISSING_ROS.format(module=error.name)}") from None
 
 
 def format_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

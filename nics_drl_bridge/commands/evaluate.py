@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
-from nics_drl_bridge import defaults
+from nics_drl_bridge import defaults, extensions
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import check_above, format_json, write_bytes, write_text
@@ -174,7 +174,7 @@ def evaluate(
         driven = partial(
             driving.drive_vehicle, order, place, arm, tell, partial(_ask, yes)
         )
-        with console.needs_ros("nics evaluate --hardware"):
+        with extensions.require_modules("nics evaluate --hardware"):
             evaluated = [driven(**options)]
     else:
         with console.show_progress("opening robot and policies") as advance:

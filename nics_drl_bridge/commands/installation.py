@@ -8,8 +8,12 @@ from importlib.metadata import PackageNotFoundError, metadata, version
 from importlib.util import find_spec
 from typing import NamedTuple
 
-from nics_drl_bridge.errors import MISSING_ROS
-from nics_drl_bridge.extensions import PACKAGE, TRAINING, find_lacking
+from nics_drl_bridge.extensions import (
+    INSTALL_ROS,
+    PACKAGE,
+    TRAINING,
+    find_lacking,
+)
 from nics_drl_bridge.nodes.message_packages import how_to_install
 
 EXTRAS = {  # extra -> purpose, modules that it installs
@@ -85,15 +89,8 @@ def _check_extras() -> list[Check]:
 
 def _check_ros() -> list[Check]:
     if find_spec("rclpy") is None:
-        reason = MISSING_ROS.format(module="rclpy").partition("; ")[2].rstrip(".")
-        return [
-            Check(
-                "ROS 2",
-                False,
-                "driving over topics: none is sourced or installed",
-                reason,
-            )
-        ]
+        text = "driving over topics: none is sourced or installed"
+        return [Check("ROS 2", False, text, INSTALL_ROS)]
     try:
         release = version("rclpy")
     except PackageNotFoundError:

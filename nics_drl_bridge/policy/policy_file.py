@@ -160,9 +160,7 @@ class PolicyFile:
             try:
                 plan_of(lidar, self.contract.scan)
             except ConfigError as error:
-                reason = (
-                    f"needs more than this lidar sees: {str(error).partition(';')[0]}"
-                )
+                reason = f"needs more than this lidar sees: {error.reason}"
                 fix = "use another lidar, or a policy trained for this one"
                 raise PolicyError(str(self.path), "scan", f"{reason}; {fix}.") from None
         self._compare(theirs)
