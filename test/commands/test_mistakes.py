@@ -15,7 +15,7 @@ import pytest
 from command_line import nics
 from numba.core.caching import CacheImpl
 
-from nics_drl_bridge.commands import start
+from nics_drl_bridge.commands import interrupts, start
 from nics_drl_bridge.config import share_folder
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.recording import textbook
@@ -253,7 +253,7 @@ def test_a_run_with_other_settings_is_not_overwritten(folder):
 @pytest.fixture
 def signals():
     """Handlers of signals as they were before a test that takes them."""
-    numbers = list(start.ENDING)
+    numbers = list(interrupts.ENDING)
     before = [signal.getsignal(number) for number in numbers]
     yield
     for number, handler in zip(numbers, before, strict=True):
