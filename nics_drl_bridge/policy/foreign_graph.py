@@ -79,12 +79,12 @@ class Composer:
         build.weights += theirs.graph.initializer
         command = self._command()
         low, high = self._task.command_limits
-        command = build.cut(command, (low, high))
+        command = build.clamp(command, (low, high))
         build.add("Identity", command, name=onnx_graph.COMMAND)
         action = build.affine(
             command, 2.0 / (high - low), -1.0 - 2.0 * low / (high - low)
         )
-        build.add("Identity", build.cut(action, (-1.0, 1.0)), name=onnx_graph.ACTION)
+        build.add("Identity", build.clamp(action, (-1.0, 1.0)), name=onnx_graph.ACTION)
         if sizes:
             self._remember()
             build.join([self._next[key] for key in sizes], name=onnx_graph.STATE_OUT)
@@ -263,7 +263,7 @@ class Composer:
             )
         if not np.any(start):
             return past
-        return self._build.blend(
+        return self._build.select(
             self._past["begun"], past, self._build.constant([start])
         )
 
@@ -277,7 +277,7 @@ class Composer:
         key = f"history {name} {k}"
         first = build.join([row] * (part.history - 1))
         # oldest first
-        past = build.blend(self._past["begun"], self._past[key], first)
+        past = build.select(self._past["begun"], self._past[key], first)
         rows = build.join([past, row])
         self._next[key] = build.pick(rows, range(size, size * part.history))
         if part.newest_first:
@@ -396,15 +396,17 @@ class Composer:
     def _element(self, name: str, command: foreign_mapping.OutputCommand) -> str:
         build = self._build
         if command.of is None:
-            return build.cut(build.constant([[command.add]]), command.clip)
+            return build.clamp(build.constant([[command.add]]), command.clip)
         size = self._output_size(command.of)
         if command.index >= size:
             reason = f"is {command.index}, but the output {command.of!r} has only {size} elements."
             raise self._fault(f"outputs.{name}.index", reason)
-        row = build.cut(
+        row = build.clamp(
             build.pick(self._flat(command.of), [command.index]), command.limits
         )
-        return build.cut(build.affine(row, command.multiply, command.add), command.clip)
+        return build.clamp(
+            build.affine(row, command.multiply, command.add), command.clip
+        )
 
     def _of_twist(self, twist: Sequence[str], robot: RobotSpec) -> str:
         """Converts forward, left and turn to a row of commands, see `geometry.Bicycle.command`."""

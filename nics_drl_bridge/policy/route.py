@@ -67,7 +67,7 @@ def _coarsen(grid: GridMap, parts: int) -> GridMap:
 
 
 def _find_cell(grid: GridMap, name: str, point: ArrayLike) -> Cell:
-    """Returns the cell of a point x, y [m]. Raises ConfigError with its name if it is off the map."""
+    """Returns the cell of a point x, y [m]. Raises ConfigError if it is off the map."""
     row, column = grid.world_to_cell(point).tolist()
     rows, columns = grid.cells.shape
     if not (0 <= row < rows and 0 <= column < columns):
