@@ -156,10 +156,8 @@ class Composer:
             model = onnx.compose.add_prefix(model, THEIRS)
             self._made = graph_folding.fold_shapes(model.graph, max(versions))
         except Exception as error:  # noqa: BLE001 - a damaged graph raises anything
-            words = " ".join(str(error).split())[:120]
-            raise self._fault(
-                "network", f"its shapes are inconsistent ({words})."
-            ) from None
+            reason = f"its shapes are inconsistent ({onnx_graph.quote(error)})."
+            raise self._fault("network", reason) from None
         return model
 
     def _shape(self, name: str) -> tuple[int, ...]:

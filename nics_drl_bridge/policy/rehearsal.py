@@ -168,10 +168,8 @@ def _do(told: dict[str, Any], data: bytes) -> None:
         try:
             fold_shapes(model.graph, told["opset"])
         except Exception as error:
-            words = " ".join(str(error).split())[:120]
-            raise PolicyError(
-                source, "network", f"its shapes do not fit ({words})."
-            ) from error
+            reason = f"its shapes do not fit ({onnx_graph.quote(error)})."
+            raise PolicyError(source, "network", reason) from error
         return
     needs = GraphNeeds(**told["needs"])
     *shape, text = told["seen"]
