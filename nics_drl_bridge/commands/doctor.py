@@ -100,7 +100,7 @@ def _tell_installation(as_json: bool) -> None:
     console.print_line(
         as_json,
         console.format_table(heads, rows),
-        checks=[each._asdict() for each in results],
+        checks=[check._asdict() for check in results],
     )
 
 

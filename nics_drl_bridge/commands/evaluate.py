@@ -149,7 +149,7 @@ def evaluate(
 
     count = episodes or (1 if hardware else defaults.EVALUATION_EPISODES)
     tell = partial(typer.echo, err=True)
-    under = Conditions(lidar, randomisation, gate, kind=task)
+    conditions = Conditions(lidar, randomisation, gate, kind=task)
     order = driving.EvaluationOrder(
         policies,
         out,
@@ -158,7 +158,7 @@ def evaluate(
         count,
         seed,
         tuple(dict.fromkeys(places or ())),
-        under,
+        conditions,
     )
     console.tell_replaced(out / driving.EVALUATION)
     if hardware:
@@ -268,12 +268,10 @@ def _replay_shadow(
         left_out = ", ".join(
             f"{count} {why}" for why, count in comparison.skipped.items() if count
         )
-        anew = (
-            f"; its state began anew after {comparison.resets} gaps"
-            if comparison.resets
-            else ""
-        )
-        lines.append(f"{compared}; left out: {left_out or 'none'}{anew}")
+        line = f"{compared}; left out: {left_out or 'none'}"
+        if comparison.resets:
+            line += f"; its state was reset after {comparison.resets} gaps"
+        lines.append(line)
     heads = (
         "policy",
         "command",

@@ -111,7 +111,7 @@ def _check_kernels() -> Check:
         import_module(f"{PACKAGE}.{name}")
     from nics_drl_bridge.kernels import KERNELS, SECONDS_EACH
 
-    cold = sum(not each.is_warm for each in KERNELS)
+    cold = sum(not kernel.is_warm for kernel in KERNELS)
     text = f"{len(KERNELS) - cold} of {len(KERNELS)} are compiled"
     seconds = max(1, round(cold * SECONDS_EACH))
     fix = f"nics warmup, about {seconds} s; else each is compiled at its first use"

@@ -189,7 +189,7 @@ def _read_standing(
         for group in standing.obstacles
     ]
     head = [f"What stands in {file.name} at a height of {height:g} m."]
-    head += [f"Left out: {each}." for each in standing.left_out]
+    head += [f"Left out: {reason}." for reason in standing.left_out]
     derived = {"name": file.stem, "bounds": field, "obstacles": groups}
     text = _format_world(file, head, derived | keys, (x2 - x1, y2 - y1))
     line = (
@@ -286,7 +286,7 @@ def _format_flow(value: Any) -> str:
     if isinstance(value, dict):
         return (
             "{"
-            + ", ".join(f"{key}: {_format_flow(each)}" for key, each in value.items())
+            + ", ".join(f"{key}: {_format_flow(item)}" for key, item in value.items())
             + "}"
         )
     if isinstance(value, list | tuple):

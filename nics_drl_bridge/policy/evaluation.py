@@ -349,7 +349,7 @@ class Tally(Summary):
             ends = [value]
             if isinstance(value, ConfidenceInterval):
                 ends = list(vars(value).values())
-            known = [each if math.isfinite(each) else None for each in ends]
+            known = [value if math.isfinite(value) else None for value in ends]
             figures[name] = known if isinstance(value, ConfidenceInterval) else known[0]
         return figures
 

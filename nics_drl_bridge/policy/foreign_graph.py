@@ -253,9 +253,8 @@ class Composer:
     def _begun(self, key: str, start: Any, place: str = "") -> str:
         """Returns the name of a state entry, replaced by its start value in the first step."""
         past = self._past[key]
-        if isinstance(start, tuple) and len(start) != (
-            size := self._state_sizes()[key]
-        ):
+        size = self._state_sizes()[key]
+        if isinstance(start, tuple) and len(start) != size:
             raise self._fault(
                 place, f"has {len(start)} numbers, but the state has {size}."
             )

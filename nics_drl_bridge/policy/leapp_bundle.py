@@ -297,18 +297,23 @@ def _merged(bundle: Bundle) -> Any:
     for name in description.models:
         model = onnx.compose.add_prefix(bundle.models[name], f"{name}/")
         held = {tensor.name for tensor in model.graph.initializer}
-        for one in (each for each in model.graph.input if each.name not in held):
-            if one.name in outside:
-                own = onnx.ValueInfoProto()
-                own.CopyFrom(one)
-                own.name = source = bundle.name_of(one.name)
-                graph.input.append(own)
-            elif (source := source_of.get(one.name, "")) not in ready:
-                reason = f"no earlier node supplies {one.name!r}; connect it."
-                raise bundle.fault("pipeline.data_flow", reason)
-            if source != one.name:
+        for needed in model.graph.input:
+            if needed.name in held:
+                continue
+            if needed.name in outside:
+                source = bundle.name_of(needed.name)
+                graph_input = onnx.ValueInfoProto()
+                graph_input.CopyFrom(needed)
+                graph_input.name = source
+                graph.input.append(graph_input)
+            else:
+                source = source_of.get(needed.name, "")
+                if source not in ready:
+                    reason = f"no earlier node supplies {needed.name!r}; connect it."
+                    raise bundle.fault("pipeline.data_flow", reason)
+            if source != needed.name:
                 graph.node.append(
-                    onnx.helper.make_node("Identity", [source], [one.name])
+                    onnx.helper.make_node("Identity", [source], [needed.name])
                 )
         graph.node.extend(model.graph.node)
         graph.initializer.extend(model.graph.initializer)

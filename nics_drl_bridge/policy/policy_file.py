@@ -134,7 +134,11 @@ class PolicyFile:
                 sensor.name: sensor.model_dump(mode="json") for sensor in model.sensors
             }
             self._compare(
-                {"sensors": [known.get(each.name) for each in self.contract.sensors]}
+                {
+                    "sensors": [
+                        known.get(sensor.name) for sensor in self.contract.sensors
+                    ]
+                }
             )
             period = model.control_period
             if abs(self.contract.control_period - period) > PERIOD_TOLERANCE:
@@ -189,7 +193,7 @@ def load_policy(path: str | Path) -> PolicyFile:
         file = contracts.shipped() / f"{path}{suffix}"
         if not file.is_file():
             hint = suggest(
-                str(path), (each.stem for each in file.parent.glob(f"*{suffix}"))
+                str(path), (shipped.stem for shipped in file.parent.glob(f"*{suffix}"))
             )
             raise PolicyError(
                 str(path), "file", f"is neither a file nor a shipped policy; {hint}"

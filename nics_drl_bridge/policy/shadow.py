@@ -160,7 +160,8 @@ def _answered(
     resets = 0
     skipped = {"no command was driven": 0, "at the goal": 0, "touching something": 0}
     for moment, goal in zip(moments, goals, strict=True):
-        verdict = task.judge(moment.view, memory := {"goal": goal})
+        memory = {"goal": goal}
+        verdict = task.judge(moment.view, memory)
         # A state also needs the observations that are not compared.
         if not (verdict.touched or verdict.reached):
             resets += bool(resume(policy, moment.stamp_ns * S_PER_NS))

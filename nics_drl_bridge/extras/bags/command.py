@@ -78,7 +78,9 @@ def info(
         "clock",
         "delay [ms]",
     )
-    table = console.format_table(heads, [_format_row(each) for each in contents.topics])
+    table = console.format_table(
+        heads, [_format_row(topic) for topic in contents.topics]
+    )
     console.print_line(
         as_json, f"{line}\n{table}", **asdict(contents) | {"path": str(path)}
     )

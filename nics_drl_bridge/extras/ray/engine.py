@@ -335,7 +335,8 @@ class Learning:
                 self._check_silence(now - heard, about)
                 continue
             heard = now
-            tell(progress := self._progress(first, now - begin))
+            progress = self._progress(first, now - begin)
+            tell(progress)
             for name in ("success", "collision", "steps_per_s", "env_share"):
                 logger.record(f"rollout/{name}", getattr(progress, name))
             logger.dump(self.steps)
