@@ -70,10 +70,10 @@ def _check_python() -> Check:
     low, high = (
         tuple(map(int, part.lstrip("<>=").split(".")[:2])) for part in parts[:2]
     )
-    found = sys.version_info[:2]
+    running = sys.version_info[:2]
     fix = f"use a Python {needed}"
     return Check(
-        "Python", low <= found < high, ".".join(map(str, sys.version_info[:3])), fix
+        "Python", low <= running < high, ".".join(map(str, sys.version_info[:3])), fix
     )
 
 

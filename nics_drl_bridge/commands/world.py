@@ -274,10 +274,10 @@ def _format_world(
         reason = f"its {obstacles} bodies make a larger file than is read"
         fix = "leave some out by --without MODEL, or split the world"
         raise ConfigError(f"{file}: {reason}; {fix}.") from None
-    found = validate(data, World, made)
-    if found.map is None:
-        found._file = made
-        check_places(found)
+    checked_world = validate(data, World, made)
+    if checked_world.map is None:
+        checked_world._file = made
+        check_places(checked_world)
     return text
 
 
@@ -345,12 +345,12 @@ def _check_overwrite(worlds: Any, given: Path, *written: Path) -> None:
             Path(member.source),
             *(files_of(member.map) if member.map else ()),
         )
-        for file in {each.resolve() for each in written} & {
-            each.resolve() for each in sources
-        }:
-            raise ConfigError(
-                f"{file}: the world itself is made of it; name another as --out."
-            )
+        own_files = {path.resolve() for path in sources}
+        for file in written:
+            if file.resolve() in own_files:
+                raise ConfigError(
+                    f"{file.resolve()}: is a file of the world itself; give another --out."
+                )
 
 
 @world.command("map")

@@ -245,9 +245,10 @@ def read_contract(text: str, source: str) -> Contract:
         raise PolicyError(
             source, "metadata", f"{reason}; export the policy again."
         ) from None
-    given = data.get("format") if isinstance(data, dict) else None
-    if given != FORMAT:
-        reason = f"is {reprlib.repr(given)}, not {FORMAT!r}; export the policy with this version."
+    file_format = data.get("format") if isinstance(data, dict) else None
+    if file_format != FORMAT:
+        fix = "export the policy with this version"
+        reason = f"is {reprlib.repr(file_format)}, not {FORMAT!r}; {fix}."
         raise PolicyError(source, "format", reason)
     try:
         # A missing field can't be added to a signed file.

@@ -174,8 +174,8 @@ class Composer:
         sizes = [size or 1 for size in sizes]
         if needed is not None and math.prod(sizes) != needed:
             parts = self._mapping.inputs[name].parts
-            each = ", ".join(f"{part.of} {self._part_size(part)}" for part in parts)
-            reason = f"the network takes {tuple(sizes)}, but the parts have {needed} ({each})."
+            listed = ", ".join(f"{part.of} {self._part_size(part)}" for part in parts)
+            reason = f"the network takes {tuple(sizes)}, but the parts have {needed} ({listed})."
             raise self._fault(f"inputs.{name}", reason)
         return tuple(sizes)
 

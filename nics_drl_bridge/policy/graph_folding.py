@@ -41,8 +41,10 @@ def fold_shapes(graph: Any, opset: int) -> dict[str, Shape]:
     for node in nodes:
         node.ClearField("domain")  # "" and "ai.onnx" are the same domain
         schema = defs.get_schema(node.op_type, opset)
-        given = {name: types[name] for name in node.input if name}
-        made = infer_node_outputs(schema, node, given, known, opset_imports=imports)
+        input_types = {name: types[name] for name in node.input if name}
+        made = infer_node_outputs(
+            schema, node, input_types, known, opset_imports=imports
+        )
         if any(len(_shape(one)) > MOST_AXES for one in made.values()):
             raise ValueError(f"{node.op_type} returns more than {MOST_AXES} dimensions")
         types |= made

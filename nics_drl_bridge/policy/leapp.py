@@ -158,17 +158,17 @@ def restored(model: Any) -> bytes | None:
 
     The seal in the file itself shows whether it is intact.
     """
-    found = [entry for entry in model.metadata_props if entry.key == TAKEN]
-    if len(found) != 1:
+    entries = [entry for entry in model.metadata_props if entry.key == TAKEN]
+    if len(entries) != 1:
         return None
     taken = onnx.ValueInfoProto()
     ours = onnx.ModelProto()
     try:
-        taken.ParseFromString(base64.b64decode(found[0].value))
+        taken.ParseFromString(base64.b64decode(entries[0].value))
     except (ValueError, DecodeError):
         return None
     ours.CopyFrom(model)
-    ours.metadata_props.remove(found[0])
+    ours.metadata_props.remove(entries[0])
     first = next(
         (k for k, n in enumerate(ours.graph.node) if onnx_graph.INPUT in n.output), -1
     )

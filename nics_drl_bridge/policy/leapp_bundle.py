@@ -63,10 +63,10 @@ class Tensor(Open):
     @property
     def names(self) -> list[str]:
         """Names of the elements; empty if there are none."""
-        given = self.element_names
-        while isinstance(given, list) and given and isinstance(given[-1], list):
-            given = given[-1]
-        return [str(name) for name in given] if isinstance(given, list) else []
+        names = self.element_names
+        while isinstance(names, list) and names and isinstance(names[-1], list):
+            names = names[-1]
+        return [str(name) for name in names] if isinstance(names, list) else []
 
 
 class Parameters(Open):
@@ -151,7 +151,7 @@ class Bundle:
         return end if sum(one.endswith(f"/{short}") for one in set(ends)) > 1 else short
 
     def _entries(self, side: str, ends: dict[str, list[str]]) -> dict[str, Tensor]:
-        found = {}
+        entries = {}
         for node, names in ends.items():
             if node not in self.description.models:
                 fix = suggest(node, self.description.models)
@@ -165,8 +165,8 @@ class Bundle:
                     raise self.fault(
                         f"pipeline.{side}.{node}", f"has no {name!r}; {fix}"
                     )
-                found[self.name_of(f"{node}/{name}")] = known[name]
-        return found
+                entries[self.name_of(f"{node}/{name}")] = known[name]
+        return entries
 
     def _states(self) -> dict[str, ForeignState]:
         pipeline = self.description.pipeline
@@ -189,20 +189,20 @@ class Bundle:
             (size,) = struct.unpack_from("<Q", data)
             head = json.loads(data[8 : 8 + size])
             kinds = {"F32": "<f4", "F64": "<f8", "I64": "<i8", "I32": "<i4"}
-            found = {}
+            arrays = {}
             for key, entry in head.items():
                 if key != "__metadata__":
                     begin, end = entry["data_offsets"]
                     values = np.frombuffer(
                         data[8 + size :][begin:end], kinds[entry["dtype"]]
                     )
-                    found[key] = tuple(values.astype(float).tolist())
+                    arrays[key] = tuple(values.astype(float).tolist())
         except (struct.error, ValueError, KeyError, TypeError, AttributeError):
             reason = (
                 f"{name!r} is not a valid safetensors file; export the bundle again."
             )
             raise self.fault("pipeline.initial_values", reason) from None
-        return found
+        return arrays
 
     def fault(self, place: str, reason: str) -> PolicyError:
         """Makes the error for a place in the YAML file."""
@@ -218,15 +218,13 @@ def description_of(place: Path) -> Path | None:
         reason = "is not a YAML file; give a LEAPP bundle, or the mapping of a foreign policy."
         raise PolicyError(str(place), "file", reason)
     files = sorted(place.glob("*.yaml")) if place.is_dir() else [place]
-    found = [
+    descriptions = [
         file for file in files if "models" in parse_yaml(read_text(file), str(file))
     ]
-    if place.is_dir() and len(found) != 1:
-        reason = (
-            f"contains {len(found)} bundle descriptions; give the path of a YAML file."
-        )
+    if place.is_dir() and len(descriptions) != 1:
+        reason = f"contains {len(descriptions)} bundle descriptions; give the path of a YAML file."
         raise PolicyError(str(place), "file", reason)
-    return found[0] if found else None
+    return descriptions[0] if descriptions else None
 
 
 def read_bundle(path: Path) -> Bundle:
@@ -239,20 +237,16 @@ def read_bundle(path: Path) -> Bundle:
     digests = []
     for name, node in description.models.items():
         place = f"models.{name}.parameters"
-        given = node.parameters
-        if given.backend != "onnx":
-            reason = (
-                f"is {given.backend!r}, which is not supported; export it with 'onnx'."
-            )
+        parameters = node.parameters
+        if parameters.backend != "onnx":
+            reason = f"is {parameters.backend!r}, which is not supported; export it with 'onnx'."
             raise bundle.fault(f"{place}.backend", reason)
-        data = _read(bundle, given.model_path, f"{place}.model_path")
+        data = _read(bundle, parameters.model_path, f"{place}.model_path")
         digests.append(hash_bytes(data))
-        if digests[-1] != given.sha256sum:
-            reason = (
-                f"does not match {given.model_path!r}, which was changed or damaged."
-            )
+        if digests[-1] != parameters.sha256sum:
+            reason = f"does not match {parameters.model_path!r}, which was changed or damaged."
             raise bundle.fault(f"{place}.sha256sum", reason)
-        file = str(path.parent / given.model_path)
+        file = str(path.parent / parameters.model_path)
         rehearsal.rehearse_network(data, file)
         models[name] = onnx_graph.parsed(data, file)
         onnx_graph.check_graph(models[name], file)

@@ -66,9 +66,9 @@ class Mppi:
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """Plans the actions; see `Policy`."""
-        given = self._seen(observation)
-        out = np.empty((len(given[0]), len(self.task.robot.command)))
-        self._plan(out, *given)
+        parts = self._seen(observation)
+        out = np.empty((len(parts[0]), len(self.task.robot.command)))
+        self._plan(out, *parts)
         actions = out.astype(np.float32)
         return actions[0] if observation.ndim == 1 else actions
 

@@ -102,12 +102,12 @@ def settings_for(task: str, name: str | None, changes: dict[str, Any]) -> Fitted
     Raises ConfigError, and ModelError if there is no such robot.
     """
     robot = changes.get("robot")
-    told = list[str]()
+    notes = list[str]()
     shipped = list_shipped("training")
     own = f"{task}_{robot}" in shipped
     if name is None and robot is not None and not own and task == OWN_TASK:
         name = f"own_{kin(open_model(robot).robot)}"
-        told.append(
+        notes.append(
             f"settings {name!r}, because the robot {robot!r} has none of its own"
         )
     settings = recordings.chosen_settings(task, name, changes)
@@ -115,7 +115,7 @@ def settings_for(task: str, name: str | None, changes: dict[str, Any]) -> Fitted
         name in shipped and recordings.load_training(str(name)).robot != settings.robot
     )
     made = fitted(settings, open_model(settings.robot, settings.lidar), inherited)
-    return Fitted(made.settings, (*told, *made.told))
+    return Fitted(made.settings, (*notes, *made.told))
 
 
 def fitted(

@@ -43,7 +43,7 @@ class Shadow:
 
     def differences(self) -> dict[str, dict[str, float]]:
         """Returns per command statistics of policy minus drive, and the rate of opposite signs."""
-        found = {}
+        figures_by_command = {}
         for c, name in enumerate(self.names):
             one = self.policy[:, c]
             other = self.driven[:, c]
@@ -55,14 +55,14 @@ class Shadow:
                 opposite = (one[signed] * other[signed] < 0.0).mean()
             else:
                 opposite = 0.0
-            found[name] = {
+            figures_by_command[name] = {
                 "mean": float(gap.mean()),
                 "mean_size": float(size.mean()),
                 **{f"p{q}": float(np.percentile(size, q)) for q in PERCENTILES},
                 "greatest": float(size.max()),
                 "opposite": float(opposite),
             }
-        return found
+        return figures_by_command
 
 
 @dataclass

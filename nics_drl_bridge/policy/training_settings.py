@@ -188,10 +188,10 @@ def chosen_settings(
         changed["worlds"] = dict.fromkeys(worlds, max(1, base.num_envs // len(worlds)))
     engine = changed.pop("engine", None)
     if engine:
-        given = changed.get("algorithm", base.algorithm)
-        if engine == "lean" and given != "ppo":
+        algorithm = changed.get("algorithm", base.algorithm)
+        if engine == "lean" and algorithm != "ppo":
             raise ConfigError(
-                f"--engine lean requires ppo, not {given!r}; leave it out."
+                f"--engine lean requires ppo, not {algorithm!r}; leave it out."
             )
         changed["ppo"] = changed.get("ppo", {}) | {"engine": engine}
     return validate(changed, TrainingSettings, "training settings")

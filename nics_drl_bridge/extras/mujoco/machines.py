@@ -209,8 +209,8 @@ def _make_ackermann(p: Parameters, step: float, physics: Physics) -> Machine:
         return np.array([speed / radius, np.arctan(left), np.arctan(right)])
 
     def measured(position: Array, speed: Array) -> Array:
-        each = np.tan(position[2:])
-        middle = each / (1.0 + half_ratio * np.array([1.0, -1.0]) * each)
+        tangents = np.tan(position[2:])
+        middle = tangents / (1.0 + half_ratio * np.array([1.0, -1.0]) * tangents)
         return np.array(
             [0.5 * radius * (speed[0] + speed[1]), np.arctan(np.mean(middle))]
         )

@@ -312,8 +312,8 @@ class Learning:
     @property
     def learner(self) -> Any:
         """RLlib's learner, which runs in this process."""
-        found = self.algorithm.learner_group.foreach_learner(lambda one: one)
-        return found.result_or_errors[0].get()
+        results = self.algorithm.learner_group.foreach_learner(lambda one: one)
+        return results.result_or_errors[0].get()
 
     @property
     def module(self) -> ActorCritic:
