@@ -45,7 +45,9 @@ class OneWordForARobot(TyperGroup):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parses a command line. Raises UsageError if the two options differ."""
-        robots = [value for word in ROBOT_OPTIONS for value in read_option(word, args)]
+        robots = []
+        for option in ROBOT_OPTIONS:
+            robots += read_option(option, args)
         if len(set(robots)) > 1:
             names = " and ".join(map(repr, robots))
             ctx.fail(
@@ -56,8 +58,13 @@ class OneWordForARobot(TyperGroup):
 
 def read_option(option: str, args: Sequence[str]) -> list[str]:
     """Returns the values of an option in a command line: `--robot X` or `--robot=X`."""
-    joined = [word.partition("=")[2] for word in args if word.startswith(f"{option}=")]
-    return joined + [args[k + 1] for k, word in enumerate(args[:-1]) if word == option]
+    values = []
+    for word, following in zip(args, [*args[1:], None], strict=True):
+        if word == option and following is not None:
+            values.append(following)
+        elif word.startswith(f"{option}="):
+            values.append(word.removeprefix(f"{option}="))
+    return values
 
 
 app = typer.Typer(

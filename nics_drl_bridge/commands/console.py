@@ -248,22 +248,26 @@ def report_in_one_sentence() -> Iterator[None]:
             raise typer.Exit(EXIT_INTERRUPTED) from None
         if not isinstance(error, Exception):
             raise
-        clause = extensions.explain_own_fault(error)
-        if isinstance(error, BridgeError):
-            clause = str(error)
-        if clause is None and isinstance(error, ImportError):
-            clause = extensions.explain_unmet(error)
-        elif (
-            not clause
-            and isinstance(error, OSError)
-            and not isinstance(error, BrokenPipeError)
-        ):
-            place = f"{error.filename}: " if error.filename else ""
-            clause = f"{place}{error.strerror or error}; choose another place."
+        clause = _explain_user_error(error)
         if clause is None:
             raise
         typer.echo(f"nics: {clause}", err=True)
         raise typer.Exit(EXIT_BAD_INPUT) from None
+
+
+def _explain_user_error(error: Exception) -> str | None:
+    """Returns a sentence about an error that the user can fix, or None."""
+    if isinstance(error, BridgeError):
+        return str(error)
+    clause = extensions.explain_own_fault(error)
+    if clause is not None:
+        return clause
+    if isinstance(error, ImportError):
+        return extensions.explain_unmet(error)
+    if isinstance(error, OSError) and not isinstance(error, BrokenPipeError):
+        place = f"{error.filename}: " if error.filename else ""
+        return f"{place}{error.strerror or error}; choose another place."
+    return None
 
 
 def tell_replaced(file: Path) -> None:
@@ -320,21 +324,24 @@ def show_progress(begin: str = "starting") -> Iterator[Tell]:
 
 @contextmanager
 def _print_progress_lines(begin: str) -> Iterator[Tell]:
-    now, over, since = [begin], threading.Event(), time.monotonic()
+    line = begin
+    ended = threading.Event()
+    begun_s = time.monotonic()
 
     def tell(what: str, done: int, total: int) -> None:
-        now[0] = f"{what}, {done:,} of {total:,}" if total else what
+        nonlocal line
+        line = f"{what}, {done:,} of {total:,}" if total else what
 
-    def speak() -> None:
-        patience = PATIENCE_S
-        while not over.wait(patience):
-            patience = REPEATED_S
-            typer.echo(f"{now[0]} ({time.monotonic() - since:.0f} s)", err=True)
+    def print_lines() -> None:
+        patience_s = PATIENCE_S
+        while not ended.wait(patience_s):
+            patience_s = REPEATED_S
+            typer.echo(f"{line} ({time.monotonic() - begun_s:.0f} s)", err=True)
 
-    thread = threading.Thread(target=speak, daemon=True)
+    thread = threading.Thread(target=print_lines, daemon=True)
     thread.start()
     try:
         yield tell
     finally:
-        over.set()
+        ended.set()
         thread.join()

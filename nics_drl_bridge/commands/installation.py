@@ -70,11 +70,9 @@ def _check_python() -> Check:
     low, high = (
         tuple(map(int, part.lstrip("<>=").split(".")[:2])) for part in parts[:2]
     )
-    running = sys.version_info[:2]
-    fix = f"use a Python {needed}"
-    return Check(
-        "Python", low <= running < high, ".".join(map(str, sys.version_info[:3])), fix
-    )
+    works = low <= sys.version_info[:2] < high
+    running = ".".join(map(str, sys.version_info[:3]))
+    return Check("Python", works, running, f"use a Python {needed}")
 
 
 def _check_extras() -> list[Check]:
