@@ -100,16 +100,19 @@ class Learned:
 
 @dataclass(frozen=True)
 class DemoEpisodes:
-    """Results of the evaluation, and the same episodes driven in process and over DDS."""
+    """Results of the evaluation, and the same episodes driven in process and over DDS.
 
-    summaries: Mapping[str, Summary]  # for the world as it is and perturbed
+    Without ROS 2, `there` is empty and `live` is None.
+    """
+
+    summaries: Mapping[str, Summary]  # by condition: `AS_IT_IS` and each perturbation
     here: Sequence[Episode]  # in process
     there: Sequence[Episode]  # over DDS
-    live: Episode | None  # deployed; without ROS 2 None, and `there` is empty
+    live: Episode | None  # the deployed episode
 
     @property
     def summary(self) -> Summary:
-        """Summary for the world as it is."""
+        """Summary of the unperturbed episodes."""
         return self.summaries[AS_IT_IS]
 
 
@@ -118,13 +121,13 @@ def run(plan: DemoPlan, say: Say) -> str:
     topics = find_spec("rclpy") is not None
     if not topics:
         say(f"only in process: the world 'dds' {extensions.explain_missing('rclpy')}")
-    took: dict[str, float] = {}
+    durations_s: dict[str, float] = {}
 
     def timed(name: str, part: Callable[..., R], *arguments: Any) -> R:
         begin = time.perf_counter()
         result = part(plan, *arguments, say)
-        took[name] = time.perf_counter() - begin
-        say(f"  {name} took {took[name]:.0f} s")
+        durations_s[name] = time.perf_counter() - begin
+        say(f"  {name} took {durations_s[name]:.0f} s")
         return result
 
     model, identified = timed("generating", _generate)
@@ -145,8 +148,8 @@ def run(plan: DemoPlan, say: Say) -> str:
         succeeded = [episode.seed for episode in there if episode.result == "success"]
         seed = succeeded[0] if succeeded else 0
         live = timed("deploying", _deploy, model, learned.policy, seed)
-    total = sum(took.values())
-    times = [(part, f"{s:.0f}") for part, s in {**took, "all": total}.items()]
+    durations_s["all"] = sum(durations_s.values())
+    times = [(part, f"{duration:.0f}") for part, duration in durations_s.items()]
     episodes = DemoEpisodes(summaries, here, there, live)
     sections = make_sections(plan, model, identified, learned, episodes)
     folded = html.make_details(

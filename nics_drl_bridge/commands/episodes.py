@@ -89,28 +89,30 @@ def drive_in(
 ) -> list[Episode]:
     """Drives episodes in one of `PLACES` and ends its node, if any. Raises BridgeError."""
     model = open_model(name)
-    drawn = conditions.ranges
     check_place(place, model.robot)
+    ranges = conditions.ranges
     if place == FAST:
-        backend_options = {"estimator": True, "randomisation": drawn}
-        env, opened = open_env(
-            policy, model, world, "sim", conditions, **backend_options
-        )
+        options: dict[str, Any] = {"estimator": True, "randomisation": ranges}
+        env, opened = open_env(policy, model, world, "sim", conditions, **options)
         with closing(env):
             return drive_all(env, opened, seeds, on_episode)
     from nics_drl_bridge.nodes.processes import NodeProcess, Witness, free_domain_id
 
     node = NODES[place]
     domain_id = free_domain_id()
-    parameters = {"model": name, "world": world, "mode": "lockstep"}
-    parameters["randomisation"] = conditions.randomisation or ""
+    parameters = {
+        "model": name,
+        "world": world,
+        "mode": "lockstep",
+        "randomisation": conditions.randomisation or "",
+    }
     options = {
         "domain_id": domain_id,
         "simulator": node,
         "timeout_s": START_S,
         "truth": True,
+        "randomisation": ranges,
     }
-    options["randomisation"] = drawn
     with (
         NodeProcess(node, logs, parameters, domain_id) as process,
         Witness(domain_id) as witness,
@@ -321,7 +323,7 @@ def judge_runs(
     among: Sequence[str] = (),
 ) -> Evaluated:
     """Computes a policy's statistics by place, and draws the first episodes into a folder."""
-    shown = {LABELS[place]: some[:panels] for place, some in runs.items()}
+    shown = {LABELS[place]: episodes[:panels] for place, episodes in runs.items()}
     picture = draw_trajectories(shown, world, model.robot.footprint_radius)
     write_bytes(out / f"trajectories_{shorten_name(policy, among)}.png", picture)
     return Evaluated(policy, runs, evaluation.tallies(runs, model.control_period))

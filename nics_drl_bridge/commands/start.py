@@ -1,4 +1,4 @@
-"""Entry point of `nics`: a missing or outdated library gives one sentence, not a traceback."""
+"""Entry point of `nics`: reports a missing or outdated library in one sentence."""
 
 import atexit
 import contextlib

@@ -93,7 +93,7 @@ class PolicyFile:
             raise cannot_run(str(self.path), error) from None
         if any(len(part) != len(rows) for part in out):
             reason = (
-                f"gives {[part.shape for part in out]} for {len(rows)} observations."
+                f"returns {[part.shape for part in out]} for {len(rows)} observations."
             )
             raise PolicyError(str(self.path), "graph", reason)
         return out
