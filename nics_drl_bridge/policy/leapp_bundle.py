@@ -136,19 +136,15 @@ class Bundle:
     def name_of(self, end: str) -> str:
         """Returns the name of `node/output` or `node/input` in the joined network."""
         pipeline = self.description.pipeline
-        ends = [
-            f"{node}/{name}"
-            for some in (pipeline.inputs, pipeline.outputs)
-            for node, names in some.items()
-            for name in names
-        ]
-        ends += [
-            one
-            for some in pipeline.feedback_flow.items()
-            for one in (some[0], *some[1])
-        ]
+        ends = set[str]()
+        for names_by_node in (pipeline.inputs, pipeline.outputs):
+            for node, names in names_by_node.items():
+                ends.update(f"{node}/{name}" for name in names)
+        for source, targets in pipeline.feedback_flow.items():
+            ends.update((source, *targets))
         short = end.partition("/")[2]
-        return end if sum(one.endswith(f"/{short}") for one in set(ends)) > 1 else short
+        namesakes = sum(other.endswith(f"/{short}") for other in ends)
+        return end if namesakes > 1 else short
 
     def _entries(self, side: str, ends: dict[str, list[str]]) -> dict[str, Tensor]:
         entries = {}
@@ -367,15 +363,11 @@ def mapping_of(bundle: Bundle, model: SimulatorModel) -> Data:
         data["inputs"][name] = {"parts": _parts(bundle, name, entry, data)}
     for name, entry in bundle.outputs.items():
         _add_commands(data["outputs"], name, entry, model)
-    if data["outputs"].keys() >= {"forward", "turn"}:
-        missing = []
-    else:
-        missing = ["forward", "turn"]
-    if missing and data["outputs"].keys() != {
-        command.name for command in model.robot.command
-    }:
+    outputs = data["outputs"].keys()
+    commands = {command.name for command in model.robot.command}
+    if not outputs >= {"forward", "turn"} and outputs != commands:
         kinds = ", ".join(
-            f"{name!r} of kind {one.kind!r}" for name, one in bundle.outputs.items()
+            f"{name!r} of kind {entry.kind!r}" for name, entry in bundle.outputs.items()
         )
         reason = f"{kinds}: none is marked as the robot's velocity; {MAPPING}."
         raise bundle.fault("pipeline.outputs", reason)
@@ -397,12 +389,16 @@ def _parts(bundle: Bundle, name: str, entry: Tensor, data: Data) -> list[Data]:
     # A pose without names is ambiguous: it may include a heading.
     if not names and len(meanings) == size and "pose" not in kind:
         names = list(meanings)
-    if not names or len(names) != size or not all(one in meanings for one in names):
-        told = f"kind {entry.kind!r}" + (f" with elements {names}" if names else "")
-        reason = f"{told} is not a known scan, goal or velocity of a robot; {MAPPING}."
+    if not names or len(names) != size or not all(name in meanings for name in names):
+        described = f"kind {entry.kind!r}"
+        if names:
+            described += f" with elements {names}"
+        reason = (
+            f"{described} is not a known scan, goal or velocity of a robot; {MAPPING}."
+        )
         raise bundle.fault(f"pipeline.inputs.{name}", reason)
     zero = {"of": ZERO, "value": 0.0}
-    return [zero if meanings[one] == ZERO else {"of": meanings[one]} for one in names]
+    return [zero if meanings[n] == ZERO else {"of": meanings[n]} for n in names]
 
 
 def _add_commands(
@@ -411,11 +407,11 @@ def _add_commands(
     meanings = DONE.get(entry.kind or "", {})
     size = math.prod(entry.shape or [0])
     names = entry.names or (list(meanings) if len(meanings) == size else [])
-    own = {command.name for command in model.robot.command}
-    for index, one in enumerate(names):
-        word = meanings.get(one, "").removeprefix("velocity.")
-        if entry.kind == "target/command" and one in own:
-            outputs[one] = {"of": name, "index": index}
+    commands = {command.name for command in model.robot.command}
+    for index, element in enumerate(names):
+        word = meanings.get(element, "").removeprefix("velocity.")
+        if entry.kind == "target/command" and element in commands:
+            outputs[element] = {"of": name, "index": index}
         elif word == "left" and not model.robot.moves_sideways:
             continue
         elif word and word != ZERO:
