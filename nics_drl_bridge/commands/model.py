@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Argument, Option
 
-from nics_drl_bridge import defaults, extensions
+from nics_drl_bridge import defaults
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.commands.first_checks import check_drive
 from nics_drl_bridge.config import parse_namespace
@@ -79,7 +79,7 @@ def record(
     check_drive(parameters)
     if not preview:
         # This comes first because ROS 2 from wheels restarts Python.
-        with extensions.require_modules("nics record"):
+        with console.needs_ros("nics record"):
             from nics_drl_bridge.nodes.record_node import record as drive
     lines = draw_preview(parameters)
     facts: dict[str, Any] = {"out": str(out), "robot": robot}
@@ -173,7 +173,7 @@ def inspect(
 ) -> None:
     """Lists the contents of any recording and drafts its mapping."""
     from nics_drl_bridge.files import write_text
-    from nics_drl_bridge.recording.guess import propose_mapping
+    from nics_drl_bridge.recording.guess import DOUBT, NOT_USED, propose_mapping
     from nics_drl_bridge.recording.readers import explain_no_mapping, open_source
     from nics_drl_bridge.recording.recording import is_recording
     from nics_drl_bridge.recording.survey import inspect_tables
@@ -183,26 +183,28 @@ def inspect(
     with open_source(source) as opened, console.show_progress(f"reading {source}"):
         tables = inspect_tables(opened)
     why = explain_no_mapping(source)
-    # A mapping can't name the arrays of a recording of this package.
-    draft = None if is_recording(source) else propose_mapping(tables)
-    written = None
-    if draft is not None and mapping is not None:
-        write_text(mapping, draft.text)
-        written = str(mapping)
-    doubts = [] if draft is None else draft.doubts
-    if as_json:
-        facts = {"tables": [asdict(table) for table in tables], "doubts": doubts}
-        facts |= {"mapping": written, "needs_mapping": not why}
-        typer.echo(format_json(facts))
-        return
+    is_own = is_recording(source)  # a mapping can't name its arrays
+    text = "" if is_own else propose_mapping(tables)
+    written = None if is_own else mapping
+    if written is not None:
+        write_text(written, text)
+    doubts = [
+        line.removeprefix(f"{DOUBT} ")
+        for line in text.splitlines()
+        if line.startswith(DOUBT)
+    ]
     needless = ""
     if why:
         needless = (
             f"{source}: {why}, and needs no mapping: nics generate {source} --out MODEL"
         )
-        typer.echo(needless)
-    for doubt in doubts:
-        typer.echo(doubt)
+    if as_json:
+        facts = {"tables": [asdict(table) for table in tables], "doubts": doubts}
+        facts |= {"mapping": written and str(written), "needs_mapping": not why}
+        typer.echo(format_json(facts))
+        return
+    for line in (*([needless] if needless else ()), *doubts):
+        typer.echo(line)
     for table in tables:
         findings = "".join(
             f"\n  {finding}" for finding in table.regularity + table.findings
@@ -211,16 +213,17 @@ def inspect(
         rows = [(c.name, f"{c.low:.6g}", f"{c.high:.6g}") for c in table.columns]
         if rows:
             typer.echo(console.format_table(("column", "least", "greatest"), rows))
-    if draft is None:
+    if is_own:
         typer.echo(
             f"no mapping was written: {needless}" if mapping is not None else needless
         )
         return
     if mapping is None:
-        typer.echo(f"A first mapping, to edit; --map FILE writes it:\n\n{draft.text}")
+        typer.echo(f"A first mapping, to edit; --map FILE writes it:\n\n{text}")
         return
-    for line in draft.unused:
-        typer.echo(line)
+    for line in text.splitlines():
+        if line.startswith(NOT_USED):
+            typer.echo(line.removeprefix("# "))
     typer.echo(
         f"a first mapping is in {mapping}: edit it, then nics import or nics generate"
     )

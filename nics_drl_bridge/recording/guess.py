@@ -33,6 +33,8 @@ from nics_drl_bridge.recording.survey import Survey, TableSurvey, split_unit
 from nics_drl_bridge.recording.switch_guess import Switch, guess_switch
 
 GUESSED = "# guessed"
+DOUBT = "# doubt:"
+NOT_USED = "# not used"
 NO_COMMAND = (
     "no command was recorded, that is: nothing here was sent to the robot, such as "
     "geometry_msgs/Twist on cmd_vel; record it together with the pose"
@@ -69,16 +71,8 @@ class _Draft(NamedTuple):
         return len(self.tables) == 1
 
 
-class MappingDraft(NamedTuple):
-    """A draft of a mapping; its text contains the other fields as comments."""
-
-    text: str  # YAML
-    doubts: list[str]
-    unused: list[str]  # for each table, the columns that the draft leaves out
-
-
-def propose_mapping(tables: Sequence[TableSurvey]) -> MappingDraft:
-    """Drafts a mapping; guesses are marked, and uncertain parts are left blank."""
+def propose_mapping(tables: Sequence[TableSurvey]) -> str:
+    """Drafts a mapping in YAML; guesses are marked, and uncertain parts are left blank."""
     pose = guess_pose(tables)
     guess = guess_command(tables, pose)
     times = [table.time for table in tables if table.time is not None]
@@ -94,10 +88,9 @@ def propose_mapping(tables: Sequence[TableSurvey]) -> MappingDraft:
     gyro = _find_free_yaw_rate(tables, guess)
     episode = guess_episode(tables)
     draft = _Draft(tables, pose, guess, switch, gyro, episode, common_time)
-    doubts = list(find_doubts(guess, poses))
+    lines = [f"{DOUBT} {doubt}" for doubt in find_doubts(guess, poses)]
     if not guess.listed:
-        doubts.append(NO_COMMAND)
-    lines = [f"# doubt: {doubt}" for doubt in doubts]
+        lines.append(f"{DOUBT} {NO_COMMAND}")
     lines.append(_write_robot(guess, _guess_radius(poses)))
     if common_time is not None:
         lines.append(f"time: {common_time}  {GUESSED}")
@@ -117,9 +110,8 @@ def propose_mapping(tables: Sequence[TableSurvey]) -> MappingDraft:
         lines.append(
             f"{write_imu_line(*gyro, draft.is_single, common_time)}  {GUESSED}"
         )
-    unused = list(_list_unused(draft))
-    lines += [f"# {line}" for line in unused]
-    return MappingDraft("\n".join(lines) + "\n", doubts, unused)
+    lines += _list_unused(draft)
+    return "\n".join(lines) + "\n"
 
 
 def _write_robot(guess: CommandGuess, radius: float) -> str:
@@ -243,7 +235,7 @@ def _find_free_yaw_rate(
 
 
 def _list_unused(draft: _Draft) -> Iterator[str]:
-    """Yields a line for each table with the columns of values that the draft does not use."""
+    """Yields a comment for each table with the columns of values that the draft does not use."""
     used = {
         (id(candidate.table), candidate.column.name)
         for candidate in draft.guess.listed.values()
@@ -266,7 +258,7 @@ def _list_unused(draft: _Draft) -> Iterator[str]:
         if len(unused) > MOST_LISTED:
             listed += f" and {len(unused) - MOST_LISTED} more"
         if unused:
-            yield f"not used: {place}{listed}"
+            yield f"{NOT_USED}: {place}{listed}"
 
 
 def _explain_unused(column: Survey) -> str:
