@@ -20,6 +20,12 @@ SHADOW_AHEAD_S: Final = 4.0  # default goal: the robot's position this much late
 CONFIRMED_BEYOND_M: Final = 5.0  # farther goals of a vehicle need confirmation
 VEHICLE_START: Final = "wait"  # until it is at the start; alternative: `present`
 
+# importing worlds
+IMPORT_CLEARANCE_M: Final = (
+    0.1  # around the footprint: imported worlds are often narrow
+)
+IMPORT_GOAL_DISTANCE_M: Final = 2.0  # minimum distance from start to goal
+
 # recording and identification
 DRIVE_S: Final = 60.0  # duration of an identification drive
 DRIVE_BOUND_M: Final = 2.0  # radius around the start that the robot stays within

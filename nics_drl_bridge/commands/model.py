@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Argument, Option
 
-from nics_drl_bridge import defaults
+from nics_drl_bridge import defaults, extensions
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.commands.first_checks import check_drive
 from nics_drl_bridge.config import parse_namespace
@@ -79,7 +79,7 @@ def record(
     check_drive(parameters)
     if not preview:
         # This comes first because ROS 2 from wheels restarts Python.
-        with console.needs_ros("nics record"):
+        with extensions.require_modules("nics record"):
             from nics_drl_bridge.nodes.record_node import record as drive
     lines = draw_preview(parameters)
     facts: dict[str, Any] = {"out": str(out), "robot": robot}
@@ -372,12 +372,10 @@ def generate(
         write_fit_page(out / "report.html", named, spec, identified, model.report)
         if pictures:
             write_pictures(spec, identified, out / "pictures")
-    lidar_line = f"its lidar is {model.lidar.name!r}"
-    if not (lidar or spec.lidar):
-        lidar_line += ", the default; choose another with --lidar"
+    why = "" if lidar or spec.lidar else ", the default; choose another with --lidar"
     lines = (
         f"{select_opening(model.report)}\n",
-        lidar_line,
+        f"its lidar is {model.lidar.name!r}{why}",
         f"all figures: {out / 'report.txt'}, with pictures: {out / 'report.html'}",
         f"model written to {out}",
     )

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 from typer import Argument, Option
 
+from nics_drl_bridge import defaults
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import format_json, write_text
@@ -26,8 +27,6 @@ MAPS = (".yaml", ".yml")
 PICTURES = (".png", ".pgm", ".bmp")
 # default height of the plane to import [m]: TurtleBot3's lidar is at 0.18 m
 HEIGHT = 0.2
-CLEARANCE = 0.1  # default [m]: imported worlds are often narrow
-NEAREST = 2.0  # default minimum distance from start to goal [m]
 NAV2 = {
     "origin": [0.0, 0.0, 0.0],
     "negate": 0,
@@ -85,12 +84,13 @@ def import_(
         tuple[float, float] | None,
         Option(
             metavar="LEAST GREATEST",
-            help=f"From start to goal [m]; else from {NEAREST:g} m on.",
+            help="From start to goal [m]; else from "
+            f"{defaults.IMPORT_GOAL_DISTANCE_M:g} m on.",
         ),
     ] = None,
     clearance: Annotated[
         float, Option(help="Free space around the footprint [m].")
-    ] = CLEARANCE,
+    ] = defaults.IMPORT_CLEARANCE_M,
     height: Annotated[
         float,
         Option(
@@ -249,7 +249,7 @@ def _format_world(
     if {"starts", "goals"} <= set(values):
         least = 0.0
     else:
-        least = min(NEAREST, round(far / 4.0, 3))
+        least = min(defaults.IMPORT_GOAL_DISTANCE_M, round(far / 4.0, 3))
     values = {"goal_distance": (least, far), **values}
     lines = [f"# {' '.join(line.split())}" for line in head]
     for key in ("name", "map"):
