@@ -140,6 +140,17 @@ for name, extension in extensions.find_extensions("commands").items():
 complete(app)
 
 
+def _unwrap_validator(error: Any) -> None:
+    """Lets an option error contain a validator's own words, without pydantic's introduction."""
+    from pydantic import ValidationError
+
+    cause = error.__cause__
+    if isinstance(cause, ValidationError):
+        first = cause.errors()[0]
+        if first["type"] == "value_error":
+            error.message = str(first["ctx"]["error"])
+
+
 def main() -> None:
     """Runs the command line; a wrong option prints one sentence and exits with code 2."""
     try:
@@ -158,6 +169,7 @@ def main() -> None:
         # Anything else is not an option error of click or typer.
         if not hasattr(error, "format_message"):
             raise
+        _unwrap_validator(error)
         # The message is empty if the help has been shown.
         message = error.format_message().strip()
         if message:
