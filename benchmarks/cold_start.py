@@ -15,6 +15,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from measuring.environments import inherit_for_newcomer
 from measuring.verdict import answer, parser_of
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -41,17 +42,8 @@ os.environ["NUMBA_CACHE_DIR"] = tempfile.mkdtemp()
 
 
 def environment(folder: Path, control: str | None) -> dict[str, str]:
-    """That of a newcomer: nothing of the environment that this runs in."""
-    left = {
-        "LD_LIBRARY_PATH",
-        "_ROS_WHEELS_BOOTSTRAP_COMPLETE",
-        "PYTHONPATH",
-        "VIRTUAL_ENV",
-    }
-    if "ROS_DISTRO" in os.environ:
-        left -= {"LD_LIBRARY_PATH", "PYTHONPATH"}
-    kept = {name: value for name, value in os.environ.items() if name not in left}
-    kept |= {"TMPDIR": str(folder), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    """The environment variables of a newcomer, with temporary files in a folder."""
+    kept = inherit_for_newcomer() | {"TMPDIR": str(folder)}
     kept.pop("MAKEFLAGS", None)
     if control == "no_cache":
         (folder / "sitecustomize.py").write_text(FORGET)

@@ -17,6 +17,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from measuring.environments import inherit_for_newcomer
 from measuring.verdict import answer, parser_of
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -49,24 +50,12 @@ def export(folder: Path) -> tuple[Path, Path]:
     return folder / "model", folder / "policy.onnx"
 
 
-def environment() -> dict[str, str]:
-    """That of a child: the ROS 2 wheels leave words in it that lead others to wrong libraries."""
-    left = {
-        "LD_LIBRARY_PATH",
-        "_ROS_WHEELS_BOOTSTRAP_COMPLETE",
-        "PYTHONPATH",
-        "VIRTUAL_ENV",
-    }
-    if "ROS_DISTRO" in os.environ:
-        left -= {"LD_LIBRARY_PATH", "PYTHONPATH"}
-    kept = {name: value for name, value in os.environ.items() if name not in left}
-    return kept | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-
-
 def installed(folder: Path) -> Path:
     """The Python of a new environment with the package and `deploy`."""
     subprocess.run(
-        [sys.executable, "-m", "venv", str(folder)], check=True, env=environment()
+        [sys.executable, "-m", "venv", str(folder)],
+        check=True,
+        env=inherit_for_newcomer(),
     )
     source = folder / "source"
     kept = shutil.ignore_patterns(".git", ".venv", "__pycache__", "build", "*.egg-info")
@@ -83,7 +72,7 @@ def installed(folder: Path) -> Path:
         str(ROOT / "constraints.txt"),
     ]
     command.append(f"{source}[{extras}]")
-    subprocess.run(command, check=True, env=environment(), timeout=INSTALL_S)
+    subprocess.run(command, check=True, env=inherit_for_newcomer(), timeout=INSTALL_S)
     return python
 
 
@@ -92,7 +81,7 @@ def present(python: Path) -> list[str]:
     code = f"import importlib.util as u; print(*[n for n in {FORBIDDEN!r} if u.find_spec(n)])"
     done = subprocess.run(
         [str(python), "-c", code],
-        env=environment(),
+        env=inherit_for_newcomer(),
         capture_output=True,
         text=True,
         check=True,
@@ -118,7 +107,7 @@ def measure(control: str | None, here: bool) -> dict[str, Any]:
         found = present(python)
         done = subprocess.run(
             [str(python), str(STAND_IN), str(model), str(policy)],
-            env=environment() | ({"PYTHONPATH": str(ROOT)} if here else {}),
+            env=inherit_for_newcomer() | ({"PYTHONPATH": str(ROOT)} if here else {}),
             cwd=folder,
             capture_output=True,
             text=True,

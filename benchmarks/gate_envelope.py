@@ -42,7 +42,7 @@ ODD = np.array([np.nan, np.inf, -np.inf, 1e300, -1e300, 1e3])
 LEAST_MOTION = 0.8
 """Of the steps within shipped limits are to be in motion; a late tick stops it for 0.2 s."""
 RANDOM_SHARE, WITH_ONE = 4, 200
-"""One in so many steps has random limits, which are drawn anew after so many steps."""
+"""One in so many steps has random limits, which are redrawn after so many steps."""
 FASTEST = 50.0
 """What odometry shows at most [m/s, rad/s]."""
 Array = NDArray[np.float64]

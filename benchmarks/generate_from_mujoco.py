@@ -2,7 +2,7 @@
 
 Each robot drives in MuJoCo, on real wheels with contact, and a model is made of that drive as
 `nics generate` makes it: calibration, fit, pruning at the knee, refinement; the same settings for
-all robots. Then the robot drives anew, with other seeds and commands held for other times, and the
+all robots. Then the robot drives again, with other seeds and commands held for other times, and the
 model predicts the pose 5 s ahead by the commands alone, from every tenth of a second. Speed is
 simulated seconds per second of one thread, both sides in this run.
 """

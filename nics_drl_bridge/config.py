@@ -71,16 +71,23 @@ class Schema(BaseModel):
 SchemaT = TypeVar("SchemaT", bound=BaseModel)
 
 
-def validate(data: dict[str, Any], schema: type[SchemaT], source: str) -> SchemaT:
+def validate(
+    data: dict[str, Any],
+    schema: type[SchemaT],
+    source: str,
+    missing_fix: str = "add it",
+) -> SchemaT:
     """Checks a file's content against a schema. Raises ConfigError with key, value and fix."""
     try:
         validated = schema.model_validate(data)
     except ValidationError as error:
-        raise ConfigError(f"{source}: {_explain_error(error, schema)}") from None
-    for place, value in _find_coerced(data, validated):
-        raise ConfigError(
-            f"{source}: key {place!r}: should be a number, not {value!r}."
-        )
+        first = _select_first(error)
+        key = _name_key(first)
+        reason = _explain_error(first, key, schema, missing_fix)
+        raise ConfigError(f"{source}: {reason}", key=key, reason=reason) from None
+    for key, value in _find_coerced(data, validated):
+        reason = f"key {key!r}: should be a number, not {value!r}."
+        raise ConfigError(f"{source}: {reason}", key=key, reason=reason)
     return validated
 
 
@@ -113,11 +120,25 @@ _SHORT = reprlib.Repr()  # a value made of YAML aliases may not fit into memory 
 _SHORT.maxstring = _SHORT.maxother = 80
 
 
-def _explain_error(error: ValidationError, schema: type[BaseModel]) -> str:
+def _select_first(error: ValidationError) -> Any:
+    """Returns the details of the error to report: unknown keys come first, missing ones last."""
     details = error.errors(include_url=False)
     problems = [d for d in details if d["type"] != "missing"] or details
-    first = next((d for d in problems if d["type"] in _UNKNOWN), problems[0])
-    key = ".".join(str(part) for part in first["loc"])
+    return next((d for d in problems if d["type"] in _UNKNOWN), problems[0])
+
+
+def _name_key(first: Any) -> str:
+    parts = list(map(str, first["loc"]))
+    if first["type"] == "union_tag_not_found":
+        parts.append("kind")
+    elif first["type"] == "missing" and isinstance(first["loc"][-1], int):
+        parts.pop()  # the key of the list that is too short
+    return ".".join(parts)
+
+
+def _explain_error(
+    first: Any, key: str, schema: type[BaseModel], missing_fix: str
+) -> str:
     if first["type"] in _UNKNOWN:
         names = _locate_fields(schema, first["loc"][:-1])
         hint = suggest(str(first["loc"][-1]), names) if names else "remove it"
@@ -126,13 +147,11 @@ def _explain_error(error: ValidationError, schema: type[BaseModel]) -> str:
         tag = first["ctx"]["tag"]
         names = re.findall("'([^']*)'", first["ctx"]["expected_tags"])
         return f"key {key!r}: unknown kind {tag!r}; {suggest(tag, names)}"
-    if first["type"] == "union_tag_not_found":
-        return f"the key '{key}.kind' is missing; add it."
-    if first["type"] == "missing" and isinstance(index := first["loc"][-1], int):
-        key = ".".join(map(str, first["loc"][:-1]))
-        return f"key {key!r}: number of entries must be more than {index}."
-    if first["type"] == "missing":
-        return f"the key {key!r} is missing; add it."
+    if first["type"] == "missing" and isinstance(first["loc"][-1], int):
+        count = first["loc"][-1]
+        return f"key {key!r}: number of entries must be more than {count}."
+    if first["type"] in ("missing", "union_tag_not_found"):
+        return f"the key {key!r} is missing; {missing_fix}."
     if first["type"] in _NO_KEYS:
         return f"key {key!r}: must hold `key: value` pairs, not {_SHORT.repr(first['input'])}."
     if first["type"] in _NO_LIST:
@@ -143,7 +162,10 @@ def _explain_error(error: ValidationError, schema: type[BaseModel]) -> str:
         )
         bounds = f"at most {maximum}" if minimum is None else f"at least {minimum}"
         return f"key {key!r}: number of entries must be {bounds}, not {count}."
-    message = first["msg"].removeprefix("Value error, ").rstrip(".")
+    message = first["msg"]
+    if first["type"] == "value_error":  # raised by this package
+        message = str(first["ctx"]["error"])
+    message = message.rstrip(".")
     message = message[0].lower() + message[1:]
     if not key:  # an error about several keys; the message names them
         return f"{message}."

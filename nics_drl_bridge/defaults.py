@@ -41,3 +41,6 @@ DATA_SILENCE_S: Final = 0.5  # after it whoever drives a robot without new data 
 LISTEN_S: Final = 5.0  # to check a robot against a model
 IMU_TOPIC: Final = "auto"  # `imu` or `imu/data`, if the model was made with a gyro
 POSE_TYPE: Final = "none"  # no pose sensor
+
+# the page of nics watch
+PAGE_PORT: Final = 8765

@@ -3,8 +3,6 @@
 import difflib
 from collections.abc import Iterable
 
-MISSING_ROS = "needs the module {module!r}; source your ROS 2 installation, or "
-MISSING_ROS += "pip install 'nics_drl_bridge[ros]'."
 # maximum length of a sentence [characters]; longer ones are cut in the middle
 LONGEST = 800
 LONGEST_NAME = 100  # characters of a name that are compared with the known names
@@ -32,7 +30,16 @@ class BridgeError(Exception):
 
 
 class ConfigError(BridgeError):
-    """A YAML file, key, name or option is wrong."""
+    """A YAML file, key, name or option is wrong.
+
+    Callers that report the error in another context read `key`, the key of a file, and `reason`,
+    what is wrong, without the place. Both are "" where no caller needs them.
+    """
+
+    def __init__(self, sentence: str = "", *, key: str = "", reason: str = "") -> None:
+        super().__init__(sentence)
+        self.key = key
+        self.reason = reason
 
 
 class MissingFileError(ConfigError):

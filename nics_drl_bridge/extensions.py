@@ -25,10 +25,11 @@ from pathlib import Path
 from traceback import extract_tb, walk_tb
 from typing import Any
 
-from nics_drl_bridge.errors import MISSING_ROS, ConfigError, suggest
+from nics_drl_bridge.errors import ConfigError, suggest
 
 PACKAGE = "nics_drl_bridge"
 ROS = ("rclpy", "_msgs", "std_srvs", "builtin_interfaces")
+INSTALL_ROS = f"source your ROS 2 installation, or pip install '{PACKAGE}[ros]'"
 # library -> the extra of this package that installs it
 INSTALL = {
     "filelock": "train",
@@ -106,6 +107,8 @@ def require_modules(user: str) -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] == PACKAGE:
+            raise
         raise ConfigError(f"{user} {explain_missing(error.name or '')}") from None
 
 
@@ -113,12 +116,12 @@ def explain_missing(module: str) -> str:
     """Returns a clause about a missing library, to follow the name of what needs it."""
     library = module.partition(".")[0]
     if library.endswith(ROS):
-        return MISSING_ROS.format(module=module)
-    if library in INSTALL:
-        return (
-            f"needs the module {module!r}; pip install '{PACKAGE}[{INSTALL[library]}]'."
-        )
-    return f"needs the module {module!r}; install it."
+        fix = INSTALL_ROS
+    elif library in INSTALL:
+        fix = f"pip install '{PACKAGE}[{INSTALL[library]}]'"
+    else:
+        fix = "install it"
+    return f"needs the module {module!r}; {fix}."
 
 
 def find_lacking(modules: Iterable[str]) -> str | None:

@@ -30,6 +30,7 @@ from numba.core.sigutils import normalize_signature
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array
 
+from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.status import REPEATED_S, STATUS
 
 PACKAGE = Path(__file__).parent
@@ -237,7 +238,11 @@ class _Cache(FunctionCache):  # type: ignore[misc]
     """Machine code on disk, stamped with a digest of all the sources it was compiled from."""
 
     def __init__(self, function: Callable[..., Any], kind: str = "") -> None:
-        super().__init__(function)
+        try:
+            super().__init__(function)
+        except RuntimeError as error:  # no folder can be written to
+            fix = "set NUMBA_CACHE_DIR to a folder that can be written to"
+            raise ConfigError(f"kernels: {error}; {fix}.") from None
         # Without the line number in the name, a function that moved overwrites its old file.
         name = re.sub(r"-\d+(\.py\d+\w*)$", rf"{kind}\1", self._impl.filename_base)
         stamp = compute_digest(Path(function.__code__.co_filename))

@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 # rclpy's major version tells the distribution where no ROS 2 is sourced, as with wheels.
 DISTRIBUTIONS = {"3": "humble", "7": "jazzy", "9": "kilted"}
-# In a process of its own: importing rclpy from wheels starts the interpreter anew.
+# In a process of its own: importing rclpy from wheels restarts the interpreter.
 ASK_ROS = """
 import os, rclpy
 print(os.environ.get("ROS_DISTRO", ""), rclpy.get_rmw_implementation_identifier())

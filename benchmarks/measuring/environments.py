@@ -37,6 +37,18 @@ def clean() -> dict[str, str]:
     }
 
 
+def inherit_for_newcomer() -> dict[str, str]:
+    """The environment variables of a user who has installed nothing of ours yet.
+
+    The ROS 2 wheels set variables that would lead child processes to wrong libraries.
+    """
+    left_out = {*OF_OUR_OWN, "VIRTUAL_ENV"}
+    if "ROS_DISTRO" in os.environ:
+        left_out -= {"LD_LIBRARY_PATH", "PYTHONPATH"}
+    kept = {name: value for name, value in os.environ.items() if name not in left_out}
+    return kept | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+
+
 def python_with(name: str, requirements: tuple[str, ...]) -> Path:
     """The interpreter of a cached environment that holds the requirements.
 

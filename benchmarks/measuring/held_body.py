@@ -107,7 +107,7 @@ class Watched:
         self.arm()
 
     def arm(self) -> None:
-        """Begins anew, armed."""
+        """Starts over, armed."""
         self.state: GateState = replace(begin(self.config), armed=True)
         self.stopped = ""
 

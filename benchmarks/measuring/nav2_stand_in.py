@@ -1,4 +1,4 @@
-"""A stand-in for Nav2's behaviour tree: plans on `map`, has `follow_path` drive, and plans anew."""
+"""A stand-in for Nav2's behaviour tree: plans on `map`, has `follow_path` drive, and replans."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 DEADLINE_S = 300.0
 # silence after which the simulator, which waits for commands, is told a zero
 STUCK_S = 2.0
-REPLAN = 40  # feedbacks after which the path is planned anew
+REPLAN = 40  # feedbacks after which the path is replanned
 
 
 class StandIn:
@@ -118,7 +118,7 @@ class StandIn:
         return future.result()
 
     def drive(self, goal: Array, radius: float) -> Any:
-        """Has the robot driven to a goal (2,), planning anew now and then; returns the result."""
+        """Has the robot driven to a goal (2,) and replans now and then; returns the result."""
         handle = self.send(self.plan(goal, radius), controller_id=self._controller)
         while True:
             result, known = handle.get_result_async(), len(self.feedback)

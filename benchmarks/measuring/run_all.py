@@ -5,7 +5,7 @@
 A run ends with its bars met, with some missed, or broken: crashed, hung, killed, or without one
 JSON object on standard output. All that is kept, with what was measured, its machine, the commit
 and the load: bars are ratios within a run, so runs on several machines may stand in one file. It is
-written anew after each run, so what was measured before an interruption stays. Ends with 1 if any
+rewritten after each run, so what was measured before an interruption stays. Ends with 1 if any
 run missed a bar or broke, 130 when it was interrupted.
 """
 

@@ -55,7 +55,7 @@ class HeldUp:
         count: how often it was held up.
         seconds: for how long in all [s].
         of_s: of so many that it ran [s].
-        repeated: episodes that were begun anew for that.
+        repeated: episodes that were restarted for that.
     """
 
     count: int = 0
@@ -195,7 +195,7 @@ class Lane:
         self._rest()
 
     def void(self) -> bool:
-        """Begins the running episode anew, if one is running, or gives it up at last."""
+        """Restarts the running episode, if there is one, or gives it up at last."""
         if not self._driving:
             return False
         if self._tries < TRIES:

@@ -201,7 +201,7 @@ class Page:
 
 
 def rendered(text: str, page: Page) -> str:
-    """A document with all its regions made anew."""
+    """A document with all its regions regenerated."""
     return REGION.sub(
         lambda match: (
             f"<!-- results:{match[1]} -->\n{page.text(match[1])}<!-- /results -->"

@@ -41,23 +41,30 @@ from nics_drl_bridge.exit_codes import EXIT_BAD_INPUT, EXIT_INTERRUPTED
 
 
 class OneWordForARobot(TyperGroup):
-    """Commands for which `--robot` and `--model` are the same option: giving both is refused."""
+    """Refuses `--robot` and `--model` with different values: they are the same option."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parses the words of a command line. Raises UsageError if both options are given."""
-        robots = [value for word in ROBOT_OPTIONS for value in read_option(word, args)]
+        """Parses a command line. Raises UsageError if the two options differ."""
+        robots = []
+        for option in ROBOT_OPTIONS:
+            robots += read_option(option, args)
         if len(set(robots)) > 1:
             names = " and ".join(map(repr, robots))
             ctx.fail(
-                f"--robot and --model are one option, and name {names}; give one of them"
+                f"--robot and --model are the same option, but got {names}; give only one."
             )
         return super().parse_args(ctx, args)
 
 
 def read_option(option: str, args: Sequence[str]) -> list[str]:
     """Returns the values of an option in a command line: `--robot X` or `--robot=X`."""
-    joined = [word.partition("=")[2] for word in args if word.startswith(f"{option}=")]
-    return joined + [args[k + 1] for k, word in enumerate(args[:-1]) if word == option]
+    values = []
+    for word, following in zip(args, [*args[1:], None], strict=True):
+        if word == option and following is not None:
+            values.append(following)
+        elif word.startswith(f"{option}="):
+            values.append(word.removeprefix(f"{option}="))
+    return values
 
 
 app = typer.Typer(
@@ -89,8 +96,8 @@ def _declare_options(
     sensor_kind: Annotated[
         list[str] | None,
         Option(
-            help="Import a kind of sensor of your own, which files may then name: "
-            "path/to/file.py:ClassName; repeatable, before the command."
+            help="Import your own kind of sensor, path/to/file.py:ClassName, so that files can "
+            "name it. Repeatable; give it before the command."
         ),
     ] = None,
 ) -> None:
@@ -133,8 +140,19 @@ for name, extension in extensions.find_extensions("commands").items():
 complete(app)
 
 
+def _unwrap_validator(error: Any) -> None:
+    """Lets an option error contain a validator's own words, without pydantic's introduction."""
+    from pydantic import ValidationError
+
+    cause = error.__cause__
+    if isinstance(cause, ValidationError):
+        first = cause.errors()[0]
+        if first["type"] == "value_error":
+            error.message = str(first["ctx"]["error"])
+
+
 def main() -> None:
-    """Runs the command line; a wrong option, too, gives one sentence and exit code 2."""
+    """Runs the command line; a wrong option prints one sentence and exits with code 2."""
     try:
         code = app(prog_name="nics", standalone_mode=False)
     except typer.Abort as abort:
@@ -151,13 +169,12 @@ def main() -> None:
         # Anything else is not an option error of click or typer.
         if not hasattr(error, "format_message"):
             raise
+        _unwrap_validator(error)
         # The message is empty if the help has been shown.
         message = error.format_message().strip()
         if message:
-            message = shorten(
-                message.rstrip(".?").replace("Value error, ", ""), LONGEST
-            )
-            typer.echo(f"nics: {message}; see `nics --help`.", err=True)
+            message = shorten(message, LONGEST)
+            typer.echo(f"nics: {message} (see `nics --help`)", err=True)
         raise SystemExit(EXIT_BAD_INPUT) from None
     raise SystemExit(code if isinstance(code, int) else 0)
 

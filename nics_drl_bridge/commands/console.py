@@ -14,9 +14,9 @@ from typing import Annotated, Any
 import typer
 from typer import Option
 
-from nics_drl_bridge import extensions
+from nics_drl_bridge import defaults, extensions
 from nics_drl_bridge.commands.interrupts import was_interrupted
-from nics_drl_bridge.errors import MISSING_ROS, BridgeError, ConfigError, suggest
+from nics_drl_bridge.errors import BridgeError, ConfigError, suggest
 from nics_drl_bridge.exit_codes import EXIT_BAD_INPUT, EXIT_INTERRUPTED
 from nics_drl_bridge.files import format_json
 from nics_drl_bridge.robot import DEFAULT_ROBOT
@@ -99,7 +99,7 @@ WorldOption = Annotated[
         "--world",
         "--scene",
         autocompletion=WORLDS,
-        help="A shipped world (arena) or a YAML file.",
+        help=f"A shipped world ({defaults.WORLD}) or a YAML file.",
     ),
 ]
 JsonOption = Annotated[bool, Option("--json", help="Print one JSON object instead.")]
@@ -248,22 +248,26 @@ def report_in_one_sentence() -> Iterator[None]:
             raise typer.Exit(EXIT_INTERRUPTED) from None
         if not isinstance(error, Exception):
             raise
-        clause = extensions.explain_own_fault(error)
-        if isinstance(error, BridgeError):
-            clause = str(error)
-        if clause is None and isinstance(error, ImportError):
-            clause = extensions.explain_unmet(error)
-        elif (
-            not clause
-            and isinstance(error, OSError)
-            and not isinstance(error, BrokenPipeError)
-        ):
-            place = f"{error.filename}: " if error.filename else ""
-            clause = f"{place}{error.strerror or error}; choose another place."
+        clause = _explain_user_error(error)
         if clause is None:
             raise
         typer.echo(f"nics: {clause}", err=True)
         raise typer.Exit(EXIT_BAD_INPUT) from None
+
+
+def _explain_user_error(error: Exception) -> str | None:
+    """Returns a sentence about an error that the user can fix, or None."""
+    if isinstance(error, BridgeError):
+        return str(error)
+    clause = extensions.explain_own_fault(error)
+    if clause is not None:
+        return clause
+    if isinstance(error, ImportError):
+        return extensions.explain_unmet(error)
+    if isinstance(error, OSError) and not isinstance(error, BrokenPipeError):
+        place = f"{error.filename}: " if error.filename else ""
+        return f"{place}{error.strerror or error}; choose another place."
+    return None
 
 
 def tell_replaced(file: Path) -> None:
@@ -272,17 +276,6 @@ def tell_replaced(file: Path) -> None:
         typer.echo(
             f"{file.parent}: the {file.name} that is there will be replaced", err=True
         )
-
-
-@contextmanager
-def needs_ros(what: str) -> Iterator[None]:
-    """Turns the ImportError of the nodes without ROS 2 into a ConfigError of one sentence."""
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        if (error.name or "").startswith("nics_drl_bridge"):
-            raise
-        raise ConfigError(f"{what} {MISSING_ROS.format(module=error.name)}") from None
 
 
 def format_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -331,21 +324,24 @@ def show_progress(begin: str = "starting") -> Iterator[Tell]:
 
 @contextmanager
 def _print_progress_lines(begin: str) -> Iterator[Tell]:
-    now, over, since = [begin], threading.Event(), time.monotonic()
+    line = begin
+    ended = threading.Event()
+    begun_s = time.monotonic()
 
     def tell(what: str, done: int, total: int) -> None:
-        now[0] = f"{what}, {done:,} of {total:,}" if total else what
+        nonlocal line
+        line = f"{what}, {done:,} of {total:,}" if total else what
 
-    def speak() -> None:
-        patience = PATIENCE_S
-        while not over.wait(patience):
-            patience = REPEATED_S
-            typer.echo(f"{now[0]} ({time.monotonic() - since:.0f} s)", err=True)
+    def print_lines() -> None:
+        patience_s = PATIENCE_S
+        while not ended.wait(patience_s):
+            patience_s = REPEATED_S
+            typer.echo(f"{line} ({time.monotonic() - begun_s:.0f} s)", err=True)
 
-    thread = threading.Thread(target=speak, daemon=True)
+    thread = threading.Thread(target=print_lines, daemon=True)
     thread.start()
     try:
         yield tell
     finally:
-        over.set()
+        ended.set()
         thread.join()

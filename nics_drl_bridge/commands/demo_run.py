@@ -16,7 +16,7 @@ from nics_drl_bridge.commands.episodes import DDS, FAST, LABELS, START_S, Say, d
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
-from nics_drl_bridge.errors import MISSING_ROS, BackendError, PolicyError
+from nics_drl_bridge.errors import BackendError, PolicyError
 from nics_drl_bridge.files import write_bytes, write_text
 from nics_drl_bridge.generator import SimulatorModel, generate, mount_lidar, save_model
 from nics_drl_bridge.identify.conclusion import conclude
@@ -100,16 +100,19 @@ class Learned:
 
 @dataclass(frozen=True)
 class DemoEpisodes:
-    """Results of the evaluation, and the same episodes driven in process and over DDS."""
+    """Results of the evaluation, and the same episodes driven in process and over DDS.
 
-    summaries: Mapping[str, Summary]  # for the world as it is and perturbed
+    Without ROS 2, `there` is empty and `live` is None.
+    """
+
+    summaries: Mapping[str, Summary]  # by condition: `AS_IT_IS` and each perturbation
     here: Sequence[Episode]  # in process
     there: Sequence[Episode]  # over DDS
-    live: Episode | None  # deployed; without ROS 2 None, and `there` is empty
+    live: Episode | None  # the deployed episode
 
     @property
     def summary(self) -> Summary:
-        """Summary for the world as it is."""
+        """Summary of the unperturbed episodes."""
         return self.summaries[AS_IT_IS]
 
 
@@ -117,14 +120,14 @@ def run(plan: DemoPlan, say: Say) -> str:
     """Runs all parts and ends their processes; returns the last line. Raises BridgeError."""
     topics = find_spec("rclpy") is not None
     if not topics:
-        say(f"in process alone: the world 'dds' {MISSING_ROS.format(module='rclpy')}")
-    took: dict[str, float] = {}
+        say(f"only in process: the world 'dds' {extensions.explain_missing('rclpy')}")
+    durations_s: dict[str, float] = {}
 
     def timed(name: str, part: Callable[..., R], *arguments: Any) -> R:
         begin = time.perf_counter()
         result = part(plan, *arguments, say)
-        took[name] = time.perf_counter() - begin
-        say(f"  {name} took {took[name]:.0f} s")
+        durations_s[name] = time.perf_counter() - begin
+        say(f"  {name} took {durations_s[name]:.0f} s")
         return result
 
     model, identified = timed("generating", _generate)
@@ -140,15 +143,13 @@ def run(plan: DemoPlan, say: Say) -> str:
     )
     say(f"  the paths are drawn in {plan.out / paths}")  # the report takes a while
     there = timed("driving over DDS", _drive, DDS, learned.policy) if topics else []
-    deployment = (
-        model,
-        learned.policy,
-        next((e.seed for e in there if e.result == "success"), 0),
-    )
-    live = timed("deploying", _deploy, *deployment) if topics else None
-    times = [
-        (part, f"{s:.0f}") for part, s in {**took, "all": sum(took.values())}.items()
-    ]
+    live = None
+    if topics:
+        succeeded = [episode.seed for episode in there if episode.result == "success"]
+        seed = succeeded[0] if succeeded else 0
+        live = timed("deploying", _deploy, model, learned.policy, seed)
+    durations_s["all"] = sum(durations_s.values())
+    times = [(part, f"{duration:.0f}") for part, duration in durations_s.items()]
     episodes = DemoEpisodes(summaries, here, there, live)
     sections = make_sections(plan, model, identified, learned, episodes)
     folded = html.make_details(
@@ -179,7 +180,8 @@ def _record_or_read(plan: DemoPlan, say: Say) -> tuple[RobotSpec, Recording]:
 
 
 def _generate(plan: DemoPlan, say: Say) -> tuple[SimulatorModel, Identified]:
-    world, (robot, recording) = load_world(plan.world), _record_or_read(plan, say)
+    world = load_world(plan.world)
+    robot, recording = _record_or_read(plan, say)
     say(f"generating a simulator of the robot {robot.name!r} from {recording.source}")
     # The demo must steer even if the drive did not; the report lists the assumptions.
     model, identified = generate(
@@ -214,7 +216,8 @@ def learn(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
         f"'nics_drl_bridge[train,deploy]'); driving with the policy {policy!r} instead"
     )
     return Learned(
-        policy, f"None was trained, as {missing!r} is not installed: {policy!r} drives."
+        policy,
+        f"No policy was trained because {missing!r} is not installed: {policy!r} drives.",
     )
 
 
@@ -230,7 +233,8 @@ def derive_settings(plan: DemoPlan, model: SimulatorModel) -> Fitted:
 def _train_policy(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
     from nics_drl_bridge.policy.train import SeedResult, export, train  # needs torch
 
-    (settings, notes), curve = derive_settings(plan, model), list[pictures.Point]()
+    settings, notes = derive_settings(plan, model)
+    curve = list[pictures.Point]()
     for line in notes:
         say(line)
     say(
@@ -254,7 +258,7 @@ def _train_policy(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
     steps = (
         f"{trained.steps:,} steps, {trained.stepping_s:.0f} s of {trained.wall_s:.0f} s"
     )
-    how = f"PPO learned it from nothing in the generated simulator: {steps} in the simulator."
+    how = f"PPO learned it from scratch in the generated simulator: {steps} in the simulator."
     return Learned(str(file), how, curve)
 
 
@@ -274,12 +278,11 @@ def _evaluate(
         outcomes = evaluation.drive_worlds(
             env, policy.act, range(FIRST_SEED, FIRST_SEED + MANY)
         )
-        summaries[condition] = summary = evaluation.summarise(
-            outcomes, model.control_period
-        )
+        summary = evaluation.summarise(outcomes, model.control_period)
+        summaries[condition] = summary
         rates = (
-            f"{result} {100 * each.value:.1f} %"
-            for result, each in summary.shares.items()
+            f"{result} {100 * share.value:.1f} %"
+            for result, share in summary.shares.items()
         )
         say(f"  {condition.replace('_', ' ')}: {', '.join(rates)}")
     return summaries
@@ -457,7 +460,7 @@ def _make_policy_lines(
         caption = "Success and collisions during exploration; every episode is new."
         drawn.append((pictures.draw_training_curve(learned.curve), caption))
     caption = f"Success unperturbed, and with each perturbation of {PERTURBED!r} alone (95 %)."
-    shares = {what: each.success for what, each in episodes.summaries.items()}
+    shares = {what: summary.success for what, summary in episodes.summaries.items()}
     drawn.append((pictures.draw_robustness(shares), caption))
     blocks = [html.make_paragraph(learned.how), html.make_gallery(drawn)]
     rows = list[tuple[str, ...]]()

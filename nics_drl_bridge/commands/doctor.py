@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
-from nics_drl_bridge import defaults
+from nics_drl_bridge import defaults, extensions
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.robot import DEFAULT_ROBOT
@@ -71,7 +71,7 @@ def doctor(
     if bag is not None:
         facts = collect_facts_of_bag(bag, namespace, imu)
     else:
-        with console.needs_ros("nics doctor"):
+        with extensions.require_modules("nics doctor"):
             from nics_drl_bridge.nodes.listen import listen
         with console.show_progress(f"listening for {duration:g} s"):
             facts = listen(duration, namespace, imu=imu)
@@ -100,7 +100,7 @@ def _tell_installation(as_json: bool) -> None:
     console.print_line(
         as_json,
         console.format_table(heads, rows),
-        checks=[each._asdict() for each in results],
+        checks=[check._asdict() for check in results],
     )
 
 

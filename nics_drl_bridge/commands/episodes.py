@@ -6,7 +6,6 @@ from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from importlib import import_module
-from importlib.util import find_spec
 from math import isnan
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from nics_drl_bridge.commands.vehicle_goals import NEAR_M, GoalOrder
 from nics_drl_bridge.config import list_shipped
 from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.env.sim_backend import make_backend
-from nics_drl_bridge.errors import MISSING_ROS, BackendError, ConfigError, suggest
+from nics_drl_bridge.errors import BackendError, ConfigError, suggest
 from nics_drl_bridge.files import format_json, write_bytes, write_text
 from nics_drl_bridge.gate.gated_backend import GatedBackend
 from nics_drl_bridge.generator import SimulatorModel, open_model
@@ -90,28 +89,30 @@ def drive_in(
 ) -> list[Episode]:
     """Drives episodes in one of `PLACES` and ends its node, if any. Raises BridgeError."""
     model = open_model(name)
-    drawn = conditions.ranges
     check_place(place, model.robot)
+    ranges = conditions.ranges
     if place == FAST:
-        backend_options = {"estimator": True, "randomisation": drawn}
-        env, opened = open_env(
-            policy, model, world, "sim", conditions, **backend_options
-        )
+        options: dict[str, Any] = {"estimator": True, "randomisation": ranges}
+        env, opened = open_env(policy, model, world, "sim", conditions, **options)
         with closing(env):
             return drive_all(env, opened, seeds, on_episode)
     from nics_drl_bridge.nodes.processes import NodeProcess, Witness, free_domain_id
 
     node = NODES[place]
     domain_id = free_domain_id()
-    parameters = {"model": name, "world": world, "mode": "lockstep"}
-    parameters["randomisation"] = conditions.randomisation or ""
+    parameters = {
+        "model": name,
+        "world": world,
+        "mode": "lockstep",
+        "randomisation": conditions.randomisation or "",
+    }
     options = {
         "domain_id": domain_id,
         "simulator": node,
         "timeout_s": START_S,
         "truth": True,
+        "randomisation": ranges,
     }
-    options["randomisation"] = drawn
     with (
         NodeProcess(node, logs, parameters, domain_id) as process,
         Witness(domain_id) as witness,
@@ -137,8 +138,8 @@ def open_env(
 ) -> tuple[gymnasium.Env[Any, Any], Policy]:
     """Makes the env of a policy's task on a named backend; opens the policy."""
     field = load_worlds(world) if isinstance(world, str) else world
-    given = {name: value for name, value in options.items() if value is not None}
-    driven = make_backend(backend, model, field, **given)
+    backend_options = {name: v for name, v in options.items() if v is not None}
+    driven = make_backend(backend, model, field, **backend_options)
     if conditions.gate is not None:
         driven = GatedBackend(driven, model, conditions.gate)
     return make_env(driven, policy, model, field, conditions)
@@ -155,14 +156,15 @@ def make_env(
     register_envs()
     opened, task = open_policy(policy, model, conditions.kind)
     task = replace(task, **conditions.task)
-    given: dict[str, Any] = {
+    limit = conditions.steps or pace_of(model, [world]).steps
+    options: dict[str, Any] = {
+        "max_episode_steps": limit,
         "backend": backend,
         "model": model,
         "world": world,
         "task": task,
     }
-    limit = conditions.steps or pace_of(model, [world]).steps
-    return gymnasium.make(NAVIGATION, max_episode_steps=limit, **given), opened
+    return gymnasium.make(NAVIGATION, **options), opened
 
 
 def check_place(place: str, robot: RobotSpec) -> None:
@@ -174,8 +176,7 @@ def check_place(place: str, robot: RobotSpec) -> None:
     if place == FAST:
         return
     robot.require_cmd_vel()
-    if find_spec("rclpy") is None:
-        raise ConfigError(f"the world {place!r} {MISSING_ROS.format(module='rclpy')}")
+    extensions.require(f"the world {place!r}", "rclpy")
     if place == MUJOCO:
         extensions.load("nodes", NODES[MUJOCO])
         import_module(extensions.find_extensions("nodes")[NODES[MUJOCO]].module).check(
@@ -250,8 +251,8 @@ def evaluate(order: EvaluationOrder, say: Say, tell: Tell) -> list[Evaluated]:
     contracts = read_contracts(order.policies, order.model)
     model, name = order.conditions.model(model_name(order.model, contracts), order.out)
     world = load_worlds(order.world)
-    under = limit_time(order.conditions, contracts, model, world, say)
-    places = _places(order, model.robot, say)
+    limited = limit_time(order.conditions, contracts, model, world, say)
+    places = select_places(order, model.robot, say)
     evaluated = []
     for policy in order.policies:
         runs = {}
@@ -263,14 +264,15 @@ def evaluate(order: EvaluationOrder, say: Say, tell: Tell) -> list[Evaluated]:
             def on_episode(episode: Episode, what: str = what) -> None:
                 tell(what, episode.seed - order.seed + 1, order.episodes)
 
-            given = place, policy, name, order.world, seeds, logs
-            runs[place] = drive_in(*given, on_episode, say, under)
+            runs[place] = drive_in(
+                place, policy, name, order.world, seeds, logs, on_episode, say, limited
+            )
         evaluated.append(
             judge_runs(
                 policy, runs, model, world, order.out, EPISODE_PANELS, order.policies
             )
         )
-        write_evaluation(replace(order, conditions=under), name, model, evaluated)
+        write_evaluation(replace(order, conditions=limited), name, model, evaluated)
     return evaluated
 
 
@@ -295,7 +297,7 @@ def limit_time(
     return replace(conditions, steps=steps)
 
 
-def _places(order: EvaluationOrder, robot: RobotSpec, say: Say) -> Sequence[str]:
+def select_places(order: EvaluationOrder, robot: RobotSpec, say: Say) -> Sequence[str]:
     """Returns the places of an order, or else all that work here; says why others don't."""
     places = list[str]()
     for place in order.places or PLACES:  # what one place lacks, later ones lack, too
@@ -304,7 +306,8 @@ def _places(order: EvaluationOrder, robot: RobotSpec, say: Say) -> Sequence[str]
         except ConfigError as error:
             if order.places:
                 raise
-            say(f"{' and '.join(LABELS[place] for place in places)} alone: {error}")
+            usable = " and ".join(LABELS[place] for place in places)
+            say(f"only {usable}: {error}")
             break
         places.append(place)
     return places
@@ -320,7 +323,7 @@ def judge_runs(
     among: Sequence[str] = (),
 ) -> Evaluated:
     """Computes a policy's statistics by place, and draws the first episodes into a folder."""
-    shown = {LABELS[place]: some[:panels] for place, some in runs.items()}
+    shown = {LABELS[place]: episodes[:panels] for place, episodes in runs.items()}
     picture = draw_trajectories(shown, world, model.robot.footprint_radius)
     write_bytes(out / f"trajectories_{shorten_name(policy, among)}.png", picture)
     return Evaluated(policy, runs, evaluation.tallies(runs, model.control_period))
@@ -331,14 +334,17 @@ ENDS = r"\.(onnx|ya?ml)$"  # suffixes of a policy or a mapping
 
 def shorten_name(policy: str, among: Sequence[str]) -> str:
     """Returns the stem of a policy's path, with parent folders if another has the same stem."""
-    own, *others = (
-        [part.strip("/") for part in Path(re.sub(ENDS, "", one)).absolute().parts]
-        for one in (policy, *({*among} - {policy}))
-    )
-    alone = (
-        k for k in range(1, len(own)) if all(one[-k:] != own[-k:] for one in others)
-    )
-    return "_".join(own[-next(alone, 1) :])
+    parts = _split_path(policy)
+    others = [_split_path(other) for other in among if other != policy]
+    for count in range(1, len(parts)):
+        if all(other[-count:] != parts[-count:] for other in others):
+            return "_".join(parts[-count:])
+    return parts[-1]
+
+
+def _split_path(policy: str) -> list[str]:
+    path = Path(re.sub(ENDS, "", policy)).absolute()
+    return [part.strip("/") for part in path.parts]
 
 
 def model_name(model: str | None, contracts: Mapping[str, Contract]) -> str:
@@ -351,12 +357,11 @@ def model_name(model: str | None, contracts: Mapping[str, Contract]) -> str:
     if not robots:
         return DEFAULT_ROBOT
     if len(set(robots.values())) > 1:
-        of_each = ", ".join(
-            f"{policy!r} is of {robot!r}" for policy, robot in robots.items()
+        listed = ", ".join(
+            f"{policy!r} is for {robot!r}" for policy, robot in robots.items()
         )
-        raise ConfigError(
-            f"{of_each}: evaluate them one by one, or say which with --model."
-        )
+        fix = "evaluate them one by one, or choose a model with --model"
+        raise ConfigError(f"the policies are for different robots: {listed}; {fix}.")
     return next(iter(robots.values()))
 
 
@@ -364,16 +369,13 @@ def write_evaluation(
     order: EvaluationOrder, name: str, model: SimulatorModel, evaluated: list[Evaluated]
 ) -> None:
     """Writes the `evaluation.json` of an order, driven with a model called `name`."""
-    policies = {
-        result.policy: {
-            place: {
-                **result.tallies[place].figures(),
-                "each": [episode.plain() for episode in drives],
-            }
-            for place, drives in result.runs.items()
-        }
-        for result in evaluated
-    }
+    policies: dict[str, dict[str, Any]] = {}
+    for result in evaluated:
+        places = policies[result.policy] = {}
+        for place, drives in result.runs.items():
+            figures = result.tallies[place].figures()
+            episodes = [episode.plain() for episode in drives]
+            places[place] = {**figures, "each": episodes}
     data = {
         "model": name,
         "model_fingerprint": model.fingerprint,
@@ -388,41 +390,46 @@ def write_evaluation(
 
 def format_rows(evaluated: Sequence[Evaluated]) -> list[tuple[str, ...]]:
     """Returns the rows of the table with the columns `HEADS`, as text."""
-    return [
-        (
-            result.policy,
-            LABELS[place],
-            _format_percent(tally.success.value),
-            f"{100 * tally.success.low:.0f} to {100 * tally.success.high:.0f} %",
-            *(
-                _format_percent(rate.value)
-                for rate in (tally.believed, tally.collision, tally.time_out)
-            ),
-            *(
-                "-" if isnan(estimate.value) else f"{estimate.value:.2f}"
-                for estimate in (tally.length, tally.time)
-            ),
-            _format_percent(tally.same),
-            f"{tally.deviation.value:.2g}",
-            f"{tally.greatest_deviation:.2g}",
-        )
-        for result in evaluated
-        for place, tally in result.tallies.items()
-    ]
+    rows = list[tuple[str, ...]]()
+    for result in evaluated:
+        for place, tally in result.tallies.items():
+            success = tally.success
+            row = (
+                result.policy,
+                LABELS[place],
+                _format_percent(success.value),
+                f"{100 * success.low:.0f} to {100 * success.high:.0f} %",
+                _format_percent(tally.believed.value),
+                _format_percent(tally.collision.value),
+                _format_percent(tally.time_out.value),
+                _format_mean(tally.length.value),
+                _format_mean(tally.time.value),
+                _format_percent(tally.same),
+                f"{tally.deviation.value:.2g}",
+                f"{tally.greatest_deviation:.2g}",
+            )
+            rows.append(row)
+    return rows
 
 
 def _format_percent(fraction: float) -> str:
     return f"{100 * fraction:.4g} %"
 
 
+def _format_mean(value: float) -> str:
+    """Formats a mean of the successful episodes, which is nan if there are none."""
+    return "-" if isnan(value) else f"{value:.2f}"
+
+
 def summarize(result: Evaluated) -> str:
     """Summarises a policy in one line."""
-    each = ", ".join(
-        f"{LABELS[place]}{', as believed,' if place == VEHICLE else ''}"
-        f" {_format_percent(tally.success.value)}"
-        for place, tally in result.tallies.items()
-    )
-    return f"{result.policy}: success {each}"
+    rates = []
+    for place, tally in result.tallies.items():
+        believed = ", as believed," if place == VEHICLE else ""
+        rates.append(
+            f"{LABELS[place]}{believed} {_format_percent(tally.success.value)}"
+        )
+    return f"{result.policy}: success {', '.join(rates)}"
 
 
 def drive_vehicle(
@@ -453,14 +460,15 @@ def drive_vehicle(
     world = load_worlds(order.world)
     localised = options.get("pose_type", defaults.POSE_TYPE) != NO_POSE
     start = options.get("start", defaults.VEHICLE_START)
-    wanted = GoalOrder(goal, goal_frame, start, localised, confirm_beyond_m)
+    goals = GoalOrder(goal, goal_frame, start, localised, confirm_beyond_m)
     radius = model.robot.footprint_radius
-    if not wanted.needs_pose:  # refuse far goals before anybody has to wait
+    if not goals.needs_pose:  # refuse far goals before anybody has to wait
         planned = [
-            wanted.episode(sample_scene(world, radius, seed)) for seed in order.seeds
+            goals.episode(sample_scene(world, radius, seed)) for seed in order.seeds
         ]
-        max(planned, key=lambda one: one.distance).confirm(confirm)
-    under = limit_time(order.conditions, contracts, model, world, say)
+        farthest = max(planned, key=lambda episode: episode.distance)
+        farthest.confirm(confirm)
+    limited = limit_time(order.conditions, contracts, model, world, say)
     # A policy that does not fit must fail before anything moves.
     open_policy(policy, model, order.conditions.kind)
     from nics_drl_bridge.nodes.listen import listen
@@ -473,36 +481,36 @@ def drive_vehicle(
     for finding in examine(heard, derive_expected(model)):
         sentence = f"{finding.where}: {finding.what} ({finding.fix})"
         say(f"  {finding.severity}: {sentence}")
-        errors += [sentence] if finding.severity == "error" else []
+        if finding.severity == "error":
+            errors.append(sentence)
     if errors:
         raise BackendError(
             f"the vehicle is not driven: {errors[0]}; see nics doctor for the rest."
         )
-    given = {
+    backend_options = {
         "mode": "realtime",
         "vehicle": True,
         "command_topic": RAW,
         "say": say,
         **options,
+        "lays_map": goals.lays_map,
     }
-    given["lays_map"] = wanted.lays_map
-    ground = wanted.ground(world)
-    backend = make_backend("dds", model, ground, **given)
-    env, driver = make_env(backend, policy, model, ground, under)
+    ground = goals.ground(world)
+    backend = make_backend("dds", model, ground, **backend_options)
+    env, driver = make_env(backend, policy, model, ground, limited)
     episodes = list[Episode]()
     with closing(env):
         for count, seed in enumerate(order.seeds, 1):
-            present = backend.present_pose() if wanted.needs_pose else None
-            episode = wanted.episode(sample_scene(world, radius, seed), present)
-            if wanted.needs_pose:
+            scene = sample_scene(world, radius, seed)
+            present = backend.present_pose() if goals.needs_pose else None
+            episode = goals.episode(scene, present)
+            if goals.needs_pose:
                 episode.confirm(confirm)
             last = "" if arm else f"; arm {GATE}"
             ask(f"episode {count} of {order.episodes}: {episode.sentence()}{last}")
-            if wanted.needs_pose:  # the vehicle may have been moved meanwhile
+            if goals.needs_pose:  # the vehicle may have been moved meanwhile
                 confirmed = episode.distance
-                episode = wanted.episode(
-                    sample_scene(world, radius, seed), backend.present_pose()
-                )
+                episode = goals.episode(scene, backend.present_pose())
                 if episode.distance > confirmed + NEAR_M:
                     episode.confirm(confirm)
             driven = drive(
@@ -511,17 +519,20 @@ def drive_vehicle(
             # Only the vehicle's own estimate of its path is known.
             episodes.append(replace(driven, path=driven.estimate))
             say(f"  {report_end(episodes[-1])}")
-    env, driver = open_env(policy, model, order.world, "sim", under, estimator=True)
+    env, driver = open_env(policy, model, order.world, "sim", limited, estimator=True)
     runs: dict[str, list[Episode]] = {VEHICLE: episodes}
-    starts = [(one.seed, {"start": one.path[0], "goal": one.goal}) for one in episodes]
+    simulated = []
     with closing(env):
         try:
-            runs[FAST] = [drive(env, driver, *each) for each in starts]
+            for driven in episodes:
+                reset_options = {"start": driven.path[0], "goal": driven.goal}
+                simulated.append(drive(env, driver, driven.seed, reset_options))
+            runs[FAST] = simulated
         except ConfigError as error:  # the start may be inside a wall of the map
             say(f"  not driven again in process: {error}")
-    made = judge_runs(policy, runs, model, world, order.out)
-    write_evaluation(replace(order, conditions=under), name, model, [made])
-    return made
+    result = judge_runs(policy, runs, model, world, order.out)
+    write_evaluation(replace(order, conditions=limited), name, model, [result])
+    return result
 
 
 ENDS_BELIEVED = {"success": "reached", "collision": "touched"}

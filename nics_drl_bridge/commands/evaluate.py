@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
-from nics_drl_bridge import defaults
+from nics_drl_bridge import defaults, extensions
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import check_above, format_json, write_bytes, write_text
@@ -149,7 +149,7 @@ def evaluate(
 
     count = episodes or (1 if hardware else defaults.EVALUATION_EPISODES)
     tell = partial(typer.echo, err=True)
-    under = Conditions(lidar, randomisation, gate, kind=task)
+    conditions = Conditions(lidar, randomisation, gate, kind=task)
     order = driving.EvaluationOrder(
         policies,
         out,
@@ -158,7 +158,7 @@ def evaluate(
         count,
         seed,
         tuple(dict.fromkeys(places or ())),
-        under,
+        conditions,
     )
     console.tell_replaced(out / driving.EVALUATION)
     if hardware:
@@ -174,7 +174,7 @@ def evaluate(
         driven = partial(
             driving.drive_vehicle, order, place, arm, tell, partial(_ask, yes)
         )
-        with console.needs_ros("nics evaluate --hardware"):
+        with extensions.require_modules("nics evaluate --hardware"):
             evaluated = [driven(**options)]
     else:
         with console.show_progress("opening robot and policies") as advance:
@@ -268,12 +268,10 @@ def _replay_shadow(
         left_out = ", ".join(
             f"{count} {why}" for why, count in comparison.skipped.items() if count
         )
-        anew = (
-            f"; its state began anew after {comparison.resets} gaps"
-            if comparison.resets
-            else ""
-        )
-        lines.append(f"{compared}; left out: {left_out or 'none'}{anew}")
+        line = f"{compared}; left out: {left_out or 'none'}"
+        if comparison.resets:
+            line += f"; its state was reset after {comparison.resets} gaps"
+        lines.append(line)
     heads = (
         "policy",
         "command",

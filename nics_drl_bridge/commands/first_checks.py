@@ -94,11 +94,10 @@ def check_settings(task: str, settings: str | None, changes: dict[str, Any]) -> 
     """Raises ConfigError unless training settings can be read and accept the changes."""
     from nics_drl_bridge.config import find_config
 
-    if (
-        settings is not None
-        and not (file := find_config(settings, "training")).is_file()
-    ):
-        raise ConfigError(f"--settings {file}: no such file; check the path.")
+    if settings is not None:
+        file = find_config(settings, "training")
+        if not file.is_file():
+            raise ConfigError(f"--settings {file}: no such file; check the path.")
     from nics_drl_bridge.policy.training_settings import chosen_settings
 
     check_task(chosen_settings(task, settings, changes).task)

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer import Argument, Option
 
+from nics_drl_bridge import extensions
 from nics_drl_bridge.commands.console import JsonOption, print_line
-from nics_drl_bridge.errors import MISSING_ROS, ConfigError, suggest
+from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.nodes.message_packages import shipped_packages, wheels_here
 
 if TYPE_CHECKING:
@@ -59,8 +60,7 @@ def install(
         return
     wheels = wheels_here()
     if wheels is None:
-        if find_spec("rclpy") is None:
-            raise ConfigError(f"nics install {MISSING_ROS.format(module='rclpy')}")
+        extensions.require("nics install", "rclpy")
         name = sources[0].name
         distribution = os.environ.get("ROS_DISTRO", "DISTRO")
         debian = f"ros-{distribution}-{name.replace('_', '-')}"

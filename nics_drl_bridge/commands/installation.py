@@ -8,8 +8,12 @@ from importlib.metadata import PackageNotFoundError, metadata, version
 from importlib.util import find_spec
 from typing import NamedTuple
 
-from nics_drl_bridge.errors import MISSING_ROS
-from nics_drl_bridge.extensions import PACKAGE, TRAINING, find_lacking
+from nics_drl_bridge.extensions import (
+    INSTALL_ROS,
+    PACKAGE,
+    TRAINING,
+    find_lacking,
+)
 from nics_drl_bridge.nodes.message_packages import how_to_install
 
 EXTRAS = {  # extra -> purpose, modules that it installs
@@ -66,11 +70,9 @@ def _check_python() -> Check:
     low, high = (
         tuple(map(int, part.lstrip("<>=").split(".")[:2])) for part in parts[:2]
     )
-    found = sys.version_info[:2]
-    fix = f"use a Python {needed}"
-    return Check(
-        "Python", low <= found < high, ".".join(map(str, sys.version_info[:3])), fix
-    )
+    works = low <= sys.version_info[:2] < high
+    running = ".".join(map(str, sys.version_info[:3]))
+    return Check("Python", works, running, f"use a Python {needed}")
 
 
 def _check_extras() -> list[Check]:
@@ -85,15 +87,8 @@ def _check_extras() -> list[Check]:
 
 def _check_ros() -> list[Check]:
     if find_spec("rclpy") is None:
-        reason = MISSING_ROS.format(module="rclpy").partition("; ")[2].rstrip(".")
-        return [
-            Check(
-                "ROS 2",
-                False,
-                "driving over topics: none is sourced or installed",
-                reason,
-            )
-        ]
+        text = "driving over topics: none is sourced or installed"
+        return [Check("ROS 2", False, text, INSTALL_ROS)]
     try:
         release = version("rclpy")
     except PackageNotFoundError:
@@ -114,7 +109,7 @@ def _check_kernels() -> Check:
         import_module(f"{PACKAGE}.{name}")
     from nics_drl_bridge.kernels import KERNELS, SECONDS_EACH
 
-    cold = sum(not each.is_warm for each in KERNELS)
+    cold = sum(not kernel.is_warm for kernel in KERNELS)
     text = f"{len(KERNELS) - cold} of {len(KERNELS)} are compiled"
     seconds = max(1, round(cold * SECONDS_EACH))
     fix = f"nics warmup, about {seconds} s; else each is compiled at its first use"

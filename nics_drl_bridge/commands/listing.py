@@ -35,17 +35,18 @@ def robots() -> list[Row]:
     from nics_drl_bridge.generator import mount_lidar
     from nics_drl_bridge.robot.spec import load_robot
 
-    return [
-        {
+    rows = []
+    for name in list_shipped("robots"):
+        robot = load_robot(name)
+        commands = [f"{c.name} {c.min:g} to {c.max:g} {c.unit}" for c in robot.command]
+        row = {
             "name": name,
-            "commands": ", ".join(
-                f"{c.name} {c.min:g} to {c.max:g} {c.unit}" for c in robot.command
-            ),
+            "commands": ", ".join(commands),
             "lidar": mount_lidar(robot).name,
             "description": robot.description,
         }
-        for name, robot in ((name, load_robot(name)) for name in list_shipped("robots"))
-    ]
+        rows.append(row)
+    return rows
 
 
 def worlds() -> list[Row]:
@@ -96,16 +97,18 @@ def lidars() -> list[Row]:
 
     from nics_drl_bridge.lidar.spec import load_lidar
 
-    return [
-        {
+    rows = []
+    for name in list_shipped("lidars"):
+        lidar = load_lidar(name)
+        row = {
             "name": name,
-            "beams": spec.beams,
-            "view [deg]": round(degrees(spec.angle_max - spec.angle_min)),
-            "range [m]": f"{spec.range_min:g} to {spec.range_max:g}",
-            "scans [Hz]": spec.rate,
+            "beams": lidar.beams,
+            "view [deg]": round(degrees(lidar.angle_max - lidar.angle_min)),
+            "range [m]": f"{lidar.range_min:g} to {lidar.range_max:g}",
+            "scans [Hz]": lidar.rate,
         }
-        for name, spec in ((name, load_lidar(name)) for name in list_shipped("lidars"))
-    ]
+        rows.append(row)
+    return rows
 
 
 def policies() -> list[Row]:

@@ -287,11 +287,11 @@ class Generators(AbstractContextManager["Generators", None]):
         needed = interfaces.needed
         lists = CMAKE_LISTS.format(
             name=interfaces.name,
-            find="\n".join(f"find_package({each} REQUIRED)" for each in needed),
+            find="\n".join(f"find_package({name} REQUIRED)" for name in needed),
             files=" ".join(names),
             needed=" ".join(needed),
         )
-        depend = "".join(f"<depend>{each}</depend>" for each in needed)
+        depend = "".join(f"<depend>{name}</depend>" for name in needed)
         manifest = PACKAGE_XML.format(name=interfaces.name, depend=depend)
         (place / "CMakeLists.txt").write_text(lists, encoding="utf-8")
         (place / "package.xml").write_text(manifest, encoding="utf-8")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Argument, Option
 
-from nics_drl_bridge import defaults
+from nics_drl_bridge import defaults, extensions
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.commands.first_checks import check_drive
 from nics_drl_bridge.config import parse_namespace
@@ -79,7 +79,7 @@ def record(
     check_drive(parameters)
     if not preview:
         # This comes first because ROS 2 from wheels restarts Python.
-        with console.needs_ros("nics record"):
+        with extensions.require_modules("nics record"):
             from nics_drl_bridge.nodes.record_node import record as drive
     lines = draw_preview(parameters)
     facts: dict[str, Any] = {"out": str(out), "robot": robot}
@@ -107,15 +107,20 @@ def record(
 
 def make_node_arguments(namespace: str, remap: Sequence[str]) -> list[str]:
     """Returns `record_node`'s command line. Raises ConfigError for a malformed remapping rule."""
-    rules = [f"__ns:={space}"] if (space := parse_namespace(namespace)) else []
+    space = parse_namespace(namespace)
+    rules = [f"__ns:={space}"] if space else []
     for rule in remap:
         if not all(rule.partition(":=")):
             raise ConfigError(
                 f"--remap {rule!r}: must be NAME:=OTHER, as in odom:=/wheel_odom."
             )
         rules.append(rule)
-    flags = [word for rule in rules for word in ("-r", rule)]
-    return ["nics", "--ros-args", *flags] if flags else ["nics"]
+    if not rules:
+        return ["nics"]
+    arguments = ["nics", "--ros-args"]
+    for rule in rules:
+        arguments += ["-r", rule]
+    return arguments
 
 
 def draw_preview(parameters: dict[str, Any]) -> tuple[str, ...]:
@@ -153,7 +158,7 @@ def drive_summary(recording: Any, parameters: dict[str, Any]) -> tuple[str, ...]
     reach = np.hypot(*place.T).max()
     return (
         f"measured: a path of {path:.1f} m, up to {reach:.2f} m from the start",
-        *(each.line() for each in coverage(recording, load_robot(parameters["robot"]))),
+        *(span.line() for span in coverage(recording, load_robot(parameters["robot"]))),
         f"next: nics generate {out} --robot {parameters['robot']} --out {out.stem}_model",
     )
 
@@ -367,7 +372,7 @@ def generate(
         write_fit_page(out / "report.html", named, spec, identified, model.report)
         if pictures:
             write_pictures(spec, identified, out / "pictures")
-    why = "" if lidar or spec.lidar else ", as none is named: --lidar says which"
+    why = "" if lidar or spec.lidar else ", the default; choose another with --lidar"
     lines = (
         f"{select_opening(model.report)}\n",
         f"its lidar is {model.lidar.name!r}{why}",
@@ -399,7 +404,7 @@ def fit_facts(out: Path, robot: str, identified: "Identified") -> dict[str, Any]
         "robot": robot,
         **conclude(identified)._asdict(),
         "equations": format_equations(identified.model),
-        "errors": [asdict(each) for each in identified.judgement],
+        "errors": [asdict(error) for error in identified.judgement],
         "report": str(out / "report.txt"),
         "page": str(out / "report.html"),
     }
@@ -433,7 +438,8 @@ def drive(
     from nics_drl_bridge.robot.spec import load_robot
 
     spec = load_robot(robot)
-    check_place(out := out or Path(f"{Path(robot).stem}_model"))
+    out = out or Path(f"{Path(robot).stem}_model")
+    check_place(out)
     lidar_spec = mount_lidar(spec, lidar)
     if recording is not None and recording.suffix != ".npz":
         raise ConfigError(f"--recording {recording}: must end in .npz.")
@@ -475,7 +481,7 @@ def urdf(
     opened = open_model(model)
     file = out or Path(f"{opened.robot.name}.urdf")
     lidar = opened.lidar
-    further = {each.frame: each.mount for each in opened.sensors}
+    further = {sensor.frame: sensor.mount for sensor in opened.sensors}
     write_text(file, make_urdf(opened.robot, lidar.mount, lidar.frame, further=further))
     name = opened.robot.name
     console.print_line(

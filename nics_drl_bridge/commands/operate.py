@@ -6,10 +6,12 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
+from nics_drl_bridge import extensions
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.config import parse_namespace
 
 EXIT_REFUSED = 1
+CONSENT_S = 60.0  # default time for a node to appear and to consent [s]
 
 WaitOption = Annotated[
     float,
@@ -29,12 +31,12 @@ def arm(
             "--reset", help="First release a latched stop, for example of nics stop."
         ),
     ] = False,
-    wait: WaitOption = 60.0,
+    wait: WaitOption = CONSENT_S,
     as_json: console.JsonOption = False,
 ) -> None:
     """Arms command_gate, or explains why it refuses."""
     parse_namespace(namespace)
-    with console.needs_ros("nics arm"):
+    with extensions.require_modules("nics arm"):
         from nics_drl_bridge.nodes.operator import Operator
     with Operator() as operator:
         answer = operator.arm(namespace, wait, reset, _tell)
@@ -57,7 +59,7 @@ def stop(
 ) -> None:
     """Stops one robot, or all, through the emergency stop of its gate."""
     parse_namespace(namespace or "")
-    with console.needs_ros("nics stop"):
+    with extensions.require_modules("nics stop"):
         from nics_drl_bridge.nodes.operator import Operator
     with Operator() as operator:
         answers = operator.stop(namespace, wait)
@@ -93,12 +95,12 @@ def goal(
         ),
     ] = "",
     namespace: NamespaceOption = "",
-    wait: WaitOption = 60.0,
+    wait: WaitOption = CONSENT_S,
     as_json: console.JsonOption = False,
 ) -> None:
     """Sends a goal, and reports whether policy_node accepts it."""
     parse_namespace(namespace)
-    with console.needs_ros("nics goal"):
+    with extensions.require_modules("nics goal"):
         from nics_drl_bridge.nodes.operator import GoalRequest, Operator
     with Operator() as operator:
         answer = operator.send_goal(

@@ -1,4 +1,4 @@
-"""Entry point of `nics`: a missing or outdated library gives one sentence, not a traceback."""
+"""Entry point of `nics`: reports a missing or outdated library in one sentence."""
 
 import atexit
 import contextlib
@@ -66,10 +66,10 @@ def _explain(error: BaseException) -> NoReturn:
             raise error
         sys.stderr.write(f"nics: {clause}\n")
         raise SystemExit(EXIT_BAD_INPUT) from None
-    if isinstance(error, RuntimeError) and "no locator available" in str(error):
-        # numba raises this when kernels are imported.
-        reason = "neither the package's folder nor your home can be written to, to keep kernels in"
-        sys.stderr.write(f"nics: {reason}; set NUMBA_CACHE_DIR to a folder that can.\n")
+    from nics_drl_bridge.errors import BridgeError
+
+    if isinstance(error, BridgeError):  # a module refuses to be imported
+        sys.stderr.write(f"nics: {error}\n")
         raise SystemExit(EXIT_BAD_INPUT) from None
     raise error
 

@@ -181,7 +181,8 @@ def report_interruption(
                 typer.echo(f"to go on from the last checkpoint: {again.line}", err=True)
             else:
                 typer.echo(
-                    f"{again.out}: no checkpoint was written yet; begin anew.", err=True
+                    f"{again.out}: no checkpoint was written yet; start again.",
+                    err=True,
                 )
         raise
 
@@ -302,16 +303,22 @@ def _run(
     typer.echo(
         f"policy files, checkpoints and logs: {folder}; tensorboard --logdir {folder}"
     )
-    policy, (world, *_) = (
-        folder / f"seed_{results[0].seed}" / "policy.onnx",
-        results[0].summaries,
-    )
-    task = f" --task {own}" if ":" in (own := order.settings.task) else ""
-    if task and not any(
-        one.success.value for each in results for one in each.summaries.values()
-    ):
-        typer.echo(
-            "no episode was a success: does `info` of the task tell `is_success`?",
-            err=True,
-        )
-    typer.echo(f"see it drive: nics watch {policy} --world {world}{task}")
+    policy = folder / f"seed_{results[0].seed}" / "policy.onnx"
+    world = next(iter(results[0].summaries))
+    task_option = ""
+    if ":" in order.settings.task:
+        task_option = f" --task {order.settings.task}"
+        if not _has_success(results):
+            typer.echo(
+                "no episode was a success: does the task's `info` contain `is_success`?",
+                err=True,
+            )
+    typer.echo(f"see it drive: nics watch {policy} --world {world}{task_option}")
+
+
+def _has_success(results: Sequence[Any]) -> bool:
+    for result in results:
+        for summary in result.summaries.values():
+            if summary.success.value > 0.0:
+                return True
+    return False

@@ -4,7 +4,6 @@ import signal
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any, NoReturn
@@ -12,8 +11,9 @@ from typing import Annotated, Any, NoReturn
 import typer
 from typer import Argument, Option
 
+from nics_drl_bridge import extensions
 from nics_drl_bridge.commands import console
-from nics_drl_bridge.errors import MISSING_ROS, ConfigError, suggest
+from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.exit_codes import EXIT_BAD_INPUT
 from nics_drl_bridge.nodes.node_process import ChildProcess, command_of
 from nics_drl_bridge.nodes.starting import LAUNCHES, Launch, NodeStart, complete
@@ -59,8 +59,7 @@ def up(
         return
     values = parse_values(arguments or ())
     complete(launch.arguments, values)
-    if find_spec("rclpy") is None:
-        raise ConfigError(f"nics up {MISSING_ROS.format(module='rclpy')}")
+    extensions.require("nics up", "rclpy")
     nodes = launch.nodes(values)
     if not nodes:
         raise ConfigError(f"nics up {what}: there is nothing to start; say rviz:=true.")

@@ -52,8 +52,8 @@ class GoalOrder:
                 f"--start {self.start!r}: {suggest(self.start, (WAIT, PRESENT))}"
             )
         if not self.confirm_beyond_m >= 0.0:
-            told = f"--confirm-beyond {self.confirm_beyond_m:g}"
-            raise ConfigError(f"{told}: must be a distance of 0 m or more.")
+            option = f"--confirm-beyond {self.confirm_beyond_m:g}"
+            raise ConfigError(f"{option}: must be a distance of 0 m or more.")
 
     @property
     def relative(self) -> bool:
@@ -115,13 +115,12 @@ class VehicleEpisode:
     @property
     def options(self) -> dict[str, Array]:
         """Options for the env's reset."""
-        if self.order.point is None and not self.order.needs_pose:
-            given = {}
-        else:
-            given = {"goal": self.goal}
+        options = {}
+        if self.order.point is not None or self.order.needs_pose:
+            options["goal"] = self.goal
         if self.order.lays_map and self.order.point is not None:
-            given["start"] = self.start
-        return given
+            options["start"] = self.start
+        return options
 
     def sentence(self) -> str:
         """Describes where the vehicle has to stand and where it will drive."""
@@ -144,10 +143,10 @@ class VehicleEpisode:
         limit = self.order.confirm_beyond_m
         if self.distance <= limit:
             return
-        told = f"{self.sentence()}, farther than {limit:g} m"
+        question = f"{self.sentence()}, farther than {limit:g} m"
         if confirm is None:
-            raise ConfigError(f"{told}: nobody can confirm that here; {UNATTENDED}")
-        confirm(told)
+            raise ConfigError(f"{question}: nobody can confirm that here; {UNATTENDED}")
+        confirm(question)
 
 
 UNATTENDED = (
@@ -163,5 +162,5 @@ def confirm_at_terminal(question: str) -> None:
         raise ConfigError(f"{question}: nobody can confirm that here; {UNATTENDED}")
     if not typer.confirm(f"{question}. Drive there?", err=True):
         raise ConfigError(
-            "the vehicle is not driven, as the goal was not confirmed; choose another."
+            "the vehicle is not driven because the goal was not confirmed; choose another."
         )

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer import Argument, Option
@@ -12,6 +12,9 @@ from nics_drl_bridge import defaults, extensions
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.robot import DEFAULT_ROBOT
+
+if TYPE_CHECKING:
+    from nics_drl_bridge.commands.conditions import Conditions
 
 
 def watch(
@@ -60,18 +63,11 @@ def watch(
         int, Option(min=1, help="For --record: number of episodes.")
     ] = 1,
     port: Annotated[
-        int | None,
-        Option(min=0, max=65535, help="Port of the page; 0 takes any (default 8765)."),
-    ] = None,
+        int, Option(min=0, max=65535, help="Port of the page; 0 takes any.")
+    ] = defaults.PAGE_PORT,
     browser: Annotated[bool, Option(help="Open the page in a browser.")] = True,
 ) -> None:
     """Shows a policy, live topics or a bag on a page in the browser."""
-    conditions = {
-        "lidar": lidar,
-        "randomisation": randomisation,
-        "gate": gate,
-        "task": task,
-    }
     if record is None:  # first, because opening the source may take a while
         extensions.require("the page", "websockets")
     else:
@@ -83,12 +79,14 @@ def watch(
     elif ros:
         source = _watch_ros(model, world, namespace)
     else:
+        from nics_drl_bridge.commands.conditions import Conditions
+
         source = _watch_episodes(
             policy or DEFAULT_ROBOT,
             model,
             world or [defaults.EVALUATION_WORLD],
             seed,
-            conditions,
+            Conditions(lidar, randomisation, gate, kind=task),
         )
     with closing(source):
         if record is not None:
@@ -102,28 +100,21 @@ def _watch_episodes(
     name: str | None,
     worlds: list[str],
     seed: int,
-    given: dict[str, str | None],
+    conditions: "Conditions",
 ) -> Any:
     from nics_drl_bridge.commands import episodes as driving
-    from nics_drl_bridge.commands.conditions import Conditions
     from nics_drl_bridge.generator import open_model
     from nics_drl_bridge.sim.world_set import load_worlds
     from nics_drl_bridge.watch.episode import EpisodeSource
 
-    under = Conditions(
-        given["lidar"], given["randomisation"], given["gate"], kind=given["task"]
-    )
-    robots = [
-        driving.find_robot(*entry) for entry in driving.read_contracts([policy]).items()
-    ]
-    model = open_model(name or (robots or [DEFAULT_ROBOT])[0], under.lidar)
+    robot = driving.model_name(name, driving.read_contracts([policy]))
+    model = open_model(robot, conditions.lidar)
 
     def make(policy: str, world: Any) -> Any:
-        options = {"estimator": True, "randomisation": under.ranges}
-        within = driving.limit_time(
-            under, driving.read_contracts([policy]), model, world, typer.echo
-        )
-        return driving.open_env(policy, model, world, "sim", within, **options)
+        contracts = driving.read_contracts([policy])
+        limited = driving.limit_time(conditions, contracts, model, world, typer.echo)
+        options = {"estimator": True, "randomisation": conditions.ranges}
+        return driving.open_env(policy, model, world, "sim", limited, **options)
 
     return EpisodeSource(
         make, policy, [load_worlds(world) for world in worlds], seed, name or ""
@@ -148,7 +139,7 @@ def _watch_bag(
 def _watch_ros(name: str | None, worlds: list[str] | None, namespace: str) -> Any:
     from nics_drl_bridge.generator import open_model
 
-    with console.needs_ros("nics watch --ros"):
+    with extensions.require_modules("nics watch --ros"):
         from nics_drl_bridge.nodes.watching import RosSource
     model = open_model(name or DEFAULT_ROBOT)
     return RosSource(model, _make_only_world(worlds), namespace, model_name=name or "")
@@ -178,10 +169,10 @@ def _record(path: Path, source: Any, episodes: int) -> None:
     typer.echo(f"wrote {path}")
 
 
-def _serve(source: Any, port: int | None, browser: bool) -> None:
-    from nics_drl_bridge.watch.server import PORT, PageServer
+def _serve(source: Any, port: int, browser: bool) -> None:
+    from nics_drl_bridge.watch.server import PageServer
     from nics_drl_bridge.watch.show import open_page, show
 
-    with closing(PageServer(PORT if port is None else port)) as server:
+    with closing(PageServer(port)) as server:
         open_page(server.url, browser)
         show(source, server)

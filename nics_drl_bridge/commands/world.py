@@ -83,7 +83,9 @@ def import_(
     goal_distance: Annotated[
         tuple[float, float] | None,
         Option(
-            metavar="LEAST GREATEST", help="From start to goal [m]; else from 2 m on."
+            metavar="LEAST GREATEST",
+            help="From start to goal [m]; else from "
+            f"{defaults.IMPORT_GOAL_DISTANCE_M:g} m on.",
         ),
     ] = None,
     clearance: Annotated[
@@ -187,7 +189,7 @@ def _read_standing(
         for group in standing.obstacles
     ]
     head = [f"What stands in {file.name} at a height of {height:g} m."]
-    head += [f"Left out: {each}." for each in standing.left_out]
+    head += [f"Left out: {reason}." for reason in standing.left_out]
     derived = {"name": file.stem, "bounds": field, "obstacles": groups}
     text = _format_world(file, head, derived | keys, (x2 - x1, y2 - y1))
     line = (
@@ -272,10 +274,10 @@ def _format_world(
         reason = f"its {obstacles} bodies make a larger file than is read"
         fix = "leave some out by --without MODEL, or split the world"
         raise ConfigError(f"{file}: {reason}; {fix}.") from None
-    found = validate(data, World, made)
-    if found.map is None:
-        found._file = made
-        check_places(found)
+    checked_world = validate(data, World, made)
+    if checked_world.map is None:
+        checked_world._file = made
+        check_places(checked_world)
     return text
 
 
@@ -284,7 +286,7 @@ def _format_flow(value: Any) -> str:
     if isinstance(value, dict):
         return (
             "{"
-            + ", ".join(f"{key}: {_format_flow(each)}" for key, each in value.items())
+            + ", ".join(f"{key}: {_format_flow(item)}" for key, item in value.items())
             + "}"
         )
     if isinstance(value, list | tuple):
@@ -343,12 +345,12 @@ def _check_overwrite(worlds: Any, given: Path, *written: Path) -> None:
             Path(member.source),
             *(files_of(member.map) if member.map else ()),
         )
-        for file in {each.resolve() for each in written} & {
-            each.resolve() for each in sources
-        }:
-            raise ConfigError(
-                f"{file}: the world itself is made of it; name another as --out."
-            )
+        own_files = {path.resolve() for path in sources}
+        for file in written:
+            if file.resolve() in own_files:
+                raise ConfigError(
+                    f"{file.resolve()}: is a file of the world itself; give another --out."
+                )
 
 
 @world.command("map")

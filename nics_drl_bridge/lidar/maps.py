@@ -262,7 +262,7 @@ def read_image(
         ValueError,
         struct.error,
     ):
-        reason = "is no whole PGM, PNG or BMP image; save the map anew in one of them."
+        reason = "is no whole PGM, PNG or BMP image; save the map again in one of them."
         raise ConfigError(f"{path}: {reason}") from None
 
 

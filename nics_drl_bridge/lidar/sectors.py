@@ -166,14 +166,13 @@ def _check(lidar: LidarSpec, layout: ScanLayout, angles: Array) -> None:
     apart = lidar.angle_increment if lidar.beams > 1 else np.inf
     if apart > COARSEST_RAD:
         found, most = np.degrees([apart, COARSEST_RAD])
-        reason = f"are {found:.3g} deg apart, a scan layout needs at most {most:.3g}"
-        raise ConfigError(
-            f"the beams of the lidar {lidar.name!r} {reason}; use a finer lidar."
-        )
+        seen = f"the beams of the lidar {lidar.name!r} are {found:.3g} deg apart"
+        reason = f"{seen}, a scan layout needs at most {most:.3g}"
+        raise ConfigError(f"{reason}; use a finer lidar.", reason=reason)
     if lidar.range_max < layout.range_max * (1.0 - RANGE_TOLERANCE):
-        needed = f"{layout.range_max:g} m; {_narrower(lidar, layout)}."
         seen = f"range_max of the lidar {lidar.name!r} is {lidar.range_max:g} m"
-        raise ConfigError(f"{seen}, the scan layout needs {needed}")
+        reason = f"{seen}, the scan layout needs {layout.range_max:g} m"
+        raise ConfigError(f"{reason}; {_narrower(lidar, layout)}.", reason=reason)
     steps = max(
         layout.sectors, int(np.ceil((layout.angle_max - layout.angle_min) / apart))
     )
@@ -188,12 +187,9 @@ def _check(lidar: LidarSpec, layout: ScanLayout, angles: Array) -> None:
     if (gap > apart + BORDER_RAD).any():
         limits = np.degrees([angles[0], angles[-1], layout.angle_min, layout.angle_max])
         a, b, c, d = (f"{limit:.4g}" for limit in limits)
-        reason = (
-            f"looks from {a} to {b} deg in base_link, the scan layout needs {c} to {d}"
-        )
-        raise ConfigError(
-            f"the lidar {lidar.name!r} {reason}; {_narrower(lidar, layout)}."
-        )
+        seen = f"the lidar {lidar.name!r} looks from {a} to {b} deg in base_link"
+        reason = f"{seen}, the scan layout needs {c} to {d}"
+        raise ConfigError(f"{reason}; {_narrower(lidar, layout)}.", reason=reason)
 
 
 def _narrower(lidar: LidarSpec, layout: ScanLayout) -> str:

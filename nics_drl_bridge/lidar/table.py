@@ -210,11 +210,11 @@ class LidarTable:
             data = json.loads(read_text(path, MOST_BYTES))
         except (RecursionError, ValueError) as error:
             raise ModelError(
-                f"{path}: is not JSON ({error}); generate the model anew."
+                f"{path}: is not JSON ({error}); generate the model again."
             ) from None
         if not isinstance(data, dict) or data.get("format") != FORMAT:
             raise ModelError(
-                f"{path}: its format is not {FORMAT!r}; generate the model anew."
+                f"{path}: its format is not {FORMAT!r}; generate the model again."
             )
         parts: dict[str, Any] = dict(validate(data, TableAbout, str(path)))
         parts |= {name: _mapped(folder / f"{name}.npy") for name in ARRAYS}
@@ -223,7 +223,7 @@ class LidarTable:
         try:
             table._check()
         except (ArithmeticError, IndexError, ValueError) as error:
-            reason = f"is not a lidar table ({error}); generate the model anew."
+            reason = f"is not a lidar table ({error}); generate the model again."
             raise ModelError(f"{folder}: {reason}") from None
         return table
 
@@ -275,6 +275,6 @@ def _mapped(path: Path) -> NDArray[Any]:
             raise TypeError("an archive of arrays")
     except Exception:  # noqa: BLE001 - a false header breaks numpy in any way
         raise ModelError(
-            f"{path}: is not an array of numbers; generate the model anew."
+            f"{path}: is not an array of numbers; generate the model again."
         ) from None
     return np.asarray(array)

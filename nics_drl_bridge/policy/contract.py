@@ -15,7 +15,7 @@ from pydantic import Field, field_validator
 from nics_drl_bridge.config import Schema, share_folder, validate
 from nics_drl_bridge.env.registry import TASKS
 from nics_drl_bridge.env.task import Task
-from nics_drl_bridge.errors import ConfigError, PolicyError
+from nics_drl_bridge.errors import ConfigError, PolicyError, shorten
 from nics_drl_bridge.files import hash_bytes
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.sectors import ScanLayout
@@ -239,25 +239,22 @@ def read_contract(text: str, source: str) -> Contract:
     try:
         data = json.loads(text, object_pairs_hook=_once, parse_constant=_no_constant)
     except (ValueError, RecursionError) as error:
-        reason = f"is not the JSON that `export_policy` writes ({str(error)[:80]})"
+        reason = (
+            f"is not the JSON that `export_policy` writes ({shorten(str(error), 80)})"
+        )
         raise PolicyError(
             source, "metadata", f"{reason}; export the policy again."
         ) from None
-    given = data.get("format") if isinstance(data, dict) else None
-    if given != FORMAT:
-        reason = f"is {reprlib.repr(given)}, not {FORMAT!r}; export the policy with this version."
+    file_format = data.get("format") if isinstance(data, dict) else None
+    if file_format != FORMAT:
+        fix = "export the policy with this version"
+        reason = f"is {reprlib.repr(file_format)}, not {FORMAT!r}; {fix}."
         raise PolicyError(source, "format", reason)
     try:
-        contract = validate(data, Contract, source)
+        # A missing field can't be added to a signed file.
+        contract = validate(data, Contract, source, "export the policy again")
     except ConfigError as error:
-        reason = str(error).removeprefix(f"{source}: ")
-        # A missing field can't be added to a signed file, so the advice is to export again.
-        reason = reason.replace(
-            "is missing; add it.", "is missing; export the policy again."
-        )
-        quoted = reason.split("'")
-        key = quoted[1] if len(quoted) > 2 and "key" in quoted[0] else "metadata"
-        raise PolicyError(source, key, reason) from None
+        raise PolicyError(source, error.key or "metadata", error.reason) from None
     _check_unchanged(data, source)
     _check_agreement(contract, source)
     return contract

@@ -206,13 +206,16 @@ def drive_worlds(env: BridgeVectorEnv, act: Act, seeds: Sequence[int]) -> Outcom
     For a policy with a state, pass its method `act`, so that the state can be reset.
     """
     width = env.num_envs
-    given = check_seeds(seeds)
+    checked_seeds = check_seeds(seeds)
     # Seeds that fill up the last batch are run but not counted.
     batches = (
-        np.resize(given[k : k + width], width) for k in range(0, len(given), width)
+        np.resize(checked_seeds[k : k + width], width)
+        for k in range(0, len(checked_seeds), width)
     )
     done = zip(*(_drive_once(env, act, batch) for batch in batches), strict=True)
-    return Outcomes(given, *(np.concatenate(rows)[: len(given)] for rows in done))
+    return Outcomes(
+        checked_seeds, *(np.concatenate(rows)[: len(checked_seeds)] for rows in done)
+    )
 
 
 def _drive_once(
@@ -349,7 +352,7 @@ class Tally(Summary):
             ends = [value]
             if isinstance(value, ConfidenceInterval):
                 ends = list(vars(value).values())
-            known = [each if math.isfinite(each) else None for each in ends]
+            known = [value if math.isfinite(value) else None for value in ends]
             figures[name] = known if isinstance(value, ConfidenceInterval) else known[0]
         return figures
 
@@ -359,7 +362,7 @@ def tallies(
 ) -> dict[str, Tally]:
     """Computes the statistics of each world, compared with the first world's by seed."""
     first = next(iter(runs.values()))
-    found = {}
+    by_place = {}
     for place, episodes in runs.items():
         rows = (
             (e.seed, e.result, e.steps, e.length, e.reward, e.believed_success)
@@ -371,10 +374,10 @@ def tallies(
         )
         pairs = list(zip(episodes, first, strict=True))
         gaps = [deviation(one, other) for one, other in pairs]
-        found[place] = Tally(
+        by_place[place] = Tally(
             **vars(summarise(outcomes, control_period)),
             same=sum(one.result == other.result for one, other in pairs) / len(pairs),
             deviation=mean(gaps),
             greatest_deviation=max(gaps),
         )
-    return found
+    return by_place

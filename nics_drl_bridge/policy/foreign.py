@@ -24,7 +24,12 @@ from nics_drl_bridge.policy.contract import (
 from nics_drl_bridge.policy.foreign_graph import Composer, Network
 from nics_drl_bridge.policy.foreign_mapping import ForeignPolicy
 from nics_drl_bridge.policy.onnx_graph import STATE_IN
-from nics_drl_bridge.policy.onnx_session import GraphNeeds, in_turn, open_session
+from nics_drl_bridge.policy.onnx_session import (
+    GraphNeeds,
+    cannot_run,
+    in_turn,
+    open_session,
+)
 
 
 @dataclass(frozen=True)
@@ -150,10 +155,7 @@ def _golden(graph: Any, seen: Rows, size: int, source: str) -> dict[str, Rows]:
         try:
             return list(session.run(None, dict(zip(names, given, strict=False))))
         except Exception as error:  # noqa: BLE001 - the runtime's errors have no common base class
-            words = " ".join(str(error).split())[:120]
-            raise PolicyError(
-                source, "network", f"onnxruntime can't run it ({words})."
-            ) from None
+            raise cannot_run(source, error, "network") from None
 
     rows = in_turn(run if size else lambda one, state: [*run(one), state], seen, start)
     if not all(np.isfinite(part).all() for part in rows):

@@ -1,7 +1,7 @@
 """Connects a foreign network to the observation of a task and the commands of a robot."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -34,13 +34,14 @@ class Network:
     @property
     def inputs(self) -> dict[str, Any]:
         """Inputs by name, as onnx.ValueInfoProto; weights may be among them."""
-        held = {tensor.name for tensor in self.model.graph.initializer}
-        return {one.name: one for one in self.model.graph.input if one.name not in held}
+        weights = {tensor.name for tensor in self.model.graph.initializer}
+        values = [v for v in self.model.graph.input if v.name not in weights]
+        return {value.name: value for value in values}
 
     @property
     def outputs(self) -> dict[str, Any]:
         """Outputs by name, as onnx.ValueInfoProto."""
-        return {one.name: one for one in self.model.graph.output}
+        return {value.name: value for value in self.model.graph.output}
 
 
 class Composer:
@@ -79,12 +80,12 @@ class Composer:
         build.weights += theirs.graph.initializer
         command = self._command()
         low, high = self._task.command_limits
-        command = build.cut(command, (low, high))
+        command = build.clamp(command, (low, high))
         build.add("Identity", command, name=onnx_graph.COMMAND)
         action = build.affine(
             command, 2.0 / (high - low), -1.0 - 2.0 * low / (high - low)
         )
-        build.add("Identity", build.cut(action, (-1.0, 1.0)), name=onnx_graph.ACTION)
+        build.add("Identity", build.clamp(action, (-1.0, 1.0)), name=onnx_graph.ACTION)
         if sizes:
             self._remember()
             build.join([self._next[key] for key in sizes], name=onnx_graph.STATE_OUT)
@@ -95,16 +96,15 @@ class Composer:
 
     def _check_names(self) -> None:
         mapping = self._mapping
-        taken = self._network.inputs
-        given = self._network.outputs
+        inputs = self._network.inputs
         for name in (*mapping.inputs, *self._states):
-            if name not in taken:
+            if name not in inputs:
                 where = "inputs" if name in mapping.inputs else "states"
-                fix = suggest(name, taken)
+                fix = suggest(name, inputs)
                 raise self._fault(
                     f"{where}.{name}", f"the network has no such input; {fix}"
                 )
-        for name in taken:
+        for name in inputs:
             if name not in mapping.inputs and name not in self._states:
                 reason = "the network has this input, but the mapping does not; add it."
                 raise self._fault(f"inputs.{name}", reason)
@@ -113,22 +113,25 @@ class Composer:
                     f"states.{name}",
                     "is also listed under inputs; keep one of the two.",
                 )
-        commands = mapping.outputs.items()
-        named = [
-            (f"outputs.{key}.of", one.of) for key, one in commands if one.of is not None
-        ]
-        named += [(f"states.{key}.next", one.next) for key, one in self._states.items()]
-        named += [] if mapping.choices is None else [("choices.of", mapping.choices.of)]
-        named += [
-            (f"inputs.{key}.parts.{k}.output", part.output)
-            for key, one in mapping.inputs.items()
-            for k, part in enumerate(one.parts)
-            if part.output is not None
-        ]
-        for place, name in named:
-            if name not in given:
-                fix = suggest(name, given)
+        for place, name in self._list_used_outputs():
+            if name not in self._network.outputs:
+                fix = suggest(name, self._network.outputs)
                 raise self._fault(place, f"the network has no output {name!r}; {fix}")
+
+    def _list_used_outputs(self) -> Iterator[tuple[str, str]]:
+        """Yields each output that the mapping names, after the place where it does."""
+        mapping = self._mapping
+        for key, command in mapping.outputs.items():
+            if command.of is not None:
+                yield f"outputs.{key}.of", command.of
+        for key, state in self._states.items():
+            yield f"states.{key}.next", state.next
+        if mapping.choices is not None:
+            yield "choices.of", mapping.choices.of
+        for key, mapped in mapping.inputs.items():
+            for k, part in enumerate(mapped.parts):
+                if part.output is not None:
+                    yield f"inputs.{key}.parts.{k}.output", part.output
 
     # Shapes: the graph takes one observation at a time, so an open first dimension is 1.
 
@@ -137,18 +140,21 @@ class Composer:
         model = onnx.ModelProto()
         model.CopyFrom(self._network.model)
         versions = [
-            one.version for one in model.opset_import if one.domain in ("", "ai.onnx")
+            opset.version
+            for opset in model.opset_import
+            if opset.domain in ("", "ai.onnx")
         ]
         if not versions or max(versions) < OLDEST_OPSET:
             reason = (
                 f"is {max(versions, default=0)}; {OLDEST_OPSET} or newer is needed."
             )
             raise self._fault("network.opset", reason)
-        for one in model.graph.input:
-            if one.name in self._network.inputs:
-                shape = one.type.tensor_type.shape
-                for place, size in zip(shape.dim, self._shape(one.name), strict=True):
-                    place.dim_value = size
+        for value in model.graph.input:
+            if value.name in self._network.inputs:
+                shape = value.type.tensor_type.shape
+                sizes = self._shape(value.name)
+                for dimension, size in zip(shape.dim, sizes, strict=True):
+                    dimension.dim_value = size
         rehearsal.rehearse_folding(
             model.SerializeToString(), max(versions), self._source
         )
@@ -156,16 +162,14 @@ class Composer:
             model = onnx.compose.add_prefix(model, THEIRS)
             self._made = graph_folding.fold_shapes(model.graph, max(versions))
         except Exception as error:  # noqa: BLE001 - a damaged graph raises anything
-            words = " ".join(str(error).split())[:120]
-            raise self._fault(
-                "network", f"its shapes are inconsistent ({words})."
-            ) from None
+            reason = f"its shapes are inconsistent ({onnx_graph.quote(error)})."
+            raise self._fault("network", reason) from None
         return model
 
     def _shape(self, name: str) -> tuple[int, ...]:
         """Returns the shape of an input: an open first dimension is 1, others fit the parts."""
-        one = self._network.inputs[name].type.tensor_type
-        sizes = [d.dim_value if d.HasField("dim_value") else 0 for d in one.shape.dim]
+        shape = self._network.inputs[name].type.tensor_type.shape
+        sizes = [d.dim_value if d.HasField("dim_value") else 0 for d in shape.dim]
         if sizes and sizes[0] == 0:
             sizes[0] = 1
         needed = self._given_size(name)
@@ -176,8 +180,8 @@ class Composer:
         sizes = [size or 1 for size in sizes]
         if needed is not None and math.prod(sizes) != needed:
             parts = self._mapping.inputs[name].parts
-            each = ", ".join(f"{part.of} {self._part_size(part)}" for part in parts)
-            reason = f"the network takes {tuple(sizes)}, but the parts have {needed} ({each})."
+            listed = ", ".join(f"{part.of} {self._part_size(part)}" for part in parts)
+            reason = f"the network takes {tuple(sizes)}, but the parts have {needed} ({listed})."
             raise self._fault(f"inputs.{name}", reason)
         return tuple(sizes)
 
@@ -211,8 +215,8 @@ class Composer:
     def _state_sizes(self) -> dict[str, int]:
         """Returns the number of elements of each entry in the state."""
         sizes = {f"state {name}": math.prod(self._shape(name)) for name in self._states}
-        for name, one in self._mapping.inputs.items():
-            for k, part in enumerate(one.parts):
+        for name, mapped in self._mapping.inputs.items():
+            for k, part in enumerate(mapped.parts):
                 if part.of.startswith("last.") and part.output is None:
                     sizes["twist"] = len(foreign_mapping.TWIST)
                 if part.output is not None:
@@ -227,21 +231,21 @@ class Composer:
 
     def _feed(self, theirs: Any) -> None:
         build = self._build
-        taken = {one.name: one.type.tensor_type.elem_type for one in theirs.graph.input}
+        types = {v.name: v.type.tensor_type.elem_type for v in theirs.graph.input}
         for name in self._network.inputs:
             if name in self._states:
                 row = self._begun(
                     f"state {name}", self._states[name].start, f"states.{name}.start"
                 )
             else:
-                one = self._mapping.inputs[name]
-                parts = [self._part(name, k, part) for k, part in enumerate(one.parts)]
-                self._check_scaled(one, self._given_size(name) or 0, f"inputs.{name}")
-                row = build.scale(
-                    parts[0] if len(parts) == 1 else build.join(parts), one
-                )
+                mapped = self._mapping.inputs[name]
+                rows = [self._part(name, k, p) for k, p in enumerate(mapped.parts)]
+                size = self._given_size(name) or 0
+                self._check_scaled(mapped, size, f"inputs.{name}")
+                row = rows[0] if len(rows) == 1 else build.join(rows)
+                row = build.scale(row, mapped)
             row = build.add("Reshape", row, build.constant(self._shape(name), np.int64))
-            build.add("Cast", row, name=THEIRS + name, to=taken[THEIRS + name])
+            build.add("Cast", row, name=THEIRS + name, to=types[THEIRS + name])
 
     def _check_scaled(
         self, scaled: foreign_mapping.Scaled, size: int, place: str
@@ -255,15 +259,14 @@ class Composer:
     def _begun(self, key: str, start: Any, place: str = "") -> str:
         """Returns the name of a state entry, replaced by its start value in the first step."""
         past = self._past[key]
-        if isinstance(start, tuple) and len(start) != (
-            size := self._state_sizes()[key]
-        ):
+        size = self._state_sizes()[key]
+        if isinstance(start, tuple) and len(start) != size:
             raise self._fault(
                 place, f"has {len(start)} numbers, but the state has {size}."
             )
         if not np.any(start):
             return past
-        return self._build.blend(
+        return self._build.select(
             self._past["begun"], past, self._build.constant([start])
         )
 
@@ -277,7 +280,7 @@ class Composer:
         key = f"history {name} {k}"
         first = build.join([row] * (part.history - 1))
         # oldest first
-        past = build.blend(self._past["begun"], self._past[key], first)
+        past = build.select(self._past["begun"], self._past[key], first)
         rows = build.join([past, row])
         self._next[key] = build.pick(rows, range(size, size * part.history))
         if part.newest_first:
@@ -396,15 +399,17 @@ class Composer:
     def _element(self, name: str, command: foreign_mapping.OutputCommand) -> str:
         build = self._build
         if command.of is None:
-            return build.cut(build.constant([[command.add]]), command.clip)
+            return build.clamp(build.constant([[command.add]]), command.clip)
         size = self._output_size(command.of)
         if command.index >= size:
             reason = f"is {command.index}, but the output {command.of!r} has only {size} elements."
             raise self._fault(f"outputs.{name}.index", reason)
-        row = build.cut(
+        row = build.clamp(
             build.pick(self._flat(command.of), [command.index]), command.limits
         )
-        return build.cut(build.affine(row, command.multiply, command.add), command.clip)
+        return build.clamp(
+            build.affine(row, command.multiply, command.add), command.clip
+        )
 
     def _of_twist(self, twist: Sequence[str], robot: RobotSpec) -> str:
         """Converts forward, left and turn to a row of commands, see `geometry.Bicycle.command`."""
@@ -500,7 +505,7 @@ class Composer:
         graph = onnx.helper.make_graph(
             self._build.nodes, "foreign", *made, self._build.weights
         )
-        imports = [one for one in theirs.opset_import if one.domain in ("", "ai.onnx")]
+        opsets = [o for o in theirs.opset_import if o.domain in ("", "ai.onnx")]
         return onnx.helper.make_model(
-            graph, opset_imports=imports, ir_version=theirs.ir_version
+            graph, opset_imports=opsets, ir_version=theirs.ir_version
         )

@@ -1,4 +1,9 @@
-"""Builds the ONNX graph of a policy file, node by node, around a network."""
+"""Builds the ONNX graph of a policy file, node by node, around a network.
+
+A foreign network may use any opset from 8 on. The nodes added here therefore use only operators
+that mean the same in all of them: `Clip`, for instance, takes its limits as inputs only since
+opset 11, `Where` exists since opset 9, and there is no `Atan2`. They are composed from arithmetic.
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -10,78 +15,93 @@ from numpy.typing import ArrayLike
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.policy.foreign_mapping import Limits, Scaled
 
-STEP = 1e30  # factor that lifts nearly every non-zero float32 above 1
+# slope of the ramp that stands for a step: only numbers below 1e-30 land on the ramp
+STEEP = 1e30
 
 
 class Builder:
-    """Nodes and weights of a growing graph; each name stands for a tensor of one row (1, K)."""
+    """A growing graph: lists of its nodes and weights.
+
+    Each method adds nodes and returns the name of the resulting tensor, to be passed to other
+    methods. All tensors are rows (1, K), because the graph takes one observation at a time.
+    """
 
     def __init__(self, prefix: str = "") -> None:
-        self._prefix = prefix
-        self.nodes: list[Any] = []
-        self.weights: list[Any] = []
+        self._prefix = prefix  # of the names of all tensors added here
+        self.nodes: list[Any] = []  # onnx.NodeProto, in the order of computation
+        self.weights: list[Any] = []  # onnx.TensorProto
 
     def constant(self, values: ArrayLike, kind: Any = np.float32) -> str:
-        """Adds an array of weights."""
+        """Adds an array as a weight; `kind` is its dtype."""
         name = f"{self._prefix}constant_{len(self.weights)}"
-        self.weights.append(
-            onnx.numpy_helper.from_array(np.asarray(values, kind), name)
-        )
+        tensor = onnx.numpy_helper.from_array(np.asarray(values, kind), name)
+        self.weights.append(tensor)
         return name
 
     def add(self, kind: str, *inputs: str, name: str = "", **settings: Any) -> str:
-        """Adds a node with one output."""
+        """Adds a node of an ONNX operator with one output, called `name` if one is given."""
         name = name or f"{self._prefix}{kind.lower()}_{len(self.nodes)}"
         self.nodes.append(onnx.helper.make_node(kind, inputs, [name], **settings))
         return name
 
     def pick(self, row: str, places: Sequence[int]) -> str:
-        """Selects elements of a row."""
+        """Selects the elements of a row at these places."""
         return self.add("Gather", row, self.constant(places, np.int64), axis=1)
 
     def join(self, rows: Sequence[str], name: str = "") -> str:
         """Concatenates rows."""
         return self.add("Concat", *rows, name=name, axis=1)
 
-    def cut(self, row: str, limits: Limits | tuple[Array, Array] | None) -> str:
-        """Clamps the elements of a row between two limits."""
+    def clamp(self, row: str, limits: Limits | tuple[Array, Array] | None) -> str:
+        """Clamps the elements of a row between two limits; None leaves them as they are."""
         if limits is None:
             return row
         low, high = map(self.constant, limits)
         return self.add("Min", self.add("Max", row, low), high)
 
     def affine(self, row: str, factor: ArrayLike, offset: ArrayLike) -> str:
-        """Computes row * factor + offset."""
+        """Computes row * factor + offset, without nodes that would change nothing."""
         if np.any(np.asarray(factor) != 1.0):
             row = self.add("Mul", row, self.constant(factor))
-        return self.add("Add", row, self.constant(offset)) if np.any(offset) else row
+        if np.any(offset):
+            row = self.add("Add", row, self.constant(offset))
+        return row
 
     def scale(self, row: str, scaled: Scaled) -> str:
-        """Scales a row as described by `Scaled`."""
-        row = self.cut(row, scaled.limits)
+        """Scales a row as a mapping describes it: clamp, subtract, divide, clamp."""
+        row = self.clamp(row, scaled.limits)
         if np.any(scaled.subtract):
             row = self.add("Sub", row, self.constant(scaled.subtract))
         if scaled.divide != 1.0:
             row = self.add("Div", row, self.constant(scaled.divide))
-        return self.cut(row, scaled.clip)
+        return self.clamp(row, scaled.clip)
 
-    def blend(self, share: str, row: str, start: str) -> str:
-        """Selects `row` if `share` (1, 1) is 1, `start` if it is 0."""
-        rest = self.affine(share, -1.0, 1.0)
-        kept = self.add("Mul", share, row)
-        begun = self.add("Mul", rest, start)
-        return self.add("Add", kept, begun)
+    def select(self, condition: str, row: str, other: str) -> str:
+        """Selects `row` where `condition` (1, 1) is 1 and `other` where it is 0.
+
+        Computes condition * row + (1 - condition) * other.
+        """
+        opposite = self.affine(condition, -1.0, 1.0)
+        from_row = self.add("Mul", condition, row)
+        from_other = self.add("Mul", opposite, other)
+        return self.add("Add", from_row, from_other)
 
     def is_negative(self, row: str) -> str:
-        """Computes 1 where a row is negative, else 0."""
-        return self.cut(self.affine(row, -STEP, 0.0), (0.0, 1.0))
+        """Computes 1 where a row is negative and 0 elsewhere, as a very steep ramp."""
+        return self.clamp(self.affine(row, -STEEP, 0.0), (0.0, 1.0))
 
     def angle(self, cosine: str, sine: str) -> str:
-        """Computes the angle [rad] of a direction, exact up to rounding in all four quadrants."""
-        across = self.add("Abs", sine)
-        along = self.add("Abs", cosine)
-        half = self.add("Atan", self.add("Div", across, self.affine(along, 1.0, 1.0)))
+        """Computes the angle atan2(sine, cosine) [rad], with cosine^2 + sine^2 = 1.
+
+        In the first quadrant it is 2 atan(sine / (1 + cosine)), which never divides by 0. A
+        negative cosine mirrors it at pi / 2, a negative sine changes its sign.
+        """
+        sine_size = self.add("Abs", sine)
+        cosine_size = self.add("Abs", cosine)
+        tangent_of_half = self.add("Div", sine_size, self.affine(cosine_size, 1.0, 1.0))
+        half = self.add("Atan", tangent_of_half)
         ahead = self.affine(half, 2.0, 0.0)
         behind = self.affine(half, -2.0, np.pi)
-        size = self.blend(self.is_negative(cosine), behind, ahead)
-        return self.add("Mul", size, self.affine(self.is_negative(sine), -2.0, 1.0))
+        size = self.select(self.is_negative(cosine), behind, ahead)
+        sign = self.affine(self.is_negative(sine), -2.0, 1.0)
+        return self.add("Mul", size, sign)

@@ -41,8 +41,10 @@ def fold_shapes(graph: Any, opset: int) -> dict[str, Shape]:
     for node in nodes:
         node.ClearField("domain")  # "" and "ai.onnx" are the same domain
         schema = defs.get_schema(node.op_type, opset)
-        given = {name: types[name] for name in node.input if name}
-        made = infer_node_outputs(schema, node, given, known, opset_imports=imports)
+        input_types = {name: types[name] for name in node.input if name}
+        made = infer_node_outputs(
+            schema, node, input_types, known, opset_imports=imports
+        )
         if any(len(_shape(one)) > MOST_AXES for one in made.values()):
             raise ValueError(f"{node.op_type} returns more than {MOST_AXES} dimensions")
         types |= made
@@ -76,18 +78,20 @@ def _is_small(kind: Any) -> bool:
 def _value(node: Any, types: dict[str, Any], known: dict[str, Any], opset: int) -> Any:
     """Returns the value, or None if it is not small or is unknown before the network runs."""
     name = node.output[0]
-    given = [known.get(one) for one in node.input if one]
-    if node.op_type == "Shape" and all(shape := _shape(types[node.input[0]])):
-        ends = {setting.name: setting.i for setting in node.attribute}
-        sizes = np.array(shape[ends.get("start", 0) : ends.get("end")], np.int64)
-        return numpy_helper.from_array(sizes, name)
-    if node.op_type not in FOLDED or None in given or not _is_small(types[name]):
+    if node.op_type == "Shape":
+        shape = _shape(types[node.input[0]])
+        if all(shape):
+            ends = {setting.name: setting.i for setting in node.attribute}
+            sizes = np.array(shape[ends.get("start", 0) : ends.get("end")], np.int64)
+            return numpy_helper.from_array(sizes, name)
+    inputs = [known.get(input_name) for input_name in node.input if input_name]
+    if node.op_type not in FOLDED or None in inputs or not _is_small(types[name]):
         return None
     if node.op_type == "Div" and any(
-        numpy_helper.to_array(one).min() <= 0 for one in given
+        numpy_helper.to_array(tensor).min() <= 0 for tensor in inputs
     ):
         # Division by zero, or signs for which ONNX and numpy round differently.
         return None
-    graph = helper.make_graph([node], "", [], [ValueInfoProto(name=name)], given)
+    graph = helper.make_graph([node], "", [], [ValueInfoProto(name=name)], inputs)
     (value,) = ReferenceEvaluator(graph, opsets={"": opset}).run(None, {})
     return numpy_helper.from_array(np.asarray(value), name)

@@ -158,23 +158,23 @@ def restored(model: Any) -> bytes | None:
 
     The seal in the file itself shows whether it is intact.
     """
-    found = [entry for entry in model.metadata_props if entry.key == TAKEN]
-    if len(found) != 1:
+    entries = [entry for entry in model.metadata_props if entry.key == TAKEN]
+    if len(entries) != 1:
         return None
     taken = onnx.ValueInfoProto()
     ours = onnx.ModelProto()
     try:
-        taken.ParseFromString(base64.b64decode(found[0].value))
+        taken.ParseFromString(base64.b64decode(entries[0].value))
     except (ValueError, DecodeError):
         return None
     ours.CopyFrom(model)
-    ours.metadata_props.remove(found[0])
+    ours.metadata_props.remove(entries[0])
     first = next(
         (k for k, n in enumerate(ours.graph.node) if onnx_graph.INPUT in n.output), -1
     )
     del ours.graph.node[: first + 1]
-    weights = [one for one in ours.graph.initializer if not one.name.startswith(OURS)]
-    states = [one for one in model.graph.input if one.name == onnx_graph.STATE_IN]
+    weights = [w for w in ours.graph.initializer if not w.name.startswith(OURS)]
+    states = [v for v in model.graph.input if v.name == onnx_graph.STATE_IN]
     for held, values in (
         (ours.graph.initializer, weights),
         (ours.graph.input, [taken, *states]),
@@ -205,10 +205,9 @@ def _described(
     }
     state = contract.state
     if state is not None:
-        one, other = (
-            f"{NODE}/{end}" for end in (onnx_graph.STATE_OUT, onnx_graph.STATE_IN)
-        )
-        pipeline["feedback_flow"] = {one: [other]}
+        source = f"{NODE}/{onnx_graph.STATE_OUT}"
+        target = f"{NODE}/{onnx_graph.STATE_IN}"
+        pipeline["feedback_flow"] = {source: [target]}
         pipeline["initial_values"] = f"{name}_initial_values.safetensors"
         pipeline["configs"]["longest_gap"] = state.longest_gap
         inputs.append(_tensor(onnx_graph.STATE_IN, [1, state.size]))

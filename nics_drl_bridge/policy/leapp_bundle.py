@@ -63,10 +63,10 @@ class Tensor(Open):
     @property
     def names(self) -> list[str]:
         """Names of the elements; empty if there are none."""
-        given = self.element_names
-        while isinstance(given, list) and given and isinstance(given[-1], list):
-            given = given[-1]
-        return [str(name) for name in given] if isinstance(given, list) else []
+        names = self.element_names
+        while isinstance(names, list) and names and isinstance(names[-1], list):
+            names = names[-1]
+        return [str(name) for name in names] if isinstance(names, list) else []
 
 
 class Parameters(Open):
@@ -136,22 +136,18 @@ class Bundle:
     def name_of(self, end: str) -> str:
         """Returns the name of `node/output` or `node/input` in the joined network."""
         pipeline = self.description.pipeline
-        ends = [
-            f"{node}/{name}"
-            for some in (pipeline.inputs, pipeline.outputs)
-            for node, names in some.items()
-            for name in names
-        ]
-        ends += [
-            one
-            for some in pipeline.feedback_flow.items()
-            for one in (some[0], *some[1])
-        ]
+        ends = set[str]()
+        for names_by_node in (pipeline.inputs, pipeline.outputs):
+            for node, names in names_by_node.items():
+                ends.update(f"{node}/{name}" for name in names)
+        for source, targets in pipeline.feedback_flow.items():
+            ends.update((source, *targets))
         short = end.partition("/")[2]
-        return end if sum(one.endswith(f"/{short}") for one in set(ends)) > 1 else short
+        namesakes = sum(other.endswith(f"/{short}") for other in ends)
+        return end if namesakes > 1 else short
 
     def _entries(self, side: str, ends: dict[str, list[str]]) -> dict[str, Tensor]:
-        found = {}
+        entries = {}
         for node, names in ends.items():
             if node not in self.description.models:
                 fix = suggest(node, self.description.models)
@@ -165,8 +161,8 @@ class Bundle:
                     raise self.fault(
                         f"pipeline.{side}.{node}", f"has no {name!r}; {fix}"
                     )
-                found[self.name_of(f"{node}/{name}")] = known[name]
-        return found
+                entries[self.name_of(f"{node}/{name}")] = known[name]
+        return entries
 
     def _states(self) -> dict[str, ForeignState]:
         pipeline = self.description.pipeline
@@ -189,20 +185,20 @@ class Bundle:
             (size,) = struct.unpack_from("<Q", data)
             head = json.loads(data[8 : 8 + size])
             kinds = {"F32": "<f4", "F64": "<f8", "I64": "<i8", "I32": "<i4"}
-            found = {}
+            arrays = {}
             for key, entry in head.items():
                 if key != "__metadata__":
                     begin, end = entry["data_offsets"]
                     values = np.frombuffer(
                         data[8 + size :][begin:end], kinds[entry["dtype"]]
                     )
-                    found[key] = tuple(values.astype(float).tolist())
+                    arrays[key] = tuple(values.astype(float).tolist())
         except (struct.error, ValueError, KeyError, TypeError, AttributeError):
             reason = (
                 f"{name!r} is not a valid safetensors file; export the bundle again."
             )
             raise self.fault("pipeline.initial_values", reason) from None
-        return found
+        return arrays
 
     def fault(self, place: str, reason: str) -> PolicyError:
         """Makes the error for a place in the YAML file."""
@@ -218,15 +214,13 @@ def description_of(place: Path) -> Path | None:
         reason = "is not a YAML file; give a LEAPP bundle, or the mapping of a foreign policy."
         raise PolicyError(str(place), "file", reason)
     files = sorted(place.glob("*.yaml")) if place.is_dir() else [place]
-    found = [
+    descriptions = [
         file for file in files if "models" in parse_yaml(read_text(file), str(file))
     ]
-    if place.is_dir() and len(found) != 1:
-        reason = (
-            f"contains {len(found)} bundle descriptions; give the path of a YAML file."
-        )
+    if place.is_dir() and len(descriptions) != 1:
+        reason = f"contains {len(descriptions)} bundle descriptions; give the path of a YAML file."
         raise PolicyError(str(place), "file", reason)
-    return found[0] if found else None
+    return descriptions[0] if descriptions else None
 
 
 def read_bundle(path: Path) -> Bundle:
@@ -239,20 +233,16 @@ def read_bundle(path: Path) -> Bundle:
     digests = []
     for name, node in description.models.items():
         place = f"models.{name}.parameters"
-        given = node.parameters
-        if given.backend != "onnx":
-            reason = (
-                f"is {given.backend!r}, which is not supported; export it with 'onnx'."
-            )
+        parameters = node.parameters
+        if parameters.backend != "onnx":
+            reason = f"is {parameters.backend!r}, which is not supported; export it with 'onnx'."
             raise bundle.fault(f"{place}.backend", reason)
-        data = _read(bundle, given.model_path, f"{place}.model_path")
+        data = _read(bundle, parameters.model_path, f"{place}.model_path")
         digests.append(hash_bytes(data))
-        if digests[-1] != given.sha256sum:
-            reason = (
-                f"does not match {given.model_path!r}, which was changed or damaged."
-            )
+        if digests[-1] != parameters.sha256sum:
+            reason = f"does not match {parameters.model_path!r}, which was changed or damaged."
             raise bundle.fault(f"{place}.sha256sum", reason)
-        file = str(path.parent / given.model_path)
+        file = str(path.parent / parameters.model_path)
         rehearsal.rehearse_network(data, file)
         models[name] = onnx_graph.parsed(data, file)
         onnx_graph.check_graph(models[name], file)
@@ -297,18 +287,23 @@ def _merged(bundle: Bundle) -> Any:
     for name in description.models:
         model = onnx.compose.add_prefix(bundle.models[name], f"{name}/")
         held = {tensor.name for tensor in model.graph.initializer}
-        for one in (each for each in model.graph.input if each.name not in held):
-            if one.name in outside:
-                own = onnx.ValueInfoProto()
-                own.CopyFrom(one)
-                own.name = source = bundle.name_of(one.name)
-                graph.input.append(own)
-            elif (source := source_of.get(one.name, "")) not in ready:
-                reason = f"no earlier node supplies {one.name!r}; connect it."
-                raise bundle.fault("pipeline.data_flow", reason)
-            if source != one.name:
+        for needed in model.graph.input:
+            if needed.name in held:
+                continue
+            if needed.name in outside:
+                source = bundle.name_of(needed.name)
+                graph_input = onnx.ValueInfoProto()
+                graph_input.CopyFrom(needed)
+                graph_input.name = source
+                graph.input.append(graph_input)
+            else:
+                source = source_of.get(needed.name, "")
+                if source not in ready:
+                    reason = f"no earlier node supplies {needed.name!r}; connect it."
+                    raise bundle.fault("pipeline.data_flow", reason)
+            if source != needed.name:
                 graph.node.append(
-                    onnx.helper.make_node("Identity", [source], [one.name])
+                    onnx.helper.make_node("Identity", [source], [needed.name])
                 )
         graph.node.extend(model.graph.node)
         graph.initializer.extend(model.graph.initializer)
@@ -368,15 +363,11 @@ def mapping_of(bundle: Bundle, model: SimulatorModel) -> Data:
         data["inputs"][name] = {"parts": _parts(bundle, name, entry, data)}
     for name, entry in bundle.outputs.items():
         _add_commands(data["outputs"], name, entry, model)
-    if data["outputs"].keys() >= {"forward", "turn"}:
-        missing = []
-    else:
-        missing = ["forward", "turn"]
-    if missing and data["outputs"].keys() != {
-        command.name for command in model.robot.command
-    }:
+    outputs = data["outputs"].keys()
+    commands = {command.name for command in model.robot.command}
+    if not outputs >= {"forward", "turn"} and outputs != commands:
         kinds = ", ".join(
-            f"{name!r} of kind {one.kind!r}" for name, one in bundle.outputs.items()
+            f"{name!r} of kind {entry.kind!r}" for name, entry in bundle.outputs.items()
         )
         reason = f"{kinds}: none is marked as the robot's velocity; {MAPPING}."
         raise bundle.fault("pipeline.outputs", reason)
@@ -398,12 +389,16 @@ def _parts(bundle: Bundle, name: str, entry: Tensor, data: Data) -> list[Data]:
     # A pose without names is ambiguous: it may include a heading.
     if not names and len(meanings) == size and "pose" not in kind:
         names = list(meanings)
-    if not names or len(names) != size or not all(one in meanings for one in names):
-        told = f"kind {entry.kind!r}" + (f" with elements {names}" if names else "")
-        reason = f"{told} is not a known scan, goal or velocity of a robot; {MAPPING}."
+    if not names or len(names) != size or not all(name in meanings for name in names):
+        described = f"kind {entry.kind!r}"
+        if names:
+            described += f" with elements {names}"
+        reason = (
+            f"{described} is not a known scan, goal or velocity of a robot; {MAPPING}."
+        )
         raise bundle.fault(f"pipeline.inputs.{name}", reason)
     zero = {"of": ZERO, "value": 0.0}
-    return [zero if meanings[one] == ZERO else {"of": meanings[one]} for one in names]
+    return [zero if meanings[n] == ZERO else {"of": meanings[n]} for n in names]
 
 
 def _add_commands(
@@ -412,11 +407,11 @@ def _add_commands(
     meanings = DONE.get(entry.kind or "", {})
     size = math.prod(entry.shape or [0])
     names = entry.names or (list(meanings) if len(meanings) == size else [])
-    own = {command.name for command in model.robot.command}
-    for index, one in enumerate(names):
-        word = meanings.get(one, "").removeprefix("velocity.")
-        if entry.kind == "target/command" and one in own:
-            outputs[one] = {"of": name, "index": index}
+    commands = {command.name for command in model.robot.command}
+    for index, element in enumerate(names):
+        word = meanings.get(element, "").removeprefix("velocity.")
+        if entry.kind == "target/command" and element in commands:
+            outputs[element] = {"of": name, "index": index}
         elif word == "left" and not model.robot.moves_sideways:
             continue
         elif word and word != ZERO:

@@ -66,9 +66,9 @@ class Mppi:
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """Plans the actions; see `Policy`."""
-        given = self._seen(observation)
-        out = np.empty((len(given[0]), len(self.task.robot.command)))
-        self._plan(out, *given)
+        parts = self._seen(observation)
+        out = np.empty((len(parts[0]), len(self.task.robot.command)))
+        self._plan(out, *parts)
         actions = out.astype(np.float32)
         return actions[0] if observation.ndim == 1 else actions
 
@@ -89,7 +89,7 @@ class Mppi:
         def part(rows: slice) -> None:
             scratch, lanes = self._free.pop() if self._free else self._memory()
             kernels.plan_all(
-                *(each[rows] for each in arrays),
+                *(array[rows] for array in arrays),
                 (*self._sense, scratch),
                 self._plant,
                 self._sampling,
@@ -169,7 +169,7 @@ class Mppi:
     def _halt(self) -> kernels.Halt:
         """The stop at the end of a rollout; empty if the robot can stop within half a rollout."""
         robot = self.task.robot
-        angles = np.array([each.unit == "rad" for each in robot.command])
+        angles = np.array([variable.unit == "rad" for variable in robot.command])
         braking = find_braking(robot, self._kinematics, *self.task.command_limits)
         longest = longest_stop_s(braking, self._top_twists)
         if longest <= 0.5 * self.horizon:

@@ -10,7 +10,7 @@ import onnx
 from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
 from onnx import TensorProto
 
-from nics_drl_bridge.errors import PolicyError
+from nics_drl_bridge.errors import PolicyError, shorten
 from nics_drl_bridge.files import hash_bytes
 
 KEY = "nics_drl_bridge"  # key of the metadata entry with the contract
@@ -307,12 +307,13 @@ def check_graph(model: Any, source: str) -> None:
     try:
         onnx.checker.check_model(model)
     except (onnx.checker.ValidationError, ValueError) as error:
-        reason = f"is not a valid ONNX graph ({_shown(error)})."
+        reason = f"is not a valid ONNX graph ({quote(error)})."
         raise PolicyError(source, "graph", reason) from None
 
 
-def _shown(error: Exception) -> str:
-    return " ".join(str(error).split())[:120]
+def quote(error: Exception) -> str:
+    """Returns the message of a library's error as one short line."""
+    return shorten(str(error), 120)
 
 
 def _graph_faults(model: Any) -> Iterator[Fault]:
@@ -545,7 +546,7 @@ def _sizes(
         ).graph
     except Exception as error:  # noqa: BLE001 - a damaged graph raises anything
         raise PolicyError(
-            source, "graph", f"its shapes are inconsistent ({_shown(error)})."
+            source, "graph", f"its shapes are inconsistent ({quote(error)})."
         ) from None
     kinds = {tensor.name: tensor.data_type for tensor in graph.initializer}
     shapes = {tensor.name: tuple(tensor.dims) for tensor in graph.initializer}

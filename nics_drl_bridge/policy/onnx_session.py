@@ -59,10 +59,10 @@ def open_session(data: bytes, source: str) -> Any:
         raise cannot_run(source, error) from None
 
 
-def cannot_run(source: str, error: Exception) -> PolicyError:
+def cannot_run(source: str, error: Exception, field: str = "graph") -> PolicyError:
     """Returns the error for a graph that the runtime refuses."""
-    words = " ".join(str(error).split())[:120]
-    return PolicyError(source, "graph", f"onnxruntime can't run it ({words}).")
+    reason = f"onnxruntime can't run it ({onnx_graph.quote(error)})."
+    return PolicyError(source, field, reason)
 
 
 def in_turn(

@@ -58,10 +58,11 @@ def pace_of(
 ) -> Pace:
     """Returns the pace of a robot in worlds; `top` limits its speed [m/s]."""
     members = [member for world in worlds for member in world.members]
-    far, name = max(
-        (min(one.goal_distance[1], math.dist(one.extent[:2], one.extent[2:])), one.name)
-        for one in members
-    )
+    distances = []
+    for member in members:
+        diagonal = math.dist(member.extent[:2], member.extent[2:])
+        distances.append((min(member.goal_distance[1], diagonal), member.name))
+    far, name = max(distances)
     near = min(member.goal_distance[0] for member in members)
     return Pace(
         name,
@@ -76,10 +77,12 @@ def top_speed(robot: RobotSpec) -> float:
     """Returns a robot's maximum speed along one axis [m/s]; inf if nothing limits it."""
     if has_textbook(robot):
         return float(reach(robot)[:2].max())
-    told = [
-        max(abs(one.min), abs(one.max)) for one in robot.command if one.unit == "m/s"
+    speeds = [
+        max(abs(command.min), abs(command.max))
+        for command in robot.command
+        if command.unit == "m/s"
     ]
-    return max(told, default=math.inf)
+    return max(speeds, default=math.inf)
 
 
 def kin(robot: RobotSpec) -> str:
@@ -102,12 +105,12 @@ def settings_for(task: str, name: str | None, changes: dict[str, Any]) -> Fitted
     Raises ConfigError, and ModelError if there is no such robot.
     """
     robot = changes.get("robot")
-    told = list[str]()
+    notes = list[str]()
     shipped = list_shipped("training")
     own = f"{task}_{robot}" in shipped
     if name is None and robot is not None and not own and task == OWN_TASK:
         name = f"own_{kin(open_model(robot).robot)}"
-        told.append(
+        notes.append(
             f"settings {name!r}, because the robot {robot!r} has none of its own"
         )
     settings = recordings.chosen_settings(task, name, changes)
@@ -115,7 +118,7 @@ def settings_for(task: str, name: str | None, changes: dict[str, Any]) -> Fitted
         name in shipped and recordings.load_training(str(name)).robot != settings.robot
     )
     made = fitted(settings, open_model(settings.robot, settings.lidar), inherited)
-    return Fitted(made.settings, (*told, *made.told))
+    return Fitted(made.settings, (*notes, *made.told))
 
 
 def fitted(

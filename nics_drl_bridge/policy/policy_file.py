@@ -62,19 +62,19 @@ class PolicyFile:
 
         Raises PolicyError for a wrong shape or a missing state; see `make_policy`.
         """
-        given = np.asarray(observation, np.float32)
+        rows = np.asarray(observation, np.float32)
         size = self.contract.observation.size
         kept = self.contract.state
-        if given.ndim not in (1, 2) or given.shape[-1] != size:
-            reason = f"is {size}, but observations are {given.shape}; use the policy's own task."
+        if rows.ndim not in (1, 2) or rows.shape[-1] != size:
+            reason = f"is {size}, but observations are {rows.shape}; use the policy's own task."
             raise PolicyError(str(self.path), "observation.size", reason)
-        wanted = None if kept is None else (*given.shape[:-1], kept.size)
+        wanted = None if kept is None else (*rows.shape[:-1], kept.size)
         if wanted != (None if state is None else np.shape(state)):
             reason = f"must have shape {wanted}, not {None if state is None else np.shape(state)}"
             raise PolicyError(
                 str(self.path), "state", f"{reason}; `make_policy` keeps it."
             )
-        feeds = {onnx_graph.INPUT: given.reshape(-1, size)}
+        feeds = {onnx_graph.INPUT: rows.reshape(-1, size)}
         if kept is not None:
             feeds[onnx_graph.STATE_IN] = np.asarray(state, np.float32).reshape(
                 -1, kept.size
@@ -82,18 +82,18 @@ class PolicyFile:
         firsts = range(0, max(len(feeds[onnx_graph.INPUT]), 1), self._rows_at_once)
         out = [self._run_rows(feeds, slice(k, k + self._rows_at_once)) for k in firsts]
         whole = [np.concatenate(parts) for parts in zip(*out, strict=True)]
-        return [part[0] if given.ndim == 1 else part for part in whole]
+        return [part[0] if rows.ndim == 1 else part for part in whole]
 
     def _run_rows(self, feeds: Mapping[str, Rows], which: slice) -> list[NDArray[Any]]:
-        given = {name: rows[which] for name, rows in feeds.items()}
-        rows = given[onnx_graph.INPUT]
+        chunk = {name: rows[which] for name, rows in feeds.items()}
+        rows = chunk[onnx_graph.INPUT]
         try:
-            out: list[NDArray[Any]] = self._session.run(None, given)
+            out: list[NDArray[Any]] = self._session.run(None, chunk)
         except Exception as error:  # noqa: BLE001 - the runtime's errors have no common base class
             raise cannot_run(str(self.path), error) from None
         if any(len(part) != len(rows) for part in out):
             reason = (
-                f"gives {[part.shape for part in out]} for {len(rows)} observations."
+                f"returns {[part.shape for part in out]} for {len(rows)} observations."
             )
             raise PolicyError(str(self.path), "graph", reason)
         return out
@@ -134,7 +134,11 @@ class PolicyFile:
                 sensor.name: sensor.model_dump(mode="json") for sensor in model.sensors
             }
             self._compare(
-                {"sensors": [known.get(each.name) for each in self.contract.sensors]}
+                {
+                    "sensors": [
+                        known.get(sensor.name) for sensor in self.contract.sensors
+                    ]
+                }
             )
             period = model.control_period
             if abs(self.contract.control_period - period) > PERIOD_TOLERANCE:
@@ -160,9 +164,7 @@ class PolicyFile:
             try:
                 plan_of(lidar, self.contract.scan)
             except ConfigError as error:
-                reason = (
-                    f"needs more than this lidar sees: {str(error).partition(';')[0]}"
-                )
+                reason = f"needs more than this lidar sees: {error.reason}"
                 fix = "use another lidar, or a policy trained for this one"
                 raise PolicyError(str(self.path), "scan", f"{reason}; {fix}.") from None
         self._compare(theirs)
@@ -191,7 +193,7 @@ def load_policy(path: str | Path) -> PolicyFile:
         file = contracts.shipped() / f"{path}{suffix}"
         if not file.is_file():
             hint = suggest(
-                str(path), (each.stem for each in file.parent.glob(f"*{suffix}"))
+                str(path), (shipped.stem for shipped in file.parent.glob(f"*{suffix}"))
             )
             raise PolicyError(
                 str(path), "file", f"is neither a file nor a shipped policy; {hint}"
@@ -253,8 +255,8 @@ def _check_golden(policy: PolicyFile, source: str) -> None:
     kept = policy.contract.state
     start = None if kept is None else np.full(kept.size, kept.start, np.float32)
     action, command = in_turn(policy.run, golden.rows("observations"), start)
-    found = {"actions": action.reshape(len(command), -1), "commands": command}
-    for name, rows in found.items():
+    computed = {"actions": action.reshape(len(command), -1), "commands": command}
+    for name, rows in computed.items():
         gap = np.abs(rows - golden.rows(name)).max()
         if not gap <= GOLDEN_TOLERANCE:
             reason = f"differ by {gap:.3g} from the graph's outputs on this machine; not used."

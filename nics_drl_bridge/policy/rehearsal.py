@@ -136,14 +136,14 @@ def main() -> None:
 
     request = sys.stdin.buffer.read()
     head, _, data = request.partition(b"\n")
-    told = json.loads(head)
+    about = json.loads(head)
     del request
-    if told["step"] == "folding":
+    if about["step"] == "folding":
         from nics_drl_bridge.policy import graph_folding  # noqa: F401 - before the limits
     _limit(MEMORY + MEMORY_OF_SIZE * len(data))
     answer = None
     try:
-        _do(told, data)
+        _do(about, data)
     except Exception as error:
         if _is_of_memory(error):
             os._exit(EXIT_MEMORY)
@@ -155,8 +155,8 @@ def main() -> None:
     os._exit(0)  # skip the slow and needless teardown of the session
 
 
-def _do(told: dict[str, Any], data: bytes) -> None:
-    step = told["step"]
+def _do(about: dict[str, Any], data: bytes) -> None:
+    step = about["step"]
     source = "policy"
     if step in ("network", "folding"):
         model = onnx_graph.parsed(data, source)
@@ -166,15 +166,13 @@ def _do(told: dict[str, Any], data: bytes) -> None:
         from nics_drl_bridge.policy.graph_folding import fold_shapes
 
         try:
-            fold_shapes(model.graph, told["opset"])
+            fold_shapes(model.graph, about["opset"])
         except Exception as error:
-            words = " ".join(str(error).split())[:120]
-            raise PolicyError(
-                source, "network", f"its shapes do not fit ({words})."
-            ) from error
+            reason = f"its shapes do not fit ({onnx_graph.quote(error)})."
+            raise PolicyError(source, "network", reason) from error
         return
-    needs = GraphNeeds(**told["needs"])
-    *shape, text = told["seen"]
+    needs = GraphNeeds(**about["needs"])
+    *shape, text = about["seen"]
     seen = np.frombuffer(base64.b64decode(text), "<f4").reshape(shape)
     if step == "policy":
         check_policy_graph(data, needs, source)

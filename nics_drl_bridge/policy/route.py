@@ -1,9 +1,15 @@
-"""Shortest paths on a map for a disc-shaped robot: Dijkstra's search over cells."""
+"""Shortest paths on a map for a disc-shaped robot: Dijkstra's search over cells.
+
+The search runs on a coarser map. Its cells are the nodes of a graph; links connect each free cell
+with its free neighbours, also diagonally. The cost of a link is its length in cells, and up to
+1 + `DEARER` times that next to obstacles.
+"""
 
 import math
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
@@ -14,7 +20,14 @@ from nics_drl_bridge.lidar.maps import FREE, OCCUPIED, GridMap
 CELL = 0.1  # minimum side of a cell [m]
 COMFORT = 0.4  # distance from obstacles below which a path costs more [m]
 DEARER = 3.0  # maximum additional cost, as a fraction of the length
-STEPS = ((0, 1, 1.0), (1, 0, 1.0), (1, 1, math.sqrt(2.0)), (1, -1, math.sqrt(2.0)))
+# four of the eight neighbours of a cell, the others by symmetry: rows, columns, length [cells]
+NEIGHBOURS = (
+    (0, 1, 1.0),
+    (1, 0, 1.0),
+    (1, 1, math.sqrt(2.0)),
+    (1, -1, math.sqrt(2.0)),
+)
+Cell = tuple[int, int]  # row, column
 
 
 def route(grid: GridMap, start: ArrayLike, goal: ArrayLike, radius: float) -> Array:
@@ -23,53 +36,83 @@ def route(grid: GridMap, start: ArrayLike, goal: ArrayLike, radius: float) -> Ar
     It keeps a greater distance where there is space. Unknown cells count as free. Raises
     ConfigError if start or goal is off the map, or if there is no path.
     """
-    coarse = _coarse(grid, max(1, math.ceil(CELL / grid.resolution - 1e-6)))
-    room = coarse.distance_field
-    ends = [tuple(coarse.world_to_cell(each).tolist()) for each in (start, goal)]
-    for name, cell in zip(("start", "goal"), ends, strict=True):
-        if not all(0 <= i < n for i, n in zip(cell, room.shape, strict=True)):
-            raise ConfigError(f"the {name} of the path is off the map; give one on it.")
-    passable = room > radius
-    for cell in ends:  # free by assumption: the robot is or will be there
-        passable[cell] = True
-    dear = 1.0 + DEARER * np.clip(1.0 - (room - radius) / COMFORT, 0.0, 1.0)
-    number = np.arange(room.size).reshape(room.shape)
-    links = []
-    for down, right, far in STEPS:
-        a = (
-            slice(0, room.shape[0] - down),
-            slice(max(0, -right), room.shape[1] - max(0, right)),
-        )
-        b = (slice(down, None), slice(max(0, right), room.shape[1] - max(0, -right)))
-        both = passable[a] & passable[b]
-        cost = far * 0.5 * (dear[a] + dear[b])
-        links.append((number[a][both], number[b][both], cost[both]))
-    first, second, cost = (np.concatenate(each) for each in zip(*links, strict=True))
-    graph = coo_array((cost, (first, second)), shape=(room.size, room.size)).tocsr()
-    begin, end = (int(number[cell]) for cell in ends)
-    far, before = dijkstra(graph, directed=False, indices=end, return_predecessors=True)
-    if not np.isfinite(far[begin]):
+    coarse = _coarsen(grid, max(1, math.ceil(CELL / grid.resolution - 1e-6)))
+    start_cell = _find_cell(coarse, "start", start)
+    goal_cell = _find_cell(coarse, "goal", goal)
+    clearance = coarse.distance_field
+    passable = clearance > radius
+    # The robot stands or will stand there, whatever the map says.
+    passable[start_cell] = True
+    passable[goal_cell] = True
+    closeness = np.clip(1.0 - (clearance - radius) / COMFORT, 0.0, 1.0)
+    cells = _search(passable, 1.0 + DEARER * closeness, start_cell, goal_cell)
+    if not cells:
         reason = f"for a robot of radius {radius:g} m there is no path to the goal on the map"
         raise ConfigError(f"{reason}; give a goal that it can reach.")
-    cells = [begin]
-    while cells[-1] != end:
-        cells.append(int(before[cells[-1]]))
-    middles = coarse.cell_to_world(
-        np.stack(np.divmod(cells[1:-1], room.shape[1]), axis=-1)
-    )
-    return np.array(
-        [np.asarray(start, np.float64)[:2], *middles, np.asarray(goal, np.float64)[:2]]
-    )
+    between = coarse.cell_to_world(np.reshape(cells[1:-1], (-1, 2)))
+    first = np.asarray(start, np.float64)[:2]
+    last = np.asarray(goal, np.float64)[:2]
+    return np.array([first, *between, last])
 
 
-def _coarse(grid: GridMap, parts: int) -> GridMap:
+def _coarsen(grid: GridMap, parts: int) -> GridMap:
     """Returns the map with cells `parts` times as large; they are occupied if any part is."""
-    rows, columns = (math.ceil(count / parts) * parts for count in grid.cells.shape)
-    cells = np.full((rows, columns), FREE, np.int8)
-    cells[: grid.cells.shape[0], : grid.cells.shape[1]] = np.where(
-        grid.blocked, OCCUPIED, FREE
+    rows, columns = grid.cells.shape
+    large_rows = math.ceil(rows / parts)
+    large_columns = math.ceil(columns / parts)
+    padded = np.full((large_rows * parts, large_columns * parts), FREE, np.int8)
+    padded[:rows, :columns] = np.where(grid.blocked, OCCUPIED, FREE)
+    blocks = padded.reshape(large_rows, parts, large_columns, parts)
+    return GridMap(blocks.max(axis=(1, 3)), grid.resolution * parts, grid.origin)
+
+
+def _find_cell(grid: GridMap, name: str, point: ArrayLike) -> Cell:
+    """Returns the cell of a point x, y [m]. Raises ConfigError if it is off the map."""
+    row, column = grid.world_to_cell(point).tolist()
+    rows, columns = grid.cells.shape
+    if not (0 <= row < rows and 0 <= column < columns):
+        raise ConfigError(f"the {name} of the path is off the map; give one on it.")
+    return row, column
+
+
+def _search(
+    passable: NDArray[np.bool_], cell_costs: Array, start: Cell, goal: Cell
+) -> list[Cell]:
+    """Returns the cells of the cheapest path, or [] if there is none."""
+    shape = passable.shape
+    first = int(np.ravel_multi_index(start, shape))
+    last = int(np.ravel_multi_index(goal, shape))
+    # Searching backwards from the goal, the predecessor of a cell is the next one to drive to.
+    costs, following = dijkstra(
+        _link_cells(passable, cell_costs),
+        directed=False,
+        indices=last,
+        return_predecessors=True,
     )
-    large = cells.reshape(rows // parts, parts, columns // parts, parts).max(
-        axis=(1, 3)
-    )
-    return GridMap(large, grid.resolution * parts, grid.origin)
+    if not np.isfinite(costs[first]):
+        return []
+    nodes = [first]
+    while nodes[-1] != last:
+        nodes.append(int(following[nodes[-1]]))
+    return [divmod(node, shape[1]) for node in nodes]
+
+
+def _link_cells(passable: NDArray[np.bool_], cell_costs: Array) -> Any:
+    """Returns the sparse matrix (rows * columns)^2 of the costs of all links."""
+    rows, columns = passable.shape
+    nodes = np.arange(passable.size).reshape(passable.shape)
+    ends = []
+    other_ends = []
+    costs = []
+    for down, right, length in NEIGHBOURS:
+        # Two views of the grid, in which the same index is a cell and its neighbour.
+        cell = np.s_[: rows - down, max(0, -right) : columns - max(0, right)]
+        neighbour = np.s_[down:, max(0, right) : columns - max(0, -right)]
+        linked = passable[cell] & passable[neighbour]
+        link_costs = length * 0.5 * (cell_costs[cell] + cell_costs[neighbour])
+        ends.append(nodes[cell][linked])
+        other_ends.append(nodes[neighbour][linked])
+        costs.append(link_costs[linked])
+    links = (np.concatenate(ends), np.concatenate(other_ends))
+    size = passable.size
+    return coo_array((np.concatenate(costs), links), shape=(size, size)).tocsr()

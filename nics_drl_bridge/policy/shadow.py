@@ -43,7 +43,7 @@ class Shadow:
 
     def differences(self) -> dict[str, dict[str, float]]:
         """Returns per command statistics of policy minus drive, and the rate of opposite signs."""
-        found = {}
+        figures_by_command = {}
         for c, name in enumerate(self.names):
             one = self.policy[:, c]
             other = self.driven[:, c]
@@ -55,14 +55,14 @@ class Shadow:
                 opposite = (one[signed] * other[signed] < 0.0).mean()
             else:
                 opposite = 0.0
-            found[name] = {
+            figures_by_command[name] = {
                 "mean": float(gap.mean()),
                 "mean_size": float(size.mean()),
                 **{f"p{q}": float(np.percentile(size, q)) for q in PERCENTILES},
                 "greatest": float(size.max()),
                 "opposite": float(opposite),
             }
-        return found
+        return figures_by_command
 
 
 @dataclass
@@ -160,7 +160,8 @@ def _answered(
     resets = 0
     skipped = {"no command was driven": 0, "at the goal": 0, "touching something": 0}
     for moment, goal in zip(moments, goals, strict=True):
-        verdict = task.judge(moment.view, memory := {"goal": goal})
+        memory = {"goal": goal}
+        verdict = task.judge(moment.view, memory)
         # A state also needs the observations that are not compared.
         if not (verdict.touched or verdict.reached):
             resets += bool(resume(policy, moment.stamp_ns * S_PER_NS))

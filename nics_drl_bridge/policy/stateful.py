@@ -63,8 +63,8 @@ class Stateful:
         if self._state is None:
             self._state = np.tile(self._start, (*lead, 1))
         if self._state.shape[:-1] != lead:
-            given = f"the state is of {self._state.shape[:-1]} worlds, the observations of {lead}"
-            raise ConfigError(f"{given}; reset the policy when episodes begin.")
+            problem = f"the state is of {self._state.shape[:-1]} worlds, the observations of {lead}"
+            raise ConfigError(f"{problem}; reset the policy when episodes begin.")
         action, self._state = self._step(observation, self._state)
         return action
 
@@ -78,5 +78,5 @@ def begin(policy: Any, *worlds: Any) -> None:
 
 def resume(policy: Policy, time_s: float) -> str:
     """Resumes a policy, see `Stateful.resume`; returns '' for a policy without a state."""
-    told = getattr(policy, "resume", None)
-    return "" if told is None else str(told(time_s))
+    resume_policy = getattr(policy, "resume", None)
+    return "" if resume_policy is None else str(resume_policy(time_s))

@@ -218,15 +218,15 @@ def evaluate(
 
 def _stop_of(settings: TrainingSettings) -> Stop:
     """Makes the early stop of a training, with separate worlds."""
-    given = settings.stop
-    if given is None:
+    stop = settings.stop
+    if stop is None:
         return Stop(None, {})
     model = open_model(settings.robot, settings.lidar)
     envs = {
-        world: _env_of(settings, world, given.episodes, model)
+        world: _env_of(settings, world, stop.episodes, model)
         for world in settings.worlds
     }
-    return Stop(given, envs)
+    return Stop(stop, envs)
 
 
 def _env_of(

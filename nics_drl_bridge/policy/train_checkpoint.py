@@ -212,10 +212,10 @@ MEMORY, DRAWN = "memory.", "drawn."
 
 def snapshot(env: BridgeVectorEnv) -> Arrays:
     """Copies everything that changes in a vector env, for a bit-identical `restore`."""
-    found = dict(env.changing)
-    found |= {MEMORY + name: rows for name, rows in env.memory.items()}
-    found |= {DRAWN + name: rows for name, rows in env.simulator.drawn.items()}
-    return {name: rows.copy() for name, rows in found.items()}
+    arrays = dict(env.changing)
+    arrays |= {MEMORY + name: rows for name, rows in env.memory.items()}
+    arrays |= {DRAWN + name: rows for name, rows in env.simulator.drawn.items()}
+    return {name: rows.copy() for name, rows in arrays.items()}
 
 
 def restore(env: BridgeVectorEnv, state: Mapping[str, NDArray[Any]]) -> None:
@@ -225,15 +225,15 @@ def restore(env: BridgeVectorEnv, state: Mapping[str, NDArray[Any]]) -> None:
         prefix = next((p for p in (MEMORY, DRAWN) if name.startswith(p)), "")
         parts[prefix][name.removeprefix(prefix)] = np.array(rows)
     targets = env.changing
-    given = parts[""]
-    for name in sorted(given.keys() | targets.keys()):
-        was, now = (_kind(rows.get(name)) for rows in (given, targets))
+    arrays = parts[""]
+    for name in sorted(arrays.keys() | targets.keys()):
+        was, now = (_kind(rows.get(name)) for rows in (arrays, targets))
         if was != now:
             reason = f"{name!r} is {was}, but this env's is {now}"
             advice = "make the env with the original arguments"
             raise ConfigError(f"state of a vector env: {reason}; {advice}.")
     for name, target in targets.items():
-        target[...] = given[name]  # in place: the compiled steps refer to these arrays
+        target[...] = arrays[name]  # in place: the compiled steps refer to these arrays
     env.memory = parts[MEMORY]
     env.simulator.drawn = parts[DRAWN]
     env.simulator.sort_bodies()

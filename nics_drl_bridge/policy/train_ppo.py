@@ -158,7 +158,7 @@ class Learner:
             gains,
             gains + values[:-1],
         )
-        return Transitions(*(each.flatten(0, 1) for each in rows))
+        return Transitions(*(field.flatten(0, 1) for field in rows))
 
     def learn(self, rollout: Transitions, rate: float) -> float:
         """Learns from a rollout at a learning rate; returns the loss of the last batch."""
@@ -174,16 +174,19 @@ class Learner:
     def differentiate(self, batch: Transitions) -> torch.Tensor:
         """Sets the gradients of all weights for a batch; returns the loss."""
         columns = batch.actions.float().view(len(batch.seen), -1)
-        given = Batch(*(each.numpy() for each in batch))._replace(
+        arrays = Batch(*(field.numpy() for field in batch))._replace(
             actions=columns.numpy()
         )
         (actor, critic), spread = self._nets, self.networks.log_std
         own = spread.detach().numpy(), spread.grad.numpy()
         bounds = np.float32(self.ppo.clip), np.float32(self.ppo.entropy)
         jobs: list[Callable[[], Any]] = [
-            partial(train_kernels.actor_gradients, actor, given, *own, *bounds),
+            partial(train_kernels.actor_gradients, actor, arrays, *own, *bounds),
             partial(
-                train_kernels.critic_gradients, critic, given, np.float32(VALUE_WEIGHT)
+                train_kernels.critic_gradients,
+                critic,
+                arrays,
+                np.float32(VALUE_WEIGHT),
             ),
         ]
         free = self.core_is_free.is_set()

@@ -32,4 +32,4 @@ class Transitions(NamedTuple):
     def batches(self, size: int, generator: torch.Generator) -> Iterator[Transitions]:
         """Yields batches of `size` transitions in random order; the last may be smaller."""
         for rows in torch.randperm(len(self.seen), generator=generator).split(size):
-            yield Transitions(*(each[rows] for each in self))
+            yield Transitions(*(field[rows] for field in self))

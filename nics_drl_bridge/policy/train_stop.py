@@ -47,19 +47,19 @@ class Stop:
 
     def judge(self, steps: int, act: Act) -> bool:
         """Evaluates the policy `act` if due after `steps`; returns True if it did."""
-        given = self._given
-        if given is None or steps // given.every <= self._due:
+        settings = self._given
+        if settings is None or steps // settings.every <= self._due:
             return False
-        self._due = steps // given.every
-        first = HELD_OUT_SEED + self._due * given.episodes
-        seeds = range(first, first + given.episodes)
+        self._due = steps // settings.every
+        first = HELD_OUT_SEED + self._due * settings.episodes
+        seeds = range(first, first + settings.episodes)
         driven = {
             world: drive_worlds(env, act, seeds) for world, env in self._envs.items()
         }
         self.shares = {
             world: float(one.success.mean()) for world, one in driven.items()
         }
-        self._reached = self._reached + 1 if self.least >= given.success else 0
+        self._reached = self._reached + 1 if self.least >= settings.success else 0
         return True
 
     def state(self) -> dict[str, Any]:

@@ -55,8 +55,8 @@ class TrainVecEnv(VecEnv):
         """Starts an episode in every world, with the seeds given to `seed`."""
         shown = []
         for env, rows in zip(self.envs, self._rows, strict=True):
-            given = self._seeds[rows]
-            seeds = None if all(one is None for one in given) else given
+            seeds_of_env = self._seeds[rows]
+            seeds = None if all(one is None for one in seeds_of_env) else seeds_of_env
             shown.append(env.reset(seed=seeds, options=self._options[0] or None)[0])
         self._reset_seeds()
         self._reset_options()
@@ -99,11 +99,11 @@ class TrainVecEnv(VecEnv):
                 flags[name] = (
                     info["final_info"][name].reshape(len(done), -1).all(axis=1)
                 )
-            told = {name: flag.tolist() for name, flag in flags.items()}
+            flag_lists = {name: flag.tolist() for name, flag in flags.items()}
             for n in over:
                 self._ended.append(rows.start + n)
-                own = {name: each[n] for name, each in told.items()}
-                self._infos[rows.start + n] = own | {
+                world_flags = {name: values[n] for name, values in flag_lists.items()}
+                self._infos[rows.start + n] = world_flags | {
                     "terminal_observation": info["final_obs"][n]
                 }
         return observation, reward, done

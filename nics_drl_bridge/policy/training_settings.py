@@ -27,6 +27,7 @@ MOST_WIDE = 8_192
 # maximum number of stored transitions: a rollout in all worlds, or SAC's buffer
 MOST_KEPT = 2**26
 Width = Annotated[int, Field(ge=1, le=MOST_WIDE)]
+DISCOUNT = 0.98  # of both algorithms
 
 
 class PpoSettings(Schema):
@@ -41,7 +42,7 @@ class PpoSettings(Schema):
     rollout: Count = 32  # steps in each world between two updates
     batch: Count = 2048  # transitions of one gradient step
     epochs: Count = 5  # passes through the rollout in each update
-    discount: Share = 0.98  # gamma, per step
+    discount: Share = DISCOUNT  # gamma, per step
     gae_lambda: Share = 0.95  # lambda of generalised advantage estimation
     clip: float = Field(default=0.2, gt=0.0)  # range of the probability ratio around 1
     # weight of the entropy bonus; a higher weight means more exploration
@@ -57,7 +58,7 @@ class SacSettings(Schema):
     batch: Count = 512  # transitions of one gradient step
     updates: Count = 8  # gradient steps after each step of the worlds
     begin_after: Count = 5_000  # transitions of random actions before the first update
-    discount: Share = 0.98  # gamma, per step
+    discount: Share = DISCOUNT  # gamma, per step
     # fraction by which each gradient step moves the target critics
     soft_update: Share = 0.01
 
@@ -187,10 +188,10 @@ def chosen_settings(
         changed["worlds"] = dict.fromkeys(worlds, max(1, base.num_envs // len(worlds)))
     engine = changed.pop("engine", None)
     if engine:
-        given = changed.get("algorithm", base.algorithm)
-        if engine == "lean" and given != "ppo":
+        algorithm = changed.get("algorithm", base.algorithm)
+        if engine == "lean" and algorithm != "ppo":
             raise ConfigError(
-                f"--engine lean requires ppo, not {given!r}; leave it out."
+                f"--engine lean requires ppo, not {algorithm!r}; leave it out."
             )
         changed["ppo"] = changed.get("ppo", {}) | {"engine": engine}
     return validate(changed, TrainingSettings, "training settings")

@@ -130,7 +130,7 @@ class SceneSampler:
     def _packed(self) -> Any:
         return pack(self.plan)
 
-    def __getstate__(self) -> dict[str, Any]:  # a copy packs its plan anew
+    def __getstate__(self) -> dict[str, Any]:  # a copy packs its plan again
         return {name: value for name, value in vars(self).items() if name != "_packed"}
 
     def draw(

@@ -87,7 +87,7 @@ class Lane:
     def advance(self, command: NDArray[np.float64] | None) -> bool:
         """Advances one period by a command (C,) or the policy; returns True if the env is new."""
         if self.over:
-            return self.anew(self.seed + 1)
+            return self.restart(self.seed + 1)
         if self.state:
             self._over_s += self.env.model.control_period
             return False
@@ -114,7 +114,7 @@ class Lane:
             )
         return actions_of(self.task, command)
 
-    def anew(self, seed: float) -> bool:
+    def restart(self, seed: float) -> bool:
         """Starts the episode of a seed in the original world; returns True if the env is new.
 
         Raises ConfigError for a bad seed.
@@ -277,7 +277,7 @@ class EpisodeSource:
         elif request.kind in ("seed", "restart"):
             for episodes in self.lanes:
                 is_restart = request.kind == "restart"
-                episodes.anew(episodes.seed if is_restart else request.value)
+                episodes.restart(episodes.seed if is_restart else request.value)
         else:
             return self._change_world(lane, request)
         return request.kind in ("policy", "seed", "restart")

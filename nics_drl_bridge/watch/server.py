@@ -12,15 +12,15 @@ from typing import Any, Literal
 
 from pydantic import Field, ValidationError
 
+from nics_drl_bridge import defaults
 from nics_drl_bridge.config import Schema
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.extensions import explain_missing
+from nics_drl_bridge.extensions import require_modules
 from nics_drl_bridge.seeds import GREATEST_SEED
 from nics_drl_bridge.watch.frame import Frame, Stage
 from nics_drl_bridge.watch.motion import MotionMeter
 
 HOST = "127.0.0.1"
-PORT = 8765
 MOST_REQUESTS = 256
 MOST_BYTES = 4096
 # Sleeping or failing pages are not logged.
@@ -79,13 +79,9 @@ class PageServer:
     missing.
     """
 
-    def __init__(self, port: int = PORT) -> None:
-        try:
+    def __init__(self, port: int = defaults.PAGE_PORT) -> None:
+        with require_modules("the page"):
             from websockets.sync.server import serve
-        except ImportError as error:
-            raise ConfigError(
-                f"the page {explain_missing(error.name or 'websockets')}"
-            ) from None
         self._requests: queue.Queue[Request] = queue.Queue(MOST_REQUESTS)
         self._news = threading.Condition()
         # newest stage, notice and frame

@@ -153,7 +153,7 @@ def test_without_ros_it_drives_in_process_alone_and_says_so(tmp_path, monkeypatc
     said = list[str]()
     line = demo_run.run(DemoPlan(tmp_path, episodes=1), said.append)
     assert line == f"demo: in process 1/1, report {tmp_path / 'report.html'}"
-    assert said[0].startswith("in process alone: ")
+    assert said[0].startswith("only in process: ")
     assert "needs the module 'rclpy'" in said[0]
     (of,) = shown
     assert (of.there, of.live) == ([], None)

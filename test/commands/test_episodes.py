@@ -11,16 +11,16 @@ import pytest
 
 pytest.importorskip("gymnasium")
 
-from nics_drl_bridge.commands import episodes
+from nics_drl_bridge import extensions
 from nics_drl_bridge.commands.conditions import NO_CONDITIONS, Conditions
 from nics_drl_bridge.commands.episodes import (
     FAST,
     PLACES,
     EvaluationOrder,
-    _places,
     limit_time,
     model_name,
     read_contracts,
+    select_places,
     shorten_name,
 )
 from nics_drl_bridge.errors import ConfigError
@@ -56,17 +56,17 @@ def order(*places):
 
 def test_a_robot_without_cmd_vel_is_driven_in_process_alone_and_that_is_said():
     said = []
-    assert _places(order(), KART.robot, said.append) == [FAST]
+    assert select_places(order(), KART.robot, said.append) == [FAST]
     assert said[0].startswith(
-        "in process alone: robot 'ackermann_throttle': the command 'throttl"
+        "only in process: robot 'ackermann_throttle': the command 'throttl"
     )
-    assert _places(order(FAST), KART.robot, said.append) == [FAST]
+    assert select_places(order(FAST), KART.robot, said.append) == [FAST]
     assert len(said) == 1
 
 
 def test_to_ask_for_topics_with_such_a_robot_is_refused():
     with pytest.raises(ConfigError, match="names no field of cmd_vel"):
-        _places(order(FAST, "dds"), KART.robot, print)
+        select_places(order(FAST, "dds"), KART.robot, print)
 
 
 @pytest.mark.parametrize(
@@ -76,19 +76,19 @@ def test_to_ask_for_topics_with_such_a_robot_is_refused():
             "rclpy",
             "differential",
             [FAST],
-            "in process alone: the world 'dds' needs the module",
+            "only in process: the world 'dds' needs the module",
         ),
         (
             "mujoco",
             "differential",
             [FAST, "dds"],
-            "in process and over DDS alone: .*mujoco",
+            "only in process and over DDS: .*mujoco",
         ),
         (
             "",
             "tricycle",
             [FAST, "dds"],
-            "in process and over DDS alone: .*no machine of the kind",
+            "only in process and over DDS: .*no machine of the kind",
         ),
     ],
 )
@@ -100,17 +100,19 @@ def test_without_in_an_evaluation_leaves_out_where_it_can_not_run_in_one_line(
     if lacking == "mujoco":
         monkeypatch.setitem(sys.modules, "mujoco", None)
     elif lacking:
-        there = episodes.find_spec
+        there = extensions.find_spec
         monkeypatch.setattr(
-            episodes, "find_spec", lambda name: None if name == lacking else there(name)
+            extensions,
+            "find_spec",
+            lambda name: None if name == lacking else there(name),
         )
     said = list[str]()
     spec = load_robot(robot)
-    assert _places(order(), spec, said.append) == places
+    assert select_places(order(), spec, said.append) == places
     assert len(said) == 1
     assert re.match(why, said[0])
     with pytest.raises(ConfigError):
-        _places(order(*PLACES), spec, said.append)
+        select_places(order(*PLACES), spec, said.append)
     assert len(said) == 1
 
 

@@ -93,7 +93,7 @@ def test_robot_and_model_are_one_option_of_every_command(
 ) -> None:
     done = nics(*command.split(), "--robot", "jackal", "--model=mecanum", cwd=tmp_path)
     assert done.returncode == 2
-    assert "--robot and --model are one option, and name" in done.stderr
+    assert "--robot and --model are the same option, but got" in done.stderr
     for word in ("--robot", "--model"):
         shown = nics(*command.split(), word, "jackal", "--help", cwd=tmp_path)
         assert "No such option" not in shown.stderr

@@ -13,9 +13,11 @@ from unittest import mock
 import numpy as np
 import pytest
 from command_line import nics
+from numba.core.caching import CacheImpl
 
-from nics_drl_bridge.commands import start
+from nics_drl_bridge.commands import interrupts, start
 from nics_drl_bridge.config import share_folder
+from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.recording.recording import save_recording
 from nics_drl_bridge.recording.write import write_drive
@@ -251,7 +253,7 @@ def test_a_run_with_other_settings_is_not_overwritten(folder):
 @pytest.fixture
 def signals():
     """Handlers of signals as they were before a test that takes them."""
-    numbers = list(start.ENDING)
+    numbers = list(interrupts.ENDING)
     before = [signal.getsignal(number) for number in numbers]
     yield
     for number, handler in zip(numbers, before, strict=True):
@@ -269,11 +271,12 @@ def test_ctrl_c_before_a_command_has_begun_is_one_sentence(signals, capsys):
 
 
 def test_where_no_kernel_can_be_kept_the_sentence_names_the_variable(signals, capsys):
-    error = RuntimeError(
-        "cannot cache function 'step': no locator available for file 'kernels.py'"
-    )
+    def import_kernel():
+        kernel(lambda x: x)
+
     with (
-        mock.patch("nics_drl_bridge.commands.cli.main", side_effect=error),
+        mock.patch("nics_drl_bridge.commands.cli.main", import_kernel),
+        mock.patch.object(CacheImpl, "_locator_classes", []),
         pytest.raises(SystemExit) as end,
     ):
         start.main()

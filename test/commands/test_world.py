@@ -264,7 +264,7 @@ def test_neither_picture_nor_map_replaces_a_file_that_the_world_is_made_of(tmp_p
         sentence = refused(*words, cwd=tmp_path)
         assert (
             sentence
-            == f"{tmp_path / file}: the world itself is made of it; name another as --out."
+            == f"{tmp_path / file}: is a file of the world itself; give another --out."
         )
         assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
     done("draw", "plan.yaml", cwd=tmp_path)

@@ -2,7 +2,7 @@
 
 Each digest runs a part of the package on fixed seeds and keeps a few projections of all that came
 out on fixed random signs, so that one number that changes shows. In `test`,
-`PYTHONPATH=../benchmarks python -m digests.digests NAME...` takes them down anew, for a change that
+`PYTHONPATH=../benchmarks python -m digests.digests NAME...` records them again, for a change that
 is meant to change them.
 """
 
@@ -220,7 +220,7 @@ what matrix products in single precision give."""
 
 
 def main() -> None:
-    """Takes digests down anew: those that are named, or all."""
+    """Records digests again: those that are named, or all."""
     sys.path[:0] = [str(TEST), str(TEST.parent / "benchmarks")]
     kept = json.loads(FILE.read_text()) if FILE.exists() else {}
     for name in sys.argv[1:] or DIGESTS:

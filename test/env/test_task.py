@@ -325,7 +325,7 @@ def test_a_top_speed_that_is_none_is_refused():
 
 
 class Counting(Navigation):
-    """Counts the steps of an episode, in an array that is bound anew by each."""
+    """Counts the steps of an episode, in an array that each rebinds."""
 
     shown = ("count",)
 

@@ -53,7 +53,7 @@ def test_entities_that_come_and_go_are_noticed(node, executor):
     node.create_subscription(Int32, "count", two.append, 10)
     node.destroy_subscription(first)
     spin_until(
-        executor, lambda: publisher.get_subscription_count() == 1, "matched anew"
+        executor, lambda: publisher.get_subscription_count() == 1, "matched again"
     )
     publisher.publish(Int32(data=2))
     spin_until(executor, lambda: two == [Int32(data=2)], "the message of the second")

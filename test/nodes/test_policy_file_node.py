@@ -306,7 +306,7 @@ def scan_at(angles, phase):
 
 
 def aims(robot, node, x):
-    """Gives another goal, from which the policy begins anew."""
+    """Gives another goal, from which the policy starts over."""
     known = node.log.read_text(encoding="utf-8").count("new goal")
     goal = PoseStamped()
     goal.pose.position.x, goal.pose.position.y = x, GOAL[1]

@@ -293,7 +293,7 @@ def test_odometry_drifts_with_the_configured_deviation():
         np.array([linear, linear, angular]) * walk, rel=0.05
     )
     assert not history[-1]["pose"].any()
-    for k in range(3):  # each period draws anew, independent of the one before
+    for k in range(3):  # each period draws again, independent of the one before
         correlation = np.corrcoef(twists[:-1, :, k].ravel(), twists[1:, :, k].ravel())[
             0, 1
         ]

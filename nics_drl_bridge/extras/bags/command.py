@@ -8,9 +8,8 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
-from nics_drl_bridge import defaults
+from nics_drl_bridge import defaults, extensions
 from nics_drl_bridge.commands import console
-from nics_drl_bridge.commands.console import needs_ros
 from nics_drl_bridge.config import parse_namespace
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
@@ -44,7 +43,7 @@ def record(
 ) -> None:
     """Records a robot's topics without driving it."""
     kind = _choose_storage(storage)
-    with needs_ros("nics bag record"):
+    with extensions.require_modules("nics bag record"):
         from nics_drl_bridge.extras.bags.live import BagOrder, record_bag
     names = tuple(topics or ())
     say = partial(typer.echo, err=True)
@@ -79,7 +78,9 @@ def info(
         "clock",
         "delay [ms]",
     )
-    table = console.format_table(heads, [_format_row(each) for each in contents.topics])
+    table = console.format_table(
+        heads, [_format_row(topic) for topic in contents.topics]
+    )
     console.print_line(
         as_json, f"{line}\n{table}", **asdict(contents) | {"path": str(path)}
     )
@@ -150,7 +151,7 @@ def replay(
         line = "\n".join((*lines, f"sha256 {estimates.digest}"))
         console.print_line(as_json, line, **facts, sha256=estimates.digest)
         return
-    with needs_ros("nics bag replay"):
+    with extensions.require_modules("nics bag replay"):
         from nics_drl_bridge.extras.bags.live import play_bag
     say = partial(typer.echo, err=True)
     sent = play_bag(path, topics or (), rate, loop, clock, namespace, lockstep, say)

@@ -134,8 +134,8 @@ class BagRecorder(QosWatch):
         if not publishers or topic in self.skipped:
             return
         offers = [offer_of(info.qos_profile) for info in publishers]
-        lasting = all(each.transient_local for each in offers)
-        wanted = Offer(QUEUE, all(each.reliable for each in offers), lasting)
+        lasting = all(offer.transient_local for offer in offers)
+        wanted = Offer(QUEUE, all(offer.reliable for offer in offers), lasting)
         subscribed = self._heard.get(topic)
         if subscribed is not None and subscribed[0] in (wanted, Offer(QUEUE, False)):
             return
@@ -236,7 +236,8 @@ class _Player:
         count_subscribers = self._node.count_subscribers
         self._stopping.wait(DISCOVERY_S)
         self._wait(
-            lambda: any(each.get_subscription_count() for each in publishers), ALONE_S
+            lambda: any(publisher.get_subscription_count() for publisher in publishers),
+            ALONE_S,
         )
         self._wait(  # until all known subscribers are connected
             lambda: all(
@@ -285,7 +286,7 @@ class _Player:
         future = self._barrier.call_async(GetParameters.Request(names=["use_sim_time"]))
         self._executor.spin_until_future_complete(future, timeout_sec=PATIENCE_S)
         if not future.done():
-            fix = f"{PATIENCE_S:g} s; it hangs or has ended: start it anew."
+            fix = f"{PATIENCE_S:g} s; it hangs or has ended: start it again."
             raise BackendError(f"node {self._lockstep!r}: has not answered for {fix}")
 
 

@@ -312,8 +312,8 @@ class Learning:
     @property
     def learner(self) -> Any:
         """RLlib's learner, which runs in this process."""
-        found = self.algorithm.learner_group.foreach_learner(lambda one: one)
-        return found.result_or_errors[0].get()
+        results = self.algorithm.learner_group.foreach_learner(lambda one: one)
+        return results.result_or_errors[0].get()
 
     @property
     def module(self) -> ActorCritic:
@@ -335,7 +335,8 @@ class Learning:
                 self._check_silence(now - heard, about)
                 continue
             heard = now
-            tell(progress := self._progress(first, now - begin))
+            progress = self._progress(first, now - begin)
+            tell(progress)
             for name in ("success", "collision", "steps_per_s", "env_share"):
                 logger.record(f"rollout/{name}", getattr(progress, name))
             logger.dump(self.steps)
