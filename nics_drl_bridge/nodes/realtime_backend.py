@@ -128,6 +128,9 @@ class RealtimeBackend:
         command_timeout_s = max(COMMAND_S, COMMAND_PERIODS * self._period_ns / NS_PER_S)
         if chosen.gated:
             command_timeout_s = math.inf  # a gate has its own timeout
+        _ = (
+            model.robot.cmd_vel_places
+        )  # refuse a robot without them before waiting for it
         rehearse(model)
         self._link = Link(
             chosen.namespace,

@@ -276,13 +276,14 @@ def test_ctrl_c_on_the_command_line_saves_a_bag_and_tells_what_it_holds(
 @pytest.mark.parametrize(
     ("name", "pace", "options"),
     [
-        ("differential", {"rate": 1.0}, FAST),
+        ("differential", {"rate": 2.0}, FAST),
+        pytest.param("differential", {"rate": 1.0}, FAST, marks=pytest.mark.campaign),
         pytest.param("differential", {"rate": 3.0}, FAST, marks=pytest.mark.campaign),
         pytest.param(
             "ackermann", {"rate": 1.0}, ("--duration", 20), marks=pytest.mark.campaign
         ),
     ],
-    ids=["differential-1.0", "differential-3.0", "ackermann-1.0"],
+    ids=["differential-2.0", "differential-1.0", "differential-3.0", "ackermann-1.0"],
 )
 def test_a_recorded_drive_of_a_simulator_generates_it_again(
     nics, launch, meet, domain_id, tmp_path, name, pace, options
