@@ -347,7 +347,7 @@ def test_any_number_of_walls_is_met_by_any_number_of_beams(beams, view):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("beams", [7, 20, 40, 720])
+@pytest.mark.parametrize("beams", [7, 720])
 def test_a_world_of_more_bodies_than_lanes_is_the_minimum_of_its_parts_to_the_bit(
     beams,
 ):
