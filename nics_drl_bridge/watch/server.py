@@ -82,7 +82,7 @@ class PageServer:
 
     def __init__(self, port: int = PORT) -> None:
         try:
-            from websockets.sync.server import ServerConnection, serve
+            from websockets.sync.server import serve
         except ImportError as error:
             raise ConfigError(
                 f"the page {explain_missing(error.name or 'websockets')}"
@@ -98,6 +98,8 @@ class PageServer:
         self.closed = False
 
         def connect(*args: Any, **options: Any) -> Any:
+            from websockets.sync.server import ServerConnection
+
             connection = ServerConnection(*args, **options)
             with self._news:
                 self._connections.add(connection)
