@@ -14,6 +14,8 @@ PARALLEL ?= -n auto --dist loadfile
 WORKERS := $(shell echo $$(($$(nproc 2>/dev/null || getconf _NPROCESSORS_ONLN) * 3 / 2)))
 # The slowest tests are printed, and the time of each is written.
 DURATIONS := --durations 50 --durations-min 1 --junitxml runs/tests.xml
+# Tests that `make test` leaves out, each with a target of its own; test/conftest.py says which they are.
+OTHER_RINGS := docs or package or campaign
 BENCHMARKS ?=
 QUICK ?=
 OUT ?=
@@ -58,7 +60,7 @@ DESCRIBED_BY := setup.py setup.cfg package.xml pyproject.toml constraints.txt Ma
 
 OTHER_PYTHON := name another interpreter, as in: make setup PYTHON=python3.12
 
-.PHONY: help setup demo test test-quick test-all test-jazzy test-ray test-messages test-upstream test-clients test-ament test-release ros-status lint format types pytest benchmark tables docs reference notebooks pictures clean distclean
+.PHONY: help setup demo test test-quick test-docs test-package test-campaign test-all test-jazzy test-ray test-messages test-upstream test-clients test-ament ros-status lint format types pytest benchmark tables docs reference notebooks pictures clean distclean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 15
@@ -120,15 +122,24 @@ $(READY_FOR_DEMO): $(DESCRIBED_BY)
 demo: $(or $(wildcard $(READY)),$(READY_FOR_DEMO)) ## run the whole chain on a recording: make demo [RECORDING=folder]
 	$(BIN)/nics demo $(if $(RECORDING),--recording "$(RECORDING)") --out runs/demo
 
-test: ros-status setup lint ## lint, types and tests: make test [PYTEST_ARGS="-k lidar"]
+test: ros-status setup lint ## before each commit, as CI does: lint, types and tests: make test [PYTEST_ARGS="-k lidar"]
 	@$(MAKE) --no-print-directory types & types=$$!; $(MAKE) --no-print-directory pytest; wait $$types
 
 test-quick: setup ## in under a minute, after each edit: no processes, no training
-	$(BIN)/python -m pytest -q $(PARALLEL) -m "not (ros or process or slow or campaign)" $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -q $(PARALLEL) -m "not (ros or process or slow or $(OTHER_RINGS))" $(PYTEST_ARGS)
 
-test-all: test ## before a release: also long campaigns, other distributions, clients and Ray
+test-docs: setup ## examples, notebooks, commands and Python of the pages, and the site in a browser
+	$(BIN)/python -m pytest $(PARALLEL) -m docs $(PYTEST_ARGS)
+
+test-package: setup ## wheel and source archive, installations in fresh environments, without ROS 2
+	$(CLEAN_ENV) $(BIN)/python -m pytest $(PARALLEL) -m package $(PYTEST_ARGS)
+
+test-campaign: setup ## long proofs of promises, in hours: faults, abuse, soak, fleets, BARN
 	$(BIN)/python -m pytest $(PARALLEL) -m campaign $(PYTEST_ARGS)
-	$(MAKE) test-jazzy test-messages test-clients test-ament test-release test-ray $(if $(UPSTREAM_LIES_THERE),test-upstream)
+
+test-all: test ## before a release: all rings, other distributions, clients and Ray
+	$(MAKE) test-docs test-package test-campaign \
+		test-jazzy test-messages test-clients test-ament test-ray $(if $(UPSTREAM_LIES_THERE),test-upstream)
 
 ros-status:
 ifeq ($(ROS),system)
@@ -152,11 +163,13 @@ types: setup ## mypy
 	$(BIN)/mypy nics_drl_bridge
 
 # Tests that wait for other processes may fail on a busy machine, so failed tests run again, alone.
+# Kernels are compiled first, or several workers and their processes would each compile the same ones.
 pytest: setup
-	@status=0; $(BIN)/python -m pytest $(PARALLEL:auto=$(WORKERS)) -m "not campaign" $(DURATIONS) $(PYTEST_ARGS) || status=$$?; \
+	$(BIN)/nics warmup
+	@status=0; $(BIN)/python -m pytest $(PARALLEL:auto=$(WORKERS)) -m "not ($(OTHER_RINGS))" $(DURATIONS) $(PYTEST_ARGS) || status=$$?; \
 	if [ $$status = 1 ]; then \
 		echo "make: once more, alone, the tests that failed:"; \
-		$(BIN)/python -m pytest --last-failed --last-failed-no-failures none --maxfail 5 -m "not campaign" $(PYTEST_ARGS); \
+		$(BIN)/python -m pytest --last-failed --last-failed-no-failures none --maxfail 5 -m "not ($(OTHER_RINGS))" $(PYTEST_ARGS); \
 	else exit $$status; fi
 
 # Separate environments for what conflicts with .venv; shared packages have the same pins.
@@ -273,9 +286,6 @@ $(AMENT)/.ready: Makefile
 			ros-ament-flake8 ros-ament-lint ament-xmllint; \
 		$(CLEAN_ENV) $(AMENT)/bin/python -m pip install -qq $(AMENT_LIBRARIES)
 	@touch $@
-
-test-release: setup ## run the demo from the wheel and the source archive, each in its own environment
-	$(CLEAN_ENV) $(BIN)/python -m pytest test/test_release.py $(PYTEST_ARGS)
 
 # Runs to the end even if a benchmark fails; each result names machine, commit and load.
 benchmark: setup ## run every benchmark, write benchmarks/results.json: make benchmark [BENCHMARKS="parity files"] [QUICK=1] [OUT=file]

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -11,6 +12,32 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 
+# One thread for linear algebra, here and in children, set before numpy is loaded: the workers fill
+# the cores, and threads of BLAS that wait for each other multiply the time of small problems.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+# Rings of tests that `make test` leaves out; CONTRIBUTING.md describes them. A whole file is moved
+# to a ring by its row here, a single test by the ring's name as a mark.
+RINGS = {
+    "docs": "examples, notebooks, commands and Python of the pages, and the site in a browser",
+    "package": "wheels, source archives and installations of every kind",
+    "campaign": "long proofs of a promise, before a release",
+}
+FILES = {
+    "test_examples.py": "docs",
+    "docs/test_notebooks.py": "docs",
+    "docs/test_shown_commands.py": "docs",
+    "docs/test_shown_python.py": "docs",
+    "docs/test_site.py": "docs",
+    "docs/test_fresh_clone.py": "package",
+    "test_release.py": "package",
+    "test_without_ros.py": "package",
+    "benchmarks/test_abuse.py": "campaign",
+    "benchmarks/test_abuse_env.py": "campaign",
+    "benchmarks/test_barn.py": "campaign",
+    "benchmarks/test_node_endings.py": "campaign",
+}
+
 # rclpy's major version tells the distribution where no ROS 2 is sourced, as with wheels.
 DISTRIBUTIONS = {"3": "humble", "7": "jazzy", "9": "kilted"}
 # In a process of its own: importing rclpy from wheels restarts the interpreter.
@@ -20,14 +47,27 @@ print(os.environ.get("ROS_DISTRO", ""), rclpy.get_rmw_implementation_identifier(
 """
 
 
-def pytest_configure() -> None:
-    """Lets SIGINT interrupt again, here and in all children.
+def pytest_configure(config: pytest.Config) -> None:
+    """Registers the rings, and lets SIGINT interrupt again, here and in all children.
 
     A shell starts a background job, as in `make test &` of a script, with SIGINT ignored, and every
     process below it inherits that: Ctrl-C could not be tested.
     """
+    for ring, content in RINGS.items():
+        config.addinivalue_line("markers", f"{ring}: {content}")
+    if missing := [name for name in FILES if not (ROOT / "test" / name).is_file()]:
+        raise pytest.UsageError(f"FILES of {__file__}: no such file: {missing}")
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Marks every test with the ring of its file."""
+    for item in items:
+        file = os.path.relpath(item.path, ROOT / "test")
+        if file in FILES:
+            item.add_marker(FILES[file])
 
 
 def pytest_report_header() -> str:

@@ -94,7 +94,9 @@ def test_a_second_process_compiles_nothing_and_a_division_by_zero_is_inf(package
     [
         ("low_kernels.py", "x + STEP", "x - STEP", 0.0),
         ("constants.py", "1.0", "3.0", 40.0),
-        ("high_kernels.py", "10.0 *", "20.0 *", 40.0),
+        pytest.param(
+            "high_kernels.py", "10.0 *", "20.0 *", 40.0, marks=pytest.mark.campaign
+        ),
     ],
 )
 def test_an_edit_of_what_a_kernel_is_made_of_compiles_it_anew_and_no_other(

@@ -218,6 +218,7 @@ def test_the_wheel_registers_the_package_with_ament(names_in_wheel: set[str]) ->
     assert f"share/ament_index/resource_index/packages/{PACKAGE}" in names_in_wheel
 
 
+@pytest.mark.package
 def test_a_pip_install_takes_version_and_config_from_itself(environment: Path) -> None:
     answer = run(environment / "bin" / "python", "-c", WHERE_AM_I, cwd=environment)
     version, module, share = answer.splitlines()
@@ -226,11 +227,13 @@ def test_a_pip_install_takes_version_and_config_from_itself(environment: Path) -
     assert Path(share) == environment / "share" / PACKAGE
 
 
+@pytest.mark.package
 def test_a_pip_install_puts_the_executables_into_bin(environment: Path) -> None:
     assert {path.name for path in (environment / "bin").iterdir()} >= EXECUTABLES
     assert "Usage" in run(environment / "bin" / "nics", "--help", cwd=environment)
 
 
+@pytest.mark.package
 def test_every_entry_point_leads_to_code(environment: Path) -> None:
     loaded = run(
         environment / "bin" / "python", "-c", LOAD_ENTRY_POINTS, cwd=environment
@@ -349,6 +352,7 @@ def test_every_requirement_is_pinned_to_a_version_that_it_allows(
         assert one.specifier.contains(pins[canonicalize_name(one.name)]), one
 
 
+@pytest.mark.package
 def test_the_linter_of_ros_2_finds_nothing_in_the_package() -> None:
     pytest.importorskip("flake8", reason="needs flake8 of the extra `test`")
     run(

@@ -61,7 +61,6 @@ def dist(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.campaign
 @pytest.mark.process
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("kind", ["*.whl", "*.tar.gz"])

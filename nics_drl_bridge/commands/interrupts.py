@@ -50,9 +50,11 @@ def _end(number: int, frame: FrameType | None) -> None:
         "_raw_object_cache"
     ):
         frame = frame.f_back
-    # No exception can leave this callback of llvmlite: try again later.
+    # No exception can leave this callback of llvmlite: try again later, in the main thread, where
+    # the signal also ends a system call that waits.
     if frame is not None:
-        threading.Timer(0.01, signal.raise_signal, (number,)).start()
+        main = threading.main_thread().ident
+        threading.Timer(0.01, signal.pthread_kill, (main, number)).start()
     elif number == signal.SIGINT:
         raise KeyboardInterrupt
     else:

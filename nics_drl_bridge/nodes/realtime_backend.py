@@ -131,6 +131,9 @@ class RealtimeBackend:
         )
         if chosen.gated:
             command_timeout_s = math.inf  # a gate has its own timeout
+        _ = (
+            model.robot.cmd_vel_places
+        )  # refuse a robot without them before waiting for it
         rehearse(model)
         self._link = Link(
             chosen.namespace,

@@ -9,6 +9,7 @@ import threading
 from contextlib import suppress
 from importlib.resources import files
 from typing import Any, Literal
+from weakref import WeakSet
 
 from pydantic import Field, ValidationError
 
@@ -88,14 +89,25 @@ class PageServer:
         self._texts = ["", "", ""]
         self._numbers = [0, 0, 0]
         self._pages: set[Any] = set()
+        self._connections: WeakSet[Any] = WeakSet()
         self._meter = MotionMeter()
         self.closed = False
+
+        def connect(*args: Any, **options: Any) -> Any:
+            from websockets.sync.server import ServerConnection
+
+            connection = ServerConnection(*args, **options)
+            with self._news:
+                self._connections.add(connection)
+            return connection
+
         try:
             self._server = serve(
                 self._serve_page,
                 HOST,
                 port,
                 process_request=self._answer,
+                create_connection=connect,  # type: ignore[arg-type]  # it is only called
                 compression=None,
                 max_size=MOST_BYTES,
                 origins=None,
@@ -232,9 +244,12 @@ class PageServer:
     def close(self) -> None:
         """Closes all pages and frees the port; this also ends threads that wait for a frame."""
         self.closed = True
-        for page in tuple(self._pages):
-            # A page that does not read would not answer a closing handshake.
+        with self._news:
+            connections = tuple(self._connections)
+        for connection in connections:
+            # A page that does not read would not answer a closing handshake, and a connection
+            # that a browser opened in advance sends no request.
             with suppress(OSError):
-                page.socket.shutdown(socket.SHUT_RDWR)
+                connection.socket.shutdown(socket.SHUT_RDWR)
         self._server.shutdown()
         self._thread.join()

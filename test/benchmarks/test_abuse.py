@@ -18,7 +18,6 @@ def test_what_an_attacker_hands_in_is_refused_in_a_sentence_and_what_is_good_is_
     assert {"policy", "yaml", "bag", "seed"} <= set(found["by_kind"])
 
 
-@pytest.mark.campaign
 @pytest.mark.timeout(600)
 def test_without_the_checks_of_policies_and_yaml_bad_files_are_taken():
     missed = fails("abuse.py", "credulous", "--rounds", "12")
@@ -27,7 +26,6 @@ def test_without_the_checks_of_policies_and_yaml_bad_files_are_taken():
     )
 
 
-@pytest.mark.campaign
 @pytest.mark.ros
 @pytest.mark.timeout(600)
 def test_without_the_zero_behind_an_exception_a_robot_moves_on():

@@ -19,14 +19,13 @@ def abuse_env(monkeypatch):
     return abuse_env
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(77, marks=pytest.mark.campaign)])
+@pytest.mark.parametrize("seed", [1, 77])
 def test_no_motion_stays_on_cmd_vel_whatever_is_thrown(abuse_env, seed):
     score = abuse_env.campaign(seed, 3)
     assert score.tries == 3
     assert score.told == []
 
 
-@pytest.mark.campaign
 def test_without_the_guard_motions_stay(abuse_env):
     score = abuse_env.campaign(3, 4, control="no_guard")
     assert score.tries == 4
@@ -34,7 +33,6 @@ def test_without_the_guard_motions_stay(abuse_env):
     assert set(abuse_env.CONTROLS) == {"no_guard"}
 
 
-@pytest.mark.campaign
 def test_a_robot_that_does_not_move_is_no_round(abuse_env, monkeypatch):
     monkeypatch.setattr(abuse_env, "AHEAD", 0.0 * abuse_env.AHEAD)
     monkeypatch.setattr(abuse_env, "MOVES_S", 0.3)

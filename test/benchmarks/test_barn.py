@@ -154,7 +154,6 @@ def test_each_fold_learns_anew_and_is_judged_in_worlds_that_it_did_not_see(tmp_p
 
 @pytest.mark.ros
 @pytest.mark.process
-@pytest.mark.campaign
 def test_a_planner_that_heeds_no_obstacle_misses_the_score_in_mujoco(folder):
     pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
     pytest.importorskip("mujoco", reason="needs the extra mujoco")

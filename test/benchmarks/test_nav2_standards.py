@@ -13,6 +13,7 @@ BENCHMARKS = ROOT / "benchmarks"
 ARCHIVE = ROOT.parent / "shared" / "upstream" / "nav2_interfaces.tar.gz"
 
 
+@pytest.mark.campaign
 def test_without_obstacles_nodes_and_a_known_controller_the_bars_are_missed():
     code, result = asked("nav2_standards.py", "--control", "bare", "--episodes", "1")
     assert code == 1

@@ -125,6 +125,7 @@ def test_the_picture_has_a_panel_for_each_perturbation(robustness, tmp_path):
         assert 550 < picture.height < 700  # two rows of three
 
 
+@pytest.mark.slow
 def test_the_picture_is_drawn_of_runs_robot_by_robot(robustness, tmp_path):
     if not shipped_policies():
         pytest.skip("no policy is shipped")

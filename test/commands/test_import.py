@@ -58,6 +58,7 @@ def test_a_log_becomes_a_mapping_a_recording_and_a_model(folder, tmp_path):
     assert kept.robot == {"kind": "ackermann", "footprint_radius": 0.2}
 
 
+@pytest.mark.slow
 def test_several_logs_become_one_simulator(tmp_path):
     robot = load_robot("differential")
     for k in range(2):

@@ -170,7 +170,7 @@ def test_only_what_the_wheels_lack_and_this_package_has_is_named(monkeypatch):
     assert how_to_install("tf2_msgs") == "install it with your ROS 2 distribution"
 
 
-@pytest.mark.campaign
+@pytest.mark.package
 @pytest.mark.process
 @pytest.mark.timeout(1200)
 def test_the_messages_that_were_built_can_be_used(tmp_path):

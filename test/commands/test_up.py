@@ -242,7 +242,14 @@ def test_a_simulation_is_armed_driven_stopped_and_ended_by_nics_alone(start):
 @pytest.mark.process
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
+@pytest.mark.parametrize(
+    "number",
+    [
+        signal.SIGTERM,
+        signal.SIGKILL,
+        pytest.param(signal.SIGHUP, marks=pytest.mark.campaign),
+    ],
+)
 def test_no_node_outlives_it_whatever_signal_ends_it(start, number):
     up, _ = start("simulator", "world:=empty")
     up.runs("simulator_node")

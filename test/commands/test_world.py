@@ -296,6 +296,7 @@ def test_what_is_written_is_told_as_json_too(tmp_path):
     assert (tmp_path / imported["file"]).is_file()
 
 
+@pytest.mark.slow
 def test_a_world_of_too_many_bodies_is_refused_by_the_file_that_holds_them(tmp_path):
     boxes = [f"<box><size>{0.1 + 1e-5 * k:.5f} 0.1 1</size></box>" for k in range(6000)]
     many = refused("import", sdf(tmp_path, *boxes), "--out", "made.yaml", cwd=tmp_path)

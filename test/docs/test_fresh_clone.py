@@ -28,7 +28,7 @@ OF_OTHERS = (
 
 
 def blocks() -> dict[str, list[str]]:
-    """The lines of each block, by page and place; what developers type runs in `make test-all`."""
+    """The lines of each block, by page and place; developers type others in `make test-all`."""
     found: dict[str, list[str]] = {}
     for page in PAGES:
         for k, text in enumerate(INDENTED.findall(FENCED.sub("", text_of(page)))):
@@ -47,7 +47,6 @@ def environment() -> dict[str, str]:
     return clean | {"PATH": os.pathsep.join(path)}
 
 
-@pytest.mark.campaign
 @pytest.mark.process
 @pytest.mark.skipif(
     not (ROOT / ".git").exists(), reason="needs the repository, to clone it"

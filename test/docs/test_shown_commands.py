@@ -15,16 +15,7 @@ from docs.shown import ELSEWHERE, lines_of, runs_here, supply, words_of
 from docs.test_pages import PAGES
 
 NEEDED = ("rosbags", "onnx", "mujoco", "torch", "rclpy")
-BEGINNING = ("README.md", "start_robot.md", "start_training.md")
-CASES = [
-    pytest.param(
-        page,
-        id=page.name,
-        marks=() if page.name in BEGINNING else (pytest.mark.campaign,),
-    )
-    for page in PAGES
-    if any(map(runs_here, lines_of(page)))
-]
+CASES = [page for page in PAGES if any(map(runs_here, lines_of(page)))]
 
 
 @pytest.mark.skipif(None in map(find_spec, NEEDED), reason="the pages use all extras")
@@ -32,7 +23,7 @@ CASES = [
 @pytest.mark.process
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize("page", CASES)
+@pytest.mark.parametrize("page", CASES, ids=lambda page: page.name)
 def test_every_command_of_a_page_runs_as_it_is_shown(page, tmp_path):
     for line in filter(runs_here, lines_of(page)):
         supply(line, tmp_path)

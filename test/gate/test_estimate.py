@@ -189,6 +189,7 @@ class DeadReckoning:
     [0.25, pytest.param(2.0, marks=pytest.mark.campaign)],
     ids=["short", "two_hours"],
 )
+@pytest.mark.slow
 def test_without_a_localiser_it_can_be_armed_again_every_five_minutes_and_drives(hours):
     robot = DeadReckoning()
     passing = 0

@@ -53,6 +53,7 @@ ASSUMED = (
 
 
 @pytest.mark.parametrize(("shield", "hits"), [("", False), (ASSUMED, True)])
+@pytest.mark.slow
 def test_wheels_that_brake_weakly_stop_before_the_wall_unless_more_is_assumed(
     tmp_path, shield, hits
 ):

@@ -141,6 +141,7 @@ COMMANDS = [
 
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.parametrize("responds", ["as its model", "as slowly as its errors allow"])
+@pytest.mark.slow
 def test_a_point_that_the_shield_takes_for_free_is_never_touched_by_a_stop(
     model, shield, command, responds
 ):

@@ -110,6 +110,7 @@ def moved_by(sim, commands):
 @pytest.mark.parametrize(
     ("at_the_rim", "least"), [(None, 0.45), (0.2, 2.4), (0.5, 1.05)]
 )
+@pytest.mark.slow
 def test_the_way_that_is_kept_free_is_what_the_simulator_needs(at_the_rim, least):
     """Also for wheels, whose limits of rates are in rad/s^2: at 0.2 m/s^2 it is over 2.5 m."""
     model = replace(builtin_model("jackal"), noise=Noise())
@@ -150,6 +151,7 @@ def test_a_model_that_shows_no_lag_has_an_assumed_one():
     assert shield.latency_s == pytest.approx(0.5 + model.control_period)
 
 
+@pytest.mark.slow
 def test_a_robot_that_does_not_stop_by_its_model_needs_to_be_told_how_it_stops(
     tmp_path,
 ):

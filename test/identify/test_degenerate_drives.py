@@ -123,6 +123,7 @@ def test_a_constant_command_gives_a_model_without_it_and_says_so(
         identify(recording, car, strict=True)
 
 
+@pytest.mark.slow
 def test_noise_of_a_measured_state_is_no_excitation(car):
     commands = random_commands(car)
     commands[:, 1] = -0.4
@@ -146,6 +147,7 @@ def test_standing_is_refused(name):
             identify(driven(spec, still, noise=noise), spec)
 
 
+@pytest.mark.slow
 def test_constant_commands_are_refused_instead_of_predicting_nonsense(car):
     commands = np.tile([0.1, -0.5], (1500, 1))
     with pytest.raises(FitError, match="no command ever changed"):

@@ -37,7 +37,13 @@ def test_a_robot_whose_motors_follow_freely_has_no_limits_and_no_dead_zone():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mounting", [(0.25, 0.12, 0.5), (0.0, 0.0, 0.0)])
+@pytest.mark.parametrize(
+    "mounting",
+    [
+        (0.25, 0.12, 0.5),
+        pytest.param((0.0, 0.0, 0.0), marks=pytest.mark.campaign),
+    ],
+)
 def test_a_dead_zone_of_the_speed_is_found_and_predicted(mounting):
     identified = found(dead=0.1, mounting=mounting)
     (curve,) = (each for each in identified.model.inputs if each.bends)
@@ -75,7 +81,7 @@ def test_no_state_overshoots_its_command_in_a_step():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("slew", [0.4, 0.7])
+@pytest.mark.parametrize("slew", [0.7, pytest.param(0.4, marks=pytest.mark.campaign)])
 def test_a_lag_before_a_limit_makes_the_latency_uncertain(slew):
     calibration = found(slew=slew).calibration
     off = abs(calibration.command_latency_s - 0.1)
@@ -105,7 +111,14 @@ def test_a_motor_without_a_lag_may_have_limits():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("given", [{"slew": 0.7}, {"later": 0.12}, {"dead": 0.1}])
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"slew": 0.7},
+        pytest.param({"later": 0.12}, marks=pytest.mark.campaign),
+        pytest.param({"dead": 0.1}, marks=pytest.mark.campaign),
+    ],
+)
 def test_motors_are_found_where_the_wheels_tell_the_latency_of_a_pose_on_another_clock(
     given,
 ):

@@ -113,6 +113,7 @@ def test_a_lag_is_what_the_state_itself_takes_from_its_rate():
 
 
 @pytest.mark.parametrize("duration", [4.0, 8.0])
+@pytest.mark.slow
 def test_a_drive_too_short_for_predictions_over_seconds_gets_the_textbook_in_silence(
     duration,
 ):
@@ -123,6 +124,7 @@ def test_a_drive_too_short_for_predictions_over_seconds_gets_the_textbook_in_sil
     assert chosen(found.findings.trials).order == 0
 
 
+@pytest.mark.slow
 def test_no_state_grows_by_itself_however_little_it_moved():
     spec, recording = slipping_car(duration=12.0)
     model = identify(recording, spec, alpha="auto").model
@@ -133,6 +135,7 @@ def test_no_state_grows_by_itself_however_little_it_moved():
         ).all()
 
 
+@pytest.mark.slow
 def test_strict_refuses_a_motion_that_a_command_never_moved():
     spec, recording = slipping_car(duration=12.0)
     command = recording.command

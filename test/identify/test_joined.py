@@ -91,6 +91,7 @@ def test_no_prediction_window_crosses_from_one_drive_to_another():
         assert set(ends) == {0, 1, 2, 3}
 
 
+@pytest.mark.slow
 def test_no_window_of_the_fit_crosses_either(together):
     _, identified = together
     samples = identified.samples
@@ -119,6 +120,7 @@ def test_not_even_episodes_without_a_gap_are_crossed():
     assert not crossing.any()
 
 
+@pytest.mark.slow
 def test_two_drives_teach_together_what_neither_does_alone(together):
     with pytest.raises(FitError):
         generate(STRAIGHT, ROBOT, mount_lidar(ROBOT), (), strict=True)
@@ -132,6 +134,7 @@ def test_two_drives_teach_together_what_neither_does_alone(together):
     assert not identified.fit.unmoved
 
 
+@pytest.mark.slow
 def test_clocks_of_their_own_are_aligned_drive_by_drive():
     drives = [
         driven(f"{k}.csv", 0.8, 1.5, seed=k, clock_ahead=ahead)
@@ -153,6 +156,7 @@ def test_clocks_of_their_own_are_aligned_drive_by_drive():
     assert found.judgement[-1].model.position_m < 0.05
 
 
+@pytest.mark.slow
 def test_a_recording_that_alone_is_off_is_named():
     good = [driven(f"good{k}.csv", 0.8, 1.5, seed=k) for k in range(2)]
     slippery = driven("slippery.csv", 0.8, 1.5, seed=5, gain=np.array([0.5, 0.4]))
@@ -166,6 +170,7 @@ def test_a_recording_that_alone_is_off_is_named():
     )
 
 
+@pytest.mark.slow
 def test_alike_recordings_are_listed_and_none_is_blamed():
     good = [driven(f"good{k}.csv", 0.8, 1.5, seed=k) for k in range(2)]
     found = identify(join_recordings(good, ROBOT), ROBOT)

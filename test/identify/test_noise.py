@@ -200,6 +200,7 @@ def test_the_noise_of_a_pose_is_no_less_than_its_covariances_say():
         assert claimed(shown, none) == {}
 
 
+@pytest.mark.slow
 def test_covariances_leave_the_drift_that_was_measured():
     spec, recording = slipping_car(duration=12.0)
     pose = recording.pose

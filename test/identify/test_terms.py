@@ -181,6 +181,7 @@ def held_throttle(**given):
     return spec, resample_drive(found.training, found)
 
 
+@pytest.mark.slow
 def test_a_command_held_at_one_value_pushes_as_a_constant():
     spec, samples = held_throttle()
     model = fit_motion_terms(samples, spec, 3, select_textbook_terms).model
@@ -190,6 +191,7 @@ def test_a_command_held_at_one_value_pushes_as_a_constant():
     )  # it steers only
 
 
+@pytest.mark.slow
 def test_a_speed_that_never_changed_is_a_constant_of_the_twist():
     spec, samples = held_throttle()
     steady = samples.rows(samples.t > samples.t[0] + 10.0)
@@ -244,6 +246,7 @@ def test_wheels_that_always_move_together_share_what_they_do():
     assert np.abs(model.coefficients).min() > 0.0
 
 
+@pytest.mark.slow
 def test_commands_that_move_on_their_own_share_nothing():
     spec, samples = held_throttle()
     model = fit_motion_terms(samples, spec, 2, select_textbook_terms).model

@@ -21,6 +21,13 @@ from nics_drl_bridge.robot.spec import RobotSpec
 TOO_COARSE = "between rows that are 0.3 s apart, so record at a higher rate."
 
 
+THREE_ROBOTS = [
+    "car",
+    "mecanum",
+    pytest.param("differential", marks=pytest.mark.campaign),
+]
+
+
 def coarse(spec: RobotSpec, every: int, duration: float = 60.0) -> Recording:
     """A drive of which one pose and state in so many, 10 ms apart, is recorded."""
     fine = record(spec, np.random.default_rng(0), duration, dt=0.01)
@@ -100,7 +107,7 @@ def no_textbook(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["car", "differential", "mecanum"])
+@pytest.mark.parametrize("name", THREE_ROBOTS)
 def test_the_textbook_takes_the_place_of_a_useless_model(name, request):
     spec = request.getfixturevalue(name)
     found = identify(coarse(spec, every=30), spec, alpha="auto")
@@ -126,7 +133,7 @@ def test_only_rows_that_are_too_far_apart_are_named(differential):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_textbook")
-@pytest.mark.parametrize("name", ["car", "differential", "mecanum"])
+@pytest.mark.parametrize("name", THREE_ROBOTS)
 def test_rows_too_far_apart_are_named(name, request):
     spec = request.getfixturevalue(name)
     sentence = verdict_on(coarse(spec, every=30), spec)
@@ -137,7 +144,7 @@ def test_rows_too_far_apart_are_named(name, request):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["car", "differential", "mecanum"])
+@pytest.mark.parametrize("name", THREE_ROBOTS)
 def test_a_good_drive_gives_a_useful_model(name, request):
     spec = request.getfixturevalue(name)
     for every in (1, 5):

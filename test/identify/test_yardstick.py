@@ -40,6 +40,7 @@ def without_a_textbook(spec):
 
 
 @pytest.mark.parametrize("kind", ["ackermann", "differential", "mecanum", "tricycle"])
+@pytest.mark.slow
 def test_a_fitted_textbook_predicts_a_robot_of_its_kind(kind):
     spec = load_robot(kind)
     disturbed = drive(

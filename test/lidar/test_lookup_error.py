@@ -88,7 +88,13 @@ def places(shape, high, number, rng):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "name", ["paper", "paper_12m", "rplidar_a1", "hokuyo_ust_10lx"]
+    "name",
+    [
+        "paper",
+        "hokuyo_ust_10lx",
+        pytest.param("paper_12m", marks=pytest.mark.campaign),
+        pytest.param("rplidar_a1", marks=pytest.mark.campaign),
+    ],
 )
 @pytest.mark.timeout(600)  # a cold start compiles
 def test_auto_is_right_within_a_centimetre_in_every_band_for_every_shape(name):

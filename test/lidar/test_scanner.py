@@ -46,6 +46,10 @@ SOME = [
     name if n % 3 == 0 else pytest.param(name, marks=pytest.mark.campaign)
     for n, name in enumerate(SENSORS)
 ]
+FEW = [
+    name if n % 6 == 0 else pytest.param(name, marks=pytest.mark.campaign)
+    for n, name in enumerate(SENSORS)
+]
 
 
 def scan(scanner, scene):
@@ -101,7 +105,7 @@ def test_a_lidar_inside_or_beside_any_shape_sees_what_plane_geometry_says(render
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", SOME)
+@pytest.mark.parametrize("name", FEW)
 def test_baked_scans_of_random_scenes_are_near_the_exact_ones(name):
     spec = SENSORS[name]
     if spec.beams > 1000:
@@ -347,7 +351,7 @@ def test_any_number_of_walls_is_met_by_any_number_of_beams(beams, view):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("beams", [7, 20, 40, 720])
+@pytest.mark.parametrize("beams", [7, 720])
 def test_a_world_of_more_bodies_than_lanes_is_the_minimum_of_its_parts_to_the_bit(
     beams,
 ):

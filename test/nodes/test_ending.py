@@ -35,24 +35,26 @@ def make(context):
 runner.run_node(make)
 ending.leave(0)
 """
-ENDS = [
-    signal.SIGHUP,
-    signal.SIGINT,
+ENDS = [signal.SIGHUP, signal.SIGINT, signal.SIGTERM, signal.SIGRTMAX]
+FURTHER_ENDS = [
     signal.SIGQUIT,
     signal.SIGUSR1,
     signal.SIGUSR2,
     signal.SIGALRM,
-    signal.SIGTERM,
     signal.SIGXCPU,
     signal.SIGIO,
     signal.SIGRTMIN,
-    signal.SIGRTMAX,
 ]
+
+
+def rarely(number):
+    """A signal of the campaign."""
+    return pytest.param(number, marks=pytest.mark.campaign)
 
 
 def usual_signals():
     """As in a terminal, whatever the shell that started the tests ignores."""
-    for number in ENDS:
+    for number in (*ENDS, *FURTHER_ENDS):
         signal.signal(number, signal.SIG_DFL)
 
 
@@ -72,7 +74,7 @@ def node(domain_id):
     process.communicate()
 
 
-@pytest.mark.parametrize("number", ENDS)
+@pytest.mark.parametrize("number", [*ENDS, *map(rarely, FURTHER_ENDS)])
 def test_a_signal_that_would_end_it_stops_it_in_order(node, number):
     node.send_signal(number)
     assert "stopped\n" in node.communicate(timeout=DEADLINE_S)[0]
@@ -101,7 +103,12 @@ def test_a_lost_terminal_does_not_end_what_was_started_by_nohup(domain_id):
 
 
 @pytest.mark.parametrize(
-    "number", [signal.SIGHUP, signal.SIGQUIT, signal.SIGUSR1, signal.SIGALRM]
+    "number",
+    [
+        signal.SIGHUP,
+        signal.SIGUSR1,
+        *map(rarely, [signal.SIGQUIT, signal.SIGALRM]),
+    ],
 )
 def test_a_gate_that_lets_a_robot_drive_leaves_a_zero_behind(
     launch_process, meet, domain_id, model, tmp_path, number

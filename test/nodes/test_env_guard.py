@@ -180,12 +180,24 @@ CASES = {
     "render that raises": (picture_fails, OSError),
     "close whose picture raises": (close_fails, ZeroDivisionError),
 }
+# Three more ways for a reset to refuse its arguments.
+ALIKE = {
+    "reset with bad options",
+    "reset with an unknown option",
+    "reset with a great seed",
+}
 
 
 @pytest.mark.parametrize(
     "mode", ["lockstep", pytest.param("realtime", marks=pytest.mark.campaign)]
 )
-@pytest.mark.parametrize("case", list(CASES))
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(case, marks=pytest.mark.campaign) if case in ALIKE else case
+        for case in CASES
+    ],
+)
 def test_a_zero_is_the_last_that_cmd_vel_hears(driving, mode, case):
     act, error = CASES[case]
     env, peer, heard = driving(mode, render_mode="rgb_array")

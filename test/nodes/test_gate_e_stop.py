@@ -112,9 +112,19 @@ def beside(operator):
         yield
 
 
-@pytest.mark.parametrize("stall_s", [0.15, 0.5, 2.0])
-def test_a_short_press_while_the_gate_is_stalled_stops_the_robot(operator, stall_s):
-    for _ in range(4):
+@pytest.mark.parametrize(
+    ("stall_s", "count"),
+    [
+        (0.15, 2),
+        (2.0, 2),
+        pytest.param(0.15, 10, marks=pytest.mark.campaign),
+        pytest.param(0.5, 10, marks=pytest.mark.campaign),
+    ],
+)
+def test_a_short_press_while_the_gate_is_stalled_stops_the_robot(
+    operator, stall_s, count
+):
+    for _ in range(count):
         with beating(operator):
             operator.release()
         with beside(operator):
@@ -132,7 +142,7 @@ def test_a_stall_that_the_queue_outlasts_is_no_press(launch_process, meet, domai
         "command_gate", domain_id, limits="ackermann", e_stop_silence=5.0
     )
     operator = Operator(gate, meet(domain_id), beside=False)
-    for _ in range(4):
+    for _ in range(2):
         with beating(operator):
             operator.release()
         operator.stall_gate(0.15, press=False)

@@ -203,6 +203,7 @@ def test_a_burst_does_not_flood_the_log_and_each_line_says_how_many_it_stands_fo
     assert " more since the last such line)" in stops[1]
 
 
+@pytest.mark.slow
 def test_stops_that_alternate_for_long_are_told_of_ever_more_rarely(log, logger):
     rig = Recorded(log).drive()
     logger.warnings.clear()

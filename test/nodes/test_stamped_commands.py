@@ -15,7 +15,7 @@ from nav_msgs.msg import Odometry
 
 from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.interface import Start
-from nics_drl_bridge.nodes import qos
+from nics_drl_bridge.nodes import qos, record_node
 from nics_drl_bridge.nodes.backends import DdsBackend
 from nics_drl_bridge.nodes.link import Link
 from nics_drl_bridge.nodes.parameters import stamped_by_default
@@ -173,8 +173,9 @@ def test_commands_are_heard_whatever_their_type_is_and_whenever_it_changes(
 
 
 def test_a_drive_whose_chosen_type_nobody_hears_names_who_hears_the_other(
-    launch, meet, domain_id, tmp_path
+    launch, meet, domain_id, tmp_path, monkeypatch
 ):
+    monkeypatch.setattr(record_node, "PATIENCE_S", 4.0)
     peer = meet(domain_id)
     other = not stamped_by_default()
     peer.listen(KINDS[other], "cmd_vel", qos.COMMAND)

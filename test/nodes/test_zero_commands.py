@@ -124,7 +124,7 @@ def said(process, text, told=""):
     [
         ("step", "stepped", [signal.SIGINT] * 5, -signal.SIGINT),
         ("step", "stepped", [signal.SIGTERM], 128 + signal.SIGTERM),
-        ("step", "stepped", [signal.SIGHUP], 128 + signal.SIGHUP),
+        many("step", "stepped", [signal.SIGHUP], 128 + signal.SIGHUP),
         ("exit", "stepped", [], 0),
         many("step", "stepped", [signal.SIGINT], -signal.SIGINT),
         many("reset", "off its start", [signal.SIGINT], -signal.SIGINT),

@@ -68,6 +68,7 @@ def test_depths_are_distances_to_the_border_and_negative_outside():
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.slow
 def test_room_is_the_distance_from_the_outline_up_to_a_cell(robot):
     rng = np.random.default_rng(1)
     shape = footprint(robot)

@@ -293,6 +293,7 @@ def weak_jackal(rate=0.2):
 
 @pytest.mark.parametrize("name", ["dynamic_window", "mppi"])
 @pytest.mark.parametrize("rate", [0.2, 20.0])
+@pytest.mark.slow
 def test_a_planner_stops_a_robot_before_a_wall_also_if_its_wheels_brake_weakly(
     name, rate
 ):

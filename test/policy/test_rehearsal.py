@@ -59,6 +59,7 @@ def forgetful(monkeypatch):
     monkeypatch.setattr(rehearsal, "_remembered", {})
 
 
+@pytest.mark.slow
 def test_concatenations_of_a_constant_take_no_gigabytes(file):
     file.write_bytes(bytes_of(signed(doubled(onnx.load(file), 31))))
     command = [sys.executable, "-c", MEASURE, str(file)]

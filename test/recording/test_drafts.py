@@ -719,6 +719,7 @@ def test_the_car_of_the_validation_drive_is_drafted_whole(shared_recordings):
     assert draft["time"] == "vicon time"
 
 
+@pytest.mark.slow
 def test_a_bag_without_commands_is_told_what_it_lacks(shared_recordings):
     bag = shared_recordings / "robot_localization" / "husky_outdoor_395s.bag"
     text, draft = drafted(bag)

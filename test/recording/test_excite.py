@@ -133,9 +133,19 @@ def drive_another(robot, really, gain, seed):
     ("name", "changes", "gain"),
     [
         ("ackermann", {"wheelbase": 0.24, "speed_lag": 0.2}, (1.1, 1.0)),
-        ("ackermann", {"wheelbase": 0.17, "steering_lag": 0.2}, (0.8, 1.0)),
-        ("differential", {"track": 0.25, "wheel_lag": 0.2}, (1.1, 0.9)),
         ("mecanum", {"wheel_lag": 0.2}, (1.2, 0.8, 1.2)),
+        pytest.param(
+            "ackermann",
+            {"wheelbase": 0.17, "steering_lag": 0.2},
+            (0.8, 1.0),
+            marks=pytest.mark.campaign,
+        ),
+        pytest.param(
+            "differential",
+            {"track": 0.25, "wheel_lag": 0.2},
+            (1.1, 0.9),
+            marks=pytest.mark.campaign,
+        ),
     ],
 )
 def test_a_robot_that_moves_otherwise_than_expected_is_kept_within_too(

@@ -176,6 +176,7 @@ def direction_of(robot, command):
 
 
 @pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.slow
 def test_the_bound_of_a_shipped_robot_is_above_its_stops_and_not_far_above(name):
     robot, model = shipped(name)
     assert_bounds(robot, model)
@@ -183,6 +184,7 @@ def test_the_bound_of_a_shipped_robot_is_above_its_stops_and_not_far_above(name)
 
 @pytest.mark.parametrize("at_the_rim", [0.2, 0.6])
 @pytest.mark.parametrize("name", sorted(WHEELS))
+@pytest.mark.slow
 def test_so_is_that_of_wheels_that_brake_weakly(name, at_the_rim):
     robot, model = shipped(name)
     weak = limited(model, at_the_rim / WHEELS[name])
@@ -198,6 +200,7 @@ def test_a_jackal_whose_wheels_brake_by_0_2_needs_two_and_a_half_metres_from_1_m
 
 @pytest.mark.parametrize("rate", [None, 3.0])
 @pytest.mark.parametrize("name", sorted(OWN))
+@pytest.mark.slow
 def test_so_is_that_of_a_robot_that_yaml_alone_describes(name, rate):
     robot, model = own(name)
     model = model if rate is None else limited(model, rate)

@@ -129,6 +129,7 @@ def test_the_command_for_a_twist_leads_to_it(kind):
 
 
 @pytest.mark.parametrize("kind", KNOWN)
+@pytest.mark.slow
 def test_a_robot_known_by_its_twist_comes_to_that_of_its_actuators(kind):
     robot = made(kind)
     command = 0.6 * robot.command_high

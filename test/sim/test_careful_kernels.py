@@ -496,6 +496,7 @@ def test_a_robot_in_a_narrow_corner_stands_still_and_comes_out_again():
 
 
 @pytest.mark.parametrize("footprint", [BAR, DART], ids=["bar", "dart"])
+@pytest.mark.slow
 def test_nothing_overlaps_where_robots_with_corners_push_and_slide(footprint):
     rng = np.random.default_rng(3)
     number = 24

@@ -108,6 +108,7 @@ def test_a_set_holds_what_is_generated_beside_what_is_named(tmp_path):
     assert names == ["circles", "cellular_0_0", "cellular_0_1", "cellular_0_2"]
 
 
+@pytest.mark.slow
 def test_the_shipped_set_is_found_by_its_name():
     world = load_worlds("cellular")
     assert (world.name, len(world.members)) == ("cellular", 2000)

@@ -94,6 +94,7 @@ def test_the_lidar_sees_what_was_spawned_moved_and_deleted(staged):
     assert ahead() == pytest.approx(free, abs=0.1)
 
 
+@pytest.mark.slow
 def test_entities_keep_their_names_where_many_obstacles_are_sorted(staged):
     entities = staged("clutter")
     spawned = entities.spawn("disc", HERE, START)
@@ -157,6 +158,7 @@ def test_starts_are_those_of_the_robots_that_are_still_there(staged):
     assert entities.pose(entities.find("third")) == pytest.approx(START)
 
 
+@pytest.mark.slow
 def test_room_for_what_was_spawned_is_given_back(staged):
     entities = staged("arena")
     room = entities.simulator.sampler.count

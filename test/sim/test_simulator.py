@@ -73,6 +73,7 @@ def test_the_same_seeds_give_the_same_bits_in_another_simulator(renderer):
 
 @pytest.mark.parametrize("robot", ["direct", "ackermann", "mecanum"])
 @pytest.mark.parametrize("batch", [4, 16, 300])
+@pytest.mark.slow
 def test_a_world_gives_the_same_bits_in_a_batch_of_any_size(robot, batch):
     model = noisy_model() if robot == "direct" else builtin_model(robot)
     radius = RADIUS if robot == "direct" else model.robot.footprint_radius

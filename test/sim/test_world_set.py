@@ -50,6 +50,7 @@ def drive(world, seeds, given, **options):
 
 @pytest.mark.parametrize("robots", [1, 2])
 @pytest.mark.parametrize("renderer", ["baked", "exact"])
+@pytest.mark.slow
 def test_an_episode_in_a_set_is_that_of_its_member_alone_to_the_bit(renderer, robots):
     seeds = np.arange(24)
     given = commands(len(seeds), robots)
@@ -63,6 +64,7 @@ def test_an_episode_in_a_set_is_that_of_its_member_alone_to_the_bit(renderer, ro
             assert np.array_equal(one[:, rows], other)
 
 
+@pytest.mark.slow
 def test_a_world_goes_from_member_to_member_as_its_episodes_begin():
     simulator = FastSimulator(MODEL, MIXED, 2)
     begun = set()

@@ -4,6 +4,7 @@ import logging
 import socket
 import sys
 import threading
+import time
 import urllib.error
 import urllib.request
 from contextlib import closing
@@ -162,7 +163,8 @@ def test_a_page_that_falls_asleep_or_errs_is_no_traceback(monkeypatch):
     heard = []
     handler.emit = heard.append
     monkeypatch.setattr(logging.root, "handlers", [handler])
-    quick = partial(library.serve, ping_interval=0.05, ping_timeout=0.05)
+    waits = {"ping_interval": 0.05, "ping_timeout": 0.05, "close_timeout": 0.05}
+    quick = partial(library.serve, **waits)
     monkeypatch.setattr(library, "serve", quick)
     with closing(PageServer(port=0)) as server:
         with talk(server, handshake(server)):
@@ -171,6 +173,15 @@ def test_a_page_that_falls_asleep_or_errs_is_no_traceback(monkeypatch):
         with talk(server, "no request\r\n\r\n") as page:
             page.recv(1000)
     assert not heard
+
+
+def test_a_connection_that_asks_for_nothing_does_not_delay_the_end():
+    server = PageServer(port=0)
+    with talk(server, ""):
+        until(lambda: server._connections, "the connection")
+        begin = time.monotonic()
+        server.close()
+        assert time.monotonic() - begin < 5.0  # the library waits ten seconds
 
 
 def test_a_taken_port_and_a_missing_library_are_one_sentence(server, monkeypatch):
