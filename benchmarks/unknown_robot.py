@@ -152,6 +152,7 @@ class Workshop:
         (folder / "robot.yaml").write_text(yaml.safe_dump(ROBOT))
         (folder / "limits.yaml").write_text(yaml.safe_dump(LIMITS))
         (folder / "field.yaml").write_text(yaml.safe_dump(WORLD))
+        (folder / "training.yaml").write_text(yaml.safe_dump(training_settings()))
         (folder / "open_place.json").write_text(json.dumps(OPEN_PLACE))
         (folder / "field.json").write_text(json.dumps(FIELD))
 
