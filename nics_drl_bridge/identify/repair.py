@@ -22,6 +22,7 @@ from nics_drl_bridge.identify.statistics import unexplained
 from nics_drl_bridge.identify.verdict import Doubt, Gap, Mistake
 from nics_drl_bridge.recording import recording as recordings
 from nics_drl_bridge.recording.mapping import UNITS
+from nics_drl_bridge.recording.recording import HeadingKeys
 from nics_drl_bridge.recording.stamping import select_new_rows
 from nics_drl_bridge.robot.kinds import has_textbook, textbook
 from nics_drl_bridge.robot.spec import FARTHEST_STEERED, RobotSpec
@@ -590,36 +591,40 @@ def check_axes(drive: Drive) -> None:
     values = drive.dated.values
     noise = TRAVEL_NOISE * (drive.pose_noise or (0.0, 0.0))[0]
     apart = max(TRAVEL_SHARE * drive.spec.footprint_radius, noise, 1e-3)
-    some = drive.dated.rows(recordings.select_along_path(values, apart))
-    line = (
-        "" if drive.spec.moves_sideways else recordings.find_clockwise_keys(some.values)
+    spaced = drive.dated.rows(recordings.select_along_path(values, apart))
+    if drive.spec.moves_sideways:
+        keys = _find_mirrored_heading(spaced, drive)
+    else:
+        keys = recordings.find_clockwise_keys(spaced.values)
+    if keys is HeadingKeys.NONE:
+        return
+    if keys is HeadingKeys.COMPASS:
+        kind = "as that of a compass"
+        alternative = "exchange x and y"
+    else:
+        kind = "counted clockwise"
+        alternative = "reverse x or y, or remove such a scale"
+    fault = "heading and path turn opposite ways; one of x, y and heading is reversed"
+    advice = (
+        f"for a heading {kind} write `heading: {{from: ..., {keys}}}` below `pose:`"
     )
-    state = recording.state
-    if (
-        drive.spec.moves_sideways
-        and state is not None
-        and state.clock == recording.pose.clock
-        and recordings.has_visible_axes(some.values)
-    ):
-        other = some.values * np.array([1.0, 1.0, -1.0])
-        as_given, mirrored = (
-            _explained(some.t, p, state) for p in (some.values, other)
-        )
-        least = max(recordings.MIN_MIRRORED, recordings.BETTER + as_given)
-        line = "scale: -1" if mirrored > least else ""
-    if line:
-        fault = (
-            "heading and path turn opposite ways; one of x, y and heading is reversed"
-        )
-        known = "as that of a compass" if "offset" in line else "counted clockwise"
-        advice = f"for a heading {known} write `heading: {{from: ..., {line}}}` below `pose:`"
-        if "offset" in line:
-            other = "exchange x and y"
-        else:
-            other = "reverse x or y, or remove such a scale"
-        raise RecordingError(
-            f"{recording.source}: pose: {fault}: {advice}; or {other} (REP-103)."
-        )
+    raise RecordingError(
+        f"{recording.source}: pose: {fault}: {advice}; or {alternative} (REP-103)."
+    )
+
+
+def _find_mirrored_heading(pose: recordings.Stream, drive: Drive) -> HeadingKeys:
+    """Finds if only mirrored headings make the measured state explain the poses."""
+    state = drive.recording.state
+    if state is None or state.clock != drive.recording.pose.clock:
+        return HeadingKeys.NONE
+    if not recordings.has_visible_axes(pose.values):
+        return HeadingKeys.NONE
+    as_recorded = _explained(pose.t, pose.values, state)
+    mirrored = _explained(pose.t, pose.values * np.array([1.0, 1.0, -1.0]), state)
+    if mirrored > max(recordings.MIN_MIRRORED, recordings.BETTER + as_recorded):
+        return HeadingKeys.MIRRORED
+    return HeadingKeys.NONE
 
 
 def _explained(t: Array, pose: Array, state: recordings.Stream) -> float:

@@ -1,6 +1,6 @@
 """Fit report: the model's equations, the quality of its fit, and what could not be learnt."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from textwrap import fill
 
@@ -33,14 +33,7 @@ MOST_LEFT = 0.5
 
 def format_report(source: str, identified: Identified) -> str:
     """Returns the report on a recording from a source as text for people."""
-    model = identified.model
-    robot = identified.drive.spec.name
-    sections: dict[str, Iterable[str]] = {
-        f"Fit report: robot {robot!r} from {source}": _list_items(
-            conclude(identified).lines
-        ),
-        _describe_size(identified): format_equations(model),
-    }
+    sections = _make_opening(source, identified)
     motor_effects = list(list_motor_effects(identified))
     if motor_effects:
         sections["Effect of the motors (standard uncertainties):"] = motor_effects
@@ -62,15 +55,29 @@ def format_report(source: str, identified: Identified) -> str:
         sections["Latency of the device, also used by simulator_node:"] = latency
     notes = identified.notes or ("Nothing had to be corrected.",)
     sections["Findings, and what was not learnt:"] = _list_items(notes)
-    paragraphs = (
-        [head, *(f"  {line}" for line in lines)] for head, lines in sections.items()
-    )
-    return "\n\n".join("\n".join(lines) for lines in paragraphs) + "\n"
+    return _format_sections(sections) + "\n"
 
 
-def select_opening(report: str) -> str:
-    """Returns the conclusion and the model of a fit report, which are read first."""
-    return "\n\n".join(report.split("\n\n")[:2])
+def format_opening(source: str, identified: Identified) -> str:
+    """Returns the conclusion and the model, with which `format_report` opens."""
+    return _format_sections(_make_opening(source, identified))
+
+
+def _make_opening(source: str, identified: Identified) -> dict[str, Iterable[str]]:
+    """Returns the lines of the first sections, by their heads."""
+    title = f"Fit report: robot {identified.drive.spec.name!r} from {source}"
+    return {
+        title: _list_items(conclude(identified).lines),
+        _describe_size(identified): format_equations(identified.model),
+    }
+
+
+def _format_sections(sections: Mapping[str, Iterable[str]]) -> str:
+    paragraphs = []
+    for head, lines in sections.items():
+        indented = [f"  {line}" for line in lines]
+        paragraphs.append("\n".join([head, *indented]))
+    return "\n\n".join(paragraphs)
 
 
 def _list_items(sentences: Iterable[str]) -> Iterator[str]:
@@ -146,48 +153,40 @@ def list_motor_effects(identified: Identified) -> Iterator[str]:
     model = identified.model
     sigma = identified.calibration.uncertainty
     units = list_units(identified.drive.spec)
-    values = [
-        (f"{curve.command}.{name}", words, getattr(curve, name), unit, usual)
-        for curve in model.inputs
-        for name, words, unit, usual in (
-            (
-                "dead",
-                DEAD_ZONE if curve.dead > 0.0 else EAGER,
-                units[curve.command],
-                0.0,
-            ),
-            ("least", "saturates below", units[curve.command], -np.inf),
-            ("most", "saturates above", units[curve.command], np.inf),
-            ("back", "reverse gain, relative to forward", "", 1.0),
-            ("delay", "delay after the common latency", "s", 0.0),
-        )
-    ]
+    # name, parameter, description, value, unit, and the value that means "no effect"
+    rows: list[tuple[str, str, str, float, str, float]] = []
+    for curve in model.inputs:
+        name = curve.command
+        unit = units[name]
+        dead = DEAD_ZONE if curve.dead > 0.0 else EAGER
+        back = "reverse gain, relative to forward"
+        rows += [
+            (name, "dead", dead, curve.dead, unit, 0.0),
+            (name, "least", "saturates below", curve.least, unit, -np.inf),
+            (name, "most", "saturates above", curve.most, unit, np.inf),
+            (name, "back", back, curve.back, "", 1.0),
+            (name, "delay", "delay after the common latency", curve.delay, "s", 0.0),
+        ]
     actuators = model.limits, model.friction, model.drag
     rates = zip(model.variables, model.dof_units[3:], *actuators, strict=False)
     for state, unit, (fall, rise), friction, drag in rates:
-        values += [
-            (f"{state}.fall", "maximum fall", fall, unit, -np.inf),
-            (f"{state}.rise", "maximum rise", rise, unit, np.inf),
-            (f"{state}.friction", "dry friction", friction, unit, 0.0),
-            (f"{state}.drag", "drag, times its square", drag, "", 0.0),
+        rows += [
+            (state, "fall", "maximum fall", fall, unit, -np.inf),
+            (state, "rise", "maximum rise", rise, unit, np.inf),
+            (state, "friction", "dry friction", friction, unit, 0.0),
+            (state, "drag", "drag, times its square", drag, "", 0.0),
         ]
-    emf = zip(model.variables, model.back_emf.tolist(), strict=False)
-    values += [
-        (
-            f"{state}.back_emf.{command}",
-            f"back-EMF, times {state} and |{command}|",
-            value,
-            "",
-            0.0,
-        )
-        for state, row in emf
-        for command, value in zip(model.variables[model.state_size :], row, strict=True)
-    ]
-    for key, words, value, unit, usual in values:
-        if value != usual:
-            spread = f" +- {sigma[key]:.2g}" if key in sigma else ""
-            name = key.partition(".")[0]
-            yield f"{name:<24} {words}: {value:.4g}{spread} {unit}".rstrip()
+    commands = model.variables[model.state_size :]
+    for state, emf in zip(model.variables, model.back_emf.tolist(), strict=False):
+        for command, value in zip(commands, emf, strict=True):
+            words = f"back-EMF, times {state} and |{command}|"
+            rows.append((state, f"back_emf.{command}", words, value, "", 0.0))
+    for name, parameter, words, value, unit, usual in rows:
+        if value == usual:
+            continue
+        error = sigma.get(f"{name}.{parameter}")
+        spread = "" if error is None else f" +- {error:.2g}"
+        yield f"{name:<24} {words}: {value:.4g}{spread} {unit}".rstrip()
 
 
 def format_with_error(value: float, error: float | None) -> str:
@@ -429,26 +428,27 @@ def explain_uselessness(identified: Identified) -> str:
     way = f"after {held_out.horizon_s:g} s and a path of {held_out.mean_path_m:.2f} m"
     still = f"while a robot standing still would be {standing:.2f} m off"
     fault = f"the fitted model is useless: on unseen data its predictions {end} {way}, {still}"
-    return f"{recording.source}: {fault}; {_name_suspect(identified, spec)}."
+    return f"{recording.source}: {fault}; {_name_suspect(identified, spec)}"
 
 
 def _name_suspect(identified: Identified, spec: RobotSpec) -> str:
+    """Returns the end of a sentence, on the most likely cause of a useless model."""
     recording = identified.recording
     unmoved = identified.trial.fit.unmoved
     rows = recording.pose if recording.state is None else recording.state
     apart = f"{np.median(np.diff(rows.t)):.2g} s apart"
     coarse = describe_coarsest_state(recording, spec, unmoved)
     if coarse:
-        return coarse
+        return f"{coarse}."
     still = ", ".join(c.name for c in spec.command if c.name in unmoved)
     if still:
         reason = f"{still} never moved in its first {identified.train_until_s:.0f} s"
-        return f"{reason}, which the fit learns from, so change it from the start"
+        return f"{reason}, which the fit learns from, so change it from the start."
     if identified.alpha != "auto" or identified.drive.settings.order == 1:
-        return "it may lack terms, so leave order and alpha at `auto`"
+        return "it may lack terms, so leave order and alpha at `auto`."
     for note in identified.notes:
         if isinstance(note, Mistake | Doubt):
-            return f"{note[0].lower()}{note[1:].rstrip('.')}"
+            return f"the likely cause: {note}"
     got = "that nothing blocked the robot, that it received each command"
     shown = f"{got} and that rows {apart} show how it responds"
-    return f"the recording does not show why, so make sure {shown}, and record again"
+    return f"the recording does not show why, so make sure {shown}, and record again."

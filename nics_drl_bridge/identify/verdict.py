@@ -41,7 +41,6 @@ LINEAR = (
     "Predictions by terms of a higher order ended farther away than the robot drove, so the model "
     "has only those of order 1."
 )
-EARLY = "The robot moves"  # start of a note on motion before its commands
 # fraction of a state's range between two rows that is sampled too coarsely
 COARSE = 2.0 / 3.0
 ENDS = (1.0, 99.0)  # percentiles that bound the range of a state
@@ -150,7 +149,7 @@ def describe_clocks(
         finding = "Pose and commands are stamped by different clocks"
         yield f"{finding}: {offset} added to the pose's stamps gives the commands' clock."
     if timing.early > 0.0 and calibration.command_latency_s <= 0.0:
-        finding = f"{EARLY} {timing.early:.2f} s before its commands"
+        finding = f"The robot moves {timing.early:.2f} s before its commands"
         cause = "the pose is stamped by another clock; give it a `clock:` of its own in the mapping"
         if recording.state is not None:
             cause = "its state is stamped by another clock; stamp both by one, and record again"
