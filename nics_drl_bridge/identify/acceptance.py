@@ -70,7 +70,7 @@ class Assessment:
 
 def usual(judgement: tuple[HorizonErrors, ...]) -> list[HorizonErrors]:
     """Returns the errors after 5 s, or at the longest held-out horizon; empty if there is none."""
-    return [each for each in judgement if each.horizon_s <= JUDGED_S][-1:]
+    return [at for at in judgement if at.horizon_s <= JUDGED_S][-1:]
 
 
 def comparison_noise(difference: Array, start_t: Array, horizon: float) -> float:
@@ -168,11 +168,12 @@ def rate(
 
 def combined(ratings: Iterable[Assessment]) -> Assessment:
     """Returns the least favourable verdict, with the reasons of all."""
-    rated = tuple(ratings)
-    verdict = max((each.verdict for each in rated), key=list(Verdict).index)
-    return Assessment(
-        verdict, tuple(reason for each in rated for reason in each.reasons)
-    )
+    verdicts = []
+    reasons: list[str] = []
+    for rating in ratings:
+        verdicts.append(rating.verdict)
+        reasons += rating.reasons
+    return Assessment(max(verdicts, key=list(Verdict).index), tuple(reasons))
 
 
 def rate_unseen(gap_s: float, duration_s: float) -> Assessment:

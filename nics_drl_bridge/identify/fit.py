@@ -49,7 +49,8 @@ def parse_alpha(text: str) -> Alpha:
     if text == "auto":
         return "auto"
     with suppress(ValueError):
-        if 0.0 <= (value := float(text)) <= 1.0:
+        value = float(text)
+        if 0.0 <= value <= 1.0:
             return value
     raise ConfigError(f"alpha is {text!r}; it must be a number from 0 to 1, or auto.")
 

@@ -15,7 +15,7 @@ from nics_drl_bridge.identify import shooting
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.motion import as_smooth, half_width
-from nics_drl_bridge.identify.signals import taken
+from nics_drl_bridge.identify.signals import average_effect
 from nics_drl_bridge.identify.terms import fit_motion_terms, tells_lever_from_wheels
 from nics_drl_bridge.identify.yardstick import structure_of
 from nics_drl_bridge.recording.recording import Samples
@@ -218,7 +218,7 @@ def problem_of(
 
     @lru_cache(maxsize=8)  # most values of a form do not affect the commands
     def late(latency: float, curves: tuple[InputCurve, ...]) -> Array:
-        return taken(command, spec, curves, t - latency, t - latency + dt)
+        return average_effect(command, spec, curves, t - latency, t - latency + dt)
 
     def commands(values: Array) -> Array:
         return late(form.latency_at(inputs, values), form.curves_at(inputs, values))

@@ -53,6 +53,7 @@ from nics_drl_bridge.identify.judgement import (
     bands_of,
     bands_of_fixed,
     judged,
+    measure_distances,
     textbook_of,
 )
 from nics_drl_bridge.identify.motion_fit import fit_motion, refine_motion
@@ -416,13 +417,17 @@ def find_input_curves(drive: Drive, findings: Findings) -> Findings:
     training = findings.training
     findings = _with_likely_latency(findings)
     samples = resample_drive(training, findings)
-    places = range(len(drive.spec.command))
-    curves = [
-        c for place in places if (c := curve_of(samples, drive.spec, place)) is not None
-    ]
-    calibration = replace(findings.calibration, inputs=tuple(c.curve for c in curves))
-    clear = tuple(c.curve for c in curves if c.gain >= CLEAR)
-    findings = replace(findings, calibration=calibration, clear_curves=clear)
+    curves = []
+    clear = []
+    for place in range(len(drive.spec.command)):
+        candidate = curve_of(samples, drive.spec, place)
+        if candidate is None:
+            continue
+        curves.append(candidate.curve)
+        if candidate.gain >= CLEAR:
+            clear.append(candidate.curve)
+    calibration = replace(findings.calibration, inputs=tuple(curves))
+    findings = replace(findings, calibration=calibration, clear_curves=tuple(clear))
     return _with_likely_latency(findings)  # the curves may hide a part of it
 
 
@@ -452,7 +457,7 @@ def fit_terms(drive: Drive, findings: Findings) -> Findings:
     if settings.order == "auto" and is_inferred and not trials:
         trials = _try_orders(drive, findings)
     if trials:
-        order = hypotheses.chosen(list(trials)).order
+        order = hypotheses.chosen(trials).order
     else:
         order = fitting.ORDER if settings.order == "auto" else settings.order
     centred = "lever_arm_y_m" in calibration.uncertainty
@@ -478,15 +483,15 @@ def _try_orders(drive: Drive, findings: Findings) -> tuple[hypotheses.Trial, ...
         findings.calibration,
         0.0,
         training.duration_s,
-        hypotheses.HORIZON_S,
+        open_loop.HORIZON_S,
         open_loop.SPACING_S,
     ).path
     trials = []
     for order in ORDERS_OF_INFERRED:
         errors = _cross_validate(drive, findings, order)
-        if hypotheses.HORIZON_S not in errors:
+        if open_loop.HORIZON_S not in errors:
             break
-        error_m = errors[hypotheses.HORIZON_S].mean()
+        error_m = errors[open_loop.HORIZON_S].mean()
         share = float(error_m / max(float(path.mean()), NO_PATH_M))
         trials.append(hypotheses.Trial(order, 0.0, share, errors))
     return tuple(trials)
@@ -508,7 +513,7 @@ def _cross_validate(drive: Drive, findings: Findings, order: int) -> dict[float,
         rest = training.part(replace(recording, pose=pose.rows(others)))
         rest = rest.under(settings)
         try:
-            found = run(
+            fitted = run(
                 (fit_terms, prune_terms, refine_model),
                 rest,
                 replace(findings, training=rest),
@@ -516,28 +521,12 @@ def _cross_validate(drive: Drive, findings: Findings, order: int) -> dict[float,
         except (FitError, RecordingError):
             return {}
         part = training.part(replace(recording, pose=pose.rows(block)))
+        model = require_model(fitted)
         for horizon, errors_m in errors.items():
-            errors_m.append(_measure_errors(found, part, horizon))
+            far = measure_distances(model, fitted.calibration, part, horizon)
+            errors_m.append(np.where(np.isnan(far), np.inf, far))
     joined = {h: np.concatenate(parts) for h, parts in errors.items()}
     return {h: errors_m for h, errors_m in joined.items() if len(errors_m)}
-
-
-def _measure_errors(findings: Findings, part: Drive, horizon: float) -> Array:
-    """Returns the distances (W,) [m] of predictions over a horizon [s] from a part's poses."""
-    chosen = open_loop.windows(
-        part,
-        findings.calibration,
-        0.0,
-        part.duration_s,
-        horizon,
-        open_loop.SPACING_S,
-    )
-    if not len(chosen.start_t):
-        return np.zeros(0)
-    model = require_model(findings)
-    ends = open_loop.predict(model, findings.calibration, part, chosen)
-    distance = np.hypot(*(ends - chosen.end)[:, :2].T)
-    return np.where(np.isnan(distance), np.inf, distance)
 
 
 def prune_terms(drive: Drive, findings: Findings) -> Findings:

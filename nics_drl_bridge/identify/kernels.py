@@ -77,7 +77,8 @@ def follow(ends, moved, x, steps, share, terms, free, dt):  # type: ignore[no-un
         qx = 0.0
         qy = 0.0
         old = 0.0
-        now[:], last = 0.0, steps[w] + (1 if share[w] > 0.0 else 0)
+        now[:] = 0.0
+        last = steps[w] + (1 if share[w] > 0.0 else 0)
         for n in range(last):
             if n == steps[w]:
                 qx = px
@@ -285,7 +286,9 @@ def _step(lane, terms, free, scratch, dt):  # type: ignore[no-untyped-def]
         _follow_pose(
             scratch.pose_slope[lane], scratch.twist, dx, dy, along * c, along * s, dt
         )
-    pose[0], pose[1], pose[2] = pose[0] + dx, pose[1] + dy, pose[2] + turn
+    pose[0] += dx
+    pose[1] += dy
+    pose[2] += turn
     _follow_state(lane, terms, free, first, scratch, dt)
 
 

@@ -13,7 +13,7 @@ from nics_drl_bridge.geometry import Array, rotate, wrap_angle
 from nics_drl_bridge.identify import clocks
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive, TwistIntervals
-from nics_drl_bridge.identify.signals import followed, held, speed_index
+from nics_drl_bridge.identify.signals import average_held, followed, speed_index
 from nics_drl_bridge.identify.statistics import standard_errors
 from nics_drl_bridge.identify.terms import has_slipping_tyres, list_reversed_variables
 from nics_drl_bridge.recording.recording import Stream
@@ -77,7 +77,7 @@ def mounting_of(
     if spec.moves_sideways:
         return jackknifed(drive, twists, timing.offset, partial(_by_commands, timing))
     start, end = twists.on_clock(timing.offset)
-    command = held(
+    command = average_held(
         drive.recording.command, spec, start - timing.latency, end - timing.latency
     )
     forward = _response(spec, command)[:, 0]
@@ -279,7 +279,7 @@ def _by_commands(
         )
     else:
         begin = twists.start + timing.offset - timing.latency
-        command = held(
+        command = average_held(
             recording.command, spec, begin, begin + twists.end - twists.start
         )
     response = _response(spec, command)  # of base_link, up to one factor
@@ -321,7 +321,7 @@ def _as_commands(states: Array, drive: Drive, latency: float) -> Array:
     rates = np.diff(stream.values, axis=0)[keep] / span[keep, None]
     before = stream.values[:-1][keep]
     begin = stream.t - latency
-    u = held(command, spec, begin[:-1][keep], begin[1:][keep])
+    u = average_held(command, spec, begin[:-1][keep], begin[1:][keep])
     # With more wheels than degrees of freedom, the rest of their speeds is slip, not commands.
     ways = np.linalg.svd(before, full_matrices=False)[2][: u.shape[1]].T
     chi = np.concatenate([before @ ways, u, np.ones((len(u), 1))], axis=1)

@@ -21,6 +21,7 @@ from nics_drl_bridge.identify import open_loop
 from nics_drl_bridge.identify.calibration import Calibration, Response
 from nics_drl_bridge.identify.clocks import TOLD_S
 from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.shooting import HEADING_ARM_M
 from nics_drl_bridge.identify.signals import speed_index
 from nics_drl_bridge.identify.statistics import (
     CERTAIN,
@@ -34,9 +35,8 @@ from nics_drl_bridge.robot.taylor import TaylorModel
 Mask = NDArray[np.bool_]
 NamedErrors = Mapping[str, Mapping[str, float]]  # by degree of freedom and term
 
-TWIST = slice(
-    0, 3
-)  # rows of a model's coefficients: the twist, then the rates of the state
+# rows of a model's coefficients: the twist, then the rates of the state
+TWIST = slice(0, 3)
 FIRST_STATE = 3
 VX = POSE_RATES.index("vx")
 VY = POSE_RATES.index("vy")
@@ -44,7 +44,6 @@ VY = POSE_RATES.index("vy")
 HORIZONS_S = (1.0, 2.5, 5.0)
 SPACING_S = 0.25  # between the starts of windows
 MIN_WINDOWS = 10  # per horizon
-HEADING_ARM_M = 0.3  # a heading error counts as a position error at this distance
 # A window contains a jump of the pose if its error exceeds this many times the median error and
 # this fraction of the longest path,
 OUTLYING = 10.0
@@ -188,9 +187,8 @@ class Problem:
 
     drive: Drive
     horizon_s: float  # the longest horizon that fits into the drive
-    windows: tuple[
-        open_loop.Windows, ...
-    ]  # for each horizon, without jumps of the pose
+    # for each horizon, without jumps of the pose
+    windows: tuple[open_loop.Windows, ...]
     # courses of X over them if the state was measured, else empty
     courses: tuple[open_loop.Course, ...]
 
@@ -548,7 +546,10 @@ def simplify(problem: Problem, refined: Refined) -> Refined:
     best = refined
     tried = set[tuple[int, int]]()
     limit = refined.error * (1.0 + WORTH)
-    while (weakest := _find_weakest(best, tried)) is not None:
+    while True:
+        weakest = _find_weakest(best, tried)
+        if weakest is None:
+            break
         tried.add(weakest)
         coefficients = best.model.coefficients.copy()
         coefficients[weakest] = 0.0

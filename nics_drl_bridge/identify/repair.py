@@ -14,7 +14,7 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.forms import list_driving_commands
 from nics_drl_bridge.identify.signals import (
-    held,
+    average_held,
     interval_means,
     moved_commands,
     unwrapped,
@@ -504,7 +504,7 @@ def _check_sideways(drive: Drive, command: recordings.Stream) -> tuple[str, ...]
     order = [keys.index(key) for key in SIDEWAYS]
     best = np.zeros((3, 3))
     for delay in DELAYS_S:
-        asked = held(command, spec, start - delay, end - delay)[:, order]
+        asked = average_held(command, spec, start - delay, end - delay)[:, order]
         with np.errstate(invalid="ignore"):  # commands that never changed
             alike = np.nan_to_num(np.corrcoef(asked.T, driven.T)[:3, 3:])
         # a rotated mounting moves the sensor sideways
@@ -582,7 +582,7 @@ def _compare_commands(
     asked = driven
     correlation = np.zeros((2, 2))
     for delay in DELAYS_S:
-        sent = held(command, spec, start - delay, end - delay)
+        sent = average_held(command, spec, start - delay, end - delay)
         trial = np.zeros_like(driven)
         if places:
             trial[:, places] = sent

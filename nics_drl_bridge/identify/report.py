@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from textwrap import fill
 
 import numpy as np
@@ -22,7 +23,8 @@ from nics_drl_bridge.robot.taylor import EndErrors, HorizonErrors, TaylorModel
 
 WIDTH = 96
 CURVE_POINTS = 8
-TEXTBOOK_VALUES = "command_latency_s", "rotation_rad", "lever_arm_x_m", "lever_arm_y_m"
+MOUNTING_VALUES = ("rotation_rad", "lever_arm_x_m", "lever_arm_y_m")
+TEXTBOOK_VALUES = ("command_latency_s", *MOUNTING_VALUES)
 DEAD_ZONE = "dead zone on both sides of 0"
 EAGER = "does more than in proportion, by minus"
 # minimum digits of a coefficient, with which the printed equations predict like the model
@@ -218,7 +220,7 @@ def _describe_fit(identified: Identified) -> dict[str, Iterable[str]]:
     return {
         fill(_describe_pruning(identified.alpha), WIDTH): (),
         "Cross-validated error against the number of terms, largest first, * for those kept:": (
-            line for curve in fit.curves for line in _format_curve(curve)
+            chain.from_iterable(map(_format_curve, fit.curves))
         ),
         "Error of the linear fit per degree of freedom, on the part it was fitted to:": (
             f"{dof:<24} RMSE {rmse:.3g} {unit}, R2 {r2:.6f}, condition number {number:.3g}"
@@ -242,10 +244,10 @@ def _describe_pruning(alpha: Alpha) -> str:
 
 def _format_curve(curve: Curve) -> list[str]:
     shown = min(max(CURVE_POINTS, curve.kept + 1), len(curve.error))
-    points = [
-        f"{n}{'*' if n == curve.kept else ''}: {100.0 * curve.share[n]:.3g} %"
-        for n in range(shown)
-    ]
+    points = []
+    for n in range(shown):
+        mark = "*" if n == curve.kept else ""
+        points.append(f"{n}{mark}: {100.0 * curve.share[n]:.3g} %")
     more = f" ({len(curve.error) - 1} in all)" if shown < len(curve.error) else ""
     text = f"{curve.dof:<14} " + ", ".join(points) + more
     return fill(text, WIDTH, subsequent_indent=" " * 15).splitlines()
@@ -286,26 +288,20 @@ COMPARED = (
 
 def tabulate_judgement(judgement: Sequence[HorizonErrors]) -> list[tuple[str, ...]]:
     """Returns a table of predictions beside those of yardsticks, a row per horizon for `HEADS`."""
+    rows = []
+    for at in judgement:
+        cells = [f"{at.horizon_s:g} s", f"{at.path_m:.3g} m"]
+        for errors in (at.model, at.textbook, at.kept_twist):
+            cells.append("-" if errors is None else _format_errors(errors, at.path_m))
+        cells.append("-" if at.band_m is None else f"{at.band_m:.3g} m")
+        cells.append("-" if at.coverage is None else f"{at.coverage:.1%}")
+        rows.append(tuple(cells))
+    return rows
 
-    def cell(errors: EndErrors | None, path: float) -> str:
-        if errors is None:
-            return "-"
-        share = f" ({errors.position_m / path:.1%})" if path > 0.0 else ""
-        return f"{errors.position_m:.3g}{share} {errors.heading_rad:.2g}"
 
-    return [
-        (
-            f"{at.horizon_s:g} s",
-            f"{at.path_m:.3g} m",
-            *(
-                cell(errors, at.path_m)
-                for errors in (at.model, at.textbook, at.kept_twist)
-            ),
-            "-" if at.band_m is None else f"{at.band_m:.3g} m",
-            "-" if at.coverage is None else f"{at.coverage:.1%}",
-        )
-        for at in judgement
-    ]
+def _format_errors(errors: EndErrors, path: float) -> str:
+    share = f" ({errors.position_m / path:.1%})" if path > 0.0 else ""
+    return f"{errors.position_m:.3g}{share} {errors.heading_rad:.2g}"
 
 
 def _format_comparison(judgement: Sequence[HorizonErrors]) -> dict[str, Iterator[str]]:
@@ -355,15 +351,11 @@ def collect_estimates(identified: Identified) -> dict[str, CalibratedValue]:
     hidden = (few, few) if mounting is None else mounting.hidden
     unknown = recording.wheels is None
     wheels = "no wheel speeds were recorded" if unknown else "the wheels do not show it"
+    singly = "the poses are stamped one by one"
     rows = {
         "clock_offset_s": ("clock offset", found.clock_offset_s, "s", clocks),
         "command_latency_s": ("command latency", found.command_latency_s, "s", latency),
-        "burst_period_s": (
-            "period of bursts",
-            None,
-            "s",
-            "the poses are stamped one by one",
-        ),
+        "burst_period_s": ("period of bursts", None, "s", singly),
         "rotation_rad": ("rotation of base_link", found.rotation_rad, "rad", few),
         "lever_arm_x_m": ("lever arm x", found.lever_arm_m[0], "m", hidden[0]),
         "lever_arm_y_m": ("lever arm y", found.lever_arm_m[1], "m", hidden[1]),
@@ -374,12 +366,8 @@ def collect_estimates(identified: Identified) -> dict[str, CalibratedValue]:
     for key, (name, value, unit, why) in rows.items():
         values[key] = CalibratedValue(name, None, None, unit, why)
         if key in sigma:
-            zero = value == 0.0 and key in (
-                "rotation_rad",
-                "lever_arm_x_m",
-                "lever_arm_y_m",
-            )
-            remark = "below its uncertainty: taken as zero" if zero else ""
+            is_zero = value == 0.0 and key in MOUNTING_VALUES
+            remark = "below its uncertainty: taken as zero" if is_zero else ""
             values[key] = CalibratedValue(name, value, sigma[key], unit, remark)
     if identified.findings.replacement:
         for key in TEXTBOOK_VALUES:
@@ -392,15 +380,13 @@ def collect_estimates(identified: Identified) -> dict[str, CalibratedValue]:
         values["burst_period_s"] = CalibratedValue(
             "period of bursts", period, None, "s"
         )
-    swapped = found.wheels_swapped
-    meaning = {
-        None: wheels,
-        True: "left and right are interchanged",
-        False: "as named",
-    }[swapped]
-    known = None if swapped is None else float(swapped)
+    value = None
+    meaning = wheels
+    if found.wheels_swapped is not None:
+        value = float(found.wheels_swapped)
+        meaning = "left and right are interchanged" if value else "as named"
     values["wheels_swapped"] = CalibratedValue(
-        "swapped wheels", known, None, "", meaning
+        "swapped wheels", value, None, "", meaning
     )
     return values
 

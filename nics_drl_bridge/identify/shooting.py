@@ -116,8 +116,8 @@ class Shooting:
     def longest_horizon_s(self) -> float:
         """The longest horizon that fits into the drive; 0 if none does [s]."""
         _, steps = self.starts()
-        horizons = zip(self.horizons, steps.T, strict=True)
-        return max((horizon for horizon, each in horizons if each.any()), default=0.0)
+        fits = steps.any(axis=0)
+        return max(np.array(self.horizons)[fits].tolist(), default=0.0)
 
     def moved(self, first: Rows, steps: Rows) -> Array:
         """Returns the measured poses (W, H, 3) at windows' horizons, relative to the starts."""
@@ -144,8 +144,6 @@ class Shooting:
         model = self.shaped(model, values)
         if free is None:
             free = np.zeros(model.coefficients.shape, dtype=np.bool_)
-        else:
-            free = free
         used = (model.coefficients != 0.0) | free
         dofs, places = np.nonzero(used)
         terms = make_terms(replace(model, coefficients=used.astype(np.float64)))
@@ -317,8 +315,11 @@ class _Search:
     def late(self, theta: Array, rest: Array) -> Array:
         """Returns derivatives (n, I) of errors (n,) by the scaled values."""
         aside = theta + DIFFERENCE * np.eye(self.count, len(theta))
-        every = [(self.shot(each, False)[0] - rest) / DIFFERENCE for each in aside]
-        return np.ascontiguousarray(np.reshape(every, (self.count, len(rest))).T)
+        slopes = np.zeros((len(rest), self.count))
+        for i, trial in enumerate(aside):
+            errors, _ = self.shot(trial, False)
+            slopes[:, i] = (errors - rest) / DIFFERENCE
+        return slopes
 
     def run(self, first: Array | None, evaluations: int) -> Predictive:
         """Searches for the minimum of the errors."""
@@ -330,7 +331,8 @@ class _Search:
             other[count:] = (
                 first[self.free] - self.model.coefficients[self.free]
             ) / self.unit
-            if np.abs(rest := self.residual(other)).sum() < np.abs(begun).sum():
+            rest = self.residual(other)
+            if np.abs(rest).sum() < np.abs(begun).sum():
                 start = other
                 begun = rest
         low = np.full(len(start), -np.inf)

@@ -10,7 +10,7 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.calibration import Calibration, Response
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.motion import known_state
-from nics_drl_bridge.identify.signals import inferred_states
+from nics_drl_bridge.identify.signals import infer_states
 from nics_drl_bridge.identify.yardstick import LIMIT_RANGE, TextbookResponse, Yardstick
 from nics_drl_bridge.recording.recording import Samples, Stream
 from nics_drl_bridge.robot.curve import InputCurve
@@ -142,7 +142,7 @@ def with_actuators(
     command = drive.recording.command
     lag = response.lag_s[2:]
     latency = calibration.command_latency_s
-    angle = inferred_states(command, alone, lag, latency, state.t)[:, 0]
+    angle = infer_states(command, alone, lag, latency, state.t)[:, 0]
     angle = response.gain[2, steering] * angle + response.offset[2]
     speed = state.values[:, forward]
     if response.bicycle.front_drive:
