@@ -625,7 +625,11 @@ def _find_bands(drive: Drive, findings: Findings) -> dict[float, float]:
 
 
 def prefer_textbook(drive: Drive, findings: Findings) -> Findings:
-    """Replaces the model by the fitted textbook if that predicts the held-out part better."""
+    """Replaces the model by the fitted textbook if that predicts the held-out part better.
+
+    The held-out part chooses between the two, so the errors there are slightly optimistic if the
+    textbook is chosen: they are the lower of two. The report says so.
+    """
     if findings.yardstick is None:
         return findings
     if not acceptance.loses_to_textbook(findings.judgement):

@@ -476,7 +476,9 @@ def describe_replacement(lost: HorizonErrors) -> str:
     off = f"{lost.model.position_m:.3g} m off after {lost.horizon_s:g} s"
     finding = f"The learnt model ends {off}, the fitted textbook "
     finding += f"{lost.textbook.position_m:.3g} m, on the same unseen data"
-    return f"{finding}: the model written is the textbook, fitted to the training part."
+    written = "the model written is the textbook, fitted to the training part"
+    bias = "since these data chose it, its errors on them are slightly optimistic"
+    return f"{finding}: {written}; {bias}."
 
 
 def describe_refit(until: float, duration: float, worse: bool) -> str:
