@@ -745,23 +745,34 @@ def _measure_mean_error(findings: Findings, until: float) -> float:
 
 
 def cut(recording: Recording, until: float) -> Recording:
-    """Returns a recording up to `until` [s] after its first pose; commands last slightly longer."""
+    """Returns a recording up to `until` [s] after its first pose; commands last slightly longer.
+
+    Raises RecordingError if no commands, or none of the measured states, are left.
+    """
     if not until > 0.0:
         fault = f"{recording.source}: the training part ends at {until:g} s"
         raise RecordingError(f"{fault}; use more than 0.")
-    pose = recording.pose.t
-
-    def cut_stream(stream: Stream, margin: float = 0.0) -> Stream:
-        origin = stream.t[0]
-        if stream.t[0] < pose[-1] and stream.t[-1] > pose[0]:  # on the pose's clock
-            origin = max(stream.t[0], pose[0])
-        return stream.rows(stream.t <= origin + until + margin)
-
-    parts: dict[str, Any] = {
-        name: cut_stream(stream) for name, stream in recording.streams.items()
-    }
-    parts["command"] = cut_stream(recording.command, timings.SEARCH_S)
+    parts: dict[str, Any] = {}
+    for name, stream in recording.streams.items():
+        last = _find_origin(stream, recording.pose) + until
+        if name == "command":
+            last += timings.SEARCH_S
+        part = stream.rows(stream.t <= last)
+        parts[name] = part if len(part.t) else None
+        if name in ("command", "state") and parts[name] is None:
+            fault = f"{recording.source}: {name}: starts after the first {until:g} s"
+            advice = "the part of the drive to learn from; record it from the start"
+            raise RecordingError(f"{fault}, {advice}.")
     return replace(recording, **parts)
+
+
+def _find_origin(stream: Stream, pose: Stream) -> float:
+    """Returns the time of the first pose on a stream's clock [s]; a guess if that is another."""
+    if stream.clock == pose.clock:
+        return float(pose.t[0])
+    if stream.t[0] < pose.t[-1] and stream.t[-1] > pose.t[0]:  # a small offset
+        return float(max(stream.t[0], pose.t[0]))
+    return float(stream.t[0])
 
 
 STAGES = list_stages()
