@@ -139,10 +139,12 @@ def align(drive: Drive, calibration: Calibration) -> Samples:
             recording.command, drive.spec, calibration.inputs, begin, begin + step
         ),
     )
-    known = outside_gaps(samples.t, drive.sample_t + calibration.clock_offset_s, step)
+    is_known = outside_gaps(
+        samples.t, drive.sample_t + calibration.clock_offset_s, step
+    )
     if recording.state is not None:
-        known &= outside_gaps(samples.t, recording.state.t, step, STATE_GAP, 0.0)
-    return replace(samples.rows(known), dt=step)
+        is_known &= outside_gaps(samples.t, recording.state.t, step, STATE_GAP, 0.0)
+    return replace(samples.rows(is_known), dt=step)
 
 
 def part_of(period: float, step: float) -> float:

@@ -193,17 +193,17 @@ def _search(
         np.append(start[0] + reach, np.full(len(lags), limit))
         for reach, limit in BOUNDS
     )
-    found, jacobian, rest = minimise(
+    theta, jacobian, rest = minimise(
         residual, start, np.full(len(start), 0.1), (low, high)
     )
     if float((rest**2).sum()) >= min(cost):
-        found = start
+        theta = start
         rest = residual(start)
     sigma = uncertainty(jacobian, rest)
-    tau = np.exp(found[1:])
+    tau = np.exp(theta[1:])
     explained = 1.0 - float((rest**2).mean())
     return DelayEstimate(
-        float(found[0]), float(sigma[0]), tau, sigma[1:] * tau, explained
+        float(theta[0]), float(sigma[0]), tau, sigma[1:] * tau, explained
     )
 
 

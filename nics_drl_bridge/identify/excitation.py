@@ -87,9 +87,9 @@ def combinations(samples: Samples, spec: RobotSpec) -> Array:
     size, axes = np.linalg.svd(
         unit / np.linalg.norm(unit, axis=0), full_matrices=False
     )[1:]
-    found = np.zeros((np.count_nonzero(size <= TOGETHER), len(reach)))
-    found[:, moved] = axes[size <= TOGETHER]
-    return found
+    constant = np.zeros((np.count_nonzero(size <= TOGETHER), len(reach)))
+    constant[:, moved] = axes[size <= TOGETHER]
+    return constant
 
 
 def independent_columns(chi: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -251,7 +251,7 @@ def coverage(recording: Recording, spec: RobotSpec) -> tuple[CommandCoverage, ..
     faults |= dict.fromkeys(excited.unmoved, "never moved")
     lowest, highest = np.percentile(command, ENDS, axis=0)
     share = (highest - lowest) / (spec.command_high - spec.command_low)
-    own = _own(samples.x)
+    own_share = _own(samples.x)
     return tuple(
         CommandCoverage(
             c.name,
@@ -259,7 +259,7 @@ def coverage(recording: Recording, spec: RobotSpec) -> tuple[CommandCoverage, ..
             low=float(lowest[i]),
             high=float(highest[i]),
             share=float(share[i]),
-            own=float(own[i]),
+            own=float(own_share[i]),
             fault=faults.get(c.name, ""),
         )
         for i, c in enumerate(spec.command)
@@ -269,12 +269,12 @@ def coverage(recording: Recording, spec: RobotSpec) -> tuple[CommandCoverage, ..
 def _own(x: Array) -> Array:
     """Returns the fraction (C,) of each column's spread that is independent of the others."""
     centred = x - x.mean(axis=0)
-    own = np.zeros(x.shape[1])
+    shares = np.zeros(x.shape[1])
     for i, size in enumerate(np.linalg.norm(centred, axis=0)):
         others = np.delete(centred, i, axis=1)
         rest = (
             centred[:, i]
             - others @ np.linalg.lstsq(others, centred[:, i], rcond=None)[0]
         )
-        own[i] = np.linalg.norm(rest) / size if size > 0.0 else 0.0
-    return own
+        shares[i] = np.linalg.norm(rest) / size if size > 0.0 else 0.0
+    return shares

@@ -165,7 +165,7 @@ class Form:
         curves = {c.command: c for c in self.curves}
         for name, _ in self.delays:
             curves.setdefault(name, InputCurve(command=name))
-        found = (
+        curves_now = (
             InputCurve(
                 command=name,
                 dead=max(at.get(f"{name}.dead", c.dead), 0.0),
@@ -176,7 +176,7 @@ class Form:
             )
             for name, c in curves.items()
         )
-        return tuple(c for c in found if c != InputCurve(command=c.command))
+        return tuple(c for c in curves_now if c != InputCurve(command=c.command))
 
     def actuated(
         self, model: TaylorModel, inputs: shooting.Inputs, values: Array
@@ -298,16 +298,15 @@ def two_way(drive: Drive, samples: Samples) -> tuple[InputCurve, ...]:
     """Returns neutral curves of commands that drive the robot both ways."""
     spec = drive.spec
     command = samples.x[:, len(spec.state) :]
-    found = []
+    curves = []
     for place in list_driving_commands(spec):
-        reach = command[:, place]
-        if min((reach < 0.0).mean(), (reach > 0.0).mean()) > TWO_WAY:
-            low = float(reach.min())
-            high = float(reach.max())
-            found.append(
-                InputCurve(command=spec.command[place].name, least=low, most=high)
-            )
-    return tuple(found)
+        name = spec.command[place].name
+        sent = command[:, place]
+        if min((sent < 0.0).mean(), (sent > 0.0).mean()) > TWO_WAY:
+            least = float(sent.min())
+            most = float(sent.max())
+            curves.append(InputCurve(command=name, least=least, most=most))
+    return tuple(curves)
 
 
 def list_driving_commands(spec: RobotSpec) -> tuple[int, ...]:

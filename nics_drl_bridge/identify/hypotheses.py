@@ -81,7 +81,7 @@ class Draft:
         if other is not None:
             model, first = terms.merge_terms(model, other)
         free = (model.coefficients != 0.0) & ~terms.select_defined_dofs(spec)[:, None]
-        found = shooting.fitted(
+        fitted = shooting.fitted(
             self.problem,
             model,
             free,
@@ -90,7 +90,7 @@ class Draft:
             BASE_EVALUATIONS,
             first=first,
         )
-        return replace(found, model=terms.stabilise(found.model, spec))
+        return replace(fitted, model=terms.stabilise(fitted.model, spec))
 
     def refined(
         self,
@@ -108,9 +108,9 @@ class Draft:
             self.problem, base, free, self.inputs, inside, evaluations, pull, first
         )
 
-    def error_of(self, found: shooting.Predictive) -> float:
+    def error_of(self, predictive: shooting.Predictive) -> float:
         """Returns the mean distance of predicted from measured ends, over all horizons [m]."""
-        error = self.problem.errors(found.model, found.values)[0]
+        error = self.problem.errors(predictive.model, predictive.values)[0]
         return float(np.nanmean(np.hypot(error[..., 0], error[..., 1])))
 
     def tried(self, asked: tuple[Hypothesis, ...]) -> tuple[Trial, ...]:
@@ -178,7 +178,7 @@ def base_of(
     calibration: Calibration,
     samples: Samples,
     clear: tuple[InputCurve, ...] = (),
-    known: Base | None = None,
+    former: Base | None = None,
 ) -> Base:
     """Fits the textbook with and without each part of a form; keeps what improves predictions.
 
@@ -187,36 +187,38 @@ def base_of(
 
     def fitted(form: forms.Form, before: Base | None = None) -> Base:
         inputs = forms.inputs_of(drive, calibration.command_latency_s, samples, form)
-        inputs = inputs.begun_at(before.draft.inputs) if before else inputs
+        first = None
+        if before is not None:
+            inputs = inputs.begun_at(before.draft.inputs)
+            first = before.found.model
         problem = forms.problem_of(drive, calibration, samples, form, inputs)
         draft = Draft(drive.spec, form, inputs, replace(problem, spacing_s=SPACING_S))
-        found = draft.base(other=before.found.model if before else None)
-        inputs = replace(inputs, start=found.values)
-        return Base(replace(draft, inputs=inputs, problem=problem), found)
+        predictive = draft.base(other=first)
+        inputs = replace(inputs, start=predictive.values)
+        return Base(replace(draft, inputs=inputs, problem=problem), predictive)
 
     def error_of(base: Base) -> float:
         return base.draft.tried((TEXTBOOK,))[0].level
 
-    if known is not None:
-        return fitted(replace(known.draft.form, curves=calibration.inputs))
+    if former is not None:
+        return fitted(replace(former.draft.form, curves=calibration.inputs))
     best = fitted(forms.Form(calibration.inputs))
     error = error_of(best)
     if len(calibration.inputs) > len(clear):
         plain = fitted(forms.Form(clear))
-        # the drive is too short to judge
-        other = error_of(plain)
-        if other < error or np.isinf(other):
+        plain_error = error_of(plain)
+        if plain_error < error or np.isinf(plain_error):  # too short to judge
             best = plain
-            error = other
+            error = plain_error
     for change, worth in changes(drive, calibration, samples):
         form = change(best.draft.form)
         if form == best.draft.form:
             continue
-        base = fitted(form, best)
-        other = error_of(base)
-        if other < worth * error:
-            best = base
-            error = other
+        changed = fitted(form, best)
+        changed_error = error_of(changed)
+        if changed_error < worth * error:
+            best = changed
+            error = changed_error
     return best
 
 
@@ -287,32 +289,36 @@ def about_lags(latency: float, lags: dict[str, float], beside: float) -> str:
     return f"Latency ({latency:.3f} s) can't be told from the lags: trust their sums, {sums}."
 
 
-def standard_errors(found: shooting.Predictive) -> Array:
+def standard_errors(predictive: shooting.Predictive) -> Array:
     """Returns standard errors (D, K) of the free coefficients; NaN for the others."""
     span = max(shooting.HORIZONS_S)
-    cluster = np.floor((found.starts - found.starts.min()) / span).astype(np.intp)
-    errors = np.full(found.free.shape, np.nan)
-    errors[found.free] = clustered_errors(found.jacobian, found.residual, cluster)
+    cluster = np.floor((predictive.starts - predictive.starts.min()) / span).astype(
+        np.intp
+    )
+    errors = np.full(predictive.free.shape, np.nan)
+    errors[predictive.free] = clustered_errors(
+        predictive.jacobian, predictive.residual, cluster
+    )
     return errors
 
 
 def with_certain_mounting(
-    draft: Draft, calibration: Calibration, found: shooting.Predictive
+    draft: Draft, calibration: Calibration, predictive: shooting.Predictive
 ) -> Draft | None:
     """Returns a draft without the parts of its mounting below 3 standard errors; None if all stay.
 
     Removed parts are zero in the calibration that `remounted` returns.
     """
-    sigma = found.value_errors[-3:]
-    total = geometry.compose(found.values[-3:], calibration.mounting)
+    sigma = predictive.value_errors[-3:]
+    total = geometry.compose(predictive.values[-3:], calibration.mounting)
     doubtful = (np.abs(total) < CERTAIN * sigma) & (total != 0.0)
     if not doubtful.any():
         return None
-    known = calibration.mounting
-    rest = found.values[-3:].copy()
+    mounting = calibration.mounting
+    rest = predictive.values[-3:].copy()
     if doubtful[2]:
-        rest[2] = -known[2]
-    aside = geometry.rotate(known[:2], float(rest[2]))
+        rest[2] = -mounting[2]
+    aside = geometry.rotate(mounting[:2], float(rest[2]))
     rest[:2] = np.where(doubtful[:2], -aside, rest[:2])
     inputs = draft.inputs
     start = inputs.start.copy()
@@ -325,13 +331,13 @@ def with_certain_mounting(
     return replace(draft, inputs=replace(inputs, start=start, low=low, high=high))
 
 
-def remounted(calibration: Calibration, found: shooting.Predictive) -> Calibration:
+def remounted(calibration: Calibration, predictive: shooting.Predictive) -> Calibration:
     """Adds the mounting found by predictions to that of the calibration."""
     x, y, heading = map(
-        float, geometry.compose(found.values[-3:], calibration.mounting)
+        float, geometry.compose(predictive.values[-3:], calibration.mounting)
     )
     names = ("lever_arm_x_m", "lever_arm_y_m", "rotation_rad")
-    errors = zip(names, map(float, found.value_errors[-3:]), strict=True)
+    errors = zip(names, map(float, predictive.value_errors[-3:]), strict=True)
     sigma = {name: error for name, error in errors if not np.isnan(error)}
     if "lever_arm_y_m" not in sigma:
         y = calibration.lever_arm_m[1]

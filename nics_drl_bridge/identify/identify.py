@@ -320,21 +320,21 @@ def estimate_timing(drive: Drive, findings: Findings) -> Findings:
     responses: tuple[Response, ...] = ()
     if motions.by_motion(spec, drive.recording):
         by_command = replace(training, spec=motions.surrogate(spec))
-        found = timings.timing_of(by_command)
-        responses, found = _select_followers(spec, found)
+        timing = timings.timing_of(by_command)
+        responses, timing = _select_followers(spec, timing)
     else:
-        found = followers.apart(training, timings.timing_of(training))
+        timing = followers.apart(training, timings.timing_of(training))
     calibration = replace(
         findings.calibration,
         responses=responses,
-        uncertainty=found.sigma,
-        inputs=followers.late_inputs(spec, found),
-        limits=followers.limits_of(spec, found),
-        clock_offset_s=found.offset,
-        command_latency_s=found.latency,
+        uncertainty=timing.sigma,
+        inputs=followers.late_inputs(spec, timing),
+        limits=followers.limits_of(spec, timing),
+        clock_offset_s=timing.offset,
+        command_latency_s=timing.latency,
         burst_period_s=training.bursts.period_s if training.bursts else 0.0,
     )
-    return replace(findings, timing=found, calibration=calibration)
+    return replace(findings, timing=timing, calibration=calibration)
 
 
 def _select_followers(
@@ -347,12 +347,12 @@ def _select_followers(
     names = [c.name for c in spec.command]
     states = [v for v in spec.state if v.follows and v.twist is None]
     rows = [names.index(str(v.follows)) for v in states]
-    own = replace(timing, lags=timing.lags[rows], lag_sigma=timing.lag_sigma[rows])
+    selected = replace(timing, lags=timing.lags[rows], lag_sigma=timing.lag_sigma[rows])
     responses = (
         Response(v.name, str(v.follows), float(lag))
-        for v, lag in zip(states, own.lags, strict=True)
+        for v, lag in zip(states, selected.lags, strict=True)
     )
-    return tuple(responses), own
+    return tuple(responses), selected
 
 
 def find_mounting(drive: Drive, findings: Findings) -> Findings:
@@ -365,12 +365,12 @@ def find_mounting(drive: Drive, findings: Findings) -> Findings:
         index = speed_index(drive.spec)
         if index is not None:
             speed = states[:, index]
-    found = mounting_of(training, findings.timing, states)
+    mounting = mounting_of(training, findings.timing, states)
     return replace(
         findings,
         expected_speed=speed,
-        mounting=found,
-        calibration=mounted(findings.calibration, found),
+        mounting=mounting,
+        calibration=mounted(findings.calibration, mounting),
     )
 
 
@@ -502,25 +502,15 @@ def _cross_validate(drive: Drive, findings: Findings, order: int) -> dict[float,
 
     Errors of predictions that diverged are infinite; the result is empty if a fit is impossible.
     """
-    training = findings.training
-    recording = training.recording
-    pose = recording.pose
     settings = replace(drive.settings, order=order, train_until_s=np.inf)
     errors: dict[float, list[Array]] = {h: [] for h in hypotheses.BANDS_S}
-    for block in np.array_split(np.arange(len(pose.t)), hypotheses.FOLDS):
-        others = np.ones(len(pose.t), dtype=np.bool_)
-        others[block] = False
-        rest = training.part(replace(recording, pose=pose.rows(others)))
-        rest = rest.under(settings)
+    for others, part in findings.training.folds(hypotheses.FOLDS):
+        rest = others.under(settings)
+        start = replace(findings, training=rest)
         try:
-            fitted = run(
-                (fit_terms, prune_terms, refine_model),
-                rest,
-                replace(findings, training=rest),
-            )
+            fitted = run((fit_terms, prune_terms, refine_model), rest, start)
         except (FitError, RecordingError):
             return {}
-        part = training.part(replace(recording, pose=pose.rows(block)))
         model = require_model(fitted)
         for horizon, errors_m in errors.items():
             far = measure_distances(model, fitted.calibration, part, horizon)
@@ -555,8 +545,8 @@ def refine_model(drive: Drive, findings: Findings) -> Findings:
     may_lower_order = settings.order == "auto" and not findings.trials
     if may_lower_order and verdict.runs_away(errors):
         linear = replace(drive, settings=replace(settings, order=1))
-        found = run((fit_terms, prune_terms, refine_model), linear, findings)
-        return replace(found, refinement=(*found.refinement, verdict.LINEAR))
+        refined = run((fit_terms, prune_terms, refine_model), linear, findings)
+        return replace(refined, refinement=(*refined.refinement, verdict.LINEAR))
     model, calibration, note = refine_by_predictions(model, calibration, training)
     return replace(
         findings,

@@ -145,21 +145,16 @@ def bands_of(
     Each fold of the training part is predicted by the model adjusted to the others. `derived` are
     the samples of a motion derived from the poses, and the base that the model departed from.
     """
-    pose = training.recording.pose
     errors: dict[float, list[Array]] = {h: [] for h in hypotheses.BANDS_S}
-    for block in np.array_split(np.arange(len(pose.t)), FOLDS):
-        others = np.ones(len(pose.t), dtype=np.bool_)
-        others[block] = False
+    for rest, part in training.folds(FOLDS):
         if derived is None:
-            rest = training.part(replace(training.recording, pose=pose.rows(others)))
             adjusted = readjust(model, calibration, rest)
         else:
-            begin, end = pose.t[block[[0, -1]]] + calibration.clock_offset_s
+            begin, end = part.recording.pose.t[[0, -1]] + calibration.clock_offset_s
             kept = (derived[0].t < begin) | (derived[0].t > end)
             adjusted = _with_motion(model, calibration, training, *derived, kept)
         if adjusted is None:
             return {}
-        part = training.part(replace(training.recording, pose=pose.rows(block)))
         for horizon, parts in errors.items():
             parts.append(measure_distances(*adjusted, part, horizon))
     bands = {}
@@ -194,13 +189,15 @@ def _with_motion(
     problem = replace(problem, spacing_s=hypotheses.SPACING_S)
     free = (model.coefficients != 0.0) & ~select_defined_dofs(training.spec)[:, None]
     pull = hypotheses.PULLS[-1]
-    found = shooting.fitted(problem, model, free, draft.inputs, kept, EVALUATIONS, pull)
+    fitted = shooting.fitted(
+        problem, model, free, draft.inputs, kept, EVALUATIONS, pull
+    )
     calibration = replace(
         calibration,
-        command_latency_s=draft.form.latency_at(draft.inputs, found.values),
-        inputs=draft.form.curves_at(draft.inputs, found.values),
+        command_latency_s=draft.form.latency_at(draft.inputs, fitted.values),
+        inputs=draft.form.curves_at(draft.inputs, fitted.values),
     )
-    model = replace(found.model, inputs=calibration.inputs)
+    model = replace(fitted.model, inputs=calibration.inputs)
     if problem.mounted:
-        calibration = hypotheses.remounted(calibration, found)
+        calibration = hypotheses.remounted(calibration, fitted)
     return model, calibration

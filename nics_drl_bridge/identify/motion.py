@@ -119,8 +119,10 @@ def samples_of(drive: Drive, calibration: Calibration, width: float) -> Samples:
         drive.recording.command, spec, calibration.inputs, begin, begin + step
     )
     samples = samples_on_one_clock(grid, pose, state.values, command)
-    known = outside_gaps(samples.t, drive.sample_t + calibration.clock_offset_s, step)
-    return replace(samples.rows(known), dt=step)
+    is_known = outside_gaps(
+        samples.t, drive.sample_t + calibration.clock_offset_s, step
+    )
+    return replace(samples.rows(is_known), dt=step)
 
 
 def known_state(drive: Drive) -> Stream:
@@ -149,9 +151,9 @@ def surrogate(spec: RobotSpec) -> RobotSpec:
     """Returns a robot whose state follows its commands one by one, to find delays and lags."""
 
     def follows(command: CommandVariable) -> StateVariable:
-        given = command.model_dump(include={"unit", "min", "max"})
+        limits = command.model_dump(include={"unit", "min", "max"})
         return StateVariable(
-            name=f"{command.name}_state", follows=command.name, **given
+            name=f"{command.name}_state", follows=command.name, **limits
         )
 
     return spec.model_copy(update={"state": tuple(map(follows, spec.command))})

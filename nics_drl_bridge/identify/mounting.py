@@ -71,9 +71,8 @@ def mounting_of(
     """Estimates the mounting from states (n, S) at gain one; None if the drive does not show it."""
     spec = drive.spec
     twists = drive.twists
-    # its forward direction is unknown
     if not (has_textbook(spec) or spec.takes_cmd_vel):
-        return None
+        return None  # its forward direction is unknown
     if spec.moves_sideways:
         return jackknifed(drive, twists, timing.offset, partial(_by_commands, timing))
     start, end = twists.on_clock(timing.offset)
@@ -82,24 +81,24 @@ def mounting_of(
     )
     forward = _response(spec, command)[:, 0]
     _, noise = drive.pose_noise or (0.0, 0.0)
-    found = mounting_without_lateral_motion(twists, forward, noise)
+    mounting = mounting_without_lateral_motion(twists, forward, noise)
     if (
-        found is not None
+        mounting is not None
         and states is None
         and (has_slipping_tyres(spec) or slips(spec))
     ):
-        return with_slip(twists, found, spec)
-    if found is None or states is None:
-        return found
-    if drive.recording.state is None or np.isnan(found.lever_sigma[0]):
-        found = by_instruments(twists, states, forward, spec) or found
+        return with_slip(twists, mounting, spec)
+    if mounting is None or states is None:
+        return mounting
+    if drive.recording.state is None or np.isnan(mounting.lever_sigma[0]):
+        mounting = by_instruments(twists, states, forward, spec) or mounting
     place = speed_index(spec)
-    if place is not None and np.isnan(found.lever_sigma).tolist() == [False, True]:
+    if place is not None and np.isnan(mounting.lever_sigma).tolist() == [False, True]:
         speed = states[:, place]
-        found.lever[1], found.lever_sigma[1] = lateral_lever(
-            twists, found.rotation, speed
+        mounting.lever[1], mounting.lever_sigma[1] = lateral_lever(
+            twists, mounting.rotation, speed
         )
-    return found
+    return mounting
 
 
 def by_instruments(
@@ -191,17 +190,22 @@ def mounted(calibration: Calibration, mounting: Mounting | None) -> Calibration:
     """Adds the significant parts of a mounting, and all uncertainties."""
     if mounting is None:
         return calibration
-    names = ("rotation_rad", "lever_arm_x_m", "lever_arm_y_m")
-    values = map(float, (mounting.rotation, *mounting.lever))
-    sigmas = tuple(map(float, (mounting.rotation_sigma, *mounting.lever_sigma)))
-    both = zip(values, sigmas, strict=True)
-    rotation, x, y = (
-        clocks.if_certain(value, sigma, MIN_LENGTH) for value, sigma in both
-    )
-    learnt = {n: s for n, s in zip(names, sigmas, strict=True) if not np.isnan(s)}
-    uncertainty = {**calibration.uncertainty, **learnt}
+    estimates = {
+        "rotation_rad": (mounting.rotation, mounting.rotation_sigma),
+        "lever_arm_x_m": (float(mounting.lever[0]), float(mounting.lever_sigma[0])),
+        "lever_arm_y_m": (float(mounting.lever[1]), float(mounting.lever_sigma[1])),
+    }
+    certain = {}
+    uncertainty = dict(calibration.uncertainty)
+    for name, (value, sigma) in estimates.items():
+        certain[name] = clocks.if_certain(value, sigma, MIN_LENGTH)
+        if not np.isnan(sigma):
+            uncertainty[name] = sigma
     return replace(
-        calibration, rotation_rad=rotation, lever_arm_m=(x, y), uncertainty=uncertainty
+        calibration,
+        rotation_rad=certain["rotation_rad"],
+        lever_arm_m=(certain["lever_arm_x_m"], certain["lever_arm_y_m"]),
+        uncertainty=uncertainty,
     )
 
 
@@ -354,7 +358,7 @@ def jackknifed(
     if whole is None:
         return None
     edges = np.linspace(twists.start[0], twists.end[-1], BLOCKS + 1)
-    found = []
+    parts = []
     for begin, end in pairwise(edges):
         rows = (twists.end <= begin) | (twists.start >= end)
         rest = drive
@@ -365,13 +369,13 @@ def jackknifed(
         kept = TwistIntervals(twists.start[rows], twists.end[rows], twists.twist[rows])
         part = estimate(rest, kept)
         if part is not None:
-            found.append(part)
-    if len(found) < BLOCKS:
+            parts.append(part)
+    if len(parts) < BLOCKS:
         return whole
-    rotation = wrap_angle(np.array([p.rotation - whole.rotation for p in found]))
+    rotation = wrap_angle(np.array([p.rotation - whole.rotation for p in parts]))
     rotation_sigma = max(whole.rotation_sigma, float(_spread(rotation)))
     lever_sigma = np.maximum(
-        whole.lever_sigma, _spread(np.array([p.lever for p in found]))
+        whole.lever_sigma, _spread(np.array([p.lever for p in parts]))
     )
     return replace(whole, rotation_sigma=rotation_sigma, lever_sigma=lever_sigma)
 

@@ -1,6 +1,6 @@
 """Open-loop prediction: windows of a drive, and the poses that a model predicts at their ends."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,7 @@ from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.calibration import Calibration, states_at
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.kernels import follow
+from nics_drl_bridge.identify.kernels import follow, make_used_terms
 from nics_drl_bridge.identify.signals import average_effect, followed
 from nics_drl_bridge.robot.kernels import SERIES, make_terms, simulate_rollouts
 from nics_drl_bridge.robot.taylor import TaylorModel
@@ -241,10 +241,7 @@ def relative_ends(
         free = np.zeros(model.coefficients.shape, dtype=np.bool_)
     used = (model.coefficients != 0.0) | free
     used[3:] = False
-    dofs, places = np.nonzero(used)
-    terms = make_terms(replace(model, coefficients=used.astype(np.float64)))
-    terms = terms._replace(coefficient=model.coefficients[dofs, places])
-    moving = np.flatnonzero(free[dofs, places]).astype(np.int64)
+    terms, moving = make_used_terms(model, used, free)
     ends = np.zeros((len(course.steps), 3))
     moved = np.zeros((len(course.steps), 3, len(moving)))
     follow(ends, moved, course.x, course.steps, course.share, terms, moving, model.dt)

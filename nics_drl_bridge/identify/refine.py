@@ -98,13 +98,13 @@ def refine_by_predictions(
 
 
 def _describe_result(problem: "Problem", best: "Refined", before: Calibration) -> str:
-    what = "Coefficients"
+    adjusted = "Coefficients"
     if best.calibration != before:
-        what += " and calibration"
+        adjusted += " and calibration"
     by = f"the open-loop errors over up to {problem.horizon_s:g} s"
     parts = f"of x, y and heading times {HEADING_ARM_M:g} m"
     left = f"the root mean square {parts} left on the training part"
-    return f"{what} were refined by {by}: {left} is {best.error:.4f} m."
+    return f"{adjusted} were refined by {by}: {left} is {best.error:.4f} m."
 
 
 def readjust(
@@ -115,10 +115,10 @@ def readjust(
     if problem is None:
         return None
     try:
-        found = minimise_errors(problem, model, calibration)
+        refined = minimise_errors(problem, model, calibration)
     except np.linalg.LinAlgError:
         return None
-    return found.model, found.calibration
+    return refined.model, refined.calibration
 
 
 def apply_definitions(
@@ -317,14 +317,14 @@ class _FreeParameters:
         # The rotation is defined by the direction without motion; omnidirectional robots lack one.
         # A rotation known without a lever arm, and a known time, are fixed: a model that lacks
         # a term would change them to compensate.
-        known = calibration.uncertainty
+        uncertainty_by_name = calibration.uncertainty
         time = _select_time(calibration)
         is_turned = (
-            "rotation_rad" in known
+            "rotation_rad" in uncertainty_by_name
             and not calibration.is_exact
             and not spec.moves_sideways
         )
-        if calibration.responses and "lever_arm_x_m" in known:
+        if calibration.responses and "lever_arm_x_m" in uncertainty_by_name:
             is_turned = False
         names = [time] if time else []
         if is_turned:
@@ -343,12 +343,12 @@ class _FreeParameters:
         count = int(self.coefficients.sum())
         coefficients[self.coefficients] = theta[:count]
         for row, response in enumerate(self.calibration.responses, start=FIRST_STATE):
-            own, command = find_linear_terms(
+            decay, command = find_linear_terms(
                 self.model, response.state, response.command
             )
-            if own is None or command is None or self.coefficients[row, command]:
+            if decay is None or command is None or self.coefficients[row, command]:
                 continue
-            coefficients[row, command] = -response.gain * coefficients[row, own]
+            coefficients[row, command] = -response.gain * coefficients[row, decay]
         values: dict[str, Any] = dict(
             zip(self.names, map(float, theta[count:]), strict=True)
         )
@@ -361,10 +361,10 @@ class _FreeParameters:
         high = -low
         unbounded = np.full(len(self.names), np.inf)
         for row, response in enumerate(self.calibration.responses, start=FIRST_STATE):
-            own, _ = find_linear_terms(self.model, response.state, response.command)
-            if own is not None:
-                low[row, own] = -FASTEST / self.model.dt
-                high[row, own] = 0.0
+            decay, _ = find_linear_terms(self.model, response.state, response.command)
+            if decay is not None:
+                low[row, decay] = -FASTEST / self.model.dt
+                high[row, decay] = 0.0
         return (
             np.append(low[self.coefficients], -unbounded),
             np.append(high[self.coefficients], unbounded),
@@ -395,16 +395,16 @@ def select_free_coefficients(model: TaylorModel, calibration: Calibration) -> Ma
         # the rates of a measured state were fitted to that state itself
         free[FIRST_STATE:] = False
     for row, response in enumerate(calibration.responses, start=FIRST_STATE):
-        own, command = find_linear_terms(model, response.state, response.command)
-        if own is None:
+        decay, command = find_linear_terms(model, response.state, response.command)
+        if decay is None:
             continue
-        if model.coefficients[VX, own] == 1.0:
-            free[VX, own] = False
+        if model.coefficients[VX, decay] == 1.0:
+            free[VX, decay] = False
         elif command is not None:
             # the scale of this state is arbitrary, so its gain is fixed
             free[row, command] = False
         if are_lags_measured(calibration):
-            free[row, own] = False
+            free[row, decay] = False
     return np.asarray(free)
 
 
@@ -491,12 +491,14 @@ def _estimate_errors(
     errors = np.full(model.coefficients.shape, np.nan)
     errors[free.coefficients] = clustered_errors(slopes, rest, cluster)[:count]
     for row, state in enumerate(problem.drive.spec.state, start=FIRST_STATE):
-        own, command = find_linear_terms(model, state.name, state.follows)
-        if own is None or command is None:
+        decay, command = find_linear_terms(model, state.name, state.follows)
+        if decay is None or command is None:
             continue
-        if free.coefficients[row, own] and not free.coefficients[row, command]:
-            gain = abs(model.coefficients[row, command] / model.coefficients[row, own])
-            errors[row, command] = gain * errors[row, own]
+        if free.coefficients[row, decay] and not free.coefficients[row, command]:
+            gain = abs(
+                model.coefficients[row, command] / model.coefficients[row, decay]
+            )
+            errors[row, command] = gain * errors[row, decay]
     return errors
 
 
@@ -530,11 +532,11 @@ def _add_uncertainty(
 
 def _update_response(model: TaylorModel, row: int, response: Response) -> Response:
     """Returns the lag and gain that correspond to the coefficients of the state's rate."""
-    own, command = find_linear_terms(model, response.state, response.command)
+    decay, command = find_linear_terms(model, response.state, response.command)
     coefficients = model.coefficients[row]
-    if own is None or command is None:
+    if decay is None or command is None:
         return response
-    rate = -float(coefficients[own])
+    rate = -float(coefficients[decay])
     if not 0.0 < rate * model.dt < 1.0:
         return response
     lag = -model.dt / float(np.log1p(-rate * model.dt))
@@ -604,6 +606,8 @@ def drop_doubtful_rotation(
         return best
     others = {k: v for k, v in calibration.uncertainty.items() if k != "rotation_rad"}
     straight = replace(calibration, rotation_rad=0.0, uncertainty=others)
-    found = minimise_errors(problem, best.model, straight)
-    errors = found.calibration.uncertainty | {"rotation_rad": sigma}
-    return replace(found, calibration=replace(found.calibration, uncertainty=errors))
+    straightened = minimise_errors(problem, best.model, straight)
+    errors = straightened.calibration.uncertainty | {"rotation_rad": sigma}
+    return replace(
+        straightened, calibration=replace(straightened.calibration, uncertainty=errors)
+    )

@@ -102,8 +102,8 @@ def repaired(drive: Drive) -> tuple[Drive, tuple[str, ...]]:
 def _with_rows(
     recording: recordings.Recording, name: str, keep: NDArray[np.bool_]
 ) -> recordings.Recording:
-    some: Any = {name: recording.streams[name].rows(keep)}
-    return replace(recording, **some)
+    parts: Any = {name: recording.streams[name].rows(keep)}
+    return replace(recording, **parts)
 
 
 def _without_repetitions(drive: Drive, notes: list[str]) -> recordings.Recording:

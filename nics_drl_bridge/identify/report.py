@@ -254,16 +254,18 @@ def _format_curve(curve: Curve) -> list[str]:
 
 
 def _describe_held_out(identified: Identified) -> Iterator[str]:
-    found = identified.held_out
+    held_out = identified.held_out
     model = identified.model
     quality = identified.model.quality
-    if found is None:
+    if held_out is None:
         yield "the drive is too short to hold data out"
     else:
-        finding = f"position error {found.mean_position_error_m:.3g} m on average"
-        yield f"after {found.horizon_s:g} s: {finding}, {found.max_position_error_m:.3g} m at most,"
-        finding = f"heading error {found.mean_heading_error_rad:.3g} rad on average"
-        yield f"{finding}, over a mean path of {found.mean_path_m:.2f} m ({found.windows} windows)"
+        mean = f"position error {held_out.mean_position_error_m:.3g} m on average"
+        most = f"{held_out.max_position_error_m:.3g} m at most"
+        yield f"after {held_out.horizon_s:g} s: {mean}, {most},"
+        mean = f"heading error {held_out.mean_heading_error_rad:.3g} rad on average"
+        path = f"a mean path of {held_out.mean_path_m:.2f} m"
+        yield f"{mean}, over {path} ({held_out.windows} windows)"
     if quality is not None and quality.held_out_rmse:
         yield "the rates there:"
         for unit, dof in zip(model.dof_units, quality.held_out_rmse, strict=True):
@@ -336,8 +338,8 @@ class CalibratedValue:
 def collect_estimates(identified: Identified) -> dict[str, CalibratedValue]:
     """Returns all estimates of the calibration by their names in `Calibration`."""
     recording = identified.recording
-    found = identified.calibration
-    sigma = found.uncertainty
+    calibration = identified.calibration
+    sigma = calibration.uncertainty
     mounting = identified.findings.mounting
     one_clock = recording.pose.clock == recording.command.clock
     changed = bool(moved_commands(recording.command).any())
@@ -353,14 +355,19 @@ def collect_estimates(identified: Identified) -> dict[str, CalibratedValue]:
     wheels = "no wheel speeds were recorded" if unknown else "the wheels do not show it"
     singly = "the poses are stamped one by one"
     rows = {
-        "clock_offset_s": ("clock offset", found.clock_offset_s, "s", clocks),
-        "command_latency_s": ("command latency", found.command_latency_s, "s", latency),
+        "clock_offset_s": ("clock offset", calibration.clock_offset_s, "s", clocks),
+        "command_latency_s": (
+            "command latency",
+            calibration.command_latency_s,
+            "s",
+            latency,
+        ),
         "burst_period_s": ("period of bursts", None, "s", singly),
-        "rotation_rad": ("rotation of base_link", found.rotation_rad, "rad", few),
-        "lever_arm_x_m": ("lever arm x", found.lever_arm_m[0], "m", hidden[0]),
-        "lever_arm_y_m": ("lever arm y", found.lever_arm_m[1], "m", hidden[1]),
-        "wheel_scale": ("wheel scale", found.wheel_scale, "m/s per unit", wheels),
-        "turn_scale": ("turn scale", found.turn_scale, "rad/s per unit", wheels),
+        "rotation_rad": ("rotation of base_link", calibration.rotation_rad, "rad", few),
+        "lever_arm_x_m": ("lever arm x", calibration.lever_arm_m[0], "m", hidden[0]),
+        "lever_arm_y_m": ("lever arm y", calibration.lever_arm_m[1], "m", hidden[1]),
+        "wheel_scale": ("wheel scale", calibration.wheel_scale, "m/s per unit", wheels),
+        "turn_scale": ("turn scale", calibration.turn_scale, "rad/s per unit", wheels),
     }
     values = {}
     for key, (name, value, unit, why) in rows.items():
@@ -375,15 +382,15 @@ def collect_estimates(identified: Identified) -> dict[str, CalibratedValue]:
             values[key] = CalibratedValue(
                 name, value, None, unit, "by the fitted textbook"
             )
-    period = found.burst_period_s
+    period = calibration.burst_period_s
     if period > 0.0:
         values["burst_period_s"] = CalibratedValue(
             "period of bursts", period, None, "s"
         )
     value = None
     meaning = wheels
-    if found.wheels_swapped is not None:
-        value = float(found.wheels_swapped)
+    if calibration.wheels_swapped is not None:
+        value = float(calibration.wheels_swapped)
         meaning = "left and right are interchanged" if value else "as named"
     values["wheels_swapped"] = CalibratedValue(
         "swapped wheels", value, None, "", meaning

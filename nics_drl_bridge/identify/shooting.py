@@ -13,11 +13,10 @@ from scipy.optimize import least_squares
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify.kernels import Shot, shoot, tangent
+from nics_drl_bridge.identify.kernels import Shot, make_used_terms, shoot, tangent
 from nics_drl_bridge.identify.statistics import clustered_errors
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot import taylor
-from nics_drl_bridge.robot.kernels import make_terms
 from nics_drl_bridge.robot.taylor import TaylorModel
 
 Mask = NDArray[np.bool_]
@@ -66,9 +65,10 @@ class Inputs:
 
     def begun_at(self, other: "Inputs") -> "Inputs":
         """Starts from the values of other inputs, where these have them."""
-        known = dict(zip(other.names, other.start.tolist(), strict=True))
+        values = dict(zip(other.names, other.start.tolist(), strict=True))
         start = [
-            known.get(name, at) for name, at in zip(self.names, self.start, strict=True)
+            values.get(name, at)
+            for name, at in zip(self.names, self.start, strict=True)
         ]
         return replace(self, start=np.clip(start, self.low, self.high))
 
@@ -109,8 +109,8 @@ class Shooting:
         if inside is not None:
             outside = np.append(0, np.cumsum(~inside))
             whole &= outside[end] == outside[first][:, None]
-        some = whole.any(axis=1)
-        return first[some], np.where(whole, steps, 0)[some]
+        is_used = whole.any(axis=1)
+        return first[is_used], np.where(whole, steps, 0)[is_used]
 
     @property
     def longest_horizon_s(self) -> float:
@@ -145,10 +145,7 @@ class Shooting:
         if free is None:
             free = np.zeros(model.coefficients.shape, dtype=np.bool_)
         used = (model.coefficients != 0.0) | free
-        dofs, places = np.nonzero(used)
-        terms = make_terms(replace(model, coefficients=used.astype(np.float64)))
-        terms = terms._replace(coefficient=model.coefficients[dofs, places])
-        moving = np.flatnonzero(free[dofs, places]).astype(np.int64)
+        terms, moving = make_used_terms(model, used, free)
         command = self.commands(values)
         state = self.samples.q[:, 3:]
         shot = Shot(
@@ -159,7 +156,7 @@ class Shooting:
             np.zeros((*steps.shape, 3)),
             np.zeros((*steps.shape, 3, len(moving))),
         )
-        sizes = state.shape[1], command.shape[1], len(dofs), len(moving)
+        sizes = state.shape[1], command.shape[1], len(terms.dof), len(moving)
         shoot(shot, terms, moving, model.dt, tangent(*sizes))
         return _seen_from(values[-3:], shot) if self.mounted else (shot.end, shot.slope)
 
@@ -327,13 +324,13 @@ class _Search:
         start = np.zeros(self.count + len(self.unit))
         begun = self.residual(start)
         if first is not None:
-            other = start.copy()
-            other[count:] = (
+            trial = start.copy()
+            trial[count:] = (
                 first[self.free] - self.model.coefficients[self.free]
             ) / self.unit
-            rest = self.residual(other)
+            rest = self.residual(trial)
             if np.abs(rest).sum() < np.abs(begun).sum():
-                start = other
+                start = trial
                 begun = rest
         low = np.full(len(start), -np.inf)
         high = -low
@@ -343,7 +340,7 @@ class _Search:
         high[:count] = ((inputs.high - inputs.start) / inputs.scale)[at]
         aside = INSIDE * (high - low)[:count]  # at a bound the search would not move
         start[:count] = np.clip(0.0, low[:count] + aside, high[:count] - aside)
-        found = least_squares(
+        solution = least_squares(
             self.residual,
             start,
             jac=self.jacobian,
@@ -354,7 +351,7 @@ class _Search:
             ftol=TOLERANCE,
             xtol=TOLERANCE,
         )
-        return self.predictive(found.x)
+        return self.predictive(solution.x)
 
     def predictive(self, theta: Array) -> Predictive:
         """Returns the model with the data for its uncertainty."""

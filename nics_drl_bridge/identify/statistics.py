@@ -50,7 +50,7 @@ def minimise(
     slope: Any = "2-point"
     if jacobian is not None:
         slope = lambda z: jacobian(start + (z - 1.0) * scale) * scale  # noqa: E731
-    found = least_squares(
+    solution = least_squares(
         lambda z: residual(start + (z - 1.0) * scale),
         np.ones(len(start)),
         jac=slope,
@@ -60,7 +60,11 @@ def minimise(
         ftol=TOLERANCE,
         max_nfev=MAX_STEPS,
     )
-    return start + (found.x - 1.0) * scale, found.jac / scale, np.asarray(found.fun)
+    return (
+        start + (solution.x - 1.0) * scale,
+        solution.jac / scale,
+        np.asarray(solution.fun),
+    )
 
 
 def uncertainty(jacobian: Array, residual: Array) -> Array:

@@ -187,15 +187,12 @@ def describe_mounting(
         )
         return
     x, y = calibration.lever_arm_m
+    x_hidden, y_hidden = mounting.hidden
     # predictions may have found one later
-    names = (
-        "lever_arm_x_m",
-        "lever_arm_y_m",
-    )
-    found = (name in calibration.uncertainty for name in names)
-    x_hidden, y_hidden = (
-        why * (not f) for why, f in zip(mounting.hidden, found, strict=True)
-    )
+    if "lever_arm_x_m" in calibration.uncertainty:
+        x_hidden = ""
+    if "lever_arm_y_m" in calibration.uncertainty:
+        y_hidden = ""
     if calibration.rotation_rad != 0.0:
         sigma = calibration.uncertainty.get("rotation_rad", mounting.rotation_sigma)
         turned = f"{calibration.rotation_rad:.4f} rad (+- {sigma:.4f} rad)"
@@ -263,10 +260,10 @@ def refuse_unexcited(excitation: Excitation, spec: RobotSpec) -> None:
         (still, "never moved", "changing over the whole range"),
         (excitation.together, "always moved together", "each changing on its own"),
     ):
-        told = _list(names)
-        if told:
+        listed = _list(names)
+        if listed:
             raise FitError(
-                f"{told} {fault}; drive with {told} {way}, or allow a model without."
+                f"{listed} {fault}; drive with {listed} {way}, or allow a model without."
             )
 
 
@@ -297,26 +294,25 @@ def describe_unlearnt(
     `levels` are the numbers of different values of the commands as recorded, because a motor that
     saturates reduces many values to two.
     """
-    already = {name for r in calibration.responses for name in (r.command, r.state)}
+    followed = {response.command for response in calibration.responses}
     excitation = linear.regression.excitation
     unmoved = ", ".join(list_missed(linear, spec))
     if unmoved:
         finding = f"The model has no terms of {unmoved}, which never moved"
         yield Gap(f"{finding}: it is only valid for this drive's constant value.")
     still = _commands(excitation.unmoved, spec)
-    missing = ", ".join(name for name in still if name not in already)
+    missing = ", ".join(name for name in still if name not in followed)
     if missing:
         yield Gap(f"Drive with {missing} changing over the whole range to learn them.")
     together = _list(excitation.together)
     if together:
         units = {c.unit for c in spec.command if c.name in excitation.together}
-        if len(units) == 1:
-            shares = "all have a share of what they did"
-        else:
-            shares = "one has all of it"
-        told = f"{shares}, and the model holds where they move so; drive each on its own to learn"
+        shares = "all have a share of it" if len(units) == 1 else "one has all of it"
         why = "always moved together, so their effects can't be separated"
-        yield Gap(f"{together} {why}: {told}.")
+        valid = "the model holds where they move together"
+        yield Gap(
+            f"{together} {why}: {shares}, and {valid}; drive each on its own to learn."
+        )
     copies = _list(
         [v.name for v in spec.state if v.name in linear.regression.dependent]
     )

@@ -339,20 +339,24 @@ def _regressed(
     offset = np.zeros(3)
     lag = np.full(3, LAG_S)
     for i in np.flatnonzero(moves.any(axis=1)):
-        given = np.column_stack([u[:, moves[i]], np.full(len(u), float(offsets))])
-        rows = np.column_stack([given, -change[:, i]])
-        angle = bicycle.used and i == 2
-        if angle:
-            rows = given = given * twist[:, :1] / bicycle.wheelbase
-        beta = np.linalg.lstsq(rows, twist[:, i], rcond=None)[0]
-        if not angle and beta[-1] > LAG_RANGE_S[0]:
-            lag[i] = min(beta[-1], LAG_RANGE_S[1])
+        target = twist[:, i]
+        chi = np.column_stack([u[:, moves[i]], np.full(len(u), float(offsets))])
+        if bicycle.used and i == 2:  # an angle: it turns the robot in proportion to its speed
+            chi = chi * twist[:, :1] / bicycle.wheelbase
+            beta = np.linalg.lstsq(chi, target, rcond=None)[0]
         else:
-            rows = given
-            beta = np.linalg.lstsq(given, twist[:, i], rcond=None)[0]
-        gain[i, moves[i]], offset[i] = beta[: moves[i].sum()], beta[moves[i].sum()]
-        rest = rows @ beta - twist[:, i]
-        left += float((rest**2).mean() / max((twist[:, i] ** 2).mean(), 1e-12))
+            lagged = np.column_stack([chi, -change[:, i]])
+            beta = np.linalg.lstsq(lagged, target, rcond=None)[0]
+            if beta[-1] > LAG_RANGE_S[0]:
+                lag[i] = min(beta[-1], LAG_RANGE_S[1])
+                chi = lagged
+            else:
+                beta = np.linalg.lstsq(chi, target, rcond=None)[0]
+        count = int(moves[i].sum())
+        gain[i, moves[i]] = beta[:count]
+        offset[i] = beta[count]
+        rest = chi @ beta - target
+        left += float((rest**2).mean() / max((target**2).mean(), 1e-12))
     return left, gain, offset, lag
 
 
@@ -389,7 +393,7 @@ def fit_yardstick(
             return np.asarray(np.nan_to_num(rates)).ravel()
 
         theta = form.pack()
-        found = least_squares(
+        solution = least_squares(
             residuals,
             theta,
             x_scale=np.maximum(np.abs(theta), 0.05),
@@ -400,7 +404,7 @@ def fit_yardstick(
             ftol=TOLERANCE,
             xtol=TOLERANCE,
         )
-        return float(found.cost), form.unpack(found.x)
+        return float(solution.cost), form.unpack(solution.x)
 
     guesses = [
         _first_guess(drive, until_s, clock_offset_s, offsets)
