@@ -14,6 +14,7 @@ from nics_drl_bridge.identify.calibration import Calibration, Response
 from nics_drl_bridge.identify.drive import MIN_STAMPS, Drive, TwistIntervals
 from nics_drl_bridge.identify.signals import Motors
 from nics_drl_bridge.identify.statistics import (
+    CERTAIN,
     minimise,
     standard_errors,
     uncertainty,
@@ -49,7 +50,6 @@ WHEELS_EXPLAINED = 0.5
 # report instantaneous ones: times are uncertain by the spread of a uniform distribution.
 WITHIN_TICK = 12.0**-0.5
 MIN_TIME_S = 5e-4
-CERTAIN = 3.0  # corrections below this many standard uncertainties are not applied
 CLUSTER_S = 2.5  # residuals further apart count as independent
 NO_LAG_S = 0.005
 # fraction of unexplained variance above which no delay is believed
@@ -64,7 +64,9 @@ DRIFT_STEP_S = 0.03
 LEAST_DRIFT_S = 0.12
 DRIFT_OFF = 0.25
 MIN_EARLY_S = 0.03  # smaller lead times may be the effect of an imperfect lag
-TOLD_S = 0.005  # a latency less certain than this can't be distinguished from a lag
+SEPARABLE_S = (
+    0.005  # a latency less certain than this can't be distinguished from a lag
+)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.excitation import moving_dofs
 from nics_drl_bridge.identify.signals import Motors
-from nics_drl_bridge.identify.statistics import clustered_errors, minimise
+from nics_drl_bridge.identify.statistics import CERTAIN, clustered_errors, minimise
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.curve import InputCurve, delays
 from nics_drl_bridge.robot.kernels import MAX_ORDER
@@ -76,8 +76,8 @@ def apart(drive: Drive, timing: clocks.TimingEstimate) -> clocks.TimingEstimate:
     sigma = adjusted.sigma
     if not np.isfinite(sigma).all():
         return timing
-    first = int(np.argmin(delay + clocks.CERTAIN * sigma[0]))
-    spread = clocks.CERTAIN * np.hypot(sigma[0], sigma[0, first])
+    first = int(np.argmin(delay + CERTAIN * sigma[0]))
+    spread = CERTAIN * np.hypot(sigma[0], sigma[0, first])
     alike = np.abs(delay - delay[first]) <= spread
     by_wheels = len(timing.sigma) > 1  # the wheels determined the latency
     motors = adjusted.best.motors
@@ -100,7 +100,7 @@ def apart(drive: Drive, timing: clocks.TimingEstimate) -> clocks.TimingEstimate:
         least = clocks.if_certain(
             max(least, 0.0), float(sigma[0, first]), clocks.MIN_TIME_S
         )
-    if timing.separated and errors["command_latency_s"] > clocks.TOLD_S:
+    if timing.separated and errors["command_latency_s"] > clocks.SEPARABLE_S:
         names = (_of_sum(states[i].name) for i in moved)
         errors |= zip(names, map(float, sigma[1]), strict=True)
     further = 0.0 * timing.lags

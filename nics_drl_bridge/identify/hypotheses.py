@@ -286,7 +286,7 @@ def about_lags(latency: float, lags: dict[str, float], beside: float) -> str:
     """States that only the sum of latency [s] and lags is known; `beside` was found with lags."""
     # A model with one lag treats the second lag of a servo as latency.
     sums = ", ".join(f"{beside + lag:.3f} s for {name}" for name, lag in lags.items())
-    return f"Latency ({latency:.3f} s) can't be told from the lags: trust their sums, {sums}."
+    return f"Latency ({latency:.3f} s) can't be separated from the lags: trust their sums, {sums}."
 
 
 def standard_errors(predictive: shooting.Predictive) -> Array:

@@ -208,13 +208,6 @@ class Identified:
         return self.drive.settings.train_until_s
 
     @property
-    def coverage(self) -> dict[float, float]:
-        """Fraction of held-out ends within the 95 % band of predictions, by horizon [s]."""
-        return {
-            e.horizon_s: e.coverage for e in self.judgement if e.coverage is not None
-        }
-
-    @property
     def judgement(self) -> tuple[HorizonErrors, ...]:
         """Errors on held-out data, compared with those of yardsticks, by horizon."""
         return self.findings.judgement

@@ -14,7 +14,7 @@ from nics_drl_bridge.identify import clocks
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive, TwistIntervals
 from nics_drl_bridge.identify.signals import average_held, followed, speed_index
-from nics_drl_bridge.identify.statistics import standard_errors
+from nics_drl_bridge.identify.statistics import CERTAIN, standard_errors
 from nics_drl_bridge.identify.terms import has_slipping_tyres, list_reversed_variables
 from nics_drl_bridge.recording.recording import Stream
 from nics_drl_bridge.robot import taylor
@@ -127,7 +127,7 @@ def by_instruments(
     travel = float(np.arctan2(-normal[0], normal[1]))
     ahead = rotate(seen[:, :2], -travel)[:, :1]
     sigma = standard_errors(np.hstack([ahead, seen[:, 2:]]), motion.twist @ normal)
-    if clocks.CERTAIN * sigma[1] > spec.footprint_radius:
+    if CERTAIN * sigma[1] > spec.footprint_radius:
         return None
     across = 0.0
     across_sigma = np.nan
@@ -164,11 +164,11 @@ def with_slip(motion: TwistIntervals, plain: Mounting, spec: RobotSpec) -> Mount
     beta = np.linalg.lstsq(chi, along[:, 1], rcond=None)[0]
     sigma = standard_errors(chi, along[:, 1] - chi @ beta)
     hidden = skids and _ways(speed * np.abs(turn)) < 2
-    if hidden or not clocks.CERTAIN * sigma[1] < spec.footprint_radius:
+    if hidden or not CERTAIN * sigma[1] < spec.footprint_radius:
         return replace(
             plain, lever=np.zeros(2), lever_sigma=np.full(2, np.nan), slip=True
         )
-    if abs(beta[2]) < clocks.CERTAIN * sigma[2]:
+    if abs(beta[2]) < CERTAIN * sigma[2]:
         return plain
     rotation = plain.rotation + float(np.arctan(beta[0]))
     lever = np.array([float(beta[1]), 0.0])
@@ -227,7 +227,7 @@ def mounting_without_lateral_motion(
     turn = motion.twist[:, 2]
     lever = 0.0
     lever_sigma = np.nan
-    certain = np.abs(turn) > clocks.CERTAIN * np.sqrt(2.0) * noise / (
+    certain = np.abs(turn) > CERTAIN * np.sqrt(2.0) * noise / (
         motion.end - motion.start
     )
     ways = _ways(turn, certain)

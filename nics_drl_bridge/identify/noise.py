@@ -9,6 +9,7 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import open_loop
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive, find_bursts, pose_noise
+from nics_drl_bridge.identify.refine import OUTLYING
 from nics_drl_bridge.identify.signals import white_noise
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.noise import (
@@ -25,8 +26,6 @@ SPACING_S = 0.25
 GROWTH_S = (0.25, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0)
 STATE_HORIZON_S = 0.1
 MIN_WINDOWS = 20
-# a window whose error exceeds this many times the median contains a jump
-OUTLYING = 10.0
 # a larger error of a prediction over a second is divergence, not drift
 RUN_AWAY_M = 1e4
 BLOCKS = 8

@@ -19,9 +19,9 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import open_loop
 from nics_drl_bridge.identify.calibration import Calibration, Response
-from nics_drl_bridge.identify.clocks import TOLD_S
+from nics_drl_bridge.identify.clocks import SEPARABLE_S
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.shooting import HEADING_ARM_M
+from nics_drl_bridge.identify.shooting import HEADING_ARM_M, SPACING_S
 from nics_drl_bridge.identify.signals import speed_index
 from nics_drl_bridge.identify.statistics import (
     CERTAIN,
@@ -42,7 +42,6 @@ VX = POSE_RATES.index("vx")
 VY = POSE_RATES.index("vy")
 
 HORIZONS_S = (1.0, 2.5, 5.0)
-SPACING_S = 0.25  # between the starts of windows
 MIN_WINDOWS = 10  # per horizon
 # A window contains a jump of the pose if its error exceeds this many times the median error and
 # this fraction of the longest path,
@@ -382,7 +381,7 @@ def _select_time(calibration: Calibration) -> str | None:
         time = "command_latency_s"
     else:
         return None
-    if known[time] <= TOLD_S and not are_lags_measured(calibration):
+    if known[time] <= SEPARABLE_S and not are_lags_measured(calibration):
         return None
     return time
 

@@ -30,7 +30,7 @@ Shape = Callable[[TaylorModel, Array], TaylorModel]
 Trust = Callable[[Array, Array], Array]
 
 HORIZONS_S = (0.3, 1.0, 2.5, 5.0)  # the shortest separates latency from lag
-SPACING_S = 0.25
+SPACING_S = 0.25  # between the starts of windows
 HEADING_ARM_M = 0.3  # a heading error counts as a position error at this distance
 FARTHEST_M = 50.0  # errors are clipped at this distance per second of the horizon
 PULL = 0.001  # usual weight of the first coefficients relative to the predictions
@@ -197,9 +197,8 @@ class Predictive:
 
     model: TaylorModel
     values: Array  # (I,) of the inputs
-    error: float  # root mean square of the scaled errors [m/s]
     jacobian: Array  # (n, P) of the residual by the free coefficients
-    residual: Array  # (n,)
+    residual: Array  # (n,) scaled errors [m/s]
     free: Mask  # (D, K)
     starts: Array  # (n,) start of the window of each residual [s]
     # (I,) standard errors of the values; NaN for known ones
@@ -366,5 +365,4 @@ class _Search:
         if self.count:
             late_slope = self.late(theta, rest) / self.inputs.scale[self.sought]
             errors[self.sought] = clustered_errors(late_slope, rest, span)
-        error = float(np.sqrt(np.mean(rest**2)))
-        return Predictive(best, late, error, slope, rest, self.free, starts, errors)
+        return Predictive(best, late, slope, rest, self.free, starts, errors)

@@ -15,7 +15,8 @@ from nics_drl_bridge.robot.taylor import TaylorModel
 
 UNLIKE = 0.05  # correlation below which residuals are assumed to be independent
 LONGEST = 0.1  # longest correlation of residuals, as a fraction of the rows
-CERTAIN = 3.0  # minimum ratio of a term of a noisy fit to its standard error
+# minimum ratio of a term of a noisy fit, or of a correction, to its standard error
+CERTAIN = 3.0
 WEAK = 1e4  # condition number of instruments x features above which instruments are too weak
 # relative step and termination of `minimise`
 DIFFERENCE = 1e-4

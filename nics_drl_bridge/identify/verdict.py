@@ -11,14 +11,14 @@ from nics_drl_bridge.errors import FitError, RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.acceptance import THRESHOLDS
 from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.clocks import CERTAIN, TimingEstimate
+from nics_drl_bridge.identify.clocks import TimingEstimate
 from nics_drl_bridge.identify.drive import MAX_GAP_S, Drive
 from nics_drl_bridge.identify.excitation import Excitation, plausible
 from nics_drl_bridge.identify.fit import Fit
 from nics_drl_bridge.identify.mounting import Mounting
 from nics_drl_bridge.identify.open_loop import HORIZON_S, OpenLoop, open_loop_error
 from nics_drl_bridge.identify.signals import moved_commands
-from nics_drl_bridge.identify.statistics import errors_of
+from nics_drl_bridge.identify.statistics import CERTAIN, errors_of
 from nics_drl_bridge.recording.recording import Recording, Samples, Stream
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import HorizonErrors, Quality, TaylorModel
@@ -36,7 +36,7 @@ BACKWARDS = 0.3  # angle [rad] from half a turn, below which a body faces backwa
 # a pause of the pose longer than this many usual steps, and MAX_GAP_S, is a gap
 GAP_STEPS = 3.0
 # maximum number of gaps to report individually: the longest, in order of time
-GAPS_TOLD = 12
+MOST_GAPS_LISTED = 12
 LINEAR = (
     "Predictions by terms of a higher order ended farther away than the robot drove, so the model "
     "has only those of order 1."
@@ -96,7 +96,7 @@ def describe_gaps(drive: Drive) -> Iterator[str]:
     t = drive.dated.t
     pose = drive.dated.values
     rows = _gap_rows(drive)
-    for row in sorted(rows[:GAPS_TOLD]):
+    for row in sorted(rows[:MOST_GAPS_LISTED]):
         moved = geometry.between(pose[row], pose[row + 1])
         span = t[row + 1] - t[row]
         begin = t[row] - t[0]
@@ -105,8 +105,8 @@ def describe_gaps(drive: Drive) -> Iterator[str]:
         yield Gap(
             f"{finding}, across which it moves {across}: what happened there is not known."
         )
-    if len(rows) > GAPS_TOLD:
-        rest = [t[row + 1] - t[row] for row in rows[GAPS_TOLD:]]
+    if len(rows) > MOST_GAPS_LISTED:
+        rest = [t[row + 1] - t[row] for row in rows[MOST_GAPS_LISTED:]]
         yield Gap(
             f"The pose has {len(rest)} more gaps, of up to {max(rest):.2f} s "
             f"and of {sum(rest):.1f} s in all."
@@ -147,7 +147,7 @@ def describe_clocks(
             f"{calibration.clock_offset_s:.4f} s (+- {sigma['clock_offset_s']:.4f} s)"
         )
         finding = "Pose and commands are stamped by different clocks"
-        yield f"{finding}: {offset} added to the pose's stamps gives the commands' clock."
+        yield f"{finding}: add {offset} to the pose's stamps to get the commands' clock."
     if timing.early > 0.0 and calibration.command_latency_s <= 0.0:
         finding = f"The robot moves {timing.early:.2f} s before its commands"
         cause = "the pose is stamped by another clock; give it a `clock:` of its own in the mapping"

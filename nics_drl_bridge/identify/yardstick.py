@@ -341,7 +341,9 @@ def _regressed(
     for i in np.flatnonzero(moves.any(axis=1)):
         target = twist[:, i]
         chi = np.column_stack([u[:, moves[i]], np.full(len(u), float(offsets))])
-        if bicycle.used and i == 2:  # an angle: it turns the robot in proportion to its speed
+        if (
+            bicycle.used and i == 2
+        ):  # an angle: it turns the robot in proportion to its speed
             chi = chi * twist[:, :1] / bicycle.wheelbase
             beta = np.linalg.lstsq(chi, target, rcond=None)[0]
         else:

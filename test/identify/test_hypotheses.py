@@ -70,7 +70,7 @@ def test_a_car_that_slips_is_predicted_and_its_lever_is_not_bent_by_the_slip():
         "The model is the textbook with an input curve of throttle" in n
         for n in found.notes
     )
-    assert any("can't be told from the lags" in note for note in found.notes)
+    assert any("can't be separated from the lags" in note for note in found.notes)
 
 
 def trial(order, error):
