@@ -338,7 +338,7 @@ def test_another_format_is_refused(saved, value):
 @pytest.mark.parametrize("dof", ["vx", "wz", "d_steering"])
 def test_kinematics_that_lack_a_degree_of_freedom_are_refused(saved, dof):
     change(saved, lambda data: data["kinematics"]["terms"].pop(dof))
-    with pytest.raises(ModelError, match="generate the model anew"):
+    with pytest.raises(ModelError, match="generate the model again"):
         load_model(saved)
 
 
