@@ -93,16 +93,19 @@ def judged(
     given = drive.part(replace(drive.recording, command=recording.command))
     yardstick = fit_yardstick(given, until, calibration.clock_offset_s)
     error, share, heading = off(ends, chosen)
+    coverage = {
+        f"{at.horizon_s:g}": at.coverage
+        for at in found.judgement
+        if at.coverage is not None
+    }
     return {
         "error_m": error,
         "share_of_path": share,
         "heading_error_rad": heading,
         "yardstick_share": off(yardstick.predict(given, chosen), chosen)[1],
         "constant_twist_share": off(kept_twist(drive, chosen), chosen)[1],
-        "coverage_95": found.coverage.get(HORIZON_S, float("nan")),
-        "coverages_95": {
-            f"{horizon:g}": share for horizon, share in found.coverage.items()
-        },
+        "coverage_95": coverage.get(f"{HORIZON_S:g}", float("nan")),
+        "coverages_95": coverage,
         "errors_m": {
             f"{at.horizon_s:g}": at.model.position_m for at in found.judgement
         },

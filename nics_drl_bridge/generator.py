@@ -99,7 +99,7 @@ class SimulatorModel:
         fitted = (self.kinematics.variables, self.kinematics.dofs)
         needed = (robot.variable_names, robot.dof_names)
         if fitted != needed:
-            reason = f"robot {robot.name!r} needs {needed}; generate the model anew."
+            reason = f"robot {robot.name!r} needs {needed}; generate the model again."
             raise ModelError(
                 f"the kinematics have variables and rates {fitted}, {reason}"
             )
@@ -234,7 +234,7 @@ def _check_given(recording: object, shapes: object, sensors: object) -> None:
     """Raises ConfigError if the recording, shapes or sensors have a wrong type."""
     recordings = list(recording) if isinstance(recording, list | tuple) else [recording]
     if not recordings or not all(isinstance(item, Recording) for item in recordings):
-        needed = "a Recording, as read_recording(path) gives, or a list of them"
+        needed = "a Recording, as read_recording(path) returns, or a list of them"
         raise ConfigError(
             f"generate: recording={format_value(recording)}: must be {needed}."
         )
@@ -312,14 +312,17 @@ def open_model(
     # A Path never equals the name of a shipped robot.
     if Path(name).is_dir() and name not in list_shipped("robots"):
         return load_model(name)
-    if "/" in (name := str(name)) and not name.endswith((".yaml", ".yml")):
+    name = str(name)
+    is_yaml = name.endswith((".yaml", ".yml"))
+    if "/" in name and not is_yaml:
         raise ModelError(f"{name}: no such folder; make one with `nics generate`.")
-    if not name.endswith((".yaml", ".yml")) and name not in list_shipped("robots"):
+    if not is_yaml and name not in list_shipped("robots"):
         hint = suggest(name, list_shipped("robots"))
         fix = "or give a model's folder, or a robot's YAML file"
         raise ModelError(f"unknown robot {name!r}; {hint} ({fix}).")
     try:
-        return builtin_model(name, *([read_text(name)] if Path(name).is_file() else []))
+        content = (read_text(name),) if Path(name).is_file() else ()
+        return builtin_model(name, *content)
     except ConfigError as error:
         raise ModelError(str(error)) from None
 
@@ -359,7 +362,7 @@ def load_model(folder: str | Path) -> SimulatorModel:
     data = parse_yaml(read_text(path), str(path))
     if data.get("format") != FORMAT:
         reason = f"key 'format' is {data.get('format')!r}, not {FORMAT!r}"
-        raise ModelError(f"{path}: {reason}; generate the model anew.")
+        raise ModelError(f"{path}: {reason}; generate the model again.")
     files.check_sums(folder, MODEL_FILES, editable=MODEL_FILE)
     # A file without this key was written before its default changed.
     if isinstance(data.get("robot"), dict):

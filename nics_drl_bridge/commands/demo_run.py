@@ -21,7 +21,7 @@ from nics_drl_bridge.files import write_bytes, write_text
 from nics_drl_bridge.generator import SimulatorModel, generate, mount_lidar, save_model
 from nics_drl_bridge.identify.conclusion import conclude
 from nics_drl_bridge.identify.identify import Identified
-from nics_drl_bridge.identify.report import select_opening
+from nics_drl_bridge.identify.report import format_opening
 from nics_drl_bridge.policy import evaluation
 from nics_drl_bridge.policy.evaluation import (
     FIRST_SEED,
@@ -188,7 +188,7 @@ def _generate(plan: DemoPlan, say: Say) -> tuple[SimulatorModel, Identified]:
         recording, robot, mount_lidar(robot), world.shapes, assume=True
     )
     save_model(model, plan.model)
-    say(select_opening(model.report))
+    say(format_opening(recording.source, identified))
     return model, identified
 
 

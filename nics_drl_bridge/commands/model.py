@@ -364,7 +364,7 @@ def generate(
             sensors,
         )
         save_model(model, out)
-    from nics_drl_bridge.identify.report import select_opening
+    from nics_drl_bridge.identify.report import format_opening
     from nics_drl_bridge.report.fit_page import write_fit_page
     from nics_drl_bridge.report.fit_pictures import write_pictures
 
@@ -374,7 +374,7 @@ def generate(
             write_pictures(spec, identified, out / "pictures")
     why = "" if lidar or spec.lidar else ", the default; choose another with --lidar"
     lines = (
-        f"{select_opening(model.report)}\n",
+        f"{format_opening(identified.recording.source, identified)}\n",
         f"its lidar is {model.lidar.name!r}{why}",
         f"all figures: {out / 'report.txt'}, with pictures: {out / 'report.html'}",
         f"model written to {out}",

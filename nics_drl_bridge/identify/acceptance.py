@@ -70,7 +70,7 @@ class Assessment:
 
 def usual(judgement: tuple[HorizonErrors, ...]) -> list[HorizonErrors]:
     """Returns the errors after 5 s, or at the longest held-out horizon; empty if there is none."""
-    return [each for each in judgement if each.horizon_s <= JUDGED_S][-1:]
+    return [at for at in judgement if at.horizon_s <= JUDGED_S][-1:]
 
 
 def comparison_noise(difference: Array, start_t: Array, horizon: float) -> float:
@@ -101,12 +101,15 @@ def compare(
 
 def loses_to_textbook(judgement: tuple[HorizonErrors, ...]) -> bool:
     """True if a model's predictions are worse than its fitted textbook's, beyond the noise."""
-    return any(
-        at.textbook is not None
-        and compare(at.model, at.textbook, at.textbook_noise_m, at.path_m)
-        is Outcome.WORSE
-        for at in usual(judgement)
-    )
+    return any(map(_loses, usual(judgement)))
+
+
+def _loses(at: HorizonErrors) -> bool:
+    """True if predictions over one horizon are worse than those of a fitted textbook."""
+    if at.textbook is None:
+        return False
+    outcome = compare(at.model, at.textbook, at.textbook_noise_m, at.path_m)
+    return outcome is Outcome.WORSE
 
 
 def shortfall(judgement: tuple[HorizonErrors, ...]) -> Iterator[str]:
@@ -118,9 +121,7 @@ def shortfall(judgement: tuple[HorizonErrors, ...]) -> Iterator[str]:
 
 def shortfall_of_textbook(at: HorizonErrors) -> Iterator[str]:
     """Yields a sentence if predictions are worse than the fitted textbook's; a tie is fine."""
-    if at.textbook is None:
-        return
-    if compare(at.model, at.textbook, at.textbook_noise_m, at.path_m) is Outcome.WORSE:
+    if at.textbook is not None and _loses(at):
         yield f"{_beside('the fitted textbook', at, at.textbook)}."
 
 
@@ -157,22 +158,26 @@ def rate(
     if not judged:
         return Assessment(Verdict.DO_NOT_TRAIN, ())
     (at,) = judged
-    ratings = [_rate_error(at, radius), _rate_band(at), _rate_beside_twist(at)]
-    ratings.append(_rate_beside_standing(at, radius))
+    ratings = [
+        _rate_error(at, radius),
+        _rate_band(at),
+        _rate_beside_twist(at),
+        _rate_beside_standing(at, radius),
+    ]
     if not textbook and loses_to_textbook(judgement):
-        ratings.append(
-            Assessment(Verdict.DO_NOT_TRAIN, tuple(shortfall_of_textbook(at)))
-        )
+        reasons = tuple(shortfall_of_textbook(at))
+        ratings.append(Assessment(Verdict.DO_NOT_TRAIN, reasons))
     return combined(ratings)
 
 
 def combined(ratings: Iterable[Assessment]) -> Assessment:
     """Returns the least favourable verdict, with the reasons of all."""
-    rated = tuple(ratings)
-    verdict = max((each.verdict for each in rated), key=list(Verdict).index)
-    return Assessment(
-        verdict, tuple(reason for each in rated for reason in each.reasons)
-    )
+    verdicts = []
+    reasons: list[str] = []
+    for rating in ratings:
+        verdicts.append(rating.verdict)
+        reasons += rating.reasons
+    return Assessment(max(verdicts, key=list(Verdict).index), tuple(reasons))
 
 
 def rate_unseen(gap_s: float, duration_s: float) -> Assessment:

@@ -19,26 +19,27 @@ def assume_textbook(
 ) -> tuple[TaylorModel, tuple[str, ...]]:
     """Adds textbook terms for inputs that never moved; ConfigError if the spec has no textbook."""
     # A fit at a constant input is a section through the full model: `wz = c speed`, measured at
-    # the steering angle s0, becomes `wz = (c/s0) speed*steering`; at s0 = 0 parameters are used.
+    # the steering angle s0, becomes `wz = (c/s0) speed*steering`; at s0 = 0, the textbook's
+    # parameters are used.
     named = model.named
     rows = {dof: dict(terms) for dof, terms in named.terms.items()}
     point = dict(zip(model.variables, (model.low + model.high) / 2.0, strict=True))
-    found = _Completion(
+    completion = _Completion(
         model.dt, spec, textbook(spec), unmoved, point, rows, list(model.assumed)
     )
     for i, variable in enumerate(spec.state):
         if variable.twist:  # by definition
             rows[variable.twist] = {variable.name: 1.0}
         elif variable.name in unmoved:
-            found.restore_twist(i)
+            completion.restore_twist(i)
     for i in range(len(spec.state)):
-        found.restore_rate(i)
+        completion.restore_rate(i)
     update = {
         "terms": rows,
-        "assumed": tuple(found.assumed),
-        "valid": found.widened(named.valid),
+        "assumed": tuple(completion.assumed),
+        "valid": completion.widened(named.valid),
     }
-    return named.model_copy(update=update).model(), tuple(found.notes)
+    return named.model_copy(update=update).model(), tuple(completion.notes)
 
 
 @dataclass(frozen=True)
@@ -73,9 +74,10 @@ class _Completion:
                     continue
                 self.rows[dof][product] = coefficient
                 self.assumed.append((dof, product))
-                found = f"{dof} = {coefficient:.4g}*{product} ({source}), since {name} never moved"
+                term = f"{dof} = {coefficient:.4g}*{product} ({source})"
+                finding = f"{term}, since {name} never moved"
                 advice = f"to learn it, drive with {name} over its whole range"
-                self.notes.append(Gap(f"Assumed, not learnt: {found}; {advice}."))
+                self.notes.append(Gap(f"Assumed, not learnt: {finding}; {advice}."))
 
     def _slope(self, d: int, product: str) -> float:
         """Returns the coefficient of a product of state variables in the textbook twist, at 0."""
@@ -93,9 +95,9 @@ class _Completion:
         self, valid: dict[str, tuple[float, float]]
     ) -> dict[str, tuple[float, float]]:
         """Returns the ranges, widened to what commands can reach for assumed parts of the twist."""
-        told = {dof for dof, _ in self.assumed}
+        assumed = {dof for dof, _ in self.assumed}
         for variable in self.spec.state:
-            if variable.twist and f"d_{variable.name}" in told:
+            if variable.twist and f"d_{variable.name}" in assumed:
                 far = float(reach(self.spec)[POSE_RATES.index(variable.twist)])
                 low, high = valid[variable.name]
                 valid = valid | {variable.name: (min(low, -far), max(high, far))}
@@ -166,12 +168,12 @@ class _Completion:
 
         It is the product of speed and steering, measured at a constant if there is one.
         """
-        given = structure_of(self.spec)
+        structure = structure_of(self.spec)
         state = {v.twist: v.name for v in self.spec.state}
         turned = self.spec.state[i].twist == "wz" and "vx" in state
-        if given is None or not given[1].used or not turned:
+        if structure is None or not structure[1].used or not turned:
             return None
-        k = int(np.argmax(np.abs(given[0][2])))
+        k = int(np.argmax(np.abs(structure[0][2])))
         names = state["vx"], self.spec.command[k].name
         still = [name for name in names if name in self.unmoved]
         if not still:
@@ -182,4 +184,6 @@ class _Completion:
         value = float(np.prod([self.point[name] for name in still]))
         if learnt is not None and abs(value) > MIN_OPERATING_POINT:
             return {"*".join(names): learnt / value}
-        return {"*".join(names): rate * float(given[0][2, k]) / given[1].wheelbase}
+        return {
+            "*".join(names): rate * float(structure[0][2, k]) / structure[1].wheelbase
+        }

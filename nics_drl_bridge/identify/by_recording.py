@@ -49,8 +49,10 @@ def errors_by_recording(
         )
         if not len(chosen.start_t):
             continue
-        own = np.array(sources)[drive.recording.episode_at(chosen.start_t)]
-        if any((own == source).sum() < FEWEST for source in sources):
+        sources_of_windows = np.array(sources)[
+            drive.recording.episode_at(chosen.start_t)
+        ]
+        if any((sources_of_windows == source).sum() < FEWEST for source in sources):
             continue
         ends = open_loop.predict(model, calibration, drive, chosen)
         error = np.hypot(*(ends - chosen.end)[:, :2].T)
@@ -58,8 +60,8 @@ def errors_by_recording(
             ErrorOfRecording(
                 source,
                 horizon,
-                float(error[own == source].mean()),
-                float(chosen.path[own == source].mean()),
+                float(error[sources_of_windows == source].mean()),
+                float(chosen.path[sources_of_windows == source].mean()),
             )
             for source in dict.fromkeys(sources)
         ]
@@ -75,15 +77,14 @@ def about_recordings(
     errors = errors_by_recording(model, calibration, drive)
     if len(errors) < 2:
         return
-    for each in errors:
-        others = [other for other in errors if other is not each]
-        usual = float(np.median([other.share for other in others]))
-        if each.share > max(ALONE * usual, LEAST_SHARE) and np.isfinite(usual):
-            ends = f"end {each.position_m:.3g} m off after {each.horizon_s:g} s"
-            shares = f"{each.share:.1%} of the path, those of the others {usual:.1%}"
-            yield Alone(
-                f"{each.source} alone is off: its predictions {ends} ({shares}); check its clocks, "
-                "its mounting and the floor it was driven on, or leave it out."
-            )
-    listed = ", ".join(f"{each.source} {each.share:.1%}" for each in errors)
+    for error in errors:
+        others = [another for another in errors if another is not error]
+        usual = float(np.median([another.share for another in others]))
+        if error.share > max(ALONE * usual, LEAST_SHARE) and np.isfinite(usual):
+            ends = f"end {error.position_m:.3g} m off after {error.horizon_s:g} s"
+            shares = f"{error.share:.1%} of the path, those of the others {usual:.1%}"
+            finding = f"{error.source} alone is off: its predictions {ends} ({shares})"
+            causes = "its clocks, its mounting and the floor it was driven on"
+            yield Alone(f"{finding}; check {causes}, or leave it out.")
+    listed = ", ".join(f"{error.source} {error.share:.1%}" for error in errors)
     yield f"By recording, errors after {errors[0].horizon_s:g} s as shares of the path: {listed}."

@@ -13,9 +13,9 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.drive import MAX_GAP_S, MIN_STAMPS, Drive
 from nics_drl_bridge.identify.signals import (
     Motors,
-    inferred_states,
+    average_effect,
+    infer_states,
     resample,
-    taken,
     unwrapped,
 )
 from nics_drl_bridge.recording.recording import Recording, Samples, samples_on_one_clock
@@ -55,10 +55,7 @@ class Calibration:
     # heading of `base_link` minus heading of the tracked body
     rotation_rad: float = 0.0
     # (x, y) of the tracked point in `base_link`
-    lever_arm_m: tuple[float, float] = (
-        0.0,
-        0.0,
-    )
+    lever_arm_m: tuple[float, float] = (0.0, 0.0)
     # of the state variables; empty if the state was measured
     responses: tuple[Response, ...] = ()
     # of commands with an input curve or a delay of their own
@@ -84,22 +81,14 @@ class Calibration:
     notes: tuple[str, ...] = ()
 
     @property
-    def is_identity(self) -> bool:
-        """True if the streams can be used as they are."""
-        return (
-            self.clock_offset_s == self.command_latency_s == self.rotation_rad == 0.0
-            and self.lever_arm_m == (0.0, 0.0)
-            and not self.responses
-            and not self.inputs
-            and not self.limits
-            and self.burst_period_s == 0.0
-        )
-
-    @property
     def is_exact(self) -> bool:
         """True if there is nothing to correct, not even noise, as in a synthetic recording."""
         return (
-            self.is_identity and self.position_noise_m == self.heading_noise_rad == 0.0
+            self.clock_offset_s == self.command_latency_s == self.rotation_rad == 0.0
+            and self.lever_arm_m == (0.0, 0.0)
+            and not (self.responses or self.inputs or self.limits)
+            and self.burst_period_s == 0.0
+            and self.position_noise_m == self.heading_noise_rad == 0.0
         )
 
     @property
@@ -131,10 +120,8 @@ def align(drive: Drive, calibration: Calibration) -> Samples:
     # An exact drive is used bit for bit; noisy poses are smoothed by local parabolas.
     recording = drive.recording
     period = drive.settings.control_period_s
-    if (
-        calibration.is_exact
-        and (shared := _shared_stamps(recording, period)) is not None
-    ):
+    shared = _shared_stamps(recording, period) if calibration.is_exact else None
+    if shared is not None:
         samples = samples_on_one_clock(*shared)
         return replace(samples, dt=part_of(period, samples.dt))
     grid, step = _grid(recording, calibration, period)
@@ -148,12 +135,16 @@ def align(drive: Drive, calibration: Calibration) -> Samples:
         grid,
         poses_at(drive, calibration, grid, half_width),
         states_at(drive, calibration, grid),
-        taken(recording.command, drive.spec, calibration.inputs, begin, begin + step),
+        average_effect(
+            recording.command, drive.spec, calibration.inputs, begin, begin + step
+        ),
     )
-    known = outside_gaps(samples.t, drive.sample_t + calibration.clock_offset_s, step)
+    is_known = outside_gaps(
+        samples.t, drive.sample_t + calibration.clock_offset_s, step
+    )
     if recording.state is not None:
-        known &= outside_gaps(samples.t, recording.state.t, step, STATE_GAP, 0.0)
-    return replace(samples.rows(known), dt=step)
+        is_known &= outside_gaps(samples.t, recording.state.t, step, STATE_GAP, 0.0)
+    return replace(samples.rows(is_known), dt=step)
 
 
 def part_of(period: float, step: float) -> float:
@@ -190,7 +181,7 @@ def states_at(drive: Drive, calibration: Calibration, grid: Array) -> Array:
     late = delays([r.command for r in calibration.responses], calibration.inputs)
     latency = calibration.command_latency_s + late
     motors = calibration.motors
-    inferred = inferred_states(
+    inferred = infer_states(
         recording.command, drive.spec, lags, latency, longer, motors
     )
     return np.asarray(gains * inferred[lead:])
@@ -203,7 +194,10 @@ def _shared_stamps(
     pose = recording.pose
     state = recording.state
     command = recording.command
-    if state is None or not (usual := float(np.median(np.diff(pose.t)))) > 0.0:
+    if state is None:
+        return None
+    usual = float(np.median(np.diff(pose.t)))
+    if not usual > 0.0:
         return None
     step = part_of(period, usual)
     if abs(step - usual) > SAME_STEP * usual:

@@ -14,6 +14,7 @@ from nics_drl_bridge.identify.calibration import Calibration, Response
 from nics_drl_bridge.identify.drive import MIN_STAMPS, Drive, TwistIntervals
 from nics_drl_bridge.identify.signals import Motors
 from nics_drl_bridge.identify.statistics import (
+    CERTAIN,
     minimise,
     standard_errors,
     uncertainty,
@@ -49,7 +50,6 @@ WHEELS_EXPLAINED = 0.5
 # report instantaneous ones: times are uncertain by the spread of a uniform distribution.
 WITHIN_TICK = 12.0**-0.5
 MIN_TIME_S = 5e-4
-CERTAIN = 3.0  # corrections below this many standard uncertainties are not applied
 CLUSTER_S = 2.5  # residuals further apart count as independent
 NO_LAG_S = 0.005
 # fraction of unexplained variance above which no delay is believed
@@ -64,7 +64,9 @@ DRIFT_STEP_S = 0.03
 LEAST_DRIFT_S = 0.12
 DRIFT_OFF = 0.25
 MIN_EARLY_S = 0.03  # smaller lead times may be the effect of an imperfect lag
-TOLD_S = 0.005  # a latency less certain than this can't be distinguished from a lag
+SEPARABLE_S = (
+    0.005  # a latency less certain than this can't be distinguished from a lag
+)
 
 
 @dataclass(frozen=True)
@@ -96,17 +98,20 @@ def delay_of_response(
         tau[free] = np.exp(theta[1:])
         return left_over(tau, theta[0])
 
-    found = _search(residual, centers, base[free])
-    tau, sigma = base.copy(), np.full(len(base), np.nan)
-    tau[free], sigma[free] = found.lags, found.lag_sigma
-    return replace(found, lags=tau, lag_sigma=sigma)
+    estimate = _search(residual, centers, base[free])
+    tau = base.copy()
+    tau[free] = estimate.lags
+    sigma = np.full(len(base), np.nan)
+    sigma[free] = estimate.lag_sigma
+    return replace(estimate, lags=tau, lag_sigma=sigma)
 
 
 def response_residual(
     command: Stream, spec: RobotSpec, target: Target, order: int = 2
 ) -> Left:
     """Returns the residual of a signal explained by commands, given lags and delays (S,) [s]."""
-    (start, end, signal), moved = target, signals.moved_inputs(command, spec)
+    start, end, signal = target
+    moved = signals.moved_inputs(command, spec)
     powers = taylor.list_exponents(len(moved), order)
     powers = powers[(powers[:, ~moved] == 0).all(axis=1)]
     grid = np.arange(start.min() - LEAD_S, end.max() + STEP_S, STEP_S)
@@ -115,9 +120,11 @@ def response_residual(
         lags: Array, delay: Array | float, motors: Motors | None = None
     ) -> Array:
         if not spec.state:
-            means = signals.held(command, spec, start - delay, end - delay, powers)
+            means = signals.average_held(
+                command, spec, start - delay, end - delay, powers
+            )
             return unexplained(means, signal)
-        states = signals.inferred_states(command, spec, lags, delay, grid, motors)
+        states = signals.infer_states(command, spec, lags, delay, grid, motors)
         chi = taylor.evaluate(states, powers)
         return unexplained(signals.interval_means(grid, chi, start, end), signal)
 
@@ -135,7 +142,7 @@ def state_residual(command: Stream, state: Stream, spec: RobotSpec) -> Residual:
     middle = (state.values[keep + 1] + state.values[keep]) / 2.0
 
     def residual(theta: Array) -> Array:
-        u = signals.held(command, spec, start - theta[0], end - theta[0])
+        u = signals.average_held(command, spec, start - theta[0], end - theta[0])
         return unexplained(
             np.concatenate([np.ones((len(u), 1)), middle, u], axis=1), rates
         )
@@ -188,17 +195,17 @@ def _search(
         np.append(start[0] + reach, np.full(len(lags), limit))
         for reach, limit in BOUNDS
     )
-    found, jacobian, rest = minimise(
+    theta, jacobian, rest = minimise(
         residual, start, np.full(len(start), 0.1), (low, high)
     )
     if float((rest**2).sum()) >= min(cost):
-        found = start
+        theta = start
         rest = residual(start)
     sigma = uncertainty(jacobian, rest)
-    tau = np.exp(found[1:])
+    tau = np.exp(theta[1:])
     explained = 1.0 - float((rest**2).mean())
     return DelayEstimate(
-        float(found[0]), float(sigma[0]), tau, sigma[1:] * tau, explained
+        float(theta[0]), float(sigma[0]), tau, sigma[1:] * tau, explained
     )
 
 
@@ -285,24 +292,24 @@ def _drift(
 ) -> float:
     """Returns the rate [s/s] at which a delay grows over a drive; 0 unless it grows steadily."""
     start, end, signal = target
-    tries = delay.value + np.arange(
+    trials = delay.value + np.arange(
         -DRIFT_REACH_S, DRIFT_REACH_S + DRIFT_STEP_S, DRIFT_STEP_S
     )
     middles = []
-    found = []
+    delays = []
     for part in np.array_split(np.arange(len(start)), DRIFT_PARTS):
         if len(part) < FEW_ROWS // 10:
             return 0.0
         rows = start[part], end[part], signal[part]
         left_over = response_residual(command, spec, rows)
-        left = [float((left_over(delay.lags, each) ** 2).mean()) for each in tries]
+        left = [float((left_over(delay.lags, trial) ** 2).mean()) for trial in trials]
         if min(left) > MOST_UNEXPLAINED:
             return 0.0
         middles.append(float(start[part].mean()))
-        found.append(float(tries[int(np.argmin(left))]))
-    rate, begin = np.polyfit(middles, found, 1)
-    off = np.abs(np.array(found) - rate * np.array(middles) - begin).max()
-    grown = abs(found[-1] - found[0])
+        delays.append(float(trials[int(np.argmin(left))]))
+    rate, begin = np.polyfit(middles, delays, 1)
+    off = np.abs(np.array(delays) - rate * np.array(middles) - begin).max()
+    grown = abs(delays[-1] - delays[0])
     steady = grown > LEAST_DRIFT_S and off < DRIFT_OFF * grown
     return float(rate) if steady else 0.0
 
@@ -346,11 +353,11 @@ def _timing_of_measured_state(drive: Drive, state: Stream) -> TimingEstimate:
     early = 0.0
     separated = bool(signals.moved_commands(recording.command).any())
     if separated:
-        found = _search_or_zero(state_residual(recording.command, state, drive.spec))
-        sigma["command_latency_s"] = found.sigma
+        delay = _search_or_zero(state_residual(recording.command, state, drive.spec))
+        sigma["command_latency_s"] = delay.sigma
         least = 0.05 * float(np.median(np.diff(state.t)))
-        latency = if_certain(max(found.value, 0.0), found.sigma, least)
-        early = if_certain(max(-found.value, 0.0), found.sigma, MIN_EARLY_S)
+        latency = if_certain(max(delay.value, 0.0), delay.sigma, least)
+        early = if_certain(max(-delay.value, 0.0), delay.sigma, MIN_EARLY_S)
     if recording.pose.clock != state.clock:
         by_shift = residual_by_shift(state, (twists.start, twists.end, twists.twist))
         delay = _search_or_zero(by_shift, _likely_shifts(recording))
@@ -372,12 +379,11 @@ def _wheel_delay(recording: Recording, spec: RobotSpec) -> DelayEstimate | None:
     if wheels is None or wheels.clock != recording.command.clock:
         return None
     tick = float(np.median(np.diff(wheels.t)))
-    found = delay_of_response(
-        recording.command, spec, (wheels.t - tick, wheels.t, wheels.values)
-    )
-    if not found.explained > WHEELS_EXPLAINED:
+    target = (wheels.t - tick, wheels.t, wheels.values)
+    delay = delay_of_response(recording.command, spec, target)
+    if not delay.explained > WHEELS_EXPLAINED:
         return None
-    return replace(found, sigma=float(np.hypot(found.sigma, WITHIN_TICK * tick)))
+    return replace(delay, sigma=float(np.hypot(delay.sigma, WITHIN_TICK * tick)))
 
 
 def if_certain(value: float, sigma: float, least: float) -> float:
@@ -396,7 +402,7 @@ def expected_states(
         return signals.interval_means(state.t, state.values, start, end)
     grid = np.arange(min(start[0], command.t[0]) - 1.0, end[-1] + 0.01, 0.01)
     late = timing.latency + timing.delays
-    states = signals.inferred_states(
+    states = signals.infer_states(
         command, drive.spec, timing.lags, late, grid, timing.motors
     )
     return signals.interval_means(grid, states, start, end)
@@ -427,7 +433,8 @@ def responses_of(
 
 def speed_along(drive: Drive, calibration: Calibration) -> Array:
     """Returns the speed (n,) of `base_link` along x over the intervals of the twists."""
-    angle, (ux, uy, wz) = calibration.rotation_rad, drive.twists.twist.T
+    angle = calibration.rotation_rad
+    ux, uy, wz = drive.twists.twist.T
     return np.asarray(
         np.cos(angle) * ux + np.sin(angle) * uy + calibration.lever_arm_m[1] * wz
     )

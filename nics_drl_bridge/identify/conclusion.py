@@ -13,7 +13,6 @@ from nics_drl_bridge.identify.verdict import Doubt, Mistake, list_missed
 from nics_drl_bridge.robot.kinds import describe_overdrive
 from nics_drl_bridge.robot.taylor import EndErrors
 
-OF_PATH = " of the path"
 # duration of a drive above which errors have other causes than its length
 ENOUGH_S = 60.0
 UNSEEN = "otherwise a policy would rely on motion the model never saw"
@@ -44,7 +43,7 @@ def conclude(identified: Identified) -> Conclusion:
     wrong = tuple(str(note) for note in identified.notes if isinstance(note, Mistake))
     strange = tuple(str(note) for note in identified.notes if isinstance(note, Doubt))
     replaced = identified.findings.replacement
-    about = (
+    doubts = (
         *wrong,
         *strange,
         *(str(note) for note in identified.notes if isinstance(note, Alone)),
@@ -52,14 +51,18 @@ def conclude(identified: Identified) -> Conclusion:
         *doubts_of_commands(identified.judgement, identified.calibration),
         *assessment.reasons,
     )
-    beyond = *narrow(identified.recording, spec), describe_overdrive(spec)
-    gaps = *identified.gaps, *(one for one in beyond if one)
+    overdrive = describe_overdrive(spec)
+    gaps = (
+        *identified.gaps,
+        *narrow(identified.recording, spec),
+        *((overdrive,) if overdrive else ()),
+    )
     ready = (
         assessment.verdict is not Verdict.DO_NOT_TRAIN and not identified.model.assumed
     )
     advice = f"Next: {_advice(identified, bool(wrong), bool(strange), bool(gaps))}."
-    told = f"{accuracy(identified)} {relative_to(identified.recording)}".strip()
-    return Conclusion(assessment.verdict, told, about, gaps, advice, ready)
+    errors = f"{accuracy(identified)} {relative_to(identified.recording)}".strip()
+    return Conclusion(assessment.verdict, errors, doubts, gaps, advice, ready)
 
 
 def _advice(identified: Identified, mistaken: bool, strange: bool, gaps: bool) -> str:
@@ -92,18 +95,28 @@ def accuracy(identified: Identified) -> str:
     for at in usual(identified.judgement):
         if not isfinite(at.model.position_m):
             return f"On unseen data the predictions diverge within {at.horizon_s:g} s."
-        named = {"a fitted textbook": at.textbook, "constant twist": at.kept_twist}
-        ends = {name: end_of(each, at.path_m) for name, each in named.items() if each}
-        beside = (f"{name} {end.removesuffix(OF_PATH)}" for name, end in ends.items())
-        found = f"On unseen data the predictions end {at.model.position_m:.3g} m off"
-        share = f" ({end_of(at.model, at.path_m)})" if at.path_m > 0.0 else ""
-        return f"{found} after {at.horizon_s:g} s{share}; {', '.join(beside)}."
+        yardsticks = {"a fitted textbook": at.textbook, "constant twist": at.kept_twist}
+        beside = [
+            f"{name} {format_error(errors, at.path_m)}"
+            for name, errors in yardsticks.items()
+            if errors is not None
+        ]
+        finding = f"On unseen data the predictions end {at.model.position_m:.3g} m off"
+        share = ""
+        if at.path_m > 0.0:
+            share = f" ({format_error(at.model, at.path_m)} of the path)"
+        return f"{finding} after {at.horizon_s:g} s{share}; {', '.join(beside)}."
     return UNTRIED
 
 
-def end_of(errors: EndErrors, path: float) -> str:
+def is_share(errors: EndErrors, path: float) -> bool:
+    """True if `format_error` states a fraction of the path [m]."""
+    return path > 0.0 and isfinite(errors.position_m)
+
+
+def format_error(errors: EndErrors, path: float) -> str:
     """Formats a position error as a fraction of the path [m], or in metres without a path."""
-    if path > 0.0 and isfinite(errors.position_m):
-        share = 100.0 * errors.position_m / path
-        return f"{f'{share:.1f}' if share >= 0.1 else '< 0.1'} %{OF_PATH}"
-    return f"{errors.position_m:.3g} m"
+    if not is_share(errors, path):
+        return f"{errors.position_m:.3g} m"
+    percentage = 100.0 * errors.position_m / path
+    return f"{percentage:.1f} %" if percentage >= 0.1 else "< 0.1 %"

@@ -1,5 +1,6 @@
 """Drive: a recording of a robot, with cached quantities that several stages derive from it."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -68,6 +69,17 @@ class Drive:
         vars(same).update(vars(self) | {"settings": settings})
         return same
 
+    def folds(self, count: int) -> "Iterator[tuple[Drive, Drive]]":
+        """Yields the drive without the poses of a block, and with these alone, block by block."""
+        pose = self.recording.pose
+        for block in np.array_split(np.arange(len(pose.t)), count):
+            others = np.ones(len(pose.t), dtype=np.bool_)
+            others[block] = False
+            yield (
+                self.part(replace(self.recording, pose=pose.rows(others))),
+                self.part(replace(self.recording, pose=pose.rows(block))),
+            )
+
     @property
     def duration_s(self) -> float:
         """Time from the first pose to the last [s]."""
@@ -92,16 +104,12 @@ class Drive:
 
     def trust(self, start: Array, end: Array) -> Array:
         """Returns weights (..., 3) of motions from start to end on the pose's clock, usually 1."""
-        variance = 1.0 / self.recording.pose.weights
-        columns = [
-            (
-                np.interp(start, self.sample_t, each)
-                + np.interp(end, self.sample_t, each)
-            )
-            / 2.0
-            for each in variance.T
-        ]
-        return np.asarray(1.0 / np.stack(columns, axis=-1))
+        means = []
+        for variance in 1.0 / self.recording.pose.weights.T:
+            at_start = np.interp(start, self.sample_t, variance)
+            at_end = np.interp(end, self.sample_t, variance)
+            means.append((at_start + at_end) / 2.0)
+        return np.asarray(1.0 / np.stack(means, axis=-1))
 
     @cached_property
     def pose_noise(self) -> tuple[float, float] | None:
@@ -111,36 +119,38 @@ class Drive:
     @cached_property
     def twists(self) -> "TwistIntervals":
         """Twists of the tracked body over spans long enough for motion to stand out from noise."""
+        if self.bursts is not None:
+            stride = 1
+            longest = 1.8 * self.bursts.period_s
+        else:
+            stride = self._find_stride()
+            longest = MAX_GAP_S
+        t = self.dated.t[::stride]
+        pose = self.dated.values[::stride]
+        span = np.diff(t)
+        usable = (span > 0.0) & (span < max(longest, 3.0 * float(np.median(span))))
+        moved = geometry.log(geometry.between(pose[:-1], pose[1:])[usable])
+        twist = moved / span[usable, None]
+        return TwistIntervals(t[:-1][usable], t[1:][usable], twist)
+
+    def _find_stride(self) -> int:
+        """Returns the number of steps of the pose over which motion stands out from its noise."""
         t = self.dated.t
         pose = self.dated.values
-        stride = 1
-        limit = MAX_GAP_S
-        if self.bursts is not None:
-            limit = 1.8 * self.bursts.period_s
-        else:
-            dt = float(np.median(np.diff(t)))
-            coarse = max(1, round(MAX_SPAN_S / dt))
-            far = geometry.log(
-                geometry.between(pose[:-coarse:coarse], pose[coarse::coarse])
-            )
-            far = far / (coarse * dt)
-            if len(far):
-                speed = float(np.sqrt((far[:, :2] ** 2).sum(axis=1).mean()))
-            else:
-                speed = 0.0
-            turn = float(np.sqrt((far[:, 2] ** 2).mean())) if len(far) else 0.0
-            both = zip(self.pose_noise or (0.0, 0.0), (speed, turn), strict=True)
-            needed = max(noise / max(SLOPE_NOISE * size, 1e-9) for noise, size in both)
-            stride = int(np.clip(np.ceil(np.sqrt(2.0) * needed / dt), 1, coarse))
-        t = t[::stride]
-        pose = pose[::stride]
-        span = np.diff(t)
-        usable = (span > 0.0) & (span < max(limit, 3.0 * float(np.median(span))))
-        twist = (
-            geometry.log(geometry.between(pose[:-1], pose[1:])[usable])
-            / span[usable, None]
+        dt = float(np.median(np.diff(t)))
+        longest = max(1, round(MAX_SPAN_S / dt))
+        moved = geometry.between(pose[:-longest:longest], pose[longest::longest])
+        twist = geometry.log(moved) / (longest * dt)
+        if not len(twist):
+            twist = np.zeros((1, 3))
+        speed = float(np.sqrt((twist[:, :2] ** 2).sum(axis=1).mean()))
+        turn = float(np.sqrt((twist[:, 2] ** 2).mean()))
+        position_noise, heading_noise = self.pose_noise or (0.0, 0.0)
+        needed_s = np.sqrt(2.0) * max(
+            position_noise / max(SLOPE_NOISE * speed, 1e-9),
+            heading_noise / max(SLOPE_NOISE * turn, 1e-9),
         )
-        return TwistIntervals(t[:-1][usable], t[1:][usable], twist)
+        return int(np.clip(np.ceil(needed_s / dt), 1, longest))
 
 
 @dataclass(frozen=True)

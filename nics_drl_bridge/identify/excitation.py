@@ -29,10 +29,7 @@ CONCENTRATIONS = 12
 FAR = 8.0  # an outlier is this many standard deviations of the bulk away
 LEAST = 1e-6  # rates below this, in SI units, are rounding errors and never outliers
 # percentiles that bound the usual range; jumps in 5 % of the rows lie outside
-USUAL = (
-    5.0,
-    95.0,
-)
+USUAL = (5.0, 95.0)
 MOST = 0.2  # a larger fraction of rows are not outliers but a misfit of the model
 # a value beyond its limits by this fraction of its range is a sensor fault
 BEYOND = 0.5
@@ -52,13 +49,11 @@ class Excitation:
     # variables that the drive never moved, so no term contains them
     unmoved: tuple[str, ...]
     together: tuple[str, ...]  # commands that moved, but were linearly dependent
-    levels: dict[str, int]  # number of different values of each command, at most 10
 
     @classmethod
     def of(cls, samples: Samples, spec: RobotSpec) -> "Excitation":
         """Computes the excitation from a drive's samples."""
-        together = commands_together(samples, spec)
-        return cls(unmoved_variables(samples, spec), together, levels(samples, spec))
+        return cls(unmoved_variables(samples, spec), commands_together(samples, spec))
 
 
 def unmoved_variables(samples: Samples, spec: RobotSpec) -> tuple[str, ...]:
@@ -92,17 +87,9 @@ def combinations(samples: Samples, spec: RobotSpec) -> Array:
     size, axes = np.linalg.svd(
         unit / np.linalg.norm(unit, axis=0), full_matrices=False
     )[1:]
-    found = np.zeros((np.count_nonzero(size <= TOGETHER), len(reach)))
-    found[:, moved] = axes[size <= TOGETHER]
-    return found
-
-
-def levels(samples: Samples, spec: RobotSpec) -> dict[str, int]:
-    """Returns the number of different values of each command; more than ten count as ten."""
-    columns = zip(spec.command, samples.x[:, len(spec.state) :].T, strict=True)
-    return {
-        c.name: min(10, len(np.unique(np.round(values, 9)))) for c, values in columns
-    }
+    constant = np.zeros((np.count_nonzero(size <= TOGETHER), len(reach)))
+    constant[:, moved] = axes[size <= TOGETHER]
+    return constant
 
 
 def independent_columns(chi: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -229,7 +216,6 @@ class CommandCoverage:
     high: float
     share: float  # fraction of the range that the robot's limits allow
     own: float  # fraction of its spread that the other commands do not explain
-    levels: int  # number of different values; more than ten count as ten
     fault: str  # why it can't be learnt; empty if it can
 
     def line(self) -> str:
@@ -260,33 +246,35 @@ def coverage(recording: Recording, spec: RobotSpec) -> tuple[CommandCoverage, ..
     command = row[np.searchsorted(t, grid, side="right") - 1]
     nothing = np.zeros((len(grid), 3))
     samples = samples_on_one_clock(grid, nothing, nothing[:, :0], command)
-    found = Excitation.of(samples, spec.model_copy(update={"state": ()}))
-    own = _own(samples.x)
-    low, high = np.percentile(command, ENDS, axis=0)
-    share = (high - low) / (spec.command_high - spec.command_low)
-    faults = dict.fromkeys(found.levels, "")
-    faults |= dict.fromkeys(found.together, "moved only together with others")
-    faults |= dict.fromkeys(found.unmoved, "never moved")
-    figures = zip(
-        spec.command, np.stack([low, high, share, own], axis=1).tolist(), strict=True
-    )
+    excited = Excitation.of(samples, spec.model_copy(update={"state": ()}))
+    faults = dict.fromkeys(excited.together, "moved only together with others")
+    faults |= dict.fromkeys(excited.unmoved, "never moved")
+    lowest, highest = np.percentile(command, ENDS, axis=0)
+    share = (highest - lowest) / (spec.command_high - spec.command_low)
+    own_share = _own(samples.x)
     return tuple(
         CommandCoverage(
-            c.name, c.unit, low, high, share, own, found.levels[c.name], faults[c.name]
+            c.name,
+            c.unit,
+            low=float(lowest[i]),
+            high=float(highest[i]),
+            share=float(share[i]),
+            own=float(own_share[i]),
+            fault=faults.get(c.name, ""),
         )
-        for c, (low, high, share, own) in figures
+        for i, c in enumerate(spec.command)
     )
 
 
 def _own(x: Array) -> Array:
     """Returns the fraction (C,) of each column's spread that is independent of the others."""
     centred = x - x.mean(axis=0)
-    own = np.zeros(x.shape[1])
+    shares = np.zeros(x.shape[1])
     for i, size in enumerate(np.linalg.norm(centred, axis=0)):
         others = np.delete(centred, i, axis=1)
         rest = (
             centred[:, i]
             - others @ np.linalg.lstsq(others, centred[:, i], rcond=None)[0]
         )
-        own[i] = np.linalg.norm(rest) / size if size > 0.0 else 0.0
-    return own
+        shares[i] = np.linalg.norm(rest) / size if size > 0.0 else 0.0
+    return shares

@@ -49,7 +49,8 @@ def parse_alpha(text: str) -> Alpha:
     if text == "auto":
         return "auto"
     with suppress(ValueError):
-        if 0.0 <= (value := float(text)) <= 1.0:
+        value = float(text)
+        if 0.0 <= value <= 1.0:
             return value
     raise ConfigError(f"alpha is {text!r}; it must be a number from 0 to 1, or auto.")
 
@@ -293,10 +294,12 @@ def prune_and_refit(
             coefficients[d, kept] = beta / spreads[kept]
             errors[d, kept] = beta_errors / spreads[kept]
         if needs_instruments and d >= TWIST_ROWS.stop:
-            found = _fit_by_instruments(regression, d, coefficients[d], len(spec.state))
-            if found is not None:
+            by_instruments = _fit_by_instruments(
+                regression, d, coefficients[d], len(spec.state)
+            )
+            if by_instruments is not None:
                 terms = np.flatnonzero(coefficients[d])
-                coefficients[d, terms], errors[d, terms] = found
+                coefficients[d, terms], errors[d, terms] = by_instruments
         conditions[d] = statistics.condition(features[:, kept])
     used = np.abs(coefficients).sum(axis=0) > 0.0
     model = TaylorModel(

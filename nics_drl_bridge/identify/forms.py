@@ -15,7 +15,7 @@ from nics_drl_bridge.identify import shooting
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.motion import as_smooth, half_width
-from nics_drl_bridge.identify.signals import taken
+from nics_drl_bridge.identify.signals import average_effect
 from nics_drl_bridge.identify.terms import fit_motion_terms, tells_lever_from_wheels
 from nics_drl_bridge.identify.yardstick import structure_of
 from nics_drl_bridge.recording.recording import Samples
@@ -66,18 +66,19 @@ class Candidate:
 
 def curve_of(samples: Samples, spec: RobotSpec, place: int) -> Candidate | None:
     """Returns the best curve of the command at an index; None if a straight line does as well."""
-    given = structure_of(spec)
+    structure = structure_of(spec)
     # components of the twist that it drives
-    acts = np.ones(3) if given is None else given[0][:, place]
-    twists = [
-        dof for v in spec.state if v.twist and acts[dof := POSE_RATES.index(v.twist)]
-    ]
-    found = [
-        f
-        for dof in twists
-        if (f := _of_component(samples, spec, place, dof)) is not None
-    ]
-    best = max(found, key=lambda each: each.gain, default=None)
+    acts = np.ones(3) if structure is None else structure[0][:, place]
+    best = None
+    for variable in spec.state:
+        if variable.twist is None:
+            continue
+        dof = POSE_RATES.index(variable.twist)
+        if not acts[dof]:
+            continue
+        candidate = _of_component(samples, spec, place, dof)
+        if candidate and (best is None or candidate.gain > best.gain):
+            best = candidate
     if best is None:
         return None
     needed = WORTH if best.drives else CLEAR
@@ -89,41 +90,39 @@ def _of_component(
 ) -> Candidate | None:
     command = samples.x[:, len(spec.state) :]
     twist = {v.twist: samples.x[:, i] for i, v in enumerate(spec.state) if v.twist}
-    target, speed = twist[POSE_RATES[dof]], twist.get("vx", np.zeros(len(samples.t)))
+    speed = twist.get("vx", np.zeros(len(samples.t)))
     stride = max(1, round(STRIDE_S / samples.dt))
+    target = twist[POSE_RATES[dof]][::stride]
     reach = np.array([command[:, place].min(), command[:, place].max()])
 
-    def left(dead: float, full: float) -> float:
-        curve = _curve("", reach, dead, full)
+    def measure_rest(dead: float, full: float) -> float:
+        """Returns the sum of squares that a curve leaves unexplained, at the best lag."""
+        effect = command.copy()
+        effect[:, place] = _curve("", reach, dead, full).of(command[:, place])
         least = np.inf
         for lag in LAGS_S:
-            columns = [np.ones(len(target))]
-            for c in range(command.shape[1]):
-                u = curve.of(command[:, c]) if c == place else command[:, c]
-                share = 1.0 - np.exp(-samples.dt / lag)
+            columns = [np.ones(len(speed))]
+            share = 1.0 - np.exp(-samples.dt / lag)
+            for u in effect.T:
                 low = scipy.signal.lfilter([share], [1.0, share - 1.0], u)
                 columns += [low] if dof == 0 else [low, low * speed]
             chi = np.stack(columns, axis=1)[::stride]
-            rest = (
-                target[::stride]
-                - chi @ np.linalg.lstsq(chi, target[::stride], rcond=None)[0]
-            )
+            rest = target - chi @ np.linalg.lstsq(chi, target, rcond=None)[0]
             least = min(least, float(rest @ rest))
         return least
 
-    plain = left(0.0, 1.0)
-    if plain < NOTHING**2 * len(target):
+    straight = measure_rest(0.0, 1.0)
+    if straight < NOTHING**2 * len(speed):
         return None
-    tries = [(left(0.0, full), 0.0, full) for full in FULL]
-    full = min(tries)[2]
-    tries += [(left(dead, full), dead, full) for dead in DEAD if dead < full]
-    least, dead, full = min(tries)
-    gain = 1.0 - least / plain
+    trials = [(measure_rest(0.0, full), 0.0, full) for full in FULL]
+    full = min(trials)[2]
+    trials += [(measure_rest(dead, full), dead, full) for dead in DEAD if dead < full]
+    least, dead, full = min(trials)
+    gain = 1.0 - least / straight
     if gain < WORTH:
         return None
-    return Candidate(
-        _curve(spec.command[place].name, reach, dead, full), gain, dof == 0
-    )
+    curve = _curve(spec.command[place].name, reach, dead, full)
+    return Candidate(curve, gain, dof == 0)
 
 
 def _curve(name: str, reach: Array, dead: float, full: float) -> InputCurve:
@@ -166,7 +165,7 @@ class Form:
         curves = {c.command: c for c in self.curves}
         for name, _ in self.delays:
             curves.setdefault(name, InputCurve(command=name))
-        found = (
+        curves_now = (
             InputCurve(
                 command=name,
                 dead=max(at.get(f"{name}.dead", c.dead), 0.0),
@@ -177,7 +176,7 @@ class Form:
             )
             for name, c in curves.items()
         )
-        return tuple(c for c in found if c != InputCurve(command=c.command))
+        return tuple(c for c in curves_now if c != InputCurve(command=c.command))
 
     def actuated(
         self, model: TaylorModel, inputs: shooting.Inputs, values: Array
@@ -191,15 +190,15 @@ class Form:
             [-at.get(f"{n}.fall", np.inf), at.get(f"{n}.rise", np.inf)] for n in states
         ]
         commands = model.variables[model.state_size :]
-        emf = [
-            [max(at.get(f"{s}.back_emf.{c}", 0.0), 0.0) for c in commands]
-            for s in states
-        ]
+        emf = np.zeros((len(states), len(commands)))
+        for i, state in enumerate(states):
+            for j, command in enumerate(commands):
+                emf[i, j] = max(at.get(f"{state}.back_emf.{command}", 0.0), 0.0)
         return replace(
             model,
             friction=np.array(friction),
             drag=np.array(drag),
-            back_emf=np.array(emf),
+            back_emf=emf,
             limits=np.array(limits).reshape(-1, 2),
         )
 
@@ -219,7 +218,7 @@ def problem_of(
 
     @lru_cache(maxsize=8)  # most values of a form do not affect the commands
     def late(latency: float, curves: tuple[InputCurve, ...]) -> Array:
-        return taken(command, spec, curves, t - latency, t - latency + dt)
+        return average_effect(command, spec, curves, t - latency, t - latency + dt)
 
     def commands(values: Array) -> Array:
         return late(form.latency_at(inputs, values), form.curves_at(inputs, values))
@@ -228,9 +227,8 @@ def problem_of(
         return form.actuated(model, inputs, values)
 
     def trust(start: Array, end: Array) -> Array:
-        return drive.trust(
-            *(each - calibration.clock_offset_s for each in (start, end))
-        )
+        offset = calibration.clock_offset_s
+        return drive.trust(start - offset, end - offset)
 
     noise, _ = drive.pose_noise or (0.0, 0.0)
     return shooting.Shooting(samples, commands, shaped, trust, not spec.state, noise)
@@ -246,16 +244,13 @@ def inputs_of(
         size = float(np.percentile(np.abs(rates[name]), STRONG))
         rows[f"{name}.friction"] = (0.1 * size, 0.1 * size, 0.0, size)
     for name in form.drag:
-        value = samples.x[:, [v.name for v in drive.spec.state].index(name)]
-        size = float(
-            np.percentile(np.abs(rates[name]), STRONG) / max(np.mean(value**2), 1e-3)
-        )
+        value = samples.x[:, drive.spec.variable_names.index(name)]
+        strong = float(np.percentile(np.abs(rates[name]), STRONG))
+        size = strong / max(float(np.mean(value**2)), 1e-3)
         rows[f"{name}.drag"] = (0.1 * size, 0.1 * size, 0.0, size)
         for place in list_driving_commands(drive.spec):
             effect = np.abs(samples.x[:, len(drive.spec.state) + place] * value)
-            size = float(
-                np.percentile(np.abs(rates[name]), STRONG) / max(effect.mean(), 1e-3)
-            )
+            size = strong / max(float(effect.mean()), 1e-3)
             key = f"{name}.back_emf.{drive.spec.command[place].name}"
             rows[key] = (0.1 * size, 0.1 * size, 0.0, size)
     for name in form.limits:
@@ -288,21 +283,12 @@ def _rows_of_commands(
         size = max(abs(curve.least), abs(curve.most))
         if np.isfinite(size):
             step = CURVE_SCALE * size
-            rows |= {
-                f"{name}.dead": (
-                    curve.dead,
-                    step,
-                    0.0,
-                    0.5 * size if curve.dead else 0.0,
-                ),
-                f"{name}.least": (
-                    curve.least,
-                    step,
-                    1.5 * curve.least,
-                    0.5 * curve.least,
-                ),
-                f"{name}.most": (curve.most, step, 0.5 * curve.most, 1.5 * curve.most),
-            }
+            widest = 0.5 * size if curve.dead else 0.0
+            least = curve.least
+            most = curve.most
+            rows[f"{name}.dead"] = (curve.dead, step, 0.0, widest)
+            rows[f"{name}.least"] = (least, step, 1.5 * least, 0.5 * least)
+            rows[f"{name}.most"] = (most, step, 0.5 * most, 1.5 * most)
         if name in form.back:
             rows[f"{name}.back"] = (curve.back, BACK_SCALE, *BACK_RANGE)
     return rows
@@ -312,22 +298,24 @@ def two_way(drive: Drive, samples: Samples) -> tuple[InputCurve, ...]:
     """Returns neutral curves of commands that drive the robot both ways."""
     spec = drive.spec
     command = samples.x[:, len(spec.state) :]
-    found = []
+    curves = []
     for place in list_driving_commands(spec):
-        reach = command[:, place]
-        if min((reach < 0.0).mean(), (reach > 0.0).mean()) > TWO_WAY:
-            low = float(reach.min())
-            high = float(reach.max())
-            found.append(
-                InputCurve(command=spec.command[place].name, least=low, most=high)
-            )
-    return tuple(found)
+        name = spec.command[place].name
+        sent = command[:, place]
+        if min((sent < 0.0).mean(), (sent > 0.0).mean()) > TWO_WAY:
+            least = float(sent.min())
+            most = float(sent.max())
+            curves.append(InputCurve(command=name, least=least, most=most))
+    return tuple(curves)
 
 
 def list_driving_commands(spec: RobotSpec) -> tuple[int, ...]:
     """Returns the indices of the commands that drive a robot ahead, according to its textbook."""
-    given = structure_of(spec)
-    return () if given is None else tuple(np.flatnonzero(given[0][0]).tolist())
+    structure = structure_of(spec)
+    if structure is None:
+        return ()
+    moves, _ = structure
+    return tuple(np.flatnonzero(moves[0]).tolist())
 
 
 def with_dead(form: Form, drive: Drive, samples: Samples) -> Form:
@@ -346,10 +334,10 @@ def with_dead(form: Form, drive: Drive, samples: Samples) -> Form:
 
 def with_back(form: Form, curves: tuple[InputCurve, ...]) -> Form:
     """Returns a form in which the commands of curves have separate reverse gains."""
-    more = tuple(c for c in curves if c.command not in {c.command for c in form.curves})
-    return replace(
-        form, curves=form.curves + more, back=tuple(c.command for c in curves)
-    )
+    curved = {curve.command for curve in form.curves}
+    more = tuple(curve for curve in curves if curve.command not in curved)
+    back = tuple(curve.command for curve in curves)
+    return replace(form, curves=form.curves + more, back=back)
 
 
 def reached(
@@ -371,15 +359,14 @@ def reached(
         least = float(sent[:, place].min())
         most = float(sent[:, place].max())
         beyond = NEAR_END * max(-least, most)
-        curve = curve.model_copy(
-            update={
-                "least": curve.least if least < curve.least - beyond else -np.inf,
-                "most": curve.most if most > curve.most + beyond else np.inf,
-            }
-        )
-        low[model.state_size + place], high[model.state_size + place] = curve.of(
-            [least, most]
-        )
+        ends = {}
+        if not least < curve.least - beyond:
+            ends["least"] = -np.inf
+        if not most > curve.most + beyond:
+            ends["most"] = np.inf
+        curve = curve.model_copy(update=ends)
+        row = model.state_size + place
+        low[row], high[row] = curve.of([least, most])
         if curve != InputCurve(command=curve.command):
             curves.append(curve)
     free = replace(
@@ -387,21 +374,20 @@ def reached(
     )
     asked = free.rates(samples.x)[:, 3:]
     for i, name in enumerate(model.variables[: model.state_size]):
-        fall, rise = (errors.get(f"{name}.{word}", 0.0) for word in ("fall", "rise"))
-        if not np.percentile(asked[:, i], SELDOM) < limits[i, 0] < -fall:
+        lowest, highest = np.percentile(asked[:, i], (SELDOM, 100.0 - SELDOM))
+        if not lowest < limits[i, 0] < -errors.get(f"{name}.fall", 0.0):
             limits[i, 0] = -np.inf
-        if not np.percentile(asked[:, i], 100.0 - SELDOM) > limits[i, 1] > rise:
+        if not highest > limits[i, 1] > errors.get(f"{name}.rise", 0.0):
             limits[i, 1] = np.inf
     return replace(model, inputs=tuple(curves), low=low, high=high, limits=limits)
 
 
 def likely_delay(drive: Drive, calibration: Calibration, samples: Samples) -> float:
     """Returns the delay [s] of the commands that best explains the rates of the state."""
-    tries, late = _delayed(drive, calibration, samples)
+    trials, late = _delayed(drive, calibration, samples)
     left = [_left(drive.spec, samples, command) for command in late]
-    found = np.isfinite(left).all()
-    if found:
-        return float(tries[int(np.argmin(left))])
+    if np.isfinite(left).all():
+        return float(trials[int(np.argmin(left))])
     return calibration.command_latency_s
 
 
@@ -409,17 +395,17 @@ def likely_delays(
     drive: Drive, calibration: Calibration, samples: Samples
 ) -> tuple[tuple[str, float], ...]:
     """Returns the delay of each command separately, given the others; empty if they are alike."""
-    tries, late = _delayed(drive, calibration, samples)
-    now = int(np.abs(tries - calibration.command_latency_s).argmin())
-    found = []
+    trials, late = _delayed(drive, calibration, samples)
+    now = int(np.abs(trials - calibration.command_latency_s).argmin())
+    delays = {}
     for place, command in enumerate(drive.spec.command):
-        mixed = np.repeat(late[now][None], len(tries), axis=0)
+        mixed = np.repeat(late[now][None], len(trials), axis=0)
         mixed[..., place] = late[..., place]
-        left = [_left(drive.spec, samples, each) for each in mixed]
+        left = [_left(drive.spec, samples, trial) for trial in mixed]
         if np.ptp(left) > 0.0 and np.isfinite(left).all():
-            found.append((command.name, float(tries[int(np.argmin(left))])))
-    if np.ptp([delay for _, delay in found] or [0.0]) > ALIKE_S:
-        return tuple(found)
+            delays[command.name] = float(trials[int(np.argmin(left))])
+    if delays and np.ptp(list(delays.values())) > ALIKE_S:
+        return tuple(delays.items())
     return ()
 
 
@@ -431,14 +417,15 @@ def _delayed(
     now = calibration.command_latency_s
     inputs = inputs_of(drive, now, samples, form)
     problem = problem_of(drive, calibration, samples, form, inputs)
-    one_clock = drive.recording.pose.clock == drive.recording.command.clock
-    tries = np.arange(0.0, LONGEST_S, DELAY_STEP_S) - (
-        0.0 if one_clock else LONGEST_S / 2.0
-    )
-    late = [problem.commands(np.append(delay, inputs.start[1:])) for delay in tries]
-    return tries, np.array(
-        [as_smooth(each, samples.dt, half_width(drive)) for each in late]
-    )
+    trials = np.arange(0.0, LONGEST_S, DELAY_STEP_S)
+    if drive.recording.pose.clock != drive.recording.command.clock:
+        trials = trials - LONGEST_S / 2.0
+    width = half_width(drive)
+    late = []
+    for delay in trials:
+        command = problem.commands(np.append(delay, inputs.start[1:]))
+        late.append(as_smooth(command, samples.dt, width))
+    return trials, np.array(late)
 
 
 def _left(spec: RobotSpec, samples: Samples, command: Array) -> float:
@@ -446,8 +433,5 @@ def _left(spec: RobotSpec, samples: Samples, command: Array) -> float:
     states = len(spec.state)
     free = [3 + i for i, v in enumerate(spec.state) if v.twist] or [0, 2]
     x = np.concatenate([samples.x[:, :states], command], axis=1)
-    return float(
-        (
-            1.0 - fit_motion_terms(replace(samples, x=x), spec, DELAY_ORDER).r2[free]
-        ).sum()
-    )
+    fit = fit_motion_terms(replace(samples, x=x), spec, DELAY_ORDER)
+    return float((1.0 - fit.r2[free]).sum())

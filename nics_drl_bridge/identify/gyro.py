@@ -33,20 +33,19 @@ def turned_by_gyro(recording: Recording) -> Recording:
     if recording.imu is None or recording.gyro is not None:
         return recording
     if recording.imu.clock != recording.pose.clock:
-        told = "The gyro is on another clock than the pose, so it was not compared with it."
-        return replace(recording, repairs=(*recording.repairs, told))
-    turning = _compared(recording)
-    if turning is None:
+        sentence = "The gyro is on another clock than the pose, so it was not compared with it."
+        return replace(recording, repairs=(*recording.repairs, sentence))
+    pose = recording.pose
+    gyro_t = recording.imu.t
+    yaw_rate = recording.imu.values[:, 2]
+    turning = compare_turning(pose.t, pose.values, gyro_t, yaw_rate)
+    if turning is None or not turning.compared:
         return recording
     sentences = tuple(_about(recording, turning))
     if not _fits(recording, turning):
         return replace(recording, repairs=(*recording.repairs, *sentences))
-    pose = recording.pose
     if recording.measured_by == "odometry" and turning.contradicts:
-        yaw_rate = recording.imu.values[:, 2]
-        turned, covered = turn_by_gyro(
-            pose.t, pose.values, recording.imu.t, yaw_rate, turning
-        )
+        turned, covered = turn_by_gyro(pose.t, pose.values, gyro_t, yaw_rate, turning)
         if covered < LEAST_COVERED:
             sentences = (
                 f"The gyro covers only {covered:.0%} of the drive, so the heading is that of "
@@ -84,16 +83,6 @@ def relative_to(recording: Recording) -> str:
         "That is relative to the recorded pose; nothing here shows whether it is odometry, which "
         "drifts."
     )
-
-
-def _compared(recording: Recording) -> Turning | None:
-    """Compares pose and gyro; None if they can't be compared."""
-    pose = recording.pose
-    imu = recording.imu
-    if imu is None:
-        return None
-    turning = compare_turning(pose.t, pose.values, imu.t, imu.values[:, 2])
-    return turning if turning is not None and turning.compared else None
 
 
 def _fits(recording: Recording, turning: Turning) -> bool:
@@ -150,12 +139,16 @@ def _about(recording: Recording, turning: Turning) -> Iterator[str]:
             f"displacements along the heading of the gyro, whose {bias}."
         )
         return
+    times = f"{_factor(turning)} times as far"
+    if recording.measured_by == "":
+        yield (
+            f"The gyro contradicts the pose {differ}: the pose turns {times}. If it is odometry, "
+            "write `measured_by: odometry` below `pose:`, and the gyro will turn it."
+        )
+        return
     yield (
-        f"The gyro contradicts the pose {differ}: the pose turns {_factor(turning)} times as far. "
-        "If it is odometry, write `measured_by: odometry` below `pose:`, and the gyro will turn it."
-        if recording.measured_by == ""
-        else f"The gyro contradicts the tracker {differ}: the tracker turns {_factor(turning)} "
-        "times as far; check the gyro's scale and mounting."
+        f"The gyro contradicts the tracker {differ}: the tracker turns {times}; check the gyro's "
+        "scale and mounting."
     )
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.excitation import unmoved_variables
 from nics_drl_bridge.identify.fit import Order
+from nics_drl_bridge.identify.open_loop import HORIZON_S
 from nics_drl_bridge.identify.statistics import CERTAIN, clustered_errors
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.curve import InputCurve
@@ -28,10 +30,10 @@ SPACING_S = 0.5
 EVALUATIONS = 25
 BASE_ORDER = 3
 BASE_EVALUATIONS = 100
-HORIZON_S = 5.0
 NOTHING = 1e-4  # m, rad: size below which a removed part of a mounting counts as zero
 LONGEST_LAG_S = 2.0  # a state that takes longer is coasting, so it hides no latency
 BANDS_S = (0.5, 1.0, 2.0, HORIZON_S)
+UNSEEN = f"predictions over {HORIZON_S:g} s of parts that a fit did not see"
 
 # (order, 0 for the textbook's terms alone; pull towards these)
 Hypothesis = tuple[int, float]
@@ -52,7 +54,7 @@ class Trial:
     def level(self) -> float:
         """Geometric mean of the mean errors over all horizons that fit; infinite if none does."""
         # Short horizons show best what drives a robot, long ones where it ends up.
-        means = [float(each.mean()) for each in self.errors.values() if len(each)]
+        means = [float(far.mean()) for far in self.errors.values() if len(far)]
         return float(np.exp(np.mean(np.log(means)))) if means else np.inf
 
 
@@ -69,16 +71,17 @@ class Draft:
         self, inside: terms.Mask | None = None, other: TaylorModel | None = None
     ) -> shooting.Predictive:
         """Fits the textbook's terms, gains and lags; the search may start at another model."""
-        samples = self.problem.samples
         spec = self.spec
-        samples = samples if inside is None else samples.rows(inside)
+        samples = self.problem.samples
+        if inside is not None:
+            samples = samples.rows(inside)
         allowed = partial(terms.select_textbook_terms, tyres=self.form.tyres)
         model = terms.fit_motion_terms(samples, spec, BASE_ORDER, allowed).model
-        model, first = (
-            (model, None) if other is None else terms.merge_terms(model, other)
-        )
+        first = None
+        if other is not None:
+            model, first = terms.merge_terms(model, other)
         free = (model.coefficients != 0.0) & ~terms.select_defined_dofs(spec)[:, None]
-        found = shooting.fitted(
+        fitted = shooting.fitted(
             self.problem,
             model,
             free,
@@ -87,7 +90,7 @@ class Draft:
             BASE_EVALUATIONS,
             first=first,
         )
-        return replace(found, model=terms.stabilise(found.model, spec))
+        return replace(fitted, model=terms.stabilise(fitted.model, spec))
 
     def refined(
         self,
@@ -99,16 +102,15 @@ class Draft:
     ) -> shooting.Predictive:
         """Adjusts the terms of a linear fit, and those of a base that they are pulled towards."""
         base, first = terms.merge_terms(base, linear)
-        free = (
-            (base.coefficients != 0.0) | (first != 0.0)
-        ) & ~terms.select_defined_dofs(self.spec)[:, None]
+        free = (base.coefficients != 0.0) | (first != 0.0)
+        free &= ~terms.select_defined_dofs(self.spec)[:, None]
         return shooting.fitted(
             self.problem, base, free, self.inputs, inside, evaluations, pull, first
         )
 
-    def error_of(self, found: shooting.Predictive) -> float:
+    def error_of(self, predictive: shooting.Predictive) -> float:
         """Returns the mean distance of predicted from measured ends, over all horizons [m]."""
-        error = self.problem.errors(found.model, found.values)[0]
+        error = self.problem.errors(predictive.model, predictive.values)[0]
         return float(np.nanmean(np.hypot(error[..., 0], error[..., 1])))
 
     def tried(self, asked: tuple[Hypothesis, ...]) -> tuple[Trial, ...]:
@@ -121,34 +123,29 @@ class Draft:
         everything = np.arange(len(samples.t))
         unmoved = unmoved_variables(samples, self.spec)
         problem = replace(self.problem, spacing_s=SPACING_S, fixed=values)
-        given = replace(self, problem=problem, inputs=shooting.NOTHING_FREE)
-        errors: dict[Hypothesis, list[Array]] = {hypothesis: [] for hypothesis in asked}
-        paths = [np.zeros((0, len(BANDS_S)))]
+        fixed = replace(self, problem=problem, inputs=shooting.NOTHING_FREE)
+        nothing = np.zeros((0, len(BANDS_S)))
+        distances = dict.fromkeys(asked, nothing)  # (W, H) of ends
+        paths = nothing  # (W, H)
         judge = replace(problem, horizons=BANDS_S)
         for block in np.array_split(everything, FOLDS):
-            left = np.isin(everything, block)
-            if unmoved_variables(samples.rows(~left), self.spec) != unmoved:
+            unseen = np.isin(everything, block)
+            if unmoved_variables(samples.rows(~unseen), self.spec) != unmoved:
                 continue
-            for hypothesis, model in given.models(asked, ~left):
-                error, path = judge.errors(model, values, left)
-                errors[hypothesis].append(np.hypot(error[..., 0], error[..., 1]))
-            paths.append(path)
-        path = np.concatenate(paths)[:, -1]
-        length = float(path[~np.isnan(path)].sum())
-        return tuple(
-            Trial(
-                *hypothesis,
-                float(np.nansum(far[:, -1])) / length if length else np.nan,
-                {
-                    h: each[~np.isnan(each)]
-                    for h, each in zip(BANDS_S, far.T, strict=True)
-                },
-            )
-            for hypothesis, blocks in errors.items()
-            for far in [
-                np.concatenate(blocks) if blocks else np.zeros((0, len(BANDS_S)))
-            ]
-        )
+            for hypothesis, model in fixed.models(asked, ~unseen):
+                error, path = judge.errors(model, values, unseen)
+                far = np.hypot(error[..., 0], error[..., 1])
+                distances[hypothesis] = np.concatenate([distances[hypothesis], far])
+            paths = np.concatenate([paths, path])
+        longest = paths[:, -1]
+        length = float(longest[~np.isnan(longest)].sum())
+        trials = []
+        for (order, pull), far in distances.items():
+            share = float(np.nansum(far[:, -1])) / length if length else np.nan
+            columns = zip(BANDS_S, far.T, strict=True)
+            errors = {h: column[~np.isnan(column)] for h, column in columns}
+            trials.append(Trial(order, pull, share, errors))
+        return tuple(trials)
 
     def models(
         self, asked: tuple[Hypothesis, ...], inside: terms.Mask
@@ -156,18 +153,16 @@ class Draft:
         """Yields the model of each hypothesis, fitted to the rows inside (T,)."""
         samples = self.problem.samples.rows(inside)
         base = self.base(inside).model
-        orders = {order for order, _ in asked if order}
-        linear = {
-            order: terms.fit_motion_terms(samples, self.spec, order).model
-            for order in orders
-        }
+        linear: dict[int, TaylorModel] = {}
         for order, pull in asked:
-            found = base
-            if order:
-                found = self.refined(
-                    base, linear[order], inside, EVALUATIONS, pull
-                ).model
-            yield (order, pull), found
+            if not order:
+                yield (order, pull), base
+                continue
+            if order not in linear:
+                fit = terms.fit_motion_terms(samples, self.spec, order)
+                linear[order] = fit.model
+            refined = self.refined(base, linear[order], inside, EVALUATIONS, pull)
+            yield (order, pull), refined.model
 
 
 @dataclass(frozen=True)
@@ -183,7 +178,7 @@ def base_of(
     calibration: Calibration,
     samples: Samples,
     clear: tuple[InputCurve, ...] = (),
-    known: Base | None = None,
+    former: Base | None = None,
 ) -> Base:
     """Fits the textbook with and without each part of a form; keeps what improves predictions.
 
@@ -192,36 +187,38 @@ def base_of(
 
     def fitted(form: forms.Form, before: Base | None = None) -> Base:
         inputs = forms.inputs_of(drive, calibration.command_latency_s, samples, form)
-        inputs = inputs.begun_at(before.draft.inputs) if before else inputs
+        first = None
+        if before is not None:
+            inputs = inputs.begun_at(before.draft.inputs)
+            first = before.found.model
         problem = forms.problem_of(drive, calibration, samples, form, inputs)
         draft = Draft(drive.spec, form, inputs, replace(problem, spacing_s=SPACING_S))
-        found = draft.base(other=before.found.model if before else None)
-        inputs = replace(inputs, start=found.values)
-        return Base(replace(draft, inputs=inputs, problem=problem), found)
+        predictive = draft.base(other=first)
+        inputs = replace(inputs, start=predictive.values)
+        return Base(replace(draft, inputs=inputs, problem=problem), predictive)
 
     def error_of(base: Base) -> float:
         return base.draft.tried((TEXTBOOK,))[0].level
 
-    if known is not None:
-        return fitted(replace(known.draft.form, curves=calibration.inputs))
+    if former is not None:
+        return fitted(replace(former.draft.form, curves=calibration.inputs))
     best = fitted(forms.Form(calibration.inputs))
     error = error_of(best)
     if len(calibration.inputs) > len(clear):
         plain = fitted(forms.Form(clear))
-        # the drive is too short to judge
-        other = error_of(plain)
-        if other < error or np.isinf(other):
+        plain_error = error_of(plain)
+        if plain_error < error or np.isinf(plain_error):  # too short to judge
             best = plain
-            error = other
+            error = plain_error
     for change, worth in changes(drive, calibration, samples):
         form = change(best.draft.form)
         if form == best.draft.form:
             continue
-        base = fitted(form, best)
-        other = error_of(base)
-        if other < worth * error:
-            best = base
-            error = other
+        changed = fitted(form, best)
+        changed_error = error_of(changed)
+        if changed_error < worth * error:
+            best = changed
+            error = changed_error
     return best
 
 
@@ -258,16 +255,15 @@ def changes(
 def hypotheses(order: Order) -> tuple[Hypothesis, ...]:
     """Returns the hypotheses for an order, from the most constrained to the least."""
     orders = ORDERS if order == "auto" else (order,)
-    return (TEXTBOOK, *((o, pull) for o in orders for pull in PULLS))
+    return (TEXTBOOK, *product(orders, PULLS))
 
 
 def chosen(trials: Sequence[Trial], order: Order = "auto") -> Trial:
     """Returns the first trial that no other clearly improves on; of one `order` if given."""
-    asked = [trial for trial in trials if order in ("auto", trial.order)] or list(
-        trials
-    )
-    best = asked[0]
-    for trial in asked[1:]:
+    eligible = [trial for trial in trials if order in ("auto", trial.order)]
+    eligible = eligible or list(trials)
+    best = eligible[0]
+    for trial in eligible[1:]:
         if trial.error < WORTH * best.error:
             best = trial
     return best
@@ -275,49 +271,54 @@ def chosen(trials: Sequence[Trial], order: Order = "auto") -> Trial:
 
 def lags_of(model: TaylorModel, spec: RobotSpec) -> dict[str, float]:
     """Returns the lags [s] by which a base's states follow, by name, plus their own delays."""
-    alone = model.powers.sum(axis=1) == 1
-    found = {}
+    is_linear = model.powers.sum(axis=1) == 1
+    lags = {}
     delays = model.delays[model.drivers]
     for i, variable in enumerate(spec.state):
-        rate = float(model.coefficients[3 + i, alone & (model.powers[:, i] == 1)].sum())
+        term = is_linear & (model.powers[:, i] == 1)
+        rate = float(model.coefficients[3 + i, term].sum())
         if variable.twist and rate * LONGEST_LAG_S < -1.0:
-            found[variable.name] = float(delays[i]) - 1.0 / rate
-    return found
+            lags[variable.name] = float(delays[i]) - 1.0 / rate
+    return lags
 
 
 def about_lags(latency: float, lags: dict[str, float], beside: float) -> str:
     """States that only the sum of latency [s] and lags is known; `beside` was found with lags."""
     # A model with one lag treats the second lag of a servo as latency.
     sums = ", ".join(f"{beside + lag:.3f} s for {name}" for name, lag in lags.items())
-    return f"Latency ({latency:.3f} s) can't be told from the lags: trust their sums, {sums}."
+    return f"Latency ({latency:.3f} s) can't be separated from the lags: trust their sums, {sums}."
 
 
-def standard_errors(found: shooting.Predictive) -> Array:
+def standard_errors(predictive: shooting.Predictive) -> Array:
     """Returns standard errors (D, K) of the free coefficients; NaN for the others."""
     span = max(shooting.HORIZONS_S)
-    cluster = np.floor((found.starts - found.starts.min()) / span).astype(np.intp)
-    errors = np.full(found.free.shape, np.nan)
-    errors[found.free] = clustered_errors(found.jacobian, found.residual, cluster)
+    cluster = np.floor((predictive.starts - predictive.starts.min()) / span).astype(
+        np.intp
+    )
+    errors = np.full(predictive.free.shape, np.nan)
+    errors[predictive.free] = clustered_errors(
+        predictive.jacobian, predictive.residual, cluster
+    )
     return errors
 
 
 def with_certain_mounting(
-    draft: Draft, calibration: Calibration, found: shooting.Predictive
+    draft: Draft, calibration: Calibration, predictive: shooting.Predictive
 ) -> Draft | None:
     """Returns a draft without the parts of its mounting below 3 standard errors; None if all stay.
 
     Removed parts are zero in the calibration that `remounted` returns.
     """
-    sigma = found.value_errors[-3:]
-    total = geometry.compose(found.values[-3:], calibration.mounting)
+    sigma = predictive.value_errors[-3:]
+    total = geometry.compose(predictive.values[-3:], calibration.mounting)
     doubtful = (np.abs(total) < CERTAIN * sigma) & (total != 0.0)
     if not doubtful.any():
         return None
-    known = calibration.mounting
-    rest = found.values[-3:].copy()
+    mounting = calibration.mounting
+    rest = predictive.values[-3:].copy()
     if doubtful[2]:
-        rest[2] = -known[2]
-    aside = geometry.rotate(known[:2], float(rest[2]))
+        rest[2] = -mounting[2]
+    aside = geometry.rotate(mounting[:2], float(rest[2]))
     rest[:2] = np.where(doubtful[:2], -aside, rest[:2])
     inputs = draft.inputs
     start = inputs.start.copy()
@@ -330,16 +331,17 @@ def with_certain_mounting(
     return replace(draft, inputs=replace(inputs, start=start, low=low, high=high))
 
 
-def remounted(calibration: Calibration, found: shooting.Predictive) -> Calibration:
+def remounted(calibration: Calibration, predictive: shooting.Predictive) -> Calibration:
     """Adds the mounting found by predictions to that of the calibration."""
     x, y, heading = map(
-        float, geometry.compose(found.values[-3:], calibration.mounting)
+        float, geometry.compose(predictive.values[-3:], calibration.mounting)
     )
     names = ("lever_arm_x_m", "lever_arm_y_m", "rotation_rad")
-    errors = zip(names, map(float, found.value_errors[-3:]), strict=True)
+    errors = zip(names, map(float, predictive.value_errors[-3:]), strict=True)
     sigma = {name: error for name, error in errors if not np.isnan(error)}
-    y = y if "lever_arm_y_m" in sigma else calibration.lever_arm_m[1]
-    x, y, heading = (0.0 if abs(each) < NOTHING else each for each in (x, y, heading))
+    if "lever_arm_y_m" not in sigma:
+        y = calibration.lever_arm_m[1]
+    x, y, heading = (0.0 if abs(part) < NOTHING else part for part in (x, y, heading))
     return replace(
         calibration,
         rotation_rad=-heading,
@@ -350,34 +352,39 @@ def remounted(calibration: Calibration, found: shooting.Predictive) -> Calibrati
 
 def about_orders(trials: Sequence[Trial]) -> Iterator[str]:
     """Yields a sentence if the order is higher than usual."""
-    if trials and (best := chosen(list(trials))) is not trials[0]:
-        errors = ", ".join(
-            f"{trial.error:.1%} by order {trial.order}" for trial in trials
-        )
-        finding = f"The model has terms up to order {best.order}"
-        unseen = f"predictions over {HORIZON_S:g} s of parts that a fit did not see"
-        yield f"{finding}: {unseen} end {errors} of the path away."
+    if not trials or chosen(trials) is trials[0]:
+        return
+    errors = ", ".join(f"{trial.error:.1%} by order {trial.order}" for trial in trials)
+    finding = f"The model has terms up to order {chosen(trials).order}"
+    yield f"{finding}: {UNSEEN} end {errors} of the path away."
 
 
 def about_forms(base: Base, trials: Sequence[Trial], order: Order) -> Iterator[str]:
     """Lists what a motion model has besides the textbook's terms, and how much that improves it."""
-    form = base.draft.form
     best = chosen(trials, order)
+    if not np.isfinite(best.error):
+        return
+    form = base.draft.form
     parts = [
         f"an input curve of {curve.command}" for curve in form.curves if curve.bends
     ]
-    parts += ["a delay of each command"] * bool(form.delays)
-    words = (
-        ("drag and back-EMF", form.drag),
-        ("dry friction", form.friction),
-        ("limits", form.limits),
-    )
-    parts += [f"{word} of {', '.join(names)}" for word, names in words if names]
-    parts += ["tyres that slip"] * form.tyres
-    shares = f"{trials[0].error:.1%} of the path away" + " by that" * (best.order > 0)
-    shares += f", {best.error:.1%} with the terms" * (best.order > 0)
-    named = f"The model is the textbook{' with ' * bool(parts)}{', '.join(parts)}"
-    named += f", and terms up to order {best.order}" * (best.order > 0)
-    if np.isfinite(best.error):
-        unseen = f"predictions over {HORIZON_S:g} s of parts that a fit did not see"
-        yield f"{named}: {unseen} end {shares}."
+    if form.delays:
+        parts.append("a delay of each command")
+    effects = {
+        "drag and back-EMF": form.drag,
+        "dry friction": form.friction,
+        "limits": form.limits,
+    }
+    for effect, names in effects.items():
+        if names:
+            parts.append(f"{effect} of {', '.join(names)}")
+    if form.tyres:
+        parts.append("tyres that slip")
+    finding = "The model is the textbook"
+    if parts:
+        finding += f" with {', '.join(parts)}"
+    shares = f"{trials[0].error:.1%} of the path away"
+    if best.order > 0:
+        finding += f", and terms up to order {best.order}"
+        shares += f" by that, {best.error:.1%} with the terms"
+    yield f"{finding}: {UNSEEN} end {shares}."

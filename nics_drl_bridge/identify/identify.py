@@ -53,6 +53,7 @@ from nics_drl_bridge.identify.judgement import (
     bands_of,
     bands_of_fixed,
     judged,
+    measure_distances,
     textbook_of,
 )
 from nics_drl_bridge.identify.motion_fit import fit_motion, refine_motion
@@ -207,13 +208,6 @@ class Identified:
         return self.drive.settings.train_until_s
 
     @property
-    def coverage(self) -> dict[float, float]:
-        """Fraction of held-out ends within the 95 % band of predictions, by horizon [s]."""
-        return {
-            e.horizon_s: e.coverage for e in self.judgement if e.coverage is not None
-        }
-
-    @property
     def judgement(self) -> tuple[HorizonErrors, ...]:
         """Errors on held-out data, compared with those of yardsticks, by horizon."""
         return self.findings.judgement
@@ -319,21 +313,21 @@ def estimate_timing(drive: Drive, findings: Findings) -> Findings:
     responses: tuple[Response, ...] = ()
     if motions.by_motion(spec, drive.recording):
         by_command = replace(training, spec=motions.surrogate(spec))
-        found = timings.timing_of(by_command)
-        responses, found = _select_followers(spec, found)
+        timing = timings.timing_of(by_command)
+        responses, timing = _select_followers(spec, timing)
     else:
-        found = followers.apart(training, timings.timing_of(training))
+        timing = followers.apart(training, timings.timing_of(training))
     calibration = replace(
         findings.calibration,
         responses=responses,
-        uncertainty=found.sigma,
-        inputs=followers.late_inputs(spec, found),
-        limits=followers.limits_of(spec, found),
-        clock_offset_s=found.offset,
-        command_latency_s=found.latency,
+        uncertainty=timing.sigma,
+        inputs=followers.late_inputs(spec, timing),
+        limits=followers.limits_of(spec, timing),
+        clock_offset_s=timing.offset,
+        command_latency_s=timing.latency,
         burst_period_s=training.bursts.period_s if training.bursts else 0.0,
     )
-    return replace(findings, timing=found, calibration=calibration)
+    return replace(findings, timing=timing, calibration=calibration)
 
 
 def _select_followers(
@@ -346,12 +340,12 @@ def _select_followers(
     names = [c.name for c in spec.command]
     states = [v for v in spec.state if v.follows and v.twist is None]
     rows = [names.index(str(v.follows)) for v in states]
-    own = replace(timing, lags=timing.lags[rows], lag_sigma=timing.lag_sigma[rows])
+    selected = replace(timing, lags=timing.lags[rows], lag_sigma=timing.lag_sigma[rows])
     responses = (
         Response(v.name, str(v.follows), float(lag))
-        for v, lag in zip(states, own.lags, strict=True)
+        for v, lag in zip(states, selected.lags, strict=True)
     )
-    return tuple(responses), own
+    return tuple(responses), selected
 
 
 def find_mounting(drive: Drive, findings: Findings) -> Findings:
@@ -364,12 +358,12 @@ def find_mounting(drive: Drive, findings: Findings) -> Findings:
         index = speed_index(drive.spec)
         if index is not None:
             speed = states[:, index]
-    found = mounting_of(training, findings.timing, states)
+    mounting = mounting_of(training, findings.timing, states)
     return replace(
         findings,
         expected_speed=speed,
-        mounting=found,
-        calibration=mounted(findings.calibration, found),
+        mounting=mounting,
+        calibration=mounted(findings.calibration, mounting),
     )
 
 
@@ -416,13 +410,17 @@ def find_input_curves(drive: Drive, findings: Findings) -> Findings:
     training = findings.training
     findings = _with_likely_latency(findings)
     samples = resample_drive(training, findings)
-    places = range(len(drive.spec.command))
-    curves = [
-        c for place in places if (c := curve_of(samples, drive.spec, place)) is not None
-    ]
-    calibration = replace(findings.calibration, inputs=tuple(c.curve for c in curves))
-    clear = tuple(c.curve for c in curves if c.gain >= CLEAR)
-    findings = replace(findings, calibration=calibration, clear_curves=clear)
+    curves = []
+    clear = []
+    for place in range(len(drive.spec.command)):
+        candidate = curve_of(samples, drive.spec, place)
+        if candidate is None:
+            continue
+        curves.append(candidate.curve)
+        if candidate.gain >= CLEAR:
+            clear.append(candidate.curve)
+    calibration = replace(findings.calibration, inputs=tuple(curves))
+    findings = replace(findings, calibration=calibration, clear_curves=tuple(clear))
     return _with_likely_latency(findings)  # the curves may hide a part of it
 
 
@@ -452,7 +450,7 @@ def fit_terms(drive: Drive, findings: Findings) -> Findings:
     if settings.order == "auto" and is_inferred and not trials:
         trials = _try_orders(drive, findings)
     if trials:
-        order = hypotheses.chosen(list(trials)).order
+        order = hypotheses.chosen(trials).order
     else:
         order = fitting.ORDER if settings.order == "auto" else settings.order
     centred = "lever_arm_y_m" in calibration.uncertainty
@@ -478,15 +476,15 @@ def _try_orders(drive: Drive, findings: Findings) -> tuple[hypotheses.Trial, ...
         findings.calibration,
         0.0,
         training.duration_s,
-        hypotheses.HORIZON_S,
+        open_loop.HORIZON_S,
         open_loop.SPACING_S,
     ).path
     trials = []
     for order in ORDERS_OF_INFERRED:
         errors = _cross_validate(drive, findings, order)
-        if hypotheses.HORIZON_S not in errors:
+        if open_loop.HORIZON_S not in errors:
             break
-        error_m = errors[hypotheses.HORIZON_S].mean()
+        error_m = errors[open_loop.HORIZON_S].mean()
         share = float(error_m / max(float(path.mean()), NO_PATH_M))
         trials.append(hypotheses.Trial(order, 0.0, share, errors))
     return tuple(trials)
@@ -497,47 +495,21 @@ def _cross_validate(drive: Drive, findings: Findings, order: int) -> dict[float,
 
     Errors of predictions that diverged are infinite; the result is empty if a fit is impossible.
     """
-    training = findings.training
-    recording = training.recording
-    pose = recording.pose
     settings = replace(drive.settings, order=order, train_until_s=np.inf)
     errors: dict[float, list[Array]] = {h: [] for h in hypotheses.BANDS_S}
-    for block in np.array_split(np.arange(len(pose.t)), hypotheses.FOLDS):
-        others = np.ones(len(pose.t), dtype=np.bool_)
-        others[block] = False
-        rest = training.part(replace(recording, pose=pose.rows(others)))
-        rest = rest.under(settings)
+    for others, part in findings.training.folds(hypotheses.FOLDS):
+        rest = others.under(settings)
+        start = replace(findings, training=rest)
         try:
-            found = run(
-                (fit_terms, prune_terms, refine_model),
-                rest,
-                replace(findings, training=rest),
-            )
+            fitted = run((fit_terms, prune_terms, refine_model), rest, start)
         except (FitError, RecordingError):
             return {}
-        part = training.part(replace(recording, pose=pose.rows(block)))
+        model = require_model(fitted)
         for horizon, errors_m in errors.items():
-            errors_m.append(_measure_errors(found, part, horizon))
+            far = measure_distances(model, fitted.calibration, part, horizon)
+            errors_m.append(np.where(np.isnan(far), np.inf, far))
     joined = {h: np.concatenate(parts) for h, parts in errors.items()}
     return {h: errors_m for h, errors_m in joined.items() if len(errors_m)}
-
-
-def _measure_errors(findings: Findings, part: Drive, horizon: float) -> Array:
-    """Returns the distances (W,) [m] of predictions over a horizon [s] from a part's poses."""
-    chosen = open_loop.windows(
-        part,
-        findings.calibration,
-        0.0,
-        part.duration_s,
-        horizon,
-        open_loop.SPACING_S,
-    )
-    if not len(chosen.start_t):
-        return np.zeros(0)
-    model = require_model(findings)
-    ends = open_loop.predict(model, findings.calibration, part, chosen)
-    distance = np.hypot(*(ends - chosen.end)[:, :2].T)
-    return np.where(np.isnan(distance), np.inf, distance)
 
 
 def prune_terms(drive: Drive, findings: Findings) -> Findings:
@@ -566,8 +538,8 @@ def refine_model(drive: Drive, findings: Findings) -> Findings:
     may_lower_order = settings.order == "auto" and not findings.trials
     if may_lower_order and verdict.runs_away(errors):
         linear = replace(drive, settings=replace(settings, order=1))
-        found = run((fit_terms, prune_terms, refine_model), linear, findings)
-        return replace(found, refinement=(*found.refinement, verdict.LINEAR))
+        refined = run((fit_terms, prune_terms, refine_model), linear, findings)
+        return replace(refined, refinement=(*refined.refinement, verdict.LINEAR))
     model, calibration, note = refine_by_predictions(model, calibration, training)
     return replace(
         findings,
@@ -636,7 +608,11 @@ def _find_bands(drive: Drive, findings: Findings) -> dict[float, float]:
 
 
 def prefer_textbook(drive: Drive, findings: Findings) -> Findings:
-    """Replaces the model by the fitted textbook if that predicts the held-out part better."""
+    """Replaces the model by the fitted textbook if that predicts the held-out part better.
+
+    The held-out part chooses between the two, so the errors there are slightly optimistic if the
+    textbook is chosen: they are the lower of two. The report says so.
+    """
     if findings.yardstick is None:
         return findings
     if not acceptance.loses_to_textbook(findings.judgement):
@@ -752,23 +728,34 @@ def _measure_mean_error(findings: Findings, until: float) -> float:
 
 
 def cut(recording: Recording, until: float) -> Recording:
-    """Returns a recording up to `until` [s] after its first pose; commands last slightly longer."""
+    """Returns a recording up to `until` [s] after its first pose; commands last slightly longer.
+
+    Raises RecordingError if no commands, or none of the measured states, are left.
+    """
     if not until > 0.0:
         fault = f"{recording.source}: the training part ends at {until:g} s"
         raise RecordingError(f"{fault}; use more than 0.")
-    pose = recording.pose.t
-
-    def cut_stream(stream: Stream, margin: float = 0.0) -> Stream:
-        origin = stream.t[0]
-        if stream.t[0] < pose[-1] and stream.t[-1] > pose[0]:  # on the pose's clock
-            origin = max(stream.t[0], pose[0])
-        return stream.rows(stream.t <= origin + until + margin)
-
-    parts: dict[str, Any] = {
-        name: cut_stream(stream) for name, stream in recording.streams.items()
-    }
-    parts["command"] = cut_stream(recording.command, timings.SEARCH_S)
+    parts: dict[str, Any] = {}
+    for name, stream in recording.streams.items():
+        last = _find_origin(stream, recording.pose) + until
+        if name == "command":
+            last += timings.SEARCH_S
+        part = stream.rows(stream.t <= last)
+        parts[name] = part if len(part.t) else None
+        if name in ("command", "state") and parts[name] is None:
+            fault = f"{recording.source}: {name}: starts after the first {until:g} s"
+            advice = "the part of the drive to learn from; record it from the start"
+            raise RecordingError(f"{fault}, {advice}.")
     return replace(recording, **parts)
+
+
+def _find_origin(stream: Stream, pose: Stream) -> float:
+    """Returns the time of the first pose on a stream's clock [s]; a guess if that is another."""
+    if stream.clock == pose.clock:
+        return float(pose.t[0])
+    if stream.t[0] < pose.t[-1] and stream.t[-1] > pose.t[0]:  # a small offset
+        return float(max(stream.t[0], pose.t[0]))
+    return float(stream.t[0])
 
 
 STAGES = list_stages()

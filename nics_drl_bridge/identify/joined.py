@@ -19,12 +19,12 @@ def join_recordings(recordings: Sequence[Recording], spec: RobotSpec) -> Recordi
     if len(recordings) == 1:
         return recordings[0]
     # a gyro's bias differs between drives
-    turned = [turned_by_gyro(each) for each in recordings]
-    offsets = [clock_offset(each, spec) for each in turned]
+    turned = [turned_by_gyro(item) for item in recordings]
+    offsets = [clock_offset(item, spec) for item in turned]
     joined = join(turned, offsets)
-    gyros = [each.gyro for each in turned]
+    gyros = [item.gyro for item in turned]
     return replace(
-        joined, gyro=gyros[0] if all(each is not None for each in gyros) else None
+        joined, gyro=gyros[0] if all(item is not None for item in gyros) else None
     )
 
 

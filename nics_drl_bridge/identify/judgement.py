@@ -15,7 +15,6 @@ from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.forms import problem_of
 from nics_drl_bridge.identify.open_loop import (
-    HORIZON_S,
     SPACING_S,
     Windows,
     predict,
@@ -32,8 +31,7 @@ from nics_drl_bridge.identify.yardstick import (
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.taylor import EndErrors, HorizonErrors, TaylorModel
 
-HORIZONS_S = (0.5, 1.0, 2.0, HORIZON_S, 10.0)
-BANDED_S = HORIZONS_S[:4]
+HORIZONS_S = (*hypotheses.BANDS_S, 10.0)
 FOLDS = 5
 # limit for the fits to all parts but one, which start from the fit to all parts
 EVALUATIONS = 8
@@ -65,7 +63,7 @@ def judged(
     `bands` are the distances within which 95 % of the ends are expected [m], by horizon [s].
     """
     begin = drive.settings.train_until_s
-    told = []
+    judgement = []
     for horizon in HORIZONS_S:
         chosen = windows(
             drive, calibration, begin, drive.duration_s, horizon, SPACING_S
@@ -75,31 +73,30 @@ def judged(
         ends = predict(model, calibration, drive, chosen)
         twist = twists_before(drive, chosen.start_t)
         kept = kept_twist(drive, chosen, twist)
-        if textbook is None:
-            by_textbook = None
-        else:
-            by_textbook = textbook.predict(drive, chosen, twist)
         far = distances(ends, chosen)
-        band = bands.get(horizon)
-        told.append(
-            HorizonErrors(
-                horizon_s=horizon,
-                windows=len(far),
-                path_m=float(chosen.path.mean()),
-                model=errors_of_ends(ends, chosen),
-                kept_twist=errors_of_ends(kept, chosen),
-                textbook=None
-                if by_textbook is None
-                else errors_of_ends(by_textbook, chosen),
-                band_m=band,
-                coverage=None if band is None else float((far <= band).mean()),
-                kept_twist_noise_m=noise_beside(ends, kept, chosen, horizon),
-                textbook_noise_m=noise_beside(ends, by_textbook, chosen, horizon),
-                standing=errors_of_ends(chosen.start, chosen),
-                standing_noise_m=noise_beside(ends, chosen.start, chosen, horizon),
-            )
+        errors = HorizonErrors(
+            horizon_s=horizon,
+            windows=len(far),
+            path_m=float(chosen.path.mean()),
+            model=errors_of_ends(ends, chosen),
+            kept_twist=errors_of_ends(kept, chosen),
+            kept_twist_noise_m=noise_beside(ends, kept, chosen, horizon),
+            standing=errors_of_ends(chosen.start, chosen),
+            standing_noise_m=noise_beside(ends, chosen.start, chosen, horizon),
         )
-    return tuple(told)
+        if textbook is not None:
+            by_textbook = textbook.predict(drive, chosen, twist)
+            errors = replace(
+                errors,
+                textbook=errors_of_ends(by_textbook, chosen),
+                textbook_noise_m=noise_beside(ends, by_textbook, chosen, horizon),
+            )
+        band = bands.get(horizon)
+        if band is not None:
+            coverage = float((far <= band).mean())
+            errors = replace(errors, band_m=band, coverage=coverage)
+        judgement.append(errors)
+    return tuple(judgement)
 
 
 def distances(ends: Array, chosen: Windows) -> Array:
@@ -108,12 +105,10 @@ def distances(ends: Array, chosen: Windows) -> Array:
 
 
 def noise_beside(
-    ends: Array, other: Array | None, chosen: Windows, horizon: float
-) -> float | None:
+    ends: Array, yardstick: Array, chosen: Windows, horizon: float
+) -> float:
     """Returns the noise [m] of a comparison of two predictions (W, 3) of the same ends."""
-    if other is None:
-        return None
-    difference = distances(ends, chosen) - distances(other, chosen)
+    difference = distances(ends, chosen) - distances(yardstick, chosen)
     # one of them diverges, so the ranking is clear
     if not np.isfinite(difference).all():
         return 0.0
@@ -132,12 +127,9 @@ def bands_of_fixed(
 ) -> dict[float, float]:
     """Returns the bands [m] by horizon of a model that is not adjusted to any part of a drive."""
     bands = dict[float, float]()
-    for horizon in BANDED_S:
-        chosen = windows(
-            training, calibration, 0.0, training.duration_s, horizon, SPACING_S
-        )
-        if len(chosen.start_t) >= FEWEST:
-            far = distances(predict(model, calibration, training, chosen), chosen)
+    for horizon in hypotheses.BANDS_S:
+        far = measure_distances(model, calibration, training, horizon)
+        if len(far) >= FEWEST:
             bands[horizon] = float(np.percentile(far, WITHIN))
     return bands
 
@@ -153,31 +145,34 @@ def bands_of(
     Each fold of the training part is predicted by the model adjusted to the others. `derived` are
     the samples of a motion derived from the poses, and the base that the model departed from.
     """
-    pose = training.recording.pose
-    errors: dict[float, list[Array]] = {h: [] for h in BANDED_S}
-    for block in np.array_split(np.arange(len(pose.t)), FOLDS):
-        others = np.ones(len(pose.t), dtype=np.bool_)
-        others[block] = False
+    errors: dict[float, list[Array]] = {h: [] for h in hypotheses.BANDS_S}
+    for rest, part in training.folds(FOLDS):
         if derived is None:
-            rest = training.part(replace(training.recording, pose=pose.rows(others)))
-            found = readjust(model, calibration, rest)
+            adjusted = readjust(model, calibration, rest)
         else:
-            at = pose.t[block[[0, -1]]] + calibration.clock_offset_s
-            kept = (derived[0].t < at[0]) | (derived[0].t > at[1])
-            found = _with_motion(model, calibration, training, *derived, kept)
-        if found is None:
+            begin, end = part.recording.pose.t[[0, -1]] + calibration.clock_offset_s
+            kept = (derived[0].t < begin) | (derived[0].t > end)
+            adjusted = _with_motion(model, calibration, training, *derived, kept)
+        if adjusted is None:
             return {}
-        part = training.part(replace(training.recording, pose=pose.rows(block)))
-        for horizon, told in errors.items():
-            chosen = windows(part, found[1], 0.0, part.duration_s, horizon, SPACING_S)
-            if len(chosen.start_t):
-                told.append(
-                    np.hypot(*(predict(*found, part, chosen) - chosen.end)[:, :2].T)
-                )
-    every = {h: np.concatenate(told) for h, told in errors.items() if told}
-    return {
-        h: float(np.percentile(e, WITHIN)) for h, e in every.items() if len(e) >= FEWEST
-    }
+        for horizon, parts in errors.items():
+            parts.append(measure_distances(*adjusted, part, horizon))
+    bands = {}
+    for horizon, parts in errors.items():
+        far = np.concatenate(parts)
+        if len(far) >= FEWEST:
+            bands[horizon] = float(np.percentile(far, WITHIN))
+    return bands
+
+
+def measure_distances(
+    model: TaylorModel, calibration: Calibration, part: Drive, horizon: float
+) -> Array:
+    """Returns the distances (W,) [m] of all predictions over a horizon [s] in a part of a drive."""
+    chosen = windows(part, calibration, 0.0, part.duration_s, horizon, SPACING_S)
+    if not len(chosen.start_t):
+        return np.zeros(0)
+    return distances(predict(model, calibration, part, chosen), chosen)
 
 
 def _with_motion(
@@ -194,13 +189,15 @@ def _with_motion(
     problem = replace(problem, spacing_s=hypotheses.SPACING_S)
     free = (model.coefficients != 0.0) & ~select_defined_dofs(training.spec)[:, None]
     pull = hypotheses.PULLS[-1]
-    found = shooting.fitted(problem, model, free, draft.inputs, kept, EVALUATIONS, pull)
+    fitted = shooting.fitted(
+        problem, model, free, draft.inputs, kept, EVALUATIONS, pull
+    )
     calibration = replace(
         calibration,
-        command_latency_s=draft.form.latency_at(draft.inputs, found.values),
-        inputs=draft.form.curves_at(draft.inputs, found.values),
+        command_latency_s=draft.form.latency_at(draft.inputs, fitted.values),
+        inputs=draft.form.curves_at(draft.inputs, fitted.values),
     )
-    model = replace(found.model, inputs=calibration.inputs)
+    model = replace(fitted.model, inputs=calibration.inputs)
     if problem.mounted:
-        calibration = hypotheses.remounted(calibration, found)
+        calibration = hypotheses.remounted(calibration, fitted)
     return model, calibration

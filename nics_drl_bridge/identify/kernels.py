@@ -1,6 +1,7 @@
 """Compiled sensitivities: poses at the ends of windows, and derivatives by the coefficients."""
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -8,12 +9,31 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.robot.kernels import advance_state, get_bounds, sum_back_emf
+from nics_drl_bridge.robot.kernels import (
+    Terms,
+    advance_state,
+    get_bounds,
+    make_terms,
+    sum_back_emf,
+)
+from nics_drl_bridge.robot.taylor import TaylorModel
 
 # number of windows predicted at a time, for vector instructions
 WIDTH = 16
 # below this angle the series of sin(a)/a is exact to the last digits [rad]
 SMALL_TURN = 0.3
+
+
+def make_used_terms(
+    model: TaylorModel, used: NDArray[np.bool_], free: NDArray[np.bool_]
+) -> tuple[Terms, NDArray[np.int64]]:
+    """Returns the used ones (D, K) of a model's terms, and the indices of the free among them.
+
+    A term that is used may have a coefficient of 0.
+    """
+    terms = make_terms(replace(model, coefficients=used.astype(np.float64)))
+    terms = terms._replace(coefficient=model.coefficients[used])
+    return terms, np.flatnonzero(free[used]).astype(np.int64)
 
 
 @kernel(allocates=True)
@@ -77,7 +97,8 @@ def follow(ends, moved, x, steps, share, terms, free, dt):  # type: ignore[no-un
         qx = 0.0
         qy = 0.0
         old = 0.0
-        now[:], last = 0.0, steps[w] + (1 if share[w] > 0.0 else 0)
+        now[:] = 0.0
+        last = steps[w] + (1 if share[w] > 0.0 else 0)
         for n in range(last):
             if n == steps[w]:
                 qx = px
@@ -285,7 +306,9 @@ def _step(lane, terms, free, scratch, dt):  # type: ignore[no-untyped-def]
         _follow_pose(
             scratch.pose_slope[lane], scratch.twist, dx, dy, along * c, along * s, dt
         )
-    pose[0], pose[1], pose[2] = pose[0] + dx, pose[1] + dy, pose[2] + turn
+    pose[0] += dx
+    pose[1] += dy
+    pose[2] += turn
     _follow_state(lane, terms, free, first, scratch, dt)
 
 

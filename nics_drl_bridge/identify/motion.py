@@ -10,7 +10,7 @@ from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.calibration import Calibration, outside_gaps, poses_at
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.signals import inferred_states, taken, unwrapped
+from nics_drl_bridge.identify.signals import average_effect, infer_states, unwrapped
 from nics_drl_bridge.recording.recording import (
     Recording,
     Samples,
@@ -104,7 +104,7 @@ def _following(
     lag = [r.lag_s for r in calibration.responses if r.state == variable.name]
     latency = calibration.command_latency_s
     command = drive.recording.command
-    return inferred_states(command, alone, np.array(lag), latency, t)[:, 0]
+    return infer_states(command, alone, np.array(lag), latency, t)[:, 0]
 
 
 def samples_of(drive: Drive, calibration: Calibration, width: float) -> Samples:
@@ -115,12 +115,14 @@ def samples_of(drive: Drive, calibration: Calibration, width: float) -> Samples:
     step = round(float(grid[-1] - grid[0]) / (len(grid) - 1), 9)
     pose = poses_at(drive, calibration, grid, 0.5 * width)
     begin = grid - calibration.command_latency_s
-    command = taken(
+    command = average_effect(
         drive.recording.command, spec, calibration.inputs, begin, begin + step
     )
     samples = samples_on_one_clock(grid, pose, state.values, command)
-    known = outside_gaps(samples.t, drive.sample_t + calibration.clock_offset_s, step)
-    return replace(samples.rows(known), dt=step)
+    is_known = outside_gaps(
+        samples.t, drive.sample_t + calibration.clock_offset_s, step
+    )
+    return replace(samples.rows(is_known), dt=step)
 
 
 def known_state(drive: Drive) -> Stream:
@@ -149,9 +151,9 @@ def surrogate(spec: RobotSpec) -> RobotSpec:
     """Returns a robot whose state follows its commands one by one, to find delays and lags."""
 
     def follows(command: CommandVariable) -> StateVariable:
-        given = command.model_dump(include={"unit", "min", "max"})
+        limits = command.model_dump(include={"unit", "min", "max"})
         return StateVariable(
-            name=f"{command.name}_state", follows=command.name, **given
+            name=f"{command.name}_state", follows=command.name, **limits
         )
 
     return spec.model_copy(update={"state": tuple(map(follows, spec.command))})

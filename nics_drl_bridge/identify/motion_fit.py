@@ -131,9 +131,9 @@ def _search_model(
         best: the chosen order.
     """
     if best.order:
-        found = draft.refined(base.found.model, terms, pull=best.pull)
-        if not verdict.is_worse(draft.error_of(found), draft.error_of(base.found)):
-            return _Search(draft, found, has_order=True)
+        refined = draft.refined(base.found.model, terms, pull=best.pull)
+        if not verdict.is_worse(draft.error_of(refined), draft.error_of(base.found)):
+            return _Search(draft, refined, has_order=True)
     textbook = draft.base(other=base.found.model)
     return _Search(draft, textbook, has_order=best.order == 0)
 

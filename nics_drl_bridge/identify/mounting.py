@@ -13,8 +13,8 @@ from nics_drl_bridge.geometry import Array, rotate, wrap_angle
 from nics_drl_bridge.identify import clocks
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive, TwistIntervals
-from nics_drl_bridge.identify.signals import followed, held, speed_index
-from nics_drl_bridge.identify.statistics import standard_errors
+from nics_drl_bridge.identify.signals import average_held, followed, speed_index
+from nics_drl_bridge.identify.statistics import CERTAIN, standard_errors
 from nics_drl_bridge.identify.terms import has_slipping_tyres, list_reversed_variables
 from nics_drl_bridge.recording.recording import Stream
 from nics_drl_bridge.robot import taylor
@@ -71,35 +71,34 @@ def mounting_of(
     """Estimates the mounting from states (n, S) at gain one; None if the drive does not show it."""
     spec = drive.spec
     twists = drive.twists
-    # its forward direction is unknown
     if not (has_textbook(spec) or spec.takes_cmd_vel):
-        return None
+        return None  # its forward direction is unknown
     if spec.moves_sideways:
         return jackknifed(drive, twists, timing.offset, partial(_by_commands, timing))
     start, end = twists.on_clock(timing.offset)
-    command = held(
+    command = average_held(
         drive.recording.command, spec, start - timing.latency, end - timing.latency
     )
     forward = _response(spec, command)[:, 0]
     _, noise = drive.pose_noise or (0.0, 0.0)
-    found = mounting_without_lateral_motion(twists, forward, noise)
+    mounting = mounting_without_lateral_motion(twists, forward, noise)
     if (
-        found is not None
+        mounting is not None
         and states is None
         and (has_slipping_tyres(spec) or slips(spec))
     ):
-        return with_slip(twists, found, spec)
-    if found is None or states is None:
-        return found
-    if drive.recording.state is None or np.isnan(found.lever_sigma[0]):
-        found = by_instruments(twists, states, forward, spec) or found
+        return with_slip(twists, mounting, spec)
+    if mounting is None or states is None:
+        return mounting
+    if drive.recording.state is None or np.isnan(mounting.lever_sigma[0]):
+        mounting = by_instruments(twists, states, forward, spec) or mounting
     place = speed_index(spec)
-    if place is not None and np.isnan(found.lever_sigma).tolist() == [False, True]:
+    if place is not None and np.isnan(mounting.lever_sigma).tolist() == [False, True]:
         speed = states[:, place]
-        found.lever[1], found.lever_sigma[1] = lateral_lever(
-            twists, found.rotation, speed
+        mounting.lever[1], mounting.lever_sigma[1] = lateral_lever(
+            twists, mounting.rotation, speed
         )
-    return found
+    return mounting
 
 
 def by_instruments(
@@ -128,7 +127,7 @@ def by_instruments(
     travel = float(np.arctan2(-normal[0], normal[1]))
     ahead = rotate(seen[:, :2], -travel)[:, :1]
     sigma = standard_errors(np.hstack([ahead, seen[:, 2:]]), motion.twist @ normal)
-    if clocks.CERTAIN * sigma[1] > spec.footprint_radius:
+    if CERTAIN * sigma[1] > spec.footprint_radius:
         return None
     across = 0.0
     across_sigma = np.nan
@@ -165,11 +164,11 @@ def with_slip(motion: TwistIntervals, plain: Mounting, spec: RobotSpec) -> Mount
     beta = np.linalg.lstsq(chi, along[:, 1], rcond=None)[0]
     sigma = standard_errors(chi, along[:, 1] - chi @ beta)
     hidden = skids and _ways(speed * np.abs(turn)) < 2
-    if hidden or not clocks.CERTAIN * sigma[1] < spec.footprint_radius:
+    if hidden or not CERTAIN * sigma[1] < spec.footprint_radius:
         return replace(
             plain, lever=np.zeros(2), lever_sigma=np.full(2, np.nan), slip=True
         )
-    if abs(beta[2]) < clocks.CERTAIN * sigma[2]:
+    if abs(beta[2]) < CERTAIN * sigma[2]:
         return plain
     rotation = plain.rotation + float(np.arctan(beta[0]))
     lever = np.array([float(beta[1]), 0.0])
@@ -191,17 +190,22 @@ def mounted(calibration: Calibration, mounting: Mounting | None) -> Calibration:
     """Adds the significant parts of a mounting, and all uncertainties."""
     if mounting is None:
         return calibration
-    names = ("rotation_rad", "lever_arm_x_m", "lever_arm_y_m")
-    values = map(float, (mounting.rotation, *mounting.lever))
-    sigmas = tuple(map(float, (mounting.rotation_sigma, *mounting.lever_sigma)))
-    both = zip(values, sigmas, strict=True)
-    rotation, x, y = (
-        clocks.if_certain(value, sigma, MIN_LENGTH) for value, sigma in both
-    )
-    learnt = {n: s for n, s in zip(names, sigmas, strict=True) if not np.isnan(s)}
-    uncertainty = {**calibration.uncertainty, **learnt}
+    estimates = {
+        "rotation_rad": (mounting.rotation, mounting.rotation_sigma),
+        "lever_arm_x_m": (float(mounting.lever[0]), float(mounting.lever_sigma[0])),
+        "lever_arm_y_m": (float(mounting.lever[1]), float(mounting.lever_sigma[1])),
+    }
+    certain = {}
+    uncertainty = dict(calibration.uncertainty)
+    for name, (value, sigma) in estimates.items():
+        certain[name] = clocks.if_certain(value, sigma, MIN_LENGTH)
+        if not np.isnan(sigma):
+            uncertainty[name] = sigma
     return replace(
-        calibration, rotation_rad=rotation, lever_arm_m=(x, y), uncertainty=uncertainty
+        calibration,
+        rotation_rad=certain["rotation_rad"],
+        lever_arm_m=(certain["lever_arm_x_m"], certain["lever_arm_y_m"]),
+        uncertainty=uncertainty,
     )
 
 
@@ -223,7 +227,7 @@ def mounting_without_lateral_motion(
     turn = motion.twist[:, 2]
     lever = 0.0
     lever_sigma = np.nan
-    certain = np.abs(turn) > clocks.CERTAIN * np.sqrt(2.0) * noise / (
+    certain = np.abs(turn) > CERTAIN * np.sqrt(2.0) * noise / (
         motion.end - motion.start
     )
     ways = _ways(turn, certain)
@@ -279,7 +283,7 @@ def _by_commands(
         )
     else:
         begin = twists.start + timing.offset - timing.latency
-        command = held(
+        command = average_held(
             recording.command, spec, begin, begin + twists.end - twists.start
         )
     response = _response(spec, command)  # of base_link, up to one factor
@@ -321,7 +325,7 @@ def _as_commands(states: Array, drive: Drive, latency: float) -> Array:
     rates = np.diff(stream.values, axis=0)[keep] / span[keep, None]
     before = stream.values[:-1][keep]
     begin = stream.t - latency
-    u = held(command, spec, begin[:-1][keep], begin[1:][keep])
+    u = average_held(command, spec, begin[:-1][keep], begin[1:][keep])
     # With more wheels than degrees of freedom, the rest of their speeds is slip, not commands.
     ways = np.linalg.svd(before, full_matrices=False)[2][: u.shape[1]].T
     chi = np.concatenate([before @ ways, u, np.ones((len(u), 1))], axis=1)
@@ -354,7 +358,7 @@ def jackknifed(
     if whole is None:
         return None
     edges = np.linspace(twists.start[0], twists.end[-1], BLOCKS + 1)
-    found = []
+    parts = []
     for begin, end in pairwise(edges):
         rows = (twists.end <= begin) | (twists.start >= end)
         rest = drive
@@ -365,13 +369,13 @@ def jackknifed(
         kept = TwistIntervals(twists.start[rows], twists.end[rows], twists.twist[rows])
         part = estimate(rest, kept)
         if part is not None:
-            found.append(part)
-    if len(found) < BLOCKS:
+            parts.append(part)
+    if len(parts) < BLOCKS:
         return whole
-    rotation = wrap_angle(np.array([p.rotation - whole.rotation for p in found]))
+    rotation = wrap_angle(np.array([p.rotation - whole.rotation for p in parts]))
     rotation_sigma = max(whole.rotation_sigma, float(_spread(rotation)))
     lever_sigma = np.maximum(
-        whole.lever_sigma, _spread(np.array([p.lever for p in found]))
+        whole.lever_sigma, _spread(np.array([p.lever for p in parts]))
     )
     return replace(whole, rotation_sigma=rotation_sigma, lever_sigma=lever_sigma)
 

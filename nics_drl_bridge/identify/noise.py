@@ -9,6 +9,7 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import open_loop
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive, find_bursts, pose_noise
+from nics_drl_bridge.identify.refine import OUTLYING
 from nics_drl_bridge.identify.signals import white_noise
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.noise import (
@@ -25,8 +26,6 @@ SPACING_S = 0.25
 GROWTH_S = (0.25, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0)
 STATE_HORIZON_S = 0.1
 MIN_WINDOWS = 20
-# a window whose error exceeds this many times the median contains a jump
-OUTLYING = 10.0
 # a larger error of a prediction over a second is divergence, not drift
 RUN_AWAY_M = 1e4
 BLOCKS = 8
@@ -45,9 +44,9 @@ def sensor_noise(drive: Drive) -> Noise:
         return Noise()
     blocks = map(pose.rows, np.array_split(np.arange(len(pose.t)), BLOCKS))
     parts = [pose_noise(block, find_bursts(block.t)) for block in blocks]
-    known = np.array([part for part in parts if part is not None])
-    if len(known) > 1:
-        spread = known.std(axis=0, ddof=1) / np.sqrt(len(known))
+    measured = np.array([part for part in parts if part is not None])
+    if len(measured) > 1:
+        spread = measured.std(axis=0, ddof=1) / np.sqrt(len(measured))
     else:
         spread = [None, None]
     position, heading = (
@@ -69,7 +68,7 @@ def motion_noise(
     rest = odometry_residual(drive, calibration, model, samples)
     if rest is not None:
         linear = (_level(rest[:, i], "m/s") for i in (0, 1))
-        measured["odom_linear"] = max(linear, key=lambda found: found.std)
+        measured["odom_linear"] = max(linear, key=lambda level: level.std)
         measured["odom_angular"] = _level(rest[:, 2], "rad/s")
     measured |= _pose_drift(sensor, drive, calibration, model)
     measured |= claimed(sensor, drive.recording.pose.sigma)
@@ -83,19 +82,16 @@ def claimed(sensor: Noise, sigma: Array | None) -> dict[str, Level]:
         return {}
     usual = []
     for column in sigma.T:
-        known = column[np.isfinite(column) & (column > 0.0)]
-        usual.append(float(np.median(known)) if len(known) else np.nan)
+        sigmas = column[np.isfinite(column) & (column > 0.0)]
+        usual.append(float(np.median(sigmas)) if len(sigmas) else np.nan)
     across = [std for std in usual[:2] if std > 0.0]
-    claims = {
-        "pose_position": float(np.mean(across)) if across else 0.0,
-        "pose_heading": usual[2],
-    }
-    found = {name: (getattr(sensor, name), std) for name, std in claims.items()}
-    return {
-        name: assume_level(std, at.unit)
-        for name, (at, std) in found.items()
-        if std > at.std
-    }
+    position = float(np.mean(across)) if across else 0.0
+    larger = {}
+    if position > sensor.pose_position.std:
+        larger["pose_position"] = assume_level(position, sensor.pose_position.unit)
+    if usual[2] > sensor.pose_heading.std:
+        larger["pose_heading"] = assume_level(usual[2], sensor.pose_heading.unit)
+    return larger
 
 
 def _measured(std: float, unit: str, uncertainty: float | None) -> Level:
@@ -140,10 +136,10 @@ def _pose_drift(
     sensor: Noise, drive: Drive, calibration: Calibration, model: TaylorModel
 ) -> dict[str, Level]:
     """Returns the drift of position and heading; none if too short or the model diverges."""
-    found = _errors(drive, calibration, model, HORIZON_S)
-    if found is None:
+    predicted = _errors(drive, calibration, model, HORIZON_S)
+    if predicted is None:
         return {}
-    chosen, error = found
+    chosen, error = predicted
     size = np.hypot(error[:, 0], error[:, 1])
     if not (size < RUN_AWAY_M).all():
         return {}
@@ -167,10 +163,10 @@ def drift_growth(
     """Returns horizons [s], errors per axis [m] and of heading [rad]; None if it is too short."""
     rows = []
     for horizon in GROWTH_S:
-        found = _errors(drive, calibration, model, horizon)
-        if found is None:
+        predicted = _errors(drive, calibration, model, horizon)
+        if predicted is None:
             break
-        square = np.mean(found[1] ** 2, axis=0)
+        square = np.mean(predicted[1] ** 2, axis=0)
         rows.append(
             (horizon, np.sqrt(0.5 * (square[0] + square[1])), np.sqrt(square[2]))
         )
@@ -196,16 +192,16 @@ def _state_drift(
     sums = rest[: count * steps].reshape(count, steps, -1)[whole].sum(axis=1)
     if len(sums) < MIN_WINDOWS:
         return nominal
-    found = {}
+    drift = {}
     sensor = white_noise(state.values)
     for i, variable in enumerate(drive.spec.state):
         usual = OUTLYING * max(float(np.median(np.abs(sums[:, i]))), TINY)
         kept = sums[np.abs(sums[:, i]) <= usual, i]
-        found[variable.name] = level(
+        drift[variable.name] = level(
             (kept**2 - 2.0 * float(sensor[i]) ** 2) / (steps * samples.dt),
             f"{variable.unit}/sqrt(s)",
         )
-    return found
+    return drift
 
 
 def odometry_residual(

@@ -1,6 +1,6 @@
 """Open-loop prediction: windows of a drive, and the poses that a model predicts at their ends."""
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,8 +10,8 @@ from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.calibration import Calibration, states_at
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.kernels import follow
-from nics_drl_bridge.identify.signals import followed, taken
+from nics_drl_bridge.identify.kernels import follow, make_used_terms
+from nics_drl_bridge.identify.signals import average_effect, followed
 from nics_drl_bridge.robot.kernels import SERIES, make_terms, simulate_rollouts
 from nics_drl_bridge.robot.taylor import TaylorModel
 
@@ -50,7 +50,7 @@ class Windows:
 
     def rows(self, keep: NDArray[np.bool_]) -> "Windows":
         """Returns the windows selected by a mask (W,)."""
-        return Windows(*(getattr(self, each.name)[keep] for each in fields(self)))
+        return Windows(*(values[keep] for values in vars(self).values()))
 
 
 def windows(
@@ -130,16 +130,20 @@ def _by_one_rollout(
         -lead, (end.max() - start.min()) / model.dt + 2.0
     )
     begin = grid - calibration.command_latency_s
-    command = taken(recording.command, spec, model.inputs, begin, begin + model.dt)
+    command = average_effect(
+        recording.command, spec, model.inputs, begin, begin + model.dt
+    )
     state = (
         np.array([r.gain for r in calibration.responses]) * command[0, followed(spec)]
     )
-    path = _roll(model, state[None], command[None])[0][0, :-1]
-    at = [
-        np.stack([np.interp(t, grid, column) for column in path.T], axis=1)
-        for t in (start, end)
-    ]
-    return geometry.between(at[0], at[1])
+    poses, _ = _roll(model, state[None], command[None])
+    path = poses[0, :-1]
+    starts = np.zeros((len(start), 3))
+    ends = np.zeros((len(end), 3))
+    for i, column in enumerate(path.T):
+        starts[:, i] = np.interp(start, grid, column)
+        ends[:, i] = np.interp(end, grid, column)
+    return geometry.between(starts, ends)
 
 
 def _from_measured_states(
@@ -151,7 +155,7 @@ def _from_measured_states(
     )
     steps = int(np.ceil(float((end - start).max()) / model.dt - 1e-6)) + 1
     begin = start[:, None] + model.dt * np.arange(steps) - calibration.command_latency_s
-    command = taken(
+    command = average_effect(
         drive.recording.command, drive.spec, model.inputs, begin, begin + model.dt
     )
     poses, states = _roll(model, states_at(drive, calibration, start), command)
@@ -233,13 +237,11 @@ def relative_ends(
     course: Course, model: TaylorModel, free: NDArray[np.bool_] | None = None
 ) -> tuple[Array, Array]:
     """Returns relative ends (W, 3), unwrapped, their slopes (W, 3, P) by `free` coefficients."""
-    free = np.zeros(model.coefficients.shape, dtype=np.bool_) if free is None else free
+    if free is None:
+        free = np.zeros(model.coefficients.shape, dtype=np.bool_)
     used = (model.coefficients != 0.0) | free
     used[3:] = False
-    dofs, places = np.nonzero(used)
-    terms = make_terms(replace(model, coefficients=used.astype(np.float64)))
-    terms = terms._replace(coefficient=model.coefficients[dofs, places])
-    moving = np.flatnonzero(free[dofs, places]).astype(np.int64)
+    terms, moving = make_used_terms(model, used, free)
     ends = np.zeros((len(course.steps), 3))
     moved = np.zeros((len(course.steps), 3, len(moving)))
     follow(ends, moved, course.x, course.steps, course.share, terms, moving, model.dt)

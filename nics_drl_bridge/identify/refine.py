@@ -19,8 +19,9 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import open_loop
 from nics_drl_bridge.identify.calibration import Calibration, Response
-from nics_drl_bridge.identify.clocks import TOLD_S
+from nics_drl_bridge.identify.clocks import SEPARABLE_S
 from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.shooting import HEADING_ARM_M, SPACING_S
 from nics_drl_bridge.identify.signals import speed_index
 from nics_drl_bridge.identify.statistics import (
     CERTAIN,
@@ -34,17 +35,14 @@ from nics_drl_bridge.robot.taylor import TaylorModel
 Mask = NDArray[np.bool_]
 NamedErrors = Mapping[str, Mapping[str, float]]  # by degree of freedom and term
 
-TWIST = slice(
-    0, 3
-)  # rows of a model's coefficients: the twist, then the rates of the state
+# rows of a model's coefficients: the twist, then the rates of the state
+TWIST = slice(0, 3)
 FIRST_STATE = 3
 VX = POSE_RATES.index("vx")
 VY = POSE_RATES.index("vy")
 
 HORIZONS_S = (1.0, 2.5, 5.0)
-SPACING_S = 0.25  # between the starts of windows
 MIN_WINDOWS = 10  # per horizon
-HEADING_ARM_M = 0.3  # a heading error counts as a position error at this distance
 # A window contains a jump of the pose if its error exceeds this many times the median error and
 # this fraction of the longest path,
 OUTLYING = 10.0
@@ -99,13 +97,13 @@ def refine_by_predictions(
 
 
 def _describe_result(problem: "Problem", best: "Refined", before: Calibration) -> str:
-    what = "Coefficients"
+    adjusted = "Coefficients"
     if best.calibration != before:
-        what += " and calibration"
+        adjusted += " and calibration"
     by = f"the open-loop errors over up to {problem.horizon_s:g} s"
     parts = f"of x, y and heading times {HEADING_ARM_M:g} m"
     left = f"the root mean square {parts} left on the training part"
-    return f"{what} were refined by {by}: {left} is {best.error:.4f} m."
+    return f"{adjusted} were refined by {by}: {left} is {best.error:.4f} m."
 
 
 def readjust(
@@ -116,10 +114,10 @@ def readjust(
     if problem is None:
         return None
     try:
-        found = minimise_errors(problem, model, calibration)
+        refined = minimise_errors(problem, model, calibration)
     except np.linalg.LinAlgError:
         return None
-    return found.model, found.calibration
+    return refined.model, refined.calibration
 
 
 def apply_definitions(
@@ -188,9 +186,8 @@ class Problem:
 
     drive: Drive
     horizon_s: float  # the longest horizon that fits into the drive
-    windows: tuple[
-        open_loop.Windows, ...
-    ]  # for each horizon, without jumps of the pose
+    # for each horizon, without jumps of the pose
+    windows: tuple[open_loop.Windows, ...]
     # courses of X over them if the state was measured, else empty
     courses: tuple[open_loop.Course, ...]
 
@@ -319,14 +316,14 @@ class _FreeParameters:
         # The rotation is defined by the direction without motion; omnidirectional robots lack one.
         # A rotation known without a lever arm, and a known time, are fixed: a model that lacks
         # a term would change them to compensate.
-        known = calibration.uncertainty
+        uncertainty_by_name = calibration.uncertainty
         time = _select_time(calibration)
         is_turned = (
-            "rotation_rad" in known
+            "rotation_rad" in uncertainty_by_name
             and not calibration.is_exact
             and not spec.moves_sideways
         )
-        if calibration.responses and "lever_arm_x_m" in known:
+        if calibration.responses and "lever_arm_x_m" in uncertainty_by_name:
             is_turned = False
         names = [time] if time else []
         if is_turned:
@@ -345,12 +342,12 @@ class _FreeParameters:
         count = int(self.coefficients.sum())
         coefficients[self.coefficients] = theta[:count]
         for row, response in enumerate(self.calibration.responses, start=FIRST_STATE):
-            own, command = find_linear_terms(
+            decay, command = find_linear_terms(
                 self.model, response.state, response.command
             )
-            if own is None or command is None or self.coefficients[row, command]:
+            if decay is None or command is None or self.coefficients[row, command]:
                 continue
-            coefficients[row, command] = -response.gain * coefficients[row, own]
+            coefficients[row, command] = -response.gain * coefficients[row, decay]
         values: dict[str, Any] = dict(
             zip(self.names, map(float, theta[count:]), strict=True)
         )
@@ -363,10 +360,10 @@ class _FreeParameters:
         high = -low
         unbounded = np.full(len(self.names), np.inf)
         for row, response in enumerate(self.calibration.responses, start=FIRST_STATE):
-            own, _ = find_linear_terms(self.model, response.state, response.command)
-            if own is not None:
-                low[row, own] = -FASTEST / self.model.dt
-                high[row, own] = 0.0
+            decay, _ = find_linear_terms(self.model, response.state, response.command)
+            if decay is not None:
+                low[row, decay] = -FASTEST / self.model.dt
+                high[row, decay] = 0.0
         return (
             np.append(low[self.coefficients], -unbounded),
             np.append(high[self.coefficients], unbounded),
@@ -384,7 +381,7 @@ def _select_time(calibration: Calibration) -> str | None:
         time = "command_latency_s"
     else:
         return None
-    if known[time] <= TOLD_S and not are_lags_measured(calibration):
+    if known[time] <= SEPARABLE_S and not are_lags_measured(calibration):
         return None
     return time
 
@@ -397,16 +394,16 @@ def select_free_coefficients(model: TaylorModel, calibration: Calibration) -> Ma
         # the rates of a measured state were fitted to that state itself
         free[FIRST_STATE:] = False
     for row, response in enumerate(calibration.responses, start=FIRST_STATE):
-        own, command = find_linear_terms(model, response.state, response.command)
-        if own is None:
+        decay, command = find_linear_terms(model, response.state, response.command)
+        if decay is None:
             continue
-        if model.coefficients[VX, own] == 1.0:
-            free[VX, own] = False
+        if model.coefficients[VX, decay] == 1.0:
+            free[VX, decay] = False
         elif command is not None:
             # the scale of this state is arbitrary, so its gain is fixed
             free[row, command] = False
         if are_lags_measured(calibration):
-            free[row, own] = False
+            free[row, decay] = False
     return np.asarray(free)
 
 
@@ -493,12 +490,14 @@ def _estimate_errors(
     errors = np.full(model.coefficients.shape, np.nan)
     errors[free.coefficients] = clustered_errors(slopes, rest, cluster)[:count]
     for row, state in enumerate(problem.drive.spec.state, start=FIRST_STATE):
-        own, command = find_linear_terms(model, state.name, state.follows)
-        if own is None or command is None:
+        decay, command = find_linear_terms(model, state.name, state.follows)
+        if decay is None or command is None:
             continue
-        if free.coefficients[row, own] and not free.coefficients[row, command]:
-            gain = abs(model.coefficients[row, command] / model.coefficients[row, own])
-            errors[row, command] = gain * errors[row, own]
+        if free.coefficients[row, decay] and not free.coefficients[row, command]:
+            gain = abs(
+                model.coefficients[row, command] / model.coefficients[row, decay]
+            )
+            errors[row, command] = gain * errors[row, decay]
     return errors
 
 
@@ -532,11 +531,11 @@ def _add_uncertainty(
 
 def _update_response(model: TaylorModel, row: int, response: Response) -> Response:
     """Returns the lag and gain that correspond to the coefficients of the state's rate."""
-    own, command = find_linear_terms(model, response.state, response.command)
+    decay, command = find_linear_terms(model, response.state, response.command)
     coefficients = model.coefficients[row]
-    if own is None or command is None:
+    if decay is None or command is None:
         return response
-    rate = -float(coefficients[own])
+    rate = -float(coefficients[decay])
     if not 0.0 < rate * model.dt < 1.0:
         return response
     lag = -model.dt / float(np.log1p(-rate * model.dt))
@@ -548,7 +547,10 @@ def simplify(problem: Problem, refined: Refined) -> Refined:
     best = refined
     tried = set[tuple[int, int]]()
     limit = refined.error * (1.0 + WORTH)
-    while (weakest := _find_weakest(best, tried)) is not None:
+    while True:
+        weakest = _find_weakest(best, tried)
+        if weakest is None:
+            break
         tried.add(weakest)
         coefficients = best.model.coefficients.copy()
         coefficients[weakest] = 0.0
@@ -603,6 +605,8 @@ def drop_doubtful_rotation(
         return best
     others = {k: v for k, v in calibration.uncertainty.items() if k != "rotation_rad"}
     straight = replace(calibration, rotation_rad=0.0, uncertainty=others)
-    found = minimise_errors(problem, best.model, straight)
-    errors = found.calibration.uncertainty | {"rotation_rad": sigma}
-    return replace(found, calibration=replace(found.calibration, uncertainty=errors))
+    straightened = minimise_errors(problem, best.model, straight)
+    errors = straightened.calibration.uncertainty | {"rotation_rad": sigma}
+    return replace(
+        straightened, calibration=replace(straightened.calibration, uncertainty=errors)
+    )

@@ -1,5 +1,6 @@
 """Repair of a drive: faulty rows, localiser jumps, commands; refuses wrong units and axes."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -13,7 +14,7 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.forms import list_driving_commands
 from nics_drl_bridge.identify.signals import (
-    held,
+    average_held,
     interval_means,
     moved_commands,
     unwrapped,
@@ -22,6 +23,7 @@ from nics_drl_bridge.identify.statistics import unexplained
 from nics_drl_bridge.identify.verdict import Doubt, Gap, Mistake
 from nics_drl_bridge.recording import recording as recordings
 from nics_drl_bridge.recording.mapping import UNITS
+from nics_drl_bridge.recording.recording import HeadingKeys
 from nics_drl_bridge.recording.stamping import select_new_rows
 from nics_drl_bridge.robot.kinds import has_textbook, textbook
 from nics_drl_bridge.robot.spec import FARTHEST_STEERED, RobotSpec
@@ -43,7 +45,7 @@ UNUSUAL = 12.0  # this many usual differences (`USUAL`)
 JUMP_SHARE = 0.5
 JUMP_TURN = 0.3
 AROUND = 5  # number of steps on either side
-TOLD = 3  # maximum number of jumps to report individually
+MOST_LISTED = 3  # maximum number of jumps to report individually
 MOST_JUMPS = 0.02  # fraction of the steps above which jumps are noise
 # fraction of the rows above which jumps are not faults of single samples
 MOST = 0.15
@@ -68,23 +70,14 @@ SCALED = 1.5
 # a pose that stays within these,
 STANDING_M = 1e-3
 STANDING_RAD = 2e-3
-FROZEN = 12.0
 # or within this many times its noise, never moved
+FROZEN = 12.0
 # minimum correlation of each of two commands with what the other should move
 SWAPPED = 0.6
-# in speed and turn rate
-PLACES = {
-    "linear.x": 0,
-    "angular.z": 1,
-    "throttle": 0,
-    "steering": 1,
-}
+# indices in speed and turn rate
+PLACES = {"linear.x": 0, "angular.z": 1, "throttle": 0, "steering": 1}
 # commands of a robot that moves sideways
-SIDEWAYS = (
-    "linear.x",
-    "linear.y",
-    "angular.z",
-)
+SIDEWAYS = ("linear.x", "linear.y", "angular.z")
 CONFUSED = {"m/s": ("km/h", "cm/s", "mm/s"), "rad/s": ("deg/s", "rpm")}
 # Minimum distance for measuring a direction of travel, in footprint radii and in noise of the pose
 TRAVEL_SHARE = 0.1
@@ -109,8 +102,8 @@ def repaired(drive: Drive) -> tuple[Drive, tuple[str, ...]]:
 def _with_rows(
     recording: recordings.Recording, name: str, keep: NDArray[np.bool_]
 ) -> recordings.Recording:
-    some: Any = {name: recording.streams[name].rows(keep)}
-    return replace(recording, **some)
+    parts: Any = {name: recording.streams[name].rows(keep)}
+    return replace(recording, **parts)
 
 
 def _without_repetitions(drive: Drive, notes: list[str]) -> recordings.Recording:
@@ -133,8 +126,7 @@ def _without_held_poses(drive: Drive, notes: list[str]) -> recordings.Recording:
     pose = drive.recording.pose.values
     if len(t) < 2:
         return recording
-    speeds = [abs(v) for c in drive.spec.command if not c.turns for v in (c.min, c.max)]
-    reach = REACH * max(speeds, default=0.0) * np.diff(t)
+    reach = REACH * _find_largest_speed(drive.spec) * np.diff(t)
     leap = np.hypot(*np.diff(pose[:, :2], axis=0).T) > np.maximum(reach, 1e-6)
     same = np.concatenate([[False], (pose[1:] == pose[:-1]).all(axis=1)])
     held = np.zeros(len(t), dtype=np.bool_)
@@ -152,8 +144,14 @@ def _without_held_poses(drive: Drive, notes: list[str]) -> recordings.Recording:
         leap_m = np.hypot(*(pose[end + 1] - pose[end])[:2])
         finding = f"The pose keeps one value {span} and then leaps by {leap_m:.2f} m"
         cause = "as if tracking was lost: these rows were left out"
-        notes.append(f"{finding}, {cause}.")  # the gap that this leaves is told as such
+        notes.append(f"{finding}, {cause}.")  # another note reports the gap
     return _with_rows(recording, "pose", ~held)
+
+
+def _find_largest_speed(spec: RobotSpec) -> float:
+    """Returns the largest magnitude of the commands that do not turn the robot; 0 without any."""
+    sizes = [max(abs(c.min), abs(c.max)) for c in spec.command if not c.turns]
+    return max(sizes, default=0.0)
 
 
 def _without_held_end(drive: Drive, notes: list[str]) -> recordings.Recording:
@@ -183,20 +181,20 @@ def _without_held_end(drive: Drive, notes: list[str]) -> recordings.Recording:
 
 def _without_jumps(drive: Drive, notes: list[str]) -> recordings.Recording:
     recording = drive.recording
-    found = {"pose": _jumps_of_pose(drive)}
+    jumps = {"pose": _jumps_of_pose(drive)}
     if recording.state is not None and drive.spec.state:
-        found["state"] = _jumps_of_state(recording.state)
-    for name, jump in found.items():
-        share = float(jump.mean()) if len(jump) else 0.0
-        jumps = "jump away from their neighbours and back"
-        count = int(jump.sum())
+        jumps["state"] = _jumps_of_state(recording.state)
+    for name, jump in jumps.items():
+        if not jump.any():
+            continue
+        share = float(jump.mean())
+        finding = "jump away from their neighbours and back"
         if share > MOST:
-            fault = f"{recording.source}: {name}: {share:.0%} of the rows {jumps}"
+            fault = f"{recording.source}: {name}: {share:.0%} of the rows {finding}"
             raise RecordingError(f"{fault}; look for two sources mixed in one stream.")
-        if count:
-            recording = _with_rows(recording, name, ~jump)
-            some = f"{name}: {count} of {len(jump)} rows ({share:.1%})"
-            notes.append(f"{some} {jumps}, and were left out as outliers.")
+        recording = _with_rows(recording, name, ~jump)
+        rows = f"{name}: {int(jump.sum())} of {len(jump)} rows ({share:.1%})"
+        notes.append(f"{rows} {finding}, and were left out as outliers.")
     return recording
 
 
@@ -209,8 +207,7 @@ def _jumps_of_pose(drive: Drive) -> NDArray[np.bool_]:
     span[:-NEIGHBOURS] = np.maximum(
         span[:-NEIGHBOURS], t[NEIGHBOURS:] - t[:-NEIGHBOURS]
     )
-    speeds = [abs(v) for c in spec.command if not c.turns for v in (c.min, c.max)]
-    reach = np.maximum(REACH * max(speeds, default=0.0) * span, 1e-6)
+    reach = np.maximum(REACH * _find_largest_speed(spec) * span, 1e-6)
     out = [_stands_out(pose.values[:, i], reach) for i in (0, 1)]
     turns = np.maximum(HEADING_REACH, reach / max(spec.footprint_radius, 1e-3) / 2.0)
     return out[0] | out[1] | _stands_out(pose.values[:, 2], turns, turning=True)
@@ -246,22 +243,22 @@ def _joined(drive: Drive, notes: list[str]) -> recordings.Recording:
     jump = (apart > _greatest(drive, apart)).any(axis=0)
     if not jump.any() or jump.mean() > MOST_JUMPS:
         return recording
-    place = pose.copy()
-    told = []
+    joined = pose.copy()
+    descriptions = []
     for k in np.flatnonzero(jump):
-        here = geometry.compose(place[k], geometry.exp(expected[k]))
-        place[k + 1 :] = geometry.compose(
-            here, geometry.between(place[k + 1], place[k + 1 :])
+        here = geometry.compose(joined[k], geometry.exp(expected[k]))
+        joined[k + 1 :] = geometry.compose(
+            here, geometry.between(joined[k + 1], joined[k + 1 :])
         )
         size = f"{apart[0, k]:.2f} m, {apart[1, k]:.2f} rad"
-        told.append(f"at {t[k + 1] - t[0]:.2f} s ({size})")
-    some = ", ".join(told[:TOLD]) + (
-        f" and {len(told) - TOLD} more" if len(told) > TOLD else ""
-    )
-    finding = f"jumps {some} as no speed of this robot explains"
+        descriptions.append(f"at {t[k + 1] - t[0]:.2f} s ({size})")
+    places = ", ".join(descriptions[:MOST_LISTED])
+    if len(descriptions) > MOST_LISTED:
+        places += f" and {len(descriptions) - MOST_LISTED} more"
+    finding = f"jumps {places} as no speed of this robot explains"
     split = "the drive is split there and continues from where it was before"
     notes.append(Gap(f"pose: {finding}; {split}."))
-    return replace(recording, pose=replace(recording.pose, values=place))
+    return replace(recording, pose=replace(recording.pose, values=joined))
 
 
 def _greatest(drive: Drive, apart: Array) -> Array:
@@ -273,7 +270,7 @@ def _greatest(drive: Drive, apart: Array) -> Array:
     gone = np.abs(np.diff(pose[every], axis=0))
     rates = np.stack([np.hypot(*gone[:, :2].T), gone[:, 2]]) / took
     speeds = [
-        abs(v) for c in drive.spec.command if c.unit == "m/s" for v in (c.min, c.max)
+        max(abs(c.min), abs(c.max)) for c in drive.spec.command if c.unit == "m/s"
     ]
     fastest = np.percentile(rates, 95.0, axis=1) if len(took) else np.zeros(2)
     fastest[0] = max(fastest[0], REACH / FARTHER * max(speeds, default=0.0))
@@ -365,8 +362,10 @@ def check_units(drive: Drive) -> None:
                 name = f"{recording.source}: {variable.name}"
                 unit = variable.unit
                 fault = f"is {size:.4g} or more, but its limit is {limit:g} {unit}"
-                alike = "degrees, millimetres or revolutions per minute look like this"
-                raise RecordingError(f"{name} {fault}; it must be in {unit} ({alike}).")
+                causes = "degrees, millimetres or revolutions per minute look like this"
+                raise RecordingError(
+                    f"{name} {fault}; it must be in {unit} ({causes})."
+                )
     for variable, column in zip(spec.command, recording.command.values.T, strict=True):
         size = float(np.percentile(np.abs(column), STEERED_PERCENTILE))
         if variable.steers and size > FARTHEST_STEERED:
@@ -390,36 +389,41 @@ def check_commands(
     sent = command or drive.recording.command
     if spec.moves_sideways:
         return _check_sideways(drive, sent)
-    pair = _asked_and_driven(drive, sent)
-    if pair is None:
+    compared = _compare_commands(drive, sent)
+    if compared is None:
         return ()
-    asked, driven, alike = pair
+    asked, driven, alike = compared
     places = _places(spec)
-    notes = list[str]()
     if len(places) == 2:
         _check_swapped(drive, [0, 1], min(alike[0, 1], alike[1, 0]), np.trace(alike))
-    told = [(c.name, c.unit) for c in spec.command] if places else [("speed", "rad/s")]
-    for place, (name, unit) in zip(places or [0], told, strict=True):
-        times = float(asked[:, place].std() / max(driven[:, place].std(), 1e-9))
-        for other in CONFUSED.get(unit, ()) if alike[place, place] > ALIKE else ():
-            if 1.0 / NEAR < times * UNITS[other].factor < NEAR:
-                finding = f"The commands ask for {times:.3g} times the measured {name}"
-                advice = f"write `unit: {other}` beside `from:`"
-                notes.append(Mistake(f"{finding}: if they are in {other}, {advice}."))
-                break
-        else:
-            same_quantity = unit in CONFUSED  # a steering angle is not a turn rate
-            differs = not 1.0 / SCALED < times < SCALED
-            if same_quantity and differs and alike[place, place] > ALIKE:
-                notes.append(Doubt(_about_scale(name, times)))
+    commands = [(c.name, c.unit) for c in spec.command]
+    if not places:  # wheels
+        places = [0]
+        commands = [("speed", "rad/s")]
+    notes = list[str]()
+    for place, (name, unit) in zip(places, commands, strict=True):
+        # a steering angle is not comparable with a turn rate
+        if alike[place, place] <= ALIKE or unit not in CONFUSED:
+            continue
+        ratio = float(asked[:, place].std() / max(driven[:, place].std(), 1e-9))
+        notes += _describe_ratio(name, unit, ratio)
     return tuple(notes)
 
 
-def _about_scale(name: str, times: float) -> str:
-    """Formats a sentence on a robot that drives by another speed or turn rate than commanded."""
-    finding = f"The commands consistently ask for {times:.3g} times the measured {name}"
-    causes = "the scale of this command, or that of the pose, is wrong"
-    return f"{finding}: {causes}, or the robot's own driver scales it."
+def _describe_ratio(name: str, unit: str, ratio: float) -> Iterator[str]:
+    """Yields a sentence if the ratio of a commanded to the measured speed is far from 1."""
+    for confused in CONFUSED[unit]:
+        if 1.0 / NEAR < ratio * UNITS[confused].factor < NEAR:
+            finding = f"The commands ask for {ratio:.3g} times the measured {name}"
+            advice = f"write `unit: {confused}` beside `from:`"
+            yield Mistake(f"{finding}: if they are in {confused}, {advice}.")
+            return
+    if not 1.0 / SCALED < ratio < SCALED:
+        finding = (
+            f"The commands consistently ask for {ratio:.3g} times the measured {name}"
+        )
+        causes = "the scale of this command, or that of the pose, is wrong"
+        yield Doubt(f"{finding}: {causes}, or the robot's own driver scales it.")
 
 
 def check_pose_moves(drive: Drive) -> None:
@@ -431,9 +435,9 @@ def check_pose_moves(drive: Drive) -> None:
     position, heading = drive.pose_noise or (0.0, 0.0)
     reach = float(np.ptp(values[:, :2], axis=0).max())
     turn = float(np.ptp(values[:, 2]))
-    if reach <= max(STANDING_M, FROZEN * position) and turn <= max(
-        STANDING_RAD, FROZEN * heading
-    ):
+    stays = reach <= max(STANDING_M, FROZEN * position)
+    stays &= turn <= max(STANDING_RAD, FROZEN * heading)
+    if stays:
         fault = (
             f"stays within {reach:.2g} m and {turn:.2g} rad while the commands change"
         )
@@ -442,18 +446,13 @@ def check_pose_moves(drive: Drive) -> None:
 
 
 def check_encoders(drive: Drive) -> tuple[str, ...]:
-    """Yields measured wheels that turn against the motion they cause according to the textbook."""
-    recording = drive.recording
+    """Returns a sentence on each measured wheel that turns against the motion it causes."""
     spec = drive.spec
-    state = recording.state
-    wheels = bool(spec.state) and all(
-        v.unit == "rad/s" and not v.twist for v in spec.state
-    )
-    if (
-        state is None
-        or state.clock != recording.pose.clock
-        or not (wheels and has_textbook(spec))
-    ):
+    state = drive.recording.state
+    if state is None or state.clock != drive.recording.pose.clock:
+        return ()
+    are_wheels = [v.unit == "rad/s" and not v.twist for v in spec.state]
+    if not (are_wheels and all(are_wheels) and has_textbook(spec)):
         return ()
     try:
         per_wheel = textbook(spec).twist(np.eye(len(spec.state)))  # (S, 3)
@@ -463,45 +462,49 @@ def check_encoders(drive: Drive) -> tuple[str, ...]:
     inside = (start >= state.t[0]) & (end <= state.t[-1])
     if inside.sum() < MIN_COMPARED:
         return ()
+    driven = driven[inside]
     turned = interval_means(state.t, state.values, start[inside], end[inside])
-    found = np.linalg.lstsq(turned, driven[inside], rcond=1e-3)[0]  # (S, 3)
-    rest = driven[inside] - turned @ found
-    parts = [d for d in (0, 2) if np.abs(per_wheel[:, d]).min() > 0.0]
-    explained = 1.0 - (rest**2).mean(axis=0) / np.maximum(
-        (driven[inside] ** 2).mean(axis=0), 1e-12
-    )
-    if not parts or explained[parts].min() < SWAPPED:
+    effect = np.linalg.lstsq(turned, driven, rcond=1e-3)[0]  # (S, 3)
+    rest = driven - turned @ effect
+    power = np.maximum((driven**2).mean(axis=0), 1e-12)
+    explained = 1.0 - (rest**2).mean(axis=0) / power
+    dofs = [d for d in (0, 2) if np.abs(per_wheel[:, d]).min() > 0.0]
+    if not dofs or explained[dofs].min() < SWAPPED:
         return ()
-    against = (found[:, parts] * per_wheel[:, parts] < 0.0).all(axis=1)
-    names = [v.name for v, wrong in zip(spec.state, against, strict=True) if wrong]
+    is_reversed = (effect[:, dofs] * per_wheel[:, dofs] < 0.0).all(axis=1)
     finding = "turns backwards where the robot drives ahead"
     advice = "its encoder counts backwards; write `scale: -1` for it"
-    return tuple(Mistake(f"{name} {finding}: {advice}.") for name in names)
+    return tuple(
+        Mistake(f"{spec.state[i].name} {finding}: {advice}.")
+        for i in np.flatnonzero(is_reversed)
+    )
 
 
 def _check_swapped(
     drive: Drive, pair: list[int], crosswise: float, straight: float
 ) -> None:
     """Refuses two commands that correlate better with the other's motion than with their own."""
-    if crosswise > max(SWAPPED, straight):
-        one, other = (drive.spec.command[place].name for place in pair)
-        fault = (
-            f"{one} and {other} are swapped: each moves the robot like the other should"
-        )
-        advice = f"write the column of `{other}:` after `{one}:`, and vice versa"
-        raise RecordingError(f"{drive.recording.source}: {fault}; {advice}.")
+    if crosswise <= max(SWAPPED, straight):
+        return
+    first, second = (drive.spec.command[place].name for place in pair)
+    fault = (
+        f"{first} and {second} are swapped: each moves the robot like the other should"
+    )
+    advice = f"write the column of `{second}:` after `{first}:`, and vice versa"
+    raise RecordingError(f"{drive.recording.source}: {fault}; {advice}.")
 
 
 def _check_sideways(drive: Drive, command: recordings.Stream) -> tuple[str, ...]:
     """Checks commands of a robot that moves sideways, whose pose sensor may be rotated."""
-    spec, (start, end, driven) = drive.spec, _driven(drive)
+    spec = drive.spec
+    start, end, driven = _driven(drive)
     keys = [c.cmd_vel or c.name for c in spec.command]
     if sorted(keys) != sorted(SIDEWAYS) or len(start) < MIN_COMPARED:
         return ()
     order = [keys.index(key) for key in SIDEWAYS]
     best = np.zeros((3, 3))
     for delay in DELAYS_S:
-        asked = held(command, spec, start - delay, end - delay)[:, order]
+        asked = average_held(command, spec, start - delay, end - delay)[:, order]
         with np.errstate(invalid="ignore"):  # commands that never changed
             alike = np.nan_to_num(np.corrcoef(asked.T, driven.T)[:3, 3:])
         # a rotated mounting moves the sensor sideways
@@ -520,14 +523,13 @@ def _check_sideways(drive: Drive, command: recordings.Stream) -> tuple[str, ...]
         )
     if np.linalg.det(best[:2, :2]) > -(SWAPPED**2) or np.linalg.det(way[:2]) > 0.0:
         return ()
-    one, other = (spec.command[k].name for k in order[:2])
-    finding = f"The robot moves right where {other} is positive, or back where {one} is"
-    cause = "one of them has the wrong sign, or the recording is a mirror image"
-    return (
-        Mistake(
-            f"{finding}: {cause} (y and heading reversed); the model moves as recorded."
-        ),
+    ahead, left = (spec.command[k].name for k in order[:2])
+    finding = (
+        f"The robot moves right where {left} is positive, or back where {ahead} is"
     )
+    cause = "one of them has the wrong sign, or the recording is a mirror image"
+    consequence = "(y and heading reversed); the model moves as recorded"
+    return (Mistake(f"{finding}: {cause} {consequence}."),)
 
 
 def _driven(drive: Drive) -> tuple[Array, Array, Array]:
@@ -536,7 +538,9 @@ def _driven(drive: Drive) -> tuple[Array, Array, Array]:
     start = np.arange(t[0], t[-1] - COMPARED_S, COMPARED_S / 2.0)
     first = np.searchsorted(t, start)
     last = np.searchsorted(t, start + COMPARED_S)
-    first, last = first[last > first], last[last > first]
+    apart = last > first
+    first = first[apart]
+    last = last[apart]
     moved = geometry.log(
         geometry.between(drive.dated.values[first], drive.dated.values[last])
     )
@@ -549,38 +553,47 @@ def _places(spec: RobotSpec) -> list[int]:
     return [PLACES[key] for key in keys] if {*keys} <= {*PLACES} else []
 
 
-def _asked_and_driven(
+def _has_known_wheels(spec: RobotSpec) -> bool:
+    """True if the commands are those of wheels whose radius is known."""
+    return (
+        all(c.unit == "rad/s" for c in spec.command)
+        and "wheel_radius" in spec.parameters
+        and "wheel_radius" not in spec.assumed
+        and has_textbook(spec)
+    )
+
+
+def _compare_commands(
     drive: Drive, command: recordings.Stream
 ) -> tuple[Array, Array, Array] | None:
     """Returns speed and turn rate (n, 2), commanded and measured, and their correlations (2, 2).
 
     None if they can't be determined.
     """
-    spec, places, (start, end, moved) = drive.spec, _places(drive.spec), _driven(drive)
-    wheels = (
-        all(c.unit == "rad/s" for c in spec.command)
-        and "wheel_radius" in spec.parameters
-    )
-    wheels = wheels and "wheel_radius" not in spec.assumed and has_textbook(spec)
-    if not (places or wheels) or len(start) < MIN_COMPARED:
+    spec = drive.spec
+    places = _places(spec)
+    start, end, moved = _driven(drive)
+    if len(start) < MIN_COMPARED or not (places or _has_known_wheels(spec)):
         return None
     # direction of travel, ahead or back
     axis = np.sqrt(((moved[:, 0] + 1j * moved[:, 1]) ** 2).sum())
     axis = axis / max(abs(axis), 1e-9)
     driven = np.stack([moved[:, :2] @ [axis.real, axis.imag], moved[:, 2]], axis=1)
-    best = np.zeros((2, 2)), driven
+    asked = driven
+    correlation = np.zeros((2, 2))
     for delay in DELAYS_S:
-        sent = held(command, spec, start - delay, end - delay)
-        twist = np.zeros_like(driven)
-        twist[:, places or [0, 1]] = (
-            sent if places else textbook(spec).compute_twist(sent)[:, [0, 2]]
-        )
+        sent = average_held(command, spec, start - delay, end - delay)
+        trial = np.zeros_like(driven)
+        if places:
+            trial[:, places] = sent
+        else:
+            trial[:] = textbook(spec).compute_twist(sent)[:, [0, 2]]
         with np.errstate(invalid="ignore"):  # commands that never changed
-            alike = np.corrcoef(twist.T, driven.T)[:2, 2:]
-        best = max(
-            best, (np.abs(np.nan_to_num(alike)), twist), key=lambda e: e[0].sum()
-        )
-    return best[1], driven, best[0]
+            alike = np.abs(np.nan_to_num(np.corrcoef(trial.T, driven.T)[:2, 2:]))
+        if alike.sum() > correlation.sum():
+            asked = trial
+            correlation = alike
+    return asked, driven, correlation
 
 
 def check_axes(drive: Drive) -> None:
@@ -590,36 +603,40 @@ def check_axes(drive: Drive) -> None:
     values = drive.dated.values
     noise = TRAVEL_NOISE * (drive.pose_noise or (0.0, 0.0))[0]
     apart = max(TRAVEL_SHARE * drive.spec.footprint_radius, noise, 1e-3)
-    some = drive.dated.rows(recordings.select_along_path(values, apart))
-    line = (
-        "" if drive.spec.moves_sideways else recordings.find_clockwise_keys(some.values)
+    spaced = drive.dated.rows(recordings.select_along_path(values, apart))
+    if drive.spec.moves_sideways:
+        keys = _find_mirrored_heading(spaced, drive)
+    else:
+        keys = recordings.find_clockwise_keys(spaced.values)
+    if keys is HeadingKeys.NONE:
+        return
+    if keys is HeadingKeys.COMPASS:
+        kind = "as that of a compass"
+        alternative = "exchange x and y"
+    else:
+        kind = "counted clockwise"
+        alternative = "reverse x or y, or remove such a scale"
+    fault = "heading and path turn opposite ways; one of x, y and heading is reversed"
+    advice = (
+        f"for a heading {kind} write `heading: {{from: ..., {keys}}}` below `pose:`"
     )
-    state = recording.state
-    if (
-        drive.spec.moves_sideways
-        and state is not None
-        and state.clock == recording.pose.clock
-        and recordings.has_visible_axes(some.values)
-    ):
-        other = some.values * np.array([1.0, 1.0, -1.0])
-        as_given, mirrored = (
-            _explained(some.t, p, state) for p in (some.values, other)
-        )
-        least = max(recordings.MIN_MIRRORED, recordings.BETTER + as_given)
-        line = "scale: -1" if mirrored > least else ""
-    if line:
-        fault = (
-            "heading and path turn opposite ways; one of x, y and heading is reversed"
-        )
-        known = "as that of a compass" if "offset" in line else "counted clockwise"
-        advice = f"for a heading {known} write `heading: {{from: ..., {line}}}` below `pose:`"
-        if "offset" in line:
-            other = "exchange x and y"
-        else:
-            other = "reverse x or y, or remove such a scale"
-        raise RecordingError(
-            f"{recording.source}: pose: {fault}: {advice}; or {other} (REP-103)."
-        )
+    raise RecordingError(
+        f"{recording.source}: pose: {fault}: {advice}; or {alternative} (REP-103)."
+    )
+
+
+def _find_mirrored_heading(pose: recordings.Stream, drive: Drive) -> HeadingKeys:
+    """Finds if only mirrored headings make the measured state explain the poses."""
+    state = drive.recording.state
+    if state is None or state.clock != drive.recording.pose.clock:
+        return HeadingKeys.NONE
+    if not recordings.has_visible_axes(pose.values):
+        return HeadingKeys.NONE
+    as_recorded = _explained(pose.t, pose.values, state)
+    mirrored = _explained(pose.t, pose.values * np.array([1.0, 1.0, -1.0]), state)
+    if mirrored > max(recordings.MIN_MIRRORED, recordings.BETTER + as_recorded):
+        return HeadingKeys.MIRRORED
+    return HeadingKeys.NONE
 
 
 def _explained(t: Array, pose: Array, state: recordings.Stream) -> float:

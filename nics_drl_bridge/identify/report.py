@@ -1,7 +1,8 @@
 """Fit report: the model's equations, the quality of its fit, and what could not be learnt."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from textwrap import fill
 
 import numpy as np
@@ -22,7 +23,8 @@ from nics_drl_bridge.robot.taylor import EndErrors, HorizonErrors, TaylorModel
 
 WIDTH = 96
 CURVE_POINTS = 8
-TEXTBOOK_VALUES = "command_latency_s", "rotation_rad", "lever_arm_x_m", "lever_arm_y_m"
+MOUNTING_VALUES = ("rotation_rad", "lever_arm_x_m", "lever_arm_y_m")
+TEXTBOOK_VALUES = ("command_latency_s", *MOUNTING_VALUES)
 DEAD_ZONE = "dead zone on both sides of 0"
 EAGER = "does more than in proportion, by minus"
 # minimum digits of a coefficient, with which the printed equations predict like the model
@@ -33,14 +35,7 @@ MOST_LEFT = 0.5
 
 def format_report(source: str, identified: Identified) -> str:
     """Returns the report on a recording from a source as text for people."""
-    model = identified.model
-    robot = identified.drive.spec.name
-    sections: dict[str, Iterable[str]] = {
-        f"Fit report: robot {robot!r} from {source}": _list_items(
-            conclude(identified).lines
-        ),
-        _describe_size(identified): format_equations(model),
-    }
+    sections = _make_opening(source, identified)
     motor_effects = list(list_motor_effects(identified))
     if motor_effects:
         sections["Effect of the motors (standard uncertainties):"] = motor_effects
@@ -62,15 +57,29 @@ def format_report(source: str, identified: Identified) -> str:
         sections["Latency of the device, also used by simulator_node:"] = latency
     notes = identified.notes or ("Nothing had to be corrected.",)
     sections["Findings, and what was not learnt:"] = _list_items(notes)
-    paragraphs = (
-        [head, *(f"  {line}" for line in lines)] for head, lines in sections.items()
-    )
-    return "\n\n".join("\n".join(lines) for lines in paragraphs) + "\n"
+    return _format_sections(sections) + "\n"
 
 
-def select_opening(report: str) -> str:
-    """Returns the conclusion and the model of a fit report, which are read first."""
-    return "\n\n".join(report.split("\n\n")[:2])
+def format_opening(source: str, identified: Identified) -> str:
+    """Returns the conclusion and the model, with which `format_report` opens."""
+    return _format_sections(_make_opening(source, identified))
+
+
+def _make_opening(source: str, identified: Identified) -> dict[str, Iterable[str]]:
+    """Returns the lines of the first sections, by their heads."""
+    title = f"Fit report: robot {identified.drive.spec.name!r} from {source}"
+    return {
+        title: _list_items(conclude(identified).lines),
+        _describe_size(identified): format_equations(identified.model),
+    }
+
+
+def _format_sections(sections: Mapping[str, Iterable[str]]) -> str:
+    paragraphs = []
+    for head, lines in sections.items():
+        indented = [f"  {line}" for line in lines]
+        paragraphs.append("\n".join([head, *indented]))
+    return "\n\n".join(paragraphs)
 
 
 def _list_items(sentences: Iterable[str]) -> Iterator[str]:
@@ -146,48 +155,40 @@ def list_motor_effects(identified: Identified) -> Iterator[str]:
     model = identified.model
     sigma = identified.calibration.uncertainty
     units = list_units(identified.drive.spec)
-    values = [
-        (f"{curve.command}.{name}", words, getattr(curve, name), unit, usual)
-        for curve in model.inputs
-        for name, words, unit, usual in (
-            (
-                "dead",
-                DEAD_ZONE if curve.dead > 0.0 else EAGER,
-                units[curve.command],
-                0.0,
-            ),
-            ("least", "saturates below", units[curve.command], -np.inf),
-            ("most", "saturates above", units[curve.command], np.inf),
-            ("back", "reverse gain, relative to forward", "", 1.0),
-            ("delay", "delay after the common latency", "s", 0.0),
-        )
-    ]
+    # name, parameter, description, value, unit, and the value that means "no effect"
+    rows: list[tuple[str, str, str, float, str, float]] = []
+    for curve in model.inputs:
+        name = curve.command
+        unit = units[name]
+        dead = DEAD_ZONE if curve.dead > 0.0 else EAGER
+        back = "reverse gain, relative to forward"
+        rows += [
+            (name, "dead", dead, curve.dead, unit, 0.0),
+            (name, "least", "saturates below", curve.least, unit, -np.inf),
+            (name, "most", "saturates above", curve.most, unit, np.inf),
+            (name, "back", back, curve.back, "", 1.0),
+            (name, "delay", "delay after the common latency", curve.delay, "s", 0.0),
+        ]
     actuators = model.limits, model.friction, model.drag
     rates = zip(model.variables, model.dof_units[3:], *actuators, strict=False)
     for state, unit, (fall, rise), friction, drag in rates:
-        values += [
-            (f"{state}.fall", "maximum fall", fall, unit, -np.inf),
-            (f"{state}.rise", "maximum rise", rise, unit, np.inf),
-            (f"{state}.friction", "dry friction", friction, unit, 0.0),
-            (f"{state}.drag", "drag, times its square", drag, "", 0.0),
+        rows += [
+            (state, "fall", "maximum fall", fall, unit, -np.inf),
+            (state, "rise", "maximum rise", rise, unit, np.inf),
+            (state, "friction", "dry friction", friction, unit, 0.0),
+            (state, "drag", "drag, times its square", drag, "", 0.0),
         ]
-    emf = zip(model.variables, model.back_emf.tolist(), strict=False)
-    values += [
-        (
-            f"{state}.back_emf.{command}",
-            f"back-EMF, times {state} and |{command}|",
-            value,
-            "",
-            0.0,
-        )
-        for state, row in emf
-        for command, value in zip(model.variables[model.state_size :], row, strict=True)
-    ]
-    for key, words, value, unit, usual in values:
-        if value != usual:
-            spread = f" +- {sigma[key]:.2g}" if key in sigma else ""
-            name = key.partition(".")[0]
-            yield f"{name:<24} {words}: {value:.4g}{spread} {unit}".rstrip()
+    commands = model.variables[model.state_size :]
+    for state, emf in zip(model.variables, model.back_emf.tolist(), strict=False):
+        for command, value in zip(commands, emf, strict=True):
+            words = f"back-EMF, times {state} and |{command}|"
+            rows.append((state, f"back_emf.{command}", words, value, "", 0.0))
+    for name, parameter, words, value, unit, usual in rows:
+        if value == usual:
+            continue
+        error = sigma.get(f"{name}.{parameter}")
+        spread = "" if error is None else f" +- {error:.2g}"
+        yield f"{name:<24} {words}: {value:.4g}{spread} {unit}".rstrip()
 
 
 def format_with_error(value: float, error: float | None) -> str:
@@ -219,7 +220,7 @@ def _describe_fit(identified: Identified) -> dict[str, Iterable[str]]:
     return {
         fill(_describe_pruning(identified.alpha), WIDTH): (),
         "Cross-validated error against the number of terms, largest first, * for those kept:": (
-            line for curve in fit.curves for line in _format_curve(curve)
+            chain.from_iterable(map(_format_curve, fit.curves))
         ),
         "Error of the linear fit per degree of freedom, on the part it was fitted to:": (
             f"{dof:<24} RMSE {rmse:.3g} {unit}, R2 {r2:.6f}, condition number {number:.3g}"
@@ -243,26 +244,28 @@ def _describe_pruning(alpha: Alpha) -> str:
 
 def _format_curve(curve: Curve) -> list[str]:
     shown = min(max(CURVE_POINTS, curve.kept + 1), len(curve.error))
-    points = [
-        f"{n}{'*' if n == curve.kept else ''}: {100.0 * curve.share[n]:.3g} %"
-        for n in range(shown)
-    ]
+    points = []
+    for n in range(shown):
+        mark = "*" if n == curve.kept else ""
+        points.append(f"{n}{mark}: {100.0 * curve.share[n]:.3g} %")
     more = f" ({len(curve.error) - 1} in all)" if shown < len(curve.error) else ""
     text = f"{curve.dof:<14} " + ", ".join(points) + more
     return fill(text, WIDTH, subsequent_indent=" " * 15).splitlines()
 
 
 def _describe_held_out(identified: Identified) -> Iterator[str]:
-    found = identified.held_out
+    held_out = identified.held_out
     model = identified.model
     quality = identified.model.quality
-    if found is None:
+    if held_out is None:
         yield "the drive is too short to hold data out"
     else:
-        finding = f"position error {found.mean_position_error_m:.3g} m on average"
-        yield f"after {found.horizon_s:g} s: {finding}, {found.max_position_error_m:.3g} m at most,"
-        finding = f"heading error {found.mean_heading_error_rad:.3g} rad on average"
-        yield f"{finding}, over a mean path of {found.mean_path_m:.2f} m ({found.windows} windows)"
+        mean = f"position error {held_out.mean_position_error_m:.3g} m on average"
+        most = f"{held_out.max_position_error_m:.3g} m at most"
+        yield f"after {held_out.horizon_s:g} s: {mean}, {most},"
+        mean = f"heading error {held_out.mean_heading_error_rad:.3g} rad on average"
+        path = f"a mean path of {held_out.mean_path_m:.2f} m"
+        yield f"{mean}, over {path} ({held_out.windows} windows)"
     if quality is not None and quality.held_out_rmse:
         yield "the rates there:"
         for unit, dof in zip(model.dof_units, quality.held_out_rmse, strict=True):
@@ -287,26 +290,20 @@ COMPARED = (
 
 def tabulate_judgement(judgement: Sequence[HorizonErrors]) -> list[tuple[str, ...]]:
     """Returns a table of predictions beside those of yardsticks, a row per horizon for `HEADS`."""
+    rows = []
+    for at in judgement:
+        cells = [f"{at.horizon_s:g} s", f"{at.path_m:.3g} m"]
+        for errors in (at.model, at.textbook, at.kept_twist):
+            cells.append("-" if errors is None else _format_errors(errors, at.path_m))
+        cells.append("-" if at.band_m is None else f"{at.band_m:.3g} m")
+        cells.append("-" if at.coverage is None else f"{at.coverage:.1%}")
+        rows.append(tuple(cells))
+    return rows
 
-    def cell(errors: EndErrors | None, path: float) -> str:
-        if errors is None:
-            return "-"
-        share = f" ({errors.position_m / path:.1%})" if path > 0.0 else ""
-        return f"{errors.position_m:.3g}{share} {errors.heading_rad:.2g}"
 
-    return [
-        (
-            f"{at.horizon_s:g} s",
-            f"{at.path_m:.3g} m",
-            *(
-                cell(errors, at.path_m)
-                for errors in (at.model, at.textbook, at.kept_twist)
-            ),
-            "-" if at.band_m is None else f"{at.band_m:.3g} m",
-            "-" if at.coverage is None else f"{at.coverage:.1%}",
-        )
-        for at in judgement
-    ]
+def _format_errors(errors: EndErrors, path: float) -> str:
+    share = f" ({errors.position_m / path:.1%})" if path > 0.0 else ""
+    return f"{errors.position_m:.3g}{share} {errors.heading_rad:.2g}"
 
 
 def _format_comparison(judgement: Sequence[HorizonErrors]) -> dict[str, Iterator[str]]:
@@ -341,8 +338,8 @@ class CalibratedValue:
 def collect_estimates(identified: Identified) -> dict[str, CalibratedValue]:
     """Returns all estimates of the calibration by their names in `Calibration`."""
     recording = identified.recording
-    found = identified.calibration
-    sigma = found.uncertainty
+    calibration = identified.calibration
+    sigma = calibration.uncertainty
     mounting = identified.findings.mounting
     one_clock = recording.pose.clock == recording.command.clock
     changed = bool(moved_commands(recording.command).any())
@@ -356,31 +353,28 @@ def collect_estimates(identified: Identified) -> dict[str, CalibratedValue]:
     hidden = (few, few) if mounting is None else mounting.hidden
     unknown = recording.wheels is None
     wheels = "no wheel speeds were recorded" if unknown else "the wheels do not show it"
+    singly = "the poses are stamped one by one"
     rows = {
-        "clock_offset_s": ("clock offset", found.clock_offset_s, "s", clocks),
-        "command_latency_s": ("command latency", found.command_latency_s, "s", latency),
-        "burst_period_s": (
-            "period of bursts",
-            None,
+        "clock_offset_s": ("clock offset", calibration.clock_offset_s, "s", clocks),
+        "command_latency_s": (
+            "command latency",
+            calibration.command_latency_s,
             "s",
-            "the poses are stamped one by one",
+            latency,
         ),
-        "rotation_rad": ("rotation of base_link", found.rotation_rad, "rad", few),
-        "lever_arm_x_m": ("lever arm x", found.lever_arm_m[0], "m", hidden[0]),
-        "lever_arm_y_m": ("lever arm y", found.lever_arm_m[1], "m", hidden[1]),
-        "wheel_scale": ("wheel scale", found.wheel_scale, "m/s per unit", wheels),
-        "turn_scale": ("turn scale", found.turn_scale, "rad/s per unit", wheels),
+        "burst_period_s": ("period of bursts", None, "s", singly),
+        "rotation_rad": ("rotation of base_link", calibration.rotation_rad, "rad", few),
+        "lever_arm_x_m": ("lever arm x", calibration.lever_arm_m[0], "m", hidden[0]),
+        "lever_arm_y_m": ("lever arm y", calibration.lever_arm_m[1], "m", hidden[1]),
+        "wheel_scale": ("wheel scale", calibration.wheel_scale, "m/s per unit", wheels),
+        "turn_scale": ("turn scale", calibration.turn_scale, "rad/s per unit", wheels),
     }
     values = {}
     for key, (name, value, unit, why) in rows.items():
         values[key] = CalibratedValue(name, None, None, unit, why)
         if key in sigma:
-            zero = value == 0.0 and key in (
-                "rotation_rad",
-                "lever_arm_x_m",
-                "lever_arm_y_m",
-            )
-            remark = "below its uncertainty: taken as zero" if zero else ""
+            is_zero = value == 0.0 and key in MOUNTING_VALUES
+            remark = "below its uncertainty: taken as zero" if is_zero else ""
             values[key] = CalibratedValue(name, value, sigma[key], unit, remark)
     if identified.findings.replacement:
         for key in TEXTBOOK_VALUES:
@@ -388,20 +382,18 @@ def collect_estimates(identified: Identified) -> dict[str, CalibratedValue]:
             values[key] = CalibratedValue(
                 name, value, None, unit, "by the fitted textbook"
             )
-    period = found.burst_period_s
+    period = calibration.burst_period_s
     if period > 0.0:
         values["burst_period_s"] = CalibratedValue(
             "period of bursts", period, None, "s"
         )
-    swapped = found.wheels_swapped
-    meaning = {
-        None: wheels,
-        True: "left and right are interchanged",
-        False: "as named",
-    }[swapped]
-    known = None if swapped is None else float(swapped)
+    value = None
+    meaning = wheels
+    if calibration.wheels_swapped is not None:
+        value = float(calibration.wheels_swapped)
+        meaning = "left and right are interchanged" if value else "as named"
     values["wheels_swapped"] = CalibratedValue(
-        "swapped wheels", known, None, "", meaning
+        "swapped wheels", value, None, "", meaning
     )
     return values
 
@@ -429,26 +421,27 @@ def explain_uselessness(identified: Identified) -> str:
     way = f"after {held_out.horizon_s:g} s and a path of {held_out.mean_path_m:.2f} m"
     still = f"while a robot standing still would be {standing:.2f} m off"
     fault = f"the fitted model is useless: on unseen data its predictions {end} {way}, {still}"
-    return f"{recording.source}: {fault}; {_name_suspect(identified, spec)}."
+    return f"{recording.source}: {fault}; {_name_suspect(identified, spec)}"
 
 
 def _name_suspect(identified: Identified, spec: RobotSpec) -> str:
+    """Returns the end of a sentence, on the most likely cause of a useless model."""
     recording = identified.recording
     unmoved = identified.trial.fit.unmoved
     rows = recording.pose if recording.state is None else recording.state
     apart = f"{np.median(np.diff(rows.t)):.2g} s apart"
     coarse = describe_coarsest_state(recording, spec, unmoved)
     if coarse:
-        return coarse
+        return f"{coarse}."
     still = ", ".join(c.name for c in spec.command if c.name in unmoved)
     if still:
         reason = f"{still} never moved in its first {identified.train_until_s:.0f} s"
-        return f"{reason}, which the fit learns from, so change it from the start"
+        return f"{reason}, which the fit learns from, so change it from the start."
     if identified.alpha != "auto" or identified.drive.settings.order == 1:
-        return "it may lack terms, so leave order and alpha at `auto`"
+        return "it may lack terms, so leave order and alpha at `auto`."
     for note in identified.notes:
         if isinstance(note, Mistake | Doubt):
-            return f"{note[0].lower()}{note[1:].rstrip('.')}"
+            return f"the likely cause: {note}"
     got = "that nothing blocked the robot, that it received each command"
     shown = f"{got} and that rows {apart} show how it responds"
-    return f"the recording does not show why, so make sure {shown}, and record again"
+    return f"the recording does not show why, so make sure {shown}, and record again."

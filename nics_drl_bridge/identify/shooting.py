@@ -13,11 +13,10 @@ from scipy.optimize import least_squares
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify.kernels import Shot, shoot, tangent
+from nics_drl_bridge.identify.kernels import Shot, make_used_terms, shoot, tangent
 from nics_drl_bridge.identify.statistics import clustered_errors
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot import taylor
-from nics_drl_bridge.robot.kernels import make_terms
 from nics_drl_bridge.robot.taylor import TaylorModel
 
 Mask = NDArray[np.bool_]
@@ -31,7 +30,7 @@ Shape = Callable[[TaylorModel, Array], TaylorModel]
 Trust = Callable[[Array, Array], Array]
 
 HORIZONS_S = (0.3, 1.0, 2.5, 5.0)  # the shortest separates latency from lag
-SPACING_S = 0.25
+SPACING_S = 0.25  # between the starts of windows
 HEADING_ARM_M = 0.3  # a heading error counts as a position error at this distance
 FARTHEST_M = 50.0  # errors are clipped at this distance per second of the horizon
 PULL = 0.001  # usual weight of the first coefficients relative to the predictions
@@ -66,9 +65,10 @@ class Inputs:
 
     def begun_at(self, other: "Inputs") -> "Inputs":
         """Starts from the values of other inputs, where these have them."""
-        known = dict(zip(other.names, other.start.tolist(), strict=True))
+        values = dict(zip(other.names, other.start.tolist(), strict=True))
         start = [
-            known.get(name, at) for name, at in zip(self.names, self.start, strict=True)
+            values.get(name, at)
+            for name, at in zip(self.names, self.start, strict=True)
         ]
         return replace(self, start=np.clip(start, self.low, self.high))
 
@@ -109,15 +109,15 @@ class Shooting:
         if inside is not None:
             outside = np.append(0, np.cumsum(~inside))
             whole &= outside[end] == outside[first][:, None]
-        some = whole.any(axis=1)
-        return first[some], np.where(whole, steps, 0)[some]
+        is_used = whole.any(axis=1)
+        return first[is_used], np.where(whole, steps, 0)[is_used]
 
     @property
     def longest_horizon_s(self) -> float:
         """The longest horizon that fits into the drive; 0 if none does [s]."""
         _, steps = self.starts()
-        horizons = zip(self.horizons, steps.T, strict=True)
-        return max((horizon for horizon, each in horizons if each.any()), default=0.0)
+        fits = steps.any(axis=0)
+        return max(np.array(self.horizons)[fits].tolist(), default=0.0)
 
     def moved(self, first: Rows, steps: Rows) -> Array:
         """Returns the measured poses (W, H, 3) at windows' horizons, relative to the starts."""
@@ -144,13 +144,8 @@ class Shooting:
         model = self.shaped(model, values)
         if free is None:
             free = np.zeros(model.coefficients.shape, dtype=np.bool_)
-        else:
-            free = free
         used = (model.coefficients != 0.0) | free
-        dofs, places = np.nonzero(used)
-        terms = make_terms(replace(model, coefficients=used.astype(np.float64)))
-        terms = terms._replace(coefficient=model.coefficients[dofs, places])
-        moving = np.flatnonzero(free[dofs, places]).astype(np.int64)
+        terms, moving = make_used_terms(model, used, free)
         command = self.commands(values)
         state = self.samples.q[:, 3:]
         shot = Shot(
@@ -161,7 +156,7 @@ class Shooting:
             np.zeros((*steps.shape, 3)),
             np.zeros((*steps.shape, 3, len(moving))),
         )
-        sizes = state.shape[1], command.shape[1], len(dofs), len(moving)
+        sizes = state.shape[1], command.shape[1], len(terms.dof), len(moving)
         shoot(shot, terms, moving, model.dt, tangent(*sizes))
         return _seen_from(values[-3:], shot) if self.mounted else (shot.end, shot.slope)
 
@@ -202,9 +197,8 @@ class Predictive:
 
     model: TaylorModel
     values: Array  # (I,) of the inputs
-    error: float  # root mean square of the scaled errors [m/s]
     jacobian: Array  # (n, P) of the residual by the free coefficients
-    residual: Array  # (n,)
+    residual: Array  # (n,) scaled errors [m/s]
     free: Mask  # (D, K)
     starts: Array  # (n,) start of the window of each residual [s]
     # (I,) standard errors of the values; NaN for known ones
@@ -317,8 +311,11 @@ class _Search:
     def late(self, theta: Array, rest: Array) -> Array:
         """Returns derivatives (n, I) of errors (n,) by the scaled values."""
         aside = theta + DIFFERENCE * np.eye(self.count, len(theta))
-        every = [(self.shot(each, False)[0] - rest) / DIFFERENCE for each in aside]
-        return np.ascontiguousarray(np.reshape(every, (self.count, len(rest))).T)
+        slopes = np.zeros((len(rest), self.count))
+        for i, trial in enumerate(aside):
+            errors, _ = self.shot(trial, False)
+            slopes[:, i] = (errors - rest) / DIFFERENCE
+        return slopes
 
     def run(self, first: Array | None, evaluations: int) -> Predictive:
         """Searches for the minimum of the errors."""
@@ -326,12 +323,13 @@ class _Search:
         start = np.zeros(self.count + len(self.unit))
         begun = self.residual(start)
         if first is not None:
-            other = start.copy()
-            other[count:] = (
+            trial = start.copy()
+            trial[count:] = (
                 first[self.free] - self.model.coefficients[self.free]
             ) / self.unit
-            if np.abs(rest := self.residual(other)).sum() < np.abs(begun).sum():
-                start = other
+            rest = self.residual(trial)
+            if np.abs(rest).sum() < np.abs(begun).sum():
+                start = trial
                 begun = rest
         low = np.full(len(start), -np.inf)
         high = -low
@@ -341,7 +339,7 @@ class _Search:
         high[:count] = ((inputs.high - inputs.start) / inputs.scale)[at]
         aside = INSIDE * (high - low)[:count]  # at a bound the search would not move
         start[:count] = np.clip(0.0, low[:count] + aside, high[:count] - aside)
-        found = least_squares(
+        solution = least_squares(
             self.residual,
             start,
             jac=self.jacobian,
@@ -352,7 +350,7 @@ class _Search:
             ftol=TOLERANCE,
             xtol=TOLERANCE,
         )
-        return self.predictive(found.x)
+        return self.predictive(solution.x)
 
     def predictive(self, theta: Array) -> Predictive:
         """Returns the model with the data for its uncertainty."""
@@ -367,5 +365,4 @@ class _Search:
         if self.count:
             late_slope = self.late(theta, rest) / self.inputs.scale[self.sought]
             errors[self.sought] = clustered_errors(late_slope, rest, span)
-        error = float(np.sqrt(np.mean(rest**2)))
-        return Predictive(best, late, error, slope, rest, self.free, starts, errors)
+        return Predictive(best, late, slope, rest, self.free, starts, errors)

@@ -1,4 +1,14 @@
-"""Signals in time: held commands, the states that follow them, means, resampled poses, noise."""
+"""Signals in time: held commands, the states that follow them, means, resampled poses, noise.
+
+A command takes effect in this order; each step has a function:
+
+1. The stream of commands holds a value until the next stamp. `average_held` integrates it, so that
+   an interval has the mean command, wherever its ends lie between the stamps.
+2. `average_effect` first bends the values by the input curves of the motors, and delays each
+   command.
+3. `infer_states` lets unmeasured states follow the commands by first-order lags: over a step `dt`,
+   a state keeps `exp(-dt / lag)` of its distance from the command. Motors may limit its rate.
+"""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -15,62 +25,78 @@ from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.curve import InputCurve, apply_curves, delays
 from nics_drl_bridge.robot.spec import RobotSpec
 
-SMOOTHING_BATCH = 64
+MOST_SMOOTHED = 64  # maximum number of poses that a parabola is fitted to
+FEWEST_SMOOTHED = 4
+RIDGE = 1e-9  # keeps the normal equations of a parabola regular
 DEFAULT_LAG_S = 0.1
+SHORTEST_LAG_S = 1e-6
+AT_REST_S = (
+    2.0  # this long before the first command, states have the values of a robot at rest
+)
+# Sixth differences cancel smooth motion (polynomials up to the fifth order) and leave white noise,
+# which they amplify by the root of the sum of their squared weights.
 DIFFERENCE = 6
-# factor by which a sixth difference amplifies white noise
 DIFFERENCE_GAIN = np.sqrt(924.0)
+# median absolute deviation of a normal distribution with a standard deviation of 1
 GAUSSIAN_MAD = 0.6745
 
 
-def taken(
+def average_effect(
     command: Stream,
     spec: RobotSpec,
     curves: tuple[InputCurve, ...],
     start: Array,
     end: Array,
 ) -> Array:
-    """Returns means (..., C) of commands in effect over intervals (...) [s], given their curves."""
+    """Returns means (..., C) over intervals (...) [s] of commands after their curves and delays."""
     names = [c.name for c in spec.command]
-    stream = replace(command, values=apply_curves(command.values, names, curves))
-    late = delays(names, curves)
-    means = held(stream, spec, start, end)
-    for c in np.flatnonzero(late):
-        means[..., c] = held(stream, spec, start - late[c], end - late[c])[..., c]
+    bent = replace(command, values=apply_curves(command.values, names, curves))
+    delay_s = delays(names, curves)
+    means = average_held(bent, spec, start, end)
+    for c in np.flatnonzero(delay_s):
+        delayed = average_held(bent, spec, start - delay_s[c], end - delay_s[c])
+        means[..., c] = delayed[..., c]
     return means
 
 
-def held(
+def average_held(
     command: Stream,
     spec: RobotSpec,
     start: Array,
     end: Array,
     powers: NDArray[np.int64] | None = None,
 ) -> Array:
-    """Returns means (..., C), or of powers (K, C), of held commands over intervals (...) [s]."""
+    """Returns means (..., C) of held commands over intervals (...) [s].
+
+    With exponents `powers` (K, C), returns the means (..., K) of these products instead.
+    """
     # Before its first command a robot is at rest, so commands that ever change are zero then.
-    still = np.clip(0.0, spec.command_low, spec.command_high)
-    before = np.where(moved_commands(command), still, command.values[0])
+    at_rest = np.clip(0.0, spec.command_low, spec.command_high)
+    before = np.where(moved_commands(command), at_rest, command.values[0])
     values = np.concatenate([before[None], command.values])
     if powers is not None:
         values = taylor.evaluate(values, powers)
-    low = min(start.min(), command.t[0]) - 1.0
-    high = max(end.max(), command.t[-1]) + 1.0
-    edges = np.concatenate([[low], command.t, [high]])
-    return _means(edges, values * np.diff(edges)[:, None], start, end)
+    # Row k of the values holds from edge k to edge k + 1.
+    first = min(start.min(), command.t[0]) - 1.0
+    last = max(end.max(), command.t[-1]) + 1.0
+    edges = np.concatenate([[first], command.t, [last]])
+    integrals = values * np.diff(edges)[:, None]
+    return _average(edges, integrals, start, end)
 
 
 def interval_means(t: Array, values: Array, start: Array, end: Array) -> Array:
     """Returns means (n, K) over intervals (n,) of values (T, K), linear between stamps (T,)."""
-    return _means(t, np.diff(t)[:, None] * (values[1:] + values[:-1]) / 2.0, start, end)
+    trapezoids = np.diff(t)[:, None] * (values[1:] + values[:-1]) / 2.0
+    return _average(t, trapezoids, start, end)
 
 
-def _means(t: Array, parts: Array, start: Array, end: Array) -> Array:
-    """Returns means (..., K) over intervals, from the integrals (T, K) between times."""
-    area = np.concatenate([np.zeros((1, parts.shape[1])), np.cumsum(parts, axis=0)])
-    means = np.empty((*start.shape, parts.shape[1]))
+def _average(edges: Array, integrals: Array, start: Array, end: Array) -> Array:
+    """Returns means (..., K) over intervals (...), from integrals (E, K) between edges (E + 1,)."""
+    zero = np.zeros((1, integrals.shape[1]))
+    area = np.concatenate([zero, np.cumsum(integrals, axis=0)])  # up to each edge
+    means = np.empty((*start.shape, integrals.shape[1]))
     for k, column in enumerate(area.T):
-        means[..., k] = np.interp(end, t, column) - np.interp(start, t, column)
+        means[..., k] = np.interp(end, edges, column) - np.interp(start, edges, column)
     return means / (end - start)[..., None]
 
 
@@ -122,7 +148,7 @@ def free_motors(states: int) -> Motors:
     return Motors(np.full(states, -np.inf), np.full(states, np.inf), np.zeros(states))
 
 
-def inferred_states(
+def infer_states(
     command: Stream,
     spec: RobotSpec,
     lags: Array,
@@ -130,32 +156,50 @@ def inferred_states(
     grid: Array,
     motors: Motors | None = None,
 ) -> Array:
-    """Infers states (T, S) at uniform times (T,) by lags and latencies (S,) [s], with gain one."""
+    """Infers states (T, S) at uniform times (T,) from commands, with a gain of one.
+
+    Args:
+        command: the commands.
+        spec: the robot; each state follows one command.
+        lags: (S,) time constants [s].
+        latency: () or (S,) from a command's stamp to its effect [s].
+        grid: (T,) uniform times [s].
+        motors: limits and dead zones; by default none.
+    """
     dt = float(grid[1] - grid[0])
     follows = followed(spec)
     fall, rise, dead = motors or free_motors(len(follows))
-    if dead.any():
-        least = np.zeros(command.values.shape[1])
-        least[follows] = dead
-        size = np.maximum(np.abs(command.values) - least, 0.0)
-        command = replace(command, values=np.sign(command.values) * size)
-    late = np.broadcast_to(latency, len(follows)).tolist()
-    means = {one: held(command, spec, grid - one, grid + dt - one) for one in set(late)}
-    target = np.empty((len(grid), len(follows)))
-    for i, (one, c) in enumerate(zip(late, follows, strict=True)):
-        target[:, i] = means[one][:, c]
-    long_ago = np.array([command.t[0] - 2.0])
-    initial = held(command, spec, long_ago, long_ago + 1.0)[0, follows]
+    command = _without_dead_zones(command, follows, dead)
+    targets = np.empty((len(grid), len(follows)))
+    for late in np.unique(latency):
+        means = average_held(command, spec, grid - late, grid + dt - late)
+        delayed = np.broadcast_to(latency, len(follows)) == late
+        targets[:, delayed] = means[:, follows[delayed]]
+    at_rest = np.array([command.t[0] - AT_REST_S])
+    initial = average_held(command, spec, at_rest, at_rest + 1.0)[0, follows]
     states = np.empty((len(grid), len(follows)))
-    for i, a in enumerate(np.exp(-dt / np.maximum(lags, 1e-6))):
+    for i, kept in enumerate(np.exp(-dt / np.maximum(lags, SHORTEST_LAG_S))):
         if np.isinf([fall[i], rise[i]]).all():
-            lag = ([0.0, 1.0 - a], [1.0, -a])
+            # x[k + 1] = kept * x[k] + (1 - kept) * target[k]
+            lag = ([0.0, 1.0 - kept], [1.0, -kept])
             begin = initial[i : i + 1]
-            states[:, i] = scipy.signal.lfilter(*lag, target[:, i], zi=begin)[0]
+            states[:, i] = scipy.signal.lfilter(*lag, targets[:, i], zi=begin)[0]
         else:
             states[0, i] = initial[i]
-            limp(states[:, i], target[:, i], 1.0 - a, dt * fall[i], dt * rise[i])
+            limp(states[:, i], targets[:, i], 1.0 - kept, dt * fall[i], dt * rise[i])
     return states
+
+
+def _without_dead_zones(
+    command: Stream, follows: NDArray[np.intp], dead: Array
+) -> Stream:
+    """Returns commands that are smaller by the dead zones (S,) of the states that follow them."""
+    if not dead.any():
+        return command
+    zones = np.zeros(command.values.shape[1])
+    zones[follows] = dead
+    size = np.maximum(np.abs(command.values) - zones, 0.0)
+    return replace(command, values=np.sign(command.values) * size)
 
 
 def white_noise(values: Array) -> Array:
@@ -174,7 +218,11 @@ def unwrapped(pose: Array) -> Array:
 def resample(
     t: Array, pose: Array, at: Array, half_width: float, weights: Array | None = None
 ) -> Array:
-    """Resamples unwrapped poses (T, 3) at (n,), by parabolas over `half_width` [s] unless 0."""
+    """Resamples unwrapped poses (T, 3) at times (n,): smoothed if `half_width` [s] is not 0.
+
+    Without smoothing, a cubic spline passes through all poses. With it, the value at a time is that
+    of a parabola, fitted with weights (T, 3) to the poses within the half-width, at least four.
+    """
     distinct = np.concatenate([[True], np.diff(t) > 0.0])
     weights = np.ones_like(pose) if weights is None else weights
     t = t[distinct]
@@ -182,16 +230,21 @@ def resample(
     weights = weights[distinct]
     if half_width == 0.0:
         return np.asarray(make_interp_spline(t, pose, k=3)(at))
-    low = np.searchsorted(t, at - half_width)
-    low = np.clip(np.minimum(low, np.searchsorted(t, at) - 2), 0, max(len(t) - 4, 0))
-    high = np.maximum(np.searchsorted(t, at + half_width), low + 4)
-    index = low[:, None] + np.arange(min(SMOOTHING_BATCH, int((high - low).max())))
-    inside = (index < high[:, None]) & (index < len(t))
-    index = np.minimum(index, len(t) - 1)
-    weight = inside[..., None] * weights[index]
-    basis = ((t[index] - at[:, None]) / half_width)[..., None] ** np.arange(3)
-    normal = np.einsum("nki,nkd,nkj->ndij", basis, weight, basis) + 1e-9 * np.eye(3)
-    right = np.einsum(
-        "nki,nkd,nkd->ndi", basis, weight, pose[index] - pose[low][:, None]
-    )
-    return np.asarray(np.linalg.solve(normal, right[..., None])[:, :, 0, 0] + pose[low])
+    # Rows first to last - 1 are the poses of each time; `row` (n, m) pads them to one number m.
+    first = np.minimum(np.searchsorted(t, at - half_width), np.searchsorted(t, at) - 2)
+    first = np.clip(first, 0, max(len(t) - FEWEST_SMOOTHED, 0))
+    last = np.maximum(np.searchsorted(t, at + half_width), first + FEWEST_SMOOTHED)
+    most = min(MOST_SMOOTHED, int((last - first).max()))
+    row = first[:, None] + np.arange(most)
+    is_used = (row < last[:, None]) & (row < len(t))
+    row = np.minimum(row, len(t) - 1)
+    weight = is_used[..., None] * weights[row]  # (n, m, 3)
+    # The normal equations of  pose - pose[first] = c0 + c1 z + c2 z^2,  z from -1 to 1, for each
+    # time n, neighbour k, degree of freedom d, powers i and j. The value at the time is c0.
+    z = (t[row] - at[:, None]) / half_width
+    basis = z[..., None] ** np.arange(3)
+    normal = np.einsum("nki,nkd,nkj->ndij", basis, weight, basis) + RIDGE * np.eye(3)
+    change = pose[row] - pose[first][:, None]
+    right = np.einsum("nki,nkd,nkd->ndi", basis, weight, change)
+    coefficients = np.linalg.solve(normal, right[..., None])[..., 0]  # (n, 3, 3)
+    return np.asarray(coefficients[..., 0] + pose[first])

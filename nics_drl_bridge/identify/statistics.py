@@ -15,7 +15,8 @@ from nics_drl_bridge.robot.taylor import TaylorModel
 
 UNLIKE = 0.05  # correlation below which residuals are assumed to be independent
 LONGEST = 0.1  # longest correlation of residuals, as a fraction of the rows
-CERTAIN = 3.0  # minimum ratio of a term of a noisy fit to its standard error
+# minimum ratio of a term of a noisy fit, or of a correction, to its standard error
+CERTAIN = 3.0
 WEAK = 1e4  # condition number of instruments x features above which instruments are too weak
 # relative step and termination of `minimise`
 DIFFERENCE = 1e-4
@@ -50,7 +51,7 @@ def minimise(
     slope: Any = "2-point"
     if jacobian is not None:
         slope = lambda z: jacobian(start + (z - 1.0) * scale) * scale  # noqa: E731
-    found = least_squares(
+    solution = least_squares(
         lambda z: residual(start + (z - 1.0) * scale),
         np.ones(len(start)),
         jac=slope,
@@ -60,7 +61,11 @@ def minimise(
         ftol=TOLERANCE,
         max_nfev=MAX_STEPS,
     )
-    return start + (found.x - 1.0) * scale, found.jac / scale, np.asarray(found.fun)
+    return (
+        start + (solution.x - 1.0) * scale,
+        solution.jac / scale,
+        np.asarray(solution.fun),
+    )
 
 
 def uncertainty(jacobian: Array, residual: Array) -> Array:

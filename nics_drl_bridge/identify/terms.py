@@ -62,7 +62,7 @@ def fit_motion_terms(
     allowed = allowed or select_motion_terms
     constants = _find_constant_variables(samples, spec)
     held = tuple(c.name for c in spec.command if constants.get(c.name))
-    found = prune_and_refit(
+    fit = prune_and_refit(
         regress(samples, spec, order, term_filter=partial(allowed, held=held)),
         spec,
         1.0,
@@ -71,9 +71,9 @@ def fit_motion_terms(
     still[FIRST_STATE:] |= np.array(
         [v.name in constants for v in spec.state], dtype=np.bool_
     )
-    coefficients = np.where(still[:, None], 0.0, found.model.coefficients)
-    model = replace(found.model, coefficients=coefficients)
-    return replace(found, model=_define_twist(model, spec, constants))
+    coefficients = np.where(still[:, None], 0.0, fit.model.coefficients)
+    model = replace(fit.model, coefficients=coefficients)
+    return replace(fit, model=_define_twist(model, spec, constants))
 
 
 def _find_constant_variables(samples: Samples, spec: RobotSpec) -> dict[str, float]:
@@ -151,13 +151,13 @@ def select_motion_terms(
         allowed[TWIST] &= (powers[:, len(spec.state) :] == 0).all(axis=1)
     allowed[_come_to_rest(spec, reversed_names, held)] &= order > 0
     for i, variable in enumerate(spec.state):
-        own = (order == 1) & (powers[:, i] == 1)
+        alone = (order == 1) & (powers[:, i] == 1)
         if variable.twist:
-            allowed[POSE_RATES.index(variable.twist)] = own
+            allowed[POSE_RATES.index(variable.twist)] = alone
         else:
             command = find_followed_command(spec, variable)
             by_command = (order == 1) & (powers[:, command] == 1)
-            allowed[FIRST_STATE + i] = own | by_command
+            allowed[FIRST_STATE + i] = alone | by_command
     return np.asarray(allowed)
 
 
@@ -377,8 +377,8 @@ def stabilise(model: TaylorModel, spec: RobotSpec) -> TaylorModel:
     is_linear = model.powers.sum(axis=1) == 1
     for i in range(len(spec.state)):
         row = FIRST_STATE + i
-        own = is_linear & (model.powers[:, i] == 1)
-        coefficients[row, own] = np.minimum(coefficients[row, own], 0.0)
+        decay = is_linear & (model.powers[:, i] == 1)
+        coefficients[row, decay] = np.minimum(coefficients[row, decay], 0.0)
     return replace(model, coefficients=coefficients)
 
 

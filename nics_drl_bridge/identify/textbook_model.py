@@ -10,7 +10,7 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.calibration import Calibration, Response
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.motion import known_state
-from nics_drl_bridge.identify.signals import inferred_states
+from nics_drl_bridge.identify.signals import infer_states
 from nics_drl_bridge.identify.yardstick import LIMIT_RANGE, TextbookResponse, Yardstick
 from nics_drl_bridge.recording.recording import Samples, Stream
 from nics_drl_bridge.robot.curve import InputCurve
@@ -23,6 +23,7 @@ Powers = NDArray[np.int64]
 # ratio of an actuator's range to its maximum on a drive
 MARGIN = 1.25
 LEAST_COSINE = 0.1  # minimum cosine of a steering angle
+WIDEST_ANGLE = 1.4  # maximum angle of a steered wheel in the expansion [rad]
 NEGLIGIBLE = 1e-3  # fraction of a rate below which a term of the expansion is left out
 # fraction of the widest searched range above which a limit counts as not found
 UNLIMITED = 0.5
@@ -89,41 +90,42 @@ def actuated_spec(yardstick: Yardstick, drive: Drive) -> RobotSpec:
     response = yardstick.response
     spec = drive.spec
     speed, steering = _places_of_bicycle(response)
+    speed_gain = abs(float(response.gain[0, speed]))
+    angle_gain = abs(float(response.gain[2, steering]))
+    largest = np.maximum(spec.command_high, -spec.command_low)
     forward = [v.twist for v in spec.state].index("vx")
-    fastest = float(np.abs(known_state(drive).values[:, forward]).max())
-    told = np.abs(drive.recording.command.values[:, steering]).max()
-    widest = float(np.abs(response.gain[2, steering]) * told + abs(response.offset[2]))
-    told_speed, told_angle = (
-        max(abs(spec.command[place].min), abs(spec.command[place].max))
-        for place in (speed, steering)
-    )
-    gains = abs(float(response.gain[0, speed])), abs(float(response.gain[2, steering]))
+    fastest = np.abs(known_state(drive).values[:, forward]).max()
+    fastest = max(fastest, speed_gain * largest[speed])
     if spec.command[speed].unit == "m/s":
-        fastest = max(fastest, told_speed)
-    fastest = max(fastest, gains[0] * told_speed)
-    widest = max(widest, told_angle if spec.command[steering].unit == "rad" else 0.0)
-    widest = max(widest, gains[1] * told_angle)
-    reach = {"wheel_speed": MARGIN * fastest, "wheel_angle": MARGIN * widest}
-    states = (("wheel_speed", "m/s", speed), ("wheel_angle", "rad", steering))
+        fastest = max(fastest, largest[speed])
+    sent = np.abs(drive.recording.command.values[:, steering]).max()
+    widest = angle_gain * sent + abs(response.offset[2])
+    widest = max(widest, angle_gain * largest[steering])
+    if spec.command[steering].unit == "rad":
+        widest = max(widest, largest[steering])
+    states = (
+        ("wheel_speed", "m/s", MARGIN * float(fastest), speed),
+        ("wheel_angle", "rad", MARGIN * float(widest), steering),
+    )
     data = spec.model_dump()
     data["state"] = [
         {
             "name": name,
             "unit": unit,
-            "min": -reach[name],
-            "max": reach[name],
+            "min": -reach,
+            "max": reach,
             "follows": spec.command[place].name,
         }
-        for name, unit, place in states
+        for name, unit, reach, place in states
     ]
-    found = {
+    parameters = {
         "speed_lag": float(response.lag_s[0]),
         "steering_lag": float(response.lag_s[2]),
     }
     # a car commanded by fractions of throttle and steering
     if "speed_gain" in spec.parameters:
-        found |= {"speed_gain": gains[0], "greatest_steering": gains[1]}
-    data["parameters"] = spec.parameters | found
+        parameters |= {"speed_gain": speed_gain, "greatest_steering": angle_gain}
+    data["parameters"] = spec.parameters | parameters
     return RobotSpec.model_validate(data)
 
 
@@ -142,7 +144,7 @@ def with_actuators(
     command = drive.recording.command
     lag = response.lag_s[2:]
     latency = calibration.command_latency_s
-    angle = inferred_states(command, alone, lag, latency, state.t)[:, 0]
+    angle = infer_states(command, alone, lag, latency, state.t)[:, 0]
     angle = response.gain[2, steering] * angle + response.offset[2]
     speed = state.values[:, forward]
     if response.bicycle.front_drive:
@@ -158,21 +160,21 @@ def _places_of_bicycle(response: TextbookResponse) -> tuple[int, int]:
     return speed, 1 - speed
 
 
-def _actuator_of(response: TextbookResponse, spec: RobotSpec, command: str) -> int:
-    """Returns the row of the actuator that a command moves most."""
-    place = [c.name for c in spec.command].index(command)
-    return int(np.argmax(np.abs(response.gain[:, place])))
+def _find_actuator(response: TextbookResponse, command: int) -> tuple[int, float]:
+    """Returns the row of the actuator that a command moves most, and its gain."""
+    actuator = int(np.argmax(np.abs(response.gain[:, command])))
+    if response.bicycle.used and actuator == 2:  # the state is the commanded angle
+        return actuator, 1.0
+    return actuator, float(response.gain[actuator, command])
 
 
 def _responses(
     response: TextbookResponse, calibration: Calibration, spec: RobotSpec
 ) -> Iterator[Response]:
-    for known in calibration.responses:
-        actuator = _actuator_of(response, spec, known.command)
-        place = [c.name for c in spec.command].index(known.command)
-        turns = response.bicycle.used and actuator == 2
-        gain = 1.0 if turns else float(response.gain[actuator, place])
-        yield replace(known, lag_s=float(response.lag_s[actuator]), gain=gain)
+    names = [c.name for c in spec.command]
+    for follower in calibration.responses:
+        actuator, gain = _find_actuator(response, names.index(follower.command))
+        yield replace(follower, lag_s=float(response.lag_s[actuator]), gain=gain)
 
 
 def _dead_zones(response: TextbookResponse, spec: RobotSpec) -> Iterator[InputCurve]:
@@ -210,10 +212,10 @@ class _Expansion:
         dt = self.like.dt
         return (1.0 - float(np.exp(-dt / lag))) / dt
 
-    def unit(self, place: int, power: int = 1) -> NDArray[np.int64]:
-        """Returns the exponents (V,) of a variable's power."""
+    def unit(self, place: int) -> NDArray[np.int64]:
+        """Returns the exponents (V,) of a variable."""
         row = np.zeros(self.x.shape[1], dtype=np.int64)
-        row[place] = power
+        row[place] = 1
         return row
 
     def command_place(self, command: int) -> int:
@@ -226,13 +228,9 @@ class _Expansion:
         self.terms[dof][key] = self.terms[dof].get(key, 0.0) + value
 
     def add_expanded(
-        self,
-        dof: int,
-        target: Array,
-        rows: Sequence[NDArray[np.int64]],
-        factor: float = 1.0,
+        self, dof: int, target: Array, rows: Sequence[NDArray[np.int64]]
     ) -> None:
-        """Adds the terms that best approximate a target (T,) over the samples, times a factor."""
+        """Adds the terms that best approximate a target (T,) over the samples."""
         powers = np.array(rows, dtype=np.int64).reshape(len(rows), self.x.shape[1])
         chi = evaluate(self.x, powers)
         size = np.maximum(np.linalg.norm(chi, axis=0), 1e-12)
@@ -240,29 +238,25 @@ class _Expansion:
         shown = np.abs(beta) > NEGLIGIBLE * max(float(np.linalg.norm(target)), 1e-12)
         beta = np.linalg.lstsq((chi / size)[:, shown], target, rcond=1e-9)[0]
         for row, value in zip(powers[shown], beta / size[shown], strict=True):
-            self.add(dof, row, factor * float(value))
+            self.add(dof, row, float(value))
 
-    def steering_rows(self, speed: int, angle: int) -> list[NDArray[np.int64]]:
-        """Returns the terms of a turn rate by speed and steering angle."""
-        v = self.unit(speed)
-        steer = self.unit(angle)
-        return [v, v + steer, v + 2 * steer, v + 3 * steer, 3 * v + steer]
+    def steered_angle(self, steering: Array) -> Array:
+        """Returns the angle (T,) of the steered wheel for commanded steering."""
+        gain = self.response.gain[2, int(np.argmax(np.abs(self.response.gain[2])))]
+        angle = gain * steering + self.response.offset[2]
+        return np.asarray(np.clip(angle, -WIDEST_ANGLE, WIDEST_ANGLE))
 
     def turn_rate(self, speed: Array, steering: Array) -> Array:
         """Returns the turn rate (T,) of a bicycle for its speed and commanded steering."""
         bicycle = self.response.bicycle
-        gain = self.response.gain[2, int(np.argmax(np.abs(self.response.gain[2])))]
-        angle = np.clip(gain * steering + self.response.offset[2], -1.4, 1.4)
         length = bicycle.wheelbase * (1.0 + bicycle.understeer * speed * speed)
-        return np.asarray(speed * np.tan(angle) / length)
+        return np.asarray(speed * np.tan(self.steered_angle(steering)) / length)
 
     def along(self, speed: Array, steering: Array) -> Array:
         """Returns the speed (T,) along the body for that of the driven wheel."""
         if not self.response.bicycle.front_drive:
             return speed
-        gain = self.response.gain[2, int(np.argmax(np.abs(self.response.gain[2])))]
-        angle = np.clip(gain * steering + self.response.offset[2], -1.4, 1.4)
-        return np.asarray(speed * np.cos(angle))
+        return np.asarray(speed * np.cos(self.steered_angle(steering)))
 
     def speed_target(self) -> Array:
         """Returns the speeds (T,) that the drive's commands in effect ask for."""
@@ -270,18 +264,15 @@ class _Expansion:
         effect = self.x[:, self.command_place(place)]
         return np.asarray(self.response.gain[0, place] * effect)
 
-    def add_bicycle(
-        self, dofs: tuple[int, int], speed: int, steering: int, ask: Array
-    ) -> None:
-        """Adds the twist of a bicycle by the variables of its speed and of its steering."""
+    def add_bicycle(self, speed: int, steering: int, target: Array) -> None:
+        """Adds the twist of a bicycle by two variables, for the targets (T,) of its speed."""
         v = self.unit(speed)
         steer = self.unit(steering)
-        told = self.x[:, steering]
+        commanded = self.x[:, steering]
         rows = [v, v + 2 * steer] if self.response.bicycle.front_drive else [v]
-        self.add_expanded(dofs[0], self.along(ask, told), rows)
-        self.add_expanded(
-            dofs[1], self.turn_rate(ask, told), self.steering_rows(speed, steering)
-        )
+        self.add_expanded(0, self.along(target, commanded), rows)
+        rows = [v, v + steer, v + 2 * steer, v + 3 * steer, 3 * v + steer]
+        self.add_expanded(2, self.turn_rate(target, commanded), rows)
 
     def add_twist_of_commands(self) -> None:
         """Adds the twist of a robot without a state."""
@@ -289,7 +280,7 @@ class _Expansion:
             speed, steering = (
                 self.command_place(c) for c in _places_of_bicycle(self.response)
             )
-            self.add_bicycle((0, 2), speed, steering, self.speed_target())
+            self.add_bicycle(speed, steering, self.speed_target())
             return
         for dof in range(3):
             for command in np.flatnonzero(self.response.gain[dof]):
@@ -326,15 +317,14 @@ class _Expansion:
         gain = float(self.response.gain[2, steering - self.states])
         self.add(4, self.unit(1), -self.rate_of(2))
         self.add(4, self.unit(steering), self.rate_of(2) * gain)
-        self.add(
-            4, self.unit(steering, 0), self.rate_of(2) * float(self.response.offset[2])
-        )
+        constant = 0 * self.unit(0)
+        self.add(4, constant, self.rate_of(2) * float(self.response.offset[2]))
         v = self.unit(0)
         angle = self.unit(1)
         bicycle = self.response.bicycle
-        told = self.x[:, 1]
-        turning = np.sin(told) if bicycle.front_drive else np.tan(told)
-        along = np.cos(told) if bicycle.front_drive else np.ones(len(told))
+        angles = self.x[:, 1]
+        turning = np.sin(angles) if bicycle.front_drive else np.tan(angles)
+        along = np.cos(angles) if bicycle.front_drive else np.ones(len(angles))
         length = bicycle.wheelbase * (1.0 + bicycle.understeer * self.x[:, 0] ** 2)
         rows = [v + angle, 2 * v + angle, 3 * v + angle, v + 3 * angle]
         self.add_expanded(0, self.x[:, 0] * along, [v, v + 2 * angle])
@@ -345,10 +335,8 @@ class _Expansion:
         names = [c.name for c in self.spec.command]
         for i, variable in enumerate(self.spec.state):
             command = names.index(str(variable.follows))
-            actuator = _actuator_of(self.response, self.spec, names[command])
+            actuator, gain = _find_actuator(self.response, command)
             rate = self.rate_of(actuator)
-            turns = self.response.bicycle.used and actuator == 2
-            gain = 1.0 if turns else float(self.response.gain[actuator, command])
             self.add(3 + i, self.unit(i), -rate)
             self.add(3 + i, self.unit(self.command_place(command)), rate * gain)
             if actuator == 0:
@@ -360,7 +348,7 @@ class _Expansion:
             speed, steering = (
                 follow.index(c) for c in _places_of_bicycle(self.response)
             )
-            self.add_bicycle((0, 2), speed, steering, self.x[:, speed])
+            self.add_bicycle(speed, steering, self.x[:, speed])
 
     def add_wheels(self) -> None:
         """Adds the rates of wheels, and the twist by them."""
@@ -368,12 +356,8 @@ class _Expansion:
         per_command = book.target(np.eye(len(self.spec.command)))  # (C, S)
         per_wheel = book.twist(np.eye(self.states))  # (S, 3)
         steady = (per_command @ per_wheel).T  # (3, C)
-        lag = [
-            float(self.response.lag_s[d])
-            for d in range(3)
-            if self.response.gain[d].any()
-        ]
-        rate = (1.0 - float(np.exp(-self.like.dt / np.mean(lag)))) / self.like.dt
+        lag = self.response.lag_s[self.response.gain.any(axis=1)].mean()
+        rate = (1.0 - float(np.exp(-self.like.dt / lag))) / self.like.dt
         for wheel in range(self.states):
             self.add(3 + wheel, self.unit(wheel), -rate)
             for place in np.flatnonzero(per_command[:, wheel]):
@@ -389,13 +373,13 @@ class _Expansion:
 
     def speed_limits(self) -> tuple[float, float]:
         """Returns the maximum fall and rise of the speed, infinite where none was found."""
-        rise, fall = (float(each) for each in self.response.limit)
+        rise, fall = map(float, self.response.limit)
         most = UNLIMITED * LIMIT_RANGE[1]
         return -fall if fall < most else -np.inf, rise if rise < most else np.inf
 
     def made(self) -> TaylorModel:
         """Builds the model."""
-        keys = sorted({key for row in self.terms.values() for key in row})
+        keys = sorted(set().union(*self.terms.values()))
         coefficients = np.zeros((len(self.spec.dof_names), len(keys)))
         for dof, row in self.terms.items():
             for key, value in row.items():

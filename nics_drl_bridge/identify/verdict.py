@@ -11,14 +11,14 @@ from nics_drl_bridge.errors import FitError, RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.acceptance import THRESHOLDS
 from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.clocks import CERTAIN, TimingEstimate
+from nics_drl_bridge.identify.clocks import TimingEstimate
 from nics_drl_bridge.identify.drive import MAX_GAP_S, Drive
 from nics_drl_bridge.identify.excitation import Excitation, plausible
 from nics_drl_bridge.identify.fit import Fit
 from nics_drl_bridge.identify.mounting import Mounting
 from nics_drl_bridge.identify.open_loop import HORIZON_S, OpenLoop, open_loop_error
 from nics_drl_bridge.identify.signals import moved_commands
-from nics_drl_bridge.identify.statistics import errors_of
+from nics_drl_bridge.identify.statistics import CERTAIN, errors_of
 from nics_drl_bridge.recording.recording import Recording, Samples, Stream
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import HorizonErrors, Quality, TaylorModel
@@ -36,12 +36,11 @@ BACKWARDS = 0.3  # angle [rad] from half a turn, below which a body faces backwa
 # a pause of the pose longer than this many usual steps, and MAX_GAP_S, is a gap
 GAP_STEPS = 3.0
 # maximum number of gaps to report individually: the longest, in order of time
-GAPS_TOLD = 12
+MOST_GAPS_LISTED = 12
 LINEAR = (
     "Predictions by terms of a higher order ended farther away than the robot drove, so the model "
     "has only those of order 1."
 )
-EARLY = "The robot moves"  # start of a note on motion before its commands
 # fraction of a state's range between two rows that is sampled too coarsely
 COARSE = 2.0 / 3.0
 ENDS = (1.0, 99.0)  # percentiles that bound the range of a state
@@ -97,7 +96,7 @@ def describe_gaps(drive: Drive) -> Iterator[str]:
     t = drive.dated.t
     pose = drive.dated.values
     rows = _gap_rows(drive)
-    for row in sorted(rows[:GAPS_TOLD]):
+    for row in sorted(rows[:MOST_GAPS_LISTED]):
         moved = geometry.between(pose[row], pose[row + 1])
         span = t[row + 1] - t[row]
         begin = t[row] - t[0]
@@ -106,8 +105,8 @@ def describe_gaps(drive: Drive) -> Iterator[str]:
         yield Gap(
             f"{finding}, across which it moves {across}: what happened there is not known."
         )
-    if len(rows) > GAPS_TOLD:
-        rest = [t[row + 1] - t[row] for row in rows[GAPS_TOLD:]]
+    if len(rows) > MOST_GAPS_LISTED:
+        rest = [t[row + 1] - t[row] for row in rows[MOST_GAPS_LISTED:]]
         yield Gap(
             f"The pose has {len(rest)} more gaps, of up to {max(rest):.2f} s "
             f"and of {sum(rest):.1f} s in all."
@@ -148,9 +147,9 @@ def describe_clocks(
             f"{calibration.clock_offset_s:.4f} s (+- {sigma['clock_offset_s']:.4f} s)"
         )
         finding = "Pose and commands are stamped by different clocks"
-        yield f"{finding}: {offset} added to the pose's stamps gives the commands' clock."
+        yield f"{finding}: add {offset} to the pose's stamps to get the commands' clock."
     if timing.early > 0.0 and calibration.command_latency_s <= 0.0:
-        finding = f"{EARLY} {timing.early:.2f} s before its commands"
+        finding = f"The robot moves {timing.early:.2f} s before its commands"
         cause = "the pose is stamped by another clock; give it a `clock:` of its own in the mapping"
         if recording.state is not None:
             cause = "its state is stamped by another clock; stamp both by one, and record again"
@@ -188,15 +187,12 @@ def describe_mounting(
         )
         return
     x, y = calibration.lever_arm_m
+    x_hidden, y_hidden = mounting.hidden
     # predictions may have found one later
-    names = (
-        "lever_arm_x_m",
-        "lever_arm_y_m",
-    )
-    found = (name in calibration.uncertainty for name in names)
-    x_hidden, y_hidden = (
-        why * (not f) for why, f in zip(mounting.hidden, found, strict=True)
-    )
+    if "lever_arm_x_m" in calibration.uncertainty:
+        x_hidden = ""
+    if "lever_arm_y_m" in calibration.uncertainty:
+        y_hidden = ""
     if calibration.rotation_rad != 0.0:
         sigma = calibration.uncertainty.get("rotation_rad", mounting.rotation_sigma)
         turned = f"{calibration.rotation_rad:.4f} rad (+- {sigma:.4f} rad)"
@@ -264,10 +260,10 @@ def refuse_unexcited(excitation: Excitation, spec: RobotSpec) -> None:
         (still, "never moved", "changing over the whole range"),
         (excitation.together, "always moved together", "each changing on its own"),
     ):
-        told = _list(names)
-        if told:
+        listed = _list(names)
+        if listed:
             raise FitError(
-                f"{told} {fault}; drive with {told} {way}, or allow a model without."
+                f"{listed} {fault}; drive with {listed} {way}, or allow a model without."
             )
 
 
@@ -298,26 +294,25 @@ def describe_unlearnt(
     `levels` are the numbers of different values of the commands as recorded, because a motor that
     saturates reduces many values to two.
     """
-    already = {name for r in calibration.responses for name in (r.command, r.state)}
+    followed = {response.command for response in calibration.responses}
     excitation = linear.regression.excitation
     unmoved = ", ".join(list_missed(linear, spec))
     if unmoved:
         finding = f"The model has no terms of {unmoved}, which never moved"
         yield Gap(f"{finding}: it is only valid for this drive's constant value.")
     still = _commands(excitation.unmoved, spec)
-    missing = ", ".join(name for name in still if name not in already)
+    missing = ", ".join(name for name in still if name not in followed)
     if missing:
         yield Gap(f"Drive with {missing} changing over the whole range to learn them.")
     together = _list(excitation.together)
     if together:
         units = {c.unit for c in spec.command if c.name in excitation.together}
-        if len(units) == 1:
-            shares = "all have a share of what they did"
-        else:
-            shares = "one has all of it"
-        told = f"{shares}, and the model holds where they move so; drive each on its own to learn"
+        shares = "all have a share of it" if len(units) == 1 else "one has all of it"
         why = "always moved together, so their effects can't be separated"
-        yield Gap(f"{together} {why}: {told}.")
+        valid = "the model holds where they move together"
+        yield Gap(
+            f"{together} {why}: {shares}, and {valid}; drive each on its own to learn."
+        )
     copies = _list(
         [v.name for v in spec.state if v.name in linear.regression.dependent]
     )
@@ -477,7 +472,9 @@ def describe_replacement(lost: HorizonErrors) -> str:
     off = f"{lost.model.position_m:.3g} m off after {lost.horizon_s:g} s"
     finding = f"The learnt model ends {off}, the fitted textbook "
     finding += f"{lost.textbook.position_m:.3g} m, on the same unseen data"
-    return f"{finding}: the model written is the textbook, fitted to the training part."
+    written = "the model written is the textbook, fitted to the training part"
+    bias = "since these data chose it, its errors on them are slightly optimistic"
+    return f"{finding}: {written}; {bias}."
 
 
 def describe_refit(until: float, duration: float, worse: bool) -> str:

@@ -14,7 +14,8 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.open_loop import Windows, windows
-from nics_drl_bridge.identify.signals import held, unwrapped
+from nics_drl_bridge.identify.shooting import HEADING_ARM_M
+from nics_drl_bridge.identify.signals import average_held, unwrapped
 from nics_drl_bridge.identify.yardstick_kernels import (
     STRAIGHT,
     BicycleGeometry,
@@ -33,7 +34,6 @@ BEFORE_S = 0.2
 FEWEST = 4
 # maximum standard error of a start speed that is taken from a parabola
 STEADY_M_S = 0.05
-HEADING_WEIGHT_M = 0.3  # an error of 1 rad counts as this many metres
 LOSS_SCALE = 0.2  # scale of the soft L1 loss [m/s]
 MOST_EVALUATIONS = 60
 TOLERANCE = 1e-4
@@ -145,7 +145,7 @@ def _course(drive: Drive, start_t: Array, duration: Array) -> _Course:
     command = drive.recording.command
     grid = np.arange(command.t[0] - 1.0, command.t[-1] + 1.0, STEP_S)
     return _Course(
-        start_t, duration, grid, held(command, drive.spec, grid, grid + STEP_S)
+        start_t, duration, grid, average_held(command, drive.spec, grid, grid + STEP_S)
     )
 
 
@@ -252,23 +252,19 @@ def structure_of(spec: RobotSpec) -> tuple[Array, BicycleGeometry] | None:
     """Asks the textbook what each command moves (3, C), and for a bicycle; None without one."""
     half = PROBE * np.maximum(spec.command_high, -spec.command_low)
     try:
-        alone, together = (
-            compute_steady_twist(spec, np.diag(half)),
-            compute_steady_twist(spec, half),
-        )
-        if (
-            len(half) != 2
-            or np.abs(alone[:, 2]).max() > NOTHING
-            or abs(together[2]) < NOTHING
-        ):
-            return np.where(
-                np.abs(alone) > NOTHING, alone / half[:, None], 0.0
-            ).T, STRAIGHT
+        alone = compute_steady_twist(spec, np.diag(half))
+        together = compute_steady_twist(spec, half)
+        # A bicycle turns by neither command alone, but by both together.
+        turns_alone = np.abs(alone[:, 2]).max() > NOTHING
+        if len(half) != 2 or turns_alone or abs(together[2]) < NOTHING:
+            per_unit = np.where(np.abs(alone) > NOTHING, alone / half[:, None], 0.0)
+            return per_unit.T, STRAIGHT
         speed = int(np.argmax(np.abs(alone[:, 0])))
         less = np.where(np.arange(2) == speed, half, 0.5 * half)
-        forward, slower = alone[speed, 0], compute_steady_twist(spec, less)
+        slower = compute_steady_twist(spec, less)
     except ConfigError:
         return None
+    forward = alone[speed, 0]
     cosine = float(together[0] / forward)
     front = cosine < 1.0 - 1e-6
     if front:
@@ -278,10 +274,8 @@ def structure_of(spec: RobotSpec) -> tuple[Array, BicycleGeometry] | None:
         angle = 2.0 * float(np.arctan(np.sqrt(max(share, 1e-6))))
     length = abs(forward * (np.sin(angle) if front else np.tan(angle)) / together[2])
     moves = np.zeros((3, 2))
-    moves[0, speed], moves[2, 1 - speed] = (
-        forward / half[speed],
-        angle / half[1 - speed],
-    )
+    moves[0, speed] = forward / half[speed]
+    moves[2, 1 - speed] = angle / half[1 - speed]
     return moves, BicycleGeometry(True, front, float(length), 0.0)
 
 
@@ -296,38 +290,39 @@ def _first_guess(
     twist = geometry.log(geometry.between(seen.start, seen.end)) / span
     change = (twists_before(drive, seen.end_t) - before) / span
     command = drive.recording.command
-    tried = []
-    for delay in (
-        DELAYS_S if command.clock == drive.recording.pose.clock else FAR_DELAYS_S
-    ):
+    one_clock = command.clock == drive.recording.pose.clock
+    candidates = []
+    for delay in DELAYS_S if one_clock else FAR_DELAYS_S:
         shift = clock_offset - delay
-        u = held(command, drive.spec, seen.start_t + shift, seen.end_t + shift)
+        u = average_held(command, drive.spec, seen.start_t + shift, seen.end_t + shift)
         expected = u @ book.T
         rotation = 0.0
         if structure is not None:
             a, b = ((v[:, 0] + 1j * v[:, 1]) for v in (expected, twist))
             rotation = float(np.angle((a.conj() * b).sum()))
-        moved = (_turned(twist, -rotation), _turned(change, -rotation))
-        left, gain, offset, lag = _regressed(u, *moved, book != 0.0, bicycle, offsets)
-        tried.append(
-            (
-                left,
-                TextbookResponse(
-                    float(delay),
-                    gain,
-                    offset,
-                    lag,
-                    np.full(2, LIMIT),
-                    bicycle,
-                    np.array([0.0, 0.0, -rotation]),
-                ),
-            )
+        left, gain, offset, lag = _regressed(
+            u,
+            _turned(twist, -rotation),
+            _turned(change, -rotation),
+            book != 0.0,
+            bicycle,
+            offsets,
         )
+        response = TextbookResponse(
+            float(delay),
+            gain,
+            offset,
+            lag,
+            np.full(2, LIMIT),
+            bicycle,
+            np.array([0.0, 0.0, -rotation]),
+        )
+        candidates.append((left, response))
+    _, start = min(candidates, key=lambda pair: pair[0])
     # Unequal wheels look like a lateral lever arm; without a textbook, any gain may be one.
-    mounted = np.array([True, np.count_nonzero(book[0]) < 2, True]) & (
-        structure is not None
-    )
-    return _Form(min(tried, key=lambda pair: pair[0])[1], book != 0.0, mounted)
+    mounted = np.array([True, np.count_nonzero(book[0]) < 2, True])
+    mounted &= structure is not None
+    return _Form(start, book != 0.0, mounted)
 
 
 def _regressed(
@@ -344,20 +339,26 @@ def _regressed(
     offset = np.zeros(3)
     lag = np.full(3, LAG_S)
     for i in np.flatnonzero(moves.any(axis=1)):
-        given = np.column_stack([u[:, moves[i]], np.full(len(u), float(offsets))])
-        rows = np.column_stack([given, -change[:, i]])
-        angle = bicycle.used and i == 2
-        if angle:
-            rows = given = given * twist[:, :1] / bicycle.wheelbase
-        beta = np.linalg.lstsq(rows, twist[:, i], rcond=None)[0]
-        if not angle and beta[-1] > LAG_RANGE_S[0]:
-            lag[i] = min(beta[-1], LAG_RANGE_S[1])
+        target = twist[:, i]
+        chi = np.column_stack([u[:, moves[i]], np.full(len(u), float(offsets))])
+        if (
+            bicycle.used and i == 2
+        ):  # an angle: it turns the robot in proportion to its speed
+            chi = chi * twist[:, :1] / bicycle.wheelbase
+            beta = np.linalg.lstsq(chi, target, rcond=None)[0]
         else:
-            rows = given
-            beta = np.linalg.lstsq(given, twist[:, i], rcond=None)[0]
-        gain[i, moves[i]], offset[i] = beta[: moves[i].sum()], beta[moves[i].sum()]
-        rest = rows @ beta - twist[:, i]
-        left += float((rest**2).mean() / max((twist[:, i] ** 2).mean(), 1e-12))
+            lagged = np.column_stack([chi, -change[:, i]])
+            beta = np.linalg.lstsq(lagged, target, rcond=None)[0]
+            if beta[-1] > LAG_RANGE_S[0]:
+                lag[i] = min(beta[-1], LAG_RANGE_S[1])
+                chi = lagged
+            else:
+                beta = np.linalg.lstsq(chi, target, rcond=None)[0]
+        count = int(moves[i].sum())
+        gain[i, moves[i]] = beta[:count]
+        offset[i] = beta[count]
+        rest = chi @ beta - target
+        left += float((rest**2).mean() / max((target**2).mean(), 1e-12))
     return left, gain, offset, lag
 
 
@@ -389,12 +390,12 @@ def fit_yardstick(
     def fitted(form: _Form) -> tuple[float, TextbookResponse]:
         def residuals(theta: Array) -> Array:
             error = _relative_ends(form.unpack(theta), course, twist) - measured
-            error[..., 2] = HEADING_WEIGHT_M * geometry.wrap_angle(error[..., 2])
+            error[..., 2] = HEADING_ARM_M * geometry.wrap_angle(error[..., 2])
             rates = np.clip(error / horizons[..., None], -100.0, 100.0)
             return np.asarray(np.nan_to_num(rates)).ravel()
 
         theta = form.pack()
-        found = least_squares(
+        solution = least_squares(
             residuals,
             theta,
             x_scale=np.maximum(np.abs(theta), 0.05),
@@ -405,7 +406,7 @@ def fit_yardstick(
             ftol=TOLERANCE,
             xtol=TOLERANCE,
         )
-        return float(found.cost), form.unpack(found.x)
+        return float(solution.cost), form.unpack(solution.x)
 
     guesses = [
         _first_guess(drive, until_s, clock_offset_s, offsets)

@@ -4,6 +4,7 @@ import io
 import json
 import zipfile
 from dataclasses import asdict, dataclass, field, replace
+from enum import StrEnum
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -450,22 +451,28 @@ def has_visible_axes(pose: Array) -> bool:
     return float(np.ptp(np.unwrap(pose[:, 2]))) >= MIN_TURN
 
 
+class HeadingKeys(StrEnum):
+    """Keys of a mapping that correct a heading."""
+
+    NONE = ""
+    MIRRORED = "scale: -1"  # counted clockwise
+    COMPASS = f"scale: -1, offset: {np.pi / 2.0:.5g}"  # clockwise from north
+
+
 def find_clockwise_keys(
     pose: Array, minimum: float = MIN_MIRRORED, margin: float = BETTER
-) -> str:
+) -> HeadingKeys:
     """Returns the mapping's keys that mirror the heading of poses (T, 3), spaced on their path.
 
-    For example `scale: -1`; empty unless the path is aligned with the mirrored headings by at least
-    `minimum`, and by `margin` more than with the recorded ones.
+    None are needed unless the path is aligned with the mirrored headings by at least `minimum`, and
+    by `margin` more than with the recorded ones.
     """
     if not has_visible_axes(pose):
-        return ""
+        return HeadingKeys.NONE
     mirrored = _compute_course(pose, -1.0)
     if abs(mirrored) < max(minimum, margin + measure_alignment(pose, 1.0)):
-        return ""
-    if mirrored.real > 0.0:
-        return "scale: -1"
-    return f"scale: -1, offset: {np.pi / 2.0:.5g}"
+        return HeadingKeys.NONE
+    return HeadingKeys.MIRRORED if mirrored.real > 0.0 else HeadingKeys.COMPASS
 
 
 def measure_alignment(pose: Array, scale: float) -> float:

@@ -5,7 +5,12 @@ from pathlib import Path
 
 from nics_drl_bridge.files import write_text
 from nics_drl_bridge.identify.acceptance import Verdict, usual
-from nics_drl_bridge.identify.conclusion import OF_PATH, Conclusion, conclude, end_of
+from nics_drl_bridge.identify.conclusion import (
+    Conclusion,
+    conclude,
+    format_error,
+    is_share,
+)
 from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.identify.report import (
     COMPARED,
@@ -24,17 +29,15 @@ Tile = tuple[str, str, bool]
 def fit_tile(identified: Identified) -> Tile:
     """Returns the accuracy of a fit as a figure, its meaning, and False if it is doubtful."""
     for at in usual(identified.judgement):
-        errors = {
-            "": at.model,
-            "fitted textbook ": at.textbook,
-            "constant twist ": at.kept_twist,
-        }
-        texts = [
-            name + end_of(error, at.path_m) for name, error in errors.items() if error
+        figure = format_error(at.model, at.path_m)
+        yardsticks = {"fitted textbook": at.textbook, "constant twist": at.kept_twist}
+        beside = [
+            f"{name} {format_error(errors, at.path_m)}"
+            for name, errors in yardsticks.items()
+            if errors is not None
         ]
-        figure, *others = (text.removesuffix(OF_PATH) for text in texts)
-        off = f"{OF_PATH} off".lstrip() if texts[0] != figure else "off"
-        meaning = f"{off} after {at.horizon_s:g} s, on unseen data; {', '.join(others)}"
+        off = "of the path off" if is_share(at.model, at.path_m) else "off"
+        meaning = f"{off} after {at.horizon_s:g} s, on unseen data; {', '.join(beside)}"
         return figure, meaning, not conclude(identified).doubts
     return "untested", "on unseen data, as the drive is too short", False
 

@@ -20,7 +20,7 @@ from nics_drl_bridge.identify.open_loop import HORIZON_S, Windows, predict, wind
 from nics_drl_bridge.identify.report import CalibratedValue, collect_estimates
 from nics_drl_bridge.identify.signals import (
     DIFFERENCE,
-    held,
+    average_held,
 )
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot import taylor
@@ -260,7 +260,7 @@ def draw_alignment(spec: RobotSpec, identified: Identified) -> bytes:
             (0.0, ":", "as stamped"),
             (acts, "-", "as it takes effect"),
         ):
-            value = held(command, spec, t - late, t - late + samples.dt)[:, c]
+            value = average_held(command, spec, t - late, t - late + samples.dt)[:, c]
             axes.plot(t - begin, value, style, color=MODEL, linewidth=1.4, label=label)
         axes.set_ylabel(f"{name} [{unit}]", color=MODEL)
         _draw_response(axes, samples, shown, len(spec.state) + int(c), identified)

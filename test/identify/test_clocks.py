@@ -9,7 +9,7 @@ import pytest
 from identify.drives import MOTOR, calibrate, drive, servoed, tricycle
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.clocks import TOLD_S, timing_of
+from nics_drl_bridge.identify.clocks import SEPARABLE_S, timing_of
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.verdict import describe_clocks
 
@@ -20,7 +20,7 @@ SUM = "command_latency_and_speed_lag_s"
 def test_a_servo_of_second_order_is_not_taken_for_latency():
     found = calibrate(servoed(), tricycle())
     assert found.command_latency_s == pytest.approx(0.1, abs=0.003)
-    assert found.uncertainty["command_latency_s"] < TOLD_S
+    assert found.uncertainty["command_latency_s"] < SEPARABLE_S
     speed, steering = found.responses
     assert speed.lag_s == pytest.approx(0.15, abs=0.005)
     (curve,) = found.inputs  # a part of its lag looks like a delay
@@ -54,7 +54,7 @@ def test_of_latency_and_lag_that_noise_hides_the_sum_is_told(car):
         car, 4, 20.0, latency=0.05, noise=(0.003, 0.006), measured_state=False
     )
     found = calibrate(recording, car)
-    assert found.uncertainty["command_latency_s"] > TOLD_S
+    assert found.uncertainty["command_latency_s"] > SEPARABLE_S
     sigma = found.uncertainty[SUM]
     both = found.command_latency_s + found.responses[0].lag_s
     assert both == pytest.approx(0.15, abs=3.0 * sigma)

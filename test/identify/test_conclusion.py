@@ -7,9 +7,14 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge.identify.acceptance import Verdict
-from nics_drl_bridge.identify.conclusion import UNTRIED, accuracy, conclude, end_of
+from nics_drl_bridge.identify.conclusion import (
+    UNTRIED,
+    accuracy,
+    conclude,
+    format_error,
+)
 from nics_drl_bridge.identify.identify import identify
-from nics_drl_bridge.identify.report import format_report, select_opening
+from nics_drl_bridge.identify.report import format_opening, format_report
 from nics_drl_bridge.identify.verdict import Gap, Mistake
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot.spec import build_robot, load_robot
@@ -69,7 +74,7 @@ def test_a_model_that_is_beaten_is_not_to_be_trained_with(found):
 
 def test_the_report_opens_with_the_conclusion_and_the_model(found):
     report = format_report("here", found)
-    first = select_opening(report)
+    first = format_opening("here", found)
     assert report.startswith(first)
     assert conclude(found).advice in " ".join(first.split())
     assert "Verdict: good. On unseen data" in first.split("\n\n")[0]
@@ -78,7 +83,7 @@ def test_the_report_opens_with_the_conclusion_and_the_model(found):
 
 
 def test_an_error_without_a_path_is_in_metres():
-    assert end_of(EndErrors(0.5, 0.0), 0.0) == "0.5 m"
+    assert format_error(EndErrors(0.5, 0.0), 0.0) == "0.5 m"
 
 
 def test_gaps_are_those_notes_that_tell_what_the_drive_could_not_teach(found):

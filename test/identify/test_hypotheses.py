@@ -70,7 +70,7 @@ def test_a_car_that_slips_is_predicted_and_its_lever_is_not_bent_by_the_slip():
         "The model is the textbook with an input curve of throttle" in n
         for n in found.notes
     )
-    assert any("can't be told from the lags" in note for note in found.notes)
+    assert any("can't be separated from the lags" in note for note in found.notes)
 
 
 def trial(order, error):
@@ -89,7 +89,7 @@ def test_hypotheses_go_from_the_textbook_to_the_freest():
 
 def test_a_latency_is_told_as_its_sums_with_the_lags():
     sentence = about_lags(0.02, {"vx": 0.2, "wz": 0.1}, beside=0.05)
-    assert sentence.startswith("Latency (0.020 s) can't be told")
+    assert sentence.startswith("Latency (0.020 s) can't be separated")
     assert "trust their sums, 0.250 s for vx, 0.150 s for wz" in sentence
 
 

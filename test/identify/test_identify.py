@@ -203,6 +203,24 @@ def test_a_training_part_must_have_a_length(car, until):
         cut(drive(car, duration=5.0), until)
 
 
+def test_the_training_part_ends_at_one_time_in_all_streams_of_a_clock(car):
+    plain = drive(car, duration=20.0)
+    late = plain.state.rows(plain.state.t > plain.pose.t[0] + 4.0)
+    part = cut(replace(plain, state=late), 10.0)
+    assert part.state.t[0] == late.t[0]
+    assert part.state.t[-1] == part.pose.t[-1] <= plain.pose.t[0] + 10.0
+    other = cut(replace(plain, state=replace(late, clock="board")), 10.0)
+    assert other.state.t[-1] > part.state.t[-1]  # its offset is not known yet
+
+
+def test_a_stream_that_starts_after_the_training_part_is_refused_if_it_is_needed(car):
+    plain = drive(car, duration=20.0)
+    late = plain.state.rows(plain.state.t > plain.pose.t[0] + 12.0)
+    assert cut(replace(plain, wheels=late), 10.0).wheels is None
+    with pytest.raises(RecordingError, match="state: starts after the first 10 s"):
+        cut(replace(plain, state=late), 10.0)
+
+
 def test_a_part_without_a_window_is_refused(car):
     recording = drive(car, duration=20.0)
     model = identify(recording, car).model

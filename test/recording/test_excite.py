@@ -9,7 +9,6 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.identify.excitation import (
     commands_together,
-    levels,
     unmoved_variables,
 )
 from nics_drl_bridge.recording.excite import (
@@ -89,7 +88,7 @@ def test_every_command_is_moved_by_the_rules_that_a_fit_judges_a_drive_by(
     samples = samples_on_one_clock(t, pattern.pose[:-1], none, pattern.command)
     assert unmoved_variables(samples, stateless) == ()
     assert commands_together(samples, stateless) == ()
-    assert set(levels(samples, stateless).values()) == {10}
+    assert all(len(np.unique(column)) >= 10 for column in pattern.command.T)
     # Each also changes while the others are held: on its own.
     changes = np.abs(np.diff(pattern.command, axis=0)) > 1e-9
     alone = changes & (changes.sum(axis=1) == 1)[:, None]
