@@ -217,9 +217,4 @@ def make_backend(
         signature(make).bind(model, world, **options)
     except TypeError as error:
         raise ConfigError(f"backend {name!r}: {error}; check its arguments.") from None
-    try:
-        return make(model, world, **options)
-    except TypeError as error:  # raised deeper inside, for arguments passed on
-        if not any(f"argument '{name}'" in str(error) for name in options):
-            raise
-        raise ConfigError(f"backend {name!r}: {error}; check its arguments.") from None
+    return make(model, world, **options)
