@@ -43,6 +43,12 @@ SIDEWAYS = ((0, 1, 0), (0, -1, 0))  # two more for a robot that moves sideways
 PARTS = ("update", "observation", "judge", "reward", "end", "info")
 """Methods of a step; a class that overrides one does not use its base's one-pass step."""
 CONTACT_ANGLE = math.radians(4.0)  # 2 cm at a distance of 0.3 m
+# Defaults that the shipped tasks share.
+GOAL_RADIUS_M = 0.3
+SUCCESS_REWARD = 10.0  # once, at the goal
+COLLISION_REWARD = -10.0  # per step with a contact
+PROGRESS_REWARD = 1.0  # per metre of approach
+TIME_REWARD = -0.01  # per step
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from nics_drl_bridge.lidar.table import LidarTable
 
 Renderer = Literal["auto", "baked", "exact"]
 RENDERERS: tuple[Renderer, ...] = ("auto", "baked", "exact")
+DEFAULT_RENDERER: Renderer = "auto"
 NO_WALLS = np.zeros((0, 4))
 # `auto` looks up at distances where the ranges' RMSE is at most this [m]
 GREATEST_ERROR = 0.01
@@ -47,7 +48,7 @@ class Scanner:
 
     spec: LidarSpec
     table: LidarTable  # of the shapes that may occur
-    renderer: Renderer = "auto"
+    renderer: Renderer = DEFAULT_RENDERER
     grid: GridMap | None = None  # a static map of every world that `scan` sees
 
     def __post_init__(self) -> None:
@@ -205,7 +206,7 @@ class Scanner:
 def make_scanner(
     spec: LidarSpec,
     shapes: Sequence[Shape],
-    renderer: Renderer = "auto",
+    renderer: Renderer = DEFAULT_RENDERER,
     grid: GridMap | None = None,
 ) -> Scanner:
     """Return a scanner of shapes, baked now if needed; ConfigError as `Scanner` and `bake`."""
