@@ -227,8 +227,8 @@ class PursuitEvasion(Task):
         super().__post_init__()
         self.check_above_zero("capture_gap", self.capture_gap)
         if min(self.pursuers, self.evaders) < 1:
-            given = f"pursuers={self.pursuers}, evaders={self.evaders}"
-            raise ConfigError(f"task options {given}: need at least 1 each.")
+            counts = f"pursuers={self.pursuers}, evaders={self.evaders}"
+            raise ConfigError(f"task options {counts}: need at least 1 each.")
 
     @property
     def robots(self) -> int:

@@ -160,7 +160,8 @@ def load_sensor(file: Path) -> Sensor:
 def unread(sensors: Sequence[Sensor], *lead: int) -> dict[str, Readings]:
     """Return unknown readings (*lead, S) by the sensors' names."""
     return {
-        each.name: np.full((*lead, each.size), np.nan, np.float32) for each in sensors
+        sensor.name: np.full((*lead, sensor.size), np.nan, np.float32)
+        for sensor in sensors
     }
 
 

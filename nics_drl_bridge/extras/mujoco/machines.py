@@ -209,8 +209,8 @@ def _make_ackermann(p: Parameters, step: float, physics: Physics) -> Machine:
         return np.array([speed / radius, np.arctan(left), np.arctan(right)])
 
     def measured(position: Array, speed: Array) -> Array:
-        each = np.tan(position[2:])
-        middle = each / (1.0 + half_ratio * np.array([1.0, -1.0]) * each)
+        tangents = np.tan(position[2:])
+        middle = tangents / (1.0 + half_ratio * np.array([1.0, -1.0]) * tangents)
         return np.array(
             [0.5 * radius * (speed[0] + speed[1]), np.arctan(np.mean(middle))]
         )
@@ -255,7 +255,7 @@ def _make_tie_rod(half_ratio: float, steepest: float) -> str:
     row = polynomial.polyfit(left, right, [1, 2, 3, 4])
     if np.abs(polynomial.polyval(left, row) - right).max() > MISFIT:
         return ""
-    terms = " ".join(f"{each:.8g}" for each in row)
+    terms = " ".join(f"{factor:.8g}" for factor in row)
     return f"""
   <equality><joint joint1="steer_right" joint2="steer_left" polycoef="{terms}"/></equality>"""
 
@@ -299,9 +299,8 @@ def _make_differential(p: Parameters, step: float, physics: Physics) -> Machine:
         <joint type="ball" damping="{physics.bearing}"/>
         <geom class="tread" type="sphere" size="{ball:.6g}" mass="0.03"/>
       </body>{wheels}"""
-    motors = _make_motors(
-        names := ("left", "right"), inertia, p["wheel_lag"], radius, step, physics
-    )
+    names = ("left", "right")
+    motors = _make_motors(names, inertia, p["wheel_lag"], radius, step, physics)
     xml = _make_document("differential", physics, radius, robot, motors)
     return Machine(xml, names, lambda state: state, lambda _, speed: speed)
 

@@ -312,8 +312,8 @@ class Learning:
     @property
     def learner(self) -> Any:
         """RLlib's learner, which runs in this process."""
-        found = self.algorithm.learner_group.foreach_learner(lambda one: one)
-        return found.result_or_errors[0].get()
+        results = self.algorithm.learner_group.foreach_learner(lambda one: one)
+        return results.result_or_errors[0].get()
 
     @property
     def module(self) -> ActorCritic:
@@ -335,7 +335,8 @@ class Learning:
                 self._check_silence(now - heard, about)
                 continue
             heard = now
-            tell(progress := self._progress(first, now - begin))
+            progress = self._progress(first, now - begin)
+            tell(progress)
             for name in ("success", "collision", "steps_per_s", "env_share"):
                 logger.record(f"rollout/{name}", getattr(progress, name))
             logger.dump(self.steps)
@@ -346,11 +347,11 @@ class Learning:
         logger.close()
 
     def _take(self, result: Mapping[str, Any]) -> None:
-        found = result.get(ENV_RUNNER_RESULTS, {})
-        self.steps += int(found.get(NUM_ENV_STEPS_SAMPLED, 0))
-        self.stepping_s += float(found.get(STEPPING, 0.0)) / self.runners
+        metrics = result.get(ENV_RUNNER_RESULTS, {})
+        self.steps += int(metrics.get(NUM_ENV_STEPS_SAMPLED, 0))
+        self.stepping_s += float(metrics.get(STEPPING, 0.0)) / self.runners
         ended, success, collision = (
-            int(found.get(n, 0)) for n in (ENDED, SUCCESS, COLLISION)
+            int(metrics.get(n, 0)) for n in (ENDED, SUCCESS, COLLISION)
         )
         self.recent.append((ended, success, collision))
         while sum(one[0] for one in self.recent) - self.recent[0][0] >= RECENT:
