@@ -337,9 +337,9 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         if self._view is None or self.scene is None:
             raise gymnasium.error.ResetNeeded("call reset() before render().")
         facts = self._backend.facts()
-        told = self._facts
+        known = self._facts
         view = self._view
-        covariance = told.get("covariance")
+        covariance = known.get("covariance")
         return Snapshot(
             poses=np.reshape(facts.get("true_pose", view.pose), (self.robots, 3)),
             ranges=view.ranges[0],
@@ -352,7 +352,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
             if covariance is None
             else np.reshape(covariance, (-1, 3, 3)),
             commands=np.reshape(self._command, (self.robots, -1)),
-            gate=gate_of(told),
+            gate=gate_of(known),
         )
 
     @halts_on_error

@@ -81,8 +81,8 @@ def uninterrupted() -> Iterator[None]:
 def check_reset(seed: Any, options: Any, worlds: int = 1) -> None:
     """Raises ConfigError for wrong options, or a wrong seed (one for all worlds, or one each)."""
     several = isinstance(seed, list | tuple | np.ndarray)
-    given = [one for one in (seed if several else [seed]) if one is not None]
-    check_seeds(given, GREATEST_SEED if several else GREATEST_SEED + 1 - worlds)
+    seeds = [one for one in (seed if several else [seed]) if one is not None]
+    check_seeds(seeds, GREATEST_SEED if several else GREATEST_SEED + 1 - worlds)
     if options is not None and not isinstance(options, Mapping):
         needed = "must be a dict such as {'start': (x, y, heading)}, or None."
         raise ConfigError(f"reset options of type {type(options).__name__}: {needed}")
@@ -109,15 +109,15 @@ def override(
 def give(rows: NDArray[Any], name: str, value: Any) -> None:
     """Writes a value of `reset(options=...)` into rows (n, ...). Raises ConfigError."""
     try:
-        given = np.asarray(value)
+        numbers = np.asarray(value)
     except ValueError:  # a ragged list
-        given = np.asarray(None)
+        numbers = np.asarray(None)
     option = f"reset option {name!r}, {value!r}"
-    fits = given.shape in [rows.shape[k:] for k in range(max(2, rows.ndim))]
-    if not fits or given.dtype.kind not in "fiub":
+    fits = numbers.shape in [rows.shape[k:] for k in range(max(2, rows.ndim))]
+    if not fits or numbers.dtype.kind not in "fiub":
         shape = f"{rows.shape[1:]}, or its last dimensions"
         raise ConfigError(f"{option}: must be numbers of shape {shape}.")
-    rows[...] = given
+    rows[...] = numbers
     if not np.isfinite(rows).all():
         raise ConfigError(f"{option}: must be finite.")
 
@@ -155,7 +155,9 @@ def _on(
     x: float, y: float, radius: float, body: NDArray[Any], shapes: Sequence[Shape]
 ) -> bool:
     """Returns True if a disc overlaps a body."""
-    (dx, dy), (c, s), reach = (x, y) - body[:2], body[[COS, SIN]], body[RADIUS]
+    dx, dy = (x, y) - body[:2]
+    c, s = body[[COS, SIN]]
+    reach = body[RADIUS]
     if reach <= 0.0 or dx * dx + dy * dy >= (radius + reach) ** 2:
         return False
     # Each shape may occur in several sizes.
@@ -171,27 +173,27 @@ def _on(
 def check_action(action: Any, space: gymnasium.Space[Any], name: str) -> NDArray[Any]:
     """Returns an action as an array of its space's shape. Raises Gymnasium's InvalidAction."""
     try:
-        given = np.asarray(action)
+        array = np.asarray(action)
     except ValueError as error:  # a ragged list
         raise gymnasium.error.InvalidAction(f"{name}: {error}") from None
-    if given.dtype.kind not in "fiub":
+    if array.dtype.kind not in "fiub":
         raise gymnasium.error.InvalidAction(
-            f"{name} of {given.dtype}: must be real numbers."
+            f"{name} of {array.dtype}: must be real numbers."
         )
-    if given.shape != space.shape:
+    if array.shape != space.shape:
         needed = f"must be of shape {space.shape}."
-        raise gymnasium.error.InvalidAction(f"{name} of shape {given.shape}: {needed}")
+        raise gymnasium.error.InvalidAction(f"{name} of shape {array.shape}: {needed}")
     if isinstance(space, gymnasium.spaces.Box) and space.dtype == np.float32:
-        if given.dtype.char not in "fd":
+        if array.dtype.char not in "fd":
             # The kernels are compiled only for float32 and float64.
-            given = given.astype(np.float64)
-        if not kernels.finite(given.reshape(1, -1)):
+            array = array.astype(np.float64)
+        if not kernels.finite(array.reshape(1, -1)):
             raise gymnasium.error.InvalidAction(
-                f"{name} {given!r}: contains NaN or inf."
+                f"{name} {array!r}: contains NaN or inf."
             )
-    elif not space.contains(given):
-        raise gymnasium.error.InvalidAction(f"{name} {given!r}: is not in {space}.")
-    return given
+    elif not space.contains(array):
+        raise gymnasium.error.InvalidAction(f"{name} {array!r}: is not in {space}.")
+    return array
 
 
 def check_command(command: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.sector_kernels import SectorPlan, resample
 from nics_drl_bridge.random_kernels import episode_seed
@@ -37,14 +38,16 @@ class ScanScale(NamedTuple):
 
 
 @kernel(allocates=True)
-def episode_seeds(seeds, numbers, out):  # type: ignore[no-untyped-def]
+def episode_seeds(
+    seeds: NDArray[np.int64], numbers: NDArray[np.int64], out: NDArray[np.int64]
+) -> None:
     """Computes seeds (n,) of episodes from their numbers (n,) and their envs' seeds (n,)."""
     for i in range(seeds.shape[0]):
         out[i] = episode_seed(seeds[i], numbers[i])
 
 
 @kernel(allocates=True)
-def commands(out, actions, low, high):  # type: ignore[no-untyped-def]
+def commands(out: Array, actions: NDArray[np.float32], low: Array, high: Array) -> None:
     """Scales actions (R, C), clamped to [-1, 1], to commands (R, C) between their limits (C,)."""
     for i in range(out.shape[0]):
         for c in range(out.shape[1]):
@@ -53,7 +56,7 @@ def commands(out, actions, low, high):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def finite(values):  # type: ignore[no-untyped-def]
+def finite(values: Array | NDArray[np.float32]) -> bool:
     """Returns True if all values (R, C) are finite."""
     for i in range(values.shape[0]):
         for c in range(values.shape[1]):
@@ -63,7 +66,9 @@ def finite(values):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def look(shares, ranges, scale):  # type: ignore[no-untyped-def]
+def look(
+    shares: NDArray[np.float32], ranges: NDArray[np.float32], scale: ScanScale
+) -> bool:
     """Writes a scan (B,) as fractions (P,), 1 free, 0 too close; returns True for a contact."""
     if scale.sectors > 0:
         resample(shares, ranges, scale.plan)
@@ -78,7 +83,7 @@ def look(shares, ranges, scale):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline=True)
-def _share(value, scale):  # type: ignore[no-untyped-def]
+def _share(value: np.float32, scale: ScanScale) -> np.float32:
     # NaN (unknown) compares False, so it becomes 0, as does -inf (too close).
     share = value * scale.per_metre
     share = share if share > np.float32(0.0) else np.float32(0.0)
@@ -87,7 +92,7 @@ def _share(value, scale):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def contact(ranges, scale):  # type: ignore[no-untyped-def]
+def contact(ranges: NDArray[np.float32], scale: ScanScale) -> bool:
     """Returns True if a beam of a scan (B,) and its neighbours' mean end within the footprint.
 
     A single beam is too noisy: of hundreds, one is nearly always off by three standard deviations.
@@ -106,7 +111,7 @@ def contact(ranges, scale):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline=True)
-def _gap(b, ranges, scale):  # type: ignore[no-untyped-def]
+def _gap(b: int, ranges: NDArray[np.float32], scale: ScanScale) -> np.float32:
     gap = np.float32(0.0)
     for k in range(
         max(b - scale.beside, 0), min(b + scale.beside + 1, ranges.shape[0])
@@ -118,14 +123,19 @@ def _gap(b, ranges, scale):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def looks(shares, touched, ranges, scale):  # type: ignore[no-untyped-def]
+def looks(
+    shares: NDArray[np.float32],
+    touched: NDArray[np.bool_],
+    ranges: NDArray[np.float32],
+    scale: ScanScale,
+) -> None:
     """Applies `look` to the scans (R, B) of R robots; writes its results to touched (R,)."""
     for i in range(ranges.shape[0]):
         touched[i] = look(shares[i], ranges[i], scale)
 
 
 @kernel(allocates=True)
-def bearing(dx, dy, heading):  # type: ignore[no-untyped-def]
+def bearing(dx: float, dy: float, heading: float) -> tuple[float, float, float]:
     """Returns the distance [m] to a point at (dx, dy), and cosine and sine of its bearing."""
     distance = math.sqrt(dx * dx + dy * dy)
     if distance == 0.0:
@@ -138,7 +148,18 @@ def bearing(dx, dy, heading):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def navigate(out, approach, flags, before, pose, twist, ranges, goals, scale, radius):  # type: ignore[no-untyped-def]
+def navigate(
+    out: NDArray[np.float32],
+    approach: Array,
+    flags: NDArray[np.bool_],
+    before: Array,
+    pose: Array,
+    twist: Array,
+    ranges: NDArray[np.float32],
+    goals: Array,
+    scale: ScanScale,
+    radius: float,
+) -> None:
     """Writes the observations (R, P + 6) of `navigation.Navigation`, and its `GoalProgress`.
 
     The columns of flags (R, 3) are reached, touched, and succeeded.
@@ -162,7 +183,7 @@ def navigate(out, approach, flags, before, pose, twist, ranges, goals, scale, ra
 
 
 @kernel(allocates=True)
-def bearings(out, ways, headings):  # type: ignore[no-untyped-def]
+def bearings(out: Array, ways: Array, headings: Array) -> None:
     """Writes `bearing` (R, 3) of points at displacements `ways` (R, 2) from headings (R,)."""
     for r in range(out.shape[0]):
         distance, out[r, 1], out[r, 2] = bearing(ways[r, 0], ways[r, 1], headings[r])

@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.env import kernels
+from nics_drl_bridge.env import kernels, task
 from nics_drl_bridge.env.kernels import LIMIT
 from nics_drl_bridge.env.task import (
     Episodes,
@@ -71,11 +71,11 @@ class Navigation(Task):
     observes_sensors: ClassVar[bool] = True
     shown: ClassVar[tuple[str, ...]] = ("goal",)
 
-    goal_radius: float = 0.3
-    success_reward: float = 10.0
-    collision_reward: float = -10.0
-    progress_reward: float = 1.0
-    time_reward: float = -0.01
+    goal_radius: float = task.GOAL_RADIUS_M
+    success_reward: float = task.SUCCESS_REWARD
+    collision_reward: float = task.COLLISION_REWARD
+    progress_reward: float = task.PROGRESS_REWARD
+    time_reward: float = task.TIME_REWARD
 
     def __post_init__(self) -> None:
         super().__post_init__()

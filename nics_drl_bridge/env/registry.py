@@ -36,7 +36,7 @@ def make_task(
         return _checked(task, model, options)
     check_options("task_options", options)
     options = dict(options or {})
-    found = class_for(task, options)
+    task_class = class_for(task, options)
     if "scan" in options:
         options["scan"] = layout_of(options["scan"], model.lidar)
     if "sensors" in options:
@@ -46,43 +46,44 @@ def make_task(
             raise ConfigError(f"task option sensors={format_value(names)}: {fix}.")
         options["sensors"] = tuple(_sensor(name, model) for name in names)
     try:
-        return found(model.robot, model.lidar, **options)
+        # The error of a missing option names it here, without the constructor.
+        signature(task_class).bind(model.robot, model.lidar, **options)
+        return task_class(model.robot, model.lidar, **options)
     except TypeError as error:
-        reason = str(error).removeprefix(f"{found.__name__}.__init__() ")
         raise ConfigError(
-            f"task {found.__name__}, task_options {options}: {reason}."
+            f"task {task_class.__name__}, task_options {options}: {error}."
         ) from None
 
 
 def _sensor(name: Any, model: SimulatorModel) -> Sensor:
-    known = {sensor.name: sensor for sensor in model.sensors}
-    given = name.name if isinstance(name, Sensor) else str(name)
-    if given not in known:
-        hint = suggest(given, known)
+    sensors = {sensor.name: sensor for sensor in model.sensors}
+    sensor_name = name.name if isinstance(name, Sensor) else str(name)
+    if sensor_name not in sensors:
+        hint = suggest(sensor_name, sensors)
         raise ConfigError(
-            f"task option sensors: the model has no sensor {given!r}; {hint}"
+            f"task option sensors: the model has no sensor {sensor_name!r}; {hint}"
         )
-    return known[given]
+    return sensors[sensor_name]
 
 
 def class_for(task: str | type[Task], options: dict[str, Any]) -> type[Task]:
     """Returns a task's class. Raises ConfigError if it does not exist or lacks an option."""
-    found = task if isinstance(task, type) else _class_of(task)
-    if not issubclass(found, Task):
+    task_class = task if isinstance(task, type) else _class_of(task)
+    if not issubclass(task_class, Task):
         raise ConfigError(
-            f"task {found.__name__}: is not a subclass of env.task.Task; derive it."
+            f"task {task_class.__name__}: is not a subclass of env.task.Task; derive it."
         )
-    known = signature(found).parameters
-    free = any(one.kind is Parameter.VAR_KEYWORD for one in known.values())
+    parameters = signature(task_class).parameters
+    kinds = [parameter.kind for parameter in parameters.values()]
     for name, value in options.items():
-        if name not in known and not free:
-            hint = suggest(name, set(known) - {"robot", "lidar"})
+        if name in parameters:
+            check_kind(f"task option {name}", value, parameters[name].annotation)
+        elif Parameter.VAR_KEYWORD not in kinds:
+            hint = suggest(name, set(parameters) - {"robot", "lidar"})
             raise ConfigError(
-                f"task {found.__name__}: unknown task option {name!r}; {hint}"
+                f"task {task_class.__name__}: unknown task option {name!r}; {hint}"
             )
-        if name in known:
-            check_kind(f"task option {name}", value, known[name].annotation)
-    return found
+    return task_class
 
 
 def _checked(task: Task, model: SimulatorModel, options: dict[str, Any] | None) -> Task:
@@ -115,15 +116,15 @@ def _class_of(name: Any) -> type[Task]:
             )
         return _class_of(TASKS[name])
     module = extensions.load_module(path, "task")
-    found = getattr(module, attribute, None)
-    if not (isinstance(found, type) and issubclass(found, Task)):
+    task_class = getattr(module, attribute, None)
+    if not (isinstance(task_class, type) and issubclass(task_class, Task)):
         tasks = _tasks_in(module)
         if not tasks:
             raise ConfigError(f"task {name!r}: {path} {NO_TASK}")
         raise ConfigError(
             f"task {name!r}: {path} has no such Task; {suggest(attribute, tasks)}"
         )
-    return found
+    return task_class
 
 
 NO_TASK = "defines no subclass of nics_drl_bridge.env.task.Task; see docs/tasks.md."
@@ -131,9 +132,12 @@ NO_TASK = "defines no subclass of nics_drl_bridge.env.task.Task; see docs/tasks.
 
 def _tasks_in(module: Any) -> list[str]:
     """Returns the names of the tasks that a module itself defines."""
-    classes = [each for each in vars(module).values() if isinstance(each, type)]
-    own = [each for each in classes if each.__module__ == module.__name__]
-    return [each.__name__ for each in own if issubclass(each, Task)]
+    names = []
+    for value in vars(module).values():
+        is_task = isinstance(value, type) and issubclass(value, Task)
+        if is_task and value.__module__ == module.__name__:
+            names.append(value.__name__)
+    return names
 
 
 def _missing_class(file: Path) -> str:

@@ -83,14 +83,15 @@ class SimBackend:
             middleware.command(self._now_ns, one)
         self.simulator.step(commands[None])
         self._now_ns += self._period_ns
-        told = {"stamp_ns": self._now_ns, **self._truth()}
+        facts = {"stamp_ns": self._now_ns, **self._truth()}
         view = self._measure()
         if self._middlewares:  # covariance at the time of this view
-            every = np.array(
-                [each.estimator.covariance[:3, :3] for each in self._middlewares]
-            )
-            told["covariance"] = every[0] if len(every) == 1 else every
-        return view, told
+            covariances = []
+            for middleware in self._middlewares:
+                covariances.append(middleware.estimator.covariance[:3, :3])
+            alone = len(covariances) == 1
+            facts["covariance"] = np.array(covariances[0] if alone else covariances)
+        return view, facts
 
     def facts(self) -> BackendFacts:
         """Returns the truth, the obstacles and the drawn values; see `interface.Backend`."""
@@ -103,7 +104,7 @@ class SimBackend:
         drawn = simulator.drawn
         if drawn:
             known["randomisation"] = {
-                name: self._of_episode(each) for name, each in drawn.items()
+                name: self._of_episode(values) for name, values in drawn.items()
             }
         return known
 
@@ -131,7 +132,8 @@ class SimBackend:
         ranges = data.ranges[row].copy()
         if not self._middlewares:
             sensed = {
-                name: each[row].copy() for name, each in self.simulator.readings.items()
+                name: readings[row].copy()
+                for name, readings in self.simulator.readings.items()
             }
             return RobotView(odom, twist, ranges, now * 1e-9, 0.0, 0.0, sensed)
         views = []
@@ -161,7 +163,8 @@ class CompletedBackend:
         self._moved = False
         self._known = BackendFacts()
         for name in ("halt", "facts"):  # prefer the backend's own method
-            if callable(method := getattr(backend, name, None)):
+            method = getattr(backend, name, None)
+            if callable(method):
                 setattr(self, name, method)
 
     def reset(self, start: Start) -> RobotView:
@@ -217,9 +220,4 @@ def make_backend(
         signature(make).bind(model, world, **options)
     except TypeError as error:
         raise ConfigError(f"backend {name!r}: {error}; check its arguments.") from None
-    try:
-        return make(model, world, **options)
-    except TypeError as error:  # raised deeper inside, for arguments passed on
-        if not any(f"argument '{name}'" in str(error) for name in options):
-            raise
-        raise ConfigError(f"backend {name!r}: {error}; check its arguments.") from None
+    return make(model, world, **options)

@@ -43,6 +43,12 @@ SIDEWAYS = ((0, 1, 0), (0, -1, 0))  # two more for a robot that moves sideways
 PARTS = ("update", "observation", "judge", "reward", "end", "info")
 """Methods of a step; a class that overrides one does not use its base's one-pass step."""
 CONTACT_ANGLE = math.radians(4.0)  # 2 cm at a distance of 0.3 m
+# Defaults that the shipped tasks share.
+GOAL_RADIUS_M = 0.3
+SUCCESS_REWARD = 10.0  # once, at the goal
+COLLISION_REWARD = -10.0  # per step with a contact
+PROGRESS_REWARD = 1.0  # per metre of approach
+TIME_REWARD = -0.01  # per step
 
 
 @dataclass(frozen=True)
@@ -178,9 +184,9 @@ class Task(ABC):
         """Returns the command (..., C) of actions: discrete, or (..., C) and clamped to [-1, 1]."""
         if self.actions == "discrete":
             return np.asarray(self.discrete_commands[np.asarray(action)])
-        given = np.ascontiguousarray(action)
-        out = np.empty(given.shape)
-        rows = given.reshape(-1, given.shape[-1])
+        actions = np.ascontiguousarray(action)
+        out = np.empty(actions.shape)
+        rows = actions.reshape(-1, actions.shape[-1])
         low, high = self.command_limits
         kernels.commands(out.reshape(rows.shape), rows, low, high)
         # Don't teach what a vehicle can't do: a car driven by turn rates can't steer at rest.
@@ -192,18 +198,18 @@ class Task(ABC):
         self, out: Observation, before: RobotView, after: RobotView, memory: Memory
     ) -> Outcome:
         """Returns the outcome of a step and writes the observation, possibly in one pass."""
-        given = dict(memory)
+        kept = dict(memory)
         self.update(before, after, memory)
-        if memory.keys() != given.keys():
+        if memory.keys() != kept.keys():
             raise self._wrong(
-                f"memory {sorted(memory)}", f"must keep {sorted(given)} from `reset`"
+                f"memory {sorted(memory)}", f"must keep {sorted(kept)} from `reset`"
             )
         # Copy rebound arrays into the env's rows. Read all first, because they may alias.
         anew = {
-            n: np.array(memory[n]) for n, rows in given.items() if memory[n] is not rows
+            n: np.array(memory[n]) for n, rows in kept.items() if memory[n] is not rows
         }
         for name, new in anew.items():
-            rows = memory[name] = given[name]
+            rows = memory[name] = kept[name]
             if new.shape != rows.shape or not np.can_cast(
                 new.dtype, rows.dtype, "same_kind"
             ):
@@ -269,7 +275,7 @@ class Task(ABC):
         high = self.robot.command_high
         if self.top_speed is None:
             return low, high
-        speeds = np.array([each.unit == "m/s" for each in self.robot.command])
+        speeds = np.array([command.unit == "m/s" for command in self.robot.command])
         top = np.where(speeds, self.top_speed, np.inf)
         return np.maximum(low, -top), np.minimum(high, top)
 
@@ -364,8 +370,8 @@ def discrete_commands(robot: RobotSpec) -> Array:
     elif has_textbook(robot):
         return find_command(robot, drives * reach(robot))
     else:
-        each = np.eye(len(robot.command))
-        signs = np.concatenate([0.0 * each[:1], each, -each])
+        ones = np.eye(len(robot.command))
+        signs = np.concatenate([0.0 * ones[:1], ones, -ones])
     limits = np.where(signs > 0, robot.command_high, robot.command_low)
     commands: Array = np.where(signs == 0, still(robot), limits)
     return commands

@@ -72,11 +72,11 @@ class CooperativeReaching(Task):
     shown: ClassVar[tuple[str, ...]] = ("goal",)
 
     robots: int = 3
-    goal_radius: float = 0.3
-    reached_reward: float = 10.0
-    collision_reward: float = -10.0
-    progress_reward: float = 1.0
-    time_reward: float = -0.01
+    goal_radius: float = task.GOAL_RADIUS_M
+    reached_reward: float = task.SUCCESS_REWARD
+    collision_reward: float = task.COLLISION_REWARD
+    progress_reward: float = task.PROGRESS_REWARD
+    time_reward: float = task.TIME_REWARD
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -218,17 +218,17 @@ class PursuitEvasion(Task):
     pursuers: int = 2
     evaders: int = 1
     capture_gap: float = 0.15
-    capture_reward: float = 10.0
-    collision_reward: float = -10.0
-    pursuit_reward: float = 1.0
-    time_reward: float = -0.01
+    capture_reward: float = task.SUCCESS_REWARD
+    collision_reward: float = task.COLLISION_REWARD
+    pursuit_reward: float = task.PROGRESS_REWARD
+    time_reward: float = task.TIME_REWARD
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self.check_above_zero("capture_gap", self.capture_gap)
         if min(self.pursuers, self.evaders) < 1:
-            given = f"pursuers={self.pursuers}, evaders={self.evaders}"
-            raise ConfigError(f"task options {given}: need at least 1 each.")
+            counts = f"pursuers={self.pursuers}, evaders={self.evaders}"
+            raise ConfigError(f"task options {counts}: need at least 1 each.")
 
     @property
     def robots(self) -> int:

@@ -422,14 +422,12 @@ def joined(parts: Sequence[Outcome]) -> Outcome:
     """Joins the outcomes of consecutive parts of the worlds."""
     if len(parts) == 1:
         return parts[0]
-    terms = {
-        name: np.concatenate([part.terms[name] for part in parts])
-        for name in parts[0].terms
-    }
-    info = {
-        name: np.concatenate([part.info[name] for part in parts])
-        for name in parts[0].info
-    }
+    terms = {}
+    for name in parts[0].terms:
+        terms[name] = np.concatenate([part.terms[name] for part in parts])
+    info = {}
+    for name in parts[0].info:
+        info[name] = np.concatenate([part.info[name] for part in parts])
     return Outcome(terms, np.concatenate([part.ended for part in parts]), info)
 
 
@@ -439,8 +437,8 @@ def chosen_worlds(options: dict[str, Any] | None, count: int) -> Flags:
         return np.ones(count, np.bool_)
     chosen = np.asarray(options["reset_mask"])
     if chosen.shape != (count,) or chosen.dtype != np.bool_ or not chosen.any():
-        given = f"options['reset_mask'] of shape {chosen.shape}, {chosen.dtype}"
-        raise ConfigError(f"{given}: must be ({count},) bool with at least one True.")
+        mask = f"options['reset_mask'] of shape {chosen.shape}, {chosen.dtype}"
+        raise ConfigError(f"{mask}: must be ({count},) bool with at least one True.")
     return chosen.copy()
 
 
@@ -459,15 +457,15 @@ def named_seeds(
     if isinstance(seed, Sequence | np.ndarray):
         if len(seed) != count:
             raise ConfigError(f"{len(seed)} seeds for {count} worlds; give one each.")
-        given = chosen & np.array([one is not None for one in seed])
+        is_seeded = chosen & np.array([one is not None for one in seed])
         seeds = np.array([0 if one is None else one for one in seed], np.int64)
     else:
-        given = chosen & (seed is not None)
+        is_seeded = chosen & (seed is not None)
         seeds = (seed or 0) + np.arange(count, dtype=np.int64)
-    new = chosen & unnamed & ~given
+    new = chosen & unnamed & ~is_seeded
     if new.any():
         seeds = np.where(new, int(rng.integers(2**31)) + np.arange(count), seeds)
-    return seeds, given | new
+    return seeds, is_seeded | new
 
 
 def zeros(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
@@ -491,7 +489,8 @@ def masked(facts: Facts, mask: Flags, alone: bool = False) -> dict[str, Any]:
     gone = ~mask
     most = 2 * np.count_nonzero(mask) > len(mask)
     for name, values in facts.items():
-        paired[name], paired[f"_{name}"] = values, mask.copy()
+        paired[name] = values
+        paired[f"_{name}"] = mask.copy()
         if isinstance(values, Mapping):
             paired[name] = masked(values, mask, alone)
         elif alone and most:

@@ -3,15 +3,25 @@
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import exact_kernels
+from nics_drl_bridge.lidar.exact_kernels import Beams
 
 EDGE = 1e-6  # ranges at an edge are taken this far inside it, as a fraction of the whole width
 
 
 @kernel(allocates=True)
-def silhouettes(hull, radius, distances, turns, edges, hints):  # type: ignore[no-untyped-def]
+def silhouettes(
+    hull: Array,
+    radius: float,
+    distances: Array,
+    turns: Array,
+    edges: Array,
+    hints: NDArray[np.int64],
+) -> None:
     """Write the right and left edge [rad] of a shape straight ahead, and the corners there.
 
     Both results are (T, D, 2), for rotations (T,) [rad] and distances (D,) [m] of its origin. The
@@ -47,7 +57,9 @@ def silhouettes(hull, radius, distances, turns, edges, hints):  # type: ignore[n
 
 
 @kernel(allocates=True)
-def along(angle, corners, radius, distance, cos, sin):  # type: ignore[no-untyped-def]
+def along(
+    angle: float, corners: Array, radius: float, distance: float, cos: float, sin: float
+) -> np.float32:
     """Range to a shape straight ahead in one direction [rad]; see `row`."""
     ray = np.empty((2, 1))
     out = np.full(1, np.inf, np.float32)
@@ -65,7 +77,16 @@ def along(angle, corners, radius, distance, cos, sin):  # type: ignore[no-untype
 
 
 @kernel(allocates=True)
-def row(fine, beams, corners, radius, distance, cos, sin, edge):  # type: ignore[no-untyped-def]
+def row(
+    fine: NDArray[np.float32],
+    beams: Beams,
+    corners: Array,
+    radius: float,
+    distance: float,
+    cos: float,
+    sin: float,
+    edge: Array,
+) -> None:
     """Write ranges (P,) [m] of a shape straight ahead, continued beyond its edges (2,) [rad]."""
     fine[:] = np.inf
     if corners.shape[0] == 0:
@@ -89,7 +110,9 @@ def row(fine, beams, corners, radius, distance, cos, sin, edge):  # type: ignore
 
 
 @kernel(allocates=True)
-def into_phases(rows, fine, width, phases):  # type: ignore[no-untyped-def]
+def into_phases(
+    rows: NDArray[np.float32], fine: NDArray[np.float32], width: int, phases: int
+) -> None:
     """Sort points (width * phases,) so that those of one phase are contiguous."""
     for phase in range(phases):
         for k in range(width):
@@ -97,7 +120,16 @@ def into_phases(rows, fine, width, phases):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def rows_of_turn(rows, layout, shape, distances, turn, edges, step, phases):  # type: ignore[no-untyped-def]
+def rows_of_turn(
+    rows: NDArray[np.float32],
+    layout: NDArray[np.int64],
+    shape: tuple[Array, float],
+    distances: Array,
+    turn: float,
+    edges: Array,
+    step: float,
+    phases: int,
+) -> None:
     """Write the rows of one rotation [rad] into the table's ranges (R,) float32 [m].
 
     The layout (3, D) holds, per distance, the start of its row, its first beam relative to the

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.exact_kernels import RADIUS, X, Y
 
@@ -54,12 +55,12 @@ def body_cells(worlds: int, bodies: int, ordered: bool = False) -> BodyCells:
 
 
 @kernel(inline=True)
-def _place(way, cells_per_metre, side):  # type: ignore[no-untyped-def]
+def _place(way: float, cells_per_metre: float, side: float) -> int:
     return int(min(max(way * cells_per_metre, 0.0), side - 1.0))
 
 
 @kernel
-def cover(n, low_x, low_y, extent, cells):  # type: ignore[no-untyped-def]
+def cover(n: int, low_x: float, low_y: float, extent: float, cells: BodyCells) -> None:
     """Lay the cells of a world over a square from (low_x, low_y) on; they are empty then."""
     if cells.first.shape[0] > 0:
         frame = cells.frame[n]
@@ -70,7 +71,7 @@ def cover(n, low_x, low_y, extent, cells):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def clear(n, cells):  # type: ignore[no-untyped-def]
+def clear(n: int, cells: BodyCells) -> None:
     """Empty the cells of a world."""
     if cells.first.shape[0] > 0:
         cells.first[n, :] = -1
@@ -78,7 +79,7 @@ def clear(n, cells):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline=True)
-def _cell(body, stands, frame):  # type: ignore[no-untyped-def]
+def _cell(body: Array, stands: bool, frame: Array) -> int:
     side = int(frame[SIDE])
     if not stands or body[RADIUS] * frame[PER_METRE] > 1.0:
         return side * side
@@ -88,7 +89,7 @@ def _cell(body, stands, frame):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def add(n, k, body, cells):  # type: ignore[no-untyped-def]
+def add(n: int, k: int, body: Array, cells: BodyCells) -> None:
     """Add a body (7,) to the chain of its cell."""
     if cells.first.shape[0] > 0:
         cell = _cell(body, True, cells.frame[n])
@@ -97,7 +98,7 @@ def add(n, k, body, cells):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def sort(n, bodies, standing, cells):  # type: ignore[no-untyped-def]
+def sort(n: int, bodies: Array, standing: int, cells: BodyCells) -> None:
     """Sort the bodies (K, 7) of a world, the first `standing` of them by cells."""
     low_x = np.inf
     low_y = np.inf
@@ -134,13 +135,15 @@ def sort(n, bodies, standing, cells):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline=True)
-def _copy(body, to):  # type: ignore[no-untyped-def]
+def _copy(body: Array, to: Array) -> None:
     for i in range(7):
         to[i] = body[i]
 
 
 @kernel
-def put_in_order(n, bodies, standing, spare, cells):  # type: ignore[no-untyped-def]
+def put_in_order(
+    n: int, bodies: Array, standing: int, spare: Array, cells: BodyCells
+) -> None:
     """Sort the first `standing` bodies (K, 7) themselves, absent ones last; no others may move.
 
     Neighbours then share cache lines, so few accesses miss the cache. `spare` (K, 7) is scratch.
@@ -162,7 +165,9 @@ def put_in_order(n, bodies, standing, spare, cells):  # type: ignore[no-untyped-
 
 
 @kernel(inline=True)
-def _window(n, x, y, reach, cells):  # type: ignore[no-untyped-def]
+def _window(
+    n: int, x: float, y: float, reach: float, cells: BodyCells
+) -> tuple[int, int, int, int]:
     """Return minimum and maximum row, then column, of the cells around a place."""
     frame = cells.frame[n]
     per_metre = cells.frame[n, PER_METRE]
@@ -176,7 +181,7 @@ def _window(n, x, y, reach, cells):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def around(n, x, y, reach, cells):  # type: ignore[no-untyped-def]
+def around(n: int, x: float, y: float, reach: float, cells: BodyCells) -> int:
     """Write to `found` the sorted bodies that may be within `reach` [m]; return their number."""
     first = cells.first
     then = cells.then
@@ -197,7 +202,7 @@ def around(n, x, y, reach, cells):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def around_added(n, x, y, reach, cells):  # type: ignore[no-untyped-def]
+def around_added(n: int, x: float, y: float, reach: float, cells: BodyCells) -> int:
     """Do the same as `around` for bodies that were added one by one."""
     first = cells.first
     then = cells.then

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
 
 TWO_PI = 2.0 * math.pi
@@ -75,7 +76,7 @@ class OutlineArrays(NamedTuple):
 
 
 @kernel(allocates=True)
-def beams_of(directions, first, step, closed):  # type: ignore[no-untyped-def]
+def beams_of(directions: Array, first: float, step: float, closed: bool) -> Beams:
     """Return the beams of directions (2, B) that are a `step` apart, from `first` on [rad]."""
     most = max(min(int(HALF_PI / step), directions.shape[1]), 1) + BLOCK
     angles = step * np.arange(-most, most)
@@ -90,7 +91,7 @@ def beams_of(directions, first, step, closed):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline=True)
-def arctan2(y, x):  # type: ignore[no-untyped-def]
+def arctan2(y: float, x: float) -> float:
     """Angle of (x, y) within 3e-10 rad, branchless: a polynomial fitted at Chebyshev nodes."""
     ax = abs(x)
     ay = abs(y)
@@ -106,7 +107,7 @@ def arctan2(y, x):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def beam_span(low, high, beams):  # type: ignore[no-untyped-def]
+def beam_span(low: float, high: float, beams: Beams) -> tuple[int, int]:
     """First beam and number of beams in [low, high]; in a full circle modulo the count."""
     count = beams.directions.shape[1]
     first = math.ceil((low - beams.first) / beams.step - ROUNDING)
@@ -119,7 +120,14 @@ def beam_span(low, high, beams):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def circle(out, beams, x, y, radius, range_max):  # type: ignore[no-untyped-def]
+def circle(
+    out: NDArray[np.float32],
+    beams: Beams,
+    x: float,
+    y: float,
+    radius: float,
+    range_max: float,
+) -> None:
     """Fuse the exact ranges to a circle at (x, y)."""
     d2 = x * x + y * y
     r2 = radius * radius
@@ -155,13 +163,25 @@ def circle(out, beams, x, y, radius, range_max):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def segment(out, beams, x1, y1, x2, y2):  # type: ignore[no-untyped-def]
+def segment(
+    out: NDArray[np.float32], beams: Beams, x1: float, y1: float, x2: float, y2: float
+) -> None:
     """Fuse the exact ranges to the straight wall from (x1, y1) to (x2, y2)."""
     edge(out, beams, x1, y1, arctan2(y1, x1), x2, y2, arctan2(y2, x2), False)
 
 
 @kernel(inline=True)
-def edge(out, beams, x1, y1, angle1, x2, y2, angle2, one_sided):  # type: ignore[no-untyped-def]
+def edge(
+    out: NDArray[np.float32],
+    beams: Beams,
+    x1: float,
+    y1: float,
+    angle1: float,
+    x2: float,
+    y2: float,
+    angle2: float,
+    one_sided: bool,
+) -> None:
     """Like `segment`, with directions of its ends [rad]; `one_sided`: visible from its right."""
     count = out.shape[0]
     ex = x2 - x1
@@ -184,7 +204,15 @@ def edge(out, beams, x1, y1, angle1, x2, y2, angle2, one_sided):  # type: ignore
 
 
 @kernel(contracts=True, inline=True)
-def _cross(out, directions, begin, end, cross, ex, ey):  # type: ignore[no-untyped-def]
+def _cross(
+    out: NDArray[np.float32],
+    directions: Array,
+    begin: int,
+    end: int,
+    cross: float | np.float32,
+    ex: float,
+    ey: float,
+) -> None:
     cross = np.float32(cross)  # a division in single precision takes half the time
     # Ranges are fused as whole numbers, in the same order: of floats LLVM masks the store.
     whole = out.view(np.int32)
@@ -196,7 +224,15 @@ def _cross(out, directions, begin, end, cross, ex, ey):  # type: ignore[no-untyp
 
 
 @kernel
-def polygon(out, beams, x, y, c, s, corners):  # type: ignore[no-untyped-def]
+def polygon(
+    out: NDArray[np.float32],
+    beams: Beams,
+    x: float,
+    y: float,
+    c: float,
+    s: float,
+    corners: Array,
+) -> None:
     """Fuse the exact ranges to the outline `corners` (V, 2), turned by (c, s), at (x, y)."""
     last = corners.shape[0] - 1
     cull = beside_convex(x, y, c, s, corners)
@@ -212,7 +248,7 @@ def polygon(out, beams, x, y, c, s, corners):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def beside_convex(x, y, c, s, corners):  # type: ignore[no-untyped-def]
+def beside_convex(x: float, y: float, c: float, s: float, corners: Array) -> bool:
     """True if an outline is convex, the lidar outside: rays first meet sides from their right."""
     last = corners.shape[0] - 1
     rounds = 0
@@ -238,13 +274,15 @@ def beside_convex(x, y, c, s, corners):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline=True)
-def turned(x, y, c, s, corner):  # type: ignore[no-untyped-def]
+def turned(
+    x: float, y: float, c: float, s: float, corner: Array
+) -> tuple[float, float]:
     """Position of a corner (2,) of a shape turned by (c, s) and placed at (x, y)."""
     return x + c * corner[0] - s * corner[1], y + s * corner[0] + c * corner[1]
 
 
 @kernel
-def finish(out, range_min, range_max):  # type: ignore[no-untyped-def]
+def finish(out: NDArray[np.float32], range_min: float, range_max: float) -> None:
     """Apply the limits to a scan (B,): too far becomes `inf`, too close `-inf` (REP-117)."""
     low = np.float32(range_min)
     high = np.float32(range_max)
@@ -255,7 +293,14 @@ def finish(out, range_min, range_max):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def walls_into(out, beams, lidar, walls, limits, found):  # type: ignore[no-untyped-def]
+def walls_into(
+    out: NDArray[np.float32],
+    beams: Beams,
+    lidar: LidarPose,
+    walls: Array,
+    limits: tuple[float, float],
+    found: Array,
+) -> None:
     """Fuse walls (W, 4) into a scan from a `LidarPose`, as `finish` would leave them.
 
     Limits are range_min and range_max [m]; `found` (11 TOGETHER,) is scratch memory.
@@ -279,7 +324,15 @@ def walls_into(out, beams, lidar, walls, limits, found):  # type: ignore[no-unty
 
 
 @kernel(inline=True)
-def _find_walls(found, beams, lidar, walls, begin, range_max, count):  # type: ignore[no-untyped-def]
+def _find_walls(
+    found: Array,
+    beams: Beams,
+    lidar: LidarPose,
+    walls: Array,
+    begin: int,
+    range_max: float,
+    count: int,
+) -> None:
     """Find the beams that meet some walls in range, none for the others; without branches."""
     c = lidar.c
     s = lidar.s
@@ -334,7 +387,14 @@ def _find_walls(found, beams, lidar, walls, begin, range_max, count):  # type: i
 
 
 @kernel(inline=True)
-def _wall(whole, beams, first, end, line, limits):  # type: ignore[no-untyped-def]
+def _wall(
+    whole: NDArray[np.int32],
+    beams: Beams,
+    first: int,
+    end: int,
+    line: tuple[float, float, float],
+    limits: tuple[float, float],
+) -> None:
     count = whole.shape[0]
     few = BLOCK <= whole.shape[0] < MANY
     # a quarter turn
@@ -367,7 +427,16 @@ def _wall(whole, beams, first, end, line, limits):  # type: ignore[no-untyped-de
 
 
 @kernel(contracts=True, inline=True)
-def _wall_piece(whole, beams, place, width, begin, end, line, limits):  # type: ignore[no-untyped-def]
+def _wall_piece(
+    whole: NDArray[np.int32],
+    beams: Beams,
+    place: int,
+    width: int,
+    begin: int,
+    end: int,
+    line: tuple[float, float, float],
+    limits: tuple[float, float],
+) -> None:
     """Fuse a wall into those of the beams from a place on that are in [begin, end).
 
     They are turned in single precision from the first, or from the last if they meet it ever
@@ -406,7 +475,14 @@ def _wall_piece(whole, beams, place, width, begin, end, line, limits):  # type: 
 
 
 @kernel
-def body_into(out, beams, lidar, body, outlines, range_max):  # type: ignore[no-untyped-def]
+def body_into(
+    out: NDArray[np.float32],
+    beams: Beams,
+    lidar: LidarPose,
+    body: Array,
+    outlines: OutlineArrays,
+    range_max: float,
+) -> None:
     """Fuse one body (7,) into a scan from a `LidarPose`."""
     c = lidar.c
     s = lidar.s

@@ -9,6 +9,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.geometry import Array
@@ -46,7 +47,13 @@ class Distortion(NamedTuple):
 
 
 @kernel(allocates=True)
-def distort(ranges, limits, faults, seed, counter):  # type: ignore[no-untyped-def]
+def distort(
+    ranges: NDArray[np.float32],
+    limits: Array | tuple[float, float],
+    faults: Array,
+    seed: int,
+    counter: int,
+) -> None:
     """Apply faults (P,) of the device to one exact scan (B,) float32, REP-117, in place [m].
 
     A return stays within the limits, range_min and range_max [m]; `counter` is that of the scan.
@@ -75,7 +82,7 @@ def distort(ranges, limits, faults, seed, counter):  # type: ignore[no-untyped-d
 
 
 @kernel(inline=True)
-def _device(limits, faults):  # type: ignore[no-untyped-def]
+def _device(limits: tuple[float, float], faults: Array) -> Distortion:
     single = np.float32
     step = faults[QUANTISATION]
     close = np.inf
@@ -106,7 +113,7 @@ def _device(limits, faults):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def _ghosts(ranges, device, by):  # type: ignore[no-untyped-def]
+def _ghosts(ranges: NDArray[np.float32], device: Distortion, by: int) -> None:
     whole = ranges.view(np.int32)
     for i in range(ranges.shape[0]):
         ghost = device.least + random.share_of(random.bits(by, i)) * (
@@ -117,7 +124,7 @@ def _ghosts(ranges, device, by):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def _close(ranges, close):  # type: ignore[no-untyped-def]
+def _close(ranges: NDArray[np.float32], close: np.float32) -> None:
     whole = ranges.view(np.int32)
     value = np.float32(close).view(np.int32)
     for i in range(ranges.shape[0]):
@@ -125,7 +132,9 @@ def _close(ranges, close):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True, inline=True)
-def _noise(ranges, device, by, coarse):  # type: ignore[no-untyped-def]
+def _noise(
+    ranges: NDArray[np.float32], device: Distortion, by: int, coarse: bool
+) -> None:
     runs = ranges.shape[0] // random.RUN
     for k in range(runs):
         _noise_run(ranges, random.RUN, device, by, k, coarse)
@@ -133,7 +142,14 @@ def _noise(ranges, device, by, coarse):  # type: ignore[no-untyped-def]
 
 
 @kernel(contracts=True, inline=True)
-def _noise_run(ranges, count, device, by, k, coarse):  # type: ignore[no-untyped-def]
+def _noise_run(
+    ranges: NDArray[np.float32],
+    count: int,
+    device: Distortion,
+    by: int,
+    k: int,
+    coarse: bool,
+) -> None:
     run = random.run(by, k)
     begin = np.uintp(k * random.RUN)
     for j in range(count):
@@ -145,14 +161,14 @@ def _noise_run(ranges, count, device, by, k, coarse):  # type: ignore[no-untyped
 
 
 @kernel(inline=True)
-def _told(value, measured, device):  # type: ignore[no-untyped-def]
+def _told(value: np.float32, measured: np.float32, device: Distortion) -> np.float32:
     """Return the measured range, or the value reported for too close or no return."""
     other = device.close if value < device.close else value
     return measured if np.float32(value).view(np.uint32) < np.uint32(INF) else other
 
 
 @kernel(contracts=True, inline=True)
-def _coarse(value, device):  # type: ignore[no-untyped-def]
+def _coarse(value: np.float32, device: Distortion) -> np.float32:
     """Return the nearest multiple of the step within the limits."""
     count = np.floor(value * device.per_step + np.float32(0.5))
     count = device.first if count < device.first else count
@@ -161,18 +177,23 @@ def _coarse(value, device):  # type: ignore[no-untyped-def]
 
 
 @kernel(contracts=True, inline=True)
-def _multiple(count, step, rest):  # type: ignore[no-untyped-def]
+def _multiple(count: np.float32, step: np.float32, rest: np.float32) -> np.float32:
     return count * step + count * rest  # rounded once
 
 
 @kernel(inline=True)
-def _limited(value, device):  # type: ignore[no-untyped-def]
+def _limited(value: np.float32, device: Distortion) -> np.float32:
     value = device.least if value < device.least else value
     return device.most if value > device.most else value
 
 
 @kernel(allocates=True)
-def _drop(ranges, share, far, by):  # type: ignore[no-untyped-def]
+def _drop(
+    ranges: NDArray[np.float32],
+    share: float | np.float32,
+    far: float | np.float32,
+    by: int,
+) -> None:
     share = np.float32(share)
     far = np.float32(far)
     whole = ranges.view(np.int32)
@@ -230,7 +251,14 @@ def slice_poses(
 
 
 @kernel(allocates=True)
-def distort_worlds(ranges, chosen, limits, faults, seeds, steps):  # type: ignore[no-untyped-def]
+def distort_worlds(
+    ranges: NDArray[np.float32],
+    chosen: NDArray[np.int64],
+    limits: tuple[float, float],
+    faults: Array,
+    seeds: NDArray[np.int64],
+    steps: NDArray[np.int64],
+) -> None:
     """Apply the same faults to the scans (N, M, B) of some worlds (n,), see `distort`."""
     robots = ranges.shape[1]
     for n in chosen:

@@ -28,28 +28,28 @@ class Fixtures(NamedTuple):
 
 
 @kernel(view=True)
-def walls_of(n, fixtures):  # type: ignore[no-untyped-def]
+def walls_of(n: int, fixtures: Fixtures) -> Array:
     """Walls (W, 4) of one copy."""
     p = fixtures.member[n]
     return fixtures.walls[fixtures.first[p] : fixtures.first[p + 1]]
 
 
 @kernel(view=True)
-def grid_of(n, fixtures):  # type: ignore[no-untyped-def]
+def grid_of(n: int, fixtures: Fixtures) -> GridArrays:
     """Map of one copy, without squares if there is none."""
     p = fixtures.member[n]
     return GridArrays(cells_of(fixtures.squares, fixtures.maps[p]), fixtures.frames[p])
 
 
 @kernel(view=True)
-def fixtures_around(n, fixtures):  # type: ignore[no-untyped-def]
+def fixtures_around(n: int, fixtures: Fixtures) -> Fixtures:
     """Fixtures of one copy, as if it were the only copy."""
     s = fixtures
     return Fixtures(s.member[n : n + 1], s.walls, s.first, s.squares, s.maps, s.frames)
 
 
 @kernel(view=True)
-def cells_of(cells, place):  # type: ignore[no-untyped-def]
+def cells_of(cells: NDArray[np.uint32], place: NDArray[np.int64]) -> NDArray[np.uint32]:
     """Cells (rows, columns) of one map among those of many: first cell, rows, columns."""
     first = place[0]
     rows = place[1]

@@ -43,7 +43,9 @@ class FurtherLidar(Sensor):
     def renderer(self, around: SensedWorlds) -> Render:
         """Scan bodies, walls and map like the first lidar, with this one's faults."""
         scanner = make_scanner(self.lidar, around.shapes, around.renderer)
-        state, lidar, salt = around.state, scanner.arguments, crc32(self.name.encode())
+        state = around.state
+        lidar = scanner.arguments
+        salt = crc32(self.name.encode())
         limits = self.lidar.range_min, self.lidar.range_max
         faults = self.lidar.fault_parameters
 

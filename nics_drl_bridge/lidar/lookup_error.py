@@ -1,6 +1,31 @@
-"""Distances at which a shape may be looked up, measured for the renderer `auto`."""
+"""Distances at which a shape may be looked up, measured for the renderer `auto`.
+
+The space around the lidar is divided into rings by the shape's distance, and the returns into bands
+by their range. For each ring, `lookup_distances`
+
+1. places the shape at random in the ring (`_place_around`), and again so that the lidar is nearly
+   in line with one of its edges (`_turn_edge_on`), where rare beams have large errors;
+2. scans all placements by both renderers, and compares the beams that have a return in both;
+3. adds up the squared errors of the random placements by placement and band, and keeps the largest
+   error of any beam, also of the slanted placements.
+
+Then `_find_widest` takes the widest interval of rings in which no beam is off by more than
+`OUTLIER` and `_is_small` holds in each ring, and in each band over all rings of the interval:
+
+    mean + DEVIATIONS * spread <= greatest^2
+
+With the sum of squared errors q_p and the number of beams n_p of each placement p, that is
+
+    mean = sum(q_p) / sum(n_p)
+    spread = sqrt(sum((q_p - mean * n_p)^2)) / sum(n_p)    the standard deviation of this mean
+
+Beams of one placement err alike, so placements are the independent samples, not beams.
+"""
+
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar import scan_kernels
@@ -36,51 +61,62 @@ def lookup_distances(
     shape is an index in the table with its radius [m]. Returns the minimum and the maximum distance
     to its origin [m]; both inf if it may not be looked up.
     """
-    low, high, (corners, first) = exact.range_min, exact.range_max, exact.outlines
+    corners, first = exact.outlines
     outline = corners[first[shape] : first[shape + 1]]
-    rings = np.concatenate([[0.0], np.geomspace(TOUCHING * high, high, RINGS)]) + radius
-    edges = np.geomspace(max(low, TOUCHING * high), high, BANDS + 1)[1:-1]
-    squares, counts = np.zeros((2, RINGS, PLACES, BANDS))
+    high = exact.range_max
+    nearest = TOUCHING * high
+    rings = np.concatenate([[0.0], np.geomspace(nearest, high, RINGS)]) + radius
+    bands = np.geomspace(max(exact.range_min, nearest), high, BANDS + 1)[1:-1]
+    squares = np.zeros((RINGS, PLACES, BANDS))
+    counts = np.zeros((RINGS, PLACES, BANDS))
     worst = np.zeros(RINGS)
     for i in range(RINGS):
-        poses = _around(exact, rings[i : i + 2], SEED + i)
-        for some in (
-            (poses, _slanted(poses, outline, SEED + i)) if len(outline) else (poses,)
-        ):
-            one, other = _scans(place(some[:, None], radius, shape), exact, baked)
-            both = np.isfinite(one) & np.isfinite(other)
-            found = other[both] - one[both]
-            truth = one[both]
-            worst[i] = max(worst[i], np.abs(found).max(initial=0.0))
-            if some is poses:
-                cell = np.nonzero(both)[0] * BANDS + np.searchsorted(edges, truth)
-                square = np.bincount(cell, np.square(found), PLACES * BANDS)
-                squares[i] = square.reshape(PLACES, BANDS)
-                counts[i] = np.bincount(cell, minlength=PLACES * BANDS).reshape(
-                    PLACES, BANDS
-                )
-    return _widest(rings, squares, counts, np.where(worst <= OUTLIER, greatest, 0.0))
+        poses = _place_around(exact, rings[i : i + 2], SEED + i)
+        errors = _compare(place(poses[:, None], radius, shape), exact, baked)
+        cell = errors.placement * BANDS + np.searchsorted(bands, errors.truth)
+        sums = np.bincount(cell, np.square(errors.error), PLACES * BANDS)
+        squares[i] = sums.reshape(PLACES, BANDS)
+        counts[i] = np.bincount(cell, minlength=PLACES * BANDS).reshape(PLACES, BANDS)
+        worst[i] = np.abs(errors.error).max(initial=0.0)
+        if len(outline) > 0:
+            poses = _turn_edge_on(poses, outline, SEED + i)
+            errors = _compare(place(poses[:, None], radius, shape), exact, baked)
+            worst[i] = max(worst[i], np.abs(errors.error).max(initial=0.0))
+    return _find_widest(rings, squares, counts, worst <= OUTLIER, greatest)
 
 
-def _widest(
-    rings: Array, squares: Array, counts: Array, greatest: Array
+class _Errors(NamedTuple):
+    """Errors of the beams that have a return in both scans of a placement."""
+
+    placement: NDArray[np.int_]  # index of the placement
+    truth: Array  # exact range [m]
+    error: Array  # looked-up range minus exact range [m]
+
+
+def _find_widest(
+    rings: Array,
+    squares: Array,
+    counts: Array,
+    has_no_outlier: NDArray[np.bool_],
+    greatest: float,
 ) -> tuple[float, float]:
     """Edges of the widest interval of rings with small errors, or inf if too narrow."""
     best = (np.inf, np.inf)
     width = NARROWEST * (rings[-1] - rings[0])
     for i in range(RINGS):
         for j in range(i + 1, RINGS + 1):
-            wider = rings[j] - rings[i] > width and (greatest[i:j] > 0.0).all()
-            if wider and _small(squares[i:j], counts[i:j], greatest[i]):
+            if rings[j] - rings[i] <= width or not has_no_outlier[i:j].all():
+                continue
+            if _is_small(squares[i:j], counts[i:j], greatest):
                 best = (float(rings[i]), float(rings[j]))
                 width = rings[j] - rings[i]
     return best
 
 
-def _small(squares: Array, counts: Array, greatest: float) -> bool:
+def _is_small(squares: Array, counts: Array, greatest: float) -> bool:
     """True if the RMSE is small in each ring and band, from sums and counts (R, P, B)."""
-    rings = squares.sum(axis=2), counts.sum(axis=2)
-    bands = squares.reshape(-1, BANDS).T, counts.reshape(-1, BANDS).T
+    rings = (squares.sum(axis=2), counts.sum(axis=2))
+    bands = (squares.reshape(-1, BANDS).T, counts.reshape(-1, BANDS).T)
     for square, count in (rings, bands):
         total = np.maximum(count.sum(axis=1), 1.0)
         mean = square.sum(axis=1) / total
@@ -90,9 +126,8 @@ def _small(squares: Array, counts: Array, greatest: float) -> bool:
     return True
 
 
-def _scans(
-    bodies: Array, exact: LidarArrays, baked: LidarArrays
-) -> tuple[Array, Array]:
+def _compare(bodies: Array, exact: LidarArrays, baked: LidarArrays) -> _Errors:
+    """Scan bodies (P, 1, 7) of P placements by both renderers."""
     mount = exact.mount
     directions = exact.beams.directions
     # the lidar is at the origin
@@ -101,17 +136,19 @@ def _scans(
     worlds = np.arange(PLACES)
     lanes = scan_kernels.scan_lanes()
     cells = body_cells(0, bodies.shape[1])
-    nothing = np.zeros(PLACES, np.int64)
-    around = stack_fixtures([np.zeros((0, 4))], [None], nothing)
+    empty = stack_fixtures([np.zeros((0, 4))], [None], np.zeros(PLACES, np.int64))
     for ranges, sensor in zip(scans, (exact, baked), strict=True):
         scan_kernels.scan_worlds(
-            ranges, robots, worlds, bodies, -1, around, sensor, cells, lanes
+            ranges, robots, worlds, bodies, -1, empty, sensor, cells, lanes
         )
-    one, other = scans[:, :, 0].astype(np.float64)
-    return one, other
+    exact_ranges, baked_ranges = scans[:, :, 0].astype(np.float64)
+    both = np.isfinite(exact_ranges) & np.isfinite(baked_ranges)
+    truth = exact_ranges[both]
+    return _Errors(np.nonzero(both)[0], truth, baked_ranges[both] - truth)
 
 
-def _around(exact: LidarArrays, between: Array, seed: int) -> Array:
+def _place_around(exact: LidarArrays, between: Array, seed: int) -> Array:
+    """Draw poses (P, 3) within the lidar's angles, at distances between two limits (2,) [m]."""
     rng = np.random.default_rng(seed)
     beams = exact.beams
     distance = rng.uniform(between[0], between[1], PLACES)
@@ -123,15 +160,19 @@ def _around(exact: LidarArrays, between: Array, seed: int) -> Array:
     )
 
 
-def _slanted(poses: Array, outline: Array, seed: int) -> Array:
-    """Draw poses with the lidar nearly in line with an edge: rare, but with large errors."""
+def _turn_edge_on(poses: Array, outline: Array, seed: int) -> Array:
+    """Turn shapes at poses (P, 3) so that the lidar is nearly in line with a random edge.
+
+    Long edges are drawn more often. An edge whose line passes the shape's origin at a signed
+    distance `aside` is in line with a lidar at the distance d if the angle between the edge and
+    the line of sight to the origin is asin(aside / d).
+    """
     rng = np.random.default_rng(seed)
     along = np.roll(outline, -1, axis=0) - outline
     length = np.hypot(*along.T)
     chosen = rng.choice(len(along), len(poses), p=length**2 / np.sum(length**2))
-    aside = (along[:, 0] * outline[:, 1] - along[:, 1] * outline[:, 0]) / np.maximum(
-        length, 1e-12
-    )
+    cross = along[:, 0] * outline[:, 1] - along[:, 1] * outline[:, 0]
+    aside = cross / np.maximum(length, 1e-12)
     distance = np.hypot(poses[:, 0], poses[:, 1])
     bearing = np.arctan2(poses[:, 1], poses[:, 0])
     direction = np.arctan2(along[chosen, 1], along[chosen, 0])

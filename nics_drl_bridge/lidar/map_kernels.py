@@ -9,12 +9,17 @@ most 3e-7, and a beam within 1e-6 cells of a corner may pass on its other side.
 """
 
 import math
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.lidar.exact_kernels import Beams, LidarPose
+
+if TYPE_CHECKING:
+    from nics_drl_bridge.lidar.scan_kernels import ScanLanes
 
 LANES = 48  # beams that jump together: several vector registers hide the latency of look-ups
 DU, DV, PER_U, PER_V, U, V, T = (np.uintp(k * LANES) for k in range(7))
@@ -40,7 +45,7 @@ class GridArrays(NamedTuple):
 
 
 @kernel(allocates=True)
-def free_squares(blocked):  # type: ignore[no-untyped-def]
+def free_squares(blocked: NDArray[np.bool_]) -> NDArray[np.uint32]:
     """Bake the squares (rows + 2, columns + 2) of a map (rows, columns), see `GridArrays`."""
     rows, columns = blocked.shape
     side = np.zeros((rows + 2, columns + 2), np.int32)
@@ -64,14 +69,14 @@ def free_squares(blocked):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def _line(at, step, cell):  # type: ignore[no-untyped-def]
+def _line(at: float, step: float, cell: int) -> float:
     if step == 0.0:
         return np.inf
     return (cell + (1 if step > 0.0 else 0) - at) / step
 
 
 @kernel(allocates=True)
-def _entry(at, step, size):  # type: ignore[no-untyped-def]
+def _entry(at: float, step: float, size: int) -> tuple[float, float]:
     """Distances along a beam at which it enters and leaves [0, size] on one axis [cells]."""
     if step == 0.0:
         return (-np.inf, np.inf) if 0.0 <= at < size else (np.inf, -np.inf)
@@ -81,7 +86,9 @@ def _entry(at, step, size):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def walk(squares, u, v, du, dv, limit):  # type: ignore[no-untyped-def]
+def walk(
+    squares: NDArray[np.uint32], u: float, v: float, du: float, dv: float, limit: float
+) -> float:
     """Exact distance [cells] from (u, v) to the boundary of the solid cells, `inf` beyond `limit`.
 
     That is where the beam enters a solid cell, or leaves it if it starts inside. Outside is free.
@@ -124,7 +131,15 @@ def walk(squares, u, v, du, dv, limit):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def map_into(out, beams, lidar, range_max, grid, exact, lanes):  # type: ignore[no-untyped-def]
+def map_into(
+    out: NDArray[np.float32],
+    beams: Beams,
+    lidar: LidarPose,
+    range_max: float,
+    grid: GridArrays,
+    exact: bool,
+    lanes: "ScanLanes",
+) -> None:
     """Fuse a map (`GridArrays`) into a scan (B,) float32 [m]: walks if `exact`, else jumps."""
     squares = grid.squares
     frame = grid.frame
@@ -167,7 +182,16 @@ def map_into(out, beams, lidar, range_max, grid, exact, lanes):  # type: ignore[
 
 
 @kernel
-def _begin(directions, first, u, v, c, s, columns, lanes):  # type: ignore[no-untyped-def]
+def _begin(
+    directions: Array,
+    first: int,
+    u: float | np.float32,
+    v: float | np.float32,
+    c: float | np.float32,
+    s: float | np.float32,
+    columns: int,
+    lanes: "ScanLanes",
+) -> None:
     """Put the beams from `first` on into lanes, each mirrored so that it points right and up."""
     c = np.float32(c)
     s = np.float32(s)
@@ -204,7 +228,9 @@ def _begin(directions, first, u, v, c, s, columns, lanes):  # type: ignore[no-un
 
 
 @kernel
-def _jump(flat, here, limit, lanes):  # type: ignore[no-untyped-def]
+def _jump(
+    flat: NDArray[np.uint32], here: int, limit: np.float32, lanes: "ScanLanes"
+) -> np.bool_:
     """Move each lane to the end of its free square; True if any moved."""
     singles = lanes.singles
     wholes = lanes.integers
@@ -245,7 +271,15 @@ def _jump(flat, here, limit, lanes):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _end(out, x, y, shape, limit, resolution, lanes):  # type: ignore[no-untyped-def]
+def _end(
+    out: NDArray[np.float32],
+    x: int,
+    y: int,
+    shape: tuple[int, int],
+    limit: np.float32,
+    resolution: float,
+    lanes: "ScanLanes",
+) -> None:
     """Fuse the lanes that ended at a solid cell, not in the border around the map."""
     singles = lanes.singles
     wholes = lanes.integers

@@ -297,10 +297,10 @@ def stack_fixtures(
 ) -> Fixtures:
     """Stack the fixtures of P worlds: walls (W, 4) and the map of each."""
     maps = [NO_MAP if grid is None else grid.arrays for grid in grids]
-    squares, places = joined([each.squares for each in maps])
+    squares, places = joined([grid_arrays.squares for grid_arrays in maps])
     frames = np.zeros((len(maps), 5))
-    for frame, each in zip(frames, maps, strict=True):
-        frame[: len(each.frame)] = each.frame
+    for frame, grid_arrays in zip(frames, maps, strict=True):
+        frame[: len(grid_arrays.frame)] = grid_arrays.frame
     first = np.cumsum([0, *map(len, walls)])
     return Fixtures(member, np.concatenate(walls), first, squares, places, frames)
 
@@ -310,11 +310,10 @@ def joined(cells: Sequence[NDArray[Any]]) -> tuple[NDArray[Any], NDArray[np.int6
 
     An array that occurs again, as the map of several worlds, is stored once.
     """
-    once = {id(each): each for each in cells}
-    starts = np.cumsum([0, *(each.size for each in once.values())]).tolist()
+    once = {id(array): array for array in cells}
+    starts = np.cumsum([0, *(array.size for array in once.values())]).tolist()
     first = dict(zip(once, starts, strict=False))
-    shapes = [(first[id(each)], *each.shape) for each in cells]
-    flat = [each.reshape(-1) for each in once.values()]  # of one alone, no copy
-    return flat[0] if len(flat) == 1 else np.concatenate(flat), np.array(
-        shapes, np.int64
-    )
+    shapes = [(first[id(array)], *array.shape) for array in cells]
+    flat = [array.reshape(-1) for array in once.values()]  # of one alone, no copy
+    stacked = flat[0] if len(flat) == 1 else np.concatenate(flat)
+    return stacked, np.array(shapes, np.int64)

@@ -25,6 +25,7 @@ from nics_drl_bridge.lidar.table import LidarTable
 
 Renderer = Literal["auto", "baked", "exact"]
 RENDERERS: tuple[Renderer, ...] = ("auto", "baked", "exact")
+DEFAULT_RENDERER: Renderer = "auto"
 NO_WALLS = np.zeros((0, 4))
 # `auto` looks up at distances where the ranges' RMSE is at most this [m]
 GREATEST_ERROR = 0.01
@@ -47,7 +48,7 @@ class Scanner:
 
     spec: LidarSpec
     table: LidarTable  # of the shapes that may occur
-    renderer: Renderer = "auto"
+    renderer: Renderer = DEFAULT_RENDERER
     grid: GridMap | None = None  # a static map of every world that `scan` sees
 
     def __post_init__(self) -> None:
@@ -112,15 +113,15 @@ class Scanner:
                 farthest = float(table.grid[h, 0])
                 key = spec.model_dump_json(), table.shapes[h], table.density, farthest
                 if key not in _MEASURED:  # once per process
-                    ways = (
-                        replace(self, renderer=way, grid=None)
-                        for way in ("exact", "baked")
+                    exact = replace(self, renderer="exact", grid=None)
+                    baked = replace(self, renderer="baked", grid=None)
+                    _MEASURED[key] = lookup_distances(
+                        exact.arguments,
+                        baked.arguments,
+                        h,
+                        float(radii[h]),
+                        GREATEST_ERROR,
                     )
-                    exact, baked = (way.arguments for way in ways)
-                    found = lookup_distances(
-                        exact, baked, h, float(radii[h]), GREATEST_ERROR
-                    )
-                    _MEASURED[key] = found
                 between[h] = _MEASURED[key]
         return np.asarray(np.square(between))
 
@@ -188,8 +189,8 @@ class Scanner:
             bodies.shape[1],
             BODY,
         ):
-            given = f"poses {poses.shape} and bodies {bodies.shape}"
-            raise ConfigError(f"{given} must be (N, 3) and (N, K, {BODY}).")
+            shapes = f"poses {poses.shape} and bodies {bodies.shape}"
+            raise ConfigError(f"{shapes} must be (N, 3) and (N, K, {BODY}).")
         if walls.shape != (len(walls), 4):
             raise ConfigError(f"walls {walls.shape} must be (W, 4).")
         index = bodies[..., SHAPE]
@@ -205,7 +206,7 @@ class Scanner:
 def make_scanner(
     spec: LidarSpec,
     shapes: Sequence[Shape],
-    renderer: Renderer = "auto",
+    renderer: Renderer = DEFAULT_RENDERER,
     grid: GridMap | None = None,
 ) -> Scanner:
     """Return a scanner of shapes, baked now if needed; ConfigError as `Scanner` and `bake`."""

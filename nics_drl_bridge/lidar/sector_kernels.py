@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
 
 TURN = 2.0 * math.pi
@@ -32,7 +33,9 @@ class SectorPlan(NamedTuple):
 
 
 @kernel(allocates=True)
-def resample(out, ranges, plan):  # type: ignore[no-untyped-def]
+def resample(
+    out: NDArray[np.float32], ranges: NDArray[np.float32], plan: SectorPlan
+) -> None:
     """Write the nearest return in each sector (S,) of one scan (B,) [m], REP-117; NaN is unknown.
 
     A sector without a beam takes the nearer return of the two adjacent beams.
@@ -44,7 +47,12 @@ def resample(out, ranges, plan):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def _by_beam(out, ranges, first, count):  # type: ignore[no-untyped-def]
+def _by_beam(
+    out: NDArray[np.float32],
+    ranges: NDArray[np.float32],
+    first: NDArray[np.int32],
+    count: NDArray[np.int32],
+) -> None:
     """Fill each sector from its own beams, by a sparse table (Bender, Farach-Colton 2000).
 
     Row k has the minimum of each 2**k beams in a row. As whole numbers, ranges have the same order,
@@ -80,7 +88,7 @@ def _by_beam(out, ranges, first, count):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline=True)
-def _nearest(least, begin, end):  # type: ignore[no-untyped-def]
+def _nearest(least: NDArray[np.int32], begin: int, end: int) -> np.float32:
     k = np.uintp(0)
     while 2 << k <= end - begin:
         k += np.uintp(1)
@@ -88,7 +96,9 @@ def _nearest(least, begin, end):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def _by_place(out, ranges, plan):  # type: ignore[no-untyped-def]
+def _by_place(
+    out: NDArray[np.float32], ranges: NDArray[np.float32], plan: SectorPlan
+) -> None:
     """Fill each sector from its returns, or the nearer of the neighbouring beams around it."""
     sectors = out.shape[0]
     beams = ranges.shape[0]
@@ -119,7 +129,7 @@ def _by_place(out, ranges, plan):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def _seen(r, direction, plan):  # type: ignore[no-untyped-def]
+def _seen(r: np.float32, direction: Array, plan: SectorPlan) -> tuple[int, np.float32]:
     """Sector of a return seen from the viewpoint, -1 if unknown, and its distance."""
     if r != r:
         return -1, np.float32(np.nan)
@@ -133,5 +143,5 @@ def _seen(r, direction, plan):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def _nearer(one, other):  # type: ignore[no-untyped-def]
+def _nearer(one: np.float32, other: np.float32) -> np.float32:
     return one if one <= other else other

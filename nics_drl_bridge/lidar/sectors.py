@@ -165,8 +165,8 @@ def _beams_of(away: Array, half: float) -> tuple[int, int]:
 def _check(lidar: LidarSpec, layout: ScanLayout, angles: Array) -> None:
     apart = lidar.angle_increment if lidar.beams > 1 else np.inf
     if apart > COARSEST_RAD:
-        found, most = np.degrees([apart, COARSEST_RAD])
-        seen = f"the beams of the lidar {lidar.name!r} are {found:.3g} deg apart"
+        step, most = np.degrees([apart, COARSEST_RAD])
+        seen = f"the beams of the lidar {lidar.name!r} are {step:.3g} deg apart"
         reason = f"{seen}, a scan layout needs at most {most:.3g}"
         raise ConfigError(f"{reason}; use a finer lidar.", reason=reason)
     if lidar.range_max < layout.range_max * (1.0 - RANGE_TOLERANCE):
@@ -254,13 +254,13 @@ def reader_beside(
     header: ScanHeader, beams: int, like: LidarSpec, upside_down: bool = False
 ) -> Reader:
     """Like `reader_of`, but returns exactly the expected lidar if the header agrees with it."""
-    found = reader_of(header, beams, like, upside_down)
-    limits = np.array([found.lidar.range_min, found.lidar.range_max])
+    reader = reader_of(header, beams, like, upside_down)
+    limits = np.array([reader.lidar.range_min, reader.lidar.range_max])
     near = np.allclose(limits, [like.range_min, like.range_max], rtol=1e-4, atol=1e-4)
-    same = near and found.lidar.beams == like.beams
-    turned = found.lidar.angles - like.angles if same else np.ones(1)
+    same = near and reader.lidar.beams == like.beams
+    turned = reader.lidar.angles - like.angles if same else np.ones(1)
     # the beams may be the same, off by full turns
     whole = 2.0 * np.pi * np.round(turned[0] / (2.0 * np.pi))
     if same and np.abs(turned - whole).max() < 0.1 * like.angle_increment:
-        return Reader(like, found.backwards)
-    return found
+        return Reader(like, reader.backwards)
+    return reader

@@ -116,51 +116,52 @@ def add_sensor_kind(place: str) -> type[Sensor]:
     return extensions.import_class("sensors", place, Sensor)
 
 
-def sensor_of(given: Sensor | Mapping[str, Any]) -> Sensor:
+def sensor_of(entries: Sensor | Mapping[str, Any]) -> Sensor:
     """Return a sensor from a caller's entries; `kind` may be `path/to/file.py:ClassName`.
 
     Use `sensor_of_data` for entries from a file. Raises ConfigError.
     """
-    if not isinstance(given, Sensor) and isinstance(given, Mapping):
-        kind = str(given.get("kind"))
+    if not isinstance(entries, Sensor) and isinstance(entries, Mapping):
+        kind = str(entries.get("kind"))
         if ":" in kind:
-            given = {**given, "kind": add_sensor_kind(kind).__name__}
-    return sensor_of_data(given)
+            entries = {**entries, "kind": add_sensor_kind(kind).__name__}
+    return sensor_of_data(entries)
 
 
-def sensor_of_data(given: Sensor | Mapping[str, Any]) -> Sensor:
+def sensor_of_data(entries: Sensor | Mapping[str, Any]) -> Sensor:
     """Return a sensor from the entries of a file, which must name a known kind and never code.
 
     Raises ConfigError if they describe no sensor.
     """
-    if isinstance(given, Sensor):
-        return given
-    if not isinstance(given, Mapping) or "kind" not in given:
+    if isinstance(entries, Sensor):
+        return entries
+    if not isinstance(entries, Mapping) or "kind" not in entries:
         raise ConfigError("a sensor needs a 'kind' and a 'name'.")
-    kind = str(given["kind"])
+    kind = str(entries["kind"])
     if ":" in kind:
         raise ConfigError(f"sensor kind {kind!r}: {CODE_IN_DATA}")
-    found = extensions.load("sensors", kind)
-    if not (isinstance(found, type) and issubclass(found, Sensor)):
+    sensor_class = extensions.load("sensors", kind)
+    if not (isinstance(sensor_class, type) and issubclass(sensor_class, Sensor)):
         raise ConfigError(
             f"sensor kind {kind!r}: is not a subclass of lidar.sensor.Sensor."
         )
-    return validate(dict(given), found, f"sensor {given.get('name')!r}")
+    return validate(dict(entries), sensor_class, f"sensor {entries.get('name')!r}")
 
 
 def load_sensor(file: Path) -> Sensor:
     """Read a sensor from a YAML file. Raises ConfigError for what is wrong with it."""
+    content = parse_yaml(read_text(file), str(file))  # its errors name the file
     try:
-        return sensor_of_data(parse_yaml(read_text(file), str(file)))
+        return sensor_of_data(content)
     except ConfigError as error:
-        known = str(error).startswith(str(file))
-        raise error if known else ConfigError(f"{file}: {error}") from None
+        raise ConfigError(f"{file}: {error}") from None
 
 
 def unread(sensors: Sequence[Sensor], *lead: int) -> dict[str, Readings]:
     """Return unknown readings (*lead, S) by the sensors' names."""
     return {
-        each.name: np.full((*lead, each.size), np.nan, np.float32) for each in sensors
+        sensor.name: np.full((*lead, sensor.size), np.nan, np.float32)
+        for sensor in sensors
     }
 
 
@@ -178,9 +179,9 @@ def check_sensors(sensors: tuple[Sensor, ...], frames: tuple[str, ...]) -> None:
         used.append(sensor.frame)
 
 
-def _validated(given: Any) -> Sensor:
+def _validated(entries: Any) -> Sensor:
     try:
-        return sensor_of_data(given)
+        return sensor_of_data(entries)
     except ConfigError as error:
         raise ValueError(str(error)) from None
 

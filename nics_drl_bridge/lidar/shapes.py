@@ -1,4 +1,17 @@
-"""Shapes of obstacles and footprints, and their arrays for the kernels."""
+"""Shapes of obstacles and footprints, and their arrays for the kernels.
+
+A shape is data with a `kind`, as in YAML files. It has an outline (V, 2) of corners in its own
+frame, counter-clockwise, and the radius of the circle around its origin that encloses it. A circle
+has no corners.
+
+The kernels know shapes by their index in `Outlines`, which lists the corners of all shapes in one
+array. `place` turns shapes at poses into bodies (..., 7): x, y, heading, cosine and sine of the
+heading, radius, and the index of the shape.
+
+Baking needs two more properties of a shape. `convex_hull` determines its silhouette: the leftmost
+and the rightmost corner, as seen from outside, are corners of the hull. `rotational_order` counts
+the rotations that map the shape onto itself, so that a table needs only one of their sectors.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -144,10 +157,8 @@ def place(poses: ArrayLike, radii: ArrayLike, shapes: ArrayLike) -> Array:
     bodies[..., :3] = poses
     # a body with an infinite heading is NaN, and not visible
     with np.errstate(invalid="ignore"):
-        bodies[..., COS], bodies[..., SIN] = (
-            np.cos(poses[..., 2]),
-            np.sin(poses[..., 2]),
-        )
+        bodies[..., COS] = np.cos(poses[..., 2])
+        bodies[..., SIN] = np.sin(poses[..., 2])
     bodies[..., RADIUS] = radii
     bodies[..., SHAPE] = shapes
     return bodies
@@ -159,19 +170,29 @@ def convex_hull(points: Array) -> Array:
     if len(ordered) < 3:
         return np.array(ordered)
     reach = _reach(points)
+    smallest_area = 1e-12 * reach * reach
+    lower = _half_hull(ordered, smallest_area)
+    upper = _half_hull(ordered[::-1], smallest_area)
+    return np.array(lower + upper)
 
-    def half(corners: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-        chain: list[tuple[float, float]] = []
-        for x, y in corners:
-            while len(chain) > 1:
-                (ax, ay), (bx, by) = chain[-2:]
-                if (bx - ax) * (y - ay) - (by - ay) * (x - ax) > 1e-12 * reach * reach:
-                    break
-                chain.pop()
-            chain.append((x, y))
-        return chain[:-1]
 
-    return np.array(half(ordered) + half(ordered[::-1]))
+def _half_hull(
+    ordered: Sequence[tuple[float, float]], smallest_area: float
+) -> list[tuple[float, float]]:
+    """Lower hull of points from left to right, or upper one from right to left, without its end.
+
+    Corners that span less than an area [m^2] are collinear.
+    """
+    chain: list[tuple[float, float]] = []
+    for x, y in ordered:
+        while len(chain) > 1:
+            (ax, ay), (bx, by) = chain[-2:]
+            area = (bx - ax) * (y - ay) - (by - ay) * (x - ax)
+            if area > smallest_area:  # a left turn
+                break
+            chain.pop()
+        chain.append((x, y))
+    return chain[:-1]
 
 
 def rotational_order(outline: Array, hull: Array) -> int:
@@ -180,21 +201,23 @@ def rotational_order(outline: Array, hull: Array) -> int:
         return 1
     tolerance = SAME_PLACE * _reach(outline)
     for order in range(len(outline), 1, -1):
-        if len(outline) % order or len(hull) % order:
-            continue
-        angle = 2.0 * np.pi / order
-        turn = np.array(
-            [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]
-        )
-        if all(
-            np.abs(
-                corners @ turn - np.roll(corners, -len(corners) // order, axis=0)
-            ).max()
-            < tolerance
-            for corners in (outline, hull)
+        if _is_symmetric(outline, order, tolerance) and _is_symmetric(
+            hull, order, tolerance
         ):
             return order
     return 1
+
+
+def _is_symmetric(corners: Array, order: int, tolerance: float) -> bool:
+    """Return True if turning corners (V, 2) by a whole turn / order only renumbers them."""
+    if len(corners) % order:
+        return False
+    angle = 2.0 * np.pi / order
+    c = np.cos(angle)
+    s = np.sin(angle)
+    turned = corners @ np.array([[c, s], [-s, c]])
+    renumbered = np.roll(corners, -len(corners) // order, axis=0)
+    return bool(np.abs(turned - renumbered).max() < tolerance)
 
 
 @dataclass(frozen=True)
@@ -205,9 +228,8 @@ class Outlines:
     corners: Array  # (sum V, 2) of all outlines, one after the other [m]
     # (H + 1,) first corner of each outline; a circle has none
     corner: NDArray[np.int64]
-    hulls: (
-        Array  # (sum 2 V, 2) corners of all convex hulls [m]; a circle's is its centre
-    )
+    # (sum 2 V, 2) corners of all convex hulls [m]; a circle's is its centre
+    hulls: Array
     hull: NDArray[np.int64]  # (H + 1,) first corner of each hull
     radii: Array  # (H,) [m]
     orders: NDArray[np.int64]  # (H,) rotational order
@@ -215,9 +237,15 @@ class Outlines:
     @classmethod
     def of(cls, shapes: Sequence[Shape]) -> "Outlines":
         """Create the arrays of some shapes."""
-        outlines = [shape.outline for shape in shapes]
-        hulls = [convex_hull(o) if len(o) else np.zeros((1, 2)) for o in outlines]
-        orders = [rotational_order(o, h) for o, h in zip(outlines, hulls, strict=True)]
+        outlines = []
+        hulls = []
+        orders = []
+        for shape in shapes:
+            outline = shape.outline
+            hull = convex_hull(outline) if len(outline) else np.zeros((1, 2))
+            outlines.append(outline)
+            hulls.append(hull)
+            orders.append(rotational_order(outline, hull))
         twice = [np.concatenate([hull, hull]) for hull in hulls]
         nothing = np.zeros((0, 2))
         radii = np.array([shape.radius for shape in shapes], dtype=np.float64)

@@ -29,6 +29,7 @@ from nav_msgs.msg import Odometry
 from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge import defaults, interface
+from nics_drl_bridge.arguments import list_keywords, refuse_unknown
 from nics_drl_bridge.config import validate
 from nics_drl_bridge.env.guard import halts_on_error
 from nics_drl_bridge.errors import BackendError, ConfigError, StaleDataError, suggest
@@ -102,12 +103,15 @@ def dds_backend(
     if mode not in (LOCKSTEP, REALTIME):
         fix = suggest(mode, (LOCKSTEP, REALTIME))
         raise ConfigError(f"backend_options: there is no mode {mode!r}; {fix}")
+    option_names = list_keywords(DdsBackend)
     if robots > 1:
         namespaces = options.pop("namespaces", default_namespaces(robots))
         _check_fleet(mode, robots, namespaces)
+        refuse_unknown("backend 'dds'", options, option_names - {"namespace"})
         return FleetBackend(model, world, namespaces, **options)
     if mode == REALTIME:
         return RealtimeBackend(model, world, **options)
+    refuse_unknown("backend 'dds'", options, option_names)
     if isinstance(randomisation, str):
         randomisation = load_randomisation(randomisation)
     return DdsBackend(model, world, randomisation=randomisation, **options)

@@ -3,9 +3,19 @@
 import math
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.policy import local_map_kernels as kernels
+from nics_drl_bridge.policy.local_map_kernels import (
+    Clearance,
+    FootprintDiscs,
+    MapScratch,
+    ScanRays,
+    Situation,
+)
 
 # half the cost of a twist that hits something before the robot can stop
 INADMISSIBLE = 500.0
@@ -39,7 +49,16 @@ class TwistWeights(NamedTuple):
 
 
 @kernel(allocates=True)
-def choose_all(out, scans, goals, twists, candidates, ahead, weights, sense):  # type: ignore[no-untyped-def]
+def choose_all(
+    out: NDArray[np.int64],
+    scans: Array,
+    goals: Array,
+    twists: Array,
+    candidates: Array,
+    ahead: LookAhead,
+    weights: TwistWeights,
+    sense: tuple[ScanRays, FootprintDiscs, Clearance, MapScratch],
+) -> None:
     """Writes the index of the candidate that `choose` picks for each of N robots into out (N,)."""
     for n in range(out.shape[0]):
         around = kernels.look(scans[n], goals[n], *sense)
@@ -47,7 +66,13 @@ def choose_all(out, scans, goals, twists, candidates, ahead, weights, sense):  #
 
 
 @kernel
-def choose(around, twist, candidates, ahead, weights):  # type: ignore[no-untyped-def]
+def choose(
+    around: Situation,
+    twist: Array,
+    candidates: Array,
+    ahead: LookAhead,
+    weights: TwistWeights,
+) -> int:
     """Returns the index of the cheapest candidate (K, 3), preferring those within the window."""
     best = 0
     least = math.inf
@@ -71,7 +96,13 @@ def choose(around, twist, candidates, ahead, weights):  # type: ignore[no-untype
 
 
 @kernel
-def cost_of(around, aimed, twist, ahead, weights):  # type: ignore[no-untyped-def]
+def cost_of(
+    around: Situation,
+    aimed: Array,
+    twist: Array,
+    ahead: LookAhead,
+    weights: TwistWeights,
+) -> float:
     """Returns the cost of holding a twist (3,), inadmissible if it hits something before stopping.
 
     If braking takes time, the robot starts from its present twist (3,), which may be faster.

@@ -78,7 +78,14 @@ class Situation(NamedTuple):
 
 
 @kernel(allocates=True)
-def look(shares, goal, rays, outline, clearance, scratch):  # type: ignore[no-untyped-def]
+def look(
+    shares: Array,
+    goal: Array,
+    rays: ScanRays,
+    outline: FootprintDiscs,
+    clearance: Clearance,
+    scratch: MapScratch,
+) -> Situation:
     """Maps a scan of range fractions (P,) around a robot whose goal (2,) is in `base_link` [m]."""
     count = hits_of(scratch.hits, shares, rays)
     put_distances(scratch.map, scratch.hits[:count])
@@ -88,7 +95,7 @@ def look(shares, goal, rays, outline, clearance, scratch):  # type: ignore[no-un
 
 
 @kernel
-def hits_of(hits, shares, rays):  # type: ignore[no-untyped-def]
+def hits_of(hits: Array, shares: Array, rays: ScanRays) -> int:
     """Writes end points of range fractions (P,) into hits (P, 2) [m]; returns their number.
 
     Fractions of 0 are left out: they are unknown, or too close to tell from the robot itself.
@@ -111,7 +118,7 @@ def hits_of(hits, shares, rays):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def put_distances(seen, hits):  # type: ignore[no-untyped-def]
+def put_distances(seen: LocalMap, hits: Array) -> None:
     """Writes the distances of a map to hits (H, 2)."""
     grid = seen.distances
     cell = seen.cell
@@ -141,14 +148,16 @@ def put_distances(seen, hits):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _span(middle, reach, cell, size):  # type: ignore[no-untyped-def]
+def _span(middle: float, reach: float, cell: float, size: int) -> tuple[int, int]:
     """Returns the range (first, last + 1) of cells within `reach` of a coordinate [m]."""
     low = min(max(int((middle - reach) / cell), 0), size)
     return low, max(min(int((middle + reach) / cell) + 1, size), low)
 
 
 @kernel
-def value_at(grid, cell, x, y, outside):  # type: ignore[no-untyped-def]
+def value_at(
+    grid: NDArray[np.float32], cell: float, x: float, y: float, outside: float
+) -> float:
     """Returns the value of a grid at a point, bilinear between cell centres."""
     size = grid.shape[0]
     u = x / cell + 0.5 * size - 0.5
@@ -159,7 +168,9 @@ def value_at(grid, cell, x, y, outside):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline=True)
-def between(grid, u, v):  # type: ignore[no-untyped-def]
+def between(
+    grid: NDArray[np.float32], u: float | np.float32, v: float | np.float32
+) -> float:
     """Returns the value of a grid at column u and row v (in cells), which lie within it."""
     j = np.uint32(np.int32(u))
     i = np.uint32(np.int32(v))
@@ -172,7 +183,7 @@ def between(grid, u, v):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def put_ways(around, prices):  # type: ignore[no-untyped-def]
+def put_ways(around: Situation, prices: NDArray[np.float32]) -> None:
     """Writes a map's path lengths to the goal; prices (G / COARSE, G / COARSE) are scratch.
 
     Solves the eikonal equation by fast sweeping (Zhao 2005). Beyond the map, paths are straight.
@@ -207,7 +218,7 @@ def put_ways(around, prices):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def way_at(x, y, around):  # type: ignore[no-untyped-def]
+def way_at(x: float, y: float, around: Situation) -> float:
     """Returns the path length from a point to the goal [m]."""
     gap = math.hypot(around.goal[0] - x, around.goal[1] - y)
     seen = around.map
@@ -216,7 +227,7 @@ def way_at(x, y, around):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def room_at(x, y, c, s, around):  # type: ignore[no-untyped-def]
+def room_at(x: float, y: float, c: float, s: float, around: Situation) -> float:
     """Returns the clearance at a pose [m]; c and s are the cosine and sine of its heading.
 
     It is negative if the footprint overlaps a hit. Far from all hits it is a lower bound.
@@ -249,13 +260,15 @@ def room_at(x, y, c, s, around):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def astray(x, y, c, s, way, around):  # type: ignore[no-untyped-def]
+def astray(
+    x: float, y: float, c: float, s: float, way: float, around: Situation
+) -> float:
     """Returns how far a heading is off the path to the goal: 0 along it, 1 away from it."""
     ahead = way_at(x + AHEAD_M * c, y + AHEAD_M * s, around)
     return min(max(0.5 + 0.5 * (ahead - way) / AHEAD_M, 0.0), 1.0)
 
 
 @kernel
-def touching(around):  # type: ignore[no-untyped-def]
+def touching(around: Situation) -> float:
     """Returns the clearance that counts as a contact [m]; lower if the robot already touches."""
     return min(around.clearance.margin, room_at(0.0, 0.0, 1.0, 0.0, around) - 1e-3)

@@ -13,6 +13,13 @@ from numpy.typing import NDArray
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.policy import local_map_kernels as maps
+from nics_drl_bridge.policy.local_map_kernels import (
+    Clearance,
+    FootprintDiscs,
+    MapScratch,
+    ScanRays,
+    Situation,
+)
 from nics_drl_bridge.random_kernels import PLANNER_STREAM, normal, uniform
 from nics_drl_bridge.robot.kernels import Terms, advance, apply_curve, rates, run
 
@@ -89,7 +96,7 @@ class RollOuts(NamedTuple):
 
 
 @kernel(allocates=True)
-def draw(offers, noise, rest, seed):  # type: ignore[no-untyped-def]
+def draw(offers: Array, noise: Array, rest: Array, seed: int) -> None:
     """Draws `Sampling.offers`, the first of them rest (C,), and `Sampling.noise`, by seed."""
     for k in range(offers.shape[0]):
         for q in range(offers.shape[1]):
@@ -107,7 +114,17 @@ def draw(offers, noise, rest, seed):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def plan_all(out, scans, goals, twists, sense, plant, sampling, worth, lanes):  # type: ignore[no-untyped-def]
+def plan_all(
+    out: Array,
+    scans: Array,
+    goals: Array,
+    twists: Array,
+    sense: tuple[ScanRays, FootprintDiscs, Clearance, MapScratch],
+    plant: Plant,
+    sampling: Sampling,
+    worth: Worth,
+    lanes: RollOuts,
+) -> None:
     """Writes the actions (N, C) of N robots from scans (N, P), goals (N, 2) and twists (N, 3)."""
     for n in range(out.shape[0]):
         around = maps.look(scans[n], goals[n], *sense)
@@ -115,7 +132,15 @@ def plan_all(out, scans, goals, twists, sense, plant, sampling, worth, lanes):  
 
 
 @kernel(allocates=True)
-def _plan(out, twist, around, plant, sampling, worth, lanes):  # type: ignore[no-untyped-def]
+def _plan(
+    out: Array,
+    twist: Array,
+    around: Situation,
+    plant: Plant,
+    sampling: Sampling,
+    worth: Worth,
+    lanes: RollOuts,
+) -> None:
     """Writes the first action (C,) of the plan.
 
     Instead of warm-starting from the previous plan, the first round proposes actions from the whole
@@ -139,7 +164,7 @@ def _plan(out, twist, around, plant, sampling, worth, lanes):  # type: ignore[no
 
 
 @kernel
-def _wait(twist, plant, lanes):  # type: ignore[no-untyped-def]
+def _wait(twist: Array, plant: Plant, lanes: RollOuts) -> None:
     """Writes pose and state, when commands take effect, of a robot that has a twist (3,) now."""
     follow(twist, plant, lanes)
     lanes.start[:] = 0.0
@@ -148,7 +173,7 @@ def _wait(twist, plant, lanes):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _average(best, temperature, lanes):  # type: ignore[no-untyped-def]
+def _average(best: int, temperature: float, lanes: RollOuts) -> None:
     """Replaces the nominal actions by the cost-weighted mean of the sampled ones."""
     lanes.nominal[:] = 0.0
     total = 0.0
@@ -164,7 +189,7 @@ def _average(best, temperature, lanes):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def follow(twist, plant, lanes):  # type: ignore[no-untyped-def]
+def follow(twist: Array, plant: Plant, lanes: RollOuts) -> None:
     """Writes the held command whose steady twist is nearest to a twist (3,), and its state.
 
     Coordinate descent on the squared difference.
@@ -201,7 +226,7 @@ def follow(twist, plant, lanes):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _settle(command, plant, lanes):  # type: ignore[no-untyped-def]
+def _settle(command: Array, plant: Plant, lanes: RollOuts) -> None:
     """Writes the steady state of a command (C,) and its effect into `one`."""
     states, count = plant.settled.shape
     x = lanes.one
@@ -215,7 +240,9 @@ def _settle(command, plant, lanes):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _roll(around, plant, sampling, worth, lanes):  # type: ignore[no-untyped-def]
+def _roll(
+    around: Situation, plant: Plant, sampling: Sampling, worth: Worth, lanes: RollOuts
+) -> int:
     """Rolls out the actions of all lanes; writes their costs and returns the cheapest lane."""
     _begin(around, plant, worth, lanes)
     states = plant.settled.shape[0]
@@ -254,7 +281,9 @@ def _roll(around, plant, sampling, worth, lanes):  # type: ignore[no-untyped-def
 
 
 @kernel
-def _halt(around, plant, halt, limit, lanes):  # type: ignore[no-untyped-def]
+def _halt(
+    around: Situation, plant: Plant, halt: Halt, limit: float, lanes: RollOuts
+) -> None:
     """Stops all lanes at the end of their rollouts; adds the cost of contacts while stopping."""
     states = plant.settled.shape[0]
     for t in range(halt.most):
@@ -283,7 +312,7 @@ def _halt(around, plant, halt, limit, lanes):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _begin(around, plant, worth, lanes):  # type: ignore[no-untyped-def]
+def _begin(around: Situation, plant: Plant, worth: Worth, lanes: RollOuts) -> None:
     """Initialises all lanes, and their costs with the changes of action between knots."""
     states, count = plant.settled.shape
     _put(lanes, states)
@@ -303,7 +332,7 @@ def _begin(around, plant, worth, lanes):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _put(lanes, states):  # type: ignore[no-untyped-def]
+def _put(lanes: RollOuts, states: int) -> None:
     """Puts all lanes at the start pose and state."""
     x = lanes.start[0]
     y = lanes.start[1]
@@ -319,7 +348,15 @@ def _put(lanes, states):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _judge(k, t, periods, limit, around, worth, lanes):  # type: ignore[no-untyped-def]
+def _judge(
+    k: int,
+    t: int,
+    periods: int,
+    limit: float,
+    around: Situation,
+    worth: Worth,
+    lanes: RollOuts,
+) -> None:
     """Adds the cost of period t in lane k."""
     x = lanes.pose[0, k]
     y = lanes.pose[1, k]

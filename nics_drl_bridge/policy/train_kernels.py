@@ -42,7 +42,7 @@ class Batch(NamedTuple):
 
 
 @kernel(allocates=True)
-def forward(net, seen):  # type: ignore[no-untyped-def]
+def forward(net: Net, seen: NDArray[np.float32]) -> NDArray[np.float32]:
     """Returns the outputs (n, C) of a network for inputs (n, O); keeps all layers' outputs."""
     n = seen.shape[0]
     at = 0
@@ -64,7 +64,9 @@ def forward(net, seen):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def backward(net, seen, gradient):  # type: ignore[no-untyped-def]
+def backward(
+    net: Net, seen: NDArray[np.float32], gradient: NDArray[np.float32]
+) -> None:
     """Writes the gradients of the weights, given the outputs' gradients (n, C), after `forward`.
 
     `gradient` must be the first of the spare arrays.
@@ -91,7 +93,7 @@ def backward(net, seen, gradient):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def critic_gradients(net, batch, weight):  # type: ignore[no-untyped-def]
+def critic_gradients(net: Net, batch: Batch, weight: np.float32) -> np.float32:
     """Writes the gradients of the critic; returns its weighted loss."""
     values = forward(net, batch.seen)
     n = values.shape[0]
@@ -107,7 +109,14 @@ def critic_gradients(net, batch, weight):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def actor_gradients(net, batch, log_std, spread, clip, entropy):  # type: ignore[no-untyped-def]
+def actor_gradients(
+    net: Net,
+    batch: Batch,
+    log_std: NDArray[np.float32],
+    spread: NDArray[np.float32],
+    clip: np.float32,
+    entropy: np.float32,
+) -> np.float32:
     """Writes the gradients of the actor and `log_std` (C,); returns their loss.
 
     With discrete actions, `log_std` has no gradient.
@@ -150,7 +159,12 @@ def actor_gradients(net, batch, log_std, spread, clip, entropy):  # type: ignore
 
 
 @kernel(allocates=True)
-def _density(parts, raw, action, log_std):  # type: ignore[no-untyped-def]
+def _density(
+    parts: NDArray[np.float32],
+    raw: NDArray[np.float32],
+    action: NDArray[np.float32],
+    log_std: NDArray[np.float32],
+) -> tuple[np.float32, np.float32]:
     """Returns an action's (C,) log density and the entropy; writes deviations (C,) to `parts`."""
     log_prob = mixed = NONE
     for j in range(raw.shape[0]):
@@ -161,7 +175,9 @@ def _density(parts, raw, action, log_std):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def _probability(parts, raw, action):  # type: ignore[no-untyped-def]
+def _probability(
+    parts: NDArray[np.float32], raw: NDArray[np.float32], action: int
+) -> tuple[np.float32, np.float32]:
     """Returns an action's log probability and the entropy; writes probabilities (C,) to `parts`."""
     greatest = raw.max()
     total = NONE

@@ -13,8 +13,16 @@ from typing import NamedTuple
 import numpy as np
 
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.lidar.exact_kernels import COS, RADIUS, SHAPE, SIN, X, Y
-from nics_drl_bridge.sim.state import Array
+from nics_drl_bridge.lidar.exact_kernels import (
+    COS,
+    RADIUS,
+    SHAPE,
+    SIN,
+    OutlineArrays,
+    X,
+    Y,
+)
+from nics_drl_bridge.sim.state import Array, MapField
 
 # Outlines this near touch; their depth then decides about an overlap [m]
 TOUCHING = 1e-12
@@ -31,21 +39,23 @@ class Outline(NamedTuple):
 
 
 @kernel
-def outline_of(body, outlines):  # type: ignore[no-untyped-def]
+def outline_of(body: Array, outlines: OutlineArrays) -> Outline:
     """Return the outline of a body's shape, in the body's frame."""
     shape = int(body[SHAPE])
     return Outline(outlines.corners, outlines.first[shape], outlines.first[shape + 1])
 
 
 @kernel
-def is_round(body, outlines):  # type: ignore[no-untyped-def]
+def is_round(body: Array, outlines: OutlineArrays) -> bool:
     """True for a circle."""
     shape = int(body[SHAPE])
     return outlines.first[shape] == outlines.first[shape + 1]
 
 
 @kernel
-def from_segment(x, y, ax, ay, bx, by):  # type: ignore[no-untyped-def]
+def from_segment(
+    x: float, y: float, ax: float, ay: float, bx: float, by: float
+) -> tuple[float, float]:
     """Return the vector to (x, y) from the nearest point of the segment (ax, ay) to (bx, by)."""
     ex = bx - ax
     ey = by - ay
@@ -59,19 +69,30 @@ def from_segment(x, y, ax, ay, bx, by):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def segment_distance2(x, y, ax, ay, bx, by):  # type: ignore[no-untyped-def]
+def segment_distance2(
+    x: float, y: float, ax: float, ay: float, bx: float, by: float
+) -> float:
     """Square of the distance from (x, y) to the segment from (ax, ay) to (bx, by) [m^2]."""
     dx, dy = from_segment(x, y, ax, ay, bx, by)
     return dx * dx + dy * dy
 
 
 @kernel
-def _side(ax, ay, bx, by, x, y):  # type: ignore[no-untyped-def]
+def _side(ax: float, ay: float, bx: float, by: float, x: float, y: float) -> float:
     return (bx - ax) * (y - ay) - (by - ay) * (x - ax)
 
 
 @kernel
-def cross(ax, ay, bx, by, px, py, qx, qy):  # type: ignore[no-untyped-def]
+def cross(
+    ax: float,
+    ay: float,
+    bx: float,
+    by: float,
+    px: float,
+    py: float,
+    qx: float,
+    qy: float,
+) -> bool:
     """True if the segments from a to b and from p to q cross."""
     return (_side(ax, ay, bx, by, px, py) > 0.0) != (
         _side(ax, ay, bx, by, qx, qy) > 0.0
@@ -79,7 +100,16 @@ def cross(ax, ay, bx, by, px, py, qx, qy):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _edges_distance2(ax, ay, bx, by, px, py, qx, qy):  # type: ignore[no-untyped-def]
+def _edges_distance2(
+    ax: float,
+    ay: float,
+    bx: float,
+    by: float,
+    px: float,
+    py: float,
+    qx: float,
+    qy: float,
+) -> float:
     """Square of the distance between two segments [m^2]; -1 if they cross."""
     if cross(ax, ay, bx, by, px, py, qx, qy):
         return -1.0
@@ -92,7 +122,7 @@ def _edges_distance2(ax, ay, bx, by, px, py, qx, qy):  # type: ignore[no-untyped
 
 
 @kernel
-def outline_point(x, y, outline):  # type: ignore[no-untyped-def]
+def outline_point(x: float, y: float, outline: Outline) -> float:
     """Signed distance from (x, y) to an outline; negative inside."""
     corners = outline.corners
     begin = outline.begin
@@ -117,7 +147,9 @@ def outline_point(x, y, outline):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _next_cut(ax, ay, ex, ey, after, q):  # type: ignore[no-untyped-def]
+def _next_cut(
+    ax: float, ay: float, ex: float, ey: float, after: float, q: Outline
+) -> float:
     """Next cut of the edge from (ax, ay) along (ex, ey) by outline q, as a fraction of the edge."""
     least = 1.0
     cx = q.corners[q.end - 1, 0]
@@ -140,7 +172,7 @@ def _next_cut(ax, ay, ex, ey, after, q):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _deepest(p, q):  # type: ignore[no-untyped-def]
+def _deepest(p: Outline, q: Outline) -> float:
     depth = 0.0
     if q.end - q.begin == 2:
         return depth
@@ -164,7 +196,9 @@ def _deepest(p, q):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _outline_gap(p, x, y, reach, q, limit):  # type: ignore[no-untyped-def]
+def _outline_gap(
+    p: Outline, x: float, y: float, reach: float, q: Outline, limit: float
+) -> float:
     """Signed clearance of two outlines in one frame; a circle (x, y, reach) encloses p."""
     least = limit * limit
     crossing = False
@@ -209,7 +243,9 @@ def _outline_gap(p, x, y, reach, q, limit):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def body_gap(body, other, outlines, limit, spare):  # type: ignore[no-untyped-def]
+def body_gap(
+    body: Array, other: Array, outlines: OutlineArrays, limit: float, spare: Array
+) -> float:
     """Signed clearance of two bodies; see the module."""
     dx = body[X] - other[X]
     dy = body[Y] - other[Y]
@@ -246,7 +282,9 @@ def body_gap(body, other, outlines, limit, spare):  # type: ignore[no-untyped-de
 
 
 @kernel
-def wall_gap(body, wall, outlines, limit, spare):  # type: ignore[no-untyped-def]
+def wall_gap(
+    body: Array, wall: Array, outlines: OutlineArrays, limit: float, spare: Array
+) -> float:
     """Signed clearance of a body and a straight wall."""
     distance2 = segment_distance2(body[X], body[Y], wall[0], wall[1], wall[2], wall[3])
     far = body[RADIUS] + max(limit, 0.0)
@@ -271,7 +309,7 @@ def wall_gap(body, wall, outlines, limit, spare):  # type: ignore[no-untyped-def
 
 
 @kernel
-def _along(x, y, wall):  # type: ignore[no-untyped-def]
+def _along(x: float, y: float, wall: Array) -> float:
     ex = wall[2] - wall[0]
     ey = wall[3] - wall[1]
     length2 = ex * ex + ey * ey
@@ -281,14 +319,14 @@ def _along(x, y, wall):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def on_wall(x, y, wall):  # type: ignore[no-untyped-def]
+def on_wall(x: float, y: float, wall: Array) -> tuple[float, float]:
     """Return the point of a straight wall nearest to a point."""
     share = _along(x, y, wall)
     return wall[0] + share * (wall[2] - wall[0]), wall[1] + share * (wall[3] - wall[1])
 
 
 @kernel
-def wall_distance(x, y, walls):  # type: ignore[no-untyped-def]
+def wall_distance(x: float, y: float, walls: Array) -> float:
     """Distance from a point to the nearest straight wall (W, 4) [m]; inf if there is none."""
     least = np.inf
     for w in range(walls.shape[0]):
@@ -302,7 +340,7 @@ def wall_distance(x, y, walls):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def in_grid(x, y, grid):  # type: ignore[no-untyped-def]
+def in_grid(x: float, y: float, grid: MapField) -> tuple[float, float]:
     """Return a point of the map frame in the frame of a grid [m]."""
     dx = x - grid.x
     dy = y - grid.y
@@ -310,7 +348,9 @@ def in_grid(x, y, grid):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def cells_near(x, y, far, grid):  # type: ignore[no-untyped-def]
+def cells_near(
+    x: float, y: float, far: float, grid: MapField
+) -> tuple[int, int, int, int]:
     """Return first and last + 1 row and column of the cells up to `far` [m] from a point."""
     rows, columns = grid.distances.shape
     low_i = math.floor((y - far) / grid.cell)
@@ -326,7 +366,7 @@ def cells_near(x, y, far, grid):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _bounds(x, y, grid):  # type: ignore[no-untyped-def]
+def _bounds(x: float, y: float, grid: MapField) -> tuple[float, float]:
     """Bound on the distance from (x, y) to a solid cell, from that of the nearest cell [m]."""
     rows, columns = grid.distances.shape
     size = grid.cell
@@ -344,7 +384,7 @@ def _bounds(x, y, grid):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def map_bound(body, grid):  # type: ignore[no-untyped-def]
+def map_bound(body: Array, grid: MapField) -> float:
     """Lower bound on the distance from the circle around a body to the map [m]."""
     if grid.distances.size == 0:
         return np.inf
@@ -353,7 +393,9 @@ def map_bound(body, grid):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def map_gap(body, grid, outlines, limit, spare):  # type: ignore[no-untyped-def]
+def map_gap(
+    body: Array, grid: MapField, outlines: OutlineArrays, limit: float, spare: Array
+) -> float:
     """Signed clearance of a body and the solid cells of a map."""
     if grid.distances.size == 0:
         return limit

@@ -66,11 +66,11 @@ class DeviceWorld:
 
     def begin(self, seed: int, starts: Array | None) -> None:
         """Begin the episode of a seed, at x, y, heading of each robot (3 M,) if given."""
-        given = self._given
-        if starts is not None and starts.size != 3 * given:
-            needed = f"{given} robots need {3 * given}: x, y, heading of each."
+        robots = self._given
+        if starts is not None and starts.size != 3 * robots:
+            needed = f"{robots} robots need {3 * robots}: x, y, heading of each."
             raise ConfigError(f"episode_start has {starts.size} numbers; {needed}")
-        placed = None if starts is None else starts.reshape(1, given, 3)
+        placed = None if starts is None else starts.reshape(1, robots, 3)
 
         def arranged(scenes: Scenes) -> Array | None:
             world = self.simulator.world.members[int(scenes.member[0])]
@@ -117,7 +117,7 @@ class DeviceWorld:
         """Return the present values of one robot; the next step may overwrite them."""
         data = self.simulator.data
         readings = {
-            name: each[0, robot] for name, each in self.simulator.readings.items()
+            name: values[0, robot] for name, values in self.simulator.readings.items()
         }
         return Sensed(
             data.odom[0, robot],
@@ -219,7 +219,7 @@ class DrivenSimulator(FastSimulator):
         data.pose[0] = pose
         data.state[0] = state
         data.collided[0] |= touched.astype(np.uint8)
-        given = twist[None], self.wheels[None], wheels[None], counted[None]
-        step_kernels.end_period(self.packed[0], *given)
+        motion = twist[None], self.wheels[None], wheels[None], counted[None]
+        step_kernels.end_period(self.packed[0], *motion)
         self.sense(np.zeros(1, np.int64))
         self.wheels = wheels.copy()

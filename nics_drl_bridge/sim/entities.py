@@ -167,8 +167,8 @@ class Entities:
         x1, y1, x2, y2 = self.world.members[int(self.simulator.data.member[0])].extent
         if not (x1 <= pose[0] <= x2 and y1 <= pose[1] <= y2):
             held = f"x {x1:g} to {x2:g} m, y {y1:g} to {y2:g} m"
-            told = f"x {pose[0]:g} m, y {pose[1]:g} m is outside the world"
-            raise OutsideError(f"{told}, which spans {held}; move it.")
+            place = f"x {pose[0]:g} m, y {pose[1]:g} m is outside the world"
+            raise OutsideError(f"{place}, which spans {held}; move it.")
 
     def move(self, entity: Entity, pose: Array | None, twist: Array | None) -> None:
         """Put an entity at a pose (3,), or give it a twist (3,) along the axes of `map`.
@@ -209,8 +209,10 @@ class Entities:
                 np.abs(command)
                 > REACH * np.maximum(-spec.command_low, spec.command_high)
             ).any():
-                told = f"the twist is more than {REACH:g} times what {spec.name!r} can be commanded"
-                raise ConfigError(f"{told}; give a smaller one.")
+                raise ConfigError(
+                    f"the twist is more than {REACH:g} times what {spec.name!r} can be "
+                    "commanded; give a smaller one."
+                )
             state = textbook(spec).target(command)
         simulator.put_robot(robot, np.array(at), np.array(state))
         self.device.put(robot)
@@ -275,10 +277,12 @@ class Entities:
     @property
     def robot_names(self) -> list[str]:
         """Names of all robots, by their numbers."""
-        found = {
-            each.robot: each.name for each in self.spawned.values() if each.robot >= 0
+        names = {
+            entity.robot: entity.name
+            for entity in self.spawned.values()
+            if entity.robot >= 0
         }
-        return [*self._launched, *(found[m] for m in sorted(found))]
+        return [*self._launched, *(names[m] for m in sorted(names))]
 
     def delete(self, entity: Entity) -> None:
         """Remove an entity. Raises ConfigError for the last robot."""
@@ -296,8 +300,8 @@ class Entities:
             return
         if entity.robot < len(self._launched):
             self._launched.pop(entity.robot)
-        for each in self.spawned.values():
-            each.robot -= int(each.robot > entity.robot)
+        for spawned in self.spawned.values():
+            spawned.robot -= int(spawned.robot > entity.robot)
         self._remake(self._spare, kept)
 
     def restore(self) -> None:

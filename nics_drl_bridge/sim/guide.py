@@ -29,7 +29,7 @@ class Guide:
     def __init__(
         self, sampler: SetSampler, footprint: Circle | Polygon, worlds: int
     ) -> None:
-        members = [each.world for each in sampler.samplers]
+        members = [scene_sampler.world for scene_sampler in sampler.samplers]
         extents = np.array([member.extent for member in members])
         spans = extents[:, 2:] - extents[:, :2]
         cells = np.maximum(CELL, np.sqrt(spans.prod(axis=1) / MOST_CELLS))
@@ -65,8 +65,10 @@ class Guide:
 
     def begin(self, worlds: NDArray[np.intp], scenes: Scenes) -> None:
         """Compute the path lengths in the scenes of episodes that begin in some worlds (n,)."""
-        given = worlds, np.asarray(scenes.member, np.int64), scenes.bodies, scenes.goals
-        kernels.guide(self.fields, *given, self._grid)
+        member = np.asarray(scenes.member, np.int64)
+        kernels.guide(
+            self.fields, worlds, member, scenes.bodies, scenes.goals, self._grid
+        )
 
     def lengths(self, rows: slice | NDArray[np.intp], data: State) -> Array:
         """Path lengths (n, M) [m] from the present places of the robots of some worlds.

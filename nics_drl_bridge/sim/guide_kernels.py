@@ -15,7 +15,8 @@ from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.exact_kernels import COS, RADIUS, SIN, OutlineArrays, X, Y
 from nics_drl_bridge.sim import collision_kernels as collision
 from nics_drl_bridge.sim import scene_kernels
-from nics_drl_bridge.sim.state import Array, Integers
+from nics_drl_bridge.sim.collision_kernels import Outline
+from nics_drl_bridge.sim.state import Array, Integers, MapField
 
 # free space around the robot's circle above which a path is no longer tight [m]
 COMFORT = 0.3
@@ -39,7 +40,9 @@ class GuideGrid(NamedTuple):
 
 
 @kernel(allocates=True)
-def walls_of(out, extent, cell, cells):  # type: ignore[no-untyped-def]
+def walls_of(
+    out: NDArray[np.float32], extent: Array, cell: float, cells: MapField
+) -> None:
     """Write the distances of `cells` to walls and map for coarser cells (rows, columns).
 
     The field is `extent` (4,), beyond which nothing is free.
@@ -57,7 +60,14 @@ def walls_of(out, extent, cell, cells):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def guide(out, worlds, member, bodies, goals, grid):  # type: ignore[no-untyped-def]
+def guide(
+    out: NDArray[np.float32],
+    worlds: NDArray[np.int64],
+    member: NDArray[np.int64],
+    bodies: Array,
+    goals: Array,
+    grid: GuideGrid,
+) -> None:
     """Write path lengths [m] from each cell to out[world, m] (rows, columns) float32.
 
     For the worlds (n,): member (n,), bodies (n, K, 7), goals (n, M, 2).
@@ -87,7 +97,14 @@ def guide(out, worlds, member, bodies, goals, grid):  # type: ignore[no-untyped-
 
 
 @kernel
-def _approach(space, body, x, y, cell, grid):  # type: ignore[no-untyped-def]
+def _approach(
+    space: NDArray[np.float32],
+    body: Array,
+    x: float,
+    y: float,
+    cell: float,
+    grid: GuideGrid,
+) -> None:
     """Lower the space (rows, columns) around cells to that beside a body [m]."""
     far = body[RADIUS] + grid.outer + COMFORT
     first = max(int((body[Y] - far - y) / cell), 0)
@@ -102,7 +119,7 @@ def _approach(space, body, x, y, cell, grid):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _gap(x, y, body, outline):  # type: ignore[no-untyped-def]
+def _gap(x: float, y: float, body: Array, outline: Outline) -> float:
     """Distance of a point from a body with an outline [m]."""
     dx = x - body[X]
     dy = y - body[Y]
@@ -113,7 +130,7 @@ def _gap(x, y, body, outline):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _cost(space, grid):  # type: ignore[no-untyped-def]
+def _cost(space: float, grid: GuideGrid) -> float:
     """Cost of a metre at a place, given the free space around it [m]."""
     beside = space - grid.outer
     if beside >= COMFORT:
@@ -128,7 +145,9 @@ def _cost(space, grid):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _spread(field, cost, u, v):  # type: ignore[no-untyped-def]
+def _spread(
+    field: NDArray[np.float32], cost: NDArray[np.float32], u: float, v: float
+) -> None:
     """Arrival times of a front that starts at column u, row v (fractions) and takes `cost`."""
     rows, columns = field.shape
     field[...] = np.inf
@@ -146,7 +165,9 @@ def _spread(field, cost, u, v):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def sweep(ways, prices, down, left):  # type: ignore[no-untyped-def]
+def sweep(
+    ways: NDArray[np.float32], prices: NDArray[np.float32], down: bool, left: bool
+) -> np.float32:
     """Update the path lengths row by row from one corner; return the maximum change [m].
 
     Both (rows, columns) are float32; the price of a cell is the cost of crossing it.
@@ -178,7 +199,13 @@ def sweep(ways, prices, down, left):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def lengths(out, poses, member, fields, grid):  # type: ignore[no-untyped-def]
+def lengths(
+    out: Array,
+    poses: Array,
+    member: NDArray[np.int64],
+    fields: NDArray[np.float32],
+    grid: GuideGrid,
+) -> None:
     """Write the path lengths (N, M) [m] from poses (N, M, 3), interpolated linearly."""
     for n in range(out.shape[0]):
         p = member[n]

@@ -16,6 +16,7 @@ from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, X, Y
 from nics_drl_bridge.robot.kernels import wrap
 from nics_drl_bridge.sim import separation_kernels as at
 from nics_drl_bridge.sim.collision_kernels import on_wall
+from nics_drl_bridge.sim.separation_kernels import Traffic
 from nics_drl_bridge.sim.state import Array, State, Surroundings
 
 DRAWS = 64  # Maximum number of draws per obstacle and period
@@ -35,7 +36,7 @@ CANDIDATES = 16
 
 
 @kernel
-def _share(seed, counter):  # type: ignore[no-untyped-def]
+def _share(seed: int, counter: int) -> float:
     return random.uniform(seed, random.MOTION_STREAM, counter)
 
 
@@ -108,7 +109,9 @@ def steer(
 
 
 @kernel
-def _follow(mark, body, row, waypoints, period, keep):  # type: ignore[no-untyped-def]
+def _follow(
+    mark: Array, body: Array, row: Array, waypoints: Array, period: float, keep: bool
+) -> tuple[float, float]:
     """Displacement of a patrol along its path in a period; `keep` stores its progress."""
     index = int(mark[at.INDEX])
     way = mark[at.WAY]
@@ -146,7 +149,15 @@ def _follow(mark, body, row, waypoints, period, keep):  # type: ignore[no-untype
 
 
 @kernel
-def repulsion(rx, ry, vx, vy, foresight, strength, reach):  # type: ignore[no-untyped-def]
+def repulsion(
+    rx: float,
+    ry: float,
+    vx: float,
+    vy: float,
+    foresight: float,
+    strength: float,
+    reach: float,
+) -> tuple[float, float]:
     """Return the force (3, 4) of another walker [m/s^2], - V0 grad exp(-b / sigma).
 
     2 b = sqrt((|r| + |r - v dt|)^2 - (v dt)^2), with r [m] from the other to this one, not zero,
@@ -167,7 +178,9 @@ def repulsion(rx, ry, vx, vy, foresight, strength, reach):  # type: ignore[no-un
 
 
 @kernel
-def _from_bodies(k, ex, ey, marks, traffic):  # type: ignore[no-untyped-def]
+def _from_bodies(
+    k: int, ex: float, ey: float, marks: Array, traffic: Traffic
+) -> tuple[float, float]:
     bodies = traffic.bodies
     first = traffic.first
     row = traffic.plans[k]
@@ -215,7 +228,7 @@ def _from_bodies(k, ex, ey, marks, traffic):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _from_walls(k, traffic):  # type: ignore[no-untyped-def]
+def _from_walls(k: int, traffic: Traffic) -> tuple[float, float]:
     body = traffic.bodies[k]
     row = traffic.plans[k]
     walls = traffic.walls
@@ -252,7 +265,9 @@ def _from_walls(k, traffic):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _new_goal(mark, k, traffic, seed, counter, step):  # type: ignore[no-untyped-def]
+def _new_goal(
+    mark: Array, k: int, traffic: Traffic, seed: int, counter: int, step: int
+) -> None:
     body = traffic.bodies[k]
     field = traffic.field
     x = body[X]
@@ -276,7 +291,9 @@ def _new_goal(mark, k, traffic, seed, counter, step):  # type: ignore[no-untyped
 
 
 @kernel
-def _walk(marks, k, traffic, seed, counter, step):  # type: ignore[no-untyped-def]
+def _walk(
+    marks: Array, k: int, traffic: Traffic, seed: int, counter: int, step: int
+) -> tuple[float, float]:
     """Return the next velocity of walker k in `map` [m/s], after fewer than `DRAWS` draws."""
     mark = marks[k]
     row = traffic.plans[k]

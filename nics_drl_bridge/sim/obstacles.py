@@ -97,23 +97,21 @@ def plan_arrays(
             continue
         row[[at.SPEED_LOW, at.SPEED_HIGH]] = motion.speed
         if isinstance(motion, Patrol):
-            row[at.KIND], row[at.LOOP], row[at.PAUSE] = (
-                at.PATROL,
-                motion.loop,
-                motion.pause,
-            )
-            row[at.FIRST], row[at.COUNT] = len(waypoints), len(motion.waypoints)
+            row[at.KIND] = at.PATROL
+            row[at.LOOP] = motion.loop
+            row[at.PAUSE] = motion.pause
+            row[at.FIRST] = len(waypoints)
+            row[at.COUNT] = len(motion.waypoints)
             waypoints = np.concatenate([waypoints, motion.waypoints])
         else:
-            row[at.RELAXATION], row[at.FLUCTUATION] = (
-                motion.relaxation,
-                motion.fluctuation,
-            )
-            row[at.REPULSION], row[at.RANGE] = motion.repulsion, motion.range
-            row[at.WALL_REPULSION], row[at.WALL_RANGE] = (
-                motion.wall_repulsion,
-                motion.wall_range,
-            )
-            row[at.FORESIGHT], row[at.BEHIND] = motion.foresight, motion.behind
-            row[at.KIND], row[at.VIEW] = at.PEDESTRIAN, math.cos(motion.view / 2.0)
+            row[at.KIND] = at.PEDESTRIAN
+            row[at.RELAXATION] = motion.relaxation
+            row[at.FLUCTUATION] = motion.fluctuation
+            row[at.REPULSION] = motion.repulsion
+            row[at.RANGE] = motion.range
+            row[at.WALL_REPULSION] = motion.wall_repulsion
+            row[at.WALL_RANGE] = motion.wall_range
+            row[at.FORESIGHT] = motion.foresight
+            row[at.BEHIND] = motion.behind
+            row[at.VIEW] = math.cos(motion.view / 2.0)
     return rows, waypoints

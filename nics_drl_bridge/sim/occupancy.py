@@ -1,9 +1,22 @@
-"""A world as a grid of free and occupied cells, for planners; it shows all that stands still."""
+"""A world as a grid of free and occupied cells, for planners; it shows all that stands still.
+
+`occupancy` makes the grid in five steps, each of which only turns free cells into occupied ones:
+
+1. `_frame_of`: choose the cells. They are aligned with the world's own map if it has one, cover the
+   field, its walls and the map, and leave a border of one cell around them.
+2. `_enclose`: occupy every cell whose centre lies outside the field.
+3. `_copy_map`: copy the world's own map. Each of its cells becomes a square of smaller cells.
+4. `_mark_line`: occupy the cells along each wall, found by points much closer than a cell.
+5. `_fill`: occupy the cells whose centre lies in an obstacle. A part thinner than a cell may
+   contain no centre; there, the cells along its outline are occupied.
+
+Cells are indexed by row (along y of the grid) and column (along x).
+"""
 
 import math
 from collections.abc import Sequence
-from itertools import pairwise, zip_longest
-from typing import Any
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,14 +38,15 @@ ROUNDING = 1e-6  # fraction of a cell by which a field may exceed whole cells
 
 def standing(sampler: SetSampler, member: int, bodies: Array) -> list[Placed]:
     """Return the obstacles that stand still, of bodies (K, 7) in a world of the sampler."""
-    own = sampler.samplers[member].motions
-    # bodies that are not part of the world stand still
-    both = zip_longest(bodies, own[: len(bodies)])
-    return [
-        (sampler.shapes[int(body[SHAPE])], body[:3])
-        for body, motion in both
-        if motion is None and body[RADIUS] > 0.0
-    ]
+    motions = sampler.samplers[member].motions
+    placed: list[Placed] = []
+    for k, body in enumerate(bodies):
+        # Bodies that are not part of the world have no motion: they stand still.
+        stands = k >= len(motions) or motions[k] is None
+        is_present = body[RADIUS] > 0.0
+        if stands and is_present:
+            placed.append((sampler.shapes[int(body[SHAPE])], body[:3]))
+    return placed
 
 
 def occupancy(
@@ -44,60 +58,95 @@ def occupancy(
     walls is closed by cells around it. `cell` [m] is the maximum size: cells of the world's own map
     are divided evenly, so that none of its detail is lost. A large world gets larger cells.
     """
-    grid = world.grid
-    place, first, size, cell = _frame_of(world, cell)
-    origin = compose(place, [*(first * cell), 0.0])
-    made = GridMap(np.full(size, FREE, np.int8), cell, tuple(origin.tolist()))
+    frame = _frame_of(world, cell)
+    origin = compose(frame.pose, [*(frame.first * frame.cell), 0.0])
+    cells = np.full(frame.size, FREE, np.int8)
+    made = GridMap(cells, frame.cell, tuple(origin.tolist()))
     if world.size is not None:
         _enclose(made, np.array(world.size) / 2.0)
-    if grid is not None:
-        parts, (column, row) = round(grid.resolution / cell), -first
-        own = grid.cells.repeat(parts, axis=0).repeat(parts, axis=1)
-        into = made.cells[row : row + own.shape[0], column : column + own.shape[1]]
-        into[:] = np.where(into == OCCUPIED, into, own)
+    if world.grid is not None:
+        _copy_map(made, world.grid, frame.first)
     for wall in np.array(world.walls, np.float64).reshape(-1, 2, 2):
-        at = made.world_to_cell(_along(wall, cell))
-        at = at[((at >= 0) & (at < made.cells.shape)).all(axis=-1)]
-        made.cells[at[:, 0], at[:, 1]] = OCCUPIED
+        _mark_line(made, wall)
     for shape, pose in obstacles:
         _fill(made, shape, np.asarray(pose, np.float64))
     return made
 
 
-def _frame_of(
-    world: World, cell: float
-) -> tuple[Any, NDArray[np.int_], tuple[int, int], float]:
-    """Frame (3,) of the rows, first column and row, their numbers, and the side of a cell [m]."""
+class _Frame(NamedTuple):
+    """Where the cells of a grid lie."""
+
+    pose: (
+        Any  # (3,) in the world, from which columns and rows are counted along its axes
+    )
+    first: NDArray[np.int_]  # (2,) first column and first row, often negative
+    size: tuple[int, int]  # numbers of rows and columns
+    cell: float  # side of a cell [m]
+
+
+def _frame_of(world: World, cell: float) -> _Frame:
+    """Choose the cells of a world, given the maximum side of a cell [m]."""
     grid = world.grid
     ends = world.all_walls().reshape(-1, 2)
     if world.size is not None or world.bounds is not None:
         ends = np.concatenate([ends, np.reshape(world.extent, (2, 2))])
-    place: Any = grid.origin if grid is not None else (*ends.min(axis=0), 0.0)
-    corners = rotate(ends - place[:2], -place[2])
+    pose: Any = grid.origin if grid is not None else (*ends.min(axis=0), 0.0)
+    corners = rotate(ends - pose[:2], -pose[2])
     if grid is not None:
-        own = np.array([(0, 0), grid.cells.shape[::-1]]) * grid.resolution
-        corners = np.concatenate([corners, own])
+        map_corners = np.array([(0, 0), grid.cells.shape[::-1]]) * grid.resolution
+        corners = np.concatenate([corners, map_corners])
     low = corners.min(axis=0)
     high = corners.max(axis=0)
-    cell = max(cell, math.sqrt(float(np.prod(high - low)) / MOST_CELLS))
+    area = float(np.prod(high - low))
+    cell = max(cell, math.sqrt(area / MOST_CELLS))
     if grid is not None:
         cell = grid.resolution / max(1, math.ceil(grid.resolution / cell - ROUNDING))
     first = np.floor(low / cell + ROUNDING).astype(int) - 1
     columns, rows = np.ceil(high / cell - ROUNDING).astype(int) + 1 - first
-    return place, first, (int(rows), int(columns)), cell
+    return _Frame(pose, first, (int(rows), int(columns)), cell)
 
 
 def _enclose(made: GridMap, half: Array) -> None:
     """Occupy everything outside a field, given half its size (2,) [m]."""
-    rows, columns = (np.arange(count) for count in made.cells.shape)
-    if not made.origin[2]:  # x is that of the column alone
-        x = made.cell_to_world(np.stack([0 * columns, columns], axis=-1))[:, 0]
-        y = made.cell_to_world(np.stack([rows, 0 * rows], axis=-1))[:, 1]
-        made.cells[np.abs(y) > half[1]] = OCCUPIED
-        made.cells[:, np.abs(x) > half[0]] = OCCUPIED
+    is_turned = made.origin[2] != 0.0
+    if is_turned:
+        centres = made.cell_to_world(_cell_indices(made.cells))
+        made.cells[(np.abs(centres) > half).any(axis=-1)] = OCCUPIED
         return
-    away = np.abs(made.cell_to_world(np.moveaxis(np.indices(made.cells.shape), 0, -1)))
-    made.cells[(away > half).any(axis=-1)] = OCCUPIED
+    # x depends on the column alone, and y on the row alone
+    rows = np.arange(made.cells.shape[0])
+    columns = np.arange(made.cells.shape[1])
+    x = made.cell_to_world(np.stack([0 * columns, columns], axis=-1))[:, 0]
+    y = made.cell_to_world(np.stack([rows, 0 * rows], axis=-1))[:, 1]
+    made.cells[np.abs(y) > half[1]] = OCCUPIED
+    made.cells[:, np.abs(x) > half[0]] = OCCUPIED
+
+
+def _cell_indices(cells: NDArray[Any]) -> NDArray[np.int_]:
+    """Row and column (rows, columns, 2) of every cell of a grid (rows, columns)."""
+    return np.moveaxis(np.indices(cells.shape), 0, -1)
+
+
+def _copy_map(made: GridMap, grid: GridMap, first: NDArray[np.int_]) -> None:
+    """Copy a world's own map (see `_Frame.first`), except where cells are occupied already."""
+    parts = round(grid.resolution / made.resolution)
+    cells = grid.cells.repeat(parts, axis=0).repeat(parts, axis=1)
+    column, row = -first
+    into = made.cells[row : row + cells.shape[0], column : column + cells.shape[1]]
+    into[:] = np.where(into == OCCUPIED, into, cells)
+
+
+def _mark_line(made: GridMap, ends: Array) -> None:
+    """Occupy the cells that a straight line between two ends (2, 2) runs through [m]."""
+    index = made.world_to_cell(_along(ends, made.resolution))
+    index = index[_is_within(index, made.cells)]
+    made.cells[index[:, 0], index[:, 1]] = OCCUPIED
+
+
+def _is_within(index: NDArray[np.int_], cells: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return True (P,) for the indices (P, 2) of cells that a grid has."""
+    is_within = (index >= 0) & (index < cells.shape)
+    return np.asarray(is_within.all(axis=-1))
 
 
 def _along(corners: Array, cell: float) -> Array:
@@ -111,38 +160,43 @@ def _along(corners: Array, cell: float) -> Array:
 
 def _fill(made: GridMap, shape: Shape, pose: Array) -> None:
     """Occupy the cells in a shape; of a part that is too thin to hold a centre, its outline."""
-    around = made.world_to_cell(pose[:2])
+    # only the cells in the square around the shape's circle
+    middle = made.world_to_cell(pose[:2])
     reach = math.ceil(shape.radius / made.resolution) + 1
-    low = np.maximum(around - reach, 0)
-    high = np.minimum(around + reach + 1, made.cells.shape)
+    low = np.maximum(middle - reach, 0)
+    high = np.minimum(middle + reach + 1, made.cells.shape)
     if (low >= high).any():
         return
     box = made.cells[low[0] : high[0], low[1] : high[1]]
-    middles = made.cell_to_world(np.moveaxis(np.indices(box.shape), 0, -1) + low)
-    inside = _inside(shape, rotate(middles - pose[:2], -pose[2]))
+    centres = made.cell_to_world(_cell_indices(box) + low)
+    inside = _inside(shape, rotate(centres - pose[:2], -pose[2]))
     box[inside] = OCCUPIED
-    if len(shape.outline):
-        edge = _along(
-            np.concatenate([shape.outline, shape.outline[:1]]), made.resolution
-        )
-        at = made.world_to_cell(pose[:2] + rotate(edge, pose[2])) - low
-        kept = ((at >= 0) & (at < box.shape)).all(axis=-1)
-        thin = at[kept][
-            ~ndimage.maximum_filter(inside, 3)[at[kept][:, 0], at[kept][:, 1]]
-        ]
-        box[thin[:, 0], thin[:, 1]] = OCCUPIED
+    if len(shape.outline) == 0:
+        return
+    closed_outline = np.concatenate([shape.outline, shape.outline[:1]])
+    edge = _along(closed_outline, made.resolution)
+    index = made.world_to_cell(pose[:2] + rotate(edge, pose[2])) - low
+    index = index[_is_within(index, box)]
+    near_inside = ndimage.maximum_filter(inside, 3)
+    thin = index[~near_inside[index[:, 0], index[:, 1]]]
+    box[thin[:, 0], thin[:, 1]] = OCCUPIED
 
 
 def _inside(shape: Shape, points: Array) -> NDArray[np.bool_]:
+    """Return True (...) for the points (..., 2) in a shape, by the even-odd rule."""
     if isinstance(shape, Circle):
         return np.asarray(np.hypot(points[..., 0], points[..., 1]) <= shape.radius)
     within = np.zeros(points.shape[:-1], np.bool_)
+    corners = shape.outline
+    if len(corners) < 3:  # a segment has no inside
+        return within
     x = points[..., 0]
     y = points[..., 1]
-    corners = shape.outline if len(shape.outline) > 2 else np.zeros((0, 2))
     for (x1, y1), (x2, y2) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        if y1 != y2:  # a ray along x crosses an odd number of edges
-            within ^= ((y1 > y) != (y2 > y)) & (
-                x < x1 + (y - y1) * (x2 - x1) / (y2 - y1)
-            )
+        if y1 == y2:
+            continue
+        # A ray from the point along x crosses an odd number of edges if the point is inside.
+        is_level = (y1 > y) != (y2 > y)
+        crossing = x1 + (y - y1) * (x2 - x1) / (y2 - y1)
+        within ^= is_level & (x < crossing)
     return within

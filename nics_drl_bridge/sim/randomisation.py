@@ -241,11 +241,12 @@ class Sampler:
         self._step = model.timing.dt
         self._noise = _levels(randomisation, model, where)
         self._faults = _faults(randomisation, model.lidar, where)
-        self._choices = {
-            column: np.array([values[word] for word in words], np.float64)
-            for name, (column, values) in CHOICES.items()
-            if (words := getattr(randomisation.lidar, name)) is not None
-        }
+        self._choices = {}
+        for name, (column, values) in CHOICES.items():
+            words = getattr(randomisation.lidar, name)
+            if words is not None:
+                numbers = [values[word] for word in words]
+                self._choices[column] = np.array(numbers, np.float64)
         # Bounds such that flooring makes all numbers, and all sizes, equally likely.
         least, most = randomisation.obstacles.count or (0, 0)
         self._scene = (
@@ -420,9 +421,11 @@ def _levels(ranges: Randomisation, model: SimulatorModel, where: str) -> Bounds:
             lacks = f"the model of {model.robot.name!r} has no measured {key} to scale"
             fix = f"give {one!r} and {other!r} instead."
             raise ConfigError(f"{where}: key 'odometry.{key}': {lacks}; {fix}")
-        low[part], high[part] = base[part] * factor[0], base[part] * factor[1]
+        low[part] = base[part] * factor[0]
+        high[part] = base[part] * factor[1]
     for column, name in enumerate(NOISE_NAMES):
-        if name and (level := getattr(odometry, name)) is not None:
+        level = getattr(odometry, name) if name else None
+        if level is not None:
             low[column], high[column] = level
     return low, high
 

@@ -7,7 +7,7 @@ the next draw, `plan` is the ScenePlan, `scratch` the SceneScratch, `disc` a bod
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,16 @@ from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import cell_kernels, exact_kernels
 from nics_drl_bridge.lidar.cell_kernels import BodyCells
-from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SHAPE, SIN, X, Y
+from nics_drl_bridge.lidar.exact_kernels import (
+    COS,
+    HEADING,
+    RADIUS,
+    SHAPE,
+    SIN,
+    OutlineArrays,
+    X,
+    Y,
+)
 from nics_drl_bridge.random_kernels import uniform_of
 from nics_drl_bridge.sim import collision_kernels as collision
 from nics_drl_bridge.sim.state import Array, Integers, MapField
@@ -87,7 +96,7 @@ class SceneScratch(NamedTuple):
 
 
 @kernel
-def wall_distances(cells, walls):  # type: ignore[no-untyped-def]
+def wall_distances(cells: MapField, walls: Array) -> None:
     """Lower the distances of cells to the distances to the walls, in place."""
     distances = cells.distances
     for i in range(distances.shape[0]):
@@ -97,7 +106,7 @@ def wall_distances(cells, walls):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def place_in(row, column, cells):  # type: ignore[no-untyped-def]
+def place_in(row: float, column: float, cells: MapField) -> tuple[float, float]:
     """Return x, y [m] of a place in the grid, given as fractional row and column."""
     u = column * cells.cell
     v = row * cells.cell
@@ -108,7 +117,7 @@ def place_in(row, column, cells):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def cell_of(x, y, cells):  # type: ignore[no-untyped-def]
+def cell_of(x: float, y: float, cells: MapField) -> tuple[int, int, float]:
     """Return row and column of a point, and its distance from the centre of that cell [m]."""
     u, v = collision.in_grid(x, y, cells)
     u = u / cells.cell
@@ -119,7 +128,7 @@ def cell_of(x, y, cells):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def area_of(x, y, space):  # type: ignore[no-untyped-def]
+def area_of(x: float, y: float, space: FreeSpace) -> int:
     """Return the number of the area that contains a point; 0 for none."""
     i, j, _ = cell_of(x, y, space.cells)
     if 0 <= i < space.area.shape[0] and 0 <= j < space.area.shape[1]:
@@ -128,7 +137,7 @@ def area_of(x, y, space):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _within(x, y, space):  # type: ignore[no-untyped-def]
+def _within(x: float, y: float, space: FreeSpace) -> tuple[bool, float, float]:
     """True if a point is in field and grid, and bounds of its distance to walls."""
     distances = space.cells.distances
     bounds = space.bounds
@@ -146,7 +155,7 @@ def _within(x, y, space):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _clear_of_walls(body, room, plan, spare):  # type: ignore[no-untyped-def]
+def _clear_of_walls(body: Array, room: float, plan: ScenePlan, spare: Array) -> bool:
     space = plan.space
     outlines = plan.outlines
     inside, low, high = _within(body[X], body[Y], space)
@@ -168,7 +177,9 @@ def _clear_of_walls(body, room, plan, spare):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _clear_of(body, other, room, outlines, spare):  # type: ignore[no-untyped-def]
+def _clear_of(
+    body: Array, other: Array, room: float, outlines: OutlineArrays, spare: Array
+) -> bool:
     dx = body[X] - other[X]
     dy = body[Y] - other[Y]
     far = body[RADIUS] + other[RADIUS] + room
@@ -180,7 +191,15 @@ def _clear_of(body, other, room, outlines, spare):  # type: ignore[no-untyped-de
 
 
 @kernel
-def _is_clear(x, y, room, moving, plan, bodies, scratch):  # type: ignore[no-untyped-def]
+def _is_clear(
+    x: float,
+    y: float,
+    room: float,
+    moving: bool,
+    plan: ScenePlan,
+    bodies: Array,
+    scratch: SceneScratch,
+) -> bool:
     disc = scratch.disc
     disc[X] = x
     disc[Y] = y
@@ -199,14 +218,24 @@ def _is_clear(x, y, room, moving, plan, bodies, scratch):  # type: ignore[no-unt
 
 
 @kernel
-def _is_free(x, y, plan, bodies, scratch):  # type: ignore[no-untyped-def]
+def _is_free(
+    x: float, y: float, plan: ScenePlan, bodies: Array, scratch: SceneScratch
+) -> bool:
     return _is_clear(
         x, y, plan.clearance, True, plan, bodies, scratch
     ) and _clear_of_walls(scratch.disc, plan.clearance, plan, scratch.spare)
 
 
 @kernel
-def _is_joined(x, y, gx, gy, plan, bodies, scratch):  # type: ignore[no-untyped-def]
+def _is_joined(
+    x: float,
+    y: float,
+    gx: float,
+    gy: float,
+    plan: ScenePlan,
+    bodies: Array,
+    scratch: SceneScratch,
+) -> bool:
     """True if a robot can move between two points of an area, from cell to cell.
 
     Searches from both ends, each towards the other first: where there is no path, one end is often
@@ -270,7 +299,9 @@ def _is_joined(x, y, gx, gy, plan, bodies, scratch):  # type: ignore[no-untyped-
 
 
 @kernel
-def _point(source, counter, chosen, cells):  # type: ignore[no-untyped-def]
+def _point(
+    source: int, counter: int, chosen: NDArray[np.int32], cells: MapField
+) -> tuple[float, float]:
     """Draw a point in one of the chosen cells, given by row-major indices; take 3 counters."""
     cell = int(uniform_of(source, counter) * chosen.shape[0])
     # if all cells are allowed, the look-up would only miss the cache
@@ -284,7 +315,9 @@ def _point(source, counter, chosen, cells):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _put(body, x, y, heading, shape, plan):  # type: ignore[no-untyped-def]
+def _put(
+    body: Array, x: float, y: float, heading: float, shape: int, plan: ScenePlan
+) -> None:
     body[X] = x
     body[Y] = y
     body[HEADING] = heading
@@ -294,7 +327,14 @@ def _put(body, x, y, heading, shape, plan):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _choose(source, wanted, size, plan, bodies, active):  # type: ignore[no-untyped-def]
+def _choose(
+    source: int,
+    wanted: int,
+    size: int,
+    plan: ScenePlan,
+    bodies: Array,
+    active: NDArray[np.bool_],
+) -> int:
     groups = plan.groups
     counter = 0
     total = 0
@@ -329,7 +369,9 @@ def _choose(source, wanted, size, plan, bodies, active):  # type: ignore[no-unty
 
 
 @kernel
-def _place_obstacles(source, counter, plan, bodies, scratch):  # type: ignore[no-untyped-def]
+def _place_obstacles(
+    source: int, counter: int, plan: ScenePlan, bodies: Array, scratch: SceneScratch
+) -> tuple[int, bool]:
     space = plan.space
     outlines = plan.outlines
     gaps = scratch.gaps
@@ -373,7 +415,9 @@ def _place_obstacles(source, counter, plan, bodies, scratch):  # type: ignore[no
 
 
 @kernel
-def _is_apart(k, widest, plan, bodies, scratch):  # type: ignore[no-untyped-def]
+def _is_apart(
+    k: int, widest: float, plan: ScenePlan, bodies: Array, scratch: SceneScratch
+) -> bool:
     trial = scratch.trial
     gaps = scratch.gaps
     near = scratch.cells.found
@@ -391,7 +435,9 @@ def _is_apart(k, widest, plan, bodies, scratch):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _spot(source, counter, places, space):  # type: ignore[no-untyped-def]
+def _spot(
+    source: int, counter: int, places: Array, space: FreeSpace
+) -> tuple[float, float, float]:
     """Draw x, y, heading of a start or goal in one of the places; take 4 counters."""
     turn = uniform_of(source, counter + 3)
     if places.shape[0] == 0:
@@ -409,7 +455,7 @@ def _spot(source, counter, places, space):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _apart(x, y, others, m, least):  # type: ignore[no-untyped-def]
+def _apart(x: float, y: float, others: Array, m: int, least: float) -> bool:
     for other in range(m):
         dx = x - others[other, 0]
         dy = y - others[other, 1]
@@ -419,7 +465,9 @@ def _apart(x, y, others, m, least):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _goal_of(source, counter, x, y, plan):  # type: ignore[no-untyped-def]
+def _goal_of(
+    source: int, counter: int, x: float, y: float, plan: ScenePlan
+) -> tuple[float, float]:
     """Draw a goal, for some worlds uniformly in the ring around the start; take 4 counters."""
     if not plan.around:
         gx, gy, _ = _spot(source, counter, plan.goals, plan.space)
@@ -433,7 +481,15 @@ def _goal_of(source, counter, x, y, plan):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _place_robots(source, counter, plan, bodies, starts, goals, scratch):  # type: ignore[no-untyped-def]
+def _place_robots(
+    source: int,
+    counter: int,
+    plan: ScenePlan,
+    bodies: Array,
+    starts: Array,
+    goals: Array,
+    scratch: SceneScratch,
+) -> tuple[int, bool]:
     between = 2.0 * plan.footprint + plan.clearance
     for m in range(starts.shape[0]):
         placed = False
@@ -475,7 +531,9 @@ def _place_robots(source, counter, plan, bodies, starts, goals, scratch):  # typ
 
 
 @kernel
-def choose_members(seeds, members, out):  # type: ignore[no-untyped-def]
+def choose_members(
+    seeds: NDArray[np.int64], members: int, out: NDArray[np.int64]
+) -> None:
     """Write the index of the world of each seed (n,) among the members of a set."""
     for n in range(seeds.shape[0]):
         share = random.uniform(seeds[n], random.MEMBER_STREAM, 0)
@@ -483,7 +541,16 @@ def choose_members(seeds, members, out):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def draw_scenes(packed, seeds, wanted, sizes, bodies, starts, goals, scratch):  # type: ignore[no-untyped-def]
+def draw_scenes(
+    packed: Any,
+    seeds: NDArray[np.int64],
+    wanted: NDArray[np.int64],
+    sizes: NDArray[np.int64],
+    bodies: Array,
+    starts: Array,
+    goals: Array,
+    scratch: SceneScratch,
+) -> tuple[int, int]:
     """Draw the scenes of some seeds (n,) to bodies (n, K, 7), start (n, M, 3), goals (n, M, 2).
 
     K may be more than the world has: the others are absent. `wanted` (n,) are numbers of random
@@ -494,7 +561,16 @@ def draw_scenes(packed, seeds, wanted, sizes, bodies, starts, goals, scratch):  
 
 
 @kernel
-def _draw(plan, seeds, wanted, sizes, bodies, starts, goals, scratch):  # type: ignore[no-untyped-def]
+def _draw(
+    plan: ScenePlan,
+    seeds: NDArray[np.int64],
+    wanted: NDArray[np.int64],
+    sizes: NDArray[np.int64],
+    bodies: Array,
+    starts: Array,
+    goals: Array,
+    scratch: SceneScratch,
+) -> tuple[int, int]:
     count = plan.group.shape[0]
     s = scratch
     cells = scratch.cells

@@ -219,15 +219,17 @@ class SetSampler:
         most: int | None = None,
     ) -> None:
         known = Catalogue.of(world, sizes)
-        given = footprint_radius, robots, sizes, most, known
-        self.samplers = [SceneSampler(member, *given) for member in world.members]
+        self.samplers = [
+            SceneSampler(member, footprint_radius, robots, sizes, most, known)
+            for member in world.members
+        ]
         scratches = self.samplers[0].scratches
-        rooms = [each.room for each in self.samplers]
-        room = tuple(max(each) for each in zip(*rooms, strict=True))
-        for each in self.samplers:
-            each.room = room
-            each.scratches = scratches
-        drawn = max(each.count for each in self.samplers)
+        rooms = [sampler.room for sampler in self.samplers]
+        room = tuple(max(parts) for parts in zip(*rooms, strict=True))
+        for sampler in self.samplers:
+            sampler.room = room
+            sampler.scratches = scratches
+        drawn = max(sampler.count for sampler in self.samplers)
         self.robots = robots
         self.count = drawn + len(world.spare)
         self.shapes = (*known.shapes, *world.spare)  # those that are spare come last
@@ -235,8 +237,11 @@ class SetSampler:
     @property
     def motions(self) -> list[tuple[Motion | None, ...]]:
         """(P, K) the motions of all obstacles of each member."""
-        each = [sampler.motions for sampler in self.samplers]
-        return [(*own, *(None,) * (self.count - len(own))) for own in each]
+        padded: list[tuple[Motion | None, ...]] = []
+        for sampler in self.samplers:
+            absent = self.count - len(sampler.motions)
+            padded.append((*sampler.motions, *(None,) * absent))
+        return padded
 
     def draw(
         self,
@@ -361,7 +366,9 @@ def _places(places: Starts | Goals | None) -> Array:
         return np.zeros((0, kernels.PLACE))
     rows = np.zeros((len(places.at) + len(places.regions), kernels.PLACE))
     for row, at in zip(rows, places.at, strict=False):
-        row[:2], row[2:4], row[4:6] = at[:2], at[:2], at[2] if len(at) > 2 else 0.0
+        row[:2] = at[:2]
+        row[2:4] = at[:2]
+        row[4:6] = at[2] if len(at) > 2 else 0.0
     for row, (x1, y1, x2, y2) in zip(rows, places.regions, strict=False):
         row[:6] = min(x1, x2), min(y1, y2), max(x1, x2), max(y1, y2), -math.pi, math.pi
     sizes = (rows[:, 2] - rows[:, 0]) * (rows[:, 3] - rows[:, 1])
@@ -411,23 +418,26 @@ def _free_space(world: World, footprint: float, drawn: bool) -> FreeSpace:
     area, _ = ndimage.label(cells.distances >= room)
     robot = f"a robot of radius {footprint:g} m with {world.clearance:g} m around it"
     least = world.goal_distance[0]
-    fault = ""
     if not area.any():
-        fault = f"key 'clearance': no free space for {robot}; lower `clearance`"
-    elif not (area := _large_enough(area, cells.cell, least)).any():
-        fault = f"key 'goal_distance': nowhere can {robot} reach a goal {least:g} m away; lower "
-        fault += "`goal_distance` or `clearance`"
-    if fault:
-        raise ConfigError(f"{world.source}: {fault}, or enlarge the world.")
+        raise ConfigError(
+            f"{world.source}: key 'clearance': no free space for {robot}; lower `clearance`, "
+            "or enlarge the world."
+        )
+    area = _large_enough(area, cells.cell, least)
+    if not area.any():
+        raise ConfigError(
+            f"{world.source}: key 'goal_distance': nowhere can {robot} reach a goal {least:g} m "
+            "away; lower `goal_distance` or `clearance`, or enlarge the world."
+        )
     for key, places in (("starts", world.starts), ("goals", world.goals)):
         _check(world, key, places, area, cells)
     nothing = np.zeros(0, np.int32)
-    given = world.starts is not None and world.goals is not None
-    for_robots = nothing if given else np.flatnonzero(area).astype(np.int32)
+    for_robots = nothing
+    if world.starts is None or world.goals is None:
+        for_robots = np.flatnonzero(area).astype(np.int32)
+    anywhere = nothing
     if drawn:
         anywhere = np.flatnonzero(cells.distances > 0.0).astype(np.int32)
-    else:
-        anywhere = nothing
     return FreeSpace(cells, area, bounds, walls, grid, for_robots, anywhere, room)
 
 
@@ -480,7 +490,8 @@ def _check(
     x, y = _centres(cells)[:, area > 0]
     fits = {}
     for number, region in enumerate(places.regions):
-        (x1, x2), (y1, y2) = sorted(region[::2]), sorted(region[1::2])
+        x1, x2 = sorted(region[::2])
+        y1, y2 = sorted(region[1::2])
         within = (x >= x1) & (x <= x2) & (y >= y1) & (y <= y2)
         fits[f"{key}.regions.{number}"] = bool(within.any()), list(region)
     for number, at in enumerate(places.at):

@@ -116,10 +116,10 @@ def section(solid: Solid, pose: Array, height: float) -> Placed | None:
     Raises:
         ShapelessError: it leans, and its section is neither circle, rectangle nor polygon.
     """
-    found = _CUTS[type(solid)](solid, pose, height - float(pose[2, 3]))
-    if found is None or not found[0].radius > SMALLEST:
+    section = _CUTS[type(solid)](solid, pose, height - float(pose[2, 3]))
+    if section is None or not section[0].radius > SMALLEST:
         return None
-    shape, *place = found
+    shape, *place = section
     x, y, heading = (round(value, DIGITS) + 0.0 for value in place)
     return shape, (x, y, heading)
 

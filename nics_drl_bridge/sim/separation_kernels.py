@@ -61,7 +61,7 @@ class Traffic(NamedTuple):
 
 
 @kernel
-def map_distance(x, y, grid):  # type: ignore[no-untyped-def]
+def map_distance(x: float, y: float, grid: MapField) -> float:
     """Distance from a point to the static map [m], bilinear between the centres of cells."""
     distances = grid.distances
     rows, columns = distances.shape
@@ -84,7 +84,7 @@ def map_distance(x, y, grid):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def map_direction(x, y, grid):  # type: ignore[no-untyped-def]
+def map_direction(x: float, y: float, grid: MapField) -> tuple[float, float]:
     """Unit vector to the nearest point of the static map; zero where there is none."""
     step = 0.5 * grid.cell
     gx = map_distance(x - step, y, grid) - map_distance(x + step, y, grid)
@@ -96,7 +96,7 @@ def map_direction(x, y, grid):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def clearance(x, y, k, traffic):  # type: ignore[no-untyped-def]
+def clearance(x: float, y: float, k: int, traffic: Traffic) -> float:
     """Distance from a point to the nearest object except body k [m]."""
     bodies = traffic.bodies
     walls = traffic.walls
@@ -121,7 +121,9 @@ def clearance(x, y, k, traffic):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _hold(dx, dy, nx, ny, room, bend):  # type: ignore[no-untyped-def]
+def _hold(
+    dx: float, dy: float, nx: float, ny: float, room: float, bend: bool
+) -> tuple[float, float]:
     """Limit a displacement to `room` along n: bend it, or shorten the whole."""
     ahead = dx * nx + dy * ny
     room = max(room - SLACK, 0.0)
@@ -133,7 +135,9 @@ def _hold(dx, dy, nx, ny, room, bend):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _hold_bodies(dx, dy, k, traffic, bend):  # type: ignore[no-untyped-def]
+def _hold_bodies(
+    dx: float, dy: float, k: int, traffic: Traffic, bend: bool
+) -> tuple[float, float]:
     bodies = traffic.bodies
     first = traffic.first
     speeds = traffic.speeds
@@ -172,7 +176,9 @@ def _hold_bodies(dx, dy, k, traffic, bend):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _hold_walls(dx, dy, body, traffic, bend):  # type: ignore[no-untyped-def]
+def _hold_walls(
+    dx: float, dy: float, body: Array, traffic: Traffic, bend: bool
+) -> tuple[float, float]:
     x = body[X]
     y = body[Y]
     radius = body[RADIUS]
@@ -196,7 +202,9 @@ def _hold_walls(dx, dy, body, traffic, bend):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _hold_map(dx, dy, body, grid, bend):  # type: ignore[no-untyped-def]
+def _hold_map(
+    dx: float, dy: float, body: Array, grid: MapField, bend: bool
+) -> tuple[float, float]:
     x = body[X]
     y = body[Y]
     radius = body[RADIUS]
@@ -232,7 +240,9 @@ def _hold_map(dx, dy, body, grid, bend):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def restrain(dx, dy, k, traffic, bends):  # type: ignore[no-untyped-def]
+def restrain(
+    dx: float, dy: float, k: int, traffic: Traffic, bends: bool
+) -> tuple[float, float]:
     """Return the part of a displacement [m] that obstacle k can make; with `bends` it slides."""
     body = traffic.bodies[k]
     for _ in range(PASSES if bends else 0):

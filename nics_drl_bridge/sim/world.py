@@ -205,7 +205,8 @@ class World(Schema):
         rows, columns = self.grid.cells.shape
         corners = [(i - 0.5, j - 0.5) for i in (0, rows) for j in (0, columns)]
         points = self.grid.cell_to_world(corners)
-        (x1, y1), (x2, y2) = points.min(axis=0).tolist(), points.max(axis=0).tolist()
+        x1, y1 = points.min(axis=0).tolist()
+        x2, y2 = points.max(axis=0).tolist()
         return x1, y1, x2, y2
 
     def all_walls(self) -> Array:

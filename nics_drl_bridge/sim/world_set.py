@@ -99,7 +99,8 @@ def load_worlds(name: str | Path | Sequence[str | Path]) -> AnyWorld:
         return _set_of("worlds", _members([str(one) for one in name], Path()))
     text = str(name)
     sets = share_folder() / "config" / "world_sets"
-    path = shipped if (shipped := sets / f"{name}.yaml").is_file() else Path(name)
+    shipped = sets / f"{name}.yaml"
+    path = shipped if shipped.is_file() else Path(name)
     content = _content(path, KEYS)
     if content is not None:
         return _read_set(path, validate(content, SetFile, text))
@@ -107,7 +108,8 @@ def load_worlds(name: str | Path | Sequence[str | Path]) -> AnyWorld:
         return _set_of(path.name if path.is_dir() else text, _members([text], Path()))
     if text == BARN:
         return _set_of(text, [barn_world(number) for number in barn_numbers()])
-    if (number := text.removeprefix(f"{BARN}/")).isdecimal() and number != text:
+    number = text.removeprefix(f"{BARN}/")
+    if number.isdecimal() and number != text:
         return barn_world(int(number))
     if text.endswith((*YAML, *GAZEBO)):
         return _member(path)
@@ -157,7 +159,7 @@ def _set_of(name: str, members: Sequence[World], source: str = "") -> WorldSet:
 
 
 def _members(names: Sequence[str], base: Path) -> list[World]:
-    found: list[World] = []
+    members: list[World] = []
     for name in names:
         special = any(sign in name for sign in SPECIAL)
         path = base / name
@@ -168,12 +170,12 @@ def _members(names: Sequence[str], base: Path) -> list[World]:
             if not files:
                 fix = f"check the path, or make worlds of Gazebo's and of maps by `{IMPORT}`"
                 raise ConfigError(f"{pattern}: no world file (.yaml) there; {fix}.")
-            found += map(_member, files)
+            members += map(_member, files)
         elif name.endswith((*YAML, *GAZEBO)):
-            found.append(_member(path))
+            members.append(_member(path))
         else:
-            found += load_worlds(name).members
-    return found
+            members += load_worlds(name).members
+    return members
 
 
 def _member(path: Path) -> World:

@@ -665,7 +665,7 @@ def test_what_topics_can_not_give_is_refused(model):
     [
         (
             {"domian_id": 3},
-            "backend 'dds': .*argument 'domian_id'; check its arguments",
+            "backend 'dds': unknown argument 'domian_id'; did you mean 'domain_id'",
         ),
         (
             {"namespace": "ant 1"},

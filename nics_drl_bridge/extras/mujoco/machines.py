@@ -255,7 +255,7 @@ def _make_tie_rod(half_ratio: float, steepest: float) -> str:
     row = polynomial.polyfit(left, right, [1, 2, 3, 4])
     if np.abs(polynomial.polyval(left, row) - right).max() > MISFIT:
         return ""
-    terms = " ".join(f"{value:.8g}" for value in row)
+    terms = " ".join(f"{factor:.8g}" for factor in row)
     return f"""
   <equality><joint joint1="steer_right" joint2="steer_left" polycoef="{terms}"/></equality>"""
 

@@ -64,11 +64,10 @@ def find_bumpers(model: Any, robots: int) -> NDArray[np.int64]:
     """Returns (geoms,) the robot whose bumper each geom of a scene belongs to; -1 if none."""
     names = [model.geom(i).name for i in range(model.ngeom)]
     heads = [f"{make_prefix(m)}{BUMPER_NAME}" for m in range(robots)]
-    owners = [
-        next((m for m, head in enumerate(heads) if n.startswith(head)), -1)
-        for n in names
-    ]
-    return np.array(owners, dtype=np.int64)
+    owners = np.full(len(names), -1, np.int64)
+    for m, head in reversed(list(enumerate(heads))):
+        owners[[name.startswith(head) for name in names]] = m
+    return owners
 
 
 class _Maker:

@@ -79,7 +79,8 @@ class Rig:
         """Gives the body a twist (3,), and its parts no speed relative to the body."""
         speeds = data.qvel[self._drift : self._drift + len(rest) - 1]
         speeds[:] = 0.0
-        speeds[:2], speeds[5] = geometry.rotate(twist[:2], heading), twist[2]
+        speeds[:2] = geometry.rotate(twist[:2], heading)
+        speeds[5] = twist[2]
 
     def motion(self, data: Any, rest: Array) -> tuple[Array, Array]:
         """Returns copies of positions (nq,) and speeds (nq - 1,) of the body and all its parts."""

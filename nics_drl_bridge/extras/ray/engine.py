@@ -347,11 +347,11 @@ class Learning:
         logger.close()
 
     def _take(self, result: Mapping[str, Any]) -> None:
-        found = result.get(ENV_RUNNER_RESULTS, {})
-        self.steps += int(found.get(NUM_ENV_STEPS_SAMPLED, 0))
-        self.stepping_s += float(found.get(STEPPING, 0.0)) / self.runners
+        metrics = result.get(ENV_RUNNER_RESULTS, {})
+        self.steps += int(metrics.get(NUM_ENV_STEPS_SAMPLED, 0))
+        self.stepping_s += float(metrics.get(STEPPING, 0.0)) / self.runners
         ended, success, collision = (
-            int(found.get(n, 0)) for n in (ENDED, SUCCESS, COLLISION)
+            int(metrics.get(n, 0)) for n in (ENDED, SUCCESS, COLLISION)
         )
         self.recent.append((ended, success, collision))
         while sum(one[0] for one in self.recent) - self.recent[0][0] >= RECENT:
