@@ -433,7 +433,9 @@ def _find_radians(pose: Array) -> Implausible | None:
 
 def _is_only_along(pose: Array, scale: float) -> bool:
     """True if the path of poses (T, 3) follows headings x scale, but not the unscaled ones."""
-    scaled, unscaled, fixed = (measure_alignment(pose, k) for k in (scale, 1.0, 0.0))
+    scaled = _measure_alignment(pose, scale)
+    unscaled = _measure_alignment(pose, 1.0)
+    fixed = _measure_alignment(pose, 0.0)
     return scaled > max(ALONG, unscaled + LESS_ALONG, fixed + ALONG_BY_CHANCE)
 
 
@@ -450,25 +452,23 @@ def has_visible_axes(pose: Array) -> bool:
     return float(np.ptp(np.unwrap(pose[:, 2]))) >= MIN_TURN
 
 
-def find_clockwise_keys(
-    pose: Array, minimum: float = MIN_MIRRORED, margin: float = BETTER
-) -> str:
+def find_clockwise_keys(pose: Array) -> str:
     """Returns the mapping's keys that mirror the heading of poses (T, 3), spaced on their path.
 
     For example `scale: -1`; empty unless the path is aligned with the mirrored headings by at least
-    `minimum`, and by `margin` more than with the recorded ones.
+    `MIN_MIRRORED`, and by `BETTER` more than with the recorded ones.
     """
     if not has_visible_axes(pose):
         return ""
     mirrored = _compute_course(pose, -1.0)
-    if abs(mirrored) < max(minimum, margin + measure_alignment(pose, 1.0)):
+    if abs(mirrored) < max(MIN_MIRRORED, BETTER + _measure_alignment(pose, 1.0)):
         return ""
     if mirrored.real > 0.0:
         return "scale: -1"
     return f"scale: -1, offset: {np.pi / 2.0:.5g}"
 
 
-def measure_alignment(pose: Array, scale: float) -> float:
+def _measure_alignment(pose: Array, scale: float) -> float:
     """Returns the alignment, 0 to 1, of the path of poses (T, 3) with headings x scale, or back."""
     return abs(_compute_course(pose, scale))
 
