@@ -137,7 +137,10 @@ def _explain_error(error: ValidationError, schema: type[BaseModel]) -> str:
         )
         bounds = f"at most {maximum}" if minimum is None else f"at least {minimum}"
         return f"key {key!r}: number of entries must be {bounds}, not {count}."
-    message = first["msg"].removeprefix("Value error, ").rstrip(".")
+    message = first["msg"]
+    if first["type"] == "value_error":  # raised by this package
+        message = str(first["ctx"]["error"])
+    message = message.rstrip(".")
     message = message[0].lower() + message[1:]
     if not key:  # an error about several keys; the message names them
         return f"{message}."

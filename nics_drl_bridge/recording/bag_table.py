@@ -190,8 +190,7 @@ class Bag(Source):
             if has_continuous_headers(data.values()):
                 stamps = "header"
                 origin = "headers, which go on together"
-            fault = str(error).removeprefix(f"{self.place}: ").partition(";")[0]
-            note = f"{fault}; all messages were stamped by their {origin}."
+            note = f"{error.reason}; all messages were stamped by their {origin}."
             self._notes.setdefault(topic, []).append(note)
             return stamp_streams(data, stamps, self.place, robot)[topic]
 

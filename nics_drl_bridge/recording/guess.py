@@ -30,8 +30,6 @@ from nics_drl_bridge.recording.survey import Survey, TableSurvey, split_unit
 from nics_drl_bridge.recording.switch_guess import Switch, guess_switch
 
 GUESSED = "# guessed"
-DOUBT = "# doubt:"
-NOT_USED = "# not used"
 NO_COMMAND = (
     "no command was recorded, that is: nothing here was sent to the robot, such as "
     "geometry_msgs/Twist on cmd_vel; record it together with the pose"
@@ -44,7 +42,7 @@ STILL = "; it is 0"
 NO_VALUES = {"header", "stamp", "seq", "covariance", "index", "id", "row"}
 
 
-class _Draft(NamedTuple):
+class _Guesses(NamedTuple):
     """The guesses from which a mapping is drafted."""
 
     tables: Sequence[TableSurvey]
@@ -61,7 +59,22 @@ class _Draft(NamedTuple):
         return len(self.tables) == 1
 
 
-def propose_mapping(tables: Sequence[TableSurvey]) -> str:
+class MappingDraft(NamedTuple):
+    """A draft of a mapping."""
+
+    doubts: Sequence[str]  # what the user should check first
+    lines: Sequence[str]  # the mapping, in YAML
+    unused: Sequence[str]  # the columns that it does not use, a text for each table
+
+    @property
+    def text(self) -> str:
+        """The file: the mapping in YAML, with doubts and unused columns as comments."""
+        doubts = [f"# doubt: {doubt}" for doubt in self.doubts]
+        unused = [f"# {columns}" for columns in self.unused]
+        return "\n".join([*doubts, *self.lines, *unused]) + "\n"
+
+
+def propose_mapping(tables: Sequence[TableSurvey]) -> MappingDraft:
     """Drafts a mapping in YAML; guesses are marked, and uncertain parts are left blank."""
     pose = guess_pose(tables)
     guess = guess_command(tables, pose)
@@ -78,11 +91,11 @@ def propose_mapping(tables: Sequence[TableSurvey]) -> str:
         switch = guess_switch(tables)
     gyro = _find_free_yaw_rate(tables, guess)
     episode = guess_episode(tables)
-    draft = _Draft(tables, pose, guess, switch, gyro, episode, common_time)
-    lines = [f"{DOUBT} {doubt}" for doubt in _find_doubts(guess, poses)]
+    guesses = _Guesses(tables, pose, guess, switch, gyro, episode, common_time)
+    doubts = [*_find_doubts(guess, poses)]
     if not guess.listed:
-        lines.append(f"{DOUBT} {NO_COMMAND}")
-    lines.append(_write_robot(guess))
+        doubts.append(NO_COMMAND)
+    lines = [_write_robot(guess)]
     if common_time is not None:
         lines.append(f"time: {common_time}  {GUESSED}")
     elif any(table.t is None and table.rows for table in tables):
@@ -92,17 +105,16 @@ def propose_mapping(tables: Sequence[TableSurvey]) -> str:
     if episode is not None:
         table, column = episode
         lines.append(
-            f"episode: {table.refer_to(column.name, draft.is_single)}  {GUESSED}"
+            f"episode: {table.refer_to(column.name, guesses.is_single)}  {GUESSED}"
         )
     lines += pose_lines
     lines += _write_clock(pose, guess.listed)
-    lines += _write_commands(draft)
+    lines += _write_commands(guesses)
     if gyro is not None:
         lines.append(
-            f"{write_imu_line(*gyro, draft.is_single, common_time)}  {GUESSED}"
+            f"{write_imu_line(*gyro, guesses.is_single, common_time)}  {GUESSED}"
         )
-    lines += _list_unused(draft)
-    return "\n".join(lines) + "\n"
+    return MappingDraft(doubts, lines, [*_list_unused(guesses)])
 
 
 def _find_doubts(
@@ -127,37 +139,37 @@ def _write_robot(guess: CommandGuess) -> str:
     return f"{robot}  {GUESSED}{look_alikes}; radius in m"
 
 
-def _write_commands(draft: _Draft) -> Iterator[str]:
+def _write_commands(guesses: _Guesses) -> Iterator[str]:
     """Yields the commands, or a blank with the candidates as comments."""
-    guess = draft.guess
+    guess = guesses.guess
     when = ""
-    if draft.switch is not None:
-        flag = draft.switch.refer_to(draft.is_single)
-        when = f"when: {{{flag}: {draft.switch.on}}}"
+    if guesses.switch is not None:
+        flag = guesses.switch.refer_to(guesses.is_single)
+        when = f"when: {{{flag}: {guesses.switch.on}}}"
     if guess.commands:
         wheels = "  # no command was recorded: what the wheels did stands in for it"
         yield "command:" + wheels * guess.of_wheels
         for name, candidate in guess.commands.items():
-            value = _write_value(name, candidate, when, draft)
+            value = _write_value(name, candidate, when, guesses)
             yield f"  {name}: {value}  {GUESSED}{STILL * candidate.is_still}"
     elif guess.candidates:
         yield "command:  # none is certain: uncomment what was sent to the robot"
         for name, candidate in guess.candidates.items():
-            yield f"#  {name}: {_write_value(name, candidate, when, draft)}"
+            yield f"#  {name}: {_write_value(name, candidate, when, guesses)}"
     else:
         yield f"command:  # {NO_COMMAND}"
 
 
-def _write_value(name: str, candidate: Candidate, when: str, draft: _Draft) -> str:
+def _write_value(name: str, candidate: Candidate, when: str, guesses: _Guesses) -> str:
     """Returns a command as written in a mapping: a column, or a column with more keys."""
     table = candidate.table
     column = candidate.column
-    reference = table.refer_to(column.name, draft.is_single)
+    reference = table.refer_to(column.name, guesses.is_single)
     keys = [*_write_unit_keys(name, column)]
     # A switch cuts off the motor; the steering stays as it is.
     if when and "steer" not in name:
         keys.append(when)
-    if table.time not in (draft.common_time, None):
+    if table.time not in (guesses.common_time, None):
         keys.append(f"time: {table.time}")
     if not keys:
         return reference
@@ -215,31 +227,31 @@ def _find_free_yaw_rate(
     return gyro
 
 
-def _list_unused(draft: _Draft) -> Iterator[str]:
-    """Yields a comment for each table with the columns of values that the draft does not use."""
+def _list_unused(guesses: _Guesses) -> Iterator[str]:
+    """Yields a text for each table with the columns of values that the draft does not use."""
     used = {
         (id(candidate.table), candidate.column.name)
-        for candidate in draft.guess.listed.values()
+        for candidate in guesses.guess.listed.values()
     }
-    if draft.switch is not None:
-        used.add((id(draft.switch.table), draft.switch.column))
-    for pair in (draft.gyro, draft.episode):
+    if guesses.switch is not None:
+        used.add((id(guesses.switch.table), guesses.switch.column))
+    for pair in (guesses.gyro, guesses.episode):
         if pair is not None:
             used.add((id(pair[0]), pair[1].name))
-    for table in draft.tables:
-        used_here = list_used_columns(table, draft.pose)
+    for table in guesses.tables:
+        used_here = list_used_columns(table, guesses.pose)
         unused = []
         for column in table.columns:
             is_value = NO_VALUES.isdisjoint(split_words(column.name))
             is_used = (id(table), column.name) in used or column.name in used_here
             if is_value and not is_used:
                 unused.append(f"{column.name}{_explain_unused(column)}")
-        place = f"{table.name}: " * (not draft.is_single)
+        place = f"{table.name}: " * (not guesses.is_single)
         listed = ", ".join(unused[:MOST_LISTED])
         if len(unused) > MOST_LISTED:
             listed += f" and {len(unused) - MOST_LISTED} more"
         if unused:
-            yield f"{NOT_USED}: {place}{listed}"
+            yield f"not used: {place}{listed}"
 
 
 def _explain_unused(column: Survey) -> str:

@@ -67,10 +67,8 @@ def _load_folder(path: Path, *_: object) -> Recording:
         with open_source(path) as source:
             return replace(read_mapped(source, mapping), variables=())
     except RecordingError as error:
-        fault = str(error).removesuffix(".")
-        raise RecordingError(
-            f"{fault}; the mapping is {file}, --map gives another."
-        ) from None
+        advice = f"The mapping is {file}; choose another with --map."
+        raise RecordingError(f"{error} {advice}") from None
 
 
 FORMATS = (

@@ -340,8 +340,7 @@ def open_bag_sink(
             unfinished = _set_apart(beside, path) / path.name
         if not isinstance(error, Exception):  # Ctrl-C
             raise
-        reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
-        reason = reason.removeprefix(f"{path}: ").removesuffix(".")
+        reason = _get_reason(error)
         rest = f"what was written until then lies in {unfinished}"
         advice = (
             "recover it with `mcap recover` or `ros2 bag reindex` where there is room"
@@ -356,6 +355,15 @@ def open_bag_sink(
     beside.rmdir()
     if raised is not None:
         raise raised
+
+
+def _get_reason(error: Exception) -> str:
+    reason = ""
+    if isinstance(error, RecordingError):
+        reason = error.reason
+    elif isinstance(error, OSError):
+        reason = error.strerror or ""
+    return reason or str(error) or type(error).__name__
 
 
 def _set_apart(unfinished: Path, path: Path) -> Path:
@@ -373,7 +381,6 @@ def _finish(unfinished: Path, path: Path, storage: Storage) -> None:
         write_checksums(unfinished / f"{path.name}.mcap")
     sync_folder(unfinished)
     if path.exists():
-        raise RecordingError(
-            f"{path}: was made meanwhile; give the name of a new folder."
-        )
+        reason = "was made meanwhile; give the name of a new folder"
+        raise RecordingError(f"{path}: {reason}.", reason)
     os.rename(unfinished, path)

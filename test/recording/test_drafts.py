@@ -513,7 +513,7 @@ TABLES: dict[str, tuple[dict[str, Any], str | None, Any, dict[str, str]]] = {
 
 def drafted(path) -> tuple[str, dict[str, Any]]:
     with open_source(path) as source:
-        text = propose_mapping(inspect_tables(source))
+        text = propose_mapping(inspect_tables(source)).text
     return text, parse_yaml(text, "draft")
 
 

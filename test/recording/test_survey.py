@@ -37,7 +37,7 @@ def surveyed(path):
 def written(path):
     with open_source(path) as source:
         tables = inspect_tables(source)
-    return tables, propose_mapping(tables)
+    return tables, propose_mapping(tables).text
 
 
 def test_a_first_mapping_reads_a_table_whose_columns_are_called_as_usual(tmp_path):
