@@ -122,11 +122,12 @@ def _explain_error(error: ValidationError, schema: type[BaseModel]) -> str:
         return f"key {key!r}: unknown kind {tag!r}; {suggest(tag, names)}"
     if first["type"] == "union_tag_not_found":
         return f"the key '{key}.kind' is missing; add it."
-    if first["type"] == "missing" and isinstance(index := first["loc"][-1], int):
-        key = ".".join(map(str, first["loc"][:-1]))
-        return f"key {key!r}: number of entries must be more than {index}."
     if first["type"] == "missing":
-        return f"the key {key!r} is missing; add it."
+        last = first["loc"][-1]
+        if isinstance(last, str):
+            return f"the key {key!r} is missing; add it."
+        key = ".".join(map(str, first["loc"][:-1]))
+        return f"key {key!r}: number of entries must be more than {last}."
     if first["type"] in _NO_KEYS:
         return f"key {key!r}: must hold `key: value` pairs, not {_SHORT.repr(first['input'])}."
     if first["type"] in _NO_LIST:

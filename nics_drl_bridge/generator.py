@@ -88,7 +88,7 @@ class SimulatorModel:
     # time between commands [s], a multiple of `kinematics.dt`
     control_period: float = CONTROL_PERIOD_S
     report: str = ""  # how the model was made, in plain text
-    # of scans and odometry, if it was measured in the recording
+    # latency of scans and odometry, if it was measured in the recording
     latency: Latency = field(default_factory=Latency)
     sensors: tuple[Sensor, ...] = ()  # other than the lidar
     # True: a gyro measured or confirmed the recorded headings
@@ -312,9 +312,11 @@ def open_model(
     # A Path never equals the name of a shipped robot.
     if Path(name).is_dir() and name not in list_shipped("robots"):
         return load_model(name)
-    if "/" in (name := str(name)) and not name.endswith((".yaml", ".yml")):
+    name = str(name)
+    is_yaml = name.endswith((".yaml", ".yml"))
+    if "/" in name and not is_yaml:
         raise ModelError(f"{name}: no such folder; make one with `nics generate`.")
-    if not name.endswith((".yaml", ".yml")) and name not in list_shipped("robots"):
+    if not is_yaml and name not in list_shipped("robots"):
         hint = suggest(name, list_shipped("robots"))
         fix = "or give a model's folder, or a robot's YAML file"
         raise ModelError(f"unknown robot {name!r}; {hint} ({fix}).")

@@ -254,15 +254,14 @@ class BagFile:
         for connection in reader.connections:
             self._connections.setdefault(connection.topic, []).append(connection)
         # Message type of each topic; several are joined by `and`.
-        self.types = {
-            topic: " and ".join(sorted({each.msgtype for each in connections}))
-            for topic, connections in self._connections.items()
-        }
-        self.empty = frozenset(
-            topic
-            for topic, connections in self._connections.items()
-            if not any(each.msgcount for each in connections)
-        )
+        self.types: dict[str, str] = {}
+        empty: list[str] = []
+        for topic, connections in self._connections.items():
+            kinds = {connection.msgtype for connection in connections}
+            self.types[topic] = " and ".join(sorted(kinds))
+            if not any(connection.msgcount for connection in connections):
+                empty.append(topic)
+        self.empty = frozenset(empty)
 
     @property
     def span_ns(self) -> tuple[int, int]:

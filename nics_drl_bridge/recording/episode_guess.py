@@ -9,7 +9,7 @@ from nics_drl_bridge.recording.survey import Survey, TableSurvey
 
 EPISODES = word_set("episode ep trial traj trajectory rollout run")
 NO_VALUES = np.zeros(0)
-MIN_MEAN_EPISODE_ROWS = 20  # of each episode, on average
+MIN_MEAN_EPISODE_ROWS = 20  # minimum number of rows of an episode, on average
 
 
 def guess_episode(tables: Sequence[TableSurvey]) -> tuple[TableSurvey, Survey] | None:

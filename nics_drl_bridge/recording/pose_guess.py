@@ -131,10 +131,12 @@ def _find_named_poses(table: TableSurvey) -> Iterator[PoseGuess]:
             if y is None or not {x, y} & moving or not _is_in(x, kinds):
                 continue
             orientation = _find_orientation(words, names)
-            if orientation:
-                yield PoseGuess(table, x, y, **orientation)
-            elif heading := _find_heading_called_z(table, words, names):
-                yield PoseGuess(table, x, y, heading)
+            if not orientation:
+                heading = _find_heading_called_z(table, words, names)
+                if heading is None:
+                    continue
+                orientation = {"heading": heading}
+            yield PoseGuess(table, x, y, **orientation)
 
 
 def _name_by_words(table: TableSurvey) -> dict[tuple[str, ...], str]:

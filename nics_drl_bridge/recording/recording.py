@@ -128,7 +128,7 @@ class Recording:
     variables: tuple[str, ...] = ()
     # the robot's definition as in its YAML file, if a mapping gives it
     robot: dict[str, Any] | None = None
-    # of scan and odometry, if known
+    # measured latency of scan and odometry, if known
     latency: Latency = field(default_factory=Latency)
     # a sentence on each repair made while reading, such as of clocks
     repairs: tuple[str, ...] = ()
@@ -145,8 +145,8 @@ class Recording:
 
         A gap between two episodes is split in the middle.
         """
-        ends = np.array([each.end_s for each in self.episodes[:-1]])
-        starts = np.array([each.start_s for each in self.episodes[1:]])
+        ends = np.array([episode.end_s for episode in self.episodes[:-1]])
+        starts = np.array([episode.start_s for episode in self.episodes[1:]])
         return np.asarray(np.searchsorted((ends + starts) / 2.0, t))
 
     def without_gaps(self, t: Array) -> Array:
@@ -292,7 +292,7 @@ def save_recording(recording: Recording, path: str | Path) -> None:
     if recording.robot is not None:
         meta["robot"] = recording.robot
     if recording.episodes:
-        meta["episodes"] = [asdict(each) for each in recording.episodes]
+        meta["episodes"] = [asdict(episode) for episode in recording.episodes]
         meta["learn_until_s"] = recording.learn_until_s
     if recording.latency.measured:
         meta["latency"] = recording.latency.model_dump(mode="json")
@@ -328,15 +328,15 @@ def load_recording(path: str | Path) -> Recording:
             robot=meta.get("robot"),
             latency=Latency.model_validate(meta.get("latency", {})),
             measured_by=measured_by,
-            episodes=tuple(Episode(**each) for each in meta.get("episodes", ())),
+            episodes=tuple(Episode(**fields) for fields in meta.get("episodes", ())),
             learn_until_s=meta.get("learn_until_s"),
         )
     except FileNotFoundError:
         raise RecordingError(f"{path}: no such file; check the path.") from None
     except (AttributeError, KeyError, RecursionError, TypeError) as error:
         advice = "say what is what in it with --map, or write it with save_recording"
-        said = f"{path}: is not a recording of this package ({error}); {advice}."
-        raise RecordingError(said) from None
+        fault = f"is not a recording of this package ({error})"
+        raise RecordingError(f"{path}: {fault}; {advice}.") from None
     except (ValueError, OSError) as error:
         why = f"can't be read as .npz ({error}); it may be damaged"
         raise RecordingError(f"{path}: {why}.") from None

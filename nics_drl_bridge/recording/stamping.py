@@ -55,7 +55,7 @@ ONE_WAY = 0.95
 BACK = 0.2
 WITHIN = 25.0
 TREMBLING = 4.0  # range of the ticks of a wheel that stands still
-BITS = (8, 16, 24, 31, 32)  # of registers that overflow
+BITS = (8, 16, 24, 31, 32)  # sizes of registers that overflow
 STAMP_BITS = (16, 24, 31, 32)
 # Late rows come in runs of at most this length, late by at most this time.
 LATE_ROWS = 50
@@ -63,7 +63,7 @@ LATE_S = 1.0
 # minimum fraction of backward steps in rows that begin with the last
 MIN_BACKWARD_FRACTION = 0.9
 MOST_STRAY = 0.01  # maximum fraction of stamps that fit neither neighbour
-MAX_CLOCK_PAUSE_S = 86_400.0  # of a drive; after a longer one, the clock was set
+MAX_CLOCK_PAUSE_S = 86_400.0  # after a longer pause of a drive, the clock was set
 USUAL = 10.0  # maximum step across an overflow, in usual steps
 USE_RECEIPT = (
     "write `stamps: receive` into the topics file (`time: arrival` into a map)"
@@ -322,8 +322,9 @@ def repair_order(t: Array, name: str) -> tuple[Array, NDArray[np.intp], str]:
     if len(t) > 1 and np.mean(np.diff(t) < 0.0) > MIN_BACKWARD_FRACTION:
         t = t[::-1]
         rows = rows[::-1]
-        notes.append(f"{name}: its rows began with the last, and were turned round.")
-    if (stray := _find_stray(t)).any():
+        notes.append(f"{name}: its rows began with the last, and were reversed.")
+    stray = _find_stray(t)
+    if stray.any():
         where = f"(row {rows[stray][0]}: {t[stray][0]:.10g} s)"
         notes.append(
             f"{name}: {stray.sum()} stamps fit none beside them {where}; left out."

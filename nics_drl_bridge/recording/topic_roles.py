@@ -101,7 +101,7 @@ def load_topic_roles(
     roles = TopicRoles()
     if file:
         roles = load_yaml(file, TopicRoles)
-    given: dict[str, str] = {}
+    topics: dict[str, str] = {}
     for option in options:
         role, equals, topic = (part.strip() for part in option.partition("="))
         if not equals or not topic:
@@ -112,13 +112,13 @@ def load_topic_roles(
             raise ConfigError(
                 f"--topic {option!r}: unknown role {role!r}; {suggest(role, ROLES)}"
             )
-        if role in given:
+        if role in topics:
             raise ConfigError(
                 f"--topic {option!r}: {role} was given before; give it once."
             )
-        given[role] = topic
+        topics[role] = topic
     return validate(
-        {**roles.model_dump(exclude_none=True), **given}, TopicRoles, "topics"
+        {**roles.model_dump(exclude_none=True), **topics}, TopicRoles, "topics"
     )
 
 
@@ -144,7 +144,7 @@ def assign(
 class _Topics:
     types: Mapping[str, str]  # by name
     empty: Collection[str]
-    place: str  # of the bag, for errors
+    place: str  # name of the bag, for errors
 
     def choose(self, role: str, wanted: str | None) -> str | None:
         """Returns the topic of a role: the wanted one, or the only one with the usual name."""

@@ -40,7 +40,7 @@ START_NS = 1_700_000_000 * NS_PER_S  # time stamp of second 0 of the commands' c
 # Lag of other clocks, too long for a reader to take it for a delay
 APART_NS = 3600 * NS_PER_S
 FRAMES = ("odom", "base_link")
-NO_HASH = f"RIHS01_{'0' * 64}"  # of a type that is known only by its definition
+NO_HASH = f"RIHS01_{'0' * 64}"  # hash of a type that is known only by its definition
 # Damage costs a whole chunk, because a checksum covers a whole chunk.
 CHUNK_BYTES = 1 << 16
 
@@ -81,7 +81,8 @@ def write_bag(
     # Commands become `/cmd_vel`, state or wheels `/joint_states`, the IMU `/imu`. The pose becomes
     # `/odom`, or `/pose` if it has its own clock or odometry was recorded as well.
     with open_bag_sink(path, storage) as sink:
-        messages = _Messages(store := sink.store)
+        store = sink.store
+        messages = _Messages(store)
         command = recording.command
         for topic, kind, stream, make in _list_topics(recording, spec, messages):
             sink.add_topic(topic, kind)
@@ -233,17 +234,16 @@ class BagSink:
         for name, text in (texts or {}).items() if kind not in fields else ():
             if name not in fields:
                 self.store.register(get_types_from_msg(text, name))
-        if kind in fields:
-            given = {}
-        else:
-            given = {"msgdef": definition or "", "rihs01": NO_HASH}
+        definitions = {}
+        if kind not in fields:
+            definitions = {"msgdef": definition or "", "rihs01": NO_HASH}
         profiles = [msgs.make_profile(offer) for offer in offers]
         with self._record_fault():
             self._connections[topic] = self._writer.add_connection(
                 topic,
                 kind,
                 typestore=self.store,
-                **given,
+                **definitions,
                 offered_qos_profiles=profiles,
             )
         self.counts[topic] = 0

@@ -91,7 +91,9 @@ class TurnBraking:
     """
 
     reaction_s: float  # until the turn starts to brake, lags included
-    deceleration: float  # of the turn after that; infinite for lags alone [rad/s^2]
+    deceleration: (
+        float  # how fast the turn slows after that; inf for lags alone [rad/s^2]
+    )
     least_turn: float = 1.0  # minimum fraction of this bound that the robot turns
     least_path: float = 1.0  # minimum fraction of its path's bound that the robot moves
 
@@ -109,7 +111,9 @@ class Braking:
     """
 
     reaction_s: float  # from the command to stop until braking counts, lags included
-    deceleration: float  # of the braking that follows; infinite for lags alone [m/s^2]
+    deceleration: (
+        float  # how fast the robot slows after that; inf for lags alone [m/s^2]
+    )
     # Factor of the turn rate in the pace [m]; wheels that also turn the robot brake both motions
     lever_m: float = 0.0
     drift: Drift = NO_DRIFT  # off its arc while it brakes

@@ -348,15 +348,15 @@ class HorizonErrors:
     windows: int  # number of predictions
     path_m: float  # mean length of the measured path
     model: EndErrors
-    kept_twist: EndErrors  # of a robot that keeps its initial twist
-    # Of the textbook model, fitted to the same data; None: not fitted
+    kept_twist: EndErrors  # errors of a robot that keeps its initial twist
+    # errors of the textbook model, fitted to the same data; None: not fitted
     textbook: EndErrors | None = None
     band_m: float | None = None  # distance within which 95 % of the ends are expected
     coverage: float | None = None  # fraction of the ends within it
     # Noise of the differences between the model's errors and those of the baselines [m]
     kept_twist_noise_m: float | None = None
     textbook_noise_m: float | None = None
-    # Of a robot that never moves; None in older files
+    # errors of a robot that never moves; None in older files
     standing: EndErrors | None = None
     standing_noise_m: float | None = None  # noise of the difference to it [m]
 
@@ -370,7 +370,7 @@ class Quality:
     samples: int  # number of rows that the fit used
     outliers: dict[str, float]  # fraction of the rows that were dropped as outliers
     condition: dict[str, float]  # condition number of the standardised kept features
-    rmse: dict[str, float]  # of the rates, on the training data
+    rmse: dict[str, float]  # error of each rate on the training data
     r2: dict[str, float]
     held_out_rmse: dict[
         str, float

@@ -183,10 +183,10 @@ def _is_mappings(parts: Any) -> bool:
 def _count_matches(
     commands: Sequence[Part],
     names: Sequence[Any],
-    given: Sequence[Part],
+    parts: Sequence[Part],
 ) -> int:
     """Counts the commands that are given by name or by unit."""
-    units = [part.get("unit") for part in given]
+    units = [part.get("unit") for part in parts]
     return sum(
         command["name"] in names or command["unit"] in units for command in commands
     )
