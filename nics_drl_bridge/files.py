@@ -390,7 +390,7 @@ def check_sums(folder: Path, names: Sequence[str], editable: str = "") -> None:
         else:
             hint = ""
         reason = (
-            f"does not match its checksum in {SUMS}; {hint}generate the model anew."
+            f"does not match its checksum in {SUMS}; {hint}generate the model again."
         )
         raise ModelError(f"{folder / name}: {reason}")
     for line in listed:
@@ -414,4 +414,4 @@ def _open_file(path: Path) -> BinaryIO:
                 return path.open("rb")
     except OSError as error:
         reason = f"not readable ({error.strerror})"
-    raise ModelError(f"{path}: is {reason}; generate the model anew.")
+    raise ModelError(f"{path}: is {reason}; generate the model again.")

@@ -99,7 +99,7 @@ class SimulatorModel:
         fitted = (self.kinematics.variables, self.kinematics.dofs)
         needed = (robot.variable_names, robot.dof_names)
         if fitted != needed:
-            reason = f"robot {robot.name!r} needs {needed}; generate the model anew."
+            reason = f"robot {robot.name!r} needs {needed}; generate the model again."
             raise ModelError(
                 f"the kinematics have variables and rates {fitted}, {reason}"
             )
@@ -361,7 +361,7 @@ def load_model(folder: str | Path) -> SimulatorModel:
     data = parse_yaml(read_text(path), str(path))
     if data.get("format") != FORMAT:
         reason = f"key 'format' is {data.get('format')!r}, not {FORMAT!r}"
-        raise ModelError(f"{path}: {reason}; generate the model anew.")
+        raise ModelError(f"{path}: {reason}; generate the model again.")
     files.check_sums(folder, MODEL_FILES, editable=MODEL_FILE)
     # A file without this key was written before its default changed.
     if isinstance(data.get("robot"), dict):

@@ -185,7 +185,7 @@ def _check_clocks(
             raise RecordingError(
                 f"{place}: the stamps of {roles[role]!r} are {offset_s:+.3f} s off those of "
                 f"{roles[ODOM]!r}, so they are of two clocks; synchronise the clocks (NTP, or "
-                "use_sim_time on all nodes or none) and record anew, or leave the topic out."
+                "use_sim_time on all nodes or none) and record again, or leave the topic out."
             )
 
 

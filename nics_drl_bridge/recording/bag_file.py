@@ -84,9 +84,9 @@ def open_bag(path: str | Path) -> "Iterator[BagFile]":
     except Exception as error:  # noqa: BLE001 - the reader can raise anything on a damaged file
         reason = " ".join(str(error).split()).rstrip(".") or type(error).__name__
         fault = f"can't be read as a bag ({shorten(reason, LONGEST_REASON)})"
-        advice = "try `mcap recover` or `ros2 bag reindex` on a copy, or record anew"
+        advice = "try `mcap recover` or `ros2 bag reindex` on a copy, or record again"
         if path.suffix == ROS_1:
-            advice = "mend it with `rosbag reindex`, or record anew"
+            advice = "mend it with `rosbag reindex`, or record again"
         raise RecordingError(
             f"{path}: {fault}; it is damaged or was not closed: {advice}."
         ) from None

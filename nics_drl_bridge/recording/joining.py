@@ -231,7 +231,7 @@ def _describe_join(sources: Sequence[str], is_split: bool) -> tuple[str, ...]:
         names = ", ".join(sources)
     else:
         names = f"{sources[0]} to {sources[-1]}"
-    split = "all were learnt from, as they are too short to hold a part out"
+    split = "all of them were fitted because they are too short to hold a part out"
     if is_split:
         split = "the last third of each was held out of the first fit"
     joined = f"{len(sources)} drives were joined ({names})"
@@ -241,9 +241,12 @@ def _describe_join(sources: Sequence[str], is_split: bool) -> tuple[str, ...]:
 def _collect_repairs(
     recordings: Sequence[Recording], shared: Sequence[str]
 ) -> tuple[str, ...]:
-    lost = {name for recording in recordings for name in recording.streams} - {*shared}
+    lost: set[str] = set()
+    for recording in recordings:
+        lost.update(recording.streams)
+    lost.difference_update(shared)
     repairs = [
-        f"{name} was left out, as not all of the recordings have it."
+        f"{name} was left out because not all recordings have it."
         for name in sorted(lost)
     ]
     for recording in recordings:

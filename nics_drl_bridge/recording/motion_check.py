@@ -49,7 +49,7 @@ def find_doubts(guess: CommandGuess, stamps: Array, poses: Array) -> Iterator[st
             yield f"{problem}, which no latency explains; check `time:` and the command"
         elif likeness[best] > CLEAR_CORRELATION and lag < PRECEDES_S:
             problem = f"the motion precedes {name} by {-lag:.1f} s"
-            yield f"{problem}, as with a measurement; check `time:` and the command"
+            yield f"{problem}, like a measurement; check `time:` and the command"
 
 
 def _compute_rates(t: Array, pose: Array) -> tuple[Array, Array, Array] | None:

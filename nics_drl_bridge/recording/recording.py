@@ -309,7 +309,7 @@ def load_recording(path: str | Path) -> Recording:
         meta = json.loads(str(arrays["meta"]))
         version = meta["format"]
         if version != FORMAT:
-            advice = "record it anew or use the version of the package that wrote it"
+            advice = "record it again or use the version of the package that wrote it"
             raise RecordingError(
                 f"{path}: format {version!r} is not {FORMAT!r}; {advice}."
             )

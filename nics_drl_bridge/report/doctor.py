@@ -183,7 +183,7 @@ def check_rates(facts: Facts, expected: Expected) -> Findings:
             finding = error if slow else warning
             fix = "set the driver's rate; on a slow network look for losses (best effort, Wi-Fi)"
             if role == SCAN:
-                fix += f", or set `rate: {rate:.3g}` in the lidar and generate the model anew"
+                fix += f", or set `rate: {rate:.3g}` in the lidar and generate the model again"
             what = f"comes at {rate:.3g} Hz, expected {bound}{wanted:.3g} Hz"
             yield finding("rate", role, what, fix)
 
@@ -306,7 +306,7 @@ def check_turning(facts: Facts, expected: Expected) -> Findings:
             f"turns {turning.scale:.2f} times as far"
         )
         fix = (
-            "trust the gyro where wheels slip: record it and generate the model anew, which then "
+            "trust the gyro where wheels slip: record it and generate the model again, which then "
             "uses it; or give imu:=TOPIC to the nodes, --imu to nics evaluate"
         )
         yield gyro_warning(what, fix)
@@ -485,7 +485,7 @@ def check_layout(facts: Facts, expected: Expected) -> Findings:
 def _check_beams(layout: doctor_facts.Layout, expected: Expected) -> Findings:
     want = expected.lidar.header
     header = layout.header
-    fix = "set the driver, or make a lidar file of what it sends and generate the model anew"
+    fix = "set the driver, or make a lidar file of what it sends and generate the model again"
     if layout.beams != expected.lidar.beams:
         yield layout_error(
             f"has {layout.beams} beams, expected {expected.lidar.beams}", fix
@@ -525,7 +525,7 @@ def check_ranges(facts: Facts, expected: Expected) -> Findings:
         return
     if len(finite) and beyond.mean() > ODD_FRACTION:
         what = f"{100 * beyond.mean():.0f} % of the ranges exceed range_max {spec.range_max:g} m"
-        fix = "set the driver's limit, or range_max of the lidar, and generate the model anew"
+        fix = "set the driver's limit, or range_max of the lidar, and generate the model again"
         yield warning("range convention", SCAN, what, fix)
     hits = {
         "zero": values == 0.0,
@@ -536,7 +536,7 @@ def check_ranges(facts: Facts, expected: Expected) -> Findings:
     for word, hit in hits.items():
         if hit.mean() > ODD_FRACTION and word != spec.no_return:
             fraction = f"{100 * hit.mean():.0f} % of the ranges are {word}"
-            fix = f"set `no_return: {word}` in the lidar and generate the model anew"
+            fix = f"set `no_return: {word}` in the lidar and generate the model again"
             yield convention(
                 f"{fraction}, but no return is expected as {spec.no_return}", fix
             )

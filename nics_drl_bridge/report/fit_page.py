@@ -24,19 +24,23 @@ Tile = tuple[str, str, bool]
 def fit_tile(identified: Identified) -> Tile:
     """Returns the accuracy of a fit as a figure, its meaning, and False if it is doubtful."""
     for at in usual(identified.judgement):
-        errors = {
-            "": at.model,
-            "fitted textbook ": at.textbook,
-            "constant twist ": at.kept_twist,
+        yardsticks = {
+            "fitted textbook": at.textbook,
+            "constant twist": at.kept_twist,
         }
-        texts = [
-            name + end_of(error, at.path_m) for name, error in errors.items() if error
-        ]
-        figure, *others = (text.removesuffix(OF_PATH) for text in texts)
-        off = f"{OF_PATH} off".lstrip() if texts[0] != figure else "off"
-        meaning = f"{off} after {at.horizon_s:g} s, on unseen data; {', '.join(others)}"
+        compared = []
+        for name, error in yardsticks.items():
+            if error:
+                text = end_of(error, at.path_m).removesuffix(OF_PATH)
+                compared.append(f"{name} {text}")
+        text = end_of(at.model, at.path_m)
+        figure = text.removesuffix(OF_PATH)
+        off = f"{text.removeprefix(figure)} off".lstrip()
+        meaning = (
+            f"{off} after {at.horizon_s:g} s, on unseen data; {', '.join(compared)}"
+        )
         return figure, meaning, not conclude(identified).doubts
-    return "untested", "on unseen data, as the drive is too short", False
+    return "untested", "on unseen data because the drive is too short", False
 
 
 def make_verdict_blocks(

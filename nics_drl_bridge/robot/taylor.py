@@ -419,10 +419,12 @@ class NamedTaylorModel(Schema):
             }
         except KeyError as error:
             raise ModelError(
-                f"kinematics: {error} has no unit; generate the model anew."
+                f"kinematics: {error} has no unit; generate the model again."
             ) from None
         except (OverflowError, ValueError) as error:
-            raise ModelError(f"kinematics: {error}; generate the model anew.") from None
+            raise ModelError(
+                f"kinematics: {error}; generate the model again."
+            ) from None
         names = sorted(parsed, key=lambda name: make_sort_key(parsed[name]))
         powers = np.array([parsed[name] for name in names], dtype=np.int64)
         rows = [[self.terms[dof].get(name, 0.0) for name in names] for dof in dofs]

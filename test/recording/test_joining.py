@@ -108,9 +108,7 @@ def test_a_stream_that_one_recording_lacks_is_left_out_and_said():
     (one, other) = drives(12.0, 24.0)
     joined = join([one, replace(other, odometry=other.pose)])
     assert joined.odometry is None
-    assert (
-        "odometry was left out, as not all of the recordings have it." in joined.repairs
-    )
+    assert "odometry was left out because not all recordings have it." in joined.repairs
 
 
 @pytest.mark.parametrize("restarts", [True, False])

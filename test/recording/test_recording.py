@@ -177,7 +177,7 @@ def test_another_format_is_one_sentence_that_says_what_to_do(tmp_path, version, 
         load_recording(path)
     assert str(refused.value) == (
         f"{path}: format {version!r} is not {FORMAT!r}; "
-        "record it anew or use the version of the package that wrote it."
+        "record it again or use the version of the package that wrote it."
     )
 
 
