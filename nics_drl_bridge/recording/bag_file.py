@@ -270,13 +270,11 @@ class BagFile:
 
     def offers(self, topic: str) -> tuple[Offer, ...]:
         """Returns the offers of a topic's publishers, as far as the bag contains them."""
-        return tuple(
-            offer
-            for connection in self._connections[topic]
-            for offer in convert_offers(
-                getattr(connection.ext, "offered_qos_profiles", ())
-            )
-        )
+        offers: list[Offer] = []
+        for connection in self._connections[topic]:
+            profiles = getattr(connection.ext, "offered_qos_profiles", ())
+            offers += convert_offers(profiles)
+        return tuple(offers)
 
     def can_decode(self, topic: str) -> bool:
         """True if messages of the topic can be decoded."""

@@ -45,7 +45,9 @@ def join(recordings: Sequence[Recording], offsets: Sequence[float] = ()) -> Reco
     offsets = offsets or [0.0] * len(recordings)
     aligned = [_align_clocks(*pair) for pair in zip(recordings, offsets, strict=True)]
     _check_alike(aligned)
-    parts = [part for recording in aligned for part in _split_recording(recording)]
+    parts: list[_Part] = []
+    for recording in aligned:
+        parts += _split_recording(recording)
     learnt = [part for part in parts if part.is_learnt]
     held_out = [part for part in parts if not part.is_learnt]
     return _place_parts(aligned, learnt, held_out)

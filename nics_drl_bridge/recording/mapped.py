@@ -137,9 +137,11 @@ def _guess_pose_source(source: Source, mapping: Mapping) -> MeasuredBy:
     values = (pose.x, pose.y, pose.heading)
     references = [value.from_ for value in values if value is not None]
     tables = [pose.in_, *(str(name).partition(":")[0] for name in references)]
-    topics = [name for table in tables if table for name in (table, f"/{table}")]
-    kinds = [source.get_table(name).kind for name in topics if name in source.names]
-    kind = next(filter(None, kinds), "")
+    kind = ""
+    for table in tables:
+        for name in (table, f"/{table}"):
+            if table and name in source.names:
+                kind = kind or source.get_table(name).kind
     names = [pose.in_, pose.clock, *pose.frames, *references]
     return guess_source_by_names(
         (str(name) for name in names if name is not None), kind

@@ -240,7 +240,10 @@ def find_overflow(
         return None
     usual = float(np.percentile(np.abs(step), 95))
     span = float(np.ptp(values))
-    for size in sorted(2.0**b * s for b in bits for s in scale):
+    sizes: list[float] = []
+    for unit in scale:
+        sizes += [2.0**bit * unit for bit in bits]
+    for size in sorted(sizes):
         jump = np.abs(step) > size / 2.0
         if (
             max(span, np.abs(values).max()) > size

@@ -143,7 +143,9 @@ def _find_separator(lines: Sequence[str]) -> str | None:
     """Returns the separator that leaves the most numbers and the fewest other fields."""
 
     def score(separator: str | None) -> int:
-        fields = [field for line in lines for field in _split(line, separator) if field]
+        fields: list[str] = []
+        for line in lines:
+            fields += filter(None, _split(line, separator))
         return 2 * sum(map(_is_value, fields)) - len(fields)
 
     best = max(SEPARATORS, key=score)

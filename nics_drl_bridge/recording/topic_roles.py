@@ -3,6 +3,7 @@
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Literal
 
@@ -198,7 +199,7 @@ class _Topics:
 
     def describe_missing(self, roles: Sequence[str], words: str) -> str:
         """Returns that no topic has any of the roles, and the fix."""
-        kinds = dict.fromkeys(kind for role in roles for kind in TYPES[role])
+        kinds = dict.fromkeys(chain.from_iterable(TYPES[role] for role in roles))
         advice = f"record one of type {', '.join(kinds)}"
         if roles == ("cmd_vel",):
             advice += (
@@ -206,15 +207,15 @@ class _Topics:
             )
         advice += ", or, if another topic holds them, name it with --map, which "
         advice += "`nics inspect BAG --map my.yaml` begins"
-        fitting = [
-            f"{role}={topic}" for role in roles for topic in self._find_fitting(role)
-        ]
-        if fitting:
-            advice = f"say which does, as in --topic {fitting[0]}"
+        for role in roles:
+            fitting = self._find_fitting(role)
+            if fitting:
+                advice = f"choose one with --topic, for example {role}={fitting[0]}"
+                break
         return f"no topic is known to hold the {words}; {advice}; {self._list_topics(roles)}"
 
     def _find_fitting(self, *roles: str) -> list[str]:
-        kinds = {kind for role in roles for kind in TYPES[role]}
+        kinds = set(chain.from_iterable(TYPES[role] for role in roles))
         return sorted(
             t for t, kind in self.types.items() if kind in kinds and t not in self.empty
         )

@@ -118,7 +118,7 @@ def draw_trajectory_gallery(
     """Draws a picture per seed with the path of each run; all panels have the same size."""
     every_episode = chain.from_iterable(episodes.values() for episodes in shown)
     view = _make_view_of_episodes(world, every_episode)
-    runs = dict.fromkeys(name for episodes in shown for name in episodes)
+    runs = dict.fromkeys(chain.from_iterable(shown))
     rows = count_legend_rows(["goal", "start", *runs], compute_width(view.panel))
     drawn = []
     for episodes in shown:

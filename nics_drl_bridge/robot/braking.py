@@ -247,12 +247,9 @@ def list_motions(low: Array, high: Array) -> Array:
         mixed = np.array(list(product(levels, repeat=count)))
     else:
         mixed = _combine_pairs(count)
-    single = [
-        sign * fraction * row
-        for row in np.eye(count)
-        for fraction in SINGLE_LEVELS
-        for sign in (-1, 1)
-    ]
+    single = []
+    for row, fraction in product(np.eye(count), SINGLE_LEVELS):
+        single += [-fraction * row, fraction * row]
     chosen = np.concatenate([mixed, single])
     return np.clip(np.where(chosen < 0.0, -chosen * low, chosen * high), low, high)
 
@@ -462,13 +459,11 @@ def fit_bound(stops: Stops, radius: float, turns_count: bool) -> Braking:
     worst = _compute_envelope(whole[straight], distance[straight])
     slower_component = np.abs(twist[:, :2]).min(axis=1)
     orders = _list_orders(slower_component > MINOR * speed)
-    bounds = [
-        Braking(0.0, 1.0, lever * radius, order=order)
-        for lever in LEVERS
-        for order in orders
-    ]
+    bounds = []
     fits = []
-    for bound in bounds:
+    for lever, order in product(LEVERS, orders):
+        bound = Braking(0.0, 1.0, lever * radius, order=order)
+        bounds.append(bound)
         pace = bound.pace(twist)
         if turns_count:
             pace = np.maximum(pace, turn_speed)

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from itertools import combinations_with_replacement
+from itertools import chain, combinations_with_replacement
 from typing import Annotated
 
 import numpy as np
@@ -239,10 +239,9 @@ class TaylorModel:
     def named(self) -> "NamedTaylorModel":
         """The model by names, unchecked; every number is bit-identical."""
         names = self.term_names
-        terms = {
-            dof: {names[k]: float(row[k]) for k in np.flatnonzero(row)}
-            for dof, row in zip(self.dofs, self.coefficients, strict=True)
-        }
+        terms = {}
+        for dof, row in zip(self.dofs, self.coefficients, strict=True):
+            terms[dof] = {names[k]: float(row[k]) for k in np.flatnonzero(row)}
         box = zip(self.low.tolist(), self.high.tolist(), strict=True)
         states = self.variables[: self.state_size]
         commands = self.variables[self.state_size :]
@@ -412,11 +411,9 @@ class NamedTaylorModel(Schema):
         dofs = tuple(self.terms)
         try:
             units = tuple(self.units[dof] for dof in dofs)
-            parsed = {
-                name: parse_term(name, variables)
-                for row in self.terms.values()
-                for name in row
-            }
+            parsed = {}
+            for name in chain.from_iterable(self.terms.values()):
+                parsed[name] = parse_term(name, variables)
         except KeyError as error:
             raise ModelError(
                 f"kinematics: {error} has no unit; generate the model again."
@@ -427,14 +424,19 @@ class NamedTaylorModel(Schema):
             ) from None
         names = sorted(parsed, key=lambda name: make_sort_key(parsed[name]))
         powers = np.array([parsed[name] for name in names], dtype=np.int64)
-        rows = [[self.terms[dof].get(name, 0.0) for name in names] for dof in dofs]
+        rows = []
+        for dof in dofs:
+            rows.append([self.terms[dof].get(name, 0.0) for name in names])
         box = np.array(list(self.valid.values())).reshape(len(variables), 2)
         states = variables[: len(dofs) - 3]
         friction = self.friction or {}
         drag = self.drag or {}
         limits = self.limits or {}
         commands = variables[len(states) :]
-        emf = self.back_emf or {}
+        emf = []
+        for state in states:
+            brakes = (self.back_emf or {}).get(state, {})
+            emf.append([brakes.get(command, 0.0) for command in commands])
         self._check_stages(states, commands)
         return TaylorModel(
             variables,
@@ -452,9 +454,7 @@ class NamedTaylorModel(Schema):
             friction=np.array([friction.get(name, 0.0) for name in states]),
             drag=np.array([drag.get(name, 0.0) for name in states]),
             limits=np.array([limits.get(name, (-np.inf, np.inf)) for name in states]),
-            back_emf=np.array(
-                [[emf.get(s, {}).get(c, 0.0) for c in commands] for s in states]
-            ),
+            back_emf=np.array(emf),
         ).add_errors(self.standard_errors or {})
 
     def _check_stages(self, states: tuple[str, ...], commands: tuple[str, ...]) -> None:

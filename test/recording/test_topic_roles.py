@@ -92,7 +92,7 @@ def test_without_poses_the_topics_are_listed_with_their_types():
         {"/cmd_vel": kinds.TWIST, "/tf": kinds.TRANSFORMS, "/a": "a/msg/A"}
     )
     assert (
-        "no topic is known to hold the poses; say which does, as in --topic pose=/tf"
+        "no topic is known to hold the poses; choose one with --topic, for example pose=/tf"
         in sentence
     )
     assert sentence.endswith(
