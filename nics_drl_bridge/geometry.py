@@ -11,9 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
-SMALL_TURN = (
-    1e-4  # turns below this use Taylor series instead of a division by zero [rad]
-)
+# turns below this use Taylor series, which do not divide by the turn [rad]
+SMALL_TURN = 1e-4
 # ellipsoid of WGS 84
 EQUATOR_RADIUS_M = 6378137.0
 ECCENTRICITY_SQUARED = 0.00669437999014

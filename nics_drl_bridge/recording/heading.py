@@ -34,10 +34,8 @@ LEAST_TURN_RAD = 1.0  # sum of all turns below which a drive does not show a sca
 MIN_SAME_MOTION_CORRELATION = (
     0.7  # minimum correlation of two sources that measure the same motion
 )
-PLAUSIBLE_SCALES = (
-    0.33,
-    5.0,
-)  # range of odometry's turns, relative to those of the gyro
+# range of odometry's turns, relative to those of the gyro
+PLAUSIBLE_SCALES = (0.33, 5.0)
 IN_DEGREES = (40.0, 80.0)  # ratio of a rate in degrees to one in radians
 LEAST_APART_RAD = 0.02  # a smaller disagreement in `WINDOW_S` is not worth a correction
 GYRO_SCALE_STD = 0.015  # relative deviation of a typical gyro's scale
