@@ -163,9 +163,8 @@ class Time(Schema):
     from_: Reference | tuple[Reference, Reference] | None = Field(
         default=None, alias="from"
     )
-    unit: Annotated[str | None, _check_kind(("s",))] = (
-        None  # unit of the stamps; None: s
-    )
+    # unit of the stamps; None: s
+    unit: Annotated[str | None, _check_kind(("s",))] = None
     rate: float | None = Field(default=None, gt=0.0)  # rate of rows without stamps [Hz]
 
     @model_validator(mode="after")
