@@ -157,10 +157,12 @@ def _explain_error(
     if first["type"] in _NO_LIST:
         return f"key {key!r}: must be a list, as [a, b], not {_SHORT.repr(first['input'])}."
     if first["type"] in _COUNT:
-        minimum, maximum, count = map(
-            first["ctx"].get, ("min_length", "max_length", "actual_length")
-        )
-        bounds = f"at most {maximum}" if minimum is None else f"at least {minimum}"
+        limits = first["ctx"]
+        if "min_length" in limits:
+            bounds = f"at least {limits['min_length']}"
+        else:
+            bounds = f"at most {limits['max_length']}"
+        count = limits["actual_length"]
         return f"key {key!r}: number of entries must be {bounds}, not {count}."
     message = first["msg"]
     if first["type"] == "value_error":  # raised by this package
@@ -184,19 +186,11 @@ def _locate_fields(
             candidates = _find_inner_models(fields[part])
             current = candidates[0] if candidates else None
         else:
-            kinds = (
-                getattr(candidate, "model_fields", {}).get("kind")
-                for candidate in candidates
-            )
-            named = zip(candidates, kinds, strict=True)
-            current = next(
-                (
-                    candidate
-                    for candidate, kind in named
-                    if kind and kind.default == part
-                ),
-                current,
-            )
+            for candidate in candidates:
+                kind = getattr(candidate, "model_fields", {}).get("kind")
+                if kind and kind.default == part:
+                    current = candidate
+                    break
     return list(_get_annotations(current))
 
 
@@ -210,8 +204,10 @@ def _get_annotations(model: Any) -> dict[Any, Any]:
 def _find_inner_models(annotation: Any) -> list[type]:
     if _get_annotations(annotation):
         return [annotation]
-    arguments = getattr(annotation, "__args__", ())
-    return [model for argument in arguments for model in _find_inner_models(argument)]
+    models = []
+    for argument in getattr(annotation, "__args__", ()):
+        models += _find_inner_models(argument)
+    return models
 
 
 def check_no_device(path: Path) -> Path:
@@ -366,14 +362,12 @@ _FLOAT = re.compile(
     r"^(?:[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?"
     r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
 )
-_Loader.yaml_implicit_resolvers = {
-    first: [
-        (tag, pattern)
-        for tag, pattern in resolvers
-        if tag in (f"{_TAG}null", f"{_TAG}merge")
+_KEPT_TAGS = (f"{_TAG}null", f"{_TAG}merge")
+_Loader.yaml_implicit_resolvers = {}
+for _first, _resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items():
+    _Loader.yaml_implicit_resolvers[_first] = [
+        (tag, pattern) for tag, pattern in _resolvers if tag in _KEPT_TAGS
     ]
-    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
-}
 for _kind, _type, _pattern, _first in (
     (_Loader, "bool", re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$"), "tTfF"),
     (_Loader, "int", re.compile(r"^[-+]?(?:0|[1-9][0-9]*)$"), "-+0123456789"),

@@ -55,7 +55,14 @@ class UnknownNameError(ConfigError):
 
 
 class RecordingError(BridgeError):
-    """A recording can't be read or contains unusable data."""
+    """A recording can't be read or contains unusable data.
+
+    `reason` is the part of the sentence that says what is wrong, for errors that others quote.
+    """
+
+    def __init__(self, sentence: str = "", reason: str = "") -> None:
+        self.reason = reason
+        super().__init__(sentence)
 
 
 class ModelError(BridgeError):

@@ -88,7 +88,7 @@ class SimulatorModel:
     # time between commands [s], a multiple of `kinematics.dt`
     control_period: float = CONTROL_PERIOD_S
     report: str = ""  # how the model was made, in plain text
-    # of scans and odometry, if it was measured in the recording
+    # latency of scans and odometry, if it was measured in the recording
     latency: Latency = field(default_factory=Latency)
     sensors: tuple[Sensor, ...] = ()  # other than the lidar
     # True: a gyro measured or confirmed the recorded headings

@@ -1,4 +1,8 @@
-"""Plane geometry: angles, poses, bicycles. REP-103 axes, radians; heading is in [-pi, pi)."""
+"""Plane geometry: angles, poses, arcs, outlines and steered robots.
+
+Axes are those of REP-103, angles in radians. A pose (..., 3) is x, y [m] and a heading in
+[-pi, pi).
+"""
 
 from dataclasses import dataclass
 
@@ -7,7 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
-
+# turns below this use Taylor series, which do not divide by the turn [rad]
+SMALL_TURN = 1e-4
 # ellipsoid of WGS 84
 EQUATOR_RADIUS_M = 6378137.0
 ECCENTRICITY_SQUARED = 0.00669437999014
@@ -24,15 +29,15 @@ def rotate(vector: ArrayLike, angle: ArrayLike) -> Array:
     """Rotates plane vectors (..., 2) by angles (...) [rad], counter-clockwise."""
     vector = np.asarray(vector, dtype=np.float64)
     angle = np.asarray(angle, dtype=np.float64)
-    c = np.cos(angle)
-    s = np.sin(angle)
+    cosine = np.cos(angle)
+    sine = np.sin(angle)
     x = vector[..., 0]
     y = vector[..., 1]
-    return np.stack([c * x - s * y, s * x + c * y], axis=-1)
+    return np.stack([cosine * x - sine * y, sine * x + cosine * y], axis=-1)
 
 
 def compose(pose: ArrayLike, relative: ArrayLike) -> Array:
-    """Returns the pose that lies at `relative` in the frame of `pose`; (..., 3): x, y, heading."""
+    """Returns the pose (..., 3) that is `relative` (..., 3) in the frame of `pose` (..., 3)."""
     pose = np.asarray(pose, dtype=np.float64)
     relative = np.asarray(relative, dtype=np.float64)
     position = pose[..., :2] + rotate(relative[..., :2], pose[..., 2])
@@ -41,39 +46,50 @@ def compose(pose: ArrayLike, relative: ArrayLike) -> Array:
 
 
 def between(pose: ArrayLike, target: ArrayLike) -> Array:
-    """Returns `target` in the frame of `pose`, (..., 3); `compose(pose, result) == target`."""
+    """Returns `target` (..., 3) in the frame of `pose` (..., 3), which inverts `compose`."""
     pose = np.asarray(pose, dtype=np.float64)
     target = np.asarray(target, dtype=np.float64)
     position = rotate(target[..., :2] - pose[..., :2], -pose[..., 2])
-    return np.concatenate(
-        [position, wrap_angle(target[..., 2] - pose[..., 2])[..., None]], axis=-1
-    )
+    heading = wrap_angle(target[..., 2] - pose[..., 2])
+    return np.concatenate([position, heading[..., None]], axis=-1)
 
 
 def exp(twist: ArrayLike) -> Array:
-    """Returns the relative pose (..., 3) after an exact arc in SE(2): body twist x duration."""
+    """Returns the relative pose (..., 3) at the end of an arc: the exponential map of SE(2).
+
+    `twist` (..., 3) is a constant body twist times its duration: ahead, left [m] and turn [rad].
+    """
     twist = np.asarray(twist, dtype=np.float64)
-    w = twist[..., 2]
-    small = np.abs(w) < 1e-4
-    safe = np.where(small, 1.0, w)
-    a = np.where(small, 1.0 - w * w / 6.0, np.sin(safe) / safe)
-    b = np.where(small, w / 2.0 - w**3 / 24.0, (1.0 - np.cos(safe)) / safe)
-    x = twist[..., 0]
-    y = twist[..., 1]
-    return np.stack([a * x - b * y, b * x + a * y, wrap_angle(w)], axis=-1)
+    ahead = twist[..., 0]
+    left = twist[..., 1]
+    turn = twist[..., 2]
+    is_small = np.abs(turn) < SMALL_TURN
+    divisor = np.where(is_small, 1.0, turn)
+    # The integral of the rotation over the arc is [[sinc, -cosc], [cosc, sinc]].
+    sinc = np.where(is_small, 1.0 - turn * turn / 6.0, np.sin(divisor) / divisor)
+    cosc_series = turn / 2.0 - turn**3 / 24.0
+    cosc = np.where(is_small, cosc_series, (1.0 - np.cos(divisor)) / divisor)
+    x = sinc * ahead - cosc * left
+    y = cosc * ahead + sinc * left
+    return np.stack([x, y, wrap_angle(turn)], axis=-1)
 
 
 def log(relative: ArrayLike) -> Array:
-    """Inverts `exp` below half turns: returns body twist x duration (..., 3) of a pose (..., 3)."""
+    """Inverts `exp` for turns below pi: returns the body twist times its duration (..., 3)."""
     relative = np.asarray(relative, dtype=np.float64)
-    w = wrap_angle(relative[..., 2])
-    small = np.abs(w) < 1e-4
-    safe = np.where(small, 1.0, w)
-    half = w / 2.0
-    cot = np.where(small, 1.0 - w * w / 12.0, (safe / 2.0) / np.tan(safe / 2.0))
     x = relative[..., 0]
     y = relative[..., 1]
-    return np.stack([cot * x + half * y, -half * x + cot * y, w], axis=-1)
+    turn = wrap_angle(relative[..., 2])
+    is_small = np.abs(turn) < SMALL_TURN
+    half = turn / 2.0
+    safe_half = np.where(is_small, 1.0, turn) / 2.0
+    # The inverse of the matrix in `exp` is [[half_cot, half], [-half, half_cot]].
+    half_cot = np.where(
+        is_small, 1.0 - turn * turn / 12.0, safe_half / np.tan(safe_half)
+    )
+    ahead = half_cot * x + half * y
+    left = -half * x + half_cot * y
+    return np.stack([ahead, left, turn], axis=-1)
 
 
 def east_and_north(longitude: Array, latitude: Array) -> tuple[Array, Array]:
@@ -81,70 +97,90 @@ def east_and_north(longitude: Array, latitude: Array) -> tuple[Array, Array]:
 
     The error is below a centimetre within 10 km.
     """
-    flattening = 1.0 - ECCENTRICITY_SQUARED * np.sin(latitude[0]) ** 2
-    east_radius = EQUATOR_RADIUS_M / np.sqrt(flattening)
-    north_radius = east_radius * (1.0 - ECCENTRICITY_SQUARED) / flattening
+    # Radii of curvature of the ellipsoid: of the prime vertical (east) and the meridian (north)
+    shrinkage = 1.0 - ECCENTRICITY_SQUARED * np.sin(latitude[0]) ** 2
+    east_radius = EQUATOR_RADIUS_M / np.sqrt(shrinkage)
+    north_radius = east_radius * (1.0 - ECCENTRICITY_SQUARED) / shrinkage
     east = east_radius * np.cos(latitude[0]) * wrap_angle(longitude - longitude[0])
-    return east, north_radius * (latitude - latitude[0])
+    north = north_radius * (latitude - latitude[0])
+    return east, north
 
 
 def has_crossing_edges(corners: Array) -> bool:
-    """Returns True if an edge of a closed outline (K, 2) touches or crosses a non-neighbour."""
+    """True if an edge of a closed outline (K, 2) touches or crosses another one.
+
+    Neighbours share a corner, but may not run back along each other. Edges without length count
+    as touching.
+    """
     start = corners
     end = np.roll(corners, -1, axis=0)
     edge = end - start
     if (start == end).all(axis=1).any():
         return True
-
-    def find_sides(points: Array) -> Array:
-        """Returns on which side of each edge each point lies (K, K): 1 left, -1 right, 0 on it."""
-        to_point = points[None] - start[:, None]
-        along = edge[:, None]
-        cross = along[..., 0] * to_point[..., 1] - along[..., 1] * to_point[..., 0]
-        return np.asarray(np.sign(cross))
-
-    low = np.minimum(start, end)
-    high = np.maximum(start, end)
-    starts_below = low[:, None] <= high[None]
-    ends_above = low[None] <= high[:, None]
-    boxes_overlap = (starts_below & ends_above).all(axis=-1)
-    end_sides = find_sides(end)
-    # -1 where the line through one edge separates the ends of another edge
-    separation = find_sides(start) * end_sides
+    # Two edges cross if each one's line separates the ends of the other, and their boxes overlap,
+    # which matters for edges on one line. Matrices (K, K) are of edge by edge.
+    end_sides = _find_sides(end, start, edge)
+    is_separated = _find_sides(start, start, edge) * end_sides <= 0.0
+    crossing = _find_overlaps(start, end) & is_separated & is_separated.T
     index = np.arange(len(corners))
     gap = (index[None] - index[:, None]) % len(corners)
     are_neighbours = (gap <= 1) | (gap >= len(corners) - 1)
-    crossing = boxes_overlap & (separation <= 0.0) & (separation.T <= 0.0)
-    # An edge may not run back along its predecessor.
+    if (crossing & ~are_neighbours).any():
+        return True
     is_parallel = end_sides[index, (index + 1) % len(corners)] == 0.0
-    runs_back = (edge * np.roll(edge, -1, axis=0)).sum(axis=1) <= 0.0
-    return bool((crossing & ~are_neighbours).any() or (is_parallel & runs_back).any())
+    is_reversed = (edge * np.roll(edge, -1, axis=0)).sum(axis=1) <= 0.0
+    return bool((is_parallel & is_reversed).any())
+
+
+def _find_sides(points: Array, start: Array, edge: Array) -> Array:
+    """Returns on which side of each edge each point lies (K, K): 1 left, -1 right, 0 on its line.
+
+    Edges begin at `start` (K, 2) and lead along `edge` (K, 2).
+    """
+    to_point = points[None] - start[:, None]
+    along = edge[:, None]
+    cross = along[..., 0] * to_point[..., 1] - along[..., 1] * to_point[..., 0]
+    return np.asarray(np.sign(cross))
+
+
+def _find_overlaps(start: Array, end: Array) -> NDArray[np.bool_]:
+    """Returns which of the boxes around edges from `start` to `end` (K, 2) overlap (K, K)."""
+    low = np.minimum(start, end)
+    high = np.maximum(start, end)
+    is_below = low[:, None] <= high[None]
+    is_above = low[None] <= high[:, None]
+    return np.asarray((is_below & is_above).all(axis=-1))
 
 
 def compute_depths(points: Array, corners: Array) -> Array:
-    """Returns distances (n,) of points (n, 2) to an outline (V, 2) [m], negative outside it."""
+    """Returns how deep points (N, 2) lie in a closed outline (K, 2) [m]; negative outside it."""
     edge = np.roll(corners, -1, axis=0) - corners
-    to_point = points[:, None] - corners
+    to_point = points[:, None] - corners  # (N, K, 2) from each corner
     # Two corners may coincide.
     length_squared = np.maximum((edge * edge).sum(axis=-1), 1e-300)
     fraction = np.clip((to_point * edge).sum(axis=-1) / length_squared, 0.0, 1.0)
-    to_edge = to_point - fraction[..., None] * edge
-    distance = np.linalg.norm(to_edge, axis=-1).min(axis=1)
+    from_nearest = to_point - fraction[..., None] * edge
+    distance = np.linalg.norm(from_nearest, axis=-1).min(axis=1)
     # A point is inside if a ray from it to the right crosses the outline an odd number of times.
     is_above = to_point[..., 1] >= 0.0
-    crosses_height = is_above != np.roll(is_above, -1, axis=1)
+    meets_height = is_above != np.roll(is_above, -1, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        beyond = to_point[..., 0] - to_point[..., 1] * edge[:, 0] / edge[:, 1]
-    crossings = (crosses_height & (beyond < 0.0)).sum(axis=1)
-    return np.asarray(np.where(crossings % 2 == 1, distance, -distance))
+        # how far the point lies to the right of the edge, at the point's height [m]
+        right_of_edge = to_point[..., 0] - to_point[..., 1] * edge[:, 0] / edge[:, 1]
+    crossings = (meets_height & (right_of_edge < 0.0)).sum(axis=1)
+    is_inside = crossings % 2 == 1
+    return np.asarray(np.where(is_inside, distance, -distance))
 
 
 @dataclass(frozen=True)
 class Bicycle:
-    """Geometry of a steered robot with `base_link` in the middle of the unsteered axle."""
+    """A steered robot with `base_link` in the middle of the unsteered axle.
+
+    One steered wheel, a wheelbase ahead, stands for the wheels of its axle.
+    """
 
     wheelbase: float  # [m]
-    # True: speeds are those of the steered wheel, along its rolling direction
+    # True: a speed is that of the steered wheel, which it drives along its rolling direction
     front_drive: bool = False
 
     def twist(self, speed: Array, angle: Array) -> Array:
@@ -160,10 +196,10 @@ class Bicycle:
     def command(self, twist: Array) -> tuple[Array, Array]:
         """Returns speeds, steering angles (...) for twists (..., 3); zeros for turns in place."""
         forward = twist[..., 0]
-        # lateral velocity of the front wheel, positive to the left
+        # The steered wheel rolls in the direction of its velocity, or the opposite one.
         sideways = self.wheelbase * twist[..., 2]
-        sign = np.sign(forward)
-        angle = np.arctan2(sideways * sign, np.abs(forward))
+        direction = np.sign(forward)
+        angle = np.arctan2(sideways * direction, np.abs(forward))
         if self.front_drive:
-            return sign * np.hypot(forward, sideways), angle
+            return direction * np.hypot(forward, sideways), angle
         return forward, angle

@@ -34,10 +34,9 @@ class RobotView:
 
 def stack_views(views: Sequence[RobotView]) -> RobotView:
     """Stacks the views of M robots into one with a leading (M,); stamp and ages are the maxima."""
-    sensed = {
-        name: np.stack([view.sensed[name] for view in views])
-        for name in views[0].sensed
-    }
+    sensed = {}
+    for name in views[0].sensed:
+        sensed[name] = np.stack([view.sensed[name] for view in views])
     fields: dict[str, Any] = {"sensed": sensed}
     for name in ("pose", "twist", "ranges"):
         fields[name] = np.stack([getattr(view, name) for view in views])

@@ -351,7 +351,7 @@ class _Compiling(event.Listener):  # type: ignore[misc]
             interval = STATUS.interval_s if self.tell == STATUS.show else REPEATED_S
             if spent >= self.patience_s and silent > interval and not self.quiet:
                 self._told = time.monotonic()
-                left = sum(not each.is_warm for each in KERNELS)
+                left = sum(not kernel.is_warm for kernel in KERNELS)
                 self.tell(estimate(left, self.count, spent))
 
     def on_end(self, event: event.Event) -> None:

@@ -173,7 +173,7 @@ def inspect(
 ) -> None:
     """Lists the contents of any recording and drafts its mapping."""
     from nics_drl_bridge.files import write_text
-    from nics_drl_bridge.recording.guess import DOUBT, NOT_USED, propose_mapping
+    from nics_drl_bridge.recording.guess import propose_mapping
     from nics_drl_bridge.recording.readers import explain_no_mapping, open_source
     from nics_drl_bridge.recording.recording import is_recording
     from nics_drl_bridge.recording.survey import inspect_tables
@@ -184,22 +184,24 @@ def inspect(
         tables = inspect_tables(opened)
     why = explain_no_mapping(source)
     is_own = is_recording(source)  # a mapping can't name its arrays
-    text = "" if is_own else propose_mapping(tables)
-    written = None if is_own else mapping
-    if written is not None:
-        write_text(written, text)
-    doubts = [
-        line.removeprefix(f"{DOUBT} ")
-        for line in text.splitlines()
-        if line.startswith(DOUBT)
-    ]
+    draft = None if is_own else propose_mapping(tables)
+    written = None
+    doubts: Sequence[str] = ()
+    if draft is not None:
+        doubts = draft.doubts
+        if mapping is not None:
+            write_text(mapping, draft.text)
+            written = mapping
     needless = ""
     if why:
         needless = (
             f"{source}: {why}, and needs no mapping: nics generate {source} --out MODEL"
         )
     if as_json:
-        facts = {"tables": [asdict(table) for table in tables], "doubts": doubts}
+        facts: dict[str, Any] = {
+            "tables": [asdict(table) for table in tables],
+            "doubts": doubts,
+        }
         facts |= {"mapping": written and str(written), "needs_mapping": not why}
         typer.echo(format_json(facts))
         return
@@ -213,17 +215,16 @@ def inspect(
         rows = [(c.name, f"{c.low:.6g}", f"{c.high:.6g}") for c in table.columns]
         if rows:
             typer.echo(console.format_table(("column", "least", "greatest"), rows))
-    if is_own:
+    if draft is None:
         typer.echo(
             f"no mapping was written: {needless}" if mapping is not None else needless
         )
         return
     if mapping is None:
-        typer.echo(f"A first mapping, to edit; --map FILE writes it:\n\n{text}")
+        typer.echo(f"A first mapping, to edit; --map FILE writes it:\n\n{draft.text}")
         return
-    for line in text.splitlines():
-        if line.startswith(NOT_USED):
-            typer.echo(line.removeprefix("# "))
+    for line in draft.unused:
+        typer.echo(line)
     typer.echo(
         f"a first mapping is in {mapping}: edit it, then nics import or nics generate"
     )

@@ -85,7 +85,7 @@ class TopicHealth:
     """Statistics of a topic's accepted data."""
 
     received: int
-    rate_hz: float  # of arrivals; 0 before the second
+    rate_hz: float  # rate of arrivals; 0 before the second
     age_s: float  # since the latest arrival
     innovation: float = math.nan  # NIS of the newest `Judgement`; NaN without one
 

@@ -161,13 +161,11 @@ def choose_topics(bag: BagFile, topics: Mapping[str, str]) -> dict[str, str]:
 def _check_clocks(
     place: str, roles: Mapping[str, str], messages: Mapping[str, list[Message]]
 ) -> None:
-    stamps = {
-        role: np.array(
-            [(m.receive_ns, get_stamp(m.content)) for m in sent], dtype=np.int64
-        )
-        for role, sent in messages.items()
-        if hasattr(sent[0].content, "header")
-    }
+    stamps = {}
+    for role, sent in messages.items():
+        if hasattr(sent[0].content, "header"):
+            pairs = [(part.receive_ns, get_stamp(part.content)) for part in sent]
+            stamps[role] = np.array(pairs, dtype=np.int64)
     for role, times in stamps.items():
         if not times[:, 1].any():
             if role == CMD_VEL:
@@ -273,9 +271,9 @@ def merge_messages(
     messages: Mapping[str, list[Message]],
 ) -> Iterator[tuple[str, Message]]:
     """Yields all messages with their roles, in the order of receipt."""
-    merged = [
-        (role, message) for role in sorted(messages) for message in messages[role]
-    ]
+    merged: list[tuple[str, Message]] = []
+    for role in sorted(messages):
+        merged += [(role, message) for message in messages[role]]
     # The sort is stable, so equal times keep the order of the roles.
     yield from sorted(merged, key=lambda entry: entry[1].receive_ns)
 

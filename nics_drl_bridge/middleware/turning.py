@@ -16,10 +16,10 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.interface import NS_PER_S
 
 # Gyro
-GYRO_STD = 0.02  # of a yaw rate without a plausible variance [rad/s]
+GYRO_STD = 0.02  # deviation of a yaw rate without a plausible variance [rad/s]
 MIN_GYRO_STD = 1e-4  # [rad/s]
 MAX_VARIANCE = 1.0  # a larger one means that the rate is unknown [rad^2/s^2]
-BIAS_STD = 0.1  # of a gyro that was never at rest [rad/s]
+BIAS_STD = 0.1  # deviation of the bias of a gyro that was never at rest [rad/s]
 BIAS_WALK = 1e-4  # random walk of a bias [rad/s / sqrt(s)]
 REST_BIAS_STD = 3e-4  # deviation of a standing robot's yaw rate from the bias [rad/s]
 VARIANCE_RATIO = 25.0  # factor by which stated and observed variance may differ
@@ -35,7 +35,7 @@ MIN_STEP = 0.3  # change from one yaw rate to the next that is always accepted [
 RATE_FACTOR = 2.0
 PUSH_RATE = 1.0
 MAX_REJECTED = 5  # number of sudden changes in a row, the last of which is believed
-MAX_REJECTED_FRACTION = 0.2  # of the latest yaw rates
+MAX_REJECTED_FRACTION = 0.2  # maximum rejected fraction of the latest yaw rates
 # Wheels
 ASSUMED_SLIP = 0.1  # fraction of a turn, until more is known
 # Weight of that assumption, as a sum of squared turns [rad^2]
@@ -46,7 +46,7 @@ MIN_COMPARED_TURN = 0.5  # by the wheels, before they can judge the gyro [rad]
 # Bounds on the slope of gyro turns over wheel turns; beyond them, the gyro's axis or unit is wrong
 MIN_SLOPE = -0.3
 MAX_SLOPE = 3.0
-CONTRADICTION_MARGIN = 0.005  # of the turn between two odometries [rad]
+CONTRADICTION_MARGIN = 0.005  # tolerance of the turn between two odometries [rad]
 TURNING_RATE = 0.1  # slower turns of the wheels do not reveal slip [rad/s]
 MIN_COMPARED_S = 5.0  # after which the wheels' scatter is known
 WHEELS_BIAS = 0.004  # constant error of rolling wheels [rad/s]
@@ -60,9 +60,9 @@ NEVER_NS = 2**62
 class Gyro(NamedTuple):
     """Estimated errors of a gyro and of the wheels."""
 
-    stamp_ns: int  # of the newest yaw rate
+    stamp_ns: int  # stamp of the newest yaw rate
     rate: float  # that rate [rad/s]
-    integral: float  # of all rates until then [rad]
+    integral: float  # integral of all yaw rates until then [rad]
     since_ns: int  # stamp of the first yaw rate after the last gap
     period_s: float  # mean time between two yaw rates
     noise: float  # variance of a yaw rate, as stated or assumed
@@ -71,7 +71,7 @@ class Gyro(NamedTuple):
     change: float = 0.0  # between the two newest yaw rates [rad/s]
     repeats: int = 0  # consecutive yaw rates that did not change
     rejected: int = 0  # number of consecutive rejected yaw rates
-    rejected_fraction: float = 0.0  # of the latest yaw rates
+    rejected_fraction: float = 0.0  # fraction of the latest yaw rates
     bias: float = 0.0
     bias_variance: float = BIAS_STD**2
     cross: float = 0.0  # covariance of the robot's heading with the bias
@@ -86,7 +86,7 @@ class Gyro(NamedTuple):
     # The newest odometry that was used
     odom: Array | None = None  # (3,) its pose as received; None before the first
     odom_ns: int = 0
-    odom_integral: float = 0.0  # of all rates until then [rad]
+    odom_integral: float = 0.0  # integral of all yaw rates until then [rad]
     wheels_rate: float = 0.0  # yaw rate of its twist [rad/s]
     # Yaw rate of the wheels before the gyro repeated itself `FROZEN_COUNT` times [rad/s]
     wheels_rate_before: float = 0.0
@@ -350,7 +350,10 @@ def _learn_bias_at_rest(
 def _learn_bias(
     gyro: Gyro, difference: float, seconds: float, noise: float, wheels_variance: float
 ) -> Gyro:
-    """Corrects the bias slightly while the wheels roll, by the difference of both turns [rad]."""
+    """Corrects the bias slightly while the wheels roll.
+
+    `difference` is the gyro's turn minus the wheels' turn [rad].
+    """
     variance = gyro.bias_variance + BIAS_WALK**2 * seconds
     if variance < WHEELS_BIAS**2:  # unequal wheel sizes also turn a robot that fast
         return gyro._replace(bias_variance=variance)
@@ -362,10 +365,11 @@ def _learn_bias(
 def _correct_bias(
     gyro: Gyro, measured: float, variance: float, measured_variance: float
 ) -> Gyro:
-    """Corrects the bias, which has the `variance`, by a measured one [rad/s]."""
+    """Corrects the bias, whose variance is `variance`, by a measured bias [rad/s]."""
     innovation = measured - gyro.bias
     total = variance + measured_variance
-    if innovation**2 > SIGMAS**2 * total:  # the robot was pushed, or its wheels spin
+    if innovation**2 > SIGMAS**2 * total:
+        # The robot was pushed, or its wheels spin.
         return gyro._replace(bias_variance=variance)
     gain = variance / total
     return gyro._replace(

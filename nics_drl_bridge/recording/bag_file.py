@@ -254,15 +254,14 @@ class BagFile:
         for connection in reader.connections:
             self._connections.setdefault(connection.topic, []).append(connection)
         # Message type of each topic; several are joined by `and`.
-        self.types = {
-            topic: " and ".join(sorted({each.msgtype for each in connections}))
-            for topic, connections in self._connections.items()
-        }
-        self.empty = frozenset(
-            topic
-            for topic, connections in self._connections.items()
-            if not any(each.msgcount for each in connections)
-        )
+        self.types: dict[str, str] = {}
+        empty: list[str] = []
+        for topic, connections in self._connections.items():
+            kinds = {connection.msgtype for connection in connections}
+            self.types[topic] = " and ".join(sorted(kinds))
+            if not any(connection.msgcount for connection in connections):
+                empty.append(topic)
+        self.empty = frozenset(empty)
 
     @property
     def span_ns(self) -> tuple[int, int]:
@@ -271,13 +270,11 @@ class BagFile:
 
     def offers(self, topic: str) -> tuple[Offer, ...]:
         """Returns the offers of a topic's publishers, as far as the bag contains them."""
-        return tuple(
-            offer
-            for connection in self._connections[topic]
-            for offer in convert_offers(
-                getattr(connection.ext, "offered_qos_profiles", ())
-            )
-        )
+        offers: list[Offer] = []
+        for connection in self._connections[topic]:
+            profiles = getattr(connection.ext, "offered_qos_profiles", ())
+            offers += convert_offers(profiles)
+        return tuple(offers)
 
     def can_decode(self, topic: str) -> bool:
         """True if messages of the topic can be decoded."""

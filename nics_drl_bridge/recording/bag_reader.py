@@ -115,9 +115,9 @@ def _read_command(bag: BagFile, topic: str, spec: RobotSpec) -> TopicData:
     for variable in spec.command:
         if steered and variable.turns and not variable.steers:
             fault = f"{bag.place}: topic {topic!r} holds steering angles [rad]"
-            other = f"{variable.name!r} of robot {spec.name!r} is in {variable.unit}"
+            needed = f"{variable.name!r} of robot {spec.name!r} is in {variable.unit}"
             advice = "choose the robot that drove, or another topic"
-            raise RecordingError(f"{fault}, but {other}; {advice}.")
+            raise RecordingError(f"{fault}, but {needed}; {advice}.")
     data = _read_rows(bag, topic, msgs.read_command)
     if steered:
         commands = spec.from_fields(data.values)
@@ -242,7 +242,7 @@ def extract_state(
         if source is not None:
             sources.append(source.joint)
             columns.append(_read_joint(joints, variable, source))
-        elif mapping.state or any(each.must_be_measured for each in spec.state):
+        elif mapping.state or any(variable.must_be_measured for variable in spec.state):
             fault = f"no joint is known for the state {variable.name!r}"
             others = ", ".join(joints.names) or "none"
             advice = (

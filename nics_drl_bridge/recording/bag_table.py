@@ -47,7 +47,9 @@ def list_fields(message: Any, path: str = "") -> Iterator[str]:
                 yield from list_fields(element, f"{path}[{k}]")
     else:
         labels: Any = getattr(message, NAMES, None)
-        for name in (each for each in vars(message) if not each.startswith("__")):
+        for name in vars(message):
+            if name.startswith("__"):
+                continue
             inner = getattr(message, name)
             where = f"{path}.{name}".lstrip(".")
             listed = isinstance(labels, list) and isinstance(inner, (list, np.ndarray))
@@ -190,30 +192,29 @@ class Bag(Source):
             if has_continuous_headers(data.values()):
                 stamps = "header"
                 origin = "headers, which go on together"
-            fault = str(error).removeprefix(f"{self.place}: ").partition(";")[0]
-            note = f"{fault}; all messages were stamped by their {origin}."
+            note = f"{error.reason}; all messages were stamped by their {origin}."
             self._notes.setdefault(topic, []).append(note)
             return stamp_streams(data, stamps, self.place, robot)[topic]
 
 
 def list_topics_used(mapping: mapped.Mapping, topics: Sequence[str]) -> dict[str, bool]:
     """Returns the topics that a mapping names, and whether `ROBOT_STREAMS` use them."""
-    found: dict[str, bool] = {}
+    used: dict[str, bool] = {}
 
-    def walk(part: Any, own: bool) -> None:
+    def walk(part: Any, is_robots: bool) -> None:
         if isinstance(part, dict):
             for key, value in part.items():
-                walk(value, own or key in ROBOT_STREAMS)
-                walk(key, own)
+                walk(value, is_robots or key in ROBOT_STREAMS)
+                walk(key, is_robots)
         elif isinstance(part, (list, tuple)):
-            for each in part:
-                walk(each, own)
+            for item in part:
+                walk(item, is_robots)
         elif isinstance(part, str):
-            named = {part, *(part[:k] for k, sign in enumerate(part) if sign == ":")}
-            for topic in (
-                t for t in topics if t in named or t.removeprefix("/") in named
-            ):
-                found[topic] = found.get(topic, False) or own
+            names = {part[:k] for k, sign in enumerate(part) if sign == ":"}
+            names.add(part)
+            for topic in topics:
+                if topic in names or topic.removeprefix("/") in names:
+                    used[topic] = used.get(topic, False) or is_robots
 
     walk(mapping.model_dump(by_alias=True, exclude={"robot"}, exclude_none=True), False)
-    return found
+    return used

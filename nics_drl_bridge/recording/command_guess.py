@@ -68,8 +68,8 @@ STEERING = word_set("steering steer delta servo")
 THROTTLE = word_set("throttle gas accelerator pedal pwm duty")
 TURNING = word_set("angular ang omega yawrate wz w turn rot rotational")
 SPEED = word_set("speed velocity vel v vx linear lin forward trans cmdvel")
-# Kinds of robots, with the names of their commands by meaning; other kinds have them in the `words`
-# of their templates.
+# Kinds of robots, with the names of their commands by meaning; the `words` of a template name those
+# of other kinds.
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 KINDS: tuple[tuple[str, dict[str, str]], ...] = (
     ("mecanum", {wheel: f"{wheel}_wheel" for wheel in WHEELS}),
@@ -141,13 +141,11 @@ def guess_command(
     tables: Sequence[TableSurvey], pose: PoseGuess | None
 ) -> CommandGuess:
     """Finds the columns that drive a robot of a known kind, or candidates for its commands."""
-    candidates = [
-        candidate
-        for table in tables
-        for candidate in _find_candidates(table, len(tables) > 1, pose)
-    ]
+    candidates: list[Candidate] = []
+    for table in tables:
+        candidates += _find_candidates(table, len(tables) > 1, pose)
     candidates = _accept_steering(candidates)
-    certain = [each for each in candidates if each.strength >= LIKELY]
+    certain = [column for column in candidates if column.strength >= LIKELY]
     kind, commands = _choose_kind(certain)
     if kind is not None:
         return CommandGuess(kind, commands, {})
@@ -160,7 +158,7 @@ def guess_command(
             candidates += _find_unexplained(table, pose)
     kind, named = _choose_kind(candidates)
     if kind is None:
-        strongest = sorted(candidates, key=lambda each: -each.strength)
+        strongest = sorted(candidates, key=lambda column: -column.strength)
         named = {
             f"command_{k}": candidate
             for k, candidate in enumerate(strongest[:MOST_CANDIDATES])
@@ -277,7 +275,8 @@ def guess_meaning(words: set[str]) -> str | None:
 def _accept_steering(candidates: Sequence[Candidate]) -> list[Candidate]:
     """Counts a plain `steering` as a command if a throttle was also recorded."""
     has_throttle = any(
-        each.meaning == "throttle" and each.strength >= LIKELY for each in candidates
+        candidate.meaning == "throttle" and candidate.strength >= LIKELY
+        for candidate in candidates
     )
     accepted = []
     for candidate in candidates:
@@ -293,22 +292,22 @@ def _choose_kind(
     candidates: Sequence[Candidate],
 ) -> tuple[str | None, dict[str, Candidate]]:
     """Returns the kind of robot that these columns drive best, and its commands by name."""
-    kinds = [
-        (name, kind.template.words)
-        for name in list_kinds()
-        if (kind := find_kind(name))
-    ]
+    kinds: list[tuple[str, Mapping[str, str]]] = []
+    for name in list_kinds():
+        kind = find_kind(name)
+        if kind is not None:
+            kinds.append((name, kind.template.words))
     best: tuple[str | None, dict[str, Candidate]] = (None, {})
     best_merit: tuple[int, int] | None = None
-    for kind, names in (*kinds, *KINDS):
-        commands = _match_commands(names, candidates)
-        still = sum(each.is_still for each in commands.values())
+    for name, words in (*kinds, *KINDS):
+        commands = _match_commands(words, candidates)
+        still = sum(command.is_still for command in commands.values())
         if still == len(commands):
             continue
-        strength = min(each.strength for each in commands.values())
+        strength = min(command.strength for command in commands.values())
         if best_merit is None or (strength, -still) > best_merit:
             best_merit = strength, -still
-            best = kind, commands
+            best = name, commands
     return best
 
 
@@ -318,13 +317,14 @@ def _match_commands(
     """Finds a column for each of a kind's commands; none if one is missing or ambiguous."""
     commands: dict[str, Candidate] = {}
     for meaning, name in names.items():
-        fitting = [each for each in candidates if each.meaning == meaning]
+        fitting = [column for column in candidates if column.meaning == meaning]
         if not fitting:
             return {}
-        best = max(fitting, key=lambda each: each.merit)
-        rivals = [each for each in fitting if each.merit == best.merit]
-        if not all(np.array_equal(best.values, each.values) for each in rivals):
-            return {}
+        best = max(fitting, key=lambda column: column.merit)
+        for rival in fitting:
+            is_equal = np.array_equal(best.values, rival.values)
+            if rival.merit == best.merit and not is_equal:
+                return {}
         commands[name] = best
     return commands
 

@@ -9,14 +9,15 @@ from nics_drl_bridge.recording.survey import Survey, TableSurvey
 
 EPISODES = word_set("episode ep trial traj trajectory rollout run")
 NO_VALUES = np.zeros(0)
-MIN_MEAN_EPISODE_ROWS = 20  # of each episode, on average
+MIN_MEAN_EPISODE_ROWS = 20  # minimum number of rows of an episode, on average
 
 
 def guess_episode(tables: Sequence[TableSurvey]) -> tuple[TableSurvey, Survey] | None:
     """Finds the only column that numbers episodes; None if there is none, or several."""
-    columns = [
-        (table, column) for table in tables for column in _find_episode_columns(table)
-    ]
+    columns: list[tuple[TableSurvey, Survey]] = []
+    for table in tables:
+        for column in _find_episode_columns(table):
+            columns.append((table, column))
     if len(columns) != 1:
         return None
     return columns[0]
@@ -35,11 +36,11 @@ def _find_episode_columns(table: TableSurvey) -> Iterator[Survey]:
             continue
         # `run` with two values may be a switch, unless the stamps restart with it.
         may_be_switch = "run" in words and count == 2
-        if not may_be_switch or _begins_anew(table, int(changes[0])):
+        if not may_be_switch or _restarts(table, int(changes[0])):
             yield column
 
 
-def _begins_anew(table: TableSurvey, row: int) -> bool:
+def _restarts(table: TableSurvey, row: int) -> bool:
     """True if the stamps go back after a row."""
     t = table.t
     return t is not None and row + 1 < len(t) and bool(t[row + 1] < t[row])

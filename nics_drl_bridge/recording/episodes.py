@@ -14,7 +14,7 @@ from nics_drl_bridge.recording.recording import Recording
 from nics_drl_bridge.recording.table import Column, Source, Table
 from nics_drl_bridge.recording.values import MappedReader
 
-MIN_EPISODE_ROWS = 3  # of an episode; shorter ones are left out
+MIN_EPISODE_ROWS = 3  # shorter episodes are left out
 
 
 class EpisodeOfTable(Source):

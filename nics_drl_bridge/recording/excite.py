@@ -377,7 +377,7 @@ class DrivePlan:
     bound: float = defaults.DRIVE_BOUND_M
     duration: float = defaults.DRIVE_S  # [s]
     speed: float = 1.0  # fraction of the maximum speeds and rates to use
-    seed: int = 0  # of the pattern
+    seed: int = 0  # seed of the pattern
 
     def __post_init__(self) -> None:
         check_seeds(self.seed)

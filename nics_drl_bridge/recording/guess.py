@@ -1,13 +1,11 @@
 """Drafts a recording's mapping from its names, units and types, with blanks for the rest."""
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from nics_drl_bridge.geometry import Array, east_and_north
-from nics_drl_bridge.recording import recording as recordings
 from nics_drl_bridge.recording.command_guess import (
     TICKS,
     Candidate,
@@ -19,42 +17,32 @@ from nics_drl_bridge.recording.episode_guess import guess_episode
 from nics_drl_bridge.recording.imu_guess import guess_yaw_rate, write_imu_line
 from nics_drl_bridge.recording.mapped import POSES
 from nics_drl_bridge.recording.mapping import UNITS
-from nics_drl_bridge.recording.motion_check import find_doubts, find_reversed_wheels
+from nics_drl_bridge.recording.motion_check import find_doubts
 from nics_drl_bridge.recording.names import split_words, write_reference
 from nics_drl_bridge.recording.pose_guess import (
     GLOBE,
     PoseGuess,
     guess_pose,
     list_used_columns,
-    select_apart,
 )
-from nics_drl_bridge.recording.recording import find_clockwise_keys, select_along_path
+from nics_drl_bridge.recording.recording import compute_heading, find_implausible_pose
 from nics_drl_bridge.recording.survey import Survey, TableSurvey, split_unit
 from nics_drl_bridge.recording.switch_guess import Switch, guess_switch
 
 GUESSED = "# guessed"
-DOUBT = "# doubt:"
-NOT_USED = "# not used"
 NO_COMMAND = (
     "no command was recorded, that is: nothing here was sent to the robot, such as "
     "geometry_msgs/Twist on cmd_vel; record it together with the pose"
 )
 NO_POSE = "# no pose was found: give x, y, and heading or quaternion, or `pose: /tf`"
-NO_RADIUS = 0.2  # radius of a robot, unless it is taken for a car [m]
-FAST_CAR = 10.0  # a faster robot is taken for a car [m/s]
-FAR_AWAY = 1e4  # so is a robot farther than this from both axes, as on a map [m]
-CAR_RADIUS = 2.0
-USUAL_WHEEL = 5.0  # speed of a wheel from which the ticks of a turn are guessed [rad/s]
+USUAL_RADIUS = 0.2  # footprint radius of a robot [m]
 LARGEST_ANGLE = 1.6  # maximum steering angle [rad]
 MOST_LISTED = 20  # maximum number of unused columns listed per table
 STILL = "; it is 0"
 NO_VALUES = {"header", "stamp", "seq", "covariance", "index", "id", "row"}
-# Thresholds from which a draft mirrors a heading, see `find_clockwise_keys`
-MIN_MIRRORED_GUESS = 0.6
-MIRRORED_BETTER = 0.3
 
 
-class _Draft(NamedTuple):
+class _Guesses(NamedTuple):
     """The guesses from which a mapping is drafted."""
 
     tables: Sequence[TableSurvey]
@@ -71,7 +59,22 @@ class _Draft(NamedTuple):
         return len(self.tables) == 1
 
 
-def propose_mapping(tables: Sequence[TableSurvey]) -> str:
+class MappingDraft(NamedTuple):
+    """A draft of a mapping."""
+
+    doubts: Sequence[str]  # what the user should check first
+    lines: Sequence[str]  # the mapping, in YAML
+    unused: Sequence[str]  # the columns that it does not use, a text for each table
+
+    @property
+    def text(self) -> str:
+        """The file: the mapping in YAML, with doubts and unused columns as comments."""
+        doubts = [f"# doubt: {doubt}" for doubt in self.doubts]
+        unused = [f"# {columns}" for columns in self.unused]
+        return "\n".join([*doubts, *self.lines, *unused]) + "\n"
+
+
+def propose_mapping(tables: Sequence[TableSurvey]) -> MappingDraft:
     """Drafts a mapping in YAML; guesses are marked, and uncertain parts are left blank."""
     pose = guess_pose(tables)
     guess = guess_command(tables, pose)
@@ -80,18 +83,19 @@ def propose_mapping(tables: Sequence[TableSurvey]) -> str:
     pose_lines = [NO_POSE, "pose:", "  x: ", "  y: "]
     poses = None
     if pose is not None:
-        pose_lines = _write_pose(pose, len(tables) == 1, common_time)
-        poses = _compute_poses(pose, pose_lines)
+        units = _name_units(pose)
+        pose_lines = _write_pose(pose, units, len(tables) == 1, common_time)
+        poses = _compute_poses(pose, units)
     switch = None
     if guess.listed:
-        switch = guess_switch(tables, poses)
+        switch = guess_switch(tables)
     gyro = _find_free_yaw_rate(tables, guess)
     episode = guess_episode(tables)
-    draft = _Draft(tables, pose, guess, switch, gyro, episode, common_time)
-    lines = [f"{DOUBT} {doubt}" for doubt in find_doubts(guess, poses)]
+    guesses = _Guesses(tables, pose, guess, switch, gyro, episode, common_time)
+    doubts = [*_find_doubts(guess, poses)]
     if not guess.listed:
-        lines.append(f"{DOUBT} {NO_COMMAND}")
-    lines.append(_write_robot(guess, _guess_radius(poses)))
+        doubts.append(NO_COMMAND)
+    lines = [_write_robot(guess)]
     if common_time is not None:
         lines.append(f"time: {common_time}  {GUESSED}")
     elif any(table.t is None and table.rows for table in tables):
@@ -101,100 +105,89 @@ def propose_mapping(tables: Sequence[TableSurvey]) -> str:
     if episode is not None:
         table, column = episode
         lines.append(
-            f"episode: {table.refer_to(column.name, draft.is_single)}  {GUESSED}"
+            f"episode: {table.refer_to(column.name, guesses.is_single)}  {GUESSED}"
         )
     lines += pose_lines
     lines += _write_clock(pose, guess.listed)
-    lines += _write_commands(draft, find_reversed_wheels(guess, poses))
+    lines += _write_commands(guesses)
     if gyro is not None:
         lines.append(
-            f"{write_imu_line(*gyro, draft.is_single, common_time)}  {GUESSED}"
+            f"{write_imu_line(*gyro, guesses.is_single, common_time)}  {GUESSED}"
         )
-    lines += _list_unused(draft)
-    return "\n".join(lines) + "\n"
+    return MappingDraft(doubts, lines, [*_list_unused(guesses)])
 
 
-def _write_robot(guess: CommandGuess, radius: float) -> str:
+def _find_doubts(
+    guess: CommandGuess, poses: tuple[Array, Array] | None
+) -> Iterator[str]:
+    """Yields sentences on a pose in the wrong unit, else on commands that the motion ignores."""
+    if poses is None:
+        return
+    fault = find_implausible_pose(*poses, radius=USUAL_RADIUS)
+    if fault is None:
+        yield from find_doubts(guess, *poses)
+    else:
+        yield f"pose: {fault.reason}; {fault.cause}: add `{fault.line}`"
+
+
+def _write_robot(guess: CommandGuess) -> str:
     if guess.kind is None:
-        example = f"{{kind: differential, footprint_radius: {radius}}}"
+        example = f"{{kind: differential, footprint_radius: {USUAL_RADIUS}}}"
         return f"robot:  # which kind is not certain, as in {example}"
     look_alikes = "".join(f", or {kind}" for kind in find_look_alikes(guess.kind))
-    robot = f"robot: {{kind: {guess.kind}, footprint_radius: {radius}}}"
+    robot = f"robot: {{kind: {guess.kind}, footprint_radius: {USUAL_RADIUS}}}"
     return f"{robot}  {GUESSED}{look_alikes}; radius in m"
 
 
-def _write_commands(draft: _Draft, backwards: Sequence[Candidate]) -> Iterator[str]:
+def _write_commands(guesses: _Guesses) -> Iterator[str]:
     """Yields the commands, or a blank with the candidates as comments."""
-    guess = draft.guess
+    guess = guesses.guess
     when = ""
-    if draft.switch is not None:
-        flag = draft.switch.refer_to(draft.is_single)
-        when = f"when: {{{flag}: {draft.switch.on}}}"
+    if guesses.switch is not None:
+        flag = guesses.switch.refer_to(guesses.is_single)
+        when = f"when: {{{flag}: {guesses.switch.on}}}"
     if guess.commands:
         wheels = "  # no command was recorded: what the wheels did stands in for it"
         yield "command:" + wheels * guess.of_wheels
         for name, candidate in guess.commands.items():
-            keys = when
-            reason = STILL * candidate.is_still
-            if candidate in backwards:
-                keys = "scale: -1"
-                reason += ": else it turns against the other"
-            value = _write_value(name, candidate, keys, draft)
-            yield f"  {name}: {value}  {GUESSED}{reason}"
+            value = _write_value(name, candidate, when, guesses)
+            yield f"  {name}: {value}  {GUESSED}{STILL * candidate.is_still}"
     elif guess.candidates:
         yield "command:  # none is certain: uncomment what was sent to the robot"
         for name, candidate in guess.candidates.items():
-            yield f"#  {name}: {_write_value(name, candidate, when, draft)}"
+            yield f"#  {name}: {_write_value(name, candidate, when, guesses)}"
     else:
         yield f"command:  # {NO_COMMAND}"
 
 
-def _write_value(name: str, candidate: Candidate, when: str, draft: _Draft) -> str:
+def _write_value(name: str, candidate: Candidate, when: str, guesses: _Guesses) -> str:
     """Returns a command as written in a mapping: a column, or a column with more keys."""
     table = candidate.table
     column = candidate.column
-    reference = table.refer_to(column.name, draft.is_single)
-    keys = [*_write_unit_keys(name, table, column)]
+    reference = table.refer_to(column.name, guesses.is_single)
+    keys = [*_write_unit_keys(name, column)]
     # A switch cuts off the motor; the steering stays as it is.
     if when and "steer" not in name:
         keys.append(when)
-    if table.time not in (draft.common_time, None):
+    if table.time not in (guesses.common_time, None):
         keys.append(f"time: {table.time}")
     if not keys:
         return reference
     return f"{{from: {reference}, {', '.join(keys)}}}"
 
 
-def _write_unit_keys(name: str, table: TableSurvey, column: Survey) -> Iterator[str]:
+def _write_unit_keys(name: str, column: Survey) -> Iterator[str]:
     unit = split_unit(column.name)[1]
     if not TICKS.isdisjoint(split_words(column.name)):
         yield "unit: ticks"
         if "steer" in name:
             yield "differentiate: false"
-        ticks = _guess_ticks_per_turn(table)
-        if ticks:
-            yield f"ticks_per_turn: {ticks}"
     elif unit == "%":
         yield 'unit: "%"'
     elif unit is not None and UNITS[unit].factor != 1.0:
         yield f"unit: {unit}"
     elif name == "steering_command" and max(-column.low, column.high) > LARGEST_ANGLE:
         yield "unit: deg"
-
-
-def _guess_ticks_per_turn(table: TableSurvey) -> int:
-    """Guesses the ticks per turn, a power of 2, by a usual wheel speed; 0 for standing wheels."""
-    counters = [
-        table.data[column.name].astype(np.float64)
-        for column in table.numbers
-        if not TICKS.isdisjoint(split_words(column.name))
-    ]
-    steps = np.abs(np.concatenate([np.diff(counter) for counter in counters]))
-    steps = steps[steps > 0.0]
-    if table.t is None or not len(steps) or not np.ptp(table.t) > 0.0:
-        return 0
-    ticks_per_s = float(np.median(steps)) * len(table.t) / float(np.ptp(table.t))
-    return int(2 ** round(np.log2(2.0 * np.pi * ticks_per_s / USUAL_WHEEL)))
 
 
 def _write_clock(
@@ -234,31 +227,31 @@ def _find_free_yaw_rate(
     return gyro
 
 
-def _list_unused(draft: _Draft) -> Iterator[str]:
-    """Yields a comment for each table with the columns of values that the draft does not use."""
+def _list_unused(guesses: _Guesses) -> Iterator[str]:
+    """Yields a text for each table with the columns of values that the draft does not use."""
     used = {
         (id(candidate.table), candidate.column.name)
-        for candidate in draft.guess.listed.values()
+        for candidate in guesses.guess.listed.values()
     }
-    if draft.switch is not None:
-        used.add((id(draft.switch.table), draft.switch.column))
-    for pair in (draft.gyro, draft.episode):
+    if guesses.switch is not None:
+        used.add((id(guesses.switch.table), guesses.switch.column))
+    for pair in (guesses.gyro, guesses.episode):
         if pair is not None:
             used.add((id(pair[0]), pair[1].name))
-    for table in draft.tables:
-        used_here = list_used_columns(table, draft.pose)
+    for table in guesses.tables:
+        used_here = list_used_columns(table, guesses.pose)
         unused = []
         for column in table.columns:
             is_value = NO_VALUES.isdisjoint(split_words(column.name))
             is_used = (id(table), column.name) in used or column.name in used_here
             if is_value and not is_used:
                 unused.append(f"{column.name}{_explain_unused(column)}")
-        place = f"{table.name}: " * (not draft.is_single)
+        place = f"{table.name}: " * (not guesses.is_single)
         listed = ", ".join(unused[:MOST_LISTED])
         if len(unused) > MOST_LISTED:
             listed += f" and {len(unused) - MOST_LISTED} more"
         if unused:
-            yield f"{NOT_USED}: {place}{listed}"
+            yield f"not used: {place}{listed}"
 
 
 def _explain_unused(column: Survey) -> str:
@@ -269,7 +262,9 @@ def _explain_unused(column: Survey) -> str:
     return " (no numbers)"
 
 
-def _write_pose(pose: PoseGuess, is_single: bool, common_time: str | None) -> list[str]:
+def _write_pose(
+    pose: PoseGuess, units: Mapping[str, str], is_single: bool, common_time: str | None
+) -> list[str]:
     table = pose.table
     if table.stamps is None and pose.x in (form[0].format("x") for form in POSES[:4]):
         return [f"pose: {table.name}  {GUESSED}"]  # a message whose fields are known
@@ -285,60 +280,33 @@ def _write_pose(pose: PoseGuess, is_single: bool, common_time: str | None) -> li
         lines.append(f"  quaternion: [{columns}]")
     if table.time not in (common_time, None):
         lines.append(f"  time: {table.time}")
-    units = _guess_pose_units(pose)
-    return [_correct_heading(line, pose, units) for line in lines] + units
+    for key, unit in units.items():
+        lines.append(f"  {key}: {unit}  {GUESSED}")
+    return lines
 
 
-def _guess_pose_units(pose: PoseGuess) -> list[str]:
-    """Returns the lines for the units of a pose, from its names or from what is plausible."""
+def _name_units(pose: PoseGuess) -> dict[str, str]:
+    """Returns the units that the names of a pose's columns show, unless they are m and rad."""
     units = {
         "unit": split_unit(pose.x)[1],
         "heading_unit": split_unit(pose.heading or "")[1],
     }
     if not {*GLOBE}.isdisjoint(split_words(pose.x)):
         units["unit"] = "deg"
-    lines = []
+    named = {}
     for key, unit in units.items():
         if unit is None:
             continue
         si, factor = UNITS[unit]
         if factor != 1.0 and si in ("m", "rad"):
-            lines.append(f"  {key}: {unit}  {GUESSED}")
-    if any(unit is not None for unit in units.values()):
-        return lines
-    for _ in units:
-        poses = _compute_poses(pose, lines)
-        if poses is None:
-            break
-        fault = recordings.find_implausible_pose(
-            *poses, radius=_guess_radius(poses, 0.0)
-        )
-        if fault is not None and not fault.line.startswith("time"):
-            lines.append(f"  {fault.line}  {GUESSED}: else {fault.reason}")
-    return lines
+            named[key] = unit
+    return named
 
 
-def _correct_heading(line: str, pose: PoseGuess, units: Sequence[str]) -> str:
-    """Returns the heading's line, mirrored as for a compass if only then it fits the path."""
-    if not line.startswith("  heading: "):
-        return line
-    poses = _compute_poses(pose, units)
-    if poses is None:
-        return line
-    _, values = poses
-    spaced = values[select_along_path(values, _guess_radius(poses))]
-    keys = find_clockwise_keys(spaced) or find_clockwise_keys(
-        select_apart(values), MIN_MIRRORED_GUESS, MIRRORED_BETTER
-    )
-    if not keys:
-        return line
-    reason = "else heading and path turn opposite ways"
-    column = line.partition(": ")[2]
-    return f"  heading: {{from: {column}, {keys}}}  {GUESSED}: {reason}"
-
-
-def _compute_poses(pose: PoseGuess, lines: Sequence[str]) -> tuple[Array, Array] | None:
-    """Returns stamps (T,) and poses (T, 3) of a guess in the units of its lines, if known."""
+def _compute_poses(
+    pose: PoseGuess, units: Mapping[str, str]
+) -> tuple[Array, Array] | None:
+    """Returns stamps (T,) and poses (T, 3) of a guess in SI; None if its rows have no stamps."""
     table = pose.table
     if table.t is None:
         return None
@@ -349,13 +317,11 @@ def _compute_poses(pose: PoseGuess, lines: Sequence[str]) -> tuple[Array, Array]
     x, y, *orientation = columns
     heading = orientation[0]
     if pose.quaternion:
-        heading = recordings.compute_heading(*orientation)
+        heading = compute_heading(*orientation)
     values = np.stack([x, y, heading], axis=1)
     is_finite = np.isfinite(values).all(axis=1)
     if is_finite.sum() < 3:
         return None
-    text = "\n".join(lines)
-    units = dict(re.findall(r"^  (unit|heading_unit): (\S+)", text, re.MULTILINE))
     if "heading_unit" in units:
         values[:, 2] *= UNITS[units["heading_unit"]].factor
     if "unit" in units:
@@ -363,25 +329,4 @@ def _compute_poses(pose: PoseGuess, lines: Sequence[str]) -> tuple[Array, Array]
         values[:, :2] *= factor
         if si == "rad":
             values[:, :2] = np.stack(east_and_north(*values[:, :2].T), axis=1)
-    clockwise = re.search(
-        r"^  heading: .* scale: -1(?:, offset: ([\d.]+))?}", text, re.MULTILINE
-    )
-    if clockwise:
-        values[:, 2] = float(clockwise[1] or 0.0) - values[:, 2]
     return table.t[is_finite], values[is_finite]
-
-
-def _guess_radius(
-    poses: tuple[Array, Array] | None, fastest: float = FAR_AWAY
-) -> float:
-    """Returns the radius of a robot [m]: a car's if it is that fast or far out on a map."""
-    if poses is None:
-        return NO_RADIUS
-    t, values = poses
-    place = values[:, :2]
-    path = np.hypot(*np.diff(place[:: max(1, len(t) // 200)], axis=0).T).sum()
-    is_far = np.abs(place).min() > FAR_AWAY
-    is_on_map = is_far and np.ptp(place, axis=0).max() < FAR_AWAY
-    if is_on_map or FAST_CAR * float(np.ptp(t)) < path < fastest:
-        return CAR_RADIUS
-    return NO_RADIUS

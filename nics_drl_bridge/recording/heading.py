@@ -25,7 +25,7 @@ LEAST_BIAS_STD = 1e-5  # [rad/s]
 # Prior deviations of a bias from 0 [rad/s], and of the scale of turns from 1
 USUAL_BIAS = 0.01
 USUAL_FACTOR = 0.5
-LEAST_RATE_NOISE = 1e-3  # of a block's mean rate [rad/s]
+LEAST_RATE_NOISE = 1e-3  # minimum noise of a block's mean rate [rad/s]
 # Factor on errors, because the blocks of a drive are not independent of each other
 UNLIKE_BLOCKS = 2.0
 DRIFTS = 4.0  # standard errors beyond which the slope of a bias counts
@@ -34,10 +34,11 @@ LEAST_TURN_RAD = 1.0  # sum of all turns below which a drive does not show a sca
 MIN_SAME_MOTION_CORRELATION = (
     0.7  # minimum correlation of two sources that measure the same motion
 )
-PLAUSIBLE_SCALES = (0.33, 5.0)  # of odometry's turns, relative to those of the gyro
+# range of odometry's turns, relative to those of the gyro
+PLAUSIBLE_SCALES = (0.33, 5.0)
 IN_DEGREES = (40.0, 80.0)  # ratio of a rate in degrees to one in radians
 LEAST_APART_RAD = 0.02  # a smaller disagreement in `WINDOW_S` is not worth a correction
-GYRO_SCALE_STD = 0.015  # of a typical gyro's scale, as a fraction
+GYRO_SCALE_STD = 0.015  # relative deviation of a typical gyro's scale
 CLEARLY = 3.0  # standard errors
 
 
@@ -45,7 +46,7 @@ CLEARLY = 3.0  # standard errors
 class Turning:
     """Comparison of a robot's turns by odometry and by gyro."""
 
-    bias: float  # of the gyro, at the middle of its rests or of the drive [rad/s]
+    bias: float  # bias of the gyro in the middle of its rests or of the drive [rad/s]
     bias_std: float  # [rad/s]
     bias_slope: float  # its change [rad/s^2]; 0 if none shows
     bias_time: float  # time to which `bias` belongs [s]
@@ -241,9 +242,10 @@ def _estimate_bias_while_driving(
     """Fits the bias together with a factor on odometry's turns; returns like `_estimate_bias`."""
     # A robot that turns at only one rate does not show both, so both have priors.
     chi = np.stack([np.ones_like(blocks.odom_rate), blocks.odom_rate], axis=1)
-    found, *_ = np.linalg.lstsq(chi, blocks.gyro_rate, rcond=None)
-    left = blocks.gyro_rate - chi @ found
-    noise = max(float(left @ left) / max(len(left) - 2, 1), LEAST_RATE_NOISE**2)
+    coefficients, *_ = np.linalg.lstsq(chi, blocks.gyro_rate, rcond=None)
+    residual = blocks.gyro_rate - chi @ coefficients
+    variance = float(residual @ residual) / max(len(residual) - 2, 1)
+    noise = max(variance, LEAST_RATE_NOISE**2)
     noise *= UNLIKE_BLOCKS**2
     usual = np.array([0.0, 1.0])
     deviation = np.array([USUAL_BIAS, USUAL_FACTOR])

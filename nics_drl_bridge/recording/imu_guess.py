@@ -8,7 +8,7 @@ from nics_drl_bridge.recording.imu_axis import AXES, UpAxis, find_up_axis
 from nics_drl_bridge.recording.names import split_words, word_set
 from nics_drl_bridge.recording.survey import Survey, TableSurvey, split_unit
 
-OF_MESSAGE = "angular_velocity.z"  # of sensor_msgs/Imu
+OF_MESSAGE = "angular_velocity.z"  # a field of sensor_msgs/Imu
 TURNING = (
     {"gyro", "z"},
     {"gz"},
@@ -20,15 +20,17 @@ TURNING = (
 TURNING_OF_IMU = (*TURNING, {"w"}, {"wz"}, {"omega"}, {"angular", "z"}, {"z", "rate"})
 NOT_MEASURED = word_set("cmd command commanded ref setpoint target desired covariance")
 NOT_OF_GYRO = word_set("odom odometry vicon mocap gt truth")
-USUAL_NAMES = ("/imu", "/imu/data")  # of topics; the first one found is chosen
+USUAL_NAMES = ("/imu", "/imu/data")  # topics; the first one in the bag is chosen
 FASTEST_RADPS = 20.0  # faster rates are in degrees per second
 
 
 def guess_yaw_rate(tables: Sequence[TableSurvey]) -> tuple[TableSurvey, Survey] | None:
     """Finds the yaw rate of a gyro; None if no column is named like one."""
-    found = [*_find_in_messages(tables)] or [*_find_in_columns(tables)]
-    usual = [each for each in found if each[0].name in USUAL_NAMES]
-    return next(iter(usual or found), None)
+    rates = [*_find_in_messages(tables)] or [*_find_in_columns(tables)]
+    for table, column in rates:
+        if table.name in USUAL_NAMES:
+            return table, column
+    return next(iter(rates), None)
 
 
 def write_imu_line(
@@ -82,10 +84,7 @@ def _find_in_columns(
             words = {*split_words(column.name)}
             around = words | {*split_words(table.name)}
             wanted = TURNING_OF_IMU if around & {"imu", "gyro"} else ()
-            named = any(each <= words for each in wanted)
-            if (
-                named
-                and column.low < column.high
-                and not around & (NOT_MEASURED | NOT_OF_GYRO)
-            ):
+            is_named = any(names <= words for names in wanted)
+            is_other = bool(around & (NOT_MEASURED | NOT_OF_GYRO))
+            if is_named and not is_other and column.low < column.high:
                 yield table, column

@@ -19,9 +19,9 @@ from nics_drl_bridge.recording.recording import STREAMS, Episode, Recording, Str
 LEARNT_SHARE = 2.0 / 3.0  # fraction of each recording
 # Time between two episodes, longer than any prediction and any search for a delay
 APART_S = 30.0
-LEAD_S = 2.0  # of commands before an episode, so that states can follow them
+LEAD_S = 2.0  # commands kept before an episode, so that states can follow them
 SETTLE_S = 5.0  # for which the first of these commands is held before them
-AFTER_S = 5.0  # of commands after an episode, for searches of a delay
+AFTER_S = 5.0  # commands kept after an episode, for searches of a delay
 SHORTEST_SPLIT_S = 6.0  # shorter recordings are learnt from as a whole
 
 
@@ -45,7 +45,9 @@ def join(recordings: Sequence[Recording], offsets: Sequence[float] = ()) -> Reco
     offsets = offsets or [0.0] * len(recordings)
     aligned = [_align_clocks(*pair) for pair in zip(recordings, offsets, strict=True)]
     _check_alike(aligned)
-    parts = [part for recording in aligned for part in _split_recording(recording)]
+    parts: list[_Part] = []
+    for recording in aligned:
+        parts += _split_recording(recording)
     learnt = [part for part in parts if part.is_learnt]
     held_out = [part for part in parts if not part.is_learnt]
     return _place_parts(aligned, learnt, held_out)
@@ -72,21 +74,22 @@ def _align_clocks(recording: Recording, offset: float) -> Recording:
     command = recording.command
     if pose.clock == command.clock:
         return recording
-    said = f"{recording.source}: the clock of its pose was aligned by {offset:.3f} s."
+    note = f"{recording.source}: the clock of its pose was aligned by {offset:.3f} s."
     pose = replace(pose, t=pose.t + offset, clock=command.clock)
-    return replace(recording, pose=pose, repairs=(*recording.repairs, said))
+    return replace(recording, pose=pose, repairs=(*recording.repairs, note))
 
 
 def _check_alike(recordings: Sequence[Recording]) -> None:
     """Refuses recordings of different robots (RecordingError)."""
     first = recordings[0]
-    for other in recordings[1:]:
-        shapes = [each.command.values.shape[1] for each in (first, other)]
-        if shapes[0] != shapes[1] or first.variables != other.variables:
-            fault = f"{other.source}: has {', '.join(other.variables) or f'{shapes[1]} commands'}"
-            mine = ", ".join(first.variables) or f"{shapes[0]} commands"
+    for recording in recordings[1:]:
+        counts = [drive.command.values.shape[1] for drive in (first, recording)]
+        if counts[0] != counts[1] or first.variables != recording.variables:
+            names = ", ".join(recording.variables) or f"{counts[1]} commands"
+            first_names = ", ".join(first.variables) or f"{counts[0]} commands"
+            fault = f"{recording.source}: has {names}, {first.source} has {first_names}"
             advice = "join only drives of one robot, by one mapping"
-            raise RecordingError(f"{fault}, {first.source} has {mine}; {advice}.")
+            raise RecordingError(f"{fault}; {advice}.")
 
 
 def _split_recording(recording: Recording) -> list[_Part]:
@@ -121,9 +124,9 @@ def _place_parts(
     recordings: Sequence[Recording], learnt: Sequence[_Part], held_out: Sequence[_Part]
 ) -> Recording:
     """Lays parts out on one time axis; each pose begins where the one before ended."""
-    shared = [
-        name for name in STREAMS if all(name in each.streams for each in recordings)
-    ]
+    shared = [*STREAMS]
+    for recording in recordings:
+        shared = [name for name in shared if name in recording.streams]
     streams: dict[str, list[Stream]] = {name: [] for name in shared}
     episodes = []
     start = 0.0
@@ -146,12 +149,14 @@ def _place_parts(
     return replace(
         recordings[0],
         **joined,
-        source=", ".join(dict.fromkeys(each.source for each in recordings)),
+        source=", ".join(dict.fromkeys(drive.source for drive in recordings)),
         repairs=(
             *_describe_join(sources, bool(held_out)),
             *_collect_repairs(recordings, shared),
         ),
-        robot=next((each.robot for each in recordings if each.robot is not None), None),
+        robot=next(
+            (drive.robot for drive in recordings if drive.robot is not None), None
+        ),
         episodes=tuple(episodes),
         learn_until_s=until,
     )
@@ -228,7 +233,7 @@ def _describe_join(sources: Sequence[str], is_split: bool) -> tuple[str, ...]:
         names = ", ".join(sources)
     else:
         names = f"{sources[0]} to {sources[-1]}"
-    split = "all were learnt from, as they are too short to hold a part out"
+    split = "all of them were fitted because they are too short to hold a part out"
     if is_split:
         split = "the last third of each was held out of the first fit"
     joined = f"{len(sources)} drives were joined ({names})"
@@ -238,9 +243,12 @@ def _describe_join(sources: Sequence[str], is_split: bool) -> tuple[str, ...]:
 def _collect_repairs(
     recordings: Sequence[Recording], shared: Sequence[str]
 ) -> tuple[str, ...]:
-    lost = {name for recording in recordings for name in recording.streams} - {*shared}
+    lost: set[str] = set()
+    for recording in recordings:
+        lost.update(recording.streams)
+    lost.difference_update(shared)
     repairs = [
-        f"{name} was left out, as not all of the recordings have it."
+        f"{name} was left out because not all recordings have it."
         for name in sorted(lost)
     ]
     for recording in recordings:

@@ -136,10 +136,12 @@ def _guess_pose_source(source: Source, mapping: Mapping) -> MeasuredBy:
     pose = mapping.pose
     values = (pose.x, pose.y, pose.heading)
     references = [value.from_ for value in values if value is not None]
-    tables = [pose.in_, *(str(each).partition(":")[0] for each in references)]
-    topics = [name for table in tables if table for name in (table, f"/{table}")]
-    kinds = [source.get_table(name).kind for name in topics if name in source.names]
-    kind = next(filter(None, kinds), "")
+    tables = [pose.in_, *(str(name).partition(":")[0] for name in references)]
+    kind = ""
+    for table in tables:
+        for name in (table, f"/{table}"):
+            if table and name in source.names:
+                kind = kind or source.get_table(name).kind
     names = [pose.in_, pose.clock, *pose.frames, *references]
     return guess_source_by_names(
         (str(name) for name in names if name is not None), kind
@@ -184,8 +186,8 @@ def _check_units(reader: MappedReader, pose: Stream) -> None:
     if time:
         column = str(time.columns[0])
     line = fault.line.replace("...", column)
-    said = f"{reader.source.place}: pose: {fault.reason}; {fault.cause}"
-    raise RecordingError(f"{said}: write `{line}` into the mapping, below `pose:`.")
+    problem = f"{reader.source.place}: pose: {fault.reason}; {fault.cause}"
+    raise RecordingError(f"{problem}: write `{line}` into the mapping, below `pose:`.")
 
 
 def _read_measured(reader: MappedReader, name: str, stream: Measured) -> Stream:
@@ -301,10 +303,10 @@ def _complete_pose(reader: MappedReader, pose: PoseSource) -> PoseSource:
             keys["heading"] = orientation
         if len(keys) < 3 or keys["x"] not in table.names:
             continue
-        given = pose.model_dump(by_alias=True, exclude_none=True)
-        if covariance is not None and "covariance" not in given:
+        mapped = pose.model_dump(by_alias=True, exclude_none=True)
+        if covariance is not None and "covariance" not in mapped:
             keys["covariance"] = covariance
-        return PoseSource.model_validate({**given, **keys})
+        return PoseSource.model_validate({**mapped, **keys})
     fault = f"{table.place}: its messages are no poses of a known form"
     advice = "name x, y and heading or quaternion in the mapping"
     raise RecordingError(f"{fault}; {advice}.")

@@ -114,9 +114,10 @@ Condition = float | str | bool | list[float | str]
 def _expand_reference(key: str) -> Any:
     """Lets a plain reference, or a list of them, stand for the model with only that key."""
 
-    def expand(given: Any) -> Any:
-        plain = isinstance(given, (str, int, list)) and not isinstance(given, bool)
-        return {key: given} if plain else given
+    def expand(value: Any) -> Any:
+        if isinstance(value, (str, int, list)) and not isinstance(value, bool):
+            return {key: value}
+        return value
 
     return BeforeValidator(expand)
 
@@ -126,7 +127,7 @@ def _check_kind(kinds: tuple[str, ...]) -> Any:
 
     def check(unit: str | None) -> str | None:
         if unit is not None and UNITS[check_unit(unit)].si not in kinds:
-            fitting = (name for name, each in UNITS.items() if each.si in kinds)
+            fitting = [name for name in UNITS if UNITS[name].si in kinds]
             raise ValueError(f"must be one of {', '.join(fitting)}")
         return unit
 
@@ -162,8 +163,9 @@ class Time(Schema):
     from_: Reference | tuple[Reference, Reference] | None = Field(
         default=None, alias="from"
     )
-    unit: Annotated[str | None, _check_kind(("s",))] = None  # of the stamps; None: s
-    rate: float | None = Field(default=None, gt=0.0)  # of rows without stamps [Hz]
+    # unit of the stamps; None: s
+    unit: Annotated[str | None, _check_kind(("s",))] = None
+    rate: float | None = Field(default=None, gt=0.0)  # rate of rows without stamps [Hz]
 
     @model_validator(mode="after")
     def _check_source(self) -> "Time":
@@ -186,7 +188,7 @@ class Value(Schema):
     maximum: float | None = None  # SI value of a full share
     scale: float = 1.0  # -1 reverses the sign
     offset: float = 0.0  # in SI
-    # of an encoder; turns ticks into angles
+    # encoder ticks per turn; with it, ticks become angles
     ticks_per_turn: float | None = Field(default=None, gt=0.0)
     differentiate: bool | None = None  # by default true for `ticks`, which are counters
     # value at which a counter overflows; by default found from the data
@@ -240,9 +242,9 @@ class PoseSource(Measured):
     heading: AValue | None = None  # direction of the body, counter-clockwise from x
     # instead of the heading: x, y, z, w, or the field of a message
     quaternion: str | tuple[Reference, Reference, Reference, Reference] | None = None
-    # of x and y and their variances; an angle if they are longitude and latitude
+    # unit of x and y and their variances; an angle if they are longitude and latitude
     unit: Annotated[str, _check_kind(("m", "rad"))] = "m"
-    # of the heading and its variance
+    # unit of the heading and its variance
     heading_unit: Annotated[str, _check_kind(("rad",))] = "rad"
     # variances of x, y, heading; or all of a 3 x 3 or 6 x 6 matrix, by rows; or a message's field
     covariance: str | list[Reference] | None = None
@@ -332,14 +334,10 @@ class Mapping(Schema):
 
     @model_validator(mode="before")
     @classmethod
-    def _require_commands(cls, given: Any) -> Any:
-        if (
-            isinstance(given, dict)
-            and "command" in given
-            and given["command"] in (None, {})
-        ):
+    def _require_commands(cls, data: Any) -> Any:
+        if isinstance(data, dict) and data.get("command", True) in (None, {}):
             raise ValueError(NO_COMMAND_NAMED)
-        return given
+        return data
 
     @model_validator(mode="after")
     def _check_commands(self) -> "Mapping":

@@ -39,7 +39,7 @@ class DamageError(ValueError):
 class Record(NamedTuple):
     """One record."""
 
-    offset: int  # of its opcode, from the start of the file or of the chunk
+    offset: int  # place of its opcode, from the start of the file or of the chunk
     end: int  # offset of the next record
     content: Any  # one of `mcap.records`, with views of the data for bytes; None if it is private
 
@@ -131,12 +131,11 @@ def write_checksums(path: Path) -> None:
             )
         elif isinstance(record.content, kinds.DataEnd):
             struct.pack_into("<I", data, content, crc32(data[: record.offset]))
-        elif isinstance(record.content, kinds.Footer) and (
-            start := record.content.summary_start
-        ):
-            struct.pack_into(
-                "<I", data, record.end - 4, crc32(data[start : record.end - 4])
-            )
+        elif isinstance(record.content, kinds.Footer):
+            start = record.content.summary_start
+            end = record.end - 4
+            if start:
+                struct.pack_into("<I", data, end, crc32(data[start:end]))
 
 
 def check_mcap(path: Path) -> None:

@@ -34,7 +34,7 @@ ACKERMANN_STAMPED_DEFINITION = (
     "std_msgs/Header header\nackermann_msgs/AckermannDrive drive\n"
 )
 LIBRARIES = ("rosbags", "mcap")
-POSITION_UNITS = ("rad", "m")  # of states that a JointState reports as positions
+POSITION_UNITS = ("rad", "m")  # units of states that a JointState reports as positions
 HEADER = "std_msgs/msg/Header"
 WHEELS = ("left_wheel", "right_wheel")
 
@@ -96,7 +96,8 @@ def collect_types(
         for name, fields in defined.items()
         if store.fielddefs.get(name) != fields
     }
-    if new.keys() & store.fielddefs.keys():  # of another release, or of ROS 1
+    # Known types may be those of another release, or of ROS 1.
+    if new.keys() & store.fielddefs.keys():
         new = {**store.fielddefs, **new}
         store = get_typestore(Stores.EMPTY)
         for name in store.fielddefs:
@@ -193,7 +194,7 @@ def read_imu(message: Any) -> Row:
 class Offer:
     """Quality of service that a publisher offers, as far as matching with subscribers needs it."""
 
-    depth: int = 10  # of its history
+    depth: int = 10  # depth of its history
     reliable: bool = True  # False for best effort
     # late subscribers get earlier messages; False for volatile
     transient_local: bool = False

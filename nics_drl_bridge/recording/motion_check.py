@@ -5,8 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.recording.command_guess import TICKS, Candidate, CommandGuess
-from nics_drl_bridge.recording.names import split_words
+from nics_drl_bridge.recording.command_guess import Candidate, CommandGuess
 
 STEP_S = 0.1
 SMOOTHED = 3  # steps over which measured rates are averaged
@@ -19,14 +18,14 @@ CLEAR_CORRELATION = 0.6  # minimum at which a latency is reported
 MIN_STEPS = 100  # steps
 
 
-def find_doubts(guess: CommandGuess, pose: tuple[Array, Array] | None) -> Iterator[str]:
+def find_doubts(guess: CommandGuess, stamps: Array, poses: Array) -> Iterator[str]:
     """Yields sentences on commands that the motion ignores, or follows much too early or late.
 
-    `pose` holds stamps (T,) [s] and poses (T, 3).
+    `stamps` are those (T,) of `poses` (T, 3) [s].
     """
-    if pose is None or guess.of_wheels:
+    if guess.of_wheels:
         return
-    motion = _compute_rates(*pose)
+    motion = _compute_rates(stamps, poses)
     if motion is None:
         return
     t, speed, turn_rate = motion
@@ -39,63 +38,18 @@ def find_doubts(guess: CommandGuess, pose: tuple[Array, Array] | None) -> Iterat
         likeness = _compute_likeness(command, t, signal, lags)
         if likeness is None:
             continue
+        name = f"{command.table.name}:{command.column.name}"
         best = int(np.argmax(likeness))
+        lag = lags[best]
         if likeness[best] < LEAST_CORRELATION:
-            said = f"{_name_candidate(command)} hardly goes with the motion"
-            yield f"{said}; is it what was sent to the robot?"
-        elif likeness[best] > CLEAR_CORRELATION and lags[best] > IMPLAUSIBLE_LATENCY_S:
-            late = f"the motion follows {_name_candidate(command)} after {lags[best]:.1f} s"
-            yield f"{late}, which no latency explains; check `time:` and the command"
-        elif likeness[best] > CLEAR_CORRELATION and lags[best] < PRECEDES_S:
-            early = (
-                f"the motion precedes {_name_candidate(command)} by {-lags[best]:.1f} s"
-            )
-            yield f"{early}, as a measurement's would; check `time:` and the command"
-
-
-def find_reversed_wheels(
-    guess: CommandGuess, pose: tuple[Array, Array] | None
-) -> list[Candidate]:
-    """Returns the measured wheel, left or right, that counts backwards according to the motion.
-
-    Both wheels turn the same way when the robot drives, and the right one turns faster when the
-    robot turns counter-clockwise.
-    """
-    sides = {wheel.meaning: wheel for wheel in guess.commands.values()}
-    if pose is None or not guess.of_wheels or sides.keys() != {"left", "right"}:
-        return []
-    motion = _compute_rates(*pose)
-    if motion is None:
-        return []
-    t, speed, turn_rate = motion
-    left, right = (_compute_wheel_rate(sides[side], t) for side in ("left", "right"))
-    if left is None or right is None:
-        return []
-    likeness = [float(np.corrcoef(rate, speed)[0, 1]) for rate in (left, right)]
-    if likeness[0] * likeness[1] > 0.0 or min(map(abs, likeness)) < LEAST_CORRELATION:
-        return []
-    turned_by_left = float(np.corrcoef(right + left, turn_rate)[0, 1])
-    if turned_by_left > 0.0:
-        return [sides["left"]]
-    return [sides["right"]]
-
-
-def _compute_wheel_rate(wheel: Candidate, t: Array) -> Array | None:
-    """Returns the rate (K,) of a wheel at times t (K,) [s]; None if it is unknown or constant."""
-    values = wheel.table.data[wheel.column.name].astype(np.float64)
-    if wheel.table.t is None or len(wheel.table.t) != len(values):
-        return None
-    rate = np.interp(t, wheel.table.t, values)
-    if not TICKS.isdisjoint(split_words(wheel.column.name)):
-        rate = np.gradient(rate, STEP_S)
-    rate = np.convolve(rate, np.ones(SMOOTHED) / SMOOTHED, "same")
-    if rate.std() <= 1e-9:
-        return None
-    return np.asarray(rate)
-
-
-def _name_candidate(candidate: Candidate) -> str:
-    return f"{candidate.table.name}:{candidate.column.name}"
+            problem = f"the motion hardly follows {name}"
+            yield f"{problem}; check that it was sent to the robot"
+        elif likeness[best] > CLEAR_CORRELATION and lag > IMPLAUSIBLE_LATENCY_S:
+            problem = f"the motion follows {name} after {lag:.1f} s"
+            yield f"{problem}, which no latency explains; check `time:` and the command"
+        elif likeness[best] > CLEAR_CORRELATION and lag < PRECEDES_S:
+            problem = f"the motion precedes {name} by {-lag:.1f} s"
+            yield f"{problem}, like a measurement; check `time:` and the command"
 
 
 def _compute_rates(t: Array, pose: Array) -> tuple[Array, Array, Array] | None:
@@ -107,18 +61,19 @@ def _compute_rates(t: Array, pose: Array) -> tuple[Array, Array, Array] | None:
     if len(grid) < MIN_STEPS or len(grid) > 10 * len(t) + MIN_STEPS:
         return None
     heading = np.unwrap(pose[:, 2])
-    x, y, turned = (np.interp(grid, t, column) for column in (*pose[:, :2].T, heading))
     mean = np.ones(SMOOTHED) / SMOOTHED
-    dx, dy, turn = (
-        np.convolve(np.diff(each) / STEP_S, mean, "same") for each in (x, y, turned)
-    )
-    middle = (turned[1:] + turned[:-1]) / 2.0
-    speed = dx * np.cos(middle) + dy * np.sin(middle)
-    sideways = -dx * np.sin(middle) + dy * np.cos(middle)
+    rates = []
+    for column in (pose[:, 0], pose[:, 1], heading):
+        steps = np.diff(np.interp(grid, t, column))
+        rates.append(np.convolve(steps / STEP_S, mean, "same"))
+    vx, vy, turn_rate = rates
+    middle = np.interp(grid[:-1] + STEP_S / 2.0, t, heading)
+    speed = vx * np.cos(middle) + vy * np.sin(middle)
+    sideways = -vx * np.sin(middle) + vy * np.cos(middle)
     # A tracked body may be mounted across the robot.
     if np.abs(sideways).sum() > np.abs(speed).sum():
         speed = sideways
-    return grid[:-1] + STEP_S / 2.0, speed, turn
+    return grid[:-1] + STEP_S / 2.0, speed, turn_rate
 
 
 def _compute_likeness(
@@ -134,17 +89,17 @@ def _compute_likeness(
     stamps = table.t[order]
     values = np.nan_to_num(values[order])
     if stamps[0] > t[-1] or stamps[-1] < t[0]:
-        return None  # of another clock
+        return None  # they are on another clock
     likeness = []
     for lag in lags:
         row = np.searchsorted(stamps, t - lag, side="right") - 1
         known = row >= 0
         command = values[np.clip(row, 0, None)]
-        if (
-            known.sum() < MIN_STEPS
-            or command[known].std() < 1e-9
-            or signal[known].std() < 1e-9
-        ):
+        if known.sum() < MIN_STEPS:
             return None
-        likeness.append(abs(float(np.corrcoef(command[known], signal[known])[0, 1])))
+        sent = command[known]
+        measured = signal[known]
+        if sent.std() < 1e-9 or measured.std() < 1e-9:
+            return None
+        likeness.append(abs(float(np.corrcoef(sent, measured)[0, 1])))
     return np.array(likeness)

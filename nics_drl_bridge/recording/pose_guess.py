@@ -7,11 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.recording import recording as recordings
 from nics_drl_bridge.recording.mapping import UNITS
 from nics_drl_bridge.recording.names import split_words, word_set
-from nics_drl_bridge.recording.recording import measure_alignment
 from nics_drl_bridge.recording.survey import TableSurvey, split_unit
 
 # Words of the first coordinate, with the matching word of the second
@@ -59,12 +56,7 @@ OTHER_PLACES = re.compile(
     r"^(visualization|actionlib|action|move_base|map)_msgs/"
     r"|/(Path|OccupancyGrid|MapMetaData|PoseArray|GridCells|Imu|Joy|LaserScan|MagneticField)$"
 )
-UNIT_LENGTH = 0.01  # maximum difference of a quaternion's length from 1
-ALONG = 0.9  # minimum alignment of the path of columns without names with their heading
-CONFIRMED = 0.7  # minimum alignment of a path with the quaternion that follows it
 NEARLY_A_TURN = 5.5  # minimum change between two rows where an angle wraps [rad]
-PIECES = 30  # number of steps over the extent of a path
-MOST_COMPARED = 200  # approximate number of poses
 ELEMENT = re.compile(r"\[\d+\]")
 
 
@@ -94,12 +86,12 @@ def list_used_columns(table: TableSurvey, pose: PoseGuess | None) -> set[str]:
 
 
 def guess_pose(tables: Sequence[TableSurvey]) -> PoseGuess | None:
-    """Finds x, y and heading or quaternion by their names, or by the motion."""
-    if len(tables) > 1:  # then the names of tables show what they hold
-        tables = [each for each in tables if OTHERS.isdisjoint(split_words(each.name))]
-    poses = [pose for table in tables for pose in _find_named_poses(table)]
-    if not poses:
-        poses = [pose for table in tables for pose in _find_unnamed_poses(table)]
+    """Finds x, y and heading or quaternion by their names."""
+    poses: list[PoseGuess] = []
+    for table in tables:
+        # The names of several tables show what they hold.
+        if len(tables) == 1 or OTHERS.isdisjoint(split_words(table.name)):
+            poses.extend(_find_named_poses(table))
     return max(poses, key=_rank_pose, default=None)
 
 
@@ -139,10 +131,12 @@ def _find_named_poses(table: TableSurvey) -> Iterator[PoseGuess]:
             if y is None or not {x, y} & moving or not _is_in(x, kinds):
                 continue
             orientation = _find_orientation(words, names)
-            if orientation:
-                yield PoseGuess(table, x, y, **orientation)
-            elif heading := _find_heading_called_z(table, words, names):
-                yield PoseGuess(table, x, y, heading)
+            if not orientation:
+                heading = _find_heading_called_z(table, words, names)
+                if heading is None:
+                    continue
+                orientation = {"heading": heading}
+            yield PoseGuess(table, x, y, **orientation)
 
 
 def _name_by_words(table: TableSurvey) -> dict[tuple[str, ...], str]:
@@ -187,105 +181,15 @@ def _find_orientation(
 def _find_heading_called_z(
     table: TableSurvey, place: tuple[str, ...], names: dict[tuple[str, ...], str]
 ) -> str | None:
-    """Returns the column z next to x and y if the path shows that it is a heading, not a height."""
+    """Returns the column z next to x and y if it wraps as only an angle does, not a height."""
     if place[-1] != "x" or "position" in place:
         return None
     z = names.get((*place[:-1], "z"))
     if z is None or not _is_in(z, ["rad"]):
         return None
-    height = next(column for column in table.columns if column.name == z)
-    is_angle = -3.3 < height.low < height.high < 6.4
-    if not is_angle or height.high - height.low <= 0.5:
-        return None
-    x = names[place]
-    y = names[(*place[:-1], "y")]
-    pose = _stack_finite([table.data[name].astype(np.float64) for name in (x, y, z)])
-    if pose is None:
-        return None
-    if (np.abs(np.diff(pose[:, 2])) > NEARLY_A_TURN).any():
-        return z  # it wraps, as only an angle does
-    pose = select_apart(pose)
-    alignment = max(measure_alignment(pose, 1.0), measure_alignment(pose, -1.0))
-    if len(pose) > 2 and alignment > CONFIRMED:
+    values = table.data[z].astype(np.float64)
+    values = values[np.isfinite(values)]
+    is_angle = np.all((values > -3.3) & (values < 6.4))
+    if is_angle and (np.abs(np.diff(values)) > NEARLY_A_TURN).any():
         return z
     return None
-
-
-def _stack_finite(columns: Sequence[Array]) -> Array | None:
-    """Returns the rows of columns without NaN; None for columns of several streams."""
-    if len({len(column) for column in columns}) > 1:
-        return None
-    rows = np.stack(columns, axis=1)
-    return np.asarray(rows[np.isfinite(rows).all(axis=1)])
-
-
-def select_apart(pose: Array) -> Array:
-    """Returns poses of (T, 3) that are at least 1 / `PIECES` of the path's extent apart."""
-    distance = np.ptp(pose[:, :2], axis=0).max() / PIECES
-    kept = [0]
-    for k in range(1, len(pose)):
-        if np.hypot(*(pose[k, :2] - pose[kept[-1], :2])) > distance:
-            kept.append(k)
-    return np.asarray(pose[kept])
-
-
-def _find_unnamed_poses(table: TableSurvey) -> Iterator[PoseGuess]:
-    """Yields poses that the motion shows: x, y before a quaternion, or adjacent x, y, heading."""
-    if table.kind:
-        return  # the fields of messages have names
-    names = [c.name for c in table.numbers if c.name not in table.stamp_columns]
-    columns = [table.data[name].astype(np.float64) for name in names]
-    for k in range(2, len(names) - 3):
-        pose = _match_quaternion(table, names, columns, k)
-        if pose is not None:
-            yield pose
-    for k in range(len(names) - 2):
-        if not all(name.isdecimal() for name in names[k : k + 3]):
-            continue
-        values = _stack_finite(columns[k : k + 3])
-        if values is None or not len(values) or not np.ptp(values, axis=0).all():
-            continue
-        values = values[:: max(1, len(values) // MOST_COMPARED)]
-        in_radians = measure_alignment(values, 1.0)
-        in_degrees = measure_alignment(values, np.pi / 180.0)
-        if max(in_radians, in_degrees) > ALONG > measure_alignment(values, 0.0):
-            x, y, heading = names[k : k + 3]
-            yield PoseGuess(table, x, y, heading)
-
-
-def _match_quaternion(
-    table: TableSurvey, names: Sequence[str], columns: Sequence[Array], k: int
-) -> PoseGuess | None:
-    """Returns the pose whose quaternion is in four columns from `k` on; None if it is not one."""
-    turn = list(names[k : k + 4])
-    if not all(name.isdecimal() or {*split_words(name)} & TURNS for name in turn):
-        return None
-    parts = list(columns[k : k + 4])
-    if len({len(part) for part in parts}) > 1 or not any(map(np.ptp, parts)):
-        return None
-    length = np.linalg.norm(parts, axis=0)
-    if not np.nanmax(np.abs(length - 1.0)) < UNIT_LENGTH:
-        return None
-    if recordings.is_w_first(np.stack(parts, axis=1)):
-        turn = [*turn[1:], turn[0]]
-        parts = [*parts[1:], parts[0]]
-    place = [
-        name
-        for axis in ("x", "y")
-        for name in names
-        if split_unit(name)[0] == [axis] and name not in turn
-    ]
-    if len(place) != 2:
-        place = list(names[max(k - 3, 0) :][:2])
-    if {*split_words(" ".join(place))} & NOT_PLACES or {*place} & {*turn}:
-        return None
-    heading = 2.0 * np.arctan2(parts[2], parts[3])
-    x, y = place
-    path = [columns[names.index(name)] for name in (x, y)]
-    pose = _stack_finite([*path, heading])
-    if pose is None:
-        return None
-    pose = pose[:: max(1, len(pose) // MOST_COMPARED)]
-    if len(pose) < 3 or measure_alignment(pose, 1.0) < CONFIRMED:
-        return None
-    return PoseGuess(table, x, y, quaternion=tuple(turn))

@@ -67,10 +67,8 @@ def _load_folder(path: Path, *_: object) -> Recording:
         with open_source(path) as source:
             return replace(read_mapped(source, mapping), variables=())
     except RecordingError as error:
-        fault = str(error).removesuffix(".")
-        raise RecordingError(
-            f"{fault}; the mapping is {file}, --map gives another."
-        ) from None
+        advice = f"The mapping is {file}; choose another with --map."
+        raise RecordingError(f"{error} {advice}") from None
 
 
 FORMATS = (
@@ -103,7 +101,8 @@ def read_recording(
     topics = topics or TopicRoles()
     if mapping is not None and not is_recording(path):
         return _read_by_mapping(path, spec, topics, mapping)
-    file_format = next((known for known in FORMATS if known.recognises(path)), None)
+    recognised = [form for form in FORMATS if form.recognises(path)]
+    file_format = next(iter(recognised), None)
     if topics != TopicRoles() and not (file_format and file_format.has_topics):
         advice = "leave out --topics and --topic, which are for bags only"
         raise RecordingError(f"{path}: is no bag; {advice}.")
@@ -111,7 +110,7 @@ def read_recording(
         return file_format.read(path, spec, topics)
     if not path.exists():
         raise RecordingError(f"{path}: no such file or folder; check the path.")
-    names = " nor ".join(each.name for each in FORMATS)
+    names = " nor ".join(form.name for form in FORMATS)
     begin = f"`nics inspect {path.name} --map my.yaml` begins one"
     fault = f"{path}: is neither {names}"
     raise RecordingError(f"{fault}; say what is what in it with --map; {begin}.")
@@ -195,11 +194,11 @@ def read_robot_and_drive(
         _check_units(mapping, spec)
         return spec, reorder_variables(drive, spec)
     if not is_recording(path):
-        own: str | dict[str, Any] | None = robot
+        definition: str | dict[str, Any] | None = robot
         # It may be a folder that is read by its shipped mapping.
         if not robot and _holds(path, FILES) and not is_bag(path):
-            own = load_mapping(find_config(FOLDER, "recordings")).robot
-        spec = build_robot(own or DEFAULT_ROBOT)
+            definition = load_mapping(find_config(FOLDER, "recordings")).robot
+        spec = build_robot(definition or DEFAULT_ROBOT)
         return spec, read_recording(path, spec, topics)
     drive = read_recording(path, None, topics)
     spec = _build_with_ranges(
@@ -215,32 +214,33 @@ def read_robot_and_drives(
     mapping: Mapping | str | Path | None,
 ) -> tuple[RobotSpec, list[Recording]]:
     """Reads drives of one robot, whose ranges cover all of them."""
-    read = [read_robot_and_drive(path, robot, topics, mapping) for path in paths]
-    first, *others = [spec for spec, _ in read]
-    for path, spec in zip(paths[1:], others, strict=True):
-        if (
-            spec.variable_names != first.variable_names
-            or spec.textbook != first.textbook
-        ):
+    specs = []
+    drives = []
+    for path in paths:
+        spec, drive = read_robot_and_drive(path, robot, topics, mapping)
+        specs.append(spec)
+        drives.append(drive)
+    first = specs[0]
+    for path, spec in zip(paths, specs, strict=True):
+        has_variables = spec.variable_names == first.variable_names
+        if not has_variables or spec.textbook != first.textbook:
             fault = f"{path}: is a drive of {spec.name!r}, {paths[0]} of {first.name!r}"
             raise RecordingError(f"{fault}; fit only drives of one robot together.")
-    if others:
-        ranges = {
-            stream: tuple(
-                _merge_ranges([getattr(spec, stream)[k] for spec, _ in read])
-                for k in range(len(getattr(first, stream)))
-            )
-            for stream in ("command", "state")
-        }
-        first = first.model_copy(update=ranges)
-    return first, [check(drive, first) for _, drive in read]
+    if len(specs) > 1:
+        commands = _merge_ranges([spec.command for spec in specs])
+        states = _merge_ranges([spec.state for spec in specs])
+        first = first.model_copy(update={"command": commands, "state": states})
+    return first, [check(drive, first) for drive in drives]
 
 
-def _merge_ranges(variables: Sequence[Any]) -> Any:
-    """Returns a variable whose range covers all of these."""
-    low = min(each.min for each in variables)
-    high = max(each.max for each in variables)
-    return variables[0].model_copy(update={"min": low, "max": high})
+def _merge_ranges(drives: Sequence[Sequence[Any]]) -> tuple[Any, ...]:
+    """Returns variables whose ranges cover those of all drives."""
+    merged = []
+    for variables in zip(*drives, strict=True):
+        low = min(variable.min for variable in variables)
+        high = max(variable.max for variable in variables)
+        merged.append(variables[0].model_copy(update={"min": low, "max": high}))
+    return tuple(merged)
 
 
 def build_mapped_robot(
@@ -279,18 +279,18 @@ def reorder_variables(recording: Recording, spec: RobotSpec) -> Recording:
         "state": (slice(-count), spec.state),
     }
     for part, (place, variables) in parts.items():
-        known = recording.variables[place]
-        names = [v.name for v in variables]
+        recorded = recording.variables[place]
+        names = [variable.name for variable in variables]
         stream = recording.streams.get(part)
         if stream is None:
             continue
-        if set(known) != set(names):
-            fault = f"{recording.source}: the {part} is {', '.join(known)}"
-            other = f"that of the robot {spec.name!r} {', '.join(names)}"
+        if set(recorded) != set(names):
+            fault = f"{recording.source}: the {part} is {', '.join(recorded)}"
+            needed = f"that of the robot {spec.name!r} is {', '.join(names)}"
             raise ConfigError(
-                f"{fault}, {other}; use the robot's names in the mapping."
+                f"{fault}, {needed}; use the robot's names in the mapping."
             )
-        order = [known.index(name) for name in names]
+        order = [recorded.index(name) for name in names]
         made[part] = replace(stream, values=stream.values[:, order])
     return check(replace(recording, **made, variables=spec.variable_names), spec)
 

@@ -129,7 +129,7 @@ class Recording:
     variables: tuple[str, ...] = ()
     # the robot's definition as in its YAML file, if a mapping gives it
     robot: dict[str, Any] | None = None
-    # of scan and odometry, if known
+    # measured latency of scan and odometry, if known
     latency: Latency = field(default_factory=Latency)
     # a sentence on each repair made while reading, such as of clocks
     repairs: tuple[str, ...] = ()
@@ -146,8 +146,8 @@ class Recording:
 
         A gap between two episodes is split in the middle.
         """
-        ends = np.array([each.end_s for each in self.episodes[:-1]])
-        starts = np.array([each.start_s for each in self.episodes[1:]])
+        ends = np.array([episode.end_s for episode in self.episodes[:-1]])
+        starts = np.array([episode.start_s for episode in self.episodes[1:]])
         return np.asarray(np.searchsorted((ends + starts) / 2.0, t))
 
     def without_gaps(self, t: Array) -> Array:
@@ -293,7 +293,7 @@ def save_recording(recording: Recording, path: str | Path) -> None:
     if recording.robot is not None:
         meta["robot"] = recording.robot
     if recording.episodes:
-        meta["episodes"] = [asdict(each) for each in recording.episodes]
+        meta["episodes"] = [asdict(episode) for episode in recording.episodes]
         meta["learn_until_s"] = recording.learn_until_s
     if recording.latency.measured:
         meta["latency"] = recording.latency.model_dump(mode="json")
@@ -329,15 +329,15 @@ def load_recording(path: str | Path) -> Recording:
             robot=meta.get("robot"),
             latency=Latency.model_validate(meta.get("latency", {})),
             measured_by=measured_by,
-            episodes=tuple(Episode(**each) for each in meta.get("episodes", ())),
+            episodes=tuple(Episode(**fields) for fields in meta.get("episodes", ())),
             learn_until_s=meta.get("learn_until_s"),
         )
     except FileNotFoundError:
         raise RecordingError(f"{path}: no such file; check the path.") from None
     except (AttributeError, KeyError, RecursionError, TypeError) as error:
         advice = "say what is what in it with --map, or write it with save_recording"
-        said = f"{path}: is not a recording of this package ({error}); {advice}."
-        raise RecordingError(said) from None
+        fault = f"is not a recording of this package ({error})"
+        raise RecordingError(f"{path}: {fault}; {advice}.") from None
     except (ValueError, OSError) as error:
         why = f"can't be read as .npz ({error}); it may be damaged"
         raise RecordingError(f"{path}: {why}.") from None
@@ -434,7 +434,9 @@ def _find_radians(pose: Array) -> Implausible | None:
 
 def _is_only_along(pose: Array, scale: float) -> bool:
     """True if the path of poses (T, 3) follows headings x scale, but not the unscaled ones."""
-    scaled, unscaled, fixed = (measure_alignment(pose, k) for k in (scale, 1.0, 0.0))
+    scaled = _measure_alignment(pose, scale)
+    unscaled = _measure_alignment(pose, 1.0)
+    fixed = _measure_alignment(pose, 0.0)
     return scaled > max(ALONG, unscaled + LESS_ALONG, fixed + ALONG_BY_CHANCE)
 
 
@@ -459,23 +461,21 @@ class HeadingKeys(StrEnum):
     COMPASS = f"scale: -1, offset: {np.pi / 2.0:.5g}"  # clockwise from north
 
 
-def find_clockwise_keys(
-    pose: Array, minimum: float = MIN_MIRRORED, margin: float = BETTER
-) -> HeadingKeys:
+def find_clockwise_keys(pose: Array) -> HeadingKeys:
     """Returns the mapping's keys that mirror the heading of poses (T, 3), spaced on their path.
 
-    None are needed unless the path is aligned with the mirrored headings by at least `minimum`, and
-    by `margin` more than with the recorded ones.
+    None are needed unless the path is aligned with the mirrored headings by at least
+    `MIN_MIRRORED`, and by `BETTER` more than with the recorded ones.
     """
     if not has_visible_axes(pose):
         return HeadingKeys.NONE
     mirrored = _compute_course(pose, -1.0)
-    if abs(mirrored) < max(minimum, margin + measure_alignment(pose, 1.0)):
+    if abs(mirrored) < max(MIN_MIRRORED, BETTER + _measure_alignment(pose, 1.0)):
         return HeadingKeys.NONE
     return HeadingKeys.MIRRORED if mirrored.real > 0.0 else HeadingKeys.COMPASS
 
 
-def measure_alignment(pose: Array, scale: float) -> float:
+def _measure_alignment(pose: Array, scale: float) -> float:
     """Returns the alignment, 0 to 1, of the path of poses (T, 3) with headings x scale, or back."""
     return abs(_compute_course(pose, scale))
 

@@ -55,17 +55,19 @@ ONE_WAY = 0.95
 BACK = 0.2
 WITHIN = 25.0
 TREMBLING = 4.0  # range of the ticks of a wheel that stands still
-BITS = (8, 16, 24, 31, 32)  # of registers that overflow
+BITS = (8, 16, 24, 31, 32)  # sizes of registers that overflow
 STAMP_BITS = (16, 24, 31, 32)
 # Late rows come in runs of at most this length, late by at most this time.
 LATE_ROWS = 50
 LATE_S = 1.0
-MIN_BACKWARD_FRACTION = (
-    0.9  # minimum fraction of backward steps in rows that begin with the last
-)
+# minimum fraction of backward steps in rows that begin with the last
+MIN_BACKWARD_FRACTION = 0.9
 MOST_STRAY = 0.01  # maximum fraction of stamps that fit neither neighbour
-MAX_CLOCK_PAUSE_S = 86_400.0  # of a drive; after a longer one, the clock was set
+MAX_CLOCK_PAUSE_S = 86_400.0  # after a longer pause of a drive, the clock was set
 USUAL = 10.0  # maximum step across an overflow, in usual steps
+USE_RECEIPT = (
+    "write `stamps: receive` into the topics file (`time: arrival` into a map)"
+)
 
 
 @dataclass(frozen=True)
@@ -152,13 +154,16 @@ def _assign_clocks(
         late = np.percentile(delay, 100.0 - STALLED)
         wander = max(late - median, median - minimum) * S_PER_NS
         if wander > MAX_WANDER_S or (maximum - median) * S_PER_NS > MAX_STALL_S:
-            raise RecordingError(
-                f"{place}: topic {topic!r}: its header stamps lie {minimum * S_PER_NS:.3f} to "
-                f"{maximum * S_PER_NS:.3f} s before their receipt, so they are of several clocks "
-                "or of a simulated time at another rate; write `stamps: receive` into the topics "
-                "file (`time: arrival` into a map), or for a simulation `stamps: header` (`time: "
-                "header`), and record it with `ros2 bag record --use-sim-time`."
+            delays = f"{minimum * S_PER_NS:.3f} to {maximum * S_PER_NS:.3f} s"
+            fault = (
+                f"its header stamps lie {delays} before their receipt, so they are of several "
+                "clocks or of a simulated time at another rate"
             )
+            advice = (
+                f"{USE_RECEIPT}, or for a simulation `stamps: header` (`time: header`), and record "
+                "it with `ros2 bag record --use-sim-time`"
+            )
+            raise _make_error(place, topic, fault, advice)
         if SAME_CLOCK_S[0] <= median * S_PER_NS <= SAME_CLOCK_S[1]:
             continue
         clock = HEADER
@@ -174,20 +179,21 @@ def _assign_clocks(
 
 def _check_header(part: TopicData, stamps: Stamps, place: str) -> Nanoseconds | None:
     ns = part.header_ns
-    topic = f"{place}: topic {part.topic!r}"
     if ns is None or not ns.any():
         if stamps == "header":
             fault = "its messages have no header stamps"
             advice = "write `stamps: auto` into the topics file, or no `time: header` into a map"
-            raise RecordingError(f"{topic}: {fault}; {advice}.")
+            raise _make_error(place, part.topic, fault, advice)
         return None
     if not ns.all():
         fault = f"{(ns == 0).sum()} of {len(ns)} headers have no stamp"
-        advice = (
-            "write `stamps: receive` into the topics file (`time: arrival` into a map)"
-        )
-        raise RecordingError(f"{topic}: {fault}; {advice}.")
+        raise _make_error(place, part.topic, fault, USE_RECEIPT)
     return ns
+
+
+def _make_error(place: str, topic: str, fault: str, advice: str) -> RecordingError:
+    reason = f"topic {topic!r}: {fault}"
+    return RecordingError(f"{place}: {reason}; {advice}.", reason)
 
 
 def _sort_by_stamp(part: TopicData, place: str) -> TopicData:
@@ -205,11 +211,8 @@ def _sort_by_stamp(part: TopicData, place: str) -> TopicData:
     if np.mean(late > 0) > MAX_LATE or late.max() * S_PER_NS > MAX_WANDER_S:
         k = int(np.argmax(late > 0))
         fault = f"the header stamps run backwards at message {k}, by {late[k] * S_PER_NS:.3f} s"
-        advice = (
-            "write `stamps: receive` into the topics file (`time: arrival` into a map)"
-        )
-        advice += ", or cut the bag there"
-        raise RecordingError(f"{place}: topic {part.topic!r}: {fault}; {advice}.")
+        advice = f"{USE_RECEIPT}, or cut the bag there"
+        raise _make_error(place, part.topic, fault, advice)
     return part.rows(np.argsort(ns, kind="stable"))
 
 
@@ -237,7 +240,10 @@ def find_overflow(
         return None
     usual = float(np.percentile(np.abs(step), 95))
     span = float(np.ptp(values))
-    for size in sorted(2.0**b * s for b in bits for s in scale):
+    sizes: list[float] = []
+    for unit in scale:
+        sizes += [2.0**bit * unit for bit in bits]
+    for size in sorted(sizes):
         jump = np.abs(step) > size / 2.0
         if (
             max(span, np.abs(values).max()) > size
@@ -319,8 +325,9 @@ def repair_order(t: Array, name: str) -> tuple[Array, NDArray[np.intp], str]:
     if len(t) > 1 and np.mean(np.diff(t) < 0.0) > MIN_BACKWARD_FRACTION:
         t = t[::-1]
         rows = rows[::-1]
-        notes.append(f"{name}: its rows began with the last, and were turned round.")
-    if (stray := _find_stray(t)).any():
+        notes.append(f"{name}: its rows began with the last, and were reversed.")
+    stray = _find_stray(t)
+    if stray.any():
         where = f"(row {rows[stray][0]}: {t[stray][0]:.10g} s)"
         notes.append(
             f"{name}: {stray.sum()} stamps fit none beside them {where}; left out."

@@ -22,7 +22,7 @@ from nics_drl_bridge.recording.table import Column, Source, Table, is_text
 from nics_drl_bridge.recording.values import parse_dates
 
 GAP = 5.0  # a gap is longer than this many usual steps
-MOST_COLUMNS = 200  # of a table
+MOST_COLUMNS = 200  # maximum number of columns of a table that are surveyed
 # Stamps that would be closer are not in the unit that their name states.
 SHORTEST_STEP_S = 1e-4
 LEAST_SCORE = 0.25  # minimum score of a column of stamps
@@ -137,7 +137,7 @@ class TableSurvey:
     rows: int
     columns: list[Survey]
     stamps: str | None = None  # column of the stamps; None if they come with the rows
-    unit: str | None = None  # of these, unless seconds
+    unit: str | None = None  # unit of the stamps, unless seconds
     findings: list[str] = field(default_factory=list)
     t: Array | None = None  # (T,) [s]
     data: dict[str, Column] = field(default_factory=dict)
@@ -288,7 +288,8 @@ def _guess_stamps(data: dict[str, Column]) -> tuple[str | None, Array | None]:
             stamps = stamping.join_stamps(data[seconds], data[fraction])
             return f"[{seconds}, {fraction}]", stamps
     for name, column in data.items():
-        if name not in values and (dates := parse_dates(column)) is not None:
+        dates = None if name in values else parse_dates(column)
+        if dates is not None:
             values[name] = dates
     scores = {name: _score_stamps(name, column) for name, column in values.items()}
     best = max(scores, key=lambda name: scores[name], default=None)

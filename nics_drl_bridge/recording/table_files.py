@@ -23,7 +23,7 @@ from nics_drl_bridge.recording.table import (
 )
 
 TEXTS = (".csv", ".tsv", ".txt", ".dat", ".tum", ".log", ".data", ".asc")
-MOST_FILES = 500  # of a folder
+MOST_FILES = 500  # maximum number of files that are read from a folder
 SEPARATORS = (",", ";", "\t", "|", None)  # None: any white space
 NO_SEPARATOR = re.compile(r"[\w\s.,;|+\"'#-]")
 MAX_TABLE_BYTES = 256 * 2**20
@@ -62,8 +62,10 @@ def read_text_table(path: Path) -> Table:
     may_be_tum = separator is None or path.suffix == TUM_SUFFIX
     if head is None and may_be_tum and _is_tum(columns):
         head = list(TUM)
-    if head is None and (labelled := _split_labels(columns)):
-        columns, head = labelled
+    if head is None:
+        labelled = _split_labels(columns)
+        if labelled:
+            columns, head = labelled
     columns = [_replace_commas(column) for column in columns]
     names = tuple([*(head or ()), *[""] * len(columns)][: len(columns)])
     data = [_convert_column(column) for column in columns]
@@ -141,7 +143,9 @@ def _find_separator(lines: Sequence[str]) -> str | None:
     """Returns the separator that leaves the most numbers and the fewest other fields."""
 
     def score(separator: str | None) -> int:
-        fields = [field for line in lines for field in _split(line, separator) if field]
+        fields: list[str] = []
+        for line in lines:
+            fields += filter(None, _split(line, separator))
         return 2 * sum(map(_is_value, fields)) - len(fields)
 
     best = max(SEPARATORS, key=score)

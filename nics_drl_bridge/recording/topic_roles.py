@@ -3,6 +3,7 @@
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Literal
 
@@ -101,7 +102,7 @@ def load_topic_roles(
     roles = TopicRoles()
     if file:
         roles = load_yaml(file, TopicRoles)
-    given: dict[str, str] = {}
+    topics: dict[str, str] = {}
     for option in options:
         role, equals, topic = (part.strip() for part in option.partition("="))
         if not equals or not topic:
@@ -112,13 +113,13 @@ def load_topic_roles(
             raise ConfigError(
                 f"--topic {option!r}: unknown role {role!r}; {suggest(role, ROLES)}"
             )
-        if role in given:
+        if role in topics:
             raise ConfigError(
                 f"--topic {option!r}: {role} was given before; give it once."
             )
-        given[role] = topic
+        topics[role] = topic
     return validate(
-        {**roles.model_dump(exclude_none=True), **given}, TopicRoles, "topics"
+        {**roles.model_dump(exclude_none=True), **topics}, TopicRoles, "topics"
     )
 
 
@@ -144,7 +145,7 @@ def assign(
 class _Topics:
     types: Mapping[str, str]  # by name
     empty: Collection[str]
-    place: str  # of the bag, for errors
+    place: str  # name of the bag, for errors
 
     def choose(self, role: str, wanted: str | None) -> str | None:
         """Returns the topic of a role: the wanted one, or the only one with the usual name."""
@@ -198,7 +199,7 @@ class _Topics:
 
     def describe_missing(self, roles: Sequence[str], words: str) -> str:
         """Returns that no topic has any of the roles, and the fix."""
-        kinds = dict.fromkeys(kind for role in roles for kind in TYPES[role])
+        kinds = dict.fromkeys(chain.from_iterable(TYPES[role] for role in roles))
         advice = f"record one of type {', '.join(kinds)}"
         if roles == ("cmd_vel",):
             advice += (
@@ -206,15 +207,15 @@ class _Topics:
             )
         advice += ", or, if another topic holds them, name it with --map, which "
         advice += "`nics inspect BAG --map my.yaml` begins"
-        fitting = [
-            f"{role}={topic}" for role in roles for topic in self._find_fitting(role)
-        ]
-        if fitting:
-            advice = f"say which does, as in --topic {fitting[0]}"
+        for role in roles:
+            fitting = self._find_fitting(role)
+            if fitting:
+                advice = f"choose one with --topic, for example {role}={fitting[0]}"
+                break
         return f"no topic is known to hold the {words}; {advice}; {self._list_topics(roles)}"
 
     def _find_fitting(self, *roles: str) -> list[str]:
-        kinds = {kind for role in roles for kind in TYPES[role]}
+        kinds = set(chain.from_iterable(TYPES[role] for role in roles))
         return sorted(
             t for t, kind in self.types.items() if kind in kinds and t not in self.empty
         )

@@ -85,10 +85,12 @@ class MappedReader:
         default = within or self.mapping.in_
         if default is None and len(names) == 1:
             default = names[0]
-        if default is not None and (name := _match_table(default, names)) is not None:
-            table = self._read_table(name)
-            if not colons or reference in table.names:
-                return table, reference
+        if default is not None:
+            name = _match_table(default, names)
+            if name is not None:
+                table = self._read_table(name)
+                if not colons or reference in table.names:
+                    return table, reference
         if colons:
             default = text.rpartition(":")[0]
         if default is not None:
@@ -157,7 +159,8 @@ class MappedReader:
             self.add_notes(f"{name}: {missing} rows without a stamp were left out.")
         t, note = stamping.remove_overflow(t, name)
         self.add_notes(note)
-        if time.unit is None and (unit := guess_time_unit(t)) is not None:
+        unit = guess_time_unit(t)
+        if time.unit is None and unit is not None:
             column = time.columns[0]
             step = f"{np.median(np.diff(t)):.4g} apart, which can't be seconds"
             fault = f"{table.place}: the stamps {column!r} are {step}"
@@ -169,14 +172,16 @@ class MappedReader:
         return StampedRows(t, rows[order], "", len(raw))
 
     def _read_raw_stamps(self, table: Table, time: schema.Time) -> Array:
-        references = [self._locate_beside(table, each)[1] for each in time.columns]
-        if len(references) == 2:
-            seconds, nanoseconds = (read_numbers(table, each) for each in references)
+        names = [self._locate_beside(table, column)[1] for column in time.columns]
+        if len(names) == 2:
+            seconds = read_numbers(table, names[0])
+            nanoseconds = read_numbers(table, names[1])
             return stamping.join_stamps(seconds, nanoseconds)
-        column = table.column(references[0])
-        if is_text(column) and (dates := parse_dates(column)) is not None:
+        column = table.column(names[0])
+        dates = parse_dates(column) if is_text(column) else None
+        if dates is not None:
             return dates
-        return read_numbers(table, references[0])
+        return read_numbers(table, names[0])
 
     def _locate_beside(
         self, table: Table, reference: Reference

@@ -40,7 +40,7 @@ START_NS = 1_700_000_000 * NS_PER_S  # time stamp of second 0 of the commands' c
 # Lag of other clocks, too long for a reader to take it for a delay
 APART_NS = 3600 * NS_PER_S
 FRAMES = ("odom", "base_link")
-NO_HASH = f"RIHS01_{'0' * 64}"  # of a type that is known only by its definition
+NO_HASH = f"RIHS01_{'0' * 64}"  # hash of a type that is known only by its definition
 # Damage costs a whole chunk, because a checksum covers a whole chunk.
 CHUNK_BYTES = 1 << 16
 
@@ -81,7 +81,8 @@ def write_bag(
     # Commands become `/cmd_vel`, state or wheels `/joint_states`, the IMU `/imu`. The pose becomes
     # `/odom`, or `/pose` if it has its own clock or odometry was recorded as well.
     with open_bag_sink(path, storage) as sink:
-        messages = _Messages(store := sink.store)
+        store = sink.store
+        messages = _Messages(store)
         command = recording.command
         for topic, kind, stream, make in _list_topics(recording, spec, messages):
             sink.add_topic(topic, kind)
@@ -233,17 +234,16 @@ class BagSink:
         for name, text in (texts or {}).items() if kind not in fields else ():
             if name not in fields:
                 self.store.register(get_types_from_msg(text, name))
-        if kind in fields:
-            given = {}
-        else:
-            given = {"msgdef": definition or "", "rihs01": NO_HASH}
+        definitions = {}
+        if kind not in fields:
+            definitions = {"msgdef": definition or "", "rihs01": NO_HASH}
         profiles = [msgs.make_profile(offer) for offer in offers]
         with self._record_fault():
             self._connections[topic] = self._writer.add_connection(
                 topic,
                 kind,
                 typestore=self.store,
-                **given,
+                **definitions,
                 offered_qos_profiles=profiles,
             )
         self.counts[topic] = 0
@@ -340,8 +340,7 @@ def open_bag_sink(
             unfinished = _set_apart(beside, path) / path.name
         if not isinstance(error, Exception):  # Ctrl-C
             raise
-        reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
-        reason = reason.removeprefix(f"{path}: ").removesuffix(".")
+        reason = _get_reason(error)
         rest = f"what was written until then lies in {unfinished}"
         advice = (
             "recover it with `mcap recover` or `ros2 bag reindex` where there is room"
@@ -356,6 +355,15 @@ def open_bag_sink(
     beside.rmdir()
     if raised is not None:
         raise raised
+
+
+def _get_reason(error: Exception) -> str:
+    reason = ""
+    if isinstance(error, RecordingError):
+        reason = error.reason
+    elif isinstance(error, OSError):
+        reason = error.strerror or ""
+    return reason or str(error) or type(error).__name__
 
 
 def _set_apart(unfinished: Path, path: Path) -> Path:
@@ -373,7 +381,6 @@ def _finish(unfinished: Path, path: Path, storage: Storage) -> None:
         write_checksums(unfinished / f"{path.name}.mcap")
     sync_folder(unfinished)
     if path.exists():
-        raise RecordingError(
-            f"{path}: was made meanwhile; give the name of a new folder."
-        )
+        reason = "was made meanwhile; give the name of a new folder"
+        raise RecordingError(f"{path}: {reason}.", reason)
     os.rename(unfinished, path)

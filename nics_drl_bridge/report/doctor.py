@@ -85,7 +85,9 @@ def examine(facts: Facts, expected: Expected) -> list[Mismatch]:
         check_motion,
         check_turning,
     )
-    findings = [finding for check in checks for finding in check(facts, expected)]
+    findings: list[Mismatch] = []
+    for check in checks:
+        findings += check(facts, expected)
     named = [replace(finding, where=facts.names[finding.where]) for finding in findings]
     return sorted(named, key=lambda finding: finding.severity)
 

@@ -79,7 +79,7 @@ class Layout(NamedTuple):
 
 @dataclass
 class Facts:
-    """All collected facts; a role is `scan`, `odom`, `cmd_vel`, `imu` or `/clock`."""
+    """What was observed of a robot; a role is `scan`, `odom`, `cmd_vel`, `imu` or `/clock`."""
 
     source: str
     live: bool  # True over DDS, False from a bag
@@ -88,19 +88,21 @@ class Facts:
     heard: dict[str, TopicFacts] = field(default_factory=dict)  # by role
     end_ns: int = 0  # end of listening, on the clock of arrivals [ns]
     layouts: list[Layout] = field(default_factory=list)  # distinct layouts of the scans
-    # of up to `MOST_SCANS` scans [m]
+    # ranges of the first `MOST_SCANS` scans [m]
     ranges: list[NDArray[np.float32]] = field(default_factory=list)
-    # of odometry: x, y [m], heading [rad]
+    # poses of odometry: x, y [m], heading [rad]
     poses: list[Row] = field(default_factory=list)
-    # of odometry: vx, vy [m/s], wz [rad/s]
+    # twists of odometry: vx, vy [m/s], wz [rad/s]
     twists: list[Row] = field(default_factory=list)
-    lengths: list[float] = field(default_factory=list)  # of odometry's quaternions
+    lengths: list[float] = field(
+        default_factory=list
+    )  # norms of odometry's quaternions
     # number of odometry messages whose covariance of pose or twist is all zeros
     uncovered: int = 0
     commands: list[Row] = field(default_factory=list)  # vx, vy [m/s], wz [rad/s]
-    clock_ns: list[int] = field(default_factory=list)  # content of `/clock` [ns]
+    clock_ns: list[int] = field(default_factory=list)  # times on `/clock` [ns]
     gyro: GyroReader = field(default_factory=GyroReader)
-    # of the gyro: stamp [ns] and yaw rate [rad/s]
+    # stamps [ns] and yaw rates [rad/s] of the gyro
     yaw_rates: list[tuple[int, float]] = field(default_factory=list)
 
     def take(self, role: str, arrival_ns: int, message: Any) -> None:
@@ -114,7 +116,7 @@ class Facts:
             fields = {
                 name: float(getattr(message, name)) for name in ScanHeader._fields
             }
-            header = ScanHeader(**fields | {"time_increment": 0.0, "scan_time": 0.0})
+            header = ScanHeader(**fields)._replace(time_increment=0.0, scan_time=0.0)
             layout = Layout(len(message.ranges), header)
             if layout not in self.layouts:
                 self.layouts.append(layout)
@@ -140,19 +142,25 @@ class Facts:
 
 
 def names_in(namespace: str, imu: str = defaults.IMU_TOPIC) -> dict[str, str]:
-    """Returns the topics of a robot in a namespace by role; without a gyro if `imu` is none."""
+    """Returns the topic of each role for a robot in a namespace; no gyro if `imu` is `none`."""
     space = parse_namespace(namespace)
     names = {role: f"{space}/{role}" for role in (SCAN, ODOM, CMD_VEL)} | {CLOCK: CLOCK}
     gyros = list_imu_topics(imu, by_default=True)
     if gyros:
-        names[GYRO] = gyros[0] if gyros[0].startswith("/") else f"{space}/{gyros[0]}"
+        name = gyros[0]
+        if not name.startswith("/"):
+            name = f"{space}/{name}"
+        names[GYRO] = name
     return names
 
 
 def name_of_gyro(
     names: Mapping[str, str], imu: str, types: Mapping[str, Sequence[str]]
 ) -> str:
-    """Returns the gyro's topic: the wanted one, else one of its type, else the usual one."""
+    """Returns the gyro's topic: the one the user named, else one that carries `Imu` messages.
+
+    Topics of the robot's namespace come first. Without any, it is the default one.
+    """
     usual = names[GYRO]
     if imu != defaults.IMU_TOPIC or IMU in types.get(usual, ()):
         return usual
@@ -197,14 +205,14 @@ class Mismatch:
 
 @dataclass(frozen=True)
 class Expected:
-    """What is expected of a robot."""
+    """What a model or policy expects of a robot."""
 
     robot: RobotSpec
     lidar: LidarSpec
-    period_s: float  # between commands
-    # layout that any lidar may fill; None: the beams must be exactly those of `lidar`
+    period_s: float  # time between commands
+    # sectors that any lidar may fill; None: the beams must be exactly those of `lidar`
     scan: ScanLayout | None = None
-    gyro: bool = False  # True if the model was made with one
+    gyro: bool = False  # True if the model was identified with a gyro
 
 
 def derive_expected(
@@ -216,7 +224,7 @@ def derive_expected(
 
 
 def expect_present_lidar(facts: Facts, expected: Expected) -> Expected:
-    """Replaces the expected lidar by the present one if this fills the required sectors."""
+    """Replaces the expected lidar by the robot's own if that fills the required sectors."""
     if expected.scan is None or not facts.layouts:
         return expected
     try:
@@ -229,9 +237,9 @@ def expect_present_lidar(facts: Facts, expected: Expected) -> Expected:
 def fit_lidar_to_header(
     layout: Layout, mounted: LidarSpec, scan: ScanLayout
 ) -> LidarSpec:
-    """Returns the lidar of a scan header, mounted like `mounted`.
+    """Returns the lidar that a scan header describes, at the place of `mounted`.
 
-    Raises ConfigError if it does not fill the sectors of the scan.
+    Raises ConfigError if it does not fill the sectors of `scan`.
     """
     lidar = reader_of(layout.header, layout.beams, mounted).lidar
     plan_of(lidar, scan)

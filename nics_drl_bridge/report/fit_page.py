@@ -39,7 +39,7 @@ def fit_tile(identified: Identified) -> Tile:
         off = "of the path off" if is_share(at.model, at.path_m) else "off"
         meaning = f"{off} after {at.horizon_s:g} s, on unseen data; {', '.join(beside)}"
         return figure, meaning, not conclude(identified).doubts
-    return "untested", "on unseen data, as the drive is too short", False
+    return "untested", "on unseen data because the drive is too short", False
 
 
 def make_verdict_blocks(

@@ -41,13 +41,13 @@ from nics_drl_bridge.style import (
 SHOWN_S = 8.0
 PATHS = 6
 POINTS = 40
-UNSEEN_PANEL = Panel(3.4, 3.4)  # of one unseen path on a page
+UNSEEN_PANEL = Panel(3.4, 3.4)  # for one unseen path on a page
 SETTLED_S = 1.0
 LEAST_ERROR = 1e-12
 LEAST_RATE = 1e-6
 MOST_POINTS = 3000
 BINS = 60
-CURVE_POINTS = 400  # of an input curve
+CURVE_POINTS = 400  # number of points at which an input curve is drawn
 REACH = 5.0  # histograms end at this many standard deviations
 CAPTIONS = {
     "accuracy": "Error against the number of terms; circles mark how many are kept.",
@@ -182,9 +182,8 @@ def draw_yardsticks(identified: Identified) -> bytes:
         ("textbook", "fitted textbook", MEASURED, "s--"),
         ("kept_twist", "constant twist", OTHER, "^:"),
     ):
-        points = [
-            (at.horizon_s, error) for at in judgement if (error := getattr(at, name))
-        ]
+        points = [(at.horizon_s, getattr(at, name)) for at in judgement]
+        points = [(horizon_s, error) for horizon_s, error in points if error]
         if points:
             axes.plot(
                 [horizon_s for horizon_s, _ in points],
@@ -396,12 +395,12 @@ def _draw_restraint(axes: Axes, identified: Identified, dof: str) -> None:
     model = identified.model
     samples = identified.samples
     d = identified.model.dofs.index(dof)
-    some = slice(None, None, max(1, len(samples.t) // MOST_POINTS))
-    asked = taylor.evaluate(samples.x[some], model.powers) @ model.coefficients[d]
-    axes.plot(
-        asked, samples.dq[some, d], ".", markersize=3, color=MEASURED, label="measured"
-    )
-    held = model.rates(samples.x[some])[:, d]
+    every = max(1, len(samples.t) // MOST_POINTS)
+    x = samples.x[::every]
+    measured = samples.dq[::every, d]
+    asked = taylor.evaluate(x, model.powers) @ model.coefficients[d]
+    axes.plot(asked, measured, ".", markersize=3, color=MEASURED, label="measured")
+    held = model.rates(x)[:, d]
     axes.plot(asked, held, ".", markersize=3, color=MODEL, label="model")
     for word, edge in zip(("fall", "rise"), model.limits[d - 3].tolist(), strict=True):
         sigma = identified.calibration.uncertainty.get(
@@ -429,12 +428,11 @@ def draw_noise(identified: Identified) -> bytes | None:
     drive = identified.drive
     calibration = identified.calibration
     model = identified.model
-    if (
-        drive.bursts is None
-        and len(pose := pose_residual(drive.recording.pose)) > DIFFERENCE
-    ):
-        histograms += [("pose position", levels.pose_position, pose[:, :2].ravel())]
-        histograms += [("pose heading", levels.pose_heading, pose[:, 2])]
+    if drive.bursts is None:
+        pose = pose_residual(drive.recording.pose)
+        if len(pose) > DIFFERENCE:
+            histograms += [("pose position", levels.pose_position, pose[:, :2].ravel())]
+            histograms += [("pose heading", levels.pose_heading, pose[:, 2])]
     odometry = odometry_residual(drive, calibration, model, identified.samples)
     if odometry is not None:
         histograms += [("odometry, linear", levels.odom_linear, odometry[:, 0])]

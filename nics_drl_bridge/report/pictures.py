@@ -99,18 +99,16 @@ def draw_trajectories(
 ) -> bytes:
     """Draws a panel per seed with the path of each run (the paper's Fig. 7)."""
     view = _make_view_of_episodes(world, chain.from_iterable(runs.values()))
-    by_seed = [
-        {
-            name: episode
-            for name, episode in zip(runs, some, strict=True)
-            if episode is not None
-        }
-        for some in zip_longest(*runs.values())
-    ]
+    by_seed: list[dict[str, Episode]] = []
+    for episodes in zip_longest(*runs.values()):
+        driven = zip(runs, episodes, strict=True)
+        by_seed.append(
+            {name: episode for name, episode in driven if episode is not None}
+        )
     columns = min(len(by_seed), max(1, int(GREATEST_WIDTH / view.panel.width)))
     figure, grid = make_panels(-(-len(by_seed) // columns), columns)
-    for axes, episodes in zip(grid, by_seed, strict=False):
-        _draw_panel(axes, episodes, world, footprint, view)
+    for axes, episodes_of_seed in zip(grid, by_seed, strict=False):
+        _draw_panel(axes, episodes_of_seed, world, footprint, view)
     return render_png(figure, grid[0], view.panel)
 
 
@@ -118,10 +116,9 @@ def draw_trajectory_gallery(
     shown: Sequence[Mapping[str, Episode]], world: AnyWorld, footprint: float
 ) -> list[bytes]:
     """Draws a picture per seed with the path of each run; all panels have the same size."""
-    view = _make_view_of_episodes(
-        world, [each for episodes in shown for each in episodes.values()]
-    )
-    runs = dict.fromkeys(name for episodes in shown for name in episodes)
+    every_episode = chain.from_iterable(episodes.values() for episodes in shown)
+    view = _make_view_of_episodes(world, every_episode)
+    runs = dict.fromkeys(chain.from_iterable(shown))
     rows = count_legend_rows(["goal", "start", *runs], compute_width(view.panel))
     drawn = []
     for episodes in shown:

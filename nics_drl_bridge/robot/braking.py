@@ -91,7 +91,9 @@ class TurnBraking:
     """
 
     reaction_s: float  # until the turn starts to brake, lags included
-    deceleration: float  # of the turn after that; infinite for lags alone [rad/s^2]
+    deceleration: (
+        float  # how fast the turn slows after that; inf for lags alone [rad/s^2]
+    )
     least_turn: float = 1.0  # minimum fraction of this bound that the robot turns
     least_path: float = 1.0  # minimum fraction of its path's bound that the robot moves
 
@@ -109,7 +111,9 @@ class Braking:
     """
 
     reaction_s: float  # from the command to stop until braking counts, lags included
-    deceleration: float  # of the braking that follows; infinite for lags alone [m/s^2]
+    deceleration: (
+        float  # how fast the robot slows after that; inf for lags alone [m/s^2]
+    )
     # Factor of the turn rate in the pace [m]; wheels that also turn the robot brake both motions
     lever_m: float = 0.0
     drift: Drift = NO_DRIFT  # off its arc while it brakes
@@ -243,12 +247,9 @@ def list_motions(low: Array, high: Array) -> Array:
         mixed = np.array(list(product(levels, repeat=count)))
     else:
         mixed = _combine_pairs(count)
-    single = [
-        sign * fraction * row
-        for row in np.eye(count)
-        for fraction in SINGLE_LEVELS
-        for sign in (-1, 1)
-    ]
+    single = []
+    for row, fraction in product(np.eye(count), SINGLE_LEVELS):
+        single += [-fraction * row, fraction * row]
     chosen = np.concatenate([mixed, single])
     return np.clip(np.where(chosen < 0.0, -chosen * low, chosen * high), low, high)
 
@@ -458,13 +459,11 @@ def fit_bound(stops: Stops, radius: float, turns_count: bool) -> Braking:
     worst = _compute_envelope(whole[straight], distance[straight])
     slower_component = np.abs(twist[:, :2]).min(axis=1)
     orders = _list_orders(slower_component > MINOR * speed)
-    bounds = [
-        Braking(0.0, 1.0, lever * radius, order=order)
-        for lever in LEVERS
-        for order in orders
-    ]
+    bounds = []
     fits = []
-    for bound in bounds:
+    for lever, order in product(LEVERS, orders):
+        bound = Braking(0.0, 1.0, lever * radius, order=order)
+        bounds.append(bound)
         pace = bound.pace(twist)
         if turns_count:
             pace = np.maximum(pace, turn_speed)

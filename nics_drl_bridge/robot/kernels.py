@@ -22,7 +22,7 @@ from nics_drl_bridge.robot.taylor import TaylorModel
 # and to 1e-8 below WIDE_TURN
 SERIES: Array = np.array([1 / 6, 1 / 120, 1 / 5040, 1 / 2, 1 / 24, 1 / 720])
 WIDE_TURN = 0.5  # larger turns per step use sine and cosine, not the series [rad]
-MAX_ORDER = 4  # of a term
+MAX_ORDER = 4  # maximum order of a term
 # Columns of `Terms.curves`, as in `InputCurve`
 DEAD = 0
 LOW = 1

@@ -145,7 +145,7 @@ def _read_half(parameters: Mapping[str, float], name: str) -> float:
 class RobotKind:
     """A kind of robot. Its functions raise KeyError for a parameter that the spec lacks."""
 
-    # of its actuators; None if unknown
+    # kinematics of its actuators; None if unknown
     kinematics: Callable[[RobotSpec], Textbook] | None
     drawing: Callable[[RobotSpec], Drawing]
     template: Template = field(default_factory=Template)

@@ -44,8 +44,8 @@ TWIST_UNITS = dict(zip(CMD_VEL_FIELDS, POSE_UNITS, strict=True))
 Unit = Literal[
     "m", "rad", "m/s", "rad/s", "m/s^2", "rad/s^2", "N", "N*m", "V", "A", "1"
 ]
-MAX_CORNERS = 512  # of a footprint
-MAX_VARIABLES = 32  # of a state or a command
+MAX_CORNERS = 512  # maximum number of corners of a footprint
+MAX_VARIABLES = 32  # maximum size of a state or a command
 # Maximum radius of a footprint [m]; a larger one is probably given in centimetres
 MAX_RADIUS = 10.0
 LENGTH_PARAMETERS = {
@@ -56,7 +56,7 @@ LENGTH_PARAMETERS = {
     "half_length",
     "half_width",
 }
-MAX_LENGTH = 20.0  # of these parameters, in radii of the footprint
+MAX_LENGTH = 20.0  # maximum of these parameters, in radii of the footprint
 FARTHEST_STEERED = 3.2  # maximum angle of a steered wheel [rad]
 # 1 + cosine at a corner; at sharper corners, a grown outline does not keep its edges parallel
 MIN_CORNER = 0.2
@@ -154,7 +154,7 @@ class RobotSpec(Schema):
     # meaning of `angular.z` for a robot that steers: a turn rate [rad/s], as in any Twist, or the
     # steering angle [rad] itself
     angular_is: Literal["turn_rate", "steering"] = "turn_rate"
-    # of a circle around `base_link` [m], at most 10; by default the circle around the `footprint`
+    # radius of a circle around `base_link` [m], at most 10; by default it encloses the `footprint`
     footprint_radius: float = Field(ge=1e-3)
     # corners of a polygon instead of the circle, in `base_link` [m], in either direction
     footprint: tuple[tuple[float, float], ...] | None = Field(

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from itertools import combinations_with_replacement
+from itertools import chain, combinations_with_replacement
 from typing import Annotated
 
 import numpy as np
@@ -239,10 +239,9 @@ class TaylorModel:
     def named(self) -> "NamedTaylorModel":
         """The model by names, unchecked; every number is bit-identical."""
         names = self.term_names
-        terms = {
-            dof: {names[k]: float(row[k]) for k in np.flatnonzero(row)}
-            for dof, row in zip(self.dofs, self.coefficients, strict=True)
-        }
+        terms = {}
+        for dof, row in zip(self.dofs, self.coefficients, strict=True):
+            terms[dof] = {names[k]: float(row[k]) for k in np.flatnonzero(row)}
         box = zip(self.low.tolist(), self.high.tolist(), strict=True)
         states = self.variables[: self.state_size]
         commands = self.variables[self.state_size :]
@@ -348,15 +347,15 @@ class HorizonErrors:
     windows: int  # number of predictions
     path_m: float  # mean length of the measured path
     model: EndErrors
-    kept_twist: EndErrors  # of a robot that keeps its initial twist
-    # Of the textbook model, fitted to the same data; None: not fitted
+    kept_twist: EndErrors  # errors of a robot that keeps its initial twist
+    # errors of the textbook model, fitted to the same data; None: not fitted
     textbook: EndErrors | None = None
     band_m: float | None = None  # distance within which 95 % of the ends are expected
     coverage: float | None = None  # fraction of the ends within it
     # Noise of the differences between the model's errors and those of the baselines [m]
     kept_twist_noise_m: float | None = None
     textbook_noise_m: float | None = None
-    # Of a robot that never moves; None in older files
+    # errors of a robot that never moves; None in older files
     standing: EndErrors | None = None
     standing_noise_m: float | None = None  # noise of the difference to it [m]
 
@@ -370,7 +369,7 @@ class Quality:
     samples: int  # number of rows that the fit used
     outliers: dict[str, float]  # fraction of the rows that were dropped as outliers
     condition: dict[str, float]  # condition number of the standardised kept features
-    rmse: dict[str, float]  # of the rates, on the training data
+    rmse: dict[str, float]  # error of each rate on the training data
     r2: dict[str, float]
     held_out_rmse: dict[
         str, float
@@ -412,11 +411,9 @@ class NamedTaylorModel(Schema):
         dofs = tuple(self.terms)
         try:
             units = tuple(self.units[dof] for dof in dofs)
-            parsed = {
-                name: parse_term(name, variables)
-                for row in self.terms.values()
-                for name in row
-            }
+            parsed = {}
+            for name in chain.from_iterable(self.terms.values()):
+                parsed[name] = parse_term(name, variables)
         except KeyError as error:
             raise ModelError(
                 f"kinematics: {error} has no unit; generate the model again."
@@ -427,14 +424,19 @@ class NamedTaylorModel(Schema):
             ) from None
         names = sorted(parsed, key=lambda name: make_sort_key(parsed[name]))
         powers = np.array([parsed[name] for name in names], dtype=np.int64)
-        rows = [[self.terms[dof].get(name, 0.0) for name in names] for dof in dofs]
+        rows = []
+        for dof in dofs:
+            rows.append([self.terms[dof].get(name, 0.0) for name in names])
         box = np.array(list(self.valid.values())).reshape(len(variables), 2)
         states = variables[: len(dofs) - 3]
         friction = self.friction or {}
         drag = self.drag or {}
         limits = self.limits or {}
         commands = variables[len(states) :]
-        emf = self.back_emf or {}
+        emf = []
+        for state in states:
+            brakes = (self.back_emf or {}).get(state, {})
+            emf.append([brakes.get(command, 0.0) for command in commands])
         self._check_stages(states, commands)
         return TaylorModel(
             variables,
@@ -452,9 +454,7 @@ class NamedTaylorModel(Schema):
             friction=np.array([friction.get(name, 0.0) for name in states]),
             drag=np.array([drag.get(name, 0.0) for name in states]),
             limits=np.array([limits.get(name, (-np.inf, np.inf)) for name in states]),
-            back_emf=np.array(
-                [[emf.get(s, {}).get(c, 0.0) for c in commands] for s in states]
-            ),
+            back_emf=np.array(emf),
         ).add_errors(self.standard_errors or {})
 
     def _check_stages(self, states: tuple[str, ...], commands: tuple[str, ...]) -> None:

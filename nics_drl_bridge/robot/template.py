@@ -172,21 +172,24 @@ class Template:
 
 
 def _is_mappings(parts: Any) -> bool:
-    """Returns True for a sequence of mappings that contain no lists or mappings."""
-    return isinstance(parts, list | tuple) and all(
-        isinstance(part, Mapping)
-        and not any(isinstance(value, list | dict) for value in part.values())
-        for part in parts
-    )
+    """True for a sequence of mappings that contain no lists or mappings."""
+    if not isinstance(parts, list | tuple):
+        return False
+    for part in parts:
+        if not isinstance(part, Mapping):
+            return False
+        if any(isinstance(value, list | dict) for value in part.values()):
+            return False
+    return True
 
 
 def _count_matches(
     commands: Sequence[Part],
     names: Sequence[Any],
-    given: Sequence[Part],
+    parts: Sequence[Part],
 ) -> int:
     """Counts the commands that are given by name or by unit."""
-    units = [part.get("unit") for part in given]
+    units = [part.get("unit") for part in parts]
     return sum(
         command["name"] in names or command["unit"] in units for command in commands
     )
@@ -220,7 +223,9 @@ def _complete_state(state: Part, command: Sequence[Part]) -> dict[str, Any]:
         related = [
             part for part in command if part.get("unit") == unit and part.get("cmd_vel")
         ]
-    ends = [part.get(end) for part in related for end in ("min", "max")]
+    ends: list[Any] = []
+    for part in related:
+        ends += [part.get("min"), part.get("max")]
     sizes = [abs(end) for end in ends if isinstance(end, int | float)]
     if sizes:
         limit = STATE_RANGE_FACTOR * max(sizes)

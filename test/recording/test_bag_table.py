@@ -216,7 +216,7 @@ def test_the_covariance_of_a_message_gives_deviations(tmp_path):
 def test_a_bag_is_surveyed_to_a_first_mapping(tmp_path):
     with open_source(foreign_bag(tmp_path / "bag")) as source:
         tables = {table.name: table for table in inspect_tables(source)}
-        guess = parse_yaml(propose_mapping(list(tables.values())), "guess")
+        guess = parse_yaml(propose_mapping(list(tables.values())).text, "guess")
     assert [column.name for column in tables["/drive"].columns][-2:] == [
         "armed",
         "mode",

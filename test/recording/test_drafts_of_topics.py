@@ -158,7 +158,7 @@ BAGS: dict[str, tuple[list[TableSurvey], str, list[str]]] = {
 @pytest.mark.parametrize("bag", BAGS)
 def test_a_draft_of_a_bag_is_right_or_blank(bag):
     tables, place, commands = BAGS[bag]
-    text = propose_mapping(tables)
+    text = propose_mapping(tables).text
     draft = parse_yaml(text, "draft")
     assert draft["pose"] == place, text
     assert list((draft["command"] or {}).values()) == commands, text

@@ -99,6 +99,6 @@ def test_a_draft_of_a_bag_with_an_imu_names_its_yaw_rate(tmp_path):
     ]
     bag = bags.write(tmp_path / "bag", bags.drive() | {"/imu/data": rows})
     with open_source(bag) as source:
-        draft = propose_mapping(inspect_tables(source))
+        draft = propose_mapping(inspect_tables(source)).text
     assert "yaw_rate: /imu/data:angular_velocity.z" in draft
     assert "not used: /imu/data: angular_velocity.z" not in draft

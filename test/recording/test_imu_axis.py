@@ -67,6 +67,6 @@ def test_the_imu_of_a_bag_and_of_its_draft_is_read_as_it_is_mounted(
     assert read.imu.values[:, 2].mean() == pytest.approx(0.25, abs=0.08)
     assert any("points up" in told for told in read.repairs)
     with open_source(bag) as source:
-        draft = propose_mapping(inspect_tables(source))
+        draft = propose_mapping(inspect_tables(source)).text
     assert f"/imu/data:angular_velocity.{'xyz'[axis]}" in draft
     assert ("scale: -1" in draft) == (sign < 0.0)

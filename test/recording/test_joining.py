@@ -108,9 +108,7 @@ def test_a_stream_that_one_recording_lacks_is_left_out_and_said():
     (one, other) = drives(12.0, 24.0)
     joined = join([one, replace(other, odometry=other.pose)])
     assert joined.odometry is None
-    assert (
-        "odometry was left out, as not all of the recordings have it." in joined.repairs
-    )
+    assert "odometry was left out because not all recordings have it." in joined.repairs
 
 
 @pytest.mark.parametrize("restarts", [True, False])
@@ -139,7 +137,7 @@ def test_a_draft_names_the_column_that_numbers_episodes(tmp_path, name, restarts
     episode = np.repeat([0, 1], [400, 600])
     path = write(tmp_path / "log.csv", columns | {name: episode})
     with open_source(path) as source:
-        draft = parse_yaml(propose_mapping(inspect_tables(source)), "draft")
+        draft = parse_yaml(propose_mapping(inspect_tables(source)).text, "draft")
     assert draft["episode"] == name
 
 
@@ -150,7 +148,7 @@ def test_a_draft_names_the_column_that_numbers_episodes(tmp_path, name, restarts
 def test_a_draft_leaves_out_a_column_that_numbers_no_episodes(tmp_path, values):
     path = write(tmp_path / "log.csv", drive(1000) | {"episode": values})
     with open_source(path) as source:
-        draft = propose_mapping(inspect_tables(source))
+        draft = propose_mapping(inspect_tables(source)).text
     assert "episode:" not in draft
 
 

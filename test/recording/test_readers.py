@@ -105,7 +105,7 @@ def test_a_bad_row_is_named_with_place_and_fix_and_the_mapping(
     with pytest.raises(RecordingError, match=sentence) as caught:
         read_recording(folder)
     assert re.search(
-        r"; the mapping is .*\.yaml, --map gives another\.$", str(caught.value)
+        r" The mapping is .*\.yaml; choose another with --map\.$", str(caught.value)
     )
 
 

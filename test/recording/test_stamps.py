@@ -56,7 +56,7 @@ def test_rows_that_begin_with_the_last_are_turned_round():
     t, rows, note = stamping.repair_order(T[::-1], "log")
     assert np.array_equal(t, T)
     assert rows[0] == 299
-    assert "turned round" in note
+    assert "were reversed" in note
 
 
 def test_a_clock_that_was_set_ahead_by_years_goes_on():
