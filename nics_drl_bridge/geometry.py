@@ -93,17 +93,23 @@ def log(relative: ArrayLike) -> Array:
 
 
 def east_and_north(longitude: Array, latitude: Array) -> tuple[Array, Array]:
-    """Projects WGS 84 positions [rad] onto the tangent plane at the first position [m].
+    """Returns the positions (T,) east and north of the first one [m], for WGS 84 positions [rad].
 
-    The error is below a centimetre within 10 km.
+    They are those on the ground, projected onto the tangent plane at the first position: distances
+    shrink by less than a centimetre within 10 km.
     """
-    # Radii of curvature of the ellipsoid: of the prime vertical (east) and the meridian (north)
-    shrinkage = 1.0 - ECCENTRICITY_SQUARED * np.sin(latitude[0]) ** 2
-    east_radius = EQUATOR_RADIUS_M / np.sqrt(shrinkage)
-    north_radius = east_radius * (1.0 - ECCENTRICITY_SQUARED) / shrinkage
-    east = east_radius * np.cos(latitude[0]) * wrap_angle(longitude - longitude[0])
-    north = north_radius * (latitude - latitude[0])
-    return east, north
+    shrinkage = 1.0 - ECCENTRICITY_SQUARED * np.sin(latitude) ** 2
+    radius = EQUATOR_RADIUS_M / np.sqrt(shrinkage)  # of curvature, in the prime vertical
+    turned = wrap_angle(longitude - longitude[0])
+    # Earth-centred coordinates, with x in the meridian of the first position
+    from_axis = radius * np.cos(latitude)
+    x = from_axis * np.cos(turned)
+    y = from_axis * np.sin(turned)
+    z = radius * (1.0 - ECCENTRICITY_SQUARED) * np.sin(latitude)
+    sine = np.sin(latitude[0])
+    cosine = np.cos(latitude[0])
+    north = cosine * (z - z[0]) - sine * (x - x[0])
+    return y, north
 
 
 def has_crossing_edges(corners: Array) -> bool:

@@ -126,3 +126,23 @@ def test_a_batch_gives_what_its_rows_give_one_by_one():
 
 def test_a_quarter_turn_takes_x_to_y():
     assert np.allclose(geometry.rotate([1.0, 0.0], np.pi / 2), [0.0, 1.0])
+
+
+def test_positions_on_earth_lie_the_same_way_to_each_other_wherever_they_begin():
+    longitude = np.radians([8.0, 8.1, 8.05, 7.93])
+    latitude = np.radians([50.0, 50.06, 49.95, 50.03])
+    distances = []
+    for order in (np.array([0, 1, 2, 3]), np.array([1, 0, 2, 3])):
+        east, north = geometry.east_and_north(longitude[order], latitude[order])
+        positions = np.empty((4, 2))
+        positions[order] = np.stack([east, north], axis=1)
+        distances.append(np.linalg.norm(positions[:, None] - positions, axis=-1))
+    assert np.abs(distances[0] - distances[1]).max() < 0.03
+
+
+def test_a_degree_of_latitude_and_of_longitude_has_its_known_length():
+    thousandth = np.radians(0.001)
+    east, _ = geometry.east_and_north(np.array([0.0, thousandth]), np.radians([45.0, 45.0]))
+    _, north = geometry.east_and_north(np.zeros(2), np.radians([45.0, 45.001]))
+    assert east[1] == pytest.approx(78.847, abs=0.001)
+    assert north[1] == pytest.approx(111.132, abs=0.001)

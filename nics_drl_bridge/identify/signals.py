@@ -221,7 +221,8 @@ def resample(
     """Resamples unwrapped poses (T, 3) at times (n,): smoothed if `half_width` [s] is not 0.
 
     Without smoothing, a cubic spline passes through all poses. With it, the value at a time is that
-    of a parabola, fitted with weights (T, 3) to the poses within the half-width, at least four.
+    of a parabola, fitted with weights (T, 3) to the poses within the half-width, at least four. Of
+    more than `MOST_SMOOTHED` poses, only every second, third and so on is used.
     """
     distinct = np.concatenate([[True], np.diff(t) > 0.0])
     weights = np.ones_like(pose) if weights is None else weights
@@ -234,8 +235,9 @@ def resample(
     first = np.minimum(np.searchsorted(t, at - half_width), np.searchsorted(t, at) - 2)
     first = np.clip(first, 0, max(len(t) - FEWEST_SMOOTHED, 0))
     last = np.maximum(np.searchsorted(t, at + half_width), first + FEWEST_SMOOTHED)
+    stride = -(-(last - first) // MOST_SMOOTHED)  # rounded up
     most = min(MOST_SMOOTHED, int((last - first).max()))
-    row = first[:, None] + np.arange(most)
+    row = first[:, None] + stride[:, None] * np.arange(most)
     is_used = (row < last[:, None]) & (row < len(t))
     row = np.minimum(row, len(t) - 1)
     weight = is_used[..., None] * weights[row]  # (n, m, 3)

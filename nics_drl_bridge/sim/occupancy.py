@@ -89,7 +89,9 @@ def _frame_of(world: World, cell: float) -> _Frame:
     grid = world.grid
     ends = world.all_walls().reshape(-1, 2)
     if world.size is not None or world.bounds is not None:
-        ends = np.concatenate([ends, np.reshape(world.extent, (2, 2))])
+        low_x, low_y, high_x, high_y = world.extent
+        field = [(low_x, low_y), (high_x, low_y), (high_x, high_y), (low_x, high_y)]
+        ends = np.concatenate([ends, field])
     pose: Any = grid.origin if grid is not None else (*ends.min(axis=0), 0.0)
     corners = rotate(ends - pose[:2], -pose[2])
     if grid is not None:
@@ -171,7 +173,9 @@ def _fill(made: GridMap, shape: Shape, pose: Array) -> None:
     centres = made.cell_to_world(_cell_indices(box) + low)
     inside = _inside(shape, rotate(centres - pose[:2], -pose[2]))
     box[inside] = OCCUPIED
-    if len(shape.outline) == 0:
+    if isinstance(shape, Circle):
+        if not inside.any() and _is_within(middle, made.cells):
+            made.cells[middle[0], middle[1]] = OCCUPIED
         return
     closed_outline = np.concatenate([shape.outline, shape.outline[:1]])
     edge = _along(closed_outline, made.resolution)

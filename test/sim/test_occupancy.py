@@ -97,6 +97,25 @@ def test_things_thinner_than_a_cell_do_not_vanish():
         assert seen[beam] == pytest.approx(far, abs=0.06)
 
 
+@pytest.mark.parametrize("at", [(0.0, 0.0), (0.025, 0.025), (0.31, -0.17)])
+def test_a_pole_thinner_than_a_cell_does_not_vanish(at):
+    world = world_of(bounds=(-1.0, -1.0, 1.0, 1.0))
+    grid = occupancy(world, [(Circle(radius=0.01), (*at, 0.0))], 0.05)
+    assert (grid.cells == OCCUPIED).sum() == 1
+    assert grid.cells[tuple(grid.world_to_cell(at))] == OCCUPIED
+
+
+def test_the_grid_covers_the_bounds_beside_a_turned_map(tmp_path):
+    map_files(load_map("room"), tmp_path / "own.yaml")
+    text = (tmp_path / "own.yaml").read_text().replace("- 0.0\n", "- 0.785\n")
+    (tmp_path / "own.yaml").write_text(text)
+    bounds = (-20.0, -20.0, 20.0, 20.0)
+    grid = occupancy(world_of(bounds=bounds, map=str(tmp_path / "own.yaml")))
+    corners = [(-20.0, -20.0), (20.0, -20.0), (20.0, 20.0), (-20.0, 20.0)]
+    index = grid.world_to_cell(corners)
+    assert ((index >= 0) & (index < grid.cells.shape)).all()
+
+
 def test_a_field_beside_a_turned_map_is_closed_all_around(tmp_path):
     map_files(load_map("room"), tmp_path / "own.yaml")
     text = (tmp_path / "own.yaml").read_text().replace("- 0.0\n", "- 0.3\n")
