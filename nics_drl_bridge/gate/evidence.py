@@ -1,12 +1,13 @@
 """What counts as an obstacle: what the newest scan hits, and where the lidar can't see.
 
 Obstacles are rows (P, 3): x, y [m] in the robot's frame, and the speed [m/s] at which each may
-approach. `find_obstacles` collects them in these steps:
+approach, `obstacle_speed` for a mover and 0 for all else. `find_obstacles` collects them in these
+steps:
 
 1. Compare the newest scan with earlier ones: a beam that ends where an earlier one saw free space
    ends on a mover, which may approach. All other obstacles are static. The motion in between is
    that of odometry, but with the turn that fits both scans best: the wheels of a skid-steer slip
-   when it turns, and by their odometry all that stands would seem to move.
+   when it turns, so with uncorrected odometry, standing things would seem to move.
 2. Place an obstacle at the end of each beam that returns.
 3. Place one at the minimum range of each beam that was too close to measure.
 4. Place a wall on the footprint wherever too many beams are unknown.
@@ -35,23 +36,29 @@ from nics_drl_bridge.geometry import between, exp, log
 from nics_drl_bridge.interface import S_PER_NS, Array
 
 Flags = NDArray[np.bool_]
+FULL_CIRCLE = 2.0 * math.pi
 MEMORY_S = 0.45  # maximum age of a scan that the newest one is compared with [s]
 SPACING_S = 0.09  # minimum time between two such scans that are kept [s]
-# A beam ends in space that was free if it is shorter than an old beam by this [m], plus this many
-# standard deviations of its range.
+# The place where a beam ends was free if the old scan saw further in that direction, by this [m]
+# plus this many standard deviations of its range.
 TOLERANCE = 0.03
 DEVIATIONS = 3.0
-MIN_SLIP_TURN = (
-    0.02  # odometry is believed in turns up to this one between two scans [rad]
-)
-# True turns that are compared with both scans, as fractions of the turn by odometry
-TURN_FRACTIONS = np.linspace(0.0, 1.3, 14)
+# The turn between two scans: odometry is believed in smaller turns, because an error of them is
+# within the angle over which the beams of an old scan are compared.
+MIN_SLIP_TURN = evidence_kernels.COMPARED_ANGLE
+MAX_TURN_FRACTION = 1.3  # of the turns that are tried, over odometry's
+TURN_SPACING = 0.03  # between two turns that are tried, at most [rad]
+MIN_TURNS = 14  # minimum number of turns that are tried
 COMPARED_BEAMS = 200  # number of beams that suffice for that
-# A turn other than odometry's must let at least this fraction of the beams agree. A person who
-# walks around the robot fills less, and must not pass for a turn.
+# Another turn than odometry's must let this fraction of all compared beams agree, and this fraction
+# more than odometry does.
 MIN_AGREEING = 0.3
-# It must also let more beams agree than odometry does, by this fraction of the beams.
 MIN_GAIN = 0.05
+# The beams that agree by that turn alone must show in so many sectors of an eighth of a circle,
+# each with so many beams: a person who walks around the robot must not pass for a turn.
+SECTORS = 8
+MIN_SECTORS = 4
+MIN_SECTOR_BEAMS = 2
 
 
 def find_obstacles(
@@ -101,10 +108,18 @@ def find_movers(
             shield.range_max,
             tolerance,
         )
-    neighbour_entered = np.zeros_like(entered)
-    neighbour_entered[1:] |= entered[:-1]
-    neighbour_entered[:-1] |= entered[1:]
-    return entered & neighbour_entered
+    return entered & _has_entered_neighbour(entered, lidar)
+
+
+def _has_entered_neighbour(entered: Flags, lidar: MountedBeams) -> Flags:
+    """Returns whether a beam beside each one (B,) is marked; of a full circle, the ends adjoin."""
+    before = np.roll(entered, 1)
+    after = np.roll(entered, -1)
+    is_full_circle = (len(entered) + 0.5) * abs(lidar.step) > FULL_CIRCLE
+    if not is_full_circle:
+        before[0] = False
+        after[-1] = False
+    return before | after
 
 
 def estimate_motion(
@@ -112,32 +127,59 @@ def estimate_motion(
 ) -> Array:
     """Returns the robot's motion (3,) between two views, by odometry with the turn of the scans.
 
-    Of several turns between none and somewhat more than odometry's, it is the one by which most
-    beams of the new scan end where the old scan ended. Odometry's own turn is taken if it is as
-    good, or if no turn lets enough beams agree, as in the open.
+    Of turns between none and `MAX_TURN_FRACTION` of odometry's, it is the one by which most beams
+    of the new scan end where the old scan ended. Odometry's own turn is taken unless another one
+    lets clearly more beams agree, and in several directions.
     """
     by_odometry = between(old.pose, new.pose)
     if abs(by_odometry[2]) <= MIN_SLIP_TURN:
         return by_odometry
-    stride = max(1, len(new.ranges) // COMPARED_BEAMS)
+    stride = math.ceil(len(new.ranges) / COMPARED_BEAMS)
+    returns = np.isfinite(new.ranges[::stride])
+    compared = len(returns)
 
-    def count_agreeing(motion: Array) -> int:
-        count: int = evidence_kernels.count_agreeing(
-            new.ranges, old.ranges, lidar, motion, tolerance, stride
+    def find_agreeing(motion: Array) -> Flags:
+        agreeing = np.empty(compared, np.bool_)
+        evidence_kernels.mark_agreeing(
+            agreeing, new.ranges, old.ranges, lidar, motion, tolerance, stride
         )
-        return count
+        return agreeing
 
-    arcs = np.tile(log(by_odometry), (len(TURN_FRACTIONS), 1))
-    arcs[:, 2] *= TURN_FRACTIONS
-    motions = exp(arcs)
-    counts = [count_agreeing(motion) for motion in motions]
+    agreeing_by_odometry = find_agreeing(by_odometry)
+    needed = max(
+        np.count_nonzero(agreeing_by_odometry) + MIN_GAIN * compared,
+        MIN_AGREEING * compared,
+    )
+    if np.count_nonzero(returns) < needed:
+        return by_odometry  # no turn can be better
+    motions = _vary_turn(by_odometry)
+    agreeing = np.stack([find_agreeing(motion) for motion in motions])
+    counts = np.count_nonzero(agreeing, axis=1)
     best = int(np.argmax(counts))
-    compared = math.ceil(len(new.ranges) / stride)
-    needed = count_agreeing(by_odometry) + MIN_GAIN * compared
-    if counts[best] >= max(needed, MIN_AGREEING * compared):
-        by_scans: Array = motions[best]
-        return by_scans
-    return by_odometry
+    gained = np.flatnonzero(agreeing[best] & ~agreeing_by_odometry) * stride
+    if counts[best] < needed or _count_sectors(gained, lidar) < MIN_SECTORS:
+        return by_odometry
+    by_scans: Array = motions[best]
+    return by_scans
+
+
+def _vary_turn(motion: Array) -> Array:
+    """Returns motions (n, 3) like one, with other turns; those nearest to its own turn first."""
+    span = MAX_TURN_FRACTION * abs(float(motion[2]))
+    count = max(MIN_TURNS, math.ceil(span / TURN_SPACING) + 1)
+    fractions = np.linspace(0.0, MAX_TURN_FRACTION, count)
+    fractions = fractions[np.argsort(np.abs(fractions - 1.0), kind="stable")]
+    arcs = np.tile(log(motion), (count, 1))
+    arcs[:, 2] *= fractions
+    return exp(arcs)
+
+
+def _count_sectors(beams: NDArray[np.intp], lidar: MountedBeams) -> int:
+    """Returns the number of sectors around the lidar that hold enough of the beams (n,)."""
+    bearings = np.mod(lidar.first + beams * lidar.step, FULL_CIRCLE)
+    sectors = (bearings / FULL_CIRCLE * SECTORS).astype(np.intp) % SECTORS
+    counts = np.bincount(sectors, minlength=SECTORS)
+    return int(np.count_nonzero(counts >= MIN_SECTOR_BEAMS))
 
 
 def place_returns(

@@ -1,6 +1,6 @@
 """Compiled: compares the ends of a scan's beams with what an earlier scan saw there.
 
-- `count_agreeing` counts the beams that end where the old scan ended, too.
+- `mark_agreeing` marks the beams that end where the old scan ended.
 - `mark_entered` marks those that end in space that the old scan showed to be free.
 """
 
@@ -63,9 +63,9 @@ def mark_entered(
         ranges: (B,) of the scan [m].
         old_ranges: (B,) of the old scan [m].
         lidar: its beams.
-        moved: (3,) motion of the robot since the old scan: x, y [m], heading [rad].
+        moved: (3,) motion since the old scan, in the robot's frame then: x, y [m], heading [rad].
         range_max: of the lidar [m].
-        tolerance: by which a beam must end before the old ones.
+        tolerance: by which a beam must end before the free space of the old scan does.
     """
     beams = len(ranges)
     whole_circle = round(2.0 * math.pi / abs(lidar.step))
@@ -74,48 +74,51 @@ def mark_entered(
         if entered[b] or not np.isfinite(ranges[b]):
             continue
         distance, middle = find_in_old_scan(ranges[b], b, lidar, moved)
-        free = range_max
+        free_range = range_max
         for i in range(middle - neighbours, middle + neighbours + 1):
             index = i % whole_circle
             old_range = old_ranges[index] if index < beams else np.nan
-            free = take_shorter(free, old_range)
-        if distance < free - tolerance.constant - tolerance.proportional * distance:
+            free_range = take_shorter(free_range, old_range)
+        if (
+            distance
+            < free_range - tolerance.constant - tolerance.proportional * distance
+        ):
             entered[b] = True
 
 
 @kernel
-def count_agreeing(
+def mark_agreeing(
+    agreeing: Flags,
     ranges: Ranges,
     old_ranges: Ranges,
     lidar: MountedBeams,
     moved: Array,
     tolerance: Tolerance,
     stride: int,
-) -> int:
-    """Returns how many of every `stride`-th beam end where the old scan ended, too.
+) -> None:
+    """Takes every `stride`-th beam, and marks those that end where the old scan ended.
 
     Args:
+        agreeing: (ceil(B / stride),) flags, set or cleared.
         ranges: (B,) of the scan [m].
         old_ranges: (B,) of the old scan [m].
         lidar: its beams.
-        moved: (3,) motion of the robot since the old scan: x, y [m], heading [rad].
+        moved: (3,) motion since the old scan, in the robot's frame then: x, y [m], heading [rad].
         tolerance: by which the ends may differ.
         stride: number of beams from one that is compared to the next.
     """
     beams = len(ranges)
     whole_circle = round(2.0 * math.pi / abs(lidar.step))
-    count = 0
-    for b in range(0, beams, stride):
-        if not np.isfinite(ranges[b]):
+    for k in range(len(agreeing)):
+        agreeing[k] = False
+        beam = k * stride
+        if not np.isfinite(ranges[beam]):
             continue
-        distance, middle = find_in_old_scan(ranges[b], b, lidar, moved)
+        distance, middle = find_in_old_scan(ranges[beam], beam, lidar, moved)
         index = middle % whole_circle
-        if index >= beams:
-            continue
-        allowed = tolerance.constant + tolerance.proportional * distance
-        if abs(distance - old_ranges[index]) <= allowed:
-            count += 1
-    return count
+        if index < beams:
+            allowed = tolerance.constant + tolerance.proportional * distance
+            agreeing[k] = abs(distance - old_ranges[index]) <= allowed
 
 
 @kernel
@@ -128,11 +131,12 @@ def find_in_old_scan(
         length: range of the beam [m].
         beam: its index.
         lidar: its beams.
-        moved: (3,) motion of the robot since the old scan: x, y [m], heading [rad].
+        moved: (3,) motion since the old scan, in the robot's frame then: x, y [m], heading [rad].
 
     Returns:
         distance: from the lidar at the old scan [m].
-        index: of the beam that points there, as if the beams went all around.
+        index: of the beam that points there, as if the beams went all around; it may be one whole
+            circle.
     """
     angle = lidar.first + beam * lidar.step + lidar.heading
     x = lidar.x + length * math.cos(angle)

@@ -346,7 +346,7 @@ def warm_up() -> None:
     tolerance = Tolerance(0.0, 0.0)
     entered = np.zeros(1, np.bool_)
     still = np.zeros(3)
-    evidence_kernels.count_agreeing(ranges, ranges, lidar, still, tolerance, 1)
+    evidence_kernels.mark_agreeing(entered, ranges, ranges, lidar, still, tolerance, 1)
     evidence_kernels.mark_entered(entered, ranges, ranges, lidar, still, 1.0, tolerance)
     view = View(0, np.zeros(3), ranges)
     before: Ground | None = None

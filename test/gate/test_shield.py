@@ -17,7 +17,7 @@ from nics_drl_bridge.gate.evidence import (
     find_movers,
     find_obstacles,
 )
-from nics_drl_bridge.gate.evidence_kernels import mark_entered
+from nics_drl_bridge.gate.evidence_kernels import mark_agreeing, mark_entered
 from nics_drl_bridge.gate.footprint import get_body
 from nics_drl_bridge.gate.gate import decide
 from nics_drl_bridge.gate.inputs import Odometry, Scan, Tick
@@ -81,15 +81,22 @@ def test_without_a_shield_nothing_is_cut():
 @pytest.mark.slow
 @pytest.mark.parametrize("wheelbase", [CAR.wheelbase, 0.0])
 def test_nothing_remains_to_be_compiled_after_a_rehearsal(wheelbase, monkeypatch):
-    fresh = {"free": njit(is_free.py_func), "entered": njit(mark_entered.py_func)}
+    fresh = {
+        "free": njit(is_free.py_func),
+        "entered": njit(mark_entered.py_func),
+        "agreeing": njit(mark_agreeing.py_func),
+    }
     monkeypatch.setattr(shield_kernels, "is_free", fresh["free"])
     monkeypatch.setattr(evidence_kernels, "mark_entered", fresh["entered"])
+    monkeypatch.setattr(evidence_kernels, "mark_agreeing", fresh["agreeing"])
     warm_up()
     known = {name: list(kernel.signatures) for name, kernel in fresh.items()}
     assert all(known.values())
     Faced(ranges(0.3), replace(CAR, wheelbase=wheelbase, obstacle_speed=1.0)).settles(
         0.1
     )
+    turning = drive((0.0, 0.0, 1.0), lambda _: [(1.5, 0.4, 0.2)])
+    find_movers(GIVEN, SHIELD, by_slipping_odometry(turning, 1.35))
     assert {name: kernel.signatures for name, kernel in fresh.items()} == known
 
 
@@ -408,8 +415,10 @@ def by_slipping_odometry(views, factor):
     )
 
 
-@pytest.mark.parametrize("factor", [0.8, 1.35, 1.7, 2.5])
-@pytest.mark.parametrize("twist", [(0.0, 0.0, 1.0), (0.5, 0.0, -0.8)])
+@pytest.mark.parametrize("factor", [0.8, 1.2, 1.35, 1.54, 1.7, 2.5])
+@pytest.mark.parametrize(
+    "twist", [(0.0, 0.0, 1.0), (0.5, 0.0, -0.8), (0.0, 0.0, 2.0), (0.3, 0.0, -3.0)]
+)
 def test_what_stands_does_not_move_where_wheels_slip_in_a_turn(twist, factor):
     discs = [(1.5, 0.4, 0.2), (1.0, -0.9, 0.15), (-0.8, 0.3, 0.25), (2.4, -0.2, 0.2)]
     views = by_slipping_odometry(drive(twist, lambda _: discs), factor)
@@ -436,6 +445,22 @@ def test_somebody_who_walks_around_a_turning_robot_in_the_open_does_not_pass_for
         pose = geometry.exp(t * twist) - (0.0, beyond_the_wall, 0.0)
         walker = (np.cos(0.6 * t), np.sin(0.6 * t) - beyond_the_wall, 0.25)
         views.append(View(round(t * NS_PER_S), pose, seen(pose, [walker])))
+    assert find_movers(GIVEN, SHIELD, tuple(views)).any()
+
+
+@pytest.mark.parametrize("around", [0.4, 0.6, 0.9])
+def test_somebody_who_circles_a_turning_robot_within_round_walls_moves(around):
+    pillars = [
+        (2.4 * np.cos(angle), 2.4 * np.sin(angle), 0.7)
+        for angle in np.arange(0.0, 2.0 * np.pi, 0.5)
+    ]
+    twist = np.array([0.0, 0.0, 1.2])
+    views = []
+    for t in (0.0, 0.1, 0.2, 0.3):
+        pose = geometry.exp(t * twist)
+        bearing = 0.3 + around * 1.2 * t
+        walker = (np.cos(bearing), np.sin(bearing), 0.25)
+        views.append(View(round(t * NS_PER_S), pose, seen(pose, [*pillars, walker])))
     assert find_movers(GIVEN, SHIELD, tuple(views)).any()
 
 
