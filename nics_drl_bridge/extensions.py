@@ -28,7 +28,7 @@ from typing import Any
 from nics_drl_bridge.errors import ConfigError, suggest
 
 PACKAGE = "nics_drl_bridge"
-ROS = ("rclpy", "_msgs", "std_srvs", "builtin_interfaces")
+ROS = ("rclpy", "_msgs", "std_srvs", "builtin_interfaces", "rcl_interfaces")
 INSTALL_ROS = f"source your ROS 2 installation, or pip install '{PACKAGE}[ros]'"
 # library -> the extra of this package that installs it
 INSTALL = {

@@ -286,7 +286,9 @@ def test_a_wrong_option_is_one_sentence(tmp_path, words):
     assert names(tmp_path) == set()
 
 
-def test_no_command_shows_the_help(tmp_path):
-    done = nics(cwd=tmp_path)
+@pytest.mark.parametrize("words", [(), ("bag",)])
+def test_no_command_shows_the_help(tmp_path, words):
+    done = nics(*words, cwd=tmp_path)
     assert done.returncode == 2
-    assert "Usage: nics" in done.stdout + done.stderr
+    assert done.stderr.startswith("Usage: nics")
+    assert len(done.stderr.splitlines()) > 10

@@ -142,7 +142,9 @@ def test_positions_on_earth_lie_the_same_way_to_each_other_wherever_they_begin()
 
 def test_a_degree_of_latitude_and_of_longitude_has_its_known_length():
     thousandth = np.radians(0.001)
-    east, _ = geometry.east_and_north(np.array([0.0, thousandth]), np.radians([45.0, 45.0]))
+    east, _ = geometry.east_and_north(
+        np.array([0.0, thousandth]), np.radians([45.0, 45.0])
+    )
     _, north = geometry.east_and_north(np.zeros(2), np.radians([45.0, 45.001]))
     assert east[1] == pytest.approx(78.847, abs=0.001)
     assert north[1] == pytest.approx(111.132, abs=0.001)

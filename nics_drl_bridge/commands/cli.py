@@ -3,6 +3,7 @@
 import os
 import sys
 from collections.abc import Sequence
+from itertools import zip_longest
 from typing import Annotated, Any
 
 import typer
@@ -59,7 +60,7 @@ class OneWordForARobot(TyperGroup):
 def read_option(option: str, args: Sequence[str]) -> list[str]:
     """Returns the values of an option in a command line: `--robot X` or `--robot=X`."""
     values = []
-    for word, following in zip(args, [*args[1:], None], strict=True):
+    for word, following in zip_longest(args, args[1:]):
         if word == option and following is not None:
             values.append(following)
         elif word.startswith(f"{option}="):
@@ -170,9 +171,11 @@ def main() -> None:
         if not hasattr(error, "format_message"):
             raise
         _unwrap_validator(error)
-        # The message is empty if the help has been shown.
+        # The message is empty if the help has been shown. Typer has a copy of click's classes.
         message = error.format_message().strip()
-        if message:
+        if type(error).__name__ == "NoArgsIsHelpError":
+            typer.echo(message, err=True)
+        elif message:
             message = shorten(message, LONGEST)
             typer.echo(f"nics: {message} (see `nics --help`)", err=True)
         raise SystemExit(EXIT_BAD_INPUT) from None

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from enum import Enum, StrEnum
+from enum import Enum
 
 import numpy as np
 
@@ -12,8 +12,10 @@ from nics_drl_bridge.robot.taylor import EndErrors, HorizonErrors
 JUDGED_S = 5.0  # horizon of the predictions that decide on a model
 
 
-class Verdict(StrEnum):
+class Verdict(str, Enum):
     """What a model is suitable for."""
+
+    __str__ = str.__str__
 
     GOOD = "good"
     WITH_CARE = "usable with care"

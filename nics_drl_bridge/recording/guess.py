@@ -92,7 +92,7 @@ def propose_mapping(tables: Sequence[TableSurvey]) -> MappingDraft:
     gyro = _find_free_yaw_rate(tables, guess)
     episode = guess_episode(tables)
     guesses = _Guesses(tables, pose, guess, switch, gyro, episode, common_time)
-    doubts = [*_find_doubts(guess, poses)]
+    doubts = [*_find_doubts(guess, poses, str(common_time))]
     if not guess.listed:
         doubts.append(NO_COMMAND)
     lines = [_write_robot(guess)]
@@ -118,16 +118,21 @@ def propose_mapping(tables: Sequence[TableSurvey]) -> MappingDraft:
 
 
 def _find_doubts(
-    guess: CommandGuess, poses: tuple[Array, Array] | None
+    guess: CommandGuess, poses: tuple[Array, Array] | None, time: str
 ) -> Iterator[str]:
-    """Yields sentences on a pose in the wrong unit, else on commands that the motion ignores."""
+    """Yields sentences on a pose in the wrong unit, else on commands that the motion ignores.
+
+    `time` is the reference to the column of the stamps.
+    """
     if poses is None:
         return
-    fault = find_implausible_pose(*poses, radius=USUAL_RADIUS)
+    # A car may accelerate harder than a small robot, and which of them it is, nobody has said yet.
+    fault = find_implausible_pose(*poses, radius=np.inf)
     if fault is None:
         yield from find_doubts(guess, *poses)
     else:
-        yield f"pose: {fault.reason}; {fault.cause}: add `{fault.line}`"
+        line = fault.line.replace("...", time)
+        yield f"pose: {fault.reason}; {fault.cause}: add `{line}`"
 
 
 def _write_robot(guess: CommandGuess) -> str:

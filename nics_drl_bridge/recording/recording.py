@@ -4,7 +4,7 @@ import io
 import json
 import zipfile
 from dataclasses import asdict, dataclass, field, replace
-from enum import StrEnum
+from enum import Enum
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -453,8 +453,10 @@ def has_visible_axes(pose: Array) -> bool:
     return float(np.ptp(np.unwrap(pose[:, 2]))) >= MIN_TURN
 
 
-class HeadingKeys(StrEnum):
+class HeadingKeys(str, Enum):
     """Keys of a mapping that correct a heading."""
+
+    __str__ = str.__str__
 
     NONE = ""
     MIRRORED = "scale: -1"  # counted clockwise

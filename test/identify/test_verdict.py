@@ -30,7 +30,7 @@ def throttled():
 
 
 def told(spec, *unmoved: str) -> str:
-    regression = SimpleNamespace(excitation=Excitation(unmoved, (), {}), dependent=())
+    regression = SimpleNamespace(excitation=Excitation(unmoved, ()), dependent=())
     return " ".join(
         describe_unlearnt(
             SimpleNamespace(regression=regression), Calibration(), spec, {}
@@ -52,15 +52,15 @@ def test_only_a_robot_that_moves_sideways_is_told_that_it_never_did(throttled):
 
 
 def test_a_car_that_never_moves_sideways_is_not_refused(throttled, car):
-    refuse_unexcited(Excitation(("vy",), (), {}), throttled)
+    refuse_unexcited(Excitation(("vy",), ()), throttled)
     with pytest.raises(
         FitError, match="steering never moved; drive with steering changing"
     ):
-        refuse_unexcited(Excitation(("vy", "wz", "steering"), (), {}), throttled)
+        refuse_unexcited(Excitation(("vy", "wz", "steering"), ()), throttled)
     with pytest.raises(
         FitError, match="steering never moved"
     ):  # a sensor that is stuck
-        refuse_unexcited(Excitation(("steering",), (), {}), car)
+        refuse_unexcited(Excitation(("steering",), ()), car)
 
 
 def of_mounting(spec, sigma: tuple[float, float], **learnt: float) -> str:
