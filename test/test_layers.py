@@ -18,7 +18,8 @@ PACKAGE = "nics_drl_bridge"
 # From the bottom up. What stands on one line does not import each other.
 LAYERS = (
     ("defaults", "exit_codes", "status"),
-    ("errors", "geometry", "interface", "kernels"),
+    ("errors", "geometry", "interface"),
+    ("kernels",),
     ("arguments", "extensions", "random_kernels", "seeds"),
     ("config", "files", "style", "threads"),
     ("robot",),

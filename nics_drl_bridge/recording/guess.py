@@ -126,8 +126,9 @@ def _find_doubts(
     """
     if poses is None:
         return
-    # A car may accelerate harder than a small robot, and which of them it is, nobody has said yet.
-    fault = find_implausible_pose(*poses, radius=np.inf)
+    # A car may accelerate harder than a small robot, and only its kind tells.
+    may_be_car = guess.kind is None or guess.kind.startswith("ackermann")
+    fault = find_implausible_pose(*poses, radius=np.inf if may_be_car else USUAL_RADIUS)
     if fault is None:
         yield from find_doubts(guess, *poses)
     else:

@@ -210,7 +210,7 @@ class _Topics:
         for role in roles:
             fitting = self._find_fitting(role)
             if fitting:
-                advice = f"choose one with --topic, for example {role}={fitting[0]}"
+                advice = f"name one, for example with --topic {role}={fitting[0]}"
                 break
         return f"no topic is known to hold the {words}; {advice}; {self._list_topics(roles)}"
 

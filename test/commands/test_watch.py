@@ -18,6 +18,7 @@ from watch.rig import Client, source
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.commands import episodes as driving
 from nics_drl_bridge.commands import watch as module
+from nics_drl_bridge.commands.conditions import Conditions
 
 
 @pytest.mark.parametrize(
@@ -81,8 +82,8 @@ def test_an_episode_has_the_time_that_its_policy_was_learnt_with(monkeypatch):
         "open_env",
         lambda *given, **more: driven.append(given[4]) or env_of(*given, **more),
     )
-    under = dict.fromkeys(("lidar", "randomisation", "gate", "task"))
-    with closing(module._watch_episodes("straight", None, ["circles"], 0, under)):
+    conditions = Conditions()
+    with closing(module._watch_episodes("straight", None, ["circles"], 0, conditions)):
         assert [each.steps for each in driven] == [777]
 
 
