@@ -1,11 +1,11 @@
-"""Signals in time: held commands, the states that follow them, means, resampled poses, noise.
+"""Time series: means of held commands, states that follow them, smoothed poses, and noise.
 
-A command takes effect in this order; each step has a function:
+A command takes effect in this order:
 
-1. The stream of commands holds a value until the next stamp. `average_held` integrates it, so that
-   an interval has the mean command, wherever its ends lie between the stamps.
-2. `average_effect` first bends the values by the input curves of the motors, and delays each
-   command.
+1. `average_effect` bends the values of the commands by the input curves of the motors, and delays
+   each one.
+2. The stream of commands holds a value until the next stamp. `average_held` integrates it, so that
+   any interval gets its exact mean.
 3. `infer_states` lets unmeasured states follow the commands by first-order lags: over a step `dt`,
    a state keeps `exp(-dt / lag)` of its distance from the command. Motors may limit its rate.
 """

@@ -100,7 +100,7 @@ def _find_widest(
     has_no_outlier: NDArray[np.bool_],
     greatest: float,
 ) -> tuple[float, float]:
-    """Edges of the widest interval of rings with small errors, or inf if too narrow."""
+    """Edges of the widest interval of rings with small errors; inf if none is wide enough."""
     best = (np.inf, np.inf)
     width = NARROWEST * (rings[-1] - rings[0])
     for i in range(RINGS):

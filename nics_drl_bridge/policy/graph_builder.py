@@ -1,8 +1,8 @@
 """Builds the ONNX graph of a policy file, node by node, around a network.
 
 A foreign network may use any opset from 8 on. The nodes added here therefore use only operators
-that mean the same in all of them: `Clip`, for instance, takes its limits as inputs only since
-opset 11, `Where` exists since opset 9, and there is no `Atan2`. They are composed from arithmetic.
+that mean the same in all of them. `Clip` (limits are inputs only since opset 11), `Where` (since
+opset 9) and atan2 (no such operator) are composed from arithmetic.
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.policy.foreign_mapping import Limits, Scaled
 
-# slope of the ramp that stands for a step: only numbers below 1e-30 land on the ramp
+# slope of the steep ramp that replaces a step: only numbers from -1e-30 to 0 are on the ramp
 STEEP = 1e30
 
 
@@ -79,7 +79,7 @@ class Builder:
     def select(self, condition: str, row: str, other: str) -> str:
         """Selects `row` where `condition` (1, 1) is 1 and `other` where it is 0.
 
-        Computes condition * row + (1 - condition) * other.
+        Computes condition * row + (1 - condition) * other, so both must be finite.
         """
         opposite = self.affine(condition, -1.0, 1.0)
         from_row = self.add("Mul", condition, row)

@@ -1,8 +1,8 @@
 """Shortest paths on a map for a disc-shaped robot: Dijkstra's search over cells.
 
 The search runs on a coarser map. Its cells are the nodes of a graph; links connect each free cell
-with its free neighbours, also diagonally. The cost of a link is its length in cells, and up to
-1 + `DEARER` times that next to obstacles.
+with its free neighbours, also diagonally. The cost of a link is its length in cells; next to
+obstacles, it is up to 1 + `DEARER` times as high.
 """
 
 import math
@@ -18,8 +18,8 @@ from nics_drl_bridge.interface import Array
 from nics_drl_bridge.lidar.maps import FREE, OCCUPIED, GridMap
 
 CELL = 0.1  # minimum side of a cell [m]
-COMFORT = 0.4  # distance from obstacles below which a path costs more [m]
-DEARER = 3.0  # maximum additional cost, as a fraction of the length
+COMFORT = 0.4  # distance of the disc from obstacles below which a path costs more [m]
+DEARER = 3.0  # maximum additional cost, as a multiple of the length
 # four of the eight neighbours of a cell, the others by symmetry: rows, columns, length [cells]
 NEIGHBOURS = (
     (0, 1, 1.0),
@@ -33,15 +33,17 @@ Cell = tuple[int, int]  # row, column
 def route(grid: GridMap, start: ArrayLike, goal: ArrayLike, radius: float) -> Array:
     """Returns a path (P, 2) [m] from start to goal that keeps a radius [m] off occupied cells.
 
-    It keeps a greater distance where there is space. Unknown cells count as free. Raises
-    ConfigError if start or goal is off the map, or if there is no path.
+    It keeps a greater distance where there is space. The cells of start and goal count as free.
+    Unknown cells count as free, too, unless the map says that they stop. A cell of the coarser map
+    is occupied if any part of it is, so a gap must be wider than the disc by up to two cells.
+    Raises ConfigError if start or goal is off the map, or if there is no path.
     """
     coarse = _coarsen(grid, max(1, math.ceil(CELL / grid.resolution - 1e-6)))
     start_cell = _find_cell(coarse, "start", start)
     goal_cell = _find_cell(coarse, "goal", goal)
     clearance = coarse.distance_field
     passable = clearance > radius
-    # The robot stands or will stand there, whatever the map says.
+    # At both ends, the robot may be nearer to an obstacle than the map allows.
     passable[start_cell] = True
     passable[goal_cell] = True
     closeness = np.clip(1.0 - (clearance - radius) / COMFORT, 0.0, 1.0)
@@ -56,7 +58,7 @@ def route(grid: GridMap, start: ArrayLike, goal: ArrayLike, radius: float) -> Ar
 
 
 def _coarsen(grid: GridMap, parts: int) -> GridMap:
-    """Returns the map with cells `parts` times as large; they are occupied if any part is."""
+    """Returns the map with cells `parts` times as large; each is occupied if any part of it is."""
     rows, columns = grid.cells.shape
     large_rows = math.ceil(rows / parts)
     large_columns = math.ceil(columns / parts)

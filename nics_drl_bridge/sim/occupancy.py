@@ -1,4 +1,4 @@
-"""A world as a grid of free and occupied cells, for planners; it shows all that stands still.
+"""A world as a grid of free and occupied cells, for planners, with everything that does not move.
 
 `occupancy` makes the grid in five steps, each of which only turns free cells into occupied ones:
 
@@ -8,7 +8,7 @@
 3. `_copy_map`: copy the world's own map. Each of its cells becomes a square of smaller cells.
 4. `_mark_line`: occupy the cells along each wall, found by points much closer than a cell.
 5. `_fill`: occupy the cells whose centre lies in an obstacle. A part thinner than a cell may
-   contain no centre; there, the cells along its outline are occupied.
+   contain no centre; there, the cells along its outline are occupied, and of a disc its middle.
 
 Cells are indexed by row (along y of the grid) and column (along x).
 """
@@ -33,7 +33,7 @@ Placed = tuple[Shape, ArrayLike]  # a shape, and its pose (3,)
 CELL = 0.01  # side of a cell [m]
 MOST_CELLS = 1_000_000  # in fields with more cells, the cells are larger
 SAMPLES = 8  # number of samples of an edge in a cell
-ROUNDING = 1e-6  # fraction of a cell by which a field may exceed whole cells
+ROUNDING = 1e-6  # allowance for rounding errors [cells]
 
 
 def standing(sampler: SetSampler, member: int, bodies: Array) -> list[Placed]:
@@ -41,7 +41,7 @@ def standing(sampler: SetSampler, member: int, bodies: Array) -> list[Placed]:
     motions = sampler.samplers[member].motions
     placed: list[Placed] = []
     for k, body in enumerate(bodies):
-        # Bodies that are not part of the world have no motion: they stand still.
+        # Bodies after those of the world were added later, and never move.
         stands = k >= len(motions) or motions[k] is None
         is_present = body[RADIUS] > 0.0
         if stands and is_present:
@@ -55,8 +55,9 @@ def occupancy(
     """Return the map of a world: its own map, walls, and the given obstacles.
 
     A cell is occupied if its centre is in something solid, or a wall runs through it. A field with
-    walls is closed by cells around it. `cell` [m] is the maximum size: cells of the world's own map
-    are divided evenly, so that none of its detail is lost. A large world gets larger cells.
+    walls is closed by cells around it. `cell` [m] is the desired size. Cells of the world's own map
+    are divided evenly, so that none of its detail is lost. Without a map, a world of more than
+    `MOST_CELLS` gets larger cells.
     """
     frame = _frame_of(world, cell)
     origin = compose(frame.pose, [*(frame.first * frame.cell), 0.0])
@@ -74,7 +75,7 @@ def occupancy(
 
 
 class _Frame(NamedTuple):
-    """Where the cells of a grid lie."""
+    """Position, size and number of the cells of a grid."""
 
     pose: (
         Any  # (3,) in the world, from which columns and rows are counted along its axes
