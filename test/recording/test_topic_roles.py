@@ -66,7 +66,7 @@ def test_what_is_measured_is_no_command():
     types = {"/vrpn_mocap/car/twist": kinds.TWIST_STAMPED, "/odom": kinds.ODOMETRY}
     sentence = refused(types)
     assert "no topic is known to hold the commands" in sentence
-    assert "for example cmd_vel=/vrpn_mocap/car/twist" in sentence
+    assert "for example with --topic cmd_vel=/vrpn_mocap/car/twist" in sentence
 
 
 def test_the_mapping_goes_before_the_names():
@@ -92,7 +92,7 @@ def test_without_poses_the_topics_are_listed_with_their_types():
         {"/cmd_vel": kinds.TWIST, "/tf": kinds.TRANSFORMS, "/a": "a/msg/A"}
     )
     assert (
-        "no topic is known to hold the poses; choose one with --topic, for example pose=/tf"
+        "no topic is known to hold the poses; name one, for example with --topic pose=/tf"
         in sentence
     )
     assert sentence.endswith(
