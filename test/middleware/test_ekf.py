@@ -280,7 +280,7 @@ NOISY = Noise(
     position_drift=Level(std=0.03, unit="m/sqrt(s)", source="measured"),
     heading_drift=Level(std=0.03, unit="rad/sqrt(s)", source="measured"),
 )
-RUNS = 30
+RUNS = 60
 
 
 def noisy_model(robot):
