@@ -7,6 +7,7 @@ import runpy
 import shlex
 import shutil
 from collections.abc import Callable
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -59,8 +60,8 @@ def runs_here(line: str) -> bool:
     return not any(re.match(pattern, line) for pattern in ELSEWHERE)
 
 
-def drive_of(robot: str | Path) -> Recording:
-    return record(load_robot(robot), np.random.default_rng(0), 40.0, dt=0.02)
+def drive_of(robot: str | Path, seed: int = 0) -> Recording:
+    return record(load_robot(robot), np.random.default_rng(seed), 40.0, dt=0.02)
 
 
 def drive(path: Path) -> None:
@@ -69,9 +70,9 @@ def drive(path: Path) -> None:
     save_recording(drive_of(own if own.exists() else "differential"), path)
 
 
-def table(path: Path) -> None:
+def table(path: Path, seed: int = 0) -> None:
     """A drive as columns of text."""
-    drive = drive_of("differential")
+    drive = drive_of("differential", seed)
     rows = np.column_stack([drive.pose.t, drive.pose.values, drive.command.values])
     np.savetxt(
         path,
@@ -196,6 +197,8 @@ SUPPLIES: dict[str, Callable[[Path], object]] = {
     "SOURCE": table,
     "my_drive": bag,
     "drive": bag,
+    "monday.csv": table,
+    "tuesday.csv": partial(table, seed=1),
     "drive.npz": drive,
     "my_robot": model,
     "my_car": model,
