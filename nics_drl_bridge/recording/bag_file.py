@@ -3,7 +3,7 @@
 import sqlite3
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -69,23 +69,30 @@ def open_bag(path: str | Path) -> "Iterator[BagFile]":
     """Opens a bag, given by its folder or its only file.
 
     Raises RecordingError if the bag is missing, damaged or empty, or if a library is missing.
+    Errors of the block that reads it stay what they are.
     """
     path = Path(path)
     check_libraries(path, "reading")
+    is_ros_1 = path.suffix == ROS_1
+    with ExitStack() as stack:
+        with _refuse_damage(path, is_ros_1):
+            opened = _open_ros_1(path) if is_ros_1 else _open_ros_2(path)
+            bag = stack.enter_context(opened)
+        yield bag
+
+
+@contextmanager
+def _refuse_damage(path: Path, is_ros_1: bool) -> Iterator[None]:
+    """Turns whatever a reader raises on a damaged file into a RecordingError."""
     try:
-        if path.suffix == ROS_1:
-            with _open_ros_1(path) as bag:
-                yield bag
-        else:
-            with _open_ros_2(path) as bag:
-                yield bag
+        yield
     except BridgeError:
         raise
     except Exception as error:  # noqa: BLE001 - the reader can raise anything on a damaged file
         reason = " ".join(str(error).split()).rstrip(".") or type(error).__name__
         fault = f"can't be read as a bag ({shorten(reason, LONGEST_REASON)})"
         advice = "try `mcap recover` or `ros2 bag reindex` on a copy, or record again"
-        if path.suffix == ROS_1:
+        if is_ros_1:
             advice = "mend it with `rosbag reindex`, or record again"
         raise RecordingError(
             f"{path}: {fault}; it is damaged or was not closed: {advice}."
@@ -239,7 +246,7 @@ def read_times(messages: Sequence[Message]) -> tuple[Nanoseconds, Nanoseconds | 
 
 
 class BagFile:
-    """A bag opened by `open_bag`; raises ValueError if messages of a topic are lost or damaged."""
+    """A bag opened by `open_bag`; RecordingError if messages of a topic are lost or damaged."""
 
     def __init__(self, reader: "AnyBag", place: str, is_ros_1: bool = False) -> None:
         if not reader.message_count:
@@ -292,22 +299,26 @@ class BagFile:
         decode = self._store.deserialize_cdr
         if self._is_ros_1:
             decode = self._store.deserialize_ros1
-        for k, (kind, receive_ns, data) in enumerate(self._read_raw(topic)):
-            try:
-                messages.append(Message(receive_ns, decode(data, kind)))
-            except Exception as error:  # noqa: BLE001 - damaged bytes break the decoder in any way
-                raise ValueError(
-                    f"topic {topic!r}: message {k} can't be decoded as {kind} ({error})"
-                ) from None
+        with _refuse_damage(Path(self.place), self._is_ros_1):
+            for k, (kind, receive_ns, data) in enumerate(self._read_raw(topic)):
+                try:
+                    messages.append(Message(receive_ns, decode(data, kind)))
+                except Exception as error:  # noqa: BLE001 - damaged bytes break it in any way
+                    raise ValueError(
+                        f"topic {topic!r}: message {k} can't be decoded as {kind} ({error})"
+                    ) from None
         return messages
 
     def read_serialized(self, topic: str) -> list[tuple[int, bytes]]:
         """Returns all messages of a topic as ROS 2 serializes them: receipt [ns] and bytes."""
-        raw = self._read_raw(topic)
-        if self._is_ros_1:
-            convert = collect_types(self._connections[topic], header=False).ros1_to_cdr
-            return [(ns, bytes(convert(data, kind))) for kind, ns, data in raw]
-        return [(ns, bytes(data)) for _, ns, data in raw]
+        with _refuse_damage(Path(self.place), self._is_ros_1):
+            raw = self._read_raw(topic)
+            if not self._is_ros_1:
+                return [(ns, bytes(data)) for _, ns, data in raw]
+            types = collect_types(self._connections[topic], header=False)
+            return [
+                (ns, bytes(types.ros1_to_cdr(data, kind))) for kind, ns, data in raw
+            ]
 
     def _read_raw(self, topic: str) -> list[tuple[str, int, bytes]]:
         connections = self._connections[topic]

@@ -13,6 +13,7 @@ pytest.importorskip("rosbags", reason="needs the extra 'bags'")
 import bags
 
 from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.recording.bag_file import open_bag
 from nics_drl_bridge.recording.readers import read_recording
 from nics_drl_bridge.robot.spec import load_robot
 
@@ -152,6 +153,11 @@ def test_a_cut_file_is_refused(bag, share, alone):
     if alone:
         (bag / "metadata.yaml").unlink()
     refused(file if alone else bag)
+
+
+def test_a_fault_of_the_code_that_reads_a_bag_is_not_told_as_damage(bag):
+    with pytest.raises(KeyError, match="wheels"), open_bag(bag) as opened:
+        opened.types["wheels"]
 
 
 MANY = (pytest.param(seed, marks=pytest.mark.campaign) for seed in range(5, 40))
