@@ -80,6 +80,7 @@ def record(
     if not preview:
         # This comes first because ROS 2 from wheels restarts Python.
         with extensions.require_modules("nics record"):
+            from nics_drl_bridge.nodes.output import forwarded_errors
             from nics_drl_bridge.nodes.record_node import record as drive
     lines = draw_preview(parameters)
     facts: dict[str, Any] = {"out": str(out), "robot": robot}
@@ -92,7 +93,8 @@ def record(
             as_json, "nothing was driven or recorded.", **facts, recorded=False
         )
         return
-    driven = drive(parameters, arguments)
+    with forwarded_errors():
+        driven = drive(parameters, arguments)
     if driven.failure is not None:
         raise BackendError(driven.line)
     recording = driven.recording

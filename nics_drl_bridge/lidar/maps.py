@@ -100,8 +100,18 @@ class GridMap:
         for down in range(3):
             for right in range(3):
                 clear[2 * at + down, 2 * to + right] = False
-        steps = ndimage.distance_transform_edt(clear)[1::2, 1::2]
-        return np.asarray(steps * (self.resolution / 2.0), dtype=np.float32)
+        # The nearest lattice points take far less memory than distances at every lattice point.
+        nearest = ndimage.distance_transform_edt(
+            clear, return_distances=False, return_indices=True
+        )
+        distances = np.empty((rows, columns), np.float32)
+        own_columns = 2 * np.arange(columns) + 1
+        for row in range(rows):
+            up = nearest[0, 2 * row + 1, 1::2] - (2.0 * row + 1.0)
+            right = nearest[1, 2 * row + 1, 1::2] - own_columns.astype(np.float64)
+            steps = np.sqrt(up * up + right * right)
+            distances[row] = steps * (self.resolution / 2.0)
+        return distances
 
 
 MAX_CELLS = 64_000_000

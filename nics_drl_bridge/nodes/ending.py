@@ -13,7 +13,7 @@ import sys
 from collections.abc import Iterator
 from typing import NoReturn
 
-from nics_drl_bridge.nodes.output import finish_output
+from nics_drl_bridge.nodes.output import FINISH_S, finish_output
 
 ENDING = (
     signal.SIGHUP,  # the terminal or the ssh session is gone
@@ -32,7 +32,6 @@ ENDING = (
 )
 """Signals that end a process unless it handles them, except SIGKILL, signals of a fault in the
 process itself, and those that Python ignores, such as SIGPIPE."""
-OUTPUT_S = 1.0  # time limit for writing the last lines [s]
 _own_process = False  # True if this process is a single node
 _within = False  # `at_once`
 
@@ -42,7 +41,7 @@ def leave(code: int) -> NoReturn:
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(Exception):  # whoever read it has gone
             stream.flush()
-    finish_output(OUTPUT_S)
+    finish_output(FINISH_S)
     os._exit(code)
 
 

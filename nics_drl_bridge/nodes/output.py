@@ -13,13 +13,15 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any, TextIO
 
 PROGRAM = Path(__file__).with_name("output_forwarder.py")
 STDOUT = 1
 STDERR = 2
 PIPE_BYTES = 2**20  # Linux's maximum for an unprivileged process
+FINISH_S = 1.0  # time for writing the last lines [s]
 # variable of ROS 2 that sets whether log lines are coloured, "0" or "1"
 COLOUR = "RCUTILS_COLORIZED_OUTPUT"
 
@@ -95,12 +97,8 @@ def forward_output(log: str = "") -> None:
             _lead_into(entrance, descriptor)
         if STDOUT not in descriptors:
             os.dup2(STDERR, STDOUT)
-        sys.stdout = io.TextIOWrapper(
-            _DroppingFile(STDOUT), "utf-8", "backslashreplace", write_through=True
-        )
-        sys.stderr = io.TextIOWrapper(
-            _DroppingFile(STDERR), "utf-8", "backslashreplace", write_through=True
-        )
+        sys.stdout = _dropping_text(STDOUT)
+        sys.stderr = _dropping_text(STDERR)
     for exit_, entrance in pipes.values():
         os.close(exit_)
         os.close(entrance)
@@ -115,6 +113,50 @@ def finish_output(seconds: float) -> None:
         os.dup2(nowhere, descriptor)
     with contextlib.suppress(subprocess.TimeoutExpired):
         _forwarder.wait(seconds)
+
+
+@contextlib.contextmanager
+def forwarded_errors() -> Iterator[None]:
+    """Within this context, let a separate process write what this one writes to stderr.
+
+    For a command that is not a node's own process but moves a robot, or records one: ROS 2 and this
+    package log to stderr meanwhile. At the end, wait for a moment until all is written.
+    """
+    if _forwarder is not None:
+        yield
+        return
+    python_errors = sys.stderr
+    direct = os.dup(STDERR)
+    exit_, entrance = os.pipe()
+    try:
+        forwarder = _start_forwarder("", {STDERR: (exit_, entrance)})
+        _lead_into(entrance, STDERR)
+    finally:
+        os.close(exit_)
+        os.close(entrance)
+    if _writes_to_stderr(python_errors):
+        python_errors.flush()
+        sys.stderr = _dropping_text(STDERR)
+    try:
+        yield
+    finally:
+        sys.stderr = python_errors
+        os.dup2(direct, STDERR)
+        os.close(direct)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            forwarder.wait(FINISH_S)
+
+
+def _writes_to_stderr(stream: TextIO) -> bool:
+    try:
+        return stream.fileno() == STDERR
+    except (OSError, ValueError):  # a stream without a descriptor, or closed
+        return False
+
+
+def _dropping_text(descriptor: int) -> TextIO:
+    file: Any = _DroppingFile(descriptor)
+    return io.TextIOWrapper(file, "utf-8", "backslashreplace", write_through=True)
 
 
 def _different_outputs() -> list[int]:

@@ -2,12 +2,14 @@
 
 import csv
 import re
+import zipfile
 from collections import Counter
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +29,7 @@ MOST_FILES = 500  # maximum number of files that are read from a folder
 SEPARATORS = (",", ";", "\t", "|", None)  # None: any white space
 NO_SEPARATOR = re.compile(r"[\w\s.,;|+\"'#-]")
 MAX_TABLE_BYTES = 256 * 2**20
+MAX_UNPACKED_BYTES = 2**30  # of an .npz file, whose arrays may be packed a thousandfold
 # Maximum number of rows, and of characters in one
 MOST_ROWS = 2_000_000
 LONGEST_ROW = 20_000
@@ -267,10 +270,15 @@ def read_arrays(path: Path) -> Table:
     """Reads an .npz or .npy file, also of records. Raises RecordingError for objects or damage."""
     try:
         with check_no_device(path).open("rb") as file:
+            if _count_unpacked(file) > MAX_UNPACKED_BYTES:
+                reason = f"unpacked it is larger than {MAX_UNPACKED_BYTES // 2**20} MB"
+                raise RecordingError(f"{path}: {reason}; split it.")
             loaded = np.load(file, allow_pickle=False)
             if isinstance(loaded, np.ndarray):
                 loaded = {"": loaded}
             arrays = dict(loaded)
+    except RecordingError:
+        raise
     except Exception as error:  # noqa: BLE001 - damage breaks numpy in any way
         advice = "write numbers with numpy.save or numpy.savez, without pickle"
         why = " ".join(str(error).split())[:200]
@@ -283,6 +291,16 @@ def read_arrays(path: Path) -> Table:
     return make_table(
         str(path), tuple(name for name, _ in columns), tuple(c for _, c in columns)
     )
+
+
+def _count_unpacked(file: BinaryIO) -> int:
+    """Returns the size of an archive's members when unpacked [bytes]; 0 for other files."""
+    size = 0
+    if zipfile.is_zipfile(file):
+        with zipfile.ZipFile(file) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+    file.seek(0)
+    return size
 
 
 def read_parquet(path: Path) -> Table:

@@ -1,10 +1,12 @@
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 import shapely
 
-from nics_drl_bridge.lidar.maps import GridMap
+from nics_drl_bridge.lidar.maps import OCCUPIED, GridMap
 
 TURNED = (1.0, -2.0, 0.7)
 
@@ -66,3 +68,19 @@ def test_the_distance_field_is_the_distance_to_the_nearest_square():
 
 def test_without_anything_blocked_the_distance_is_infinite():
     assert np.isinf(grid(["..", ".."]).distance_field).all()
+
+
+def test_the_distance_field_of_a_large_map_takes_few_bytes_for_a_cell():
+    """A few kilobytes of PNG hold millions of cells, whose distances the first scene needs."""
+    side = 1000
+    cells = np.zeros((side, side), np.int8)
+    cells[::97, ::83] = OCCUPIED
+    large = GridMap(cells, 0.05)
+    tracemalloc.start()
+    try:
+        distances = large.distance_field
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert distances.shape == (side, side)
+    assert peak < 60 * side**2, f"{peak / side**2:.1f} bytes for a cell"

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -26,6 +27,7 @@ from nodes.peer import stamp_ns
 pytestmark = [pytest.mark.ros, pytest.mark.process, pytest.mark.timeout(240)]
 
 ENDS_S = 60.0
+SMALL_FILE = 100_000  # bytes
 
 
 def nics(domain_id, *words):
@@ -144,6 +146,27 @@ def test_a_recorder_that_is_killed_leaves_what_it_flushed(meet, domain_id, tmp_p
     assert not (tmp_path / "drive").exists()
     (left,) = tmp_path.glob(".drive.*")
     assert bags.unfinished_messages(left / "drive") > 10
+
+
+@pytest.mark.parametrize(
+    "storage", ["mcap", pytest.param("sqlite3", marks=pytest.mark.campaign)]
+)
+def test_a_recorder_whose_storage_is_full_ends_and_tells_where_the_bag_lies(
+    storage, meet, domain_id, tmp_path
+):
+    robot = Robot(meet(domain_id))
+    place = tmp_path / "drive"
+    recorder = nics(domain_id, "bag", "record", place, "--storage", storage)
+    robot.until(lambda: robot.odom.get_subscription_count() > 0, "a recorder of odom")
+    resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (SMALL_FILE, SMALL_FILE))
+    robot.until(lambda: recorder.poll() is not None, "its end")
+    _, err, code = ended(recorder)
+    assert code == 2
+    (left,) = tmp_path.glob(".drive.*/drive")
+    (told,) = (line for line in err.splitlines() if "drive" in line)
+    assert told.startswith(f"nics: {place}: ")
+    assert f"what was written until then lies in {left}" in told
+    assert bags.unfinished_messages(left) > 10
 
 
 @pytest.mark.campaign

@@ -161,6 +161,40 @@ def test_a_forwarder_that_is_frozen_or_killed_delays_nothing():
         assert talker.wait(DEADLINE_S) == 3
 
 
+ERRORS = """
+import os, sys
+from nics_drl_bridge.nodes.output import forwarded_errors
+with forwarded_errors():
+    for number in range(30_000):
+        print("line", number, "x" * 80, file=sys.stderr)
+        if number == 0:
+            os.write(2, b"of a library\\n")
+    print("over", file=sys.stderr)
+print("after", flush=True)
+os._exit(3)
+"""
+
+
+def test_a_command_that_moves_a_robot_never_waits_for_who_reads_its_errors():
+    exit_, entrance = full_pipe()
+    command = start(ERRORS, stdout=subprocess.PIPE, stderr=entrance)
+    os.close(entrance)
+    assert command.communicate(timeout=DEADLINE_S)[0] == b"after\n"
+    assert command.returncode == 3
+    os.close(exit_)
+
+
+def test_the_errors_of_a_command_arrive_in_order_and_stderr_is_its_own_again():
+    code = ERRORS.replace("30_000", "3").replace(
+        "os._exit", "os.write(2, b'own');os._exit"
+    )
+    command = start(code, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    told, errors = command.communicate(timeout=DEADLINE_S)
+    lines = [line.split(" x")[0] for line in errors.decode().splitlines()]
+    assert lines == ["line 0", "of a library", "line 1", "line 2", "over", "own"]
+    assert told == b"after\n"
+
+
 class TestGate:
     """The gate in a process of its own, whose output nobody reads."""
 

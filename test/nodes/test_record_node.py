@@ -24,6 +24,7 @@ from nics_drl_bridge.recording.readers import read_recording
 from nics_drl_bridge.recording.recording import check
 from nics_drl_bridge.robot.spec import load_robot
 from nodes.peer import DEADLINE_S
+from nodes.test_output import full_pipe
 
 pytestmark = pytest.mark.ros
 
@@ -208,7 +209,7 @@ def test_a_simulator_that_is_faster_than_the_clock_is_noticed(
 class Nics:
     """`nics record` in a process of its own, in a folder."""
 
-    def __init__(self, folder, domain_id, *options):
+    def __init__(self, folder, domain_id, *options, errors=subprocess.STDOUT):
         self._said = folder / "said"
         environment = {
             "ROS_DOMAIN_ID": str(domain_id),
@@ -227,7 +228,7 @@ class Nics:
                 cwd=folder,
                 env=os.environ | environment,
                 stdout=log,
-                stderr=subprocess.STDOUT,
+                stderr=errors,
             )
 
     @property
@@ -244,8 +245,9 @@ def nics(tmp_path, domain_id):
     """Starts `nics record`; it has ended after the test."""
     started = []
     yield (
-        lambda *options: (
-            started.append(Nics(tmp_path, domain_id, *options)) or started[-1]
+        lambda *options, **outputs: (
+            started.append(Nics(tmp_path, domain_id, *options, **outputs))
+            or started[-1]
         )
     )
     for each in started:
@@ -270,6 +272,23 @@ def test_ctrl_c_on_the_command_line_saves_a_bag_and_tells_what_it_holds(
     assert "steering_command: " in command.said
     assert set(os.listdir(tmp_path)) == {"said", "drive", "drive_preview.png"}
     assert seconds(tmp_path / "drive") > 0.5
+
+
+@pytest.mark.process
+def test_the_command_line_drives_on_and_heeds_ctrl_c_though_nobody_reads_its_errors(
+    nics, meet, domain_id, tmp_path
+):
+    exit_, entrance = full_pipe()
+    robot = FakeRobot(meet(domain_id))
+    command = nics("--robot", "ackermann", "--out", "drive.npz", errors=entrance)
+    os.close(entrance)
+    robot.until(lambda: robot.driven, "it drives")
+    command.process.send_signal(signal.SIGINT)
+    robot.until(lambda: command.ended, "it ends")
+    os.close(exit_)
+    assert command.process.returncode == 130
+    robot.peer.until(lambda: robot.heard[-1] == Twist(), "zero")
+    assert "s are recorded in drive.npz\n" in command.said
 
 
 @pytest.mark.process

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.recording import table_files
 from nics_drl_bridge.recording.table import read_numbers
-from nics_drl_bridge.recording.table_files import read_text_table
+from nics_drl_bridge.recording.table_files import read_arrays, read_text_table
 
 NUMBERS = [(0.0, 1.5, -2.0), (0.1, 1.6, -2.5), (0.2, 1.7, -3.0)]
 
@@ -152,3 +153,12 @@ def test_words_for_a_missing_value_are_none(tmp_path, word):
 def test_excel_in_utf_16_and_comments_of_matlab_are_read(tmp_path):
     assert table(tmp_path, "t\tx\n0\t1\n", encoding="utf-16").names == ("t", "x")
     assert table(tmp_path, "% t, x\n0,1\n1,2\n").names == ("t", "x")
+
+
+def test_an_archive_that_unpacks_to_gigabytes_is_refused_packed(monkeypatch, tmp_path):
+    path = tmp_path / "drive.npz"
+    np.savez_compressed(path, t=np.arange(1000.0), x=np.zeros(1000))
+    assert read_arrays(path).names == ("t", "x")
+    monkeypatch.setattr(table_files, "MAX_UNPACKED_BYTES", 10_000)
+    with pytest.raises(RecordingError, match="unpacked it is larger than 0 MB; split"):
+        read_arrays(path)

@@ -45,12 +45,14 @@ def record(
     kind = _choose_storage(storage)
     with extensions.require_modules("nics bag record"):
         from nics_drl_bridge.extras.bags.live import BagOrder, record_bag
+        from nics_drl_bridge.nodes.output import forwarded_errors
     names = tuple(topics or ())
     say = partial(typer.echo, err=True)
     order = BagOrder(
         out, names, everything, parse_namespace(namespace), duration, kind, use_sim_time
     )
-    counts = dict(sorted(record_bag(order, say).items()))
+    with forwarded_errors():
+        counts = dict(sorted(record_bag(order, say).items()))
     lines = [f"{topic}: {count} messages" for topic, count in counts.items()]
     lines.append(f"bag written to {out}")
     console.print_line(as_json, "\n".join(lines), path=str(out), messages=counts)

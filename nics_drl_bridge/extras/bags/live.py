@@ -3,7 +3,8 @@
 import signal
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -118,7 +119,8 @@ class BagRecorder(QosWatch):
         now = time.monotonic()
         if now - self._flushed >= FLUSH_S:
             self._flushed = now
-            self._sink.flush()
+            with self._end_by_fault():
+                self._sink.flush()
         if (
             self._order.duration is not None
             and now - self._began >= self._order.duration
@@ -148,7 +150,8 @@ class BagRecorder(QosWatch):
             self._say(f"not recorded: {self.skipped[topic]}")
             return
         if subscribed is None:
-            self._sink.add_topic(topic, kinds[0], offers, message_texts(kinds[0]))
+            with self._end_by_fault():
+                self._sink.add_topic(topic, kinds[0], offers, message_texts(kinds[0]))
             self._say(f"{topic} ({kinds[0]})")
         else:
             self.destroy_subscription(subscribed[1])
@@ -163,8 +166,19 @@ class BagRecorder(QosWatch):
         received = info.get("received_timestamp") or time.time_ns()
         if self._order.use_sim_time:
             received = self.get_clock().now().nanoseconds
-        if received > 0:
-            self._sink.write(topic, int(received), data)
+        if received > 0 and self._sink.fault is None:
+            with self._end_by_fault():
+                self._sink.write(topic, int(received), data)
+
+    @contextmanager
+    def _end_by_fault(self) -> Iterator[None]:
+        """Ends the recording when its storage fails; `record_bag` raises the fault."""
+        try:
+            yield
+        except Exception:
+            if self._sink.fault is None:
+                raise
+            self.context.try_shutdown()
 
 
 def record_bag(order: BagOrder, say: Callable[[str], None]) -> dict[str, int]:
@@ -176,6 +190,8 @@ def record_bag(order: BagOrder, say: Callable[[str], None]) -> dict[str, int]:
         node = run_node(
             lambda context: BagRecorder(context, order, sink, say), ["nics"]
         )
+        if sink.fault is not None:
+            raise sink.fault
         if not sum(sink.counts.values()):
             skipped = " ".join(node.skipped.values())
             fix = "start the robot, or correct --topics, --namespace or ROS_DOMAIN_ID."
