@@ -159,7 +159,13 @@ def guess_command(
     if not certain:
         kind, commands = _choose_kind(list(_find_wheels(tables)))
         if kind is not None:
-            named = _choose_kind(candidates)[1]
+            wheels = {(id(c.table), c.column.name) for c in commands.values()}
+            others = [
+                candidate
+                for candidate in candidates
+                if (id(candidate.table), candidate.column.name) not in wheels
+            ]
+            named = _choose_kind(others)[1]
             return CommandGuess(kind, commands, named, of_wheels=True)
     if not candidates:
         for table in tables:

@@ -860,3 +860,5 @@ def test_what_names_do_not_show_of_a_real_recording_is_blank_or_in_doubt(
         "right_wheel": {"from": "Right_Tick", "unit": "ticks"},
     }
     assert text.count("guessed; add `ticks_per_turn:`") == 2
+    assert "no command was recorded: what the wheels did stands in for it" in text
+    assert "\n#  or " not in text
