@@ -5,8 +5,6 @@ from __future__ import annotations
 from functools import cache
 from pathlib import Path
 
-import pytest
-
 from nics_drl_bridge.config import parse_yaml
 from nics_drl_bridge.identify.acceptance import Outcome, Verdict, compare, usual
 from nics_drl_bridge.identify.conclusion import conclude
@@ -16,8 +14,6 @@ from nics_drl_bridge.recording.mapping import Mapping
 from nics_drl_bridge.recording.readers import open_source, read_robot_and_drive
 from nics_drl_bridge.recording.survey import inspect_tables
 from nics_drl_bridge.recording.topic_roles import TopicRoles
-
-pytestmark = pytest.mark.campaign
 
 
 @cache
