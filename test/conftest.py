@@ -36,6 +36,7 @@ FILES = {
     "benchmarks/test_abuse_env.py": "campaign",
     "benchmarks/test_barn.py": "campaign",
     "benchmarks/test_node_endings.py": "campaign",
+    "identify/test_drives_of_others.py": "campaign",
 }
 
 # rclpy's major version tells the distribution where no ROS 2 is sourced, as with wheels.

@@ -446,25 +446,35 @@ def check_pose_moves(drive: Drive) -> None:
 
 
 def check_encoders(drive: Drive) -> tuple[str, ...]:
-    """Returns a sentence on each measured wheel that turns against the motion it causes."""
+    """Returns a sentence on each wheel that turns against the motion it causes.
+
+    The wheels are those of the measured state, or else the commands.
+    """
     spec = drive.spec
-    state = drive.recording.state
-    if state is None or state.clock != drive.recording.pose.clock:
+    if not has_textbook(spec):
         return ()
-    are_wheels = [v.unit == "rad/s" and not v.twist for v in spec.state]
-    if not (are_wheels and all(are_wheels) and has_textbook(spec)):
+    has_state = drive.recording.state is not None
+    units = [v.unit for v in (spec.state if has_state else spec.command)]
+    if {*units} != {"rad/s"}:
+        return ()
+    wheels = _average_inputs(drive, drive.dated.values)
+    if wheels is None:
         return ()
     try:
-        per_wheel = textbook(spec).twist(np.eye(len(spec.state)))  # (S, 3)
+        book = textbook(spec)
     except ConfigError:
         return ()
-    start, end, driven = _driven(drive)
-    inside = (start >= state.t[0]) & (end <= state.t[-1])
-    if inside.sum() < MIN_COMPARED:
-        return ()
-    driven = driven[inside]
-    turned = interval_means(state.t, state.values, start[inside], end[inside])
-    effect = np.linalg.lstsq(turned, driven, rcond=1e-3)[0]  # (S, 3)
+    turned, driven = wheels
+    unit_speeds = np.eye(turned.shape[1])
+    if has_state:
+        names = [v.name for v in spec.state]
+        per_wheel = book.twist(unit_speeds)  # (wheels, 3)
+        fault = "its encoder counts backwards"
+    else:
+        names = [c.name for c in spec.command]
+        per_wheel = book.compute_twist(unit_speeds)
+        fault = "its sign is reversed, as if its encoder counts backwards"
+    effect = np.linalg.lstsq(turned, driven, rcond=1e-3)[0]  # (wheels, 3)
     rest = driven - turned @ effect
     power = np.maximum((driven**2).mean(axis=0), 1e-12)
     explained = 1.0 - (rest**2).mean(axis=0) / power
@@ -473,11 +483,42 @@ def check_encoders(drive: Drive) -> tuple[str, ...]:
         return ()
     is_reversed = (effect[:, dofs] * per_wheel[:, dofs] < 0.0).all(axis=1)
     finding = "turns backwards where the robot drives ahead"
-    advice = "its encoder counts backwards; write `scale: -1` for it"
     return tuple(
-        Mistake(f"{spec.state[i].name} {finding}: {advice}.")
+        Mistake(f"{names[i]} {finding}: {fault}; write `scale: -1` for it.")
         for i in np.flatnonzero(is_reversed)
     )
+
+
+def _average_inputs(
+    drive: Drive, pose: Array, delay_s: float = 0.0
+) -> tuple[Array, Array] | None:
+    """Returns mean inputs (n, inputs) and the twists (n, 3) of poses (T, 3) meanwhile.
+
+    The inputs are the measured speeds of the wheels, or else commands for the wheels or the twist,
+    which act after a delay. None if they are others or on another clock, or for too few spans.
+    """
+    recording = drive.recording
+    spec = drive.spec
+    start, end, driven = _measure_twists(drive.dated.t, pose)
+    state = recording.state
+    if state is not None:
+        are_linear = {(v.unit, v.twist) for v in spec.state} == {("rad/s", None)}
+        source = state
+        inside = (start >= state.t[0]) & (end <= state.t[-1])
+    else:
+        are_wheels = all(c.unit == "rad/s" and not c.cmd_vel for c in spec.command)
+        are_linear = are_wheels or all(c.is_twist for c in spec.command)
+        source = recording.command
+        inside = np.ones(len(start), dtype=np.bool_)
+    if not are_linear or source.clock != recording.pose.clock:
+        return None
+    if inside.sum() < MIN_COMPARED:
+        return None
+    start, end, driven = (values[inside] for values in (start, end, driven))
+    if state is not None:
+        return interval_means(state.t, state.values, start, end), driven
+    sent = average_held(recording.command, spec, start - delay_s, end - delay_s)
+    return sent, driven
 
 
 def _check_swapped(
@@ -534,16 +575,18 @@ def _check_sideways(drive: Drive, command: recordings.Stream) -> tuple[str, ...]
 
 def _driven(drive: Drive) -> tuple[Array, Array, Array]:
     """Returns the ends (n,) of time spans [s], and the twist (n, 3) measured in each."""
-    t = drive.dated.t
+    return _measure_twists(drive.dated.t, drive.dated.values)
+
+
+def _measure_twists(t: Array, pose: Array) -> tuple[Array, Array, Array]:
+    """Returns the ends (n,) of time spans [s], and the twist (n, 3) of poses (T, 3) in each."""
     start = np.arange(t[0], t[-1] - COMPARED_S, COMPARED_S / 2.0)
     first = np.searchsorted(t, start)
     last = np.searchsorted(t, start + COMPARED_S)
     apart = last > first
     first = first[apart]
     last = last[apart]
-    moved = geometry.log(
-        geometry.between(drive.dated.values[first], drive.dated.values[last])
-    )
+    moved = geometry.log(geometry.between(pose[first], pose[last]))
     return t[first], t[last], moved / (t[last] - t[first])[:, None]
 
 
@@ -609,6 +652,8 @@ def check_axes(drive: Drive) -> None:
     else:
         keys = recordings.find_clockwise_keys(spaced.values)
     if keys is HeadingKeys.NONE:
+        keys = _find_heading_by_inputs(spaced.values, drive)
+    if keys is HeadingKeys.NONE:
         return
     if keys is HeadingKeys.COMPASS:
         kind = "as that of a compass"
@@ -637,6 +682,37 @@ def _find_mirrored_heading(pose: recordings.Stream, drive: Drive) -> HeadingKeys
     if mirrored > max(recordings.MIN_MIRRORED, recordings.BETTER + as_recorded):
         return HeadingKeys.MIRRORED
     return HeadingKeys.NONE
+
+
+def _find_heading_by_inputs(spaced: Array, drive: Drive) -> HeadingKeys:
+    """Finds if only mirrored headings make wheels or commands explain where the robot went.
+
+    A tracked point ahead of the axle moves sideways in turns, so its path alone may not show this.
+    """
+    if not recordings.has_visible_axes(spaced):
+        return HeadingKeys.NONE
+    as_recorded, mirrored = (
+        _explain_velocity(drive, drive.dated.values * [1.0, 1.0, scale])
+        for scale in (1.0, -1.0)
+    )
+    if mirrored < max(recordings.MIN_MIRRORED, recordings.BETTER + as_recorded):
+        return HeadingKeys.NONE
+    return recordings.choose_clockwise_keys(spaced)
+
+
+def _explain_velocity(drive: Drive, pose: Array) -> float:
+    """Returns the fraction (0 to 1) of the body velocity that inputs explain after some delay."""
+    explained = [0.0]
+    for delay_s in DELAYS_S:
+        averages = _average_inputs(drive, pose, delay_s)
+        if averages is None:
+            return 0.0
+        sent, driven = averages
+        velocity = driven[:, :2]
+        rest = velocity - sent @ np.linalg.lstsq(sent, velocity, rcond=1e-3)[0]
+        share = (rest**2).sum() / max(float((velocity**2).sum()), 1e-12)
+        explained.append(1.0 - float(share))
+    return max(explained)
 
 
 def _explained(t: Array, pose: Array, state: recordings.Stream) -> float:

@@ -23,7 +23,7 @@ from nics_drl_bridge.robot.template import list_names
 COMMANDING = word_set("cmd command commanded commands cmdvel ctrl control controls")
 WISHING = word_set("""
     ref reference setpoint target desired des input inputs set u req request
-    requested demand
+    requested demand vtarget
 """)
 # Words that show that something was measured or computed from measurements
 MEASURING = word_set("""
@@ -31,18 +31,20 @@ MEASURING = word_set("""
     actual act state states real true truth gt est groundtruth estimated
     estimate sensor sensors gyro gps gnss fix ekf vicon mocap vrpn optitrack pf
     filtered predicted pred joint core telemetry status current voltage battery
-    temp temperature
+    temp temperature vins hector gmapping ins rtk
 """)
 # Words of columns that never drive a robot
 NEVER = word_set("""
     header stamp seq index id row frame time timestamp layout range ranges scan
     laser lidar beam beams intensity intensities depth image pixel sonar
-    ultrasonic bumper cliff slam amcl orb lio loam cartographer rtabmap
+    ultrasonic bumper cliff distance dist proximity prox tof infrared ir lds
+    obstacle obstacles person people pedestrian wind
+    slam amcl orb lio loam cartographer rtabmap
     localization map pose position orientation quaternion quat pos translation
     rotation yaw heading roll pitch easting northing utm goal waypoint path acc
     accel acceleration jerk mag magnetic magnetometer gravity gear brake error
-    err std stddev sigma var fps latency torque force status axes buttons level
-    line
+    err std stddev sd rms sigma var uncertainty confidence fps latency torque
+    force load status axes buttons level line
 """)
 NOT_COMMANDED = NEVER | NO_COMMANDS | MEASURING
 TICKS = word_set("tick ticks encoder enc encoders count counts")
@@ -53,8 +55,8 @@ NO_SPEED = word_set("""
     pos position angle current force torque slip distance dist pressure load
     temp effort travel accel acc steer steering
 """)
-LEFT = word_set("left l lw wl vl le")
-RIGHT = word_set("right r rw wr vr ri")
+LEFT = word_set("left l lw wl vl le lwheel leftwheel")
+RIGHT = word_set("right r rw wr vr ri rwheel rightwheel")
 FRONT = word_set("front f")
 REAR = word_set("rear back b")
 CORNERS = (
@@ -65,9 +67,14 @@ CORNERS = (
 )
 NO_VEHICLE = word_set("motor arm gripper pan tilt head fan")
 STEERING = word_set("steering steer delta servo")
-THROTTLE = word_set("throttle gas accelerator pedal pwm duty")
+PULSES = word_set("pwm duty")  # what a motor driver is sent
+THROTTLE = PULSES | word_set("throttle gas accelerator pedal")
 TURNING = word_set("angular ang omega yawrate wz w turn rot rotational")
 SPEED = word_set("speed velocity vel v vx linear lin forward trans cmdvel")
+# Words that belong to a measurement, unless a command of turn rate or steering has them
+ORIENTATIONS = word_set("yaw heading rotation")
+RATES = word_set("rate speed velocity vel")
+POSITIONS = word_set("position pos")
 # Kinds of robots, with the names of their commands by meaning; the `words` of a template name those
 # of other kinds.
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
@@ -128,7 +135,7 @@ class CommandGuess(NamedTuple):
     commands: dict[str, Candidate]  # by the robot's names; empty if none is certain
     # by the robot's names, for the user to choose from
     candidates: dict[str, Candidate]
-    # True if no command was recorded and the motion of the wheels stands in for it
+    # True if no command is certain and the motion of the wheels stands in for it
     of_wheels: bool = False
 
     @property
@@ -152,10 +159,17 @@ def guess_command(
     if not certain:
         kind, commands = _choose_kind(list(_find_wheels(tables)))
         if kind is not None:
-            return CommandGuess(kind, commands, {}, of_wheels=True)
+            wheels = {(id(c.table), c.column.name) for c in commands.values()}
+            others = [
+                candidate
+                for candidate in candidates
+                if (id(candidate.table), candidate.column.name) not in wheels
+            ]
+            named = _choose_kind(others)[1]
+            return CommandGuess(kind, commands, named, of_wheels=True)
     if not candidates:
         for table in tables:
-            candidates += _find_unexplained(table, pose)
+            candidates += _find_unexplained(table, len(tables) > 1, pose)
     kind, named = _choose_kind(candidates)
     if kind is None:
         strongest = sorted(candidates, key=lambda column: -column.strength)
@@ -185,6 +199,8 @@ def _find_candidates(
     used = list_used_columns(table, pose)
     for column in table.numbers:
         words = {*table.list_words(column.name)}
+        if (words | context) & (COMMANDING | WISHING):
+            words = _name_commanded(words)
         if column.name in used or words & NOT_COMMANDED or column.is_place_on_earth:
             continue
         meaning = guess_meaning(words | context_of_topic)
@@ -194,25 +210,41 @@ def _find_candidates(
         yield Candidate(table, column, meaning, strength, _rank_topic(table, context))
 
 
+def _name_commanded(words: set[str]) -> set[str]:
+    """Returns the words of a command: `yaw rate` as `yawrate`, `servo position` as `servo`."""
+    if words & ORIENTATIONS and words & RATES:
+        return words - ORIENTATIONS - RATES | {"yawrate"}
+    if words & STEERING:
+        return words - POSITIONS
+    return words
+
+
 def _find_unexplained(
-    table: TableSurvey, pose: PoseGuess | None
+    table: TableSurvey, has_others: bool, pose: PoseGuess | None
 ) -> Iterator[Candidate]:
-    """Yields the columns of a file with unknown names, as in other languages.
+    """Yields the columns without a name, or with an unknown one, as in other languages.
 
     Each may have been sent to the robot, or measured.
     """
-    if table.kind:
+    if STANDARD_PACKAGES.match(table.kind):
         return
     pose_is_elsewhere = pose is not None and pose.table is not table
-    if pose_is_elsewhere and NOT_COMMANDED.intersection(split_words(table.name)):
+    has_place = bool(table.kind) or pose_is_elsewhere
+    if has_place and has_others and NOT_COMMANDED.intersection(split_words(table.name)):
         return
     used = list_used_columns(table, pose)
     for column in table.numbers:
         says_something = not EXPLAINED.isdisjoint(split_words(column.name))
-        if says_something or column.name in used or column.name.isdecimal():
+        if says_something or column.name in used or _counts_rows(table, column):
             continue
         if column.low < column.high and not column.is_place_on_earth:
             yield Candidate(table, column, None, POSSIBLE)
+
+
+def _counts_rows(table: TableSurvey, column: Survey) -> bool:
+    """True for a column without a name that numbers the rows."""
+    steps = np.diff(table.data[column.name].astype(np.float64))
+    return column.name.isdecimal() and bool((steps == 1.0).all())
 
 
 def _estimate_strength(
@@ -222,7 +254,7 @@ def _estimate_strength(
         return POSSIBLE
     if table.kind in ACKERMANN_KINDS or (words | context) & COMMANDING:
         return CERTAIN
-    if meaning == "throttle" or (words & WISHING and meaning is not None):
+    if meaning == "throttle" or (words & (WISHING | PULSES) and meaning is not None):
         return LIKELY
     return POSSIBLE
 
@@ -231,7 +263,7 @@ def _rank_topic(table: TableSurvey, context: set[str]) -> int:
     """Ranks a topic by its distance to the robot: `cmd_vel` itself before the inputs of a mux."""
     if not table.kind:
         return 0
-    if context & ROUNDABOUT:
+    if context & ROUNDABOUT and "output" not in context:
         return -1
     return int(context <= BARE_TWIST)
 

@@ -27,7 +27,7 @@ from nics_drl_bridge.recording.pose_guess import (
 )
 from nics_drl_bridge.recording.recording import compute_heading, find_implausible_pose
 from nics_drl_bridge.recording.survey import Survey, TableSurvey, split_unit
-from nics_drl_bridge.recording.switch_guess import Switch, guess_switch
+from nics_drl_bridge.recording.switch_guess import Switch, guess_switches
 
 GUESSED = "# guessed"
 NO_COMMAND = (
@@ -39,6 +39,7 @@ USUAL_RADIUS = 0.2  # footprint radius of a robot [m]
 LARGEST_ANGLE = 1.6  # maximum steering angle [rad]
 MOST_LISTED = 20  # maximum number of unused columns listed per table
 STILL = "; it is 0"
+NEEDS_TURN = "; add `ticks_per_turn:`, the counts of a turn of the wheel"
 NO_VALUES = {"header", "stamp", "seq", "covariance", "index", "id", "row"}
 
 
@@ -48,7 +49,7 @@ class _Guesses(NamedTuple):
     tables: Sequence[TableSurvey]
     pose: PoseGuess | None
     guess: CommandGuess
-    switch: Switch | None
+    switches: tuple[Switch, ...]
     gyro: tuple[TableSurvey, Survey] | None
     episode: tuple[TableSurvey, Survey] | None
     common_time: str | None  # the stamps of most tables, for the whole mapping
@@ -86,12 +87,12 @@ def propose_mapping(tables: Sequence[TableSurvey]) -> MappingDraft:
         units = _name_units(pose)
         pose_lines = _write_pose(pose, units, len(tables) == 1, common_time)
         poses = _compute_poses(pose, units)
-    switch = None
+    switches: tuple[Switch, ...] = ()
     if guess.listed:
-        switch = guess_switch(tables)
+        switches = guess_switches(tables)
     gyro = _find_free_yaw_rate(tables, guess)
     episode = guess_episode(tables)
-    guesses = _Guesses(tables, pose, guess, switch, gyro, episode, common_time)
+    guesses = _Guesses(tables, pose, guess, switches, gyro, episode, common_time)
     doubts = [*_find_doubts(guess, poses, str(common_time))]
     if not guess.listed:
         doubts.append(NO_COMMAND)
@@ -149,15 +150,23 @@ def _write_commands(guesses: _Guesses) -> Iterator[str]:
     """Yields the commands, or a blank with the candidates as comments."""
     guess = guesses.guess
     when = ""
-    if guesses.switch is not None:
-        flag = guesses.switch.refer_to(guesses.is_single)
-        when = f"when: {{{flag}: {guesses.switch.on}}}"
+    if guesses.switches:
+        flags = [
+            f"{switch.refer_to(guesses.is_single)}: {switch.on}"
+            for switch in guesses.switches
+        ]
+        when = f"when: {{{', '.join(flags)}}}"
     if guess.commands:
-        wheels = "  # no command was recorded: what the wheels did stands in for it"
-        yield "command:" + wheels * guess.of_wheels
+        if guess.of_wheels:
+            found = "none is certain" if guess.candidates else "no command was recorded"
+            yield f"command:  # {found}: what the wheels did stands in for it"
+        else:
+            yield "command:"
         for name, candidate in guess.commands.items():
             value = _write_value(name, candidate, when, guesses)
-            yield f"  {name}: {value}  {GUESSED}{STILL * candidate.is_still}"
+            yield f"  {name}: {value}  {GUESSED}{_write_remark(candidate)}"
+        for name, candidate in guess.candidates.items():
+            yield f"#  or {name}: {_write_value(name, candidate, when, guesses)}"
     elif guess.candidates:
         yield "command:  # none is certain: uncomment what was sent to the robot"
         for name, candidate in guess.candidates.items():
@@ -180,6 +189,13 @@ def _write_value(name: str, candidate: Candidate, when: str, guesses: _Guesses) 
     if not keys:
         return reference
     return f"{{from: {reference}, {', '.join(keys)}}}"
+
+
+def _write_remark(candidate: Candidate) -> str:
+    if candidate.is_still:
+        return STILL
+    is_counter = not TICKS.isdisjoint(split_words(candidate.column.name))
+    return NEEDS_TURN * (is_counter and candidate.meaning != "steering")
 
 
 def _write_unit_keys(name: str, column: Survey) -> Iterator[str]:
@@ -235,12 +251,13 @@ def _find_free_yaw_rate(
 
 def _list_unused(guesses: _Guesses) -> Iterator[str]:
     """Yields a text for each table with the columns of values that the draft does not use."""
+    guess = guesses.guess
     used = {
         (id(candidate.table), candidate.column.name)
-        for candidate in guesses.guess.listed.values()
+        for candidate in (*guess.commands.values(), *guess.candidates.values())
     }
-    if guesses.switch is not None:
-        used.add((id(guesses.switch.table), guesses.switch.column))
+    for switch in guesses.switches:
+        used.add((id(switch.table), switch.column))
     for pair in (guesses.gyro, guesses.episode):
         if pair is not None:
             used.add((id(pair[0]), pair[1].name))

@@ -92,7 +92,9 @@ def to_si(unit: str, ticks_per_turn: float | None = None) -> UnitOfData:
 PLACES_ON_EARTH = word_set("latitude longitude altitude")
 SHORT_OF_EARTH = word_set("lat lon lng long")
 NEAR_DEG = 1.0  # a drive stays within this range of latitude and longitude
-NO_COMMANDS = PLACES_ON_EARTH | word_set("covariance covariances cov variance")
+NO_COMMANDS = PLACES_ON_EARTH | word_set(
+    "covariance covariances cov covar variance variances"
+)
 
 NO_COMMAND_NAMED = (
     "command: names none, but a model learns what the robot does from what was sent to it; name "

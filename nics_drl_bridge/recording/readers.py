@@ -167,7 +167,7 @@ def _check_units(mapping: Mapping, spec: RobotSpec) -> None:
             if si and si != variable.unit != "1":
                 turns = si.startswith("ticks") and variable.unit.startswith("rad")
                 if turns:
-                    cure = "add `ticks_per_turn:`"
+                    cure = "add `ticks_per_turn:`, the counts of a turn of the wheel"
                 else:
                     cure = "check its unit, or give `scale:`"
                 fault = f"{stream}.{variable.name}: is in {si}, where {variable.unit} is needed"

@@ -474,7 +474,13 @@ def find_clockwise_keys(pose: Array) -> HeadingKeys:
     mirrored = _compute_course(pose, -1.0)
     if abs(mirrored) < max(MIN_MIRRORED, BETTER + _measure_alignment(pose, 1.0)):
         return HeadingKeys.NONE
-    return HeadingKeys.MIRRORED if mirrored.real > 0.0 else HeadingKeys.COMPASS
+    return choose_clockwise_keys(pose)
+
+
+def choose_clockwise_keys(pose: Array) -> HeadingKeys:
+    """Returns the keys that mirror the heading of poses (T, 3) so that it is along the path."""
+    is_ahead = _compute_course(pose, -1.0).real > 0.0
+    return HeadingKeys.MIRRORED if is_ahead else HeadingKeys.COMPASS
 
 
 def _measure_alignment(pose: Array, scale: float) -> float:

@@ -1,9 +1,10 @@
-"""Finds the switch of a recording: a column of two values, one of which enables the commands."""
+"""Finds the switches of a recording: columns of two values, one of which enables the commands."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nics_drl_bridge.recording.names import word_set
 from nics_drl_bridge.recording.survey import TableSurvey
@@ -14,6 +15,8 @@ ENABLING = word_set("""
     deadman engaged engage
 """)
 DISABLING = word_set("estop emergency kill stop stopped disabled manual fault")
+POWER = word_set("on power powered")
+POWERED = word_set("motor motors drive drives")
 ON_WORDS = word_set("auto autonomous autonomy enabled on armed active offboard run")
 MODES = ENABLING | word_set("mode state status safety switch")
 NO_VALUES = np.zeros(0)
@@ -34,19 +37,29 @@ class Switch(NamedTuple):
         return text
 
 
-def guess_switch(tables: Sequence[TableSurvey]) -> Switch | None:
-    """Finds the only switch by the names of columns and values; None if there are several."""
+def guess_switches(tables: Sequence[TableSurvey]) -> tuple[Switch, ...]:
+    """Finds switches by the names of columns and values; none if they are never on together."""
     switches = []
     for table in tables:
+        is_on = np.ones(table.rows, dtype=np.bool_)
         for column in table.columns:
             words = {*table.list_words(column.name)}
             values = table.data.get(column.name, NO_VALUES)
             on = _find_on_value(words, values)
-            if on is not None:
-                switches.append(Switch(table, column.name, on))
-    if len(switches) != 1:
-        return None
-    return switches[0]
+            if on is None:
+                continue
+            switches.append(Switch(table, column.name, on))
+            if len(values) == table.rows:
+                is_on &= _equals(values, on)
+        if not is_on.any():
+            return ()
+    return tuple(switches)
+
+
+def _equals(values: Column, on: str) -> NDArray[np.bool_]:
+    if is_text(values):
+        return np.array([str(value) == on for value in values])
+    return np.asarray(values.astype(np.float64) == float(on))
 
 
 def _find_on_value(words: set[str], values: Column) -> str | None:
@@ -60,10 +73,12 @@ def _find_on_value(words: set[str], values: Column) -> str | None:
     if values.dtype.kind not in "fiub":
         return None
     numbers = np.unique(values.astype(np.float64))
-    if {*numbers[np.isfinite(numbers)].tolist()} != {0.0, 1.0}:
+    numbers = numbers[np.isfinite(numbers)]
+    if len(numbers) != 2 or numbers[0] != 0.0:
         return None
     if words & DISABLING or {"e", "stop"} <= words:
         return "0"
-    if words & ENABLING:
-        return "1"
+    is_powered = words & POWER and words & POWERED and numbers[1] == 1.0
+    if words & ENABLING or {"dead", "man"} <= words or is_powered:
+        return f"{numbers[1]:g}"
     return None

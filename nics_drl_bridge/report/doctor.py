@@ -118,7 +118,10 @@ def check_presence(facts: Facts, _: Expected) -> Findings:
                 ]
                 if same_type:
                     hint = f"; {', '.join(same_type)} is of its type: remap it"
-            fix = f"start its driver, or correct namespace or ROS_DOMAIN_ID{hint}"
+            if facts.live:
+                fix = f"start its driver, or correct namespace or ROS_DOMAIN_ID{hint}"
+            else:
+                fix = f"record it with the others, or name its --namespace{hint}"
             yield error("missing topic", role, what, fix)
         if doctor_facts.TWIST_STAMPED_TYPE in types and not facts.live:
             fix = (

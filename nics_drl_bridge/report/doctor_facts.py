@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge import defaults
 from nics_drl_bridge.config import parse_namespace
-from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.lidar.sectors import ScanLayout, plan_of, reader_of
 from nics_drl_bridge.lidar.spec import LidarSpec, ScanHeader
 from nics_drl_bridge.policy.contract import Contract
 from nics_drl_bridge.recording import messages
-from nics_drl_bridge.recording.bag_file import open_bag
+from nics_drl_bridge.recording.bag_file import is_bag, open_bag
 from nics_drl_bridge.recording.imu_axis import GyroReader
 from nics_drl_bridge.recording.messages import Offer, Row
 from nics_drl_bridge.recording.topic_roles import IMU, IMU_NAMES, list_imu_topics
@@ -174,7 +174,12 @@ def name_of_gyro(
 def collect_facts_of_bag(
     path: str | Path, namespace: str = "", imu: str = defaults.IMU_TOPIC
 ) -> Facts:
-    """Collects the facts of a robot from a bag. Raises RecordingError if it is damaged."""
+    """Collects the facts of a robot from a bag. Raises RecordingError if it is none, or damaged."""
+    if Path(path).exists() and not is_bag(path):
+        advice = f"for another recording run `nics inspect {path}`"
+        raise RecordingError(
+            f"{path}: is no bag; nics doctor checks bags and live robots; {advice}."
+        )
     facts = Facts(str(path), False, names_in(namespace, imu))
     with open_bag(path) as bag:
         if GYRO in facts.names:

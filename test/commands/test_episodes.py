@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 pytest.importorskip("gymnasium")
@@ -20,10 +21,13 @@ from nics_drl_bridge.commands.episodes import (
     limit_time,
     model_name,
     read_contracts,
+    report_end,
     select_places,
     shorten_name,
 )
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.middleware.uncertainty import Uncertainty
+from nics_drl_bridge.policy.evaluation import Episode
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 from nics_drl_bridge.robot.spec import build_robot, load_robot
 from nics_drl_bridge.sim.world_set import load_worlds
@@ -152,3 +156,27 @@ def test_an_evaluation_uses_the_time_limit_of_the_policy_and_tells_if_it_is_shor
         limit_time(Conditions(steps=300), known, slow, world, said.append).steps == 300
     )
     assert "an episode ends after 30 s" in said[0]
+
+
+def drive_of_a_vehicle(result: str, uncertain: Uncertainty | None) -> Episode:
+    path = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.6, 0.0, 0.0]])
+    goal = np.array([0.6, 0.0])
+    return Episode(
+        0, result, path, path, goal, np.zeros((0, 7)), 0.0, uncertain=uncertain
+    )
+
+
+@pytest.mark.parametrize(
+    ("result", "word"),
+    [("success", "reached"), ("collision", "touched"), ("time-out", "time-out")],
+)
+def test_the_end_of_a_vehicles_episode_is_told_as_believed_and_how_uncertain(
+    result, word
+):
+    told = report_end(drive_of_a_vehicle(result, Uncertainty(0.12, 0.034)))
+    assert told == (
+        f"{word}, as believed; position uncertain by 0.12 m, heading by 0.034 rad since the "
+        "start; 2 steps, 0.60 m"
+    )
+    told = report_end(drive_of_a_vehicle(result, None))
+    assert told == f"{word}, as believed; 2 steps, 0.60 m"

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from identify import planted
 from identify.drives import drive, tricycle, without
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import RecordingError
@@ -18,11 +19,12 @@ from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.identify.repair import (
     check_axes,
     check_commands,
+    check_encoders,
     check_units,
     repaired,
 )
 from nics_drl_bridge.identify.verdict import Gap, Mistake
-from nics_drl_bridge.recording.mapping import load_mapping
+from nics_drl_bridge.recording.mapping import Mapping, load_mapping
 from nics_drl_bridge.recording.readers import read_robot_and_drive
 from nics_drl_bridge.recording.recording import (
     Recording,
@@ -341,6 +343,90 @@ def test_wheels_in_rpm_are_told_if_their_radius_is_known():
     )
     assert "write `unit: rpm` beside `from:`" in check_commands(Drive(other, known))[0]
     assert check_commands(Drive(other, unknown)) == ()
+
+
+def by_wheels(ahead_m: float = 0.0) -> tuple[Recording, RobotSpec]:
+    """A drive whose commands are the measured wheels, tracked at a point ahead of the axle."""
+    given = {
+        "kind": "differential_wheels",
+        "footprint_radius": 0.25,
+        "parameters": {
+            "wheel_radius": planted.WHEEL_RADIUS_M,
+            "track": planted.TRACK_M,
+        },
+    }
+    whole = planted.wheeled_drive()
+    ahead = geometry.compose(whole.pose.values, np.array([ahead_m, 0.0, 0.0]))
+    pose = replace(whole.pose, values=ahead)
+    spec = build_robot(given, {})
+    return replace(whole, command=whole.state, pose=pose, state=None), spec
+
+
+@pytest.mark.parametrize("ahead_m", [0.0, 0.2])
+def test_an_encoder_that_counts_backwards_is_named_though_it_is_the_command(ahead_m):
+    recording, spec = by_wheels(ahead_m)
+    assert check_encoders(Drive(recording, spec)) == ()
+    for signs, names in (((-1.0, 1.0), ["left_wheel"]), ((1.0, -1.0), ["right_wheel"])):
+        values = recording.command.values * signs
+        command = replace(recording.command, values=values)
+        reversed_ = replace(recording, command=command)
+        told = check_encoders(Drive(reversed_, spec))
+        assert [note.split()[0] for note in told] == names
+        assert all("its encoder counts backwards; write `scale: -1`" in n for n in told)
+        assert all(isinstance(note, Mistake) for note in told)
+
+
+@pytest.mark.parametrize("inputs", ["wheels", "measured wheels", "twists"])
+def test_inputs_tell_a_clockwise_heading_of_a_point_ahead_of_the_axle(inputs):
+    recording, spec = by_wheels(ahead_m=0.2)
+    if inputs != "wheels":
+        spec = planted.wheeled()
+        recording = replace(planted.wheeled_drive(), pose=recording.pose)
+    if inputs == "twists":
+        spec = spec.model_copy(update={"state": ()})
+        recording = replace(recording, state=None)
+    check_axes(Drive(recording, spec))
+    values = recording.pose.values * [1.0, 1.0, -1.0]
+    mirrored = replace(recording, pose=replace(recording.pose, values=values))
+    with pytest.raises(
+        RecordingError, match=r"heading counted clockwise write .*scale: -1\}"
+    ):
+        check_axes(Drive(mirrored, spec))
+
+
+@pytest.mark.parametrize(
+    ("k", "left", "right"), [(1, "Left_Tick", "Right_Tick"), (2, 13, 14)]
+)
+def test_the_defects_of_a_real_robot_with_encoders_are_named_in_turn(
+    shared_recordings, k, left, right
+):
+    file = shared_recordings / "differential_ticks" / f"Camera_Odo_Data_0{k}.txt"
+
+    def read(heading: int, sign: int) -> Drive:
+        given = {
+            "robot": {"kind": "differential_wheels", "footprint_radius": 0.2},
+            "time": {"from": "time", "unit": "ms"},
+            "pose": {
+                "x": "pose.x",
+                "y": "pose.y",
+                "heading": {"from": "pose.z", "scale": heading},
+                "unit": "cm",
+            },
+            "command": {
+                "left_wheel": {"from": left, "ticks_per_turn": 409600, "scale": sign},
+                "right_wheel": {"from": right, "ticks_per_turn": 409600},
+            },
+        }
+        mapping = Mapping.model_validate(given)
+        spec, recording = read_robot_and_drive(file, None, TopicRoles(), mapping)
+        return repaired(Drive(recording, spec))[0]
+
+    with pytest.raises(RecordingError, match="for a heading counted clockwise"):
+        check_axes(read(1, 1))
+    check_axes(read(-1, 1))
+    (told,) = check_encoders(read(-1, 1))
+    assert told.startswith("left_wheel turns backwards")
+    assert check_encoders(read(-1, -1)) == ()
 
 
 @pytest.mark.skipif(not JUMPING.exists(), reason=f"no recording of others at {JUMPING}")

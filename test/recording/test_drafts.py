@@ -454,6 +454,65 @@ TABLES: dict[str, tuple[dict[str, Any], str | None, Any, dict[str, str]]] = {
         "yaw",
         {"left_wheel": "motor_left_cmd", "right_wheel": "motor_right_cmd"},
     ),
+    "yaw rate of a command": (
+        {
+            "t": "t",
+            "x": "x",
+            "y": "y",
+            "yaw": "yaw",
+            "commanded_velocity": "v",
+            "commanded_yaw_rate": "w",
+            "yaw_rate": "rate",
+        },
+        "x",
+        "yaw",
+        {"forward_command": "commanded_velocity", "turn_command": "commanded_yaw_rate"},
+    ),
+    "pulses beside encoders": (
+        {
+            "t": "t",
+            "x": "x",
+            "y": "y",
+            "yaw": "yaw",
+            "PWM_L": "v",
+            "PWM_R": "w",
+            "enc_L": "left",
+            "enc_R": "right",
+        },
+        "x",
+        "yaw",
+        {"left_wheel": "PWM_L", "right_wheel": "PWM_R"},
+    ),
+    "uncertainties": (
+        {
+            "t": "t",
+            "x": "x",
+            "y": "y",
+            "yaw": "yaw",
+            "v_rms": "noise",
+            "omega_sd": "noise",
+            "speed_uncertainty": "noise",
+            "cmd_v_covar": "noise",
+        },
+        "x",
+        "yaw",
+        {},
+    ),
+    "ranges to both sides": (
+        {
+            "t": "t",
+            "x": "x",
+            "y": "y",
+            "yaw": "yaw",
+            "left_distance": "noise",
+            "right_distance": "noise",
+            "obstacle_speed": "noise",
+            "obstacle_turn": "noise",
+        },
+        "x",
+        "yaw",
+        {},
+    ),
     "two commands of one meaning": (
         {
             "t": "t",
@@ -562,6 +621,36 @@ def test_columns_of_a_tracker_are_taken_before_odometry_whatever_the_file_is_cal
         assert "x: gt_x" in text, (name, text)
 
 
+@pytest.mark.parametrize("style", ["uncertainties", "ranges to both sides"])
+def test_what_can_not_have_been_sent_is_no_candidate(tmp_path, style):
+    columns, *_ = TABLES[style]
+    filled = {name: M[column] for name, column in columns.items()}
+    assert "\n#  " not in drafted(write(tmp_path / "log.csv", filled))[0]
+
+
+def test_columns_without_a_name_are_candidates(tmp_path):
+    numbers = np.arange(COUNT)
+    columns = [numbers, *(M[key] for key in ("t", "x", "y", "yaw", "v", "w"))]
+    rows = [", ".join(map(repr, map(float, row))) for row in zip(*columns, strict=True)]
+    path = tmp_path / "drive.txt"
+    path.write_text("row, t, x, y, yaw\n" + "\n".join(rows) + "\n")
+    text, draft = drafted(path)
+    assert draft["pose"] == {"x": "x", "y": "y", "heading": "yaw"}
+    assert "no command was recorded" not in text
+    assert "#  command_0: 5\n#  command_1: 6\n" in text
+
+
+def test_wheels_that_stand_in_leave_other_candidates_as_comments(tmp_path):
+    keys = ("t", "x", "y", "yaw", "v", "w")
+    columns = {key: M[key] for key in keys}
+    columns |= {"left_ticks": M["left"], "right_ticks": M["right"]}
+    text, draft = drafted(write(tmp_path / "log.csv", columns))
+    assert draft["command"].keys() == {"left_wheel", "right_wheel"}
+    assert "no command was recorded" not in text
+    assert "none is certain: what the wheels did stands in for it" in text
+    assert "#  or forward_command: v\n#  or turn_command: w\n" in text
+
+
 def test_columns_that_no_word_explains_are_candidates(tmp_path):
     given = {
         "t": M["t"],
@@ -667,7 +756,14 @@ def switched(name: str, on: float, off: float) -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize(
     ("name", "on", "off"),
-    [("safety_value", 1.0, 0.0), ("estop", 0.0, 1.0), ("enabled", 1, 0)],
+    [
+        ("safety_value", 1.0, 0.0),
+        ("estop", 0.0, 1.0),
+        ("enabled", 1, 0),
+        ("dead_man_switch", 1, 0),
+        ("motors_on", 1, 0),
+        ("motor_enable", 100, 0),
+    ],
 )
 def test_a_switch_of_two_values_is_recognised(tmp_path, name, on, off):
     _, draft = drafted(write(tmp_path / "log.csv", switched(name, on, off)))
@@ -677,12 +773,25 @@ def test_a_switch_of_two_values_is_recognised(tmp_path, name, on, off):
 
 @pytest.mark.parametrize(
     ("name", "on", "off"),
-    [("light", 1.0, 0.0), ("enable", 1.0, 0.5)],
+    [("light", 1.0, 0.0), ("enable", 1.0, 0.5), ("light_on", 1, 0)],
 )
 def test_a_column_without_the_name_or_values_of_a_switch_is_none(
     tmp_path, name, on, off
 ):
     _, draft = drafted(write(tmp_path / "log.csv", switched(name, on, off)))
+    assert draft["command"]["throttle"] == "throttle"
+
+
+def test_all_of_several_switches_must_be_on(tmp_path):
+    columns = switched("enabled", 1, 0) | {"estop": (M["t"] < 1.0).astype(float)}
+    _, draft = drafted(write(tmp_path / "log.csv", columns))
+    assert draft["command"]["throttle"]["when"] == {"enabled": 1, "estop": 0}
+
+
+def test_switches_that_are_never_on_together_are_none(tmp_path):
+    columns = switched("enabled", 1, 0)
+    columns["active"] = 1 - columns["enabled"]
+    _, draft = drafted(write(tmp_path / "log.csv", columns))
     assert draft["command"]["throttle"] == "throttle"
 
 
@@ -742,8 +851,14 @@ def test_what_names_do_not_show_of_a_real_recording_is_blank_or_in_doubt(
     file = shared_recordings / "differential_ticks" / "Camera_Odo_Data_01.txt"
     text, draft = drafted(file)
     assert text.splitlines()[0].endswith("add `unit: cm`")
+    other, draft_of_other = drafted(file.with_name("Camera_Odo_Data_02.txt"))
+    assert draft_of_other["command"] is None  # the names of the wheels are missing
+    assert "#  command_0: 13\n#  command_1: 14\n" in other
     assert draft["pose"] == {"x": "pose.x", "y": "pose.y", "heading": "pose.z"}
     assert draft["command"] == {
         "left_wheel": {"from": "Left_Tick", "unit": "ticks"},
         "right_wheel": {"from": "Right_Tick", "unit": "ticks"},
     }
+    assert text.count("guessed; add `ticks_per_turn:`") == 2
+    assert "no command was recorded: what the wheels did stands in for it" in text
+    assert "\n#  or " not in text

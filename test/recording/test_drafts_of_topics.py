@@ -109,6 +109,31 @@ BAGS: dict[str, tuple[list[TableSurvey], str, list[str]]] = {
         "/pf/viz/inferred_pose",
         ["/drive:drive.speed", "/drive:drive.steering_angle"],
     ),
+    "the output of a mux": (
+        [
+            odometry(),
+            topic("/ackermann_cmd_mux/output", kinds.ACKERMANN_STAMPED, STEERED),
+            topic(
+                "/ackermann_cmd_mux/input/nav",
+                kinds.ACKERMANN_STAMPED,
+                STEERED | {"drive.speed": "noise"},
+            ),
+        ],
+        "/odom",
+        [
+            "/ackermann_cmd_mux/output:drive.speed",
+            "/ackermann_cmd_mux/output:drive.steering_angle",
+        ],
+    ),
+    "targets of wheels": (
+        [
+            odometry(),
+            topic("/lwheel_vtarget", FLOAT, {"data": "v"}),
+            topic("/rwheel_vtarget", FLOAT, {"data": "w"}),
+        ],
+        "/odom",
+        ["/lwheel_vtarget:data", "/rwheel_vtarget:data"],
+    ),
     "a car's measured steering": (
         [odometry(), topic("/ackermann_odom", kinds.ACKERMANN_STAMPED, STEERED)],
         "/odom",
@@ -162,3 +187,16 @@ def test_a_draft_of_a_bag_is_right_or_blank(bag):
     draft = parse_yaml(text, "draft")
     assert draft["pose"] == place, text
     assert list((draft["command"] or {}).values()) == commands, text
+
+
+def test_topics_that_no_word_explains_are_candidates():
+    motor = topic("/commands/motor/speed", FLOAT, {"data": "v"})
+    servo = topic("/commands/servo/position", FLOAT, {"data": "w"})
+    consigne = topic("/consigne", "my_msgs/msg/Consigne", {"vitesse": "v"})
+    for tables, expected in (
+        ([odometry(), motor, servo], "#  command_1: /commands/servo/position:data"),
+        ([odometry(), consigne], "#  command_0: /consigne:vitesse"),
+    ):
+        text = propose_mapping(tables).text
+        assert "no command was recorded" not in text
+        assert expected in text

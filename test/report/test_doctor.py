@@ -10,6 +10,7 @@ pytest.importorskip("rosbags", reason="needs the extra 'bags'")
 
 import bags
 
+from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.lidar.sectors import ScanLayout
 from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.recording.messages import Offer
@@ -362,6 +363,23 @@ def test_a_missing_topic_is_named_with_one_of_its_type():
     finding = only(facts)
     assert finding.what == "there is no such topic"
     assert "/front/scan is of its type: remap it" in finding.fix
+
+
+def test_a_topic_that_a_bag_lacks_is_to_be_recorded():
+    facts = replace(heard(), live=False)
+    del facts.topics["/scan"], facts.heard["scan"]
+    facts.layouts = []
+    facts.ranges = []
+    fix = only(facts).fix
+    assert fix.startswith("record it with the others")
+    assert "driver" not in fix
+
+
+def test_a_table_is_no_damaged_bag(tmp_path):
+    table = tmp_path / "drive.csv"
+    table.write_text("t,x,y,yaw\n0,0,0,0\n")
+    with pytest.raises(RecordingError, match=r"drive\.csv: is no bag; .*`nics inspect"):
+        collect_facts_of_bag(table)
 
 
 def with_gyro(rate, noise=0.003, seconds=SECONDS):
