@@ -1,22 +1,29 @@
-"""What a person does with a running robot: arm its gate, stop it, give it a goal."""
+"""What a person does with a running robot: arm its gate, stop it, give it a goal.
 
+It imports no simulator and no kernels: an emergency stop must not wait for seconds of imports.
+"""
+
+import math
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 from nics_drl_bridge.config import parse_namespace
 from nics_drl_bridge.errors import BackendError
-from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.nodes import qos
 from nics_drl_bridge.nodes.goal_answer import GoalAnswer, answer_from_values
-from nics_drl_bridge.nodes.runner import Listener, holds
+from nics_drl_bridge.nodes.listener import Listener, holds
 
 GATE = "command_gate"
 POLICY = ": policy"  # how the name of a policy node's status ends
@@ -48,7 +55,13 @@ class GoalRequest:
 
     def to_ros(self, stamp_ns: int) -> PoseStamped:
         """Return the goal as a message."""
-        return conversions.pose_to_ros([self.x, self.y, self.yaw], stamp_ns, self.frame)
+        stamp = Time(sec=stamp_ns // NS_PER_S, nanosec=stamp_ns % NS_PER_S)
+        message = PoseStamped(header=Header(stamp=stamp, frame_id=self.frame))
+        message.pose.position.x = self.x
+        message.pose.position.y = self.y
+        message.pose.orientation.z = math.sin(self.yaw / 2.0)
+        message.pose.orientation.w = math.cos(self.yaw / 2.0)
+        return message
 
 
 class _Call:

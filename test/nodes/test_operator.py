@@ -8,8 +8,8 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
+from nics_drl_bridge.nodes import listener
 from nics_drl_bridge.nodes import operator as module
-from nics_drl_bridge.nodes import runner
 from nics_drl_bridge.nodes.goal_answer import GoalAnswer
 from nics_drl_bridge.nodes.operator import GateAnswer, GoalRequest, Operator
 
@@ -46,8 +46,8 @@ def test_a_node_that_can_not_be_made_leaves_no_context(monkeypatch):
     def fail(*_, **__):
         raise RuntimeError("no node")
 
-    monkeypatch.setattr(runner, "open_context", lambda *_: context)
-    monkeypatch.setattr(runner.Node, "__init__", fail)
+    monkeypatch.setattr(listener, "open_context", lambda *_: context)
+    monkeypatch.setattr(listener.Node, "__init__", fail)
     with pytest.raises(RuntimeError, match="no node"):
         Operator()
     assert ended == [True]
