@@ -225,10 +225,13 @@ def parse_roles(options: Sequence[str]) -> dict[str, str]:
     roles = {}
     for option in options:
         role, _, name = option.partition("=")
-        if role not in TYPES or not name:
+        if role not in TYPES:
             raise ConfigError(
                 f"--topic {option!r}: must be ROLE=TOPIC; {suggest(role, TYPES)}"
             )
+        if not name:
+            fix = f"must be ROLE=TOPIC, as {role}=/my_{role}"
+            raise ConfigError(f"--topic {option!r}: {fix}.")
         roles[role] = name if name.startswith("/") else f"/{name}"
     return roles
 
