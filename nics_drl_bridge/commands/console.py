@@ -156,6 +156,7 @@ NEEDED: dict[str, dict[str, tuple[str, ...]]] = {
     "evaluate": dict.fromkeys(HARDWARE_OPTIONS, ("hardware",))
     | {"topic": ("shadow",), "ahead": ("shadow",), "goal": ("hardware", "shadow")},
     "watch": {"topic": ("bag",), "namespace": ("ros",), "episodes": ("record",)},
+    "replay": dict.fromkeys(("model", "topic", "out"), ("estimate",)),
 }
 # command -> option -> options that can't be combined with it
 APART: dict[str, dict[str, tuple[str, ...]]] = {

@@ -140,7 +140,10 @@ MISTAKES = {
     "generate drive.npz --out taken": "taken",
     "world draw clutter --out /proc/clutter.png": "/proc",
     # Options that do not go together.
+    "--sensor-kind mine.py list robots": "sensor 'mine.py': give path/to/file.py:ClassName",
     "train --resume": "--resume needs --out",
+    "train --resume --out taken": "taken: contains no settings.yaml; name the folder of a run",
+    "bag replay bag --out d.npz": "--out: belongs to --estimate; add that, or leave it out",
     "train --address auto": "belongs to --engine ray",
     "evaluate differential --backend dds": "--backend dds drives the vehicle: add --hardware",
     "evaluate differential --hardware --goal 2": "--goal",
