@@ -159,8 +159,8 @@ def missing(
     from tf2_msgs.msg import TFMessage
 
     from nics_drl_bridge.nodes import qos
+    from nics_drl_bridge.nodes.listener import holds, open_context, spin
     from nics_drl_bridge.nodes.processes import NodeProcess
-    from nics_drl_bridge.nodes.runner import holds, open_context, spin
 
     frame = "" if bare else "base_footprint"
     simulated = {"model": ROBOT, "world": WORLD, "footprint_frame": frame}

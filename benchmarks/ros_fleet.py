@@ -35,8 +35,8 @@ from sensor_msgs.msg import LaserScan
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.nodes import qos, wire
 from nics_drl_bridge.nodes.executor import StandingExecutor
+from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
-from nics_drl_bridge.nodes.runner import open_context
 
 CONTROLS = {
     "standing": "the commands: no robot drives",

@@ -34,8 +34,8 @@ from std_srvs.srv import Trigger
 from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
-from nics_drl_bridge.nodes.runner import open_context
 
 ROBOT = "differential"
 WORLD = "empty"

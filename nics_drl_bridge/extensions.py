@@ -90,6 +90,8 @@ def import_class(group: str, place: str, base: type) -> type:
     """
     kind = group.rstrip("s")
     path, _, name = place.rpartition(":")
+    if not path:
+        raise ConfigError(f"{kind} {place!r}: give path/to/file.py:ClassName.")
     loaded = getattr(load_module(path, kind), name, None)
     if not (isinstance(loaded, type) and issubclass(loaded, base)):
         needed = f"{base.__module__.removeprefix(f'{PACKAGE}.')}.{base.__name__}"

@@ -191,8 +191,11 @@ def format_json(data: Any, indent: int | None = None) -> str:
     return json.dumps(finite, allow_nan=False, indent=indent)
 
 
-def check_folder(path: str | Path, marker: str) -> Path:
-    """Resolves a path; creates nothing. Raises ConfigError unless a folder can be written there."""
+def check_folder(path: str | Path, marker: str, sign: str = "") -> Path:
+    """Resolves a path; creates nothing. Raises ConfigError unless a folder can be written there.
+
+    A folder that is there must be empty or contain the file `marker` with the text `sign`.
+    """
     path = Path(path).resolve()
     if path.exists() and not path.is_dir():
         raise ConfigError(
@@ -201,6 +204,10 @@ def check_folder(path: str | Path, marker: str) -> Path:
     if path.is_dir() and any(path.iterdir()) and not (path / marker).exists():
         fix = "give a new folder, or empty this one."
         raise ConfigError(f"{path}: holds other files and no {marker!r}; {fix}")
+    file = path / marker
+    if sign and file.is_file() and sign.encode() not in file.read_bytes():
+        reason = "is not what this command writes under that name"
+        raise ConfigError(f"{file}: {reason}; give a new folder.")
     check_above(path)
     return path
 
@@ -218,16 +225,20 @@ def check_above(path: Path) -> None:
 
 @contextmanager
 def write_whole_folder(
-    path: str | Path, marker: str, is_own: Callable[[str], bool] = lambda _: True
+    path: str | Path,
+    marker: str,
+    is_own: Callable[[str], bool] = lambda _: True,
+    sign: str = "",
 ) -> Iterator[Path]:
     """Yields a temporary folder that replaces `path` if the block succeeds, or else is removed.
 
     It replaces only an empty folder or one with the file `marker`, which all folders of this kind
-    contain, so that a wrong `--out` never deletes work. A symbolic link is kept. The user's files
-    are kept, too: those that the block did not write and whose relative path `is_own` rejects.
+    contain and whose text contains `sign`, so that a wrong `--out` never deletes work. A symbolic
+    link is kept. The user's files are kept, too: those that the block did not write and whose
+    relative path `is_own` rejects.
     Raises ConfigError, see `check_folder`.
     """
-    path = check_folder(path, marker)
+    path = check_folder(path, marker, sign)
     path.parent.mkdir(parents=True, exist_ok=True)
     with _name_path_in_errors(path):
         remove_leftovers(path.parent)

@@ -38,7 +38,8 @@ from nics_drl_bridge.robot.noise import Latency, Noise
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 from nics_drl_bridge.robot.taylor import NamedTaylorModel, TaylorModel
 
-FORMAT = "nics_drl_bridge/simulator_model/4"
+FORMATS = "nics_drl_bridge/simulator_model/"  # how those of all versions begin
+FORMAT = f"{FORMATS}4"
 MODEL_FILE = "model.yaml"
 TABLE_FOLDER = "lidar_table"
 REPORT_FILE = "report.txt"
@@ -333,7 +334,7 @@ def check_place(folder: str | Path) -> None:
         raise ConfigError(
             f"{folder}: a shipped robot has this name; name another folder."
         )
-    files.check_folder(folder, MODEL_FILE)
+    files.check_folder(folder, MODEL_FILE, FORMATS)
 
 
 def save_model(model: SimulatorModel, folder: str | Path) -> None:
@@ -342,7 +343,9 @@ def save_model(model: SimulatorModel, folder: str | Path) -> None:
     It replaces an older model with its report and pictures, and keeps other files in the folder.
     """
     owned = {*MODEL_FILES, files.SUMS, *DRAWN_FILES, *files.names_in_sums(Path(folder))}
-    with files.write_whole_folder(folder, MODEL_FILE, owned.__contains__) as temporary:
+    with files.write_whole_folder(
+        folder, MODEL_FILE, owned.__contains__, FORMATS
+    ) as temporary:
         files.write_text(temporary / MODEL_FILE, model.text)
         files.write_text(temporary / REPORT_FILE, model.report)
         model.table.save(temporary / TABLE_FOLDER)
@@ -355,6 +358,11 @@ def load_model(folder: str | Path) -> SimulatorModel:
     folder = Path(folder)
     path = folder / MODEL_FILE
     if not path.is_file():
+        if not folder.exists():
+            fix = (
+                "make one with `nics generate`; `open_model` opens shipped robots, too"
+            )
+            raise ModelError(f"{folder}: no such folder; {fix}.")
         raise ModelError(
             f"{folder}: holds no {MODEL_FILE}; make a model with `nics generate`."
         )

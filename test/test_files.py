@@ -288,6 +288,19 @@ def test_a_file_is_not_taken_for_a_folder(tmp_path):
     assert tree(tmp_path) == {"out": b"a file"}
 
 
+def test_a_file_of_the_users_with_the_name_of_ours_is_not_replaced(tmp_path):
+    mine = tmp_path / "model.yaml"
+    mine.write_text("name: mine\n", encoding="utf-8")
+    with (
+        pytest.raises(ConfigError, match=r"model.yaml: is not what this command writ"),
+        write_whole_folder(tmp_path, "model.yaml", sign="format: ours"),
+    ):
+        pass
+    assert tree(tmp_path) == {"model.yaml": b"name: mine\n"}
+    mine.write_text("format: ours\n", encoding="utf-8")
+    assert check_folder(tmp_path, "model.yaml", "format: ours") == tmp_path
+
+
 def test_a_place_is_checked_without_making_anything(tmp_path, monkeypatch):
     assert check_folder(tmp_path / "a" / "b", "model.yaml") == tmp_path / "a" / "b"
     (tmp_path / "file").write_text("mine", encoding="utf-8")

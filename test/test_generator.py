@@ -471,3 +471,10 @@ def test_a_name_that_is_no_model_is_refused(name, sentence):
 def test_a_folder_without_a_model_is_refused(tmp_path):
     with pytest.raises(ModelError, match=f"holds no {MODEL_FILE}"):
         load_model(tmp_path)
+
+
+def test_a_model_that_is_not_there_is_told_apart_from_a_folder_without_one(tmp_path):
+    with pytest.raises(ModelError, match="nothing: no such folder; make one with"):
+        load_model(tmp_path / "nothing")
+    with pytest.raises(ModelError, match=f"{tmp_path.name}: holds no model.yaml"):
+        load_model(tmp_path)

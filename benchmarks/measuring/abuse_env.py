@@ -32,8 +32,8 @@ from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.nodes import qos
 from nics_drl_bridge.nodes.link import Link
+from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
-from nics_drl_bridge.nodes.runner import open_context
 
 GRACE_S, WATCH_S = 0.25, 1.2
 """A motion on `cmd_vel` so long after the exception has stayed; it is watched for so long."""

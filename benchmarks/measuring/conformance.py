@@ -19,7 +19,7 @@ from rosgraph_msgs.msg import Clock
 from simulation_interfaces import msg, srv
 from simulation_interfaces.action import SimulateSteps
 
-from nics_drl_bridge.nodes.runner import open_context
+from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.nodes.simulation_interfaces.client import snake_case
 
 OK = msg.Result.RESULT_OK

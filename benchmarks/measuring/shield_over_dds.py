@@ -30,8 +30,8 @@ from std_srvs.srv import Trigger
 from measuring.shield_places import SCAN_STEPS, SILENCE_S, STEP_S, Job, Outcome, Place
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
-from nics_drl_bridge.nodes.runner import open_context
 
 Array = NDArray[np.float64]
 REST_S = 1.3

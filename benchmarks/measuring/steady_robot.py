@@ -17,7 +17,7 @@ from std_srvs.srv import Trigger
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.runner import open_context
+from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.nodes.wire import OdometryWriter, ScanWriter
 
 ROBOT = "ackermann"

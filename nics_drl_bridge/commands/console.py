@@ -156,6 +156,7 @@ NEEDED: dict[str, dict[str, tuple[str, ...]]] = {
     "evaluate": dict.fromkeys(HARDWARE_OPTIONS, ("hardware",))
     | {"topic": ("shadow",), "ahead": ("shadow",), "goal": ("hardware", "shadow")},
     "watch": {"topic": ("bag",), "namespace": ("ros",), "episodes": ("record",)},
+    "replay": dict.fromkeys(("model", "topic", "out"), ("estimate",)),
 }
 # command -> option -> options that can't be combined with it
 APART: dict[str, dict[str, tuple[str, ...]]] = {
@@ -225,10 +226,13 @@ def parse_roles(options: Sequence[str]) -> dict[str, str]:
     roles = {}
     for option in options:
         role, _, name = option.partition("=")
-        if role not in TYPES or not name:
+        if role not in TYPES:
             raise ConfigError(
                 f"--topic {option!r}: must be ROLE=TOPIC; {suggest(role, TYPES)}"
             )
+        if not name:
+            fix = f"must be ROLE=TOPIC, as {role}=/my_{role}"
+            raise ConfigError(f"--topic {option!r}: {fix}.")
         roles[role] = name if name.startswith("/") else f"/{name}"
     return roles
 

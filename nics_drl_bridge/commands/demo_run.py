@@ -31,7 +31,12 @@ from nics_drl_bridge.policy.evaluation import (
     successes,
 )
 from nics_drl_bridge.policy.pace import Fitted, fitted, pace_of
-from nics_drl_bridge.policy.policies import open_policy, shipped_policies
+from nics_drl_bridge.policy.policies import (
+    check_policy_file,
+    is_policy_file,
+    open_policy,
+    shipped_policies,
+)
 from nics_drl_bridge.policy.training_settings import load_training
 from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.recording.readers import read_recording, read_robot_and_drive
@@ -130,6 +135,8 @@ def run(plan: DemoPlan, say: Say) -> str:
         say(f"  {name} took {durations_s[name]:.0f} s")
         return result
 
+    if plan.policy is not None and is_policy_file(plan.policy):
+        check_policy_file(plan.policy)
     model, identified = timed("generating", _generate)
     learned = timed("learning", learn, model)
     summaries = timed("evaluating", _evaluate, model, learned.policy)

@@ -127,7 +127,12 @@ def read_source(folder: Path) -> Source:
     if not PACKAGE_NAME.fullmatch(name):
         fix = "name the package in its package.xml, in lower case, as my_messages"
         raise ConfigError(f"{folder}: {name!r} is no name of a package; {fix}.")
-    return Source(name, folder)
+    source = Source(name, folder)
+    if not source.list_files():
+        kinds = ", ".join(f"{kind}/*.{kind}" for kind in FOLDERS)
+        fix = "give the folder of a package with messages"
+        raise ConfigError(f"{folder}: holds none of {kinds}; {fix}.")
+    return source
 
 
 def sort_by_use(sources: Sequence[Source]) -> list[Source]:

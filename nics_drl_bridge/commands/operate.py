@@ -61,23 +61,24 @@ def stop(
     parse_namespace(namespace or "")
     with extensions.require_modules("nics stop"):
         from nics_drl_bridge.nodes.operator import Operator
+    stopped = {}
     with Operator() as operator:
-        answers = operator.stop(namespace, wait)
-    lines = []
-    for answer in answers:
-        space = answer.gate.rpartition("/")[0].strip("/")
-        rearm = f"nics arm --reset{f' --namespace {space}' if space else ''}"
-        if answer.granted:
-            lines.append(
-                f"{answer.gate} has stopped its robot; `{rearm}` lets it drive again"
-            )
-        else:
-            typer.echo(f"nics: {answer.gate} was NOT stopped: {answer.told}", err=True)
-    if lines or as_json:
-        stopped = {answer.gate: answer.granted for answer in answers}
-        console.print_line(as_json, "\n".join(lines), stopped=stopped)
-    if not all(answer.granted for answer in answers):
+        for answer in operator.stop(namespace, wait):
+            stopped[answer.gate] = answer.granted
+            if not answer.granted:
+                _tell(f"nics: {answer.gate} was NOT stopped: {answer.told}")
+            elif not as_json:
+                typer.echo(_describe_stop(answer.gate))
+    if as_json:
+        console.print_line(as_json, "", stopped=stopped)
+    if not all(stopped.values()):
         raise typer.Exit(EXIT_REFUSED)
+
+
+def _describe_stop(gate: str) -> str:
+    space = gate.rpartition("/")[0].strip("/")
+    rearm = f"nics arm --reset{f' --namespace {space}' if space else ''}"
+    return f"{gate} has stopped its robot; `{rearm}` lets it drive again"
 
 
 def goal(

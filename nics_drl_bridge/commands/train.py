@@ -100,6 +100,9 @@ def train(
         )
     if resume and out is None:
         raise ConfigError("--resume needs --out, the folder of the run to go on with.")
+    if resume and out is not None and not (out / "settings.yaml").is_file():
+        fix = "name the folder of a run with --out"
+        raise ConfigError(f"{out}: contains no settings.yaml; {fix}.")
     if watch and engine is not None and engine not in OWN:
         reason = (
             "worlds of other processes are not shown; leave out --watch, or --engine"

@@ -205,7 +205,8 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         drawn = self._backend.facts().get("randomisation")
         if drawn:
             facts["randomisation"] = drawn
-        observation = self.task.observation(self._view, self.memory)[0]
+        seen = self.task.observation(self._view, self.memory)
+        observation = self.task.valid("observation", seen, self._shape)[0]
         if self.render_mode == "human":
             self.render()
         return observation.reshape(-1), self._info(self._view, facts)

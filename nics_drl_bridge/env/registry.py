@@ -33,7 +33,9 @@ def make_task(
     Options are arguments of the class: `scan` as in `sectors.layout_of`, `sensors` as names.
     """
     if isinstance(task, Task):
-        return _checked(task, model, options)
+        made = _checked(task, model, options)
+        made.check_observation_space()
+        return made
     check_options("task_options", options)
     options = dict(options or {})
     task_class = class_for(task, options)
@@ -48,11 +50,13 @@ def make_task(
     try:
         # The error of a missing option names it here, without the constructor.
         signature(task_class).bind(model.robot, model.lidar, **options)
-        return task_class(model.robot, model.lidar, **options)
+        made = task_class(model.robot, model.lidar, **options)
     except TypeError as error:
         raise ConfigError(
             f"task {task_class.__name__}, task_options {options}: {error}."
         ) from None
+    made.check_observation_space()
+    return made
 
 
 def _sensor(name: Any, model: SimulatorModel) -> Sensor:

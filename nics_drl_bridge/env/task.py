@@ -268,6 +268,13 @@ class Task(ABC):
             raise self._wrong(what, fault)
         return given
 
+    def check_observation_space(self) -> None:
+        """Raises ConfigError unless `observation_space` is a Box (O,), as `box` makes it."""
+        space: Any = self.observation_space
+        if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1:
+            fix = "must be a property that returns a Box of one dimension; see `box`"
+            raise self._wrong("observation_space", fix)
+
     @cached_property
     def command_limits(self) -> tuple[Array, Array]:
         """Commands (C,) of the minimum and the maximum action."""

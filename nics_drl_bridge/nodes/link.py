@@ -37,8 +37,9 @@ from nics_drl_bridge.nodes import qos
 from nics_drl_bridge.nodes.command_types import deaf_subscribers, heard_stamped
 from nics_drl_bridge.nodes.ending import ENDING
 from nics_drl_bridge.nodes.executor import StandingExecutor
+from nics_drl_bridge.nodes.listener import holds, open_context
 from nics_drl_bridge.nodes.parameters import stamped_by_default
-from nics_drl_bridge.nodes.runner import holds, last_word, open_context
+from nics_drl_bridge.nodes.runner import last_word
 from nics_drl_bridge.nodes.wire import stamped_twist_to_bytes, twist_to_bytes
 from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.world_set import AnyWorld

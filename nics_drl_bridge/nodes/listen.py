@@ -9,8 +9,8 @@ from rclpy.node import Node
 
 from nics_drl_bridge import defaults
 from nics_drl_bridge.nodes.conversions import message_type
+from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.nodes.qos import offer_of, profile_of
-from nics_drl_bridge.nodes.runner import open_context
 from nics_drl_bridge.recording.messages import Offer
 from nics_drl_bridge.report.doctor_facts import (
     GYRO,

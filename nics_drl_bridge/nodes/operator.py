@@ -1,22 +1,29 @@
-"""What a person does with a running robot: arm its gate, stop it, give it a goal."""
+"""What a person does with a running robot: arm its gate, stop it, give it a goal.
 
+It imports no simulator and no kernels: an emergency stop must not wait for seconds of imports.
+"""
+
+import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 from nics_drl_bridge.config import parse_namespace
 from nics_drl_bridge.errors import BackendError
-from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.nodes import qos
 from nics_drl_bridge.nodes.goal_answer import GoalAnswer, answer_from_values
-from nics_drl_bridge.nodes.runner import Listener, holds
+from nics_drl_bridge.nodes.listener import Listener, holds
 
 GATE = "command_gate"
 POLICY = ": policy"  # how the name of a policy node's status ends
@@ -48,7 +55,13 @@ class GoalRequest:
 
     def to_ros(self, stamp_ns: int) -> PoseStamped:
         """Return the goal as a message."""
-        return conversions.pose_to_ros([self.x, self.y, self.yaw], stamp_ns, self.frame)
+        stamp = Time(sec=stamp_ns // NS_PER_S, nanosec=stamp_ns % NS_PER_S)
+        message = PoseStamped(header=Header(stamp=stamp, frame_id=self.frame))
+        message.pose.position.x = self.x
+        message.pose.position.y = self.y
+        message.pose.orientation.z = math.sin(self.yaw / 2.0)
+        message.pose.orientation.w = math.cos(self.yaw / 2.0)
+        return message
 
 
 class _Call:
@@ -60,15 +73,14 @@ class _Call:
         self._client = node.create_client(Trigger, f"{gate}/{service}")
         self._future: Any = None
 
-    def send_when_ready(self) -> None:
-        """Send the request, unless it was sent or the service is not there yet."""
+    def _send_when_ready(self) -> None:
         if self._future is None and self._client.service_is_ready():
             self._future = self._client.call_async(Trigger.Request())
 
     def wait_for_answer(self, seconds: float) -> GateAnswer:
         """Return the answer, or why there is none after so long; end the call."""
         try:
-            holds(self._is_answered, max(seconds, 0.0), POLL_S)
+            holds(self.is_answered, max(seconds, 0.0), POLL_S)
             if self._future is None:
                 return GateAnswer(self._gate, False, "it has ended")
             if not self._future.done():
@@ -79,8 +91,9 @@ class _Call:
         finally:
             self._node.destroy_client(self._client)
 
-    def _is_answered(self) -> bool:
-        self.send_when_ready()
+    def is_answered(self) -> bool:
+        """Send the request once the service is there; return whether the answer has come."""
+        self._send_when_ready()
         return self._future is not None and bool(self._future.done())
 
 
@@ -115,27 +128,33 @@ class Operator(AbstractContextManager["Operator", None]):
             answer = self._call(gate, "arm", deadline)
         return answer
 
-    def stop(self, namespace: str | None, seconds: float) -> list[GateAnswer]:
-        """Press the e-stop of one gate, or of every one that is seen if no namespace is given."""
+    def stop(self, namespace: str | None, seconds: float) -> Iterator[GateAnswer]:
+        """Press the e-stop of one gate, or of all if no namespace is given; yield each answer.
+
+        An answer is yielded as soon as it comes, so that nobody waits for gates that may follow.
+        """
         if namespace is not None:
             gate = self._wait_for_gate(namespace, seconds)
-            return [self._call(gate, "e_stop", time.monotonic() + CALL_S)]
-        calls: dict[str, _Call] = {}
+            yield self._call(gate, "e_stop", time.monotonic() + CALL_S)
+            return
+        waiting: dict[str, _Call] = {}
+        seen = set[str]()
         deadline = time.monotonic() + seconds
         while time.monotonic() < deadline:
-            for gate in self._gates() - calls.keys():
-                if not calls:
+            for gate in self._gates() - seen:
+                if not seen:
                     deadline = time.monotonic() + SETTLE_S
-                calls[gate] = _Call(self._node, gate, "e_stop")
-            for call in calls.values():  # a gate that hangs holds up no other
-                call.send_when_ready()
+                seen.add(gate)
+                waiting[gate] = _Call(self._node, gate, "e_stop")
+            # a gate that hangs holds up no other
+            for gate in [gate for gate, call in waiting.items() if call.is_answered()]:
+                yield waiting.pop(gate).wait_for_answer(0.0)
             time.sleep(POLL_S)
-        if not calls:
+        if not seen:
             raise BackendError(f"{self._nobody(GATE, seconds)}; nothing was stopped.")
         deadline = time.monotonic() + GATE_ANSWER_S
-        return [
-            call.wait_for_answer(deadline - time.monotonic()) for call in calls.values()
-        ]
+        for call in waiting.values():
+            yield call.wait_for_answer(deadline - time.monotonic())
 
     def send_goal(
         self, namespace: str, goal: GoalRequest, seconds: float, tell: Tell

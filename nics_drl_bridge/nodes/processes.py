@@ -17,8 +17,8 @@ from std_srvs.srv import Trigger
 from nics_drl_bridge.config import PACKAGE
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.listener import GREATEST_DOMAIN_ID, Listener, holds
 from nics_drl_bridge.nodes.node_process import ChildProcess, command_of
-from nics_drl_bridge.nodes.runner import GREATEST_DOMAIN_ID, Listener, holds
 from nics_drl_bridge.nodes.starting import NodeStart
 from nics_drl_bridge.nodes.transport import domains_in_use
 

@@ -22,9 +22,9 @@ from nics_drl_bridge.interface import NS_PER_S, Array, BackendFacts, RobotView, 
 from nics_drl_bridge.middleware.measurement import CMD_VEL, SCAN
 from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes.link import EpisodeServices, Link
+from nics_drl_bridge.nodes.listener import holds
 from nics_drl_bridge.nodes.parameters import NO_POSE
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, data_facts, declare_sensors
-from nics_drl_bridge.nodes.runner import holds
 from nics_drl_bridge.sim.world_set import AnyWorld
 
 POLL_S = 0.01

@@ -3,7 +3,6 @@
 import contextlib
 import gc
 import hashlib
-import os
 import signal
 import socket
 import sys
@@ -19,7 +18,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.exceptions import ParameterException
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
@@ -31,18 +30,14 @@ from nics_drl_bridge.exit_codes import EXIT_BAD_INPUT
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.nodes import qos
 from nics_drl_bridge.nodes.ending import at_once, ending_signals
-from nics_drl_bridge.nodes.executor import StandingExecutor
+from nics_drl_bridge.nodes.listener import holds, open_context, spin
 from nics_drl_bridge.nodes.output import ros_arguments
 from nics_drl_bridge.nodes.parameters import MODEL, Row
-from nics_drl_bridge.nodes.transport import OF_THIS_PROCESS
 
-SPIN_S = 0.1
-UNKNOWN = "UnknownROSArgsError"  # of rclpy, which exports it nowhere
 UNCONFIGURED = "unconfigured"
 INACTIVE = "inactive"
 ACTIVE = "active"
 DELIVERY_S = 0.5
-GREATEST_DOMAIN_ID = 232  # above it, DDS has no ports
 # time until the graph shows all nodes [s]
 SETTLE_S = 0.3
 POLL_S = 0.02
@@ -54,38 +49,6 @@ RANGES = {
     float: (FloatingPointRange, "floating_point_range"),
 }
 SHARED = "model"  # a file may also set it for nodes without a model
-
-
-def open_context(
-    args: Sequence[str] | None = None, domain_id: int | None = None
-) -> Context:
-    """Return a new context, on this machine unless the environment sets a range. BackendError."""
-
-    def make() -> Context:
-        context = Context()
-        context.init(None if args is None else list(args), domain_id=domain_id)
-        return context
-
-    if domain_id is None:
-        asked = os.environ.get("ROS_DOMAIN_ID", "0")
-    else:
-        asked = str(domain_id)
-    # otherwise DDS would end the process
-    if asked.isdecimal() and int(asked) > GREATEST_DOMAIN_ID:
-        raise BackendError(
-            f"ROS 2 does not start: domain {asked} is above {GREATEST_DOMAIN_ID}."
-        )
-    try:
-        return OF_THIS_PROCESS.open(make)
-    except RuntimeError as error:
-        if type(error).__name__ == UNKNOWN:
-            fix = "as in `--ros-args -p NAME:=VALUE -r FROM:=TO --params-file FILE`"
-            raise BackendError(
-                f"ROS 2 knows no argument {error}; write them {fix}."
-            ) from None
-        raise BackendError(
-            f"ROS 2 does not start: {' '.join(str(error).split())}"
-        ) from None
 
 
 def last_word(publisher: Publisher, message: Any) -> None:
@@ -150,62 +113,6 @@ def _sentence(error: Exception) -> str:
         place = f"{error.filename}: " if error.filename else ""
         return f"{place}{error.strerror or error}; choose another place."
     return " ".join(str(error).split())
-
-
-def holds(condition: Callable[[], Any], seconds: float, poll_s: float) -> bool:
-    """Wait until a condition holds; return False if it does not within `seconds`."""
-    deadline = time.monotonic() + seconds
-    while not condition():
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(poll_s)
-    return True
-
-
-def spin(node: Node, stopping: threading.Event) -> None:
-    """Spin a node until `stopping` is set or its context has been shut down."""
-    executor = StandingExecutor(node.context)
-    executor.add_node(node)
-    with contextlib.suppress(ExternalShutdownException):
-        while node.context.ok() and not stopping.is_set():
-            executor.spin_once(timeout_sec=SPIN_S)
-    executor.shutdown(timeout_sec=1.0)
-
-
-class Listener(Node):
-    """A node in a context of its own, which spins in a thread from `start` to `close`."""
-
-    def __init__(
-        self,
-        name: str,
-        domain_id: int | None = None,
-        namespace: str = "",
-        has_parameters: bool = False,
-    ) -> None:
-        context = open_context([], domain_id)
-        self._thread = threading.Thread(
-            target=spin, args=(self, threading.Event()), daemon=True, name=name
-        )
-        try:
-            super().__init__(
-                name,
-                context=context,
-                namespace=namespace,
-                start_parameter_services=has_parameters,
-            )
-        except BaseException:
-            context.try_shutdown()
-            raise
-
-    def start(self) -> None:
-        """Start the thread, once all subscriptions exist."""
-        self._thread.start()
-
-    def close(self) -> None:
-        """End the thread, the node and its context."""
-        self.context.try_shutdown()
-        self._thread.join(timeout=2.0)
-        self.destroy_node()
 
 
 @contextlib.contextmanager

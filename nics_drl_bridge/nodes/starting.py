@@ -18,6 +18,7 @@ from nics_drl_bridge.config import (
     PACKAGE,
     find_config,
     list_shipped,
+    parse_namespace,
     parse_yaml,
     read_text,
     share_folder,
@@ -104,6 +105,11 @@ class Setup:
         self.values = {**values, **flags}
         file = self["params_file"]
         self._file = parse_yaml(read_text(file), file) if file else {}
+        check_sections(file, self._file)
+        if self["world"]:
+            check_world(self["world"])
+        if self["policy"]:
+            check_policy(self["policy"])
         self.model = self["model"] or str(self._of_file("model", "") or MODEL.default)
         shipped = share_folder() / "urdf" / f"{self.model}.urdf"
         self._opened: Any = None if shipped.is_file() else opened(self.model)
@@ -245,18 +251,52 @@ def flag_of(name: str, word: str) -> str:
     return FLAG_WORDS[word.lower()]
 
 
+def check_sections(file: str, sections: Mapping[Any, Any]) -> None:
+    """Raise ConfigError unless a file holds parameters of nodes; ROS 2 says it less clearly."""
+    for name, section in sections.items():
+        if section is None:
+            continue
+        if not isinstance(section, dict):
+            form = "`NODE: {ros__parameters: {NAME: VALUE}}`"
+            fix = f"parameter files hold {form}, as config/nodes/bridge.yaml does"
+            raise ConfigError(f"{file}: key {name!r} is no section of a node; {fix}.")
+        if name != "ros__parameters":
+            check_sections(file, section)
+
+
+def check_world(name: str) -> None:
+    """Raise ConfigError unless a world is shipped or a file of the user's that can be read."""
+    if name not in list_shipped("worlds"):  # reading one takes a second
+        from nics_drl_bridge.sim.world_set import load_worlds
+
+        load_worlds(name)
+
+
+def check_policy(name: str) -> None:
+    """Raise ConfigError if a policy is a file that does not exist."""
+    is_file = name.endswith((".onnx", ".yaml", ".yml"))
+    if is_file and not Path(name).is_file():
+        raise ConfigError(f"policy {name!r}: no such file; check the path.")
+
+
 def names_of(robots: Any) -> tuple[str, ...]:
     """Return the namespaces of a fleet from a count or a list; none for one robot."""
     if isinstance(robots, list):
         words = [str(name) for name in robots]
     else:
         words = re.findall(r"[^\s,\[\]'\"]+", str(robots))
+    text = str(robots)
+    if text and (not words or text.count("[") != text.count("]")):
+        fix = "give a count from 1, or namespaces, as in robots:='[ant, bee]'"
+        raise ConfigError(f"launch argument 'robots' is {text!r}; {fix}.")
     if len(words) == 1 and words[0].isdecimal():
         count = int(words[0])
         if count < 1:
             fix = "give a count from 1, or namespaces, as in robots:='[ant, bee]'"
             raise ConfigError(f"launch argument 'robots' is {count}; {fix}.")
         return default_namespaces(count) if count > 1 else ()
+    for word in words:
+        parse_namespace(word)
     twice = {word for word in words if words.count(word) > 1}
     if twice:
         raise ConfigError(

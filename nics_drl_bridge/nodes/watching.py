@@ -15,9 +15,9 @@ from nics_drl_bridge.interface import Array
 from nics_drl_bridge.lidar.shapes import BODY
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.listener import Listener
 from nics_drl_bridge.nodes.parameters import MAP_FRAME
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, declare_sensors
-from nics_drl_bridge.nodes.runner import Listener
 from nics_drl_bridge.sim.world import World, check_place
 from nics_drl_bridge.sim.world_set import AnyWorld
 from nics_drl_bridge.watch.frame import Frame, Stage, Track, WorldFrame

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
+from nics_drl_bridge.config import read_text
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.errors import ConfigError, PolicyError, suggest
 from nics_drl_bridge.generator import SimulatorModel
@@ -303,6 +304,16 @@ def is_policy_file(name: str) -> bool:
             f"unknown policy {name!r}; {suggest(name, (*POLICIES, *files))}"
         )
     return name not in POLICIES
+
+
+def check_policy_file(name: str) -> None:
+    """Raises PolicyError or ConfigError unless a policy file can be read, for whatever robot."""
+    from nics_drl_bridge.policy.policy_file import load_policy
+
+    if name.endswith(MAPPINGS):
+        read_text(name)
+    else:
+        load_policy(name)
 
 
 def make_policy(

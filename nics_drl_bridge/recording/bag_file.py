@@ -36,6 +36,7 @@ SUFFIXES = (".mcap", DATABASE)
 ROS_1 = ".bag"
 COMPRESSED = (".zst", ".zstd")
 URI_SIGNS = "?#%"
+BAGS = "a bag is the folder of a rosbag2, or a file *.mcap, *.db3 or *.bag."
 # Maximum length of the name of a topic or type, and of a fault [characters]
 LONGEST_NAME = 60
 LONGEST_REASON = 260
@@ -73,6 +74,8 @@ def open_bag(path: str | Path) -> "Iterator[BagFile]":
     """
     path = Path(path)
     check_libraries(path, "reading")
+    if path.is_file() and not is_storage(path):
+        raise RecordingError(f"{path}: is no bag; {BAGS}")
     is_ros_1 = path.suffix == ROS_1
     with ExitStack() as stack:
         with _refuse_damage(path, is_ros_1):
@@ -149,6 +152,8 @@ def _find_place(path: Path) -> Path:
     file = path
     if path.is_dir():
         if len(files) != 1:
+            if not files:
+                raise RecordingError(f"{path}: holds no bag file; {BAGS}")
             fault = f"holds {len(files)} bag files and no {METADATA}"
             raise RecordingError(f"{path}: {fault}; write it with `ros2 bag reindex`.")
         file = files[0]

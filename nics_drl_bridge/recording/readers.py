@@ -214,6 +214,9 @@ def read_robot_and_drives(
     mapping: Mapping | str | Path | None,
 ) -> tuple[RobotSpec, list[Recording]]:
     """Reads drives of one robot, whose ranges cover all of them."""
+    twice = [path for path in paths if paths.count(path) > 1]
+    if twice:
+        raise RecordingError(f"{twice[0]}: is given twice; give each recording once.")
     specs = []
     drives = []
     for path in paths:

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge import files, geometry
+from nics_drl_bridge.arguments import format_value
 from nics_drl_bridge.config import check_no_device
-from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording.heading import Turning
 from nics_drl_bridge.recording.mapping import UNITS
@@ -215,8 +216,19 @@ def samples_on_one_clock(
     )
 
 
+def _check_types(recording: object, spec: object) -> None:
+    """Raises ConfigError for a path or a name where the object is meant."""
+    if not isinstance(recording, Recording):
+        needed = "a Recording, as read_recording(path) returns"
+        raise ConfigError(f"recording={format_value(recording)}: must be {needed}.")
+    if not isinstance(spec, RobotSpec):
+        needed = "a RobotSpec, as load_robot(name) returns"
+        raise ConfigError(f"robot={format_value(spec)}: must be {needed}.")
+
+
 def check(recording: Recording, spec: RobotSpec) -> Recording:
     """Returns a recording that fits a robot. Raises RecordingError with place and fault if not."""
+    _check_types(recording, spec)
     names = spec.variable_names
     recorded = recording.variables
     if recording.state is None:  # then only the order of the commands matters

@@ -78,7 +78,7 @@ def test_a_topic_whose_quality_of_service_does_not_fit_is_named(
     from rclpy.node import Node
     from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-    from nics_drl_bridge.nodes.runner import holds, open_context
+    from nics_drl_bridge.nodes.listener import holds, open_context
 
     durability = (
         DurabilityPolicy.TRANSIENT_LOCAL if durable else DurabilityPolicy.VOLATILE

@@ -48,6 +48,15 @@ def test_an_unknown_package_gets_the_nearest(absent, tmp_path):
     assert "unknown message package 'tf_msgs'; did you mean 'tf2_msgs'?" in done.stderr
 
 
+def test_a_folder_without_messages_is_refused_before_anything_is_fetched(
+    absent, tmp_path
+):
+    (tmp_path / "leg_msgs").mkdir()
+    done = nics("install", "leg_msgs", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "leg_msgs: holds none of msg/*.msg, srv/*.srv, action/" in done.stderr
+
+
 def test_a_missing_compiler_is_one_sentence_with_the_fix(absent, tmp_path, monkeypatch):
     monkeypatch.setattr(message_build.shutil, "which", lambda name: None)
     done = nics("install", "tf2_msgs", cwd=tmp_path)

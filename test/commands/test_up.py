@@ -87,6 +87,31 @@ def test_a_wrong_argument_is_told_before_anything_heavy_is_loaded():
     assert done.stdout == "2 set()\n"
 
 
+@pytest.mark.ros
+@pytest.mark.process
+@pytest.mark.parametrize("words", ["arm", "stop", "goal 1 0"])
+def test_a_command_to_a_running_robot_loads_no_simulator(words):
+    """An emergency stop must not wait for seconds of imports."""
+    pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+    ask = (
+        "import sys\n"
+        "from nics_drl_bridge.commands import start\n"
+        f"sys.argv = ['nics', *{words.split()}, '--wait', '0']\n"
+        "try:\n"
+        "    start.main()\n"
+        "except SystemExit as end:\n"
+        "    print(end.code, set(sys.modules) & {'numba', 'scipy', 'rclpy'})\n"
+    )
+    with claimed_domain() as domain_id:
+        done = subprocess.run(
+            [sys.executable, "-c", ask],
+            env={**os.environ, "ROS_DOMAIN_ID": str(domain_id)},
+            capture_output=True,
+            text=True,
+        )
+    assert done.stdout == "2 {'rclpy'}\n", done.stderr
+
+
 @pytest.mark.parametrize("name", LAUNCHES)
 def test_every_launch_lists_its_arguments(name, tmp_path):
     done = nics("up", name, "--show-args", cwd=tmp_path)

@@ -195,6 +195,22 @@ class ObservesTooLittle(Navigation):
         return super().observation(view, memory)[..., 1:]
 
 
+class ObservesADictionary(Navigation):
+    """Its `observation` is a dictionary."""
+
+    def observation(self, view: Any, memory: Any) -> Any:
+        """Returns a dictionary."""
+        return {"scan": super().observation(view, memory)}
+
+
+class HasAMethodForItsSpace(Navigation):
+    """Its `observation_space` is a method, not a property."""
+
+    def observation_space(self) -> Any:
+        """Returns a space when it is called."""
+        return super().observation_space
+
+
 @pytest.mark.parametrize("make", [nics_drl_bridge.make, nics_drl_bridge.make_vec])
 @pytest.mark.parametrize(
     ("task", "sentence"),
@@ -203,6 +219,11 @@ class ObservesTooLittle(Navigation):
         (ResetsToAnArray, "its reset must return a dictionary of arrays"),
         (RewardsByText, "its reward term 'progress' must be finite"),
         (ObservesTooLittle, "its observation must be finite, of shape"),
+        (ObservesADictionary, "its observation must be finite, of shape"),
+        (
+            HasAMethodForItsSpace,
+            "its observation_space must be a property that returns a Box",
+        ),
     ],
 )
 def test_a_task_that_returns_what_no_task_may_is_told_which_method(

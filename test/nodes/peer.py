@@ -13,7 +13,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.runner import open_context
+from nics_drl_bridge.nodes.listener import open_context
 
 DEADLINE_S = 90.0
 # Fast DDS drops an answer whose client the server has not discovered within 0.1 s.

@@ -20,8 +20,8 @@ from nics_drl_bridge.gate.state import begin
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes.command_gate import declare_gate
+from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.nodes.parameters import NODES
-from nics_drl_bridge.nodes.runner import open_context
 
 pytestmark = pytest.mark.ros
 

@@ -27,7 +27,7 @@ from nics_drl_bridge.gate.black_box import replay
 from nics_drl_bridge.gate.inputs import Press, Tick
 from nics_drl_bridge.generator import save_model
 from nics_drl_bridge.nodes import command_gate, conversions, qos
-from nics_drl_bridge.nodes.runner import open_context
+from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.nodes.wire import stamped_twist_of
 from nodes.peer import DEADLINE_S
 
@@ -232,7 +232,7 @@ def test_it_imports_nothing_that_learns_or_infers():
 def test_it_does_not_listen_before_its_shield_is_compiled(domain_id):
     code = f"""
 from nics_drl_bridge.nodes.command_gate import CommandGate
-from nics_drl_bridge.nodes.runner import open_context
+from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.gate.shield_kernels import is_free
 CommandGate._listen = lambda _: print(len(is_free.signatures))
 node = CommandGate(open_context([], domain_id={domain_id}))

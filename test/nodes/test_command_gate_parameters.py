@@ -15,7 +15,8 @@ from nics_drl_bridge.config import dump_yaml, find_config
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.nodes.command_gate import declare_black_box, declare_gate
-from nics_drl_bridge.nodes.runner import declare_model, open_context
+from nics_drl_bridge.nodes.listener import open_context
+from nics_drl_bridge.nodes.runner import declare_model
 
 pytestmark = pytest.mark.ros
 

@@ -22,7 +22,7 @@ from std_srvs.srv import Trigger
 
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.device_parameters import declare_device, timing
-from nics_drl_bridge.nodes.runner import open_context
+from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.robot.noise import Delay, Latency
 from nodes.peer import stamp_ns
 

@@ -11,7 +11,7 @@ from std_srvs.srv import Trigger
 
 from nics_drl_bridge.nodes import executor as executor_module
 from nics_drl_bridge.nodes.executor import HANDED_OVER, StandingExecutor
-from nics_drl_bridge.nodes.runner import open_context
+from nics_drl_bridge.nodes.listener import open_context
 
 pytestmark = pytest.mark.ros
 SPINS = 2000

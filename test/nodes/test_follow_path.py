@@ -27,8 +27,9 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import conversions, policy_node, qos
 from nics_drl_bridge.nodes.follow_path import FOLLOW, NAVIGATE, PathActions
+from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.nodes.policy_node import PolicyNode
-from nics_drl_bridge.nodes.runner import open_context, unknown
+from nics_drl_bridge.nodes.runner import unknown
 
 pytestmark = pytest.mark.ros
 SUCCEEDED = 4

@@ -15,8 +15,9 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.nodes import conversions
 from nics_drl_bridge.nodes.goal_frames import GoalFrames
+from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.nodes.parameters import policy
-from nics_drl_bridge.nodes.runner import declare_row, open_context
+from nics_drl_bridge.nodes.runner import declare_row
 
 pytestmark = pytest.mark.ros
 

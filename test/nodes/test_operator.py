@@ -8,8 +8,8 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
+from nics_drl_bridge.nodes import listener
 from nics_drl_bridge.nodes import operator as module
-from nics_drl_bridge.nodes import runner
 from nics_drl_bridge.nodes.goal_answer import GoalAnswer
 from nics_drl_bridge.nodes.operator import GateAnswer, GoalRequest, Operator
 
@@ -46,8 +46,8 @@ def test_a_node_that_can_not_be_made_leaves_no_context(monkeypatch):
     def fail(*_, **__):
         raise RuntimeError("no node")
 
-    monkeypatch.setattr(runner, "open_context", lambda *_: context)
-    monkeypatch.setattr(runner.Node, "__init__", fail)
+    monkeypatch.setattr(listener, "open_context", lambda *_: context)
+    monkeypatch.setattr(listener.Node, "__init__", fail)
     with pytest.raises(RuntimeError, match="no node"):
         Operator()
     assert ended == [True]
@@ -107,3 +107,38 @@ def test_a_goal_without_an_answer_takes_no_longer_than_was_given(clock, monkeypa
     answer = operator.send_goal("", GoalRequest(1.0, 0.0), 2.0, lambda _: None)
     assert answer == GoalAnswer(0, False, "no answer within 2.0 s, active")
     assert clock.now == 2.0
+
+
+def test_a_stopped_robot_is_told_at_once_and_one_seen_later_is_stopped_too(
+    clock, monkeypatch
+):
+    appearing = {"/ant/command_gate": 0.0, "/bee/command_gate": 0.5}
+    hanging = "/cat/command_gate"
+
+    class Call:
+        def __init__(self, node, gate, service):
+            self.gate = gate
+
+        def is_answered(self):
+            return self.gate != hanging
+
+        def wait_for_answer(self, left_s):
+            clock.sleep(left_s)
+            return GateAnswer(self.gate, self.gate != hanging, "")
+
+    def find_gates():
+        return {hanging} | {gate for gate, s in appearing.items() if s <= clock.now}
+
+    operator = Operator.__new__(Operator)
+    operator._node = None
+    monkeypatch.setattr(operator, "_gates", find_gates)
+    monkeypatch.setattr(module, "_Call", Call)
+    told = [
+        (answer.gate, answer.granted, round(clock.now, 1))
+        for answer in operator.stop(None, 5.0)
+    ]
+    assert told == [
+        ("/ant/command_gate", True, 0.0),
+        ("/bee/command_gate", True, 0.5),
+        (hanging, False, module.SETTLE_S + module.GATE_ANSWER_S),
+    ]

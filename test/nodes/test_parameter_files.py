@@ -14,10 +14,10 @@ from rclpy.node import Node
 from nics_drl_bridge.extras.mujoco.node import mujoco_node
 from nics_drl_bridge.nodes import runner
 from nics_drl_bridge.nodes.command_gate import CommandGate
+from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.nodes.middleware_node import MiddlewareNode
 from nics_drl_bridge.nodes.policy_node import PolicyNode
 from nics_drl_bridge.nodes.record_node import declare_drive
-from nics_drl_bridge.nodes.runner import open_context
 from nics_drl_bridge.nodes.simulator_node import simulator_node
 
 pytestmark = pytest.mark.ros

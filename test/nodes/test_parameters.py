@@ -12,9 +12,9 @@ pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 from rclpy.parameter import Parameter
 
 from nics_drl_bridge.nodes import parameters
+from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.nodes.parameters import NODES, frame_fault, stamped_by_default
 from nics_drl_bridge.nodes.record_node import RecordNode
-from nics_drl_bridge.nodes.runner import open_context
 from nodes.in_process import NodeThread
 from nodes.test_parameter_files import MAKERS
 

@@ -16,8 +16,8 @@ from sensor_msgs.msg import LaserScan
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.nodes.policy_node import PolicyNode
-from nics_drl_bridge.nodes.runner import open_context
 from nodes.peer import stamp_ns
 
 pytestmark = pytest.mark.ros

@@ -11,8 +11,8 @@ from std_msgs.msg import Bool
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.nodes import qos
+from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.nodes.qos import QosWatch
-from nics_drl_bridge.nodes.runner import open_context
 
 pytestmark = pytest.mark.ros
 

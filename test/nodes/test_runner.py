@@ -11,15 +11,11 @@ from std_msgs.msg import Bool
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.nodes.backends import DdsBackend
+from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.nodes.parameters import Row
 from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
 from nics_drl_bridge.nodes.record_node import declare_drive
-from nics_drl_bridge.nodes.runner import (
-    declare_model,
-    declare_row,
-    open_context,
-    unknown,
-)
+from nics_drl_bridge.nodes.runner import declare_model, declare_row, unknown
 from nics_drl_bridge.sim.world import load_world
 
 pytestmark = pytest.mark.ros

@@ -24,7 +24,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from nics_drl_bridge.generator import save_model
 from nics_drl_bridge.nodes import conversions, qos, simulator_node
-from nics_drl_bridge.nodes.runner import open_context
+from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.robot.noise import Noise
 from nics_drl_bridge.sim.entities import Entities
 from nics_drl_bridge.sim.world import load_world

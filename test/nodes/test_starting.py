@@ -51,6 +51,44 @@ def test_a_robot_that_is_named_twice_is_refused():
         names_of("[ant, bee, ant]")
 
 
+@pytest.mark.parametrize("robots", ["[ant", "ant]", "[]", "[ ]"])
+def test_a_list_of_robots_that_is_none_is_refused(robots):
+    with pytest.raises(ConfigError, match=r"'robots' is '.*'; give a count from 1"):
+        names_of(robots)
+
+
+def test_a_robot_whose_name_is_no_namespace_is_refused():
+    with pytest.raises(ConfigError, match="namespace '9x': must be words of letters"):
+        names_of("[ant, 9x]")
+
+
+@pytest.mark.parametrize(
+    ("argument", "value", "sentence"),
+    [
+        ("world", "corridr", "unknown world 'corridr'; did you mean 'corridor'?"),
+        ("world", "nope.yaml", "nope.yaml: no such file"),
+        ("policy", "nope.onnx", "policy 'nope.onnx': no such file; check the path"),
+    ],
+)
+def test_a_missing_file_or_name_is_told_before_any_node_starts(
+    argument, value, sentence
+):
+    with pytest.raises(ConfigError, match=re.escape(sentence)):
+        setup_of(**{argument: value})
+
+
+@pytest.mark.parametrize(
+    "text", ["name: mine\n", "simulator_node: 3\n", "ant:\n  simulator_node: [1]\n"]
+)
+def test_a_file_that_holds_no_parameters_is_refused_in_one_sentence(text, tmp_path):
+    file = tmp_path / "robot.yaml"
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(
+        ConfigError, match=r"robot.yaml: key '\w+' is no section of a n"
+    ):
+        setup_of(params_file=str(file))
+
+
 @pytest.mark.parametrize("name", starting.FLAGS)
 def test_a_flag_that_is_neither_true_nor_false_is_refused_before_any_node_starts(name):
     with pytest.raises(
@@ -170,7 +208,8 @@ def test_a_simulation_arms_without_an_e_stop_and_a_vehicle_does_not():
     assert required["command_gate"]["e_stop_required"] is True
 
 
-def test_every_parameter_has_the_type_that_its_node_declares():
+def test_every_parameter_has_the_type_that_its_node_declares(monkeypatch):
+    monkeypatch.setattr(starting, "check_world", lambda name: None)
     given = {
         "world": "7",
         "policy": "1e3",

@@ -169,7 +169,7 @@ from pathlib import Path
 from rclpy.context import Context
 from rclpy.node import Node
 from nics_drl_bridge.errors import BackendError
-from nics_drl_bridge.nodes.runner import open_context
+from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.nodes.transport import multicast_port, ports_of
 
 def ours(where=None):

@@ -12,7 +12,7 @@ from nav_msgs.msg import Odometry
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.nodes import qos
-from nics_drl_bridge.nodes.runner import holds
+from nics_drl_bridge.nodes.listener import holds
 from nics_drl_bridge.nodes.watching import RosSource
 from nics_drl_bridge.sim.world import load_world
 from nics_drl_bridge.watch.server import Request

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.files import MOST_BYTES, seal
 from nics_drl_bridge.recording import recording as recordings
 from nics_drl_bridge.recording.recording import (
@@ -47,6 +47,15 @@ def spoilt(recording, name, row, value):
     values = stream.values.copy()
     values[row, 0] = value
     return replace(recording, **{name: replace(stream, values=values)})
+
+
+def test_a_path_or_a_name_where_the_object_is_meant_is_told(recording, car):
+    with pytest.raises(
+        ConfigError, match=r"recording='drive.npz': must be a Recording"
+    ):
+        check("drive.npz", car)
+    with pytest.raises(ConfigError, match=r"robot='ackermann': must be a RobotSpec"):
+        check(recording, "ackermann")
 
 
 def test_the_rates_of_samples_are_the_twist_of_the_exact_arc():

@@ -16,9 +16,9 @@ from nics_drl_bridge.interface import NS_PER_S, Array, Start
 from nics_drl_bridge.lidar.exact_kernels import RADIUS
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.link import POLL_S, Link
+from nics_drl_bridge.nodes.listener import holds
 from nics_drl_bridge.nodes.lockstep_inbox import Inbox
 from nics_drl_bridge.nodes.parameters import NEWEST
-from nics_drl_bridge.nodes.runner import holds
 from nics_drl_bridge.sim.entities import OBSTACLE
 from nics_drl_bridge.sim.scenes import sample_scene
 from nics_drl_bridge.sim.world_set import AnyWorld

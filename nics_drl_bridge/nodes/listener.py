@@ -1,0 +1,108 @@
+"""A node that listens in a thread of its own, as commands need it; imports no simulator."""
+
+import contextlib
+import os
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from rclpy.context import Context
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+
+from nics_drl_bridge.errors import BackendError
+from nics_drl_bridge.nodes.executor import StandingExecutor
+from nics_drl_bridge.nodes.transport import OF_THIS_PROCESS
+
+SPIN_S = 0.1
+UNKNOWN = "UnknownROSArgsError"  # of rclpy, which exports it nowhere
+GREATEST_DOMAIN_ID = 232  # above it, DDS has no ports
+
+
+def open_context(
+    args: Sequence[str] | None = None, domain_id: int | None = None
+) -> Context:
+    """Return a new context, on this machine unless the environment sets a range. BackendError."""
+
+    def make() -> Context:
+        context = Context()
+        context.init(None if args is None else list(args), domain_id=domain_id)
+        return context
+
+    if domain_id is None:
+        asked = os.environ.get("ROS_DOMAIN_ID", "0")
+    else:
+        asked = str(domain_id)
+    # otherwise DDS would end the process
+    if asked.isdecimal() and int(asked) > GREATEST_DOMAIN_ID:
+        raise BackendError(
+            f"ROS 2 does not start: domain {asked} is above {GREATEST_DOMAIN_ID}."
+        )
+    try:
+        return OF_THIS_PROCESS.open(make)
+    except RuntimeError as error:
+        if type(error).__name__ == UNKNOWN:
+            fix = "as in `--ros-args -p NAME:=VALUE -r FROM:=TO --params-file FILE`"
+            raise BackendError(
+                f"ROS 2 knows no argument {error}; write them {fix}."
+            ) from None
+        raise BackendError(
+            f"ROS 2 does not start: {' '.join(str(error).split())}"
+        ) from None
+
+
+def holds(condition: Callable[[], Any], seconds: float, poll_s: float) -> bool:
+    """Wait until a condition holds; return False if it does not within `seconds`."""
+    deadline = time.monotonic() + seconds
+    while not condition():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(poll_s)
+    return True
+
+
+def spin(node: Node, stopping: threading.Event) -> None:
+    """Spin a node until `stopping` is set or its context has been shut down."""
+    executor = StandingExecutor(node.context)
+    executor.add_node(node)
+    with contextlib.suppress(ExternalShutdownException):
+        while node.context.ok() and not stopping.is_set():
+            executor.spin_once(timeout_sec=SPIN_S)
+    executor.shutdown(timeout_sec=1.0)
+
+
+class Listener(Node):
+    """A node in a context of its own, which spins in a thread from `start` to `close`."""
+
+    def __init__(
+        self,
+        name: str,
+        domain_id: int | None = None,
+        namespace: str = "",
+        has_parameters: bool = False,
+    ) -> None:
+        context = open_context([], domain_id)
+        self._thread = threading.Thread(
+            target=spin, args=(self, threading.Event()), daemon=True, name=name
+        )
+        try:
+            super().__init__(
+                name,
+                context=context,
+                namespace=namespace,
+                start_parameter_services=has_parameters,
+            )
+        except BaseException:
+            context.try_shutdown()
+            raise
+
+    def start(self) -> None:
+        """Start the thread, once all subscriptions exist."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the thread, the node and its context."""
+        self.context.try_shutdown()
+        self._thread.join(timeout=2.0)
+        self.destroy_node()
