@@ -121,6 +121,14 @@ def test_a_seed_draws_the_same_mutants_after_a_change_of_other_places(tree):
     assert before == after != other
 
 
+def test_seeds_differ_in_the_places_of_a_kind_that_they_draw_first(tree):
+    firsts = set()
+    for seed in range(20):
+        drawn = mutants.draw(tree, seed, ("gate",), len(KINDS))
+        firsts.add(next(mutant.key for mutant in drawn if mutant.kind == "constant"))
+    assert len(firsts) > 2
+
+
 def test_a_larger_draw_contains_the_smaller_one_and_rooms_have_equal_parts():
     few = mutants.draw(ROOT, 54, ("gate", "env"), 9)
     many = mutants.draw(ROOT, 54, ("gate", "env"), 30)
