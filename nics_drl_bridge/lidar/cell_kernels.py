@@ -182,21 +182,21 @@ def _window(
 
 @kernel
 def around(n: int, x: float, y: float, reach: float, cells: BodyCells) -> int:
-    """Write to `found` the sorted bodies that may be within `reach` [m]; return their number."""
+    """Write the sorted bodies that may be within `reach` [m] to `cells.found`; return how many."""
     first = cells.first
     then = cells.then
-    found = cells.found
+    nearby = cells.found
     count = 0
     if first.shape[0] == 0:
-        return found.shape[0]  # which lists all bodies
+        return nearby.shape[0]  # which lists all bodies
     low, high, left, right = _window(n, x, y, reach, cells)
     side = int(cells.frame[n, SIDE])
     for row in range(low, high + 1):
         for i in range(first[n, row * side + left], first[n, row * side + right + 1]):
-            found[count] = i if cells.ordered else then[n, i]
+            nearby[count] = i if cells.ordered else then[n, i]
             count = count + 1
     for i in range(first[n, side * side], first[n, side * side + 1]):
-        found[count] = i if cells.ordered else then[n, i]
+        nearby[count] = i if cells.ordered else then[n, i]
         count = count + 1
     return count
 
@@ -206,10 +206,10 @@ def around_added(n: int, x: float, y: float, reach: float, cells: BodyCells) -> 
     """Do the same as `around` for bodies that were added one by one."""
     first = cells.first
     then = cells.then
-    found = cells.found
+    nearby = cells.found
     count = 0
     if first.shape[0] == 0:
-        return found.shape[0]
+        return nearby.shape[0]
     low, high, left, right = _window(n, x, y, reach, cells)
     side = int(cells.frame[n, SIDE])
     for row in range(low, high + 2):
@@ -221,5 +221,5 @@ def around_added(n: int, x: float, y: float, reach: float, cells: BodyCells) -> 
         for cell in range(begin, end + 1):
             k = first[n, cell]
             while k >= 0:
-                found[count], k, count = k, then[n, k], count + 1
+                nearby[count], k, count = k, then[n, k], count + 1
     return count

@@ -163,8 +163,10 @@ def _noise_run(
 @kernel(inline=True)
 def _told(value: np.float32, measured: np.float32, device: Distortion) -> np.float32:
     """Return the measured range, or the value reported for too close or no return."""
-    other = device.close if value < device.close else value
-    return measured if np.float32(value).view(np.uint32) < np.uint32(INF) else other
+    replacement = device.close if value < device.close else value
+    return (
+        measured if np.float32(value).view(np.uint32) < np.uint32(INF) else replacement
+    )
 
 
 @kernel(contracts=True, inline=True)

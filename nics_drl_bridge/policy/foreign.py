@@ -90,8 +90,8 @@ def _ordered(path: Path, model: SimulatorModel | None) -> Order:
             made = leapp_bundle.read_bundle(description)
             return Order(mapping, made.network, path, made.sha256)
     if file.suffix != SUFFIX:
-        known = f"must be an {SUFFIX} file or a LEAPP bundle"
-        raise PolicyError(str(path), "network", f"{known}, not {mapping.network!r}.")
+        needed = f"must be an {SUFFIX} file or a LEAPP bundle"
+        raise PolicyError(str(path), "network", f"{needed}, not {mapping.network!r}.")
     try:
         if file.stat().st_size > onnx_graph.SIZE_LIMIT:
             most = f"{onnx_graph.SIZE_LIMIT // 2**20} MB; not opened."

@@ -76,15 +76,15 @@ class Builder:
             row = self.add("Div", row, self.constant(scaled.divide))
         return self.clamp(row, scaled.clip)
 
-    def select(self, condition: str, row: str, other: str) -> str:
-        """Selects `row` where `condition` (1, 1) is 1 and `other` where it is 0.
+    def select(self, condition: str, row: str, fallback: str) -> str:
+        """Selects `row` where `condition` (1, 1) is 1 and `fallback` where it is 0.
 
-        Computes condition * row + (1 - condition) * other, so both must be finite.
+        Computes condition * row + (1 - condition) * fallback, so both must be finite.
         """
         opposite = self.affine(condition, -1.0, 1.0)
         from_row = self.add("Mul", condition, row)
-        from_other = self.add("Mul", opposite, other)
-        return self.add("Add", from_row, from_other)
+        from_fallback = self.add("Mul", opposite, fallback)
+        return self.add("Add", from_row, from_fallback)
 
     def is_negative(self, row: str) -> str:
         """Computes 1 where a row is negative and 0 elsewhere, as a very steep ramp."""

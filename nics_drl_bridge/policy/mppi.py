@@ -197,12 +197,12 @@ class Mppi:
         latency = float(model.delays.max(initial=0.0))
         if self.model is not None:
             latency += max(0.0, self.model.calibration.command_latency_s)
-        own = (
+        decays = (
             (terms.dof >= 3)
             & (terms.degree == 1)
             & (terms.factors[:, 0] == terms.dof - 3)
         )
-        fastest = np.abs(terms.coefficient[own]).max(initial=0.0)
+        fastest = np.abs(terms.coefficient[decays]).max(initial=0.0)
         substeps = min(
             max(1, math.ceil(period * fastest / FINEST)), round(period / model.dt)
         )
@@ -235,9 +235,9 @@ class Mppi:
 
 def _settled(model: TaylorModel, high: Array) -> Array:
     """Returns the steady state (S, C) per unit of each command."""
-    given = np.diag(0.5 * high)
+    commands = np.diag(0.5 * high)
     pose = np.zeros((len(high), 3))
     state = np.zeros((len(high), model.state_size))
     for _ in range(round(SETTLED_S / model.dt)):
-        pose, state = model.step(pose, state, given)
+        pose, state = model.step(pose, state, commands)
     return np.ascontiguousarray((state / (0.5 * high)[:, None]).T)

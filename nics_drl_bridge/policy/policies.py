@@ -55,10 +55,11 @@ def _grid(robot: RobotSpec) -> Array:
     axes = [
         np.unique(
             np.append(
-                np.linspace(one.min, one.max, count), np.clip(0, one.min, one.max)
+                np.linspace(command.min, command.max, count),
+                np.clip(0, command.min, command.max),
             )
         )
-        for one, count in zip(
+        for command, count in zip(
             robot.command, counts or [3] * len(robot.command), strict=True
         )
     ]
@@ -337,11 +338,11 @@ def open_policy(
     from nics_drl_bridge.policy.foreign import load_any
 
     policy = load_any(name, model)
-    found: Any = policy.make_task(model, kind)  # any task, if `kind` names its class
-    if kind is None and not isinstance(found, Navigation):
+    opened: Any = policy.make_task(model, kind)  # any task, if `kind` names its class
+    if kind is None and not isinstance(opened, Navigation):
         reason = f"is {policy.contract.task.name!r}; only policies of 'navigation' can be driven."
         raise PolicyError(name, "task.name", reason)
-    return _acting(policy), found
+    return _acting(policy), opened
 
 
 def _acting(policy: "PolicyFile") -> Policy:

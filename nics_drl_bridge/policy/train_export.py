@@ -100,8 +100,8 @@ def actor_of(model: Any) -> torch.nn.Module:
         return torch.nn.Sequential(*parts)
     if isinstance(policy, torch.nn.Module):
         return policy
-    known = "give a PPO, A2C or SAC, or a torch module."
-    raise ConfigError(f"a {type(model).__name__} can't be exported; {known}")
+    fix = "give a PPO, A2C or SAC, or a torch module."
+    raise ConfigError(f"a {type(model).__name__} can't be exported; {fix}")
 
 
 def export_policy(

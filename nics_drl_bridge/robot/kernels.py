@@ -220,9 +220,9 @@ def move(
 ) -> Moved:
     """Moves x, y [m], cosine and sine of the heading along an arc of `turn` [rad] in dt [s]."""
     if abs(turn) > WIDE_TURN:
-        one = series[3] + series[3]
+        unit = series[3] + series[3]
         sine = math.sin(turn)
-        versine = one - math.cos(turn)
+        versine = unit - math.cos(turn)
         ahead, left = _compute_chord(vx, vy, sine / turn, versine / turn, dt)
         moved: Moved = _turn_and_shift(x, y, c, s, ahead, left, sine, versine)
     else:

@@ -130,17 +130,17 @@ def pose_at(b: int, time: float, moving: Moving) -> tuple[float, float, float, f
 @kernel
 def _placed_at(b: int, edge: Edge, time: float, moving: Moving) -> Placed:
     x, y, c, s = pose_at(b, time, moving)
-    there = _in_map(edge, x, y, c, s)
+    placed = _in_map(edge, x, y, c, s)
     if b < 0 or time >= moving.flights[b, STOP]:
-        return Placed(there, x, y, 0.0, 0.0, 0.0, 0.0)
+        return Placed(placed, x, y, 0.0, 0.0, 0.0, 0.0)
     flight = moving.flights[b]
     vx = flight[VX]
     vy = flight[VY]
     turn = flight[TURN]
     if not in_own_frame(b, moving):
-        return Placed(there, x, y, vx, vy, turn, 0.0)
+        return Placed(placed, x, y, vx, vy, turn, 0.0)
     bend = abs(turn) * math.sqrt(vx * vx + vy * vy)
-    return Placed(there, x, y, c * vx - s * vy, s * vx + c * vy, turn, bend)
+    return Placed(placed, x, y, c * vx - s * vy, s * vx + c * vy, turn, bend)
 
 
 @kernel
@@ -233,16 +233,16 @@ def _free_time(
     beyond = max(near, near2)
     keep = 0.5 * SLACK if gap > SLACK else 0.25 * gap
     free = np.inf
-    own = 0.0
-    others = 0.0
+    own_rate = 0.0
+    other_rate = 0.0
     for ahead, u in ((far, rate_p), (far2, rate_p2)):
         for behind, v in ((near, rate_q), (near2, rate_q2)):
             root = _root(gap - keep + (ahead - front) + (beyond - behind), u + v, bend)
             if root < free:
                 free = root
-                own = u
-                others = v
-    return free, own, others
+                own_rate = u
+                other_rate = v
+    return free, own_rate, other_rate
 
 
 @kernel
@@ -269,10 +269,10 @@ def _corner(nx: float, ny: float, body: Placed, rate: float) -> tuple[float, flo
 def touch(
     event: Array,
     a: int,
-    edge: Edge,
+    edge_a: Edge,
     round_a: float,
     b: int,
-    other: Edge,
+    edge_b: Edge,
     round_b: float,
     begin: float,
     moving: Moving,
@@ -281,14 +281,14 @@ def touch(
 
     The edges are in the bodies' frames, with a radius [m] around each.
     """
-    reach_a = _reach(edge)
-    reach_b = _reach(other)
+    reach_a = _reach(edge_a)
+    reach_b = _reach(edge_b)
     time = begin
     flights = moving.flights
     until = event[TIME]
     for _ in range(MOST_LOOKS):
-        p = _placed_at(a, edge, time, moving)
-        q = _placed_at(b, other, time, moving)
+        p = _placed_at(a, edge_a, time, moving)
+        q = _placed_at(b, edge_b, time, moving)
         nx, ny = _between(p.edge, q.edge)
         away = math.sqrt(nx * nx + ny * ny)
         if away <= NOTHING:
@@ -297,7 +297,7 @@ def touch(
         nx = nx / away
         ny = ny / away
         bend = p.bend + q.bend + p.turn * p.turn * reach_a + q.turn * q.turn * reach_b
-        free, own, others = _free_time(p, q, nx, ny, gap, bend)
+        free, own_rate, other_rate = _free_time(p, q, nx, ny, gap, bend)
         rest = _next_stop(b, time, _next_stop(a, time, until, flights), flights) - time
         if free >= rest:
             if time + rest >= until:
@@ -306,12 +306,12 @@ def touch(
             continue
         # Nearer than half the slack not even a creep is let through: it would end in an overlap.
         least = 0.5 * gap if gap > 0.5 * SLACK else NOTHING
-        if gap <= SLACK and -(own + others) * rest >= least:
+        if gap <= SLACK and -(own_rate + other_rate) * rest >= least:
             if time < until:
                 event[TIME] = time
                 event[WITH] = b
-                event[OWN] = own
-                event[OTHERS] = others
+                event[OWN] = own_rate
+                event[OTHERS] = other_rate
                 _note(event, nx, ny, p, q)
             return
         time += free
@@ -403,7 +403,7 @@ def touch_edge(
     event: Array,
     a: int,
     b: int,
-    other: Edge,
+    edge_b: Edge,
     round_b: float,
     begin: float,
     moving: Moving,
@@ -413,16 +413,18 @@ def touch_edge(
     flights = moving.flights
     x, y, _, _ = pose_at(a, begin, moving)
     ox, oy, oc, os = pose_at(b, begin, moving)
-    there = _in_map(other, ox, oy, oc, os)
+    placed = _in_map(edge_b, ox, oy, oc, os)
     spin = abs(flights[b, TURN]) if b >= 0 and begin < flights[b, STOP] else 0.0
     speed = (
-        speed_at(a, begin, flights) + speed_at(b, begin, flights) + spin * _reach(other)
+        speed_at(a, begin, flights)
+        + speed_at(b, begin, flights)
+        + spin * _reach(edge_b)
     )
     far = world[a, RADIUS] + round_b + speed * (event[TIME] - begin)
     if speed == 0.0 and (begin >= flights[a, STOP] or flights[a, TURN] == 0.0):
         return
     if (
-        collision.segment_distance2(x, y, there.ax, there.ay, there.bx, there.by)
+        collision.segment_distance2(x, y, placed.ax, placed.ay, placed.bx, placed.by)
         > far * far
     ):
         return
@@ -430,7 +432,7 @@ def touch_edge(
     round_a = world[a, RADIUS] if outline.begin == outline.end else 0.0
     for v in range(_edges(outline)):
         edge = _edge_of(v, outline)
-        touch(event, a, edge, round_a, b, other, round_b, begin, moving)
+        touch(event, a, edge, round_a, b, edge_b, round_b, begin, moving)
 
 
 @kernel
