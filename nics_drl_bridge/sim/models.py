@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 from nics_drl_bridge.config import Schema, parse_yaml, validate
 from nics_drl_bridge.errors import BridgeError, ConfigError
 from nics_drl_bridge.lidar.shapes import Shape
-from nics_drl_bridge.sim.sdf import AssetsError, read_sdf, root_of
+from nics_drl_bridge.sim.sdf import AssetsError, SdfError, read_sdf, root_of
 from nics_drl_bridge.sim.sections import Placed
 from nics_drl_bridge.sim.world import Pose
 
@@ -97,6 +97,7 @@ def file_of(text: str, source: str = TEXT) -> Iterator[Path]:
         file.write_text(text, encoding="utf-8")
         try:
             yield file
-        except ConfigError as error:
-            error.reword(str(error).replace(str(file), source))
+        except SdfError as error:
+            if error.file == file:
+                error.reword(f"{source}{error.reason}")
             raise
