@@ -311,15 +311,16 @@ class LeanPpo:
         rate = self._ppo.learning_rate * max(left, train_algorithms.LEAST_RATE)
         self.steps += self._ppo.rollout * self.collector.env.num_envs
         self.collector.networks.load_state_dict(self.networks.state_dict())
-        self.learner.core_is_free.clear()
         learner = self.learner
         jobs: list[Callable[[], Any]] = [
-            lambda: learner.learn(learner.judge(rollout), rate),
-            self._collect,
+            lambda: learner.learn(learner.judge(rollout), rate)
         ]
-        loss, *collected = run_parts(
-            lambda job: job(), jobs[: 1 + (self.steps < self._total)]
-        )
+        if self.steps < self._total:
+            learner.core_is_free.clear()
+            jobs.append(self._collect)
+        else:
+            learner.core_is_free.set()
+        loss, *collected = run_parts(lambda job: job(), jobs)
         self._rollout = None
         for part in collected:
             self._take(watch, *part)
