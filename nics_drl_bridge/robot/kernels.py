@@ -359,6 +359,11 @@ def _compute_all_rates(dq: Array, x: Array, terms: Terms) -> None:
         else:  # the constant
             for i in range(n):
                 rate[i] += value[i]
+    _subtract_back_emf(dq, x, terms)
+
+
+@kernel
+def _subtract_back_emf(dq: Array, x: Array, terms: Terms) -> None:
     states = terms.emf.shape[0]
     for d in range(states):
         rate = dq[3 + d]
@@ -366,7 +371,7 @@ def _compute_all_rates(dq: Array, x: Array, terms: Terms) -> None:
         for c in range(terms.emf.shape[1]):
             emf = terms.emf[d, c]
             command = x[states + c]
-            for i in range(n):
+            for i in range(x.shape[1]):
                 rate[i] -= emf * abs(command[i]) * state[i]
 
 
