@@ -557,20 +557,7 @@ def draw_scenes(
     obstacles, -1 for the world's own, and `sizes` (n,) rows of `plan.variants`. Returns the first
     row that could not be drawn, or n, and the reason.
     """
-    return _draw(packed.content, seeds, wanted, sizes, bodies, starts, goals, scratch)
-
-
-@kernel
-def _draw(
-    plan: ScenePlan,
-    seeds: NDArray[np.int64],
-    wanted: NDArray[np.int64],
-    sizes: NDArray[np.int64],
-    bodies: Array,
-    starts: Array,
-    goals: Array,
-    scratch: SceneScratch,
-) -> tuple[int, int]:
+    plan: ScenePlan = packed.content
     count = plan.group.shape[0]
     s = scratch
     cells = scratch.cells
