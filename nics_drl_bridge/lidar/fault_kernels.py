@@ -73,7 +73,7 @@ def distort(
         _noise(ranges, device, random.key(seed, random.RANGE_STREAM, counter), False)
     elif coarse:
         for i in range(ranges.shape[0]):
-            ranges[i] = _told(ranges[i], _coarse(ranges[i], device), device)
+            ranges[i] = _report(ranges[i], _coarse(ranges[i], device), device)
     if faults[DROPOUT] > 0.0 or faults[DROPOUT_FAR] > 0.0:
         by = random.key(seed, random.DROPOUT_STREAM, counter)
         _drop(
@@ -157,11 +157,11 @@ def _noise_run(
         value = ranges[i]
         noisy = value + (device.std + device.grows * value) * random.normal_of(run, j)
         noisy = _coarse(noisy, device) if coarse else _limited(noisy, device)
-        ranges[i] = _told(value, noisy, device)
+        ranges[i] = _report(value, noisy, device)
 
 
 @kernel(inline=True)
-def _told(value: np.float32, measured: np.float32, device: Distortion) -> np.float32:
+def _report(value: np.float32, measured: np.float32, device: Distortion) -> np.float32:
     """Return the measured range, or the value reported for too close or no return."""
     replacement = device.close if value < device.close else value
     return (
