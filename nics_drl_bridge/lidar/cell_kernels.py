@@ -41,7 +41,9 @@ class BodyCells(NamedTuple):
 
 def body_cells(worlds: int, bodies: int, ordered: bool = False) -> BodyCells:
     """Allocate cells for K bodies in each of N worlds; 0 worlds if all bodies are looked at."""
-    rows = min(worlds, 1) if ordered else worlds
+    rows = worlds
+    if ordered:
+        rows = min(worlds, 1)
     side = max(int(math.sqrt(PER_BODY * bodies)), 1)
     cells = BodyCells(
         np.full((worlds, side * side + 2), -1, np.int32),
@@ -66,7 +68,9 @@ def cover(n: int, low_x: float, low_y: float, extent: float, cells: BodyCells) -
         frame = cells.frame[n]
         frame[LEFT] = low_x
         frame[BOTTOM] = low_y
-        frame[PER_METRE] = frame[SIDE] / extent if 0.0 < extent < np.inf else 1.0
+        frame[PER_METRE] = 1.0
+        if 0.0 < extent < np.inf:
+            frame[PER_METRE] = frame[SIDE] / extent
         clear(n, cells)
 
 

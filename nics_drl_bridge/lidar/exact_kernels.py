@@ -189,7 +189,12 @@ def edge(
     cross = x1 * ey - y1 * ex
     if cross == 0.0 or (one_sided and cross > 0.0):  # seen edge-on, or from behind
         return
-    low, high = (angle1, angle2) if cross > 0.0 else (angle2, angle1)
+    if cross > 0.0:
+        low = angle1
+        high = angle2
+    else:
+        low = angle2
+        high = angle1
     if high < low:
         high += TWO_PI
     turns = 1 if beams.closed else 3
@@ -397,8 +402,12 @@ def _wall(
 ) -> None:
     count = whole.shape[0]
     few = BLOCK <= whole.shape[0] < MANY
-    # a quarter turn
-    most = min(beams.turns.shape[0] // 4 - BLOCK, BLOCK if few else count)
+    # a quarter turn at a time
+    most = beams.turns.shape[0] // 4 - BLOCK
+    if few:
+        most = min(most, BLOCK)
+    else:
+        most = min(most, count)
     for begin in range(first, end, most):
         until = min(begin + most, end)
         width = min((until - begin + UNIT - 1) // UNIT * UNIT, count)

@@ -90,7 +90,9 @@ def _device(limits: tuple[float, float], faults: Array) -> Distortion:
         close = limits[0]
     elif faults[TOO_CLOSE] == AS_MINUS_INF:
         close = -np.inf
-    per_step = 1.0 / step if step > 0.0 else 0.0
+    per_step = 0.0
+    if step > 0.0:
+        per_step = 1.0 / step
     rest = single(step - single(step))
     least = single(limits[0])
     most = single(limits[1])
@@ -211,7 +213,10 @@ def slice_pose(out: Array, pose: Array, twist: Array, ago: float) -> None:
     turn = -twist[2] * ago
     half = 0.5 * turn
     # The chord of the arc is rotated by half the turn: |chord| = arc * sin(half) / half.
-    chord = 1.0 - half * half / 6.0 if abs(half) < 1e-4 else math.sin(half) / half
+    if abs(half) < 1e-4:
+        chord = 1.0 - half * half / 6.0
+    else:
+        chord = math.sin(half) / half
     c = math.cos(pose[2] + half)
     s = math.sin(pose[2] + half)
     x = -twist[0] * ago * chord
@@ -247,7 +252,9 @@ def slice_poses(
     for g in range(count):
         ago = 0.0
         if direction != AT_ONCE:
-            later = count - 1 - g if direction > AT_ONCE else g
+            later = g
+            if direction > AT_ONCE:
+                later = count - 1 - g
             ago = min(sweep * (later + 0.5) / count, moving)
         slice_pose(out[g], pose, twist, ago)
 

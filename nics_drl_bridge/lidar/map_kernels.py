@@ -79,7 +79,9 @@ def _line(at: float, step: float, cell: int) -> float:
 def _entry(at: float, step: float, size: int) -> tuple[float, float]:
     """Distances along a beam at which it enters and leaves [0, size] on one axis [cells]."""
     if step == 0.0:
-        return (-np.inf, np.inf) if 0.0 <= at < size else (np.inf, -np.inf)
+        if 0.0 <= at < size:
+            return -np.inf, np.inf
+        return np.inf, -np.inf
     to_start = -at / step
     to_end = (size - at) / step
     return min(to_start, to_end), max(to_start, to_end)

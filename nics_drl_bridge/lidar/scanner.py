@@ -145,7 +145,8 @@ class Scanner:
         """
         poses, bodies, walls = self._scene(poses, bodies, walls)
         shape = (len(poses), self.spec.beams)
-        out = np.empty(shape, np.float32) if out is None else out
+        if out is None:
+            out = np.empty(shape, np.float32)
         if out.shape != shape or out.dtype != np.float32:
             raise ConfigError(
                 f"out is {out.shape} {out.dtype}; it must be {shape} float32."
@@ -181,9 +182,9 @@ class Scanner:
             bodies = np.zeros((len(poses), 0, BODY))
         elif bodies.ndim == 2:
             bodies = bodies[None]
-        walls = np.array(
-            walls if np.size(walls) else NO_WALLS, np.float64, order="C", ndmin=2
-        )
+        if np.size(walls) == 0:
+            walls = NO_WALLS
+        walls = np.array(walls, np.float64, order="C", ndmin=2)
         if poses.shape[1:] != (3,) or bodies.shape != (
             len(poses),
             bodies.shape[1],

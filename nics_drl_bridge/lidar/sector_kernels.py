@@ -115,14 +115,19 @@ def _by_place(
             out[s] = _nearer(out[s], value[b])
     around = round(TURN / plan.width)
     for b in range(beams if plan.closed else beams - 1):
-        after = b + 1 if b + 1 < beams else 0
+        after = b + 1
+        if after == beams:
+            after = 0
         if where[b] < 0 or where[after] < 0:
             continue
         gap = (where[after] - where[b]) % around
-        step = 1 if gap <= around // 2 else -1
+        step = 1
+        if gap > around // 2:  # the other way round is shorter
+            step = -1
+            gap = around - gap
         near = min(value[b], value[after])
         s = where[b]
-        for _ in range((gap if step > 0 else around - gap) - 1):
+        for _ in range(gap - 1):
             s = (s + step) % around
             if s < sectors and not has_return[s]:
                 out[s] = _nearer(out[s], near)
@@ -137,9 +142,12 @@ def _seen(r: np.float32, direction: Array, plan: SectorPlan) -> tuple[int, np.fl
     x = plan.shift[0] + reach * direction[0]
     y = plan.shift[1] + reach * direction[1]
     angle = (math.atan2(y, x) - plan.angle_min) % TURN
-    # a tiny negative angle is rounded to TURN
-    s = int(angle / plan.width) if angle < TURN else 0
-    return s, np.float32(math.sqrt(x * x + y * y)) if math.isfinite(r) else r
+    s = 0
+    if angle < TURN:  # a tiny negative angle is rounded to TURN
+        s = int(angle / plan.width)
+    if not math.isfinite(r):
+        return s, r
+    return s, np.float32(math.sqrt(x * x + y * y))
 
 
 @kernel(allocates=True)
