@@ -57,7 +57,8 @@ class Builder:
         if limits is None:
             return row
         low, high = map(self.constant, limits)
-        return self.add("Min", self.add("Max", row, low), high)
+        raised = self.add("Max", row, low)
+        return self.add("Min", raised, high)
 
     def affine(self, row: str, factor: ArrayLike, offset: ArrayLike) -> str:
         """Computes row * factor + offset, without nodes that would change nothing."""
@@ -88,7 +89,8 @@ class Builder:
 
     def is_negative(self, row: str) -> str:
         """Computes 1 where a row is negative and 0 elsewhere, as a very steep ramp."""
-        return self.clamp(self.affine(row, -STEEP, 0.0), (0.0, 1.0))
+        ramp = self.affine(row, -STEEP, 0.0)
+        return self.clamp(ramp, (0.0, 1.0))
 
     def angle(self, cosine: str, sine: str) -> str:
         """Computes the angle atan2(sine, cosine) [rad], with cosine^2 + sine^2 = 1.
@@ -98,7 +100,8 @@ class Builder:
         """
         sine_size = self.add("Abs", sine)
         cosine_size = self.add("Abs", cosine)
-        tangent_of_half = self.add("Div", sine_size, self.affine(cosine_size, 1.0, 1.0))
+        divisor = self.affine(cosine_size, 1.0, 1.0)
+        tangent_of_half = self.add("Div", sine_size, divisor)
         half = self.add("Atan", tangent_of_half)
         ahead = self.affine(half, 2.0, 0.0)
         behind = self.affine(half, -2.0, np.pi)
