@@ -63,7 +63,7 @@ def _place(way: float, cells_per_metre: float, side: float) -> int:
 
 @kernel
 def cover(n: int, low_x: float, low_y: float, extent: float, cells: BodyCells) -> None:
-    """Lay the cells of a world over a square from (low_x, low_y) on; they are empty then."""
+    """Place the empty cells of a world on a square with the corner (low_x, low_y)."""
     if cells.first.shape[0] > 0:
         frame = cells.frame[n]
         frame[LEFT] = low_x

@@ -446,11 +446,11 @@ def _wall_piece(
     line: tuple[float, float, float],
     limits: tuple[float, float],
 ) -> None:
-    """Fuse a wall into those of the beams from a place on that are in [begin, end).
+    """Fuse a wall into the beams in [begin, end), of the `width` beams from a place on.
 
-    They are turned in single precision from the first, or from the last if they meet it ever
-    flatter: up to a quarter turn, nothing cancels out. Ranges are whole numbers, in the same order
-    as floats; of the unsigned ones, all that are negative are beyond the limit.
+    Directions are rotated in single precision from the first beam, or from the last if the angle of
+    incidence grows: up to a quarter turn, nothing cancels out. Ranges are compared as integers,
+    which have the same order as floats; negative ones, as unsigned integers, exceed the limit.
     """
     cross = np.float32(line[0])
     ex = line[1]
@@ -463,7 +463,7 @@ def _wall_piece(
     start = np.uintp(begin)
     c = beams.directions[0, start]
     s = beams.directions[1, start]
-    if (s * ey + c * ex) * line[0] > 0.0:  # it is met ever flatter
+    if (s * ey + c * ex) * line[0] > 0.0:  # the angle of incidence grows
         start = np.uintp(end - 1)
         c = beams.directions[0, start]
         s = beams.directions[1, start]

@@ -96,7 +96,7 @@ class Fitted(NamedTuple):
     """Training settings that fit robot and worlds, with a sentence per adaptation."""
 
     settings: recordings.TrainingSettings
-    told: tuple[str, ...]
+    notes: tuple[str, ...]
 
 
 def settings_for(task: str, name: str | None, changes: dict[str, Any]) -> Fitted:
@@ -118,7 +118,7 @@ def settings_for(task: str, name: str | None, changes: dict[str, Any]) -> Fitted
         name in shipped and recordings.load_training(str(name)).robot != settings.robot
     )
     made = fitted(settings, open_model(settings.robot, settings.lidar), inherited)
-    return Fitted(made.settings, (*notes, *made.told))
+    return Fitted(made.settings, (*notes, *made.notes))
 
 
 def fitted(

@@ -31,7 +31,7 @@ LANES = 256  # Number of robots moved side by side: their arrays stay in the L1 
 CROWD = 4096
 # Minimum number of robots: for fewer, testing all bodies takes less time
 FEWEST_OF_A_CROWD = 8
-STANDING = 32  # Minimum number of obstacles, all of which stand, for sorting them into cells once
+STANDING = 32  # Minimum number of obstacles for sorting them into cells once, if all of them stand
 
 
 # Limits of a simulation: robots in one world, each of which is tested against every other, and

@@ -169,7 +169,7 @@ def _hold(
     events: Array,
     moving: Moving,
 ) -> None:
-    """Let robot m, whose point (px, py) approaches something against n, come no nearer."""
+    """Stop the point (px, py) of robot m from moving against n, where it approaches something."""
     flight = moving.flights[moving.first + m]
     event = events[m]
     slides = (

@@ -20,7 +20,7 @@ FREE = 0
 BODIES = 1
 WALLS = 2
 MAP = 4
-# Most bodies that are listed near a robot; if there are more, all are tested
+# Maximum number of bodies listed near a robot; if there are more, all are tested
 SEVERAL = 32
 
 

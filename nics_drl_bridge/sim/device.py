@@ -187,7 +187,7 @@ class DrivenSimulator(FastSimulator):
         step_kernels.begin_period(self.packed[0])
 
     def in_force(self, time: float) -> Array:
-        """Commands (M, C) in force `time` [s] after the beginning, by the drawn latency alone."""
+        """Commands (M, C) in effect `time` [s] after the beginning, by the drawn latency alone."""
         timing = self.model.timing
         late = (self.data.delay[0] - timing.delay) * timing.dt - time
         rows = np.ceil(np.maximum(late, 0.0) / self.model.control_period - 1e-6).astype(

@@ -36,9 +36,11 @@ and the number of its holds, with which both are in the map frame, too; then the
 HOLD_X, HOLD_Y, ARM, PUSH, HOLD = range(5)
 """Columns of a hold: direction away from what holds a robot; lever arm of its point there [m]; and
 the speed that it is given [m/s]."""
-MOST_HOLDS = 8  # Of a robot in a substep; then it stops: it is wedged in
+MOST_HOLDS = (
+    8  # Maximum number of holds in a substep; a robot with more is wedged in, and stops
+)
 FLIGHT = FIRST_HOLD + MOST_HOLDS * HOLD
-SWEEPS = 30  # Through the holds, to find the speeds with which they agree
+SWEEPS = 30  # Number of passes over the holds to find speeds that satisfy all of them
 (
     TIME,
     WITH,
@@ -61,8 +63,8 @@ none, negative if approaching [m/s]; these points [m]; the clearance, negative w
 something, before and after the substep [m]; and 1 if it touched something before."""
 SLACK = 1e-7  # Bodies touch if they are nearer than this to each other and approach [m]
 NOTHING = 1e-12  # Distances up to this count as zero [m]
-PARTING = 1e-5  # Speed at which what is turned aside parts, so that roundings don't add up [m/s]
-# After so many a pair counts as touching: only absurdly fast turns need more
+PARTING = 1e-5  # Speed at which a deflected body moves away, so that roundings don't add up [m/s]
+# Maximum number of iterations, then a pair counts as touching: only absurd turns need more
 MOST_LOOKS = 2000
 
 
@@ -304,7 +306,7 @@ def touch(
                 return
             time += rest
             continue
-        # Nearer than half the slack not even a creep is let through: it would end in an overlap.
+        # Within half the slack, even the slowest approach is a contact: it would end in an overlap.
         least = 0.5 * gap if gap > 0.5 * SLACK else NOTHING
         if gap <= SLACK and -(own_rate + other_rate) * rest >= least:
             if time < until:
@@ -327,10 +329,10 @@ def touch(
 def hold(
     b: int, nx: float, ny: float, px: float, py: float, time: float, moving: Moving
 ) -> None:
-    """Let the point (px, py) of a robot approach nothing against n from a time on.
+    """Stop the point (px, py) of a robot from moving against n, from a time on.
 
-    Of all motions that its holds allow, it makes the one nearest to its wish by the energy of a
-    ring: it slides without friction, and a corner that is held turns it aside. The speeds
+    Of all motions that its holds allow, it makes the one closest to its free motion, measured by
+    the energy of a ring: it slides without friction, and a held corner deflects it. The speeds
     that the holds give are found by projected Gauss-Seidel sweeps.
     """
     flight = moving.flights[b]

@@ -199,7 +199,7 @@ class SceneSampler:
         return ConfigError(
             f"{where}: key 'goal_distance': no free places for {self.robots} start(s) and goal(s) "
             f"of robots of radius {self.plan.footprint:g} m, {least:g} to {greatest:g} m apart "
-            f"with a way between among {self.count} obstacles, {scene}; change `goal_distance`, "
+            f"with a path between them, {self.count} obstacles, {scene}; change `goal_distance`, "
             "lower `clearance` or `obstacles`, or enlarge the field."
         )
 
@@ -426,7 +426,7 @@ def _free_space(world: World, footprint: float, drawn: bool) -> FreeSpace:
     area = _large_enough(area, cells.cell, least)
     if not area.any():
         raise ConfigError(
-            f"{world.source}: key 'goal_distance': nowhere can {robot} reach a goal {least:g} m "
+            f"{world.source}: key 'goal_distance': {robot} can't reach any goal {least:g} m "
             "away; lower `goal_distance` or `clearance`, or enlarge the world."
         )
     for key, places in (("starts", world.starts), ("goals", world.goals)):

@@ -126,12 +126,12 @@ def read_sdf(
         fix = "leave it out by --skip-unknown or --without MODEL, or put a box in its place"
         raise AssetsError(
             path,
-            f": {left_out[0]}{more}, which is no shape of a world; {fix}.",
+            f": {left_out[0]}{more}, which a world can't hold; {fix}.",
             next(iter(unknown)) in missing,
         )
     shapes = seen - sum(map(len, unknown.values()))
     if left_out and not shapes and not may_be_empty:
-        reason = f"holds nothing but what is no shape of a world ({left_out[0]})"
+        reason = f"contains nothing that a world can hold ({left_out[0]})"
         raise AssetsError(
             path,
             f": {reason}; put a box in its place.",
@@ -157,7 +157,9 @@ def _section_of(body: "_Body", height: float) -> Placed | None:
         problem = error.errors(include_url=False)[0]["msg"].removeprefix(
             "Value error, "
         )
-        reason = f"its shape at a height of {height:g} m is none of a world ({problem})"
+        reason = (
+            f"its shape at a height of {height:g} m can't stand in a world ({problem})"
+        )
         raise body.where.error(f": {reason}; change it.") from None
 
 
@@ -249,7 +251,7 @@ class _Scope:
             self._named.setdefault(name, model)
 
     def frame(self, name: str) -> Array:
-        """(4, 4) pose of a frame of this scope, in its own frame. Raises ConfigError for none."""
+        """(4, 4) pose of a frame in this scope. Raises ConfigError for an unknown name."""
         if name in ("", "world", "__model__"):
             return np.eye(4)
         named = self._named.get(name)
@@ -428,7 +430,7 @@ def _text(element: Element, tag: str) -> str:
 
 
 def _found(uri: str, file: Path) -> Path | None:
-    """The file of an included model, beside a file or on the paths of Gazebo; None for none."""
+    """The file of an included model, beside a file or on the paths of Gazebo, if any."""
     kind, _, name = uri.rpartition("://")
     if kind.startswith("http"):
         return None
@@ -472,13 +474,13 @@ def root_of(path: Path) -> Element:
     """Return the root of an SDF file, with tags as they stand there. Raises ConfigError."""
     root = _tree(path)
     if root.tag != "sdf":
-        reason = f": is no SDF but <{root.tag}>; give a .world or .sdf file."
+        reason = f": is not SDF but <{root.tag}>; give a .world or .sdf file."
         raise SdfError(path, reason)
     version = root.get("version", "")
     if not OLDEST <= _version(version) <= NEWEST:
         span = " to ".join(".".join(map(str, end)) for end in (OLDEST, NEWEST))
         fix = "convert it by `gz sdf -p`"
-        reason = f": SDF version {version!r} is not read, {span} are; {fix}."
+        reason = f": SDF version {version!r} is not supported, only {span}; {fix}."
         raise SdfError(path, reason)
     return root
 
@@ -487,15 +489,15 @@ def _tree(path: Path) -> Element:
     """Read XML. Raises ConfigError with line and column, and for entity declarations."""
     try:
         if check_no_device(path).stat().st_size > MOST_BYTES:
-            reason = f"is larger than {MOST_BYTES // 2**20} MB, which no such file is"
-            raise SdfError(path, f": {reason}; give another.")
+            reason = f"is larger than {MOST_BYTES // 2**20} MB"
+            raise SdfError(path, f": {reason}; give a smaller file.")
         data = path.read_bytes()
     except OSError as error:
         raise SdfError(path, f": can't be read ({error.strerror}).") from None
     parser, builder = expat.ParserCreate(), TreeBuilder()
 
     def refuse(*_: Any) -> None:
-        reason = "declares a document type, whose entities may grow without end"
+        reason = "declares a document type, whose entities can expand without end"
         line = parser.CurrentLineNumber
         raise SdfError(path, f", line {line}: {reason}; remove <!DOCTYPE>.")
 
@@ -508,5 +510,7 @@ def _tree(path: Path) -> Element:
     except (expat.ExpatError, ValueError, LookupError) as error:
         at = f"line {parser.ErrorLineNumber}, column {parser.ErrorColumnNumber + 1}"
         problem = expat.ErrorString(parser.ErrorCode) or str(error)
-        raise SdfError(path, f", {at}: is no XML: {problem}; mend it.") from None
+        raise SdfError(
+            path, f", {at}: is not valid XML: {problem}; correct it."
+        ) from None
     return builder.close()

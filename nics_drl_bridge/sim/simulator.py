@@ -101,7 +101,7 @@ class FastSimulator:
 
         Args:
             model: robot, kinematics, lidar and noise.
-            world: the world, or the set of which each episode draws one.
+            world: the world, or a set; each episode draws one of its worlds.
             worlds: N.
             robots: M in each world.
             renderer: `auto`, `baked` or `exact`, see `lidar.scanner.Scanner`.

@@ -1,4 +1,4 @@
-"""World sets: many worlds under one name, of which every episode draws one."""
+"""World sets: many worlds under one name; every episode draws one of them."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class SetFile(Schema):
 
 @dataclass(frozen=True, eq=False)
 class WorldSet:
-    """Worlds of which every episode draws one by its seed, with equal probability."""
+    """Worlds; the seed of an episode draws one of them, with equal probability."""
 
     name: str
     members: tuple[World, ...]

@@ -311,7 +311,7 @@ CYCLE = (
         ),
         (
             model(FAR),
-            "collision 'c': its shape at a height of 0.2 m is none of a world (Input",
+            "collision 'c': its shape at a height of 0.2 m can't stand in a world (Input",
         ),
         ("", "none of its 0 collision geometries"),
         ("</world><world name='v'>", "holds 2 worlds; give a file with one."),
@@ -331,7 +331,7 @@ def test_a_world_of_too_many_bodies_is_refused_by_its_own_name(write):
 
 @pytest.mark.parametrize("version", ["1.3", "2.0", "", "x"])
 def test_another_version_of_sdf_is_refused(write, version):
-    assert f"SDF version {version!r} is not read, 1.4 to 1.12 are" in refused(
+    assert f"SDF version {version!r} is not supported, only 1.4 to 1.12" in refused(
         write("", version)
     )
 
@@ -341,14 +341,14 @@ def test_another_version_of_sdf_is_refused(write, version):
     [
         (
             "<sdf version='1.6'>\n<a></b></sdf>",
-            ", line 2, column 6: is no XML: mismatched tag",
+            ", line 2, column 6: is not valid XML: mismatched tag",
         ),
-        ("", ", line 1, column 1: is no XML: no element found"),
-        ("<robot name='r'/>", ": is no SDF but <robot>"),
+        ("", ", line 1, column 1: is not valid XML: no element found"),
+        ("<robot name='r'/>", ": is not SDF but <robot>"),
         ("<sdf version='1.6'/>", ": holds 0 worlds"),
         (
             "<?xml version='1.0' encoding='klingon'?><sdf/>",
-            "is no XML: unknown encoding",
+            "is not valid XML: unknown encoding",
         ),
         (
             "<!DOCTYPE s [<!ENTITY c 'dd'>]>\n<sdf>&c;</sdf>",
