@@ -15,7 +15,13 @@ from nics_drl_bridge.generator import BUILTIN_SEED, CONTROL_PERIOD_S, SimulatorM
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.policy import mppi_kernels as kernels
-from nics_drl_bridge.policy.local_map import MOST_M, outline_of, rays_of, scratch_of
+from nics_drl_bridge.policy.local_map import (
+    MOST_M,
+    outline_of,
+    rays_of,
+    scratch_of,
+    split_observation,
+)
 from nics_drl_bridge.policy.local_map_kernels import (
     Clearance,
     FootprintDiscs,
@@ -66,20 +72,11 @@ class Mppi:
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """Plans the actions; see `Policy`."""
-        parts = self._seen(observation)
+        parts = split_observation(self.task, observation)
         out = np.empty((len(parts[0]), len(self.task.robot.command)))
         self._plan(out, *parts)
         actions = out.astype(np.float32)
         return actions[0] if observation.ndim == 1 else actions
-
-    def _seen(self, observation: NDArray[np.float32]) -> tuple[Array, Array, Array]:
-        """Returns scans (N, P) as fractions, goals (N, 2) in `base_link` [m], and twists (N, 3)."""
-        parts = self.task.scan_parts
-        rows = np.atleast_2d(observation).astype(np.float64)
-        goals = rows[:, parts : parts + 1] * rows[:, parts + 1 : parts + 3]
-        scans = rows[:, :parts]
-        twists = rows[:, parts + 3 : parts + 6]
-        return np.ascontiguousarray(scans), goals, np.ascontiguousarray(twists)
 
     def _plan(self, *arrays: Array) -> None:
         """Plans for the rows of arrays (N, ...) on all cores, each core with its own memory."""

@@ -380,7 +380,7 @@ def _tensors(graph: Any) -> Iterator[Any]:
 
 
 def check_ends(
-    model: Any, widths: dict[str, int | None], source: str, batch: int | None = None
+    model: Any, widths: dict[str, int | None], source: str, batch: int | None
 ) -> None:
     """Raises PolicyError unless inputs and outputs have these widths; None means integers (n,).
 

@@ -17,7 +17,13 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.policy import dynamic_window_kernels as kernels
 from nics_drl_bridge.policy.contract import MAPPINGS, SUFFIX, shipped
-from nics_drl_bridge.policy.local_map import MOST_M, outline_of, rays_of, scratch_of
+from nics_drl_bridge.policy.local_map import (
+    MOST_M,
+    outline_of,
+    rays_of,
+    scratch_of,
+    split_observation,
+)
 from nics_drl_bridge.policy.local_map_kernels import (
     Clearance,
     FootprintDiscs,
@@ -188,18 +194,9 @@ class DynamicWindow:
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """Chooses the action; see `Policy`."""
-        parts = self.task.scan_parts
-        seen = np.atleast_2d(observation).astype(np.float64)
-        goals = seen[:, parts : parts + 1] * seen[:, parts + 1 : parts + 3]
-        chosen = np.empty(len(seen), np.int64)
-        kernels.choose_all(
-            chosen,
-            np.ascontiguousarray(seen[:, :parts]),
-            goals,
-            np.ascontiguousarray(seen[:, parts + 3 : parts + 6]),
-            *self._search,
-            self._sense,
-        )
+        parts = split_observation(self.task, observation)
+        chosen = np.empty(len(parts[0]), np.int64)
+        kernels.choose_all(chosen, *parts, *self._search, self._sense)
         return self._scaled[chosen[0] if observation.ndim == 1 else chosen]
 
     @cached_property
