@@ -99,5 +99,5 @@ def file_of(text: str, source: str = TEXT) -> Iterator[Path]:
             yield file
         except SdfError as error:
             if error.file == file:
-                error.reword(f"{source}{error.reason}")
+                error.reword(f"{source}{error.rest}")
             raise

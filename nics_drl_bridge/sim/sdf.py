@@ -44,18 +44,19 @@ NUMBERS = {"euler_rpy": 6, "quat_xyzw": 7}  # of a pose, by its rotation_format
 
 
 class SdfError(ConfigError):
-    """An SDF file is wrong; `reason` is the sentence without the file's path."""
+    """An SDF file is wrong; `rest` is the sentence after the file's path."""
 
-    def __init__(self, file: Path, reason: str) -> None:
-        super().__init__(f"{file}{reason}", reason=reason)
+    def __init__(self, file: Path, rest: str) -> None:
+        super().__init__(f"{file}{rest}")
         self.file = file
+        self.rest = rest
 
 
 class AssetsError(SdfError):
     """An SDF file contains something that is not a shape of a world, or a missing file."""
 
-    def __init__(self, file: Path, reason: str, missing: bool = False) -> None:
-        super().__init__(file, reason)
+    def __init__(self, file: Path, rest: str, missing: bool = False) -> None:
+        super().__init__(file, rest)
         self.missing = missing  # it is a file, and missing
 
 
@@ -69,9 +70,9 @@ class Where(NamedTuple):
         """Return the place of an element in this one."""
         return Where(self.file, self.element + element)
 
-    def error(self, reason: str) -> SdfError:
+    def error(self, rest: str) -> SdfError:
         """Return an error that names the place."""
-        return SdfError(self.file, self.element + reason)
+        return SdfError(self.file, self.element + rest)
 
 
 def read_sdf(
