@@ -230,13 +230,13 @@ def read_image(
     if not path.is_file():
         endings = sum(FORMATS.values(), ())
         folder = path.parent
-        known = [
+        images = [
             file.name
             for file in folder.glob("*")
             if file.name.lower().endswith(endings)
         ]
-        if known:
-            hint = suggest(path.name, known)
+        if images:
+            hint = suggest(path.name, images)
         else:
             hint = f"there are no images in {str(folder)!r}."
         raise ConfigError(

@@ -56,8 +56,8 @@ class Scanner:
         table = self.table
         spec = self.spec
         if self.renderer not in RENDERERS:
-            known = suggest(str(self.renderer), RENDERERS)
-            raise ConfigError(f"unknown renderer {self.renderer!r}; {known}")
+            fix = suggest(str(self.renderer), RENDERERS)
+            raise ConfigError(f"unknown renderer {self.renderer!r}; {fix}")
         if self.renderer == "exact" or not table.shapes:
             return
         reach = float((table.grid[:, 0] - table.outlines.radii).min())
@@ -195,9 +195,9 @@ class Scanner:
         if walls.shape != (len(walls), 4):
             raise ConfigError(f"walls {walls.shape} must be (W, 4).")
         index = bodies[..., SHAPE]
-        known = len(self.table.shapes)
-        if index.size and not (index.min() >= 0 and index.max() < known):
-            reason = f"none of the {known} in the lidar table"  # the kernels would read beyond it
+        count = len(self.table.shapes)
+        if index.size and not (index.min() >= 0 and index.max() < count):
+            reason = f"none of the {count} in the lidar table"  # the kernels would read beyond it
             raise ModelError(
                 f"a body's shape is {reason}; make bodies by `place` of its scanner."
             )

@@ -67,19 +67,19 @@ LAYOUTS = {  # the full circle, and the 270 deg that most front-mounted lidars c
 }
 
 
-def layout_of(given: Any, lidar: LidarSpec) -> ScanLayout | None:
+def layout_of(setting: Any, lidar: LidarSpec) -> ScanLayout | None:
     """Return the layout for a user's setting. Raises ConfigError if it is invalid.
 
     It is None, a ScanLayout, a name in `LAYOUTS`, its fields, or a number of sectors over the view.
     """
-    if given is None or isinstance(given, ScanLayout):
-        return given
-    option = f"task option scan={given!r}"
-    if isinstance(given, str):
-        if given not in LAYOUTS:
-            raise ConfigError(f"{option}: no such layout; {suggest(given, LAYOUTS)}")
-        return LAYOUTS[given]
-    if isinstance(given, int | np.integer) and not isinstance(given, bool):
+    if setting is None or isinstance(setting, ScanLayout):
+        return setting
+    option = f"task option scan={setting!r}"
+    if isinstance(setting, str):
+        if setting not in LAYOUTS:
+            raise ConfigError(f"{option}: no such layout; {suggest(setting, LAYOUTS)}")
+        return LAYOUTS[setting]
+    if isinstance(setting, int | np.integer) and not isinstance(setting, bool):
         x, y, heading = lidar.mount
         middle = 0.5 * (lidar.angle_min + lidar.angle_max)
         begin = lidar.angle_min + float(wrap_angle(middle + heading)) - middle
@@ -89,13 +89,13 @@ def layout_of(given: Any, lidar: LidarSpec) -> ScanLayout | None:
             "angle_max": begin + span,
             "range_max": lidar.range_max,
         }
-        given = {"sectors": int(given), "viewpoint": (x, y), **fields}
-    if not isinstance(given, Mapping):
-        known = ", ".join(map(repr, LAYOUTS))
+        setting = {"sectors": int(setting), "viewpoint": (x, y), **fields}
+    if not isinstance(setting, Mapping):
+        names = ", ".join(map(repr, LAYOUTS))
         raise ConfigError(
-            f"{option}: must be a number of sectors, a mapping, or one of {known}."
+            f"{option}: must be a number of sectors, a mapping, or one of {names}."
         )
-    return validate(dict(given), ScanLayout, "task option scan")
+    return validate(dict(setting), ScanLayout, "task option scan")
 
 
 def sectors_over(lidar: LidarSpec) -> int:

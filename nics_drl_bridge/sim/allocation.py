@@ -155,7 +155,7 @@ def stack_members(
     """
     grids = _share_equal_maps([world.grid for world in worlds])
     distances, map_places = joined([map_field(grid).distances for grid in grids])
-    moves = any(motion is not None for each in motions for motion in each)
+    moves = any(motion is not None for group in motions for motion in group)
     standing = not (sizes.crowded or moves) and sizes.obstacles >= STANDING
     plans, waypoints = _stack_plans(motions if moves else [() for _ in worlds])
     bounds = np.array([world.extent for world in worlds])
