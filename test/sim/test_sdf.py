@@ -199,7 +199,7 @@ def test_the_ground_is_nothing_to_run_into(write):
     [
         (
             model(MESH, "table"),
-            "model 'table' has a mesh model://table/table.dae, which is no",
+            "model 'table' has a mesh model://table/table.dae, which a world",
         ),
         (
             model("<heightmap><uri>hill.png</uri></heightmap>"),
@@ -243,7 +243,7 @@ def test_what_is_no_shape_is_named_in_one_sentence_or_left_out_and_listed(
 def test_a_file_of_which_all_would_be_left_out_is_refused_for_that_and_not_for_the_height(
     write,
 ):
-    sentence = r"holds nothing but what is no shape .*'table' has a mesh"
+    sentence = r"contains nothing that a world can hold .*'table' has a mesh"
     with pytest.raises(ConfigError, match=sentence):
         read_sdf(write(model(MESH, "table")), HEIGHT, skip_unknown=True)
     low = write(model(MESH, "table") + model(DISC, "disc"))
@@ -259,7 +259,7 @@ def test_one_sentence_tells_all_of_a_model_and_how_many_more_there_are(write):
     pair = model(MESH, "a").replace("</link>", more)
     sentence = refused(write(pair + model(MESH, "b") + model(MESH, "c")))
     assert (
-        "table.dae, a mesh model://table/leg.stl (as 2 more models), which is"
+        "table.dae, a mesh model://table/leg.stl (as 2 more models), which a"
         in sentence
     )
 
