@@ -311,9 +311,9 @@ def _merged(bundle: Bundle) -> Any:
         infos |= {tensor.name: tensor for tensor in model.graph.output}
         ready |= infos.keys()
         opsets |= {
-            one.version: one
-            for one in model.opset_import
-            if one.domain in ("", "ai.onnx")
+            opset.version: opset
+            for opset in model.opset_import
+            if opset.domain in ("", "ai.onnx")
         }
         newest = max(newest, model.ir_version)
     if len(opsets) != 1:
