@@ -223,7 +223,7 @@ def read_text(path: str | Path, limit: int = MAX_BYTES) -> str:
     try:
         size = check_no_device(path).stat().st_size
         if size > limit and path.is_file():
-            reason = f"is larger than {limit // 2**20} MB, which no such file is"
+            reason = f"is larger than {limit // 2**20} MB"
             raise ConfigError(f"{path}: {reason}; give another.")
         return path.read_text(encoding="utf-8")
     except FileNotFoundError:

@@ -99,9 +99,8 @@ def east_and_north(longitude: Array, latitude: Array) -> tuple[Array, Array]:
     shrink by less than a centimetre within 10 km.
     """
     shrinkage = 1.0 - ECCENTRICITY_SQUARED * np.sin(latitude) ** 2
-    radius = EQUATOR_RADIUS_M / np.sqrt(
-        shrinkage
-    )  # of curvature, in the prime vertical
+    # of curvature, in the prime vertical
+    radius = EQUATOR_RADIUS_M / np.sqrt(shrinkage)
     turned = wrap_angle(longitude - longitude[0])
     # Earth-centred coordinates, with x in the meridian of the first position
     from_axis = radius * np.cos(latitude)

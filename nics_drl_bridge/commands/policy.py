@@ -121,7 +121,7 @@ def _format_lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
         "lidar": f"{lidar['name']}: {lidar['beams']} beams, {lidar['range_max']:g} m",
         "observation": f"{observation['size']} parts, {observation['scan_parts']} of them the scan",
         "control period": f"{facts['control_period']:g} s",
-        "time limit": "not told"
+        "time limit": "not given"
         if steps is None
         else f"{steps * facts['control_period']:g} s",
         "model": facts["model_fingerprint"],

@@ -215,7 +215,7 @@ def _load_settings(task: str, settings: str | None, named: dict[str, Any]) -> An
     from nics_drl_bridge.policy.pace import settings_for
 
     chosen = settings_for(task, settings, named)
-    for line in chosen.told:
+    for line in chosen.notes:
         typer.echo(line, err=True)
     return chosen.settings
 

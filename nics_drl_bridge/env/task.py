@@ -205,10 +205,10 @@ class Task(ABC):
                 f"memory {sorted(memory)}", f"must keep {sorted(kept)} from `reset`"
             )
         # Copy rebound arrays into the env's rows. Read all first, because they may alias.
-        anew = {
+        rebound = {
             n: np.array(memory[n]) for n, rows in kept.items() if memory[n] is not rows
         }
-        for name, new in anew.items():
+        for name, new in rebound.items():
             rows = memory[name] = kept[name]
             if new.shape != rows.shape or not np.can_cast(
                 new.dtype, rows.dtype, "same_kind"

@@ -152,8 +152,8 @@ def find_in_old_scan(
 
 
 @kernel
-def take_shorter(length: float, other: float) -> float:
+def take_shorter(first: float, second: float) -> float:
     """Returns the shorter of two ranges; NaN as soon as either of them is unknown."""
-    if math.isnan(length) or other >= length:
-        return length
-    return other
+    if math.isnan(first) or second >= first:
+        return first
+    return second

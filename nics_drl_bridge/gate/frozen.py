@@ -90,7 +90,7 @@ def watch_motion(config: GateConfig, state: GateState, now: float) -> GateState:
             return state if push is None else replace(state, push=None)
         mark = (now, np.zeros(3), state.odometry.pose)
         return replace(state, push=Push(now, now, now, np.zeros(3), (mark,)))
-    commanded: Array = push.told + (now - push.last_s) * moving
+    commanded: Array = push.commanded + (now - push.last_s) * moving
     marks = push.marks
     if now - marks[-1][0] >= MARK_S:
         start = now - WINDOW * config.stuck_s
@@ -98,7 +98,7 @@ def watch_motion(config: GateConfig, state: GateState, now: float) -> GateState:
         later = (k for k, (time, _, _) in enumerate(marks[1:]) if time > start)
         first = next(later, len(marks) - 1)
         marks = (*marks[first:], (now, commanded, state.odometry.pose))
-    push = replace(push, last_s=now, told=commanded, marks=marks)
+    push = replace(push, last_s=now, commanded=commanded, marks=marks)
     if moving.any():
         push = replace(push, moving_s=now)
     return replace(state, push=push)
@@ -120,7 +120,7 @@ def no_motion(config: GateConfig, state: GateState, now: float) -> Cause | None:
     if push is None or state.odometry is None or now - push.since_s <= config.stuck_s:
         return None
     time, before, _ = push.marks[0]
-    commanded = push.told - before
+    commanded = push.commanded - before
     path = float(np.hypot(commanded[0], commanded[1]))
     turn = abs(float(commanded[2]))
     if path < MIN_PATH and turn < MIN_TURN:

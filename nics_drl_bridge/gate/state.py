@@ -245,8 +245,8 @@ class Push:
     last_s: float  # last integration
     moving_s: float  # last time that motion was commanded
     # (3,) integral of the commanded twists [m, m, rad], in which forth and back cancel out
-    told: Array
-    # Times [s], `told` at those times, and poses (3,) by odometry, oldest first.
+    commanded: Array
+    # Times [s], `commanded` at those times, and poses (3,) by odometry, oldest first.
     marks: tuple[tuple[float, Array, Array], ...] = ()
 
 

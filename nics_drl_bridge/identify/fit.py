@@ -163,7 +163,7 @@ def fit(
 def regress(
     samples: Samples,
     spec: RobotSpec,
-    order: int = ORDER,
+    order: int,
     noisy: bool = False,
     term_filter: TermFilter | None = None,
 ) -> Regression:
@@ -245,7 +245,7 @@ def _spreads(features: Array) -> Array:
     return np.where(spread > 0.0, spread, 1.0)
 
 
-def sort_by_size(beta: Array, noise_floor: float = 0.0) -> NDArray[np.intp]:
+def sort_by_size(beta: Array, noise_floor: float) -> NDArray[np.intp]:
     """Returns the indices of standardised coefficients (K,), largest first.
 
     Leaves out coefficients that are not above `noise_floor`.
@@ -269,9 +269,7 @@ def prune(beta: Array, alpha: float, noise_floor: float = 0.0) -> NDArray[np.boo
     return np.isin(np.arange(len(beta)), kept)
 
 
-def prune_and_refit(
-    regression: Regression, spec: RobotSpec, alpha: Alpha = ALPHA
-) -> Fit:
+def prune_and_refit(regression: Regression, spec: RobotSpec, alpha: Alpha) -> Fit:
     """Prunes a regression (Eq. 2) and fits the terms that are kept again (Eq. 1).
 
     With `auto` in place of a threshold, terms are taken in the order of their size, the fewest

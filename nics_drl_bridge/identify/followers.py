@@ -1,6 +1,6 @@
 """Followers: delay, lag, dead zone and limits of each unmeasured state that follows a command."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
@@ -18,7 +18,7 @@ from nics_drl_bridge.identify.statistics import CERTAIN, clustered_errors, minim
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.curve import InputCurve, delays
 from nics_drl_bridge.robot.kernels import MAX_ORDER
-from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.robot.spec import RobotSpec, StateVariable
 
 # fall, rise and dead zone of a motor without limits
 FREE = (-np.inf, np.inf, 0.0)
@@ -113,12 +113,7 @@ def apart(drive: Drive, timing: clocks.TimingEstimate) -> clocks.TimingEstimate:
     for i, error in zip(moved, delay_sigma.tolist(), strict=True):
         if further[i] > 0.0:
             errors[f"{states[i].follows}.delay"] = error
-    for variable, row in zip(states, adjusted.motor_sigma.tolist(), strict=True):
-        name = variable.name
-        keys = (f"{name}.fall", f"{name}.rise", f"{variable.follows}.dead")
-        for key, error in zip(keys, row, strict=True):
-            if error > 0.0:
-                errors[key] = error
+    errors |= _name_motor_errors(states, adjusted.motor_sigma)
     if by_wheels:
         latency = timing.latency
     elif timing.separated:
@@ -135,6 +130,20 @@ def apart(drive: Drive, timing: clocks.TimingEstimate) -> clocks.TimingEstimate:
         delays=further,
         motors=motors,
     )
+
+
+def _name_motor_errors(
+    states: Sequence[StateVariable], motor_sigma: Array
+) -> dict[str, float]:
+    """Returns the standard errors (S, 3) that are known, by the names of their parameters."""
+    errors = {}
+    for variable, row in zip(states, motor_sigma.tolist(), strict=True):
+        name = variable.name
+        keys = (f"{name}.fall", f"{name}.rise", f"{variable.follows}.dead")
+        for key, error in zip(keys, row, strict=True):
+            if error > 0.0:
+                errors[key] = error
+    return errors
 
 
 def late_inputs(

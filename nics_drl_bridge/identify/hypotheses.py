@@ -177,7 +177,7 @@ def base_of(
     drive: Drive,
     calibration: Calibration,
     samples: Samples,
-    clear: tuple[InputCurve, ...] = (),
+    clear: tuple[InputCurve, ...],
     former: Base | None = None,
 ) -> Base:
     """Fits the textbook with and without each part of a form; keeps what improves predictions.

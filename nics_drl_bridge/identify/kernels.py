@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.robot.kernels import (
+    Bounds,
     Terms,
     advance_state,
     get_bounds,
@@ -37,7 +38,7 @@ def make_used_terms(
 
 
 @kernel(allocates=True)
-def _product(row, factors, count):  # type: ignore[no-untyped-def]
+def _product(row: Array, factors: NDArray[np.int64], count: int) -> float:
     value = 1.0
     for f in range(count):
         value *= row[factors[f]]
@@ -45,7 +46,7 @@ def _product(row, factors, count):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _sinc(half):  # type: ignore[no-untyped-def]
+def _sinc(half: float) -> float:
     if abs(half) > SMALL_TURN:
         return math.sin(half) / half
     square = half * half
@@ -53,7 +54,18 @@ def _sinc(half):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True, inline=True)
-def _follow_derivatives(now, values, dof, free, dx, dy, turn, along_x, along_y, dt):  # type: ignore[no-untyped-def]
+def _follow_derivatives(
+    now: Array,
+    values: Array,
+    dof: NDArray[np.int64],
+    free: NDArray[np.int64],
+    dx: float,
+    dy: float,
+    turn: float,
+    along_x: float,
+    along_y: float,
+    dt: float,
+) -> None:
     """Propagates the derivatives (3, P) of a pose along one arc: (dx, dy, turn)."""
     for p in range(now.shape[1]):
         value = values[free[p]]
@@ -77,7 +89,16 @@ def _follow_derivatives(now, values, dof, free, dx, dy, turn, along_x, along_y, 
 
 
 @kernel(allocates=True)
-def follow(ends, moved, x, steps, share, terms, free, dt):  # type: ignore[no-untyped-def]
+def follow(
+    ends: Array,
+    moved: Array,
+    x: Array,
+    steps: NDArray[np.int64],
+    share: Array,
+    terms: Terms,
+    free: NDArray[np.int64],
+    dt: float,
+) -> None:
     """Writes end poses (W, 3), and derivatives (W, 3, P) by the `free` (P,) of `terms`."""
     # Body twists along courses of X (W, T, V + 1), whose last entry is 1, are integrated as in the
     # simulator: whole `steps` (W,) of `dt` [s] and a `share` (W,) of one more; headings are
@@ -196,7 +217,13 @@ def tangent(states: int, commands: int, terms: int, free: int) -> Tangent:
 
 
 @kernel
-def shoot(shot, terms, free, dt, scratch):  # type: ignore[no-untyped-def]
+def shoot(
+    shot: Shot,
+    terms: Terms,
+    free: NDArray[np.int64],
+    dt: float,
+    scratch: Tangent,
+) -> None:
     """Predicts windows in steps of dt [s], and the derivatives by the `free` (P,) of `terms`.
 
     The indices of free terms, and the degrees of freedom of the terms, must ascend.
@@ -212,7 +239,7 @@ def shoot(shot, terms, free, dt, scratch):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _begin(shot, begin, end, scratch):  # type: ignore[no-untyped-def]
+def _begin(shot: Shot, begin: int, end: int, scratch: Tangent) -> int:
     """Initialises windows at their starts, and returns the number of steps to the last horizon."""
     scratch.x[-1] = 1.0
     last = 0
@@ -231,7 +258,7 @@ def _begin(shot, begin, end, scratch):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline=True)
-def _put(shot, w, n, lane, scratch):  # type: ignore[no-untyped-def]
+def _put(shot: Shot, w: int, n: int, lane: int, scratch: Tangent) -> None:
     """Writes the requested outputs after n steps, and the command of the next step."""
     row = min(shot.first[w] + n, shot.command.shape[0] - 1)
     for i in range(shot.command.shape[1]):
@@ -245,7 +272,7 @@ def _put(shot, w, n, lane, scratch):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _linearise(terms, free, scratch):  # type: ignore[no-untyped-def]
+def _linearise(terms: Terms, free: NDArray[np.int64], scratch: Tangent) -> None:
     """Computes the terms and the rates, and their derivatives by the state if any are needed."""
     states = scratch.state_slope.shape[1]
     sloped = free.shape[0] > 0
@@ -278,7 +305,14 @@ def _linearise(terms, free, scratch):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _multiply(product, first, factors, degree, without, x):  # type: ignore[no-untyped-def]
+def _multiply(
+    product: Array,
+    first: float,
+    factors: NDArray[np.int64],
+    degree: int,
+    without: int,
+    x: Array,
+) -> None:
     """Writes products (L,) of a number and all factors except one."""
     for lane in range(product.shape[0]):
         product[lane] = first
@@ -290,7 +324,9 @@ def _multiply(product, first, factors, degree, without, x):  # type: ignore[no-u
 
 
 @kernel(inline=True)
-def _step(lane, terms, free, scratch, dt):  # type: ignore[no-untyped-def]
+def _step(
+    lane: int, terms: Terms, free: NDArray[np.int64], scratch: Tangent, dt: float
+) -> None:
     """Advances a window and its derivatives by a step."""
     rate = scratch.rate[:, lane]
     pose = scratch.pose[lane]
@@ -313,7 +349,9 @@ def _step(lane, terms, free, scratch, dt):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _follow_twist(lane, terms, free, scratch):  # type: ignore[no-untyped-def]
+def _follow_twist(
+    lane: int, terms: Terms, free: NDArray[np.int64], scratch: Tangent
+) -> int:
     state = scratch.state_slope[lane]
     for d in range(3):
         scratch.twist[d] = 0.0
@@ -327,14 +365,22 @@ def _follow_twist(lane, terms, free, scratch):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _add(total, factor, by):  # type: ignore[no-untyped-def]
+def _add(total: Array, factor: float, by: Array) -> None:
     if factor != 0.0:
         for p in range(total.shape[0]):
             total[p] += factor * by[p]
 
 
 @kernel
-def _follow_pose(pose, twist, dx, dy, along_x, along_y, dt):  # type: ignore[no-untyped-def]
+def _follow_pose(
+    pose: Array,
+    twist: Array,
+    dx: float,
+    dy: float,
+    along_x: float,
+    along_y: float,
+    dt: float,
+) -> None:
     x = pose[0]
     y = pose[1]
     heading = pose[2]
@@ -350,7 +396,14 @@ def _follow_pose(pose, twist, dx, dy, along_x, along_y, dt):  # type: ignore[no-
 
 
 @kernel(inline=True)
-def _follow_state(lane, terms, free, k, scratch, dt):  # type: ignore[no-untyped-def]
+def _follow_state(
+    lane: int,
+    terms: Terms,
+    free: NDArray[np.int64],
+    k: int,
+    scratch: Tangent,
+    dt: float,
+) -> None:
     state = scratch.state_slope[lane]
     before = scratch.before
     rate = scratch.rate[:, lane]
@@ -376,7 +429,14 @@ def _follow_state(lane, terms, free, k, scratch, dt):  # type: ignore[no-untyped
 
 
 @kernel
-def _hold(slope, value, moved, rate, dt, bounds):  # type: ignore[no-untyped-def]
+def _hold(
+    slope: Array,
+    value: float,
+    moved: float,
+    rate: float,
+    dt: float,
+    bounds: Bounds,
+) -> None:
     """Scales derivatives (P,) of a state by its drag; zeroes them if it sticks or is limited."""
     unheld = value + dt * min(max(rate, bounds.fall), bounds.rise)
     slower = 1.0 + dt * bounds.drag * abs(unheld)
@@ -390,7 +450,7 @@ def _hold(slope, value, moved, rate, dt, bounds):  # type: ignore[no-untyped-def
 
 
 @kernel
-def limp(states, targets, share, fall, rise):  # type: ignore[no-untyped-def]
+def limp(states: Array, targets: Array, share: float, fall: float, rise: float) -> None:
     """Follows targets (T,) from the first state, a fraction of the rest per step, within limits."""
     for k in range(1, states.shape[0]):
         change = share * (targets[k - 1] - states[k - 1])

@@ -187,19 +187,18 @@ def open_loop_error(
     drive: Drive,
     start: float,
     stop: float,
-    horizon: float = HORIZON_S,
 ) -> OpenLoop:
     """Predicts part of a drive [s] open-loop, every 0.1 s; RecordingError if it is too short."""
-    chosen = windows(drive, calibration, start, stop, horizon, SPACING_S)
+    chosen = windows(drive, calibration, start, stop, HORIZON_S, SPACING_S)
     if len(chosen.start_t) == 0:
-        fault = f"the {stop - start:.1f} s from {start:.1f} s on hold no window of {horizon:g} s"
-        advice = "record a longer drive or shorten the horizon"
-        raise RecordingError(f"{drive.recording.source}: {fault}; {advice}.")
+        fault = f"the {stop - start:.1f} s from {start:.1f} s on hold no window of {HORIZON_S:g} s"
+        source = drive.recording.source
+        raise RecordingError(f"{source}: {fault}; record a longer drive.")
     error = predict(model, calibration, drive, chosen) - chosen.end
     position = np.hypot(error[:, 0], error[:, 1])
     moved = chosen.end - chosen.start
     return OpenLoop(
-        horizon,
+        HORIZON_S,
         len(position),
         float(position.mean()),
         float(np.median(position)),

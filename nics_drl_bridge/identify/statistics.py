@@ -43,11 +43,11 @@ def minimise(
     residual: Callable[[Array], Array],
     start: Array,
     scale: Array,
-    bounds: tuple[Array, Array] | None = None,
+    bounds: tuple[Array, Array],
     jacobian: Callable[[Array], Array] | None = None,
 ) -> tuple[Array, Array, Array]:
     """Minimises a residual (n,) within bounds (P,); returns minimum, Jacobian (n, P), residual."""
-    low, high = bounds or (np.full(len(start), -np.inf), np.full(len(start), np.inf))
+    low, high = bounds
     slope: Any = "2-point"
     if jacobian is not None:
         slope = lambda z: jacobian(start + (z - 1.0) * scale) * scale  # noqa: E731

@@ -3,6 +3,7 @@
 import math
 from typing import NamedTuple
 
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
 
 
@@ -19,15 +20,15 @@ STRAIGHT = BicycleGeometry(False, False, 1.0, 0.0)
 
 
 @kernel
-def _limited(value, target, lag, limit):  # type: ignore[no-untyped-def]
+def _limited(value: float, target: float, lag: float, limit: Array) -> float:
     """Returns a target close enough that a first-order lag towards it stays within `limit` (2,)."""
     gap = target - value
-    most = lag * (limit[0] if gap * value >= 0.0 else limit[1])
+    most: float = lag * (limit[0] if gap * value >= 0.0 else limit[1])
     return value + most * math.tanh(gap / most)
 
 
 @kernel
-def _twist(state, bicycle):  # type: ignore[no-untyped-def]
+def _twist(state: Array, bicycle: BicycleGeometry) -> tuple[float, float, float]:
     if not bicycle.used:
         return state[0], state[1], state[2]
     speed = state[0]
@@ -39,7 +40,17 @@ def _twist(state, bicycle):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def roll_windows(ends, actuator, begin, stops, target, lag, limit, bicycle, dt):  # type: ignore[no-untyped-def]
+def roll_windows(
+    ends: Array,
+    actuator: Array,
+    begin: Array,
+    stops: Array,
+    target: Array,
+    lag: Array,
+    limit: Array,
+    bicycle: BicycleGeometry,
+    dt: float,
+) -> None:
     """Writes relative poses (W, H, 3) at ascending `stops` (W, H), in steps of `dt` after `begin`.
 
     `actuator` (W, 3) holds the initial states and is overwritten: a body twist, or speed, 0 and

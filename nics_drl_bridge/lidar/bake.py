@@ -92,8 +92,13 @@ def grid_of(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> Gr
     order = outlines.orders[h]
     distances = np.linspace(radius, spec.range_max + radius, density.distances)
     distances[0] *= 1.0 + TOUCHING
-    round_ = isinstance(shape, Circle)
-    count = 1 if round_ else max(1, -(-density.rotations // order))
+    is_round = isinstance(shape, Circle)
+    if is_round:
+        count = 1
+        round_radius = radius
+    else:
+        count = max(1, math.ceil(density.rotations / order))
+        round_radius = 0.0
     unit = 2.0 * np.pi / (count * order)
     hull = outlines.hulls[
         outlines.hull[h] : (outlines.hull[h] + outlines.hull[h + 1]) // 2
@@ -102,15 +107,13 @@ def grid_of(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> Gr
     turns = np.arange(-parts // 2, parts * count - parts // 2 + 1) * unit / parts
     edges = np.zeros((len(turns), density.distances, 2))
     hints = np.zeros(edges.shape, np.int64)
-    bake_kernels.silhouettes(
-        hull, radius if round_ else 0.0, distances, turns, edges, hints
-    )
+    bake_kernels.silhouettes(hull, round_radius, distances, turns, edges, hints)
     cell = np.zeros((count, density.distances, 6), np.int64)
     low = _reach_of(edges[..., 0], parts, np.minimum) / spec.angle_increment
     high = _reach_of(edges[..., 1], parts, np.maximum) / spec.angle_increment
     cell[..., 0] = np.floor(low - 0.5)
     cell[..., 1] = np.ceil(high + 0.5) - cell[..., 0] + 1
-    if not round_:
+    if not is_round:
         for side in (0, 1):
             wound = _wound(
                 hull, hints[..., side], edges[..., side] - turns[:, None] + side * np.pi

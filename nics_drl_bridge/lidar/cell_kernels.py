@@ -41,7 +41,9 @@ class BodyCells(NamedTuple):
 
 def body_cells(worlds: int, bodies: int, ordered: bool = False) -> BodyCells:
     """Allocate cells for K bodies in each of N worlds; 0 worlds if all bodies are looked at."""
-    rows = min(worlds, 1) if ordered else worlds
+    rows = worlds
+    if ordered:
+        rows = min(worlds, 1)
     side = max(int(math.sqrt(PER_BODY * bodies)), 1)
     cells = BodyCells(
         np.full((worlds, side * side + 2), -1, np.int32),
@@ -61,12 +63,14 @@ def _place(way: float, cells_per_metre: float, side: float) -> int:
 
 @kernel
 def cover(n: int, low_x: float, low_y: float, extent: float, cells: BodyCells) -> None:
-    """Lay the cells of a world over a square from (low_x, low_y) on; they are empty then."""
+    """Place the empty cells of a world on a square with the corner (low_x, low_y)."""
     if cells.first.shape[0] > 0:
         frame = cells.frame[n]
         frame[LEFT] = low_x
         frame[BOTTOM] = low_y
-        frame[PER_METRE] = frame[SIDE] / extent if 0.0 < extent < np.inf else 1.0
+        frame[PER_METRE] = 1.0
+        if 0.0 < extent < np.inf:
+            frame[PER_METRE] = frame[SIDE] / extent
         clear(n, cells)
 
 
@@ -182,21 +186,21 @@ def _window(
 
 @kernel
 def around(n: int, x: float, y: float, reach: float, cells: BodyCells) -> int:
-    """Write to `found` the sorted bodies that may be within `reach` [m]; return their number."""
+    """Write the sorted bodies that may be within `reach` [m] to `cells.found`; return how many."""
     first = cells.first
     then = cells.then
-    found = cells.found
+    nearby = cells.found
     count = 0
     if first.shape[0] == 0:
-        return found.shape[0]  # which lists all bodies
+        return nearby.shape[0]  # which lists all bodies
     low, high, left, right = _window(n, x, y, reach, cells)
     side = int(cells.frame[n, SIDE])
     for row in range(low, high + 1):
         for i in range(first[n, row * side + left], first[n, row * side + right + 1]):
-            found[count] = i if cells.ordered else then[n, i]
+            nearby[count] = i if cells.ordered else then[n, i]
             count = count + 1
     for i in range(first[n, side * side], first[n, side * side + 1]):
-        found[count] = i if cells.ordered else then[n, i]
+        nearby[count] = i if cells.ordered else then[n, i]
         count = count + 1
     return count
 
@@ -206,10 +210,10 @@ def around_added(n: int, x: float, y: float, reach: float, cells: BodyCells) -> 
     """Do the same as `around` for bodies that were added one by one."""
     first = cells.first
     then = cells.then
-    found = cells.found
+    nearby = cells.found
     count = 0
     if first.shape[0] == 0:
-        return found.shape[0]
+        return nearby.shape[0]
     low, high, left, right = _window(n, x, y, reach, cells)
     side = int(cells.frame[n, SIDE])
     for row in range(low, high + 2):
@@ -221,5 +225,5 @@ def around_added(n: int, x: float, y: float, reach: float, cells: BodyCells) -> 
         for cell in range(begin, end + 1):
             k = first[n, cell]
             while k >= 0:
-                found[count], k, count = k, then[n, k], count + 1
+                nearby[count], k, count = k, then[n, k], count + 1
     return count

@@ -189,7 +189,12 @@ def edge(
     cross = x1 * ey - y1 * ex
     if cross == 0.0 or (one_sided and cross > 0.0):  # seen edge-on, or from behind
         return
-    low, high = (angle1, angle2) if cross > 0.0 else (angle2, angle1)
+    if cross > 0.0:
+        low = angle1
+        high = angle2
+    else:
+        low = angle2
+        high = angle1
     if high < low:
         high += TWO_PI
     turns = 1 if beams.closed else 3
@@ -299,25 +304,25 @@ def walls_into(
     lidar: LidarPose,
     walls: Array,
     limits: tuple[float, float],
-    found: Array,
+    scratch: Array,
 ) -> None:
     """Fuse walls (W, 4) into a scan from a `LidarPose`, as `finish` would leave them.
 
-    Limits are range_min and range_max [m]; `found` (11 TOGETHER,) is scratch memory.
+    Limits are range_min and range_max [m]; `scratch` (11 TOGETHER,) is memory.
     """
     whole = out.view(np.int32)
     for begin in range(0, walls.shape[0], TOGETHER):
-        _find_walls(found, beams, lidar, walls, begin, limits[1], out.shape[0])
+        _find_walls(scratch, beams, lidar, walls, begin, limits[1], out.shape[0])
         for j in range(min(TOGETHER, walls.shape[0] - begin)):
             w = np.uintp(j)
             for first, end in ((FIRST, END), (FIRST_AGAIN, END_AGAIN)):
-                if found[w + first] < found[w + end]:
-                    line = found[w + CROSS], found[w + EX], found[w + EY]
+                if scratch[w + first] < scratch[w + end]:
+                    line = scratch[w + CROSS], scratch[w + EX], scratch[w + EY]
                     _wall(
                         whole,
                         beams,
-                        int(found[w + first]),
-                        int(found[w + end]),
+                        int(scratch[w + first]),
+                        int(scratch[w + end]),
                         line,
                         limits,
                     )
@@ -325,7 +330,7 @@ def walls_into(
 
 @kernel(inline=True)
 def _find_walls(
-    found: Array,
+    scratch: Array,
     beams: Beams,
     lidar: LidarPose,
     walls: Array,
@@ -341,13 +346,13 @@ def _find_walls(
     per_turn = beams.step / TWO_PI
     for j in range(min(TOGETHER, walls.shape[0] - begin)):
         for i in range(4):
-            found[np.uintp(j + i * TOGETHER)] = walls[begin + j, i]
+            scratch[np.uintp(j + i * TOGETHER)] = walls[begin + j, i]
     for j in range(TOGETHER):  # unused ones contain old values
         k = np.uintp(j)
-        ax = found[k + AX] - lidar.x
-        ay = found[k + AY] - lidar.y
-        bx = found[k + BX] - lidar.x
-        by = found[k + BY] - lidar.y
+        ax = scratch[k + AX] - lidar.x
+        ay = scratch[k + AY] - lidar.y
+        bx = scratch[k + BX] - lidar.x
+        by = scratch[k + BY] - lidar.y
         ax, ay = c * ax + s * ay, c * ay - s * ax
         bx, by = c * bx + s * by, c * by - s * bx
         ex = bx - ax
@@ -366,22 +371,22 @@ def _find_walls(
             & (begins <= ends)
             & (cross * cross > IN_LINE * IN_LINE * length2)
         )
-        one = arctan2(ay + begins * ey, ax + begins * ex)
-        other = arctan2(ay + ends * ey, ax + ends * ex)
-        low = one if cross > 0.0 else other
-        wide = other - one if cross > 0.0 else one - other
+        angle_a = arctan2(ay + begins * ey, ax + begins * ex)
+        angle_b = arctan2(ay + ends * ey, ax + ends * ex)
+        low = angle_a if cross > 0.0 else angle_b
+        wide = angle_b - angle_a if cross > 0.0 else angle_a - angle_b
         # a whole turn, or rounding
         wide = wide + TWO_PI if wide < -1.0 else max(wide, 0.0)
         low = (low - beams.first) * per_beam
         low -= np.floor(low * per_turn) * turn
         high = low + wide * per_beam
-        found[k + CROSS] = cross
-        found[k + EX] = ex
-        found[k + EY] = ey
-        found[k + FIRST] = np.ceil(low - ROUNDING)
-        found[k + END] = min(np.floor(high + ROUNDING) + 1.0, count) if seen else 0.0
-        found[k + FIRST_AGAIN] = max(np.ceil(low - turn - ROUNDING), 0.0)
-        found[k + END_AGAIN] = (
+        scratch[k + CROSS] = cross
+        scratch[k + EX] = ex
+        scratch[k + EY] = ey
+        scratch[k + FIRST] = np.ceil(low - ROUNDING)
+        scratch[k + END] = min(np.floor(high + ROUNDING) + 1.0, count) if seen else 0.0
+        scratch[k + FIRST_AGAIN] = max(np.ceil(low - turn - ROUNDING), 0.0)
+        scratch[k + END_AGAIN] = (
             min(np.floor(high - turn + ROUNDING) + 1.0, count) if seen else 0.0
         )
 
@@ -397,8 +402,12 @@ def _wall(
 ) -> None:
     count = whole.shape[0]
     few = BLOCK <= whole.shape[0] < MANY
-    # a quarter turn
-    most = min(beams.turns.shape[0] // 4 - BLOCK, BLOCK if few else count)
+    # a quarter turn at a time
+    most = beams.turns.shape[0] // 4 - BLOCK
+    if few:
+        most = min(most, BLOCK)
+    else:
+        most = min(most, count)
     for begin in range(first, end, most):
         until = min(begin + most, end)
         width = min((until - begin + UNIT - 1) // UNIT * UNIT, count)
@@ -437,11 +446,11 @@ def _wall_piece(
     line: tuple[float, float, float],
     limits: tuple[float, float],
 ) -> None:
-    """Fuse a wall into those of the beams from a place on that are in [begin, end).
+    """Fuse a wall into the beams in [begin, end), of the `width` beams from a place on.
 
-    They are turned in single precision from the first, or from the last if they meet it ever
-    flatter: up to a quarter turn, nothing cancels out. Ranges are whole numbers, in the same order
-    as floats; of the unsigned ones, all that are negative are beyond the limit.
+    Directions are rotated in single precision from the first beam, or from the last if the angle of
+    incidence grows: up to a quarter turn, nothing cancels out. Ranges are compared as integers,
+    which have the same order as floats; negative ones, as unsigned integers, exceed the limit.
     """
     cross = np.float32(line[0])
     ex = line[1]
@@ -451,27 +460,27 @@ def _wall_piece(
     skip = np.int32(place - begin)
     hits = np.uint32(end - begin)
     sines = beams.turns.shape[0] // 2
-    one = np.uintp(begin)
-    c = beams.directions[0, one]
-    s = beams.directions[1, one]
-    if (s * ey + c * ex) * line[0] > 0.0:  # it is met ever flatter
-        one = np.uintp(end - 1)
-        c = beams.directions[0, one]
-        s = beams.directions[1, one]
+    start = np.uintp(begin)
+    c = beams.directions[0, start]
+    s = beams.directions[1, start]
+    if (s * ey + c * ex) * line[0] > 0.0:  # the angle of incidence grows
+        start = np.uintp(end - 1)
+        c = beams.directions[0, start]
+        s = beams.directions[1, start]
     across = np.float32(c * ey - s * ex)
     along = np.float32(s * ey + c * ex)
     at = np.uintp(place)
-    turn = np.uintp(sines // 2 + place) - one
+    turn = np.uintp(sines // 2 + place) - start
     for k in range(width):
         j = np.uintp(k)
         cosine = beams.turns[turn + j]
         sine = beams.turns[turn + j + np.uintp(sines)]
         distance = cross / (across * cosine - along * sine)
-        found = np.float32(distance).view(np.int32)
-        meets = (np.uint32(skip) < hits) & (np.uint32(found) <= most)
+        bits = np.float32(distance).view(np.int32)
+        meets = (np.uint32(skip) < hits) & (np.uint32(bits) <= most)
         skip = np.int32(skip + np.int32(1))  # of 32 bits, as the ranges
-        found = found if meets else INF
-        whole[at + j] = min(whole[at + j], found if found >= least else MINUS_INF)
+        bits = bits if meets else INF
+        whole[at + j] = min(whole[at + j], bits if bits >= least else MINUS_INF)
 
 
 @kernel

@@ -73,7 +73,7 @@ def distort(
         _noise(ranges, device, random.key(seed, random.RANGE_STREAM, counter), False)
     elif coarse:
         for i in range(ranges.shape[0]):
-            ranges[i] = _told(ranges[i], _coarse(ranges[i], device), device)
+            ranges[i] = _report(ranges[i], _coarse(ranges[i], device), device)
     if faults[DROPOUT] > 0.0 or faults[DROPOUT_FAR] > 0.0:
         by = random.key(seed, random.DROPOUT_STREAM, counter)
         _drop(
@@ -90,7 +90,9 @@ def _device(limits: tuple[float, float], faults: Array) -> Distortion:
         close = limits[0]
     elif faults[TOO_CLOSE] == AS_MINUS_INF:
         close = -np.inf
-    per_step = 1.0 / step if step > 0.0 else 0.0
+    per_step = 0.0
+    if step > 0.0:
+        per_step = 1.0 / step
     rest = single(step - single(step))
     least = single(limits[0])
     most = single(limits[1])
@@ -157,14 +159,16 @@ def _noise_run(
         value = ranges[i]
         noisy = value + (device.std + device.grows * value) * random.normal_of(run, j)
         noisy = _coarse(noisy, device) if coarse else _limited(noisy, device)
-        ranges[i] = _told(value, noisy, device)
+        ranges[i] = _report(value, noisy, device)
 
 
 @kernel(inline=True)
-def _told(value: np.float32, measured: np.float32, device: Distortion) -> np.float32:
+def _report(value: np.float32, measured: np.float32, device: Distortion) -> np.float32:
     """Return the measured range, or the value reported for too close or no return."""
-    other = device.close if value < device.close else value
-    return measured if np.float32(value).view(np.uint32) < np.uint32(INF) else other
+    replacement = device.close if value < device.close else value
+    return (
+        measured if np.float32(value).view(np.uint32) < np.uint32(INF) else replacement
+    )
 
 
 @kernel(contracts=True, inline=True)
@@ -209,7 +213,10 @@ def slice_pose(out: Array, pose: Array, twist: Array, ago: float) -> None:
     turn = -twist[2] * ago
     half = 0.5 * turn
     # The chord of the arc is rotated by half the turn: |chord| = arc * sin(half) / half.
-    chord = 1.0 - half * half / 6.0 if abs(half) < 1e-4 else math.sin(half) / half
+    if abs(half) < 1e-4:
+        chord = 1.0 - half * half / 6.0
+    else:
+        chord = math.sin(half) / half
     c = math.cos(pose[2] + half)
     s = math.sin(pose[2] + half)
     x = -twist[0] * ago * chord
@@ -245,7 +252,9 @@ def slice_poses(
     for g in range(count):
         ago = 0.0
         if direction != AT_ONCE:
-            later = count - 1 - g if direction > AT_ONCE else g
+            later = g
+            if direction > AT_ONCE:
+                later = count - 1 - g
             ago = min(sweep * (later + 0.5) / count, moving)
         slice_pose(out[g], pose, twist, ago)
 

@@ -88,8 +88,8 @@ class FurtherLidar(Sensor):
 
     def shares(self, readings: Readings) -> Readings:
         """Ranges as fractions of the maximum: 1 free, 0 too close or unknown."""
-        known = np.nan_to_num(readings, nan=0.0, posinf=np.inf, neginf=0.0)
-        shares: Readings = np.clip(known / np.float32(self.lidar.range_max), 0.0, 1.0)
+        ranges = np.nan_to_num(readings, nan=0.0, posinf=np.inf, neginf=0.0)
+        shares: Readings = np.clip(ranges / np.float32(self.lidar.range_max), 0.0, 1.0)
         return shares.astype(np.float32)
 
     def points(self, reading: Readings) -> NDArray[np.float64]:

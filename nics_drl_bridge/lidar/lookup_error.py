@@ -65,8 +65,10 @@ def lookup_distances(
     outline = corners[first[shape] : first[shape + 1]]
     high = exact.range_max
     nearest = TOUCHING * high
-    rings = np.concatenate([[0.0], np.geomspace(nearest, high, RINGS)]) + radius
-    bands = np.geomspace(max(exact.range_min, nearest), high, BANDS + 1)[1:-1]
+    edges = np.geomspace(nearest, high, RINGS)
+    rings = np.concatenate([[0.0], edges]) + radius
+    limits = np.geomspace(max(exact.range_min, nearest), high, BANDS + 1)
+    bands = limits[1:-1]
     squares = np.zeros((RINGS, PLACES, BANDS))
     counts = np.zeros((RINGS, PLACES, BANDS))
     worst = np.zeros(RINGS)
@@ -76,7 +78,8 @@ def lookup_distances(
         cell = errors.placement * BANDS + np.searchsorted(bands, errors.truth)
         sums = np.bincount(cell, np.square(errors.error), PLACES * BANDS)
         squares[i] = sums.reshape(PLACES, BANDS)
-        counts[i] = np.bincount(cell, minlength=PLACES * BANDS).reshape(PLACES, BANDS)
+        beams = np.bincount(cell, minlength=PLACES * BANDS)
+        counts[i] = beams.reshape(PLACES, BANDS)
         worst[i] = np.abs(errors.error).max(initial=0.0)
         if len(outline) > 0:
             poses = _turn_edge_on(poses, outline, SEED + i)
@@ -120,7 +123,8 @@ def _is_small(squares: Array, counts: Array, greatest: float) -> bool:
     for square, count in (rings, bands):
         total = np.maximum(count.sum(axis=1), 1.0)
         mean = square.sum(axis=1) / total
-        spread = np.sqrt(np.square(square - mean[:, None] * count).sum(axis=1)) / total
+        rest = square - mean[:, None] * count
+        spread = np.sqrt(np.square(rest).sum(axis=1)) / total
         if (mean + DEVIATIONS * spread > greatest**2).any():
             return False
     return True
@@ -170,12 +174,14 @@ def _turn_edge_on(poses: Array, outline: Array, seed: int) -> Array:
     rng = np.random.default_rng(seed)
     along = np.roll(outline, -1, axis=0) - outline
     length = np.hypot(*along.T)
-    chosen = rng.choice(len(along), len(poses), p=length**2 / np.sum(length**2))
+    probability = length**2 / np.sum(length**2)
+    chosen = rng.choice(len(along), len(poses), p=probability)
     cross = along[:, 0] * outline[:, 1] - along[:, 1] * outline[:, 0]
     aside = cross / np.maximum(length, 1e-12)
     distance = np.hypot(poses[:, 0], poses[:, 1])
     bearing = np.arctan2(poses[:, 1], poses[:, 0])
     direction = np.arctan2(along[chosen, 1], along[chosen, 0])
     onto = np.arcsin(np.clip(aside[chosen] / distance, -1.0, 1.0))
-    heading = bearing - direction + onto + rng.uniform(-SLANT, SLANT, len(poses))
+    slant = rng.uniform(-SLANT, SLANT, len(poses))
+    heading = bearing - direction + onto + slant
     return np.column_stack([poses[:, :2], heading])

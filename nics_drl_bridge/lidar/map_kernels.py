@@ -79,10 +79,12 @@ def _line(at: float, step: float, cell: int) -> float:
 def _entry(at: float, step: float, size: int) -> tuple[float, float]:
     """Distances along a beam at which it enters and leaves [0, size] on one axis [cells]."""
     if step == 0.0:
-        return (-np.inf, np.inf) if 0.0 <= at < size else (np.inf, -np.inf)
-    one = -at / step
-    other = (size - at) / step
-    return min(one, other), max(one, other)
+        if 0.0 <= at < size:
+            return -np.inf, np.inf
+        return np.inf, -np.inf
+    to_start = -at / step
+    to_end = (size - at) / step
+    return min(to_start, to_end), max(to_start, to_end)
 
 
 @kernel(allocates=True)
@@ -164,11 +166,11 @@ def map_into(
             if value < out[i]:
                 out[i] = value
         return
-    here = (int(y) + 1) * squares.shape[1] + int(x) + 1
+    start = (int(y) + 1) * squares.shape[1] + int(x) + 1
     for first in range(0, out.shape[0], LANES):
         last = min(first + LANES, out.shape[0])
         _begin(beams.directions, first, u - x, v - y, c, s, squares.shape[1], lanes)
-        while _jump(squares.reshape(-1), here, np.float32(limit), lanes):
+        while _jump(squares.reshape(-1), start, np.float32(limit), lanes):
             pass
         _end(
             out[first:last],
@@ -197,8 +199,8 @@ def _begin(
     s = np.float32(s)
     u = np.float32(u)
     v = np.float32(v)
-    one = np.float32(1.0)
-    none = np.float32(0.0)
+    unit = np.float32(1.0)
+    zero = np.float32(0.0)
     singles = lanes.singles
     wholes = lanes.integers
     for j in range(LANES):
@@ -209,17 +211,17 @@ def _begin(
         b = np.float32(directions[1, i])
         du = c * a - s * b
         dv = s * a + c * b
-        right = du > none
-        up = dv > none
+        right = du > zero
+        up = dv > zero
         du = max(abs(du), PARALLEL)
         dv = max(abs(dv), PARALLEL)
         singles[k + DU] = du
         singles[k + DV] = dv
-        singles[k + PER_U] = one / du
-        singles[k + PER_V] = one / dv
-        singles[k + U] = u if right else one - u
-        singles[k + V] = v if up else one - v
-        singles[k + T] = none
+        singles[k + PER_U] = unit / du
+        singles[k + PER_V] = unit / dv
+        singles[k + U] = u if right else unit - u
+        singles[k + V] = v if up else unit - v
+        singles[k + T] = zero
         wholes[k + COLUMN] = 0
         wholes[k + ROW] = 0
         wholes[k + ASIDE] = 1 if right else -1
@@ -229,7 +231,7 @@ def _begin(
 
 @kernel
 def _jump(
-    flat: NDArray[np.uint32], here: int, limit: np.float32, lanes: "ScanLanes"
+    flat: NDArray[np.uint32], start: int, limit: np.float32, lanes: "ScanLanes"
 ) -> np.bool_:
     """Move each lane to the end of its free square; True if any moved."""
     singles = lanes.singles
@@ -238,7 +240,7 @@ def _jump(
     for j in range(LANES):
         k = np.uintp(j)
         cell = (
-            here
+            start
             + wholes[k + COLUMN] * wholes[k + ASIDE]
             + wholes[k + ROW] * wholes[k + ABOVE]
         )

@@ -216,7 +216,9 @@ def _cells_by_brightness(file: MapFile) -> NDArray[np.int8]:
         return np.where(grey <= OCCUPIED, grey, UNKNOWN).astype(np.int8)
     # In float32, as in Nav2: 0.6 and the pixel 102 are equal there.
     bright = grey.astype(np.float32) / np.float32(255.0)
-    dark = bright if file.negate else np.float32(1.0) - bright
+    dark = bright
+    if not file.negate:
+        dark = np.float32(1.0) - bright
     low = np.float32(file.free_thresh)
     high = np.float32(file.occupied_thresh)
     cells = np.full(grey.shape, UNKNOWN, np.int8)
@@ -238,13 +240,13 @@ def read_image(
     if not path.is_file():
         endings = sum(FORMATS.values(), ())
         folder = path.parent
-        known = [
+        images = [
             file.name
             for file in folder.glob("*")
             if file.name.lower().endswith(endings)
         ]
-        if known:
-            hint = suggest(path.name, known)
+        if images:
+            hint = suggest(path.name, images)
         else:
             hint = f"there are no images in {str(folder)!r}."
         raise ConfigError(
@@ -282,7 +284,9 @@ def _pixels(image: Image.Image) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | 
     grey = np.empty(shape, np.uint8)
     sixteen_bits = image.mode in ("I", "F") or image.mode.startswith("I;")
     transparent = image.has_transparency_data and not sixteen_bits
-    opaque = np.empty(shape, np.bool_) if transparent else None
+    opaque = None
+    if transparent:
+        opaque = np.empty(shape, np.bool_)
     rows = max(1, PIXELS_AT_ONCE // max(image.width, 1))
     for first in range(0, image.height, rows):
         block = slice(first, first + rows)
@@ -324,6 +328,8 @@ def joined(cells: Sequence[NDArray[Any]]) -> tuple[NDArray[Any], NDArray[np.int6
     starts = np.cumsum([0, *(array.size for array in once.values())]).tolist()
     first = dict(zip(once, starts, strict=False))
     shapes = [(first[id(array)], *array.shape) for array in cells]
-    flat = [array.reshape(-1) for array in once.values()]  # of one alone, no copy
-    stacked = flat[0] if len(flat) == 1 else np.concatenate(flat)
-    return stacked, np.array(shapes, np.int64)
+    flat = [array.reshape(-1) for array in once.values()]
+    places = np.array(shapes, np.int64)
+    if len(flat) == 1:  # no copy
+        return flat[0], places
+    return np.concatenate(flat), places

@@ -183,7 +183,9 @@ def scan_worlds(
             for i in range(scan.shape[0]):
                 scan[i] = np.float32(np.inf)
             lidar_pose, heading = baked.locate_lidar(robot_poses[n, m], lidar.mount)
-            own_body = first_robot + m if first_robot >= 0 else -1
+            own_body = -1
+            if first_robot >= 0:
+                own_body = first_robot + m
             scan_start = (n * robots + m) * scan.shape[0]
             nearby_count = cell_kernels.around(
                 n, lidar_pose.x, lidar_pose.y, lidar.range_max, cells

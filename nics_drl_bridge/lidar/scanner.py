@@ -56,8 +56,8 @@ class Scanner:
         table = self.table
         spec = self.spec
         if self.renderer not in RENDERERS:
-            known = suggest(str(self.renderer), RENDERERS)
-            raise ConfigError(f"unknown renderer {self.renderer!r}; {known}")
+            fix = suggest(str(self.renderer), RENDERERS)
+            raise ConfigError(f"unknown renderer {self.renderer!r}; {fix}")
         if self.renderer == "exact" or not table.shapes:
             return
         reach = float((table.grid[:, 0] - table.outlines.radii).min())
@@ -145,7 +145,8 @@ class Scanner:
         """
         poses, bodies, walls = self._scene(poses, bodies, walls)
         shape = (len(poses), self.spec.beams)
-        out = np.empty(shape, np.float32) if out is None else out
+        if out is None:
+            out = np.empty(shape, np.float32)
         if out.shape != shape or out.dtype != np.float32:
             raise ConfigError(
                 f"out is {out.shape} {out.dtype}; it must be {shape} float32."
@@ -181,9 +182,9 @@ class Scanner:
             bodies = np.zeros((len(poses), 0, BODY))
         elif bodies.ndim == 2:
             bodies = bodies[None]
-        walls = np.array(
-            walls if np.size(walls) else NO_WALLS, np.float64, order="C", ndmin=2
-        )
+        if np.size(walls) == 0:
+            walls = NO_WALLS
+        walls = np.array(walls, np.float64, order="C", ndmin=2)
         if poses.shape[1:] != (3,) or bodies.shape != (
             len(poses),
             bodies.shape[1],
@@ -194,9 +195,9 @@ class Scanner:
         if walls.shape != (len(walls), 4):
             raise ConfigError(f"walls {walls.shape} must be (W, 4).")
         index = bodies[..., SHAPE]
-        known = len(self.table.shapes)
-        if index.size and not (index.min() >= 0 and index.max() < known):
-            reason = f"none of the {known} in the lidar table"  # the kernels would read beyond it
+        count = len(self.table.shapes)
+        if index.size and not (index.min() >= 0 and index.max() < count):
+            reason = f"none of the {count} in the lidar table"  # the kernels would read beyond it
             raise ModelError(
                 f"a body's shape is {reason}; make bodies by `place` of its scanner."
             )

@@ -73,11 +73,11 @@ def _by_beam(
     for k in range(rows - 1):
         step = 1 << k
         last = beams - (2 << k) + 1
-        one = least[k, :last]
-        two = least[k, step : step + last]
+        left = least[k, :last]
+        right = least[k, step : step + last]
         row = least[k + 1]
         for b in range(last):
-            row[b] = min(one[b], two[b])
+            row[b] = min(left[b], right[b])
     for s in range(out.shape[0]):
         begin = first[s]
         end = first[s] + count[s]
@@ -104,27 +104,32 @@ def _by_place(
     beams = ranges.shape[0]
     where = np.empty(beams, np.int32)
     value = np.empty(beams, np.float32)
-    own = np.zeros(sectors, np.bool_)
+    has_return = np.zeros(sectors, np.bool_)
     for s in range(sectors):
         out[s] = np.nan
     for b in range(beams):
         where[b], value[b] = _seen(ranges[b], plan.directions[b], plan)
         s = where[b]
         if 0 <= s < sectors:
-            own[s] = True
+            has_return[s] = True
             out[s] = _nearer(out[s], value[b])
     around = round(TURN / plan.width)
     for b in range(beams if plan.closed else beams - 1):
-        after = b + 1 if b + 1 < beams else 0
+        after = b + 1
+        if after == beams:
+            after = 0
         if where[b] < 0 or where[after] < 0:
             continue
         gap = (where[after] - where[b]) % around
-        step = 1 if gap <= around // 2 else -1
+        step = 1
+        if gap > around // 2:  # the other way round is shorter
+            step = -1
+            gap = around - gap
         near = min(value[b], value[after])
         s = where[b]
-        for _ in range((gap if step > 0 else around - gap) - 1):
+        for _ in range(gap - 1):
             s = (s + step) % around
-            if s < sectors and not own[s]:
+            if s < sectors and not has_return[s]:
                 out[s] = _nearer(out[s], near)
 
 
@@ -137,11 +142,14 @@ def _seen(r: np.float32, direction: Array, plan: SectorPlan) -> tuple[int, np.fl
     x = plan.shift[0] + reach * direction[0]
     y = plan.shift[1] + reach * direction[1]
     angle = (math.atan2(y, x) - plan.angle_min) % TURN
-    # a tiny negative angle is rounded to TURN
-    s = int(angle / plan.width) if angle < TURN else 0
-    return s, np.float32(math.sqrt(x * x + y * y)) if math.isfinite(r) else r
+    s = 0
+    if angle < TURN:  # a tiny negative angle is rounded to TURN
+        s = int(angle / plan.width)
+    if not math.isfinite(r):
+        return s, r
+    return s, np.float32(math.sqrt(x * x + y * y))
 
 
 @kernel(allocates=True)
-def _nearer(one: np.float32, other: np.float32) -> np.float32:
-    return one if one <= other else other
+def _nearer(first: np.float32, second: np.float32) -> np.float32:
+    return first if first <= second else second

@@ -67,19 +67,19 @@ LAYOUTS = {  # the full circle, and the 270 deg that most front-mounted lidars c
 }
 
 
-def layout_of(given: Any, lidar: LidarSpec) -> ScanLayout | None:
+def layout_of(setting: Any, lidar: LidarSpec) -> ScanLayout | None:
     """Return the layout for a user's setting. Raises ConfigError if it is invalid.
 
     It is None, a ScanLayout, a name in `LAYOUTS`, its fields, or a number of sectors over the view.
     """
-    if given is None or isinstance(given, ScanLayout):
-        return given
-    option = f"task option scan={given!r}"
-    if isinstance(given, str):
-        if given not in LAYOUTS:
-            raise ConfigError(f"{option}: no such layout; {suggest(given, LAYOUTS)}")
-        return LAYOUTS[given]
-    if isinstance(given, int | np.integer) and not isinstance(given, bool):
+    if setting is None or isinstance(setting, ScanLayout):
+        return setting
+    option = f"task option scan={setting!r}"
+    if isinstance(setting, str):
+        if setting not in LAYOUTS:
+            raise ConfigError(f"{option}: no such layout; {suggest(setting, LAYOUTS)}")
+        return LAYOUTS[setting]
+    if isinstance(setting, int | np.integer) and not isinstance(setting, bool):
         x, y, heading = lidar.mount
         middle = 0.5 * (lidar.angle_min + lidar.angle_max)
         begin = lidar.angle_min + float(wrap_angle(middle + heading)) - middle
@@ -89,13 +89,13 @@ def layout_of(given: Any, lidar: LidarSpec) -> ScanLayout | None:
             "angle_max": begin + span,
             "range_max": lidar.range_max,
         }
-        given = {"sectors": int(given), "viewpoint": (x, y), **fields}
-    if not isinstance(given, Mapping):
-        known = ", ".join(map(repr, LAYOUTS))
+        setting = {"sectors": int(setting), "viewpoint": (x, y), **fields}
+    if not isinstance(setting, Mapping):
+        names = ", ".join(map(repr, LAYOUTS))
         raise ConfigError(
-            f"{option}: must be a number of sectors, a mapping, or one of {known}."
+            f"{option}: must be a number of sectors, a mapping, or one of {names}."
         )
-    return validate(dict(given), ScanLayout, "task option scan")
+    return validate(dict(setting), ScanLayout, "task option scan")
 
 
 def sectors_over(lidar: LidarSpec) -> int:
@@ -159,11 +159,16 @@ def _beams_of(away: Array, half: float) -> tuple[int, int]:
         beside = [b for b in (below, above) if abs(away[b]) <= COARSEST_RAD]
         return beside[0], len(beside)
     begins = np.flatnonzero(inside & ~np.roll(inside, 1))
-    return (int(begins[0]) if len(begins) else 0), int(inside.sum())
+    begin = 0
+    if len(begins) > 0:
+        begin = int(begins[0])
+    return begin, int(inside.sum())
 
 
 def _check(lidar: LidarSpec, layout: ScanLayout, angles: Array) -> None:
-    apart = lidar.angle_increment if lidar.beams > 1 else np.inf
+    apart = np.inf
+    if lidar.beams > 1:
+        apart = lidar.angle_increment
     if apart > COARSEST_RAD:
         step, most = np.degrees([apart, COARSEST_RAD])
         seen = f"the beams of the lidar {lidar.name!r} are {step:.3g} deg apart"
@@ -207,7 +212,9 @@ class Reader:
 
     def ordered(self, values: Ranges) -> Ranges:
         """Return ranges (..., B) in counter-clockwise order."""
-        return values[..., ::-1] if self.backwards else values
+        if self.backwards:
+            return values[..., ::-1]
+        return values
 
 
 def reader_of(
@@ -258,9 +265,11 @@ def reader_beside(
     limits = np.array([reader.lidar.range_min, reader.lidar.range_max])
     near = np.allclose(limits, [like.range_min, like.range_max], rtol=1e-4, atol=1e-4)
     same = near and reader.lidar.beams == like.beams
-    turned = reader.lidar.angles - like.angles if same else np.ones(1)
+    if not same:
+        return reader
+    turned = reader.lidar.angles - like.angles
     # the beams may be the same, off by full turns
     whole = 2.0 * np.pi * np.round(turned[0] / (2.0 * np.pi))
-    if same and np.abs(turned - whole).max() < 0.1 * like.angle_increment:
+    if np.abs(turned - whole).max() < 0.1 * like.angle_increment:
         return Reader(like, reader.backwards)
     return reader

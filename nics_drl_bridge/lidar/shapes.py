@@ -114,7 +114,9 @@ class Polygon(Outlined):
         corners = np.array(self.points, dtype=np.float64)
         x, y = corners.T
         twice_area = np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)
-        return corners if twice_area >= 0.0 else np.ascontiguousarray(corners[::-1])
+        if twice_area >= 0.0:
+            return corners
+        return np.ascontiguousarray(corners[::-1])
 
 
 class Segment(Outlined):

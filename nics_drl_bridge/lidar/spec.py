@@ -105,7 +105,9 @@ class LidarSpec(Schema):
     @property
     def angle_increment(self) -> float:
         """Angle between neighbouring beams [rad]."""
-        gaps = self.beams if self.full_circle else max(self.beams - 1, 1)
+        gaps = self.beams
+        if not self.full_circle:
+            gaps = max(self.beams - 1, 1)
         return (self.angle_max - self.angle_min) / gaps
 
     @cached_property
@@ -175,8 +177,11 @@ def from_device(values: ArrayLike, spec: LidarSpec) -> Ranges:
     """
     out = np.array(values, dtype=np.float32)
     if spec.no_return != "inf":
-        none = _no_return(spec)
-        out[np.isnan(out) if np.isnan(none) else out == none] = np.inf
+        no_return = _no_return(spec)
+        if np.isnan(no_return):
+            out[np.isnan(out)] = np.inf
+        else:
+            out[out == no_return] = np.inf
     out[out > np.float32(spec.range_max)] = np.inf
     out[out < np.float32(spec.range_min)] = -np.inf
     return out

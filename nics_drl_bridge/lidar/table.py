@@ -189,8 +189,8 @@ class LidarTable:
 
     def save(self, folder: str | Path) -> None:
         """Write the table as a folder, whole or not at all; ConfigError if not of its kind."""
-        own = {*TABLE_FILES, SUMS}
-        with write_whole_folder(folder, ABOUT_FILE, own.__contains__) as temporary:
+        names = {*TABLE_FILES, SUMS}
+        with write_whole_folder(folder, ABOUT_FILE, names.__contains__) as temporary:
             write_text(temporary / ABOUT_FILE, self._about)
             for name, array in self._arrays.items():
                 np.save(temporary / f"{name}.npy", array, allow_pickle=False)
@@ -257,11 +257,11 @@ class LidarTable:
             :, None
         ]
         hint = self.cell[:, 2::2]
-        other = self.cell[:, 3::2]
+        climb = self.cell[:, 3::2]
         if (
             (hint < 0).any()
             or (hint >= corners).any()
-            or (np.abs(other) >= corners).any()
+            or (np.abs(climb) >= corners).any()
         ):
             raise ValueError("a cell names a corner that its shape does not have")
 

@@ -83,12 +83,12 @@ def compute_rates_jacobian(jacobian: Array, x: Array, terms: robot.Terms) -> Non
     """Writes the Jacobian (3 + S, S + C) of `robot.kernels.rates` by state and command."""
     jacobian[:] = 0.0
     for k in range(terms.dof.shape[0]):
-        for f in range(terms.degree[k]):
+        for position in range(terms.degree[k]):
             product = terms.coefficient[k]
-            for other in range(terms.degree[k]):
-                if other != f:
-                    product *= x[terms.factors[k, other]]
-            jacobian[terms.dof[k], terms.factors[k, f]] += product
+            for factor in range(terms.degree[k]):
+                if factor != position:
+                    product *= x[terms.factors[k, factor]]
+            jacobian[terms.dof[k], terms.factors[k, position]] += product
     for i in range(terms.emf.shape[0]):
         jacobian[3 + i, i] -= robot.sum_back_emf(i, x, terms)
 

@@ -242,7 +242,7 @@ def fuse_odometry(
     twist: Array,
     now_ns: int,
     rate_variance: float,
-    is_at_rest: bool = False,
+    is_at_rest: bool,
 ) -> FusedOdometry:
     """Fuses the turn since the last odometry, as measured by wheels and gyro.
 

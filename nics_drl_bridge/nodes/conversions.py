@@ -111,9 +111,7 @@ def scan_to_ros(
     return message
 
 
-def reader_from_ros(
-    message: LaserScan, like: LidarSpec, upside_down: bool = False
-) -> Reader:
+def reader_from_ros(message: LaserScan, like: LidarSpec, upside_down: bool) -> Reader:
     """Return the reader of the lidar that a header describes. Raises ConfigError."""
     header = ScanHeader(*(float(getattr(message, name)) for name in ScanHeader._fields))
     return reader_beside(header, len(message.ranges), like, upside_down)

@@ -74,7 +74,7 @@ def log_file(node: str, words: Sequence[str]) -> str:
     return os.path.abspath(os.path.join(os.path.expanduser(folder), name))
 
 
-def forward_output(log: str = "") -> None:
+def forward_output(log: str) -> None:
     """Let a separate process write the output of this one, and to the file `log` if it is named.
 
     Call this before any thread exists.

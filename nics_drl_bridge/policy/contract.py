@@ -205,12 +205,12 @@ def observation_entry(task: Task) -> dict[str, Any]:
 
 
 def _task_hash(entry: Mapping[str, Any], observation: Mapping[str, Any]) -> str:
-    known = {
+    identity = {
         "name": entry["name"],
         "options": entry["options"],
         "observation": observation,
     }
-    return hash_bytes(json.dumps(known, sort_keys=True).encode())
+    return hash_bytes(json.dumps(identity, sort_keys=True).encode())
 
 
 def leaves(data: Any, path: str = "") -> Iterator[tuple[str, Any]]:
@@ -224,9 +224,10 @@ def leaves(data: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 def checksums(data: Mapping[str, Any]) -> dict[str, str]:
     """Returns path -> checksum of each entry, leaving out `checksums` itself."""
-    known = {name: value for name, value in data.items() if name != "checksums"}
+    entries = {name: value for name, value in data.items() if name != "checksums"}
     return {
-        path: hash_bytes(json.dumps(v).encode())[:CHECKSUM] for path, v in leaves(known)
+        path: hash_bytes(json.dumps(v).encode())[:CHECKSUM]
+        for path, v in leaves(entries)
     }
 
 

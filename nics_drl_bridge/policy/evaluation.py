@@ -118,15 +118,15 @@ def drive(
             uncertain = compute_uncertainty_gain(covariances[0], covariances[-1])
         if "true_pose" not in info:
             return Episode(seed, believed, *driven, uncertain=uncertain)
-        known = info.get("true_collision")
+        collisions = info.get("true_collision")
         # Without the truth, `touched` decides if given, otherwise the robot itself.
-        if known is None:
-            known = believed == "collision" if touched is None else touched()
-        hit = bool(np.any(known))
-        there = truly_near(
+        if collisions is None:
+            collisions = believed == "collision" if touched is None else touched()
+        hit = bool(np.any(collisions))
+        near_goal = truly_near(
             getattr(env.unwrapped, "task", None), info["true_pose"], goal
         ).all()
-        wrong = (believed == "success" and not there) or believed == "collision"
+        wrong = (believed == "success" and not near_goal) or believed == "collision"
         true = ELSEWHERE if wrong else believed
         return Episode(seed, "collision" if hit else true, *driven, believed)
     except BaseException:
@@ -174,11 +174,11 @@ def successes(episodes: Iterable[Episode]) -> int:
     return sum(episode.result == "success" for episode in episodes)
 
 
-def deviation(one: Episode, other: Episode) -> float:
+def deviation(first: Episode, second: Episode) -> float:
     """Returns the maximum distance [m] between two paths at the same step, over common steps."""
-    steps = min(len(one.path), len(other.path))
+    steps = min(len(first.path), len(second.path))
     return float(
-        np.linalg.norm(one.path[:steps, :2] - other.path[:steps, :2], axis=1).max()
+        np.linalg.norm(first.path[:steps, :2] - second.path[:steps, :2], axis=1).max()
     )
 
 
@@ -225,16 +225,16 @@ def _drive_once(
     count = env.num_envs
     observation, info = env.reset(seed=list(seeds))
     begin(act)
-    where = np.reshape(info["start"], (count, -1, 3))[..., :2]
+    previous = np.reshape(info["start"], (count, -1, 3))[..., :2]
     success, collision, believed = np.zeros((3, count), np.bool_)
     steps, (length, reward) = np.zeros(count, np.int64), np.zeros((2, count))
     running = np.ones(count, np.bool_)
     while running.any():
         action = _answer(act, observation, int(steps.max()) + 1)
         observation, gain, terminated, truncated, info = env.step(action)
-        there = np.reshape(info["true_pose"], (count, -1, 3))[..., :2]
-        moved = np.hypot(*np.moveaxis(there - where, -1, 0)).mean(axis=-1)
-        where = there
+        position = np.reshape(info["true_pose"], (count, -1, 3))[..., :2]
+        moved = np.hypot(*np.moveaxis(position - previous, -1, 0)).mean(axis=-1)
+        previous = position
         length += np.where(running, moved, 0.0)
         reward += np.where(running, gain, 0.0)
         steps += running
@@ -272,8 +272,8 @@ class ConfidenceInterval:
         """Formats the statistic with its interval, or whichever part is known."""
         if math.isnan(self.value):
             return "unknown"
-        known = f"{self.value:.2f} {unit}"
-        return known + (
+        formatted = f"{self.value:.2f} {unit}"
+        return formatted + (
             f" ({self.low:.2f} to {self.high:.2f})" if math.isfinite(self.low) else ""
         )
 
@@ -333,7 +333,7 @@ def summarise(outcomes: Outcomes, control_period: float) -> Summary:
     flags = arrived, outcomes.collision, outcomes.time_out, outcomes.believed
     length = outcomes.length[arrived]
     time = outcomes.steps[arrived] * control_period
-    shares = (rate(int(one.sum()), count) for one in flags)
+    shares = (rate(int(flag.sum()), count) for flag in flags)
     return Summary(count, *shares, *map(mean, (length, time)))
 
 
@@ -352,8 +352,10 @@ class Tally(Summary):
             ends = [value]
             if isinstance(value, ConfidenceInterval):
                 ends = list(vars(value).values())
-            known = [value if math.isfinite(value) else None for value in ends]
-            figures[name] = known if isinstance(value, ConfidenceInterval) else known[0]
+            finite = [value if math.isfinite(value) else None for value in ends]
+            figures[name] = (
+                finite if isinstance(value, ConfidenceInterval) else finite[0]
+            )
         return figures
 
 
@@ -373,10 +375,11 @@ def tallies(
             seeds, results == "success", results == "collision", *figures
         )
         pairs = list(zip(episodes, first, strict=True))
-        gaps = [deviation(one, other) for one, other in pairs]
+        gaps = [deviation(episode, reference) for episode, reference in pairs]
         by_place[place] = Tally(
             **vars(summarise(outcomes, control_period)),
-            same=sum(one.result == other.result for one, other in pairs) / len(pairs),
+            same=sum(episode.result == reference.result for episode, reference in pairs)
+            / len(pairs),
             deviation=mean(gaps),
             greatest_deviation=max(gaps),
         )

@@ -124,8 +124,8 @@ class GoalChecker:
         """Returns the remaining turn [rad], 0 at the goal; None before its position is reached."""
         check = self._check
         near = place.distance <= check.xy_goal_tolerance
-        here = near and place.remaining <= check.path_length_tolerance
-        self._there = here or (self._there and check.stateful)
+        reached = near and place.remaining <= check.path_length_tolerance
+        self._there = reached or (self._there and check.stateful)
         if not self._there:
             return None
         if self._turns and len(end) > 2:

@@ -90,8 +90,8 @@ def _ordered(path: Path, model: SimulatorModel | None) -> Order:
             made = leapp_bundle.read_bundle(description)
             return Order(mapping, made.network, path, made.sha256)
     if file.suffix != SUFFIX:
-        known = f"must be an {SUFFIX} file or a LEAPP bundle"
-        raise PolicyError(str(path), "network", f"{known}, not {mapping.network!r}.")
+        needed = f"must be an {SUFFIX} file or a LEAPP bundle"
+        raise PolicyError(str(path), "network", f"{needed}, not {mapping.network!r}.")
     try:
         if file.stat().st_size > onnx_graph.SIZE_LIMIT:
             most = f"{onnx_graph.SIZE_LIMIT // 2**20} MB; not opened."
@@ -151,13 +151,13 @@ def _golden(graph: Any, seen: Rows, size: int, source: str) -> dict[str, Rows]:
     names = (onnx_graph.INPUT, STATE_IN)
     start = np.zeros(size, np.float32)
 
-    def run(*given: Rows) -> list[Rows]:
+    def run(*tensors: Rows) -> list[Rows]:
         try:
-            return list(session.run(None, dict(zip(names, given, strict=False))))
+            return list(session.run(None, dict(zip(names, tensors, strict=False))))
         except Exception as error:  # noqa: BLE001 - the runtime's errors have no common base class
             raise cannot_run(source, error, "network") from None
 
-    rows = in_turn(run if size else lambda one, state: [*run(one), state], seen, start)
+    rows = in_turn(run if size else lambda row, state: [*run(row), state], seen, start)
     if not all(np.isfinite(part).all() for part in rows):
         reason = (
             "returns NaN or inf for ordinary observations; check scaling and weights."

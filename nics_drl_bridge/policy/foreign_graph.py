@@ -360,27 +360,28 @@ class Composer:
         self._next["twist"] = self._build.join(rows)
         return self._of_twist(rows, robot)
 
-    def _names(self, given: Mapping[str, Any], place: str) -> tuple[str, ...]:
-        """Returns the names that `given` must have: a twist's, or those of the robot's commands."""
+    def _names(self, rates: Mapping[str, Any], place: str) -> tuple[str, ...]:
+        """Returns the names that `rates` must have: a twist's, or those of the robot's commands."""
         robot = self._task.robot
-        own = tuple(command.name for command in robot.command)
-        if all(name in foreign_mapping.TWIST for name in given):
+        commands = tuple(command.name for command in robot.command)
+        if all(name in foreign_mapping.TWIST for name in rates):
             if not robot.takes_cmd_vel:
-                reason = f"the robot {robot.name!r} is not driven by cmd_vel; map {', '.join(own)}."
+                fix = f"map {', '.join(commands)}."
+                reason = f"the robot {robot.name!r} is not driven by cmd_vel; {fix}"
                 raise self._fault(place, reason)
             return foreign_mapping.TWIST
-        for name in given:
-            if name not in own:
-                fix = suggest(name, (*foreign_mapping.TWIST, *own))
+        for name in rates:
+            if name not in commands:
+                fix = suggest(name, (*foreign_mapping.TWIST, *commands))
                 raise self._fault(
                     f"{place}.{name}", f"the robot has no such command; {fix}"
                 )
-        for name in own:
-            if name not in given and place == "outputs":
+        for name in commands:
+            if name not in rates and place == "outputs":
                 raise self._fault(
                     f"{place}.{name}", "is missing; name the output to use."
                 )
-        return own
+        return commands
 
     def _check_twist(
         self, outputs: Mapping[str, foreign_mapping.OutputCommand]
@@ -442,13 +443,15 @@ class Composer:
         beyond = ""
         kind = self._network.outputs[choices.of].type.tensor_type.elem_type
         if kind in onnx_graph.INTEGERS and size == 1:
-            one, *ends = (build.constant(k, np.int64) for k in ([1], 0, len(rows) - 1))
-            given = build.add("Reshape", THEIRS + choices.of, one)
-            given = build.add("Cast", given, to=TensorProto.INT64)
-            index = build.add("Clip", given, *ends)
+            single, *ends = (
+                build.constant(k, np.int64) for k in ([1], 0, len(rows) - 1)
+            )
+            choice = build.add("Reshape", THEIRS + choices.of, single)
+            choice = build.add("Cast", choice, to=TensorProto.INT64)
+            index = build.add("Clip", choice, *ends)
             # An integer that selects nothing gives a NaN command, which is never sent to a robot.
             beyond = build.add(
-                "Cast", build.add("Sub", given, index), to=TensorProto.FLOAT
+                "Cast", build.add("Sub", choice, index), to=TensorProto.FLOAT
             )
             beyond = build.add("Sqrt", build.add("Neg", build.add("Abs", beyond)))
         elif size == len(rows):

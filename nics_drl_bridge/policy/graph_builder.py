@@ -57,7 +57,8 @@ class Builder:
         if limits is None:
             return row
         low, high = map(self.constant, limits)
-        return self.add("Min", self.add("Max", row, low), high)
+        raised = self.add("Max", row, low)
+        return self.add("Min", raised, high)
 
     def affine(self, row: str, factor: ArrayLike, offset: ArrayLike) -> str:
         """Computes row * factor + offset, without nodes that would change nothing."""
@@ -76,19 +77,20 @@ class Builder:
             row = self.add("Div", row, self.constant(scaled.divide))
         return self.clamp(row, scaled.clip)
 
-    def select(self, condition: str, row: str, other: str) -> str:
-        """Selects `row` where `condition` (1, 1) is 1 and `other` where it is 0.
+    def select(self, condition: str, row: str, fallback: str) -> str:
+        """Selects `row` where `condition` (1, 1) is 1 and `fallback` where it is 0.
 
-        Computes condition * row + (1 - condition) * other, so both must be finite.
+        Computes condition * row + (1 - condition) * fallback, so both must be finite.
         """
         opposite = self.affine(condition, -1.0, 1.0)
         from_row = self.add("Mul", condition, row)
-        from_other = self.add("Mul", opposite, other)
-        return self.add("Add", from_row, from_other)
+        from_fallback = self.add("Mul", opposite, fallback)
+        return self.add("Add", from_row, from_fallback)
 
     def is_negative(self, row: str) -> str:
         """Computes 1 where a row is negative and 0 elsewhere, as a very steep ramp."""
-        return self.clamp(self.affine(row, -STEEP, 0.0), (0.0, 1.0))
+        ramp = self.affine(row, -STEEP, 0.0)
+        return self.clamp(ramp, (0.0, 1.0))
 
     def angle(self, cosine: str, sine: str) -> str:
         """Computes the angle atan2(sine, cosine) [rad], with cosine^2 + sine^2 = 1.
@@ -98,7 +100,8 @@ class Builder:
         """
         sine_size = self.add("Abs", sine)
         cosine_size = self.add("Abs", cosine)
-        tangent_of_half = self.add("Div", sine_size, self.affine(cosine_size, 1.0, 1.0))
+        divisor = self.affine(cosine_size, 1.0, 1.0)
+        tangent_of_half = self.add("Div", sine_size, divisor)
         half = self.add("Atan", tangent_of_half)
         ahead = self.affine(half, 2.0, 0.0)
         behind = self.affine(half, -2.0, np.pi)

@@ -30,36 +30,40 @@ FOLDED = (
 
 def fold_shapes(graph: Any, opset: int) -> dict[str, Shape]:
     """Folds known small integers; returns the outputs' shapes, with 0 for unknown sizes."""
-    weights = {one.name: one for one in graph.initializer}
+    weights = {weight.name: weight for weight in graph.initializer}
     nodes = list(graph.node)
     imports = [helper.make_opsetid("", opset)]
-    types = {one.name: one.type for one in graph.input}
-    for one in graph.initializer:
-        types[one.name] = helper.make_tensor_type_proto(one.data_type, one.dims)
-    known = {name: one for name, one in weights.items() if _is_small(types[name])}
+    types = {end.name: end.type for end in graph.input}
+    for weight in graph.initializer:
+        types[weight.name] = helper.make_tensor_type_proto(
+            weight.data_type, weight.dims
+        )
+    constants = {
+        name: weight for name, weight in weights.items() if _is_small(types[name])
+    }
     del graph.node[:], graph.initializer[:]
     for node in nodes:
         node.ClearField("domain")  # "" and "ai.onnx" are the same domain
         schema = defs.get_schema(node.op_type, opset)
         input_types = {name: types[name] for name in node.input if name}
         made = infer_node_outputs(
-            schema, node, input_types, known, opset_imports=imports
+            schema, node, input_types, constants, opset_imports=imports
         )
-        if any(len(_shape(one)) > MOST_AXES for one in made.values()):
+        if any(len(_shape(made_type)) > MOST_AXES for made_type in made.values()):
             raise ValueError(f"{node.op_type} returns more than {MOST_AXES} dimensions")
         types |= made
-        value = _value(node, types, known, opset)
+        value = _value(node, types, constants, opset)
         if value is None:
             graph.node.append(node)
         else:
-            known[value.name] = value
-    used = {one.name for one in graph.output}.union(
+            constants[value.name] = value
+    used = {end.name for end in graph.output}.union(
         *(node.input for node in graph.node)
     )
     graph.initializer.extend(
-        one for name, one in (weights | known).items() if name in used
+        constant for name, constant in (weights | constants).items() if name in used
     )
-    return {one.name: _shape(types[one.name]) for one in graph.output}
+    return {end.name: _shape(types[end.name]) for end in graph.output}
 
 
 def _shape(kind: Any) -> Shape:
@@ -75,7 +79,9 @@ def _is_small(kind: Any) -> bool:
     )
 
 
-def _value(node: Any, types: dict[str, Any], known: dict[str, Any], opset: int) -> Any:
+def _value(
+    node: Any, types: dict[str, Any], constants: dict[str, Any], opset: int
+) -> Any:
     """Returns the value, or None if it is not small or is unknown before the network runs."""
     name = node.output[0]
     if node.op_type == "Shape":
@@ -84,7 +90,7 @@ def _value(node: Any, types: dict[str, Any], known: dict[str, Any], opset: int) 
             ends = {setting.name: setting.i for setting in node.attribute}
             sizes = np.array(shape[ends.get("start", 0) : ends.get("end")], np.int64)
             return numpy_helper.from_array(sizes, name)
-    inputs = [known.get(input_name) for input_name in node.input if input_name]
+    inputs = [constants.get(input_name) for input_name in node.input if input_name]
     if node.op_type not in FOLDED or None in inputs or not _is_small(types[name]):
         return None
     if node.op_type == "Div" and any(

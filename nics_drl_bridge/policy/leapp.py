@@ -66,8 +66,8 @@ def export_bundle(policy: PolicyFile, folder: str | Path) -> Path:
         raise PolicyError(str(policy.path), "file", reason)
     network = f"{NODE}.onnx"
     start_values = f"{place.resolve().name}_initial_values.safetensors"
-    own = {marker, network, start_values}
-    with write_whole_folder(place, marker, own.__contains__, PIPELINE) as temporary:
+    names = {marker, network, start_values}
+    with write_whole_folder(place, marker, names.__contains__, PIPELINE) as temporary:
         write_bytes(temporary / network, made)
         state = policy.contract.state
         if state is not None:

@@ -143,7 +143,7 @@ class Bundle:
         for source, targets in pipeline.feedback_flow.items():
             ends.update((source, *targets))
         short = end.partition("/")[2]
-        namesakes = sum(other.endswith(f"/{short}") for other in ends)
+        namesakes = sum(name.endswith(f"/{short}") for name in ends)
         return end if namesakes > 1 else short
 
     def _entries(self, side: str, ends: dict[str, list[str]]) -> dict[str, Tensor]:
@@ -152,16 +152,17 @@ class Bundle:
             if node not in self.description.models:
                 fix = suggest(node, self.description.models)
                 raise self.fault(f"pipeline.{side}", f"names no node {node!r}; {fix}")
-            known = {
-                one.name: one for one in getattr(self.description.models[node], side)
+            tensors = {
+                tensor.name: tensor
+                for tensor in getattr(self.description.models[node], side)
             }
             for name in names:
-                if name not in known:
-                    fix = suggest(name, known)
+                if name not in tensors:
+                    fix = suggest(name, tensors)
                     raise self.fault(
                         f"pipeline.{side}.{node}", f"has no {name!r}; {fix}"
                     )
-                entries[self.name_of(f"{node}/{name}")] = known[name]
+                entries[self.name_of(f"{node}/{name}")] = tensors[name]
         return entries
 
     def _states(self) -> dict[str, ForeignState]:
@@ -307,21 +308,21 @@ def _merged(bundle: Bundle) -> Any:
                 )
         graph.node.extend(model.graph.node)
         graph.initializer.extend(model.graph.initializer)
-        infos |= {one.name: one for one in model.graph.output}
+        infos |= {tensor.name: tensor for tensor in model.graph.output}
         ready |= infos.keys()
         opsets |= {
-            one.version: one
-            for one in model.opset_import
-            if one.domain in ("", "ai.onnx")
+            opset.version: opset
+            for opset in model.opset_import
+            if opset.domain in ("", "ai.onnx")
         }
         newest = max(newest, model.ir_version)
     if len(opsets) != 1:
         reason = f"have opsets {sorted(opsets)}; export all networks with the same one."
         raise bundle.fault("models", reason)
-    given = {
+    ends = {
         f"{node}/{name}" for node, names in pipeline.outputs.items() for name in names
     }
-    for end in sorted(given | pipeline.feedback_flow.keys()):
+    for end in sorted(ends | pipeline.feedback_flow.keys()):
         if end not in infos:
             raise bundle.fault(
                 "pipeline.outputs", f"no network has the output {end!r}."

@@ -25,6 +25,18 @@ def rays_of(task: Navigation) -> kernels.ScanRays:
     return kernels.ScanRays(directions, sight.origin, float(sight.range_max))
 
 
+def split_observation(
+    task: Navigation, observation: NDArray[np.float32]
+) -> tuple[Array, Array, Array]:
+    """Returns scans (N, P) as fractions, goals (N, 2) in `base_link` [m], and twists (N, 3)."""
+    parts = task.scan_parts
+    rows = np.atleast_2d(observation).astype(np.float64)
+    goals = rows[:, parts : parts + 1] * rows[:, parts + 1 : parts + 3]
+    scans = rows[:, :parts]
+    twists = rows[:, parts + 3 : parts + 6]
+    return np.ascontiguousarray(scans), goals, np.ascontiguousarray(twists)
+
+
 def outline_of(robot: RobotSpec) -> kernels.FootprintDiscs:
     """Returns a robot's footprint as discs that fill it, and points along its border."""
     if robot.footprint is None:

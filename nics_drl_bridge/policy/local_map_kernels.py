@@ -176,9 +176,9 @@ def between(
     i = np.uint32(np.int32(v))
     u = np.float32(u) - np.float32(j)
     v = np.float32(v) - np.float32(i)
-    one = np.uint32(1)
-    low = grid[i, j] + (grid[i, j + one] - grid[i, j]) * u
-    high = grid[i + one, j] + (grid[i + one, j + one] - grid[i + one, j]) * u
+    step = np.uint32(1)
+    low = grid[i, j] + (grid[i, j + step] - grid[i, j]) * u
+    high = grid[i + step, j] + (grid[i + step, j + step] - grid[i + step, j]) * u
     return low + (high - low) * v
 
 
@@ -207,8 +207,8 @@ def put_ways(around: Situation, prices: NDArray[np.float32]) -> None:
             prices[i, j] = price * side
             edge = i == 0 or j == 0 or i == size - 1 or j == size - 1
             gap = math.hypot(goal[0] - x, goal[1] - y)
-            known = gap < 1.5 * side if inside else edge
-            ways[i, j] = gap if known else np.inf
+            is_start = gap < 1.5 * side if inside else edge
+            ways[i, j] = gap if is_start else np.inf
     for _ in range(ROUNDS):
         most = np.float32(0.0)
         for turn in range(4):

@@ -15,7 +15,13 @@ from nics_drl_bridge.generator import BUILTIN_SEED, CONTROL_PERIOD_S, SimulatorM
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.policy import mppi_kernels as kernels
-from nics_drl_bridge.policy.local_map import MOST_M, outline_of, rays_of, scratch_of
+from nics_drl_bridge.policy.local_map import (
+    MOST_M,
+    outline_of,
+    rays_of,
+    scratch_of,
+    split_observation,
+)
 from nics_drl_bridge.policy.local_map_kernels import (
     Clearance,
     FootprintDiscs,
@@ -66,20 +72,11 @@ class Mppi:
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """Plans the actions; see `Policy`."""
-        parts = self._seen(observation)
+        parts = split_observation(self.task, observation)
         out = np.empty((len(parts[0]), len(self.task.robot.command)))
         self._plan(out, *parts)
         actions = out.astype(np.float32)
         return actions[0] if observation.ndim == 1 else actions
-
-    def _seen(self, observation: NDArray[np.float32]) -> tuple[Array, Array, Array]:
-        """Returns scans (N, P) as fractions, goals (N, 2) in `base_link` [m], and twists (N, 3)."""
-        parts = self.task.scan_parts
-        rows = np.atleast_2d(observation).astype(np.float64)
-        goals = rows[:, parts : parts + 1] * rows[:, parts + 1 : parts + 3]
-        scans = rows[:, :parts]
-        twists = rows[:, parts + 3 : parts + 6]
-        return np.ascontiguousarray(scans), goals, np.ascontiguousarray(twists)
 
     def _plan(self, *arrays: Array) -> None:
         """Plans for the rows of arrays (N, ...) on all cores, each core with its own memory."""
@@ -197,12 +194,12 @@ class Mppi:
         latency = float(model.delays.max(initial=0.0))
         if self.model is not None:
             latency += max(0.0, self.model.calibration.command_latency_s)
-        own = (
+        decays = (
             (terms.dof >= 3)
             & (terms.degree == 1)
             & (terms.factors[:, 0] == terms.dof - 3)
         )
-        fastest = np.abs(terms.coefficient[own]).max(initial=0.0)
+        fastest = np.abs(terms.coefficient[decays]).max(initial=0.0)
         substeps = min(
             max(1, math.ceil(period * fastest / FINEST)), round(period / model.dt)
         )
@@ -235,9 +232,9 @@ class Mppi:
 
 def _settled(model: TaylorModel, high: Array) -> Array:
     """Returns the steady state (S, C) per unit of each command."""
-    given = np.diag(0.5 * high)
+    commands = np.diag(0.5 * high)
     pose = np.zeros((len(high), 3))
     state = np.zeros((len(high), model.state_size))
     for _ in range(round(SETTLED_S / model.dt)):
-        pose, state = model.step(pose, state, given)
+        pose, state = model.step(pose, state, commands)
     return np.ascontiguousarray((state / (0.5 * high)[:, None]).T)

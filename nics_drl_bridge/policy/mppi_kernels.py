@@ -86,7 +86,7 @@ class RollOuts(NamedTuple):
     actions: Array  # (K, Q, C)
     nominal: Array  # (Q, C)
     held: Array  # (C,) held command that explains the present twist
-    one: Array  # (S + C + 1,)
+    x_single: Array  # (S + C + 1,) of one robot
     rate: Array  # (3 + S,)
     start: Array  # (3,)
     cost: Array  # (K,)
@@ -195,7 +195,7 @@ def follow(twist: Array, plant: Plant, lanes: RollOuts) -> None:
     Coordinate descent on the squared difference.
     """
     held = lanes.held
-    x = lanes.one
+    x = lanes.x_single
     dq = lanes.rate
     terms = plant.single
     count = plant.settled.shape[1]
@@ -229,7 +229,7 @@ def follow(twist: Array, plant: Plant, lanes: RollOuts) -> None:
 def _settle(command: Array, plant: Plant, lanes: RollOuts) -> None:
     """Writes the steady state of a command (C,) and its effect into `one`."""
     states, count = plant.settled.shape
-    x = lanes.one
+    x = lanes.x_single
     for s in range(states):
         x[s] = 0.0
         for c in range(count):
@@ -344,7 +344,7 @@ def _put(lanes: RollOuts, states: int) -> None:
         lanes.pose[4, k] = heading
         lanes.pose[5, k] = 0.0
         for s in range(states):
-            lanes.x[s, k] = lanes.one[s]
+            lanes.x[s, k] = lanes.x_single[s]
 
 
 @kernel

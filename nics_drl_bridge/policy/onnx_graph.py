@@ -198,18 +198,16 @@ def metadata_in(data: bytes, source: str) -> str:
 
 def metadata(model: Any, source: str) -> str:
     """Returns the text of the contract. Raises PolicyError unless the model has exactly one."""
-    found = [entry.value for entry in model.metadata_props if entry.key == KEY]
-    if len(found) != 1:
+    contracts = [entry.value for entry in model.metadata_props if entry.key == KEY]
+    if len(contracts) != 1:
+        reason = f"has {len(contracts)} contracts; only files of `export_policy` are policies."
+        raise PolicyError(source, "metadata", reason)
+    if len(contracts[0]) > CONTRACT_LIMIT:
         reason = (
-            f"has {len(found)} contracts; only files of `export_policy` are policies."
+            f"has {len(contracts[0])} characters, more than {CONTRACT_LIMIT}; not read."
         )
         raise PolicyError(source, "metadata", reason)
-    if len(found[0]) > CONTRACT_LIMIT:
-        reason = (
-            f"has {len(found[0])} characters, more than {CONTRACT_LIMIT}; not read."
-        )
-        raise PolicyError(source, "metadata", reason)
-    return str(found[0])
+    return str(contracts[0])
 
 
 def graph_hash(model: Any) -> str:
@@ -382,22 +380,22 @@ def _tensors(graph: Any) -> Iterator[Any]:
 
 
 def check_ends(
-    model: Any, widths: dict[str, int | None], source: str, batch: int | None = None
+    model: Any, widths: dict[str, int | None], source: str, batch: int | None
 ) -> None:
     """Raises PolicyError unless inputs and outputs have these widths; None means integers (n,).
 
     Their first dimension is the number of observations, `batch`; None: any number.
     """
     weights = {tensor.name for tensor in model.graph.initializer}
-    inputs = [one for one in model.graph.input if one.name not in weights]
-    if STATE_IN not in widths and STATE_IN in [one.name for one in inputs]:
+    inputs = [end for end in model.graph.input if end.name not in weights]
+    if STATE_IN not in widths and STATE_IN in [end.name for end in inputs]:
         reason = "is missing, although the graph needs one; export the policy again."
         raise PolicyError(source, "state", reason)
-    for kind, ends, known in (
+    for kind, ends, order in (
         ("inputs", inputs, [INPUT, STATE_IN]),
         ("outputs", model.graph.output, [ACTION, COMMAND, STATE_OUT]),
     ):
-        names = [name for name in known if name in widths]
+        names = [name for name in order if name in widths]
         if [end.name for end in ends] != names:
             reason = f"are {[end.name for end in ends]}, not {names}; export the policy again."
             raise PolicyError(source, f"graph.{kind}", reason)
@@ -457,8 +455,8 @@ def _setting_faults(graph: Any) -> Iterator[Fault]:
                 reason = f"of {node.op_type} exceeds {GREATEST_SETTING}; not run."
                 yield f"graph.node.{attribute.name}", reason
         if node.op_type == "Constant":
-            given = (max(len(a.ints), math.prod(a.t.dims)) for a in node.attribute)
-            lengths.update(dict.fromkeys(node.output, max(given, default=0)))
+            sizes = (max(len(a.ints), math.prod(a.t.dims)) for a in node.attribute)
+            lengths.update(dict.fromkeys(node.output, max(sizes, default=0)))
     added = 0
     for node in graph.node:
         if node.op_type in ("Reshape", "Unsqueeze"):
@@ -498,37 +496,39 @@ def _costs(model: Any, rows: int, source: str) -> tuple[int, int]:
     for node in model.graph.node:
         try:
             # omitted optional inputs have an empty name
-            given = [shapes[name] for name in node.input if name]
-            made = [shapes[name] for name in node.output if name]
+            inputs = [shapes[name] for name in node.input if name]
+            outputs = [shapes[name] for name in node.output if name]
         except KeyError:
             reason = f"the output size of {node.op_type} can't be known before it runs."
             raise PolicyError(source, "graph.node", reason) from None
-        buffer, multiplied = _work(node, given, made)
-        numbers += sum(map(math.prod, made)) + buffer
-        work += sum(map(math.prod, (*given, *made))) + multiplied + buffer
+        buffer, multiplied = _work(node, inputs, outputs)
+        numbers += sum(map(math.prod, outputs)) + buffer
+        work += sum(map(math.prod, (*inputs, *outputs))) + multiplied + buffer
     return numbers, work
 
 
-def _work(node: Any, given: list[Shape], made: list[Shape]) -> tuple[int, int]:
+def _work(node: Any, inputs: list[Shape], outputs: list[Shape]) -> tuple[int, int]:
     """Counts the numbers that the runtime allocates besides the output, and multiplications."""
     settings = {attribute.name: attribute for attribute in node.attribute}
     if node.op_type in ("MatMul", "Gemm"):
         turned = (
             node.op_type == "Gemm" and "transA" in settings and settings["transA"].i
         )
-        return 0, math.prod(made[0]) * (given[0][0] if turned else given[0][-1])
+        return 0, math.prod(outputs[0]) * (inputs[0][0] if turned else inputs[0][-1])
     if node.op_type == "Conv":
         groups = int(settings["group"].i) if "group" in settings else 1
-        kernel = math.prod(given[1][1:])
-        return math.prod(made[0][2:]) * kernel * max(groups, 1), math.prod(
-            made[0]
+        kernel = math.prod(inputs[1][1:])
+        return math.prod(outputs[0][2:]) * kernel * max(groups, 1), math.prod(
+            outputs[0]
         ) * kernel
     # Inputs: a sequence (T, n, I), weights (D, G H, I) and (D, G H, H).
     if node.op_type in RECURRENT:
-        steps = math.prod(given[0][:2])
-        return steps * math.prod(given[1][:2]), steps * sum(map(math.prod, given[1:3]))
+        steps = math.prod(inputs[0][:2])
+        return steps * math.prod(inputs[1][:2]), steps * sum(
+            map(math.prod, inputs[1:3])
+        )
     if "kernel_shape" in settings:  # pooling
-        return 0, math.prod(made[0]) * int(math.prod(settings["kernel_shape"].ints))
+        return 0, math.prod(outputs[0]) * int(math.prod(settings["kernel_shape"].ints))
     return 0, 0
 
 
@@ -576,7 +576,7 @@ def _without_weights(model: Any, rows: int) -> Any:
         else:
             graph.node.append(node)
     held = {tensor.name for tensor in model.graph.initializer}
-    for value in (one for one in model.graph.input if one.name not in held):
+    for value in (end for end in model.graph.input if end.name not in held):
         graph.input.append(value)
         graph.input[-1].type.tensor_type.shape.dim[0].dim_value = rows
     for value in model.graph.output:  # infer output shapes instead of trusting them

@@ -85,10 +85,10 @@ def run_once(session: Any, needs: GraphNeeds, seen: Rows, source: str) -> None:
     if needs.start is not None:
         start = np.full(needs.widths[onnx_graph.STATE_IN] or 1, needs.start, np.float32)
 
-    def run(*given: Rows) -> list[NDArray[Any]]:
+    def run(*tensors: Rows) -> list[NDArray[Any]]:
         names = (onnx_graph.INPUT, onnx_graph.STATE_IN)
         try:
-            return list(session.run(None, dict(zip(names, given, strict=False))))
+            return list(session.run(None, dict(zip(names, tensors, strict=False))))
         except Exception as error:  # noqa: BLE001 - the runtime's errors have no common base class
             raise cannot_run(source, error) from None
 

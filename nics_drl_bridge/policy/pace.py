@@ -96,7 +96,7 @@ class Fitted(NamedTuple):
     """Training settings that fit robot and worlds, with a sentence per adaptation."""
 
     settings: recordings.TrainingSettings
-    told: tuple[str, ...]
+    notes: tuple[str, ...]
 
 
 def settings_for(task: str, name: str | None, changes: dict[str, Any]) -> Fitted:
@@ -107,8 +107,8 @@ def settings_for(task: str, name: str | None, changes: dict[str, Any]) -> Fitted
     robot = changes.get("robot")
     notes = list[str]()
     shipped = list_shipped("training")
-    own = f"{task}_{robot}" in shipped
-    if name is None and robot is not None and not own and task == OWN_TASK:
+    has_settings = f"{task}_{robot}" in shipped
+    if name is None and robot is not None and not has_settings and task == OWN_TASK:
         name = f"own_{kin(open_model(robot).robot)}"
         notes.append(
             f"settings {name!r}, because the robot {robot!r} has none of its own"
@@ -118,7 +118,7 @@ def settings_for(task: str, name: str | None, changes: dict[str, Any]) -> Fitted
         name in shipped and recordings.load_training(str(name)).robot != settings.robot
     )
     made = fitted(settings, open_model(settings.robot, settings.lidar), inherited)
-    return Fitted(made.settings, (*notes, *made.told))
+    return Fitted(made.settings, (*notes, *made.notes))
 
 
 def fitted(
@@ -130,7 +130,7 @@ def fitted(
     a time reward and discount that amount to the same over an episode.
     """
     options = dict(settings.task_options)
-    told = list[str]()
+    notes = list[str]()
     lidar = model.lidar
     worlds = [load_worlds(world) for world in settings.worlds]
     class_for(settings.task, options)
@@ -141,7 +141,7 @@ def fitted(
             "front" if covers(lidar, "front") else sectors_over(lidar)
         )
         far = LAYOUTS["around"].range_max
-        told.append(
+        notes.append(
             f"the lidar {lidar.name!r} does not cover {far:g} m all around: scan: {scan}"
         )
     if (
@@ -150,29 +150,29 @@ def fitted(
     ):
         changed["max_episode_steps"] = pace.steps
         limit = f"{pace.steps * pace.period:g} s ({pace.steps} steps)"
-        told.append(f"time limit {limit}, for {pace.far:g} m at {pace.speed:g} m/s")
+        notes.append(f"time limit {limit}, for {pace.far:g} m at {pace.speed:g} m/s")
         if inherited and pace.steps > defaults.EPISODE_STEPS:
             changed |= _stretched(
-                settings, options, pace.steps / defaults.EPISODE_STEPS, told
+                settings, options, pace.steps / defaults.EPISODE_STEPS, notes
             )
     made = settings.model_copy(update={**changed, "task_options": options})
     short = pace.shortfall(made.max_episode_steps)
-    return Fitted(made, tuple(told) if short is None else (*told, short))
+    return Fitted(made, tuple(notes) if short is None else (*notes, short))
 
 
 def _stretched(
     settings: recordings.TrainingSettings,
     options: dict[str, Any],
     factor: float,
-    told: list[str],
+    notes: list[str],
 ) -> dict[str, Any]:
     """Returns the settings to change for episodes `factor` times as long; updates `options`."""
     reward = options.get("time_reward")
     if reward:
         options["time_reward"] = round(reward / factor, 6)
-        told.append(f"time_reward {options['time_reward']:g}, was {reward:g}")
+        notes.append(f"time_reward {options['time_reward']:g}, was {reward:g}")
     name = settings.algorithm
     learner = settings.ppo if name == "ppo" else settings.sac
     discount = round(1.0 - (1.0 - learner.discount) / factor, 6)
-    told.append(f"{name}.discount {discount:g}, was {learner.discount:g}")
+    notes.append(f"{name}.discount {discount:g}, was {learner.discount:g}")
     return {name: learner.model_copy(update={"discount": discount})}

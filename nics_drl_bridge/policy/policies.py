@@ -18,7 +18,13 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.policy import dynamic_window_kernels as kernels
 from nics_drl_bridge.policy.contract import MAPPINGS, SUFFIX, shipped
-from nics_drl_bridge.policy.local_map import MOST_M, outline_of, rays_of, scratch_of
+from nics_drl_bridge.policy.local_map import (
+    MOST_M,
+    outline_of,
+    rays_of,
+    scratch_of,
+    split_observation,
+)
 from nics_drl_bridge.policy.local_map_kernels import (
     Clearance,
     FootprintDiscs,
@@ -56,10 +62,11 @@ def _grid(robot: RobotSpec) -> Array:
     axes = [
         np.unique(
             np.append(
-                np.linspace(one.min, one.max, count), np.clip(0, one.min, one.max)
+                np.linspace(command.min, command.max, count),
+                np.clip(0, command.min, command.max),
             )
         )
-        for one, count in zip(
+        for command, count in zip(
             robot.command, counts or [3] * len(robot.command), strict=True
         )
     ]
@@ -188,18 +195,9 @@ class DynamicWindow:
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """Chooses the action; see `Policy`."""
-        parts = self.task.scan_parts
-        seen = np.atleast_2d(observation).astype(np.float64)
-        goals = seen[:, parts : parts + 1] * seen[:, parts + 1 : parts + 3]
-        chosen = np.empty(len(seen), np.int64)
-        kernels.choose_all(
-            chosen,
-            np.ascontiguousarray(seen[:, :parts]),
-            goals,
-            np.ascontiguousarray(seen[:, parts + 3 : parts + 6]),
-            *self._search,
-            self._sense,
-        )
+        parts = split_observation(self.task, observation)
+        chosen = np.empty(len(parts[0]), np.int64)
+        kernels.choose_all(chosen, *parts, *self._search, self._sense)
         return self._scaled[chosen[0] if observation.ndim == 1 else chosen]
 
     @cached_property
@@ -348,11 +346,11 @@ def open_policy(
     from nics_drl_bridge.policy.foreign import load_any
 
     policy = load_any(name, model)
-    found: Any = policy.make_task(model, kind)  # any task, if `kind` names its class
-    if kind is None and not isinstance(found, Navigation):
+    opened: Any = policy.make_task(model, kind)  # any task, if `kind` names its class
+    if kind is None and not isinstance(opened, Navigation):
         reason = f"is {policy.contract.task.name!r}; only policies of 'navigation' can be driven."
         raise PolicyError(name, "task.name", reason)
-    return _acting(policy), found
+    return _acting(policy), opened
 
 
 def _acting(policy: "PolicyFile") -> Policy:

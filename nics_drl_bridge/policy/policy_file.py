@@ -130,13 +130,13 @@ class PolicyFile:
         """Raises PolicyError, naming the field, unless the policy fits a robot and a task."""
         if model is not None:
             self._check_robot(model.robot, model.lidar)
-            known = {
+            sensors = {
                 sensor.name: sensor.model_dump(mode="json") for sensor in model.sensors
             }
             self._compare(
                 {
                     "sensors": [
-                        known.get(sensor.name) for sensor in self.contract.sensors
+                        sensors.get(sensor.name) for sensor in self.contract.sensors
                     ]
                 }
             )
@@ -174,12 +174,10 @@ class PolicyFile:
         for name, entry in theirs.items():
             only: Any = {name: set(entry) if isinstance(entry, dict) else True}
             ours = dict(leaves(self.contract.model_dump(mode="json", include=only)))
-            other = dict(leaves({name: entry}))
-            for path in (*ours, *other):
-                if ours.get(path) != other.get(path):
-                    reason = (
-                        f"is {ours.get(path)!r}, but the robot's is {other.get(path)!r}"
-                    )
+            robots = dict(leaves({name: entry}))
+            for path in (*ours, *robots):
+                if ours.get(path) != robots.get(path):
+                    reason = f"is {ours.get(path)!r}, but the robot's is {robots.get(path)!r}"
                     reason += "; use a policy trained for that."
                     raise PolicyError(str(self.path), path, reason)
 

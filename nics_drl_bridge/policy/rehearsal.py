@@ -71,11 +71,11 @@ def _digest_of(step: str, data: bytes) -> str:
     return hash_bytes(step.encode() + b"\0" + data)
 
 
-def _rehearse(step: str, data: bytes, source: str, **told: Any) -> None:
+def _rehearse(step: str, data: bytes, source: str, **settings: Any) -> None:
     digest = _digest_of(step, data)
     if digest in _remembered:
         return
-    head = json.dumps({"step": step, **told}).encode()
+    head = json.dumps({"step": step, **settings}).encode()
     refusal = _answer_of(head + b"\n" + data)
     if refusal is not None:
         raise PolicyError(source, *refusal)

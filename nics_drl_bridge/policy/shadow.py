@@ -45,14 +45,14 @@ class Shadow:
         """Returns per command statistics of policy minus drive, and the rate of opposite signs."""
         figures_by_command = {}
         for c, name in enumerate(self.names):
-            one = self.policy[:, c]
-            other = self.driven[:, c]
+            wanted = self.policy[:, c]
+            driven = self.driven[:, c]
             band = DEAD_BAND * self.scale[c]
-            gap = one - other
-            size = np.abs(one - other)
-            signed = (np.abs(one) > band) & (np.abs(other) > band)
+            gap = wanted - driven
+            size = np.abs(wanted - driven)
+            signed = (np.abs(wanted) > band) & (np.abs(driven) > band)
             if signed.any():
-                opposite = (one[signed] * other[signed] < 0.0).mean()
+                opposite = (wanted[signed] * driven[signed] < 0.0).mean()
             else:
                 opposite = 0.0
             figures_by_command[name] = {
@@ -188,8 +188,8 @@ def _answered(
         np.array(column) for column in zip(*rows, strict=True)
     )
     return Shadow(
-        tuple(one.name for one in robot.command),
-        tuple(one.unit for one in robot.command),
+        tuple(command.name for command in robot.command),
+        tuple(command.unit for command in robot.command),
         (stamps - stamps[0]) * S_PER_NS,
         poses,
         aims,

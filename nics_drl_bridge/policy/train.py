@@ -308,7 +308,8 @@ def run(
             result = SeedResult(seed, trained, summaries)
             plain: dict[str, Any] = {"training_steps": trained.steps}
             plain |= {
-                world: dataclasses.asdict(one) for world, one in summaries.items()
+                world: dataclasses.asdict(summary)
+                for world, summary in summaries.items()
             }
             write_text(folder / EVALUATION, format_json(plain, 2) + "\n")
             export(settings, result, order.command, folder / POLICY)
@@ -323,12 +324,12 @@ def _alone(out: Path) -> Iterator[None]:
     out.mkdir(parents=True, exist_ok=True)
     try:
         with filelock.FileLock(out / LOCK, timeout=0.0):
-            known = (out / SETTINGS).is_file()
+            existed = (out / SETTINGS).is_file()
             try:
                 yield
             except ConfigError:
                 # Unreadable settings must not block other trainings.
-                if not known and not seeds_of(out):
+                if not existed and not seeds_of(out):
                     (out / SETTINGS).unlink(missing_ok=True)
                 raise
     except filelock.Timeout:
@@ -343,8 +344,8 @@ def export(
     model = open_model(settings.robot, settings.lidar)
     task = make_task(settings.task, model, settings.task_options)
     rates = {
-        f"success in {world}": one.success.value
-        for world, one in result.summaries.items()
+        f"success in {world}": summary.success.value
+        for world, summary in result.summaries.items()
     }
     provenance = {
         "command": command,
@@ -378,8 +379,8 @@ def _check(
         fix = "choose another --out, or remove it."
         raise ConfigError(f"{out}: contains a run with other settings; {fix}")
     if resumed and not begun:
-        found = seeds_of(out)
-        fix = f"name one of {found} with --seeds" if found else "leave out --resume"
+        started = seeds_of(out)
+        fix = f"name one of {started} with --seeds" if started else "leave out --resume"
         raise ConfigError(f"{out}: contains no checkpoint of these seeds; {fix}.")
 
 

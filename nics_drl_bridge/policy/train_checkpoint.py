@@ -34,7 +34,7 @@ def save_checkpoint(
     """Writes a checkpoint between two rollouts; `about` identifies the training."""
     content = {"format": FORMAT, "about": json.dumps(about), "state": state}
     write_content(
-        path, content | {"envs": [tensors(snapshot(one)) for one in env.envs]}
+        path, content | {"envs": [tensors(snapshot(worlds)) for worlds in env.envs]}
     )
 
 
@@ -64,16 +64,16 @@ def read_checkpoint(path: Path, kind: str = FORMAT) -> dict[str, Any]:
             # weights_only blocks code in pickles; before torch 2.6 it had gaps.
             content: Any = torch.load(file, map_location="cpu", weights_only=True)
         _check_tensors(content, size)
-        found = str(content["format"])
+        format_name = str(content["format"])
         read = {**content, "about": json.loads(content["about"])}
     except Exception:  # noqa: BLE001 - a damaged file breaks torch in any way
         reason = "is not a training checkpoint, or is damaged"
         raise ConfigError(
             f"{path}: {reason}; leave out --resume to start again."
         ) from None
-    if found != kind:
+    if format_name != kind:
         raise ConfigError(
-            f"{path}: is a {found!r}, not a {kind!r}; resume with the same --engine."
+            f"{path}: is a {format_name!r}, not a {kind!r}; resume with the same --engine."
         )
     return read
 
@@ -92,8 +92,8 @@ def _check_tensors(content: Any, size: int) -> None:
 
 def restore_envs(content: dict[str, Any], env: TrainVecEnv) -> None:
     """Restores the worlds of a checkpoint into an env made with the same arguments."""
-    for one, state in zip(env.envs, content["envs"], strict=True):
-        restore(one, {name: value.numpy() for name, value in state.items()})
+    for worlds, state in zip(env.envs, content["envs"], strict=True):
+        restore(worlds, {name: value.numpy() for name, value in state.items()})
 
 
 def tensors(arrays: dict[str, NDArray[Any]]) -> dict[str, torch.Tensor]:
@@ -128,10 +128,10 @@ class Progress:
         """Success rate, if known, and speed, as readable text."""
         unknown = math.isnan(self.success)
         if unknown:
-            known = "no episode has ended yet"
+            rate = "no episode has ended yet"
         else:
-            known = f"success {100 * self.success:.1f} %"
-        return f"{known}, {self.steps_per_s:,.0f} steps/s"
+            rate = f"success {100 * self.success:.1f} %"
+        return f"{rate}, {self.steps_per_s:,.0f} steps/s"
 
 
 Save = Callable[[], None]

@@ -100,8 +100,8 @@ def actor_of(model: Any) -> torch.nn.Module:
         return torch.nn.Sequential(*parts)
     if isinstance(policy, torch.nn.Module):
         return policy
-    known = "give a PPO, A2C or SAC, or a torch module."
-    raise ConfigError(f"a {type(model).__name__} can't be exported; {known}")
+    fix = "give a PPO, A2C or SAC, or a torch module."
+    raise ConfigError(f"a {type(model).__name__} can't be exported; {fix}")
 
 
 def export_policy(
@@ -151,12 +151,12 @@ def _golden(deployed: Deployed, graph: Any, task: Task, source: str) -> dict[str
     kept = deployed.state
     start = None if kept is None else np.full(kept[0], kept[1], np.float32)
 
-    def infer(*given: Rows) -> list[Rows]:
-        return list(session.run(None, dict(zip(inputs, given, strict=False))))
+    def infer(*tensors: Rows) -> list[Rows]:
+        return list(session.run(None, dict(zip(inputs, tensors, strict=False))))
 
-    def compute(*given: Rows) -> list[Rows]:
+    def compute(*tensors: Rows) -> list[Rows]:
         with torch.no_grad():
-            return [part.numpy() for part in deployed(*map(torch.as_tensor, given))]
+            return [part.numpy() for part in deployed(*map(torch.as_tensor, tensors))]
 
     out, wanted = (in_turn(run, seen, start) for run in (infer, compute))
     for name, ours, theirs in zip(("actions", "commands"), out, wanted, strict=True):

@@ -70,11 +70,13 @@ def flattened(networks: Networks) -> torch.nn.Parameter:
 
     An optimiser step takes a fifth of the time it takes over many arrays.
     """
-    every = list(networks.parameters())
-    flat = torch.nn.Parameter(torch.nn.utils.parameters_to_vector(every).detach())
+    parameters = list(networks.parameters())
+    flat = torch.nn.Parameter(torch.nn.utils.parameters_to_vector(parameters).detach())
     flat.grad = torch.zeros_like(flat)
-    sizes = [one.numel() for one in every]
-    parts = zip(every, flat.detach().split(sizes), flat.grad.split(sizes), strict=True)
+    sizes = [parameter.numel() for parameter in parameters]
+    parts = zip(
+        parameters, flat.detach().split(sizes), flat.grad.split(sizes), strict=True
+    )
     for parameter, values, gradient in parts:
         parameter.data, parameter.grad = (
             values.view_as(parameter),
@@ -85,13 +87,15 @@ def flattened(networks: Networks) -> torch.nn.Parameter:
 
 def net_of(layers: torch.nn.Sequential, rows: int) -> Net:
     """Returns the layers of a `flattened` network for the kernels, with memory for `rows`."""
-    every = list(layers.parameters())
-    whole = (sum(one.numel() for one in every),)
+    parameters = list(layers.parameters())
+    whole = (sum(parameter.numel() for parameter in parameters),)
     weights, gradients = (
         first.view(-1).as_strided(whole, (1,)).numpy()
-        for first in (every[0].detach(), every[0].grad)
+        for first in (parameters[0].detach(), parameters[0].grad)
     )
-    widths = np.array([every[0].shape[1], *(len(bias) for bias in every[1::2])])
+    widths = np.array(
+        [parameters[0].shape[1], *(len(bias) for bias in parameters[1::2])]
+    )
     kept, spare = (
         np.empty((k, rows * widths.max()), np.float32) for k in (len(widths) - 1, 2)
     )
@@ -178,10 +182,12 @@ class Learner:
             actions=columns.numpy()
         )
         (actor, critic), spread = self._nets, self.networks.log_std
-        own = spread.detach().numpy(), spread.grad.numpy()
+        spread_arrays = spread.detach().numpy(), spread.grad.numpy()
         bounds = np.float32(self.ppo.clip), np.float32(self.ppo.entropy)
         jobs: list[Callable[[], Any]] = [
-            partial(train_kernels.actor_gradients, actor, arrays, *own, *bounds),
+            partial(
+                train_kernels.actor_gradients, actor, arrays, *spread_arrays, *bounds
+            ),
             partial(
                 train_kernels.critic_gradients,
                 critic,
@@ -230,13 +236,13 @@ class Collector:
                 self.last, reward, over, infos = self.env.step(acted)
                 rewards[t], done[t] = torch.from_numpy(reward), torch.from_numpy(over)
                 for n in np.flatnonzero(over):
-                    one = infos[n]
+                    info = infos[n]
                     ended.append(
-                        (one.get("is_success", False), one.get("collision", False))
+                        (info.get("is_success", False), info.get("collision", False))
                     )
-                    if one["TimeLimit.truncated"]:
+                    if info["TimeLimit.truncated"]:
                         cut.append(t * worlds + int(n))
-                        last = one["terminal_observation"][None]
+                        last = info["terminal_observation"][None]
                         final.append(self._see(last))
             seen[steps] = self._see(self.last)
             beyond = torch.tensor(cut, dtype=torch.int64), torch.cat(final)
@@ -305,18 +311,19 @@ class LeanPpo:
         rate = self._ppo.learning_rate * max(left, train_algorithms.LEAST_RATE)
         self.steps += self._ppo.rollout * self.collector.env.num_envs
         self.collector.networks.load_state_dict(self.networks.state_dict())
-        self.learner.core_is_free.clear()
         learner = self.learner
         jobs: list[Callable[[], Any]] = [
-            lambda: learner.learn(learner.judge(rollout), rate),
-            self._collect,
+            lambda: learner.learn(learner.judge(rollout), rate)
         ]
-        loss, *collected = run_parts(
-            lambda job: job(), jobs[: 1 + (self.steps < self._total)]
-        )
+        if self.steps < self._total:
+            learner.core_is_free.clear()
+            jobs.append(self._collect)
+        else:
+            learner.core_is_free.set()
+        loss, *collected = run_parts(lambda job: job(), jobs)
         self._rollout = None
-        for one in collected:
-            self._take(watch, *one)
+        for part in collected:
+            self._take(watch, *part)
         return float(loss)
 
     def _collect(self) -> tuple[Driven, Ended]:

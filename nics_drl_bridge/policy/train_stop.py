@@ -26,9 +26,9 @@ class Stop:
     """
 
     def __init__(
-        self, given: StopSettings | None, envs: Mapping[str, BridgeVectorEnv]
+        self, settings: StopSettings | None, envs: Mapping[str, BridgeVectorEnv]
     ) -> None:
-        self._given = given
+        self._settings = settings
         self._envs = envs
         self._due = 0  # number of the latest evaluation
         self._reached = 0  # consecutive evaluations that passed
@@ -47,7 +47,7 @@ class Stop:
 
     def judge(self, steps: int, act: Act) -> bool:
         """Evaluates the policy `act` if due after `steps`; returns True if it did."""
-        settings = self._given
+        settings = self._settings
         if settings is None or steps // settings.every <= self._due:
             return False
         self._due = steps // settings.every
@@ -57,7 +57,7 @@ class Stop:
             world: drive_worlds(env, act, seeds) for world, env in self._envs.items()
         }
         self.shares = {
-            world: float(one.success.mean()) for world, one in driven.items()
+            world: float(outcomes.success.mean()) for world, outcomes in driven.items()
         }
         self._reached = self._reached + 1 if self.least >= settings.success else 0
         return True
@@ -70,8 +70,8 @@ class Stop:
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continues from a saved state; starts afresh if the checkpoint has none."""
-        known = state.get("stop")
-        if known:
-            self._due = known["due"]
-            self._reached = known["reached"]
-            self.shares = dict(known["shares"])
+        saved = state.get("stop")
+        if saved:
+            self._due = saved["due"]
+            self._reached = saved["reached"]
+            self.shares = dict(saved["shares"])

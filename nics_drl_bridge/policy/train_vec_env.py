@@ -56,7 +56,7 @@ class TrainVecEnv(VecEnv):
         shown = []
         for env, rows in zip(self.envs, self._rows, strict=True):
             seeds_of_env = self._seeds[rows]
-            seeds = None if all(one is None for one in seeds_of_env) else seeds_of_env
+            seeds = None if all(seed is None for seed in seeds_of_env) else seeds_of_env
             shown.append(env.reset(seed=seeds, options=self._options[0] or None)[0])
         self._reset_seeds()
         self._reset_options()
@@ -79,7 +79,7 @@ class TrainVecEnv(VecEnv):
             for env, rows in zip(self.envs, self._rows, strict=True)
         ]
         observation, reward, done = (
-            _together(list(each)) for each in zip(*parts, strict=True)
+            _together(list(rows_of_envs)) for rows_of_envs in zip(*parts, strict=True)
         )
         self.stepping_s += time.perf_counter() - begin
         if self.on_step is not None:

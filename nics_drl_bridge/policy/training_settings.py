@@ -158,7 +158,7 @@ def load_training(name: str | Path, task: str | None = None) -> TrainingSettings
     return read_settings(find_config(name, "training"), task)
 
 
-def read_settings(path: Path, task: str | None = None) -> TrainingSettings:
+def read_settings(path: Path, task: str | None) -> TrainingSettings:
     """Reads settings from a file, with the caller's own task if given; see `load_training`."""
     settings = load_yaml(path, TrainingSettings)
     if is_code(settings.task) and not (task is not None and is_code(task)):

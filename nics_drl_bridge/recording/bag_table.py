@@ -120,7 +120,7 @@ def read_column(
 class Bag(Source):
     """The topics of an open bag as tables; of transforms, only those between two frames."""
 
-    def __init__(self, bag: BagFile, mapping: mapped.Mapping | None = None) -> None:
+    def __init__(self, bag: BagFile, mapping: mapped.Mapping | None) -> None:
         topics = [
             topic
             for topic, kind in sorted(bag.types.items())

@@ -80,7 +80,7 @@ def check_unit(name: str) -> str:
     return str(name)
 
 
-def to_si(unit: str, ticks_per_turn: float | None = None) -> UnitOfData:
+def to_si(unit: str, ticks_per_turn: float | None) -> UnitOfData:
     """Returns the SI unit and the factor of a unit; ticks are angles if their count is known."""
     si = UNITS[unit].si
     if si in TICKS and ticks_per_turn:

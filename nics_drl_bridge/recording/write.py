@@ -340,7 +340,8 @@ def open_bag_sink(
             unfinished = _set_apart(beside, path) / path.name
         if not isinstance(error, Exception):  # Ctrl-C
             raise
-        reason = _get_reason(error)
+        # A caller may have turned a fault of the storage into an error that names the path.
+        reason = _get_reason(fault or error)
         rest = f"what was written until then lies in {unfinished}"
         advice = (
             "recover it with `mcap recover` or `ros2 bag reindex` where there is room"
@@ -357,13 +358,13 @@ def open_bag_sink(
         raise raised
 
 
-def _get_reason(error: Exception) -> str:
-    reason = ""
+def _get_reason(error: BaseException) -> str:
+    """Returns what is wrong, without the path, which the caller's sentence names."""
     if isinstance(error, RecordingError):
-        reason = error.reason
-    elif isinstance(error, OSError):
-        reason = error.strerror or ""
-    return reason or str(error) or type(error).__name__
+        return error.reason or "could not be finished"
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return str(error) or type(error).__name__
 
 
 def _set_apart(unfinished: Path, path: Path) -> Path:

@@ -284,7 +284,7 @@ def check_turning(facts: Facts, expected: Expected) -> Findings:
         return
     if GYRO not in facts.heard:
         if expected.gyro:
-            what = "the model was made with a gyro, and nothing is heard of one"
+            what = "the model was made with a gyro, but none publishes"
             fix = "start its driver, or name its topic: --imu TOPIC here, imu:=TOPIC of the nodes"
             yield gyro_warning(what, fix)
         return
@@ -410,7 +410,7 @@ def _compare_rates(
         return
     if size == 0.0 or abs(real @ claimed) < ALIKE * size:
         fix = "free the robot if it is stuck; else let both come from the same odometry"
-        yield odometry_warning(f"the pose does not do what twist.{field} says", fix)
+        yield odometry_warning(f"the pose does not follow twist.{field}", fix)
         return
     what = f"twist.{field} is {ratio:.3g} times what the pose does"
     fix = "let both come from the same odometry, the twist in the body's frame"

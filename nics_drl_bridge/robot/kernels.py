@@ -220,9 +220,9 @@ def move(
 ) -> Moved:
     """Moves x, y [m], cosine and sine of the heading along an arc of `turn` [rad] in dt [s]."""
     if abs(turn) > WIDE_TURN:
-        one = series[3] + series[3]
+        unit = series[3] + series[3]
         sine = math.sin(turn)
-        versine = one - math.cos(turn)
+        versine = unit - math.cos(turn)
         ahead, left = _compute_chord(vx, vy, sine / turn, versine / turn, dt)
         moved: Moved = _turn_and_shift(x, y, c, s, ahead, left, sine, versine)
     else:
@@ -359,6 +359,11 @@ def _compute_all_rates(dq: Array, x: Array, terms: Terms) -> None:
         else:  # the constant
             for i in range(n):
                 rate[i] += value[i]
+    _subtract_back_emf(dq, x, terms)
+
+
+@kernel
+def _subtract_back_emf(dq: Array, x: Array, terms: Terms) -> None:
     states = terms.emf.shape[0]
     for d in range(states):
         rate = dq[3 + d]
@@ -366,7 +371,7 @@ def _compute_all_rates(dq: Array, x: Array, terms: Terms) -> None:
         for c in range(terms.emf.shape[1]):
             emf = terms.emf[d, c]
             command = x[states + c]
-            for i in range(n):
+            for i in range(x.shape[1]):
                 rate[i] -= emf * abs(command[i]) * state[i]
 
 

@@ -194,11 +194,15 @@ class RobotSpec(Schema):
         return data
 
     @model_validator(mode="after")
-    def _check_consistency(self) -> "RobotSpec":
+    def _check_name(self) -> "RobotSpec":
         if any(part in self.name for part in ("/", "\\", "..")):
             raise ValueError(
                 f"name {self.name!r}: it names files, so leave out .., / and \\"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _check_footprint(self) -> "RobotSpec":
         if not self.footprint_radius <= MAX_RADIUS:
             fault = (
                 f"its footprint reaches {self.footprint_radius:.6g} m from base_link"
@@ -218,6 +222,10 @@ class RobotSpec(Schema):
                     f"footprint reaches {reach:.6g} m from base_link, footprint_radius is "
                     f"{radius:.6g} m; leave footprint_radius out"
                 )
+        return self
+
+    @model_validator(mode="after")
+    def _check_parameters(self) -> "RobotSpec":
         for name, size in self.parameters.items():
             if not size > 0.0 and (name in LENGTH_PARAMETERS or name.endswith("_lag")):
                 raise ValueError(f"{name} {size:g}: must be more than 0")
@@ -229,6 +237,10 @@ class RobotSpec(Schema):
                     f"{name} {size:g} m is too long for a robot of {self.footprint_radius:.3g} m "
                     "around base_link; lengths are in metres"
                 )
+        return self
+
+    @model_validator(mode="after")
+    def _check_variables(self) -> "RobotSpec":
         names = self.variable_names
         if len(set(names)) != len(names):
             raise ValueError("every state and command variable needs a name of its own")

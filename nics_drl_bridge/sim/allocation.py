@@ -31,7 +31,7 @@ LANES = 256  # Number of robots moved side by side: their arrays stay in the L1 
 CROWD = 4096
 # Minimum number of robots: for fewer, testing all bodies takes less time
 FEWEST_OF_A_CROWD = 8
-STANDING = 32  # Minimum number of obstacles, all of which stand, for sorting them into cells once
+STANDING = 32  # Minimum number of obstacles for sorting them into cells once, if all of them stand
 
 
 # Limits of a simulation: robots in one world, each of which is tested against every other, and
@@ -155,7 +155,7 @@ def stack_members(
     """
     grids = _share_equal_maps([world.grid for world in worlds])
     distances, map_places = joined([map_field(grid).distances for grid in grids])
-    moves = any(motion is not None for each in motions for motion in each)
+    moves = any(motion is not None for group in motions for motion in group)
     standing = not (sizes.crowded or moves) and sizes.obstacles >= STANDING
     plans, waypoints = _stack_plans(motions if moves else [() for _ in worlds])
     bounds = np.array([world.extent for world in worlds])

@@ -169,7 +169,7 @@ def _hold(
     events: Array,
     moving: Moving,
 ) -> None:
-    """Let robot m, whose point (px, py) approaches something against n, come no nearer."""
+    """Stop the point (px, py) of robot m from moving against n, where it approaches something."""
     flight = moving.flights[moving.first + m]
     event = events[m]
     slides = (
@@ -210,19 +210,19 @@ def _settle(
         k = int(events[m, impact.WITH])
         if time >= until:
             return
-        own = -events[m, impact.OWN]
-        others = -events[m, impact.OTHERS]
+        own_rate = -events[m, impact.OWN]
+        other_rate = -events[m, impact.OTHERS]
         touched[m] = 1
         if k >= first:
             touched[k - first] = 1
         touch = events[m]
         nx = touch[impact.NX]
         ny = touch[impact.NY]
-        if own >= SHARE * (own + others):
+        if own_rate >= SHARE * (own_rate + other_rate):
             px = touch[impact.OWN_X]
             py = touch[impact.OWN_Y]
             _hold(m, nx, ny, px, py, time, events, moving)
-        if k >= 0 and others >= SHARE * (own + others):
+        if k >= 0 and other_rate >= SHARE * (own_rate + other_rate):
             if k >= first:
                 px = touch[impact.OTHERS_X]
                 py = touch[impact.OTHERS_Y]

@@ -62,28 +62,28 @@ class Cellular(Schema):
 
 
 @lru_cache(2048)  # a training opens each of them several times
-def grow(given: Cellular, number: int) -> World:
+def grow(parameters: Cellular, number: int) -> World:
     """Return one of the worlds, which the parameters determine. ConfigError if none has a path.
 
     The robot starts before the field, between two walls, and its goal lies beyond.
     """
-    rng = np.random.default_rng([given.seed, number])
+    rng = np.random.default_rng([parameters.seed, number])
     for _ in range(TRIES):
-        filled = _field(given, rng)
-        if _has_way(filled, given):
-            return _world(filled, given, number)
+        filled = _field(parameters, rng)
+        if _has_way(filled, parameters):
+            return _world(filled, parameters, number)
     raise ConfigError(
         f"key 'generate': none of {TRIES} fields drawn for world {number} has a path of "
-        f"{given.passage:g} m; lower `fill` or `passage`."
+        f"{parameters.passage:g} m; lower `fill` or `passage`."
     )
 
 
-def _field(given: Cellular, rng: np.random.Generator) -> NDArray[np.bool_]:
-    share = rng.uniform(*given.fill)
-    filled = rng.random((given.rows, given.columns)) < share
-    around = np.zeros((given.rows + 2, given.columns + 2), np.uint8)
+def _field(parameters: Cellular, rng: np.random.Generator) -> NDArray[np.bool_]:
+    share = rng.uniform(*parameters.fill)
+    filled = rng.random((parameters.rows, parameters.columns)) < share
+    around = np.zeros((parameters.rows + 2, parameters.columns + 2), np.uint8)
     around[1:-1] = 1  # the walls at both sides
-    for _ in range(rng.integers(given.smoothing[0], given.smoothing[1] + 1)):
+    for _ in range(rng.integers(parameters.smoothing[0], parameters.smoothing[1] + 1)):
         around[1:-1, 1:-1] = filled
         three = around[:-2] + around[1:-1] + around[2:]
         neighbours = three[:, :-2] + three[:, 1:-1] + three[:, 2:] - filled
@@ -91,44 +91,48 @@ def _field(given: Cellular, rng: np.random.Generator) -> NDArray[np.bool_]:
     return filled
 
 
-def _has_way(filled: NDArray[np.bool_], given: Cellular) -> bool:
+def _has_way(filled: NDArray[np.bool_], parameters: Cellular) -> bool:
     """True if a disc of the passage's width gets from before the field to behind it."""
     # beyond, all is free
-    ahead = FINE * (1 + math.ceil(given.passage / 2.0 / given.cell))
-    free = np.ones((FINE * given.rows + 2 * ahead, FINE * given.columns + 2), np.bool_)
+    ahead = FINE * (1 + math.ceil(parameters.passage / 2.0 / parameters.cell))
+    free = np.ones(
+        (FINE * parameters.rows + 2 * ahead, FINE * parameters.columns + 2), np.bool_
+    )
     free[:, [0, -1]] = False  # the walls at both sides
     free[ahead:-ahead, 1:-1] = ~np.repeat(np.repeat(filled, FINE, axis=0), FINE, axis=1)
-    away = ndimage.distance_transform_edt(free) * given.cell / FINE
-    areas, _ = ndimage.label(away > given.passage / 2.0)
+    away = ndimage.distance_transform_edt(free) * parameters.cell / FINE
+    areas, _ = ndimage.label(away > parameters.passage / 2.0)
     start, goal = areas[[0, -1], areas.shape[1] // 2].tolist()
     return bool(start > 0 and start == goal)
 
 
-def _world(filled: NDArray[np.bool_], given: Cellular, number: int) -> World:
+def _world(filled: NDArray[np.bool_], parameters: Cellular, number: int) -> World:
     rows, columns = np.nonzero(filled)
-    x = (columns + 0.5) * given.cell
-    y = given.margin + (rows + 0.5) * given.cell
-    wide = given.columns * given.cell
-    deep = given.rows * given.cell
-    long = deep + 2.0 * given.margin
+    x = (columns + 0.5) * parameters.cell
+    y = parameters.margin + (rows + 0.5) * parameters.cell
+    wide = parameters.columns * parameters.cell
+    deep = parameters.rows * parameters.cell
+    long = deep + 2.0 * parameters.margin
     middle = wide / 2.0
     poses = [(px, py, 0.0) for px, py in np.round(np.stack([x, y], axis=1), 6).tolist()]
     if poses:
-        one = Obstacles(shapes=(Circle(radius=given.cell / 2.0),), at=tuple(poses))
+        cylinders = Obstacles(
+            shapes=(Circle(radius=parameters.cell / 2.0),), at=tuple(poses)
+        )
     else:
-        one = None
-    start = given.margin / 2.0
-    goal = long - given.margin / 2.0
+        cylinders = None
+    start = parameters.margin / 2.0
+    goal = long - parameters.margin / 2.0
     return World(
-        name=f"cellular_{given.seed}_{number}",
+        name=f"cellular_{parameters.seed}_{number}",
         bounds=(0.0, 0.0, wide, long),
         clearance=0.0,
         walls=(
-            (0.0, 0.0, 0.0, given.margin + deep),
-            (wide, 0.0, wide, given.margin + deep),
+            (0.0, 0.0, 0.0, parameters.margin + deep),
+            (wide, 0.0, wide, parameters.margin + deep),
             (0.0, 0.0, wide, 0.0),
         ),
-        obstacles=(one,) if one else (),
+        obstacles=(cylinders,) if cylinders else (),
         goal_distance=(0.0, 2.0 * long),
         starts=Starts(at=((middle, start, math.pi / 2.0),)),
         goals=Goals(at=((middle, goal),)),

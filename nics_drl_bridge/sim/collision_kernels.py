@@ -244,30 +244,30 @@ def _outline_gap(
 
 @kernel
 def body_gap(
-    body: Array, other: Array, outlines: OutlineArrays, limit: float, spare: Array
+    body: Array, obstacle: Array, outlines: OutlineArrays, limit: float, spare: Array
 ) -> float:
     """Signed clearance of two bodies; see the module."""
-    dx = body[X] - other[X]
-    dy = body[Y] - other[Y]
-    far = body[RADIUS] + other[RADIUS] + max(limit, 0.0)
+    dx = body[X] - obstacle[X]
+    dy = body[Y] - obstacle[Y]
+    far = body[RADIUS] + obstacle[RADIUS] + max(limit, 0.0)
     if dx * dx + dy * dy > far * far:
         return limit
     mine = outline_of(body, outlines)
-    outline = outline_of(other, outlines)
-    c = other[COS]
-    s = other[SIN]
+    outline = outline_of(obstacle, outlines)
+    c = obstacle[COS]
+    s = obstacle[SIN]
     x = c * dx + s * dy
     y = c * dy - s * dx
     if mine.begin == mine.end:
         if outline.begin == outline.end:
-            gap = math.sqrt(dx * dx + dy * dy) - other[RADIUS]
+            gap = math.sqrt(dx * dx + dy * dy) - obstacle[RADIUS]
         else:
             gap = outline_point(x, y, outline)
         return min(gap - body[RADIUS], limit)
     if outline.begin == outline.end:
         x = -(body[COS] * dx + body[SIN] * dy)
         y = -(body[COS] * dy - body[SIN] * dx)
-        return min(outline_point(x, y, mine) - other[RADIUS], limit)
+        return min(outline_point(x, y, mine) - obstacle[RADIUS], limit)
     cos = body[COS] * c + body[SIN] * s
     sin = body[SIN] * c - body[COS] * s
     for v in range(mine.end - mine.begin):

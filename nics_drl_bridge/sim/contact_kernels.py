@@ -20,7 +20,7 @@ FREE = 0
 BODIES = 1
 WALLS = 2
 MAP = 4
-# Most bodies that are listed near a robot; if there are more, all are tested
+# Maximum number of bodies listed near a robot; if there are more, all are tested
 SEVERAL = 32
 
 
@@ -66,16 +66,16 @@ def find_near(
     me = bodies.shape[1] - near.shape[0] + m
     x = bodies[n, me, X]
     y = bodies[n, me, Y]
-    own = reach[me]
+    own_reach = reach[me]
     count = 0
     standing = bodies.shape[1] - near.shape[0] if scene.standing else 0
-    for i in range(around(n, x, y, own, cells)):
+    for i in range(around(n, x, y, own_reach, cells)):
         k = cells.found[i]
-        other = bodies[n, k, RADIUS] if k < standing else reach[k]
+        other_reach = bodies[n, k, RADIUS] if k < standing else reach[k]
         dx = bodies[n, k, X] - x
         dy = bodies[n, k, Y] - y
-        far = own + other
-        if dx * dx + dy * dy <= far * far and k != me and other > 0.0:
+        far = own_reach + other_reach
+        if dx * dx + dy * dy <= far * far and k != me and other_reach > 0.0:
             if count < SEVERAL:
                 near[m, 1 + count] = k
             count += 1
@@ -85,10 +85,13 @@ def find_near(
         d2 = collision.segment_distance2(
             x, y, walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3]
         )
-        if d2 <= own * own:
+        if d2 <= own_reach * own_reach:
             meets |= WALLS
             break
-    if collision.map_bound(bodies[n, me], scene.grid) <= own - bodies[n, me, RADIUS]:
+    if (
+        collision.map_bound(bodies[n, me], scene.grid)
+        <= own_reach - bodies[n, me, RADIUS]
+    ):
         meets |= MAP  # without a map, the bound is inf
     return meets
 

@@ -62,7 +62,7 @@ class DeviceWorld:
     @property
     def touched(self) -> list[bool]:
         """For each robot, true if it has touched something in this episode."""
-        return [bool(one) for one in self.simulator.data.collided[0]]
+        return [bool(collided) for collided in self.simulator.data.collided[0]]
 
     def begin(self, seed: int, starts: Array | None) -> None:
         """Begin the episode of a seed, at x, y, heading of each robot (3 M,) if given."""
@@ -138,7 +138,7 @@ LEAST_VARIANCE = 1e-9
 
 def variances(std: tuple[float, float]) -> Array:
     """Variances (3,) of a measured twist, from its linear [m/s] and angular [rad/s] deviation."""
-    linear, angular = (max(one * one, LEAST_VARIANCE) for one in std)
+    linear, angular = (max(deviation * deviation, LEAST_VARIANCE) for deviation in std)
     return np.array([linear, linear, angular])
 
 
@@ -157,7 +157,7 @@ def propagate(
     """
     out = np.array(covariance, np.float64)
     poses = (
-        np.asarray(each, np.float64).reshape(len(out), 3) for each in (before, after)
+        np.asarray(pose, np.float64).reshape(len(out), 3) for pose in (before, after)
     )
     covariance_kernels.propagate(out, *poses, added)
     return out
@@ -187,7 +187,7 @@ class DrivenSimulator(FastSimulator):
         step_kernels.begin_period(self.packed[0])
 
     def in_force(self, time: float) -> Array:
-        """Commands (M, C) in force `time` [s] after the beginning, by the drawn latency alone."""
+        """Commands (M, C) in effect `time` [s] after the beginning, by the drawn latency alone."""
         timing = self.model.timing
         late = (self.data.delay[0] - timing.delay) * timing.dt - time
         rows = np.ceil(np.maximum(late, 0.0) / self.model.control_period - 1e-6).astype(

@@ -85,18 +85,18 @@ class Entities:
         """Complete the scene of an episode; return the starts (1, M, 3) of all robots."""
         bodies = scenes.bodies[0]
         bodies[sorted(self.removed), RADIUS] = 0.0
-        found = scenes.starts.copy()
+        placed = scenes.starts.copy()
         if starts is not None:
             # robots of the start that are still there
-            own = [self.robots.index(name) for name in self._launched]
-            found[:, : len(own)] = starts[:, own]
+            indices = [self.robots.index(name) for name in self._launched]
+            placed[:, : len(indices)] = starts[:, indices]
         for entity in self.spawned.values():
             if entity.robot >= 0:
-                found[0, entity.robot] = entity.start
+                placed[0, entity.robot] = entity.start
             else:
                 self._put(bodies, entity, entity.start)
         self._table = bodies.copy()
-        return found
+        return placed
 
     def _put(self, bodies: Array, entity: Entity, pose: Array | None) -> None:
         first = len(self.simulator.sampler.shapes) - len(self._spare)
@@ -126,18 +126,18 @@ class Entities:
 
     def find(self, name: str) -> Entity:
         """Return the entity of a name. Raises UnknownEntityError."""
-        known = {entity.name: entity for entity in self}
-        if name not in known:
+        entities = {entity.name: entity for entity in self}
+        if name not in entities:
             raise UnknownEntityError(
-                f"there is no entity {name!r}; {suggest(name, known)}"
+                f"there is no entity {name!r}; {suggest(name, entities)}"
             )
-        return known[name]
+        return entities[name]
 
     def pose(self, entity: Entity) -> Array:
         """Return x, y, heading (3,) of an entity in `map`."""
         if entity.robot >= 0:
-            own: Array = self.simulator.data.pose[0, entity.robot].copy()
-            return own
+            robot_pose: Array = self.simulator.data.pose[0, entity.robot].copy()
+            return robot_pose
         part = np.array(entity.parts[0][1])
         body = self.bodies()[entity.slots[0], :3]
         return geometry.compose(body, geometry.between(part, np.zeros(3)))
@@ -245,8 +245,8 @@ class Entities:
         for shape, _ in parts:
             free = (
                 k
-                for k, one in enumerate(spare)
-                if one == shape and self._own + k not in used
+                for k, spare_shape in enumerate(spare)
+                if spare_shape == shape and self._own + k not in used
             )
             k = next(free, len(spare))
             if k == len(spare):
@@ -341,15 +341,15 @@ def hull_of(shape: Shape) -> Array:
     return np.column_stack([np.cos(angles), np.sin(angles)]) * shape.radius
 
 
-def overlap(one: Array, other: Array) -> bool:
+def overlap(first: Array, second: Array) -> bool:
     """True if two convex polygons (V, 2) have a point in common: no edge of either divides them."""
-    for corners in (one, other):
+    for corners in (first, second):
         edges = np.roll(corners, -1, axis=0) - corners
         axes = np.column_stack([-edges[:, 1], edges[:, 0]])
         if len(corners) == 2:  # a segment: also along itself
             axes = np.concatenate([axes[:1], edges[:1]])
-        mine = one @ axes.T
-        theirs = other @ axes.T
+        mine = first @ axes.T
+        theirs = second @ axes.T
         apart = (mine.max(axis=0) < theirs.min(axis=0)) | (
             theirs.max(axis=0) < mine.min(axis=0)
         )

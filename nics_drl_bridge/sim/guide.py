@@ -38,14 +38,16 @@ class Guide:
         )
         walls = np.full((len(members), *sizes.max(axis=0)), np.inf, np.float32)
         stands = np.zeros((len(members), sampler.count), np.bool_)
-        for p, each in enumerate(sampler.samplers):
+        for p, scene_sampler in enumerate(sampler.samplers):
             kernels.walls_of(
                 walls[p, : sizes[p, 0], : sizes[p, 1]],
                 extents[p],
                 cells[p],
-                each.plan.space.cells,
+                scene_sampler.plan.space.cells,
             )
-            stands[p, : each.count] = [motion is None for motion in each.motions]
+            stands[p, : scene_sampler.count] = [
+                motion is None for motion in scene_sampler.motions
+            ]
         frames = np.column_stack([extents[:, :2], cells])
         inner = footprint.radius
         if isinstance(footprint, Polygon):

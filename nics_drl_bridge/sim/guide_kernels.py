@@ -221,8 +221,8 @@ def lengths(
             j = int(u)
             s = v - i
             t = u - j
-            one = fields[n, m, i]
-            two = fields[n, m, i + 1]
-            out[n, m] = (1.0 - s) * ((1.0 - t) * one[j] + t * one[j + 1]) + s * (
-                (1.0 - t) * two[j] + t * two[j + 1]
+            row = fields[n, m, i]
+            next_row = fields[n, m, i + 1]
+            out[n, m] = (1.0 - s) * ((1.0 - t) * row[j] + t * row[j + 1]) + s * (
+                (1.0 - t) * next_row[j] + t * next_row[j + 1]
             )

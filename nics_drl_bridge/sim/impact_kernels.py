@@ -36,9 +36,11 @@ and the number of its holds, with which both are in the map frame, too; then the
 HOLD_X, HOLD_Y, ARM, PUSH, HOLD = range(5)
 """Columns of a hold: direction away from what holds a robot; lever arm of its point there [m]; and
 the speed that it is given [m/s]."""
-MOST_HOLDS = 8  # Of a robot in a substep; then it stops: it is wedged in
+MOST_HOLDS = (
+    8  # Maximum number of holds in a substep; a robot with more is wedged in, and stops
+)
 FLIGHT = FIRST_HOLD + MOST_HOLDS * HOLD
-SWEEPS = 30  # Through the holds, to find the speeds with which they agree
+SWEEPS = 30  # Number of passes over the holds to find speeds that satisfy all of them
 (
     TIME,
     WITH,
@@ -61,8 +63,8 @@ none, negative if approaching [m/s]; these points [m]; the clearance, negative w
 something, before and after the substep [m]; and 1 if it touched something before."""
 SLACK = 1e-7  # Bodies touch if they are nearer than this to each other and approach [m]
 NOTHING = 1e-12  # Distances up to this count as zero [m]
-PARTING = 1e-5  # Speed at which what is turned aside parts, so that roundings don't add up [m/s]
-# After so many a pair counts as touching: only absurdly fast turns need more
+PARTING = 1e-5  # Speed at which a deflected body moves away, so that roundings don't add up [m/s]
+# Maximum number of iterations, then a pair counts as touching: only absurd turns need more
 MOST_LOOKS = 2000
 
 
@@ -130,17 +132,17 @@ def pose_at(b: int, time: float, moving: Moving) -> tuple[float, float, float, f
 @kernel
 def _placed_at(b: int, edge: Edge, time: float, moving: Moving) -> Placed:
     x, y, c, s = pose_at(b, time, moving)
-    there = _in_map(edge, x, y, c, s)
+    placed = _in_map(edge, x, y, c, s)
     if b < 0 or time >= moving.flights[b, STOP]:
-        return Placed(there, x, y, 0.0, 0.0, 0.0, 0.0)
+        return Placed(placed, x, y, 0.0, 0.0, 0.0, 0.0)
     flight = moving.flights[b]
     vx = flight[VX]
     vy = flight[VY]
     turn = flight[TURN]
     if not in_own_frame(b, moving):
-        return Placed(there, x, y, vx, vy, turn, 0.0)
+        return Placed(placed, x, y, vx, vy, turn, 0.0)
     bend = abs(turn) * math.sqrt(vx * vx + vy * vy)
-    return Placed(there, x, y, c * vx - s * vy, s * vx + c * vy, turn, bend)
+    return Placed(placed, x, y, c * vx - s * vy, s * vx + c * vy, turn, bend)
 
 
 @kernel
@@ -233,16 +235,16 @@ def _free_time(
     beyond = max(near, near2)
     keep = 0.5 * SLACK if gap > SLACK else 0.25 * gap
     free = np.inf
-    own = 0.0
-    others = 0.0
+    own_rate = 0.0
+    other_rate = 0.0
     for ahead, u in ((far, rate_p), (far2, rate_p2)):
         for behind, v in ((near, rate_q), (near2, rate_q2)):
             root = _root(gap - keep + (ahead - front) + (beyond - behind), u + v, bend)
             if root < free:
                 free = root
-                own = u
-                others = v
-    return free, own, others
+                own_rate = u
+                other_rate = v
+    return free, own_rate, other_rate
 
 
 @kernel
@@ -269,10 +271,10 @@ def _corner(nx: float, ny: float, body: Placed, rate: float) -> tuple[float, flo
 def touch(
     event: Array,
     a: int,
-    edge: Edge,
+    edge_a: Edge,
     round_a: float,
     b: int,
-    other: Edge,
+    edge_b: Edge,
     round_b: float,
     begin: float,
     moving: Moving,
@@ -281,14 +283,14 @@ def touch(
 
     The edges are in the bodies' frames, with a radius [m] around each.
     """
-    reach_a = _reach(edge)
-    reach_b = _reach(other)
+    reach_a = _reach(edge_a)
+    reach_b = _reach(edge_b)
     time = begin
     flights = moving.flights
     until = event[TIME]
     for _ in range(MOST_LOOKS):
-        p = _placed_at(a, edge, time, moving)
-        q = _placed_at(b, other, time, moving)
+        p = _placed_at(a, edge_a, time, moving)
+        q = _placed_at(b, edge_b, time, moving)
         nx, ny = _between(p.edge, q.edge)
         away = math.sqrt(nx * nx + ny * ny)
         if away <= NOTHING:
@@ -297,21 +299,21 @@ def touch(
         nx = nx / away
         ny = ny / away
         bend = p.bend + q.bend + p.turn * p.turn * reach_a + q.turn * q.turn * reach_b
-        free, own, others = _free_time(p, q, nx, ny, gap, bend)
+        free, own_rate, other_rate = _free_time(p, q, nx, ny, gap, bend)
         rest = _next_stop(b, time, _next_stop(a, time, until, flights), flights) - time
         if free >= rest:
             if time + rest >= until:
                 return
             time += rest
             continue
-        # Nearer than half the slack not even a creep is let through: it would end in an overlap.
+        # Within half the slack, even the slowest approach is a contact: it would end in an overlap.
         least = 0.5 * gap if gap > 0.5 * SLACK else NOTHING
-        if gap <= SLACK and -(own + others) * rest >= least:
+        if gap <= SLACK and -(own_rate + other_rate) * rest >= least:
             if time < until:
                 event[TIME] = time
                 event[WITH] = b
-                event[OWN] = own
-                event[OTHERS] = others
+                event[OWN] = own_rate
+                event[OTHERS] = other_rate
                 _note(event, nx, ny, p, q)
             return
         time += free
@@ -327,10 +329,10 @@ def touch(
 def hold(
     b: int, nx: float, ny: float, px: float, py: float, time: float, moving: Moving
 ) -> None:
-    """Let the point (px, py) of a robot approach nothing against n from a time on.
+    """Stop the point (px, py) of a robot from moving against n, from a time on.
 
-    Of all motions that its holds allow, it makes the one nearest to its wish by the energy of a
-    ring: it slides without friction, and a corner that is held turns it aside. The speeds
+    Of all motions that its holds allow, it makes the one closest to its free motion, measured by
+    the energy of a ring: it slides without friction, and a held corner deflects it. The speeds
     that the holds give are found by projected Gauss-Seidel sweeps.
     """
     flight = moving.flights[b]
@@ -403,7 +405,7 @@ def touch_edge(
     event: Array,
     a: int,
     b: int,
-    other: Edge,
+    edge_b: Edge,
     round_b: float,
     begin: float,
     moving: Moving,
@@ -413,16 +415,18 @@ def touch_edge(
     flights = moving.flights
     x, y, _, _ = pose_at(a, begin, moving)
     ox, oy, oc, os = pose_at(b, begin, moving)
-    there = _in_map(other, ox, oy, oc, os)
+    placed = _in_map(edge_b, ox, oy, oc, os)
     spin = abs(flights[b, TURN]) if b >= 0 and begin < flights[b, STOP] else 0.0
     speed = (
-        speed_at(a, begin, flights) + speed_at(b, begin, flights) + spin * _reach(other)
+        speed_at(a, begin, flights)
+        + speed_at(b, begin, flights)
+        + spin * _reach(edge_b)
     )
     far = world[a, RADIUS] + round_b + speed * (event[TIME] - begin)
     if speed == 0.0 and (begin >= flights[a, STOP] or flights[a, TURN] == 0.0):
         return
     if (
-        collision.segment_distance2(x, y, there.ax, there.ay, there.bx, there.by)
+        collision.segment_distance2(x, y, placed.ax, placed.ay, placed.bx, placed.by)
         > far * far
     ):
         return
@@ -430,7 +434,7 @@ def touch_edge(
     round_a = world[a, RADIUS] if outline.begin == outline.end else 0.0
     for v in range(_edges(outline)):
         edge = _edge_of(v, outline)
-        touch(event, a, edge, round_a, b, other, round_b, begin, moving)
+        touch(event, a, edge, round_a, b, edge_b, round_b, begin, moving)
 
 
 @kernel

@@ -12,13 +12,13 @@ from pydantic import Field, model_validator
 from nics_drl_bridge.config import Schema, parse_yaml, validate
 from nics_drl_bridge.errors import BridgeError, ConfigError
 from nics_drl_bridge.lidar.shapes import Shape
-from nics_drl_bridge.sim.sdf import AssetsError, read_sdf, root_of
+from nics_drl_bridge.sim.sdf import AssetsError, SdfError, read_sdf, root_of
 from nics_drl_bridge.sim.sections import Placed
 from nics_drl_bridge.sim.world import Pose
 
 HEIGHT = 0.2  # height at which SDF bodies count, as in `nics world import` [m]
 MOST_PARTS = 100
-TEXT = "resource_string"  # the place that errors in a text name
+TEXT = "resource_string"  # how errors name a text without a file
 
 
 class ModelFile(Schema):
@@ -35,7 +35,7 @@ class ModelFile(Schema):
     def _one_each(self) -> "ModelFile":
         if self.at and len(self.at) != len(self.shapes):
             raise ValueError(
-                f"at must hold {len(self.shapes)} poses, one of each shape"
+                f"at must hold {len(self.shapes)} poses, one for each shape"
             )
         return self
 
@@ -64,8 +64,8 @@ def model_of_yaml(text: str, source: str = TEXT) -> Model:
 def model_of_sdf(text: str, z: float, source: str = TEXT) -> Model:
     """Read an entity from SDF, whose origin is spawned at a height z [m].
 
-    Raises ConfigError for no SDF, more than one model, or what is no shape; `AssetsError` of it
-    where that is a mesh, or a file that is not there; BridgeError for too many shapes.
+    Raises ConfigError unless the text is SDF with one model of known shapes, AssetsError for a mesh
+    or a missing file, BridgeError for too many shapes.
     """
     with file_of(text, source) as file:
         root = root_of(file)  # refuses XML entities that grow
@@ -82,7 +82,7 @@ def model_of_sdf(text: str, z: float, source: str = TEXT) -> Model:
             standing = read_sdf(file, HEIGHT - z)
         except AssetsError:
             raise
-        except ConfigError:  # it is lower than that: at the height of its own origin
+        except ConfigError:  # too low to be cut at that height
             standing = read_sdf(file, 0.0)
     if len(standing.placed) > MOST_PARTS:
         raise BridgeError(f"{source}: holds more than {MOST_PARTS} shapes; split it.")
@@ -91,12 +91,13 @@ def model_of_sdf(text: str, z: float, source: str = TEXT) -> Model:
 
 @contextmanager
 def file_of(text: str, source: str = TEXT) -> Iterator[Path]:
-    """Give a file with a text, in errors about which `source` takes the place of its path."""
+    """Yield a temporary file with a text; errors name `source` instead of its path."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "text.sdf"
         file.write_text(text, encoding="utf-8")
         try:
             yield file
-        except ConfigError as error:
-            error.reword(str(error).replace(str(file), source))
+        except SdfError as error:
+            if error.file == file:
+                error.reword(f"{source}{error.rest}")
             raise

@@ -167,14 +167,16 @@ def repulsion(
     sy = vy * foresight
     qx = rx - sx
     qy = ry - sy
-    one = math.sqrt(rx * rx + ry * ry)
-    two = max(math.sqrt(qx * qx + qy * qy), NEAREST)
-    both = one + two
+    distance = math.sqrt(rx * rx + ry * ry)
+    next_distance = max(math.sqrt(qx * qx + qy * qy), NEAREST)
+    both = distance + next_distance
     b = 0.5 * math.sqrt(max(both * both - sx * sx - sy * sy, NEAREST * NEAREST))
     if b > FAR * reach:
         return 0.0, 0.0
     size = strength / reach * math.exp(-b / reach) * both / (4.0 * b)
-    return size * (rx / one + qx / two), size * (ry / one + qy / two)
+    return size * (rx / distance + qx / next_distance), size * (
+        ry / distance + qy / next_distance
+    )
 
 
 @kernel

@@ -51,7 +51,7 @@ class Patrol(Schema):
     @model_validator(mode="after")
     def _apart(self) -> "Patrol":
         corners = [*self.waypoints, *self.waypoints[: int(self.loop)]]
-        if any(one == other for one, other in pairwise(corners)):
+        if any(corner == next_corner for corner, next_corner in pairwise(corners)):
             raise ValueError("consecutive waypoints must differ")
         return self
 

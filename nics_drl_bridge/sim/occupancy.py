@@ -77,9 +77,8 @@ def occupancy(
 class _Frame(NamedTuple):
     """Position, size and number of the cells of a grid."""
 
-    pose: (
-        Any  # (3,) in the world, from which columns and rows are counted along its axes
-    )
+    # (3,) in the world, from which columns and rows are counted along its axes
+    pose: Any
     first: NDArray[np.int_]  # (2,) first column and first row, often negative
     size: tuple[int, int]  # numbers of rows and columns
     cell: float  # side of a cell [m]
@@ -103,9 +102,11 @@ def _frame_of(world: World, cell: float) -> _Frame:
     area = float(np.prod(high - low))
     cell = max(cell, math.sqrt(area / MOST_CELLS))
     if grid is not None:
-        cell = grid.resolution / max(1, math.ceil(grid.resolution / cell - ROUNDING))
+        parts = math.ceil(grid.resolution / cell - ROUNDING)
+        cell = grid.resolution / max(1, parts)
     first = np.floor(low / cell + ROUNDING).astype(int) - 1
-    columns, rows = np.ceil(high / cell - ROUNDING).astype(int) + 1 - first
+    end = np.ceil(high / cell - ROUNDING).astype(int) + 1
+    columns, rows = end - first
     return _Frame(pose, first, (int(rows), int(columns)), cell)
 
 
@@ -157,7 +158,8 @@ def _along(corners: Array, cell: float) -> Array:
     parts = []
     for begin, end in pairwise(corners):
         count = max(2, math.ceil(math.dist(begin, end) / cell * SAMPLES))
-        parts.append(begin + np.linspace(0.0, 1.0, count)[:, None] * (end - begin))
+        fractions = np.linspace(0.0, 1.0, count)[:, None]
+        parts.append(begin + fractions * (end - begin))
     return np.concatenate(parts)
 
 
@@ -197,7 +199,8 @@ def _inside(shape: Shape, points: Array) -> NDArray[np.bool_]:
         return within
     x = points[..., 0]
     y = points[..., 1]
-    for (x1, y1), (x2, y2) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+    next_corners = np.roll(corners, -1, axis=0)
+    for (x1, y1), (x2, y2) in zip(corners, next_corners, strict=True):
         if y1 == y2:
             continue
         # A ray from the point along x crosses an odd number of edges if the point is inside.

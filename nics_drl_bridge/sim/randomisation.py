@@ -172,10 +172,10 @@ class Randomisation(Schema):
 
     def alone(self) -> "dict[str, Randomisation]":
         """Each of the set ranges alone, by the name of its field."""
-        given = {name: getattr(self, name) for name in type(self).model_fields}
-        names = (name for name in given if name in self.model_fields_set - {"name"})
+        ranges = {name: getattr(self, name) for name in type(self).model_fields}
+        names = (name for name in ranges if name in self.model_fields_set - {"name"})
         return {
-            name: Randomisation(**{"name": name, name: given[name]}) for name in names
+            name: Randomisation(**{"name": name, name: ranges[name]}) for name in names
         }
 
     @property
@@ -362,14 +362,14 @@ def _coefficients(ranges: KinematicRanges, model: TaylorModel, where: str) -> Bo
 
 
 def _term(d: int, name: str, model: TaylorModel, where: str) -> int:
-    known = {model.term_names[k]: int(k) for k in np.flatnonzero(model.coefficients[d])}
+    terms = {model.term_names[k]: int(k) for k in np.flatnonzero(model.coefficients[d])}
     with suppress(ValueError, KeyError):
-        return known[
+        return terms[
             taylor.format_term(
                 taylor.parse_term(name, model.variables), model.variables
             )
         ]
-    hint = suggest(name, known) if known else "it has none at all: remove it."
+    hint = suggest(name, terms) if terms else "it has none at all: remove it."
     raise ConfigError(f"{where}: the model has no term {name!r} there; {hint}")
 
 
@@ -413,13 +413,13 @@ def _levels(ranges: Randomisation, model: SimulatorModel, where: str) -> Bounds:
     base = np.array([*model.noise.odometry, *model.noise.simulated_drift(model.robot)])
     low = base.copy()
     high = base.copy()
-    for key, (part, (one, other)) in SCALED.items():
+    for key, (part, names) in SCALED.items():
         factor = getattr(odometry, key)
         if factor is None:
             continue
         if not base[part].any():
             lacks = f"the model of {model.robot.name!r} has no measured {key} to scale"
-            fix = f"give {one!r} and {other!r} instead."
+            fix = f"give {names[0]!r} and {names[1]!r} instead."
             raise ConfigError(f"{where}: key 'odometry.{key}': {lacks}; {fix}")
         low[part] = base[part] * factor[0]
         high[part] = base[part] * factor[1]

@@ -178,16 +178,16 @@ def _clear_of_walls(body: Array, room: float, plan: ScenePlan, spare: Array) -> 
 
 @kernel
 def _clear_of(
-    body: Array, other: Array, room: float, outlines: OutlineArrays, spare: Array
+    body: Array, obstacle: Array, room: float, outlines: OutlineArrays, spare: Array
 ) -> bool:
-    dx = body[X] - other[X]
-    dy = body[Y] - other[Y]
-    far = body[RADIUS] + other[RADIUS] + room
+    dx = body[X] - obstacle[X]
+    dy = body[Y] - obstacle[Y]
+    far = body[RADIUS] + obstacle[RADIUS] + room
     if dx * dx + dy * dy >= far * far:
         return True
-    if collision.is_round(body, outlines) and collision.is_round(other, outlines):
+    if collision.is_round(body, outlines) and collision.is_round(obstacle, outlines):
         return False
-    return collision.body_gap(body, other, outlines, room, spare) >= room
+    return collision.body_gap(body, obstacle, outlines, room, spare) >= room
 
 
 @kernel
@@ -262,7 +262,7 @@ def _is_joined(
     seen[start], seen[goal] = latest[0], latest[0] + 1
     # of the stack of this side, and of that of the other one
     height = 1
-    other = 1
+    other_height = 1
     side = 0
     while height > 0:
         height -= 1
@@ -294,7 +294,7 @@ def _is_joined(
             seen[new] = latest[0] + side if free else blocked
             stack[side, height] = new
             height += int(free)
-        height, other, side = other, height, 1 - side
+        height, other_height, side = other_height, height, 1 - side
     return False
 
 
@@ -425,10 +425,10 @@ def _is_apart(
     for i in range(
         cell_kernels.around_added(0, trial[X], trial[Y], reach, scratch.cells)
     ):
-        other = bodies[near[i]]
+        obstacle = bodies[near[i]]
         gap = max(gaps[k], gaps[near[i]])
-        if other[RADIUS] > 0.0 and not _clear_of(
-            trial, other, gap, plan.outlines, scratch.spare
+        if obstacle[RADIUS] > 0.0 and not _clear_of(
+            trial, obstacle, gap, plan.outlines, scratch.spare
         ):
             return False
     return True
@@ -456,9 +456,9 @@ def _spot(
 
 @kernel
 def _apart(x: float, y: float, others: Array, m: int, least: float) -> bool:
-    for other in range(m):
-        dx = x - others[other, 0]
-        dy = y - others[other, 1]
+    for k in range(m):
+        dx = x - others[k, 0]
+        dy = y - others[k, 1]
         if dx * dx + dy * dy <= least * least:
             return False
     return True
@@ -557,26 +557,13 @@ def draw_scenes(
     obstacles, -1 for the world's own, and `sizes` (n,) rows of `plan.variants`. Returns the first
     row that could not be drawn, or n, and the reason.
     """
-    return _draw(packed.content, seeds, wanted, sizes, bodies, starts, goals, scratch)
-
-
-@kernel
-def _draw(
-    plan: ScenePlan,
-    seeds: NDArray[np.int64],
-    wanted: NDArray[np.int64],
-    sizes: NDArray[np.int64],
-    bodies: Array,
-    starts: Array,
-    goals: Array,
-    scratch: SceneScratch,
-) -> tuple[int, int]:
+    plan: ScenePlan = packed.content
     count = plan.group.shape[0]
     s = scratch
     cells = scratch.cells
     # the scratch memory may be sized for another world with more obstacles
-    found = cells.found[:count]
-    cells = BodyCells(cells.first, cells.then, cells.ordered, cells.frame, found)
+    nearby = cells.found[:count]
+    cells = BodyCells(cells.first, cells.then, cells.ordered, cells.frame, nearby)
     scratch = SceneScratch(
         s.seen, s.stack, s.latest, s.active, s.gaps, s.trial, s.disc, s.spare, cells
     )

@@ -106,13 +106,13 @@ class SceneSampler:
         robots: int = 1,
         sizes: Sequence[float] = (1.0,),
         most: int | None = None,
-        known: Catalogue | None = None,
+        catalogue: Catalogue | None = None,
     ) -> None:
         self.world = world = world if most is None else _with_room(world, most)
         self.robots = robots
         self._sizes = len(sizes)
-        known = known or Catalogue.of(world, sizes)
-        self.shapes = known.shapes
+        catalogue = catalogue or Catalogue.of(world, sizes)
+        self.shapes = catalogue.shapes
         slots = [
             g for g, group in enumerate(world.obstacles) for _ in range(group.counts[1])
         ]
@@ -120,7 +120,7 @@ class SceneSampler:
         self.motions: tuple[Motion | None, ...] = tuple(
             world.obstacles[g].motion for g in slots
         )
-        self.plan = _plan(world, footprint_radius, slots, known)
+        self.plan = _plan(world, footprint_radius, slots, catalogue)
         # Maximum number of cells, obstacles and corners; threads draw with a scratch memory each.
         corners = max(int(np.diff(self.plan.outlines.first).max()), 4)
         self.room = self.plan.space.area.size, len(self.plan.group), corners
@@ -179,7 +179,7 @@ class SceneSampler:
             scratch = self.scratches.pop()
         except IndexError:
             scratch = _scratch(*self.room)
-        numbers, wanted, sizes = (each[rows] for each in draws)
+        numbers, wanted, sizes = (values[rows] for values in draws)
         into = scenes.bodies[rows], scenes.starts[rows], scenes.goals[rows]
         drawn, why = kernels.draw_scenes(
             self._packed, numbers, wanted, sizes, *into, scratch
@@ -199,7 +199,7 @@ class SceneSampler:
         return ConfigError(
             f"{where}: key 'goal_distance': no free places for {self.robots} start(s) and goal(s) "
             f"of robots of radius {self.plan.footprint:g} m, {least:g} to {greatest:g} m apart "
-            f"with a way between among {self.count} obstacles, {scene}; change `goal_distance`, "
+            f"with a path between them, {self.count} obstacles, {scene}; change `goal_distance`, "
             "lower `clearance` or `obstacles`, or enlarge the field."
         )
 
@@ -218,9 +218,9 @@ class SetSampler:
         sizes: Sequence[float] = (1.0,),
         most: int | None = None,
     ) -> None:
-        known = Catalogue.of(world, sizes)
+        catalogue = Catalogue.of(world, sizes)
         self.samplers = [
-            SceneSampler(member, footprint_radius, robots, sizes, most, known)
+            SceneSampler(member, footprint_radius, robots, sizes, most, catalogue)
             for member in world.members
         ]
         scratches = self.samplers[0].scratches
@@ -232,7 +232,8 @@ class SetSampler:
         drawn = max(sampler.count for sampler in self.samplers)
         self.robots = robots
         self.count = drawn + len(world.spare)
-        self.shapes = (*known.shapes, *world.spare)  # those that are spare come last
+        # those that are spare come last
+        self.shapes = (*catalogue.shapes, *world.spare)
 
     @property
     def motions(self) -> list[tuple[Motion | None, ...]]:
@@ -312,15 +313,15 @@ def _with_room(world: World, most: int) -> World:
 
 
 def _plan(
-    world: World, footprint: float, slots: Sequence[int], known: Catalogue
+    world: World, footprint: float, slots: Sequence[int], catalogue: Catalogue
 ) -> ScenePlan:
     check_places(world)
     drawn = any(group.count for group in world.obstacles)
     alike = f"{drawn} {world.model_dump_json(exclude={'name', 'obstacles'})}"
-    if alike not in known.spaces:
-        known.spaces[alike] = _free_space(world, footprint, drawn)
-    space = known.spaces[alike]
-    outlines = known.outlines
+    if alike not in catalogue.spaces:
+        catalogue.spaces[alike] = _free_space(world, footprint, drawn)
+    space = catalogue.spaces[alike]
+    outlines = catalogue.outlines
     groups = np.zeros((len(world.obstacles), kernels.GROUP))
     choices: list[int] = []
     poses = np.zeros((len(slots), 3))
@@ -335,7 +336,7 @@ def _plan(
             fixed,
             moving,
         )
-        choices += [known.place[shape] for shape in group.shapes]
+        choices += [catalogue.place[shape] for shape in group.shapes]
         if group.at:
             poses[np.flatnonzero(np.equal(slots, g))] = group.at
     least, greatest = world.goal_distance
@@ -348,7 +349,7 @@ def _plan(
         groups,
         np.array(slots, dtype=np.int64),
         np.array(choices, dtype=np.int64),
-        np.arange(len(known.shapes)).reshape(-1, max(len(known.place), 1)),
+        np.arange(len(catalogue.shapes)).reshape(-1, max(len(catalogue.place), 1)),
         poses,
         _places(world.starts),
         _places(world.goals),
@@ -426,7 +427,7 @@ def _free_space(world: World, footprint: float, drawn: bool) -> FreeSpace:
     area = _large_enough(area, cells.cell, least)
     if not area.any():
         raise ConfigError(
-            f"{world.source}: key 'goal_distance': nowhere can {robot} reach a goal {least:g} m "
+            f"{world.source}: key 'goal_distance': {robot} can't reach any goal {least:g} m "
             "away; lower `goal_distance` or `clearance`, or enlarge the world."
         )
     for key, places in (("starts", world.starts), ("goals", world.goals)):

@@ -43,12 +43,36 @@ POSE = {"relative_to", "frame", "degrees", "rotation_format"}  # attributes
 NUMBERS = {"euler_rpy": 6, "quat_xyzw": 7}  # of a pose, by its rotation_format
 
 
-class AssetsError(ConfigError):
+class SdfError(ConfigError):
+    """An SDF file is wrong; `rest` is the sentence after the file's path."""
+
+    def __init__(self, file: Path, rest: str) -> None:
+        super().__init__(f"{file}{rest}")
+        self.file = file
+        self.rest = rest
+
+
+class AssetsError(SdfError):
     """An SDF file contains something that is not a shape of a world, or a missing file."""
 
-    def __init__(self, sentence: str = "", missing: bool = False) -> None:
-        super().__init__(sentence)
+    def __init__(self, file: Path, rest: str, missing: bool = False) -> None:
+        super().__init__(file, rest)
         self.missing = missing  # it is a file, and missing
+
+
+class Where(NamedTuple):
+    """A place in an SDF file."""
+
+    file: Path
+    element: str = ""  # model and element, after a separator
+
+    def at(self, element: str) -> "Where":
+        """Return the place of an element in this one."""
+        return Where(self.file, self.element + element)
+
+    def error(self, rest: str) -> SdfError:
+        """Return an error that names the place."""
+        return SdfError(self.file, self.element + rest)
 
 
 def read_sdf(
@@ -80,22 +104,21 @@ def read_sdf(
         for body in _bodies(_Scope(_world(path), path, "", _Order(without)), np.eye(4)):
             seen += 1
             try:
-                found = _section_of(body, height)
+                obstacle = _section_of(body, height)
             except ShapelessError as error:
                 unknown.setdefault(body.model, []).append(str(error))
                 if error.missing:
                     missing.add(body.model)
                 continue
-            if found is not None:
-                placed.append(found)
+            if obstacle is not None:
+                placed.append(obstacle)
             if len(placed) > MOST_OBSTACLES:
                 reason = f"holds more than {MOST_OBSTACLES} bodies at a height of {height:g} m"
                 fix = "leave some out by --without MODEL, or split the world"
-                raise ConfigError(f"{path}: {reason}; {fix}.")
+                raise SdfError(path, f": {reason}; {fix}.")
     except RecursionError:
-        raise ConfigError(
-            f"{path}: is nested too deeply; flatten its models."
-        ) from None
+        reason = ": is nested too deeply; flatten its models."
+        raise SdfError(path, reason) from None
     left_out = tuple(
         f"model {name!r} has {', '.join(what)}" for name, what in unknown.items()
     )
@@ -103,18 +126,21 @@ def read_sdf(
         more = f" (as {len(left_out) - 1} more models)" if len(left_out) > 1 else ""
         fix = "leave it out by --skip-unknown or --without MODEL, or put a box in its place"
         raise AssetsError(
-            f"{path}: {left_out[0]}{more}, which is no shape of a world; {fix}.",
+            path,
+            f": {left_out[0]}{more}, which a world can't hold; {fix}.",
             next(iter(unknown)) in missing,
         )
     shapes = seen - sum(map(len, unknown.values()))
     if left_out and not shapes and not may_be_empty:
-        reason = f"holds nothing but what is no shape of a world ({left_out[0]})"
+        reason = f"contains nothing that a world can hold ({left_out[0]})"
         raise AssetsError(
-            f"{path}: {reason}; put a box in its place.", next(iter(unknown)) in missing
+            path,
+            f": {reason}; put a box in its place.",
+            next(iter(unknown)) in missing,
         )
     if not placed and not may_be_empty:
         reason = f"none of its {shapes} collision geometries stands at a height of {height:g} m"
-        raise ConfigError(f"{path}: {reason}; choose another --height.")
+        raise SdfError(path, f": {reason}; choose another --height.")
     return Standing(tuple(placed), left_out, bool(missing))
 
 
@@ -132,8 +158,10 @@ def _section_of(body: "_Body", height: float) -> Placed | None:
         problem = error.errors(include_url=False)[0]["msg"].removeprefix(
             "Value error, "
         )
-        reason = f"its shape at a height of {height:g} m is none of a world ({problem})"
-        raise ConfigError(f"{body.where}: {reason}; change it.") from None
+        reason = (
+            f"its shape at a height of {height:g} m can't stand in a world ({problem})"
+        )
+        raise body.where.error(f": {reason}; change it.") from None
 
 
 class _Order:
@@ -150,9 +178,8 @@ class _Order:
     def count(self, file: Path) -> None:
         self._models += 1
         if self._models > MOST_MODELS:
-            raise ConfigError(
-                f"{file}: holds more than {MOST_MODELS} models; split the world."
-            )
+            reason = f": holds more than {MOST_MODELS} models; split the world."
+            raise SdfError(file, reason)
 
 
 class _Scope:
@@ -179,7 +206,7 @@ class _Scope:
         # name of a model, and why it can't be read
         self.strange: list[tuple[str, ShapelessError]] = []
         states = element.iterfind("state/model")
-        self._state = {one.get("name", ""): one.find("pose") for one in states}
+        self._state = {state.get("name", ""): state.find("pose") for state in states}
         self._named: dict[str, Element | _Scope] = {}
         self._open: set[str] = set()  # frames whose poses are being resolved
         order.count(file)
@@ -187,8 +214,10 @@ class _Scope:
             self._add(child)
 
     @property
-    def where(self) -> str:
-        return f"{self.file}: model {self.name!r}" if self.name else str(self.file)
+    def where(self) -> Where:
+        if self.name:
+            return Where(self.file, f": model {self.name!r}")
+        return Where(self.file)
 
     def _add(self, child: Element) -> None:
         name = child.get("name", "") or _text(child, "name")
@@ -223,33 +252,31 @@ class _Scope:
             self._named.setdefault(name, model)
 
     def frame(self, name: str) -> Array:
-        """(4, 4) pose of a frame of this scope, in its own frame. Raises ConfigError for none."""
+        """(4, 4) pose of a frame in this scope. Raises ConfigError for an unknown name."""
         if name in ("", "world", "__model__"):
             return np.eye(4)
-        found, (first, _, rest) = self._named.get(name), name.partition("::")
-        if (
-            found is None
-            and rest
-            and isinstance(inner := self._named.get(first), _Scope)
-        ):
-            return self.frame(first) @ inner.frame(rest)
-        if found is None:
+        named = self._named.get(name)
+        if named is None:
+            first, _, rest = name.partition("::")
+            inner = self._named.get(first)
+            if rest and isinstance(inner, _Scope):
+                return self.frame(first) @ inner.frame(rest)
             near = suggest(name, self._named) if self._named else "there are none here."
-            raise ConfigError(f"{self.where}: there is no frame {name!r}; {near}")
+            raise self.where.error(f": there is no frame {name!r}; {near}")
         if name in self._open:
             reason = (
                 f"the pose of {name!r} is relative to itself; give it another frame"
             )
-            raise ConfigError(f"{self.where}: {reason}.")
+            raise self.where.error(f": {reason}.")
         self._open.add(name)
-        if isinstance(found, _Scope):
-            pose = self.of_model(found)
+        if isinstance(named, _Scope):
+            pose = self.of_model(named)
         else:
             bases = {
-                "joint": _text(found, "child"),
-                "frame": found.get("attached_to", ""),
+                "joint": _text(named, "child"),
+                "frame": named.get("attached_to", ""),
             }
-            pose = self.posed(found.find("pose"), bases.get(found.tag, ""))
+            pose = self.posed(named.find("pose"), bases.get(named.tag, ""))
         self._open.remove(name)
         return pose
 
@@ -258,15 +285,15 @@ class _Scope:
         pose: Element | None,
         base: str = "",
         start: Array | None = None,
-        where: str = "",
+        where: Where | None = None,
     ) -> Array:
         """(4, 4) of a `<pose>` in this scope; by default from `start`, or from the frame `base`."""
         if pose is None:
-            given = ""
+            frame = ""
         else:
-            given = pose.get("relative_to") or pose.get("frame") or ""
-        if start is None or given:
-            start = self.frame(given or base)
+            frame = pose.get("relative_to") or pose.get("frame") or ""
+        if start is None or frame:
+            start = self.frame(frame or base)
         return start @ _matrix(pose, where or self.where)
 
     def of_model(self, model: "_Scope") -> Array:
@@ -282,7 +309,7 @@ class _Body(NamedTuple):
     """A collision geometry, or an error that says why there is none."""
 
     model: str
-    where: str
+    where: Where
     geometry: Element | ShapelessError
     pose: Array  # (4, 4) in the world
 
@@ -319,28 +346,26 @@ class _Body(NamedTuple):
 
     def _prism(self, polyline: Element) -> Solid:
         texts = [point.text or "" for point in polyline.findall("point")]
-        points = [_floats(text, 2, f"{self.where}: <point>") for text in texts]
+        points = [_floats(text, 2, self.where.at(": <point>")) for text in texts]
         if len(points) > 1 and points[0] == points[-1]:
             points.pop()
         if len(set(points)) < 3:
-            raise ConfigError(
-                f"{self.where}: <polyline> needs three different points; add some."
-            )
+            reason = ": <polyline> needs three different points; add some."
+            raise self.where.error(reason)
         if len(points) > MOST_CORNERS:
             most = f"has {len(points)} points, a shape at most {MOST_CORNERS}"
-            raise ConfigError(f"{self.where}: <polyline> {most}; coarsen it.")
+            raise self.where.error(f": <polyline> {most}; coarsen it.")
         return sections.Prism(tuple(points), *self._lengths(polyline, "height"))
 
     def _lengths(self, shape: Element, key: str, count: int = 1) -> tuple[float, ...]:
-        where = f"{self.where}: <{key}> of its <{shape.tag}>"
+        where = self.where.at(f": <{key}> of its <{shape.tag}>")
         text = shape.findtext(key)
         if text is None:
-            raise ConfigError(f"{where} is missing; add it.")
+            raise where.error(" is missing; add it.")
         lengths = _floats(text, count, where)
         if not all(SMALLEST <= length <= LARGEST for length in lengths):
-            raise ConfigError(
-                f"{where} must be above 0 and at most {LARGEST:g} m, not {text!r}."
-            )
+            reason = f" must be above 0 and at most {LARGEST:g} m, not {text!r}."
+            raise where.error(reason)
         return lengths
 
 
@@ -351,16 +376,16 @@ def _bodies(scope: _Scope, pose: Array) -> Iterator[_Body]:
     for link in scope.element.iterfind("link"):
         of_link = scope.posed(link.find("pose"))
         for collision in link.iterfind("collision"):
-            where = f"{scope.where}, collision {collision.get('name', '')!r}"
-            own = scope.posed(collision.find("pose"), start=of_link)
-            what = collision.find("geometry")
-            if what is not None:
-                yield _Body(scope.name, where, what, pose @ own)
+            where = scope.where.at(f", collision {collision.get('name', '')!r}")
+            of_collision = scope.posed(collision.find("pose"), start=of_link)
+            geometry = collision.find("geometry")
+            if geometry is not None:
+                yield _Body(scope.name, where, geometry, pose @ of_collision)
     for model in scope.models:
         yield from _bodies(model, pose @ scope.of_model(model))
 
 
-def _matrix(pose: Element | None, where: str) -> Array:
+def _matrix(pose: Element | None, where: Where) -> Array:
     """(4, 4) of the numbers in a `<pose>`, with angles about the fixed axes x, y, z."""
     matrix = np.eye(4)
     if pose is None or not (pose.text or "").strip():
@@ -368,27 +393,21 @@ def _matrix(pose: Element | None, where: str) -> Array:
     unknown = [name for name in pose.attrib if name not in POSE and ":" not in name]
     if unknown:
         hint = suggest(unknown[0], POSE)
-        raise ConfigError(
-            f"{where}: unknown attribute {unknown[0]!r} of a <pose>; {hint}"
-        )
+        raise where.error(f": unknown attribute {unknown[0]!r} of a <pose>; {hint}")
     form = pose.get("rotation_format", "euler_rpy")
     degrees = pose.get("degrees", "false")
-    for name, given, known in (
+    for name, value, allowed in (
         ("rotation_format", form, list(NUMBERS)),
         ("degrees", degrees, ["true", "false", "1", "0"]),
     ):
-        if given not in known:
-            hint = suggest(given, known)
-            raise ConfigError(
-                f"{where}: attribute {name}={given!r} of a <pose>; {hint}"
-            )
-    numbers = _floats(pose.text or "", NUMBERS[form], f"{where}: <pose>")
+        if value not in allowed:
+            hint = suggest(value, allowed)
+            raise where.error(f": attribute {name}={value!r} of a <pose>; {hint}")
+    numbers = _floats(pose.text or "", NUMBERS[form], where.at(": <pose>"))
     matrix[:3, 3] = numbers[:3]
     if form == "quat_xyzw":
         if not any(numbers[3:]):
-            raise ConfigError(
-                f"{where}: the quaternion of a <pose> is 0; give a rotation."
-            )
+            raise where.error(": the quaternion of a <pose> is 0; give a rotation.")
         matrix[:3, :3] = Rotation.from_quat(numbers[3:]).as_matrix()
     elif any(numbers[3:]):
         turned = Rotation.from_euler("xyz", numbers[3:], degrees in ("true", "1"))
@@ -396,14 +415,14 @@ def _matrix(pose: Element | None, where: str) -> Array:
     return matrix
 
 
-def _floats(text: str, count: int, where: str) -> tuple[float, ...]:
+def _floats(text: str, count: int, where: Where) -> tuple[float, ...]:
     try:
         numbers = tuple(float(word) for word in text.split())
     except ValueError:
         numbers = ()
     if len(numbers) != count or not all(abs(number) <= FARTHEST for number in numbers):
         words = f"{count} numbers" if count > 1 else "a number"
-        raise ConfigError(f"{where} must be {words}, not {text.strip()!r}.")
+        raise where.error(f" must be {words}, not {text.strip()!r}.")
     return numbers
 
 
@@ -412,13 +431,16 @@ def _text(element: Element, tag: str) -> str:
 
 
 def _found(uri: str, file: Path) -> Path | None:
-    """The file of an included model, beside a file or on the paths of Gazebo; None for none."""
+    """The file of an included model, beside a file or on the paths of Gazebo, if any."""
     kind, _, name = uri.rpartition("://")
-    here = file.resolve().parent
-    near = [here, here / "models", here.parent, here.parent / "models"]
-    given = (one for key in PATHS for one in os.environ.get(key, "").split(os.pathsep))
-    listed = [Path(one) for one in given if one]
-    for folder in () if kind.startswith("http") else (*near, *listed):
+    if kind.startswith("http"):
+        return None
+    folder = file.resolve().parent
+    folders = [folder, folder / "models", folder.parent, folder.parent / "models"]
+    for key in PATHS:
+        listed = os.environ.get(key, "").split(os.pathsep)
+        folders += [Path(entry) for entry in listed if entry]
+    for folder in folders:
         path = folder / name
         if name and path.is_file():
             return path
@@ -431,7 +453,7 @@ def _model_in(folder: Path) -> Path | None:
     """The SDF of the newest version in a model's folder."""
     config = folder / "model.config"
     listed = list(_tree(config).iterfind("sdf")) if config.is_file() else []
-    newest = max(listed, key=lambda one: _version(one.get("version", "")), default=None)
+    newest = max(listed, key=lambda sdf: _version(sdf.get("version", "")), default=None)
     file = folder / ("model.sdf" if newest is None else (newest.text or "").strip())
     return file if file.is_file() else None
 
@@ -445,7 +467,7 @@ def _world(path: Path) -> Element:
     root = root_of(path)
     worlds = root.findall("world")
     if len(worlds) > 1 or not (worlds or root.findall("model")):
-        raise ConfigError(f"{path}: holds {len(worlds)} worlds; give a file with one.")
+        raise SdfError(path, f": holds {len(worlds)} worlds; give a file with one.")
     return worlds[0] if worlds else root
 
 
@@ -453,16 +475,14 @@ def root_of(path: Path) -> Element:
     """Return the root of an SDF file, with tags as they stand there. Raises ConfigError."""
     root = _tree(path)
     if root.tag != "sdf":
-        raise ConfigError(
-            f"{path}: is no SDF but <{root.tag}>; give a .world or .sdf file."
-        )
+        reason = f": is not SDF but <{root.tag}>; give a .world or .sdf file."
+        raise SdfError(path, reason)
     version = root.get("version", "")
     if not OLDEST <= _version(version) <= NEWEST:
-        known = " to ".join(".".join(map(str, one)) for one in (OLDEST, NEWEST))
+        span = " to ".join(".".join(map(str, end)) for end in (OLDEST, NEWEST))
         fix = "convert it by `gz sdf -p`"
-        raise ConfigError(
-            f"{path}: SDF version {version!r} is not read, {known} are; {fix}."
-        )
+        reason = f": SDF version {version!r} is not supported, only {span}; {fix}."
+        raise SdfError(path, reason)
     return root
 
 
@@ -470,18 +490,17 @@ def _tree(path: Path) -> Element:
     """Read XML. Raises ConfigError with line and column, and for entity declarations."""
     try:
         if check_no_device(path).stat().st_size > MOST_BYTES:
-            reason = f"is larger than {MOST_BYTES // 2**20} MB, which no such file is"
-            raise ConfigError(f"{path}: {reason}; give another.")
+            reason = f"is larger than {MOST_BYTES // 2**20} MB"
+            raise SdfError(path, f": {reason}; give a smaller file.")
         data = path.read_bytes()
     except OSError as error:
-        raise ConfigError(f"{path}: can't be read ({error.strerror}).") from None
+        raise SdfError(path, f": can't be read ({error.strerror}).") from None
     parser, builder = expat.ParserCreate(), TreeBuilder()
 
     def refuse(*_: Any) -> None:
-        reason = "declares a document type, whose entities may grow without end"
-        raise ConfigError(
-            f"{path}, line {parser.CurrentLineNumber}: {reason}; remove <!DOCTYPE>."
-        )
+        reason = "declares a document type, whose entities can expand without end"
+        line = parser.CurrentLineNumber
+        raise SdfError(path, f", line {line}: {reason}; remove <!DOCTYPE>.")
 
     parser.StartDoctypeDeclHandler = refuse
     parser.StartElementHandler = builder.start
@@ -492,5 +511,7 @@ def _tree(path: Path) -> Element:
     except (expat.ExpatError, ValueError, LookupError) as error:
         at = f"line {parser.ErrorLineNumber}, column {parser.ErrorColumnNumber + 1}"
         problem = expat.ErrorString(parser.ErrorCode) or str(error)
-        raise ConfigError(f"{path}, {at}: is no XML: {problem}; mend it.") from None
+        raise SdfError(
+            path, f", {at}: is not valid XML: {problem}; correct it."
+        ) from None
     return builder.close()

@@ -74,7 +74,7 @@ class Standing(NamedTuple):
     """Shapes that stand in a field at the height of a plane."""
 
     placed: tuple[Placed, ...]
-    left_out: tuple[str, ...]  # a clause for each model that is no shape of a world
+    left_out: tuple[str, ...]  # a clause for each model that a world can't hold
     missing: bool = False  # the file of one of these models is missing
 
     @property

@@ -209,20 +209,20 @@ def _hold_map(
     y = body[Y]
     radius = body[RADIUS]
     length = math.sqrt(dx * dx + dy * dy)
-    here = map_distance(x, y, grid) - radius
-    if here - SLACK > length or length == 0.0:
+    clearance = map_distance(x, y, grid) - radius
+    if clearance - SLACK > length or length == 0.0:
         return dx, dy
     nx, ny = map_direction(x, y, grid)
     if bend:
-        return _hold(dx, dy, nx, ny, here, True)
-    if here <= SLACK and dx * nx + dy * ny <= 0.0 and nx * nx + ny * ny > 0.0:
+        return _hold(dx, dy, nx, ny, clearance, True)
+    if clearance <= SLACK and dx * nx + dy * ny <= 0.0 and nx * nx + ny * ny > 0.0:
         # In contact with the map, it may only move where the clearance does not decrease.
-        if map_distance(x + dx, y + dy, grid) - radius >= here:
+        if map_distance(x + dx, y + dy, grid) - radius >= clearance:
             return (dx, dy)
         return (0.0, 0.0)
     free = 0.0
     way = 0.0
-    room = here
+    room = clearance
     finest = FINEST * grid.cell / length
     while way < 1.0:
         way = min(way + max(room / length, finest), 1.0)

@@ -101,7 +101,7 @@ class FastSimulator:
 
         Args:
             model: robot, kinematics, lidar and noise.
-            world: the world, or the set of which each episode draws one.
+            world: the world, or a set; each episode draws one of its worlds.
             worlds: N.
             robots: M in each world.
             renderer: `auto`, `baked` or `exact`, see `lidar.scanner.Scanner`.
@@ -179,8 +179,11 @@ class FastSimulator:
         """
         chosen = self._choose_worlds(worlds)
         scenes, draws = self.episodes.draw(seeds)
-        given = starts(scenes) if callable(starts) else starts
-        poses = scenes.starts if given is None else np.asarray(given, dtype=np.float64)
+        if callable(starts):
+            starts = starts(scenes)
+        poses = scenes.starts
+        if starts is not None:
+            poses = np.asarray(starts, dtype=np.float64)
         if len(scenes) != len(chosen) or poses.shape != scenes.starts.shape:
             needed = f"{len(chosen)} worlds with {self.data.pose.shape[1]} robots each."
             raise ConfigError(
@@ -273,19 +276,19 @@ class FastSimulator:
             step_kernels.sort_worlds(self.packed[part.start], part.start, part.stop)
 
     def take_over(
-        self, other: "FastSimulator", robots: Indices, obstacles: Indices
+        self, source: "FastSimulator", robots: Indices, obstacles: Indices
     ) -> None:
         """Continue the episode of another simulator of this model, in its first world.
 
         The poses of the obstacles are not taken over; `put_bodies` puts them.
 
         Args:
-            other: the other simulator.
+            source: the other simulator.
             robots: indices of its robots that become the first robots here.
             obstacles: (K,) index of each obstacle there, whose motion continues; -1 if it is new.
         """
         mine = self.data
-        theirs = other.data
+        theirs = source.data
         poses = mine.pose[0].copy()
         poses[: len(robots)] = theirs.pose[0, robots]
         states = mine.state[0].copy()
@@ -351,16 +354,16 @@ class FastSimulator:
         count = len(self.data.steps)
         if worlds is None:
             return np.arange(count)
-        given = np.asarray(worlds)
-        whole = given.size == 0 or given.dtype.kind in "iu"
-        if given.ndim == 1 and whole:
-            listed = given.tolist()
+        indices = np.asarray(worlds)
+        whole = indices.size == 0 or indices.dtype.kind in "iu"
+        if indices.ndim == 1 and whole:
+            listed = indices.tolist()
             inside = all(0 <= n < count for n in listed)
             if inside and len(set(listed)) == len(listed):
-                return given.astype(np.int64)
+                return indices.astype(np.int64)
         raise ConfigError(
-            f"worlds {np.array2string(given, threshold=10)} must be indices from 0 to {count - 1}, "
-            "each at most once."
+            f"worlds {np.array2string(indices, threshold=10)} must be indices from 0 to "
+            f"{count - 1}, each at most once."
         )
 
     def _place_scenes(

@@ -33,7 +33,7 @@ Region = tuple[Coordinate, Coordinate, Coordinate, Coordinate]
 class Obstacles(Schema):
     """A group of obstacles with common properties."""
 
-    # shapes, of which each obstacle takes any
+    # shapes; each obstacle has one of them, drawn at random
     shapes: tuple[Shape, ...] = Field(min_length=1, max_length=MOST_SHAPES)
     # number of obstacles, or [minimum, maximum] to draw from per episode
     count: int | tuple[int, int] | None = None

@@ -1,4 +1,4 @@
-"""World sets: many worlds under one name, of which every episode draws one."""
+"""World sets: many worlds under one name; every episode draws one of them."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class SetFile(Schema):
 
 @dataclass(frozen=True, eq=False)
 class WorldSet:
-    """Worlds of which every episode draws one by its seed, with equal probability."""
+    """Worlds; the seed of an episode draws one of them, with equal probability."""
 
     name: str
     members: tuple[World, ...]
@@ -93,10 +93,10 @@ def load_worlds(name: str | Path | Sequence[str | Path]) -> AnyWorld:
     """
     if not isinstance(name, str | Path):
         several = isinstance(name, list | tuple)
-        if not several or not all(isinstance(one, str | Path) for one in name):
+        if not several or not all(isinstance(member, str | Path) for member in name):
             needed = "a name, the path of a YAML file or a folder, a World, or a list of names"
             raise ConfigError(f"world={format_value(name)}: must be {needed}.")
-        return _set_of("worlds", _members([str(one) for one in name], Path()))
+        return _set_of("worlds", _members([str(member) for member in name], Path()))
     text = str(name)
     sets = share_folder() / "config" / "world_sets"
     shipped = sets / f"{name}.yaml"
@@ -134,13 +134,13 @@ def _read_set(path: Path, file: SetFile) -> WorldSet:
     try:
         without = {world.source for world in _members(file.without, path.parent)}
         chosen = [
-            one
-            for one in _members(file.worlds, path.parent)
-            if one.source not in without
+            member
+            for member in _members(file.worlds, path.parent)
+            if member.source not in without
         ]
-        given = file.generate
-        if given is not None:
-            chosen += [grow(given, number) for number in range(given.worlds)]
+        generated = file.generate
+        if generated is not None:
+            chosen += [grow(generated, number) for number in range(generated.worlds)]
     except ConfigError as error:
         error.reword(f"{path}: {error}")
         raise
@@ -165,8 +165,10 @@ def _members(names: Sequence[str], base: Path) -> list[World]:
         path = base / name
         if special or (name and path.is_dir()):
             pattern = str(path) if special else f"{path}/*"
-            every = [Path(one) for one in sorted(glob(pattern)) if one.endswith(YAML)]
-            files = [one for one in every if _content(one, MAP_KEYS) is None]
+            every = [
+                Path(file) for file in sorted(glob(pattern)) if file.endswith(YAML)
+            ]
+            files = [file for file in every if _content(file, MAP_KEYS) is None]
             if not files:
                 fix = f"check the path, or make worlds of Gazebo's and of maps by `{IMPORT}`"
                 raise ConfigError(f"{pattern}: no world file (.yaml) there; {fix}.")

@@ -105,7 +105,7 @@ def test_a_mesh_is_refused_or_left_out_and_listed_in_the_file_too(tmp_path):
     name = sdf(tmp_path, DISC, MESH)
     sentence = refused("import", name, cwd=tmp_path)
     assert sentence.startswith(
-        "my.world: model 'm1' has a mesh chair.dae, which is no shape of a"
+        "my.world: model 'm1' has a mesh chair.dae, which a world can't"
     )
     told = done("import", name, "--skip-unknown", cwd=tmp_path)
     assert told.endswith("\n  left out: model 'm1' has a mesh chair.dae\n")

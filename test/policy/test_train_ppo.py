@@ -214,6 +214,22 @@ def test_a_core_is_free_to_learn_from_the_end_of_a_rollout_to_the_next_begin():
     assert seen == [False, False]
 
 
+def test_both_cores_are_free_for_the_last_update():
+    lean, _ = pair()
+    lean.collector.last = lean.collector.env.reset()
+    rollout, _ = lean.collector.collect()
+    lean._total = lean.steps + 1  # no rollout follows
+    free = []
+    learn = lean.learner.learn
+    lean.learner.learn = lambda *batch: (
+        free.append(lean.learner.core_is_free.is_set()) or learn(*batch)
+    )
+    lean.learner.core_is_free.clear()
+    lean._advance(rollout, SimpleNamespace(collisions=[]))
+    assert lean._rollout is None
+    assert free == [True]
+
+
 def test_a_batch_of_fewer_rows_than_the_one_before_has_gradients_of_its_own():
     lean, theirs = pair()
     batch = filled(lean, theirs)

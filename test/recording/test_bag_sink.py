@@ -119,6 +119,39 @@ def test_an_error_of_the_storage_of_any_type_keeps_what_was_recorded(
     assert bags.unfinished_messages(left) == (50 if method == "write" else 60)
 
 
+def test_the_sentence_about_a_full_disk_names_the_bag_once(tmp_path, monkeypatch):
+    from rosbags.rosbag2 import Writer
+
+    working = Writer.write
+    place = tmp_path / "drive"
+    count = [0]
+
+    def fail(self, *message):
+        count[0] += 1
+        if count[0] > 50:
+            raise OSError(28, "No space left on device")
+        return working(self, *message)
+
+    def record_with_errors_of_its_own():
+        with open_bag_sink(place, "mcap", keep=True) as sink:
+            sink.add_topic("/cmd_vel", bags.kinds.TWIST, [Offer(depth=1)])
+            message = bags.STORE.serialize_cdr(
+                bags.twist(1.0, 0.0, 0.0), bags.kinds.TWIST
+            )
+            try:
+                for k in range(60):
+                    sink.write("/cmd_vel", bags.ns(0.1 * k), bytes(message))
+            except OSError:
+                raise RecordingError(f"{place}: is lost.") from None
+
+    monkeypatch.setattr(Writer, "write", fail)
+    with pytest.raises(RecordingError) as refused:
+        record_with_errors_of_its_own()
+    sentence = str(refused.value)
+    assert sentence.startswith(f"{place}: No space left on device; what was written")
+    assert sentence.count(f"{place}: ") == 1
+
+
 @pytest.mark.parametrize("storage", STORAGES)
 @pytest.mark.parametrize(
     "raised", [RuntimeError("of a callback"), KeyboardInterrupt(), SystemExit(1)]

@@ -199,7 +199,7 @@ def test_the_ground_is_nothing_to_run_into(write):
     [
         (
             model(MESH, "table"),
-            "model 'table' has a mesh model://table/table.dae, which is no",
+            "model 'table' has a mesh model://table/table.dae, which a world",
         ),
         (
             model("<heightmap><uri>hill.png</uri></heightmap>"),
@@ -243,7 +243,7 @@ def test_what_is_no_shape_is_named_in_one_sentence_or_left_out_and_listed(
 def test_a_file_of_which_all_would_be_left_out_is_refused_for_that_and_not_for_the_height(
     write,
 ):
-    sentence = r"holds nothing but what is no shape .*'table' has a mesh"
+    sentence = r"contains nothing that a world can hold .*'table' has a mesh"
     with pytest.raises(ConfigError, match=sentence):
         read_sdf(write(model(MESH, "table")), HEIGHT, skip_unknown=True)
     low = write(model(MESH, "table") + model(DISC, "disc"))
@@ -259,7 +259,7 @@ def test_one_sentence_tells_all_of_a_model_and_how_many_more_there_are(write):
     pair = model(MESH, "a").replace("</link>", more)
     sentence = refused(write(pair + model(MESH, "b") + model(MESH, "c")))
     assert (
-        "table.dae, a mesh model://table/leg.stl (as 2 more models), which is"
+        "table.dae, a mesh model://table/leg.stl (as 2 more models), which a"
         in sentence
     )
 
@@ -311,7 +311,7 @@ CYCLE = (
         ),
         (
             model(FAR),
-            "collision 'c': its shape at a height of 0.2 m is none of a world (Input",
+            "collision 'c': its shape at a height of 0.2 m can't stand in a world (Input",
         ),
         ("", "none of its 0 collision geometries"),
         ("</world><world name='v'>", "holds 2 worlds; give a file with one."),
@@ -331,7 +331,7 @@ def test_a_world_of_too_many_bodies_is_refused_by_its_own_name(write):
 
 @pytest.mark.parametrize("version", ["1.3", "2.0", "", "x"])
 def test_another_version_of_sdf_is_refused(write, version):
-    assert f"SDF version {version!r} is not read, 1.4 to 1.12 are" in refused(
+    assert f"SDF version {version!r} is not supported, only 1.4 to 1.12" in refused(
         write("", version)
     )
 
@@ -341,14 +341,14 @@ def test_another_version_of_sdf_is_refused(write, version):
     [
         (
             "<sdf version='1.6'>\n<a></b></sdf>",
-            ", line 2, column 6: is no XML: mismatched tag",
+            ", line 2, column 6: is not valid XML: mismatched tag",
         ),
-        ("", ", line 1, column 1: is no XML: no element found"),
-        ("<robot name='r'/>", ": is no SDF but <robot>"),
+        ("", ", line 1, column 1: is not valid XML: no element found"),
+        ("<robot name='r'/>", ": is not SDF but <robot>"),
         ("<sdf version='1.6'/>", ": holds 0 worlds"),
         (
             "<?xml version='1.0' encoding='klingon'?><sdf/>",
-            "is no XML: unknown encoding",
+            "is not valid XML: unknown encoding",
         ),
         (
             "<!DOCTYPE s [<!ENTITY c 'dd'>]>\n<sdf>&c;</sdf>",

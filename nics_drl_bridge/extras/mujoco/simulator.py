@@ -247,14 +247,14 @@ class MujocoSimulator(DrivenSimulator):
         self._mujoco.mj_forward(self._simulation, self._data)
 
     def take_over(
-        self, other: FastSimulator, robots: Indices, obstacles: Indices
+        self, source: FastSimulator, robots: Indices, obstacles: Indices
     ) -> None:
         """Continues the episode of another simulator; see `FastSimulator.take_over`."""
-        super().take_over(other, robots, obstacles)
-        if isinstance(other, MujocoSimulator):
-            self.wheels[: len(robots)] = other.wheels[robots]
+        super().take_over(source, robots, obstacles)
+        if isinstance(source, MujocoSimulator):
+            self.wheels[: len(robots)] = source.wheels[robots]
             self._resume(
-                [other._rigs[r].motion(other._data, self._rest) for r in robots]
+                [source._rigs[r].motion(source._data, self._rest) for r in robots]
             )
 
     def _resume(self, motions: Sequence[tuple[Array, Array]]) -> None:

@@ -153,7 +153,7 @@ class Worlds:
                 code = self._codes.missing_assets
             else:
                 code = self._codes.unsupported_assets
-            fault = f"{name}: {standing.left_out[0]}, which is no shape of a world"
+            fault = f"{name}: {standing.left_out[0]}, which a world can't hold"
             raise RefusalError(
                 code, f"{fault}; put a box in its place, or ignore such assets."
             )

@@ -408,7 +408,7 @@ def test_poses_may_be_given_in_the_frame_of_an_entity(client):
             "SpawnEntity",
             spawned(resource_string=sdf("<model name='m'>")),
             106,
-            "is no XML",
+            "is not valid XML",
         ),
         (
             "SpawnEntity",
