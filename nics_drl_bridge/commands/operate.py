@@ -63,12 +63,14 @@ def stop(
         from nics_drl_bridge.nodes.operator import Operator
     stopped = {}
     with Operator() as operator:
-        for answer in operator.stop(namespace, wait):
-            stopped[answer.gate] = answer.granted
-            if not answer.granted:
-                _tell(f"nics: {answer.gate} was NOT stopped: {answer.told}")
-            elif not as_json:
-                typer.echo(_describe_stop(answer.gate))
+        # Nothing is printed before all gates were called: a halted terminal would hold that up.
+        answers = list(operator.stop(namespace, wait))
+    for answer in answers:
+        stopped[answer.gate] = answer.granted
+        if not answer.granted:
+            _tell(f"nics: {answer.gate} was NOT stopped: {answer.told}")
+        elif not as_json:
+            typer.echo(_describe_stop(answer.gate))
     if as_json:
         console.print_line(as_json, "", stopped=stopped)
     if not all(stopped.values()):

@@ -697,6 +697,10 @@ def _find_heading_by_inputs(spaced: Array, drive: Drive) -> HeadingKeys:
     )
     if mirrored < max(recordings.MIN_MIRRORED, recordings.BETTER + as_recorded):
         return HeadingKeys.NONE
+    if (
+        drive.spec.moves_sideways
+    ):  # its course says nothing of where its heading is zero
+        return HeadingKeys.MIRRORED
     return recordings.choose_clockwise_keys(spaced)
 
 

@@ -74,7 +74,7 @@ def log_file(node: str, words: Sequence[str]) -> str:
     return os.path.abspath(os.path.join(os.path.expanduser(folder), name))
 
 
-def forward_output(log: str) -> None:
+def forward_output(log: str = "") -> None:
     """Let a separate process write the output of this one, and to the file `log` if it is named.
 
     Call this before any thread exists.
@@ -126,14 +126,23 @@ def forwarded_errors() -> Iterator[None]:
         yield
         return
     python_errors = sys.stderr
-    direct = os.dup(STDERR)
     exit_, entrance = os.pipe()
+    forwarder = None
     try:
         forwarder = _start_forwarder("", {STDERR: (exit_, entrance)})
+    except OSError as error:
+        sys.stderr.write(
+            f"output is written directly, and may block ({error.strerror})\n"
+        )
+    else:
+        direct = os.dup(STDERR)
         _lead_into(entrance, STDERR)
     finally:
         os.close(exit_)
         os.close(entrance)
+    if forwarder is None:
+        yield
+        return
     if _writes_to_stderr(python_errors):
         python_errors.flush()
         sys.stderr = _dropping_text(STDERR)

@@ -141,7 +141,8 @@ class Setup:
         value = None
         for key in ("/**", f"/**/{node}", node, f"/{node}"):
             section = self._file.get(key) or {}
-            value = section.get("ros__parameters", {}).get(name, value)
+            parameters = section.get("ros__parameters") or {}
+            value = parameters.get(name, value)
         return value
 
     def limits(self) -> str:

@@ -34,7 +34,7 @@ from nics_drl_bridge.policy.policy_file import PolicyFile
 
 NODE = "policy"
 CONFIG_VERSION = "1.3"  # version of the format
-PIPELINE = "pipeline:"  # in the YAML file of every bundle
+SIGN = "system information:"  # in the YAML file of every bundle
 OURS = "leapp/"  # prefix of the nodes and weights that an export adds
 TAKEN = "nics_drl_bridge_observation"  # metadata key: the input that an export replaces
 VELOCITIES = ("x", "y", "z")
@@ -67,7 +67,7 @@ def export_bundle(policy: PolicyFile, folder: str | Path) -> Path:
     network = f"{NODE}.onnx"
     start_values = f"{place.resolve().name}_initial_values.safetensors"
     names = {marker, network, start_values}
-    with write_whole_folder(place, marker, names.__contains__, PIPELINE) as temporary:
+    with write_whole_folder(place, marker, names.__contains__, SIGN) as temporary:
         write_bytes(temporary / network, made)
         state = policy.contract.state
         if state is not None:

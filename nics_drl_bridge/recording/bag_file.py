@@ -295,7 +295,11 @@ class BagFile:
     def get_definition(self, topic: str) -> str:
         """Returns the ROS 2 definition of a topic's type, with all types that it contains."""
         if self.can_decode(topic):
-            return str(self._store.generate_msgdef(self.types[topic], ros_version=2)[0])
+            with _refuse_damage(Path(self.place), self._is_ros_1):
+                definition, _ = self._store.generate_msgdef(
+                    self.types[topic], ros_version=2
+                )
+            return str(definition)
         return str(self._connections[topic][0].msgdef.data)
 
     def read_messages(self, topic: str) -> list[Message]:

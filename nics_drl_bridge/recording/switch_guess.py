@@ -51,7 +51,7 @@ def guess_switches(tables: Sequence[TableSurvey]) -> tuple[Switch, ...]:
             switches.append(Switch(table, column.name, on))
             if len(values) == table.rows:
                 is_on &= _equals(values, on)
-        if not is_on.any():
+        if table.rows and not is_on.any():
             return ()
     return tuple(switches)
 
@@ -80,5 +80,5 @@ def _find_on_value(words: set[str], values: Column) -> str | None:
         return "0"
     is_powered = words & POWER and words & POWERED and numbers[1] == 1.0
     if words & ENABLING or {"dead", "man"} <= words or is_powered:
-        return f"{numbers[1]:g}"
+        return np.format_float_positional(numbers[1], trim="-")
     return None

@@ -193,7 +193,13 @@ def collect_facts_of_bag(
         for role, topic in facts.names.items():
             if bag.types.get(topic) in KINDS[role]:
                 for message in bag.read_messages(topic):
-                    facts.take(role, message.receive_ns, message.content)
+                    try:
+                        facts.take(role, message.receive_ns, message.content)
+                    except AttributeError as error:  # the bag has its own definition
+                        fault = f"topic {topic!r} is not a standard {bag.types[topic]}"
+                        raise RecordingError(
+                            f"{path}: {fault}: it lacks the field {error.name!r}."
+                        ) from None
     return facts
 
 

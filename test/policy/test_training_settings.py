@@ -5,6 +5,7 @@ import pytest
 from nics_drl_bridge.config import share_folder, validate
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.gate.limits import Stopping
 from nics_drl_bridge.policy.training_settings import (
     TrainingSettings,
     chosen_settings,
@@ -30,6 +31,13 @@ def test_shipped_settings_name_worlds_and_a_task_that_there_are(name):
         )
         assert env.single_observation_space.shape == (PARTS.get(settings.robot, 78),)
     assert settings.ppo.rollout * settings.num_envs >= settings.ppo.batch
+
+
+@pytest.mark.parametrize("name", [n for n in SHIPPED if n.startswith("own_")])
+def test_own_robots_learn_to_keep_the_clearance_of_the_shield(name):
+    assert (
+        load_training(name).teaching.margin == Stopping.model_fields["margin"].default
+    )
 
 
 def test_settings_are_those_of_task_and_robot_and_a_user_changes_them():

@@ -795,6 +795,18 @@ def test_switches_that_are_never_on_together_are_none(tmp_path):
     assert draft["command"]["throttle"] == "throttle"
 
 
+def test_a_switch_of_a_large_value_keeps_all_its_digits(tmp_path):
+    _, draft = drafted(write(tmp_path / "log.csv", switched("enabled", 1234567, 0)))
+    assert draft["command"]["throttle"]["when"] == {"enabled": 1234567}
+
+
+def test_a_table_without_rows_hides_no_switch_of_another(tmp_path):
+    write(tmp_path / "log.csv", switched("enabled", 1, 0))
+    (tmp_path / "empty.csv").write_text("t,volume\n")
+    _, draft = drafted(tmp_path)
+    assert draft["command"]["throttle"]["when"]
+
+
 def test_a_command_that_the_motion_does_not_follow_is_said_on_top(tmp_path):
     columns = {key: M[key] for key in ("t", "x", "y", "yaw")}
     noise = np.repeat(np.random.default_rng(8).normal(size=COUNT // 20), 20)

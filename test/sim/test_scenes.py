@@ -310,7 +310,7 @@ def test_starts_are_spread_evenly_over_the_free_space():
     ("changes", "sentence"),
     [
         ({"size": [0.5, 0.5]}, "key 'clearance': no free space"),
-        ({"goal_distance": [50.0, 60.0]}, "key 'goal_distance': nowhere"),
+        ({"goal_distance": [50.0, 60.0]}, "key 'goal_distance': a robot of radius"),
         ({"starts": {"at": [[0.0, 0.0, 0.0], [9.0, 0.0, 0.0]]}}, "key 'starts.at.1'"),
         ({"goals": {"regions": [[2.95, 2.95, 3.0, 3.0]]}}, "key 'goals.regions.0'"),
     ],

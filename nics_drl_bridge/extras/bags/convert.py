@@ -79,7 +79,8 @@ def _convert_fixed(
         for m in _make_messages(bag, f"/{ODOM}", topic_roles.ODOMETRY)
     ]
     scan = scans[0].content.header
-    header = type(scan)(scan.stamp, (*bases, FRAMES[1])[0])
+    base = (*bases, FRAMES[1])[0]
+    header = store.types["std_msgs/msg/Header"](scan.stamp, base)
     yield (
         FIXED,
         bag.span_ns[0],
