@@ -4,7 +4,8 @@ The robot is a skid-steer in DART (`measuring/dart_skid_steer.py`): a real proce
 topics, with wheel odometry that believes in turns that slip, and a gyro. It is recorded in an open
 place, a simulator is generated, a policy is trained, and then gate, estimator and policy drive it
 to goals among pillars. Each goal is given relative to the robot, and judged by the true pose, which
-no node hears. Afterwards its body is held while its wheels go on, and the gate has to stop it.
+no node hears. Afterwards its body is held again and again while its wheels go on, each time at
+another moment of a drive, and the gate has to stop it.
 """
 
 from __future__ import annotations
@@ -53,6 +54,8 @@ GOAL_CLEARANCE = 0.9  # of a goal from pillars and walls [m]
 GOAL_PATIENCE_S = 60.0
 ANSWER_S = 3.0  # within which the policy takes up a goal
 REST_S = 1.0  # at rest for so long, the robot has ended a drive
+HELD_PATIENCE_S = 10.0  # within which a held body is stopped, or never
+DRIVES_BEFORE_HOLD_S = (0.2, 5.0)  # between the first moving command and a hold
 ARMED_S = 300.0  # between two armings
 HERE = Path(__file__).resolve().parent
 
@@ -129,6 +132,9 @@ def arguments() -> argparse.Namespace:
     )
     parser.add_argument(
         "--minutes", type=float, default=0.0, help="drive on, re-arming every 5"
+    )
+    parser.add_argument(
+        "--holds", type=int, default=20, help="how often its body is held"
     )
     parser.add_argument(
         "--folder", type=Path, help="keep all files there, and use what is there"
@@ -367,6 +373,10 @@ class Operator(Node):
             return math.nan
         return float(np.linalg.norm(self.pose[:2] - goal))
 
+    def is_driving(self) -> bool:
+        """Returns whether the newest command moves the robot."""
+        return bool(self.commanded) and self.commanded[-1][1]
+
     def is_at_rest(self, since_s: float) -> bool:
         """Returns whether the robot moved after a moment and has been at rest for a while since."""
         moved = [at for at, moves in self.commanded if moves and at > since_s]
@@ -429,25 +439,39 @@ def drive_to_goals(operator: Operator, goals: int, minutes: float) -> Drives:
     return drives
 
 
-def time_to_stop_when_held(operator: Operator) -> float:
-    """Holds the body while the robot drives; returns the time to the last moving command [s]."""
-    refusal = operator.arm(60.0)
-    if refusal:
-        return math.nan
-    operator.send_goal(operator.draw_goal())
-    began_s = time.monotonic()
-    drives = operator.wait_until(
-        lambda: sum(moves for at, moves in operator.commanded if at > began_s) > 40,
-        20.0,
-    )
-    if not drives:
-        return math.nan
+def stop_held_body(operator: Operator, drives_for_s: float) -> float:
+    """Holds the body after it has driven for so long; returns the time to the last moving command.
+
+    It is NaN [s] if the robot cannot be armed or does not drive, and inf if it is never stopped.
+    """
+    while True:
+        if operator.arm(60.0):
+            return math.nan
+        operator.commanded.clear()
+        operator.send_goal(operator.draw_goal())
+        if not operator.wait_until(operator.is_driving, 20.0):
+            return math.nan
+        operator.wait_until(lambda: False, drives_for_s)
+        if operator.is_driving():
+            break
     operator.hold(True)
     held_s = time.monotonic()
-    operator.wait_until(lambda: operator.is_at_rest(held_s - 1.0), 10.0)
+    stops = operator.wait_until(lambda: operator.is_at_rest(0.0), HELD_PATIENCE_S)
     moved = [at for at, moves in operator.commanded if moves]
     operator.hold(False)
-    return moved[-1] - held_s
+    return moved[-1] - held_s if stops else math.inf
+
+
+def hold_again_and_again(operator: Operator, holds: int, seed: int) -> list[float]:
+    """Returns after how long each of so many held bodies was stopped [s]."""
+    rng = np.random.default_rng(seed)
+    delays = []
+    for _ in range(holds):
+        delays.append(stop_held_body(operator, rng.uniform(*DRIVES_BEFORE_HOLD_S)))
+        print(f"hold {len(delays)}: stopped after {delays[-1]:.2f} s", file=sys.stderr)
+        if math.isnan(delays[-1]):
+            break
+    return delays
 
 
 def run_bridge(
@@ -492,7 +516,7 @@ def measure(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
         if not operator.wait_until(operator.is_policy_there, 120.0):
             raise SystemExit("the policy does not listen; see nodes/policy_node.log.")
         drives = drive_to_goals(operator, options.goals, options.minutes)
-        held_s = time_to_stop_when_held(operator)
+        held_s = hold_again_and_again(operator, options.holds, options.seed)
     operator.destroy_node()
     rclpy.try_shutdown()
     return {
@@ -517,15 +541,18 @@ def missed_of(result: dict[str, Any]) -> list[str]:
         missed.append("the robot touched something")
     if result["refusals"]:
         missed.append(f"the gate could not be armed: {result['refusals'][-1]}")
-    if not result["held_stopped_after_s"] <= HELD_BAR_S:
-        told = f"a held body was stopped after {result['held_stopped_after_s']:.2f} s"
-        missed.append(f"{told}, bar {HELD_BAR_S:g} s")
+    delays = result["held_stopped_after_s"]
+    late = [delay for delay in delays if not delay <= HELD_BAR_S]
+    if late:
+        told = f"{len(late)} of {len(delays)} held bodies were stopped late"
+        missed.append(f"{told}, after {max(late):.2f} s, bar {HELD_BAR_S:g} s")
     return missed
 
 
 def table_of(result: dict[str, Any]) -> str:
     """Returns the figures for people."""
     ended = [away for away in result["away_m"] if math.isfinite(away)]
+    delays = result["held_stopped_after_s"]
     rows = [
         *result["report"],
         f"goals              {len(result['away_m'])}",
@@ -535,7 +562,10 @@ def table_of(result: dict[str, Any]) -> str:
         else "no drive has ended",
         f"touched            {result['touched']}",
         f"armed              {result['armings']} times, refused: {result['refusals']}",
-        f"held body stopped  after {result['held_stopped_after_s']:.2f} s",
+        f"held bodies        {len(delays)}, stopped after {np.median(delays):.2f} s in the median, "
+        f"{np.max(delays):.2f} s at most"
+        if delays
+        else "no body was held",
     ]
     return "\n".join(rows) + "\n"
 

@@ -6,8 +6,9 @@ steps:
 
 1. Compare the newest scan with earlier ones: a beam that ends where an earlier one saw free space
    ends on a mover, which may approach. All other obstacles are static. The motion in between is
-   that of odometry, but with the turn that fits both scans best: the wheels of a skid-steer slip
-   when it turns, so with uncorrected odometry, standing things would seem to move.
+   that of odometry, corrected if another one clearly fits both scans better: wheels slip when a
+   skid-steer turns, and spin when its body is held. With uncorrected odometry, standing things
+   would seem to move then.
 2. Place an obstacle at the end of each beam that returns.
 3. Place one at the minimum range of each beam that was too close to measure.
 4. Place a wall on the footprint wherever too many beams are unknown.
@@ -43,18 +44,21 @@ SPACING_S = 0.09  # minimum time between two such scans that are kept [s]
 # plus this many standard deviations of its range.
 TOLERANCE = 0.03
 DEVIATIONS = 3.0
-# The turn between two scans: odometry is believed in smaller turns, because an error of them is
-# within the angle over which the beams of an old scan are compared.
+# The motion between two scans: odometry is believed in smaller turns and shorter paths, because
+# their errors are within the angle and the distance over which beams are compared.
 MIN_SLIP_TURN = evidence_kernels.COMPARED_ANGLE
+MIN_SLIP_PATH = TOLERANCE
 MAX_TURN_FRACTION = 1.3  # of the turns that are tried, over odometry's
 TURN_SPACING = 0.03  # between two turns that are tried, at most [rad]
 MIN_TURNS = 14  # minimum number of turns that are tried
+PATH_SPACING = 0.05  # between two lesser motions that are tried, at most [m]
+MIN_LESSER = 4  # minimum number of lesser motions that are tried
 COMPARED_BEAMS = 200  # number of beams that suffice for that
-# Another turn than odometry's must let this fraction of all compared beams agree, and this fraction
-# more than odometry does.
+# Another motion than odometry's must let this fraction of all compared beams agree, and this
+# fraction more than odometry does.
 MIN_AGREEING = 0.3
 MIN_GAIN = 0.05
-# The beams that agree by that turn alone must show in so many sectors of an eighth of a circle,
+# The beams that agree by that motion alone must show in so many sectors of an eighth of a circle,
 # each with so many beams: a person who walks around the robot must not pass for a turn.
 SECTORS = 8
 MIN_SECTORS = 4
@@ -125,14 +129,15 @@ def _has_entered_neighbour(entered: Flags, lidar: MountedBeams) -> Flags:
 def estimate_motion(
     old: View, new: View, lidar: MountedBeams, tolerance: Tolerance
 ) -> Array:
-    """Returns the robot's motion (3,) between two views, by odometry with the turn of the scans.
+    """Returns the robot's motion (3,) between two views, by odometry and the scans.
 
-    Of turns between none and `MAX_TURN_FRACTION` of odometry's, it is the one by which most beams
-    of the new scan end where the old scan ended. Odometry's own turn is taken unless another one
-    lets clearly more beams agree, and in several directions.
+    Of the motions that wheels may show by mistake, it is the one by which most beams of the new
+    scan end where the old scan ended. Odometry's own is taken unless another one lets clearly more
+    beams agree, and in several directions.
     """
     by_odometry = between(old.pose, new.pose)
-    if abs(by_odometry[2]) <= MIN_SLIP_TURN:
+    path = math.hypot(by_odometry[0], by_odometry[1])
+    if path <= MIN_SLIP_PATH and abs(by_odometry[2]) <= MIN_SLIP_TURN:
         return by_odometry
     stride = math.ceil(len(new.ranges) / COMPARED_BEAMS)
     returns = np.isfinite(new.ranges[::stride])
@@ -151,8 +156,8 @@ def estimate_motion(
         MIN_AGREEING * compared,
     )
     if np.count_nonzero(returns) < needed:
-        return by_odometry  # no turn can be better
-    motions = _vary_turn(by_odometry)
+        return by_odometry  # no motion can be better
+    motions = np.concatenate([_vary_turn(by_odometry), _lessen_motion(by_odometry)])
     agreeing = np.stack([find_agreeing(motion) for motion in motions])
     counts = np.count_nonzero(agreeing, axis=1)
     best = int(np.argmax(counts))
@@ -172,6 +177,15 @@ def _vary_turn(motion: Array) -> Array:
     arcs = np.tile(log(motion), (count, 1))
     arcs[:, 2] *= fractions
     return exp(arcs)
+
+
+def _lessen_motion(motion: Array) -> Array:
+    """Returns motions (n, 3) that are fractions of one, from none on: of wheels that spin."""
+    arc = log(motion)
+    path = math.hypot(arc[0], arc[1])
+    count = max(MIN_LESSER, math.ceil(path / PATH_SPACING))
+    fractions = np.arange(count) / count
+    return exp(fractions[:, None] * arc)
 
 
 def _count_sectors(beams: NDArray[np.intp], lidar: MountedBeams) -> int:

@@ -437,6 +437,38 @@ def test_somebody_who_crosses_moves_where_wheels_slip_in_a_turn(factor):
     assert find_movers(GIVEN, SHIELD, views)[facing(views, leading_edge)].any()
 
 
+STANDING = [(1.5, 0.4, 0.2), (1.0, -0.9, 0.15), (-0.8, 0.3, 0.25), (-1.4, -0.8, 0.2)]
+
+
+def hold_body(twist, discs_at, held_s):
+    """Views of a body that is held from a time on, while its wheels go on."""
+    views = []
+    for t in (0.0, 0.1, 0.2, 0.3):
+        by_odometry = geometry.exp(t * np.array(twist))
+        true_pose = geometry.exp(min(t, held_s) * np.array(twist))
+        ranges = seen(true_pose, discs_at(t))
+        views.append(View(round(t * NS_PER_S), by_odometry, ranges))
+    return tuple(views)
+
+
+@pytest.mark.parametrize("held_s", [0.0, 0.1, 0.2])
+@pytest.mark.parametrize(
+    "twist", [(0.8, 0.0, 0.0), (-0.4, 0.0, 0.5), (0.8, 0.0, -0.8), (0.3, 0.5, 0.0)]
+)
+def test_what_stands_does_not_move_while_the_wheels_of_a_held_body_spin(twist, held_s):
+    views = hold_body(twist, lambda _: STANDING, held_s)
+    assert not find_movers(GIVEN, SHIELD, views).any()
+
+
+@pytest.mark.parametrize("twist", [(0.8, 0.0, 0.0), (0.8, 0.0, -0.8)])
+def test_somebody_who_comes_on_moves_while_the_wheels_of_a_held_body_spin(twist):
+    def discs_at(t):
+        return [(1.8 - 1.2 * t, 0.0, 0.2), *STANDING]
+
+    views = hold_body(twist, discs_at, 0.0)
+    assert find_movers(GIVEN, SHIELD, views)[facing(views, 0.0)].all()
+
+
 def test_somebody_who_walks_around_a_turning_robot_in_the_open_does_not_pass_for_a_turn():
     beyond_the_wall = 2.0 * LIDAR.range_max
     twist = np.array([0.0, 0.0, 1.2])
