@@ -16,6 +16,8 @@ WORKERS := $(shell echo $$(($$(nproc 2>/dev/null || getconf _NPROCESSORS_ONLN) *
 DURATIONS := --durations 50 --durations-min 1 --junitxml runs/tests.xml
 # Tests that `make test` leaves out, each with a target of its own; test/conftest.py says which they are.
 OTHER_RINGS := docs or package or campaign
+# Message packages that `nox -s messages` builds; some benchmarks need them.
+MESSAGES := .nox/message_packages/setup.bash
 BENCHMARKS ?=
 QUICK ?=
 OUT ?=
@@ -60,7 +62,7 @@ DESCRIBED_BY := setup.py setup.cfg package.xml pyproject.toml constraints.txt Ma
 
 OTHER_PYTHON := name another interpreter, as in: make setup PYTHON=python3.12
 
-.PHONY: help setup demo test test-quick test-docs test-package test-campaign test-all test-jazzy test-ray test-messages test-upstream test-clients test-ament ros-status lint format types pytest benchmark tables docs reference notebooks pictures clean distclean
+.PHONY: help setup demo test test-quick test-docs test-package test-campaign test-all ros-status lint format types pytest benchmark tables docs reference notebooks pictures clean distclean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 15
@@ -137,9 +139,9 @@ test-package: setup ## wheel and source archive, installations in fresh environm
 test-campaign: setup ## long proofs of promises, in hours: faults, abuse, soak, fleets, BARN
 	$(BIN)/python -m pytest $(PARALLEL) -m campaign $(PYTEST_ARGS)
 
-test-all: test ## before a release: all rings, other distributions, clients and Ray
-	$(MAKE) test-docs test-package test-campaign \
-		test-jazzy test-messages test-clients test-ament test-ray $(if $(UPSTREAM_LIES_THERE),test-upstream)
+test-all: test ## before a release: all rings, and the environments of noxfile.py
+	$(MAKE) test-docs test-package test-campaign
+	$(BIN)/nox
 
 ros-status:
 ifeq ($(ROS),system)
@@ -172,124 +174,9 @@ pytest: setup
 		$(BIN)/python -m pytest --last-failed --last-failed-no-failures none --maxfail 5 -m "not ($(OTHER_RINGS))" $(PYTEST_ARGS); \
 	else exit $$status; fi
 
-# Separate environments for what conflicts with .venv; shared packages have the same pins.
-# $(1): folder. $(2): command that prints its constraints. $(3): what it holds.
-define BUILD_APART
-@echo "Building $(1) with Python $(VERSION); the first time takes a minute or more."
-@test -x $(1)/bin/python || $(CLEAN_ENV) $(BASE) -m venv $(1)
-@$(2) > $(1)/constraints.txt
-@export PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_CONSTRAINT=$(1)/constraints.txt; \
-	$(CLEAN_ENV) $(1)/bin/python -m pip install -qq setuptools; \
-	$(CLEAN_ENV) $(1)/bin/python -m pip install -qq --no-build-isolation --editable $(3)
-@touch $@
-endef
-
-# The wheels of another distribution have the same names as ours.
-JAZZY := .venv-jazzy
-JAZZY_WHEELS := ros-jazzy-rclpy ros-jazzy-common-interfaces ros-jazzy-rmw-fastrtps-cpp
-JAZZY_EXTRAS := bags,deploy,mujoco,multi,test
-
-test-jazzy: $(JAZZY)/.ready ## the node tests on the wheels of ROS 2 Jazzy, in .venv-jazzy
-	$(CLEAN_ENV) $(JAZZY)/bin/python -m pytest test/nodes $(PYTEST_ARGS)
-
-$(JAZZY)/.ready: $(DESCRIBED_BY)
-	@if [ "$(ROS)" != wheels ]; then \
-		echo "make test-jazzy: needs Linux on x86-64 and a shell without a sourced ROS 2." >&2; \
-		exit 1; fi
-	$(call BUILD_APART,$(JAZZY),grep -v '^ros-' constraints.txt,'.[$(JAZZY_EXTRAS)]' onnx \
-		$(JAZZY_WHEELS))
-
-# RLlib pins its own version of Gymnasium.
-RAY := .venv-ray
-RAY_EXTRAS := deploy,distributed,test,train
-RAY_TESTS := test/extras/ray/test_engine.py test/policy/test_train_vec_env.py
-
-test-ray: $(RAY)/.ready ## training on a Ray cluster of two nodes on this machine, in .venv-ray
-	$(CLEAN_ENV) $(RAY)/bin/python -m pytest $(RAY_TESTS) $(PYTEST_ARGS)
-
-$(RAY)/.ready: $(DESCRIBED_BY) constraints-ray.txt
-	$(call BUILD_APART,$(RAY),(grep -v '^gymnasium==' constraints.txt; cat constraints-ray.txt),\
-		'.[$(RAY_EXTRAS)]')
-
-# Archives of repositories without wheels; tests that need them are skipped without them.
-UPSTREAM ?= ../shared/upstream
-UPSTREAM_LIES_THERE := $(wildcard $(UPSTREAM)/launch_ros.tar.gz)
-
-# Message packages without wheels are built from their sources.
-MESSAGES := .venv-messages
-MESSAGE_TESTS := test/nodes/test_device_node.py test/nodes/simulation_interfaces test/nodes/test_map_to_odom.py \
-	test/nodes/test_follow_path.py test/benchmarks/test_nav2_standards.py test/benchmarks/test_standards.py
-
-test-messages: setup $(MESSAGES)/.ready ## the tests that need tf2_msgs, ackermann_msgs, simulation_interfaces, nav2_msgs, built here
-	source $(MESSAGES)/setup.bash && $(CLEAN_ENV) PYTHONPATH="$$PYTHONPATH" \
-		LD_LIBRARY_PATH="$$LD_LIBRARY_PATH" \
-		$(BIN)/python -m pytest $(MESSAGE_TESTS) $(PYTEST_ARGS)
-
-$(MESSAGES)/.ready: test/build_messages.sh nics_drl_bridge/commands/message_build.py constraints.txt \
-		$(wildcard config/messages/*/msg/*.msg $(UPSTREAM)/*_interfaces.tar.gz) | $(READY)
-	@if [ "$(ROS)" != wheels ]; then \
-		echo "make test-messages: needs Linux on x86-64 and a shell without a sourced ROS 2." >&2; \
-		exit 1; fi
-	@echo "Building $(MESSAGES); the first time takes some minutes."
-	@$(CLEAN_ENV) test/build_messages.sh $(BIN)/nics $(MESSAGES) $(UPSTREAM)
-	@touch $@
-
-# The real tools on top of the wheels, and this package as colcon installs it.
-TOOLS := .venv-upstream
-TOOLS_EXTRAS := bags,deploy,mujoco,multi,ros,test
-UPSTREAM_TESTS := test/upstream test/nodes/test_launching.py
-
-test-upstream: $(MESSAGES)/.ready $(TOOLS)/.ready ## this package under the real `ros2 run`, `ros2 launch` and more, in .venv-upstream
-	@$(CLEAN_ENV) test/install_upstream_tools.sh $(TOOLS) $(UPSTREAM) $(MESSAGES)
-	set +u; source $(TOOLS)/setup.bash; python -m pytest $(UPSTREAM_TESTS) $(PYTEST_ARGS)  # colcon reads unset variables
-
-$(TOOLS)/.ready: $(DESCRIBED_BY) test/install_upstream_tools.sh
-	@if [ "$(ROS)" != wheels ] || [ -z "$(UPSTREAM_LIES_THERE)" ]; then \
-		echo "make test-upstream: needs Linux on x86-64, a shell without a sourced ROS 2 and the sources" \
-			"of launch, launch_ros and ros2cli in $(UPSTREAM) (or UPSTREAM=folder)." >&2; exit 1; fi
-	$(call BUILD_APART,$(TOOLS),cat constraints.txt,'.[$(TOOLS_EXTRAS)]' osrf-pycommon psutil)
-	@$(TOOLS)/bin/python -m pip uninstall -qq -y nics_drl_bridge  # colcon installs it
-
-# Clients that speak DDS without ROS 2, separate from the wheels, whose libraries they must not load.
-CLIENTS := .venv-clients
-CLIENT_LIBRARIES := cyclonedds==11.0.1 rosless==0.5.0 roswell==0.1.0
-
-test-clients: setup $(CLIENTS)/.ready ## third-party clients read a simulator and drive it
-	$(CLEAN_ENV) OTHER_CLIENTS_PYTHON=$(CLIENTS)/bin/python \
-		$(BIN)/python -m pytest test/nodes/test_other_clients.py $(PYTEST_ARGS)
-
-$(CLIENTS)/.ready: Makefile
-	@echo "Building $(CLIENTS) with Python $(VERSION)."
-	@test -x $(CLIENTS)/bin/python || $(CLEAN_ENV) $(BASE) -m venv $(CLIENTS)
-	@$(CLEAN_ENV) PIP_DISABLE_PIP_VERSION_CHECK=1 \
-		$(CLIENTS)/bin/python -m pip install -qq $(CLIENT_LIBRARIES)
-	@touch $@
-
-# The ament linters, with the plugins that they expect. `ament_xmllint` skips package.xml, because it
-# would fetch the schema from the network; `make test` checks package.xml against what colcon reads.
-AMENT := .venv-ament
-AMENT_LIBRARIES := flake8 flake8-blind-except flake8-builtins flake8-class-newline flake8-comprehensions \
-	flake8-deprecated flake8-docstrings flake8-import-order flake8-quotes
-
-test-ament: $(AMENT)/.ready ## ament_flake8, with the rules of setup.cfg, and ament_xmllint
-	$(CLEAN_ENV) $(AMENT)/bin/ament_flake8 --config setup.cfg
-	@if command -v xmllint > /dev/null; then \
-		$(CLEAN_ENV) $(AMENT)/bin/ament_xmllint launch config nics_drl_bridge; else \
-		echo "make test-ament: ament_xmllint is left out, as there is no xmllint (Debian, Ubuntu:" \
-			"apt install libxml2-utils)."; fi
-
-$(AMENT)/.ready: Makefile
-	@echo "Building $(AMENT) with Python $(VERSION)."
-	@test -x $(AMENT)/bin/python || $(CLEAN_ENV) $(BASE) -m venv $(AMENT)
-	@export PIP_DISABLE_PIP_VERSION_CHECK=1; \
-		$(CLEAN_ENV) $(AMENT)/bin/python -m pip install -qq --no-deps \
-			ros-ament-flake8 ros-ament-lint ament-xmllint; \
-		$(CLEAN_ENV) $(AMENT)/bin/python -m pip install -qq $(AMENT_LIBRARIES)
-	@touch $@
-
 # Runs to the end even if a benchmark fails; each result names machine, commit and load.
 benchmark: setup ## run every benchmark, write benchmarks/results.json: make benchmark [BENCHMARKS="parity files"] [QUICK=1] [OUT=file]
-	@if [ -e $(MESSAGES)/setup.bash ]; then source $(MESSAGES)/setup.bash; fi; \
+	@if [ -e $(MESSAGES) ]; then source $(MESSAGES); fi; \
 		cd benchmarks && ../$(BIN)/python -m measuring.run_all \
 		$(if $(BENCHMARKS),--only $(BENCHMARKS)) $(if $(QUICK),--quick) $(if $(OUT),--out "$(abspath $(OUT))")
 
@@ -313,5 +200,5 @@ clean: ## remove the products of building and testing
 	rm -rf build dist install log *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -not -path './.venv*' -prune -exec rm -rf {} +
 
-distclean: clean ## also remove all environments (.venv and those of test-...) and runs/
-	rm -rf $(VENV) $(JAZZY) $(RAY) $(MESSAGES) $(TOOLS) $(CLIENTS) $(AMENT) runs
+distclean: clean ## also remove all environments (.venv and .nox) and runs/
+	rm -rf $(VENV) .nox runs

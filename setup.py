@@ -49,7 +49,7 @@ EXTRAS = {
         "tensorboard>=2.16",
         "torch>=2.6,<2.14",
     ],
-    # RLlib holds Gymnasium at a version of its own: for an environment apart, as `make test-ray`
+    # RLlib holds Gymnasium at a version of its own: for an environment apart, as `nox -s ray`
     # builds one, and no part of `dev`.
     "distributed": ["ray[rllib]>=2.60,<2.61"],
     "deploy": ["onnx>=1.16", "onnxruntime>=1.18"],
@@ -76,6 +76,7 @@ EXTRAS = {
         "flake8",
         "hypothesis",
         "mypy",
+        "nox",
         "pre-commit",
         "pyarrow",
         "pytest",

@@ -7,7 +7,7 @@ planned on that map are sent to `follow_path`, in lock-step over DDS, by a stand
 behaviour tree; one is followed if the action succeeds, at the goal, without a touch. The last
 figure counts topics, frames, types, qualities of service and actions that Nav2's parameter file
 names and nobody serves. Needs nav2_msgs and tf2_msgs for the last two: source what
-`make test-messages` builds.
+`nox -s messages` builds.
 """
 
 from __future__ import annotations
@@ -239,9 +239,7 @@ def missed_of(result: dict[str, Any]) -> list[str]:
         value = result[name]
         least = name != "nav2_names_missing"
         if math.isnan(value):
-            found.append(
-                f"{name}: not measured; source what `make test-messages` builds"
-            )
+            found.append(f"{name}: not measured; source what `nox -s messages` builds")
         elif value < bar if least else value > bar:
             found.append(
                 f"{name}: {value:g}, bar at {'least' if least else 'most'} {bar:g}"

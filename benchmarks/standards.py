@@ -206,7 +206,7 @@ def missed_of(result: dict[str, Any]) -> list[str]:
     return [*missed, *result.get("failed", [])]
 
 
-NOT_BUILT = "simulation_interfaces: run `make test-messages`, then source .venv-messages/setup.bash"
+NOT_BUILT = "simulation_interfaces: source what `nox -s messages` builds"
 SIMULATION = ("sim_features", "sim_conformance_failed", "client_overhead")
 PARTS = ("simulation_interfaces", "leapp", "nav2")
 

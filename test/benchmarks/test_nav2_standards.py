@@ -33,7 +33,7 @@ def test_without_obstacles_nodes_and_a_known_controller_the_bars_are_missed():
 @pytest.mark.timeout(900)
 @pytest.mark.skipif(not ARCHIVE.is_file(), reason="needs Nav2's parameter file")
 def test_paths_are_followed_and_every_name_of_nav2_is_served():
-    pytest.importorskip("nav2_msgs", reason="needs what `make test-messages` builds")
+    pytest.importorskip("nav2_msgs", reason="needs what `nox -s messages` builds")
     code, result = asked("nav2_standards.py", "--episodes", "3")
     assert (code, result["missing"], result["not_followed"]) == (0, [], [])
 

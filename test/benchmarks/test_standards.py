@@ -8,7 +8,7 @@ from .runs import asked, fails
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 pytest.importorskip(
-    "simulation_interfaces", reason="needs what `make test-messages` builds"
+    "simulation_interfaces", reason="needs what `nox -s messages` builds"
 )
 
 pytestmark = [pytest.mark.ros, pytest.mark.campaign, pytest.mark.timeout(900)]

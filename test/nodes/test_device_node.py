@@ -277,9 +277,7 @@ HAS_TF, HAS_ACKERMANN = (
 )
 
 
-@pytest.mark.skipif(
-    not HAS_ACKERMANN, reason="needs ackermann_msgs: make test-messages"
-)
+@pytest.mark.skipif(not HAS_ACKERMANN, reason="needs ackermann_msgs: nox -s messages")
 def test_a_car_is_driven_by_speed_and_steering_angle(stamped):
     kind = import_module("ackermann_msgs.msg").AckermannDriveStamped
     topic = stamped.stranger.speak(kind, "ackermann_cmd")
@@ -294,7 +292,7 @@ def test_a_car_is_driven_by_speed_and_steering_angle(stamped):
     stamped.peer.until(turns, "a turn to the left")
 
 
-@pytest.mark.skipif(not HAS_TF, reason="needs tf2_msgs: make test-messages")
+@pytest.mark.skipif(not HAS_TF, reason="needs tf2_msgs: nox -s messages")
 def test_its_transforms_are_those_of_rep_105_and_the_mount_is_told_to_late_comers(
     stamped,
 ):

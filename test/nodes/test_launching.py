@@ -1,10 +1,10 @@
-"""Launch descriptions start what `nics up` starts; `make test-upstream` has `launch`."""
+"""Launch descriptions start what `nics up` starts; `nox -s upstream` has `launch`."""
 
 from __future__ import annotations
 
 import pytest
 
-pytest.importorskip("launch_ros", reason="needs launch: make test-upstream")
+pytest.importorskip("launch_ros", reason="needs launch: nox -s upstream")
 
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 

@@ -20,7 +20,7 @@ CLIENT = Path(__file__).with_name("other_client.py")
 # What the ROS wheels leave behind for their children, which would load their libraries.
 LEFT = {"LD_LIBRARY_PATH", "_ROS_WHEELS_BOOTSTRAP_COMPLETE"}
 ENVIRONMENT = {key: value for key, value in os.environ.items() if key not in LEFT}
-# `make test-clients` installs the libraries into an environment of their own, without ROS 2.
+# `nox -s clients` installs the libraries into an environment of their own, without ROS 2.
 PYTHON = os.environ.get("OTHER_CLIENTS_PYTHON", sys.executable)
 
 
@@ -32,7 +32,7 @@ def installed(library):
 @pytest.mark.parametrize("library", ["cyclonedds", "rosless", "roswell"])
 def test_a_client_without_ros_reads_scans_and_drives(library, launch, meet, domain_id):
     if not installed(library):
-        pytest.skip(f"{library} is not installed; run make test-clients")
+        pytest.skip(f"{library} is not installed; run nox -s clients")
     # The wall ahead is within the lidar's reach.
     start = {
         "world": "empty",

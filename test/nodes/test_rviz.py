@@ -24,7 +24,7 @@ def test_the_map_is_shown_to_who_comes_late_too():
 
 
 def test_every_topic_of_the_picture_is_led_to_those_of_the_robot_and_the_map_to_that_of_all():
-    pytest.importorskip("launch_ros", reason="needs launch: make test-upstream")
+    pytest.importorskip("launch_ros", reason="needs launch: nox -s upstream")
     from nics_drl_bridge.config import find_config
     from nics_drl_bridge.nodes import launching
 

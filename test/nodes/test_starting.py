@@ -260,7 +260,7 @@ def test_rviz_starts_by_either_name_and_shows_the_first_robot():
 
 
 def test_every_launch_file_starts_the_launch_of_its_name():
-    """Those files need `launch`, which only `make test-upstream` has."""
+    """Those files need `launch`, which only `nox -s upstream` has."""
     folder = share_folder() / "launch"
     files = {file.name.partition(".")[0]: file for file in folder.glob("*.launch.py")}
     assert files.keys() == LAUNCHES.keys()

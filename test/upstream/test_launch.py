@@ -9,7 +9,7 @@ from contextlib import ExitStack
 
 import pytest
 
-pytest.importorskip("ros2launch", reason="needs ros2: make test-upstream")
+pytest.importorskip("ros2launch", reason="needs ros2: nox -s upstream")
 
 from benchmarks.runs import BENCHMARKS
 from nodes.peer import Peer

@@ -7,7 +7,7 @@ import subprocess
 
 import pytest
 
-pytest.importorskip("ros2cli", reason="needs ros2: make test-upstream")
+pytest.importorskip("ros2cli", reason="needs ros2: nox -s upstream")
 from domains import claimed_domain
 
 from upstream.launched import PACKAGE, Launched

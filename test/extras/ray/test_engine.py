@@ -17,7 +17,7 @@ from nics_drl_bridge.policy.policy_file import load_policy
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 
 pytest.importorskip(
-    "ray", reason="needs Ray, in an environment of its own; run 'make test-ray'"
+    "ray", reason="needs Ray, in an environment of its own; run 'nox -s ray'"
 )
 
 from ray.cluster_utils import Cluster

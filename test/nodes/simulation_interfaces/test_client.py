@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 pytest.importorskip(
-    "simulation_interfaces", reason="needs what `make test-messages` builds"
+    "simulation_interfaces", reason="needs what `nox -s messages` builds"
 )
 
 from builtin_interfaces.msg import Time
