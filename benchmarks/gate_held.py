@@ -63,6 +63,7 @@ def zero_thresholds() -> None:
         min_path=0.0,
         min_turn=0.0,
         min_half=0.0,
+        min_half_motion=0.0,
         min_change=0.0,
         min_deviations=0.0,
         min_sectors=1,

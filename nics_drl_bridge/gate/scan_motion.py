@@ -66,7 +66,11 @@ class Settings:
         min_path: minimum path by odometry since the reference [m], unless the turn suffices.
         min_turn: minimum turn by odometry since the reference [rad], unless the path suffices.
         min_half: minimum fraction of the motion in either half of that time. Otherwise a robot that
-            has just started would look held if its scans were stamped up to 0.25 s too late.
+            has just started would look held if its scans were stamped up to 0.25 s too late: they
+            would show the motion of one half alone. With less than `usual_half`, a contradiction
+            needs shares that are smaller in proportion.
+        usual_half: fraction of the motion in either half for which the shares below hold.
+        min_half_motion: minimum motion in either half, in multiples of the minimum motion.
         usual_turn: a younger reference is preferred if the robot turned further than this [rad].
         max_turn: no reference is used if it turned further: a room may repeat itself [rad].
         min_change: root mean square of the predicted changes of a sector that is compared [m].
@@ -93,7 +97,9 @@ class Settings:
     kept_every_s: float = 0.08
     min_path: float = 0.04
     min_turn: float = 0.05
-    min_half: float = 0.25
+    min_half: float = 0.1
+    usual_half: float = 0.25
+    min_half_motion: float = 0.5
     usual_turn: float = 0.6
     max_turn: float = 1.4
     min_change: float = 0.03
@@ -235,9 +241,10 @@ def judge_motion(
     settings: Settings,
 ) -> Verdict:
     """Judges whether the newest scan shows the motion that odometry shows since an earlier one."""
-    reference = _select_reference(kept, newest, settings)
+    reference, lesser_half = _select_reference(kept, newest, settings)
     if reference is None:
         return UNDECIDED
+    strictness = min(1.0, lesser_half / max(settings.usual_half, TINY))
     mount = np.array(config.mount)
     moved = between(compose(reference.pose, mount), compose(newest.pose, mount))
     directions = get_directions(config, settings)
@@ -260,11 +267,11 @@ def judge_motion(
         return UNDECIDED._replace(sectors=sectors)
     share = float(np.median(observed[is_compared]))
     contradicting = np.count_nonzero(
-        np.abs(observed[is_compared]) < settings.sector_share
+        np.abs(observed[is_compared]) < strictness * settings.sector_share
     )
     held = (
         contradicting >= settings.min_contradicting * sectors
-        and abs(share) < settings.held_share
+        and abs(share) < strictness * settings.held_share
         and np.median(changed[is_compared]) < settings.max_changed
     )
     return Verdict(sectors, share, bool(held), reference)
@@ -272,8 +279,12 @@ def judge_motion(
 
 def _select_reference(
     kept: tuple[ReducedScan, ...], newest: ReducedScan, settings: Settings
-) -> ReducedScan | None:
-    """Returns the scan to compare the newest one with; None if odometry shows too little motion."""
+) -> tuple[ReducedScan | None, float]:
+    """Returns the scan to compare the newest one with, and the lesser half of the motion.
+
+    The scan is None if odometry shows too little motion. The half is that of the time since the
+    scan in which the robot moved less, as a fraction of the motion.
+    """
     # The oldest scan since which the robot has not turned further than usual; without one, the
     # youngest that is of any use. The last one is left out: a scan has to lie in between.
     chosen = None
@@ -285,7 +296,7 @@ def _select_reference(
         if turn <= settings.usual_turn:
             break
     if chosen is None:
-        return None
+        return None, 0.0
     reference = kept[chosen]
     half_ns = (reference.stamp_ns + newest.stamp_ns) // 2
     middle = min(kept[chosen + 1 :], key=lambda scan: abs(scan.stamp_ns - half_ns))
@@ -294,8 +305,14 @@ def _select_reference(
         _measure_motion(reference, middle, settings),
         _measure_motion(middle, newest, settings),
     )
-    is_enough = motion >= 1.0 and lesser_half >= settings.min_half * motion
-    return reference if is_enough else None
+    is_usual = lesser_half >= settings.usual_half * motion
+    is_seen = (
+        lesser_half >= settings.min_half * motion
+        and lesser_half >= settings.min_half_motion
+    )
+    if motion < 1.0 or not (is_usual or is_seen):
+        return None, 0.0
+    return reference, lesser_half / max(motion, TINY)
 
 
 def _measure_motion(old: ReducedScan, new: ReducedScan, settings: Settings) -> float:

@@ -310,11 +310,8 @@ def test_a_robot_at_rest_is_never_taken_for_a_held_one():
     assert scene.run(3.0).cause is None
 
 
-@pytest.mark.parametrize("late_s", [0.1, 0.2])
-def test_scans_that_are_older_than_their_stamps_do_not_stop_a_robot_that_starts_and_stops(
-    late_s,
-):
-    scene = started(twist=(0.6, 0.0, 0.0))
+def stamp_too_late(scene, late_s):
+    """Lets each scan show what there was some time before its stamp."""
     past = [scene.body.copy()]
     scan = scene.scan
 
@@ -327,10 +324,51 @@ def test_scans_that_are_older_than_their_stamps_do_not_stop_a_robot_that_starts_
         return decision
 
     scene.scan = scan_of_before
+
+
+@pytest.mark.parametrize("late_s", [0.1, 0.2])
+def test_scans_that_are_older_than_their_stamps_do_not_stop_a_robot_that_starts_and_stops(
+    late_s,
+):
+    scene = started(twist=(0.6, 0.0, 0.0))
+    stamp_too_late(scene, late_s)
     for k in range(12):
         scene.wish = np.array([0.0 if k % 2 else (0.6, -0.6)[k // 2 % 2], 0.0, 0.0])
         scene.run(0.7)
         assert scene.decision.cause is None
+
+
+RAMPS = [(0.8, 0.0, 0.0), (0.6, 0.0, -0.6), (0.0, 0.0, 1.2)]
+
+
+@pytest.mark.parametrize("ramp_s", [0.4, 0.8, 1.6])
+@pytest.mark.parametrize("twist", RAMPS)
+def test_scans_that_are_older_than_their_stamps_do_not_stop_a_robot_that_gains_speed(
+    ramp_s, twist
+):
+    scene = started(twist=np.array(twist) / 20.0)
+    stamp_too_late(scene, 0.2)
+    for _ in range(3):
+        for share in np.linspace(0.05, 1.0, round(ramp_s / TICK_S)):
+            scene.wish = share * np.array(twist)
+            assert scene.run(TICK_S).cause is None
+        scene.wish = np.zeros(3)
+        scene.run(0.6)
+
+
+@pytest.mark.parametrize("twist", [(0.8, 0.0, 0.0), (0.0, 0.0, 1.2)])
+def test_a_body_that_is_held_while_its_robot_gains_speed_is_stopped_within_a_second(
+    twist,
+):
+    scene = started(twist=0.1 * np.array(twist))
+    scene.held = True
+    began = scene.now
+    while scene.moves and scene.now - began < 2.0:
+        share = np.interp(scene.now - began, [0.0, 0.3, 0.8], [0.1, 0.1, 1.0])
+        scene.wish = share * np.array(twist)
+        scene.run(TICK_S)
+    assert scene.rule == "body_held"
+    assert scene.now - began <= 1.0
 
 
 def test_a_scan_is_reduced_to_medians_that_forget_lost_and_wrong_beams():
