@@ -10,7 +10,7 @@ from nics_drl_bridge.lidar.scanner import make_scanner
 from nics_drl_bridge.lidar.shapes import Circle, Polygon, Segment
 from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.sim.occupancy import MOST_CELLS, occupancy, standing
-from nics_drl_bridge.sim.scenes import SetSampler
+from nics_drl_bridge.sim.scenes import SceneSampler
 from nics_drl_bridge.sim.world import World
 from nics_drl_bridge.sim.world_set import load_worlds
 
@@ -25,7 +25,7 @@ def world_of(**keys):
 def agreement(name, seed, spare=()):
     """Share of beams whose end in the map is within a cell of what the beams beside it show."""
     worlds = load_worlds(name)
-    sampler = SetSampler(worlds, 0.2)
+    sampler = SceneSampler(worlds, 0.2)
     scene = sampler.draw([seed])[0]
     world = worlds.members[int(scene.member)]
     placed = standing(sampler, int(scene.member), scene.bodies)
@@ -73,7 +73,7 @@ def test_a_map_of_a_world_is_kept_to_its_cells_however_coarse_they_are():
 
 def test_what_moves_is_left_out():
     worlds = load_worlds("crowd")
-    sampler = SetSampler(worlds, 0.2)
+    sampler = SceneSampler(worlds, 0.2)
     scene = sampler.draw([0])[0]
     pillars = worlds.obstacles[-1]
     assert np.count_nonzero(scene.bodies[:, 5]) > len(pillars.at)

@@ -230,7 +230,7 @@ def test_a_given_count_is_kept_and_shared_among_the_groups():
 
 def test_a_given_size_scales_every_obstacle_of_the_scene():
     sampler = SceneSampler(load_world("clutter"), 0.2, sizes=(1.0, 0.5))
-    base = len(sampler.world.shapes)
+    base = len(sampler.shapes) // 2
     scenes = sampler.draw([3, 3], size=[0, 1])
     assert (scenes.bodies[0, :, SHAPE] < base).all()
     assert (scenes.bodies[1, :, SHAPE] >= base).all()
@@ -249,7 +249,7 @@ def test_obstacles_stand_where_the_file_says_and_know_how_they_move():
     assert np.array_equal(
         scenes.bodies[:, -2:, :3], np.tile(world.obstacles[2].at, (50, 1, 1))
     )
-    kinds = [motion and motion.kind for motion in sampler.motions]
+    kinds = [motion and motion.kind for motion in sampler.motions[0]]
     assert kinds == ["pedestrian"] * 8 + ["patrol", None, None]
 
 

@@ -9,7 +9,7 @@ from robots import circles, direct_model, field, lidar
 
 from nics_drl_bridge.config import dump_yaml, share_folder
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.sim.scenes import SetSampler, member_of, sample_scene
+from nics_drl_bridge.sim.scenes import SceneSampler, member_of, sample_scene
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import load_world
 from nics_drl_bridge.sim.world_set import WorldSet, load_worlds
@@ -88,7 +88,7 @@ def test_a_copy_of_a_simulator_goes_on_in_the_same_members():
 
 
 def test_every_member_has_the_same_chance_and_its_own_scenes():
-    sampler = SetSampler(MIXED, 0.2)
+    sampler = SceneSampler(MIXED, 0.2)
     scenes = sampler.draw(range(4000))
     counts = np.bincount(scenes.member, minlength=4)
     assert (np.abs(counts - 1000) < 5.0 * np.sqrt(750.0)).all()
@@ -113,7 +113,7 @@ def test_sizes_and_numbers_of_a_randomisation_hold_in_every_member():
             field(9.0, obstacles=[circles(6, (0.2,), 0.1)]),
         ),
     )
-    sampler = SetSampler(worlds, 0.1, sizes=(1.0, 0.5))
+    sampler = SceneSampler(worlds, 0.1, sizes=(1.0, 0.5))
     scenes = sampler.draw(range(50), count=np.full(50, 2), size=np.arange(50) % 2)
     for seed, scene in enumerate(scenes):
         radii = scene.bodies[scene.bodies[:, 5] > 0.0][:, 5]
@@ -280,7 +280,7 @@ def test_what_worlds_share_is_stored_once():
         )
         for n in range(5)
     )
-    samplers = SetSampler(WorldSet("alike", fields), 0.2).samplers
+    samplers = SceneSampler(WorldSet("alike", fields), 0.2).samplers
     assert all(one.plan.space is samplers[0].plan.space for one in samplers)
     rooms = WorldSet(
         "rooms", (load_world("room"), load_world("room"), load_world("circles"))
