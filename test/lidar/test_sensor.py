@@ -210,13 +210,3 @@ def test_a_task_that_observes_no_sensors_refuses_them(model):
         make_task("cooperative_reaching", model, {"sensors": ["rear"]})
     with pytest.raises(ConfigError, match=r"no sensor 'raer'.*rear"):
         make_task("navigation", model, {"sensors": ["raer"]})
-
-
-def test_points_of_a_lidar_are_where_its_beams_end():
-    sensor = rear()
-    reading = np.full(31, np.inf, np.float32)
-    reading[15], reading[0], reading[3] = 1.0, -np.inf, np.nan
-    points = sensor.points(reading)
-    assert len(points) == 2
-    assert points[1] == pytest.approx([-0.1 - 1.0, 0.05], abs=1e-6)
-    assert np.hypot(*(points[0] - [-0.1, 0.05])) == pytest.approx(0.05)
