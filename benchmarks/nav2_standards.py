@@ -28,7 +28,7 @@ from nics_drl_bridge.lidar.scanner import make_scanner
 from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.robot.spec import load_robot
 from nics_drl_bridge.sim.occupancy import occupancy, standing
-from nics_drl_bridge.sim.scenes import SetSampler
+from nics_drl_bridge.sim.scenes import SceneSampler
 from nics_drl_bridge.sim.world_set import load_worlds
 
 CONTROLS = {
@@ -62,7 +62,7 @@ def map_agreement(
     worlds = load_worlds(name)
     lidar = load_lidar(LIDAR)
     shares = []
-    sampler = SetSampler(worlds, load_robot(ROBOT).footprint_radius)
+    sampler = SceneSampler(worlds, load_robot(ROBOT).footprint_radius)
     for seed in seeds:
         scene = sampler.draw([seed])[0]
         world = worlds.members[int(scene.member)]
@@ -103,7 +103,7 @@ def followed(
 
     radius = load_robot(ROBOT).footprint_radius
     worlds = load_worlds(WORLD)
-    sampler = SetSampler(worlds, radius)
+    sampler = SceneSampler(worlds, radius)
     common: dict[str, Any] = {"model": ROBOT, "enable_stamped_cmd_vel": False}
     simulated = common | {"world": WORLD, "mode": "lockstep"}
     policy = common | {"policy": ROBOT, "rate": 0.0, "deadline": 30.0}

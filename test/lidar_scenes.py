@@ -101,6 +101,23 @@ def random_scene(seed: int, shapes: tuple[Shape, ...], far: float = 0.0) -> Scen
     return Scene(robot, chosen, poses, walls)
 
 
+def poses_around(rng: np.random.Generator, distance: np.ndarray) -> np.ndarray:
+    """Poses (..., 3) at distances (...) from the origin, in random directions."""
+    bearing, heading = rng.uniform(-np.pi, np.pi, (2, *np.shape(distance)))
+    x = distance * np.cos(bearing)
+    y = distance * np.sin(bearing)
+    return np.stack([x, y, heading], axis=-1)
+
+
+def solid_of(shape: Shape, pose: np.ndarray) -> shapely.Geometry:
+    """A shape at a pose (3,); of a circle the centre, whose radius is to be subtracted."""
+    if isinstance(shape, Circle):
+        return shapely.Point(pose[:2])
+    corners = geometry.rotate(shape.outline, pose[2]) + pose[:2]
+    make = shapely.LineString if len(corners) == 2 else shapely.Polygon
+    return make(corners)
+
+
 def placed(shape: Shape, pose: np.ndarray) -> tuple[shapely.Geometry, np.ndarray]:
     """The outline of a shape at a pose, and its corners (V, 2)."""
     if isinstance(shape, Circle):

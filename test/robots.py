@@ -99,11 +99,11 @@ def circles(count: int, radii: tuple[float, ...] = (RADIUS,), gap: float = 0.3) 
     return {"shapes": shapes, "count": count, "gap": gap}
 
 
-def field(size: float = 6.0, count: int = 0, **changes) -> World:
-    """A square field with `count` obstacles."""
+def field(size: float | None = 6.0, count: int = 0, **changes) -> World:
+    """A square field with `count` obstacles; without a size, `bounds` are needed."""
     data = {
         "name": "field",
-        "size": [size, size],
+        "size": size and [size, size],
         "obstacles": [circles(count)],
         "clearance": 0.1,
         "goal_distance": [1.0, 3.0],

@@ -23,7 +23,7 @@ from nics_drl_bridge.errors import BridgeError, ConfigError
 from nics_drl_bridge.files import SUMS, write_sums
 from nics_drl_bridge.gate.limits import load_limits
 from nics_drl_bridge.generator import load_model, open_model, save_model
-from nics_drl_bridge.lidar.sensor import add_sensor_kind, load_sensor, sensor_of
+from nics_drl_bridge.lidar.sensor import add_sensor_kind, load_sensor, sensor_of_data
 from nics_drl_bridge.policy.contract import _task_hash
 from nics_drl_bridge.policy.foreign import import_policy, load_any
 from nics_drl_bridge.policy.policies import open_policy
@@ -336,10 +336,8 @@ def test_a_sensor_of_ones_own_is_given_by_the_caller_and_named_by_files(trap):
         "name": "rear",
         "lidar": {**direct_model().lidar.model_dump(), "frame": "back"},
     }
-    sensor = sensor_of({"kind": "TrapSensor", **rear})
+    sensor = sensor_of_data({"kind": "TrapSensor", **rear})
     assert type(sensor) is kind
-    by_path = sensor_of({"kind": f"{trap.file}:TrapSensor", **rear})
-    assert by_path == sensor, "a model that is written with it names no path"
 
 
 def test_the_command_line_imports_a_kind_of_sensor(trap):

@@ -373,13 +373,13 @@ def map_(
         from nics_drl_bridge.lidar.maps import map_files
         from nics_drl_bridge.robot.spec import load_robot
         from nics_drl_bridge.sim.occupancy import occupancy, standing
-        from nics_drl_bridge.sim.scenes import SetSampler
+        from nics_drl_bridge.sim.scenes import SceneSampler
         from nics_drl_bridge.sim.world_set import load_worlds
 
     if not 1e-3 <= resolution <= 100.0:
         raise ConfigError(f"--resolution {resolution:g}: must be from 0.001 to 100 m.")
     worlds = load_worlds(name)
-    sampler = SetSampler(worlds, load_robot(robot).footprint_radius)
+    sampler = SceneSampler(worlds, load_robot(robot).footprint_radius)
     scenes = sampler.draw([seed])
     scene = scenes[0]
     member = int(scenes.member[0])

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.geometry import Array, rotate
+from nics_drl_bridge.geometry import rotate
 from nics_drl_bridge.lidar import bake_kernels
+from nics_drl_bridge.lidar.arrays import Array, Integers
 from nics_drl_bridge.lidar.shapes import Circle, Outlines, Shape, describe
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.lidar.table import MOST_WIDE, Density, LidarTable, padding
@@ -31,7 +32,7 @@ class Grid:
     distances: Array  # (D,) [m]
     turns: Array  # (T,) [rad]
     edges: Array  # (T, D, 2) right and left edge of the shape [rad]
-    cell: NDArray[np.int64]  # (T, D, 6) see `LidarTable.cell`
+    cell: Integers  # (T, D, 6) see `LidarTable.cell`
 
 
 def bake(
@@ -152,7 +153,7 @@ def _reach_of(edge: Array, parts: int, outer: np.ufunc) -> Array:
     return result
 
 
-def _wound(hull: Array, hints: NDArray[np.int64], along: Array) -> NDArray[np.int64]:
+def _wound(hull: Array, hints: Integers, along: Array) -> Integers:
     """Unwrap corners at an edge (...), which points `along` in the shape's frame [rad]."""
     x, y = (np.roll(hull, -1, axis=0) - hull).T
     after = np.arctan2(y, x)
@@ -161,9 +162,7 @@ def _wound(hull: Array, hints: NDArray[np.int64], along: Array) -> NDArray[np.in
     return np.asarray(hints + len(hull) * rounds)
 
 
-def _candidates(
-    wound: NDArray[np.int64], parts: int, corners: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _candidates(wound: Integers, parts: int, corners: int) -> tuple[Integers, Integers]:
     """Two corners (T, D, 2) that can be an edge within each cell, or a start for climbing.
 
     Along a line and around a circle outside, the corner changes monotonically: those at the rim of
@@ -181,7 +180,7 @@ def _candidates(
 
 def _miss(
     hull: Array,
-    two: NDArray[np.int64],
+    two: Integers,
     edge: Array,
     turns: Array,
     distances: Array,

@@ -3,11 +3,10 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import exact_kernels
+from nics_drl_bridge.lidar.arrays import Array, Integers, Singles
 from nics_drl_bridge.lidar.exact_kernels import Beams
 
 EDGE = 1e-6  # ranges at an edge are taken this far inside it, as a fraction of the whole width
@@ -20,7 +19,7 @@ def silhouettes(
     distances: Array,
     turns: Array,
     edges: Array,
-    hints: NDArray[np.int64],
+    hints: Integers,
 ) -> None:
     """Write the right and left edge [rad] of a shape straight ahead, and the corners there.
 
@@ -78,7 +77,7 @@ def along(
 
 @kernel(allocates=True)
 def row(
-    fine: NDArray[np.float32],
+    fine: Singles,
     beams: Beams,
     corners: Array,
     radius: float,
@@ -110,9 +109,7 @@ def row(
 
 
 @kernel(allocates=True)
-def into_phases(
-    rows: NDArray[np.float32], fine: NDArray[np.float32], width: int, phases: int
-) -> None:
+def into_phases(rows: Singles, fine: Singles, width: int, phases: int) -> None:
     """Sort points (width * phases,) so that those of one phase are contiguous."""
     for phase in range(phases):
         for k in range(width):
@@ -121,8 +118,8 @@ def into_phases(
 
 @kernel(allocates=True)
 def rows_of_turn(
-    rows: NDArray[np.float32],
-    layout: NDArray[np.int64],
+    rows: Singles,
+    layout: Integers,
     shape: tuple[Array, float],
     distances: Array,
     turn: float,

@@ -38,10 +38,10 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import exact_kernels
+from nics_drl_bridge.lidar.arrays import Array, ShortIntegers, Singles
 from nics_drl_bridge.lidar.exact_kernels import (
     RADIUS,
     SHAPE,
@@ -52,9 +52,6 @@ from nics_drl_bridge.lidar.exact_kernels import (
     Y,
 )
 
-Array = NDArray[np.float64]
-Integers = NDArray[np.int32]
-Singles = NDArray[np.float32]
 Index = int | np.integer[Any]
 
 TABLE_SHAPE = np.dtype(
@@ -85,7 +82,7 @@ class TableArrays(NamedTuple):
     # (cells, 4) of each grid distance at each grid rotation: where its row starts in `rows`; the
     # row's extent, see `unpack_extent`; corners for the right and the left silhouette, see
     # `unpack_corners`
-    cells: Integers
+    cells: ShortIntegers
     rows: Singles  # (R,) ranges [m]; in a row all points of one phase, then those of the next
     shift: int  # log2 of the phases, which are the points per beam
     hulls: Array  # (sum V, 2) corners [m], see `shapes.Outlines`; each hull twice

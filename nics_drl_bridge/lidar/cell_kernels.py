@@ -10,10 +10,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.lidar.arrays import Array, ShortIntegers
 from nics_drl_bridge.lidar.exact_kernels import RADIUS, X, Y
 
 LEFT, BOTTOM, PER_METRE, SIDE, LARGEST, MOVED, FRAME = range(7)
@@ -30,13 +29,13 @@ class BodyCells(NamedTuple):
 
     # (N, G^2 + 2) place in `then` of each cell's first body, those in no cell being the last; of
     # chains the first body itself, or -1
-    first: NDArray[np.int32]
+    first: ShortIntegers
     # (N, K) the bodies in the order of cells; of a chain the next, or -1. One row if the bodies
     # themselves are put into that order
-    then: NDArray[np.int32]
+    then: ShortIntegers
     ordered: bool  # True if they are
-    frame: NDArray[np.float64]  # (N, FRAME)
-    found: NDArray[np.int32]  # (K,) scratch for one thread: the bodies around a point
+    frame: Array  # (N, FRAME)
+    found: ShortIntegers  # (K,) scratch for one thread: the bodies around a point
 
 
 def body_cells(worlds: int, bodies: int, ordered: bool = False) -> BodyCells:
@@ -54,6 +53,13 @@ def body_cells(worlds: int, bodies: int, ordered: bool = False) -> BodyCells:
     )
     cells.frame[:, SIDE] = side
     return cells
+
+
+@kernel(view=True)
+def limit_found(cells: BodyCells, count: int) -> BodyCells:
+    """Return cells whose list of all bodies ends after some of them."""
+    c = cells
+    return BodyCells(c.first, c.then, c.ordered, c.frame, c.found[:count])
 
 
 @kernel(inline=True)

@@ -8,10 +8,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.lidar.arrays import Array, Integers, ShortIntegers, Singles
 
 TWO_PI = 2.0 * math.pi
 # beams this near to an edge, in beams, are candidates; the exact test decides
@@ -49,14 +48,14 @@ AX, AY, BX, BY, CROSS, EX, EY, FIRST, END, FIRST_AGAIN, END_AGAIN = (
 class Beams(NamedTuple):
     """Directions of the beams in the frame of the lidar."""
 
-    directions: NDArray[np.float64]  # (2, B) cosines and sines, in rows that vectorise
+    directions: Array  # (2, B) cosines and sines, in rows that vectorise
     first: float  # angle of beam 0 [rad]
     step: float  # between beams [rad]
     closed: bool  # True for a full circle
     # (4 Q,) cosines, sines of turns by up to Q beams either way
-    turns: NDArray[np.float32]
+    turns: Singles
     # (2, 2) unit vectors: what lies farther along both than its radius is behind all beams
-    behind: NDArray[np.float64]
+    behind: Array
 
 
 class LidarPose(NamedTuple):
@@ -71,8 +70,8 @@ class LidarPose(NamedTuple):
 class OutlineArrays(NamedTuple):
     """Outlines of all shapes, see `shapes.Outlines`."""
 
-    corners: NDArray[np.float64]  # (sum V, 2) of all outlines [m]
-    first: NDArray[np.int64]  # (H + 1,) first corner of each outline; a circle has none
+    corners: Array  # (sum V, 2) of all outlines [m]
+    first: Integers  # (H + 1,) first corner of each outline; a circle has none
 
 
 @kernel(allocates=True)
@@ -121,7 +120,7 @@ def beam_span(low: float, high: float, beams: Beams) -> tuple[int, int]:
 
 @kernel
 def circle(
-    out: NDArray[np.float32],
+    out: Singles,
     beams: Beams,
     x: float,
     y: float,
@@ -162,17 +161,9 @@ def circle(
                 out[i] = min(out[i], c * x + s * y - math.sqrt(rest))
 
 
-@kernel
-def segment(
-    out: NDArray[np.float32], beams: Beams, x1: float, y1: float, x2: float, y2: float
-) -> None:
-    """Fuse the exact ranges to the straight wall from (x1, y1) to (x2, y2)."""
-    edge(out, beams, x1, y1, arctan2(y1, x1), x2, y2, arctan2(y2, x2), False)
-
-
 @kernel(inline=True)
 def edge(
-    out: NDArray[np.float32],
+    out: Singles,
     beams: Beams,
     x1: float,
     y1: float,
@@ -182,7 +173,10 @@ def edge(
     angle2: float,
     one_sided: bool,
 ) -> None:
-    """Like `segment`, with directions of its ends [rad]; `one_sided`: visible from its right."""
+    """Fuse the exact ranges to the straight wall from (x1, y1) to (x2, y2).
+
+    The angles are the directions of its ends [rad]; `one_sided`: visible from its right.
+    """
     count = out.shape[0]
     ex = x2 - x1
     ey = y2 - y1
@@ -210,7 +204,7 @@ def edge(
 
 @kernel(contracts=True, inline=True)
 def _cross(
-    out: NDArray[np.float32],
+    out: Singles,
     directions: Array,
     begin: int,
     end: int,
@@ -230,7 +224,7 @@ def _cross(
 
 @kernel
 def polygon(
-    out: NDArray[np.float32],
+    out: Singles,
     beams: Beams,
     x: float,
     y: float,
@@ -287,7 +281,7 @@ def turned(
 
 
 @kernel
-def finish(out: NDArray[np.float32], range_min: float, range_max: float) -> None:
+def finish(out: Singles, range_min: float, range_max: float) -> None:
     """Apply the limits to a scan (B,): too far becomes `inf`, too close `-inf` (REP-117)."""
     low = np.float32(range_min)
     high = np.float32(range_max)
@@ -299,7 +293,7 @@ def finish(out: NDArray[np.float32], range_min: float, range_max: float) -> None
 
 @kernel
 def walls_into(
-    out: NDArray[np.float32],
+    out: Singles,
     beams: Beams,
     lidar: LidarPose,
     walls: Array,
@@ -393,7 +387,7 @@ def _find_walls(
 
 @kernel(inline=True)
 def _wall(
-    whole: NDArray[np.int32],
+    whole: ShortIntegers,
     beams: Beams,
     first: int,
     end: int,
@@ -437,7 +431,7 @@ def _wall(
 
 @kernel(contracts=True, inline=True)
 def _wall_piece(
-    whole: NDArray[np.int32],
+    whole: ShortIntegers,
     beams: Beams,
     place: int,
     width: int,
@@ -485,7 +479,7 @@ def _wall_piece(
 
 @kernel
 def body_into(
-    out: NDArray[np.float32],
+    out: Singles,
     beams: Beams,
     lidar: LidarPose,
     body: Array,

@@ -9,11 +9,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge import random_kernels as random
-from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.lidar.arrays import Array, Integers, Singles
 
 # Columns of a row of faults; `faults.LidarFaults` explains them.
 NOISE_STD, NOISE_PROPORTIONAL, DROPOUT, DROPOUT_FAR, TOO_CLOSE, QUANTISATION, SKEW = (
@@ -48,7 +47,7 @@ class Distortion(NamedTuple):
 
 @kernel(allocates=True)
 def distort(
-    ranges: NDArray[np.float32],
+    ranges: Singles,
     limits: Array | tuple[float, float],
     faults: Array,
     seed: int,
@@ -115,7 +114,7 @@ def _device(limits: tuple[float, float], faults: Array) -> Distortion:
 
 
 @kernel(allocates=True)
-def _ghosts(ranges: NDArray[np.float32], device: Distortion, by: int) -> None:
+def _ghosts(ranges: Singles, device: Distortion, by: int) -> None:
     whole = ranges.view(np.int32)
     for i in range(ranges.shape[0]):
         ghost = device.least + random.share_of(random.bits(by, i)) * (
@@ -126,7 +125,7 @@ def _ghosts(ranges: NDArray[np.float32], device: Distortion, by: int) -> None:
 
 
 @kernel(allocates=True)
-def _close(ranges: NDArray[np.float32], close: np.float32) -> None:
+def _close(ranges: Singles, close: np.float32) -> None:
     whole = ranges.view(np.int32)
     value = np.float32(close).view(np.int32)
     for i in range(ranges.shape[0]):
@@ -134,9 +133,7 @@ def _close(ranges: NDArray[np.float32], close: np.float32) -> None:
 
 
 @kernel(allocates=True, inline=True)
-def _noise(
-    ranges: NDArray[np.float32], device: Distortion, by: int, coarse: bool
-) -> None:
+def _noise(ranges: Singles, device: Distortion, by: int, coarse: bool) -> None:
     runs = ranges.shape[0] // random.RUN
     for k in range(runs):
         _noise_run(ranges, random.RUN, device, by, k, coarse)
@@ -145,7 +142,7 @@ def _noise(
 
 @kernel(contracts=True, inline=True)
 def _noise_run(
-    ranges: NDArray[np.float32],
+    ranges: Singles,
     count: int,
     device: Distortion,
     by: int,
@@ -193,7 +190,7 @@ def _limited(value: np.float32, device: Distortion) -> np.float32:
 
 @kernel(allocates=True)
 def _drop(
-    ranges: NDArray[np.float32],
+    ranges: Singles,
     share: float | np.float32,
     far: float | np.float32,
     by: int,
@@ -261,12 +258,12 @@ def slice_poses(
 
 @kernel(allocates=True)
 def distort_worlds(
-    ranges: NDArray[np.float32],
-    chosen: NDArray[np.int64],
+    ranges: Singles,
+    chosen: Integers,
     limits: tuple[float, float],
     faults: Array,
-    seeds: NDArray[np.int64],
-    steps: NDArray[np.int64],
+    seeds: Integers,
+    steps: Integers,
 ) -> None:
     """Apply the same faults to the scans (N, M, B) of some worlds (n,), see `distort`."""
     robots = ranges.shape[1]

@@ -3,11 +3,11 @@
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from nics_drl_bridge.config import Schema
 from nics_drl_bridge.lidar import fault_kernels as kernels
+from nics_drl_bridge.lidar.arrays import Array
 
 TooClose = Literal["minus_inf", "range_min", "no_return", "ghost"]
 Skew = Literal["none", "counter_clockwise", "clockwise"]
@@ -53,7 +53,7 @@ class LidarFaults(Schema):
             raise ValueError("dropout and dropout_far must add up to at most 1")
         return self
 
-    def parameters(self, noise_std: float) -> NDArray[np.float64]:
+    def parameters(self, noise_std: float) -> Array:
         """Return the kernels' row (P,), in the order of the columns in `fault_kernels`."""
         too_close = TOO_CLOSE[self.too_close]
         skew = SKEW[self.skew]

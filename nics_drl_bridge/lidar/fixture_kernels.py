@@ -9,11 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.lidar.arrays import Array, Integers
 from nics_drl_bridge.lidar.map_kernels import GridArrays
-
-Integers = NDArray[np.int64]
 
 
 class Fixtures(NamedTuple):
@@ -49,7 +47,7 @@ def fixtures_around(n: int, fixtures: Fixtures) -> Fixtures:
 
 
 @kernel(view=True)
-def cells_of(cells: NDArray[np.uint32], place: NDArray[np.int64]) -> NDArray[np.uint32]:
+def cells_of(cells: NDArray[np.uint32], place: Integers) -> NDArray[np.uint32]:
     """Cells (rows, columns) of one map among those of many: first cell, rows, columns."""
     first = place[0]
     rows = place[1]

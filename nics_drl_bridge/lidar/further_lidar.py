@@ -5,9 +5,9 @@ from typing import Any, Literal
 from zlib import crc32
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge.lidar import fault_kernels, scan_kernels
+from nics_drl_bridge.lidar.arrays import Array, Integers
 from nics_drl_bridge.lidar.cell_kernels import body_cells
 from nics_drl_bridge.lidar.scanner import make_scanner
 from nics_drl_bridge.lidar.sensor import Readings, Render, SensedWorlds, Sensor
@@ -49,7 +49,7 @@ class FurtherLidar(Sensor):
         limits = self.lidar.range_min, self.lidar.range_max
         faults = self.lidar.fault_parameters
 
-        def render(out: Readings, worlds: NDArray[np.int64]) -> None:
+        def render(out: Readings, worlds: Integers) -> None:
             lanes = scan_kernels.scan_lanes()
             cells = body_cells(0, state.bodies.shape[1])
             scan_kernels.scan_worlds(
@@ -92,7 +92,7 @@ class FurtherLidar(Sensor):
         shares: Readings = np.clip(ranges / np.float32(self.lidar.range_max), 0.0, 1.0)
         return shares.astype(np.float32)
 
-    def points(self, reading: Readings) -> NDArray[np.float64]:
+    def points(self, reading: Readings) -> Array:
         """End of the beams that hit something (Q, 2); what is too close counts as at range_min."""
         x, y, heading = self.mount
         near = np.where(

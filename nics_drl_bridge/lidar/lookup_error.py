@@ -27,8 +27,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar import scan_kernels
+from nics_drl_bridge.lidar.arrays import Array, Mask
 from nics_drl_bridge.lidar.baked_kernels import LidarArrays
 from nics_drl_bridge.lidar.cell_kernels import body_cells
 from nics_drl_bridge.lidar.maps import stack_fixtures
@@ -100,7 +100,7 @@ def _find_widest(
     rings: Array,
     squares: Array,
     counts: Array,
-    has_no_outlier: NDArray[np.bool_],
+    has_no_outlier: Mask,
     greatest: float,
 ) -> tuple[float, float]:
     """Edges of the widest interval of rings with small errors; inf if none is wide enough."""

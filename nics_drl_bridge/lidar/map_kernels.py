@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.lidar.arrays import Array, Mask, Singles
 from nics_drl_bridge.lidar.exact_kernels import Beams, LidarPose
 
 if TYPE_CHECKING:
@@ -41,11 +41,11 @@ class GridArrays(NamedTuple):
     # (rows + 2, columns + 2), a byte per quadrant: 0 in solid cells and the border around the map
     squares: NDArray[np.uint32]
     # (5,) x, y [m], cosine, sine of its origin, resolution [m]
-    frame: NDArray[np.float64]
+    frame: Array
 
 
 @kernel(allocates=True)
-def free_squares(blocked: NDArray[np.bool_]) -> NDArray[np.uint32]:
+def free_squares(blocked: Mask) -> NDArray[np.uint32]:
     """Bake the squares (rows + 2, columns + 2) of a map (rows, columns), see `GridArrays`."""
     rows, columns = blocked.shape
     side = np.zeros((rows + 2, columns + 2), np.int32)
@@ -134,7 +134,7 @@ def walk(
 
 @kernel
 def map_into(
-    out: NDArray[np.float32],
+    out: Singles,
     beams: Beams,
     lidar: LidarPose,
     range_max: float,
@@ -274,7 +274,7 @@ def _jump(
 
 @kernel
 def _end(
-    out: NDArray[np.float32],
+    out: Singles,
     x: int,
     y: int,
     shape: tuple[int, int],

@@ -20,6 +20,7 @@ from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.files import write_bytes, write_text
 from nics_drl_bridge.geometry import rotate
 from nics_drl_bridge.lidar import map_kernels
+from nics_drl_bridge.lidar.arrays import Array, Integers, Mask, Singles
 from nics_drl_bridge.lidar.fixture_kernels import Fixtures
 from nics_drl_bridge.lidar.shapes import Coordinate
 
@@ -48,12 +49,12 @@ class GridMap:
     occupied_from: int = OCCUPIED
 
     @cached_property
-    def free(self) -> NDArray[np.bool_]:
+    def free(self) -> Mask:
         """(rows, columns) cells that are known to be free."""
         return np.asarray(self.cells == FREE)
 
     @cached_property
-    def blocked(self) -> NDArray[np.bool_]:
+    def blocked(self) -> Mask:
         """(rows, columns) cells that stop a beam."""
         if self.unknown_stops:
             return ~self.free
@@ -66,14 +67,14 @@ class GridMap:
         frame = np.array([x, y, np.cos(heading), np.sin(heading), self.resolution])
         return map_kernels.GridArrays(map_kernels.free_squares(self.blocked), frame)
 
-    def world_to_cell(self, points: ArrayLike) -> NDArray[np.int64]:
+    def world_to_cell(self, points: ArrayLike) -> Integers:
         """Return row and column (..., 2) of points (..., 2) x, y [m]; may be outside the map."""
         place = rotate(
             np.asarray(points, dtype=np.float64) - self.origin[:2], -self.origin[2]
         )
         return np.floor(place[..., ::-1] / self.resolution).astype(np.int64)
 
-    def cell_to_world(self, cells: ArrayLike) -> NDArray[np.float64]:
+    def cell_to_world(self, cells: ArrayLike) -> Array:
         """Return the centres (..., 2) x, y [m] of cells (..., 2) row, column."""
         x, y, heading = self.origin
         place = (np.asarray(cells, dtype=np.float64) + 0.5) * self.resolution
@@ -84,7 +85,7 @@ class GridMap:
         return np.stack([x + c * across - s * up, y + s * across + c * up], axis=-1)
 
     @cached_property
-    def distance_field(self) -> NDArray[np.float32]:
+    def distance_field(self) -> Singles:
         """(rows, columns) distance from each cell's centre to the nearest blocked square [m].
 
         Exact, 0 in blocked cells and `inf` if nothing is blocked. A disc around the centre touches
@@ -200,7 +201,7 @@ def map_files(grid: GridMap, path: Path) -> None:
 
 
 def cells_of(
-    grey: NDArray[np.uint8], opaque: NDArray[np.bool_] | None, file: MapFile
+    grey: NDArray[np.uint8], opaque: Mask | None, file: MapFile
 ) -> NDArray[np.int8]:
     """Cells (rows, columns) of an image from brightness and opacity, in the image's row order."""
     cells: NDArray[np.int8] = _cells_by_brightness(file)[grey]
@@ -230,9 +231,7 @@ def _cells_by_brightness(file: MapFile) -> NDArray[np.int8]:
     return cells
 
 
-def read_image(
-    path: Path, source: str
-) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+def read_image(path: Path, source: str) -> tuple[NDArray[np.uint8], Mask | None]:
     """Read brightness (rows, columns), and opacity if any, of a PGM (8, 16 bit), PNG or BMP.
 
     Raises ConfigError, with the `source` that names it, if it is missing, damaged or too large.
@@ -278,7 +277,7 @@ def read_image(
         raise ConfigError(f"{path}: {reason}") from None
 
 
-def _pixels(image: Image.Image) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+def _pixels(image: Image.Image) -> tuple[NDArray[np.uint8], Mask | None]:
     """Brightness and opacity, computed in blocks of rows: intermediate numbers are far larger."""
     shape = (image.height, image.width)
     grey = np.empty(shape, np.uint8)
@@ -305,9 +304,9 @@ def _pixels(image: Image.Image) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | 
 
 
 def stack_fixtures(
-    walls: Sequence[NDArray[np.float64]],
+    walls: Sequence[Array],
     grids: Sequence[GridMap | None],
-    member: NDArray[np.int64],
+    member: Integers,
 ) -> Fixtures:
     """Stack the fixtures of P worlds: walls (W, 4) and the map of each."""
     maps = [NO_MAP if grid is None else grid.arrays for grid in grids]
@@ -319,7 +318,7 @@ def stack_fixtures(
     return Fixtures(member, np.concatenate(walls), first, squares, places, frames)
 
 
-def joined(cells: Sequence[NDArray[Any]]) -> tuple[NDArray[Any], NDArray[np.int64]]:
+def joined(cells: Sequence[NDArray[Any]]) -> tuple[NDArray[Any], Integers]:
     """Cells (rows, columns) one after the other, and first cell, rows, columns of each (P, 3).
 
     An array that occurs again, as the map of several worlds, is stored once.

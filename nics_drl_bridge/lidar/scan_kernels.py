@@ -28,11 +28,11 @@ offset: `lanes.doubles[k + DX]` is `DX` of the body in lane k.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge.kernels import kernel, prefetch
 from nics_drl_bridge.lidar import baked_kernels as baked
 from nics_drl_bridge.lidar import cell_kernels, exact_kernels, map_kernels
+from nics_drl_bridge.lidar.arrays import Array, Integers, ShortIntegers, Singles
 from nics_drl_bridge.lidar.baked_kernels import (
     LEFT,
     LEFT_CORNERS,
@@ -58,10 +58,6 @@ from nics_drl_bridge.lidar.exact_kernels import (
     Y,
 )
 from nics_drl_bridge.lidar.fixture_kernels import Fixtures, grid_of, walls_of
-
-Array = NDArray[np.float64]
-Integers = NDArray[np.int32]
-Singles = NDArray[np.float32]
 
 # Beams of a body are fused in blocks of so many.
 BLOCK = 16
@@ -134,7 +130,7 @@ class ScanLanes(NamedTuple):
 
     doubles: Array  # (DOUBLES * LANES,)
     singles: Singles  # (SINGLES * LANES,)
-    integers: Integers  # (INTEGERS * LANES,)
+    integers: ShortIntegers  # (INTEGERS * LANES,)
     walls: Array  # for `exact_kernels.walls_into`
 
 
@@ -152,7 +148,7 @@ def scan_lanes() -> ScanLanes:
 def scan_worlds(
     ranges: Singles,
     robot_poses: Array,
-    chosen: NDArray[np.int64],
+    chosen: Integers,
     bodies: Array,
     first_robot: int,
     fixtures: Fixtures,
@@ -229,7 +225,7 @@ def scan_worlds(
 @kernel(contracts=True, inline=True)
 def select_bodies(
     bodies: Array,
-    nearby: Integers,
+    nearby: ShortIntegers,
     own_body: int,
     lidar_pose: LidarPose,
     lidar_heading: float,
@@ -506,7 +502,7 @@ def find_body_points(
 
 @kernel(contracts=True, inline=True)
 def fuse_body(
-    flat_ranges: Integers, k: int, lidar: LidarArrays, lanes: ScanLanes
+    flat_ranges: ShortIntegers, k: int, lidar: LidarArrays, lanes: ScanLanes
 ) -> None:
     """Fuse one body into its scan (step 7), in blocks of beams or, where none fits, beam by beam.
 
@@ -546,7 +542,7 @@ def fuse_body(
 
 @kernel(contracts=True, inline=True)
 def fuse_beam(
-    flat_ranges: Integers,
+    flat_ranges: ShortIntegers,
     fused_from: int,
     offset: int,
     is_hit: bool,
@@ -576,7 +572,7 @@ def fuse_beam(
 def add_maps(
     ranges: Singles,
     robot_poses: Array,
-    chosen: NDArray[np.int64],
+    chosen: Integers,
     fixtures: Fixtures,
     lidar: LidarArrays,
     lanes: ScanLanes,

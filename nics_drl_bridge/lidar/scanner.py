@@ -7,11 +7,11 @@ from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from nics_drl_bridge.errors import ConfigError, ModelError, suggest
-from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar import scan_kernels
+from nics_drl_bridge.lidar.arrays import Array, Singles
 from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.baked_kernels import LidarArrays
 from nics_drl_bridge.lidar.cell_kernels import body_cells
@@ -125,7 +125,7 @@ class Scanner:
                 between[h] = _MEASURED[key]
         return np.asarray(np.square(between))
 
-    def place(self, shapes: Sequence[Shape], poses: ArrayLike) -> NDArray[np.float64]:
+    def place(self, shapes: Sequence[Shape], poses: ArrayLike) -> Array:
         """Bodies (..., K, 7) of K shapes at poses (..., K, 3); ModelError if one is not baked."""
         index = [self.table.outlines.index_of(shape) for shape in shapes]
         return place(poses, self.table.outlines.radii[index], index)
@@ -135,8 +135,8 @@ class Scanner:
         poses: ArrayLike,
         bodies: ArrayLike,
         walls: ArrayLike = NO_WALLS,
-        out: NDArray[np.float32] | None = None,
-    ) -> NDArray[np.float32]:
+        out: Singles | None = None,
+    ) -> Singles:
         """Scan (N, B) [m], REP-117, from poses (N, 3) of robots, each in a separate world.
 
         The bodies (N, K, 7) are from `place`; walls (W, 4) x1, y1, x2, y2 [m] are the same in every

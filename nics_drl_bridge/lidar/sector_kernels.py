@@ -7,10 +7,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.lidar.arrays import Array, ShortIntegers, Singles
 
 TURN = 2.0 * math.pi
 INF, UNKNOWN = np.array([np.inf, np.nan], np.float32).view(np.int32)
@@ -19,12 +18,12 @@ INF, UNKNOWN = np.array([np.inf, np.nan], np.float32).view(np.int32)
 class SectorPlan(NamedTuple):
     """Assignment of the beams of one lidar to the sectors of one layout."""
 
-    first: NDArray[np.int32]  # (S,) first beam of each sector
+    first: ShortIntegers  # (S,) first beam of each sector
     # (S,) number of beams of each sector; beam 0 follows the last
-    hits: NDArray[np.int32]
-    directions: NDArray[np.float64]  # (B, 2) of the beams in `base_link`
+    hits: ShortIntegers
+    directions: Array  # (B, 2) of the beams in `base_link`
     # (2,) position of the lidar relative to the viewpoint [m]; if zero, sectors are filled by beam
-    shift: NDArray[np.float64]
+    shift: Array
     angle_min: float  # start of sector 0 [rad]
     width: float  # of the sectors [rad]
     range_min: float  # of the lidar [m]
@@ -33,9 +32,7 @@ class SectorPlan(NamedTuple):
 
 
 @kernel(allocates=True)
-def resample(
-    out: NDArray[np.float32], ranges: NDArray[np.float32], plan: SectorPlan
-) -> None:
+def resample(out: Singles, ranges: Singles, plan: SectorPlan) -> None:
     """Write the nearest return in each sector (S,) of one scan (B,) [m], REP-117; NaN is unknown.
 
     A sector without a beam takes the nearer return of the two adjacent beams.
@@ -48,57 +45,30 @@ def resample(
 
 @kernel(allocates=True)
 def _by_beam(
-    out: NDArray[np.float32],
-    ranges: NDArray[np.float32],
-    first: NDArray[np.int32],
-    count: NDArray[np.int32],
+    out: Singles,
+    ranges: Singles,
+    first: ShortIntegers,
+    count: ShortIntegers,
 ) -> None:
-    """Fill each sector from its own beams, by a sparse table (Bender, Farach-Colton 2000).
-
-    Row k has the minimum of each 2**k beams in a row. As whole numbers, ranges have the same order,
-    NaN is the maximum, and LLVM vectorises.
-    """
+    """Fill each sector from its own beams; as whole numbers, ranges have the same order."""
     beams = ranges.shape[0]
-    rows = 1
     whole = ranges.view(np.int32)
-    for s in range(out.shape[0]):
-        while 1 << rows <= count[s]:
-            rows += 1
-    least = np.empty((rows, beams), np.int32)
-    row = least[0]
+    nearest = out.view(np.int32)
+    known = np.empty(2 * beams, np.int32)  # twice, because a sector may span the seam
     for b in range(beams):
-        row[b] = (
-            whole[b] if np.int32(whole[b] & np.int32(0x7FFFFFFF)) <= INF else UNKNOWN
-        )
-    for k in range(rows - 1):
-        step = 1 << k
-        last = beams - (2 << k) + 1
-        left = least[k, :last]
-        right = least[k, step : step + last]
-        row = least[k + 1]
-        for b in range(last):
-            row[b] = min(left[b], right[b])
+        is_known = np.int32(whole[b] & np.int32(0x7FFFFFFF)) <= INF
+        known[b] = whole[b] if is_known else UNKNOWN
+        known[beams + b] = known[b]
     for s in range(out.shape[0]):
-        begin = first[s]
-        end = first[s] + count[s]
-        near = _nearest(least, begin, min(end, beams))
-        if end > beams:
-            near = min(near, _nearest(least, 0, end - beams))
-        out[s] = np.int32(near).view(np.float32)
-
-
-@kernel(inline=True)
-def _nearest(least: NDArray[np.int32], begin: int, end: int) -> np.float32:
-    k = np.uintp(0)
-    while 2 << k <= end - begin:
-        k += np.uintp(1)
-    return min(least[k, np.uintp(begin)], least[k, np.uintp(end - (1 << k))])
+        begin = np.uintp(first[s])
+        near = UNKNOWN
+        for b in range(count[s]):
+            near = min(near, known[begin + np.uintp(b)])
+        nearest[s] = near
 
 
 @kernel(allocates=True)
-def _by_place(
-    out: NDArray[np.float32], ranges: NDArray[np.float32], plan: SectorPlan
-) -> None:
+def _by_place(out: Singles, ranges: Singles, plan: SectorPlan) -> None:
     """Fill each sector from its returns, or the nearer of the neighbouring beams around it."""
     sectors = out.shape[0]
     beams = ranges.shape[0]

@@ -9,12 +9,12 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from nics_drl_bridge.config import Schema, validate
 from nics_drl_bridge.errors import ConfigError, suggest
-from nics_drl_bridge.geometry import Array, wrap_angle
+from nics_drl_bridge.geometry import wrap_angle
+from nics_drl_bridge.lidar.arrays import Array, Singles
 from nics_drl_bridge.lidar.sector_kernels import SectorPlan
 from nics_drl_bridge.lidar.shapes import LARGEST, Place
 from nics_drl_bridge.lidar.spec import (
@@ -24,7 +24,7 @@ from nics_drl_bridge.lidar.spec import (
     check_angles,
 )
 
-Ranges = NDArray[np.float32]
+Ranges = Singles
 # Beams farther apart are rejected: at 1 m they miss objects 0.2 m wide
 COARSEST_RAD = 0.21
 # A beam this near to a border counts in both: headers have angles in float32

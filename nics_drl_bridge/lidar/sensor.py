@@ -11,18 +11,17 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, PlainSerializer, PlainValidator
 
 from nics_drl_bridge import extensions
 from nics_drl_bridge.config import Schema, parse_yaml, read_text, validate
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.lidar.arrays import Array, Integers, Singles
 from nics_drl_bridge.lidar.fixture_kernels import Fixtures
 from nics_drl_bridge.lidar.scanner import Renderer
 from nics_drl_bridge.lidar.shapes import Shape
 
-Readings = NDArray[np.float32]
+Readings = Singles
 # Topics of a robot that are no sensor's.
 TAKEN = ("scan", "odom", "pose", "imu", "joint_states", "ground_truth", "cmd_vel")
 
@@ -43,7 +42,7 @@ class SensedWorlds:
 
 
 # Writes the readings (N, M, S) of some worlds (n,) in place, of all their robots.
-Render = Callable[[Readings, NDArray[np.int64]], None]
+Render = Callable[[Readings, Integers], None]
 
 
 class Sensor(Schema, ABC):
@@ -114,18 +113,6 @@ def add_sensor_kind(place: str) -> type[Sensor]:
     This runs the file. Pass only your own paths, never a path from a data file.
     """
     return extensions.import_class("sensors", place, Sensor)
-
-
-def sensor_of(entries: Sensor | Mapping[str, Any]) -> Sensor:
-    """Return a sensor from a caller's entries; `kind` may be `path/to/file.py:ClassName`.
-
-    Use `sensor_of_data` for entries from a file. Raises ConfigError.
-    """
-    if not isinstance(entries, Sensor) and isinstance(entries, Mapping):
-        kind = str(entries.get("kind"))
-        if ":" in kind:
-            entries = {**entries, "kind": add_sensor_kind(kind).__name__}
-    return sensor_of_data(entries)
 
 
 def sensor_of_data(entries: Sensor | Mapping[str, Any]) -> Sensor:

@@ -18,12 +18,12 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field, field_validator, model_validator
 
 from nics_drl_bridge.config import Schema
 from nics_drl_bridge.errors import ModelError
-from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.lidar.arrays import Array, Integers
 from nics_drl_bridge.lidar.exact_kernels import COS, RADIUS, SHAPE, SIN, OutlineArrays
 
 MOST_CORNERS = 16_384
@@ -229,12 +229,12 @@ class Outlines:
     shapes: tuple[Shape, ...]  # H
     corners: Array  # (sum V, 2) of all outlines, one after the other [m]
     # (H + 1,) first corner of each outline; a circle has none
-    corner: NDArray[np.int64]
+    corner: Integers
     # (sum 2 V, 2) corners of all convex hulls [m]; a circle's is its centre
     hulls: Array
-    hull: NDArray[np.int64]  # (H + 1,) first corner of each hull
+    hull: Integers  # (H + 1,) first corner of each hull
     radii: Array  # (H,) [m]
-    orders: NDArray[np.int64]  # (H,) rotational order
+    orders: Integers  # (H,) rotational order
 
     @classmethod
     def of(cls, shapes: Sequence[Shape]) -> "Outlines":

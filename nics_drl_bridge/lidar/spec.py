@@ -11,10 +11,11 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
 
 from nics_drl_bridge.config import Mount, Schema, find_config, load_yaml
+from nics_drl_bridge.lidar.arrays import Array, Singles
 from nics_drl_bridge.lidar.faults import SKEW, LidarFaults
 from nics_drl_bridge.lidar.shapes import LARGEST
 
@@ -111,12 +112,12 @@ class LidarSpec(Schema):
         return (self.angle_max - self.angle_min) / gaps
 
     @cached_property
-    def angles(self) -> NDArray[np.float64]:
+    def angles(self) -> Array:
         """(B,) direction of each beam in the frame of the lidar [rad]."""
         return np.asarray(self.angle_min + self.angle_increment * np.arange(self.beams))
 
     @cached_property
-    def directions(self) -> NDArray[np.float64]:
+    def directions(self) -> Array:
         """(B, 2) cosine and sine of each beam's direction."""
         return np.stack([np.cos(self.angles), np.sin(self.angles)], axis=1)
 
@@ -149,7 +150,7 @@ class LidarSpec(Schema):
         )
 
     @property
-    def fault_parameters(self) -> NDArray[np.float64]:
+    def fault_parameters(self) -> Array:
         """The faults of this lidar as the kernels' row (P,)."""
         return self.faults.parameters(self.noise_std)
 
@@ -159,7 +160,7 @@ def load_lidar(name: str | Path) -> LidarSpec:
     return load_yaml(find_config(name, "lidars"), LidarSpec)
 
 
-Ranges = NDArray[np.float32]
+Ranges = Singles
 
 
 def to_device(ranges: ArrayLike, spec: LidarSpec) -> Ranges:

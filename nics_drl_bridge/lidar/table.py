@@ -23,6 +23,7 @@ from nics_drl_bridge.files import (
     write_text,
     write_whole_folder,
 )
+from nics_drl_bridge.lidar.arrays import Array, Integers, ShortIntegers, Singles
 from nics_drl_bridge.lidar.baked_kernels import TABLE_SHAPE, TableArrays
 from nics_drl_bridge.lidar.shapes import Circle, Outlines, Shape
 from nics_drl_bridge.lidar.spec import LidarSpec, without_sensor_model
@@ -89,10 +90,10 @@ class LidarTable:
     density: Density
     beam_angle: float  # between the beams that it was baked for [rad]
     # (H, 3) maximum distance [m], rotations in a period, first cell
-    grid: NDArray[np.float64]
-    start: NDArray[np.int32]  # (cells,) begin of each row in `rows`
+    grid: Array
+    start: ShortIntegers  # (cells,) begin of each row in `rows`
     cell: NDArray[np.int16]  # (cells, 6) see above
-    rows: NDArray[np.float32]  # (R,) ranges [m], padded by what one look-up can read
+    rows: Singles  # (R,) ranges [m], padded by what one look-up can read
 
     @classmethod
     def without_rows(cls, spec: LidarSpec, shapes: Sequence[Shape]) -> "LidarTable":
@@ -113,7 +114,7 @@ class LidarTable:
         return len(self.cell) > 0 or not self.shapes
 
     @property
-    def widths(self) -> NDArray[np.int64]:
+    def widths(self) -> Integers:
         """(cells,) widths of the rows, in beams."""
         return self.cell[:, 1].astype(np.int64) & MOST_WIDE
 

@@ -289,7 +289,7 @@ def draw_seeded_world(
             }
             area["label"] = None if number else f"region of {kind}"
             axes.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, zorder=0.5, **area))
-    _draw_movers(axes, sampler.motions, scene)
+    _draw_movers(axes, sampler.motions[0], scene)
     look: dict[str, Any] = {
         "facecolor": MEASURED,
         "edgecolor": DARK,

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import hash_bytes
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar import scan_kernels
+from nics_drl_bridge.lidar.arrays import Array, Integers
 from nics_drl_bridge.lidar.cell_kernels import BodyCells, body_cells
 from nics_drl_bridge.lidar.exact_kernels import OutlineArrays
 from nics_drl_bridge.lidar.maps import GridMap, joined, stack_fixtures
@@ -142,7 +142,7 @@ def stack_members(
     motions: Sequence[Sequence[Motion | None]],
     outlines: OutlineArrays,
     sizes: Sizes,
-    member: NDArray[np.int64],
+    member: Integers,
 ) -> records.WorldSetArrays:
     """Stack the surroundings of the members of a world set.
 
@@ -208,7 +208,7 @@ def allocate_cells(sizes: Sizes, world_set: records.WorldSetArrays) -> BodyCells
 
 def _stack_plans(
     motions: Sequence[Sequence[Motion | None]],
-) -> tuple[records.Array, records.Array]:
+) -> tuple[Array, Array]:
     """Return the plans (P, K, PLAN) and waypoints (Q, 2) of the motions (P, K) of all members."""
     plans = np.zeros((len(motions), max(map(len, motions)), PLAN))
     waypoints = []

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.config import share_folder
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.lidar.arrays import Array
 from nics_drl_bridge.lidar.shapes import Circle
 from nics_drl_bridge.sim.world import Goals, Obstacles, Starts, World
 
@@ -52,13 +53,13 @@ def barn_world(number: int) -> World:
     )
 
 
-def barn_path(number: int) -> NDArray[np.float64]:
+def barn_path(number: int) -> Array:
     """Return (P, 2) the benchmark's own shortest path in a world, from cell to cell [m]."""
     paths = _arrays()["paths"]
     return _centres(paths[paths[:, 0] == _index(number), 1:], PATH_CORNER)
 
 
-def _centres(cells: NDArray[Any], corner: tuple[float, float]) -> NDArray[np.float64]:
+def _centres(cells: NDArray[Any], corner: tuple[float, float]) -> Array:
     """Return x, y (n, 2) [m] of cells (n, 2), row and column."""
     return np.asarray(np.round(cells[:, ::-1] * CELL + corner, 6))
 

@@ -10,12 +10,12 @@ from functools import lru_cache
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from scipy import ndimage
 
 from nics_drl_bridge.config import Schema
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.lidar.arrays import Mask
 from nics_drl_bridge.lidar.shapes import Circle
 from nics_drl_bridge.sim.world import Goals, Obstacles, Starts, World
 
@@ -78,7 +78,7 @@ def grow(parameters: Cellular, number: int) -> World:
     )
 
 
-def _field(parameters: Cellular, rng: np.random.Generator) -> NDArray[np.bool_]:
+def _field(parameters: Cellular, rng: np.random.Generator) -> Mask:
     share = rng.uniform(*parameters.fill)
     filled = rng.random((parameters.rows, parameters.columns)) < share
     around = np.zeros((parameters.rows + 2, parameters.columns + 2), np.uint8)
@@ -91,7 +91,7 @@ def _field(parameters: Cellular, rng: np.random.Generator) -> NDArray[np.bool_]:
     return filled
 
 
-def _has_way(filled: NDArray[np.bool_], parameters: Cellular) -> bool:
+def _has_way(filled: Mask, parameters: Cellular) -> bool:
     """True if a disc of the passage's width gets from before the field to behind it."""
     # beyond, all is free
     ahead = FINE * (1 + math.ceil(parameters.passage / 2.0 / parameters.cell))
@@ -106,7 +106,7 @@ def _has_way(filled: NDArray[np.bool_], parameters: Cellular) -> bool:
     return bool(start > 0 and start == goal)
 
 
-def _world(filled: NDArray[np.bool_], parameters: Cellular, number: int) -> World:
+def _world(filled: Mask, parameters: Cellular, number: int) -> World:
     rows, columns = np.nonzero(filled)
     x = (columns + 0.5) * parameters.cell
     y = parameters.margin + (rows + 0.5) * parameters.cell

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.lidar.arrays import Array
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel

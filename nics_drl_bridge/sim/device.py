@@ -4,13 +4,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.sim import contact_kernels, covariance_kernels, step_kernels
+from nics_drl_bridge.lidar.arrays import Array, Integers, Mask, Singles
+from nics_drl_bridge.sim import contact_kernels, step_kernels
 from nics_drl_bridge.sim.scenes import Scenes
 from nics_drl_bridge.sim.simulator import FastSimulator, Starts
 from nics_drl_bridge.sim.world import room_at
@@ -24,11 +24,11 @@ class Sensed:
     covariance: Array  # (3, 3) of `odom`
     twist: Array  # (3,) measured body twist
     state: Array  # (S,) true state
-    ranges: NDArray[np.float32]  # (B,) scan
+    ranges: Singles  # (B,) scan
     pose: Array  # (3,) true pose in `map`
     before: Array  # (3,) true pose one step earlier
     period: float  # length of a step [s]
-    readings: Mapping[str, NDArray[np.float32]]  # name -> (S,) of each further sensor
+    readings: Mapping[str, Singles]  # name -> (S,) of each further sensor
 
     @property
     def true_twist(self) -> Array:
@@ -74,11 +74,11 @@ class DeviceWorld:
 
         def arranged(scenes: Scenes) -> Array | None:
             world = self.simulator.world.members[int(scenes.member[0])]
-            for x, y, _ in starts.reshape(-1, 3).tolist() if starts is not None else ():
+            for x, y, _ in [] if placed is None else placed[0].tolist():
                 if room_at(world, x, y) < 0.0:
-                    fault = f"({x:g}, {y:g}) m lies outside the world"
                     raise ConfigError(
-                        f"episode_start: {fault} {world.name!r}; move it inside."
+                        f"episode_start: ({x:g}, {y:g}) m lies outside the world "
+                        f"{world.name!r}; move it inside."
                     )
             return self.arrange(scenes, placed)
 
@@ -87,7 +87,7 @@ class DeviceWorld:
         self._covariance[:] = self._added
         self._before[:] = self.simulator.data.pose[0]
 
-    def exchange(self, simulator: FastSimulator, kept: NDArray[np.int64]) -> None:
+    def exchange(self, simulator: FastSimulator, kept: Integers) -> None:
         """Continue in another simulator, whose first robots have these numbers here."""
 
         def moved(old: Array, new: Array) -> Array:
@@ -155,12 +155,11 @@ def propagate(
     A heading error rotates the motion that follows: P' = F P F^T + Q, F the new pose's derivative
     to the old one (Thrun et al., Probabilistic Robotics, Sec. 5.4), Q `added`.
     """
-    out = np.array(covariance, np.float64)
-    poses = (
-        np.asarray(pose, np.float64).reshape(len(out), 3) for pose in (before, after)
-    )
-    covariance_kernels.propagate(out, *poses, added)
-    return out
+    moved = np.subtract(after, before)
+    derivative = np.tile(np.eye(3), (len(covariance), 1, 1))
+    derivative[:, 0, 2] = -moved[:, 1]
+    derivative[:, 1, 2] = moved[:, 0]
+    return np.asarray(derivative @ covariance @ derivative.transpose(0, 2, 1) + added)
 
 
 class DrivenSimulator(FastSimulator):
@@ -208,7 +207,7 @@ class DrivenSimulator(FastSimulator):
         state: Array,
         wheels: Array,
         counted: Array,
-        touched: NDArray[np.bool_],
+        touched: Mask,
     ) -> None:
         """Take over the motion of the robots in the period, and measure what they sense.
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BridgeError, ConfigError, suggest
-from nics_drl_bridge.interface import Array
+from nics_drl_bridge.lidar.arrays import Array
 from nics_drl_bridge.lidar.exact_kernels import RADIUS, SHAPE
 from nics_drl_bridge.lidar.shapes import Shape, convex_hull, place
 from nics_drl_bridge.robot.kinds import textbook

@@ -6,11 +6,12 @@ Only a simulator knows them; they serve as a reward in training.
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.geometry import Array, compute_depths
+from nics_drl_bridge.geometry import compute_depths
+from nics_drl_bridge.lidar.arrays import Array
 from nics_drl_bridge.lidar.shapes import Circle, Polygon
 from nics_drl_bridge.sim import guide_kernels as kernels
 from nics_drl_bridge.sim.guide_kernels import GuideGrid
-from nics_drl_bridge.sim.scenes import Scenes, SetSampler
+from nics_drl_bridge.sim.scenes import Scenes, SceneSampler
 from nics_drl_bridge.sim.state import State
 
 CELL = 0.15  # side of a cell [m]
@@ -27,7 +28,7 @@ class Guide:
     """
 
     def __init__(
-        self, sampler: SetSampler, footprint: Circle | Polygon, worlds: int
+        self, sampler: SceneSampler, footprint: Circle | Polygon, worlds: int
     ) -> None:
         members = [scene_sampler.world for scene_sampler in sampler.samplers]
         extents = np.array([member.extent for member in members])

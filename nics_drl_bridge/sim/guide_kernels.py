@@ -9,14 +9,14 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.lidar.arrays import Array, Integers, Mask, Singles
 from nics_drl_bridge.lidar.exact_kernels import COS, RADIUS, SIN, OutlineArrays, X, Y
 from nics_drl_bridge.sim import collision_kernels as collision
 from nics_drl_bridge.sim import scene_kernels
 from nics_drl_bridge.sim.collision_kernels import Outline
-from nics_drl_bridge.sim.state import Array, Integers, MapField
+from nics_drl_bridge.sim.state import MapField
 
 # free space around the robot's circle above which a path is no longer tight [m]
 COMFORT = 0.3
@@ -30,19 +30,17 @@ ROUNDS, SETTLED = 20, np.float32(1e-3)
 class GuideGrid(NamedTuple):
     """Cells over the P worlds of a set, and everything that stands in every scene."""
 
-    walls: NDArray[np.float32]  # (P, rows, columns) distance to walls and map [m]
+    walls: Singles  # (P, rows, columns) distance to walls and map [m]
     frames: Array  # (P, 3) minimum x, y and the cells' side [m]
     sizes: Integers  # (P, 2) rows and columns that a world has
-    stands: NDArray[np.bool_]  # (P, K) obstacles that do not move
+    stands: Mask  # (P, K) obstacles that do not move
     outlines: OutlineArrays  # of the obstacles' shapes
     inner: float  # radii of the robot's inscribed and circumscribed circles [m]
     outer: float
 
 
 @kernel(allocates=True)
-def walls_of(
-    out: NDArray[np.float32], extent: Array, cell: float, cells: MapField
-) -> None:
+def walls_of(out: Singles, extent: Array, cell: float, cells: MapField) -> None:
     """Write the distances of `cells` to walls and map for coarser cells (rows, columns).
 
     The field is `extent` (4,), beyond which nothing is free.
@@ -61,9 +59,9 @@ def walls_of(
 
 @kernel(allocates=True)
 def guide(
-    out: NDArray[np.float32],
-    worlds: NDArray[np.int64],
-    member: NDArray[np.int64],
+    out: Singles,
+    worlds: Integers,
+    member: Integers,
     bodies: Array,
     goals: Array,
     grid: GuideGrid,
@@ -98,7 +96,7 @@ def guide(
 
 @kernel
 def _approach(
-    space: NDArray[np.float32],
+    space: Singles,
     body: Array,
     x: float,
     y: float,
@@ -145,9 +143,7 @@ def _cost(space: float, grid: GuideGrid) -> float:
 
 
 @kernel
-def _spread(
-    field: NDArray[np.float32], cost: NDArray[np.float32], u: float, v: float
-) -> None:
+def _spread(field: Singles, cost: Singles, u: float, v: float) -> None:
     """Arrival times of a front that starts at column u, row v (fractions) and takes `cost`."""
     rows, columns = field.shape
     field[...] = np.inf
@@ -165,9 +161,7 @@ def _spread(
 
 
 @kernel
-def sweep(
-    ways: NDArray[np.float32], prices: NDArray[np.float32], down: bool, left: bool
-) -> np.float32:
+def sweep(ways: Singles, prices: Singles, down: bool, left: bool) -> np.float32:
     """Update the path lengths row by row from one corner; return the maximum change [m].
 
     Both (rows, columns) are float32; the price of a cell is the cost of crossing it.
@@ -202,8 +196,8 @@ def sweep(
 def lengths(
     out: Array,
     poses: Array,
-    member: NDArray[np.int64],
-    fields: NDArray[np.float32],
+    member: Integers,
+    fields: Singles,
     grid: GuideGrid,
 ) -> None:
     """Write the path lengths (N, M) [m] from poses (N, M, 3), interpolated linearly."""

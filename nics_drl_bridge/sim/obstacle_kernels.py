@@ -12,12 +12,13 @@ import math
 
 from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.lidar.arrays import Array
 from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, X, Y
 from nics_drl_bridge.robot.kernels import wrap
 from nics_drl_bridge.sim import separation_kernels as at
 from nics_drl_bridge.sim.collision_kernels import on_wall
 from nics_drl_bridge.sim.separation_kernels import Traffic
-from nics_drl_bridge.sim.state import Array, State, Surroundings
+from nics_drl_bridge.sim.state import State, Surroundings
 
 DRAWS = 64  # Maximum number of draws per obstacle and period
 MOST = 10_000  # Obstacles of a world at most: draws do not depend on how many there are

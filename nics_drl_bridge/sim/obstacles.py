@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
 from nics_drl_bridge.config import Schema
-from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.lidar.arrays import Array
 from nics_drl_bridge.lidar.shapes import Coordinate
 from nics_drl_bridge.sim import separation_kernels as at
 

@@ -4,7 +4,7 @@
 
 1. `_frame_of`: choose the cells. They are aligned with the world's own map if it has one, cover the
    field, its walls and the map, and leave a border of one cell around them.
-2. `_enclose`: occupy every cell whose centre lies outside the field.
+2. Occupy every cell whose centre lies outside a walled field.
 3. `_copy_map`: copy the world's own map. Each of its cells becomes a square of smaller cells.
 4. `_mark_line`: occupy the cells along each wall, found by points much closer than a cell.
 5. `_fill`: occupy the cells whose centre lies in an obstacle. A part thinner than a cell may
@@ -22,11 +22,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from nics_drl_bridge.geometry import Array, compose, rotate
+from nics_drl_bridge.geometry import compose, rotate
+from nics_drl_bridge.lidar.arrays import Array, Mask
 from nics_drl_bridge.lidar.exact_kernels import RADIUS, SHAPE
 from nics_drl_bridge.lidar.maps import FREE, OCCUPIED, GridMap
 from nics_drl_bridge.lidar.shapes import Circle, Shape
-from nics_drl_bridge.sim.scenes import SetSampler
+from nics_drl_bridge.sim.scenes import SceneSampler
 from nics_drl_bridge.sim.world import World
 
 Placed = tuple[Shape, ArrayLike]  # a shape, and its pose (3,)
@@ -36,7 +37,7 @@ SAMPLES = 8  # number of samples of an edge in a cell
 ROUNDING = 1e-6  # allowance for rounding errors [cells]
 
 
-def standing(sampler: SetSampler, member: int, bodies: Array) -> list[Placed]:
+def standing(sampler: SceneSampler, member: int, bodies: Array) -> list[Placed]:
     """Return the obstacles that stand still, of bodies (K, 7) in a world of the sampler."""
     motions = sampler.samplers[member].motions
     placed: list[Placed] = []
@@ -64,7 +65,8 @@ def occupancy(
     cells = np.full(frame.size, FREE, np.int8)
     made = GridMap(cells, frame.cell, tuple(origin.tolist()))
     if world.size is not None:
-        _enclose(made, np.array(world.size) / 2.0)
+        centres = made.cell_to_world(_cell_indices(cells))
+        cells[(np.abs(centres) > np.divide(world.size, 2.0)).any(axis=-1)] = OCCUPIED
     if world.grid is not None:
         _copy_map(made, world.grid, frame.first)
     for wall in np.array(world.walls, np.float64).reshape(-1, 2, 2):
@@ -110,22 +112,6 @@ def _frame_of(world: World, cell: float) -> _Frame:
     return _Frame(pose, first, (int(rows), int(columns)), cell)
 
 
-def _enclose(made: GridMap, half: Array) -> None:
-    """Occupy everything outside a field, given half its size (2,) [m]."""
-    is_turned = made.origin[2] != 0.0
-    if is_turned:
-        centres = made.cell_to_world(_cell_indices(made.cells))
-        made.cells[(np.abs(centres) > half).any(axis=-1)] = OCCUPIED
-        return
-    # x depends on the column alone, and y on the row alone
-    rows = np.arange(made.cells.shape[0])
-    columns = np.arange(made.cells.shape[1])
-    x = made.cell_to_world(np.stack([0 * columns, columns], axis=-1))[:, 0]
-    y = made.cell_to_world(np.stack([rows, 0 * rows], axis=-1))[:, 1]
-    made.cells[np.abs(y) > half[1]] = OCCUPIED
-    made.cells[:, np.abs(x) > half[0]] = OCCUPIED
-
-
 def _cell_indices(cells: NDArray[Any]) -> NDArray[np.int_]:
     """Row and column (rows, columns, 2) of every cell of a grid (rows, columns)."""
     return np.moveaxis(np.indices(cells.shape), 0, -1)
@@ -147,7 +133,7 @@ def _mark_line(made: GridMap, ends: Array) -> None:
     made.cells[index[:, 0], index[:, 1]] = OCCUPIED
 
 
-def _is_within(index: NDArray[np.int_], cells: NDArray[Any]) -> NDArray[np.bool_]:
+def _is_within(index: NDArray[np.int_], cells: NDArray[Any]) -> Mask:
     """Return True (P,) for the indices (P, 2) of cells that a grid has."""
     is_within = (index >= 0) & (index < cells.shape)
     return np.asarray(is_within.all(axis=-1))
@@ -189,7 +175,7 @@ def _fill(made: GridMap, shape: Shape, pose: Array) -> None:
     box[thin[:, 0], thin[:, 1]] = OCCUPIED
 
 
-def _inside(shape: Shape, points: Array) -> NDArray[np.bool_]:
+def _inside(shape: Shape, points: Array) -> Mask:
     """Return True (...) for the points (..., 2) in a shape, by the even-odd rule."""
     if isinstance(shape, Circle):
         return np.asarray(np.hypot(points[..., 0], points[..., 1]) <= shape.radius)

@@ -15,8 +15,8 @@ from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.config import Schema, find_config, load_yaml, validate
 from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar import fault_kernels
+from nics_drl_bridge.lidar.arrays import Array, Integers
 from nics_drl_bridge.lidar.faults import SKEW, TOO_CLOSE, Skew, TooClose
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.robot import taylor
@@ -25,7 +25,6 @@ from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.seeds import check_seeds
 
 __all__ = ["Draws", "LidarRanges", "Randomisation", "Sampler", "load_randomisation"]
-Integers = NDArray[np.int64]
 Bounds = tuple[Array, Array]
 MOST_OBSTACLES = 10_000
 # Columns of the noise, before those of the state; the drift of y equals that of x.

@@ -9,12 +9,10 @@ the next draw, `plan` is the ScenePlan, `scratch` the SceneScratch, `disc` a bod
 import math
 from typing import Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import cell_kernels, exact_kernels
+from nics_drl_bridge.lidar.arrays import Array, Integers, Mask, ShortIntegers
 from nics_drl_bridge.lidar.cell_kernels import BodyCells
 from nics_drl_bridge.lidar.exact_kernels import (
     COS,
@@ -28,7 +26,7 @@ from nics_drl_bridge.lidar.exact_kernels import (
 )
 from nics_drl_bridge.random_kernels import uniform_of
 from nics_drl_bridge.sim import collision_kernels as collision
-from nics_drl_bridge.sim.state import Array, Integers, MapField
+from nics_drl_bridge.sim.state import MapField
 
 TRIES = 2000
 RESTARTS = 50
@@ -49,14 +47,14 @@ class FreeSpace(NamedTuple):
 
     cells: MapField  # distances to the nearest wall or solid cell of the map
     # (rows, columns) number of the connected free space; 0 for none
-    area: NDArray[np.int32]
+    area: ShortIntegers
     bounds: Array  # (4,) minimum x, y and maximum x, y of the field [m]
     walls: Array  # (W, 4)
     grid: MapField  # the static map
     # (C,) row-major indices of the cells where a robot may start, and of those with any free space;
     # none where nothing is drawn there
-    for_robots: NDArray[np.int32]
-    for_anything: NDArray[np.int32]
+    for_robots: ShortIntegers
+    for_anything: ShortIntegers
     room: float  # free space that a robot on its path needs around the centre of a cell [m]
 
 
@@ -87,7 +85,7 @@ class SceneScratch(NamedTuple):
     seen: Integers  # (rows * columns,) number of the search that last visited each cell
     stack: Integers  # (2, rows * columns) cells to visit, from either end
     latest: Integers  # (1,) number of the latest search
-    active: NDArray[np.bool_]  # (K,) obstacles of the scene
+    active: Mask  # (K,) obstacles of the scene
     gaps: Array  # (K,) free space around each obstacle [m]
     trial: Array  # (7,) an obstacle
     disc: Array  # (7,) a robot
@@ -300,7 +298,7 @@ def _is_joined(
 
 @kernel
 def _point(
-    source: int, counter: int, chosen: NDArray[np.int32], cells: MapField
+    source: int, counter: int, chosen: ShortIntegers, cells: MapField
 ) -> tuple[float, float]:
     """Draw a point in one of the chosen cells, given by row-major indices; take 3 counters."""
     cell = int(uniform_of(source, counter) * chosen.shape[0])
@@ -333,7 +331,7 @@ def _choose(
     size: int,
     plan: ScenePlan,
     bodies: Array,
-    active: NDArray[np.bool_],
+    active: Mask,
 ) -> int:
     groups = plan.groups
     counter = 0
@@ -531,9 +529,7 @@ def _place_robots(
 
 
 @kernel
-def choose_members(
-    seeds: NDArray[np.int64], members: int, out: NDArray[np.int64]
-) -> None:
+def choose_members(seeds: Integers, members: int, out: Integers) -> None:
     """Write the index of the world of each seed (n,) among the members of a set."""
     for n in range(seeds.shape[0]):
         share = random.uniform(seeds[n], random.MEMBER_STREAM, 0)
@@ -543,9 +539,9 @@ def choose_members(
 @kernel(allocates=True)
 def draw_scenes(
     packed: Any,
-    seeds: NDArray[np.int64],
-    wanted: NDArray[np.int64],
-    sizes: NDArray[np.int64],
+    seeds: Integers,
+    wanted: Integers,
+    sizes: Integers,
     bodies: Array,
     starts: Array,
     goals: Array,
@@ -560,10 +556,8 @@ def draw_scenes(
     plan: ScenePlan = packed.content
     count = plan.group.shape[0]
     s = scratch
-    cells = scratch.cells
     # the scratch memory may be sized for another world with more obstacles
-    nearby = cells.found[:count]
-    cells = BodyCells(cells.first, cells.then, cells.ordered, cells.frame, nearby)
+    cells = cell_kernels.limit_found(scratch.cells, count)
     scratch = SceneScratch(
         s.seen, s.stack, s.latest, s.active, s.gaps, s.trial, s.disc, s.spare, cells
     )

@@ -7,12 +7,12 @@ from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import ValidationError
 from scipy import ndimage
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.lidar.arrays import Array, Integers, ShortIntegers
 from nics_drl_bridge.lidar.cell_kernels import FEWEST, body_cells
 from nics_drl_bridge.lidar.maps import OCCUPIED, GridMap
 from nics_drl_bridge.lidar.shapes import (
@@ -29,11 +29,10 @@ from nics_drl_bridge.sim import scene_kernels as kernels
 from nics_drl_bridge.sim.obstacles import Motion
 from nics_drl_bridge.sim.packing_kernels import pack
 from nics_drl_bridge.sim.scene_kernels import FreeSpace, ScenePlan, SceneScratch
-from nics_drl_bridge.sim.state import NO_FIELD, Integers, MapField
+from nics_drl_bridge.sim.state import NO_FIELD, MapField
 from nics_drl_bridge.sim.world import Goals, Starts, World, check_places
 from nics_drl_bridge.sim.world_set import AnyWorld
 
-__all__ = ["Scene", "SceneSampler", "Scenes", "SetSampler", "sample_scene", "scaled"]
 CELL = 0.1  # Side of cells without a map [m]; larger in large fields, smaller in small ones
 FEWEST_CELLS = 20
 MOST_CELLS = 4_000_000
@@ -52,7 +51,7 @@ class Scene:
 class Scenes(Scene):
     """Scenes of n seeds, as arrays (n, ...) of the fields of `Scene`; `scenes[i]` is one scene."""
 
-    member: NDArray[np.int64]
+    member: Integers
 
     @classmethod
     def of(cls, n: int, obstacles: int, robots: int) -> "Scenes":
@@ -90,29 +89,19 @@ class Catalogue:
         return cls(shapes, place, Outlines.of((*shapes, Circle(radius=1.0))), {})
 
 
-class SceneSampler:
-    """Draws scenes of a world for M robots of a radius [m].
-
-    Start and goal are free, with the world's clearance, and a robot that keeps it can move from one
-    to the other among walls, map and static obstacles. Obstacles keep their gaps, from each other,
-    walls and map; they may be scaled by `sizes`, and `most` random ones requested if that is more
-    than the world has. Raises ConfigError if the world has no free space for such a robot.
-    """
+class MemberSampler:
+    """Draws scenes of one world of a set, see `SceneSampler`."""
 
     def __init__(
         self,
         world: World,
         footprint_radius: float,
-        robots: int = 1,
-        sizes: Sequence[float] = (1.0,),
-        most: int | None = None,
-        catalogue: Catalogue | None = None,
+        robots: int,
+        most: int | None,
+        catalogue: Catalogue,
     ) -> None:
         self.world = world = world if most is None else _with_room(world, most)
         self.robots = robots
-        self._sizes = len(sizes)
-        catalogue = catalogue or Catalogue.of(world, sizes)
-        self.shapes = catalogue.shapes
         slots = [
             g for g, group in enumerate(world.obstacles) for _ in range(group.counts[1])
         ]
@@ -133,48 +122,14 @@ class SceneSampler:
     def __getstate__(self) -> dict[str, Any]:  # a copy packs its plan again
         return {name: value for name, value in vars(self).items() if name != "_packed"}
 
-    def draw(
-        self,
-        seeds: ArrayLike,
-        count: ArrayLike | None = None,
-        size: ArrayLike | None = None,
-    ) -> Scenes:
-        """Draw the scenes of seeds (n,); identical in every process and batch.
-
-        The `count` (n,) of random obstacles is at most, and by default, that of the world; `size`
-        (n,) is the index of their size. Raises ConfigError if the world has no room for a scene.
-        """
-        draws = self.draws(seeds, count, size)
-        scenes = Scenes.of(len(draws[0]), self.count, self.robots)
-        self.draw_into(scenes, draws, slice(0, len(scenes)))
-        return scenes
-
-    def draws(
-        self, seeds: ArrayLike, count: ArrayLike | None, size: ArrayLike | None
-    ) -> tuple[Integers, Integers, Integers]:
-        """Return seeds, numbers of obstacles (-1 for the world's own) and sizes; see `draw`."""
-        numbers = check_seeds(seeds)
-        n = len(numbers)
-        if count is None:
-            wanted = np.full(n, -1)
-        else:
-            wanted = np.maximum(np.asarray(count, np.int64), 0)
-        if size is None:
-            sizes = np.zeros(n, np.int64)
-        else:
-            sizes = np.asarray(size, dtype=np.int64)
-        if wanted.shape != (n,) or sizes.shape != (n,):
-            raise ConfigError(
-                f"count {wanted.shape} and size {sizes.shape} must be ({n},)."
-            )
-        if n and not 0 <= sizes.min() <= sizes.max() < self._sizes:
-            raise ConfigError(f"size must be from 0 to {self._sizes - 1}.")
-        return numbers, wanted, sizes
-
     def draw_into(
         self, scenes: Scenes, draws: tuple[Integers, Integers, Integers], rows: slice
     ) -> None:
-        """Draw some rows of scenes of at least K obstacles; `draws` are those of all rows."""
+        """Draw some rows of scenes of at least K obstacles.
+
+        `draws` are, for all rows, the seed, the number of random obstacles (-1 for the world's
+        own), and the index of their size.
+        """
         try:
             scratch = self.scratches.pop()
         except IndexError:
@@ -204,10 +159,14 @@ class SceneSampler:
         )
 
 
-class SetSampler:
-    """Draws scenes of a world, or of the worlds of a set: a seed has its world, and a scene there.
+class SceneSampler:
+    """Draws scenes for M robots of a radius [m] in a world, or in the worlds of a set.
 
-    Arguments and errors are those of `SceneSampler`; so are the scenes of each member.
+    A seed has its world, and a scene there. Start and goal are free, with the world's clearance,
+    and a robot that keeps it can move from one to the other among walls, map and static obstacles.
+    Obstacles keep their gaps, from each other, walls and map; they may be scaled by `sizes`, and
+    `most` random ones requested if that is more than the world has. Raises ConfigError if a world
+    has no free space for such a robot.
     """
 
     def __init__(
@@ -220,7 +179,7 @@ class SetSampler:
     ) -> None:
         catalogue = Catalogue.of(world, sizes)
         self.samplers = [
-            SceneSampler(member, footprint_radius, robots, sizes, most, catalogue)
+            MemberSampler(member, footprint_radius, robots, most, catalogue)
             for member in world.members
         ]
         scratches = self.samplers[0].scratches
@@ -231,6 +190,7 @@ class SetSampler:
             sampler.scratches = scratches
         drawn = max(sampler.count for sampler in self.samplers)
         self.robots = robots
+        self._sizes = len(sizes)
         self.count = drawn + len(world.spare)
         # those that are spare come last
         self.shapes = (*catalogue.shapes, *world.spare)
@@ -250,13 +210,32 @@ class SetSampler:
         count: ArrayLike | None = None,
         size: ArrayLike | None = None,
     ) -> Scenes:
-        """Draw the scenes of seeds (n,), see `SceneSampler.draw`; K is the most of all members."""
-        draws = self.samplers[0].draws(seeds, count, size)
-        scenes = Scenes.of(len(draws[0]), self.count, self.robots)
+        """Draw the scenes of seeds (n,); identical in every process and batch.
+
+        The `count` (n,) of random obstacles is at most, and by default, that of the world; `size`
+        (n,) is the index of their size. K is the most of all worlds. Raises ConfigError if a world
+        has no room for a scene.
+        """
+        numbers = check_seeds(seeds)
+        n = len(numbers)
+        wanted = np.full(n, -1)
+        if count is not None:
+            wanted = np.maximum(np.asarray(count, np.int64), 0)
+        sizes = np.zeros(n, np.int64)
+        if size is not None:
+            sizes = np.asarray(size, dtype=np.int64)
+        if wanted.shape != (n,) or sizes.shape != (n,):
+            raise ConfigError(
+                f"count {wanted.shape} and size {sizes.shape} must be ({n},)."
+            )
+        if n and not 0 <= sizes.min() <= sizes.max() < self._sizes:
+            raise ConfigError(f"size must be from 0 to {self._sizes - 1}.")
+        draws = numbers, wanted, sizes
+        scenes = Scenes.of(n, self.count, self.robots)
         if len(self.samplers) == 1:
             self.samplers[0].draw_into(scenes, draws, slice(0, len(scenes)))
             return scenes
-        kernels.choose_members(draws[0], len(self.samplers), scenes.member)
+        kernels.choose_members(numbers, len(self.samplers), scenes.member)
         for row, p in enumerate(scenes.member.tolist()):
             self.samplers[p].draw_into(scenes, draws, slice(row, row + 1))
         return scenes
@@ -276,7 +255,7 @@ def sample_scene(
     return _sampler(world, footprint, robots).draw([seed])[0]
 
 
-_sampler = lru_cache(maxsize=16)(SetSampler)
+_sampler = lru_cache(maxsize=16)(SceneSampler)
 
 
 def scaled(shape: Shape, factor: float) -> Shape:
@@ -469,9 +448,7 @@ def _centres(cells: MapField) -> Array:
     return np.array(kernels.place_in.py_func(rows, columns, cells))  # type: ignore[attr-defined]
 
 
-def _large_enough(
-    area: NDArray[np.int32], cell: float, least: float
-) -> NDArray[np.int32]:
+def _large_enough(area: ShortIntegers, cell: float, least: float) -> ShortIntegers:
     keep = [0]
     for number, parts in enumerate(ndimage.find_objects(area), 1):
         span = cell * math.hypot(*(part.stop - part.start for part in parts))
@@ -483,7 +460,7 @@ def _check(
     world: World,
     key: str,
     places: Starts | Goals | None,
-    area: NDArray[np.int32],
+    area: ShortIntegers,
     cells: MapField,
 ) -> None:
     if places is None:

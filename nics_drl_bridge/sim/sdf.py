@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from nics_drl_bridge.arguments import check_path
 from nics_drl_bridge.config import check_no_device
 from nics_drl_bridge.errors import ConfigError, suggest
-from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.lidar.arrays import Array
 from nics_drl_bridge.lidar.shapes import FARTHEST, LARGEST, MOST_CORNERS, SMALLEST
 from nics_drl_bridge.sim import sections
 from nics_drl_bridge.sim.sections import Placed, ShapelessError, Solid, Standing

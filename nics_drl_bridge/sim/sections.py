@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.lidar.arrays import Array
 from nics_drl_bridge.lidar.shapes import (
     SMALLEST,
     Circle,

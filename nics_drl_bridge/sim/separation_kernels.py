@@ -12,9 +12,10 @@ from typing import NamedTuple
 import numpy as np
 
 from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.lidar.arrays import Array
 from nics_drl_bridge.lidar.exact_kernels import RADIUS, X, Y
 from nics_drl_bridge.sim.collision_kernels import in_grid, on_wall
-from nics_drl_bridge.sim.state import Array, MapField
+from nics_drl_bridge.sim.state import MapField
 
 # A row of a plan (K, P): the motion of an obstacle.
 (

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from nics_drl_bridge import defaults
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, footprint_shape
-from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.lidar.arrays import Array, Integers
 from nics_drl_bridge.lidar.bake import with_shapes
 from nics_drl_bridge.lidar.exact_kernels import SHAPE
 from nics_drl_bridge.lidar.scanner import Renderer, Scanner
@@ -32,12 +32,12 @@ from nics_drl_bridge.sim.randomisation import (
     Sampler,
     load_randomisation,
 )
-from nics_drl_bridge.sim.scenes import Scenes, SetSampler
+from nics_drl_bridge.sim.scenes import Scenes, SceneSampler
 from nics_drl_bridge.sim.state import POSE, TRUE_TWIST, WorldSetArrays
 from nics_drl_bridge.sim.world_set import AnyWorld
 from nics_drl_bridge.threads import run_parts
 
-Indices = NDArray[np.int64]
+Indices = Integers
 Result = TypeVar("Result")
 # Poses of robots (n, M, 3), or a function that returns them for scenes; None: the scenes' poses
 Starts = ArrayLike | Callable[[Scenes], Array | None] | None
@@ -437,7 +437,7 @@ class EpisodeSampler:
             sizes = randomisation.sizes
             if randomisation.obstacles.count is not None:
                 most_obstacles = randomisation.obstacles.count[1]
-        self.scenes = SetSampler(
+        self.scenes = SceneSampler(
             world, model.robot.footprint_radius, robots, sizes, most_obstacles
         )
         self.draws = None

@@ -14,15 +14,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.geometry import Array as Array
+from nics_drl_bridge.lidar.arrays import Array, Integers, Singles
 from nics_drl_bridge.lidar.baked_kernels import LidarArrays
 from nics_drl_bridge.lidar.cell_kernels import BodyCells
 from nics_drl_bridge.lidar.exact_kernels import OutlineArrays
 from nics_drl_bridge.lidar.fixture_kernels import Fixtures
 from nics_drl_bridge.lidar.scan_kernels import ScanLanes
 from nics_drl_bridge.robot.kernels import Terms
-
-Integers = NDArray[np.int64]
 
 # Columns of `State.noise`: standard deviations of the odometry's linear velocity [m/s] and turn
 # rate [rad/s]; then of the drift of x, y [m/sqrt(s)], heading [rad/sqrt(s)], each state variable.
@@ -66,7 +64,7 @@ class State(NamedTuple):
     bodies: Array
     odom: Array  # (N, M, 3) pose by odometry, which drifts; it begins at the start pose
     twist: Array  # (N, M, 3) measured body twist
-    ranges: NDArray[np.float32]  # (N, M, B) scan, REP-117
+    ranges: Singles  # (N, M, B) scan, REP-117
     collided: NDArray[np.uint8]  # (N, M) 1 once a robot has touched something
     steps: Integers  # (N,) control periods since the reset
     seeds: Integers  # (N,) of the episode
@@ -86,7 +84,7 @@ class State(NamedTuple):
 class MapField(NamedTuple):
     """Distances from the centres of square cells to what is solid; no cells without a map."""
 
-    distances: NDArray[np.float32]  # (rows, columns) [m]
+    distances: Singles  # (rows, columns) [m]
     x: float  # outer corner of cell (0, 0) [m]
     y: float
     cos: float  # of the heading of the rows
@@ -124,7 +122,7 @@ class WorldSetArrays(NamedTuple):
     """
 
     fixtures: Fixtures
-    distances: NDArray[np.float32]  # of all maps one after the other, see `MapField`
+    distances: Singles  # of all maps one after the other, see `MapField`
     map_places: Integers  # (P, 3) first distance, rows and columns of each map
     outlines: OutlineArrays
     crowded: bool  # `crowded`, `standing`: as in `Surroundings`
@@ -189,7 +187,7 @@ class Scans(NamedTuple):
     pose: Array  # (1, 1, 3) pose that one robot scans from
     twist: Array  # (3,) twist of that robot during the sweep
     slice_poses: Array  # (G, 3) poses during a sweep
-    slice_ranges: NDArray[np.float32]  # (1, 1, B) scan from one of these poses
+    slice_ranges: Singles  # (1, 1, B) scan from one of these poses
     only_world: (
         Integers  # (1,) zero: index of the only world in the arrays of one robot
     )

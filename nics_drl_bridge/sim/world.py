@@ -12,7 +12,7 @@ from pydantic import Field, PrivateAttr, field_validator, model_validator
 from nics_drl_bridge.config import Heading, Schema, find_config, load_yaml
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import hash_bytes
-from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.lidar.arrays import Array
 from nics_drl_bridge.lidar.maps import GridMap, load_map
 from nics_drl_bridge.lidar.shapes import LARGEST, MOST_SHAPES, Coordinate, Shape
 from nics_drl_bridge.sim.collision_kernels import wall_distance

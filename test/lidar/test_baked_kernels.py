@@ -8,32 +8,25 @@ from nics_drl_bridge.lidar import baked_kernels as kernels
 from nics_drl_bridge.lidar.shapes import convex_hull
 
 
-@pytest.mark.parametrize("corners", [3, 4, 7, 50, 1000])
+@pytest.mark.parametrize("corners", [3, 7, 1000])
 @pytest.mark.parametrize("make", [convex, star])
 def test_climbing_along_a_hull_ends_at_its_silhouette_from_wherever_it_begins(
     make, corners
 ):
     rng = np.random.default_rng(corners)
     hull = convex_hull(make(rng, corners).outline)
-    twice = np.concatenate([hull, hull])
     count = len(hull)
-    radius = np.hypot(*hull.T).max()
-    for _ in range(100):
-        distance = radius * (1.0 + 10.0 ** rng.uniform(-6.0, 1.0))
+    for _ in range(50):
+        distance = np.hypot(*hull.T).max() * (1.0 + 10.0 ** rng.uniform(-6.0, 1.0))
         turn = rng.uniform(-np.pi, np.pi)
-        skip = int(rng.integers(count + 1))
-        first = int(rng.integers(count))
-        stride = int(2 ** rng.integers(np.log2(count) + 1))
-        cos = distance * np.cos(turn)
-        sin = distance * np.sin(turn)
-        along = distance**2 + twice[skip : skip + count] @ [cos, -sin]
-        across = twice[skip : skip + count] @ [sin, cos]
+        first, stride = rng.integers([0, 1], [count, count])
+        view = kernels.ShapeView(
+            distance**2, distance * np.cos(turn), distance * np.sin(turn)
+        )
+        along, across = kernels.view_corner.py_func(view, *hull.T)
         angles = np.arctan2(across, along)
         for side, edge in ((1.0, angles.min()), (-1.0, angles.max())):
-            view = kernels.ShapeView(distance**2, cos, sin)
-            x, y = kernels.climb_hull(
-                view, first, min(stride, count - 1), skip, twice, count, side
-            )
+            x, y = kernels.climb_hull(view, first, stride, 0, hull, count, side)
             assert np.arctan2(y, x) == pytest.approx(edge, abs=1e-9)
 
 

@@ -42,27 +42,6 @@ def test_every_body_that_comes_within_reach_is_found_once(count):
     assert some or count < 60
 
 
-def test_bodies_that_moved_since_are_found_if_the_cells_know_how_far():
-    rng = np.random.default_rng(0)
-    cells = kernels.body_cells(1, 100)
-    late = 0
-    for _ in range(40):
-        bodies = bodies_at_random(rng, 100)
-        turn = rng.uniform(-np.pi, np.pi, 100)
-        kernels.sort(0, bodies, 100, cells)
-        bodies[:, :2] += 2.0 * np.stack([np.cos(turn), np.sin(turn)], axis=1)
-        spot = rng.uniform(-10.0, 10.0, 2)
-        missed = within(bodies, spot, 1.0) - {
-            *cells.found[: kernels.around(0, *spot, 1.0, cells)]
-        }
-        late += len(missed)
-        cells.frame[0, kernels.MOVED] = 2.0
-        assert within(bodies, spot, 1.0) <= {
-            *cells.found[: kernels.around(0, *spot, 1.0, cells)]
-        }
-    assert late > 0
-
-
 def test_bodies_are_found_as_they_are_added():
     cells = kernels.body_cells(1, 30)
     bodies = bodies_at_random(np.random.default_rng(1), 30)

@@ -64,10 +64,3 @@ def test_scans_come_back_from_every_shipped_device(name):
     inside = np.random.default_rng(0).uniform(*limits, 500).astype(np.float32)
     ranges = np.concatenate([limits, inside, np.array([np.inf, -np.inf], np.float32)])
     assert np.array_equal(from_device(to_device(ranges, spec), spec), ranges)
-
-
-def test_batches_of_scans_are_taken_too():
-    ranges = np.full((2, 3, 4), np.inf, np.float32)
-    spec = lidar(no_return="zero")
-    assert not to_device(ranges, spec).any()
-    assert np.array_equal(from_device(to_device(ranges, spec), spec), ranges)

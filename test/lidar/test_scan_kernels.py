@@ -5,15 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 
-import numpy as np
 import pytest
-from robots import lidar
-
-from nics_drl_bridge.lidar import baked_kernels, scan_kernels
-from nics_drl_bridge.lidar.bake import bake
-from nics_drl_bridge.lidar.exact_kernels import LidarPose
-from nics_drl_bridge.lidar.scanner import Scanner
-from nics_drl_bridge.lidar.shapes import Circle
 
 BETWEEN_FORBIDDEN_PAGES = """
 import ctypes, mmap, sys
@@ -63,56 +55,3 @@ def test_a_look_up_reads_nothing_outside_of_its_table(beams, side):
         command, capture_output=True, text=True, timeout=120, check=False
     )
     assert done.returncode == 0, done.stderr
-
-
-def looked_up(view: float, ahead: float, bearing: float) -> bool:
-    """True if a disc 1 m away of a lidar that looks `ahead`, as wide as `view`, gets a lane."""
-    spec = lidar(beams=91, angle_min=ahead - view / 2.0, angle_max=ahead + view / 2.0)
-    disc = Circle(radius=0.2)
-    scanner = Scanner(spec, bake(spec, [disc]), "baked")
-    turned = bearing + 0.7  # as the lidar is
-    body = scanner.place([disc], [[np.cos(turned), np.sin(turned), 0.0]])
-    here = LidarPose(0.0, 0.0, np.cos(0.7), np.sin(0.7))
-    lanes = scan_kernels.scan_lanes()
-    near = np.zeros(1, int)
-    found, computed = scan_kernels.select_bodies(
-        body, near, -1, here, 0.7, 0, scanner.arguments, lanes, 0
-    )
-    assert computed == 0
-    return bool(found)
-
-
-@pytest.mark.parametrize("ahead", [0.0, 2.5])
-@pytest.mark.parametrize("view", [0.5, np.pi, 1.5 * np.pi, 1.9 * np.pi])
-def test_of_bodies_only_those_wholly_behind_all_beams_are_not_looked_up(view, ahead):
-    half = np.arcsin(0.2)  # of the angle at which the disc is seen
-    edge = view / 2.0 + half
-    assert looked_up(view, ahead, ahead)
-    assert looked_up(view, ahead, ahead + edge - 0.01)
-    assert looked_up(view, ahead, ahead - edge + 0.01)
-    behind = (
-        np.pi - edge > view / 90.0
-    )  # the disc fits between the last beam and the first
-    assert looked_up(view, ahead, ahead + np.pi) != behind
-
-
-def test_a_body_behind_all_beams_is_not_scanned_exactly_either():
-    spec = lidar(beams=91, angle_min=-1.0, angle_max=1.0)
-    disc = Circle(radius=0.2)
-    scanner = Scanner(spec, bake(spec, [disc]), "exact")
-    body = scanner.place([disc], [[1.0, 0.0, 0.0]])
-    sensor = scanner.arguments
-    scratch = scan_kernels.scan_lanes().walls
-    near = np.zeros(1, np.int32)
-
-    def hits(sensor):
-        scan = np.full(91, np.inf, np.float32)
-        here = LidarPose(0.0, 0.0, 1.0, 0.0)
-        walls = np.zeros((0, 4))
-        baked_kernels.scan_exactly(scan, here, body, near, -1, walls, sensor, scratch)
-        return int(np.isfinite(scan).sum())
-
-    # The same beams, of which the kernels believe that they all point backwards.
-    turned = sensor.beams._replace(behind=-sensor.beams.behind)
-    assert hits(sensor) > 10
-    assert hits(sensor._replace(beams=turned)) == 0

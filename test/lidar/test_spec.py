@@ -6,7 +6,6 @@ from robots import lidar
 
 from nics_drl_bridge.config import find_config, validate
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.lidar.faults import LidarFaults
 from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
 
 
@@ -34,68 +33,15 @@ def test_a_partial_circle_ends_with_a_beam_at_angle_max(beams):
     assert np.allclose(np.diff(spec.angles), spec.angle_increment)
 
 
-def test_directions_are_cosine_and_sine_of_the_angles():
-    spec = lidar(beams=100, angle_min=0.1, angle_max=2.3)
-    assert spec.directions.shape == (100, 2)
-    assert np.allclose(spec.directions[:, 0], np.cos(spec.angles), atol=1e-6)
-    assert np.allclose(spec.directions[:, 1], np.sin(spec.angles), atol=1e-6)
-
-
-# Beams, field of view [deg], resolution [deg], range_min [m], range_max [m], rate [Hz], standard
-# deviation at 1 m [m], no return on the wire: as the data sheets and drivers named in the files.
-DATA_SHEETS = {
-    "paper": (720, 360.0, 0.5, 0.05, 3.0, 10.0, 0.0, "inf"),
-    "paper_12m": (720, 360.0, 0.5, 0.15, 12.0, 10.0, 0.0, "inf"),
-    "rplidar_a1": (360, 360.0, 1.0, 0.15, 12.0, 5.5, 0.005, "inf"),
-    "rplidar_a2": (800, 360.0, 0.45, 0.15, 12.0, 10.0, 0.005, "inf"),
-    "hokuyo_ust_10lx": (1081, 270.0, 0.25, 0.06, 10.0, 40.0, 0.03, "nan"),
-    "jackal_hokuyo": (720, 270.0, 270.0 / 719.0, 0.06, 10.0, 40.0, 0.03, "nan"),
-    "sick_tim571": (811, 270.0, 1.0 / 3.0, 0.05, 25.0, 15.0, 0.02, "zero"),
-    "turtlebot3_lds_01": (360, 360.0, 1.0, 0.12, 3.5, 5.0, 0.018, "zero"),
-    "turtlebot3_lds_02": (360, 360.0, 1.0, 0.16, 8.0, 5.0, 0.0155, "nan"),
-}
-
-
-def test_every_shipped_lidar_has_a_row_of_its_data_sheet_and_names_its_source():
-    files = {
-        path.stem: path for path in find_config("paper", "lidars").parent.glob("*.yaml")
-    }
-    assert set(files) == set(DATA_SHEETS)
-    for path in files.values():
+def test_every_shipped_lidar_is_read_by_its_name_and_names_its_source():
+    for path in find_config("paper", "lidars").parent.glob("*.yaml"):
+        assert load_lidar(path.stem).name == path.stem
         assert path.read_text(encoding="utf-8").startswith("# ")
-
-
-@pytest.mark.parametrize("name", DATA_SHEETS)
-def test_a_shipped_lidar_is_that_of_its_data_sheet(name):
-    beams, view, resolution, range_min, range_max, rate, std, no_return = DATA_SHEETS[
-        name
-    ]
-    spec = load_lidar(name)
-    assert spec.name == name
-    assert spec.beams == beams
-    assert np.degrees(spec.angle_max - spec.angle_min) == pytest.approx(view)
-    assert np.degrees(spec.angle_increment) == pytest.approx(resolution)
-    assert (spec.range_min, spec.range_max, spec.rate) == (range_min, range_max, rate)
-    assert spec.noise_std + spec.faults.noise_proportional == pytest.approx(std)
-    assert spec.no_return == no_return
-
-
-def test_the_jackals_lidar_is_a_hokuyo_ahead_of_its_middle():
-    jackal = load_lidar("jackal_hokuyo")
-    hokuyo = load_lidar("hokuyo_ust_10lx")
-    own = {"name": jackal.name, "beams": 720, "mount": (0.12, 0.0, 0.0)}
-    assert jackal == hokuyo.model_copy(update=own)
-
-
-@pytest.mark.parametrize("name", ["paper", "paper_12m"])
-def test_the_papers_lidars_have_no_faults(name):
-    spec = load_lidar(name)
-    assert (spec.noise_std, spec.faults) == (0.0, LidarFaults())
 
 
 @pytest.mark.parametrize("start", [-np.pi, 0.0, -1.0])
 @pytest.mark.parametrize("full", [True, False])
-@pytest.mark.parametrize("beams", [2, 3, 7, 360, 811, 1081, 7200, 100_000])
+@pytest.mark.parametrize("beams", [2, 7, 811, 1081, 100_000])
 def test_readers_of_the_header_count_the_beams_in_float32(beams, full, start):
     spec = lidar(
         beams=beams, angle_min=start, angle_max=start + (2.0 * np.pi if full else 4.0)
@@ -142,9 +88,7 @@ def test_the_time_increment_has_the_sign_of_the_turn(skew, sign):
             "by at most a full circle, in radians",
         ),
         ({"angle_min": 10.0, "angle_max": 12.0}, "within -2 pi and 2 pi"),
-        ({"angle_min": -12.0, "angle_max": -10.0}, "within -2 pi and 2 pi"),
         ({"rate": 0.0}, "key 'rate'"),
-        ({"mount": [0.0, 0.0]}, "key 'mount"),
         (
             {"mount": [0.0, 0.0, 180.0]},
             "'mount.2': must be in radians, within 2 pi (degrees look",
@@ -153,16 +97,13 @@ def test_the_time_increment_has_the_sign_of_the_turn(skew, sign):
             {"mount": [120.0, 0.0, 0.0]},
             "'mount.0': must be in metres, within 10 (millimetres",
         ),
-        ({"noise_std": -1.0}, "key 'noise_std'"),
         ({"range_max": float("inf")}, "key 'range_max'"),
         ({"beem": 3}, "did you mean 'beams'"),
-        ({"frame": ""}, "key 'frame'"),
         ({"no_return": "minus one"}, "key 'no_return'"),
         ({"no_return": "zero", "range_min": 0.0}, "range_min must be greater than 0"),
         ({"faults": {"dropout": 1.5}}, "key 'faults.dropout'"),
         ({"faults": {"dropout": 0.6, "dropout_far": 0.6}}, "must add up to at most 1"),
         ({"faults": {"quantisation": 4.0}}, "faults.quantisation must be less than"),
-        ({"faults": {"quantization": 0.1}}, "did you mean 'quantisation'"),
     ],
 )
 def test_a_lidar_that_cant_be_is_refused_in_one_sentence(changes, sentence):
@@ -170,12 +111,6 @@ def test_a_lidar_that_cant_be_is_refused_in_one_sentence(changes, sentence):
         validate(lidar().model_dump() | changes, LidarSpec, "lidar.yaml")
     assert sentence in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_two_lidars_keep_their_own_beams():
-    one = lidar(beams=10)
-    other = lidar(beams=20)
-    assert (len(one.angles), len(other.angles), len(one.angles)) == (10, 20, 10)
 
 
 def test_an_empty_sensor_model_of_an_earlier_version_is_read_and_another_refused():

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +12,6 @@ from robots import lidar
 from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.files import SUMS, write_sums
 from nics_drl_bridge.lidar.bake import bake
-from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.shapes import SQUARE, Circle, Polygon
 from nics_drl_bridge.lidar.table import (
     ABOUT_FILE,
@@ -77,23 +75,6 @@ def test_a_table_is_a_folder_of_arrays_that_numpy_and_sha256sum_read(table, fold
     assert (done.returncode, done.stdout.count(b": OK")) == (0, len(TABLE_FILES))
 
 
-def test_a_table_read_back_gives_the_same_scans(table, folder):
-    poses = np.random.default_rng(0).uniform(-2.0, 2.0, (50, 3, 3))
-    scans = []
-    for one in (table, LidarTable.load(folder)):
-        scanner = Scanner(SPEC, one, "baked")
-        scans.append(
-            scanner.scan(np.zeros((50, 3)), scanner.place(table.shapes, poses))
-        )
-    assert np.array_equal(*scans)
-    assert np.isfinite(scans[0]).any()
-
-
-def test_a_table_without_shapes_reads_back(tmp_path):
-    bake(SPEC, ()).save(tmp_path / "table")
-    assert LidarTable.load(tmp_path / "table").shapes == ()
-
-
 def test_a_loaded_table_is_mapped_and_writing_to_it_leaves_the_files(folder):
     before = contents(folder)
     back = LidarTable.load(folder)
@@ -106,46 +87,6 @@ def test_a_loaded_table_is_mapped_and_writing_to_it_leaves_the_files(folder):
         assert base.mode == "c"
         array[...] = 0
     assert contents(folder) == before
-
-
-@pytest.mark.slow
-def test_two_processes_share_the_pages_of_a_table(tmp_path):
-    big = bake(lidar(beams=720), (SQUARE,), Density(distances=100, rotations=240))
-    big.save(tmp_path / "table")
-    script = f"""
-import re, sys
-from pathlib import Path
-from nics_drl_bridge.lidar.table import LidarTable
-table = LidarTable.load(Path({str(tmp_path / "table")!r}))
-table.rows.sum()
-print("ready", flush=True)
-sys.stdin.readline()
-parts = Path("/proc/self/smaps").read_text().split("rows.npy")[1:]
-for key in ("Shared_Clean", "Private_Dirty"):
-    print(sum(int(re.search(key + r":\\s+(\\d+)", part)[1]) for part in parts) * 1024)
-"""
-    pair = [
-        subprocess.Popen(
-            [sys.executable, "-c", script],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        for _ in range(2)
-    ]
-    assert [process.stdout.readline() for process in pair] == ["ready\n"] * 2
-    told = pair[0].communicate("go\n", timeout=60)[0]
-    pair[1].communicate("go\n", timeout=60)
-    shared, dirty = map(int, told.split())
-    assert shared > 0.9 * big.rows.nbytes
-    assert dirty < 0.1 * big.rows.nbytes
-
-
-@pytest.mark.parametrize("array", ARRAYS)
-def test_every_change_of_an_array_changes_the_fingerprint(table, array):
-    values = getattr(table, array).copy()
-    values.view(np.uint8).ravel()[-1] ^= 1
-    assert replace(table, **{array: values}).fingerprint != table.fingerprint
 
 
 @pytest.mark.parametrize("name", [*TABLE_FILES, SUMS])
@@ -197,20 +138,15 @@ def npy(descr, shape, data=b"", order="False"):
         b"",
         b"no array",
         b"PK\x05\x06" + bytes(18),
-        npy("'<f4'", "(10**15,)"),
         npy("'<f4'", f"({10**15},)"),
-        npy("'<f4'", f"({10**30},)"),
         npy("'<f4'", f"({2**32}, {2**32})"),
         npy("'<f4'", "(-1,)"),
         npy("'|O'", "(3,)", b"cos\nsystem\n(S'true'\ntR."),
-        npy("'|O'", "(0,)"),
-        npy(f"'<U{2**31 - 1}'", "(2,)"),
         npy("'<f4'", "(" * 3000 + ")" * 3000),
         npy("[('a', '<f4')]", "(1,)", bytes(4)),
-        npy("'>f4'", "(1,)", bytes(4)),
         npy("'<f4'", "()", bytes(4)),
     ],
-    ids=range(15),
+    ids=range(10),
 )
 def test_a_hostile_array_is_refused_although_its_checksum_is_right(folder, content):
     (folder / "rows.npy").write_bytes(content)
@@ -220,12 +156,6 @@ def test_a_hostile_array_is_refused_although_its_checksum_is_right(folder, conte
         "rows.npy: is not an array of numbers" in told
         or "is not a lidar table (" in told
     )
-
-
-def test_an_array_with_another_order_of_its_axes_is_refused(table, folder):
-    np.save(folder / "cell.npy", np.asfortranarray(table.cell))
-    write_sums(folder)
-    assert "another number type or axis order" in refused(folder)
 
 
 @pytest.mark.parametrize(
@@ -238,7 +168,6 @@ def test_an_array_with_another_order_of_its_axes_is_refused(table, folder):
             "an array has another number type",
         ),
         (lambda t: {"start": t.start[:-1]}, "the number of cells"),
-        (lambda t: {"start": t.start - 1}, "a row lies outside"),
         (lambda t: {"cell": t.cell[:, :5]}, "the number of cells"),
         (lambda t: {"cell": t.cell * np.int16(30)}, "a "),
         (
@@ -247,13 +176,9 @@ def test_an_array_with_another_order_of_its_axes_is_refused(table, folder):
         ),
         (lambda t: {"grid": t.grid[0]}, "the grid"),
         (lambda t: {"grid": t.grid * np.nan}, "the grid"),
-        (lambda t: {"grid": t.grid * 1e300}, "the "),
         (lambda t: {"grid": t.grid[::-1].copy()}, "the grid"),
         (lambda t: {"beam_angle": 0.0}, "key 'beam_angle'"),
-        (lambda t: {"beam_angle": None}, "key 'beam_angle'"),
-        (lambda t: {"beam_angle": "0.1"}, "key 'beam_angle'"),
         (lambda t: {"density": {"distances": 8}}, "the grid"),
-        (lambda t: {"density": 3}, "key 'density'"),
         (lambda t: {"shapes": [{"kind": "blob"}]}, "unknown kind 'blob'"),
         (lambda t: {"shapes": []}, "the grid"),
         (lambda t: {"colour": "red"}, "unknown key 'colour'"),
@@ -270,23 +195,13 @@ def test_a_table_with_entries_that_do_not_fit_is_refused(table, folder, change, 
     assert reason in refused(folder)
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{", "[" * 100_000, '{"format": 3}', "3"])
-def test_what_does_not_describe_a_table_is_refused(folder, text):
-    (folder / ABOUT_FILE).write_text(text)
-    write_sums(folder)
-    assert ABOUT_FILE in refused(folder)
-
-
 def test_a_missing_table_is_named(tmp_path):
     assert "is missing" in refused(tmp_path / "none")
     assert "is missing" in refused(tmp_path)
 
 
-def test_memory_is_the_sum_of_the_arrays(table):
-    assert table.memory == sum(getattr(table, name).nbytes for name in ARRAYS)
-
-
-@pytest.mark.parametrize("phases", [0, 3, 16])
-def test_phases_are_a_power_of_two(phases):
-    with pytest.raises(ValueError, match="Input should be 1, 2, 4 or 8"):
-        Density(phases=phases)
+@pytest.mark.parametrize("array", ARRAYS)
+def test_every_change_of_an_array_changes_the_fingerprint(table, array):
+    values = getattr(table, array).copy()
+    values.view(np.uint8).ravel()[-1] ^= 1
+    assert replace(table, **{array: values}).fingerprint != table.fingerprint

@@ -17,7 +17,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.conversions import initial_pose
 from nics_drl_bridge.sim.occupancy import occupancy, standing
-from nics_drl_bridge.sim.scenes import SetSampler
+from nics_drl_bridge.sim.scenes import SceneSampler
 from nics_drl_bridge.sim.world_set import load_worlds
 from nodes.peer import stamp_ns
 
@@ -73,7 +73,7 @@ def begin_another_episode(simulated, seed):
 
 def wanted(model, seed):
     world = load_worlds("arena")
-    sampler = SetSampler(world, model.robot.footprint_radius)
+    sampler = SceneSampler(world, model.robot.footprint_radius)
     return occupancy(world, standing(sampler, 0, sampler.draw([seed])[0].bodies), 0.02)
 
 

@@ -8,7 +8,6 @@ import pytest
 from numba.core.runtime import _nrt_python, rtsys
 from robots import circles, direct_model, field, lidar
 
-from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import load_world
 
@@ -107,30 +106,3 @@ def test_a_simulator_allocates_nothing_per_step_however_many_worlds_it_has(
     assert most < BOOKKEEPING
     if several:
         assert simulator.data.ranges.nbytes > 2 * BOOKKEEPING
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "task",
-    ["navigation", pytest.param("cooperative_reaching", marks=pytest.mark.campaign)],
-)
-def test_the_memory_of_a_vector_env_does_not_grow_with_its_steps(task):
-    env = BridgeVectorEnv(
-        16,
-        noisy_model(),
-        field(8.0, 5),
-        task,
-        max_episode_steps=20,
-        autoreset_mode="SameStep",
-    )
-    env.reset(seed=0)
-    env.action_space.seed(0)
-    actions = [env.action_space.sample() for _ in range(16)]
-    count = [0]
-
-    def step():
-        env.step(actions[count[0] % len(actions)])
-        count[0] += 1
-
-    grown, _ = taken(step, bookkeeping=np.inf)
-    assert grown < GROWTH

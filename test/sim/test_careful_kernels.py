@@ -6,10 +6,12 @@ import dataclasses
 
 import numpy as np
 import pytest
+import shapely
 from robots import DIRECT, direct_model, field, lidar
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import compose, exp, rotate
+from nics_drl_bridge.lidar.shapes import Circle, Polygon
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.simulator import FastSimulator
 
@@ -17,8 +19,8 @@ DT = 0.01
 OVERLAP = 1e-6
 FASTEST = 50.0
 TURNS = 100.0
-BAR = ((0.3, 0.05), (-0.3, 0.05), (-0.3, -0.05), (0.3, -0.05))
-DART = ((0.2, 0.0), (-0.1, 0.12), (0.0, 0.0), (-0.1, -0.12))
+BAR = Polygon(points=((0.3, 0.05), (-0.3, 0.05), (-0.3, -0.05), (0.3, -0.05)))
+DART = Polygon(points=((0.2, 0.0), (-0.1, 0.12), (0.0, 0.0), (-0.1, -0.12)))
 SEGMENT = {"kind": "segment", "ends": [[-0.3, 0.0], [0.4, 0.1]]}
 CIRCLE = {"kind": "circle", "radius": 0.2}
 PLATE = {"kind": "rectangle", "size": [0.8, 0.02]}
@@ -33,177 +35,77 @@ HOOK = {
         [-0.5, 0.5],
     ],
 }
+TIMES = np.linspace(0.0, DT, 2001)
+BETWEEN = 1e-3
+"""A robot moves less from one of these times to the next [m]."""
 
 
 def fast_model(footprint):
-    """A robot with a radius, or an outline, that is told its twist 100 times a second."""
+    """A robot with a radius, or a shape, that is told its twist 100 times a second."""
     about = DIRECT.model_dump(exclude={"footprint_radius", "footprint"})
     for command, most in zip(about["command"], (FASTEST, FASTEST, TURNS), strict=True):
         command["min"] = -most
         command["max"] = most
-    about |= (
-        {"footprint_radius": footprint}
-        if isinstance(footprint, float)
-        else {"footprint": footprint}
-    )
+    if isinstance(footprint, Polygon):
+        about["footprint"] = footprint.points
+    else:
+        about["footprint_radius"] = footprint
+    robot = RobotSpec.model_validate(about)
     model = direct_model(sensor=lidar(rate=1.0 / DT))
-    return dataclasses.replace(
-        model, robot=RobotSpec.model_validate(about), control_period=DT
-    )
+    return dataclasses.replace(model, robot=robot, control_period=DT)
 
 
 def silent(_message):
     """The commands leave the range that the model was fitted to, and are meant to."""
 
 
-def edges_of(shape, pose):
-    """((E, 4) edges of a placed shape, and the radius around them)."""
-    if shape.kind == "circle":
-        return np.tile(pose[:2], 2)[None], shape.radius
-    corners = rotate(np.asarray(shape.outline), pose[2]) + pose[:2]
-    if len(corners) == 2:
-        return corners.reshape(1, 4), 0.0
-    return np.concatenate([corners, np.roll(corners, -1, axis=0)], axis=1), 0.0
+def drawn(shape, poses):
+    """A shape, or a radius, at poses (T, 3), as shapely's geometries and a radius around them."""
+    if isinstance(shape, float | Circle):
+        return shapely.points(poses[:, :2]), getattr(shape, "radius", shape)
+    corners = rotate(np.asarray(shape.outline)[None], poses[:, None, 2])
+    make = shapely.linestrings if len(shape.outline) == 2 else shapely.polygons
+    return make(corners + poses[:, None, :2]), 0.0
 
 
-def points_from(p, q):
-    """(..., P, Q) distance of points (..., P, 2) from segments (..., Q, 4)."""
-    p = p[..., :, None, :]
-    q = q[..., None, :, :]
-    along = q[..., 2:] - q[..., :2]
-    length = np.maximum((along**2).sum(axis=-1), 1e-300)
-    share = np.clip(((p - q[..., :2]) * along).sum(axis=-1) / length, 0.0, 1.0)
-    return np.linalg.norm(p - q[..., :2] - share[..., None] * along, axis=-1)
-
-
-def between(p, q):
-    """(...) least distance of segments (..., P, 4) and (..., Q, 4); 0 where two cross."""
-    least = np.minimum(
-        np.minimum(points_from(p[..., :2], q), points_from(p[..., 2:], q)).min(
-            axis=(-1, -2)
-        ),
-        np.minimum(points_from(q[..., :2], p), points_from(q[..., 2:], p)).min(
-            axis=(-1, -2)
-        ),
+def gaps(shape, poses, scene):
+    """(T,) clearance of a shape at poses (T, 3) from the parts of a scene; 0 inside of one."""
+    own, radius = drawn(shape, poses)
+    return np.min(
+        [shapely.distance(own, part) - radius - r for part, r in scene], axis=0
     )
 
-    def side(a, b, c):
-        return (b[..., 0] - a[..., 0]) * (c[..., 1] - a[..., 1]) - (
-            b[..., 1] - a[..., 1]
-        ) * (c[..., 0] - a[..., 0])
 
-    p = p[..., :, None, :]
-    q = q[..., None, :, :]
-    a = p[..., :2]
-    b = p[..., 2:]
-    c = q[..., :2]
-    d = q[..., 2:]
-    crossing = (side(a, b, c) * side(a, b, d) < 0.0) & (
-        side(c, d, a) * side(c, d, b) < 0.0
-    )
-    return np.where(crossing.any(axis=(-1, -2)), 0.0, least)
-
-
-class Mover:
-    """Edges with a radius, which move by a body twist from a pose, or by a velocity in the map."""
-
-    def __init__(self, edges, radius, pose, twist, in_map=False):
-        self.edges = edges
-        self.radius = radius
-        self.pose = pose
-        self.in_map = in_map
-        self.twist = np.asarray(twist)
-        reach = np.linalg.norm(edges.reshape(-1, 2), axis=-1).max()
-        self.speed = np.hypot(*self.twist[:2]) + abs(self.twist[2]) * reach
-
-    def poses(self, times):
-        if self.in_map:
-            return self.pose + times[:, None] * self.twist
-        return compose(self.pose, exp(times[:, None] * self.twist))
-
-    def at(self, times):
-        poses = self.poses(times)
-        ends = self.edges.reshape(1, -1, 2)
-        turned = np.stack([rotate(ends[0], heading) for heading in poses[:, 2]])
-        return (turned + poses[:, None, :2]).reshape(len(times), -1, 4)
+def scenes_of(simulator, scenes):
+    """The walls of the world, and the obstacles of each scene, see `gaps`."""
+    walls = shapely.multilinestrings(simulator.world.all_walls().reshape(-1, 2, 2))
+    found = []
+    for scene in scenes:
+        parts = [(walls, 0.0)]
+        for body in scene.bodies:
+            (part,), radius = drawn(
+                simulator.sampler.shapes[int(body[6])], body[None, :3]
+            )
+            parts.append((part, radius))
+        found.append(parts)
+    return found
 
 
-def clearance(one, other, times):
-    return between(one.at(times), other.at(times)) - one.radius - other.radius
+def assert_flagged(flagged, clearance):
+    """A robot is marked if it touched something at one of the times, unless it was too close."""
+    if (clearance <= 0.0).any():
+        assert flagged
+    elif clearance.min() > BETWEEN:
+        assert not flagged
 
 
-def first_touch(one, others):
-    """When one first touches any of the others within DT, inf if never, and the least clearance.
-
-    Each stretch of time in which the clearance can't fall below zero at their speeds is left; the
-    rest is looked at ten times as finely.
-    """
-    touch = np.inf
-    least = np.inf
-    for other in others:
-        speed = one.speed + other.speed
-        spans = np.array([0.0])
-        step = DT
-        for _ in range(9):
-            edges = np.linspace(0.0, step, 11)
-            times = (spans[:, None] + edges).ravel()
-            gaps = clearance(one, other, times).reshape(-1, 11)
-            least = min(least, float(gaps.min()))
-            if (gaps <= 0.0).any():
-                touch = min(touch, float(times.reshape(-1, 11)[gaps <= 0.0].min()))
-            low = (gaps[:, :-1] + gaps[:, 1:] - speed * step / 10.0) / 2.0
-            begin = spans[:, None] + edges[:-1]
-            chosen = np.sort(begin[(low <= max(0.0, least)) & (begin < touch)])[:40]
-            if len(chosen) == 0:
-                break
-            spans = chosen
-            step = step / 10.0
-    return touch, least
-
-
-def footprint_mover(footprint, pose, twist):
-    if isinstance(footprint, float):
-        return Mover(np.zeros((1, 4)), footprint, pose, twist)
-    corners = np.array(footprint)
-    edges = np.concatenate([corners, np.roll(corners, -1, axis=0)], axis=1)
-    return Mover(edges, 0.0, pose, twist)
-
-
-def still(edges, radius=0.0):
-    return Mover(np.asarray(edges, dtype=float), radius, np.zeros(3), np.zeros(3))
-
-
-def random_walls(rng, count, size):
-    ends = rng.uniform(-size, size, (count, 2))
-    angle = rng.uniform(-np.pi, np.pi, count)
-    length = rng.uniform(0.1, 2.0, count)
-    away = length[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    return np.clip(np.concatenate([ends, ends + away], axis=1), -size, size)
-
-
-def free_starts(rng, footprint, scenes, size, number):
-    """Poses at which a footprint overlaps nothing of its scene."""
-    starts = np.zeros((number, 1, 3))
-    for n in range(number):
-        while True:
-            pose = np.array([*rng.uniform(-size, size, 2), rng.uniform(-np.pi, np.pi)])
-            here = footprint_mover(footprint, pose, np.zeros(3))
-            if all(
-                clearance(here, other, np.zeros(1))[0] > 1e-3 for other in scenes[n]
-            ):
-                starts[n, 0] = pose
-                break
-    return starts
-
-
-SHAPES = [CIRCLE, PLATE, HOOK, SEGMENT]
 MORE = {"marks": pytest.mark.campaign}
 FOOTPRINTS = [
     pytest.param(0.01, **MORE, id="1cm"),
     pytest.param(0.1, id="10cm"),
     pytest.param(0.5, **MORE, id="50cm"),
     pytest.param(BAR, id="bar"),
-    pytest.param(DART, id="dart"),
+    pytest.param(DART, **MORE, id="dart"),
 ]
 
 
@@ -211,50 +113,40 @@ FOOTPRINTS = [
 @pytest.mark.slow
 @pytest.mark.timeout(600)  # a cold start compiles
 def test_a_robot_ends_where_its_arc_first_touches_at_any_size_and_speed(footprint):
-    number = 160
+    number = 80
     rng = np.random.default_rng(5)
-    walls = random_walls(rng, 8, 3.4)
-    groups = [{"shapes": [shape], "count": 1} for shape in SHAPES]
+    walls = rng.uniform(-3.4, 3.4, (8, 4))
+    groups = [
+        {"shapes": [shape], "count": 1} for shape in (CIRCLE, PLATE, HOOK, SEGMENT)
+    ]
     world = field(7.0, obstacles=groups, walls=[tuple(wall) for wall in walls])
     simulator = FastSimulator(
         fast_model(footprint), world, number, renderer="exact", tell=silent
     )
-    drawn = simulator.reset(range(number))
-    shapes = simulator.sampler.shapes
-    scenes = [
-        [still(world.all_walls())]
-        + [still(*edges_of(shapes[int(body[6])], body[:3])) for body in bodies]
-        for bodies in drawn.bodies
-    ]
-    starts = free_starts(rng, footprint, scenes, 3.4, number)
+    scenes = scenes_of(simulator, simulator.reset(range(number)))
+    starts = np.zeros((number, 1, 3))
+    for start, scene in zip(starts, scenes, strict=True):
+        while gaps(footprint, start, scene)[0] < BETWEEN or not start.any():
+            start[0] = rng.uniform(-1.0, 1.0, 3) * [3.4, 3.4, np.pi]
     speed = FASTEST * rng.uniform(0.0, 1.0, number)
     course = rng.uniform(-np.pi, np.pi, number)
     turn = TURNS * rng.uniform(-1.0, 1.0, number) ** 3
     twists = np.stack([speed * np.cos(course), speed * np.sin(course), turn], axis=1)
     simulator.reset(range(number), starts=starts)
     simulator.step(twists[:, None])
-    touched = 0
-    for n in range(number):
-        robot = footprint_mover(footprint, starts[n, 0], twists[n])
-        touch, least = first_touch(robot, scenes[n])
-        flagged = bool(simulator.data.collided[n, 0])
-        if abs(least) > OVERLAP:
-            assert flagged == (least < 0.0 or touch < np.inf), (n, least, touch)
-        end = simulator.data.pose[n, 0]
-        if not flagged:
-            assert end[:2] == pytest.approx(
-                robot.poses(np.array([DT]))[0, :2], abs=1e-6
-            )
-            continue
-        touched += 1
-        here = footprint_mover(footprint, end, np.zeros(3))
-        gaps = [clearance(here, other, np.zeros(1))[0] for other in scenes[n]]
-        assert -OVERLAP <= min(gaps) <= OVERLAP
-        if touch < np.inf:
-            at = robot.poses(np.array([touch]))[0]
-            # Where it touches at a slant the time is less sharp than the clearance.
-            assert np.hypot(*(end - at)[:2]) < 1e-3
-    assert touched > 5
+    for n, scene in enumerate(scenes):
+        poses = compose(starts[n], exp(TIMES[:, None] * twists[n]))
+        clearance = gaps(footprint, poses, scene)
+        flagged = simulator.data.collided[n, 0]
+        assert_flagged(flagged, clearance)
+        end = simulator.data.pose[n]
+        stop = -1
+        if flagged:
+            assert abs(gaps(footprint, end, scene)[0]) <= OVERLAP
+            stop = np.argmax(clearance <= 0.0) if clearance.min() <= 0.0 else None
+        if stop is not None:
+            assert end[0, :2] == pytest.approx(poses[stop, :2], abs=2.0 * BETWEEN)
+    assert simulator.data.collided.sum() > 3
 
 
 def test_a_robot_of_a_centimetre_does_not_pass_a_wall_at_50_m_per_s():
@@ -265,82 +157,6 @@ def test_a_robot_of_a_centimetre_does_not_pass_a_wall_at_50_m_per_s():
         simulator.step([[[50.0, 0.0, 0.0]]])
         assert simulator.data.collided[0, 0] == 1
         assert simulator.data.pose[0, 0, 0] == pytest.approx(0.29, abs=OVERLAP)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "shape", [CIRCLE, PLATE, HOOK], ids=["circle", "plate", "hook"]
-)
-def test_a_robot_and_a_moving_obstacle_stop_where_they_touch(shape):
-    number = 100
-    rng = np.random.default_rng(7)
-    world = field(10.0, obstacles=[{"shapes": [shape], "count": 1}])
-    simulator = FastSimulator(fast_model(0.05), world, number, tell=silent)
-    simulator.reset(range(number), starts=np.tile([0.0, 0.0, 0.3], (number, 1, 1)))
-    outline = simulator.sampler.shapes[0]
-    away = rng.uniform(0.8, 1.2, number)
-    bearing, heading = rng.uniform(-np.pi, np.pi, (2, number))
-    bodies = simulator.data.bodies[:, 0]
-    bodies[:, 0], bodies[:, 1], bodies[:, 2] = (
-        away * np.cos(bearing),
-        away * np.sin(bearing),
-        heading,
-    )
-    bodies[:, 3], bodies[:, 4] = np.cos(heading), np.sin(heading)
-    before = bodies[:, :3].copy()
-    own = rng.uniform(0.0, 40.0, number)[:, None] * np.stack(
-        [np.cos(bearing - 0.3), np.sin(bearing - 0.3)], axis=1
-    )
-    twists = np.concatenate([own, rng.uniform(-30.0, 30.0, (number, 1))], axis=1)
-    velocity = np.concatenate(
-        [
-            rng.uniform(20.0, 90.0, number)[:, None]
-            * np.stack([-np.cos(bearing + 0.2), -np.sin(bearing + 0.2)], axis=1),
-            rng.uniform(-20.0, 20.0, (number, 1)),
-        ],
-        axis=1,
-    )
-    simulator.data.velocity[:, 0] = velocity
-    simulator.step(twists[:, None])
-    touched = 0
-    edges = edges_of(outline, np.zeros(3))
-    for n in range(number):
-        robot = footprint_mover(0.05, np.array([0.0, 0.0, 0.3]), twists[n])
-        other = Mover(*edges, before[n], velocity[n], in_map=True)
-        touch, least = first_touch(robot, [other])
-        flagged = bool(simulator.data.collided[n, 0])
-        if abs(least) > OVERLAP:
-            assert flagged == (touch < np.inf), (n, least)
-        here = footprint_mover(0.05, simulator.data.pose[n, 0], np.zeros(3))
-        there = Mover(*edges, simulator.data.bodies[n, 0, :3], np.zeros(3), in_map=True)
-        assert clearance(here, there, np.zeros(1))[0] >= -OVERLAP
-        touched += flagged
-    assert 10 < touched < number
-
-
-@pytest.mark.slow
-def test_robots_that_run_into_each_other_stop_there_and_are_marked():
-    number = 200
-    rng = np.random.default_rng(9)
-    simulator = FastSimulator(fast_model(0.03), field(10.0), number, 2, tell=silent)
-    starts = np.zeros((number, 2, 3))
-    starts[:, 1, :2] = rng.uniform(-0.05, 0.05, (number, 2)) + np.array([0.0, 0.2])
-    twists = rng.uniform(-1.0, 1.0, (number, 2, 3)) * [FASTEST, FASTEST, TURNS]
-    simulator.reset(range(number), starts=starts)
-    simulator.step(twists)
-    touched = 0
-    for n in range(number):
-        one, other = (
-            footprint_mover(0.03, starts[n, m], twists[n, m]) for m in range(2)
-        )
-        touch, least = first_touch(one, [other])
-        flags = simulator.data.collided[n].tolist()
-        if abs(least) > OVERLAP:
-            assert flags == [int(touch < np.inf)] * 2, (n, least)
-        apart = np.hypot(*(simulator.data.pose[n, 1] - simulator.data.pose[n, 0])[:2])
-        assert apart >= 0.06 - OVERLAP
-        touched += sum(flags)
-    assert touched > 10
 
 
 def test_robots_that_follow_each_other_at_any_speed_do_not_touch():
@@ -392,17 +208,6 @@ def test_nothing_overlaps_in_a_long_drive_of_fast_robots(deviation):
         own = np.eye(robots, bodies.shape[1], bodies.shape[1] - robots, dtype=bool)
         assert ((apart >= near - OVERLAP) | own).all()
     assert simulator.data.collided.any()
-
-
-def test_a_robot_that_slides_along_a_wall_gets_along():
-    simulator = FastSimulator(fast_model(0.1), field(8.0), tell=silent)
-    simulator.reset([0], starts=np.array([[[-3.0, 3.8, 0.0]]]))
-    simulator.step([[[1.0, 30.0, 0.0]]])
-    assert simulator.data.pose[0, 0, 1] == pytest.approx(3.9, abs=OVERLAP)
-    before = simulator.data.pose[0, 0, 0]
-    for _ in range(10):
-        simulator.step([[[10.0, 0.0, 0.0]]])
-    assert simulator.data.pose[0, 0, 0] == pytest.approx(before + 1.0)
 
 
 def test_a_robot_that_is_placed_in_something_may_leave_it_and_gets_no_deeper():
@@ -474,15 +279,6 @@ def test_a_wall_turns_a_robot_with_corners_parallel_and_lets_it_leave():
     assert simulator.data.pose[0, 0, 0] < 0.6
 
 
-def test_a_robot_that_is_pushed_flat_against_a_wall_stands():
-    simulator = at_a_wall(BAR, 0.6)
-    turned_by(simulator, [1.0, 0.0, 0.3], 100)
-    assert simulator.data.pose[0, 0, 0] == pytest.approx(0.7, abs=1e-2)
-    stands = simulator.data.pose[0, 0].copy()
-    turned_by(simulator, [1.0, 0.0, 0.3], 100)
-    assert simulator.data.pose[0, 0] == pytest.approx(stands, abs=1e-3)
-
-
 def test_a_robot_in_a_narrow_corner_stands_still_and_comes_out_again():
     walls = [(1.0, 0.0, -1.0, 0.3), (1.0, 0.0, -1.0, -0.3)]
     simulator = FastSimulator(fast_model(0.1), field(8.0, walls=walls), tell=silent)
@@ -495,40 +291,27 @@ def test_a_robot_in_a_narrow_corner_stands_still_and_comes_out_again():
     assert simulator.data.pose[0, 0, 0] < stuck[0] - 0.15
 
 
-@pytest.mark.parametrize("footprint", [BAR, DART], ids=["bar", "dart"])
 @pytest.mark.slow
-def test_nothing_overlaps_where_robots_with_corners_push_and_slide(footprint):
+def test_nothing_overlaps_where_robots_with_corners_push_and_slide():
     rng = np.random.default_rng(3)
-    number = 24
+    number = 12
     groups = [{"shapes": [CIRCLE, PLATE], "count": 4}]
     world = field(3.0, obstacles=groups, walls=[(0.0, 0.0, 1.0, 0.4)])
-    simulator = FastSimulator(fast_model(footprint), world, number, 2, tell=silent)
-    drawn = simulator.reset(range(number))
-    shapes = simulator.sampler.shapes
+    simulator = FastSimulator(fast_model(DART), world, number, 2, tell=silent)
+    scenes = scenes_of(simulator, simulator.reset(range(number)))
+    pose = simulator.data.pose
     moved = 0.0
-    scenes = [
-        [still(world.all_walls())]
-        + [still(*edges_of(shapes[int(body[6])], body[:3])) for body in bodies]
-        for bodies in drawn.bodies
-    ]
-    for k in range(120):
+    for k in range(90):
         if k % 15 == 0:
             twists = rng.uniform(-1.0, 1.0, (number, 2, 3)) * [4.0, 4.0, 10.0]
-        before = simulator.data.pose[..., :2].copy()
+        before = pose[..., :2].copy()
         simulator.step(twists)
         touching = simulator.data.collided != 0
-        moved += np.abs(simulator.data.pose[..., :2] - before)[touching].sum()
-        if k % 10:
-            continue
-        for n in range(number):
-            ends = simulator.data.pose[n]
-            robots = [footprint_mover(footprint, end, np.zeros(3)) for end in ends]
-            for robot, rest in (
-                (robots[0], [*scenes[n], robots[1]]),
-                (robots[1], scenes[n]),
-            ):
-                gaps = [clearance(robot, other, np.zeros(1))[0] for other in rest]
-                assert min(gaps) > 0.0, (n, k)
+        moved += np.abs(pose[..., :2] - before)[touching].sum()
+        for n in range(number if k % 10 == 0 else 0):
+            one, other = drawn(DART, pose[n])[0]
+            assert shapely.distance(one, other) > 0.0, (n, k)
+            assert (gaps(DART, pose[n], scenes[n]) > 0.0).all(), (n, k)
     assert simulator.data.collided.any(axis=1).sum() > number // 2
     assert moved > 1.0
 

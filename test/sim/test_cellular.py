@@ -33,19 +33,6 @@ def test_the_worlds_of_a_seed_stay_the_same():
     assert counts == [84, 114, 113, 195, 194, 101, 104, 138]
 
 
-def test_the_share_of_filled_cells_follows_fill():
-    few, many = (
-        np.mean(
-            [
-                len(cylinders(grow(Cellular(worlds=9, fill=(share, share)), n)))
-                for n in range(9)
-            ]
-        )
-        for share in (0.1, 0.3)
-    )
-    assert 0 < few < many / 2
-
-
 @pytest.mark.parametrize("number", range(8))
 def test_a_disc_as_wide_as_the_passage_can_get_to_the_goal(number):
     world = grow(GIVEN, number)
@@ -64,13 +51,6 @@ def test_a_disc_as_wide_as_the_passage_can_get_to_the_goal(number):
     assert any(
         area.contains(start) and area.contains(goal) for area in shapely.get_parts(free)
     )
-
-
-def test_a_field_without_a_way_is_refused():
-    with pytest.raises(
-        ConfigError, match=r"has a path of 0\.5 m; lower `fill` or `passage`"
-    ):
-        grow(Cellular(worlds=1, fill=(0.9, 0.9)), 0)
 
 
 @pytest.mark.parametrize(
@@ -106,9 +86,3 @@ def test_a_set_holds_what_is_generated_beside_what_is_named(tmp_path):
     )
     names = [world.name for world in load_worlds(file).members]
     assert names == ["circles", "cellular_0_0", "cellular_0_1", "cellular_0_2"]
-
-
-@pytest.mark.slow
-def test_the_shipped_set_is_found_by_its_name():
-    world = load_worlds("cellular")
-    assert (world.name, len(world.members)) == ("cellular", 2000)

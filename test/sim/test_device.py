@@ -37,9 +37,10 @@ def end_of(fast: FastSimulator) -> tuple[np.ndarray, ...]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["crowd", "room"])
-@pytest.mark.parametrize("skew", ["none", "counter_clockwise"])
-@pytest.mark.parametrize("drawn", [None, LATE])
+@pytest.mark.parametrize(
+    ("name", "skew", "drawn"),
+    [("crowd", "none", None), ("room", "counter_clockwise", LATE)],
+)
 def test_robots_moved_from_outside_sense_what_those_of_the_fast_simulator_do(
     name, skew, drawn
 ):
@@ -90,19 +91,16 @@ def test_commands_are_in_force_as_late_as_is_drawn_and_without_the_latency_of_th
 
 
 def test_odometry_is_what_the_wheels_count_and_the_scan_is_of_where_the_robot_is():
-    model = direct_model(odometry=(0.0, 0.0))
-    world = load_world("empty")
+    driven = DrivenSimulator(direct_model(), load_world("empty"))
     start = np.array([[[0.5, 0.0, 0.0]]])
-    driven = DrivenSimulator(model, world)
     driven.reset([0], starts=start)
-    before = driven.data.ranges.copy()
-    turned = np.array([[1.0, 0.2, 0.1]])
-    stuck = start[0], np.zeros((1, 3)), np.zeros((1, 0)), turned, turned
-    driven.begin_period(np.zeros((1, 3)))
-    driven.end_period(*stuck, np.array([True]))
-    driven.begin_period(np.zeros((1, 3)))
-    driven.end_period(*stuck, np.array([False]))
     data = driven.data
+    before = data.ranges.copy()
+    turned = np.array([[1.0, 0.2, 0.1]])
+    for touched in (True, False):
+        driven.begin_period(np.zeros((1, 3)))
+        stuck = start[0], np.zeros((1, 3)), np.zeros((1, 0))
+        driven.end_period(*stuck, turned, turned, np.array([touched]))
     assert data.odom[0] == pytest.approx(turned)
     assert data.twist[0] == pytest.approx(turned)
     assert np.array_equal(data.pose, start)
@@ -130,22 +128,6 @@ def test_the_covariance_of_odometry_is_that_of_the_errors_of_many_drives():
     assert nees.mean() == pytest.approx(3.0, abs=4 * np.sqrt(6 / worlds))
 
 
-def test_a_heading_error_widens_the_pose_across_the_way_and_not_along_it():
-    heading_only = np.diag([0.0, 0.0, 0.01])[None]
-    after = propagate(
-        heading_only, [[0.0, 0.0, 0.0]], [[2.0, 0.0, 0.0]], np.zeros((3, 3))
-    )[0]
-    assert after[0, 0] == 0.0
-    assert after[1, 1] == pytest.approx(2.0**2 * 0.01)
-    assert after[1, 2] == pytest.approx(2.0 * 0.01)
-    assert (after == after.T).all()
-
-
-def test_odometry_without_noise_is_not_said_to_be_unknown():
-    assert (variances((0.0, 0.0)) > 0.0).all()
-    assert (np.linalg.eigvalsh(step_covariance((0.0, 0.0), 0.1)) > 0.0).all()
-
-
 def test_an_episode_that_would_begin_outside_the_world_is_refused_and_the_one_at_hand_goes_on():
     model = direct_model()
     world = load_world("empty")
@@ -157,3 +139,8 @@ def test_an_episode_that_would_begin_outside_the_world_is_refused_and_the_one_at
         device.begin(4, np.array([99.0, 0.0, 0.0]))
     device.advance()
     assert device.simulator.data.pose[0, 0] == pytest.approx([1.0, -1.0, 0.5])
+
+
+def test_odometry_without_noise_is_not_said_to_be_unknown():
+    assert (variances((0.0, 0.0)) > 0.0).all()
+    assert (np.linalg.eigvalsh(step_covariance((0.0, 0.0), 0.1)) > 0.0).all()

@@ -1,16 +1,15 @@
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 
+from nics_drl_bridge.geometry import rotate
 from nics_drl_bridge.lidar.maps import FREE, OCCUPIED, load_map, map_files
 from nics_drl_bridge.lidar.scanner import make_scanner
 from nics_drl_bridge.lidar.shapes import Circle, Polygon, Segment
 from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.sim.occupancy import MOST_CELLS, occupancy, standing
-from nics_drl_bridge.sim.scenes import SetSampler
+from nics_drl_bridge.sim.scenes import SceneSampler
 from nics_drl_bridge.sim.world import World
 from nics_drl_bridge.sim.world_set import load_worlds
 
@@ -25,7 +24,7 @@ def world_of(**keys):
 def agreement(name, seed, spare=()):
     """Share of beams whose end in the map is within a cell of what the beams beside it show."""
     worlds = load_worlds(name)
-    sampler = SetSampler(worlds, 0.2)
+    sampler = SceneSampler(worlds, 0.2)
     scene = sampler.draw([seed])[0]
     world = worlds.members[int(scene.member)]
     placed = standing(sampler, int(scene.member), scene.bodies)
@@ -53,10 +52,6 @@ def test_beams_in_the_map_end_where_they_end_in_the_world(name):
     assert agreement(name, 3) > 0.995
 
 
-def test_a_map_that_lacks_an_obstacle_does_not_agree():
-    assert agreement("arena", 3, spare=(0,)) < 0.99
-
-
 def test_a_map_of_a_world_is_kept_to_its_cells_however_coarse_they_are():
     world = load_worlds("room")
     for cell in (0.05, 0.03, 1.0):
@@ -73,7 +68,7 @@ def test_a_map_of_a_world_is_kept_to_its_cells_however_coarse_they_are():
 
 def test_what_moves_is_left_out():
     worlds = load_worlds("crowd")
-    sampler = SetSampler(worlds, 0.2)
+    sampler = SceneSampler(worlds, 0.2)
     scene = sampler.draw([0])[0]
     pillars = worlds.obstacles[-1]
     assert np.count_nonzero(scene.bodies[:, 5]) > len(pillars.at)
@@ -84,17 +79,16 @@ def test_what_moves_is_left_out():
 
 def test_things_thinner_than_a_cell_do_not_vanish():
     world = world_of(bounds=(-1.0, -1.0, 1.0, 1.0), walls=[(-0.5, -0.5, 0.5, -0.4)])
-    thin = Polygon(points=((0.0, 0.0), (0.6, 0.001), (0.6, 0.002), (0.0, 0.001)))
-    placed = [
-        (thin, (-0.3, 0.3, 0.2)),
-        (Segment(ends=((0.0, 0.0), (0.3, 0.0))), (0.0, 0.7, 1.0)),
-    ]
+    bar = Segment(ends=((0.0, 0.0), (0.3, 0.0)))
+    sliver = Polygon(points=((0.0, 0.0), (0.6, 0.001), (0.6, 0.002), (0.0, 0.001)))
+    placed = [(sliver, (-0.3, 0.3, 0.2)), (bar, (0.0, 0.7, 1.0))]
     grid = occupancy(world, placed, 0.05)
-    scanner = make_scanner(LIDAR, [], "exact", grid)
-    seen = scanner.scan([(0.0, 0.0, 0.0)], [])[0]
-    for degrees, far in ((-90.0, 0.45), (90.0, 0.36)):
-        beam = np.argmin(np.abs(LIDAR.angles - math.radians(degrees)))
-        assert seen[beam] == pytest.approx(far, abs=0.06)
+    ends = [[(-0.5, -0.5), (0.5, -0.4)]]
+    for shape, pose in placed:
+        ends.append(rotate(shape.outline[[0, 1]], pose[2]) + pose[:2])
+    for begin, end in ends:
+        line = np.linspace(begin, end, 50)
+        assert (grid.cells[tuple(grid.world_to_cell(line).T)] == OCCUPIED).mean() > 0.9
 
 
 @pytest.mark.parametrize("at", [(0.0, 0.0), (0.025, 0.025), (0.31, -0.17)])
@@ -103,17 +97,6 @@ def test_a_pole_thinner_than_a_cell_does_not_vanish(at):
     grid = occupancy(world, [(Circle(radius=0.01), (*at, 0.0))], 0.05)
     assert (grid.cells == OCCUPIED).sum() == 1
     assert grid.cells[tuple(grid.world_to_cell(at))] == OCCUPIED
-
-
-def test_the_grid_covers_the_bounds_beside_a_turned_map(tmp_path):
-    map_files(load_map("room"), tmp_path / "own.yaml")
-    text = (tmp_path / "own.yaml").read_text().replace("- 0.0\n", "- 0.785\n")
-    (tmp_path / "own.yaml").write_text(text)
-    bounds = (-20.0, -20.0, 20.0, 20.0)
-    grid = occupancy(world_of(bounds=bounds, map=str(tmp_path / "own.yaml")))
-    corners = [(-20.0, -20.0), (20.0, -20.0), (20.0, 20.0), (-20.0, 20.0)]
-    index = grid.world_to_cell(corners)
-    assert ((index >= 0) & (index < grid.cells.shape)).all()
 
 
 def test_a_field_beside_a_turned_map_is_closed_all_around(tmp_path):

@@ -11,7 +11,7 @@ from nics_drl_bridge.config import validate
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.lidar import fault_kernels
-from nics_drl_bridge.lidar.faults import SKEW, LidarFaults
+from nics_drl_bridge.lidar.faults import LidarFaults
 from nics_drl_bridge.robot.kernels import make_terms
 from nics_drl_bridge.robot.noise import MEASURED, Level, Noise
 from nics_drl_bridge.sim.randomisation import (
@@ -60,22 +60,15 @@ def test_nothing_named_is_exactly_the_model():
 @pytest.mark.parametrize("name", ["mild", "strong"])
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_the_shipped_ranges_fit_every_shipped_robot(name, robot):
-    sampler = Sampler(load_randomisation(name), builtin_model(robot), 2)
-    drawn = sampler.draw(SEEDS)
-    nominal = make_terms(builtin_model(robot).kinematics).coefficient
-    low, high = load_randomisation(name).kinematics.scale
-    factor = drawn.coefficient / nominal
-    assert factor.min() >= low * (1.0 - 1e-12)
-    assert factor.max() <= high * (1.0 + 1e-12)
+    ranges = load_randomisation(name)
+    model = builtin_model(robot)
+    drawn = Sampler(ranges, model, 2).draw(SEEDS)
+    factor = drawn.coefficient / make_terms(model.kinematics).coefficient
+    low, high = ranges.kinematics.scale
+    assert low * (1.0 - 1e-12) <= factor.min() <= factor.max() <= high * (1.0 + 1e-12)
     assert factor.std(axis=0).min() > 0.2 * (high - low)
-    named = drawn.named()
-    assert {
-        "action_latency_s",
-        "observation_latency_s",
-        "lidar.noise_std",
-    } <= named.keys()
-    assert f"kinematics.{builtin_model(robot).kinematics.dofs[0]}" in ".".join(named)
-    assert all(np.isfinite(value).all() for value in named.values())
+    assert {"action_latency_s", "lidar.noise_std"} <= drawn.named().keys()
+    assert all(np.isfinite(value).all() for value in drawn.named().values())
 
 
 def test_a_seed_gives_the_same_bits_in_any_batch_and_among_any_robots():
@@ -136,126 +129,80 @@ def test_each_coefficient_is_scaled_evenly_and_on_its_own():
     assert (np.sign(drawn.coefficient) == np.sign(nominal)).all()
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
-def test_a_slower_response_scales_all_time_constants_alike_and_leads_to_the_same_state(
-    robot,
-):
-    nominal = builtin_model(robot).kinematics
-    command = builtin_model(robot).robot.command_high
-    sampler = Sampler(
-        given(kinematics={"response": [1.0, 3.0]}), builtin_model(robot), 2
-    )
-    drawn = sampler.draw(SEEDS[:50])
-    kept = np.nonzero(nominal.coefficients)
-    size = nominal.state_size
-    factor = make_terms(nominal).coefficient / drawn.coefficient
-    assert np.allclose(factor[..., kept[0] < 3], 1.0)
-    assert np.allclose(
-        factor[..., kept[0] >= 3], drawn.named()["kinematics.response"][..., None]
-    )
-    assert drawn.response.min() < 1.2
-    assert drawn.response.max() > 2.8
-    settled = []
-    for coefficient in (make_terms(nominal).coefficient, drawn.coefficient[0, 0]):
-        coefficients = nominal.coefficients.copy()
-        coefficients[kept] = coefficient
-        state = np.zeros(size)
-        for _ in range(1000):
-            slow = dataclasses.replace(nominal, coefficients=coefficients)
-            state = slow.step(np.zeros(3), state, command)[1]
-        settled.append(state)
-    assert settled[0] == pytest.approx(settled[1], rel=1e-3)
+def test_a_slower_response_scales_all_rates_of_the_state_alike():
+    model = builtin_model("ackermann")
+    ranges = given(kinematics={"response": [1.0, 3.0]})
+    drawn = Sampler(ranges, model, 2).draw(SEEDS[:50])
+    of_state = np.nonzero(model.kinematics.coefficients)[0] >= 3
+    factor = make_terms(model.kinematics).coefficient / drawn.coefficient
+    response = drawn.named()["kinematics.response"]
+    assert np.allclose(factor[..., ~of_state], 1.0)
+    assert np.allclose(factor[..., of_state], response[..., None])
+    assert response.min() < 1.2
+    assert response.max() > 2.8
 
 
 def test_a_rate_and_a_term_may_have_ranges_of_their_own():
-    kinematics = {
-        "scale": [0.9, 1.1],
-        "dofs": {"wz": [2.0, 2.0]},
-        "terms": {"wz": {"steering*speed": [3.0, 4.0]}},
-    }
-    drawn = Sampler(given(kinematics=kinematics), builtin_model("ackermann")).draw(
-        SEEDS
-    )
+    own = {"dofs": {"wz": [2.0, 2.0]}, "terms": {"wz": {"steering*speed": [3.0, 4.0]}}}
+    ranges = given(kinematics={"scale": [0.9, 1.1], **own})
     nominal = builtin_model("ackermann").kinematics
-    named = drawn.named()
+    named = Sampler(ranges, builtin_model("ackermann")).draw(SEEDS).named()
     assert "kinematics.wz.speed*steering_command" not in named  # always twice as much
-    d = nominal.dofs.index("wz")
-    k = nominal.term_names.index("speed*steering")
-    factor = named["kinematics.wz.speed*steering"][:, 0] / nominal.coefficients[d, k]
-    assert_even(factor, 3.0, 4.0)
-    factor = named["kinematics.vx.speed"][:, 0]
-    assert_even(
-        factor / nominal.coefficients[0, nominal.term_names.index("speed")], 0.9, 1.1
-    )
+    for dof, term, span in (
+        ("wz", "speed*steering", (3, 4)),
+        ("vx", "speed", (0.9, 1.1)),
+    ):
+        place = nominal.dofs.index(dof), nominal.term_names.index(term)
+        factor = named[f"kinematics.{dof}.{term}"][:, 0] / nominal.coefficients[place]
+        assert_even(factor, *span)
 
 
 @pytest.mark.parametrize(
-    ("kinematics", "sentence"),
+    ("ranges", "match"),
     [
-        (
-            {"dofs": {"d_sped": [1, 2]}},
-            "unknown rate 'd_sped'; did you mean 'd_speed'?",
-        ),
-        (
-            {"terms": {"vy": {"speed": [1, 2]}}},
-            "no term 'speed' there; it has none at all",
-        ),
-        (
-            {"terms": {"wz": {"sped*steering": [1, 2]}}},
-            "did you mean 'speed*steering'?",
-        ),
-        (
-            {"terms": {"wz": {"speed": [1, 2]}}},
-            "no term 'speed' there; valid are: 'speed*",
-        ),
-        ({"scale": [1.0, 30.0]}, "the state of the robot grows by itself"),
+        ({"kinematics": {"dofs": {"d_sped": [1, 2]}}}, "did you mean 'd_speed'"),
+        ({"kinematics": {"terms": {"vy": {"speed": [1, 2]}}}}, "has none at all"),
+        ({"kinematics": {"terms": {"wz": {"speed": [1, 2]}}}}, "no term 'speed' there"),
+        ({"kinematics": {"scale": [1.0, 30.0]}}, "the robot grows by itself"),
+        ({"lidar": {"dropout": [0.0, 0.4], "dropout_far": [0.0, 0.7]}}, "at most 1"),
     ],
 )
-def test_a_range_that_the_model_cannot_take_is_one_sentence(kinematics, sentence):
-    with pytest.raises(ConfigError) as caught:
-        Sampler(given(kinematics=kinematics), builtin_model("ackermann"))
-    assert sentence in str(caught.value)
-    assert str(caught.value).startswith("randomisation 'mine': key 'kinematics")
+def test_a_range_that_the_model_cannot_take_is_refused_by_its_key(ranges, match):
+    with pytest.raises(ConfigError, match=match):
+        Sampler(given(**ranges), builtin_model("ackermann"))
 
 
 @pytest.mark.parametrize(
-    ("data", "sentence"),
+    ("ranges", "match"),
     [
-        (
-            {"kinematics": {"scale": [1.1, 0.9]}},
-            "key 'kinematics.scale': a range is [minimum",
-        ),
-        ({"kinematics": {"scale": [0.0, 0.9]}}, "key 'kinematics.scale.0': input"),
-        ({"kinematics": {"dofs": {"wz": [-1.0, 0.9]}}}, "key 'kinematics.dofs.wz.0'"),
-        ({"action_latency": [-0.1, 0.9]}, "key 'action_latency.0'"),
-        ({"observation_latency": [0, 51]}, "less than or equal to 50"),
+        ({"odometry": {"drift": [0.5, 2.0]}}, "no measured drift to scale"),
+        ({"lidar": {"dropout_far": [0.0, 0.95]}}, "must add up to at most 1"),
+    ],
+)
+def test_what_does_not_go_with_the_models_own_noise_is_refused(ranges, match):
+    with pytest.raises(ConfigError, match=match):
+        Sampler(given(**ranges), model())
+
+
+@pytest.mark.parametrize(
+    ("data", "key"),
+    [
+        ({"kinematics": {"scale": [1.1, 0.9]}}, "'kinematics.scale'"),
+        ({"kinematics": {"scale": [0.0, 0.9]}}, "'kinematics.scale.0'"),
+        ({"kinematics": {"dofs": {"wz": [-1.0, 0.9]}}}, "'kinematics.dofs.wz.0'"),
+        ({"action_latency": [-0.1, 0.9]}, "'action_latency.0'"),
+        ({"observation_latency": [0, 51]}, "'observation_latency.1'"),
         ({"lidar": {"dropuot": [0, 1]}}, "did you mean 'dropout'?"),
-        (
-            {"lidar": {"dropout": [0, 0.6], "dropout_far": [0, 0.6]}},
-            "add up to at most 1",
-        ),
-        ({"lidar": {"skew": ["anticlockwise"]}}, "key 'lidar.skew.0'"),
-        (
-            {"odometry": {"noise": [1, 2], "odom_linear": [0, 1]}},
-            "either the factor noise or",
-        ),
+        ({"lidar": {"skew": ["anticlockwise"]}}, "'lidar.skew.0'"),
+        ({"odometry": {"noise": [1, 2], "odom_linear": [0, 1]}}, "either the factor"),
         ({"obstacles": {"count": [4, 3]}}, "count must be [minimum, maximum]"),
-        ({"obstacles": {"size": [-1.0, 3]}}, "key 'obstacles.size.0'"),
-        ({"latency": [0, 1]}, "unknown key 'latency'"),
+        ({"obstacles": {"size": [-1.0, 3]}}, "'obstacles.size.0'"),
     ],
 )
-def test_a_wrong_range_is_one_sentence(data, sentence):
+def test_a_wrong_range_is_refused_by_its_key(data, key):
     with pytest.raises(ConfigError) as caught:
         given(**data)
-    assert sentence in str(caught.value)
-    assert str(caught.value).startswith("mine.yaml: ")
-
-
-def test_an_unknown_name_is_answered_with_the_nearest():
-    with pytest.raises(
-        ConfigError, match="unknown randomisation 'stronk'; did you mean 'strong'"
-    ):
-        load_randomisation("stronk")
+    assert key in str(caught.value)
 
 
 def test_latencies_are_rounded_to_substeps_and_added_to_the_model():
@@ -271,14 +218,6 @@ def test_latencies_are_rounded_to_substeps_and_added_to_the_model():
     named = drawn.named()
     assert np.allclose(named["action_latency_s"], drawn.delay * 0.01)
     assert named["observation_latency_s"].shape == (len(SEEDS), 2)
-
-
-def test_a_latency_of_one_value_is_no_draw():
-    sampler = Sampler(given(action_latency=[1.0, 1.0]), model())
-    drawn = sampler.draw(SEEDS)
-    assert (drawn.delay == 17).all()
-    assert sampler.longest_delay == 17
-    assert drawn.named() == {}
 
 
 def test_odometry_is_scaled_or_given():
@@ -302,13 +241,6 @@ def test_odometry_is_scaled_or_given():
     assert (noise[:, 0] == 0.05).all()
 
 
-def test_a_factor_on_a_drift_that_nobody_measured_is_refused():
-    with pytest.raises(
-        ConfigError, match="no measured drift to scale; give 'position_drift'"
-    ):
-        Sampler(given(odometry={"drift": [0.5, 2.0]}), model())
-
-
 def test_every_fault_of_a_lidar_may_be_drawn():
     assert set(LidarRanges.model_fields) == {"noise_std", *LidarFaults.model_fields}
 
@@ -329,25 +261,6 @@ def test_the_lidar_gets_faults_within_the_ranges_and_keeps_the_others():
     assert drawn.named().keys() == {"lidar.noise_std", "lidar.too_close"}
 
 
-@pytest.mark.parametrize(
-    ("own", "drawn"),
-    [("none", None), ("clockwise", ["none"]), ("none", ["none", "counter_clockwise"])],
-)
-def test_a_skew_is_one_of_the_words_or_the_lidars_own(own, drawn):
-    sensor = lidar(faults={"skew": own})
-    ranges = given(lidar={"skew": drawn} if drawn else {})
-    draws = Sampler(ranges, direct_model(sensor=sensor)).draw(SEEDS)
-    values = np.unique(draws.faults[..., fault_kernels.SKEW])
-    assert set(values) == {SKEW[word] for word in drawn or [own]}
-
-
-def test_a_fault_that_the_lidar_cannot_have_on_top_of_its_own_is_refused():
-    with pytest.raises(
-        ConfigError, match="dropout and dropout_far must add up to at most 1"
-    ):
-        Sampler(given(lidar={"dropout_far": [0.0, 0.95]}), model())
-
-
 def test_number_and_size_of_the_obstacles_are_each_as_likely():
     ranges = given(obstacles={"count": [4, 6], "size": [0.7, 1.3], "rungs": 3})
     assert np.allclose(ranges.sizes, [0.7, 1.0, 1.3])
@@ -360,8 +273,3 @@ def test_number_and_size_of_the_obstacles_are_each_as_likely():
         drawn.named()["obstacles.size"], np.array(ranges.sizes)[drawn.size]
     )
     assert np.array_equal(drawn.named()["obstacles.count"], drawn.count)
-
-
-def test_obstacles_of_one_size_need_one_bake():
-    assert given().sizes == (1.0,)
-    assert given(obstacles={"size": [1.2, 1.2]}).sizes == (1.2,)

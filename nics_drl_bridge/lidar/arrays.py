@@ -1,0 +1,11 @@
+"""Names of arrays by the type of their numbers."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.geometry import Array as Array
+
+Singles = NDArray[np.float32]
+Integers = NDArray[np.int64]
+ShortIntegers = NDArray[np.int32]
+Mask = NDArray[np.bool_]
