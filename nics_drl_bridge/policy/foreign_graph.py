@@ -155,8 +155,8 @@ class Composer:
                 sizes = self._shape(value.name)
                 for dimension, size in zip(shape.dim, sizes, strict=True):
                     dimension.dim_value = size
-        rehearsal.rehearse_folding(
-            model.SerializeToString(), max(versions), self._source
+        rehearsal.rehearse(
+            "folding", model.SerializeToString(), self._source, opset=max(versions)
         )
         try:
             model = onnx.compose.add_prefix(model, THEIRS)

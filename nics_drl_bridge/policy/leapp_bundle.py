@@ -244,7 +244,7 @@ def read_bundle(path: Path) -> Bundle:
             reason = f"does not match {parameters.model_path!r}, which was changed or damaged."
             raise bundle.fault(f"{place}.sha256sum", reason)
         file = str(path.parent / parameters.model_path)
-        rehearsal.rehearse_network(data, file)
+        rehearsal.rehearse("network", data, file)
         models[name] = onnx_graph.parsed(data, file)
         onnx_graph.check_graph(models[name], file)
     return Bundle(path, description, models, hash_bytes("".join(digests).encode()))
@@ -256,15 +256,7 @@ def _read(bundle: Bundle, name: str, place: str) -> bytes:
     file = (folder / name).resolve()
     if not file.is_relative_to(folder):
         raise bundle.fault(place, f"{name!r} lies outside the bundle; not opened.")
-    try:
-        if file.stat().st_size > onnx_graph.SIZE_LIMIT:
-            most = onnx_graph.SIZE_LIMIT // 2**20
-            raise bundle.fault(place, f"{name!r} is larger than {most} MB; not opened.")
-        return file.read_bytes()
-    except OSError as error:
-        raise bundle.fault(
-            place, f"{name!r} can't be read ({error.strerror})."
-        ) from None
+    return onnx_graph.read_network(file, str(bundle.path), place)
 
 
 def _merged(bundle: Bundle) -> Any:

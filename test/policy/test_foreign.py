@@ -317,7 +317,7 @@ def changed(path, value):
 
 SPOILT = {
     "kind": (changed("kind", "policy"), "not the mapping of a foreign policy"),
-    "no network": (changed("network", "nets.onnx"), "'nets.onnx' can't be read"),
+    "no network": (changed("network", "nets.onnx"), "'nets.onnx' does not exist"),
     "pickle": (changed("network", "net.pt"), "must be an .onnx file or a LEAPP bundle"),
     "unknown key": (
         changed("output", {}),

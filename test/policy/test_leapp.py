@@ -430,7 +430,7 @@ REFUSED = {
         lambda data, _: data["models"]["policy"]["parameters"].update(
             model_path="p.onnx"
         ),
-        "'p.onnx' can't be read",
+        "'p.onnx' does not exist",
     ),
     "not connected": (
         lambda data, _: data["pipeline"].update(data_flow={}),
