@@ -16,7 +16,6 @@ from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.env.sim_backend import SimBackend
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.interface import Backend
 from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.shapes import Circle
 from nics_drl_bridge.sim.world_set import WorldSet
@@ -132,16 +131,6 @@ def test_driving_to_the_goal_ends_in_success(env):
     assert total == pytest.approx(10.0 + approach - 0.01 * 8)
 
 
-def test_a_time_limit_truncates_and_never_terminates():
-    env = made(model=direct_model(), world=field())
-    env.reset(seed=0, options={"start": (0.0, 0.0, 0.0), "goal": (2.0, 0.0)})
-    for step in range(1, EPISODE_STEPS + 1):
-        _, _, terminated, truncated, info = env.step(STILL)
-        assert not terminated
-        assert truncated == (step == EPISODE_STEPS)
-    assert not info["is_success"]
-
-
 def test_the_env_answers_to_the_command_just_given(env):
     env.reset(seed=0, options={"start": (0.0, 0.0, 0.0), "goal": (2.0, 0.0)})
     for share in (0.1, 0.4, -0.2):
@@ -193,21 +182,6 @@ def test_any_backendwith_reset_step_and_close_is_a_backend_that_a_still_command_
     env.close()
     assert np.array_equal(backend.commands, [[2.0, -2.0, 0.0], [0.0, 0.0, 0.0]])
     assert backend.closed == 1
-
-
-def test_a_backend_with_a_halt_of_its_own_is_halted_by_it():
-    class Halting(Recorder):
-        halts = 0
-
-        def halt(self):
-            self.halts += 1
-
-    backend = Halting()
-    assert isinstance(SimBackend(direct_model(), field()), Backend)
-    env = BridgeEnv(backend, model=direct_model(), world=field())
-    env.reset(seed=0)
-    env.halt()
-    assert (backend.halts, backend.commands) == (1, [])
 
 
 def test_facts_of_a_backend_of_ones_own_are_those_of_its_last_step_unless_it_has_some():

@@ -1,8 +1,6 @@
 from __future__ import annotations
 
 import hashlib
-import subprocess
-import sys
 import warnings
 
 import gymnasium
@@ -143,32 +141,6 @@ def digest(arrays):
     return found.hexdigest()
 
 
-COURSE = """
-import hashlib, sys
-import numpy as np
-from nics_drl_bridge.env.vector_env import BridgeVectorEnv
-env = BridgeVectorEnv(4, model="differential", threads=int(sys.argv[1]))
-env.action_space.seed(0)
-found = hashlib.sha256(env.reset(seed=1)[0].tobytes())
-for _ in range(500):
-    for part in env.step(env.action_space.sample())[:4]:
-        found.update(part.tobytes())
-print(found.hexdigest())
-"""
-
-
-@pytest.mark.process
-@pytest.mark.slow
-def test_steps_give_the_same_digest_in_fresh_processes_with_any_number_of_threads():
-    found = []
-    for threads in THREADS:
-        command = [sys.executable, "-c", COURSE, str(threads)]
-        done = subprocess.run(command, capture_output=True, text=True, check=True)
-        found.append(done.stdout.strip())
-    assert len(set(found)) == 1
-    assert len(found[0]) == 64
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("task", TASKS, ids=IDS)
@@ -188,18 +160,6 @@ def test_threads_change_no_bit(task, mode):
             for a, b in zip(one[:4], other[:4], strict=True):
                 assert np.array_equal(a, b)
             assert_alike(one[4], other[4])
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_a_reset_amid_episodes_is_as_good_as_a_fresh_env(mode):
-    used, fresh = (vector(3, autoreset_mode=mode) for _ in range(2))
-    used.reset(seed=9)
-    for action in actions_of(used, 37, seed=3):
-        used.step(action)
-    assert np.array_equal(used.reset(seed=2)[0], fresh.reset(seed=2)[0])
-    for action in actions_of(used, 60):
-        for a, b in zip(used.step(action)[:4], fresh.step(action)[:4], strict=True):
-            assert np.array_equal(a, b)
 
 
 def test_returned_arrays_are_the_callers_own_unless_it_wants_none():
