@@ -279,10 +279,7 @@ def _merged(bundle: Bundle) -> Any:
     }
     for name in description.models:
         model = onnx.compose.add_prefix(bundle.models[name], f"{name}/")
-        held = {tensor.name for tensor in model.graph.initializer}
-        for needed in model.graph.input:
-            if needed.name in held:
-                continue
+        for needed in onnx_graph.inputs_of(model):
             if needed.name in outside:
                 source = bundle.name_of(needed.name)
                 graph_input = onnx.ValueInfoProto()
@@ -302,11 +299,7 @@ def _merged(bundle: Bundle) -> Any:
         graph.initializer.extend(model.graph.initializer)
         infos |= {tensor.name: tensor for tensor in model.graph.output}
         ready |= infos.keys()
-        opsets |= {
-            opset.version: opset
-            for opset in model.opset_import
-            if opset.domain in ("", "ai.onnx")
-        }
+        opsets |= {opset.version: opset for opset in onnx_graph.opsets_of(model)}
         newest = max(newest, model.ir_version)
     if len(opsets) != 1:
         reason = f"have opsets {sorted(opsets)}; export all networks with the same one."

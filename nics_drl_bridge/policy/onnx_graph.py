@@ -28,6 +28,7 @@ MOST_DIMENSIONS = 8  # maximum number of dimensions of an array of weights
 CONTRACT_LIMIT = 4 * 2**20
 # maximum number of observations per run; a file is first opened with as many, see `rehearsal`
 MOST_ROWS = 256
+STANDARD = ("", "ai.onnx")  # names of the domain of the standard operators
 INPUT = "observation"
 ACTION = "action"
 COMMAND = "command"
@@ -339,7 +340,7 @@ def _graph_faults(model: Any) -> Iterator[Fault]:
     ):
         yield "graph", "contains functions, training or sparse weights; remove them."
     for node in graph.node:
-        if node.domain not in ("", "ai.onnx") or node.op_type not in OPERATORS:
+        if node.domain not in STANDARD or node.op_type not in OPERATORS:
             name = f"{node.domain}.{node.op_type}" if node.domain else node.op_type
             reason = (
                 f"the operator {name} is not one of a feed-forward network; not run."
@@ -377,6 +378,17 @@ def _tensors(graph: Any) -> Iterator[Any]:
         yield from attribute.tensors
 
 
+def inputs_of(model: Any) -> list[Any]:
+    """Returns the inputs of a graph that are no weights, as onnx.ValueInfoProto."""
+    weights = {tensor.name for tensor in model.graph.initializer}
+    return [value for value in model.graph.input if value.name not in weights]
+
+
+def opsets_of(model: Any) -> list[Any]:
+    """Returns the sets of standard operators that a model imports."""
+    return [opset for opset in model.opset_import if opset.domain in STANDARD]
+
+
 def check_ends(
     model: Any, widths: dict[str, int | None], source: str, batch: int | None
 ) -> None:
@@ -384,8 +396,7 @@ def check_ends(
 
     Their first dimension is the number of observations, `batch`; None: any number.
     """
-    weights = {tensor.name for tensor in model.graph.initializer}
-    inputs = [end for end in model.graph.input if end.name not in weights]
+    inputs = inputs_of(model)
     if STATE_IN not in widths and STATE_IN in [end.name for end in inputs]:
         reason = "is missing, although the graph needs one; export the policy again."
         raise PolicyError(source, "state", reason)
@@ -449,10 +460,8 @@ def _without_shapes(model: Any, rows: int) -> Any:
     bare.CopyFrom(model)
     graph = bare.graph
     del graph.value_info[:]
-    weights = {tensor.name for tensor in graph.initializer}
-    for value in graph.input:
-        if value.name not in weights:
-            value.type.tensor_type.shape.dim[0].dim_value = rows
+    for value in inputs_of(bare):
+        value.type.tensor_type.shape.dim[0].dim_value = rows
     for value in graph.output:
         value.type.tensor_type.ClearField("shape")
     return bare
