@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -100,16 +101,17 @@ def run_in_turn(
     return [np.concatenate(rows) for rows in zip(*parts, strict=True)]
 
 
+def run_rows(session: Any, source: str, *tensors: Rows) -> list[NDArray[Any]]:
+    """Runs observations (n, O), and states (n, S) if there are any. Raises PolicyError."""
+    names = (onnx_graph.INPUT, onnx_graph.STATE_IN)
+    try:
+        return list(session.run(None, dict(zip(names, tensors, strict=False))))
+    except Exception as error:  # noqa: BLE001 - the runtime's errors have no common base class
+        raise cannot_run(source, error) from None
+
+
 def run_session(
     session: Any, needs: GraphNeeds, seen: Rows, source: str
 ) -> list[NDArray[Any]]:
     """Runs observations (T, O) like `run_in_turn`. Raises PolicyError."""
-
-    def run(*tensors: Rows) -> list[NDArray[Any]]:
-        names = (onnx_graph.INPUT, onnx_graph.STATE_IN)
-        try:
-            return list(session.run(None, dict(zip(names, tensors, strict=False))))
-        except Exception as error:  # noqa: BLE001 - the runtime's errors have no common base class
-            raise cannot_run(source, error) from None
-
-    return run_in_turn(run, seen, needs)
+    return run_in_turn(partial(run_rows, session, source), seen, needs)

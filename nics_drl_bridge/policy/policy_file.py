@@ -20,10 +20,10 @@ from nics_drl_bridge.policy import onnx_graph, rehearsal
 from nics_drl_bridge.policy.contract import Contract, Rows, leaves
 from nics_drl_bridge.policy.onnx_session import (
     GraphNeeds,
-    cannot_run,
     check_policy_graph,
     open_session,
     run_in_turn,
+    run_rows,
 )
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -71,24 +71,17 @@ class PolicyFile:
             raise PolicyError(
                 str(self.path), "state", f"{reason}; `make_policy` keeps it."
             )
-        feeds = {onnx_graph.INPUT: rows.reshape(-1, size)}
+        tensors = [rows.reshape(-1, size)]
         if kept is not None:
-            feeds[onnx_graph.STATE_IN] = np.asarray(state, np.float32).reshape(
-                -1, kept.size
-            )
+            tensors.append(np.asarray(state, np.float32).reshape(-1, kept.size))
         step = self.contract.batch or onnx_graph.MOST_ROWS
-        firsts = range(0, max(len(feeds[onnx_graph.INPUT]), 1), step)
-        out = [self._run_rows(feeds, slice(k, k + step)) for k in firsts]
+        firsts = range(0, max(len(tensors[0]), 1), step)
+        out = [self._run(*(part[k : k + step] for part in tensors)) for k in firsts]
         whole = [np.concatenate(parts) for parts in zip(*out, strict=True)]
         return [part[0] if rows.ndim == 1 else part for part in whole]
 
-    def _run_rows(self, feeds: Mapping[str, Rows], which: slice) -> list[NDArray[Any]]:
-        chunk = {name: rows[which] for name, rows in feeds.items()}
-        rows = chunk[onnx_graph.INPUT]
-        try:
-            out: list[NDArray[Any]] = self._session.run(None, chunk)
-        except Exception as error:  # noqa: BLE001 - the runtime's errors have no common base class
-            raise cannot_run(str(self.path), error) from None
+    def _run(self, rows: Rows, *state: Rows) -> list[NDArray[Any]]:
+        out = run_rows(self._session, str(self.path), rows, *state)
         if any(len(part) != len(rows) for part in out):
             reason = (
                 f"returns {[part.shape for part in out]} for {len(rows)} observations."

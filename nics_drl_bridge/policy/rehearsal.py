@@ -25,6 +25,7 @@ from nics_drl_bridge.policy.onnx_session import (
     Rows,
     check_policy_graph,
     open_session,
+    run_rows,
     run_session,
 )
 
@@ -155,9 +156,13 @@ def _do(about: dict[str, Any], data: bytes) -> None:
         *shape, text = about["seen"]
         seen = np.frombuffer(base64.b64decode(text), "<f4").reshape(shape)
         check_policy_graph(data, needs, source)
-        if needs.state is None:  # measure as many observations as are ever run at once
-            seen = np.resize(seen, (max(needs.most_rows, len(seen)), shape[1]))
-        run_session(open_session(data, source), needs, seen, source)
+        session = open_session(data, source)
+        run_session(session, needs, seen, source)
+        # Measure as many observations as are ever run at once.
+        tensors = [np.resize(seen, (needs.most_rows, shape[1]))]
+        if needs.first_state is not None:
+            tensors.append(np.tile(needs.first_state, (needs.most_rows, 1)))
+        run_rows(session, source, *tensors)
 
 
 def _limit(memory: int) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import onnx
 import pytest
@@ -44,6 +46,19 @@ def add(proto, *nodes, **arrays):
     return bytes_of(signed(proto))
 
 
+def wide(proto):
+    """Sixteen observations fit into the memory, the 256 that may be run at once do not."""
+    for node in proto.graph.node:
+        node.input[:] = [
+            "cut" if name == "observation" else name for name in node.input
+        ]
+    names = ["observation", *(f"d{k}" for k in range(15))]
+    nodes = [make_node("Concat", [a, a], [b], axis=1) for a, b in pairwise(names)]
+    nodes.append(make_node("Slice", [names[-1], "from_", "to_", "one"], ["cut"]))
+    ends = {"from_": [0], "to_": [SECTORS + 6], "one": [1]}
+    return add(proto, *nodes, **{name: np.int64(end) for name, end in ends.items()})
+
+
 def by_value(proto):
     """A size that only the observation tells."""
     return add(
@@ -84,6 +99,7 @@ def divided(proto):
 
 REFUSED = {
     "division of whole numbers": (divided, "graph.node", "may crash the process"),
+    "memory": (wide, "graph", "can't run it|takes more than"),
     "sizes by value": (by_value, "graph.node", "can't be known"),
     "shapes that do not fit": (mismatched, "graph", "are inconsistent"),
     "sparse weights": (sparse, "graph.node", "sparse"),
