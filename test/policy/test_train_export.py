@@ -72,6 +72,9 @@ def test_what_is_no_policy_cannot_be_exported(tmp_path):
         export_policy("PPO", task, model, tmp_path / "one.onnx")
     with pytest.raises(ConfigError, match=r"ends with .\.onnx"):
         export_policy(network(78, 3), task, model, tmp_path / "one.zip")
+    path = tmp_path / "one.onnx"
+    with pytest.raises(ValueError, match="not JSON"):
+        export_policy(network(78, 3), task, model, path, None, {"success": np.nan})
 
 
 def test_a_network_with_nan_weights_is_not_written(tmp_path):
