@@ -1,8 +1,6 @@
 """BridgeEnv: one task over one backend, as a Gymnasium environment."""
 
 from contextlib import suppress
-from functools import reduce
-from operator import add
 from typing import Any
 
 import gymnasium
@@ -23,6 +21,7 @@ from nics_drl_bridge.env.task import (
     Task,
     still,
     team_space,
+    total,
 )
 from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.generator import SimulatorModel, open_model
@@ -229,22 +228,14 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Applies an action for one control period; see Gymnasium."""
         observation, terms, info = self.advance(action)
-        values = {name: term.tolist() for name, term in terms.items()}
         # Sum in the vector env's order, for bit-identical rewards.
-        each = [reduce(add, own, 0.0) for own in zip(*values.values(), strict=True)]
-        alone = self.robots == 1
-        info["reward_terms"] = (
-            {name: v[0] for name, v in values.items()} if alone else terms
-        )
+        reward = float(total(sum(terms.values(), np.zeros(self.robots))))
+        info["reward_terms"] = terms
+        if self.robots == 1:
+            info["reward_terms"] = {name: term.item() for name, term in terms.items()}
         if self.render_mode == "human":
             self.render()
-        return (
-            observation.reshape(-1),
-            reduce(add, each, 0.0),
-            bool(self.ended.all()),
-            False,
-            info,
-        )
+        return observation.reshape(-1), reward, bool(self.ended.all()), False, info
 
     @refused_after_close
     @halts_on_error

@@ -23,13 +23,7 @@ from nics_drl_bridge.policy.contract import (
 )
 from nics_drl_bridge.policy.foreign_graph import Composer, Network
 from nics_drl_bridge.policy.foreign_mapping import ForeignPolicy
-from nics_drl_bridge.policy.onnx_graph import STATE_IN
-from nics_drl_bridge.policy.onnx_session import (
-    GraphNeeds,
-    cannot_run,
-    in_turn,
-    open_session,
-)
+from nics_drl_bridge.policy.onnx_session import GraphNeeds, open_session, run_session
 
 
 @dataclass(frozen=True)
@@ -92,17 +86,8 @@ def _ordered(path: Path, model: SimulatorModel | None) -> Order:
     if file.suffix != SUFFIX:
         needed = f"must be an {SUFFIX} file or a LEAPP bundle"
         raise PolicyError(str(path), "network", f"{needed}, not {mapping.network!r}.")
-    try:
-        if file.stat().st_size > onnx_graph.SIZE_LIMIT:
-            most = f"{onnx_graph.SIZE_LIMIT // 2**20} MB; not opened."
-            raise PolicyError(
-                str(path), "network", f"{mapping.network!r} has more than {most}"
-            )
-        content = file.read_bytes()
-    except OSError as error:
-        reason = f"{mapping.network!r} can't be read ({error.strerror}); see its path."
-        raise PolicyError(str(path), "network", reason) from None
-    rehearsal.rehearse_network(content, str(file))
+    content = onnx_graph.read_network(file, str(path), "network")
+    rehearsal.rehearse("network", content, str(file))
     network = onnx_graph.parsed(content, str(file))
     onnx_graph.check_graph(network, str(file))
     return Order(mapping, Network(network), path, hash_bytes(content))
@@ -130,9 +115,12 @@ def _content(order: Order, model: SimulatorModel | None) -> bytes:
         raise ConfigError(f"{source}: key 'scan': {error}") from None
     graph, size = Composer(order.network, mapping, task, source).compose()
     state = (size, 0.0) if size else None
-    golden = _golden(graph, golden_observations(task), size, source)
-    provenance = {"network": mapping.network, "network_sha256": order.sha256}
+    commands = len(model.robot.command)
     digest = onnx_graph.graph_hash(graph)
+    size_of_observation = task.observation_space.shape[0]
+    needs = GraphNeeds(size_of_observation, commands, False, 1, digest, state)
+    golden = _golden(graph, golden_observations(task), needs, source)
+    provenance = {"network": mapping.network, "network_sha256": order.sha256}
     text = contract_of(task, model, golden, digest, provenance, state, batch=1)
     onnx.helper.set_model_props(graph, {onnx_graph.KEY: text})
     content = onnx_graph.sealed(graph.SerializeToString(deterministic=True))
@@ -140,27 +128,15 @@ def _content(order: Order, model: SimulatorModel | None) -> bytes:
     return content
 
 
-def _golden(graph: Any, seen: Rows, size: int, source: str) -> dict[str, Rows]:
+def _golden(graph: Any, seen: Rows, needs: GraphNeeds, source: str) -> dict[str, Rows]:
     content = graph.SerializeToString()
-    widths: dict[str, int | None] = {STATE_IN: size} if size else {}
-    needs = GraphNeeds(widths, batch=1, graph_sha256="", start=0.0 if size else None)
     # The composed graph is as untrusted as the network in it.
-    rehearsal.rehearse_graph(content, needs, seen, source)
-    onnx_graph.rows_at_once(graph, source, 1)
-    session = open_session(content, source)
-    names = (onnx_graph.INPUT, STATE_IN)
-    start = np.zeros(size, np.float32)
-
-    def run(*tensors: Rows) -> list[Rows]:
-        try:
-            return list(session.run(None, dict(zip(names, tensors, strict=False))))
-        except Exception as error:  # noqa: BLE001 - the runtime's errors have no common base class
-            raise cannot_run(source, error, "network") from None
-
-    rows = in_turn(run if size else lambda row, state: [*run(row), state], seen, start)
-    if not all(np.isfinite(part).all() for part in rows):
+    rehearsal.rehearse_policy(content, needs, seen, source)
+    onnx_graph.check_shapes(graph, source, needs.most_rows)
+    action, command = run_session(open_session(content, source), needs, seen, source)
+    if not (np.isfinite(action).all() and np.isfinite(command).all()):
         reason = (
             "returns NaN or inf for ordinary observations; check scaling and weights."
         )
         raise PolicyError(source, "network", reason)
-    return {"observations": seen, "actions": rows[0], "commands": rows[1]}
+    return {"observations": seen, "actions": action, "commands": command}

@@ -34,9 +34,7 @@ class Network:
     @property
     def inputs(self) -> dict[str, Any]:
         """Inputs by name, as onnx.ValueInfoProto; weights may be among them."""
-        weights = {tensor.name for tensor in self.model.graph.initializer}
-        values = [v for v in self.model.graph.input if v.name not in weights]
-        return {value.name: value for value in values}
+        return {value.name: value for value in onnx_graph.inputs_of(self.model)}
 
     @property
     def outputs(self) -> dict[str, Any]:
@@ -139,28 +137,21 @@ class Composer:
         """Returns the foreign graph with prefixed names, fixed shapes, and inputs to feed here."""
         model = onnx.ModelProto()
         model.CopyFrom(self._network.model)
-        versions = [
-            opset.version
-            for opset in model.opset_import
-            if opset.domain in ("", "ai.onnx")
-        ]
-        if not versions or max(versions) < OLDEST_OPSET:
-            reason = (
-                f"is {max(versions, default=0)}; {OLDEST_OPSET} or newer is needed."
-            )
+        opsets = onnx_graph.opsets_of(model)
+        version = max((opset.version for opset in opsets), default=0)
+        if version < OLDEST_OPSET:
+            reason = f"is {version}; {OLDEST_OPSET} or newer is needed."
             raise self._fault("network.opset", reason)
-        for value in model.graph.input:
-            if value.name in self._network.inputs:
-                shape = value.type.tensor_type.shape
-                sizes = self._shape(value.name)
-                for dimension, size in zip(shape.dim, sizes, strict=True):
-                    dimension.dim_value = size
-        rehearsal.rehearse_folding(
-            model.SerializeToString(), max(versions), self._source
-        )
+        for value in onnx_graph.inputs_of(model):
+            dimensions = value.type.tensor_type.shape.dim
+            sizes = self._shape(value.name)
+            for dimension, size in zip(dimensions, sizes, strict=True):
+                dimension.dim_value = size
+        content = model.SerializeToString()
+        rehearsal.rehearse("folding", content, self._source, opset=version)
         try:
             model = onnx.compose.add_prefix(model, THEIRS)
-            self._made = graph_folding.fold_shapes(model.graph, max(versions))
+            self._made = graph_folding.fold_shapes(model.graph, version)
         except Exception as error:  # noqa: BLE001 - a damaged graph raises anything
             reason = f"its shapes are inconsistent ({onnx_graph.quote(error)})."
             raise self._fault("network", reason) from None
@@ -508,7 +499,7 @@ class Composer:
         graph = onnx.helper.make_graph(
             self._build.nodes, "foreign", *made, self._build.weights
         )
-        opsets = [o for o in theirs.opset_import if o.domain in ("", "ai.onnx")]
+        opsets = onnx_graph.opsets_of(theirs)
         return onnx.helper.make_model(
             graph, opset_imports=opsets, ir_version=theirs.ir_version
         )

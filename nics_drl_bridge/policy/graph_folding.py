@@ -8,8 +8,11 @@ from onnx import ValueInfoProto, defs, helper, numpy_helper
 from onnx.reference import ReferenceEvaluator
 from onnx.shape_inference import infer_node_outputs
 
-from nics_drl_bridge.policy.onnx_graph import INTEGERS, MOST_AXES, SMALL, Shape
+from nics_drl_bridge.policy.onnx_graph import INTEGERS
 
+# maximum length of an integer array that may be a shape, an axis or an index
+SMALL = 1024
+Shape = tuple[int, ...]
 FOLDED = (
     "Add",
     "Cast",
@@ -46,12 +49,9 @@ def fold_shapes(graph: Any, opset: int) -> dict[str, Shape]:
         node.ClearField("domain")  # "" and "ai.onnx" are the same domain
         schema = defs.get_schema(node.op_type, opset)
         input_types = {name: types[name] for name in node.input if name}
-        made = infer_node_outputs(
+        types |= infer_node_outputs(
             schema, node, input_types, constants, opset_imports=imports
         )
-        if any(len(_shape(made_type)) > MOST_AXES for made_type in made.values()):
-            raise ValueError(f"{node.op_type} returns more than {MOST_AXES} dimensions")
-        types |= made
         value = _value(node, types, constants, opset)
         if value is None:
             graph.node.append(node)

@@ -37,7 +37,7 @@ CONFIG_VERSION = "1.3"  # version of the format
 SIGN = "system information:"  # in the YAML file of every bundle
 OURS = "leapp/"  # prefix of the nodes and weights that an export adds
 TAKEN = "nics_drl_bridge_observation"  # metadata key: the input that an export replaces
-VELOCITIES = ("x", "y", "z")
+AXES = ["x", "y", "z"]
 SECTORS = "state/lidar/sectors"
 BEAMS = "state/lidar/beams"
 Data = dict[str, Any]
@@ -92,27 +92,21 @@ def _pieces(policy: PolicyFile) -> list[Piece]:
         seen = {"kind": SECTORS, "scan": layout.model_dump(mode="json")}
     seen["unit"] = "fraction of range_max; 1 free, 0 too close or unknown"
     pieces = [Piece("scan", parts, tuple(range(parts)), seen)]
+    facts: Data
     if contract.task.name != "navigation":
         low = contract.observation.rest_low
         high = contract.observation.rest_high
         limits = [list(pair) for pair in zip(low, high, strict=True)]
-        facts: Data = {"kind": f"state/task/{contract.task.name}", "limits": limits}
+        facts = {"kind": f"state/task/{contract.task.name}", "limits": limits}
         return [*pieces, Piece("rest", rest, tuple(range(rest)), facts)]
-    goal: Data = {"kind": "command/goal/polar", "unit": "m"}
-    names = [["goal.distance", "goal.cosine", "goal.sine"]]
-    linear: Data = {
-        "kind": "state/body/linear_velocity",
-        "element_names": [[*VELOCITIES]],
-    }
-    angular: Data = {
-        "kind": "state/body/angular_velocity",
-        "element_names": [[*VELOCITIES]],
-    }
-    pieces += [
-        Piece("goal", 3, (0, 1, 2), {**goal, "element_names": names}),
-        Piece("linear_velocity", 3, (0, 1), {**linear, "unit": "m/s"}),
-        Piece("angular_velocity", 3, (2,), {**angular, "unit": "rad/s"}),
-    ]
+    goal = ["goal.distance", "goal.cosine", "goal.sine"]
+    for name, kind, kept, elements, unit in (
+        ("goal", "command/goal/polar", (0, 1, 2), goal, "m"),
+        ("linear_velocity", "state/body/linear_velocity", (0, 1), AXES, "m/s"),
+        ("angular_velocity", "state/body/angular_velocity", (2,), AXES, "rad/s"),
+    ):
+        facts = {"kind": kind, "element_names": [elements], "unit": unit}
+        pieces.append(Piece(name, 3, kept, facts))
     for sensor in contract.sensors:
         facts = {
             "kind": f"state/{sensor.kind}",

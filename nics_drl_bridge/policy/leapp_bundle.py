@@ -244,7 +244,7 @@ def read_bundle(path: Path) -> Bundle:
             reason = f"does not match {parameters.model_path!r}, which was changed or damaged."
             raise bundle.fault(f"{place}.sha256sum", reason)
         file = str(path.parent / parameters.model_path)
-        rehearsal.rehearse_network(data, file)
+        rehearsal.rehearse("network", data, file)
         models[name] = onnx_graph.parsed(data, file)
         onnx_graph.check_graph(models[name], file)
     return Bundle(path, description, models, hash_bytes("".join(digests).encode()))
@@ -256,15 +256,7 @@ def _read(bundle: Bundle, name: str, place: str) -> bytes:
     file = (folder / name).resolve()
     if not file.is_relative_to(folder):
         raise bundle.fault(place, f"{name!r} lies outside the bundle; not opened.")
-    try:
-        if file.stat().st_size > onnx_graph.SIZE_LIMIT:
-            most = onnx_graph.SIZE_LIMIT // 2**20
-            raise bundle.fault(place, f"{name!r} is larger than {most} MB; not opened.")
-        return file.read_bytes()
-    except OSError as error:
-        raise bundle.fault(
-            place, f"{name!r} can't be read ({error.strerror})."
-        ) from None
+    return onnx_graph.read_network(file, str(bundle.path), place)
 
 
 def _merged(bundle: Bundle) -> Any:
@@ -287,10 +279,7 @@ def _merged(bundle: Bundle) -> Any:
     }
     for name in description.models:
         model = onnx.compose.add_prefix(bundle.models[name], f"{name}/")
-        held = {tensor.name for tensor in model.graph.initializer}
-        for needed in model.graph.input:
-            if needed.name in held:
-                continue
+        for needed in onnx_graph.inputs_of(model):
             if needed.name in outside:
                 source = bundle.name_of(needed.name)
                 graph_input = onnx.ValueInfoProto()
@@ -310,11 +299,7 @@ def _merged(bundle: Bundle) -> Any:
         graph.initializer.extend(model.graph.initializer)
         infos |= {tensor.name: tensor for tensor in model.graph.output}
         ready |= infos.keys()
-        opsets |= {
-            opset.version: opset
-            for opset in model.opset_import
-            if opset.domain in ("", "ai.onnx")
-        }
+        opsets |= {opset.version: opset for opset in onnx_graph.opsets_of(model)}
         newest = max(newest, model.ir_version)
     if len(opsets) != 1:
         reason = f"have opsets {sorted(opsets)}; export all networks with the same one."

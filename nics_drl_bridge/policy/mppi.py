@@ -28,9 +28,8 @@ from nics_drl_bridge.policy.local_map_kernels import (
     MapScratch,
     ScanRays,
 )
-from nics_drl_bridge.policy.stopping import longest_stop_s
 from nics_drl_bridge.recording import textbook
-from nics_drl_bridge.robot.braking import find_braking
+from nics_drl_bridge.robot.braking import Braking, find_braking
 from nics_drl_bridge.robot.kernels import SERIES, make_terms, replace_coefficients
 from nics_drl_bridge.robot.kinds import compute_steady_twist
 from nics_drl_bridge.robot.taylor import TaylorModel
@@ -167,8 +166,8 @@ class Mppi:
         """The stop at the end of a rollout; empty if the robot can stop within half a rollout."""
         robot = self.task.robot
         angles = np.array([variable.unit == "rad" for variable in robot.command])
-        braking = find_braking(robot, self._kinematics, *self.task.command_limits)
-        longest = longest_stop_s(braking, self._top_twists)
+        times = self._braking.time_s(self._top_twists)
+        longest = float(np.max(times, initial=0.0))
         if longest <= 0.5 * self.horizon:
             return kernels.Halt(angles, still(robot), 0, math.inf)
         far = min(self._reach, self.task.sight.range_max, MOST_M)
@@ -180,10 +179,12 @@ class Mppi:
     def _reach(self) -> float:
         """Distance covered by a rollout at full speed and the following stop [m]."""
         fastest = np.hypot(*np.abs(self._top_twists)[:, :2].max(axis=0))
-        braking = find_braking(
-            self.task.robot, self._kinematics, *self.task.command_limits
-        )
-        return float(fastest * self.horizon + braking.distance(fastest))
+        return float(fastest * self.horizon + self._braking.distance(fastest))
+
+    @cached_property
+    def _braking(self) -> Braking:
+        limits = self.task.command_limits
+        return find_braking(self.task.robot, self._kinematics, *limits)
 
     @cached_property
     def _plant(self) -> kernels.Plant:

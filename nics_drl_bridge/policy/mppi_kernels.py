@@ -313,10 +313,19 @@ def _halt(
 
 @kernel
 def _begin(around: Situation, plant: Plant, worth: Worth, lanes: RollOuts) -> None:
-    """Initialises all lanes, and their costs with the changes of action between knots."""
+    """Puts all lanes at the start; begins their costs with the changes of action between knots."""
     states, count = plant.settled.shape
-    _put(lanes, states)
+    x = lanes.start[0]
+    y = lanes.start[1]
+    heading = lanes.start[2]
     for k in range(lanes.cost.shape[0]):
+        lanes.pose[0, k] = x
+        lanes.pose[1, k] = y
+        lanes.pose[2, k], lanes.pose[3, k] = math.cos(heading), math.sin(heading)
+        lanes.pose[4, k] = heading
+        lanes.pose[5, k] = 0.0
+        for s in range(states):
+            lanes.x[s, k] = lanes.x_single[s]
         change = 0.0
         for c in range(count):
             before = (
@@ -329,22 +338,6 @@ def _begin(around: Situation, plant: Plant, worth: Worth, lanes: RollOuts) -> No
         lanes.cost[k] = worth.change * change
         lanes.way[k] = 0.0
         lanes.ended[k] = -1
-
-
-@kernel
-def _put(lanes: RollOuts, states: int) -> None:
-    """Puts all lanes at the start pose and state."""
-    x = lanes.start[0]
-    y = lanes.start[1]
-    heading = lanes.start[2]
-    for k in range(lanes.cost.shape[0]):
-        lanes.pose[0, k] = x
-        lanes.pose[1, k] = y
-        lanes.pose[2, k], lanes.pose[3, k] = math.cos(heading), math.sin(heading)
-        lanes.pose[4, k] = heading
-        lanes.pose[5, k] = 0.0
-        for s in range(states):
-            lanes.x[s, k] = lanes.x_single[s]
 
 
 @kernel

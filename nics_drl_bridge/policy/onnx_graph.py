@@ -1,8 +1,9 @@
-"""Checks a policy file's graph before any of it runs: size, form, operators, amount of work."""
+"""Checks a policy file's graph before any of it runs: size, form, operators, known shapes."""
 
 import itertools
 import math
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,18 +26,9 @@ MOST_NODES = 1000  # maximum number of nodes; an exported network has a few doze
 MOST_DIMENSIONS = 8  # maximum number of dimensions of an array of weights
 # maximum size of the contract [bytes], mostly golden observations
 CONTRACT_LIMIT = 4 * 2**20
-MOST_NUMBERS = 1_000_000  # maximum size of all nodes' outputs for one observation
-# maximum number of multiplications, or of numbers read and written, per observation
-MOST_WORK = 20_000_000
-# maximum size of all nodes' outputs in one run: 256 MB of float32
-MOST_AT_ONCE = 64 * MOST_NUMBERS
-# number of observations for which sizes are computed; equals the number of golden ones
-ROWS = 16
-# maximum length of an integer array that may be a shape, an axis or an index
-SMALL = 1024
-GREATEST_SETTING = 65_536  # maximum size, stride, padding or dilation of a kernel
-# maximum number of axes that all nodes together may add; each slows inference
-MOST_AXES = 256
+# maximum number of observations per run; a file is first opened with as many, see `rehearsal`
+MOST_ROWS = 256
+STANDARD = ("", "ai.onnx")  # names of the domain of the standard operators
 INPUT = "observation"
 ACTION = "action"
 COMMAND = "command"
@@ -129,16 +121,24 @@ _VARINT = 0
 _BYTES = 2
 _FIXED = {1: 8, 5: 4}  # fixed-size wire types and their sizes [bytes]
 _LONGEST_VARINT = 10
-Shape = tuple[int, ...]
 Fault = tuple[str, str]  # faulty field and the reason
 
 
-def parse(data: bytes, source: str) -> Any:
-    """Parses and checks a policy file's ModelProto. Raises PolicyError if it must not be run."""
-    model = parsed(data, source)
-    metadata(model, source)
-    check_graph(model, source)
-    return model
+def read_network(file: Path, source: str, field: str) -> bytes:
+    """Reads a network's file, which `field` of the source names. Raises PolicyError."""
+    name = "" if str(file) == source else f"{file.name!r} "
+    if not file.is_file():
+        reason = f"{name}does not exist or is not a file; check its path."
+        raise PolicyError(source, field, reason)
+    try:
+        size = file.stat().st_size
+        if size <= SIZE_LIMIT:
+            return file.read_bytes()
+    except OSError as error:
+        reason = f"{name}can't be read ({error.strerror})."
+        raise PolicyError(source, field, reason) from None
+    sizes = f"{size / 2**20:.0f} MB, more than the {SIZE_LIMIT // 2**20} MB of a policy"
+    raise PolicyError(source, field, f"{name}has {sizes}; not opened.")
 
 
 def parsed(data: bytes, source: str) -> Any:
@@ -340,7 +340,7 @@ def _graph_faults(model: Any) -> Iterator[Fault]:
     ):
         yield "graph", "contains functions, training or sparse weights; remove them."
     for node in graph.node:
-        if node.domain not in ("", "ai.onnx") or node.op_type not in OPERATORS:
+        if node.domain not in STANDARD or node.op_type not in OPERATORS:
             name = f"{node.domain}.{node.op_type}" if node.domain else node.op_type
             reason = (
                 f"the operator {name} is not one of a feed-forward network; not run."
@@ -351,7 +351,6 @@ def _graph_faults(model: Any) -> Iterator[Fault]:
                 yield "graph.node", f"{node.op_type} contains a subgraph."
             if a.HasField("sparse_tensor") or len(a.sparse_tensors):
                 yield "graph.node", f"{node.op_type} contains sparse weights."
-    yield from _setting_faults(graph)
 
 
 def _weight_faults(graph: Any) -> Iterator[Fault]:
@@ -379,6 +378,17 @@ def _tensors(graph: Any) -> Iterator[Any]:
         yield from attribute.tensors
 
 
+def inputs_of(model: Any) -> list[Any]:
+    """Returns the inputs of a graph that are no weights, as onnx.ValueInfoProto."""
+    weights = {tensor.name for tensor in model.graph.initializer}
+    return [value for value in model.graph.input if value.name not in weights]
+
+
+def opsets_of(model: Any) -> list[Any]:
+    """Returns the sets of standard operators that a model imports."""
+    return [opset for opset in model.opset_import if opset.domain in STANDARD]
+
+
 def check_ends(
     model: Any, widths: dict[str, int | None], source: str, batch: int | None
 ) -> None:
@@ -386,8 +396,7 @@ def check_ends(
 
     Their first dimension is the number of observations, `batch`; None: any number.
     """
-    weights = {tensor.name for tensor in model.graph.initializer}
-    inputs = [end for end in model.graph.input if end.name not in weights]
+    inputs = inputs_of(model)
     if STATE_IN not in widths and STATE_IN in [end.name for end in inputs]:
         reason = "is missing, although the graph needs one; export the policy again."
         raise PolicyError(source, "state", reason)
@@ -415,181 +424,44 @@ def check_ends(
             raise PolicyError(source, f"graph.{end.name}", reason)
 
 
-def rows_at_once(model: Any, source: str, batch: int | None = None) -> int:
-    """Computes the number of observations per run, at most `batch`.
+def check_shapes(model: Any, source: str, rows: int) -> None:
+    """Raises PolicyError for shapes that do not fit, or depend on the `rows` observations of a run.
 
-    Raises PolicyError if a size is unknown or far too large.
+    Also refuses divisions of integers.
     """
-    rows = batch or ROWS
-    faults = itertools.chain(
-        _setting_faults(model.graph), _integer_faults(model, rows, source)
-    )
-    for field, reason in faults:
-        raise PolicyError(source, field, reason)
-    numbers, work = _costs(model, rows, source)
-    if max(numbers / MOST_NUMBERS, work / MOST_WORK) > rows:
-        needs = (
-            f"needs {numbers / rows:.3g} numbers and {work / rows:.3g} multiplications"
-        )
-        limits = (
-            f"per observation; a policy may have {MOST_NUMBERS:.0e} and {MOST_WORK:.0e}"
-        )
-        raise PolicyError(source, "graph", f"{needs} {limits}; not run.")
-    if batch is not None:
-        return batch
-    more_numbers, more_work = _costs(model, 2 * ROWS, source)
-    if more_numbers > 2 * numbers or more_work > 2 * work:
-        reason = "grows faster than the number of observations; not run."
-        raise PolicyError(source, "graph", reason)
-    return max(1, ROWS * MOST_AT_ONCE // max(numbers, 1))
-
-
-def _setting_faults(graph: Any) -> Iterator[Fault]:
-    """Yields huge kernels and arrays of thousands of dimensions, which slow inference down."""
-    lengths = {tensor.name: math.prod(tensor.dims) for tensor in graph.initializer}
-    for node in graph.node:
-        for attribute in node.attribute:
-            if node.op_type != "Slice" and any(
-                abs(n) > GREATEST_SETTING for n in attribute.ints
-            ):
-                reason = f"of {node.op_type} exceeds {GREATEST_SETTING}; not run."
-                yield f"graph.node.{attribute.name}", reason
-        if node.op_type == "Constant":
-            sizes = (max(len(a.ints), math.prod(a.t.dims)) for a in node.attribute)
-            lengths.update(dict.fromkeys(node.output, max(sizes, default=0)))
-    added = 0
-    for node in graph.node:
-        if node.op_type in ("Reshape", "Unsqueeze"):
-            named = [lengths.get(name, 1) for name in node.input[1:2]]
-            added += max(named + [len(a.ints) for a in node.attribute], default=0)
-    if added > MOST_AXES:
-        reason = (
-            f"reshapes to {added} dimensions, more than {MOST_AXES} in total; not run."
-        )
-        yield "graph.node", reason
-
-
-def _integer_faults(model: Any, rows: int, source: str) -> Iterator[Fault]:
-    """Yields integers that are divided, or that grow during shape inference."""
-    kinds, shapes = _sizes(model, rows, source, values=False)
-    for node in model.graph.node:
-        if node.op_type in DIVIDING and kinds.get(node.input[0]) not in FLOATS:
-            yield (
-                "graph.node",
-                f"{node.op_type} of integers may crash the process; use float32.",
-            )
-        if (
-            node.op_type in ("Concat", "Gather")
-            and kinds.get(node.output[0]) not in FLOATS
-        ):
-            size = math.prod(shapes.get(node.output[0], (0,)))
-            if size > SMALL * rows:
-                reason = (
-                    f"of {size} integers is too large for a shape or an index; not run."
-                )
-                yield "graph.node", f"{node.op_type} {reason}"
-
-
-def _costs(model: Any, rows: int, source: str) -> tuple[int, int]:
-    _, shapes = _sizes(model, rows, source, values=True)
-    numbers = work = 0
-    for node in model.graph.node:
-        try:
-            # omitted optional inputs have an empty name
-            inputs = [shapes[name] for name in node.input if name]
-            outputs = [shapes[name] for name in node.output if name]
-        except KeyError:
-            reason = f"the output size of {node.op_type} can't be known before it runs."
-            raise PolicyError(source, "graph.node", reason) from None
-        buffer, multiplied = _work(node, inputs, outputs)
-        numbers += sum(map(math.prod, outputs)) + buffer
-        work += sum(map(math.prod, (*inputs, *outputs))) + multiplied + buffer
-    return numbers, work
-
-
-def _work(node: Any, inputs: list[Shape], outputs: list[Shape]) -> tuple[int, int]:
-    """Counts the numbers that the runtime allocates besides the output, and multiplications."""
-    settings = {attribute.name: attribute for attribute in node.attribute}
-    if node.op_type in ("MatMul", "Gemm"):
-        turned = (
-            node.op_type == "Gemm" and "transA" in settings and settings["transA"].i
-        )
-        return 0, math.prod(outputs[0]) * (inputs[0][0] if turned else inputs[0][-1])
-    if node.op_type == "Conv":
-        groups = int(settings["group"].i) if "group" in settings else 1
-        kernel = math.prod(inputs[1][1:])
-        return math.prod(outputs[0][2:]) * kernel * max(groups, 1), math.prod(
-            outputs[0]
-        ) * kernel
-    # Inputs: a sequence (T, n, I), weights (D, G H, I) and (D, G H, H).
-    if node.op_type in RECURRENT:
-        steps = math.prod(inputs[0][:2])
-        return steps * math.prod(inputs[1][:2]), steps * sum(
-            map(math.prod, inputs[1:3])
-        )
-    if "kernel_shape" in settings:  # pooling
-        return 0, math.prod(outputs[0]) * int(math.prod(settings["kernel_shape"].ints))
-    return 0, 0
-
-
-def _sizes(
-    model: Any, rows: int, source: str, values: bool
-) -> tuple[dict[str, int], dict[str, Shape]]:
-    """Returns types and known shapes of all tensors for `rows` observations.
-
-    `values` also uses the values of integers.
-    """
-    bare = _without_weights(model, rows)
     try:
         graph = onnx.shape_inference.infer_shapes(
-            bare, strict_mode=True, data_prop=values
+            _without_shapes(model, rows), strict_mode=True, data_prop=True
         ).graph
     except Exception as error:  # noqa: BLE001 - a damaged graph raises anything
         raise PolicyError(
             source, "graph", f"its shapes are inconsistent ({quote(error)})."
         ) from None
     kinds = {tensor.name: tensor.data_type for tensor in graph.initializer}
-    shapes = {tensor.name: tuple(tensor.dims) for tensor in graph.initializer}
+    known = {""}  # omitted optional outputs have an empty name
     for value in (*graph.input, *graph.value_info, *graph.output):
         tensor = value.type.tensor_type
         kinds[value.name] = tensor.elem_type
-        if tensor.HasField("shape") and all(
-            d.HasField("dim_value") for d in tensor.shape.dim
-        ):
-            shapes[value.name] = tuple(d.dim_value for d in tensor.shape.dim)
-    return kinds, {
-        name: shape for name, shape in shapes.items() if min(shape, default=0) >= 0
-    }
+        sizes = tensor.shape.dim
+        if tensor.HasField("shape") and all(d.HasField("dim_value") for d in sizes):
+            known.add(value.name)
+    for node in graph.node:
+        if node.op_type in DIVIDING and kinds.get(node.input[0]) not in FLOATS:
+            reason = f"{node.op_type} of integers may crash the process; use float32."
+            raise PolicyError(source, "graph.node", reason)
+        if not known.issuperset(node.output):
+            reason = f"the output size of {node.op_type} can't be known before it runs."
+            raise PolicyError(source, "graph.node", reason)
 
 
-def _without_weights(model: Any, rows: int) -> Any:
-    """Returns the graph for `rows` observations, with weights and constants as inputs."""
-    bare = onnx.ModelProto(ir_version=model.ir_version, opset_import=model.opset_import)
+def _without_shapes(model: Any, rows: int) -> Any:
+    """Returns the model for `rows` observations, without the shapes that it states itself."""
+    bare = onnx.ModelProto()
+    bare.CopyFrom(model)
     graph = bare.graph
-    graph.name = "sizes"
-    for tensor in model.graph.initializer:
-        _add_tensor(graph, tensor, tensor.name)
-    for node in model.graph.node:
-        tensor = next((a.t for a in node.attribute if a.name == "value"), None)
-        if node.op_type == "Constant" and tensor is not None and len(node.output) == 1:
-            _add_tensor(graph, tensor, node.output[0])
-        else:
-            graph.node.append(node)
-    held = {tensor.name for tensor in model.graph.initializer}
-    for value in (end for end in model.graph.input if end.name not in held):
-        graph.input.append(value)
-        graph.input[-1].type.tensor_type.shape.dim[0].dim_value = rows
-    for value in model.graph.output:  # infer output shapes instead of trusting them
-        kind = value.type.tensor_type.elem_type
-        graph.output.append(onnx.helper.make_tensor_value_info(value.name, kind, None))
+    del graph.value_info[:]
+    for value in inputs_of(bare):
+        value.type.tensor_type.shape.dim[0].dim_value = rows
+    for value in graph.output:
+        value.type.tensor_type.ClearField("shape")
     return bare
-
-
-def _add_tensor(graph: Any, tensor: Any, name: str) -> None:
-    """Adds small integer arrays, which may be shapes, with their values; others only by shape."""
-    if math.prod(tensor.dims) <= SMALL and tensor.data_type in INTEGERS:
-        graph.initializer.append(tensor)
-        graph.initializer[-1].name = name
-        return
-    info = onnx.helper.make_tensor_value_info(name, tensor.data_type, list(tensor.dims))
-    graph.input.append(info)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,25 +18,47 @@ Rows = NDArray[np.float32]
 class GraphNeeds:
     """What a policy file states about its graph, as plain data."""
 
-    # widths of inputs and outputs; None: integers, one per row
-    widths: dict[str, int | None]
+    observation: int  # size of an observation
+    commands: int  # number of commands
+    discrete: bool  # True: each action is an integer
     batch: int | None  # maximum number of observations per run; None: no maximum
     graph_sha256: str
-    # start value of each element of the state; None: the policy has no state
-    start: float | None = None
+    # size and start value of the state; None: the policy has no state
+    state: tuple[int, float] | None = None
+
+    @property
+    def widths(self) -> dict[str, int | None]:
+        """Widths of inputs and outputs; None: integers, one per row."""
+        widths: dict[str, int | None] = {
+            onnx_graph.INPUT: self.observation,
+            onnx_graph.COMMAND: self.commands,
+            onnx_graph.ACTION: None if self.discrete else self.commands,
+        }
+        if self.state is not None:
+            ends = (onnx_graph.STATE_IN, onnx_graph.STATE_OUT)
+            widths |= dict.fromkeys(ends, self.state[0])
+        return widths
+
+    @property
+    def most_rows(self) -> int:
+        """Maximum number of observations per run."""
+        return onnx_graph.MOST_ROWS if self.batch is None else self.batch
+
+    @property
+    def first_state(self) -> Rows | None:
+        """State (S,) at the start of an episode; None without a state."""
+        return None if self.state is None else np.full(*self.state, np.float32)
 
 
-def check_policy_graph(data: bytes, needs: GraphNeeds, source: str) -> int:
-    """Checks the graph of a policy file before any of it runs. Raises PolicyError.
-
-    Returns the number of observations per run.
-    """
-    model = onnx_graph.parse(data, source)
+def check_policy_graph(data: bytes, needs: GraphNeeds, source: str) -> None:
+    """Checks the graph of a policy file before any of it runs. Raises PolicyError."""
+    model = onnx_graph.parsed(data, source)
+    onnx_graph.check_graph(model, source)
     onnx_graph.check_ends(model, needs.widths, source, needs.batch)
     if onnx_graph.graph_hash(model) != needs.graph_sha256:
         reason = "does not match the graph, which was changed after the export."
         raise PolicyError(source, "graph_sha256", reason)
-    return onnx_graph.rows_at_once(model, source, needs.batch)
+    onnx_graph.check_shapes(model, source, needs.most_rows)
 
 
 def open_session(data: bytes, source: str) -> Any:
@@ -59,39 +82,36 @@ def open_session(data: bytes, source: str) -> Any:
         raise cannot_run(source, error) from None
 
 
-def cannot_run(source: str, error: Exception, field: str = "graph") -> PolicyError:
+def cannot_run(source: str, error: Exception) -> PolicyError:
     """Returns the error for a graph that the runtime refuses."""
     reason = f"onnxruntime can't run it ({onnx_graph.quote(error)})."
-    return PolicyError(source, field, reason)
+    return PolicyError(source, "graph", reason)
 
 
-def in_turn(
-    run: Callable[..., Sequence[NDArray[Any]]], seen: Rows, start: Rows | None
+def run_in_turn(
+    run: Callable[..., Sequence[NDArray[Any]]], seen: Rows, needs: GraphNeeds
 ) -> list[NDArray[Any]]:
-    """Computes actions and commands for observations (T, O), step by step if given a state (S,)."""
-    if start is None:
-        return list(run(seen))
-    state = start[None]
-    rows = []
-    for k in range(len(seen)):
-        *out, state = run(seen[k : k + 1], state)
-        rows.append(out)
-    return [np.concatenate(parts) for parts in zip(*rows, strict=True)]
+    """Computes actions and commands for observations (T, O), step by step if there is a state."""
+    state = [] if needs.first_state is None else [needs.first_state[None]]
+    size = 1 if state else needs.most_rows
+    parts = []
+    for first in range(0, len(seen), size):
+        action, command, *state = run(seen[first : first + size], *state)
+        parts.append((action, command))
+    return [np.concatenate(rows) for rows in zip(*parts, strict=True)]
 
 
-def run_once(session: Any, needs: GraphNeeds, seen: Rows, source: str) -> None:
-    """Runs observations (T, O), as one episode if there is a state. Raises PolicyError."""
-    start = None
-    if needs.start is not None:
-        start = np.full(needs.widths[onnx_graph.STATE_IN] or 1, needs.start, np.float32)
+def run_rows(session: Any, source: str, *tensors: Rows) -> list[NDArray[Any]]:
+    """Runs observations (n, O), and states (n, S) if there are any. Raises PolicyError."""
+    names = (onnx_graph.INPUT, onnx_graph.STATE_IN)
+    try:
+        return list(session.run(None, dict(zip(names, tensors, strict=False))))
+    except Exception as error:  # noqa: BLE001 - the runtime's errors have no common base class
+        raise cannot_run(source, error) from None
 
-    def run(*tensors: Rows) -> list[NDArray[Any]]:
-        names = (onnx_graph.INPUT, onnx_graph.STATE_IN)
-        try:
-            return list(session.run(None, dict(zip(names, tensors, strict=False))))
-        except Exception as error:  # noqa: BLE001 - the runtime's errors have no common base class
-            raise cannot_run(source, error) from None
 
-    rows_at_once = 1 if needs.batch == 1 else len(seen)
-    for first in range(0, len(seen), rows_at_once):
-        in_turn(run, seen[first : first + rows_at_once], start)
+def run_session(
+    session: Any, needs: GraphNeeds, seen: Rows, source: str
+) -> list[NDArray[Any]]:
+    """Runs observations (T, O) like `run_in_turn`. Raises PolicyError."""
+    return run_in_turn(partial(run_rows, session, source), seen, needs)

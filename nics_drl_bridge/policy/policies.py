@@ -33,7 +33,7 @@ from nics_drl_bridge.policy.local_map_kernels import (
 )
 from nics_drl_bridge.policy.mppi import Mppi
 from nics_drl_bridge.policy.stateful import Policy, Stateful
-from nics_drl_bridge.policy.stopping import braking_for
+from nics_drl_bridge.robot.braking import Braking, find_braking
 from nics_drl_bridge.robot.kinds import (
     compute_steady_twist,
     find_command,
@@ -91,6 +91,12 @@ def _settled(task: Navigation, commands: Array, model: SimulatorModel | None) ->
         moved, state = kinematics.step(start, state, commands)
         state = np.clip(state, low, high)
     return geometry.log(moved) / kinematics.dt
+
+
+def _find_slowest_lag(robot: RobotSpec) -> float:
+    """Returns the slowest lag that a robot's kind states [s]; 0 without any."""
+    lags = [value for name, value in robot.parameters.items() if name.endswith("_lag")]
+    return max(lags, default=0.0)
 
 
 def actions_of(task: Navigation, commands: Array) -> NDArray[np.float32]:
@@ -202,14 +208,14 @@ class DynamicWindow:
 
     @cached_property
     def _search(self) -> tuple[Array, kernels.LookAhead, kernels.TwistWeights]:
-        robot = self.task.robot
         twists = _settled(self.task, self._commands, self.model)
-        lags = [
-            value for name, value in robot.parameters.items() if name.endswith("_lag")
-        ]
-        lag = max(lags, default=0.0)
+        lag = _find_slowest_lag(self.task.robot)
         share = 1.0 - math.exp(-self.period / lag) if lag > 0.0 else 1.0
-        braking = braking_for(self.task, self.model)
+        if self.model is None:
+            braking = Braking(lag, math.inf)
+        else:
+            limits = self.task.command_limits
+            braking = find_braking(self.task.robot, self.model.kinematics, *limits)
         steps = [
             np.diff(np.unique(speeds.round(6))).max(initial=0.0) for speeds in twists.T
         ]

@@ -20,10 +20,10 @@ from nics_drl_bridge.policy import onnx_graph, rehearsal
 from nics_drl_bridge.policy.contract import Contract, Rows, leaves
 from nics_drl_bridge.policy.onnx_session import (
     GraphNeeds,
-    cannot_run,
     check_policy_graph,
-    in_turn,
     open_session,
+    run_in_turn,
+    run_rows,
 )
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -36,13 +36,10 @@ LIDAR = {"beams", "angle_min", "angle_max", "range_max", "mount"}
 class PolicyFile:
     """A loaded and checked policy, with the path of its file and its contract."""
 
-    def __init__(
-        self, path: Path, contract: Contract, session: Any, rows_at_once: int
-    ) -> None:
+    def __init__(self, path: Path, contract: Contract, session: Any) -> None:
         self.path = path
         self.contract = contract
         self._session = session
-        self._rows_at_once = rows_at_once
 
     def act(self, observation: Rows) -> NDArray[Any]:
         """Returns the action (C,) in [-1, 1], or () discrete, for (O,); or n actions for (n, O)."""
@@ -74,23 +71,17 @@ class PolicyFile:
             raise PolicyError(
                 str(self.path), "state", f"{reason}; `make_policy` keeps it."
             )
-        feeds = {onnx_graph.INPUT: rows.reshape(-1, size)}
+        tensors = [rows.reshape(-1, size)]
         if kept is not None:
-            feeds[onnx_graph.STATE_IN] = np.asarray(state, np.float32).reshape(
-                -1, kept.size
-            )
-        firsts = range(0, max(len(feeds[onnx_graph.INPUT]), 1), self._rows_at_once)
-        out = [self._run_rows(feeds, slice(k, k + self._rows_at_once)) for k in firsts]
+            tensors.append(np.asarray(state, np.float32).reshape(-1, kept.size))
+        step = self.contract.batch or onnx_graph.MOST_ROWS
+        firsts = range(0, max(len(tensors[0]), 1), step)
+        out = [self._run(*(part[k : k + step] for part in tensors)) for k in firsts]
         whole = [np.concatenate(parts) for parts in zip(*out, strict=True)]
         return [part[0] if rows.ndim == 1 else part for part in whole]
 
-    def _run_rows(self, feeds: Mapping[str, Rows], which: slice) -> list[NDArray[Any]]:
-        chunk = {name: rows[which] for name, rows in feeds.items()}
-        rows = chunk[onnx_graph.INPUT]
-        try:
-            out: list[NDArray[Any]] = self._session.run(None, chunk)
-        except Exception as error:  # noqa: BLE001 - the runtime's errors have no common base class
-            raise cannot_run(str(self.path), error) from None
+    def _run(self, rows: Rows, *state: Rows) -> list[NDArray[Any]]:
+        out = run_rows(self._session, str(self.path), rows, *state)
         if any(len(part) != len(rows) for part in out):
             reason = (
                 f"returns {[part.shape for part in out]} for {len(rows)} observations."
@@ -196,25 +187,7 @@ def load_policy(path: str | Path) -> PolicyFile:
             raise PolicyError(
                 str(path), "file", f"is neither a file nor a shipped policy; {hint}"
             )
-    source = str(file)
-    try:
-        size = file.stat().st_size
-        limit = onnx_graph.SIZE_LIMIT
-        if not file.is_file():
-            raise PolicyError(
-                source, "file", "is not a file; give the path of an .onnx file."
-            )
-        if size > limit:
-            sizes = f"is {size / 2**20:.0f} MB, more than the {limit // 2**20} MB of a policy"
-            raise PolicyError(source, "file", f"{sizes}; not opened.")
-        data = file.read_bytes()
-    except FileNotFoundError:
-        raise PolicyError(source, "file", "does not exist; check the path.") from None
-    except OSError as error:
-        raise PolicyError(
-            source, "file", f"can't be read ({error.strerror})."
-        ) from None
-    return policy_of(data, file)
+    return policy_of(onnx_graph.read_network(file, str(file), "file"), file)
 
 
 def policy_of(data: bytes, path: Path) -> PolicyFile:
@@ -228,31 +201,27 @@ def policy_of(data: bytes, path: Path) -> PolicyFile:
     # Shipped policies are trusted like the package's code.
     if path.parent != contracts.shipped():
         rehearsal.rehearse_policy(data, needs, seen, source)
-    rows = check_policy_graph(data, needs, source)
-    policy = PolicyFile(path, contract, open_session(data, source), rows)
-    _check_golden(policy, source)
+    check_policy_graph(data, needs, source)
+    policy = PolicyFile(path, contract, open_session(data, source))
+    _check_golden(policy, needs, source)
     return policy
 
 
 def _needs_of(contract: Contract) -> GraphNeeds:
-    commands = len(contract.robot.command)
-    widths: dict[str, int | None] = {
-        onnx_graph.INPUT: contract.observation.size,
-        onnx_graph.COMMAND: commands,
-        onnx_graph.ACTION: None if contract.actions == "discrete" else commands,
-    }
     state = contract.state
-    if state is not None:
-        widths |= dict.fromkeys((onnx_graph.STATE_IN, onnx_graph.STATE_OUT), state.size)
-    start = None if state is None else state.start
-    return GraphNeeds(widths, contract.batch, contract.graph_sha256, start)
+    return GraphNeeds(
+        contract.observation.size,
+        len(contract.robot.command),
+        contract.actions == "discrete",
+        contract.batch,
+        contract.graph_sha256,
+        None if state is None else (state.size, state.start),
+    )
 
 
-def _check_golden(policy: PolicyFile, source: str) -> None:
+def _check_golden(policy: PolicyFile, needs: GraphNeeds, source: str) -> None:
     golden = policy.contract.golden
-    kept = policy.contract.state
-    start = None if kept is None else np.full(kept.size, kept.start, np.float32)
-    action, command = in_turn(policy.run, golden.rows("observations"), start)
+    action, command = run_in_turn(policy.run, golden.rows("observations"), needs)
     computed = {"actions": action.reshape(len(command), -1), "commands": command}
     for name, rows in computed.items():
         gap = np.abs(rows - golden.rows(name)).max()

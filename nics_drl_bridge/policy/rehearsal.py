@@ -25,7 +25,8 @@ from nics_drl_bridge.policy.onnx_session import (
     Rows,
     check_policy_graph,
     open_session,
-    run_once,
+    run_rows,
+    run_session,
 )
 
 MEMORY = 512 * 2**20  # limit, in addition to what the libraries use [bytes]
@@ -42,22 +43,9 @@ _remembered: dict[str, None] = {}
 
 def rehearse_policy(data: bytes, needs: GraphNeeds, seen: Rows, source: str) -> None:
     """Opens a policy file in another process and runs observations (T, O). Raises PolicyError."""
-    _rehearse("policy", data, source, needs=_plain(needs), seen=_text(seen))
-
-
-def rehearse_network(data: bytes, source: str) -> None:
-    """Parses and checks a foreign network in another process. Raises PolicyError."""
-    _rehearse("network", data, source)
-
-
-def rehearse_folding(data: bytes, opset: int, source: str) -> None:
-    """Folds the shapes of a foreign network in another process. Raises PolicyError."""
-    _rehearse("folding", data, source, opset=opset)
-
-
-def rehearse_graph(data: bytes, needs: GraphNeeds, seen: Rows, source: str) -> None:
-    """Opens and runs a composed graph in another process. Raises PolicyError."""
-    _rehearse("graph", data, source, needs=_plain(needs), seen=_text(seen))
+    rows = np.ascontiguousarray(seen, "<f4")
+    text = base64.b64encode(rows.tobytes()).decode()
+    rehearse("policy", data, source, needs=asdict(needs), seen=[*rows.shape, text])
 
 
 def remember(data: bytes) -> None:
@@ -71,7 +59,11 @@ def _digest_of(step: str, data: bytes) -> str:
     return hash_bytes(step.encode() + b"\0" + data)
 
 
-def _rehearse(step: str, data: bytes, source: str, **settings: Any) -> None:
+def rehearse(step: str, data: bytes, source: str, **settings: Any) -> None:
+    """Does a step of opening a network in another process. Raises PolicyError.
+
+    The step `network` parses and checks it, `folding` folds its shapes, `policy` also runs it.
+    """
     digest = _digest_of(step, data)
     if digest in _remembered:
         return
@@ -118,15 +110,6 @@ def _answer_of(request: bytes) -> tuple[str, str] | None:
     return "file", f"the process that opens it first failed ({last}); not opened."
 
 
-def _plain(needs: GraphNeeds) -> dict[str, Any]:
-    return asdict(needs)
-
-
-def _text(seen: Rows) -> list[Any]:
-    rows = np.ascontiguousarray(seen, "<f4")
-    return [*rows.shape, base64.b64encode(rows.tobytes()).decode()]
-
-
 # The rest runs in the other process.
 
 
@@ -156,29 +139,30 @@ def main() -> None:
 
 
 def _do(about: dict[str, Any], data: bytes) -> None:
-    step = about["step"]
     source = "policy"
-    if step in ("network", "folding"):
-        model = onnx_graph.parsed(data, source)
-        if step == "network":
-            onnx_graph.check_graph(model, source)
-            return
+    if about["step"] == "network":
+        onnx_graph.check_graph(onnx_graph.parsed(data, source), source)
+    elif about["step"] == "folding":
         from nics_drl_bridge.policy.graph_folding import fold_shapes
 
+        model = onnx_graph.parsed(data, source)
         try:
             fold_shapes(model.graph, about["opset"])
         except Exception as error:
             reason = f"its shapes do not fit ({onnx_graph.quote(error)})."
             raise PolicyError(source, "network", reason) from error
-        return
-    needs = GraphNeeds(**about["needs"])
-    *shape, text = about["seen"]
-    seen = np.frombuffer(base64.b64decode(text), "<f4").reshape(shape)
-    if step == "policy":
-        check_policy_graph(data, needs, source)
     else:
-        onnx_graph.rows_at_once(onnx_graph.parsed(data, source), source, needs.batch)
-    run_once(open_session(data, source), needs, seen, source)
+        needs = GraphNeeds(**about["needs"])
+        *shape, text = about["seen"]
+        seen = np.frombuffer(base64.b64decode(text), "<f4").reshape(shape)
+        check_policy_graph(data, needs, source)
+        session = open_session(data, source)
+        run_session(session, needs, seen, source)
+        # Measure as many observations as are ever run at once.
+        tensors = [np.resize(seen, (needs.most_rows, shape[1]))]
+        if needs.first_state is not None:
+            tensors.append(np.tile(needs.first_state, (needs.most_rows, 1)))
+        run_rows(session, source, *tensors)
 
 
 def _limit(memory: int) -> None:

@@ -82,7 +82,8 @@ def train(
     path = folder / CHECKPOINT
     content = checkpoints.read_checkpoint(path) if resumed else None
     about: dict[str, Any] = {"seed": seed, "settings": settings.model_dump(mode="json")}
-    env, stop = make_train_env(settings), _stop_of(settings)
+    model = open_model(settings.robot, settings.lidar)
+    env, stop = make_train_env(settings, model), _stop_of(settings, model)
     on_env(env)
     engine = LeanPpo if settings.lean else Sb3Training
     if content is None:
@@ -216,12 +217,11 @@ def evaluate(
     )
 
 
-def _stop_of(settings: TrainingSettings) -> Stop:
+def _stop_of(settings: TrainingSettings, model: SimulatorModel) -> Stop:
     """Makes the early stop of a training, with separate worlds."""
     stop = settings.stop
     if stop is None:
         return Stop(None, {})
-    model = open_model(settings.robot, settings.lidar)
     envs = {
         world: _env_of(settings, world, stop.episodes, model)
         for world in settings.worlds

@@ -27,7 +27,12 @@ with extensions.require_modules("the export of a policy"):
     import torch
 
     from nics_drl_bridge.policy import onnx_graph, policy_file, rehearsal
-    from nics_drl_bridge.policy.onnx_session import in_turn, open_session
+    from nics_drl_bridge.policy.onnx_session import (
+        GraphNeeds,
+        open_session,
+        run_in_turn,
+        run_session,
+    )
 
 Normaliser = tuple[ArrayLike, ArrayLike, float]
 OPSET = 17
@@ -125,13 +130,20 @@ def export_policy(
         )
     deployed = Deployed(actor_of(model), task, normaliser).eval().cpu()
     graph = _graph(deployed, task)
-    golden = _golden(deployed, graph, task, str(file))
-    sha256 = onnx_graph.graph_hash(graph)
+    needs = GraphNeeds(
+        task.observation_space.shape[0],
+        len(task.robot.command),
+        deployed.discrete,
+        None,
+        onnx_graph.graph_hash(graph),
+        deployed.state,
+    )
+    golden = _golden(deployed, graph, needs, golden_observations(task), str(file))
     text = contract_of(
         task,
         simulator_model,
         golden,
-        sha256,
+        needs.graph_sha256,
         provenance or {},
         deployed.state,
         max_episode_steps=max_episode_steps,
@@ -144,21 +156,17 @@ def export_policy(
     return policy
 
 
-def _golden(deployed: Deployed, graph: Any, task: Task, source: str) -> dict[str, Rows]:
-    seen = golden_observations(task)
+def _golden(
+    deployed: Deployed, graph: Any, needs: GraphNeeds, seen: Rows, source: str
+) -> dict[str, Rows]:
     session = open_session(graph.SerializeToString(), source)
-    inputs = (onnx_graph.INPUT, onnx_graph.STATE_IN)
-    kept = deployed.state
-    start = None if kept is None else np.full(kept[0], kept[1], np.float32)
-
-    def infer(*tensors: Rows) -> list[Rows]:
-        return list(session.run(None, dict(zip(inputs, tensors, strict=False))))
 
     def compute(*tensors: Rows) -> list[Rows]:
         with torch.no_grad():
             return [part.numpy() for part in deployed(*map(torch.as_tensor, tensors))]
 
-    out, wanted = (in_turn(run, seen, start) for run in (infer, compute))
+    out = run_session(session, needs, seen, source)
+    wanted = run_in_turn(compute, seen, needs)
     for name, ours, theirs in zip(("actions", "commands"), out, wanted, strict=True):
         error = float(np.abs(ours - theirs).max())
         if not error <= policy_file.GOLDEN_TOLERANCE:

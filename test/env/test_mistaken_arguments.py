@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
-import numpy as np
 import pytest
 
 import nics_drl_bridge
@@ -163,81 +162,6 @@ def test_a_closed_env_refuses_what_is_called_after_close(
     env.close()  # a second time does nothing
 
 
-class EndsByFloats(Navigation):
-    """Its `end` returns 0.0 or 1.0."""
-
-    def end(self, view: Any, memory: Any) -> Any:
-        """Returns floats."""
-        return np.where(super().end(view, memory), 1.0, 0.0)
-
-
-class ResetsToAnArray(Navigation):
-    """Its `reset` returns the goals alone."""
-
-    def reset(self, episodes: Any) -> Any:
-        """Returns an array."""
-        return episodes.goals.copy()
-
-
-class RewardsByText(Navigation):
-    """Its `reward` holds text."""
-
-    def reward(self, before: Any, after: Any, memory: Any) -> Any:
-        """Returns an array of text."""
-        return {"progress": np.full(after.pose.shape[:-1], "x")}
-
-
-class ObservesTooLittle(Navigation):
-    """Its `observation` lacks a part."""
-
-    def observation(self, view: Any, memory: Any) -> Any:
-        """Returns all parts but one."""
-        return super().observation(view, memory)[..., 1:]
-
-
-class ObservesADictionary(Navigation):
-    """Its `observation` is a dictionary."""
-
-    def observation(self, view: Any, memory: Any) -> Any:
-        """Returns a dictionary."""
-        return {"scan": super().observation(view, memory)}
-
-
-class HasAMethodForItsSpace(Navigation):
-    """Its `observation_space` is a method, not a property."""
-
-    def observation_space(self) -> Any:
-        """Returns a space when it is called."""
-        return super().observation_space
-
-
-@pytest.mark.parametrize("make", [nics_drl_bridge.make, nics_drl_bridge.make_vec])
-@pytest.mark.parametrize(
-    ("task", "sentence"),
-    [
-        (EndsByFloats, "its end must be True or False for each robot, not float64"),
-        (ResetsToAnArray, "its reset must return a dictionary of arrays"),
-        (RewardsByText, "its reward term 'progress' must be finite"),
-        (ObservesTooLittle, "its observation must be finite, of shape"),
-        (ObservesADictionary, "its observation must be finite, of shape"),
-        (
-            HasAMethodForItsSpace,
-            "its observation_space must be a property that returns a Box",
-        ),
-    ],
-)
-def test_a_task_that_returns_what_no_task_may_is_told_which_method(
-    make: Maker, task: type, sentence: str
-) -> None:
-    def drive() -> None:
-        env = make(task)
-        env.reset(seed=0)
-        env.step(env.action_space.sample())
-
-    with pytest.raises(BridgeError, match=f"task {task.__name__}: {sentence}"):
-        drive()
-
-
 @pytest.mark.parametrize(
     ("text", "suffix", "sentence"),
     [
@@ -261,17 +185,7 @@ def test_a_file_without_a_task_is_told(
         nics_drl_bridge.make(f"{file}{suffix}")
 
 
-def test_a_field_of_800_metres_is_refused_with_the_limit(tmp_path: Path) -> None:
-    file = tmp_path / "large.yaml"
-    file.write_text("name: large\nsize: [800, 800]\ngoal_distance: [2, 700]\n")
-    with pytest.raises(BridgeError, match=r"800 m x 800 m is 1131 m across.*1000 m"):
-        nics_drl_bridge.make(world=str(file))
-
-
-def test_a_model_that_is_not_there_is_told_without_a_dangling_clause() -> None:
-    with pytest.raises(BridgeError) as caught:
-        nics_drl_bridge.make(model="jackel")
-    assert str(caught.value).startswith(
-        "unknown robot 'jackel'; did you mean 'jackal'? (or"
-    )
-    assert "either." not in str(caught.value)
+def test_a_space_that_is_a_method_is_refused() -> None:
+    methods = {"observation_space": lambda self: None}
+    with pytest.raises(BridgeError, match="observation_space must be a property"):
+        nics_drl_bridge.make(type("Own", (Navigation,), methods))

@@ -10,13 +10,12 @@ from robots import direct_model, field
 
 from nics_drl_bridge import extensions
 from nics_drl_bridge.env.bridge_env import BridgeEnv
-from nics_drl_bridge.env.rendering import ROBOTS, WorldPicture
+from nics_drl_bridge.env.rendering import ROBOTS
 from nics_drl_bridge.env.sim_backend import SimBackend
-from nics_drl_bridge.env.snapshot import Snapshot, gate_of
+from nics_drl_bridge.env.snapshot import gate_of
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.robot.spec import RobotSpec
-from nics_drl_bridge.sim.world import World
 
 
 def pixel(colour):
@@ -52,28 +51,6 @@ def test_a_picture_shows_the_robot_where_it_stands():
     row, column = blue_at(shown.render())
     assert row == pytest.approx(0.5 + 1.5 / 6.6, abs=0.02)
     assert column > 0.5 + 1.9 / 6.6
-
-
-def test_a_picture_has_the_proportions_of_its_world_unless_it_would_be_a_line():
-    for size, shape in (
-        ((6.0, 3.0), (250, 500)),
-        ((3.0, 6.0), (500, 250)),
-        ((50, 2), (100, 500)),
-    ):
-        world = World.model_validate(
-            {"name": "f", "size": size, "goal_distance": [0.5, 1.0]}
-        )
-        picture = WorldPicture(direct_model(), world).draw(empty_shot())
-        assert picture.shape == (*shape, 3)
-        rows, columns = np.nonzero((picture < 90).all(axis=-1))
-        drawn = np.ptp(columns) / np.ptp(rows)
-        assert drawn == pytest.approx(size[0] / size[1], rel=0.1)
-
-
-def empty_shot():
-    """A world without robots, obstacles and goals."""
-    ranges = np.zeros((0, 72), np.float32)
-    return Snapshot(np.zeros((0, 3)), ranges, np.zeros((0, 7)), np.zeros((0, 2)))
 
 
 def test_every_robot_of_a_team_is_drawn():

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import gymnasium
 import numpy as np
 import pytest
 from robots import direct_model, field
@@ -34,6 +33,7 @@ ENVS = {"single": single, "vector": vector, "agents": agents}
         ({"seed": 2**63}, "^seed 9223372036854775808: must be a whole number"),
         ({"seed": 2**200}, "^seed 16069\\d*\\.\\.\\.\\d*: must be a whole number"),
         ({"seed": 10**6000}, "^seed of very many digits: must be a whole number"),
+        ({"seed": -1}, "^seed -1: must be a whole number"),
         ({"seed": "three"}, "^seed 'three': must be a whole number"),
         ({"seed": 3.0}, "^seed 3.0: must be a whole number"),
         ({"options": [1]}, "^reset options of type list: must be a dict"),
@@ -54,12 +54,6 @@ def test_what_a_reset_cant_use_is_one_sentence_and_the_next_reset_works(
     first = env.reset(seed=3)[0]
     again = ENVS[kind]().reset(seed=3)[0]
     np.testing.assert_equal(first, again)
-
-
-@pytest.mark.parametrize("kind", sorted(ENVS))
-def test_a_negative_seed_is_one_sentence(kind):
-    with pytest.raises(ConfigError, match="seed -1: must be a whole number"):
-        ENVS[kind]().reset(seed=-1)
 
 
 def test_the_greatest_seed_works():
@@ -103,17 +97,6 @@ def test_an_option_of_another_shape_is_refused_rather_than_spread(goal):
         ConfigError, match=r"reset option 'goal'.*must be numbers of shape"
     ):
         single().reset(options={"goal": goal})
-
-
-@pytest.mark.parametrize(
-    "action",
-    [np.array(["a", "b", "c"]), np.ones(3) * 1j, np.array([None] * 3), [[1.0], 2.0]],
-)
-def test_an_action_of_no_numbers_is_refused_by_its_type(action):
-    env = single()
-    env.reset(seed=0)
-    with pytest.raises(gymnasium.error.InvalidAction):
-        env.step(action)
 
 
 @pytest.mark.parametrize("kind", [np.float16, np.int8, np.uint64, np.bool_, list])

@@ -45,13 +45,6 @@ def test_a_contact_behind_ends_an_episode_with_its_reward_once():
     assert all(info["reward_terms"]["contact"][0] == 0.0 for *_, info in before)
 
 
-def test_without_it_the_task_does_not_notice():
-    rest = list(drive(env_of(None), BACK))
-    assert len(rest) == 80
-    assert bool(rest[-1][2]["true_collision"][0])
-    assert "contact" not in rest[-1][2]["reward_terms"]
-
-
 def test_the_reward_of_the_path_adds_up_to_its_length():
     env = env_of(Teaching(path=2.0))
     terms = [
@@ -97,26 +90,3 @@ def test_an_episode_that_succeeded_is_not_driven_again():
     seeds = episodes(env, np.array([[1.0, 0.0, 0.0]], np.float32), 60)
     assert len(seeds) > 2
     assert len(set(seeds)) == len(seeds)
-
-
-def test_teaching_does_not_depend_on_the_number_of_threads():
-    def driven(threads):
-        env = BridgeVectorEnv(
-            120,
-            direct_model(),
-            field(9.0, count=4, goal_distance=[2.0, 6.0]),
-            max_episode_steps=20,
-            autoreset_mode="SameStep",
-            threads=threads,
-        )
-        env.teach(Teaching(path=1.0, retries=1))
-        env.reset(seed=0)
-        ahead = np.tile(np.array([[1.0, 0.0, 0.0]], np.float32), (120, 1))
-        for _ in range(50):
-            seen = env.step(ahead)[0]
-        return seen, env._starts.copy()
-
-    one = driven(1)
-    three = driven(3)
-    np.testing.assert_array_equal(one[0], three[0])
-    np.testing.assert_array_equal(one[1], three[1])

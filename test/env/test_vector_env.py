@@ -1,8 +1,6 @@
 from __future__ import annotations
 
 import hashlib
-import subprocess
-import sys
 import warnings
 
 import gymnasium
@@ -17,8 +15,8 @@ from nics_drl_bridge.env import vector_env
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.registry import ENVIRONMENTS, NAVIGATION
+from nics_drl_bridge.env.teaching import Teaching
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
-from nics_drl_bridge.errors import ConfigError
 
 CHECKS = [
     getattr(checking, f"check_{name}")
@@ -121,7 +119,7 @@ def test_it_steps_as_gymnasiums_own_vector_env_of_single_envs(task, mode):
 
 @pytest.mark.parametrize(
     ("steps", "counts"),
-    [(300, (1, 17)), pytest.param(2000, (1, 4, 16, 64), marks=pytest.mark.campaign)],
+    [(100, (1, 17)), pytest.param(2000, (1, 4, 16, 64), marks=pytest.mark.campaign)],
 )
 @pytest.mark.parametrize("task", TASKS, ids=IDS)
 def test_a_world_does_not_depend_on_how_many_others_there_are(task, steps, counts):
@@ -143,32 +141,6 @@ def digest(arrays):
     return found.hexdigest()
 
 
-COURSE = """
-import hashlib, sys
-import numpy as np
-from nics_drl_bridge.env.vector_env import BridgeVectorEnv
-env = BridgeVectorEnv(4, model="differential", threads=int(sys.argv[1]))
-env.action_space.seed(0)
-found = hashlib.sha256(env.reset(seed=1)[0].tobytes())
-for _ in range(500):
-    for part in env.step(env.action_space.sample())[:4]:
-        found.update(part.tobytes())
-print(found.hexdigest())
-"""
-
-
-@pytest.mark.process
-@pytest.mark.slow
-def test_steps_give_the_same_digest_in_fresh_processes_with_any_number_of_threads():
-    found = []
-    for threads in THREADS:
-        command = [sys.executable, "-c", COURSE, str(threads)]
-        done = subprocess.run(command, capture_output=True, text=True, check=True)
-        found.append(done.stdout.strip())
-    assert len(set(found)) == 1
-    assert len(found[0]) == 64
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("task", TASKS, ids=IDS)
@@ -176,6 +148,9 @@ def test_threads_change_no_bit(task, mode):
     envs = [
         vector(5, threads=threads, autoreset_mode=mode, **task) for threads in THREADS
     ]
+    if mode == "SameStep" and envs[0].robots == 1:
+        for env in envs:
+            env.teach(Teaching(path=1.0, contact=-1.0, retries=1))
     firsts = [env.reset(seed=6) for env in envs]
     for other in firsts[1:]:
         assert np.array_equal(firsts[0][0], other[0])
@@ -185,18 +160,6 @@ def test_threads_change_no_bit(task, mode):
             for a, b in zip(one[:4], other[:4], strict=True):
                 assert np.array_equal(a, b)
             assert_alike(one[4], other[4])
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_a_reset_amid_episodes_is_as_good_as_a_fresh_env(mode):
-    used, fresh = (vector(3, autoreset_mode=mode) for _ in range(2))
-    used.reset(seed=9)
-    for action in actions_of(used, 37, seed=3):
-        used.step(action)
-    assert np.array_equal(used.reset(seed=2)[0], fresh.reset(seed=2)[0])
-    for action in actions_of(used, 60):
-        for a, b in zip(used.step(action)[:4], fresh.step(action)[:4], strict=True):
-            assert np.array_equal(a, b)
 
 
 def test_returned_arrays_are_the_callers_own_unless_it_wants_none():
@@ -250,6 +213,8 @@ def test_gymnasiums_checks_of_an_env_find_nothing_to_warn_of_in_a_vector(
             autoreset_mode=mode,
             task_options={"actions": actions},
         ).unwrapped
+        assert isinstance(env, BridgeVectorEnv)
+        assert env.metadata["autoreset_mode"] is AutoresetMode(mode)
         for check in CHECKS:
             check(env)
         for space in (env.observation_space, env.single_observation_space):
@@ -258,24 +223,6 @@ def test_gymnasiums_checks_of_an_env_find_nothing_to_warn_of_in_a_vector(
             checking.check_action_space(space)
             checking.check_space_limit(space, "action")
         env.close()
-        env.close()
-
-
-@pytest.mark.parametrize("name", ENVIRONMENTS)
-@pytest.mark.parametrize("mode", MODES)
-def test_make_vec_gives_the_native_env_without_a_warning(name, mode):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        env = gymnasium.make_vec(
-            name, 2, model=model(), world=field(), autoreset_mode=mode
-        )
-        assert isinstance(env.unwrapped, BridgeVectorEnv)
-        assert env.metadata["autoreset_mode"] is AutoresetMode(mode)
-        observation, _ = env.reset(seed=0)
-        assert observation in env.observation_space
-        observation, reward, *_ = env.step(env.action_space.sample())
-        assert observation in env.observation_space
-        assert reward.dtype == np.float64
         env.close()
 
 
@@ -290,19 +237,6 @@ def test_gymnasiums_wrappers_take_it():
             lengths += info["episode"]["l"][info["_episode"]].tolist()
     assert lengths
     assert min(lengths) >= 1
-
-
-@pytest.mark.parametrize(
-    ("arguments", "sentence"),
-    [
-        ({"autoreset_mode": "Disabled"}, "autoreset_mode 'Disabled': must be one of"),
-        ({"task": "navigtion"}, "unknown task 'navigtion'; did you mean 'navigation'?"),
-        ({"render_mode": "human"}, "unknown render_mode 'human'"),
-    ],
-)
-def test_a_wrong_argument_gives_one_sentence(arguments, sentence):
-    with pytest.raises(ConfigError, match=sentence[:40].replace("?", ".")):
-        vector(1, **arguments)
 
 
 class Fragile(Navigation):
@@ -333,38 +267,6 @@ def test_an_exception_amid_a_step_wants_a_reset_of_all_worlds_which_sets_all_rig
     assert np.array_equal(env.reset(seed=7)[0], fresh.reset(seed=7)[0])
     for _ in range(3):
         assert np.array_equal(env.step(actions)[0], fresh.step(actions)[0])
-
-
-class Forgetful(Navigation):
-    shown = ()
-
-    def reset(self, episodes):
-        return {}
-
-    def step_into(self, out, before, after, memory):
-        return super().step_into(
-            out, before, after, {"goal": np.zeros((*after.pose.shape[:2], 2))}
-        )
-
-    def observation(self, view, memory):
-        return super().observation(view, {"goal": np.zeros((*view.pose.shape[:2], 2))})
-
-
-def test_a_task_that_remembers_nothing_can_be_stepped():
-    env = vector(2, task=Forgetful)
-    env.reset(seed=0)
-    observation, reward, *_ = env.step(np.zeros((2, 3), np.float32))
-    assert np.isfinite(observation).all()
-    assert reward.shape == (2,)
-
-
-def test_actions_that_hold_nan_are_refused():
-    env = vector(2)
-    env.reset(seed=0)
-    with pytest.raises(gymnasium.error.InvalidAction, match="NaN"):
-        env.step(np.full((2, 3), np.nan, np.float32))
-    with pytest.raises(gymnasium.error.InvalidAction, match="shape"):
-        env.step(np.zeros((3, 3), np.float32))
 
 
 def test_many_zeros_are_zeros_where_memory_can_not_be_mapped_privately_as_on_windows(

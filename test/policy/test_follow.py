@@ -25,13 +25,6 @@ def test_the_sub_goal_lies_ahead_on_the_path():
     assert place.nearest == 1  # the nearest of the given poses ahead
 
 
-def test_near_the_end_the_sub_goal_is_the_end():
-    path = PlannedPath(CORNER)
-    for pose in ((1.0, 0.0, 0.0), (2.0, 0.5, 0.0), (2.0, 1.5, 0.0)):
-        place = path.locate(np.array(pose), 1.0)
-    assert place.ahead == pytest.approx([2.0, 2.0])
-
-
 def test_errors_have_the_signs_of_the_standard():
     left = PlannedPath(CORNER).locate(np.array([0.5, 0.2, 0.3]), 1.0)
     assert left.left == pytest.approx(0.2)  # to the left of the path

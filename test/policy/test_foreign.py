@@ -2,24 +2,24 @@ from __future__ import annotations
 
 import json
 
-import gymnasium
 import numpy as np
 import onnx
 import onnxruntime
 import pytest
 
 from nics_drl_bridge.commands.episodes import FAST, EvaluationOrder, evaluate
-from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import BridgeError, ConfigError, PolicyError
 from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.generator import builtin_model
-from nics_drl_bridge.policy.evaluation import drive_all, drive_worlds
+from nics_drl_bridge.policy.evaluation import drive_worlds
 from nics_drl_bridge.policy.foreign import import_policy, load_any
-from nics_drl_bridge.policy.policies import make_policy, open_policy
+from nics_drl_bridge.policy.policies import open_policy
 from policy import foreign_nets
 from policy.foreign_nets import FAR, SECTORS, UNITS, write, write_mapping
 
+CORNERS = (0.0, 1e-4, np.pi / 2, 3.1415, -1e-4, -1.6, -3.1415)
+"""Bearings at which a part of the graph that computes them changes [rad]."""
 TWISTS = np.array([[0, 0], [0.5, 0], [0.3, 1.0], [0.3, -1.0], [0, 0.7]])
 
 
@@ -32,11 +32,12 @@ def session(folder):
     return onnxruntime.InferenceSession(str(folder / "net.onnx"))
 
 
-def seen(steps: int = 8):
+def seen(steps: int = 16):
     """Observations (T, O) of a robot somewhere: shares of a scan, goal, velocity."""
     rng = np.random.default_rng(1)
     shares = rng.uniform(0.0, 1.0, (steps, SECTORS))
     bearing = rng.uniform(-3.1, 3.1, steps)
+    bearing[: len(CORNERS)] = CORNERS[:steps]
     distance = rng.uniform(0.1, 8.0, steps)
     velocity = rng.uniform(-0.5, 0.5, (steps, 3))
     goal = np.stack([distance, np.cos(bearing), np.sin(bearing)], axis=-1)
@@ -79,29 +80,21 @@ def test_a_whole_number_that_chooses_nothing_is_no_command(tmp_path, robot, limi
         open_policy(str(path), robot)
 
 
-def test_an_evaluation_names_a_command_that_is_none_and_keeps_what_was_driven_before(
-    tmp_path,
-):
+def test_an_evaluation_keeps_what_was_driven_before_a_command_that_is_none(tmp_path):
     path = write(tmp_path, "chooser")
     # Beyond the last command from 5 m on, farther than where policies are tried as they are opened.
-    write_bytes(
-        tmp_path / "net.onnx", foreign_nets.chooser(0.0, 3.0).SerializeToString()
-    )
+    network = foreign_nets.chooser(0.0, 3.0)
+    write_bytes(tmp_path / "net.onnx", network.SerializeToString())
     world = tmp_path / "far.yaml"
     world.write_text("name: far\nsize: [16.0, 16.0]\ngoal_distance: [6.0, 7.0]\n")
+    policies = ["straight", str(path)]
+    out = tmp_path / "out"
     order = EvaluationOrder(
-        ["straight", str(path)],
-        tmp_path / "out",
-        "differential",
-        str(world),
-        1,
-        places=(FAST,),
+        policies, out, "differential", str(world), 1, places=(FAST,)
     )
-    with pytest.raises(
-        ConfigError, match="the policy's action in step 1 contains NaN or inf"
-    ):
+    with pytest.raises(ConfigError, match="action in step 1 contains NaN or inf"):
         evaluate(order, lambda _: None, lambda *_: None)
-    kept = json.loads((tmp_path / "out" / "evaluation.json").read_text())
+    kept = json.loads((out / "evaluation.json").read_text())
     assert list(kept["policies"]) == ["straight"]
 
 
@@ -167,24 +160,6 @@ def test_a_recurrent_network_keeps_its_state_and_its_last_output(tmp_path, robot
     assert np.abs(found[1:] - fresh[1:]).max() > 0.01  # its state matters
 
 
-def test_bearings_are_right_all_around(tmp_path, robot):
-    data = foreign_nets.three_mapping()
-    data["outputs"]["turn"] = {"of": "action", "index": 1}
-    nodes = [
-        onnx.helper.make_node("Identity", ["goal"], ["action"]),
-        onnx.helper.make_node("Identity", ["scan"], ["unused"]),
-        onnx.helper.make_node("Identity", ["velocity"], ["unused_too"]),
-    ]
-    inputs = {"scan": [1, SECTORS], "goal": [1, 2], "velocity": [1, 2]}
-    made = foreign_nets.model_of(nodes, inputs, {"action": [1, 2]}, {})
-    write_bytes(tmp_path / "net.onnx", made.SerializeToString())
-    for angle in (0.0, 1e-4, 1.5, np.pi / 2, 3.0, 3.1415, -1e-4, -1.6, -3.1415):
-        row = np.zeros(SECTORS + 6, np.float32)
-        row[SECTORS : SECTORS + 3] = 1.0, np.cos(angle), np.sin(angle)
-        (command,) = commands_of(write_mapping(tmp_path, data), robot, [row])
-        assert command[1] == pytest.approx(angle / np.pi, abs=1e-6)
-
-
 @pytest.mark.parametrize("name", ["ackermann", "tricycle"])
 def test_turn_rates_become_the_steering_angles_of_a_car(tmp_path, name):
     model, (rows, _) = builtin_model(name), seen()
@@ -195,17 +170,6 @@ def test_turn_rates_become_the_steering_angles_of_a_car(tmp_path, name):
     wanted = np.clip(np.stack([speed, angle], axis=1), *task.command_limits)
     assert np.abs(wanted[:, 1]).max() > 0.1
     assert policy.command(rows) == pytest.approx(wanted, abs=1e-5)
-
-
-def of_goal(folder, nodes, outputs, weights, turn):
-    """Writes a network of the goal (x, y) and its mapping; `turn` says what turns."""
-    ends = {name: ["n", size] for name, size in outputs.items()}
-    made = foreign_nets.model_of(nodes, {"goal": ["n", 2]}, ends, weights)
-    write_bytes(folder / "net.onnx", made.SerializeToString())
-    data = foreign_nets.three_mapping()
-    data["inputs"] = {"goal": {"parts": [{"of": "goal.x"}, {"of": "goal.y"}]}}
-    data["outputs"] = {"forward": {"of": "action", "clip": [0.0, 0.4]}, "turn": turn}
-    return write_mapping(folder, data)
 
 
 def test_sizes_that_follow_from_shapes_are_known(tmp_path, robot):
@@ -222,31 +186,19 @@ def test_sizes_that_follow_from_shapes_are_known(tmp_path, robot):
     numbers = {"zero": [0], "one": [1], "two": [2], "last": [-1]}
     weights = {name: np.int64(values) for name, values in numbers.items()}
     weights["weights"] = np.float32([[0.1, -0.1, 9.0, 9.0], [0.3, 0.1, 9.0, 9.0]])
-    turn = {"of": "action", "index": 1, "clip": [-0.5, 0.5]}
-    path, (rows, bearing) = (
-        of_goal(tmp_path, nodes, {"action": "half"}, weights, turn),
-        seen(),
-    )
-    x = rows[:, SECTORS] * np.cos(bearing)
-    y = rows[:, SECTORS] * np.sin(bearing)
-    wanted = [
-        np.clip(0.1 * x + 0.3 * y, 0.0, 0.4),
-        np.clip(0.1 * y - 0.1 * x, -0.5, 0.5),
-    ]
-    found = commands_of(path, robot, rows)
-    assert found == pytest.approx(np.stack(wanted, axis=-1), abs=1e-5)
-
-
-def test_an_output_may_be_an_input_as_it_is(tmp_path, robot):
-    nodes = [onnx.helper.make_node("Neg", ["goal"], ["action"])]
+    # An input may be an output, too.
+    ends = {"action": ["n", "half"], "goal": ["n", 2]}
+    made = foreign_nets.model_of(nodes, {"goal": ["n", 2]}, ends, weights)
+    write_bytes(tmp_path / "net.onnx", made.SerializeToString())
+    data = foreign_nets.three_mapping()
+    data["inputs"] = {"goal": {"parts": [{"of": "goal.x"}, {"of": "goal.y"}]}}
     turn = {"of": "goal", "index": 1, "clip": [-0.5, 0.5]}
-    path, (rows, bearing) = (
-        of_goal(tmp_path, nodes, {"action": 2, "goal": 2}, {}, turn),
-        seen(),
-    )
+    data["outputs"] = {"forward": {"of": "action", "clip": [0.0, 0.4]}, "turn": turn}
+    path = write_mapping(tmp_path, data)
+    rows, bearing = seen()
     x = rows[:, SECTORS] * np.cos(bearing)
     y = rows[:, SECTORS] * np.sin(bearing)
-    wanted = [np.clip(-x, 0.0, 0.4), np.clip(y, -0.5, 0.5)]
+    wanted = [np.clip(0.1 * x + 0.3 * y, 0.0, 0.4), np.clip(y, -0.5, 0.5)]
     found = commands_of(path, robot, rows)
     assert found == pytest.approx(np.stack(wanted, axis=-1), abs=1e-5)
 
@@ -261,20 +213,6 @@ def test_it_drives_to_the_goal(tmp_path, robot):
     assert drive_worlds(env, policy.act, range(8)).success.mean() == 1.0
 
 
-@pytest.mark.parametrize("name", ["flat", "gru"])
-def test_many_worlds_are_driven_as_one_after_the_other(tmp_path, robot, name):
-    path = str(write(tmp_path, name))
-    policy, task = open_policy(path, robot)
-    env = BridgeVectorEnv(3, robot, "empty", task=task, max_episode_steps=30)
-    found = drive_worlds(env, policy.act, range(4))
-    given = {"model": robot, "world": "empty", "task": task}
-    alone = gymnasium.make("NicsBridge/Navigation-v0", max_episode_steps=30, **given)
-    episodes = drive_all(alone, open_policy(path, robot)[0], range(4))
-    for k, episode in enumerate(episodes):
-        assert found.length[k] == pytest.approx(episode.length, abs=1e-4)
-        assert episode.length > 0.0
-
-
 def test_it_becomes_a_policy_file(tmp_path, robot):
     rows, _ = seen()
     path = write(tmp_path, "gru")
@@ -285,15 +223,6 @@ def test_it_becomes_a_policy_file(tmp_path, robot):
         == commands_of(path, robot, rows).tolist()
     )
     assert load_any(file).contract.robot == robot.robot
-
-
-def test_it_must_fit_the_task(tmp_path, robot):
-    path = str(write(tmp_path, "three"))
-    _, task = open_policy(path, robot)
-    assert make_policy(path, task, robot).act(seen()[0][0]).shape == (2,)
-    env = BridgeEnv(model=robot, task_options={"scan": 36})
-    with pytest.raises(PolicyError, match=r"field 'scan\.?"):
-        make_policy(path, env.task, robot)
 
 
 # What is refused: one sentence with the place, what is wrong, and what to do.
@@ -317,7 +246,7 @@ def changed(path, value):
 
 SPOILT = {
     "kind": (changed("kind", "policy"), "not the mapping of a foreign policy"),
-    "no network": (changed("network", "nets.onnx"), "'nets.onnx' can't be read"),
+    "no network": (changed("network", "nets.onnx"), "'nets.onnx' does not exist"),
     "pickle": (changed("network", "net.pt"), "must be an .onnx file or a LEAPP bundle"),
     "unknown key": (
         changed("output", {}),
@@ -394,38 +323,6 @@ def test_a_network_that_gives_no_numbers_or_hides_others_operators_is_refused(
         write_bytes(tmp_path / "net.onnx", spoilt.SerializeToString())
         with pytest.raises(PolicyError, match=words):
             open_policy(str(path), robot)
-
-
-def test_a_domain_that_no_operator_is_of_is_no_hindrance(tmp_path, robot):
-    path = write(tmp_path, "three")
-    network = foreign_nets.three()
-    network.opset_import.append(onnx.helper.make_opsetid("ai.onnx.ml", 2))
-    write_bytes(tmp_path / "net.onnx", network.SerializeToString())
-    policy = load_any(path, robot)
-    network.graph.node[3].domain = "ai.onnx.ml"
-    write_bytes(tmp_path / "net.onnx", network.SerializeToString())
-    with pytest.raises(
-        PolicyError, match=r"the operator ai\.onnx\.ml\.Tanh is not one"
-    ):
-        load_any(path, robot)
-    assert policy.contract.robot == robot.robot
-
-
-def test_weights_in_another_file_are_refused_with_the_fix(tmp_path, robot):
-    path = write(tmp_path, "three")
-    file = tmp_path / "net.onnx"
-    given = {
-        "location": "net.onnx.data",
-        "size_threshold": 0,
-        "save_as_external_data": True,
-    }
-    onnx.save(onnx.load(file), file, **given)
-    with pytest.raises(
-        PolicyError, match=r"'net.onnx.data'.* export with `external_data=False`"
-    ):
-        load_any(path, robot)
-    onnx.save(onnx.load(file), file)
-    assert load_any(path, robot).contract.robot == robot.robot
 
 
 def test_without_a_robot_it_says_how_to_name_one(tmp_path):

@@ -85,10 +85,3 @@ def test_arrays_that_double_are_folded_while_they_are_small():
     small = [one for one in model.graph.initializer if one.data_type in INTEGERS]
     assert len(model.graph.node) > 30
     assert sum(len(one.raw_data) for one in small) < 2**14
-
-
-def test_axes_that_are_folded_do_not_grow_without_end():
-    names = ["x", *(f"u{k}" for k in range(900)), "y"]
-    grown = [node("Unsqueeze", [a, "axes"], [b]) for a, b in itertools.pairwise(names)]
-    with pytest.raises(ValueError, match="more than 256 dimensions"):
-        folded([node("Identity", ["a"], ["axes"]), *grown], {"a": np.arange(2, 10)})

@@ -25,7 +25,7 @@ from nics_drl_bridge.robot.spec import build_robot, load_robot
 
 CLOSE = Clearance(margin=0.05, soft=0.3)
 GOAL = np.array([3.0, 0.0])
-ROBOTS = ("differential", "jackal", "tricycle")
+ROBOTS = ("differential", "tricycle")
 
 
 def seen(points, robot="jackal", goal=GOAL):
@@ -99,9 +99,7 @@ def box(length, width):
     return build_robot({"name": "box", "kind": "differential", "footprint": corners})
 
 
-@pytest.mark.parametrize(
-    ("length", "width"), [(0.6, 0.4), (1.2, 0.8), (2.4, 1.6), (6.0, 3.0)]
-)
+@pytest.mark.parametrize(("length", "width"), [(0.6, 0.4), (6.0, 3.0)])
 def test_the_discs_of_a_large_footprint_take_little_memory_and_leave_little_out(
     length, width
 ):

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from gymnasium.wrappers import TimeLimit
 from robots import field, lidar
-from shapely.geometry import LineString, Point
 
 from nics_drl_bridge.config import share_folder
 from nics_drl_bridge.env.bridge_env import BridgeEnv
@@ -86,54 +85,6 @@ def test_it_turns_or_moves_to_the_side_of_the_goal_and_drives_to_one_ahead(robot
         assert (left, turn) == pytest.approx((0.0, 0.0), abs=1e-6)
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
-@pytest.mark.parametrize("name", PLANNERS)
-def test_a_planner_does_not_drive_on_towards_a_wall_that_the_straight_one_drives_into(
-    robot, name
-):
-    task = task_of(robot)
-    ahead = np.abs(task.lidar.angles) < 1.2
-    ranges = np.full(90, np.inf, np.float32)
-    ranges[ahead] = 0.3 / np.cos(task.lidar.angles[ahead])
-    observation = observe(task, 0.0, ranges=ranges)
-    assert twist_of(task, make_policy(name, task).act(observation))[0] < 0.2
-    assert twist_of(task, make_policy("straight", task).act(observation))[0] > 0.5
-
-
-@pytest.mark.parametrize("name", PLANNERS)
-def test_a_planner_drives_through_a_gap_narrower_than_the_circle_around_its_outline(
-    name,
-):
-    robot = load_robot("jackal")
-    assert 2.0 * robot.footprint_radius > 0.62
-    task = Navigation(robot, lidar(beams=360, range_max=10.0))
-    walls = (
-        LineString([(1.0, 0.31), (1.0, 4.0)]),
-        LineString([(1.0, -0.31), (1.0, -4.0)]),
-    )
-    ranges = np.full(360, np.inf, np.float32)
-    for b, angle in enumerate(task.lidar.angles):
-        beam = LineString([(0.0, 0.0), (10.0 * np.cos(angle), 10.0 * np.sin(angle))])
-        ends = (beam.intersection(wall) for wall in walls)
-        ranges[b] = min(
-            (end.distance(Point(0, 0)) for end in ends if not end.is_empty),
-            default=np.inf,
-        )
-    policy = make_policy(name, task)
-    forward, _, turn = twist_of(task, policy.act(observe(task, 0.0, 3.0, ranges)))
-    assert forward > 0.4
-    assert abs(turn) < 0.5
-
-
-def test_random_actions_are_those_of_the_seed():
-    task = task_of("differential")
-    seen = observe(task, 0.0)
-    one, other = (make_policy("random", task) for _ in range(2))
-    first = one.act(seen)
-    assert np.array_equal(first, other.act(seen))
-    assert not np.array_equal(first, one.act(seen))
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "robot",
@@ -153,16 +104,6 @@ def test_the_planner_reaches_most_goals_where_straight_ones_collide(robot):
     }
     assert share["dynamic_window"] >= 0.8
     assert share["dynamic_window"] > share["straight"] > share["random"]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "robot", ["ackermann", *(pytest.param(name, marks=campaign) for name in ROBOTS[1:])]
-)
-def test_the_planner_reaches_every_goal_of_the_empty_world(robot):
-    env = BridgeEnv(model=robot, world="empty")
-    policy = make_policy("dynamic_window", env.task)
-    assert successes(drive_all(TimeLimit(env, 300), policy, range(3))) == 3
 
 
 @pytest.mark.slow
@@ -221,12 +162,6 @@ def test_a_car_of_unknown_wheelbase_is_refused_and_none_assumed():
         ConfigError, match="'ackermann' steers, and its wheelbase is not known"
     ):
         make_policy("dynamic_window", Navigation(unknown, lidar()))
-
-
-def test_an_unknown_policy_gives_the_nearest():
-    sentence = "unknown policy 'dynamic_widow'; did you mean 'dynamic_window'"
-    with pytest.raises(ConfigError, match=sentence):
-        make_policy("dynamic_widow", task_of("ackermann"))
 
 
 def counting(longest_gap=0.5):
@@ -312,20 +247,6 @@ def test_a_planner_stops_a_robot_before_a_wall_also_if_its_wheels_brake_weakly(
         assert not told["true_collision"]
     assert fastest > 0.4
     assert farthest > 0.5
-
-
-@pytest.mark.parametrize(
-    "robot", ["ackermann", "differential", "jackal", "mecanum", "f1tenth"]
-)
-def test_planners_look_ahead_as_far_as_ever_for_robots_that_stop_soon(robot):
-    model = builtin_model(robot)
-    task = Navigation(model.robot, model.lidar)
-    ahead = make_policy("dynamic_window", task, model)._search[1]
-    lag = max(v for k, v in model.robot.parameters.items() if k.endswith("_lag"))
-    assert (ahead.steps, ahead.far) == (10, np.inf)
-    assert ahead.reaction == pytest.approx(2.0 * model.control_period + lag)
-    assert ahead.slowness == 0.0
-    assert make_policy("mppi", task, model)._halt.most == 0
 
 
 @pytest.mark.parametrize("name", ["dynamic_window", "mppi"])

@@ -11,14 +11,14 @@ import zipfile
 import numpy as np
 import onnx
 import pytest
-import torch
-from robots import DIRECT, lidar
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from robots import DIRECT
 
 from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.errors import ConfigError, PolicyError
-from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.policy import onnx_graph
-from nics_drl_bridge.policy.contract import GoldenEntry
+from nics_drl_bridge.policy.contract import GoldenEntry, leaves
 from nics_drl_bridge.policy.policies import make_policy
 from nics_drl_bridge.policy.policy_file import load_policy
 from policy.policy_rig import (
@@ -54,18 +54,6 @@ def test_a_policy_acts_as_its_network_alone_and_in_batches(file):
     assert policy.command(rows) == pytest.approx(2.0 * actions, abs=1e-6)
 
 
-def test_its_command_is_what_the_task_makes_of_its_action(file):
-    model = model_of()
-    policy = load_policy(file)
-    task = policy.make_task(model)
-    ranges = np.full(72, 1.0, np.float32)
-    view = RobotView(np.zeros(3), np.zeros(3), ranges, 0.0, 0.0, 0.0)
-    seen = task.observation(view, {"goal": np.array([1.0, 0.5])})
-    assert policy.command(seen) == pytest.approx(
-        task.command(policy.act(seen)), abs=1e-5
-    )
-
-
 def test_make_policy_opens_a_file_and_checks_it_against_the_task(file):
     model = model_of()
     task = make_task("navigation", model, {"scan": SECTORS})
@@ -97,15 +85,6 @@ def changed(path, value, resigned):
         return bytes_of(
             signed(proto, data) if resigned else with_contract(proto, json.dumps(data))
         )
-
-    return spoil
-
-
-def without(key):
-    def spoil(proto):
-        data = contract_in(proto)
-        del data[key]
-        return bytes_of(with_contract(proto, json.dumps(data)))
 
     return spoil
 
@@ -209,12 +188,6 @@ def zipped(proto):
     return buffer.getvalue()
 
 
-def torch_file(_):
-    buffer = io.BytesIO()
-    torch.save({"weights": torch.zeros(3)}, buffer)
-    return buffer.getvalue()
-
-
 def two_contracts(proto):
     entry = proto.metadata_props.add()
     entry.key = onnx_graph.KEY
@@ -222,87 +195,112 @@ def two_contracts(proto):
     return bytes_of(proto)
 
 
-def bare(proto):
+@pytest.fixture(scope="module")
+def remembering(tmp_path_factory):
+    path = tmp_path_factory.mktemp("remembering") / "go.onnx"
+    export_remembering(path)
+    return path
+
+
+def forgetful(proto):
+    """The state comes back as it was given."""
+    for node in proto.graph.node:
+        for k, name in enumerate(node.output):
+            node.output[k] = "forgotten" if name == "state_out" else name
+        for k, name in enumerate(node.input):
+            node.input[k] = "forgotten" if name == "state_out" else name
+    last = onnx.helper.make_node("Identity", ["state_in"], ["state_out"])
+    proto.graph.node.append(last)
+    return bytes_of(signed(proto))
+
+
+def contract_without(*path):
+    """The contract without an entry, with checksums that are right."""
+
+    def spoil(proto):
+        data = contract_in(proto)
+        at = data
+        for key in path[:-1]:
+            at = at[key]
+        del at[path[-1]]
+        if path == ("checksums",):
+            return bytes_of(with_contract(proto, json.dumps(data)))
+        return bytes_of(signed(proto, data))
+
+    return spoil
+
+
+def text(words):
+    return lambda proto: bytes_of(with_contract(proto, words))
+
+
+def no_contract(proto):
     del proto.metadata_props[:]
     return bytes_of(proto)
 
 
+def stateful(proto):
+    data = contract_in(proto)
+    data["state"] = {"size": 4, "start": 0.0, "longest_gap": 1.0}
+    return bytes_of(signed(proto, data))
+
+
 REFUSED = {
-    "beams": (changed(["lidar", "beams"], 360, False), "lidar.beams"),
-    "range": (changed(["scan", "range_max"], 5.0, False), "scan.range_max"),
-    "lidar range": (changed(["lidar", "range_max"], 12.0, False), "lidar.range_max"),
     "sectors": (changed(["scan", "sectors"], 36, True), "scan.sectors"),
-    "rate": (changed(["control_period"], 0.05, False), "control_period"),
     "no rate": (changed(["control_period"], 0.0, True), "control_period"),
-    "task": (changed(["task", "name"], "pursuit_evasion", False), "task.name"),
-    "task signed": (changed(["task", "name"], "pursuit_evasion", True), "task.sha256"),
     "task option": (
         changed(["task", "options", "goal_radius"], 3.0, True),
         "task.sha256",
     ),
-    "task hash": (changed(["task", "sha256"], "0" * 64, True), "task.sha256"),
-    "model hash": (
-        changed(["model_fingerprint"], "0" * 16, False),
-        "model_fingerprint",
-    ),
-    "graph hash": (changed(["graph_sha256"], "0" * 64, False), "graph_sha256"),
-    "command limit": (
-        changed(["robot", "command", 0, "max"], 9.0, False),
-        "robot.command.0.max",
-    ),
-    "seed": (changed(["provenance", "seed"], 4, False), "provenance.seed"),
     "other format": (changed(["format"], "nics_drl_bridge/policy/9", True), "format"),
     "unknown entry": (changed(["extra"], 1, True), "extra"),
     "size": (changed(["observation", "size"], 31, True), "observation.size"),
-    "missing": (without("robot"), "robot"),
-    "no checksums": (without("checksums"), "checksums"),
-    "no JSON": (lambda proto: bytes_of(with_contract(proto, "{")), "metadata"),
-    "NaN in JSON": (
-        lambda p: bytes_of(with_contract(p, '{"format": NaN}')),
-        "metadata",
-    ),
-    "a key twice": (
-        lambda p: bytes_of(with_contract(p, '{"a": 1, "a": 2}')),
-        "metadata",
-    ),
-    "no contract": (bare, "metadata"),
+    "missing": (contract_without("robot"), "robot"),
+    "no checksums": (contract_without("checksums"), "checksums"),
+    "NaN in JSON": (text('{"format": NaN}'), "metadata"),
+    "a key twice": (text('{"a": 1, "a": 2}'), "metadata"),
+    "no contract": (no_contract, "metadata"),
     "two contracts": (two_contracts, "metadata"),
     "NaN weights": (weights(np.nan), "weights."),
-    "inf weights": (weights(np.inf, resigned=False), "weights."),
     "other weights": (weights(0.5, resigned=False), "graph_sha256"),
     "other weights signed": (weights(5.0), "golden."),
     "external data": (elsewhere("weights.bin"), "weights."),
-    "absolute path": (elsewhere("/etc/passwd"), "weights."),
-    "path outside": (elsewhere("../../weights.bin"), "weights."),
     "own operator": (node("Evil", "com.example"), "graph.node"),
     "loop": (node("Loop"), "graph.node"),
-    "random": (node("RandomNormalLike"), "graph.node"),
     "graph in a node": (branch, "graph.node"),
     "function": (function, "graph"),
     "input name": (end("input", "obs"), "graph"),
     "output name": (end("output", "mean"), "graph"),
-    "input width": (narrower, "graph"),
-    "input type": (doubles, "graph"),
+    "input width": (narrower, "graph.observation"),
+    "input type": (doubles, "graph.observation"),
     "golden command": (golden("commands", (3, 1)), "golden.commands"),
     "golden action": (golden("actions", (0, 0)), "golden.actions"),
     "golden cut": (changed(["golden", "actions"], "AAAA", True), "golden.actions"),
     "limits of a weaker robot": (loud, "robot.command"),
-    "cut at half": (lambda proto: bytes_of(proto)[: len(bytes_of(proto)) // 2], "file"),
-    "cut at the end": (lambda proto: bytes_of(proto)[:-3], ""),
-    "empty": (lambda _: b"", "file"),
-    "text": (lambda _: b"format: policy\n" * 20, "file"),
+    "a state that the graph does not take": (stateful, "graph.inputs"),
     "pickle": (lambda _: pickle.dumps({"weights": [1.0]}), "file"),
     "zip of Stable-Baselines3": (zipped, "file"),
-    "torch": (torch_file, "file"),
-    "numpy": (lambda _: b"\x93NUMPY\x01\x00" + bytes(64), "file"),
+    "text": (lambda _: b"format: policy\n" * 20, "file"),
 }
+REFUSED_STATES = {
+    "none": (contract_without("state"), "state"),
+    "no size": (contract_without("state", "size"), "state.size"),
+    "another size": (changed(["state", "size"], 5, True), "graph.state_in"),
+    "another start": (changed(["state", "start"], 0.5, True), "golden.actions"),
+    "no gap": (changed(["state", "longest_gap"], 0.0, True), "state.longest_gap"),
+    "not passed on": (forgetful, "golden.actions"),
+}
+CASES = [("file", name, REFUSED) for name in REFUSED]
+CASES += [("remembering", name, REFUSED_STATES) for name in REFUSED_STATES]
 
 
-@pytest.mark.parametrize("name", REFUSED)
-def test_a_spoilt_file_is_refused_and_the_field_named(file, tmp_path, name):
-    spoil, field = REFUSED[name]
+@pytest.mark.parametrize(("whole", "name", "table"), CASES)
+def test_a_spoilt_file_is_refused_and_the_field_named(
+    request, tmp_path, whole, name, table
+):
+    spoil, field = table[name]
     path = tmp_path / "spoilt.onnx"
-    path.write_bytes(spoil(onnx.load(file)))
+    path.write_bytes(spoil(onnx.load(request.getfixturevalue(whole))))
     with pytest.raises(PolicyError) as refused:
         load_policy(path)
     assert refused.value.field.startswith(field)
@@ -310,13 +308,29 @@ def test_a_spoilt_file_is_refused_and_the_field_named(file, tmp_path, name):
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.parametrize("share", np.linspace(0.01, 0.99, 23).tolist())
-def test_a_file_cut_anywhere_is_refused(file, tmp_path, share):
-    whole = file.read_bytes()
-    path = tmp_path / "cut.onnx"
-    path.write_bytes(whole[: int(share * len(whole))])
-    with pytest.raises(PolicyError):
-        load_policy(path)
+@settings(
+    max_examples=25,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(st.data())
+def test_an_entry_that_was_changed_after_the_export_is_refused_by_its_name(
+    file, tmp_path, data
+):
+    proto = onnx.load(file)
+    entries = dict(leaves(contract_in(proto)))
+    path = data.draw(st.sampled_from(sorted(entries)).filter(lambda p: "sum" not in p))
+    *above, last = path.split(".")
+    contract = contract_in(proto)
+    at = contract
+    for key in above:
+        at = at[int(key)] if isinstance(at, list) else at[key]
+    at[int(last) if isinstance(at, list) else last] = 0.123
+    spoilt = tmp_path / "spoilt.onnx"
+    spoilt.write_bytes(bytes_of(with_contract(proto, json.dumps(contract))))
+    with pytest.raises(PolicyError) as refused:
+        load_policy(spoilt)
+    assert refused.value.field == path or path.startswith(refused.value.field)
 
 
 @pytest.mark.slow
@@ -329,7 +343,7 @@ def test_a_flipped_bit_anywhere_is_refused(file, tmp_path):
     )  # every byte of the checksum, and any of the rest
     places = [
         *range(len(whole) - last, len(whole)),
-        *rng.integers(len(whole) - last, size=150),
+        *rng.integers(len(whole) - last, size=60),
     ]
     for place in places:
         data = bytearray(whole)
@@ -354,116 +368,12 @@ def test_a_file_without_its_checksum_or_with_an_addition_is_refused(file, tmp_pa
             load_policy(path)
 
 
-def test_a_pickle_in_disguise_is_never_opened(tmp_path):
-    class Trap:
-        def __reduce__(self):
-            return open, (str(tmp_path / "sprung"), "w")
-
-    path = tmp_path / "trap.onnx"
-    path.write_bytes(pickle.dumps(Trap()))
-    with pytest.raises(PolicyError, match="a pickle, which is not a policy"):
-        load_policy(path)
-    assert not (tmp_path / "sprung").exists()
-
-
-def test_a_file_that_is_not_there_or_too_large_is_refused(tmp_path):
-    with pytest.raises(PolicyError, match=r"none\.onnx: field 'file': does not exist"):
-        load_policy(tmp_path / "none.onnx")
-    with pytest.raises(PolicyError, match="field 'file'"):
-        load_policy(tmp_path)
+def test_a_file_that_is_too_large_is_refused(tmp_path):
     path = tmp_path / "large.onnx"
     with path.open("wb") as large:
         large.truncate(onnx_graph.SIZE_LIMIT + 1)
     with pytest.raises(PolicyError, match="more than the 32 MB"):
         load_policy(path)
-
-
-# A state.
-
-
-@pytest.fixture(scope="module")
-def remembering(tmp_path_factory):
-    path = tmp_path_factory.mktemp("remembering") / "go.onnx"
-    export_remembering(path)
-    return path
-
-
-def stateless(proto):
-    data = contract_in(proto)
-    del data["state"]
-    return bytes_of(signed(proto, data))
-
-
-def shapeless(proto):
-    data = contract_in(proto)
-    del data["state"]["size"]
-    return bytes_of(signed(proto, data))
-
-
-def forgetful(proto):
-    """The state comes back as it was given."""
-    for node in proto.graph.node:
-        for k, name in enumerate(node.output):
-            node.output[k] = "forgotten" if name == "state_out" else name
-        for k, name in enumerate(node.input):
-            node.input[k] = "forgotten" if name == "state_out" else name
-    last = onnx.helper.make_node("Identity", ["state_in"], ["state_out"])
-    proto.graph.node.append(last)
-    return bytes_of(signed(proto))
-
-
-REFUSED_STATES = {
-    "none": (stateless, "state", "is missing, although the graph needs one"),
-    "no shape": (shapeless, "state.size", "is missing; export the policy again"),
-    "a list": (
-        changed(["state"], [6, 0.0], True),
-        "state",
-        "must hold `key: value` pairs, not [6",
-    ),
-    "another shape": (
-        changed(["state", "size"], 5, True),
-        "graph.state_in",
-        "5] is needed",
-    ),
-    "another start": (
-        changed(["state", "start"], 0.5, True),
-        "golden.actions",
-        "differ by",
-    ),
-    "unsigned": (changed(["state", "start"], 0.5, False), "state.start", "was changed"),
-    "no gap": (
-        changed(["state", "longest_gap"], 0.0, True),
-        "state.longest_gap",
-        "greater than 0",
-    ),
-    "not passed on": (forgetful, "golden.actions", "differ by"),
-}
-
-
-@pytest.mark.parametrize("name", REFUSED_STATES)
-def test_a_spoilt_state_is_refused_in_one_sentence(remembering, tmp_path, name):
-    spoil, field, words = REFUSED_STATES[name]
-    path = tmp_path / "spoilt.onnx"
-    path.write_bytes(spoil(onnx.load(remembering)))
-    with pytest.raises(PolicyError) as refused:
-        load_policy(path)
-    assert refused.value.field == field
-    assert words in str(refused.value)
-    assert "\n" not in str(refused.value)
-
-
-def test_a_state_that_the_graph_does_not_take_is_refused(file, tmp_path):
-    data = contract_in(proto := onnx.load(file))
-    data["state"] = {"size": 4, "start": 0.0, "longest_gap": 1.0}
-    path = tmp_path / "spoilt.onnx"
-    path.write_bytes(bytes_of(signed(proto, data)))
-    with pytest.raises(PolicyError, match=r"field 'graph\.inputs'.*'state_in'"):
-        load_policy(path)
-
-
-def test_a_policy_without_a_state_says_nothing_of_one(file):
-    assert "state" not in contract_in(onnx.load(file))
-    assert load_policy(file).contract.state is None
 
 
 def test_an_observation_without_the_state_that_a_policy_needs_is_refused(
@@ -569,19 +479,3 @@ def test_it_loads_where_nothing_of_training_is_installed(file):
         [sys.executable, "-c", BLOCKED + code], capture_output=True, text=True
     )
     assert done.stdout.strip() == "direct", done.stderr
-
-
-def test_a_scan_of_another_lidar_gives_the_same_command(file):
-    policy = load_policy(file)
-    commands = []
-    for spec in (
-        lidar(beams=1440),
-        lidar(beams=720, angle_min=0.0, angle_max=2.0 * np.pi),
-    ):
-        task = policy.make_task(
-            model_of(**spec.model_dump(include={"beams", "angle_min", "angle_max"}))
-        )
-        ranges = (1.5 + np.cos(spec.angles)).astype(np.float32)
-        view = RobotView(np.zeros(3), np.zeros(3), ranges, 0.0, 0.0, 0.0)
-        commands.append(policy.command(task.observation(view, {"goal": np.ones(2)})))
-    assert commands[0] == pytest.approx(commands[1], abs=0.01)

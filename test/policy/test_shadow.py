@@ -137,13 +137,6 @@ def test_after_a_gap_in_a_drive_the_state_begins_anew_and_it_is_counted(
     assert made.resets == 1
 
 
-def test_another_policy_differs(recorded):
-    goal, bag, _ = recorded
-    told = shadow(bag, builtin_model("ackermann"), "random", {}, goal).differences()
-    assert all(figures["mean_size"] > 0.1 for figures in told.values())
-    assert told["steering_command"]["opposite"] > 0.2
-
-
 def test_without_a_goal_it_is_where_the_robot_was_later(recorded):
     _, bag, _ = recorded
     made = shadow(bag, builtin_model("ackermann"), "dynamic_window", {}, ahead_s=1.0)

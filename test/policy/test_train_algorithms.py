@@ -45,14 +45,3 @@ def test_a_normaliser_bends_what_lies_between_0_and_1_and_cuts_what_is_far_off()
     torch.testing.assert_close(
         seen, torch.tensor([[0.2, 2.0], [-2.0, 5.0], [2.0, -5.0]])
     )
-
-
-def test_an_actor_sees_through_its_normaliser():
-    task = make_task("navigation", MODEL)
-    size = task.observation_space.shape[0]
-    actor = Actor(
-        task.observation_space, task.action_space, [4], (np.zeros(size), np.ones(size))
-    )
-    seen = torch.full((1, size), 0.3)
-    with torch.no_grad():
-        assert torch.equal(actor(seen), actor.layers(actor.normaliser(seen)))

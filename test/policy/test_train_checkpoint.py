@@ -45,16 +45,6 @@ def test_an_env_that_is_given_the_state_of_another_goes_on_with_the_same_bits(
             assert np.array_equal(a, b)
 
 
-def test_a_snapshot_does_not_change_with_the_env():
-    env = vector()
-    env.reset(seed=3)
-    kept = snapshot(env)
-    before = kept["data.pose"].copy()
-    env.step(actions(5, 1)[0])
-    assert np.array_equal(kept["data.pose"], before)
-    assert not np.array_equal(env.simulator.data.pose, before)
-
-
 def test_the_state_of_another_env_is_refused():
     one = vector(5)
     other = vector(6)

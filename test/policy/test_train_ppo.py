@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 import torch
@@ -165,16 +163,6 @@ def test_loss_and_gradients_are_those_of_stable_baselines3(actions):
         )
 
 
-def test_an_update_moves_the_weights_as_stable_baselines3_does():
-    torch.manual_seed(0)
-    lean, theirs = pair()
-    batch = filled(lean, theirs)
-    theirs.train()
-    lean.learner.learn(batch, 3e-4)
-    for ours, other in zip(weights_of(lean), their_weights(theirs), strict=True):
-        assert torch.allclose(ours, other, atol=2e-5)
-
-
 def test_actor_and_critic_learn_at_once_while_a_core_is_free_to_the_same_bits(
     monkeypatch,
 ):
@@ -196,38 +184,6 @@ def test_actor_and_critic_learn_at_once_while_a_core_is_free_to_the_same_bits(
     assert jobs == [2]
     for ours, grad in zip(weights_of(lean), wanted, strict=True):
         assert torch.equal(ours.grad, grad)
-
-
-def test_a_core_is_free_to_learn_from_the_end_of_a_rollout_to_the_next_begin():
-    lean, _ = pair()
-    seen = []
-    collect = lean.collector.collect
-    lean.collector.collect = lambda: (
-        seen.append(lean.learner.core_is_free.is_set()) or collect()
-    )
-    lean.collector.last = lean.collector.env.reset()
-    rollout, _ = collect()
-    for _ in range(2):
-        lean._advance(rollout, SimpleNamespace(collisions=[]))
-        rollout = lean._rollout
-        assert lean.learner.core_is_free.is_set()
-    assert seen == [False, False]
-
-
-def test_both_cores_are_free_for_the_last_update():
-    lean, _ = pair()
-    lean.collector.last = lean.collector.env.reset()
-    rollout, _ = lean.collector.collect()
-    lean._total = lean.steps + 1  # no rollout follows
-    free = []
-    learn = lean.learner.learn
-    lean.learner.learn = lambda *batch: (
-        free.append(lean.learner.core_is_free.is_set()) or learn(*batch)
-    )
-    lean.learner.core_is_free.clear()
-    lean._advance(rollout, SimpleNamespace(collisions=[]))
-    assert lean._rollout is None
-    assert free == [True]
 
 
 def test_a_batch_of_fewer_rows_than_the_one_before_has_gradients_of_its_own():

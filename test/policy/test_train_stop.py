@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 from robots import direct_model, field
@@ -73,25 +71,6 @@ def test_each_evaluation_has_episodes_of_its_own_beyond_those_of_training_and_pr
     assert seeds[0] == seeds[1]  # the same ones in both worlds
     assert not set(seeds[0]) & set(seeds[2])
     assert min(seeds[0]) >= HELD_OUT_SEED > SEEDS + 1_000_000 > FIRST_SEED + 1_000_000
-
-
-def test_its_state_goes_on_where_another_was(told):
-    stop, rates, _ = told
-    rates.extend([1.0] * 4)
-    stop.judge(100, None)
-    other = Stop(GIVEN, stop._envs)
-    other.restore(stop.state())
-    assert not other.judge(150, None)
-    assert other.least == 1.0
-    other.judge(200, None)
-    assert other.over
-
-
-def test_without_settings_it_never_ends():
-    stop = Stop(None, {})
-    assert not stop.judge(10**9, None)
-    assert not stop.over
-    assert math.isnan(stop.least)
 
 
 def test_episodes_are_driven_with_the_policy_that_is_given():

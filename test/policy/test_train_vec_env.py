@@ -6,9 +6,8 @@ import gymnasium
 import numpy as np
 import pytest
 from robots import direct_model, field
-from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.env_checker import check_env
-from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from nics_drl_bridge.env.registry import ENVIRONMENTS
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
@@ -75,35 +74,6 @@ def test_it_feeds_what_a_vec_env_of_single_envs_feeds():
                 assert mine[key] == other[key]
         assert all(one[3][n] == {} for n in np.flatnonzero(~one[2]))
     assert ended > 4
-
-
-def test_the_observations_are_those_of_the_vector_env_without_a_copy():
-    env = vector()
-    fed = TrainVecEnv(env)
-    made = []
-    step = env.step
-    env.step = lambda actions: made.append(step(actions)) or made[-1]
-    fed.reset()
-    observation = fed.step(np.zeros((4, 3), np.float32))[0]
-    assert observation is made[0][0]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "algorithm", [PPO, pytest.param(DQN, marks=pytest.mark.campaign)]
-)
-def test_an_algorithm_learns_on_it_and_counts_episodes(algorithm):
-    options = {"actions": "discrete"} if algorithm is DQN else None
-    env = VecMonitor(TrainVecEnv(vector(task_options=options)))
-    sizes = (
-        {"learning_starts": 100}
-        if algorithm is DQN
-        else {"n_steps": 64, "batch_size": 64}
-    )
-    model = algorithm("MlpPolicy", env, seed=0, device="cpu", **sizes)
-    model.learn(512)
-    assert len(model.ep_info_buffer) > 3
-    assert max(one["l"] for one in model.ep_info_buffer) <= LIMIT
 
 
 def test_an_env_that_it_can_not_feed_from_is_refused():
