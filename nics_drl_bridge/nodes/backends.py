@@ -223,7 +223,7 @@ class DdsBackend:
         kinds[SCAN] = LaserScan
         kinds |= {name: sensor_type(sensor) for name, sensor in self._sensors.items()}
         for topic, kind in kinds.items():
-            put = partial(self._inbox.put, topic)
+            put = partial(_put, self._inbox, topic)
             self._link.node.create_subscription(kind, topic, put, qos.SENSOR, raw=True)
 
     def _advise_start(self) -> str:
@@ -373,6 +373,10 @@ class DdsBackend:
     def close(self) -> None:
         """Publish a zero command and end the node."""
         self._link.close()
+
+
+def _put(inbox: Inbox, topic: str, content: bytes) -> object:
+    return inbox.put(topic, content)
 
 
 def _update_estimator(
