@@ -33,7 +33,6 @@ ENDING = (
 """Signals that end a process unless it handles them, except SIGKILL, signals of a fault in the
 process itself, and those that Python ignores, such as SIGPIPE."""
 _own_process = False  # True if this process is a single node
-_within = False  # `at_once`
 
 
 def leave(code: int) -> NoReturn:
@@ -63,17 +62,14 @@ def own_process() -> None:
 @contextlib.contextmanager
 def at_once() -> Iterator[None]:
     """Within this context, let ending signals end the process at once, whatever it is doing."""
-    global _within
-    if not _own_process or _within:
+    if not _own_process:
         yield
         return
     handlers = {number: signal.getsignal(number) for number in ending_signals()}
     for number in handlers:
         signal.signal(number, signal.SIG_DFL)
-    _within = True
     try:
         yield
     finally:
-        _within = False
         for number, handler in handlers.items():
             signal.signal(number, handler)

@@ -4,9 +4,8 @@ import contextlib
 import inspect
 import itertools
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
-from functools import partial
 from typing import Any
 
 from rclpy.context import Context
@@ -60,12 +59,10 @@ class StandingExecutor(SingleThreadedExecutor):
         if received:  # taking what arrived meanwhile costs less than a wait
             self._call(self._come())
         due = list[Any]()
-        asked = list[Callable[[], object]]()
         left = False
         try:
             # a callback may have shut down the executor or its context
             if self._entities is not None and self.context.ok():
-                asked = self._entities.asked()
                 woken, others = self._entities.others_ready(self._guard)
                 # the executor is also woken when an entity is added to a node
                 self._changed |= woken or others
@@ -74,15 +71,12 @@ class StandingExecutor(SingleThreadedExecutor):
                 left = others or (woken and bool(self._tasks))
         except PARTS_MISSING as error:
             self._fall_back(error)
-        if asked:  # a message sent before a request must also be handled before it
-            self._call(self._come())
-        for answer in asked:
-            answer()
         # The callbacks may have destroyed entities, which must leave the wait set.
-        self._changed |= bool(asked or due)
+        self._changed |= bool(due)
         for timer in due:
             self._tick(timer)
-        if left:
+        if left:  # a message sent before a request must also be handled before it
+            self._call(self._come())
             self._handle_others()
 
     def _wait(self, timeout_sec: float | None) -> list[Received]:
@@ -174,10 +168,12 @@ class _Entities:
         for subscription in subscriptions:
             count = 1 if _takes(subscription.callback, None) else 2
             self._subscriptions.append((subscription, count))
-        self._clients = {client.handle.pointer: client for client in clients}
-        self._services = _index_plain(services)
-        self._timers = _index_plain(timer for timer in timers if _takes(timer.callback))
-        self._handled = {*self._timers, *self._services, *self._clients}
+        self._timers = {
+            timer.handle.pointer: timer
+            for timer in timers
+            if _takes(timer.callback)
+            and not inspect.iscoroutinefunction(timer.callback)
+        }
         kinds = {
             "subscription": subscriptions,
             "guard_condition": (*guards, *others),
@@ -224,25 +220,9 @@ class _Entities:
     def come(self) -> list[Received]:
         return _take(self._subscriptions)
 
-    def asked(self) -> list[Callable[[], object]]:
-        """Take requests to services and answers to clients; return how each is handled."""
-        ready = self._wait_set.get_ready_entities
-        answers = list[Callable[[], object]]()
-        for service in _known(self._services, ready("service")):
-            request, header = service.handle.service_take_request(
-                service.srv_type.Request
-            )
-            if header is not None:
-                answers.append(partial(_serve, service, request, header))
-        for client in _known(self._clients, ready("client")):
-            header, response = client.handle.take_response(client.srv_type.Response)
-            if header is not None:
-                number = header.request_id.sequence_number
-                answers.append(partial(_answer, client, number, response))
-        return answers
-
     def due(self) -> list[Any]:
-        return _known(self._timers, self._wait_set.get_ready_entities("timer"))
+        ready = self._wait_set.get_ready_entities("timer")
+        return [self._timers[pointer] for pointer in ready if pointer in self._timers]
 
     def others_ready(self, wake_up: Any) -> tuple[bool, bool]:
         """Return whether the executor was woken, and whether rclpy has to handle something."""
@@ -255,36 +235,11 @@ class _Entities:
         woken = wake_up is not None and wake_up.handle.pointer in triggered
         if woken:
             triggered.remove(wake_up.handle.pointer)
-        others = bool(triggered)
-        for kind in ("client", "service", "timer"):
-            others = others or not self._handled.issuperset(ready(kind))
+        others = bool(triggered or ready("client") or ready("service"))
+        others = others or not self._timers.keys() >= set(ready("timer"))
         for waitable in self._waitables:
             others = others or waitable.is_ready(self._wait_set)
         return woken, others
-
-
-def _index_plain(entities: Iterable[Any]) -> dict[int, Any]:
-    """Return entities by their pointers, without those whose callbacks are coroutines."""
-    return {
-        entity.handle.pointer: entity
-        for entity in entities
-        if not inspect.iscoroutinefunction(entity.callback)
-    }
-
-
-def _known(entities: Mapping[int, Any], pointers: Iterable[int]) -> list[Any]:
-    return [entities[pointer] for pointer in pointers if pointer in entities]
-
-
-def _serve(service: Any, request: Any, header: Any) -> None:
-    service.send_response(
-        service.callback(request, service.srv_type.Response()), header
-    )
-
-
-def _answer(client: Any, number: int, response: Any) -> None:
-    with contextlib.suppress(KeyError):  # nobody waits for it any more
-        client.get_pending_request(number).set_result(response)
 
 
 def _take(subscriptions: Iterable[tuple[Any, int]]) -> list[Received]:

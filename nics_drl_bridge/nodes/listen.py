@@ -9,7 +9,7 @@ from rclpy.node import Node
 
 from nics_drl_bridge import defaults
 from nics_drl_bridge.nodes.conversions import message_type
-from nics_drl_bridge.nodes.listener import open_context
+from nics_drl_bridge.nodes.listener import Listener
 from nics_drl_bridge.nodes.qos import offer_of, profile_of
 from nics_drl_bridge.recording.messages import Offer
 from nics_drl_bridge.report.doctor_facts import (
@@ -36,9 +36,8 @@ def listen(
     imu: str = defaults.IMU_TOPIC,
 ) -> Facts:
     """Listen for a time [s] after the first message, awaited for at most 10 s; send nothing."""
-    context = open_context([], domain_id)
-    node = Node(NAME, context=context, start_parameter_services=False)
-    executor = SingleThreadedExecutor(context=context)
+    node = Listener(NAME, domain_id)
+    executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
     facts = Facts(f"the robot in {namespace or '/'}", True, names_in(namespace, imu))
     subscribed: set[str] = set()
@@ -56,8 +55,8 @@ def listen(
         _look(node, facts, subscribed, imu)
     finally:
         executor.shutdown(timeout_sec=1.0)
+        node.context.try_shutdown()
         node.destroy_node()
-        context.try_shutdown()
     facts.end_ns = time.time_ns()
     return facts
 

@@ -90,7 +90,10 @@ class Inbox:
         finally:
             self._awaited_ns = -1
         with self._lock:
-            self._raise_failure()
+            failure = self._failure
+            self._failure = None
+            if failure is not None:
+                raise failure
             late_topic = self._find_late(stamp_ns)
             if late_topic is None:
                 return dict(self._messages)
@@ -99,12 +102,6 @@ class Inbox:
         if latest.content:
             age_s = (time.monotonic_ns() - latest.arrival_ns) * S_PER_NS
         raise StaleDataError(late_topic, age_s, timeout_s)
-
-    def _raise_failure(self) -> None:
-        failure = self._failure
-        self._failure = None
-        if failure is not None:
-            raise failure
 
     def _update_if_due(self) -> None:
         """Update the estimator, once, with the odometry that is awaited, if it is there."""

@@ -73,10 +73,6 @@ class _Call:
         self._client = node.create_client(Trigger, f"{gate}/{service}")
         self._future: Any = None
 
-    def _send_when_ready(self) -> None:
-        if self._future is None and self._client.service_is_ready():
-            self._future = self._client.call_async(Trigger.Request())
-
     def wait_for_answer(self, seconds: float) -> GateAnswer:
         """Return the answer, or why there is none after so long; end the call."""
         try:
@@ -93,7 +89,8 @@ class _Call:
 
     def is_answered(self) -> bool:
         """Send the request once the service is there; return whether the answer has come."""
-        self._send_when_ready()
+        if self._future is None and self._client.service_is_ready():
+            self._future = self._client.call_async(Trigger.Request())
         return self._future is not None and bool(self._future.done())
 
 

@@ -85,23 +85,13 @@ def forward_output(log: str = "") -> None:
     descriptors = _different_outputs()
     if os.isatty(STDERR):
         os.environ.setdefault(COLOUR, "1")
-    pipes = {descriptor: os.pipe() for descriptor in descriptors}
-    try:
-        _forwarder = _start_forwarder(log, pipes)
-    except OSError as error:
-        sys.stderr.write(
-            f"output is written directly, and may block ({error.strerror})\n"
-        )
-    else:
-        for descriptor, (_, entrance) in pipes.items():
-            _lead_into(entrance, descriptor)
-        if STDOUT not in descriptors:
-            os.dup2(STDERR, STDOUT)
-        sys.stdout = _dropping_text(STDOUT)
-        sys.stderr = _dropping_text(STDERR)
-    for exit_, entrance in pipes.values():
-        os.close(exit_)
-        os.close(entrance)
+    _forwarder = _forward(log, descriptors)
+    if _forwarder is None:
+        return
+    if STDOUT not in descriptors:
+        os.dup2(STDERR, STDOUT)
+    sys.stdout = _dropping_text(STDOUT)
+    sys.stderr = _dropping_text(STDERR)
 
 
 def finish_output(seconds: float) -> None:
@@ -126,21 +116,10 @@ def forwarded_errors() -> Iterator[None]:
         yield
         return
     python_errors = sys.stderr
-    exit_, entrance = os.pipe()
-    forwarder = None
-    try:
-        forwarder = _start_forwarder("", {STDERR: (exit_, entrance)})
-    except OSError as error:
-        sys.stderr.write(
-            f"output is written directly, and may block ({error.strerror})\n"
-        )
-    else:
-        direct = os.dup(STDERR)
-        _lead_into(entrance, STDERR)
-    finally:
-        os.close(exit_)
-        os.close(entrance)
+    direct = os.dup(STDERR)
+    forwarder = _forward("", [STDERR])
     if forwarder is None:
+        os.close(direct)
         yield
         return
     if _writes_to_stderr(python_errors):
@@ -180,22 +159,31 @@ def _different_outputs() -> list[int]:
     return [STDERR, STDOUT]
 
 
-def _start_forwarder(
-    log: str, pipes: dict[int, tuple[int, int]]
-) -> subprocess.Popen[bytes]:
+def _forward(log: str, descriptors: Sequence[int]) -> subprocess.Popen[bytes] | None:
+    """Replace outputs by pipes to a separate process; None if it can't be started."""
+    pipes = {descriptor: os.pipe() for descriptor in descriptors}
     pairs = [f"{exit_}:{descriptor}" for descriptor, (exit_, _) in pipes.items()]
-    return subprocess.Popen(
-        [sys.executable, "-I", "-S", str(PROGRAM), log, *pairs],
-        stdin=subprocess.DEVNULL,
-        pass_fds=[exit_ for exit_, _ in pipes.values()],
-        start_new_session=True,  # neither Ctrl-C nor Ctrl-Z of the terminal reaches it
-    )
-
-
-def _lead_into(entrance: int, descriptor: int) -> None:
-    """Replace an output by the entrance of a pipe."""
-    widen_pipe(entrance)
-    os.dup2(entrance, descriptor)
+    try:
+        forwarder = subprocess.Popen(
+            [sys.executable, "-I", "-S", str(PROGRAM), log, *pairs],
+            stdin=subprocess.DEVNULL,
+            pass_fds=[exit_ for exit_, _ in pipes.values()],
+            start_new_session=True,  # neither Ctrl-C nor Ctrl-Z of the terminal reaches it
+        )
+    except OSError as error:
+        sys.stderr.write(
+            f"output is written directly, and may block ({error.strerror})\n"
+        )
+        return None
+    else:
+        for descriptor, (_, entrance) in pipes.items():
+            widen_pipe(entrance)
+            os.dup2(entrance, descriptor)
+        return forwarder
+    finally:
+        for exit_, entrance in pipes.values():
+            os.close(exit_)
+            os.close(entrance)
 
 
 def widen_pipe(entrance: int) -> None:

@@ -61,11 +61,9 @@ class PolicyNode(ManagedNode):
             raise ConfigError(f"parameter 'goal': {needed}, not {self._goal.tolist()}.")
         names = ("rate", "deadline", "late_limit")
         rate, limit, patience = (self.get_parameter(name).value for name in names)
-        if rate < 0.0 or limit <= 0.0 or patience < 1:
-            values = f"parameters rate {rate}, deadline {limit}, late_limit {patience}"
-            raise ConfigError(
-                f"{values}: must be at least 0, more than 0, and at least 1."
-            )
+        if rate < 0.0 or limit <= 0.0:
+            values = f"parameters rate {rate}, deadline {limit}"
+            raise ConfigError(f"{values}: must be at least 0, and more than 0.")
         period = model.control_period
         self._deadline = Deadline(0.5 * period if np.isnan(limit) else limit, patience)
         pace_s = 0.0

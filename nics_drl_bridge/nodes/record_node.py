@@ -58,37 +58,14 @@ FEWEST = 2
 SAME_PACE = (0.8, 1.25)
 
 
-@dataclass(frozen=True)
-class DriveParameters:
-    """Values of the parameters of `record_node`."""
-
-    plan: DrivePlan
-    out: Path  # of the recording
-    odom_timeout: float  # silence of odometry after which the robot stops [s]
-    stamped: bool  # use TwistStamped for `cmd_vel`, if set; else the robot's type
-    roles: TopicRoles  # may name the joints of the state and the wheels
-    imu: str  # topic of the IMU, auto or none
-
-
-def declare_drive(node: Node) -> DriveParameters:
-    """Declare the parameters of a drive, and read them. Raises ConfigError."""
+def declare_drive(node: Node) -> tuple[DrivePlan, Path, TopicRoles]:
+    """Declare the parameters of a drive; return plan, file and roles. Raises ConfigError."""
     values = {row.name: runner.declare_row(node, row) for row in drive()}
     robot = load_robot(values["robot"])
     robot.require_cmd_vel()
-    return DriveParameters(
-        out=check_out(Path(values["out"])),
-        plan=DrivePlan(
-            robot,
-            values["bound"],
-            values["duration"],
-            values["speed"],
-            values["seed"],
-        ),
-        odom_timeout=values["odom_timeout"],
-        stamped=values["stamped"],
-        roles=load_topic_roles(values["topics"] or None),
-        imu=values[IMU],
-    )
+    pattern = [values[name] for name in ("bound", "duration", "speed", "seed")]
+    out = check_out(Path(values["out"]))
+    return DrivePlan(robot, *pattern), out, load_topic_roles(values["topics"] or None)
 
 
 class DriveLog:
@@ -216,15 +193,14 @@ class RecordNode(qos.QosWatch):
         ]
         super().__init__("record_node", context=context, parameter_overrides=overrides)
         self.outcome: DriveResult | None = None
-        self._order = declare_drive(self)
-        self._drive = self._order.plan.begin()
+        self._plan, self._out, roles = declare_drive(self)
+        self._drive = self._plan.begin()
         self._sim_time = runner.get_flag(self, "use_sim_time")
         self._steady_origin_ns = time.time_ns() - time.monotonic_ns()
-        self._log = DriveLog(self._order.plan.robot, self._order.roles, self._now_ns)
-        self._chosen = "stamped" in qos.given_values(self)
+        self._log = DriveLog(self._plan.robot, roles, self._now_ns)
         self._topic: Publisher | None = None
-        if self._chosen:
-            self._speak(self._order.stamped)
+        if "stamped" in qos.given_values(self):
+            self._speak(runner.get_flag(self, "stamped"))
         self.create_subscription(Odometry, "odom", self._on_odometry, qos.SENSOR)
         self.create_subscription(
             JointState, "joint_states", self._log.joints, qos.SENSOR
@@ -233,7 +209,7 @@ class RecordNode(qos.QosWatch):
         self.create_subscription(PoseStamped, "pose", take_pose, qos.SENSOR)
         self._imu_topic = ""  # the first topic that is heard
         self._gyro = GyroReader()
-        for topic in list_imu_topics(self._order.imu, by_default=True):
+        for topic in list_imu_topics(runner.get_text(self, IMU), by_default=True):
             self.create_subscription(
                 Imu, topic, partial(self._take_imu, topic), qos.SENSOR
             )
@@ -299,7 +275,7 @@ class RecordNode(qos.QosWatch):
         topic = self.resolve_topic_name(CMD_VEL)
         if self._topic is None and self.count_subscribers(topic):
             heard = heard_stamped(self, CMD_VEL)
-            self._speak(self._order.stamped if heard is None else heard)
+            self._speak(runner.get_flag(self, "stamped") if heard is None else heard)
         listened = self._topic is not None and self._topic.get_subscription_count() > 0
         if listened and self._pose is not None and self._now_ns() > 0:
             others = self.count_publishers(topic) - 1
@@ -344,15 +320,15 @@ class RecordNode(qos.QosWatch):
 
     def _guard(self) -> None:
         age = time.monotonic() - self._heard
-        limit = self._order.odom_timeout
+        limit = runner.get_number(self, "odom_timeout")
         if age > limit:
             reason = f"nothing new for {age:.2f} s (the limit is {limit:g} s)"
             place = self._place("odom")
             raise BackendError(
                 f"topic {place}: {reason}; find out why odometry stopped."
             )
-        bound = self._order.plan.bound
-        radius = self._order.plan.robot.footprint_radius
+        bound = self._plan.bound
+        radius = self._plan.robot.footprint_radius
         x, y, _ = geometry.between(
             self._start, self._start if self._pose is None else self._pose
         )
@@ -364,7 +340,7 @@ class RecordNode(qos.QosWatch):
             )
 
     def _send(self, command: Array) -> None:
-        robot = self._order.plan.robot
+        robot = self._plan.robot
         if self._topic is not None:
             self._topic.publish(self._message(robot.to_cmd_vel(command)))
         self._log.add(CMD_VEL, 0, robot.pass_through_cmd_vel(command))
@@ -393,7 +369,7 @@ class RecordNode(qos.QosWatch):
 
     def _halt(self) -> None:
         until = time.monotonic() + HALT_S
-        zero = np.zeros(len(self._order.plan.robot.command))
+        zero = np.zeros(len(self._plan.robot.command))
         while time.monotonic() < until:
             self._send(zero)
             time.sleep(PERIOD_S)
@@ -403,10 +379,10 @@ class RecordNode(qos.QosWatch):
     def _save(self) -> tuple[Recording | None, str]:
         try:
             recording = self._log.recording()
-            write_drive(recording, self._order.out, self._order.plan.robot)
+            write_drive(recording, self._out, self._plan.robot)
         except (BridgeError, OSError) as error:
             return None, f"nothing was saved ({error})"
-        return recording, f"{self._log.seconds:.1f} s are recorded in {self._order.out}"
+        return recording, f"{self._log.seconds:.1f} s are recorded in {self._out}"
 
 
 def record(

@@ -1,7 +1,6 @@
 """Entry points of the nodes; without ROS 2 they print one sentence, not a traceback."""
 
 import faulthandler
-import os
 import signal
 import sys
 import time
@@ -17,7 +16,7 @@ def start(node: str, args: list[str] | None = None) -> None:
     from nics_drl_bridge.nodes import ending, output, usage
 
     for number in ending.ending_signals():  # importing the node takes seconds
-        signal.signal(number, lambda *_: os._exit(0))
+        signal.signal(number, signal.SIG_DFL)
     words = sys.argv[1:] if args is None else args[1:]
     if any(word in usage.HELP for word in words):
         sys.stdout.write(usage.help_of(node))
@@ -34,8 +33,7 @@ def start(node: str, args: list[str] | None = None) -> None:
     code: Any = 0
     try:
         ending.own_process()
-        with ending.at_once():
-            main = _main_of(node)
+        main = _main_of(node)
         main(args)
     except SystemExit as end:
         code = end.code

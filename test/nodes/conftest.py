@@ -1,7 +1,5 @@
-from __future__ import annotations
-
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -73,6 +71,26 @@ def module_domain_id(domains: ExitStack) -> int:
     return domains.enter_context(claimed_domain())
 
 
+@pytest.fixture
+def make_node(domain_id: int) -> Iterator[Callable[..., Any]]:
+    """Makes nodes that do not spin, `make_node("rate:=2.0", words=("-r", "__ns:=/car"))`."""
+    from rclpy.node import Node
+
+    from nics_drl_bridge.nodes.listener import open_context
+
+    with ExitStack() as made:
+
+        def make(*parameters: str, kind: Any = None, words: Sequence[str] = ()) -> Any:
+            given = [word for each in parameters for word in ("-p", each)]
+            context = open_context(["node", "--ros-args", *given, *words], domain_id)
+            made.callback(context.try_shutdown)
+            node = Node("node", context=context) if kind is None else kind(context)
+            made.callback(node.destroy_node)
+            return node
+
+        yield make
+
+
 def starter(
     kind: Any, model_folder: str, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Callable[..., Any]]:
@@ -88,11 +106,9 @@ def starter(
         ) -> Any:
             folder: Path = tmp_path_factory.mktemp(f"{node}_{next(numbers)}")
             stamped = "stamped" if node == "record_node" else "enable_stamped_cmd_vel"
-            own = (
-                {"robot": "ackermann"}
-                if node == "record_node"
-                else {"model": model_folder}
-            )
+            own = {"model": model_folder}
+            if node == "record_node":
+                own = {"robot": "ackermann"}
             parameters = {**own, stamped: False} | parameters
             LAUNCHED.append(kind(node, folder, parameters, domain_id, namespace, remap))
             return started.enter_context(LAUNCHED[-1])

@@ -1,12 +1,13 @@
 """The test's own end of the topics: a node in a context of its own."""
 
-from __future__ import annotations
-
 import itertools
 import time
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+from nav_msgs.msg import Odometry
+from numpy.typing import ArrayLike
 from rcl_interfaces.srv import GetParameters, SetParametersAtomically
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -133,3 +134,16 @@ class Peer:
 
 def stamp_ns(message: Any) -> int:
     return conversions.stamp_from_ros(message.header.stamp)
+
+
+def pose_of(odometry: Odometry) -> np.ndarray:
+    """The pose (3,) of an odometry."""
+    return conversions.odometry_from_ros(odometry)[0]
+
+
+def odometry(
+    stamp: int, pose: ArrayLike = (0.0, 0.0, 0.0), twist: ArrayLike = (0.0, 0.0, 0.0)
+) -> Odometry:
+    """An odometry of a robot, at rest at its origin unless said otherwise."""
+    frames = ("odom", "base_link")
+    return conversions.odometry_to_ros(pose, twist, stamp, frames, (1e-4,) * 4)

@@ -1,17 +1,11 @@
 """Every shipped robot can be armed with the parameters that the launch files give its nodes."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
 import yaml
-from rclpy.node import Node
-from std_srvs.srv import Trigger
 
 from nics_drl_bridge.config import find_config, list_shipped
 from nics_drl_bridge.gate import inputs
@@ -20,7 +14,6 @@ from nics_drl_bridge.gate.state import begin
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes.command_gate import declare_gate
-from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.nodes.parameters import NODES
 
 pytestmark = pytest.mark.ros
@@ -30,34 +23,6 @@ FILE = find_config("bridge", "nodes")
 TICK_S = 0.02
 SETTLED_S = 3.0
 START_NS = 10**18
-REFUSED_S = 60.0
-
-
-@pytest.fixture
-def declared(domain_id):
-    """Declares a gate of a robot as the launch files start it, `declared(robot)`."""
-    contexts = []
-
-    def declare(robot):
-        words = ["--params-file", str(FILE)]
-        for argument in (
-            f"model:={robot}",
-            f"limits:={robot}",
-            "e_stop_required:=false",
-        ):
-            words += [
-                "-p",
-                f"command_gate:{argument}",
-            ]  # as specific as those of `launch`
-        contexts.append(open_context(["node", "--ros-args", *words], domain_id))
-        node = Node("command_gate", context=contexts[-1])
-        config = declare_gate(node, builtin_model(robot))
-        node.destroy_node()
-        return config
-
-    yield declare
-    for context in contexts:
-        context.try_shutdown()
 
 
 class Standing:
@@ -99,8 +64,12 @@ class Standing:
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
-def test_a_shipped_robot_is_armed_with_the_shipped_parameters(declared, robot):
-    standing = Standing(declared(robot), builtin_model(robot))
+def test_a_shipped_robot_is_armed_with_the_shipped_parameters(make_node, robot):
+    words = ["--params-file", str(FILE), "-r", "__node:=command_gate"]
+    for given in (f"model:={robot}", f"limits:={robot}", "e_stop_required:=false"):
+        words += ["-p", f"command_gate:{given}"]  # as specific as those of `launch`
+    model = builtin_model(robot)
+    standing = Standing(declare_gate(make_node(words=words), model), model)
     standing.stand(SETTLED_S)
     answer = standing.give(inputs.Arm(publishers=1))
     assert answer.granted, answer.answer
@@ -112,35 +81,3 @@ def test_the_shipped_file_sets_nothing_that_a_node_derives_from_the_robot(node):
     given = content.get(f"/**/{node}", {"ros__parameters": {}})["ros__parameters"]
     derived = {row.name for row in NODES[node]().parameters if row.shown}
     assert not derived & given.keys()
-
-
-@pytest.mark.process
-def test_a_turtlebot_is_armed_as_it_is_launched(
-    launch_process, meet, domain_id, tmp_path
-):
-    content = yaml.safe_load(Path(FILE).read_text(encoding="utf-8"))
-
-    def start(node, **arguments):
-        own = content.get(f"/**/{node}", {"ros__parameters": {}})["ros__parameters"]
-        launch_process(
-            node, domain_id, **own | {"model": "turtlebot3_burger"} | arguments
-        )
-
-    start("simulator_node", world="empty")
-    start("middleware_node", use_sim_time=True)
-    start(
-        "command_gate",
-        limits="turtlebot3_burger",
-        use_sim_time=True,
-        e_stop_required=False,
-        black_box=str(tmp_path),
-    )
-    peer = meet(domain_id)
-    answers = []
-
-    def armed():
-        answers.append(peer.call(Trigger, "command_gate/arm").message)
-        peer.within(0.5, lambda: False)
-        return answers[-1] == "armed"
-
-    peer.until(armed, f"to be armed: {answers[-1:]}", REFUSED_S)

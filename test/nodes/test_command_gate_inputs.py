@@ -1,7 +1,5 @@
 """The gate reads from bytes what it would make of rclpy's messages, to the same bits."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from importlib import import_module
@@ -15,16 +13,14 @@ pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 from domains import claimed_domain
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
-from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import LaserScan
 from std_srvs.srv import Trigger
 
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.device_parameters import declare_device, timing
-from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.robot.noise import Delay, Latency
-from nodes.peer import stamp_ns
+from nodes.peer import pose_of, stamp_ns
 
 pytestmark = pytest.mark.ros
 
@@ -65,7 +61,7 @@ class Fleet:
         self.commands[name].publish(conversions.twist_to_ros([speed, 0.0, 0.0]))
 
     def x(self, name):
-        return conversions.odometry_from_ros(self.odoms[name][-1])[0][0]
+        return pose_of(self.odoms[name][-1])[0]
 
 
 FACING = [0.0, 0.0, 0.0, 1.0, 0.0, np.pi]
@@ -116,13 +112,6 @@ def test_the_frames_of_a_fleet_begin_with_the_namespace_of_each_robot(fleet):
             f"{name}/odom",
             f"{name}/base_link",
         )
-
-
-def test_a_fleet_that_gets_starts_for_other_robots_says_how_many_it_needs(fleet):
-    answer = fleet.peer.set_parameters("simulator_node", episode_start=[0.0, 0.0, 0.0])
-    assert not answer.successful
-    assert "episode_start has 3 numbers; give 6" in answer.reason
-    assert fleet.reset(FACING).success
 
 
 class Stamped:
@@ -220,22 +209,14 @@ def test_a_scan_is_told_as_late_as_the_latency_says_but_stamped_when_it_was_meas
     ],
 )
 def test_a_device_is_as_late_as_was_measured_unless_told_otherwise_and_never_in_lockstep(
-    model, domain_id, given, scan_ns, odom_ns
+    model, make_node, given, scan_ns, odom_ns
 ):
     latency = Latency(
         scan=Delay(least=0.012, jitter=0.01), odom=Delay(least=0.003, jitter=0.0)
     )
-    asked = [
-        word for name, value in given.items() for word in ("-p", f"{name}:={value}")
-    ]
-    context = open_context(["node", "--ros-args", *asked], domain_id)
-    try:
-        node = Node("device", context=context)
-        declare_device(node, "laser")
-        time = timing(node, replace(model, latency=latency))
-        node.destroy_node()
-    finally:
-        context.try_shutdown()
+    node = make_node(*(f"{name}:={value}" for name, value in given.items()))
+    declare_device(node, "laser")
+    time = timing(node, replace(model, latency=latency))
     assert (time.scan_late_ns, time.odom_late_ns) == (scan_ns, odom_ns)
 
 

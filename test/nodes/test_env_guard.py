@@ -1,8 +1,7 @@
 """An env over DDS leaves a zero on `cmd_vel` whatever leaves one of its methods by an exception."""
 
-from __future__ import annotations
-
 import threading
+from contextlib import closing
 from types import SimpleNamespace
 
 import gymnasium
@@ -13,12 +12,11 @@ pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
 from geometry_msgs.msg import Twist
 
-from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.registry import COOPERATIVE_REACHING, NAVIGATION
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.interface import Start
-from nics_drl_bridge.nodes import link, qos, realtime_backend
+from nics_drl_bridge.nodes import link, qos
 from nics_drl_bridge.nodes.backends import DdsBackend
 from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
 from nics_drl_bridge.sim.world import load_world
@@ -97,10 +95,7 @@ def driving(simulators, listeners):
         )
         made.append(env)
         env.reset(seed=1)
-        heard.clear()
-        peer.until(
-            lambda: step(env) and heard and heard[-1].linear.x > 0.0, "that it drives"
-        )
+        drive_on(env, peer, heard)
         return env, peer, heard
 
     yield start
@@ -114,6 +109,13 @@ def step(env):
     if ended:
         env.reset()
     return True
+
+
+def drive_on(env, peer, heard):
+    heard.clear()
+    peer.until(
+        lambda: step(env) and heard and heard[-1].linear.x > 0.0, "that it drives"
+    )
 
 
 def throw(error=None, value=None):
@@ -140,81 +142,35 @@ def task_raises_in_reset(env):
     env.reset(seed=2)
 
 
-def picture_fails(env):
-    def draw(*_):
-        raise OSError("no screen")
-
-    env.unwrapped._picture = SimpleNamespace(draw=draw, close=lambda: None)
-    env.render()
-
-
-def close_fails(env):
-    env.unwrapped.render_mode = "human"  # whose page is all that is closed
-    env.unwrapped._picture = SimpleNamespace(close=lambda: 1 / 0)
-    env.close()
-
-
 CASES = {
     "step with NaN": (
         lambda env: env.step(AHEAD * np.nan),
         gymnasium.error.InvalidAction,
     ),
-    "step with a wrong shape": (
-        lambda env: env.step(AHEAD[:1]),
-        gymnasium.error.InvalidAction,
-    ),
-    "a task whose command raises": (task_raises, ZeroDivisionError),
     "reset with a bad seed": (lambda env: env.reset(seed=-1), ConfigError),
-    "reset with bad options": (
-        lambda env: env.reset(options={"start": "there"}),
-        ConfigError,
-    ),
-    "reset with an unknown option": (
-        lambda env: env.reset(options={"x": 1}),
-        ConfigError,
-    ),
-    "reset with a great seed": (lambda env: env.reset(seed=2**63), ConfigError),
+    "a task whose command raises": (task_raises, ZeroDivisionError),
     "a task whose command is NaN": (task_says_nan, ConfigError),
     "a task whose reset raises": (task_raises_in_reset, ZeroDivisionError),
     "Ctrl-C in step": (interrupted, KeyboardInterrupt),
-    "render that raises": (picture_fails, OSError),
-    "close whose picture raises": (close_fails, ZeroDivisionError),
-}
-# Three more ways for a reset to refuse its arguments.
-ALIKE = {
-    "reset with bad options",
-    "reset with an unknown option",
-    "reset with a great seed",
 }
 
 
 @pytest.mark.parametrize(
     "mode", ["lockstep", pytest.param("realtime", marks=pytest.mark.campaign)]
 )
-@pytest.mark.parametrize(
-    "case",
-    [
-        pytest.param(case, marks=pytest.mark.campaign) if case in ALIKE else case
-        for case in CASES
-    ],
-)
-def test_a_zero_is_the_last_that_cmd_vel_hears(driving, mode, case):
-    act, error = CASES[case]
-    env, peer, heard = driving(mode, render_mode="rgb_array")
-    with pytest.raises(error):
-        act(env)
-    peer.until(lambda: heard[-1] == Twist(), "a zero command")
-    assert all(np.isfinite([each.linear.x, each.angular.z]).all() for each in heard)
-    throw()
-    if not case.startswith("close"):
+def test_a_zero_is_the_last_that_cmd_vel_hears(driving, mode):
+    """Each case of the guard is tested in process; over topics one drive meets them in turn."""
+    env, peer, heard = driving(mode)
+    for act, error in CASES.values():
+        with pytest.raises(error):
+            act(env)
+        peer.until(lambda: heard[-1] == Twist(), "a zero command")
+        assert np.isfinite([(one.linear.x, one.angular.z) for one in heard]).all()
+        throw()
         with pytest.raises(gymnasium.error.ResetNeeded):
             env.step(AHEAD)
         env.reset(seed=2)
-        heard.clear()
-        peer.until(
-            lambda: step(env) and heard and heard[-1].linear.x > 0.0,
-            "that it drives on",
-        )
+        drive_on(env, peer, heard)
 
 
 def test_a_command_that_no_other_one_follows_is_followed_by_a_zero(driving):
@@ -274,98 +230,46 @@ def test_one_robot_of_a_fleet_that_cant_be_halted_keeps_none_of_the_others_movin
             env.reset()
         return all(each and each[-1].linear.x > 0.0 for each in heard)
 
-    def refuses():
+    def refuse():
         raise BackendError("can't be halted")
 
     env.reset(seed=0)
+    peer.until(drive, "that all drive")
+    deaf = env._backend._robots[1]
     try:
-        for deaf in range(3):
-            peer.until(drive, "that all drive")
-            robots = env._backend._robots
-            with monkeypatch.context() as patch:
-                patch.setattr(robots[deaf], "halt", refuses)
-                with pytest.raises(BackendError, match="can't be halted"):
-                    env.step(np.tile(AHEAD, 3) * np.nan)
-            others = [each for k, each in enumerate(heard) if k != deaf]
-            peer.until(
-                lambda others=others: all(x[-1] == Twist() for x in others), "zeros"
-            )
-            env.reset(seed=0)
+        with monkeypatch.context() as patch:
+            patch.setattr(deaf, "halt", refuse)
+            with pytest.raises(BackendError, match="can't be halted"):
+                env.step(np.tile(AHEAD, 3) * np.nan)
+        for others in (heard[0], heard[2]):
+            peer.until(lambda others=others: others[-1] == Twist(), "zeros")
+        env.reset(seed=0)
         peer.until(drive, "that all drive")
-        monkeypatch.setattr(robots[0], "close", refuses)
+        monkeypatch.setattr(deaf, "close", refuse)
         with pytest.raises(BackendError, match="can't be halted"):
             env.close()
-        peer.until(
-            lambda: all(each[-1] == Twist() for each in heard), "zeros at the end"
-        )
+        peer.until(lambda: all(each[-1] == Twist() for each in heard[::2]), "zeros")
     finally:
-        for robot in robots:
-            robot._link.close()
-
-
-def test_what_a_user_is_told_by_may_raise(simulators, listeners, monkeypatch):
-    """A `say` that raises ends a reset amid waiting for the robot."""
-
-    def say(_):
-        if raising:
-            raise ValueError("of the user")
-
-    mode = "realtime"
-    raising = []
-    told = {"say": say, "vehicle": True, "start": "present"}
-    peer, heard = listeners[mode]
-    options = {
-        "mode": mode,
-        "domain_id": simulators[mode],
-        "stale_after_s": PATIENCE_S,
-        **told,
-    }
-    env = BridgeEnv("dds", "ackermann", "empty", backend_options=options)
-    try:
-        env.reset(seed=0)
-        heard.clear()
-        peer.until(
-            lambda: env.step(AHEAD) and heard and heard[-1].linear.x > 0.0, "driving"
-        )
-        hindrance = realtime_backend.Hindrance("nothing, but somebody says so", "")
-        monkeypatch.setattr(env._backend, "_find_hindrance", lambda _: hindrance)
-        raising.append(True)
-        with pytest.raises(ValueError, match="of the user"):
-            env.reset(seed=0)
-        peer.until(lambda: heard[-1] == Twist(), "a zero command")
-    finally:
-        env.close()
+        deaf._link.close()
 
 
 @pytest.mark.parametrize("kind", [DdsBackend, RealtimeBackend])
-@pytest.mark.parametrize(
-    "command",
-    [
-        [np.nan, -np.inf],
-        *(
-            pytest.param(c, marks=pytest.mark.campaign)
-            for c in ([np.nan, 0.0], [0.5, np.inf])
-        ),
-    ],
-)
 def test_a_backend_publishes_nothing_that_is_not_finite(
-    simulators, listeners, model, kind, command
+    simulators, listeners, model, kind
 ):
     mode = "lockstep" if kind is DdsBackend else "realtime"
     peer, heard = listeners[mode]
     backend = kind(model, load_world("empty"), domain_id=simulators[mode])
-    try:
+    with closing(backend):
         backend.reset(Start(seed=3, pose=np.zeros(3)))
         heard.clear()
-        moves = lambda: heard and heard[-1].linear.x > 0.0  # noqa: E731
         peer.until(
-            lambda: backend.step(np.array([0.5, 0.1])) and moves(), "that it drives"
+            lambda: (
+                backend.step(np.array([0.5, 0.1])) and heard and heard[-1] != Twist()
+            ),
+            "that it drives",
         )
-        with pytest.raises(
-            BackendError, match="must be finite, a zero was sent instead"
-        ):
-            backend.step(np.array(command))
+        with pytest.raises(BackendError, match="a zero was sent instead"):
+            backend.step(np.array([np.nan, -np.inf]))
         peer.until(lambda: heard[-1] == Twist(), "a zero command")
-        assert all(np.isfinite([each.linear.x, each.angular.z]).all() for each in heard)
-    finally:
-        backend.close()
+        assert np.isfinite([(one.linear.x, one.angular.z) for one in heard]).all()

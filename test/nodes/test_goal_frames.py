@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 
@@ -9,13 +7,11 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
 from geometry_msgs.msg import PoseStamped, TransformStamped
-from rclpy.node import Node
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.nodes import conversions
 from nics_drl_bridge.nodes.goal_frames import GoalFrames
-from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.nodes.parameters import policy
 from nics_drl_bridge.nodes.runner import declare_row
 
@@ -43,14 +39,11 @@ class Topics:
 
 
 @pytest.fixture
-def frames(domain_id):
-    context = open_context(["node"], domain_id)
-    node = Node("node", context=context)
+def frames(make_node):
+    node = make_node()
     for row in policy():
         declare_row(node, row)
-    yield GoalFrames(node, Topics())
-    node.destroy_node()
-    context.try_shutdown()
+    return GoalFrames(node, Topics())
 
 
 def goal(frame, x, y):

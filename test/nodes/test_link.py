@@ -1,7 +1,5 @@
 """A link leaves nothing open, wherever the constructor of its backend fails."""
 
-from __future__ import annotations
-
 import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")

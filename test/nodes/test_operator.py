@@ -1,7 +1,5 @@
 """What a person asks of a running robot keeps to the time that was given."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import pytest

@@ -1,7 +1,5 @@
 """A node never waits for who reads its output; what is dropped is counted and told."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import pty
@@ -16,6 +14,7 @@ import pytest
 pytestmark = pytest.mark.process
 
 DEADLINE_S = 30.0
+LINES = [*(f"line {k}" for k in range(50)), "over"]
 TALKER = """
 import os, sys, time
 from nics_drl_bridge.nodes.ending import leave
@@ -64,22 +63,12 @@ def read_all(descriptor):
 def test_all_lines_arrive_in_order_where_somebody_reads_them():
     talker = start(TALKER, "50", stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
     lines = talker.communicate(timeout=DEADLINE_S)[0].decode().splitlines()
-    assert [line.split(" .")[0] for line in lines] == [
-        f"line {k}" for k in range(50)
-    ] + ["over"]
+    assert [line.split(" .")[0] for line in lines] == LINES
     assert talker.returncode == 3
 
 
-def test_stdout_and_stderr_stay_apart():
-    talker = start(TALKER, "5", stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    told, errors = talker.communicate(timeout=DEADLINE_S)
-    assert told == b"over\n"
-    assert errors.count(b"line ") == 5
-
-
-@pytest.mark.parametrize("stdio", ["stdout", "stderr"])
-def test_a_closed_output_is_no_error(stdio):
-    closed = {"stdout": "1", "stderr": "2"}[stdio]
+@pytest.mark.parametrize("closed", [1, 2])
+def test_a_closed_output_is_no_error(closed):
     command = [sys.executable, "-c", TALKER, "5"]
     done = subprocess.run(
         ["sh", "-c", f'exec "$@" {closed}>&-', "sh", *command], timeout=DEADLINE_S
@@ -123,9 +112,7 @@ def test_all_lines_are_in_the_log_file_though_nobody_reads_the_output(tmp_path):
     os.close(entrance)
     assert talker.wait(DEADLINE_S) == 3
     lines = (tmp_path / "log" / "file").read_text().splitlines()
-    assert [line.split(" .")[0] for line in lines] == [
-        f"line {k}" for k in range(50)
-    ] + ["over"]
+    assert [line.split(" .")[0] for line in lines] == LINES
     os.close(exit_)
 
 
@@ -137,14 +124,6 @@ def test_a_log_file_that_hangs_delays_nothing(tmp_path):
     )
     assert talker.communicate(timeout=DEADLINE_S)[1].count(b"line ") > 0
     assert talker.returncode == 3
-
-
-def test_a_reader_that_has_gone_ends_nothing():
-    exit_, entrance = os.pipe()
-    talker = start(TALKER, "30000", stdout=entrance, stderr=entrance)
-    os.close(entrance)
-    os.close(exit_)
-    assert talker.wait(DEADLINE_S) == 3
 
 
 def test_a_forwarder_that_is_frozen_or_killed_delays_nothing():
@@ -185,9 +164,8 @@ def test_a_command_that_moves_a_robot_never_waits_for_who_reads_its_errors():
 
 
 def test_the_errors_of_a_command_arrive_in_order_and_stderr_is_its_own_again():
-    code = ERRORS.replace("30_000", "3").replace(
-        "os._exit", "os.write(2, b'own');os._exit"
-    )
+    code = ERRORS.replace("30_000", "3")
+    code = code.replace("os._exit", "os.write(2, b'own');os._exit")
     command = start(code, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     told, errors = command.communicate(timeout=DEADLINE_S)
     lines = [line.split(" x")[0] for line in errors.decode().splitlines()]
@@ -206,18 +184,10 @@ class TestGate:
             "ROS_DOMAIN_ID": str(domain_id),
             "ROS_LOG_DIR": str(tmp_path / "log"),
         }
-        words = ["-p", "limits:=differential", "-p", f"black_box:={tmp_path}"]
+        words = ["-p", "enable_stamped_cmd_vel:=false", "-p", f"black_box:={tmp_path}"]
+        start = [sys.executable, "-m", "nics_drl_bridge.nodes.start", "command_gate"]
         gate = subprocess.Popen(
-            [
-                sys.executable,
-                "-m",
-                "nics_drl_bridge.nodes.start",
-                "command_gate",
-                "--ros-args",
-                "-p",
-                "enable_stamped_cmd_vel:=false",
-                *words,
-            ],
+            [*start, "--ros-args", *words],
             env=os.environ | variables,
             stdin=subprocess.DEVNULL,
             stdout=entrance,

@@ -1,7 +1,5 @@
 """Every parameter of `config/nodes` exists in the node it is meant for."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -14,7 +12,6 @@ from rclpy.node import Node
 from nics_drl_bridge.extras.mujoco.node import mujoco_node
 from nics_drl_bridge.nodes import runner
 from nics_drl_bridge.nodes.command_gate import CommandGate
-from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.nodes.middleware_node import MiddlewareNode
 from nics_drl_bridge.nodes.policy_node import PolicyNode
 from nics_drl_bridge.nodes.record_node import declare_drive
@@ -46,21 +43,12 @@ MAKERS = {
 @pytest.mark.parametrize("name", MAKERS)
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.name)
 def test_a_node_has_every_parameter_that_a_shipped_file_gives_it(
-    name, file, domain_id, tmp_path, monkeypatch
+    name, file, make_node, tmp_path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
     section = yaml.safe_load(file.read_text(encoding="utf-8")).get(f"/**/{name}", {})
-    context = open_context(
-        ["node", "--ros-args", "--params-file", str(file)], domain_id
-    )
-    try:
-        node = MAKERS[name](context)
-        assert runner.unknown(node) == []
-        for key, value in section.get("ros__parameters", {}).items():
-            assert node.get_parameter(key).value == pytest.approx(value, nan_ok=True), (
-                key
-            )
-            assert node.describe_parameter(key).description
-        node.destroy_node()
-    finally:
-        context.try_shutdown()
+    node = make_node(words=("--params-file", str(file)), kind=MAKERS[name])
+    assert runner.unknown(node) == []
+    for key, value in section.get("ros__parameters", {}).items():
+        found = node.get_parameter(key).value
+        assert found == pytest.approx(value, nan_ok=True), key

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -19,6 +17,7 @@ from nics_drl_bridge.recording.messages import get_stamp, read_imu, read_pose
 from nics_drl_bridge.recording.recording import check
 from nics_drl_bridge.recording.topic_roles import TopicRoles
 from nics_drl_bridge.robot.spec import load_robot
+from nodes.peer import odometry
 
 pytestmark = pytest.mark.ros
 
@@ -26,8 +25,6 @@ CAR = load_robot("ackermann")
 WHEELED = load_robot("differential")
 START_NS = 1_795_000_000 * NS_PER_S
 PERIOD_NS = NS_PER_S // 10
-FRAMES = ("odom", "base_link")
-VARIANCE = (0.0,) * 4
 
 
 class Drive:
@@ -42,9 +39,7 @@ class Drive:
         stamp = START_NS + k * PERIOD_NS if stamp_ns is None else stamp_ns
         pose = [0.1 * k if x is None else x, 0.0, 0.0]
         self.now_ns = START_NS + k * PERIOD_NS + PERIOD_NS // 5
-        return self.log.odometry(
-            conversions.odometry_to_ros(pose, np.array(twist), stamp, FRAMES, VARIANCE)
-        )
+        return self.log.odometry(odometry(stamp, pose, twist))
 
     def sends(self, k):
         """Command number k."""
@@ -65,6 +60,7 @@ def test_commands_are_on_the_clock_of_the_stamps_of_odometry():
     assert recording.pose.t == pytest.approx(recording.command.t)
     assert recording.command.values[:, 0] == pytest.approx(0.01 * np.arange(30))
     assert recording.variables == CAR.variable_names
+    assert recording.odometry is None  # which is the pose, and not compared with itself
 
 
 def test_odometry_that_is_old_repeated_or_no_number_is_no_news():
@@ -119,10 +115,6 @@ def test_beside_a_pose_of_motion_capture_the_twist_of_the_odometry_is_taken():
     assert recording.odometry.clock == recording.command.clock
 
 
-def test_an_odometry_that_is_the_pose_is_not_compared_with_itself():
-    assert Drive().goes(0, 20).log.recording().odometry is None
-
-
 def test_measured_wheels_are_the_state():
     drive = Drive(WHEELED).goes(0, 5)
     with pytest.raises(
@@ -145,17 +137,6 @@ def test_stamps_at_another_pace_than_the_receipt_are_a_simulators():
         BackendError, match=r"stamps advanced by 4.50 s within 0.90 s.*use_sim_time"
     ):
         drive.log.check()
-
-
-def test_odometry_that_comes_late_and_all_at_once_is_at_its_pace():
-    drive = Drive()
-    for k in range(10):
-        drive.hears(k)
-        late = [START_NS + 4 * PERIOD_NS] * 4 + [drive.now_ns] * 6
-        drive.log.rows["odom"][-1] = (late[k], *drive.log.rows["odom"][-1][1:])
-    (first, begin, _), *_, (last, end, _) = drive.log.rows["odom"]
-    assert (end - begin) / (last - first) > 1.5
-    drive.log.check()
 
 
 def test_stamps_of_several_clocks_do_not_lose_a_drive_that_is_over():

@@ -1,63 +1,22 @@
-"""Requirements of the services on the node that offers them, and how they refuse."""
+"""How the services are answered by the node that offers them, and how they refuse."""
 
 import errno
-from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from simulation_interfaces.msg import Result
 
 from nics_drl_bridge.errors import BridgeError
-from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.sim.device import DeviceWorld
 from nics_drl_bridge.sim.entities import UnknownEntityError
-from nics_drl_bridge.sim.simulator import FastSimulator
-from nics_drl_bridge.sim.world_set import AnyWorld
+
+if TYPE_CHECKING:
+    from nics_drl_bridge.nodes.simulator_node import DeviceNode
 
 NO_WORLD = "no world is loaded; load one by load_world first."
 
 
-class Host(Protocol):
-    """A device node, as `simulator_node.DeviceNode` is one."""
-
-    device: DeviceWorld
-    world: AnyWorld
-    model: SimulatorModel
-    paused: bool
-    now_ns: int
-    robot_names: tuple[str, ...]
-    map_frame: str
-    frames: list[Any]  # of each robot, see `device_parameters.Frames`
-    context: Any
-
-    def make_simulator(self, world: AnyWorld, robots: int) -> FastSimulator:
-        """Make a simulator of a world for M robots."""
-
-    def use_world(self, world: AnyWorld) -> None:
-        """Simulate a world, with the robots that the node was started with."""
-
-    def add_robot(self, namespace: str) -> None:
-        """Open the topics of a further robot."""
-
-    def remove_robots(self, gone: Sequence[int]) -> None:
-        """Close the topics of robots."""
-
-    def reopen_robots(self) -> None:
-        """Open the topics of the robots that the node was started with, and of no other."""
-
-    def begin(self, rewind: bool = False) -> None:
-        """Begin an episode."""
-
-    def rewind(self) -> None:
-        """Put the time back to its start."""
-
-    def step(self) -> None:
-        """Move the world by one step."""
-
-    def pause(self, paused: bool) -> None:
-        """Hold time, or let it go on."""
-
-    def get_logger(self) -> Any:
-        """Return the node's logger."""
+# the device node that offers the services
+Host: TypeAlias = "DeviceNode"
 
 
 class RefusalError(BridgeError):

@@ -18,10 +18,12 @@ from nics_drl_bridge.sim.entities import Entities, overlap
 
 HEIGHT = 0.5  # of whatever stands in a plane world, as in MuJoCo [m]
 LEAN = 0.02  # maximum angle of what stands upright [rad]
+# For each type of bounds: fewest and most points, and these in words.
 SIZES = {
-    Bounds.TYPE_BOX: "two",
-    Bounds.TYPE_SPHERE: "two",
-    Bounds.TYPE_CONVEX_HULL: "three",
+    Bounds.TYPE_EMPTY: (0, 0, "no points"),
+    Bounds.TYPE_BOX: (2, 2, "two points"),
+    Bounds.TYPE_SPHERE: (2, 2, "two points"),
+    Bounds.TYPE_CONVEX_HULL: (3, math.inf, "three points or more"),
 }
 
 
@@ -95,22 +97,15 @@ class Region:
         kind = bounds.type
         self._points = np.array([[p.x, p.y, p.z] for p in bounds.points]).reshape(-1, 3)
         self.empty = kind == Bounds.TYPE_EMPTY
-        if kind not in (Bounds.TYPE_EMPTY, *SIZES):
+        if kind not in SIZES:
             fault = f"bounds of type {kind} are none of the standard"
             raise RefusalError(
                 Result.RESULT_FEATURE_UNSUPPORTED, f"{fault}; give 0 to 3."
             )
         self._sphere = kind == Bounds.TYPE_SPHERE
         count = len(self._points)
-        hull = kind == Bounds.TYPE_CONVEX_HULL
-        if self.empty:
-            fits = count == 0
-        elif hull:
-            fits = count >= 3
-        else:
-            fits = count == 2
-        if not fits:
-            needed = SIZES.get(kind, "no") + (" points or more" if hull else " points")
+        fewest, most, needed = SIZES[kind]
+        if not fewest <= count <= most:
             raise RefusalError(
                 Result.RESULT_OPERATION_FAILED,
                 f"bounds of type {kind} have {count} points; give {needed}.",

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import unquote, urlsplit
 
-from simulation_interfaces.msg import Result
+from simulation_interfaces.msg import Result, SpawnResult
+from simulation_interfaces.srv import LoadWorld
 
 from nics_drl_bridge.config import read_text
 from nics_drl_bridge.errors import ConfigError, MissingFileError
@@ -22,25 +23,8 @@ SUFFIXES = {".sdf": SDF, ".world": SDF, ".yaml": YAML, ".yml": YAML}
 MOST_BYTES = 2**24
 
 
-class Codes(NamedTuple):
-    """Codes of a service for resources that it can't use; each service has its own."""
-
-    unsupported_format: int
-    no_resource: int
-    parse_error: int
-    missing_assets: int
-    unsupported_assets: int
-
-    @classmethod
-    def of(cls, response: Any) -> Codes:
-        """Return the codes that are constants of a response's class."""
-        return cls(
-            response.UNSUPPORTED_FORMAT,
-            response.NO_RESOURCE,
-            response.RESOURCE_PARSE_ERROR,
-            response.MISSING_ASSETS,
-            response.UNSUPPORTED_ASSETS,
-        )
+# A service's message whose constants are its codes for resources that it can't use.
+Codes = type[SpawnResult] | type[LoadWorld.Response]
 
 
 @contextmanager
@@ -49,12 +33,12 @@ def refused(codes: Codes) -> Iterator[None]:
     try:
         yield
     except AssetsError as error:
-        code = codes.missing_assets if error.missing else codes.unsupported_assets
+        code = codes.MISSING_ASSETS if error.missing else codes.UNSUPPORTED_ASSETS
         raise RefusalError(code, str(error)) from None
     except MissingFileError as error:
-        raise RefusalError(codes.missing_assets, str(error)) from None
+        raise RefusalError(codes.MISSING_ASSETS, str(error)) from None
     except ConfigError as error:
-        raise RefusalError(codes.parse_error, str(error)) from None
+        raise RefusalError(codes.RESOURCE_PARSE_ERROR, str(error)) from None
 
 
 class Content(NamedTuple):
@@ -95,11 +79,11 @@ def find(resource: Any, codes: Codes) -> Content:
     text = resource.resource_string
     if not text.strip():
         fault = "both uri and resource_string are empty; give one of them."
-        raise RefusalError(codes.no_resource, fault)
+        raise RefusalError(codes.NO_RESOURCE, fault)
     if text.lstrip("\ufeff \t\r\n").startswith(("<", "#usda")):
         if "<sdf" not in text:
             fault = "the resource_string is XML or USD, but no SDF; give SDF or YAML."
-            raise RefusalError(codes.unsupported_format, fault)
+            raise RefusalError(codes.UNSUPPORTED_FORMAT, fault)
         return Content(SDF, text, "resource_string")
     return Content(YAML, text, "resource_string")
 
@@ -108,7 +92,7 @@ def _of_uri(uri: str, codes: Codes) -> Content:
     path = local(uri)
     if path is None:
         fault = f"uri {uri!r}: is not on this machine; give file:// or a path."
-        raise RefusalError(codes.unsupported_format, fault)
+        raise RefusalError(codes.UNSUPPORTED_FORMAT, fault)
     suffix = path.suffix.lower()
     named = path.is_dir() or (
         any(sign in uri for sign in SPECIAL) and not path.is_file()
@@ -117,11 +101,11 @@ def _of_uri(uri: str, codes: Codes) -> Content:
         return Content("", "", str(path), path)
     if suffix not in SUFFIXES:
         fault = f"uri {uri!r}: is none of {', '.join(SUFFIXES)}; convert it."
-        raise RefusalError(codes.unsupported_format, fault)
+        raise RefusalError(codes.UNSUPPORTED_FORMAT, fault)
     if not path.is_file():
         fault = f"uri {uri!r}: no such file; check the path on the simulator's machine."
         raise RefusalError(Result.RESULT_NOT_FOUND, fault)
     try:
         return Content(SUFFIXES[suffix], read_text(path, MOST_BYTES), str(path), path)
     except ConfigError as error:
-        raise RefusalError(codes.parse_error, str(error)) from None
+        raise RefusalError(codes.RESOURCE_PARSE_ERROR, str(error)) from None

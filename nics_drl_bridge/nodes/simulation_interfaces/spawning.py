@@ -43,7 +43,6 @@ class Spawning:
         self._host = host
         self._simulation = simulation
         self._entities = entities
-        self._codes = resources.Codes.of(SpawnResult)
 
     def spawn(self, request: Any, response: Any) -> None:
         """Answer SpawnEntity, and one part of SpawnEntities. Raises RefusalError, BridgeError."""
@@ -83,7 +82,7 @@ class Spawning:
 
     def _model(self, request: Any) -> Model | None:
         """The entity of a request; None for a robot. Raises RefusalError."""
-        resource = resources.find(request.entity_resource, self._codes)
+        resource = resources.find(request.entity_resource, SpawnResult)
         if not resource.form:
             if resource.source == self._host.model.robot.name:
                 return None
@@ -97,7 +96,7 @@ class Spawning:
                 raise RefusalError(
                     Result.RESULT_NOT_FOUND, f"{error} {held}."
                 ) from None
-        with resources.refused(self._codes):
+        with resources.refused(SpawnResult):
             if resource.form == resources.SDF:
                 z = request.initial_pose.pose.position.z
                 return model_of_sdf(

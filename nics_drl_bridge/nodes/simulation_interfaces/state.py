@@ -45,7 +45,7 @@ class Simulation:
         self.infos: dict[str, EntityInfo] = {}  # by name, where a client set it
         # or paused, or without a world, while the host is paused
         self._halted = STOPPED
-        self._turn: Any = host.create_guard_condition(lambda: None)  # type: ignore[attr-defined]
+        self._turn: Any = host.create_guard_condition(lambda: None)
         self.renew()
 
     def renew(self) -> None:

@@ -88,7 +88,6 @@ class Worlds:
         self._host = host
         self._simulation = simulation
         self._resource = Resource(uri=get_text(host, "world"))
-        self._codes = resources.Codes.of(CODES)
 
     def current(self, _: Any, response: Any) -> None:
         """Answer GetCurrentWorld."""
@@ -110,7 +109,7 @@ class Worlds:
 
     def load(self, request: Any, response: Any) -> None:
         """Answer LoadWorld: the present world is unloaded, even if the other can't be read."""
-        resource = resources.find(request.world_resource, self._codes)
+        resource = resources.find(request.world_resource, CODES)
         self._unload()
         world = self._read(resource, request)
         host = self._host
@@ -123,7 +122,7 @@ class Worlds:
         response.world = describe_world(world, self._resource)
 
     def _read(self, resource: resources.Content, request: Any) -> AnyWorld:
-        with resources.refused(self._codes):
+        with resources.refused(CODES):
             if resource.form == resources.SDF:
                 if resource.path is not None:
                     return self._standing(resource.path, resource.path.stem, request)
@@ -150,9 +149,9 @@ class Worlds:
         standing = read_sdf(file, HEIGHT, skip_unknown=True, may_be_empty=True)
         if standing.left_out and not skip:
             if standing.missing:
-                code = self._codes.missing_assets
+                code = CODES.MISSING_ASSETS
             else:
-                code = self._codes.unsupported_assets
+                code = CODES.UNSUPPORTED_ASSETS
             fault = f"{name}: {standing.left_out[0]}, which a world can't hold"
             raise RefusalError(
                 code, f"{fault}; put a box in its place, or ignore such assets."
