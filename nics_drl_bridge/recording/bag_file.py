@@ -123,8 +123,10 @@ def _open_ros_2(path: Path) -> "Iterator[BagFile]":
     # rosbags opens databases by URI, which these characters truncate.
     sign = next((sign for sign in URI_SIGNS if sign in str(place)), None)
     if sign and any(DATABASE in file.suffixes for file in files):
-        fault = f"SQLite can't open what has {sign!r} in its path"
-        raise RecordingError(f"{place}: {fault}; rename the folder.")
+        raise RecordingError(
+            f"{place}: SQLite can't open what has {sign!r} in its path; rename the "
+            "folder."
+        )
     for file in files:
         check_no_device(file)
     # Checked before rosbags reads it, because rosbags unpacks chunks of any size.
@@ -154,12 +156,16 @@ def _find_place(path: Path) -> Path:
         if len(files) != 1:
             if not files:
                 raise RecordingError(f"{path}: holds no bag file; {BAGS}")
-            fault = f"holds {len(files)} bag files and no {METADATA}"
-            raise RecordingError(f"{path}: {fault}; write it with `ros2 bag reindex`.")
+            raise RecordingError(
+                f"{path}: holds {len(files)} bag files and no {METADATA}; write it "
+                "with `ros2 bag reindex`."
+            )
         file = files[0]
     if file.suffix in COMPRESSED:
-        advice = f"unpack it with `zstd -d`, or give the folder with {METADATA}"
-        raise RecordingError(f"{file}: is compressed; {advice}.")
+        raise RecordingError(
+            f"{file}: is compressed; unpack it with `zstd -d`, or give the folder with "
+            f"{METADATA}."
+        )
     return file
 
 
@@ -198,8 +204,10 @@ def _check_storage(file: Path) -> None:
         return
     journal = file.with_name(f"{file.name}-wal")
     if journal.is_file() and journal.stat().st_size > 0:
-        advice = f"stop the recorder, or close it with `sqlite3 {file.name} .quit`"
-        raise ValueError(f"part of it is still in {journal.name}; {advice}")
+        raise ValueError(
+            f"part of it is still in {journal.name}; stop the recorder, or close it "
+            f"with `sqlite3 {file.name} .quit`"
+        )
     place = f"{file.absolute().as_uri()}?mode=ro&immutable=1"
     with closing(sqlite3.connect(place, uri=True)) as base:
         (verdict,) = base.execute("PRAGMA integrity_check(1)").fetchone()
@@ -220,15 +228,19 @@ def _check_summary(reader: "Reader") -> None:
             f"its summary speaks of {total} messages, its files hold {stored_total}"
         )
     if reader.message_count != total:
-        fault = f"its summary speaks of {reader.message_count} messages"
-        raise ValueError(f"{fault}, its topics add up to {total}")
+        raise ValueError(
+            f"its summary speaks of {reader.message_count} messages, its topics add up "
+            f"to {total}"
+        )
     if not all(isinstance(topic, str) and topic for topic, _ in summary):
         raise ValueError("its summary has lost the name of a topic")
     for key in sorted(set(summary + stored), key=str):
         if summary[key] != stored[key]:
             names = (repr(shorten(str(name), LONGEST_NAME)) for name in key)
-            fault = f"topic {' of type '.join(names)} has {stored[key]} messages in its files"
-            raise ValueError(f"{fault}, {summary[key]} by its summary")
+            raise ValueError(
+                f"topic {' of type '.join(names)} has {stored[key]} messages in its "
+                f"files, {summary[key]} by its summary"
+            )
     if reader.compression_mode == "message":
         for storage in storages:
             for _, _, data in storage.messages(storage.connections):
@@ -341,6 +353,7 @@ class BagFile:
                 f"topic {topic!r} has {len(raw)} messages, by the summary {promised}"
             )
         if any(not first <= ns <= last for _, ns, _ in raw):
-            fault = f"topic {topic!r} has messages outside of the time span"
-            raise ValueError(f"{fault} of its summary")
+            raise ValueError(
+                f"topic {topic!r} has messages outside of the time span of its summary"
+            )
         return raw

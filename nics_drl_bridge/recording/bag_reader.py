@@ -15,7 +15,7 @@ from nics_drl_bridge.recording import messages as msgs
 from nics_drl_bridge.recording import topic_roles as roles
 from nics_drl_bridge.recording.bag_file import BagFile, Message, open_bag, read_times
 from nics_drl_bridge.recording.imu_axis import AXES, UpAxis, find_up_axis, to_array
-from nics_drl_bridge.recording.pose_source import guess_pose_source
+from nics_drl_bridge.recording.pose_source import guess_source_by_names
 from nics_drl_bridge.recording.recording import W_FIRST, Recording, check, is_w_first
 from nics_drl_bridge.recording.stamping import (
     SAME_CLOCK_S,
@@ -64,7 +64,7 @@ def load_bag(
                 note = f"imu: by gravity its axis {axis.name} points up, so that is its yaw axis."
                 repairs = (note,)
         latency = measure_latency(bag, topics.get("odom"))
-        measured_by = guess_pose_source(pose, bag.types[pose])
+        measured_by = guess_source_by_names((pose,), bag.types[pose])
     recorded: Any = stamp_streams(data, mapping.stamps, str(path))
     recording = Recording(
         **recorded,
@@ -88,9 +88,10 @@ def _read_rows(
     receive_ns, header_ns = read_times(messages)
     values = np.array([row(m.content) for m in messages], dtype=np.float64)
     for k in np.flatnonzero(~np.isfinite(values).all(axis=1))[:1]:
-        fault = f"topic {topic!r}: message {k} holds NaN or inf"
-        advice = "find out why it was sent, cut the bag there, or choose another topic"
-        raise RecordingError(f"{bag.place}: {fault}; {advice}.")
+        raise RecordingError(
+            f"{bag.place}: topic {topic!r}: message {k} holds NaN or inf; find out why "
+            "it was sent, cut the bag there, or choose another topic."
+        )
     return TopicData(topic, receive_ns, header_ns, values)
 
 
@@ -114,10 +115,11 @@ def _read_command(bag: BagFile, topic: str, spec: RobotSpec) -> TopicData:
     steered = bag.types[topic] in (roles.ACKERMANN, roles.ACKERMANN_STAMPED)
     for variable in spec.command:
         if steered and variable.turns and not variable.steers:
-            fault = f"{bag.place}: topic {topic!r} holds steering angles [rad]"
-            needed = f"{variable.name!r} of robot {spec.name!r} is in {variable.unit}"
-            advice = "choose the robot that drove, or another topic"
-            raise RecordingError(f"{fault}, but {needed}; {advice}.")
+            raise RecordingError(
+                f"{bag.place}: topic {topic!r} holds steering angles [rad], but "
+                f"{variable.name!r} of robot {spec.name!r} is in {variable.unit}; "
+                "choose the robot that drove, or another topic."
+            )
     data = _read_rows(bag, topic, msgs.read_command)
     if steered:
         commands = spec.from_fields(data.values)
@@ -136,9 +138,10 @@ def _read_pose(bag: BagFile, topic: str, mapping: TopicRoles) -> TopicData:
     with np.errstate(over="ignore"):
         length = np.linalg.norm(quaternions, axis=1)
     for k in np.flatnonzero(~(np.abs(length - 1.0) < QUATERNION_TOLERANCE))[:1]:
-        fault = f"message {k}: the quaternion has the length {length[k]:.3f} and not 1"
-        advice = "check its publisher, or choose another topic"
-        raise RecordingError(f"{bag.place}: topic {topic!r}: {fault}; {advice}.")
+        raise RecordingError(
+            f"{bag.place}: topic {topic!r}: message {k}: the quaternion has the length "
+            f"{length[k]:.3f} and not 1; check its publisher, or choose another topic."
+        )
     if is_w_first(quaternions):
         raise RecordingError(f"{bag.place}: topic {topic!r}: {W_FIRST}.")
     return _read_rows(bag, topic, msgs.read_pose, messages)
@@ -175,10 +178,11 @@ def select_transforms(
     if frame or child:
         problem += " with the given names"
     frames = ", ".join(sorted(" -> ".join(pair) for pair in transforms)) or "none"
-    fault = f"{bag.place}: topic {topic!r} holds {problem}"
-    example = "as in `frame: world` and `child_frame: base_link`"
-    advice = f"write those of the robot into the topics file or the map, {example}"
-    raise RecordingError(f"{fault}; {advice}; it holds {frames}.")
+    raise RecordingError(
+        f"{bag.place}: topic {topic!r} holds {problem}; write those of the robot into "
+        "the topics file or the map, as in `frame: world` and `child_frame: "
+        f"base_link`; it holds {frames}."
+    )
 
 
 def read_joint_streams(
@@ -233,8 +237,10 @@ def extract_state(
     """
     names = [variable.name for variable in spec.state]
     for name in sorted(mapping.state.keys() - set(names)):
-        fault = f"robot {spec.name!r} has no state {name!r}"
-        raise RecordingError(f"{place}: topics: {fault}; {suggest(name, names)}")
+        raise RecordingError(
+            f"{place}: topics: robot {spec.name!r} has no state {name!r}; "
+            f"{suggest(name, names)}"
+        )
     columns = []
     sources = []
     for variable in spec.state:
@@ -245,11 +251,9 @@ def extract_state(
         elif mapping.state or any(variable.must_be_measured for variable in spec.state):
             fault = f"no joint is known for the state {variable.name!r}"
             others = ", ".join(joints.names) or "none"
-            advice = (
-                f"name it in the topics file, as in state: {{{variable.name}: JOINT}}"
-            )
             raise RecordingError(
-                f"{place}: {fault}; the joints of {joints.topic!r} are {others}: {advice}."
+                f"{place}: {fault}; the joints of {joints.topic!r} are {others}: name "
+                f"it in the topics file, as in state: {{{variable.name}: JOINT}}."
             )
     if not names or len(columns) < len(names):
         return None
@@ -297,8 +301,10 @@ def _find_joint(
 
 def _get_joint_index(joints: Joints, name: str, place: str) -> int:
     if name not in joints.names:
-        fault = f"topic {joints.topic!r} has no joint {name!r}"
-        raise RecordingError(f"{place}: {fault}; {suggest(name, joints.names)}")
+        raise RecordingError(
+            f"{place}: topic {joints.topic!r} has no joint {name!r}; "
+            f"{suggest(name, joints.names)}"
+        )
     return joints.names.index(name)
 
 
@@ -320,9 +326,11 @@ def _select_complete(
 ) -> TopicData:
     keep = np.asarray(np.isfinite(values).all(axis=1))
     if not keep.any():
-        fault = f"no message tells the position or velocity that is needed of {', '.join(names)}"
-        advice = "check what the joints' driver publishes"
-        raise RecordingError(f"{place}: topic {joints.topic!r}: {fault}; {advice}.")
+        raise RecordingError(
+            f"{place}: topic {joints.topic!r}: no message tells the position or "
+            f"velocity that is needed of {', '.join(names)}; check what the joints' "
+            "driver publishes."
+        )
     return TopicData(joints.topic, joints.receive_ns, joints.header_ns, values).rows(
         keep
     )

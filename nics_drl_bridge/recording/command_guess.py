@@ -6,16 +6,17 @@ that may be a command is listed as a candidate. Measurements are neither.
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from nics_drl_bridge.recording import topic_roles
+from nics_drl_bridge.recording.column_guess import Place
 from nics_drl_bridge.recording.mapping import NO_COMMANDS
 from nics_drl_bridge.recording.names import split_words, word_set
 from nics_drl_bridge.recording.pose_guess import PoseGuess, list_used_columns
 from nics_drl_bridge.recording.survey import Survey, TableSurvey, split_unit
-from nics_drl_bridge.recording.table import Column
 from nics_drl_bridge.robot.spec import find_kind, list_kinds
 from nics_drl_bridge.robot.template import list_names
 
@@ -103,11 +104,10 @@ POSSIBLE = 1
 MOST_CANDIDATES = 8
 
 
-class Candidate(NamedTuple):
+@dataclass(frozen=True)
+class Candidate(Place):
     """A column that was or may have been sent to the robot."""
 
-    table: TableSurvey
-    column: Survey
     meaning: str | None  # such as `speed` or `front_left`; None if it is unclear
     strength: int  # CERTAIN, LIKELY or POSSIBLE
     rank: int = 0  # among those of the same strength
@@ -121,11 +121,6 @@ class Candidate(NamedTuple):
     def merit(self) -> tuple[bool, int, int]:
         """Key that ranks columns of the same meaning."""
         return not self.is_still, self.strength, self.rank
-
-    @property
-    def values(self) -> Column:
-        """The values (T,) of the column."""
-        return self.table.data[self.column.name]
 
 
 class CommandGuess(NamedTuple):
@@ -159,12 +154,8 @@ def guess_command(
     if not certain:
         kind, commands = _choose_kind(list(_find_wheels(tables)))
         if kind is not None:
-            wheels = {(id(c.table), c.column.name) for c in commands.values()}
-            others = [
-                candidate
-                for candidate in candidates
-                if (id(candidate.table), candidate.column.name) not in wheels
-            ]
+            wheels = [wheel.key for wheel in commands.values()]
+            others = [column for column in candidates if column.key not in wheels]
             named = _choose_kind(others)[1]
             return CommandGuess(kind, commands, named, of_wheels=True)
     if not candidates:
@@ -243,7 +234,7 @@ def _find_unexplained(
 
 def _counts_rows(table: TableSurvey, column: Survey) -> bool:
     """True for a column without a name that numbers the rows."""
-    steps = np.diff(table.data[column.name].astype(np.float64))
+    steps = np.diff(table.get_numbers(column.name))
     return column.name.isdecimal() and bool((steps == 1.0).all())
 
 
@@ -315,7 +306,7 @@ def _accept_steering(candidates: Sequence[Candidate]) -> list[Candidate]:
         words = candidate.table.list_words(candidate.column.name)
         if has_throttle and words in (["steering"], ["steer"]):
             strength = max(candidate.strength, LIKELY)
-            candidate = candidate._replace(strength=strength)
+            candidate = replace(candidate, strength=strength)
         accepted.append(candidate)
     return accepted
 

@@ -71,11 +71,10 @@ def split_table(source: Source, mapping: Mapping) -> list[EpisodeOfTable]:
             label = _format_label(values[k])
             episodes.append(EpisodeOfTable(source, table, name, rows, label))
     if not episodes:
-        fault = (
-            f"no value of the column {reference!r} lasts for {MIN_EPISODE_ROWS} rows"
+        raise ConfigError(
+            f"{table.place}: no value of the column {reference!r} lasts for "
+            f"{MIN_EPISODE_ROWS} rows; name the column that numbers the episodes."
         )
-        advice = "name the column that numbers the episodes"
-        raise ConfigError(f"{table.place}: {fault}; {advice}.")
     return episodes
 
 
@@ -88,8 +87,10 @@ def split_by_time(
     different clocks.
     """
     if recording.pose.clock != recording.command.clock:
-        fault = f"{source.place}: episode: pose and commands have clocks of their own"
-        raise ConfigError(f"{fault}; give each episode as a recording of its own.")
+        raise ConfigError(
+            f"{source.place}: episode: pose and commands have clocks of their own; "
+            "give each episode as a recording of its own."
+        )
     reader = MappedReader(source, mapping)
     table, which = reader.locate(mapping.episode or 0)
     column = table.column(which)

@@ -358,9 +358,11 @@ def predict_motion(spec: RobotSpec) -> ExpectedMotion:
         )
     for command in spec.command:
         if not command.is_twist:
-            fault = f"where {command.name!r} in {command.unit} leads can't be predicted"
-            advice = "add `textbook:` and its `parameters:` to the robot's YAML file"
-            raise ConfigError(f"robot {spec.name!r}: {fault}; {advice}.")
+            raise ConfigError(
+                f"robot {spec.name!r}: where {command.name!r} in {command.unit} leads "
+                "can't be predicted; add `textbook:` and its `parameters:` to the "
+                "robot's YAML file."
+            )
     return ExpectedMotion(
         len(spec.state),
         lambda state, *_: state,
@@ -410,8 +412,8 @@ class DrivePlan:
             pattern = drive.simulate() if drive.keep_within > 0.0 else None
             if pattern is not None:
                 return number, pattern
-        circle = f"bound {self.bound:g}: a circle of {self.bound:g} m around the start is too small"
-        motion = f"for robot {self.robot.name!r} to show its motion within {self.duration:g} s"
         raise ConfigError(
-            f"{circle} {motion}; give it more space, less speed, or more time."
+            f"bound {self.bound:g}: a circle of {self.bound:g} m around the start is "
+            f"too small for robot {self.robot.name!r} to show its motion within "
+            f"{self.duration:g} s; give it more space, less speed, or more time."
         )

@@ -6,6 +6,14 @@ from typing import NamedTuple
 import numpy as np
 
 from nics_drl_bridge.geometry import Array, east_and_north
+from nics_drl_bridge.recording.column_guess import (
+    Place,
+    Switch,
+    guess_episode,
+    guess_switches,
+    guess_yaw_rate,
+    write_imu_line,
+)
 from nics_drl_bridge.recording.command_guess import (
     TICKS,
     Candidate,
@@ -13,8 +21,6 @@ from nics_drl_bridge.recording.command_guess import (
     find_look_alikes,
     guess_command,
 )
-from nics_drl_bridge.recording.episode_guess import guess_episode
-from nics_drl_bridge.recording.imu_guess import guess_yaw_rate, write_imu_line
 from nics_drl_bridge.recording.mapped import POSES
 from nics_drl_bridge.recording.mapping import UNITS
 from nics_drl_bridge.recording.motion_check import find_doubts
@@ -27,7 +33,6 @@ from nics_drl_bridge.recording.pose_guess import (
 )
 from nics_drl_bridge.recording.recording import compute_heading, find_implausible_pose
 from nics_drl_bridge.recording.survey import Survey, TableSurvey, split_unit
-from nics_drl_bridge.recording.switch_guess import Switch, guess_switches
 
 GUESSED = "# guessed"
 NO_COMMAND = (
@@ -50,8 +55,8 @@ class _Guesses(NamedTuple):
     pose: PoseGuess | None
     guess: CommandGuess
     switches: tuple[Switch, ...]
-    gyro: tuple[TableSurvey, Survey] | None
-    episode: tuple[TableSurvey, Survey] | None
+    gyro: Place | None
+    episode: Place | None
     common_time: str | None  # the stamps of most tables, for the whole mapping
 
     @property
@@ -90,7 +95,9 @@ def propose_mapping(tables: Sequence[TableSurvey]) -> MappingDraft:
     switches: tuple[Switch, ...] = ()
     if guess.listed:
         switches = guess_switches(tables)
-    gyro = _find_free_yaw_rate(tables, guess)
+    gyro = guess_yaw_rate(tables)
+    if gyro and any(gyro.key == command.key for command in guess.listed.values()):
+        gyro = None
     episode = guess_episode(tables)
     guesses = _Guesses(tables, pose, guess, switches, gyro, episode, common_time)
     doubts = [*_find_doubts(guess, poses, str(common_time))]
@@ -104,17 +111,13 @@ def propose_mapping(tables: Sequence[TableSurvey]) -> MappingDraft:
             f"time: {{rate: 50}}  {GUESSED}: no stamps were found; rows a second"
         )
     if episode is not None:
-        table, column = episode
-        lines.append(
-            f"episode: {table.refer_to(column.name, guesses.is_single)}  {GUESSED}"
-        )
+        lines.append(f"episode: {episode.refer_to(guesses.is_single)}  {GUESSED}")
     lines += pose_lines
     lines += _write_clock(pose, guess.listed)
     lines += _write_commands(guesses)
     if gyro is not None:
-        lines.append(
-            f"{write_imu_line(*gyro, guesses.is_single, common_time)}  {GUESSED}"
-        )
+        line = write_imu_line(gyro, guesses.is_single, common_time)
+        lines.append(f"{line}  {GUESSED}")
     return MappingDraft(doubts, lines, [*_list_unused(guesses)])
 
 
@@ -139,11 +142,15 @@ def _find_doubts(
 
 def _write_robot(guess: CommandGuess) -> str:
     if guess.kind is None:
-        example = f"{{kind: differential, footprint_radius: {USUAL_RADIUS}}}"
-        return f"robot:  # which kind is not certain, as in {example}"
+        return (
+            "robot:  # which kind is not certain, as in {kind: differential, "
+            f"footprint_radius: {USUAL_RADIUS}}}"
+        )
     look_alikes = "".join(f", or {kind}" for kind in find_look_alikes(guess.kind))
-    robot = f"robot: {{kind: {guess.kind}, footprint_radius: {USUAL_RADIUS}}}"
-    return f"{robot}  {GUESSED}{look_alikes}; radius in m"
+    return (
+        f"robot: {{kind: {guess.kind}, footprint_radius: {USUAL_RADIUS}}}  "
+        f"{GUESSED}{look_alikes}; radius in m"
+    )
 
 
 def _write_commands(guesses: _Guesses) -> Iterator[str]:
@@ -177,15 +184,14 @@ def _write_commands(guesses: _Guesses) -> Iterator[str]:
 
 def _write_value(name: str, candidate: Candidate, when: str, guesses: _Guesses) -> str:
     """Returns a command as written in a mapping: a column, or a column with more keys."""
-    table = candidate.table
-    column = candidate.column
-    reference = table.refer_to(column.name, guesses.is_single)
-    keys = [*_write_unit_keys(name, column)]
+    time = candidate.table.time
+    reference = candidate.refer_to(guesses.is_single)
+    keys = [*_write_unit_keys(name, candidate.column)]
     # A switch cuts off the motor; the steering stays as it is.
     if when and "steer" not in name:
         keys.append(when)
-    if table.time not in (guesses.common_time, None):
-        keys.append(f"time: {table.time}")
+    if time not in (guesses.common_time, None):
+        keys.append(f"time: {time}")
     if not keys:
         return reference
     return f"{{from: {reference}, {', '.join(keys)}}}"
@@ -235,32 +241,17 @@ def _write_clock(
         yield f"{line}: one counts from its first row, and in another unit"
 
 
-def _find_free_yaw_rate(
-    tables: Sequence[TableSurvey], guess: CommandGuess
-) -> tuple[TableSurvey, Survey] | None:
-    """Returns the yaw rate of a gyro, unless it may be a command."""
-    gyro = guess_yaw_rate(tables)
-    if gyro is None:
-        return None
-    table, column = gyro
-    for candidate in guess.listed.values():
-        if candidate.table is table and candidate.column.name == column.name:
-            return None
-    return gyro
-
-
 def _list_unused(guesses: _Guesses) -> Iterator[str]:
     """Yields a text for each table with the columns of values that the draft does not use."""
     guess = guesses.guess
-    used = {
-        (id(candidate.table), candidate.column.name)
-        for candidate in (*guess.commands.values(), *guess.candidates.values())
-    }
-    for switch in guesses.switches:
-        used.add((id(switch.table), switch.column))
-    for pair in (guesses.gyro, guesses.episode):
-        if pair is not None:
-            used.add((id(pair[0]), pair[1].name))
+    places = [
+        *guess.commands.values(),
+        *guess.candidates.values(),
+        *guesses.switches,
+        guesses.gyro,
+        guesses.episode,
+    ]
+    used = [place.key for place in places if place is not None]
     for table in guesses.tables:
         used_here = list_used_columns(table, guesses.pose)
         unused = []
@@ -333,7 +324,7 @@ def _compute_poses(
     table = pose.table
     if table.t is None:
         return None
-    columns = [table.data[name].astype(np.float64) for name in pose.columns]
+    columns = [table.get_numbers(name) for name in pose.columns]
     # The columns may be of several streams.
     if any(len(column) != len(table.t) for column in columns):
         return None

@@ -4,7 +4,7 @@ Wheels slip when a robot turns, so odometry may report too much or too little tu
 not slip, but has a bias, which shows while the wheels stand still.
 """
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,24 +43,30 @@ CLEARLY = 3.0  # standard errors
 
 
 @dataclass(frozen=True)
-class Turning:
-    """Comparison of a robot's turns by odometry and by gyro."""
+class GyroBias:
+    """The bias of a gyro."""
 
     bias: float  # bias of the gyro in the middle of its rests or of the drive [rad/s]
     bias_std: float  # [rad/s]
     bias_slope: float  # its change [rad/s^2]; 0 if none shows
     bias_time: float  # time to which `bias` belongs [s]
     rest_s: float  # time at rest that shows the bias; 0 if the drive shows it
+
+    def compute_bias(self, t: Array) -> Array:
+        """Returns the bias (T,) at times (T,) [s]."""
+        return np.asarray(self.bias + self.bias_slope * (t - self.bias_time))
+
+
+@dataclass(frozen=True)
+class Turning(GyroBias):
+    """Comparison of a robot's turns by odometry and by gyro."""
+
     scale: float  # odometry's turn per turn of the gyro; NaN if the robot turned too little
     scale_std: float
     alike: float  # correlation of both rates; NaN if the robot turned too little
     window_s: float
     apart: float  # root mean square disagreement after `window_s` [rad]; NaN if the drive is short
     apart_std: float  # what the gyro's bias and scale may contribute to that [rad]
-
-    def compute_bias(self, t: Array) -> Array:
-        """Returns the bias (T,) at times (T,) [s]."""
-        return np.asarray(self.bias + self.bias_slope * (t - self.bias_time))
 
     @property
     def compared(self) -> bool:
@@ -112,23 +118,19 @@ def compare_turning(
     blocks = _split_blocks(t, pose, gyro_t, yaw_rate)
     if len(blocks.span) < FEWEST_BLOCKS:
         return None
-    bias, bias_std, slope, bias_time, rest_s = _estimate_bias(blocks)
-    unbiased = blocks.gyro_rate - (bias + slope * (blocks.middle - bias_time))
+    bias = _estimate_bias(blocks)
+    unbiased = blocks.gyro_rate - bias.compute_bias(blocks.middle)
     scale, scale_std, alike = _estimate_scale(blocks.odom_rate, unbiased, blocks.span)
     apart = _compute_rms(blocks, blocks.odom_rate - unbiased, window_s)
     turned = _compute_rms(blocks, unbiased, window_s)
     return Turning(
-        bias=bias,
-        bias_std=bias_std,
-        bias_slope=slope,
-        bias_time=bias_time,
-        rest_s=rest_s,
+        **asdict(bias),
         scale=scale,
         scale_std=scale_std,
         alike=alike,
         window_s=window_s,
         apart=apart,
-        apart_std=float(np.hypot(bias_std * window_s, GYRO_SCALE_STD * turned)),
+        apart_std=float(np.hypot(bias.bias_std * window_s, GYRO_SCALE_STD * turned)),
     )
 
 
@@ -206,8 +208,7 @@ def _split_blocks(t: Array, pose: Array, gyro_t: Array, yaw_rate: Array) -> _Blo
     )
 
 
-def _estimate_bias(blocks: _Blocks) -> tuple[float, float, float, float, float]:
-    """Returns the gyro's bias, its deviation, slope and time, and how long it was at rest."""
+def _estimate_bias(blocks: _Blocks) -> GyroBias:
     rest = (blocks.speed < STANDING_MPS) & (np.abs(blocks.odom_rate) < STANDING_RADPS)
     if rest.sum() < FEWEST_AT_REST:
         return _estimate_bias_while_driving(blocks)
@@ -222,24 +223,23 @@ def _estimate_bias(blocks: _Blocks) -> tuple[float, float, float, float, float]:
     when = when[near]
     middle = float(when.mean())
     bias = float(rate.mean())
-    std = max(float(rate.std() / np.sqrt(len(rate))), LEAST_BIAS_STD)
-    apart = when - middle
-    if len(rate) < FEWEST_TO_DRIFT or float(np.ptp(when)) < DRIFT_SPAN_S:
-        return bias, std, 0.0, middle, rest_s
-    power = float(apart @ apart)
-    slope = float(apart @ rate) / power
-    left = rate - bias - slope * apart
-    slope_std = max(float(left.std()), LEAST_BIAS_STD) / np.sqrt(power)
-    if abs(slope) < DRIFTS * slope_std:
-        return bias, std, 0.0, middle, rest_s
+    left = rate - bias
+    slope = 0.0
+    if len(rate) >= FEWEST_TO_DRIFT and float(np.ptp(when)) >= DRIFT_SPAN_S:
+        apart = when - middle
+        power = float(apart @ apart)
+        drift = float(apart @ rate) / power
+        drifted = left - drift * apart
+        drift_std = max(float(drifted.std()), LEAST_BIAS_STD) / np.sqrt(power)
+        if abs(drift) >= DRIFTS * drift_std:
+            slope = drift
+            left = drifted
     std = max(float(left.std() / np.sqrt(len(rate))), LEAST_BIAS_STD)
-    return bias, std, slope, middle, rest_s
+    return GyroBias(bias, std, slope, middle, rest_s)
 
 
-def _estimate_bias_while_driving(
-    blocks: _Blocks,
-) -> tuple[float, float, float, float, float]:
-    """Fits the bias together with a factor on odometry's turns; returns like `_estimate_bias`."""
+def _estimate_bias_while_driving(blocks: _Blocks) -> GyroBias:
+    """Fits the bias together with a factor on odometry's turns."""
     # A robot that turns at only one rate does not show both, so both have priors.
     chi = np.stack([np.ones_like(blocks.odom_rate), blocks.odom_rate], axis=1)
     coefficients, *_ = np.linalg.lstsq(chi, blocks.gyro_rate, rcond=None)
@@ -252,7 +252,8 @@ def _estimate_bias_while_driving(
     spread = np.linalg.inv(chi.T @ chi / noise + np.diag(deviation**-2.0))
     bias = (spread @ (chi.T @ blocks.gyro_rate / noise + usual / deviation**2))[0]
     std = float(np.sqrt(spread[0, 0]))
-    return float(bias), max(std, LEAST_BIAS_STD), 0.0, float(blocks.middle.mean()), 0.0
+    std = max(std, LEAST_BIAS_STD)
+    return GyroBias(float(bias), std, 0.0, float(blocks.middle.mean()), 0.0)
 
 
 def _estimate_scale(

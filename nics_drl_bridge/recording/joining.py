@@ -87,9 +87,10 @@ def _check_alike(recordings: Sequence[Recording]) -> None:
         if counts[0] != counts[1] or first.variables != recording.variables:
             names = ", ".join(recording.variables) or f"{counts[1]} commands"
             first_names = ", ".join(first.variables) or f"{counts[0]} commands"
-            fault = f"{recording.source}: has {names}, {first.source} has {first_names}"
-            advice = "join only drives of one robot, by one mapping"
-            raise RecordingError(f"{fault}; {advice}.")
+            raise RecordingError(
+                f"{recording.source}: has {names}, {first.source} has {first_names}; "
+                "join only drives of one robot, by one mapping."
+            )
 
 
 def _split_recording(recording: Recording) -> list[_Part]:
@@ -105,9 +106,9 @@ def _split_recording(recording: Recording) -> list[_Part]:
     begin = max(float(pose[0]), float(recording.command.t[0]))
     end = float(pose[-1])
     if not begin < end:
-        fault = "its commands and poses share no time"
         raise RecordingError(
-            f"{recording.source}: {fault}; check that they are of one drive."
+            f"{recording.source}: its commands and poses share no time; check that "
+            "they are of one drive."
         )
     if end - begin < SHORTEST_SPLIT_S:
         return [_Part(recording, begin, end, True, recording.source)]
@@ -172,9 +173,10 @@ def _cut_part(part: _Part, names: Sequence[str]) -> dict[str, Stream]:
             continue
         rows = (stream.t >= part.start_s) & (stream.t <= part.end_s)
         if rows.sum() < 2:
-            where = f"between {part.start_s:.1f} and {part.end_s:.1f} s"
-            fault = f"{part.source}: has no {name} {where}"
-            raise RecordingError(f"{fault}; leave this recording, or its {name}, out.")
+            raise RecordingError(
+                f"{part.source}: has no {name} between {part.start_s:.1f} and "
+                f"{part.end_s:.1f} s; leave this recording, or its {name}, out."
+            )
         cut[name] = stream.rows(rows)
     return cut
 
@@ -236,8 +238,12 @@ def _describe_join(sources: Sequence[str], is_split: bool) -> tuple[str, ...]:
     split = "all of them were fitted because they are too short to hold a part out"
     if is_split:
         split = "the last third of each was held out of the first fit"
-    joined = f"{len(sources)} drives were joined ({names})"
-    return (f"{joined}: {split}; no prediction crosses over.",)
+    return (
+        (
+            f"{len(sources)} drives were joined ({names}): {split}; no prediction crosses "
+            "over."
+        ),
+    )
 
 
 def _collect_repairs(

@@ -186,8 +186,10 @@ def _check_units(reader: MappedReader, pose: Stream) -> None:
     if time:
         column = str(time.columns[0])
     line = fault.line.replace("...", column)
-    problem = f"{reader.source.place}: pose: {fault.reason}; {fault.cause}"
-    raise RecordingError(f"{problem}: write `{line}` into the mapping, below `pose:`.")
+    raise RecordingError(
+        f"{reader.source.place}: pose: {fault.reason}; {fault.cause}: write `{line}` "
+        "into the mapping, below `pose:`."
+    )
 
 
 def _read_measured(reader: MappedReader, name: str, stream: Measured) -> Stream:
@@ -261,24 +263,28 @@ def _read_heading(
     length = np.linalg.norm(stream.values, axis=1)
     is_lost = length < NO_LENGTH
     if is_lost.any() and is_lost.mean() <= MOST_UNTRACKED:
-        lost = f"{int(is_lost.sum())} of {len(is_lost)} rows without orientation"
-        reader.add_notes(f"pose: {lost} were left out.")
+        reader.add_notes(
+            f"pose: {int(is_lost.sum())} of {len(is_lost)} rows without orientation "
+            "were left out."
+        )
         stream = stream.rows(~is_lost)
         length = length[~is_lost]
     for row in np.flatnonzero(np.abs(length - 1.0) > QUATERNION_TOLERANCE)[:1]:
-        since = f"{stream.t[row] - stream.t[0]:.3f} s from the start"
-        fault = f"{since} the quaternion has the length {length[row]:.3f} and not 1"
-        advice = "list its columns in the order x, y, z, w"
-        raise RecordingError(f"{place}: {fault}; {advice}.")
+        raise RecordingError(
+            f"{place}: {stream.t[row] - stream.t[0]:.3f} s from the start the "
+            f"quaternion has the length {length[row]:.3f} and not 1; list its columns "
+            "in the order x, y, z, w."
+        )
     if recordings.is_w_first(stream.values):
         raise RecordingError(f"{place}: {recordings.W_FIRST}.")
     x, y, z, w = stream.values.T
     cosine = np.clip(np.abs(1.0 - 2.0 * (x * x + y * y)), 0.0, 1.0)
     tilt = np.degrees(np.median(np.arccos(cosine)))
     if tilt > MOST_TILT_DEG:
-        fault = f"by its quaternion the body is tilted by {tilt:.0f} deg"
-        advice = "list its columns in the order x, y, z, w, or, if y is up, as [qz, qx, qy, qw]"
-        raise RecordingError(f"{place}: {fault}; {advice}.")
+        raise RecordingError(
+            f"{place}: by its quaternion the body is tilted by {tilt:.0f} deg; list "
+            "its columns in the order x, y, z, w, or, if y is up, as [qz, qx, qy, qw]."
+        )
     return Series(stream.t, recordings.compute_heading(x, y, z, w), stream.clock)
 
 
@@ -307,9 +313,10 @@ def _complete_pose(reader: MappedReader, pose: PoseSource) -> PoseSource:
         if covariance is not None and "covariance" not in mapped:
             keys["covariance"] = covariance
         return PoseSource.model_validate({**mapped, **keys})
-    fault = f"{table.place}: its messages are no poses of a known form"
-    advice = "name x, y and heading or quaternion in the mapping"
-    raise RecordingError(f"{fault}; {advice}.")
+    raise RecordingError(
+        f"{table.place}: its messages are no poses of a known form; name x, y and "
+        "heading or quaternion in the mapping."
+    )
 
 
 def _read_deviations(
@@ -323,8 +330,10 @@ def _read_deviations(
         table, field = reader.locate(references, pose.in_)
         count = sum(name.startswith(f"{field}[") for name in table.names)
         if count not in schema.COVARIANCES:
-            fault = f"{table.place}: {field!r} has {count} numbers"
-            raise RecordingError(f"{fault}; a covariance has 3, 9 or 36.")
+            raise RecordingError(
+                f"{table.place}: {field!r} has {count} numbers; a covariance has 3, 9 "
+                "or 36."
+            )
         references = [f"{references}[{k}]" for k in range(count)]
     columns = []
     for k in schema.COVARIANCES[len(references)]:
@@ -384,12 +393,11 @@ def _find_spans(
         last = float(stream.t[-1])
         start, stop = spans.get(stream.clock, (first, last))
         if first > stop or last < start:
-            fault = f"{place}: {name} lasts from {first:.3f} to {last:.3f} s"
-            others = (
-                f"the streams before it from {start:.3f} to {stop:.3f} s, on one clock"
+            raise RecordingError(
+                f"{place}: {name} lasts from {first:.3f} to {last:.3f} s, the streams "
+                f"before it from {start:.3f} to {stop:.3f} s, on one clock; check "
+                "their `time:`, or give one of them a `clock:` of its own."
             )
-            advice = "check their `time:`, or give one of them a `clock:` of its own"
-            raise RecordingError(f"{fault}, {others}; {advice}.")
         spans[stream.clock] = min(first, start), max(last, stop)
     return spans
 
@@ -398,11 +406,14 @@ def _check_durations(streams: dict[str, Stream], place: str) -> None:
     """Refuses streams that last far longer or shorter than the pose, as with a wrong unit."""
     pose_s = float(np.ptp(streams["pose"].t))
     if pose_s < MIN_POSE_S:
-        advice = "give the `unit:` of its `time:`, as s, min or h"
-        raise RecordingError(f"{place}: the pose lasts {pose_s:.3g} s; {advice}.")
+        raise RecordingError(
+            f"{place}: the pose lasts {pose_s:.3g} s; give the `unit:` of its `time:`, "
+            "as s, min or h."
+        )
     for name, stream in streams.items():
         duration_s = float(np.ptp(stream.t))
         if duration_s and not 1.0 / MOST_RATIO < duration_s / pose_s < MOST_RATIO:
-            fault = f"{place}: {name} lasts {duration_s:.4g} s, the pose {pose_s:.4g} s"
-            advice = "give the `unit:` of the `time:` that is wrong"
-            raise RecordingError(f"{fault}; {advice}.")
+            raise RecordingError(
+                f"{place}: {name} lasts {duration_s:.4g} s, the pose {pose_s:.4g} s; "
+                "give the `unit:` of the `time:` that is wrong."
+            )

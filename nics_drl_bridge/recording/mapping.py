@@ -20,47 +20,57 @@ class UnitOfData(NamedTuple):
     factor: float
 
 
-def _make_units(si: str, **factors: float) -> dict[str, UnitOfData]:
-    return {
-        name.replace("_per_", "/"): UnitOfData(si, factor)
-        for name, factor in factors.items()
-    }
-
-
+# SI value of each unit, by its SI unit
+FACTORS: dict[str, dict[str, float]] = {
+    "m": {
+        "m": 1.0,
+        "dm": 1e-1,
+        "cm": 1e-2,
+        "mm": 1e-3,
+        "um": 1e-6,
+        "km": 1e3,
+        "ft": 0.3048,
+        "in": 0.0254,
+    },
+    "rad": {"rad": 1.0, "mrad": 1e-3, "deg": TURN / 360.0, "rev": TURN},
+    "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0},
+    "m/s": {
+        "m/s": 1.0,
+        "cm/s": 1e-2,
+        "mm/s": 1e-3,
+        "mph": 0.44704,
+        "knots": 1852.0 / 3600.0,
+        "km/h": 1.0 / 3.6,
+        "kmh": 1.0 / 3.6,
+        "kph": 1.0 / 3.6,
+        "ft/s": 0.3048,
+    },
+    "rad/s": {
+        "rad/s": 1.0,
+        "deg/s": TURN / 360.0,
+        "rpm": TURN / 60.0,
+        "rev/s": TURN,
+        "mrad/s": 1e-3,
+    },
+    "m/s^2": {
+        "m/s^2": 1.0,
+        "cm/s^2": 1e-2,
+        "mm/s^2": 1e-3,
+        "g": 9.80665,
+        "mg": 9.80665e-3,
+    },
+    "V": {"V": 1.0, "mV": 1e-3},
+    "A": {"A": 1.0, "mA": 1e-3},
+    "N": {"N": 1.0},
+    "N*m": {"N*m": 1.0},
+    "1": {"1": 1.0, "share": 1.0, "%": 1e-2},
+    "ticks": {"ticks": 1.0},
+    "ticks/s": {"ticks/s": 1.0},
+}
 UNITS = {
-    **_make_units("m", m=1.0, dm=1e-1, cm=1e-2, mm=1e-3, um=1e-6, km=1e3, ft=0.3048),
-    "in": UnitOfData("m", 0.0254),
-    **_make_units("rad", rad=1.0, mrad=1e-3, deg=TURN / 360.0, rev=TURN),
-    **_make_units("s", s=1.0, ms=1e-3, us=1e-6, ns=1e-9, min=60.0, h=3600.0),
-    **_make_units(
-        "m/s",
-        m_per_s=1.0,
-        cm_per_s=1e-2,
-        mm_per_s=1e-3,
-        mph=0.44704,
-        knots=1852.0 / 3600.0,
-    ),
-    **_make_units(
-        "m/s", km_per_h=1.0 / 3.6, kmh=1.0 / 3.6, kph=1.0 / 3.6, ft_per_s=0.3048
-    ),
-    **_make_units(
-        "rad/s", rad_per_s=1.0, deg_per_s=TURN / 360.0, rpm=TURN / 60.0, rev_per_s=TURN
-    ),
-    **_make_units("rad/s", mrad_per_s=1e-3),
-    "m/s^2": UnitOfData("m/s^2", 1.0),
-    "cm/s^2": UnitOfData("m/s^2", 1e-2),
-    "mm/s^2": UnitOfData("m/s^2", 1e-3),
-    "g": UnitOfData("m/s^2", 9.80665),
-    "mg": UnitOfData("m/s^2", 9.80665e-3),
-    **_make_units("V", V=1.0, mV=1e-3),
-    **_make_units("A", A=1.0, mA=1e-3),
-    **_make_units("N", N=1.0),
-    "N*m": UnitOfData("N*m", 1.0),
-    "1": UnitOfData("1", 1.0),
-    "share": UnitOfData("1", 1.0),
-    "%": UnitOfData("1", 1e-2),
-    "ticks": UnitOfData("ticks", 1.0),
-    "ticks/s": UnitOfData("ticks/s", 1.0),
+    name: UnitOfData(si, factor)
+    for si, factors in FACTORS.items()
+    for name, factor in factors.items()
 }
 SHARES = ("share", "%", "1")
 TICKS = {"ticks": "rad", "ticks/s": "rad/s"}

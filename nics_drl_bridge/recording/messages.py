@@ -43,9 +43,9 @@ def check_libraries(path: Path, what: str, instead: str = "") -> None:
     """Raises RecordingError if a library that `reading` or `writing` a bag needs is missing."""
     for library in LIBRARIES:
         if find_spec(library) is None:
-            advice = f"install it with pip install 'nics_drl_bridge[bags]'{instead}"
             raise RecordingError(
-                f"{path}: {what} a bag needs the library {library}; {advice}."
+                f"{path}: {what} a bag needs the library {library}; install it with "
+                f"pip install 'nics_drl_bridge[bags]'{instead}."
             )
 
 

@@ -82,7 +82,7 @@ def _compute_likeness(
     """Returns the correlation of a signal (K,) at t (K,) with a command, for each lag (L,) [s]."""
     table = candidate.table
     column = candidate.column
-    values = table.data[column.name].astype(np.float64)
+    values = table.get_numbers(column.name)
     if table.t is None or len(table.t) != len(values) or column.low == column.high:
         return None
     order = np.argsort(table.t, kind="stable")

@@ -187,7 +187,7 @@ def _find_heading_called_z(
     z = names.get((*place[:-1], "z"))
     if z is None or not _is_in(z, ["rad"]):
         return None
-    values = table.data[z].astype(np.float64)
+    values = table.get_numbers(z)
     values = values[np.isfinite(values)]
     is_angle = np.all((values > -3.3) & (values < 6.4))
     if is_angle and (np.abs(np.diff(values)) > NEARLY_A_TURN).any():

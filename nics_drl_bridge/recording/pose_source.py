@@ -17,11 +17,6 @@ ODOMETRY = re.compile(r"odom|wheel|encoder|dead_?reckon", re.IGNORECASE)
 TRACKERS_TYPES = (roles.POSE, roles.POSE_COVARIANCE, roles.TRANSFORM)
 
 
-def guess_pose_source(name: str, kind: str) -> MeasuredBy:
-    """Guesses what measured the poses of a topic or table by its name, and its type if any."""
-    return guess_source_by_names((name,), kind)
-
-
 def guess_source_by_names(names: Iterable[str], kind: str) -> MeasuredBy:
     """Guesses what measured poses by all names that belong to them; empty if it is unclear."""
     names = [*names]

@@ -59,16 +59,17 @@ def _load_folder(path: Path, *_: object) -> Recording:
         mapping = mapping.model_copy(update={"wheels": None})
     for name in FILES + WHEELS * wheels:
         if (path / name).stat().st_size > MAX_FILE_BYTES:
-            size = f"{MAX_FILE_BYTES // 2**20} MB, which few drives are"
             raise RecordingError(
-                f"{path / name}: is larger than {size}; cut it, or give --map {file}."
+                f"{path / name}: is larger than {MAX_FILE_BYTES // 2**20} MB, which "
+                f"few drives are; cut it, or give --map {file}."
             )
     try:
         with open_source(path) as source:
             return replace(read_mapped(source, mapping), variables=())
     except RecordingError as error:
-        advice = f"The mapping is {file}; choose another with --map."
-        raise RecordingError(f"{error} {advice}") from None
+        raise RecordingError(
+            f"{error} The mapping is {file}; choose another with --map."
+        ) from None
 
 
 FORMATS = (
@@ -104,16 +105,19 @@ def read_recording(
     recognised = [form for form in FORMATS if form.recognises(path)]
     file_format = next(iter(recognised), None)
     if topics != TopicRoles() and not (file_format and file_format.has_topics):
-        advice = "leave out --topics and --topic, which are for bags only"
-        raise RecordingError(f"{path}: is no bag; {advice}.")
+        raise RecordingError(
+            f"{path}: is no bag; leave out --topics and --topic, which are for bags "
+            "only."
+        )
     if file_format is not None:
         return file_format.read(path, spec, topics)
     if not path.exists():
         raise RecordingError(f"{path}: no such file or folder; check the path.")
     names = " nor ".join(form.name for form in FORMATS)
-    begin = f"`nics inspect {path.name} --map my.yaml` begins one"
-    fault = f"{path}: is neither {names}"
-    raise RecordingError(f"{fault}; say what is what in it with --map; {begin}.")
+    raise RecordingError(
+        f"{path}: is neither {names}; say what is what in it with --map; `nics inspect "
+        f"{path.name} --map my.yaml` begins one."
+    )
 
 
 def explain_no_mapping(path: Path) -> str:
@@ -170,8 +174,10 @@ def _check_units(mapping: Mapping, spec: RobotSpec) -> None:
                     cure = "add `ticks_per_turn:`, the counts of a turn of the wheel"
                 else:
                     cure = "check its unit, or give `scale:`"
-                fault = f"{stream}.{variable.name}: is in {si}, where {variable.unit} is needed"
-                raise ConfigError(f"{fault}; {cure}.")
+                raise ConfigError(
+                    f"{stream}.{variable.name}: is in {si}, where {variable.unit} is "
+                    f"needed; {cure}."
+                )
 
 
 def _load_if_path(mapping: Mapping | str | Path) -> Mapping:
@@ -227,8 +233,10 @@ def read_robot_and_drives(
     for path, spec in zip(paths, specs, strict=True):
         has_variables = spec.variable_names == first.variable_names
         if not has_variables or spec.textbook != first.textbook:
-            fault = f"{path}: is a drive of {spec.name!r}, {paths[0]} of {first.name!r}"
-            raise RecordingError(f"{fault}; fit only drives of one robot together.")
+            raise RecordingError(
+                f"{path}: is a drive of {spec.name!r}, {paths[0]} of {first.name!r}; "
+                "fit only drives of one robot together."
+            )
     if len(specs) > 1:
         commands = _merge_ranges([spec.command for spec in specs])
         states = _merge_ranges([spec.state for spec in specs])
@@ -288,10 +296,10 @@ def reorder_variables(recording: Recording, spec: RobotSpec) -> Recording:
         if stream is None:
             continue
         if set(recorded) != set(names):
-            fault = f"{recording.source}: the {part} is {', '.join(recorded)}"
-            needed = f"that of the robot {spec.name!r} is {', '.join(names)}"
             raise ConfigError(
-                f"{fault}, {needed}; use the robot's names in the mapping."
+                f"{recording.source}: the {part} is {', '.join(recorded)}, that of the "
+                f"robot {spec.name!r} is {', '.join(names)}; use the robot's names in "
+                "the mapping."
             )
         order = [recorded.index(name) for name in names]
         made[part] = replace(stream, values=stream.values[:, order])

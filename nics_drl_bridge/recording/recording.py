@@ -219,11 +219,15 @@ def samples_on_one_clock(
 def _check_types(recording: object, spec: object) -> None:
     """Raises ConfigError for a path or a name where the object is meant."""
     if not isinstance(recording, Recording):
-        needed = "a Recording, as read_recording(path) returns"
-        raise ConfigError(f"recording={format_value(recording)}: must be {needed}.")
+        raise ConfigError(
+            f"recording={format_value(recording)}: must be a Recording, as "
+            "read_recording(path) returns."
+        )
     if not isinstance(spec, RobotSpec):
-        needed = "a RobotSpec, as load_robot(name) returns"
-        raise ConfigError(f"robot={format_value(spec)}: must be {needed}.")
+        raise ConfigError(
+            f"robot={format_value(spec)}: must be a RobotSpec, as load_robot(name) "
+            "returns."
+        )
 
 
 def check(recording: Recording, spec: RobotSpec) -> Recording:
@@ -236,9 +240,11 @@ def check(recording: Recording, spec: RobotSpec) -> Recording:
         names = names[-count:]
         recorded = recorded[-count:]
     if recorded and recorded != names:
-        problem = f"{recording.source}: is a drive of a robot with {', '.join(recording.variables)}"
-        advice = f"the robot {spec.name!r} has {', '.join(spec.variable_names)}"
-        raise RecordingError(f"{problem}; {advice}: choose the robot that drove.")
+        raise RecordingError(
+            f"{recording.source}: is a drive of a robot with "
+            f"{', '.join(recording.variables)}; the robot {spec.name!r} has "
+            f"{', '.join(spec.variable_names)}: choose the robot that drove."
+        )
     check_streams(
         recording, {"command": len(spec.command), "state": len(spec.state), "wheels": 2}
     )
@@ -266,22 +272,27 @@ def _find_fault(stream: Stream, width: int) -> str:
     t = stream.t
     values = stream.values
     if values.shape != (len(t), width):
-        reason = f"has the shape {values.shape} where ({len(t)}, {width}) is needed"
-        return f"{reason}; check that the recording is of this robot"
+        return (
+            f"has the shape {values.shape} where ({len(t)}, {width}) is needed; check "
+            "that the recording is of this robot"
+        )
     if len(t) < 2:
         return f"has {len(t)} samples; record a drive of 20 s or more"
     if t[-1] == t[0]:
         return f"all of its stamps are {t[0]:g} s; choose another column as its time"
     is_finite = np.isfinite(values).all(axis=1) & np.isfinite(t)
     if not is_finite.all():
-        advice = "remove the row, or find out why it was recorded"
-        return f"row {int(np.argmin(is_finite))} holds NaN or inf; {advice}"
+        return (
+            f"row {int(np.argmin(is_finite))} holds NaN or inf; remove the row, or "
+            "find out why it was recorded"
+        )
     backward = np.flatnonzero(np.diff(t) < 0.0)
     if len(backward):
         before, after = t[backward[0] : backward[0] + 2]
-        times = f"({before:.6f} s, then {after:.6f} s)"
-        reason = f"time runs backwards at row {backward[0] + 1} {times}"
-        return f"{reason}; sort the rows, or cut the file there"
+        return (
+            f"time runs backwards at row {backward[0] + 1} ({before:.6f} s, then "
+            f"{after:.6f} s); sort the rows, or cut the file there"
+        )
     return ""
 
 
@@ -293,22 +304,18 @@ def save_recording(recording: Recording, path: str | Path) -> None:
         arrays[f"{name}_t"], arrays[name] = stream.t, stream.values
         if stream.sigma is not None:
             arrays[f"{name}_sigma"] = stream.sigma
-    meta: dict[str, Any] = {
+    meta = {
         "format": FORMAT,
         "source": recording.source,
         "clocks": {name: stream.clock for name, stream in streams.items()},
         "variables": recording.variables,
         "repairs": recording.repairs,
+        "measured_by": recording.measured_by,
+        "robot": recording.robot,
+        "episodes": [asdict(episode) for episode in recording.episodes],
+        "learn_until_s": recording.learn_until_s,
+        "latency": recording.latency.model_dump(mode="json"),
     }
-    if recording.measured_by:
-        meta["measured_by"] = recording.measured_by
-    if recording.robot is not None:
-        meta["robot"] = recording.robot
-    if recording.episodes:
-        meta["episodes"] = [asdict(episode) for episode in recording.episodes]
-        meta["learn_until_s"] = recording.learn_until_s
-    if recording.latency.measured:
-        meta["latency"] = recording.latency.model_dump(mode="json")
     buffer = io.BytesIO()
     np.savez_compressed(buffer, meta=np.array(json.dumps(meta)), **arrays)  # type: ignore[arg-type]
     files.write_bytes(path, files.seal(buffer.getvalue()))
@@ -322,9 +329,9 @@ def load_recording(path: str | Path) -> Recording:
         meta = json.loads(str(arrays["meta"]))
         version = meta["format"]
         if version != FORMAT:
-            advice = "record it again or use the version of the package that wrote it"
             raise RecordingError(
-                f"{path}: format {version!r} is not {FORMAT!r}; {advice}."
+                f"{path}: format {version!r} is not {FORMAT!r}; record it again or use "
+                "the version of the package that wrote it."
             )
         files.check_sealed(io.BytesIO(data))
         streams: Any = {
@@ -347,12 +354,14 @@ def load_recording(path: str | Path) -> Recording:
     except FileNotFoundError:
         raise RecordingError(f"{path}: no such file; check the path.") from None
     except (AttributeError, KeyError, RecursionError, TypeError) as error:
-        advice = "say what is what in it with --map, or write it with save_recording"
-        fault = f"is not a recording of this package ({error})"
-        raise RecordingError(f"{path}: {fault}; {advice}.") from None
+        raise RecordingError(
+            f"{path}: is not a recording of this package ({error}); say what is what "
+            "in it with --map, or write it with save_recording."
+        ) from None
     except (ValueError, OSError) as error:
-        why = f"can't be read as .npz ({error}); it may be damaged"
-        raise RecordingError(f"{path}: {why}.") from None
+        raise RecordingError(
+            f"{path}: can't be read as .npz ({error}); it may be damaged."
+        ) from None
 
 
 def is_recording(path: Path) -> bool:
@@ -379,8 +388,9 @@ def _read_arrays(data: bytes) -> dict[str, NDArray[Any]]:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             size = sum(member.file_size for member in archive.infolist())
         if size > files.MOST_BYTES:
-            limit = f"{files.MOST_BYTES // 2**20} MB"
-            raise ValueError(f"unpacked it is larger than {limit}")
+            raise ValueError(
+                f"unpacked it is larger than {files.MOST_BYTES // 2**20} MB"
+            )
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
             return {name: arrays[name] for name in arrays.files}
     except Exception as error:  # noqa: BLE001 - damage breaks zipfile and numpy in any way
@@ -439,9 +449,15 @@ def _find_degrees(t: Array, pose: Array) -> Implausible | None:
 def _find_radians(pose: Array) -> Implausible | None:
     if not _is_only_along(pose, 180.0 / np.pi):
         return None
-    reason = f"the heading is up to {np.abs(pose[:, 2]).max():.2g} rad, and the path leads along"
     cause = "it was in radians, and is taken as degrees"
-    return Implausible(f"{reason} 57 times as much", cause, "heading_unit: rad")
+    return Implausible(
+        (
+            f"the heading is up to {np.abs(pose[:, 2]).max():.2g} rad, and the path leads "
+            "along 57 times as much"
+        ),
+        cause,
+        "heading_unit: rad",
+    )
 
 
 def _is_only_along(pose: Array, scale: float) -> bool:
@@ -540,8 +556,9 @@ def _find_too_fast(
     usual_acceleration = np.percentile(acceleration, 75)
     if usual_acceleration <= hardest:
         return None
-    change = f"changes that by {usual_acceleration:.3g} m/s^2"
-    reason = f"moves at {speed:.3g} m/s and {change}"
+    reason = (
+        f"moves at {speed:.3g} m/s and changes that by {usual_acceleration:.3g} m/s^2"
+    )
     return Implausible(reason, cause, line)
 
 

@@ -154,10 +154,10 @@ def _assign_clocks(
         late = np.percentile(delay, 100.0 - STALLED)
         wander = max(late - median, median - minimum) * S_PER_NS
         if wander > MAX_WANDER_S or (maximum - median) * S_PER_NS > MAX_STALL_S:
-            delays = f"{minimum * S_PER_NS:.3f} to {maximum * S_PER_NS:.3f} s"
             fault = (
-                f"its header stamps lie {delays} before their receipt, so they are of several "
-                "clocks or of a simulated time at another rate"
+                f"its header stamps lie {minimum * S_PER_NS:.3f} to "
+                f"{maximum * S_PER_NS:.3f} s before their receipt, so they are of "
+                "several clocks or of a simulated time at another rate"
             )
             advice = (
                 f"{USE_RECEIPT}, or for a simulation `stamps: header` (`time: header`), and record "
@@ -311,8 +311,10 @@ def remove_overflow(t: Array, name: str) -> tuple[Array, str]:
     if size is None:
         return t, ""
     continued, count = unwrap_counter(t, size)
-    overflows = f"its clock overflowed at {size:.10g} {format_times(count)}"
-    return continued, f"{name}: {overflows}, and was continued."
+    return continued, (
+        f"{name}: its clock overflowed at {size:.10g} {format_times(count)}, and was "
+        "continued."
+    )
 
 
 def repair_order(t: Array, name: str) -> tuple[Array, NDArray[np.intp], str]:
@@ -328,9 +330,9 @@ def repair_order(t: Array, name: str) -> tuple[Array, NDArray[np.intp], str]:
         notes.append(f"{name}: its rows began with the last, and were reversed.")
     stray = _find_stray(t)
     if stray.any():
-        where = f"(row {rows[stray][0]}: {t[stray][0]:.10g} s)"
         notes.append(
-            f"{name}: {stray.sum()} stamps fit none beside them {where}; left out."
+            f"{name}: {stray.sum()} stamps fit none beside them (row {rows[stray][0]}: "
+            f"{t[stray][0]:.10g} s); left out."
         )
         t = t[~stray]
         rows = rows[~stray]
@@ -340,9 +342,9 @@ def repair_order(t: Array, name: str) -> tuple[Array, NDArray[np.intp], str]:
     longest = int(np.diff(on_time).max()) - 1
     if 0 < longest <= LATE_ROWS and late.max() <= LATE_S:
         order = np.argsort(t, kind="stable")
-        finding = f"{int((late > 0.0).sum())} of {len(t)} rows came after later ones"
         notes.append(
-            f"{name}: {finding}, by up to {late.max():.3g} s, and were sorted."
+            f"{name}: {int((late > 0.0).sum())} of {len(t)} rows came after later "
+            f"ones, by up to {late.max():.3g} s, and were sorted."
         )
         t = t[order]
         rows = rows[order]
@@ -356,9 +358,9 @@ def repair_order(t: Array, name: str) -> tuple[Array, NDArray[np.intp], str]:
         if step[k] < 0.0:
             direction = "back"
         count = format_times(int(is_jump.sum()))
-        joining = f"the parts were joined, a usual step of {usual:.3g} s apart"
         notes.append(
-            f"{name}: the clock was set {direction} {count} ({first}); {joining}."
+            f"{name}: the clock was set {direction} {count} ({first}); the parts were "
+            f"joined, a usual step of {usual:.3g} s apart."
         )
         t = t + np.append(0.0, np.cumsum(np.where(is_jump, usual - step, 0.0)))
     return t, rows, " ".join(notes)
@@ -389,8 +391,8 @@ def select_new_rows(
     is_repeated = (np.diff(t) == 0.0) & (np.diff(values, axis=0) == 0.0).all(axis=1)
     note = ""
     if is_repeated.any():
-        finding = (
-            f"{int(is_repeated.sum())} of {len(t)} rows repeat the row before them"
+        note = (
+            f"{name}: {int(is_repeated.sum())} of {len(t)} rows repeat the row before "
+            "them, stamp and all, and were left out."
         )
-        note = f"{name}: {finding}, stamp and all, and were left out."
     return np.append(True, ~is_repeated), note

@@ -31,67 +31,49 @@ TIMES = word_set("""
     time times stamp timestamp t s sec secs seconds elapsed ms us ns millis
     micros nanos date datetime
 """)
-# Units at the end of a name (`yaw_deg`, `v_m_s`), the longest first
-ENDINGS = {
-    "m per s": "m/s",
-    "rad per s": "rad/s",
-    "deg per s": "deg/s",
-    "m s": "m/s",
-    "rad s": "rad/s",
-    "deg s": "deg/s",
-    "mm s": "mm/s",
-    "cm s": "cm/s",
-    "km h": "km/h",
-    "m": "m",
-    "cm": "cm",
-    "mm": "mm",
-    "meters": "m",
-    "metres": "m",
-    "rad": "rad",
-    "radians": "rad",
-    "deg": "deg",
-    "degrees": "deg",
-    "mps": "m/s",
-    "kmh": "km/h",
-    "kph": "km/h",
-    "mph": "mph",
-    "rads": "rad/s",
-    "radps": "rad/s",
-    "degps": "deg/s",
-    "dps": "deg/s",
-    "rpm": "rpm",
-    "pct": "%",
-    "percent": "%",
-}
+
+
+def _index_units(text: str) -> dict[str, str]:
+    """Returns units by name from lines such as `m/s: mps, m per s`."""
+    units = {}
+    for line in text.strip().splitlines():
+        unit, _, names = line.strip().partition(": ")
+        for name in names.split(", "):
+            units[name] = unit
+    return units
+
+
+# Units at the end of a name (`yaw_deg`, `v_m_s`)
+ENDINGS = _index_units("""
+    m: m, meters, metres
+    cm: cm
+    mm: mm
+    rad: rad, radians
+    deg: deg, degrees
+    m/s: m per s, m s, mps
+    cm/s: cm s
+    mm/s: mm s
+    km/h: km h, kmh, kph
+    mph: mph
+    rad/s: rad per s, rad s, rads, radps
+    deg/s: deg per s, deg s, degps, dps
+    rpm: rpm
+    %: pct, percent
+""")
 # Units in brackets, `x(m)` or `omega [rad s^-1]`, in addition to those of a mapping
-IN_BRACKETS = {
-    "meter": "m",
-    "meters": "m",
-    "metre": "m",
-    "metres": "m",
-    "radian": "rad",
-    "radians": "rad",
-    "degree": "deg",
-    "degrees": "deg",
-    "°": "deg",
-    "sec": "s",
-    "seconds": "s",
-    "µs": "us",
-    "m/sec": "m/s",
-    "m s^-1": "m/s",
-    "m*s^-1": "m/s",
-    "rad/sec": "rad/s",
-    "rad s^-1": "rad/s",
-    "rad*s^-1": "rad/s",
-    "deg s^-1": "deg/s",
-    "°/s": "deg/s",
-    "kmph": "km/h",
-    "m/s2": "m/s^2",
-    "m/s²": "m/s^2",
-    "m s^-2": "m/s^2",
-    "m*s^-2": "m/s^2",
-    "percent": "%",
-}
+IN_BRACKETS = _index_units("""
+    m: meter, meters, metre, metres
+    rad: radian, radians
+    deg: degree, degrees, °
+    s: sec, seconds
+    us: µs
+    m/s: m/sec, m s^-1, m*s^-1
+    rad/s: rad/sec, rad s^-1, rad*s^-1
+    deg/s: deg s^-1, °/s
+    km/h: kmph
+    m/s^2: m/s2, m/s², m s^-2, m*s^-2
+    %: percent
+""")
 NO_UNIT = ("", "-", "1", "none", "unitless")
 
 
@@ -177,6 +159,10 @@ class TableSurvey:
         if self.t is None or len(self.t) < 2:
             return []
         return list(_describe_regularity(self.t, _select_numbers(self.data)))
+
+    def get_numbers(self, column: str) -> Array:
+        """Returns the values (T,) of a column of numbers."""
+        return np.asarray(self.data[column], dtype=np.float64)
 
     def list_words(self, column: str) -> list[str]:
         """Returns the words of a column's name; for `data`, the words of the table's name."""
@@ -328,8 +314,10 @@ def _describe_regularity(t: Array, numbers: dict[str, Array]) -> Iterator[str]:
     is_same = np.all([c[1:] == c[:-1] for c in whole], axis=0) & (step == 0.0)
     repeated = int((step == 0.0).sum())
     if repeated:
-        same = f"in rows that repeat all of it: {is_same.sum()}"
-        yield f"stamps like the one before: {repeated}, {same}"
+        yield (
+            f"stamps like the one before: {repeated}, in rows that repeat all of it: "
+            f"{is_same.sum()}"
+        )
     if (np.abs(step - usual) > IRREGULAR * usual).mean() > IRREGULAR:
         yield "stamps are uneven: rows arrive in bursts"
     missing = {name: int(np.isnan(column).sum()) for name, column in numbers.items()}

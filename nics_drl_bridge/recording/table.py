@@ -83,16 +83,17 @@ def _find_column(place: str, names: Sequence[str], which: str | int) -> int:
         count = Counter(names)[which]
         if count > 1:
             numbers = [str(k) for k, name in enumerate(names) if name == which]
-            advice = f"give the number of the one you mean: {' or '.join(numbers)}"
             raise RecordingError(
-                f"{place}: {count} columns are called {which!r}; {advice}."
+                f"{place}: {count} columns are called {which!r}; give the number of "
+                f"the one you mean: {' or '.join(numbers)}."
             )
         return names.index(which)
     if isinstance(which, int) or which.isdecimal():
         if 0 <= int(which) < len(names):
             return int(which)
-        columns = f"its columns are 0 to {len(names) - 1}"
-        raise RecordingError(f"{place}: has no column {which}; {columns}.")
+        raise RecordingError(
+            f"{place}: has no column {which}; its columns are 0 to {len(names) - 1}."
+        )
     named = [name for name in names if name]
     if named:
         hint = suggest(which, named)
@@ -115,10 +116,10 @@ def read_numbers(table: Table, which: str | int) -> Array:
         try:
             float(text or "nan")
         except ValueError:
-            fault = f"column {which!r} is {str(text)[:40]!r}, which is no number"
-            advice = "mend or remove the row, or choose another column"
             raise RecordingError(
-                f"{table.place}: {table.row(k)}: {fault}; {advice}."
+                f"{table.place}: {table.row(k)}: column {which!r} is "
+                f"{str(text)[:40]!r}, which is no number; mend or remove the row, or "
+                "choose another column."
             ) from None
     return np.array([float(text or "nan") for text in column])
 

@@ -80,8 +80,10 @@ def _read_lines(path: Path) -> tuple[list[tuple[int, str]], list[str]]:
     check_no_device(path)
     try:
         if path.stat().st_size > MAX_TABLE_BYTES:
-            fault = f"is larger than {MAX_TABLE_BYTES // 2**20} MB"
-            raise RecordingError(f"{path}: {fault}; cut it, or keep fewer columns.")
+            raise RecordingError(
+                f"{path}: is larger than {MAX_TABLE_BYTES // 2**20} MB; cut it, or "
+                "keep fewer columns."
+            )
         data = path.read_bytes()
     except OSError as error:
         raise RecordingError(f"{path}: can't be read ({error.strerror}).") from None
@@ -104,8 +106,10 @@ def _read_lines(path: Path) -> tuple[list[tuple[int, str]], list[str]]:
     lines = [(k, line) for k, line in enumerate(text.split("\n"), 1) if line.strip()]
     for k, line in lines:
         if len(line) > LONGEST_ROW:
-            fault = f"line {k} has {len(line)} characters, which no row has"
-            raise RecordingError(f"{path}: {fault}; remove it.")
+            raise RecordingError(
+                f"{path}: line {k} has {len(line)} characters, which no row has; "
+                "remove it."
+            )
     comments = [
         line.lstrip("#/% ") for _, line in lines if line.lstrip().startswith(COMMENTS)
     ]
@@ -169,8 +173,10 @@ def _find_first_row(path: Path, rows: list[list[str]]) -> tuple[int, int]:
         len(row) for row in rows[:: 1 + len(rows) // MOST_SAMPLED] if is_numeric(row)
     )
     if not widths:
-        advice = "give a table of numbers, a column each, with or without a header"
-        raise RecordingError(f"{path}: holds no row of numbers; {advice}.")
+        raise RecordingError(
+            f"{path}: holds no row of numbers; give a table of numbers, a column each, "
+            "with or without a header."
+        )
     width = widths.most_common(1)[0][0]
     return next(
         k for k, row in enumerate(rows) if len(row) == width and is_numeric(row)
@@ -188,18 +194,23 @@ def _keep_one_width(
     notes = []
     is_data = np.array([row not in above for row in rows], dtype=np.bool_)
     if not is_data.all():
-        headers = f"{(~is_data).sum()} lines repeat the header"
-        notes.append(f"{path.name}: {headers}, and were left out.")
+        notes.append(
+            f"{path.name}: {(~is_data).sum()} lines repeat the header, and were left "
+            "out."
+        )
     is_whole = np.array([len(row) == width for row in rows], dtype=np.bool_)
     broken = np.flatnonzero(is_data & ~is_whole)
     if len(broken) > max(1.0, MOST_BROKEN * is_data.sum()):
-        fault = f"line {line_numbers[broken[0]]} has {len(rows[broken[0]])} fields"
-        advice = f"where most lines have {width}; mend or remove it and those like it"
-        raise RecordingError(f"{path}: {fault} {advice}.")
+        raise RecordingError(
+            f"{path}: line {line_numbers[broken[0]]} has {len(rows[broken[0]])} fields "
+            f"where most lines have {width}; mend or remove it and those like it."
+        )
     if len(broken):
         where = ", ".join(map(str, line_numbers[broken[:5]]))
-        left_out = f"{len(broken)} lines of another length (line {where})"
-        notes.append(f"{path.name}: {left_out} were left out.")
+        notes.append(
+            f"{path.name}: {len(broken)} lines of another length (line {where}) were "
+            "left out."
+        )
     kept = np.flatnonzero(is_data & is_whole)
     kept_rows = [rows[k] for k in kept]
     while width > 1 and not any(row[width - 1] for row in kept_rows):
@@ -271,8 +282,10 @@ def read_arrays(path: Path) -> Table:
     try:
         with check_no_device(path).open("rb") as file:
             if _count_unpacked(file) > MAX_UNPACKED_BYTES:
-                reason = f"unpacked it is larger than {MAX_UNPACKED_BYTES // 2**20} MB"
-                raise RecordingError(f"{path}: {reason}; split it.")
+                raise RecordingError(
+                    f"{path}: unpacked it is larger than {MAX_UNPACKED_BYTES // 2**20} "
+                    "MB; split it."
+                )
             loaded = np.load(file, allow_pickle=False)
             if isinstance(loaded, np.ndarray):
                 loaded = {"": loaded}

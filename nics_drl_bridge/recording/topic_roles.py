@@ -165,9 +165,9 @@ class _Topics:
                 f"{self.place}: {fault} topic {topic!r} ({role}); {topics}"
             )
         if self.types[topic] not in TYPES[role]:
-            fault = f"{self.place}: the topic {topic!r} is of type {self.types[topic]}"
             raise RecordingError(
-                f"{fault}; {role} must be one of {', '.join(TYPES[role])}."
+                f"{self.place}: the topic {topic!r} is of type {self.types[topic]}; "
+                f"{role} must be one of {', '.join(TYPES[role])}."
             )
         return topic
 

@@ -98,8 +98,10 @@ class MappedReader:
             raise RecordingError(f"{self.source.place}: has no {default!r}; {hint}")
         advice = f"write it as TABLE:{reference}, or add `in: TABLE`"
         tables = ", ".join(names[:MOST_LISTED])
-        fault = f"{self.source.place}: {reference!r} names no table"
-        raise ConfigError(f"{fault}; {advice}; its tables are {tables}.")
+        raise ConfigError(
+            f"{self.source.place}: {reference!r} names no table; {advice}; its tables "
+            f"are {tables}."
+        )
 
     def _read_table(self, name: str) -> Table:
         table = self.source.get_table(name)
@@ -123,9 +125,9 @@ class MappedReader:
                 self._stamped_rows[key] = self._read_stamps(table, time)
         stamped = self._stamped_rows[key]
         if stamped.total != count:
-            fault = f"{table.place}: has {stamped.total} stamps for {count} values"
             raise RecordingError(
-                f"{fault}; say which are theirs with `time:` next to `from:`."
+                f"{table.place}: has {stamped.total} stamps for {count} values; say "
+                "which are theirs with `time:` next to `from:`."
             )
         return stamped
 
@@ -133,9 +135,9 @@ class MappedReader:
         """Returns the stamps that come with the rows of a table, as with a bag's messages."""
         stream = table.stamps("" if time is None else str(time.from_))
         if stream is None:
-            example = "as in `time: t`, `time: [s, ns]`, or `time: {rate: 50}` if there is none"
             raise RecordingError(
-                f"{table.place}: which column is the time? Say {example}."
+                f"{table.place}: which column is the time? Say as in `time: t`, `time: "
+                "[s, ns]`, or `time: {rate: 50}` if there is none."
             )
         self.add_notes(*table.notes)
         default_clock = stamping.RECEIVE
@@ -162,10 +164,11 @@ class MappedReader:
         unit = guess_time_unit(t)
         if time.unit is None and unit is not None:
             column = time.columns[0]
-            step = f"{np.median(np.diff(t)):.4g} apart, which can't be seconds"
-            fault = f"{table.place}: the stamps {column!r} are {step}"
-            advice = f"write `time: {{from: {column}, unit: {unit}}}` into the mapping"
-            raise RecordingError(f"{fault}; {advice} (`unit: s` if they are).")
+            raise RecordingError(
+                f"{table.place}: the stamps {column!r} are {np.median(np.diff(t)):.4g} "
+                f"apart, which can't be seconds; write `time: {{from: {column}, unit: "
+                f"{unit}}}` into the mapping (`unit: s` if they are)."
+            )
         t = t * schema.UNITS[time.unit or "s"].factor
         t, order, note = stamping.repair_order(t, name)
         self.add_notes(note)
@@ -215,24 +218,32 @@ class MappedReader:
         infinite = np.flatnonzero(np.isinf(raw))
         if len(infinite) and not allow_infinite:
             row = table.row(int(stamped.rows[infinite[0]]))
-            fault = f"{table.place}: {row}: column {column_name!r} is infinite"
-            raise RecordingError(f"{fault}; mend or remove the row.")
+            raise RecordingError(
+                f"{table.place}: {row}: column {column_name!r} is infinite; mend or "
+                "remove the row."
+            )
         is_finite = np.isfinite(raw)
         if not is_finite.any():
-            fault = f"{table.place}: {column_name!r} holds no number"
-            raise RecordingError(f"{fault}; choose another column.")
+            raise RecordingError(
+                f"{table.place}: {column_name!r} holds no number; choose another "
+                "column."
+            )
         if not is_finite.all():
-            missing = f"{int((~is_finite).sum())} of {len(raw)} rows have no value"
-            self.add_notes(f"{name}: {missing}, and were left out.")
+            self.add_notes(
+                f"{name}: {int((~is_finite).sum())} of {len(raw)} rows have no value, "
+                "and were left out."
+            )
         series = Series(stamped.t[is_finite], raw[is_finite], clock)
         may_be_speed = get_unit(value).si in ("", "rad/s", "m/s", "ticks/s")
         behaviour = ""
         if may_be_speed and value.wrap is None and not value.counts:
             behaviour = stamping.describe_counter(series.values)
         if behaviour:
-            fault = f"{table.place}: {column_name!r} is a counter that {behaviour}"
-            keys = f"{{from: {column_name}, unit: ticks, ticks_per_turn: ...}}"
-            raise RecordingError(f"{fault}, no speed: write `{keys}` for {name}.")
+            raise RecordingError(
+                f"{table.place}: {column_name!r} is a counter that {behaviour}, no "
+                f"speed: write `{{from: {column_name}, unit: ticks, ticks_per_turn: "
+                f"...}}` for {name}."
+            )
         series = self._convert_to_si(name, value, series, held)
         if value.when:
             return self._apply_flags(value, series, table, time)
@@ -248,9 +259,11 @@ class MappedReader:
             series = self._unwrap(name, value, series)
         if value.counts:
             if stamping.is_oscillating(series.values):
-                fault = f"{self.source.place}: {value.from_!r} goes up and down like a speed"
-                advice = f"write `unit: {value.unit or 'ticks'}/s` for {name}"
-                raise RecordingError(f"{fault}, and is no counter: {advice}.")
+                raise RecordingError(
+                    f"{self.source.place}: {value.from_!r} goes up and down like a "
+                    "speed, and is no counter: write `unit: "
+                    f"{value.unit or 'ticks'}/s` for {name}."
+                )
             series = _derive_rate(series, held)
         return series._replace(values=series.values * factor + value.offset)
 
@@ -267,9 +280,9 @@ class MappedReader:
         if not value.counts:
             values = values - size * np.round(values[0] / size)
         if count:
-            overflows = f"{stamping.format_times(count)}, at {size:.10g}{origin}"
             self.add_notes(
-                f"{name}: the counter overflowed {overflows}, and was continued."
+                f"{name}: the counter overflowed {stamping.format_times(count)}, at "
+                f"{size:.10g}{origin}, and was continued."
             )
         return series._replace(values=values)
 
@@ -292,10 +305,10 @@ class MappedReader:
             conditions = " and ".join(
                 f"{flag} is {wanted!r}" for flag, wanted in value.when.items()
             )
-            fault = (
-                f"{table.place}: {value.from_!r} never counts: there is no row in which"
+            raise RecordingError(
+                f"{table.place}: {value.from_!r} never counts: there is no row in "
+                f"which {conditions}; check `when:`."
             )
-            raise RecordingError(f"{fault} {conditions}; check `when:`.")
         values = np.where(counts, series.values, value.otherwise)
         return series._replace(values=values)
 
@@ -313,9 +326,9 @@ def _check_whole_seconds(table: Table, time: schema.Time, t: Array) -> None:
         if seconds == column and fraction in table.names:
             fix = f"time: [{column}, {fraction}]"
             break
-    fault = f"{table.place}: the stamps {column!r} are whole seconds, of {rows_a_second} rows each"
     raise RecordingError(
-        f"{fault}; write `{fix}` into the mapping, or choose another column."
+        f"{table.place}: the stamps {column!r} are whole seconds, of {rows_a_second} "
+        f"rows each; write `{fix}` into the mapping, or choose another column."
     )
 
 
@@ -388,8 +401,10 @@ def combine_series(name: str, parts: Sequence[Series], held: bool) -> Stream:
     """Joins values into a stream: commands are held, others interpolated at the first's stamps."""
     clocks = sorted({part.clock for part in parts})
     if len(clocks) > 1:
-        fault = f"{name}: its values are of the clocks {' and '.join(clocks)}"
-        raise ConfigError(f"{fault}; a stream needs one clock.")
+        raise ConfigError(
+            f"{name}: its values are of the clocks {' and '.join(clocks)}; a stream "
+            "needs one clock."
+        )
     t = parts[0].t
     columns = [part.values for part in parts]
     if not all(np.array_equal(t, part.t) for part in parts):

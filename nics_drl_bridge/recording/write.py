@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from rosbags.rosbag2 import Writer
     from rosbags.typesys.store import Typestore
 
-Make = Callable[[Any, Array], Any]
+Content = dict[str, Any]  # of a message, by field
 Storage = Literal["mcap", "sqlite3"]
 
 NPZ = ".npz"
@@ -54,9 +54,9 @@ def check_out(path: str | Path) -> Path:
     if path.exists():
         raise ConfigError(f"{path}: is there already; give another name, or remove it.")
     if path.suffix not in (NPZ, ""):
-        advice = f"name a file *{NPZ}, or the folder of a rosbag2 without suffix"
         raise ConfigError(
-            f"{path}: unknown kind of recording {path.suffix!r}; {advice}."
+            f"{path}: unknown kind of recording {path.suffix!r}; name a file *{NPZ}, "
+            "or the folder of a rosbag2 without suffix."
         )
     if path.suffix != NPZ:
         msgs.check_libraries(path, "writing", f", or name a file *{NPZ}")
@@ -82,9 +82,8 @@ def write_bag(
     # `/odom`, or `/pose` if it has its own clock or odometry was recorded as well.
     with open_bag_sink(path, storage) as sink:
         store = sink.store
-        messages = _Messages(store)
         command = recording.command
-        for topic, kind, stream, make in _list_topics(recording, spec, messages):
+        for topic, kind, stream, write_content in _list_topics(recording, spec):
             sink.add_topic(topic, kind)
             stamps = np.round(stream.t * NS_PER_S).astype(np.int64) + START_NS
             # Streams of other clocks are received from the first command's time on.
@@ -93,119 +92,100 @@ def write_bag(
                 receive = stamps + round(float(command.t[0] - stream.t[0]) * NS_PER_S)
                 stamps = stamps - APART_NS
             for k, values in enumerate(stream.values):
-                message = make(messages.make_header(int(stamps[k])), values)
-                sink.write(
-                    topic, int(receive[k]), bytes(store.serialize_cdr(message, kind))
-                )
+                seconds, nanoseconds = divmod(int(stamps[k]), NS_PER_S)
+                stamp = {"sec": seconds, "nanosec": nanoseconds}
+                header = {"stamp": stamp, "frame_id": FRAMES[0]}
+                content = {"header": header, **write_content(values)}
+                message = _make_message(store, kind, content)
+                data = bytes(store.serialize_cdr(message, kind))
+                sink.write(topic, int(receive[k]), data)
 
 
 def _list_topics(
-    recording: Recording, spec: RobotSpec, messages: "_Messages"
-) -> Iterator[tuple[str, str, Stream, Make]]:
-    beside = (
-        recording.odometry is not None
-        or recording.pose.clock != recording.command.clock
+    recording: Recording, spec: RobotSpec
+) -> Iterator[tuple[str, str, Stream, Callable[[Array], Content]]]:
+    """Yields topic, type, stream and contents of a message, but for its header, per row."""
+    yield (
+        "/cmd_vel",
+        topic_roles.TWIST,
+        recording.command,
+        lambda row: _write_twist(spec.to_cmd_vel(row)),
     )
-    joints, names, still = recording.wheels, list(msgs.WHEELS), np.zeros(2, dtype=bool)
+    odometry = recording.odometry
+    if odometry is not None or recording.pose.clock != recording.command.clock:
+        pose = recording.pose
+        yield "/pose", topic_roles.POSE, pose, lambda row: {"pose": _write_pose(row)}
+    else:
+        yield "/odom", topic_roles.ODOMETRY, recording.pose, _write_odometry
+    if odometry is not None:
+        yield "/odom", topic_roles.ODOMETRY, odometry, _write_odometry_twist
+    joints = recording.state or recording.wheels
+    names = list(msgs.WHEELS)
+    is_position = np.zeros(2, dtype=bool)
     if recording.state is not None:
-        joints = recording.state
         names = [v.name for v in spec.state]
-        still = np.array([v.unit in msgs.POSITION_UNITS for v in spec.state])
-    topics: list[tuple[str, str, Stream | None, Make]] = [
-        (
-            "/cmd_vel",
-            topic_roles.TWIST,
-            recording.command,
-            lambda _, row: messages.make_twist(spec.to_cmd_vel(row)),
-        ),
-        ("/pose", topic_roles.POSE, recording.pose, messages.make_pose_stamped)
-        if beside
-        else ("/odom", topic_roles.ODOMETRY, recording.pose, messages.make_odometry),
-        (
-            "/odom",
-            topic_roles.ODOMETRY,
-            recording.odometry,
-            lambda header, row: messages.make_odometry(header, row, pose_known=False),
-        ),
-        (
+        is_position = np.array([v.unit in msgs.POSITION_UNITS for v in spec.state])
+    if joints is not None:
+        yield (
             "/joint_states",
             topic_roles.JOINTS,
             joints,
-            lambda header, row: messages.make_joints(
-                header, names, row * still, row * ~still
-            ),
-        ),
-        ("/imu", topic_roles.IMU, recording.imu, messages.make_imu),
-    ]
-    for topic, kind, stream, make in topics:
-        if stream is not None:
-            yield topic, kind, stream, make
-
-
-class _Messages:
-    def __init__(self, store: "Typestore") -> None:
-        self._types = store.types
-
-    def _make(self, kind: str, *values: Any) -> Any:
-        package, name = kind.split("/")
-        return self._types[f"{package}/msg/{name}"](*values)
-
-    def make_header(self, stamp_ns: int) -> Any:
-        stamp = self._make(
-            "builtin_interfaces/Time", stamp_ns // NS_PER_S, stamp_ns % NS_PER_S
+            lambda row: {
+                "name": names,
+                "position": row * is_position,
+                "velocity": row * ~is_position,
+            },
         )
-        return self._make("std_msgs/Header", stamp, FRAMES[0])
+    if recording.imu is not None:
+        yield "/imu", topic_roles.IMU, recording.imu, _write_imu
 
-    def _make_vector(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Any:
-        return self._make("geometry_msgs/Vector3", x, y, z)
 
-    def make_twist(self, row: Array) -> Any:
-        x, y, w = (float(value) for value in row)
-        return self._make(
-            "geometry_msgs/Twist", self._make_vector(x, y), self._make_vector(z=w)
-        )
+def _write_twist(row: Array) -> Content:
+    x, y, w = row
+    return {"linear": {"x": x, "y": y}, "angular": {"z": w}}
 
-    def _make_pose(self, row: Array) -> Any:
-        x, y, heading = (float(value) for value in row)
-        z = float(np.sin(heading / 2.0))
-        w = float(np.cos(heading / 2.0))
-        turned = self._make("geometry_msgs/Quaternion", 0.0, 0.0, z, w)
-        return self._make(
-            "geometry_msgs/Pose", self._make("geometry_msgs/Point", x, y, 0.0), turned
-        )
 
-    def make_pose_stamped(self, header: Any, row: Array) -> Any:
-        return self._make("geometry_msgs/PoseStamped", header, self._make_pose(row))
+def _write_pose(row: Array) -> Content:
+    x, y, heading = row
+    orientation = {"z": np.sin(heading / 2.0), "w": np.cos(heading / 2.0)}
+    return {"position": {"x": x, "y": y}, "orientation": orientation}
 
-    def make_odometry(self, header: Any, row: Array, pose_known: bool = True) -> Any:
-        """Makes an odometry message if only its pose or only its twist was recorded."""
-        pose, twist = (row, np.zeros(3)) if pose_known else (np.zeros(3), row)
-        covariance = np.append(0.0 if pose_known else -1.0, np.zeros(35))
-        where = self._make(
-            "geometry_msgs/PoseWithCovariance", self._make_pose(pose), covariance
-        )
-        speed = self._make(
-            "geometry_msgs/TwistWithCovariance", self.make_twist(twist), np.zeros(36)
-        )
-        return self._make("nav_msgs/Odometry", header, FRAMES[1], where, speed)
 
-    def make_joints(
-        self, header: Any, names: list[str], position: Array, velocity: Array
-    ) -> Any:
-        return self._make(
-            "sensor_msgs/JointState", header, names, position, velocity, np.zeros(0)
-        )
+def _write_odometry(row: Array) -> Content:
+    return {"child_frame_id": FRAMES[1], "pose": {"pose": _write_pose(row)}}
 
-    def make_imu(self, header: Any, row: Array) -> Any:
-        ax, ay, w = (float(value) for value in row)
-        level = self._make("geometry_msgs/Quaternion", 0.0, 0.0, 0.0, 1.0)
-        absent = np.full(9, -1.0)
-        rates = self._make_vector(z=w)
-        pulls = self._make_vector(ax, ay)
-        measured = np.zeros(9)
-        return self._make(
-            "sensor_msgs/Imu", header, level, absent, rates, measured, pulls, measured
-        )
+
+def _write_odometry_twist(row: Array) -> Content:
+    """Returns the content of an odometry of which only the twist was recorded."""
+    content = _write_odometry(np.zeros(3))
+    content["pose"]["covariance"] = np.append(-1.0, np.zeros(35))
+    return content | {"twist": {"twist": _write_twist(row)}}
+
+
+def _write_imu(row: Array) -> Content:
+    ax, ay, w = row
+    return {
+        "orientation": {"w": 1.0},
+        "orientation_covariance": np.full(9, -1.0),
+        "angular_velocity": {"z": w},
+        "linear_acceleration": {"x": ax, "y": ay},
+    }
+
+
+def _make_message(store: "Typestore", kind: str, content: Content) -> Any:
+    """Makes a message of a type from its content by field; all else is zero or empty."""
+    values = []
+    fields: Any = store.fielddefs[kind][1]
+    for name, (node, detail) in fields:
+        value = content.get(name)
+        if node.name == "NAME":
+            value = _make_message(store, detail, value or {})
+        elif value is None and node.name == "BASE":
+            value = "" if detail[0] == "string" else 0
+        elif value is None:
+            value = np.zeros(detail[1])
+        values.append(value)
+    return store.types[kind](*values)
 
 
 class BagSink:

@@ -66,8 +66,10 @@ def make_terms(model: TaylorModel) -> Terms:
     """Returns the kept terms of a model. Raises ModelError if a term's order is too high."""
     order = max(1, int(model.powers.sum(axis=1).max(initial=1)))
     if order > MAX_ORDER:
-        fix = f"the maximum is {MAX_ORDER}: generate the model again."
-        raise ModelError(f"the kinematics have a term of order {order}; {fix}")
+        raise ModelError(
+            f"the kinematics have a term of order {order}; the maximum is {MAX_ORDER}: "
+            "generate the model again."
+        )
     dofs, columns = np.nonzero(model.coefficients)
     powers = model.powers[columns]
     degree = powers.sum(axis=1)

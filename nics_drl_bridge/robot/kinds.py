@@ -169,9 +169,11 @@ def textbook(spec: RobotSpec) -> Textbook:
         return replace(book, lag=np.full(len(book.lag), NO_LAG_S))
     if len(spec.state) != len(book.lag):
         names = ", ".join(v.name for v in spec.state) or "none"
-        reason = f"need a state of {len(book.lag)} actuators, not {names}"
-        fix = "correct `state:`, or leave it to the kind"
-        raise _make_error(spec, f"{reason}; {fix}.")
+        raise _make_error(
+            spec,
+            f"need a state of {len(book.lag)} actuators, not {names}; correct "
+            "`state:`, or leave it to the kind.",
+        )
     return book
 
 
@@ -180,9 +182,11 @@ def find_actuator_kinematics(spec: RobotSpec) -> Textbook:
 
     def make(kind: RobotKind) -> Textbook:
         if kind.kinematics is None:
-            fault = f"the kind {spec.textbook!r} has no textbook kinematics"
-            fix = "use a recording and its model instead, or choose another kind"
-            raise ConfigError(f"robot {spec.name!r}: {fault}; {fix}.")
+            raise ConfigError(
+                f"robot {spec.name!r}: the kind {spec.textbook!r} has no textbook "
+                "kinematics; use a recording and its model instead, or choose another "
+                "kind."
+            )
         return kind.kinematics(spec)
 
     return _apply_to_kind(spec, make)
@@ -197,9 +201,9 @@ def _add_lags(spec: RobotSpec, book: Textbook) -> Textbook:
     """Returns the kinematics of a robot whose state is its twist, which lags like its actuators."""
     dofs = [POSE_RATES.index(v.twist) for v in spec.state if v.twist is not None]
     if book.limited.any():
-        fault = "a rate limit of an actuator needs the actuators as state"
         raise ConfigError(
-            f"robot {spec.name!r}: {fault}; give lags, or correct `state:`."
+            f"robot {spec.name!r}: a rate limit of an actuator needs the actuators as "
+            "state; give lags, or correct `state:`."
         )
     lag = np.zeros(len(dofs))
     for i, v in enumerate(spec.state):
@@ -252,8 +256,10 @@ def _apply_to_kind(spec: RobotSpec, function: Callable[[RobotKind], T]) -> T:
 def require_textbook(spec: RobotSpec) -> str:
     """Returns the name of a robot's kind. Raises ConfigError if it names none."""
     if spec.textbook is None:
-        fix = "add `textbook:` to its YAML file or give a recording."
-        raise ConfigError(f"robot {spec.name!r} names no textbook kinematics; {fix}")
+        raise ConfigError(
+            f"robot {spec.name!r} names no textbook kinematics; add `textbook:` to its "
+            "YAML file or give a recording."
+        )
     return spec.textbook
 
 
@@ -284,9 +290,9 @@ def find_command(spec: RobotSpec, twist: ArrayLike) -> Array:
     else:
         book = find_actuator_kinematics(spec)
         if book.command is None:
-            fault = f"the kind {spec.textbook!r} does not say which command leads to a twist"
             raise ConfigError(
-                f"robot {spec.name!r}: {fault}; use continuous actions, no planner."
+                f"robot {spec.name!r}: the kind {spec.textbook!r} does not say which "
+                "command leads to a twist; use continuous actions, no planner."
             )
         command = book.command(twist)
     return np.clip(command, spec.command_low, spec.command_high)
@@ -322,9 +328,11 @@ def describe_overdrive(spec: RobotSpec) -> str | None:
         low = v.min - LIMIT_TOLERANCE * abs(v.min)
         high = v.max + LIMIT_TOLERANCE * abs(v.max)
         if not low <= worst <= high:
-            limits = f"beyond its limits {v.min:g} and {v.max:g}"
-            fix = "narrow the commands, or widen the limits of the state"
-            return f"the commands ask for {v.name} at {worst:.3g} {v.unit}, {limits}; {fix}."
+            return (
+                f"the commands ask for {v.name} at {worst:.3g} {v.unit}, beyond its "
+                f"limits {v.min:g} and {v.max:g}; narrow the commands, or widen the "
+                "limits of the state."
+            )
     return None
 
 
@@ -398,8 +406,11 @@ def make_wheeled(
     its twist, or by its wheel speeds with the usual names `wheels`.
     """
     if _has_actuator_state(spec) and len(spec.state) != len(inverse):
-        needed = f"have {len(inverse)} wheels as state, not {len(spec.state)} variables"
-        raise _make_error(spec, f"{needed}; correct `state:`.")
+        raise _make_error(
+            spec,
+            f"have {len(inverse)} wheels as state, not {len(spec.state)} variables; "
+            "correct `state:`.",
+        )
     dofs = [POSE_RATES.index(dof) for dof in moves]
     fields = tuple(specs.CMD_VEL_FIELDS[dof] for dof in dofs)
     if all(c.unit == "rad/s" and c.cmd_vel is None for c in spec.command):
@@ -445,8 +456,10 @@ def _find_columns(
     command_fields = [c.cmd_vel for c in spec.command]
     if not any(command_fields):
         if len(command_fields) != count:
-            reason = f"need {count} commands, not {len(command_fields)}"
-            raise _make_error(spec, f"{reason}; correct `command:`.")
+            raise _make_error(
+                spec,
+                f"need {count} commands, not {len(command_fields)}; correct `command:`.",
+            )
         command_names = [c.name for c in spec.command]
         if names and set(names) == set(command_names):
             return [command_names.index(name) for name in names]
@@ -474,8 +487,11 @@ def _find_state_places(spec: RobotSpec) -> tuple[int, int]:
         return 0, 1
     units = [v.unit for v in spec.state]
     if sorted(units) != ["m/s", "rad"]:
-        reason = f"need a state in m/s and rad, not in {', '.join(units) or 'nothing'}"
-        raise _make_error(spec, f"{reason}; correct `state:`.")
+        raise _make_error(
+            spec,
+            f"need a state in m/s and rad, not in {', '.join(units) or 'nothing'}; "
+            "correct `state:`.",
+        )
     return units.index("m/s"), units.index("rad")
 
 

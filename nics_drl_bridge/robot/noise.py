@@ -128,7 +128,8 @@ class Latency(Schema):
         """Returns one human-readable line per topic."""
         lines = []
         for topic, delay in self.measured.items():
-            low = f"{1e3 * delay.least:.1f}"
-            high = f"{1e3 * (delay.least + delay.jitter):.1f}"
-            lines.append(f"{topic} arrives {low} to {high} ms after it was measured")
+            lines.append(
+                f"{topic} arrives {1e3 * delay.least:.1f} to "
+                f"{1e3 * (delay.least + delay.jitter):.1f} ms after it was measured"
+            )
         return lines

@@ -204,11 +204,9 @@ class RobotSpec(Schema):
     @model_validator(mode="after")
     def _check_footprint(self) -> "RobotSpec":
         if not self.footprint_radius <= MAX_RADIUS:
-            fault = (
-                f"its footprint reaches {self.footprint_radius:.6g} m from base_link"
-            )
             raise ValueError(
-                f"{fault}, at most {MAX_RADIUS:g} m can be; lengths are in metres"
+                f"its footprint reaches {self.footprint_radius:.6g} m from base_link, "
+                f"at most {MAX_RADIUS:g} m can be; lengths are in metres"
             )
         if self.footprint is not None:
             if geometry.has_crossing_edges(np.array(self.footprint)):
@@ -342,9 +340,9 @@ class RobotSpec(Schema):
     def wheelbase(self) -> float:
         """Distance between the axles of a robot that steers [m]. Raises ConfigError if unknown."""
         if not self.knows_wheelbase:
-            fix = "add `wheelbase:` [m] to the `parameters:` of its YAML file."
             raise ConfigError(
-                f"robot {self.name!r} steers, and its wheelbase is not known; {fix}"
+                f"robot {self.name!r} steers, and its wheelbase is not known; add "
+                "`wheelbase:` [m] to the `parameters:` of its YAML file."
             )
         return self.parameters["wheelbase"]
 
@@ -362,9 +360,11 @@ class RobotSpec(Schema):
     def _cmd_vel_index(self) -> NDArray[np.intp]:
         for command in self.command:
             if command.cmd_vel is None:
-                reason = f"the command {command.name!r} names no field of cmd_vel"
-                fix = "add `cmd_vel:` to it, or drive it in process, without ROS 2"
-                raise ConfigError(f"robot {self.name!r}: {reason}; {fix}.")
+                raise ConfigError(
+                    f"robot {self.name!r}: the command {command.name!r} names no field "
+                    "of cmd_vel; add `cmd_vel:` to it, or drive it in process, "
+                    "without ROS 2."
+                )
         fields = [c.cmd_vel for c in self.command if c.cmd_vel is not None]
         return np.array([CMD_VEL_FIELDS.index(f) for f in fields], dtype=np.intp)
 
@@ -473,8 +473,10 @@ def build_robot(
         end = max(c.min, c.max, key=abs)
         is_recorded = end in ranges.get(c.name, ())  # then the mapping is at fault
         if c.steers and abs(end) > FARTHEST_STEERED and not is_recorded:
-            fault = f"key 'command': {c.name} reaches {end:g} rad, and no wheel steers so far"
-            raise ConfigError(f"{source}: {fault}; angles are in radians.")
+            raise ConfigError(
+                f"{source}: key 'command': {c.name} reaches {end:g} rad, and no wheel "
+                "steers so far; angles are in radians."
+            )
     return spec
 
 

@@ -460,10 +460,8 @@ class NamedTaylorModel(Schema):
     def _check_stages(self, states: tuple[str, ...], commands: tuple[str, ...]) -> None:
         curved = [curve.command for curve in self.inputs]
         _check_names("inputs", curved, commands)
-        _check_names("friction", self.friction or (), states)
-        _check_names("drag", self.drag or (), states)
-        _check_names("limits", self.limits or (), states)
-        _check_names("back_emf", self.back_emf or (), states)
+        for key in ("friction", "drag", "limits", "back_emf"):
+            _check_names(key, getattr(self, key) or (), states)
         for row in (self.back_emf or {}).values():
             _check_names("back_emf", row, commands)
         if len(set(curved)) < len(curved):
@@ -473,5 +471,7 @@ class NamedTaylorModel(Schema):
 def _check_names(key: str, names: Iterable[str], allowed: tuple[str, ...]) -> None:
     for name in names:
         if name not in allowed:
-            fault = f"key {key!r} has {name!r}, not one of ({', '.join(allowed)})"
-            raise ModelError(f"kinematics: {fault}; correct the name.")
+            raise ModelError(
+                f"kinematics: key {key!r} has {name!r}, not one of "
+                f"({', '.join(allowed)}); correct the name."
+            )

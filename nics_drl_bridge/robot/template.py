@@ -96,8 +96,10 @@ class Template:
         missing = defaults.keys() - parameters.keys()
         for name in parameters:  # any name is allowed that does not look misspelt
             if get_close_matches(str(name), missing, 1, MISSPELT_PARAMETER):
-                fault = f"unknown parameter {name!r}; {suggest(name, defaults)}"
-                raise ConfigError(f"robot {data['name']!r}: {fault}")
+                raise ConfigError(
+                    f"robot {data['name']!r}: unknown parameter {name!r}; "
+                    f"{suggest(name, defaults)}"
+                )
         data["parameters"] = {**defaults, **parameters}
         data["assumed"] = sorted(missing)
         return data
@@ -125,18 +127,17 @@ class Template:
             fits = all(by_name.get(name) in usual for name in names)
             if not fits or len(usual) != len(names):
                 needed = _join_names(n for n in by_name if not n.endswith("_command"))
-                fault = f"commands of the kind {kind!r} are {needed}"
-                fix = "use these names, or list yours in that order under `command:` of the robot"
                 raise ConfigError(
-                    f"robot {robot.get('name', kind)!r}: {fault}, "
-                    f"not {_join_names(names)}; {fix}."
+                    f"robot {robot.get('name', kind)!r}: commands of the kind {kind!r} "
+                    f"are {needed}, not {_join_names(names)}; use these names, or list "
+                    "yours in that order under `command:` of the robot."
                 )
         if command is None:
             command = [{"name": name} for name in (names or list_names(usual))]
         if not command:
-            fix = "name them under `command:` of the robot, or give a recording"
             raise ConfigError(
-                f"the commands of a robot of the kind {kind!r} are not known; {fix}."
+                f"the commands of a robot of the kind {kind!r} are not known; name "
+                "them under `command:` of the robot, or give a recording."
             )
         matches = [by_name.get(part.get("name")) for part in command]
         if None in matches and len(command) == len(usual):

@@ -3,11 +3,11 @@
 import math
 from collections.abc import Mapping
 from xml.etree import ElementTree
+from xml.sax.saxutils import quoteattr
 
 from nics_drl_bridge.robot.kinds import Wheel, draw_robot
 from nics_drl_bridge.robot.spec import RobotSpec
 
-Element = ElementTree.Element
 Place = tuple[float, float, float]
 COLOURS = {"body": "0.2 0.4 0.7 1", "wheel": "0.1 0.1 0.1 1", "laser": "0.7 0.1 0.1 1"}
 BODY_HEIGHT = 0.04
@@ -28,148 +28,108 @@ def make_urdf(
     `laser` in `base`: x [m], y [m], heading [rad]. `further` are the mounts of other sensors by
     frame.
     """
-    robot = Element("robot", name=spec.name)
-    for name, colour in COLOURS.items():
-        _add(_add(robot, "material", name=name), "color", rgba=colour)
-    link = _add(robot, "link", name=base)
-    _add_collision(_add(link, "collision"), spec)
-    if spec.textbook is None:
-        disc = (spec.footprint_radius, BODY_HEIGHT)
-        _add_visual(link, "body", disc, (0.0, 0.0, BODY_HEIGHT))
-    else:
+    parts = [
+        f'<material name="{name}"><color rgba="{colour}"/></material>'
+        for name, colour in COLOURS.items()
+    ]
+    size: tuple[float, ...] = (spec.footprint_radius, BODY_HEIGHT)
+    place = (0.0, 0.0, BODY_HEIGHT)
+    wheels: tuple[Wheel, ...] = ()
+    if spec.textbook is not None:
         drawing = draw_robot(spec)
-        body: tuple[float, ...]
-        if isinstance(drawing.body, tuple):
-            body = drawing.body
-        else:
-            body = (drawing.body,)
+        body = drawing.body if isinstance(drawing.body, tuple) else (drawing.body,)
+        size = (*body, BODY_HEIGHT)
         place = (drawing.centre[0], 0.0, drawing.centre[1])
-        _add_visual(link, "body", (*body, BODY_HEIGHT), place)
-        for wheel in drawing.wheels:
-            _add_wheel(robot, base, wheel)
-    mounts = {laser: mount, **(further or {})}
-    for frame, sensor_mount in mounts.items():
+        wheels = drawing.wheels
+    collision = f"<collision>{_write_footprint(spec)}</collision>"
+    parts.append(_write_link(base, collision + _write_visual("body", size, place)))
+    parts += [_write_wheel(base, wheel) for wheel in wheels]
+    laser_visual = _write_visual("laser", (0.02, 0.03), (0.0, 0.0, 0.07))
+    for frame, (x, y, yaw) in {laser: mount, **(further or {})}.items():
         joint = "laser_mount" if frame == laser else f"{frame}_mount"
-        _add_sensor(robot, base, frame, joint, sensor_mount)
-    ElementTree.indent(robot)
-    return f'<?xml version="1.0"?>\n{ElementTree.tostring(robot, encoding="unicode")}\n'
+        parts.append(_write_link(frame, laser_visual))
+        parts.append(_write_joint(joint, "fixed", base, frame, (x, y, 0.0), yaw))
+    robot = f"<robot name={quoteattr(spec.name)}>{''.join(parts)}</robot>"
+    root = ElementTree.fromstring(robot)  # noqa: S314 - written above
+    ElementTree.indent(root)
+    return f'<?xml version="1.0"?>\n{ElementTree.tostring(root, encoding="unicode")}\n'
 
 
-def _add_collision(parent: Element, spec: RobotSpec) -> None:
-    """Adds the footprint: a disc, or the box around its corners, because URDF has no prism."""
+def _write_footprint(spec: RobotSpec) -> str:
+    """Returns a disc, or the box around the footprint's corners, because URDF has no prism."""
     if spec.footprint is None:
         disc = (spec.footprint_radius, BODY_HEIGHT)
-        _add_geometry(parent, disc, (0.0, 0.0, BODY_HEIGHT))
-        return
+        return _write_shape(disc, (0.0, 0.0, BODY_HEIGHT))
     x, y = zip(*spec.footprint, strict=True)
     size = (max(x) - min(x), max(y) - min(y), BODY_HEIGHT)
-    middle_x = 0.5 * (min(x) + max(x))
-    middle_y = 0.5 * (min(y) + max(y))
-    middle = (middle_x, middle_y, BODY_HEIGHT)
-    _add_geometry(parent, size, middle)
+    middle = (0.5 * (min(x) + max(x)), 0.5 * (min(y) + max(y)), BODY_HEIGHT)
+    return _write_shape(size, middle)
 
 
-def _add_wheel(robot: Element, parent: str, wheel: Wheel) -> None:
-    """Adds a wheel, which may roll about y and be steered by a pivot about z."""
+def _write_wheel(parent: str, wheel: Wheel) -> str:
+    """Returns a wheel, which may roll about y and be steered by a pivot about z."""
+    text = ""
     place: Place = (*wheel.place, wheel.radius)
-    if wheel.pivot is not None:
-        pivot = wheel.pivot
-        angle = wheel.pivot.angle
-        _add(robot, "link", name=pivot.link)
-        joint = _add_joint(robot, pivot.joint, "revolute", (parent, pivot.link), place)
-        _add(joint, "axis", xyz="0 0 1")
-        _add(
-            joint,
-            "limit",
-            lower=f"{angle.min:g}",
-            upper=f"{angle.max:g}",
-            effort="1",
-            velocity="10",
+    pivot = wheel.pivot
+    if pivot is not None:
+        angle = pivot.angle
+        details = (
+            f'<axis xyz="0 0 1"/><limit lower="{angle.min:g}" upper="{angle.max:g}" '
+            'effort="1" velocity="10"/>'
         )
         if pivot.joint != angle.name:
-            _add(joint, "mimic", joint=angle.name)
+            details += f'<mimic joint="{angle.name}"/>'
+        text = _write_link(pivot.link) + _write_joint(
+            pivot.joint, "revolute", parent, pivot.link, place, details=details
+        )
         parent = pivot.link
         place = (0.0, 0.0, 0.0)
-    name = wheel.name
-    kind = "continuous" if wheel.turns else "fixed"
-    joint = _add_joint(robot, name, kind, (parent, f"{name}_link"), place)
+    link = f"{wheel.name}_link"
     if wheel.turns:
-        _add(joint, "axis", xyz="0 1 0")
+        axis = '<axis xyz="0 1 0"/>'
+        text += _write_joint(wheel.name, "continuous", parent, link, place, 0.0, axis)
+    else:
+        text += _write_joint(wheel.name, "fixed", parent, link, place)
     size = (wheel.radius, 0.4 * wheel.radius)
-    link = _add(robot, "link", name=f"{name}_link")
-    _add_visual(link, "wheel", size, (0.0, 0.0, 0.0), roll=0.5 * math.pi)
+    visual = _write_visual("wheel", size, (0.0, 0.0, 0.0), roll=0.5 * math.pi)
+    return text + _write_link(link, visual)
 
 
-def _add_sensor(
-    robot: Element,
-    base: str,
-    frame: str,
-    joint: str,
-    mount: Place,
-) -> None:
-    link = _add(robot, "link", name=frame)
-    _add_visual(link, "laser", (0.02, 0.03), (0.0, 0.0, 0.07))
-    x, y, yaw = mount
-    _add_joint(robot, joint, "fixed", (base, frame), (x, y, 0.0), yaw=yaw)
+def _write_link(name: str, content: str = "") -> str:
+    return f"<link name={quoteattr(name)}>{content}</link>"
 
 
-def _add(parent: Element, tag: str, **attributes: str) -> Element:
-    return ElementTree.SubElement(parent, tag, attributes)
-
-
-def _format_numbers(*values: float) -> str:
-    return " ".join(f"{value:.6g}" for value in values)
-
-
-def _add_joint(
-    robot: Element,
+def _write_joint(
     name: str,
     kind: str,
-    links: tuple[str, str],
+    parent: str,
+    child: str,
     place: Place,
     yaw: float = 0.0,
-) -> Element:
-    joint = _add(robot, "joint", name=name, type=kind)
-    _add(
-        joint, "origin", xyz=_format_numbers(*place), rpy=_format_numbers(0.0, 0.0, yaw)
+    details: str = "",
+) -> str:
+    return (
+        f'<joint name={quoteattr(name)} type="{kind}">{_write_origin(place, yaw=yaw)}'
+        f"<parent link={quoteattr(parent)}/><child link={quoteattr(child)}/>{details}</joint>"
     )
-    _add(joint, "parent", link=links[0])
-    _add(joint, "child", link=links[1])
-    return joint
 
 
-def _add_visual(
-    link: Element,
-    material: str,
-    size: tuple[float, ...],
-    place: Place,
-    roll: float = 0.0,
-) -> None:
-    visual = _add(link, "visual")
-    _add_geometry(visual, size, place, roll)
-    _add(visual, "material", name=material)
+def _write_origin(place: Place, roll: float = 0.0, yaw: float = 0.0) -> str:
+    x, y, z = place
+    return f'<origin xyz="{x:.6g} {y:.6g} {z:.6g}" rpy="{roll:.6g} 0 {yaw:.6g}"/>'
 
 
-def _add_geometry(
-    parent: Element,
-    size: tuple[float, ...],
-    place: Place,
-    roll: float = 0.0,
-) -> None:
-    """Adds a box (length, width, height) or a cylinder (radius, length)."""
-    _add(
-        parent,
-        "origin",
-        xyz=_format_numbers(*place),
-        rpy=_format_numbers(roll, 0.0, 0.0),
-    )
-    shape = _add(parent, "geometry")
-    if len(size) == 3:
-        _add(shape, "box", size=_format_numbers(*size))
-    else:
-        _add(
-            shape,
-            "cylinder",
-            radius=_format_numbers(size[0]),
-            length=_format_numbers(size[1]),
-        )
+def _write_visual(
+    material: str, size: tuple[float, ...], place: Place, roll: float = 0.0
+) -> str:
+    shape = _write_shape(size, place, roll)
+    return f'<visual>{shape}<material name="{material}"/></visual>'
+
+
+def _write_shape(size: tuple[float, ...], place: Place, roll: float = 0.0) -> str:
+    """Returns a box (length, width, height) or a cylinder (radius, length)."""
+    numbers = [f"{value:.6g}" for value in size]
+    shape = f'<box size="{" ".join(numbers)}"/>'
+    if len(size) == 2:
+        shape = f'<cylinder radius="{numbers[0]}" length="{numbers[1]}"/>'
+    return f"{_write_origin(place, roll)}<geometry>{shape}</geometry>"
