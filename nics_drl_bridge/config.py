@@ -414,9 +414,18 @@ def _quote(dumper: _QuotingDumper, text: str) -> Any:
 _QuotingDumper.add_representer(str, _quote)
 
 
-def dump_yaml(data: Any, quote_text: bool = False) -> str:
-    """Writes plain data as YAML that `parse_yaml` reads back to the same numbers."""
-    dumper = _QuotingDumper if quote_text else _Dumper
+def dump_yaml(data: Any, quote_text: bool = False, one_line_rows: bool = False) -> str:
+    """Writes plain data as YAML that `parse_yaml` reads back to the same numbers.
+
+    `one_line_rows` writes lists and mappings of numbers and words on one line each.
+    """
     return str(
-        yaml.dump(data, Dumper=dumper, sort_keys=False, allow_unicode=True, width=100)
+        yaml.dump(
+            data,
+            Dumper=_QuotingDumper if quote_text else _Dumper,
+            sort_keys=False,
+            allow_unicode=True,
+            width=100,
+            default_flow_style=None if one_line_rows else False,
+        )
     )

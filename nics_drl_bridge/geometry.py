@@ -128,7 +128,10 @@ def has_crossing_edges(corners: Array) -> bool:
     # which matters for edges on one line. Matrices (K, K) are of edge by edge.
     end_sides = _find_sides(end, start, edge)
     is_separated = _find_sides(start, start, edge) * end_sides <= 0.0
-    crossing = _find_overlaps(start, end) & is_separated & is_separated.T
+    low = np.minimum(start, end)
+    high = np.maximum(start, end)
+    reaches_above = (low[:, None] <= high[None]).all(axis=-1)
+    crossing = reaches_above & reaches_above.T & is_separated & is_separated.T
     index = np.arange(len(corners))
     gap = (index[None] - index[:, None]) % len(corners)
     are_neighbours = (gap <= 1) | (gap >= len(corners) - 1)
@@ -148,15 +151,6 @@ def _find_sides(points: Array, start: Array, edge: Array) -> Array:
     along = edge[:, None]
     cross = along[..., 0] * to_point[..., 1] - along[..., 1] * to_point[..., 0]
     return np.asarray(np.sign(cross))
-
-
-def _find_overlaps(start: Array, end: Array) -> NDArray[np.bool_]:
-    """Returns which of the boxes around edges from `start` to `end` (K, 2) overlap (K, K)."""
-    low = np.minimum(start, end)
-    high = np.maximum(start, end)
-    is_below = low[:, None] <= high[None]
-    is_above = low[None] <= high[:, None]
-    return np.asarray((is_below & is_above).all(axis=-1))
 
 
 def compute_depths(points: Array, corners: Array) -> Array:

@@ -13,13 +13,13 @@ class StatusLine:
     """A line on standard error, or in a progress bar that shows it instead."""
 
     def __init__(self) -> None:
-        self._bars: list[Callable[[str], None]] = []  # innermost last
+        self._bar: Callable[[str], None] | None = None  # owns the terminal's line
         self._is_shown = False  # True while the terminal's last line shows a text
 
     @property
     def in_place(self) -> bool:
         """True if each text replaces the previous one."""
-        return bool(self._bars) or sys.stderr.isatty()
+        return self._bar is not None or sys.stderr.isatty()
 
     @property
     def interval_s(self) -> float:
@@ -28,8 +28,8 @@ class StatusLine:
 
     def show(self, text: str) -> None:
         """Shows a text in place of the previous one, or on a new line if it can't be replaced."""
-        if self._bars:
-            self._bars[-1](text)
+        if self._bar is not None:
+            self._bar(text)
         elif sys.stderr.isatty():
             sys.stderr.write(f"{CLEAR_LINE}nics_drl_bridge: {text}")
             sys.stderr.flush()
@@ -47,11 +47,12 @@ class StatusLine:
     @contextmanager
     def shown_by(self, bar: Callable[[str], None]) -> Iterator[None]:
         """Lets a progress bar, which owns the terminal's line, show the texts of a block."""
-        self._bars.append(bar)
+        outer = self._bar
+        self._bar = bar
         try:
             yield
         finally:
-            self._bars.remove(bar)
+            self._bar = outer
 
 
 STATUS = StatusLine()

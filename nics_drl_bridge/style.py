@@ -25,6 +25,10 @@ GOAL = ORANGE
 OTHER = "#8d99ae"
 DARK = "#333333"
 EDGE = "#c5cbd3"
+# looks of lines and points
+MEASURED_LINE: dict[str, Any] = {"color": MEASURED, "linewidth": 2.5, "alpha": 0.55}
+MODEL_LINE: dict[str, Any] = {"color": MODEL, "linewidth": 1.4}
+POINTS: dict[str, Any] = {"linestyle": "none", "marker": ".", "markersize": 3}
 # markers for `SERIES`, for prints without colours
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 RC: dict[Any, Any] = {

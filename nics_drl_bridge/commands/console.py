@@ -59,32 +59,30 @@ POLICIES = complete_names(
     "policies", also=("dynamic_window", "mppi", "random", "straight")
 )
 ROBOT_OPTIONS = ("--robot", "--model")  # synonyms in every command
+
+
+def make_robot_option(help: str) -> Any:
+    """Returns the option that names a robot or a model."""
+    return Option(*ROBOT_OPTIONS, autocompletion=ROBOTS, help=help)
+
+
+def make_world_option(help: str) -> Any:
+    """Returns the option that names a world, or several."""
+    return Option("--world", "--scene", autocompletion=WORLDS, help=help)
+
+
 RobotOption = Annotated[
-    str,
-    Option(
-        "--robot",
-        "--model",
-        autocompletion=ROBOTS,
-        help="A shipped robot (see nics list robots) or a YAML file.",
-    ),
+    str, make_robot_option("A shipped robot (see nics list robots) or a YAML file.")
 ]
 DrivenRobotOption = Annotated[
     str | None,
-    Option(
-        "--robot",
-        "--model",
-        autocompletion=ROBOTS,
-        help=f"Shipped, or a YAML file; else the recording's own, or {DEFAULT_ROBOT}.",
+    make_robot_option(
+        f"Shipped, or a YAML file; else the recording's own, or {DEFAULT_ROBOT}."
     ),
 ]
 PolicyModelOption = Annotated[
     str | None,
-    Option(
-        "--model",
-        "--robot",
-        autocompletion=ROBOTS,
-        help="A model's folder, or a shipped robot; else the policy's own.",
-    ),
+    make_robot_option("A model's folder, or a shipped robot; else the policy's own."),
 ]
 LidarOption = Annotated[
     str | None,
@@ -94,13 +92,7 @@ LidarOption = Annotated[
     ),
 ]
 WorldOption = Annotated[
-    str,
-    Option(
-        "--world",
-        "--scene",
-        autocompletion=WORLDS,
-        help=f"A shipped world ({defaults.WORLD}) or a YAML file.",
-    ),
+    str, make_world_option(f"A shipped world ({defaults.WORLD}) or a YAML file.")
 ]
 JsonOption = Annotated[bool, Option("--json", help="Print one JSON object instead.")]
 TopicsOption = Annotated[

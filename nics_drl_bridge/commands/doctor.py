@@ -21,11 +21,8 @@ def doctor(
     ] = None,
     model: Annotated[
         str | None,
-        Option(
-            "--model",
-            "--robot",
-            autocompletion=console.ROBOTS,
-            help=f"Check against a model's folder, or a shipped robot ({DEFAULT_ROBOT}).",
+        console.make_robot_option(
+            f"Check against a model's folder, or a shipped robot ({DEFAULT_ROBOT})."
         ),
     ] = None,
     policy: Annotated[

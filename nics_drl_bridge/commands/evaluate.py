@@ -27,11 +27,8 @@ def evaluate(
     task: console.TaskOption = None,
     world: Annotated[
         str,
-        Option(
-            "--world",
-            "--scene",
-            autocompletion=console.WORLDS,
-            help=f"A shipped world ({defaults.EVALUATION_WORLD}) or a YAML file.",
+        console.make_world_option(
+            f"A shipped world ({defaults.EVALUATION_WORLD}) or a YAML file."
         ),
     ] = defaults.EVALUATION_WORLD,
     places: Annotated[

@@ -3,9 +3,12 @@
 from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from nics_drl_bridge.errors import ConfigError, ModelError, suggest
+
+if TYPE_CHECKING:
+    from nics_drl_bridge.recording.excite import DrivePlan
 
 # Limit of numpy's global generator, which Stable-Baselines3 uses.
 GREATEST_TRAINING_SEED = 2**32 - 1
@@ -25,6 +28,12 @@ def check_writable(path: Path) -> None:
         raise ConfigError(
             f"--out {path}: {above}: {reason}; choose another place."
         ) from None
+
+
+def check_suffix(option: str, file: Path, *suffixes: str) -> None:
+    """Raises ConfigError unless a file to write has the first suffix, or one of the others."""
+    if file.suffix not in suffixes:
+        raise ConfigError(f"{option} {file}: must end in {suffixes[0]}.")
 
 
 def check_robot(name: str) -> None:
@@ -103,20 +112,16 @@ def check_settings(task: str, settings: str | None, changes: dict[str, Any]) -> 
     check_task(chosen_settings(task, settings, changes).task)
 
 
-def check_drive(parameters: dict[str, Any]) -> None:
-    """Raises BridgeError for parameters with which `nics record` could not drive."""
+def check_drive(parameters: dict[str, Any]) -> "DrivePlan":
+    """Returns the drive of `nics record`. Raises BridgeError if it could not be driven."""
     from nics_drl_bridge.recording.excite import DrivePlan
     from nics_drl_bridge.recording.topic_roles import load_topic_roles
     from nics_drl_bridge.recording.write import check_out
     from nics_drl_bridge.robot.spec import load_robot
 
-    robot = load_robot(parameters["robot"])
     check_writable(check_out(Path(parameters["out"])))
     load_topic_roles(parameters["topics"] or None)
-    DrivePlan(
-        robot,
-        parameters["bound"],
-        parameters["duration"],
-        parameters["speed"],
-        parameters["seed"],
-    )
+    options = {
+        name: parameters[name] for name in ("bound", "duration", "speed", "seed")
+    }
+    return DrivePlan(load_robot(parameters["robot"]), **options)

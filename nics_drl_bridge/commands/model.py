@@ -10,7 +10,7 @@ from typer import Argument, Option
 
 from nics_drl_bridge import defaults, extensions
 from nics_drl_bridge.commands import console
-from nics_drl_bridge.commands.first_checks import check_drive
+from nics_drl_bridge.commands.first_checks import check_drive, check_suffix
 from nics_drl_bridge.config import parse_namespace
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.exit_codes import EXIT_INTERRUPTED
@@ -19,6 +19,7 @@ from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 if TYPE_CHECKING:
     from nics_drl_bridge.identify.identify import Identified
+    from nics_drl_bridge.recording.excite import DrivePlan
     from nics_drl_bridge.recording.recording import Recording
 
 
@@ -76,13 +77,13 @@ def record(
         "use_sim_time": use_sim_time,
         "imu": imu,
     } | ({} if stamped is None else {"stamped": stamped})
-    check_drive(parameters)
+    plan = check_drive(parameters)
     if not preview:
         # This comes first because ROS 2 from wheels restarts Python.
         with extensions.require_modules("nics record"):
             from nics_drl_bridge.nodes.output import forwarded_errors
             from nics_drl_bridge.nodes.record_node import record as drive
-    lines = draw_preview(parameters)
+    lines = draw_preview(plan, out)
     facts: dict[str, Any] = {"out": str(out), "robot": robot}
     if preview:
         console.print_line(as_json, "\n".join(lines), **facts, told=lines)
@@ -125,25 +126,14 @@ def make_node_arguments(namespace: str, remap: Sequence[str]) -> list[str]:
     return arguments
 
 
-def draw_preview(parameters: dict[str, Any]) -> tuple[str, ...]:
-    """Draws the drive that `record_node` would make with its parameters; returns text lines."""
+def draw_preview(plan: "DrivePlan", out: Path) -> tuple[str, ...]:
+    """Draws the drive that `record_node` would make; returns text lines."""
     from nics_drl_bridge.files import write_bytes
-    from nics_drl_bridge.recording.excite import DrivePlan
-    from nics_drl_bridge.recording.topic_roles import load_topic_roles
-    from nics_drl_bridge.recording.write import check_out
     from nics_drl_bridge.report.pictures import drive_picture
-    from nics_drl_bridge.robot.spec import load_robot
 
-    robot = load_robot(parameters["robot"])
-    out = check_out(Path(parameters["out"]))
-    # A wrong file must fail before the robot moves.
-    load_topic_roles(parameters["topics"] or None)
-    plan = DrivePlan(
-        robot, *(parameters[name] for name in ("bound", "duration", "speed", "seed"))
-    )
     pattern = plan.preview()
-    picture = out.parent / f"{out.stem}_preview.png"
-    write_bytes(picture, drive_picture(pattern, robot))
+    picture = out.with_name(f"{out.stem}_preview.png")
+    write_bytes(picture, drive_picture(pattern, plan.robot))
     return (*pattern.describe(), f"its path is drawn in {picture}")
 
 
@@ -187,24 +177,23 @@ def inspect(
     why = explain_no_mapping(source)
     is_own = is_recording(source)  # a mapping can't name its arrays
     draft = None if is_own else propose_mapping(tables)
+    doubts = () if draft is None else draft.doubts
     written = None
-    doubts: Sequence[str] = ()
-    if draft is not None:
-        doubts = draft.doubts
-        if mapping is not None:
-            write_text(mapping, draft.text)
-            written = mapping
+    if draft is not None and mapping is not None:
+        write_text(mapping, draft.text)
+        written = str(mapping)
     needless = ""
     if why:
         needless = (
             f"{source}: {why}, and needs no mapping: nics generate {source} --out MODEL"
         )
     if as_json:
-        facts: dict[str, Any] = {
+        facts = {
             "tables": [asdict(table) for table in tables],
             "doubts": doubts,
+            "mapping": written,
+            "needs_mapping": not why,
         }
-        facts |= {"mapping": written and str(written), "needs_mapping": not why}
         typer.echo(format_json(facts))
         return
     for line in (*([needless] if needless else ()), *doubts):
@@ -243,8 +232,7 @@ def import_(
     from nics_drl_bridge.recording.recording import save_recording
     from nics_drl_bridge.recording.write import check_out
 
-    if out.suffix != ".npz":
-        raise ConfigError(f"--out {out}: must end in .npz.")
+    check_suffix("--out", out, ".npz")
     check_out(out)
     with console.show_progress(f"reading {source}"):
         drive = read_recording(source, mapping=mapping)
@@ -444,8 +432,8 @@ def drive(
     out = out or Path(f"{Path(robot).stem}_model")
     check_place(out)
     lidar_spec = mount_lidar(spec, lidar)
-    if recording is not None and recording.suffix != ".npz":
-        raise ConfigError(f"--recording {recording}: must end in .npz.")
+    if recording is not None:
+        check_suffix("--recording", recording, ".npz")
     with console.show_progress(f"driving and generating {spec.name!r}"):
         driven = record_textbook(spec, np.random.default_rng(seed), duration)
         if recording is not None:

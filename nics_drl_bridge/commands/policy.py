@@ -7,7 +7,12 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
-from nics_drl_bridge.commands.console import POLICIES, ROBOTS, JsonOption, print_line
+from nics_drl_bridge.commands.console import (
+    POLICIES,
+    JsonOption,
+    make_robot_option,
+    print_line,
+)
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import write_bytes
 
@@ -71,12 +76,7 @@ def import_(
     ],
     robot: Annotated[
         str | None,
-        Option(
-            "--robot",
-            "--model",
-            autocompletion=ROBOTS,
-            help="A shipped robot, or the folder of a model.",
-        ),
+        make_robot_option("A shipped robot, or the folder of a model."),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:

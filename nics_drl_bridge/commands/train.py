@@ -5,7 +5,7 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -33,11 +33,8 @@ def train(
     ] = defaults.TASK,
     robot: Annotated[
         str | None,
-        Option(
-            "--robot",
-            "--model",
-            autocompletion=console.ROBOTS,
-            help=f"A shipped robot ({DEFAULT_ROBOT}), a YAML file, or the folder of a model.",
+        console.make_robot_option(
+            f"A shipped robot ({DEFAULT_ROBOT}), a YAML file, or the folder of a model."
         ),
     ] = None,
     settings: Annotated[
@@ -120,10 +117,9 @@ def train(
 
     task_of_user = task if ":" in task else None
     if resume and out is not None:
-        resumed = train_run.settings_of(out, task_of_user)
+        chosen = train_run.settings_of(out, task_of_user)
     else:
-        resumed = None
-    chosen = resumed or _load_settings(task, settings, named)
+        chosen = _load_settings(task, settings, named)
     folder = out or Path("runs") / chosen.title
     command = shlex.join(["nics", *sys.argv[1:]])
     started = train_run.seeds_of(folder) if resume and not seeds else []
@@ -131,62 +127,47 @@ def train(
         typer.echo(f"seeds that were begun: {started}; --seeds names others", err=True)
     all_seeds = [*(seeds or started or [0]), *further_seeds]
     order = train_run.TrainOrder(chosen, all_seeds, folder, episodes, resume, command)
-    resume_command = ResumeCommand(
-        folder, all_seeds, episodes, task_of_user, engine, address, env_runners
+    resume_command = make_resume_command(
+        folder,
+        all_seeds,
+        episodes=None if episodes == DEFAULT_EPISODES else episodes,
+        task=task_of_user,  # a shipped task is in the run's settings
+        engine=None if engine in OWN else engine,
+        address=address,
+        env_runners=env_runners,
     )
     with (
-        report_interruption(resume_command, train_run.seeds_of),
+        report_interruption(folder, resume_command, train_run.seeds_of),
         _open_learner(engine, address, env_runners, chosen.num_envs) as learn,
     ):
         (_run_watched if watch else _run)(train_run, order, learn, as_json)
 
 
-@dataclass(frozen=True)
-class ResumeCommand:
-    """Everything that the command line must repeat to resume a training."""
-
-    out: Path
-    seeds: Sequence[int]
-    episodes: int
-    task: str | None  # the user's own; a shipped task is in the run's settings
-    engine: str | None
-    address: str | None
-    env_runners: int | None
-
-    @property
-    def line(self) -> str:
-        """The command, ready to paste into a shell."""
-        words = ["nics", "train", "--resume", "--out", str(self.out)]
-        words += ["--seeds", *map(str, self.seeds)]
-        if self.episodes != DEFAULT_EPISODES:
-            words += ["--episodes", str(self.episodes)]
-        if self.task is not None:
-            words += ["--task", self.task]
-        if self.engine is not None and self.engine not in OWN:
-            words += ["--engine", self.engine]
-        if self.address is not None:
-            words += ["--address", self.address]
-        if self.env_runners is not None:
-            words += ["--env-runners", str(self.env_runners)]
-        return shlex.join(words)
+def make_resume_command(
+    out: Path, seeds: Sequence[int], **options: object | None
+) -> str:
+    """Returns the command that resumes a training, ready to paste into a shell."""
+    words = ["nics", "train", "--resume", "--out", str(out)]
+    words += ["--seeds", *map(str, seeds)]
+    for name, value in options.items():
+        if value is not None:
+            words += [f"--{name.replace('_', '-')}", str(value)]
+    return shlex.join(words)
 
 
 @contextmanager
 def report_interruption(
-    again: ResumeCommand, seeds_of: Callable[[Path], list[int]]
+    out: Path, command: str, seeds_of: Callable[[Path], list[int]]
 ) -> Iterator[None]:
     """Prints the command that resumes a training if Ctrl-C or SIGTERM ends the block."""
     try:
         yield
     except BaseException as error:
         if was_interrupted(error) or isinstance(error, SystemExit):
-            if seeds_of(again.out):
-                typer.echo(f"to go on from the last checkpoint: {again.line}", err=True)
-            else:
-                typer.echo(
-                    f"{again.out}: no checkpoint was written yet; start again.",
-                    err=True,
-                )
+            line = f"{out}: no checkpoint was written yet; start again."
+            if seeds_of(out):
+                line = f"to go on from the last checkpoint: {command}"
+            typer.echo(line, err=True)
         raise
 
 
@@ -311,17 +292,10 @@ def _run(
     task_option = ""
     if ":" in order.settings.task:
         task_option = f" --task {order.settings.task}"
-        if not _has_success(results):
+        summaries = [s for result in results for s in result.summaries.values()]
+        if not any(summary.success.value > 0.0 for summary in summaries):
             typer.echo(
                 "no episode was a success: does the task's `info` contain `is_success`?",
                 err=True,
             )
     typer.echo(f"see it drive: nics watch {policy} --world {world}{task_option}")
-
-
-def _has_success(results: Sequence[Any]) -> bool:
-    for result in results:
-        for summary in result.summaries.values():
-            if summary.success.value > 0.0:
-                return True
-    return False

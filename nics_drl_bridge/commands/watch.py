@@ -29,12 +29,9 @@ def watch(
     model: console.PolicyModelOption = None,
     world: Annotated[
         list[str] | None,
-        Option(
-            "--world",
-            "--scene",
-            help=f"A shipped world ({defaults.EVALUATION_WORLD}) or a YAML file; several "
+        console.make_world_option(
+            f"A shipped world ({defaults.EVALUATION_WORLD}) or a YAML file; several "
             "times: side by side.",
-            autocompletion=console.WORLDS,
         ),
     ] = None,
     seed: Annotated[
@@ -127,13 +124,8 @@ def _watch_bag(
     from nics_drl_bridge.generator import open_model
     from nics_drl_bridge.watch.bag import BagSource
 
-    return BagSource(
-        bag,
-        open_model(name or DEFAULT_ROBOT),
-        topics,
-        _make_only_world(worlds),
-        name or "",
-    )
+    model = open_model(name or DEFAULT_ROBOT)
+    return BagSource(bag, model, topics, _make_only_world(worlds), name or "")
 
 
 def _watch_ros(name: str | None, worlds: list[str] | None, namespace: str) -> Any:

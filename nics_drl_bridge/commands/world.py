@@ -10,6 +10,7 @@ from typer import Argument, Option
 
 from nics_drl_bridge import defaults
 from nics_drl_bridge.commands import console
+from nics_drl_bridge.commands.first_checks import check_suffix
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import format_json, write_text
 from nics_drl_bridge.robot import DEFAULT_ROBOT
@@ -33,6 +34,16 @@ NAV2 = {
     "occupied_thresh": 0.65,
     "free_thresh": 0.25,
 }
+KEYS = (  # of a world file, in this order
+    "name",
+    "map",
+    "bounds",
+    "obstacles",
+    "clearance",
+    "goal_distance",
+    "starts",
+    "goals",
+)
 Keys = dict[str, Any]  # keys of a YAML file
 Shown = Annotated[
     str,
@@ -251,19 +262,9 @@ def _format_world(
     else:
         least = min(defaults.IMPORT_GOAL_DISTANCE_M, round(far / 4.0, 3))
     values = {"goal_distance": (least, far), **values}
-    lines = [f"# {' '.join(line.split())}" for line in head]
-    for key in ("name", "map"):
-        lines += [dump_yaml({key: values[key]}).rstrip()] if key in values else []
-    lines += [
-        f"{key}: {_format_flow(values[key])}" for key in ("bounds",) if key in values
-    ]
-    for g, group in enumerate(values.get("obstacles", ())):
-        lines += [] if g else ["obstacles:"]
-        lines += [f"  - shapes: {_format_flow(group['shapes'])}", "    at:"]
-        lines += [f"      - {_format_flow(pose)}" for pose in group["at"]]
-    for key in ("clearance", "goal_distance", "starts", "goals"):
-        lines += [f"{key}: {_format_flow(values[key])}"] if key in values else []
-    text = "\n".join(lines) + "\n"
+    comments = [f"# {' '.join(line.split())}\n" for line in head]
+    ordered = {key: values[key] for key in KEYS if key in values}
+    text = "".join(comments) + dump_yaml(ordered, one_line_rows=True)
     made = f"{file}: the world made of it"
     obstacles = sum(len(group["at"]) for group in values.get("obstacles", ()))
     try:
@@ -279,19 +280,6 @@ def _format_world(
         checked_world._file = made
         check_places(checked_world)
     return text
-
-
-def _format_flow(value: Any) -> str:
-    """Formats numbers, words, lists and mappings as YAML on one line."""
-    if isinstance(value, dict):
-        return (
-            "{"
-            + ", ".join(f"{key}: {_format_flow(item)}" for key, item in value.items())
-            + "}"
-        )
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(map(_format_flow, value)) + "]"
-    return str(value)
 
 
 @world.command()
@@ -320,13 +308,13 @@ def draw(
 
         worlds = load_worlds(name)
     opened = worlds.members[member_of(worlds, seed)]
-    outline = None if footprint is not None else load_robot(robot).footprint
-    radius = load_robot(robot).footprint_radius if footprint is None else footprint
+    driven = load_robot(robot)
+    outline = driven.footprint if footprint is None else None
+    radius = driven.footprint_radius if footprint is None else footprint
     if not 0.0 < radius < math.inf:
         raise ConfigError(f"--footprint {radius:g}: must be above 0 m.")
     file = out or Path(Path(f"{opened.name}_drawn.png").name)
-    if file.suffix != ".png":
-        raise ConfigError(f"--out {file}: must end in .png.")
+    check_suffix("--out", file, ".png")
     _check_overwrite(worlds, Path(name), file)
     write_bytes(file, draw_seeded_world(opened, radius, seed, outline))
     facts = {"file": str(file), "world": opened.name, "seed": seed}
@@ -385,8 +373,7 @@ def map_(
     member = int(scenes.member[0])
     opened = worlds.members[member]
     file = out or Path(Path(f"{opened.name}_map.yaml").name)
-    if file.suffix not in MAPS:
-        raise ConfigError(f"--out {file}: must end in .yaml.")
+    check_suffix("--out", file, *MAPS)
     _check_overwrite(worlds, Path(name), file, file.with_suffix(".pgm"))
     grid = occupancy(opened, standing(sampler, member, scene.bodies), resolution)
     map_files(grid, file)

@@ -31,8 +31,11 @@ from nics_drl_bridge.style import (
     DARK,
     MARKERS,
     MEASURED,
+    MEASURED_LINE,
     MODEL,
+    MODEL_LINE,
     OTHER,
+    POINTS,
     Panel,
     make_panels,
     render_png,
@@ -40,7 +43,7 @@ from nics_drl_bridge.style import (
 
 SHOWN_S = 8.0
 PATHS = 6
-POINTS = 40
+PATH_POINTS = 40
 UNSEEN_PANEL = Panel(3.4, 3.4)  # for one unseen path on a page
 SETTLED_S = 1.0
 LEAST_ERROR = 1e-12
@@ -151,22 +154,15 @@ def _collect_unseen_paths(identified: Identified) -> list[tuple[Array, Array, fl
     paths = []
     for n, path in enumerate(_predict_rates(identified, chosen)[:PATHS]):
         during = (pose.t >= chosen.start_t[n]) & (pose.t <= chosen.end_t[n])
-        paths.append(
-            (
-                pose.values[during],
-                path,
-                float(np.hypot(*(path[-1] - chosen.end[n])[:2])),
-            )
-        )
+        distance = float(np.hypot(*(path[-1] - chosen.end[n])[:2]))
+        paths.append((pose.values[during], path, distance))
     return paths
 
 
 def _draw_unseen_path(axes: Axes, paths: tuple[Array, Array, float]) -> None:
     truth, path, distance = paths
-    axes.plot(
-        *truth[:, :2].T, color=MEASURED, linewidth=3.5, alpha=0.55, label="measured"
-    )
-    axes.plot(*path[:, :2].T, color=MODEL, linestyle="--", label="predicted")
+    axes.plot(*truth[:, :2].T, label="measured", **MEASURED_LINE)
+    axes.plot(*path[:, :2].T, "--", label="predicted", **MODEL_LINE)
     axes.plot(*truth[0, :2], "o", color=DARK, markersize=5, label="start")
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_title(f"{distance:.2g} m apart after {HORIZON_S:g} s")
@@ -184,15 +180,10 @@ def draw_yardsticks(identified: Identified) -> bytes:
     ):
         points = [(at.horizon_s, getattr(at, name)) for at in judgement]
         points = [(horizon_s, error) for horizon_s, error in points if error]
+        horizons_s = [horizon_s for horizon_s, _ in points]
+        errors = [max(error.position_m, LEAST_ERROR) for _, error in points]
         if points:
-            axes.plot(
-                [horizon_s for horizon_s, _ in points],
-                [max(error.position_m, LEAST_ERROR) for _, error in points],
-                line,
-                color=colour,
-                markersize=5,
-                label=label,
-            )
+            axes.plot(horizons_s, errors, line, color=colour, label=label)
     band = [(at.horizon_s, at.band_m) for at in judgement if at.band_m]
     if band:
         axes.plot(
@@ -224,17 +215,11 @@ def draw_residuals(identified: Identified, unseen: Samples) -> bytes:
     )
     for d, axes in zip(map(int, moving), grid, strict=True):
         rest = unseen.dq[:, d] - predicted[:, d]
-        axes.plot(
-            t[shown], unseen.dq[shown, d], color=MEASURED, linewidth=2.5, alpha=0.55
-        )
-        axes.plot(
-            t[shown], predicted[shown, d], color=MODEL, linestyle="--", linewidth=1.2
-        )
-        axes.plot(t[shown], rest[shown], color=OTHER, linewidth=0.8)
+        axes.plot(t[shown], unseen.dq[shown, d], label="measured", **MEASURED_LINE)
+        axes.plot(t[shown], predicted[shown, d], "--", label="model", **MODEL_LINE)
+        axes.plot(t[shown], rest[shown], color=OTHER, linewidth=0.8, label="residual")
         axes.set_ylabel(f"{model.dofs[d]} [{model.dof_units[d]}]")
     grid[-1].set_xlabel("time since the end of the training part [s]")
-    for color, label in ((MEASURED, "measured"), (MODEL, "model"), (OTHER, "residual")):
-        grid[0].plot([], [], color=color, label=label)
     return render_png(figure, grid[0])
 
 
@@ -260,11 +245,11 @@ def draw_alignment(spec: RobotSpec, identified: Identified) -> bytes:
             (acts, "-", "as it takes effect"),
         ):
             value = average_held(command, spec, t - late, t - late + samples.dt)[:, c]
-            axes.plot(t - begin, value, style, color=MODEL, linewidth=1.4, label=label)
+            axes.plot(t - begin, value, style, label=label, **MODEL_LINE)
         axes.set_ylabel(f"{name} [{unit}]", color=MODEL)
         _draw_response(axes, samples, shown, len(spec.state) + int(c), identified)
     grid[-1].set_xlabel("time on the commands' clock [s]")
-    grid[0].plot([], [], color=MEASURED, linewidth=2.5, alpha=0.55, label="response")
+    grid[0].plot([], [], label="response", **MEASURED_LINE)
     title = f"clock offset {calibration.clock_offset_s:.4g} s, command latency {latency:.4g} s"
     grid[0].set_title(title)
     return render_png(figure, grid[0])
@@ -284,13 +269,8 @@ def _draw_response(
     d = int(np.argmax(np.nan_to_num(np.abs(correlations))))
     response_axes = axes.twinx()
     response_axes.grid(visible=False)
-    response_axes.plot(
-        samples.t[shown] - samples.t[0] - SETTLED_S,
-        twist[shown, d],
-        color=MEASURED,
-        linewidth=2.5,
-        alpha=0.55,
-    )
+    t = samples.t[shown] - samples.t[0] - SETTLED_S
+    response_axes.plot(t, twist[shown, d], **MEASURED_LINE)
     model = identified.model
     response_axes.set_ylabel(f"{model.dofs[d]} [{model.dof_units[d]}]", color=MEASURED)
 
@@ -298,7 +278,7 @@ def _draw_response(
 def _predict_rates(identified: Identified, chosen: Windows) -> Array:
     ends = [
         chosen.start_t + fraction * (chosen.end_t - chosen.start_t)
-        for fraction in np.linspace(0.02, 1.0, POINTS)
+        for fraction in np.linspace(0.02, 1.0, PATH_POINTS)
     ]
     model = identified.model
     calibration = identified.calibration
@@ -351,8 +331,8 @@ def draw_mounting(
 
 
 def _draw_points(axes: Axes, tracked: Sequence[Array], base: Sequence[Array]) -> None:
-    axes.plot(*tracked, ".", markersize=3, color=OTHER, label="tracked body")
-    axes.plot(*base, ".", markersize=3, color=MODEL, label="base_link")
+    axes.plot(*tracked, color=OTHER, label="tracked body", **POINTS)
+    axes.plot(*base, color=MODEL, label="base_link", **POINTS)
 
 
 def draw_inputs(spec: RobotSpec, identified: Identified) -> bytes | None:
@@ -399,9 +379,8 @@ def _draw_restraint(axes: Axes, identified: Identified, dof: str) -> None:
     x = samples.x[::every]
     measured = samples.dq[::every, d]
     asked = taylor.evaluate(x, model.powers) @ model.coefficients[d]
-    axes.plot(asked, measured, ".", markersize=3, color=MEASURED, label="measured")
-    held = model.rates(x)[:, d]
-    axes.plot(asked, held, ".", markersize=3, color=MODEL, label="model")
+    axes.plot(asked, measured, color=MEASURED, label="measured", **POINTS)
+    axes.plot(asked, model.rates(x)[:, d], color=MODEL, label="model", **POINTS)
     for word, edge in zip(("fall", "rise"), model.limits[d - 3].tolist(), strict=True):
         sigma = identified.calibration.uncertainty.get(
             f"{model.variables[d - 3]}.{word}", 0.0
@@ -424,33 +403,26 @@ def _finish(axes: Axes, title: str) -> None:
 def draw_noise(identified: Identified) -> bytes | None:
     """Draws histograms of the residuals and the growth of the drift; None without noise."""
     levels = identified.noise
-    histograms = []
     drive = identified.drive
     calibration = identified.calibration
     model = identified.model
+    found = []
     if drive.bursts is None:
         pose = pose_residual(drive.recording.pose)
         if len(pose) > DIFFERENCE:
-            histograms += [("pose position", levels.pose_position, pose[:, :2].ravel())]
-            histograms += [("pose heading", levels.pose_heading, pose[:, 2])]
+            found += [("pose position", levels.pose_position, pose[:, :2].ravel())]
+            found += [("pose heading", levels.pose_heading, pose[:, 2])]
     odometry = odometry_residual(drive, calibration, model, identified.samples)
     if odometry is not None:
-        histograms += [("odometry, linear", levels.odom_linear, odometry[:, 0])]
-        histograms += [("odometry, angular", levels.odom_angular, odometry[:, 2])]
-    histograms = [
-        (name, level, residual)
-        for name, level, residual in histograms
-        if level.measured and level.std > 0.0
-    ]
+        found += [("odometry, linear", levels.odom_linear, odometry[:, 0])]
+        found += [("odometry, angular", levels.odom_angular, odometry[:, 2])]
+    histograms = [row for row in found if row[1].measured and row[1].std > 0.0]
     growth = drift_growth(drive, calibration, model)
-    drifts = (
-        growth is not None
-        and levels.position_drift.measured
-        and bool(growth[1].max() > 1e-9)
-    )
-    if not histograms and not drifts:
+    if not levels.position_drift.measured or (growth and growth[1].max() <= 1e-9):
+        growth = None
+    count = len(histograms) + 2 * (growth is not None)
+    if not count:
         return None
-    count = len(histograms) + 2 * drifts
     columns = 2 if count == 4 else min(count, 3)
     rows = -(-count // columns)
     figure, grid = make_panels(rows, columns, (4.3 * columns, 3.4 * rows))
@@ -470,7 +442,7 @@ def draw_noise(identified: Identified) -> bytes | None:
         axes.xaxis.set_major_locator(MaxNLocator(5))
         axes.set(xlabel=f"residual [{level.unit}]", ylabel="density")
         axes.set_title(f"noise of the {name}\n{_format_value(level)}")
-    if drifts and growth is not None:
+    if growth is not None:
         horizon, position, heading = growth
         after = grid[len(histograms) :]
         _draw_growth(
@@ -483,21 +455,9 @@ def draw_noise(identified: Identified) -> bytes | None:
 def _draw_growth(
     axes: Axes, horizon: Array, name: str, level: Level, error: Array, unit: str
 ) -> None:
-    axes.plot(
-        horizon,
-        error,
-        "o-",
-        color=MEASURED,
-        markersize=4,
-        label="error of the prediction",
-    )
-    axes.plot(
-        horizon,
-        level.std * np.sqrt(horizon),
-        "--",
-        color=MODEL,
-        label="the drift alone",
-    )
+    axes.plot(horizon, error, "o-", label="error of the prediction", **MEASURED_LINE)
+    drift = level.std * np.sqrt(horizon)
+    axes.plot(horizon, drift, "--", label="the drift alone", **MODEL_LINE)
     axes.set(xlabel="horizon [s]", ylabel=f"root mean square [{unit}]")
     _finish(axes, f"drift of the {name}\n{_format_value(level)}")
 

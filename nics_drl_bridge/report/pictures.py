@@ -27,7 +27,9 @@ from nics_drl_bridge.style import (
     GOAL,
     GREEN,
     MEASURED,
+    MEASURED_LINE,
     MODEL,
+    MODEL_LINE,
     OTHER,
     Panel,
     apply_style,
@@ -38,9 +40,9 @@ from nics_drl_bridge.style import (
 )
 
 LINES: tuple[dict[str, Any], ...] = (
-    {"color": MEASURED, "linewidth": 3.5, "alpha": 0.55, "linestyle": "-"},
-    {"color": MODEL, "linewidth": 1.4, "linestyle": "--"},
-    {"color": GREEN, "linewidth": 1.4, "linestyle": ":"},
+    MEASURED_LINE | {"linewidth": 3.5},
+    MODEL_LINE | {"linestyle": "--"},
+    MODEL_LINE | {"linestyle": ":", "color": GREEN},
 )
 # Sides of the pictures of a square world, and of an episode [inch]
 WORLD_SIDE = 7.0
@@ -230,22 +232,11 @@ def draw_shadow(shadow: Shadow) -> bytes:
     for c, (wide, narrow) in enumerate(zip(grid[::2], grid[1::2], strict=True)):
         driven = shadow.driven[:, c]
         wanted = shadow.policy[:, c]
-        wide.step(
-            shadow.time,
-            driven,
-            where="post",
-            color=MEASURED,
-            linewidth=1.6,
-            label="driven",
-        )
-        wide.step(
-            shadow.time,
-            wanted,
-            where="post",
-            color=MODEL,
-            linewidth=1.0,
-            label="policy",
-        )
+        for label, value, line in (
+            ("driven", driven, MEASURED_LINE),
+            ("policy", wanted, MODEL_LINE),
+        ):
+            wide.step(shadow.time, value, where="post", label=label, **line)
         wide.set_ylabel(f"{shadow.names[c]} [{shadow.units[c]}]")
         narrow.hist(wanted - driven, bins=31, color=OTHER)
         narrow.set_xlabel(f"policy less driven [{shadow.units[c]}]")
@@ -296,13 +287,9 @@ def draw_seeded_world(
         "label": "robot at its start",
     }
     draw_robot(axes, scene.starts[0], footprint, outline, zorder=4.0, **look)
-    goal: dict[str, Any] = {
-        "marker": "*",
-        "markersize": 18,
-        "color": GOAL,
-        "markeredgecolor": DARK,
-    }
-    axes.plot(*scene.goals[0], linestyle="none", zorder=5, label="goal", **goal)
+    look_of_goal: dict[str, Any] = {"marker": "*", "color": GOAL, "edgecolor": DARK}
+    x, y = scene.goals[0]
+    axes.scatter(x, y, s=320, zorder=5, label="goal", **look_of_goal)
     view.show(axes)
     count = np.count_nonzero(scene.bodies[:, RADIUS])
     about = f"{size[0]:.3g} m x {size[1]:.3g} m, {count} obstacles, seed {seed}"

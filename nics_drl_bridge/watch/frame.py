@@ -45,12 +45,7 @@ class Stage:
         robot = self.model.robot
         lidar = self.model.lidar
         commands = [
-            {
-                "name": variable.name,
-                "unit": variable.unit,
-                "min": variable.min,
-                "max": variable.max,
-            }
+            variable.model_dump(include={"name", "unit", "min", "max"})
             for variable in robot.command
         ]
         places = [
@@ -118,14 +113,11 @@ class WorldFrame:
     state: str = ""  # state of the episode, in a word or two
     time_s: float | None = None  # since the start of its episode [s]; None: the frame's
 
-    def plain(self, velocities: Velocities | None = None) -> dict[str, Any]:
-        """Returns the world as plain data, with velocities if given."""
+    def plain(self, velocities: Velocities) -> dict[str, Any]:
+        """Returns the world as plain data."""
         shot = self.shot
         exists = shot.bodies[:, RADIUS] > 0.0
         bodies = shot.bodies[exists]
-        kinds = bodies[:, SHAPE].astype(int).tolist()
-        if velocities is None:
-            velocities = Velocities.unknown(shot)
         ranges = np.where(np.isfinite(shot.ranges), shot.ranges, NO_RETURN / MM)
         return {
             "name": self.name,
@@ -135,7 +127,7 @@ class WorldFrame:
             "poses": round_to_thousandths(shot.poses),
             "ranges": round_to_thousandths(ranges),
             "bodies": round_to_thousandths(bodies[:, [X, Y, HEADING, RADIUS]]),
-            "kinds": kinds,
+            "kinds": bodies[:, SHAPE].astype(int).tolist(),
             "goals": round_to_thousandths(shot.goals),
             "velocities": round_to_thousandths(velocities.robots),
             "body_velocities": round_to_thousandths(velocities.bodies[exists]),
@@ -180,16 +172,12 @@ class Frame:
 
     def plain(self, meter: MotionMeter | None = None) -> dict[str, Any]:
         """Returns the frame as plain data, with velocities if a meter measures them."""
-        if meter is None:
-            worlds = [world.plain() for world in self.worlds]
-        else:
-            pairs = zip(self.worlds, self.measured_by(meter), strict=True)
-            worlds = [world.plain(velocities) for world, velocities in pairs]
+        pairs = zip(self.worlds, self.measured_by(meter or MotionMeter()), strict=True)
         return {
             "kind": "frame",
             "time": self.time_s,
             "note": self.note,
-            "worlds": worlds,
+            "worlds": [world.plain(velocities) for world, velocities in pairs],
         }
 
     def measured_by(self, meter: MotionMeter) -> list[Velocities]:

@@ -109,13 +109,9 @@ def write_mp4(path: Path, shown: Iterable[Pixels], fps: float) -> None:
 
 
 LIBRARIES = {".mp4": ("imageio_ffmpeg",)}
-WRITERS: dict[str, Callable[[Path, Stage, Iterable[Frame], float], None]] = {
-    ".gif": lambda path, stage, frames, fps: write_gif(
-        path, draw_frames(stage, frames), fps
-    ),
-    ".mp4": lambda path, stage, frames, fps: write_mp4(
-        path, draw_frames(stage, frames), fps
-    ),
+WRITERS: dict[str, Callable[[Path, Iterable[Pixels], float], None]] = {
+    ".gif": write_gif,
+    ".mp4": write_mp4,
 }
 
 
@@ -131,4 +127,4 @@ def write(path: Path, stage: Stage, frames: Iterable[Frame], fps: float) -> None
     """Writes frames to an MP4 or a GIF, by suffix. Raises ConfigError."""
     check_file(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    WRITERS[path.suffix](path, stage, frames, fps)
+    WRITERS[path.suffix](path, draw_frames(stage, frames), fps)
