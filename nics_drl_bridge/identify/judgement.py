@@ -122,37 +122,29 @@ def errors_of_ends(ends: Array, chosen: Windows) -> EndErrors:
     return EndErrors(float(np.hypot(*apart[:, :2].T).mean()), float(heading))
 
 
-def bands_of_fixed(
-    model: TaylorModel, calibration: Calibration, training: Drive
-) -> dict[float, float]:
-    """Returns the bands [m] by horizon of a model that is not adjusted to any part of a drive."""
-    bands = dict[float, float]()
-    for horizon in hypotheses.BANDS_S:
-        far = measure_distances(model, calibration, training, horizon)
-        if len(far) >= FEWEST:
-            bands[horizon] = float(np.percentile(far, WITHIN))
-    return bands
-
-
-def bands_of(
+def estimate_bands(
     model: TaylorModel,
     calibration: Calibration,
     training: Drive,
-    derived: tuple[Samples, hypotheses.Base] | None,
+    derived: tuple[Samples, hypotheses.Base] | None = None,
+    fixed: bool = False,
 ) -> dict[float, float]:
     """Returns the distances [m] within which 95 % of predictions are expected to end, by horizon.
 
     Each fold of the training part is predicted by the model adjusted to the others. `derived` are
-    the samples of a motion derived from the poses, and the base that the model departed from.
+    the samples of a motion derived from the poses, and the base that the model departed from. A
+    `fixed` model is not adjusted, and predicts the whole part.
     """
     errors: dict[float, list[Array]] = {h: [] for h in hypotheses.BANDS_S}
-    for rest, part in training.folds(FOLDS):
-        if derived is None:
-            adjusted = readjust(model, calibration, rest)
-        else:
+    folds = [(training, training)] if fixed else training.folds(FOLDS)
+    for rest, part in folds:
+        adjusted: tuple[TaylorModel, Calibration] | None = model, calibration
+        if derived is not None:
             begin, end = part.recording.pose.t[[0, -1]] + calibration.clock_offset_s
             kept = (derived[0].t < begin) | (derived[0].t > end)
             adjusted = _with_motion(model, calibration, training, *derived, kept)
+        elif not fixed:
+            adjusted = readjust(model, calibration, rest)
         if adjusted is None:
             return {}
         for horizon, parts in errors.items():

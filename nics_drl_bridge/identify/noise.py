@@ -122,12 +122,12 @@ def _errors(
     if state is None:
         ends = open_loop.predict(model, calibration, drive, chosen)
     else:  # restart from the measured state, so that its drift is not counted twice
-        course = open_loop.course_of(model, calibration, drive, chosen)
+        course = open_loop.trace_states(model, calibration, drive, chosen)
         begin = chosen.start_t + calibration.clock_offset_s
         t = begin[:, None] + model.dt * np.arange(course.x.shape[1])
         for i, column in enumerate(state.values.T):
             course.x[:, :, i] = np.interp(t, state.t, column)
-        relative = open_loop.relative_ends(course, model)[0]
+        relative = open_loop.predict_ends(course, model)[0]
         ends = open_loop.tracked_ends(chosen, calibration, relative)
     return chosen, geometry.between(ends, chosen.end)
 

@@ -2,21 +2,34 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import FitError, RecordingError
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify.acceptance import THRESHOLDS
+from nics_drl_bridge.identify import followers
+from nics_drl_bridge.identify.acceptance import THRESHOLDS, shortfall
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.clocks import TimingEstimate
 from nics_drl_bridge.identify.drive import MAX_GAP_S, Drive
 from nics_drl_bridge.identify.excitation import Excitation, plausible
+from nics_drl_bridge.identify.findings import (
+    Findings,
+    require_fit,
+    require_model,
+    require_samples,
+)
 from nics_drl_bridge.identify.fit import Fit
 from nics_drl_bridge.identify.mounting import Mounting
-from nics_drl_bridge.identify.open_loop import HORIZON_S, OpenLoop, open_loop_error
+from nics_drl_bridge.identify.open_loop import (
+    HORIZON_S,
+    OpenLoop,
+    open_loop_error,
+    predict,
+    windows,
+)
 from nics_drl_bridge.identify.signals import moved_commands
 from nics_drl_bridge.identify.statistics import CERTAIN, errors_of
 from nics_drl_bridge.recording.recording import Recording, Samples, Stream
@@ -46,6 +59,13 @@ COARSE = 2.0 / 3.0
 ENDS = (1.0, 99.0)  # percentiles that bound the range of a state
 # correlation of yaw rate and steering below which the robot turns the wrong way
 MIRRORED = -0.5
+# horizons for which errors are compared recording by recording, and of their windows
+HORIZONS_OF_RECORDING_S = (5.0, 2.0, 1.0, 0.5)
+FEWEST_OF_RECORDING = 5  # minimum number of windows per recording
+SPACING_OF_RECORDING_S = 0.5
+# ratio to the errors of the other recordings from which one is reported as off
+ALONE = 2.5
+LEAST_SHARE = 0.02  # fraction of the path below which errors are ignored
 
 
 class Gap(str):
@@ -54,6 +74,10 @@ class Gap(str):
 
 class Doubt(str):
     """A sentence on something that looks wrong, but may be how the robot behaves."""
+
+
+class Alone(str):
+    """A sentence on a single recording with large errors."""
 
 
 class Mistake(str):
@@ -486,3 +510,138 @@ def describe_refit(until: float, duration: float, worse: bool) -> str:
         return f"The model covers only the first {until:.1f} s: {why}."
     shown = f"errors on unseen data are those of a trial that had learnt the first {until:.1f} s"
     return f"The model was fitted to all {duration:.1f} s once it had been judged; {shown}."
+
+
+class ErrorOfRecording(NamedTuple):
+    """Mean errors of predictions within one recording."""
+
+    source: str
+    horizon_s: float
+    position_m: float
+    path_m: float  # mean length of the measured path
+
+    @property
+    def share(self) -> float:
+        """Error as a fraction of the path."""
+        return self.position_m / max(self.path_m, 1e-9)
+
+
+def errors_by_recording(
+    model: TaylorModel, calibration: Calibration, drive: Drive
+) -> list[ErrorOfRecording]:
+    """Predicts each recording of a drive over the longest horizon that fits into all of them."""
+    sources = [episode.source for episode in drive.recording.episodes]
+    for horizon in HORIZONS_OF_RECORDING_S:
+        chosen = windows(
+            drive, calibration, 0.0, drive.duration_s, horizon, SPACING_OF_RECORDING_S
+        )
+        if not len(chosen.start_t):
+            continue
+        sources_of_windows = np.array(sources)[
+            drive.recording.episode_at(chosen.start_t)
+        ]
+        if any(
+            (sources_of_windows == source).sum() < FEWEST_OF_RECORDING
+            for source in sources
+        ):
+            continue
+        ends = predict(model, calibration, drive, chosen)
+        error = np.hypot(*(ends - chosen.end)[:, :2].T)
+        return [
+            ErrorOfRecording(
+                source,
+                horizon,
+                float(error[sources_of_windows == source].mean()),
+                float(chosen.path[sources_of_windows == source].mean()),
+            )
+            for source in dict.fromkeys(sources)
+        ]
+    return []
+
+
+def about_recordings(
+    model: TaylorModel, calibration: Calibration, drive: Drive
+) -> Iterator[str]:
+    """Yields a sentence on the errors by recording, and one per recording that alone is off."""
+    if not drive.recording.episodes:
+        return
+    errors = errors_by_recording(model, calibration, drive)
+    if len(errors) < 2:
+        return
+    for error in errors:
+        others = [another for another in errors if another is not error]
+        usual = float(np.median([another.share for another in others]))
+        if error.share > max(ALONE * usual, LEAST_SHARE) and np.isfinite(usual):
+            ends = f"end {error.position_m:.3g} m off after {error.horizon_s:g} s"
+            shares = f"{error.share:.1%} of the path, those of the others {usual:.1%}"
+            finding = f"{error.source} alone is off: its predictions {ends} ({shares})"
+            causes = "its clocks, its mounting and the floor it was driven on"
+            yield Alone(f"{finding}; check {causes}, or leave it out.")
+    listed = ", ".join(f"{error.source} {error.share:.1%}" for error in errors)
+    yield f"By recording, errors after {errors[0].horizon_s:g} s as shares of the path: {listed}."
+
+
+def collect_notes(drive: Drive, findings: Findings) -> tuple[str, ...]:
+    """Collects all sentences on a drive and its model, the most serious first."""
+    fit = require_fit(findings)
+    model = require_model(findings)
+    spec = drive.spec
+    calibration = findings.calibration
+    beaten = [findings.replacement]
+    if not findings.replacement:
+        beaten = list(shortfall(findings.judgement))
+    doubts: Iterator[str] = iter(())
+    if findings.motion_width_s is None:
+        doubts = list_doubts_of_fit(fit, calibration.is_exact)
+    levels = count_levels(findings.training.recording.command, spec)
+    return (
+        *about_recordings(model, calibration, findings.whole),
+        *beaten,
+        *_explain_replacement(drive, findings),
+        *drive.recording.repairs,
+        *findings.repairs,
+        *describe_gaps(findings.whole),
+        *collect_calibration_notes(findings),
+        *findings.refinement,
+        *describe_mirror_image(require_samples(findings), spec, calibration),
+        *describe_unlearnt(fit, calibration, spec, levels),
+        *doubts,
+        *describe_untried(drive, findings.held_out, findings.judgement),
+        *findings.assumptions,
+    )
+
+
+def collect_calibration_notes(findings: Findings) -> tuple[str, ...]:
+    """Collects the sentences on stamps, clocks, mounting and responses."""
+    training = findings.training
+    calibration = findings.calibration
+    if findings.replacement:
+        # The latency is that of the fitted textbook, as are mounting and lags, which it explains.
+        calibration = replace(calibration, command_latency_s=findings.timing.latency)
+        return (
+            *describe_stamps(training),
+            *describe_clocks(training, calibration, findings.timing),
+        )
+    return (
+        *describe_stamps(training),
+        *describe_clocks(training, calibration, findings.timing),
+        *followers.about_sums(calibration),
+        *describe_mounting(training, calibration, findings.mounting),
+        *describe_responses(training, calibration, findings.timing),
+    )
+
+
+def list_plain_calibration_notes(findings: Findings) -> tuple[str, ...]:
+    """Returns these sentences as plain strings for a file, which has no kinds of sentences."""
+    return tuple(map(str, collect_calibration_notes(findings)))
+
+
+def _explain_replacement(drive: Drive, findings: Findings) -> Iterator[str]:
+    """Yields a sentence if a coarse sampling rate explains why a model lost to its textbook."""
+    if not findings.replacement or drive.recording.state is None:
+        return
+    whole = findings.whole
+    unmoved = require_fit(findings).unmoved
+    coarse = describe_coarsest_state(whole.recording, whole.spec, unmoved)
+    if coarse:
+        yield Gap(f"{coarse}.")

@@ -13,14 +13,10 @@ from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.kernels import STRAIGHT, BicycleGeometry, roll_windows
 from nics_drl_bridge.identify.open_loop import Windows, windows
 from nics_drl_bridge.identify.shooting import HEADING_ARM_M
 from nics_drl_bridge.identify.signals import average_held, unwrapped
-from nics_drl_bridge.identify.yardstick_kernels import (
-    STRAIGHT,
-    BicycleGeometry,
-    roll_windows,
-)
 from nics_drl_bridge.robot.kinds import compute_steady_twist
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.threads import one_blas_thread

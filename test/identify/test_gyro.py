@@ -11,8 +11,7 @@ from skid_steer import BIAS, OVER_REPORTED, drive_skid_steer
 from nics_drl_bridge import geometry
 from nics_drl_bridge.identify.conclusion import conclude
 from nics_drl_bridge.identify.gyro import relative_to, turned_by_gyro
-from nics_drl_bridge.identify.identify import identify
-from nics_drl_bridge.identify.joined import join_recordings
+from nics_drl_bridge.identify.identify import identify, join_recordings
 from nics_drl_bridge.identify.verdict import Mistake
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.spec import build_robot

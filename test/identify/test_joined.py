@@ -12,15 +12,17 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import FitError
 from nics_drl_bridge.generator import generate, mount_lidar
 from nics_drl_bridge.identify import open_loop
-from nics_drl_bridge.identify.by_recording import Alone
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.conclusion import conclude
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.identify import identify
-from nics_drl_bridge.identify.joined import join_recordings
+from nics_drl_bridge.identify.identify import identify, join_recordings
 from nics_drl_bridge.identify.report import format_report
 from nics_drl_bridge.identify.shooting import Shooting
-from nics_drl_bridge.identify.verdict import describe_gaps, measure_time_without_pose
+from nics_drl_bridge.identify.verdict import (
+    Alone,
+    describe_gaps,
+    measure_time_without_pose,
+)
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.spec import build_robot
 

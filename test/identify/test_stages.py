@@ -218,8 +218,10 @@ def test_a_refit_is_kept_unless_it_predicts_worse_or_not_at_all(
     errors = [SimpleNamespace(mean_position_error_m=each) for each in (error, 1.0)]
     monkeypatch.setattr(stages, "run", lambda row, driven, found: found)
     monkeypatch.setattr(stages, "require_model", lambda found: HasQuality())
-    monkeypatch.setattr(stages, "collect_notes", lambda driven, found: ())
-    monkeypatch.setattr(stages, "list_plain_calibration_notes", lambda found: ())
+    monkeypatch.setattr(stages.verdict, "collect_notes", lambda driven, found: ())
+    monkeypatch.setattr(
+        stages.verdict, "list_plain_calibration_notes", lambda found: ()
+    )
     monkeypatch.setattr(
         stages.open_loop, "open_loop_error", lambda *given: errors.pop(0)
     )
