@@ -124,20 +124,20 @@ def shortfall_of_textbook(at: HorizonErrors) -> Iterator[str]:
         return
     outcome = compare(at.model, at.textbook, at.textbook_noise_m, at.path_m)
     if outcome is Outcome.WORSE:
-        yield f"{_beside('the fitted textbook', at, at.textbook)}."
+        yield f"{_describe_errors('the fitted textbook', at, at.textbook)}."
 
 
 def shortfall_of_twist(at: HorizonErrors) -> Iterator[str]:
     """Yields a sentence if predictions are no better than those of a constant twist."""
     outcome = compare(at.model, at.kept_twist, at.kept_twist_noise_m, at.path_m)
-    finding = _beside("a constant twist", at, at.kept_twist)
+    finding = _describe_errors("a constant twist", at, at.kept_twist)
     if outcome is Outcome.WORSE:
         yield f"{finding}."
     if outcome is Outcome.ALIKE:
         yield f"{finding}, too close to distinguish: the commands explain little of this drive."
 
 
-def _beside(name: str, at: HorizonErrors, errors: EndErrors) -> str:
+def _describe_errors(name: str, at: HorizonErrors, errors: EndErrors) -> str:
     off = f"end {at.model.position_m:.3g} m off after {at.horizon_s:g} s"
     finding = f"The model does not beat {name}: on unseen data its predictions {off}"
     return f"{finding}, those of {name} {errors.position_m:.3g} m"
@@ -234,7 +234,7 @@ def _rate_beside_standing(at: HorizonErrors, radius: float) -> Assessment:
     outcome = compare(at.model, at.standing, at.standing_noise_m, 0.0)
     if outcome is Outcome.BETTER:
         return Assessment(Verdict.GOOD, ())
-    finding = _beside("a robot that never moves", at, at.standing)
+    finding = _describe_errors("a robot that never moves", at, at.standing)
     reason = f"{finding}: the pose does not follow these commands."
     return Assessment(Verdict.DO_NOT_TRAIN, (reason,))
 

@@ -67,12 +67,16 @@ def conclude(identified: Identified) -> Conclusion:
     ready = (
         assessment.verdict is not Verdict.DO_NOT_TRAIN and not identified.model.assumed
     )
-    advice = f"Next: {_advice(identified, bool(wrong), bool(strange), bool(gaps))}."
+    advice = (
+        f"Next: {_choose_advice(identified, bool(wrong), bool(strange), bool(gaps))}."
+    )
     errors = f"{accuracy(identified)} {relative_to(identified.recording)}".strip()
     return Conclusion(assessment.verdict, errors, doubts, gaps, advice, ready)
 
 
-def _advice(identified: Identified, mistaken: bool, strange: bool, gaps: bool) -> str:
+def _choose_advice(
+    identified: Identified, mistaken: bool, strange: bool, gaps: bool
+) -> str:
     """Returns the next step, by the first condition that is not met."""
     duration = identified.drive.duration_s
     if mistaken:

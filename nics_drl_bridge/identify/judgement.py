@@ -2,6 +2,7 @@
 
 from contextlib import suppress
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,30 +73,29 @@ def judged(
             break
         ends = predict(model, calibration, drive, chosen)
         twist = twists_before(drive, chosen.start_t)
-        kept = kept_twist(drive, chosen, twist)
-        far = distances(ends, chosen)
-        errors = HorizonErrors(
-            horizon_s=horizon,
-            windows=len(far),
-            path_m=float(chosen.path.mean()),
-            model=errors_of_ends(ends, chosen),
-            kept_twist=errors_of_ends(kept, chosen),
-            kept_twist_noise_m=noise_beside(ends, kept, chosen, horizon),
-            standing=errors_of_ends(chosen.start, chosen),
-            standing_noise_m=noise_beside(ends, chosen.start, chosen, horizon),
-        )
+        yardsticks = {
+            "kept_twist": kept_twist(drive, chosen, twist),
+            "standing": chosen.start,
+        }
         if textbook is not None:
-            by_textbook = textbook.predict(drive, chosen, twist)
-            errors = replace(
-                errors,
-                textbook=errors_of_ends(by_textbook, chosen),
-                textbook_noise_m=noise_beside(ends, by_textbook, chosen, horizon),
-            )
+            yardsticks["textbook"] = textbook.predict(drive, chosen, twist)
+        figures: dict[str, Any] = {}
+        for name, theirs in yardsticks.items():
+            figures[name] = errors_of_ends(theirs, chosen)
+            figures[f"{name}_noise_m"] = noise_beside(ends, theirs, chosen, horizon)
         band = bands.get(horizon)
         if band is not None:
-            coverage = float((far <= band).mean())
-            errors = replace(errors, band_m=band, coverage=coverage)
-        judgement.append(errors)
+            coverage = float((distances(ends, chosen) <= band).mean())
+            figures |= {"band_m": band, "coverage": coverage}
+        judgement.append(
+            HorizonErrors(
+                horizon_s=horizon,
+                windows=len(chosen.start_t),
+                path_m=float(chosen.path.mean()),
+                model=errors_of_ends(ends, chosen),
+                **figures,
+            )
+        )
     return tuple(judgement)
 
 
@@ -142,7 +142,7 @@ def estimate_bands(
         if derived is not None:
             begin, end = part.recording.pose.t[[0, -1]] + calibration.clock_offset_s
             kept = (derived[0].t < begin) | (derived[0].t > end)
-            adjusted = _with_motion(model, calibration, training, *derived, kept)
+            adjusted = _adjust_motion(model, calibration, training, *derived, kept)
         elif not fixed:
             adjusted = readjust(model, calibration, rest)
         if adjusted is None:
@@ -167,7 +167,7 @@ def measure_distances(
     return distances(predict(model, calibration, part, chosen), chosen)
 
 
-def _with_motion(
+def _adjust_motion(
     model: TaylorModel,
     calibration: Calibration,
     training: Drive,

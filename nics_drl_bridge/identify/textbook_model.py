@@ -48,8 +48,8 @@ def textbook_calibration(
         command_latency_s=latency,
         rotation_rad=-heading,
         lever_arm_m=(x, y),
-        responses=tuple(_responses(response, calibration, spec)),
-        inputs=tuple(_dead_zones(response, spec)),
+        responses=tuple(_update_responses(response, calibration, spec)),
+        inputs=tuple(_find_dead_zones(response, spec)),
         limits={},
         uncertainty={k: v for k, v in calibration.uncertainty.items() if k in kept},
     )
@@ -89,7 +89,7 @@ def actuated_spec(yardstick: Yardstick, drive: Drive) -> RobotSpec:
     """Returns a steered robot whose state is its speed and its steering angle."""
     response = yardstick.response
     spec = drive.spec
-    speed, steering = _places_of_bicycle(response)
+    speed, steering = _find_bicycle_commands(response)
     speed_gain = abs(float(response.gain[0, speed]))
     angle_gain = abs(float(response.gain[2, steering]))
     largest = np.maximum(spec.command_high, -spec.command_low)
@@ -139,7 +139,7 @@ def with_actuators(
     response = yardstick.response
     state = known_state(drive)
     forward = [v.twist for v in drive.spec.state].index("vx")
-    _, steering = _places_of_bicycle(response)
+    _, steering = _find_bicycle_commands(response)
     alone = spec.model_copy(update={"state": spec.state[1:]})
     command = drive.recording.command
     lag = response.lag_s[2:]
@@ -154,7 +154,7 @@ def with_actuators(
     return replace(drive.part(recording), spec=spec)
 
 
-def _places_of_bicycle(response: TextbookResponse) -> tuple[int, int]:
+def _find_bicycle_commands(response: TextbookResponse) -> tuple[int, int]:
     """Returns the indices of speed and steering among the commands of a bicycle."""
     speed = int(np.argmax(np.abs(response.gain[0])))
     return speed, 1 - speed
@@ -168,7 +168,7 @@ def _find_actuator(response: TextbookResponse, command: int) -> tuple[int, float
     return actuator, float(response.gain[actuator, command])
 
 
-def _responses(
+def _update_responses(
     response: TextbookResponse, calibration: Calibration, spec: RobotSpec
 ) -> Iterator[Response]:
     names = [c.name for c in spec.command]
@@ -177,7 +177,9 @@ def _responses(
         yield replace(follower, lag_s=float(response.lag_s[actuator]), gain=gain)
 
 
-def _dead_zones(response: TextbookResponse, spec: RobotSpec) -> Iterator[InputCurve]:
+def _find_dead_zones(
+    response: TextbookResponse, spec: RobotSpec
+) -> Iterator[InputCurve]:
     """Yields the dead zone of a speed command whose effect is below, or above, proportional."""
     if not response.bicycle.used or response.offset[0] == 0.0:
         return
@@ -282,7 +284,7 @@ class _Expansion:
     def add_twist_of_commands(self) -> None:
         """Adds the twist of a robot without a state."""
         if self.response.bicycle.used:
-            speed, steering = _places_of_bicycle(self.response)
+            speed, steering = _find_bicycle_commands(self.response)
             target = self.response.gain[0, speed] * self.x[:, speed]
             self.add_commanded_bicycle(speed, steering, target)
             return
@@ -305,7 +307,7 @@ class _Expansion:
     def add_actuators(self) -> None:
         """Adds the rates of a speed and a steering angle, and the twist by them."""
         response = self.response
-        is_speed = np.arange(2) == _places_of_bicycle(response)[0]
+        is_speed = np.arange(2) == _find_bicycle_commands(response)[0]
         rate = self.rate_of(2)
         self.add_follower(0, self.rate_of(0), np.where(is_speed, response.gain[0], 0.0))
         self.limits[0] = self.speed_limits()
@@ -329,7 +331,7 @@ class _Expansion:
             if not self.response.bicycle.used:
                 self.add(actuator, self.unit(i), 1.0)
         if self.response.bicycle.used:
-            speed, steering = map(follow.index, _places_of_bicycle(self.response))
+            speed, steering = map(follow.index, _find_bicycle_commands(self.response))
             self.add_commanded_bicycle(speed, steering, self.x[:, speed])
 
     def add_wheels(self) -> None:
@@ -374,6 +376,6 @@ class _Expansion:
             low=self.x.min(axis=0),
             high=self.x.max(axis=0),
             bounded=self.like.bounded,
-            inputs=tuple(_dead_zones(self.response, self.spec)),
+            inputs=tuple(_find_dead_zones(self.response, self.spec)),
             limits=self.limits,
         )

@@ -99,11 +99,11 @@ def describe_stamps(drive: Drive) -> Iterator[str]:
 def measure_time_without_pose(drive: Drive) -> float:
     """Returns the time in long gaps of the pose [s]."""
     t = drive.dated.t
-    spans = [float(t[row + 1] - t[row]) for row in _gap_rows(drive)]
+    spans = [float(t[row + 1] - t[row]) for row in _find_gap_rows(drive)]
     return sum(span for span in spans if span > THRESHOLDS.shortest_unseen_s)
 
 
-def _gap_rows(drive: Drive) -> list[int]:
+def _find_gap_rows(drive: Drive) -> list[int]:
     """Returns the poses that precede a gap, starting with the longest gap."""
     t = drive.dated.t
     span = np.diff(t)
@@ -119,7 +119,7 @@ def describe_gaps(drive: Drive) -> Iterator[str]:
     """Yields a sentence per gap in the pose: when, how long, how far the pose moved across it."""
     t = drive.dated.t
     pose = drive.dated.values
-    rows = _gap_rows(drive)
+    rows = _find_gap_rows(drive)
     for row in sorted(rows[:MOST_GAPS_LISTED]):
         moved = geometry.between(pose[row], pose[row + 1])
         span = t[row + 1] - t[row]
@@ -279,12 +279,12 @@ def refuse_unexcited(excitation: Excitation, spec: RobotSpec) -> None:
     sensed = [
         v.name for v in spec.state if v.twist is None and v.name in excitation.unmoved
     ]
-    still = _commands(excitation.unmoved, spec) or sensed
+    still = _list_commands(excitation.unmoved, spec) or sensed
     for names, fault, way in (
         (still, "never moved", "changing over the whole range"),
         (excitation.together, "always moved together", "each changing on its own"),
     ):
-        listed = _list(names)
+        listed = _join_names(names)
         if listed:
             raise FitError(
                 f"{listed} {fault}; drive with {listed} {way}, or allow a model without."
@@ -299,7 +299,7 @@ def list_missed(linear: Fit, spec: RobotSpec) -> tuple[str, ...]:
     )
 
 
-def _commands(names: Sequence[str], spec: RobotSpec) -> list[str]:
+def _list_commands(names: Sequence[str], spec: RobotSpec) -> list[str]:
     """Returns the names that are commands, which a driver can move."""
     return [c.name for c in spec.command if c.name in names]
 
@@ -324,11 +324,11 @@ def describe_unlearnt(
     if unmoved:
         finding = f"The model has no terms of {unmoved}, which never moved"
         yield Gap(f"{finding}: it is only valid for this drive's constant value.")
-    still = _commands(excitation.unmoved, spec)
+    still = _list_commands(excitation.unmoved, spec)
     missing = ", ".join(name for name in still if name not in followed)
     if missing:
         yield Gap(f"Drive with {missing} changing over the whole range to learn them.")
-    together = _list(excitation.together)
+    together = _join_names(excitation.together)
     if together:
         units = {c.unit for c in spec.command if c.name in excitation.together}
         shares = "all have a share of it" if len(units) == 1 else "one has all of it"
@@ -337,7 +337,7 @@ def describe_unlearnt(
         yield Gap(
             f"{together} {why}: {shares}, and {valid}; drive each on its own to learn."
         )
-    copies = _list(
+    copies = _join_names(
         [v.name for v in spec.state if v.name in linear.regression.dependent]
     )
     if copies:
@@ -348,7 +348,7 @@ def describe_unlearnt(
     moved = {
         name: count for name, count in levels.items() if name not in excitation.unmoved
     }
-    coarse = _list([name for name, count in moved.items() if count == FEW_LEVELS])
+    coarse = _join_names([name for name, count in moved.items() if count == FEW_LEVELS])
     if coarse:
         finding = "between them the model is a straight line, whatever the robot does"
         yield Gap(
@@ -371,7 +371,7 @@ def list_doubts_of_fit(linear: Fit, exact: bool) -> Iterator[str]:
             yield f"The terms of {dof} are {alike}: {useless}; {advice}."
     fitted = {dofs[d] for d in linear.regression.moving} - {"vy"} if exact else set()
     explained = zip(dofs, linear.r2, strict=True)
-    lost = _list(
+    lost = _join_names(
         [dof for dof, share in explained if share < UNEXPLAINED and dof in fitted]
     )
     if lost:
@@ -379,7 +379,7 @@ def list_doubts_of_fit(linear: Fit, exact: bool) -> Iterator[str]:
         yield f"The model explains less than half of {lost}: {why}; do not trust its predictions."
 
 
-def _list(names: Sequence[str]) -> str:
+def _join_names(names: Sequence[str]) -> str:
     """Joins names: `a`, `a and b`, `a, b and c`."""
     return " and ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))
 
