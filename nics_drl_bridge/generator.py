@@ -24,8 +24,7 @@ from nics_drl_bridge.errors import ConfigError, FitError, ModelError, suggest
 from nics_drl_bridge.identify import fit
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Settings
-from nics_drl_bridge.identify.identify import Identified, identify
-from nics_drl_bridge.identify.joined import join_recordings
+from nics_drl_bridge.identify.identify import Identified, identify, join_recordings
 from nics_drl_bridge.identify.report import explain_uselessness, format_report
 from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.sensor import AnySensor, Sensor, check_sensors

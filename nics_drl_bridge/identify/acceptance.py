@@ -1,15 +1,20 @@
 """Acceptance of a model: one of three verdicts by stated thresholds, with the reasons."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
 
 from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.robot.taylor import EndErrors, HorizonErrors
 
 JUDGED_S = 5.0  # horizon of the predictions that decide on a model
+# ratio to the errors of a constant twist above which commands hardly help
+HARDLY = 0.8
+LONGEST_S = 1.0  # a longer latency is implausible
+EARLIEST_S = -0.2  # a shorter one, too
 
 
 class Verdict(str, Enum):
@@ -103,15 +108,7 @@ def compare(
 
 def loses_to_textbook(judgement: tuple[HorizonErrors, ...]) -> bool:
     """True if a model's predictions are worse than its fitted textbook's, beyond the noise."""
-    return any(map(_loses, usual(judgement)))
-
-
-def _loses(at: HorizonErrors) -> bool:
-    """True if predictions over one horizon are worse than those of a fitted textbook."""
-    if at.textbook is None:
-        return False
-    outcome = compare(at.model, at.textbook, at.textbook_noise_m, at.path_m)
-    return outcome is Outcome.WORSE
+    return any(next(shortfall_of_textbook(at), "") for at in usual(judgement))
 
 
 def shortfall(judgement: tuple[HorizonErrors, ...]) -> Iterator[str]:
@@ -123,21 +120,24 @@ def shortfall(judgement: tuple[HorizonErrors, ...]) -> Iterator[str]:
 
 def shortfall_of_textbook(at: HorizonErrors) -> Iterator[str]:
     """Yields a sentence if predictions are worse than the fitted textbook's; a tie is fine."""
-    if at.textbook is not None and _loses(at):
-        yield f"{_beside('the fitted textbook', at, at.textbook)}."
+    if at.textbook is None:
+        return
+    outcome = compare(at.model, at.textbook, at.textbook_noise_m, at.path_m)
+    if outcome is Outcome.WORSE:
+        yield f"{_describe_errors('the fitted textbook', at, at.textbook)}."
 
 
 def shortfall_of_twist(at: HorizonErrors) -> Iterator[str]:
     """Yields a sentence if predictions are no better than those of a constant twist."""
     outcome = compare(at.model, at.kept_twist, at.kept_twist_noise_m, at.path_m)
-    finding = _beside("a constant twist", at, at.kept_twist)
+    finding = _describe_errors("a constant twist", at, at.kept_twist)
     if outcome is Outcome.WORSE:
         yield f"{finding}."
     if outcome is Outcome.ALIKE:
         yield f"{finding}, too close to distinguish: the commands explain little of this drive."
 
 
-def _beside(name: str, at: HorizonErrors, errors: EndErrors) -> str:
+def _describe_errors(name: str, at: HorizonErrors, errors: EndErrors) -> str:
     off = f"end {at.model.position_m:.3g} m off after {at.horizon_s:g} s"
     finding = f"The model does not beat {name}: on unseen data its predictions {off}"
     return f"{finding}, those of {name} {errors.position_m:.3g} m"
@@ -234,6 +234,27 @@ def _rate_beside_standing(at: HorizonErrors, radius: float) -> Assessment:
     outcome = compare(at.model, at.standing, at.standing_noise_m, 0.0)
     if outcome is Outcome.BETTER:
         return Assessment(Verdict.GOOD, ())
-    finding = _beside("a robot that never moves", at, at.standing)
+    finding = _describe_errors("a robot that never moves", at, at.standing)
     reason = f"{finding}: the pose does not follow these commands."
     return Assessment(Verdict.DO_NOT_TRAIN, (reason,))
+
+
+def list_doubts_of_commands(
+    judgement: Sequence[HorizonErrors], calibration: Calibration
+) -> Iterator[str]:
+    """Yields a sentence if the commands hardly help to predict, or take effect implausibly late."""
+    for at in usual(tuple(judgement)):
+        error = at.model.position_m
+        without = at.kept_twist.position_m
+        if HARDLY * without < error < without:
+            ends = f"end {error:.3g} m off after {at.horizon_s:g} s, without them {without:.3g} m"
+            yield (
+                f"The commands hardly help: predictions by them {ends} (by a constant twist); "
+                "check that `command:` names what was sent to the robot."
+            )
+    latency = calibration.command_latency_s
+    if not EARLIEST_S <= latency <= LONGEST_S:
+        yield (
+            f"A latency of {latency:.2f} s between command and motion is implausible; check that "
+            "`command:` names what was sent to the robot, and its `time:`."
+        )

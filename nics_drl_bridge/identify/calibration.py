@@ -120,11 +120,11 @@ def align(drive: Drive, calibration: Calibration) -> Samples:
     # An exact drive is used bit for bit; noisy poses are smoothed by local parabolas.
     recording = drive.recording
     period = drive.settings.control_period_s
-    shared = _shared_stamps(recording, period) if calibration.is_exact else None
+    shared = _find_shared_stamps(recording, period) if calibration.is_exact else None
     if shared is not None:
         samples = samples_on_one_clock(*shared)
         return replace(samples, dt=part_of(period, samples.dt))
-    grid, step = _grid(recording, calibration, period)
+    grid, step = _make_grid(recording, calibration, period)
     half_width = SMOOTHING_BURSTS * calibration.burst_period_s
     if not half_width and (
         calibration.position_noise_m or calibration.heading_noise_rad
@@ -187,7 +187,7 @@ def states_at(drive: Drive, calibration: Calibration, grid: Array) -> Array:
     return np.asarray(gains * inferred[lead:])
 
 
-def _shared_stamps(
+def _find_shared_stamps(
     recording: Recording, period: float
 ) -> tuple[Array, Array, Array, Array] | None:
     """Returns stamps (T,), poses, states, commands of rows on a grid that divides a period."""
@@ -222,7 +222,7 @@ def _shared_stamps(
     )
 
 
-def _grid(
+def _make_grid(
     recording: Recording, calibration: Calibration, period: float
 ) -> tuple[Array, float]:
     """Returns uniform times (T,) covered by pose, commands and state, on the commands' clock.

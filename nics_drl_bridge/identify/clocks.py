@@ -257,27 +257,27 @@ def timing_of(drive: Drive) -> TimingEstimate:
             f"{place}: {fault}; record a drive of 20 s or more without long gaps."
         )
     if state is not None:
-        return _timing_of_measured_state(drive, state)
+        return _estimate_by_measured_state(drive, state)
     if not signals.moved_commands(command).any():
         start = command.t[0] - recording.pose.t[0]
         return nominal_timing(drive, float(start) if abs(start) > 60.0 else 0.0)
     target = (twists.start, twists.end, twists.twist)
     if recording.pose.clock != command.clock:
-        return _timing_of_two_clocks(recording, spec, target)
+        return _estimate_on_two_clocks(recording, spec, target)
     delay = delay_of_response(command, spec, target)
     latency = if_certain(max(delay.value, 0.0), delay.sigma, MIN_TIME_S)
     sigma = {"command_latency_s": delay.sigma}
     early = if_certain(max(-delay.value, 0.0), delay.sigma, MIN_EARLY_S)
     left_over = response_residual(command, spec, target)
-    if early and not _explains(left_over, delay):
+    if early and not _is_explained(left_over, delay):
         early = 0.0
-    drift = 0.0 if recording.episodes else _drift(command, spec, target, delay)
+    drift = 0.0 if recording.episodes else _find_drift(command, spec, target, delay)
     return TimingEstimate(
         0.0, latency, sigma, delay.lags, delay.lag_sigma, True, early, drift
     )
 
 
-def _explains(left_over: Left, delay: DelayEstimate) -> bool:
+def _is_explained(left_over: Left, delay: DelayEstimate) -> bool:
     """True if a delay explains a motion well enough to be believed."""
     quick = np.minimum(delay.lags, NO_LAG_S)
     at_once = min(
@@ -287,7 +287,7 @@ def _explains(left_over: Left, delay: DelayEstimate) -> bool:
     return left < MOST_UNEXPLAINED and left < EARLY_WORTH * at_once
 
 
-def _drift(
+def _find_drift(
     command: Stream, spec: RobotSpec, target: Target, delay: DelayEstimate
 ) -> float:
     """Returns the rate [s/s] at which a delay grows over a drive; 0 unless it grows steadily."""
@@ -323,14 +323,14 @@ def nominal_timing(drive: Drive, offset: float = 0.0) -> TimingEstimate:
     return TimingEstimate(offset, 0.0, {}, lags, np.full(len(lags), np.nan), False)
 
 
-def _timing_of_two_clocks(
+def _estimate_on_two_clocks(
     recording: Recording, spec: RobotSpec, target: Target
 ) -> TimingEstimate:
     """Estimates offset and latency separately if the wheels follow the commands, else their sum."""
-    wheels = _wheel_delay(recording, spec)
+    wheels = _find_wheel_delay(recording, spec)
     lags = None if wheels is None else wheels.lags
     delay = delay_of_response(
-        recording.command, spec, target, _likely_shifts(recording), lags
+        recording.command, spec, target, _list_likely_shifts(recording), lags
     )
     if wheels is None:
         sigma = {"clock_offset_s": delay.sigma}
@@ -344,7 +344,7 @@ def _timing_of_two_clocks(
     return TimingEstimate(offset, latency, sigma, wheels.lags, wheels.lag_sigma, True)
 
 
-def _timing_of_measured_state(drive: Drive, state: Stream) -> TimingEstimate:
+def _estimate_by_measured_state(drive: Drive, state: Stream) -> TimingEstimate:
     recording = drive.recording
     twists = drive.twists
     sigma = {}
@@ -360,7 +360,7 @@ def _timing_of_measured_state(drive: Drive, state: Stream) -> TimingEstimate:
         early = if_certain(max(-delay.value, 0.0), delay.sigma, MIN_EARLY_S)
     if recording.pose.clock != state.clock:
         by_shift = residual_by_shift(state, (twists.start, twists.end, twists.twist))
-        delay = _search_or_zero(by_shift, _likely_shifts(recording))
+        delay = _search_or_zero(by_shift, _list_likely_shifts(recording))
         sigma["clock_offset_s"] = delay.sigma
         offset = -if_certain(delay.value, delay.sigma, MIN_TIME_S)
     return TimingEstimate(
@@ -368,12 +368,12 @@ def _timing_of_measured_state(drive: Drive, state: Stream) -> TimingEstimate:
     )
 
 
-def _likely_shifts(recording: Recording) -> tuple[float, ...]:
+def _list_likely_shifts(recording: Recording) -> tuple[float, ...]:
     """Returns search centres for the delay of the pose's clock [s]: no shift, or a common start."""
     return 0.0, float(recording.pose.t[0] - recording.command.t[0])
 
 
-def _wheel_delay(recording: Recording, spec: RobotSpec) -> DelayEstimate | None:
+def _find_wheel_delay(recording: Recording, spec: RobotSpec) -> DelayEstimate | None:
     """Returns the wheels' delay; None if they are on another clock or ignore the commands."""
     wheels = recording.wheels
     if wheels is None or wheels.clock != recording.command.clock:

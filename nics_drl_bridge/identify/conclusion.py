@@ -3,13 +3,20 @@
 from math import isfinite
 from typing import NamedTuple
 
-from nics_drl_bridge.identify.acceptance import Verdict, usual
-from nics_drl_bridge.identify.by_recording import Alone
-from nics_drl_bridge.identify.command_doubts import doubts_of_commands
+from nics_drl_bridge.identify.acceptance import (
+    Verdict,
+    list_doubts_of_commands,
+    usual,
+)
 from nics_drl_bridge.identify.excitation import narrow
 from nics_drl_bridge.identify.gyro import relative_to
 from nics_drl_bridge.identify.identify import Identified
-from nics_drl_bridge.identify.verdict import Doubt, Mistake, list_missed
+from nics_drl_bridge.identify.verdict import (
+    Alone,
+    Doubt,
+    Mistake,
+    list_missed,
+)
 from nics_drl_bridge.robot.kinds import describe_overdrive
 from nics_drl_bridge.robot.taylor import EndErrors
 
@@ -48,7 +55,7 @@ def conclude(identified: Identified) -> Conclusion:
         *strange,
         *(str(note) for note in identified.notes if isinstance(note, Alone)),
         *((replaced,) if replaced else ()),
-        *doubts_of_commands(identified.judgement, identified.calibration),
+        *list_doubts_of_commands(identified.judgement, identified.calibration),
         *assessment.reasons,
     )
     overdrive = describe_overdrive(spec)
@@ -60,12 +67,16 @@ def conclude(identified: Identified) -> Conclusion:
     ready = (
         assessment.verdict is not Verdict.DO_NOT_TRAIN and not identified.model.assumed
     )
-    advice = f"Next: {_advice(identified, bool(wrong), bool(strange), bool(gaps))}."
+    advice = (
+        f"Next: {_choose_advice(identified, bool(wrong), bool(strange), bool(gaps))}."
+    )
     errors = f"{accuracy(identified)} {relative_to(identified.recording)}".strip()
     return Conclusion(assessment.verdict, errors, doubts, gaps, advice, ready)
 
 
-def _advice(identified: Identified, mistaken: bool, strange: bool, gaps: bool) -> str:
+def _choose_advice(
+    identified: Identified, mistaken: bool, strange: bool, gaps: bool
+) -> str:
     """Returns the next step, by the first condition that is not met."""
     duration = identified.drive.duration_s
     if mistaken:

@@ -151,7 +151,7 @@ def states_are_noisy(samples: Samples, spec: RobotSpec) -> bool:
 def inliers(chi: Array, target: Array, usual: float) -> NDArray[np.bool_]:
     """Selects the rows of a target (T,) on features (T, K) that are not outliers."""
     everything = np.ones(len(target), dtype=np.bool_)
-    plain = _left(chi, target)
+    plain = _measure_residuals(chi, target)
     if not (
         plain > max(FAR / 2.0 * float(np.median(plain)) / GAUSSIAN_MAD, usual)
     ).any():
@@ -159,7 +159,7 @@ def inliers(chi: Array, target: Array, usual: float) -> NDArray[np.bool_]:
     count = max(int(BULK * len(target)), min(len(target), chi.shape[1] + 1))
     bulk = np.argsort(np.abs(target - np.median(target)), kind="stable")[:count]
     for start in (np.argsort(plain, kind="stable")[:count], bulk):
-        rest = _concentrated(chi, target, start)
+        rest = _fit_best_rows(chi, target, start)
         inside = (
             rest <= FAR * float(np.percentile(rest, BULK_PERCENTILE)) / GAUSSIAN_BULK
         )
@@ -178,18 +178,18 @@ def plausible(x: Array, spec: RobotSpec) -> NDArray[np.bool_]:
     return np.ones(len(x), dtype=np.bool_)
 
 
-def _concentrated(chi: Array, target: Array, chosen: NDArray[np.intp]) -> Array:
+def _fit_best_rows(chi: Array, target: Array, chosen: NDArray[np.intp]) -> Array:
     """Returns absolute residuals (T,) of a fit to the best-fitting rows, starting from `chosen`."""
     for _ in range(CONCENTRATIONS):
-        rest = _left(chi, target, chosen)
+        rest = _measure_residuals(chi, target, chosen)
         again = np.argsort(rest, kind="stable")[: len(chosen)]
         if np.array_equal(np.sort(again), np.sort(chosen)):
             return rest
         chosen = again
-    return _left(chi, target, chosen)
+    return _measure_residuals(chi, target, chosen)
 
 
-def _left(
+def _measure_residuals(
     chi: Array, target: Array, rows: NDArray[np.intp] | slice = slice(None)
 ) -> Array:
     """Returns absolute residuals (T,) of a least-squares fit to some rows."""
@@ -251,7 +251,7 @@ def coverage(recording: Recording, spec: RobotSpec) -> tuple[CommandCoverage, ..
     faults |= dict.fromkeys(excited.unmoved, "never moved")
     lowest, highest = np.percentile(command, ENDS, axis=0)
     share = (highest - lowest) / (spec.command_high - spec.command_low)
-    own_share = _own(samples.x)
+    own_share = _measure_own_shares(samples.x)
     return tuple(
         CommandCoverage(
             c.name,
@@ -266,7 +266,7 @@ def coverage(recording: Recording, spec: RobotSpec) -> tuple[CommandCoverage, ..
     )
 
 
-def _own(x: Array) -> Array:
+def _measure_own_shares(x: Array) -> Array:
     """Returns the fraction (C,) of each column's spread that is independent of the others."""
     centred = x - x.mean(axis=0)
     shares = np.zeros(x.shape[1])

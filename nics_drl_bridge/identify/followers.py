@@ -101,7 +101,7 @@ def apart(drive: Drive, timing: clocks.TimingEstimate) -> clocks.TimingEstimate:
             max(least, 0.0), float(sigma[0, first]), clocks.MIN_TIME_S
         )
     if timing.separated and errors["command_latency_s"] > clocks.SEPARABLE_S:
-        names = (_of_sum(states[i].name) for i in moved)
+        names = (_name_sum(states[i].name) for i in moved)
         errors |= zip(names, map(float, sigma[1]), strict=True)
     further = 0.0 * timing.lags
     further[moved] = np.where(alike, 0.0, np.maximum(delay - least, 0.0))
@@ -220,9 +220,9 @@ def _find_following(
         ((begin - begin[0]) / clocks.CLUSTER_S).astype(np.intp), len(moving)
     )
     best = _adjust(left, start, moved, shift, cluster)
-    with_limits = partial(_with_limits, shift=shift)
+    with_limits = partial(_try_limits, shift=shift)
     # the effect of one may hide that of another
-    for change in (with_limits, _with_dead_zones, with_limits):
+    for change in (with_limits, _try_dead_zones, with_limits):
         for i in moved:
             sent = command.values[:, signals.followed(spec)[i]]
             least = np.inf
@@ -238,27 +238,31 @@ def _find_following(
     return best
 
 
-def _with_limits(
+def _try_limits(
     now: _Following, i: int, sent: Array, shift: float
 ) -> Iterator[_Following]:
     """Yields trials in which state i has limits, with a smaller lag and delay."""
     trial_delays = {*(shift + delay for delay in DELAYS_S), *now.delays}
     for rate, lag, delay in product(RATES, LAGS_S, trial_delays):
         size = rate * float(np.ptp(sent))
-        fall = _put(now.motors.fall, i, -size)
-        rise = _put(now.motors.rise, i, size)
+        fall = _replace_value(now.motors.fall, i, -size)
+        rise = _replace_value(now.motors.rise, i, size)
         motors = now.motors._replace(fall=fall, rise=rise)
-        yield _Following(_put(now.lags, i, lag), _put(now.delays, i, delay), motors)
+        yield _Following(
+            _replace_value(now.lags, i, lag),
+            _replace_value(now.delays, i, delay),
+            motors,
+        )
 
 
-def _with_dead_zones(now: _Following, i: int, sent: Array) -> Iterator[_Following]:
+def _try_dead_zones(now: _Following, i: int, sent: Array) -> Iterator[_Following]:
     """Yields trials in which the command of state i has a dead zone."""
     for share in DEAD:
-        dead = _put(now.motors.dead, i, share * float(np.abs(sent).max()))
+        dead = _replace_value(now.motors.dead, i, share * float(np.abs(sent).max()))
         yield replace(now, motors=now.motors._replace(dead=dead))
 
 
-def _put(values: Array, i: int, value: float) -> Array:
+def _replace_value(values: Array, i: int, value: float) -> Array:
     return np.where(np.arange(len(values)) == i, value, values)
 
 
@@ -319,7 +323,7 @@ def _adjust(
     )
 
 
-def _of_sum(state: str) -> str:
+def _name_sum(state: str) -> str:
     """Returns the name of the uncertainty of a latency and a lag together."""
     return f"command_latency_and_{state}_lag_s"
 
@@ -329,7 +333,7 @@ def about_sums(calibration: Calibration) -> Iterator[str]:
     commands = [response.command for response in calibration.responses]
     further = delays(commands, calibration.inputs).tolist()
     for response, delay in zip(calibration.responses, further, strict=True):
-        sigma = calibration.uncertainty.get(_of_sum(response.state))
+        sigma = calibration.uncertainty.get(_name_sum(response.state))
         if sigma is not None:
             both = calibration.command_latency_s + delay + response.lag_s
             finding = f"Latency and the lag of {response.state} can hardly be separated"

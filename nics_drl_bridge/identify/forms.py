@@ -69,23 +69,20 @@ def curve_of(samples: Samples, spec: RobotSpec, place: int) -> Candidate | None:
     structure = structure_of(spec)
     # components of the twist that it drives
     acts = np.ones(3) if structure is None else structure[0][:, place]
-    best = None
+    candidates = []
     for variable in spec.state:
-        if variable.twist is None:
-            continue
-        dof = POSE_RATES.index(variable.twist)
-        if not acts[dof]:
-            continue
-        candidate = _of_component(samples, spec, place, dof)
-        if candidate and (best is None or candidate.gain > best.gain):
-            best = candidate
-    if best is None:
+        if variable.twist and acts[POSE_RATES.index(variable.twist)]:
+            dof = POSE_RATES.index(variable.twist)
+            candidates.append(_fit_curve(samples, spec, place, dof))
+    found = [candidate for candidate in candidates if candidate is not None]
+    if not found:
         return None
+    best = max(found, key=lambda candidate: candidate.gain)
     needed = WORTH if best.drives else CLEAR
     return best if best.gain >= needed else None
 
 
-def _of_component(
+def _fit_curve(
     samples: Samples, spec: RobotSpec, place: int, dof: int
 ) -> Candidate | None:
     command = samples.x[:, len(spec.state) :]
@@ -98,7 +95,7 @@ def _of_component(
     def measure_rest(dead: float, full: float) -> float:
         """Returns the sum of squares that a curve leaves unexplained, at the best lag."""
         effect = command.copy()
-        effect[:, place] = _curve("", reach, dead, full).of(command[:, place])
+        effect[:, place] = _make_curve("", reach, dead, full).of(command[:, place])
         least = np.inf
         for lag in LAGS_S:
             columns = [np.ones(len(speed))]
@@ -121,11 +118,11 @@ def _of_component(
     gain = 1.0 - least / straight
     if gain < WORTH:
         return None
-    curve = _curve(spec.command[place].name, reach, dead, full)
+    curve = _make_curve(spec.command[place].name, reach, dead, full)
     return Candidate(curve, gain, dof == 0)
 
 
-def _curve(name: str, reach: Array, dead: float, full: float) -> InputCurve:
+def _make_curve(name: str, reach: Array, dead: float, full: float) -> InputCurve:
     size = float(np.abs(reach).max())
     return InputCurve(
         command=name,
@@ -238,7 +235,7 @@ def inputs_of(
     drive: Drive, latency: float, samples: Samples, form: Form
 ) -> shooting.Inputs:
     """Returns the values to be estimated besides coefficients: latency, and those of a form."""
-    rows = _rows_of_commands(drive, latency, form)
+    rows = _list_command_values(drive, latency, form)
     rates = {v.name: samples.dq[:, 3 + i] for i, v in enumerate(drive.spec.state)}
     for name in form.friction:
         size = float(np.percentile(np.abs(rates[name]), STRONG))
@@ -266,7 +263,7 @@ def inputs_of(
     return shooting.Inputs(tuple(rows), *np.array(list(rows.values())).T)
 
 
-def _rows_of_commands(
+def _list_command_values(
     drive: Drive, latency: float, form: Form
 ) -> dict[str, tuple[float, float, float, float]]:
     """Returns start, scale and bounds of latency and delays [s], and of curves, by name."""
@@ -384,8 +381,8 @@ def reached(
 
 def likely_delay(drive: Drive, calibration: Calibration, samples: Samples) -> float:
     """Returns the delay [s] of the commands that best explains the rates of the state."""
-    trials, late = _delayed(drive, calibration, samples)
-    left = [_left(drive.spec, samples, command) for command in late]
+    trials, late = _delay_commands(drive, calibration, samples)
+    left = [_measure_unexplained(drive.spec, samples, command) for command in late]
     if np.isfinite(left).all():
         return float(trials[int(np.argmin(left))])
     return calibration.command_latency_s
@@ -395,13 +392,13 @@ def likely_delays(
     drive: Drive, calibration: Calibration, samples: Samples
 ) -> tuple[tuple[str, float], ...]:
     """Returns the delay of each command separately, given the others; empty if they are alike."""
-    trials, late = _delayed(drive, calibration, samples)
+    trials, late = _delay_commands(drive, calibration, samples)
     now = int(np.abs(trials - calibration.command_latency_s).argmin())
     delays = {}
     for place, command in enumerate(drive.spec.command):
         mixed = np.repeat(late[now][None], len(trials), axis=0)
         mixed[..., place] = late[..., place]
-        left = [_left(drive.spec, samples, trial) for trial in mixed]
+        left = [_measure_unexplained(drive.spec, samples, trial) for trial in mixed]
         if np.ptp(left) > 0.0 and np.isfinite(left).all():
             delays[command.name] = float(trials[int(np.argmin(left))])
     if delays and np.ptp(list(delays.values())) > ALIKE_S:
@@ -409,7 +406,7 @@ def likely_delays(
     return ()
 
 
-def _delayed(
+def _delay_commands(
     drive: Drive, calibration: Calibration, samples: Samples
 ) -> tuple[Array, Array]:
     """Returns possible delays (N,) [s], and the commands in effect (N, T, C) for each."""
@@ -428,7 +425,7 @@ def _delayed(
     return trials, np.array(late)
 
 
-def _left(spec: RobotSpec, samples: Samples, command: Array) -> float:
+def _measure_unexplained(spec: RobotSpec, samples: Samples, command: Array) -> float:
     """Returns the part of the state's rates that commands in effect (T, C) leave unexplained."""
     states = len(spec.state)
     free = [3 + i for i, v in enumerate(spec.state) if v.twist] or [0, 2]

@@ -41,8 +41,8 @@ def turned_by_gyro(recording: Recording) -> Recording:
     turning = compare_turning(pose.t, pose.values, gyro_t, yaw_rate)
     if turning is None or not turning.compared:
         return recording
-    sentences = tuple(_about(recording, turning))
-    if not _fits(recording, turning):
+    sentences = tuple(_describe_turning(recording, turning))
+    if not _is_credible(recording, turning):
         return replace(recording, repairs=(*recording.repairs, *sentences))
     if recording.measured_by == "odometry" and turning.contradicts:
         turned, covered = turn_by_gyro(pose.t, pose.values, gyro_t, yaw_rate, turning)
@@ -85,7 +85,7 @@ def relative_to(recording: Recording) -> str:
     )
 
 
-def _fits(recording: Recording, turning: Turning) -> bool:
+def _is_credible(recording: Recording, turning: Turning) -> bool:
     """True if the gyro is credible, given this pose."""
     if not turning.plausible:
         return False
@@ -94,7 +94,7 @@ def _fits(recording: Recording, turning: Turning) -> bool:
     return abs(turning.scale - 1.0) < UNLIKE_TRACKER or not turning.contradicts
 
 
-def _about(recording: Recording, turning: Turning) -> Iterator[str]:
+def _describe_turning(recording: Recording, turning: Turning) -> Iterator[str]:
     """Yields a sentence on how gyro and pose turn."""
     if turning.mirrored:
         yield Mistake(
@@ -122,7 +122,7 @@ def _about(recording: Recording, turning: Turning) -> Iterator[str]:
     bias = (
         f"bias of {turning.bias:.4f} +- {turning.bias_std:.2g} rad/s was found {where}"
     )
-    agrees = recording.measured_by == "tracker" and _fits(recording, turning)
+    agrees = recording.measured_by == "tracker" and _is_credible(recording, turning)
     if agrees or not turning.contradicts:
         yield (
             f"The gyro confirms the heading: they differ by {turning.apart:.2g} rad in "
@@ -133,13 +133,13 @@ def _about(recording: Recording, turning: Turning) -> Iterator[str]:
     if recording.measured_by == "odometry":
         slip = ""
         if abs(turning.scale - 1.0) > CLEARLY * turning.scale_std:
-            slip = f": it turns {_factor(turning)} times as far, as wheels do that slip"
+            slip = f": it turns {_format_factor(turning)} times as far, as wheels do that slip"
         yield (
             f"The gyro contradicts odometry {differ}{slip}. The model was learnt from the wheels' "
             f"displacements along the heading of the gyro, whose {bias}."
         )
         return
-    times = f"{_factor(turning)} times as far"
+    times = f"{_format_factor(turning)} times as far"
     if recording.measured_by == "":
         yield (
             f"The gyro contradicts the pose {differ}: the pose turns {times}. If it is odometry, "
@@ -152,6 +152,6 @@ def _about(recording: Recording, turning: Turning) -> Iterator[str]:
     )
 
 
-def _factor(turning: Turning) -> str:
+def _format_factor(turning: Turning) -> str:
     digits = max(2, int(np.ceil(-np.log10(max(turning.scale_std, 1e-4)))))
     return f"{turning.scale:.{digits}f} +- {turning.scale_std:.1g}"

@@ -31,7 +31,6 @@ from nics_drl_bridge.identify import fit as fitting
 from nics_drl_bridge.identify import motion as motions
 from nics_drl_bridge.identify.assume import assume_textbook
 from nics_drl_bridge.identify.calibration import Calibration, Response, align
-from nics_drl_bridge.identify.command_doubts import doubts_of_commands
 from nics_drl_bridge.identify.drive import Drive, Settings
 from nics_drl_bridge.identify.findings import (
     Findings,
@@ -50,8 +49,7 @@ from nics_drl_bridge.identify.forms import (
 )
 from nics_drl_bridge.identify.gyro import turned_by_gyro
 from nics_drl_bridge.identify.judgement import (
-    bands_of,
-    bands_of_fixed,
+    estimate_bands,
     judged,
     measure_distances,
     textbook_of,
@@ -59,7 +57,6 @@ from nics_drl_bridge.identify.judgement import (
 from nics_drl_bridge.identify.motion_fit import fit_motion, refine_motion
 from nics_drl_bridge.identify.mounting import mounted, mounting_of
 from nics_drl_bridge.identify.noise import motion_noise, sensor_noise
-from nics_drl_bridge.identify.notes import collect_notes, list_plain_calibration_notes
 from nics_drl_bridge.identify.refine import refine_by_predictions
 from nics_drl_bridge.identify.repair import (
     check_axes,
@@ -79,7 +76,7 @@ from nics_drl_bridge.identify.textbook_model import (
     with_actuators,
 )
 from nics_drl_bridge.identify.yardstick import Yardstick, fit_yardstick
-from nics_drl_bridge.recording.joining import LEARNT_SHARE
+from nics_drl_bridge.recording.joining import LEARNT_SHARE, join
 from nics_drl_bridge.recording.recording import Recording, Samples, Stream, check
 from nics_drl_bridge.robot.noise import Noise
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -229,7 +226,9 @@ class Identified:
         if unfit:
             ratings.append(acceptance.Assessment(acceptance.Verdict.DO_NOT_TRAIN, ()))
         doubtful = any(isinstance(note, verdict.Doubt) for note in self.notes)
-        doubtful |= any(doubts_of_commands(self.judgement, self.calibration))
+        doubtful |= any(
+            acceptance.list_doubts_of_commands(self.judgement, self.calibration)
+        )
         if self.model.assumed or doubtful:
             ratings.append(acceptance.Assessment(acceptance.Verdict.WITH_CARE, ()))
         return acceptance.combined(ratings)
@@ -577,7 +576,7 @@ def judge_model(drive: Drive, findings: Findings) -> Findings:
     rated = verdict.add_quality(model, fit, unseen, held_out, judgement, drive.spec)
     if model is fit.model:
         fit = replace(fit, model=rated)
-    notes = list_plain_calibration_notes(findings)
+    notes = verdict.list_plain_calibration_notes(findings)
     findings = replace(
         findings,
         pruned_fit=fit,
@@ -589,7 +588,7 @@ def judge_model(drive: Drive, findings: Findings) -> Findings:
         calibration=replace(calibration, notes=notes),
         noise=motion_noise(findings.noise, whole, calibration, model, samples),
     )
-    return replace(findings, notes=collect_notes(drive, findings))
+    return replace(findings, notes=verdict.collect_notes(drive, findings))
 
 
 def _find_bands(drive: Drive, findings: Findings) -> dict[float, float]:
@@ -598,13 +597,13 @@ def _find_bands(drive: Drive, findings: Findings) -> dict[float, float]:
     calibration = findings.calibration
     training = findings.training
     if findings.replacement:
-        return bands_of_fixed(model, calibration, training)
+        return estimate_bands(model, calibration, training, fixed=True)
     if calibration.is_exact or drive.duration_s <= drive.settings.train_until_s:
         return {}
     derived = None
     if findings.base is not None:
         derived = resample_drive(training, findings), findings.base
-    return bands_of(model, calibration, training, derived)
+    return estimate_bands(model, calibration, training, derived)
 
 
 def prefer_textbook(drive: Drive, findings: Findings) -> Findings:
@@ -692,15 +691,15 @@ def refit_model(drive: Drive, findings: Findings) -> Findings:
     sentence = verdict.describe_refit(driven(until), driven(), worse=final is None)
     if final is None:
         findings = replace(findings, refinement=(*findings.refinement, sentence))
-        return replace(findings, notes=collect_notes(drive, findings))
-    notes = list_plain_calibration_notes(final)
+        return replace(findings, notes=verdict.collect_notes(drive, findings))
+    notes = verdict.list_plain_calibration_notes(final)
     final = replace(
         final,
         refinement=(*final.refinement, sentence),
         calibration=replace(final.calibration, notes=notes),
         model=replace(require_model(final), quality=require_model(findings).quality),
     )
-    final = replace(final, notes=collect_notes(drive, final))
+    final = replace(final, notes=verdict.collect_notes(drive, final))
     return replace(findings, final=final)
 
 
@@ -756,6 +755,36 @@ def _find_origin(stream: Stream, pose: Stream) -> float:
     if stream.t[0] < pose.t[-1] and stream.t[-1] > pose.t[0]:  # a small offset
         return float(max(stream.t[0], pose.t[0]))
     return float(stream.t[0])
+
+
+def join_recordings(recordings: Sequence[Recording], spec: RobotSpec) -> Recording:
+    """Joins recordings of a robot; RecordingError for another robot, or clocks that can't align."""
+    if not recordings:
+        raise RecordingError("no recording was given; give one or more.")
+    if len(recordings) == 1:
+        return recordings[0]
+    # a gyro's bias differs between drives
+    turned = [turned_by_gyro(item) for item in recordings]
+    offsets = [_find_clock_offset(item, spec) for item in turned]
+    joined = join(turned, offsets)
+    gyros = [item.gyro for item in turned]
+    return replace(
+        joined, gyro=gyros[0] if all(item is not None for item in gyros) else None
+    )
+
+
+def _find_clock_offset(recording: Recording, spec: RobotSpec) -> float:
+    """Returns the offset [s] from the pose's clock to the commands', found from this drive."""
+    if recording.pose.clock == recording.command.clock:
+        return 0.0
+    drive = Drive(check(recording, spec), spec)
+    try:
+        return run((repair_drive, estimate_timing), drive).calibration.clock_offset_s
+    except FitError as error:
+        fault = f"{recording.source}: its two clocks can't be aligned by this drive alone ({error})"
+        raise RecordingError(
+            f"{fault}; record pose and commands by one clock."
+        ) from None
 
 
 STAGES = list_stages()

@@ -2,6 +2,7 @@
 
 from contextlib import suppress
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,30 +73,29 @@ def judged(
             break
         ends = predict(model, calibration, drive, chosen)
         twist = twists_before(drive, chosen.start_t)
-        kept = kept_twist(drive, chosen, twist)
-        far = distances(ends, chosen)
-        errors = HorizonErrors(
-            horizon_s=horizon,
-            windows=len(far),
-            path_m=float(chosen.path.mean()),
-            model=errors_of_ends(ends, chosen),
-            kept_twist=errors_of_ends(kept, chosen),
-            kept_twist_noise_m=noise_beside(ends, kept, chosen, horizon),
-            standing=errors_of_ends(chosen.start, chosen),
-            standing_noise_m=noise_beside(ends, chosen.start, chosen, horizon),
-        )
+        yardsticks = {
+            "kept_twist": kept_twist(drive, chosen, twist),
+            "standing": chosen.start,
+        }
         if textbook is not None:
-            by_textbook = textbook.predict(drive, chosen, twist)
-            errors = replace(
-                errors,
-                textbook=errors_of_ends(by_textbook, chosen),
-                textbook_noise_m=noise_beside(ends, by_textbook, chosen, horizon),
-            )
+            yardsticks["textbook"] = textbook.predict(drive, chosen, twist)
+        figures: dict[str, Any] = {}
+        for name, theirs in yardsticks.items():
+            figures[name] = errors_of_ends(theirs, chosen)
+            figures[f"{name}_noise_m"] = noise_beside(ends, theirs, chosen, horizon)
         band = bands.get(horizon)
         if band is not None:
-            coverage = float((far <= band).mean())
-            errors = replace(errors, band_m=band, coverage=coverage)
-        judgement.append(errors)
+            coverage = float((distances(ends, chosen) <= band).mean())
+            figures |= {"band_m": band, "coverage": coverage}
+        judgement.append(
+            HorizonErrors(
+                horizon_s=horizon,
+                windows=len(chosen.start_t),
+                path_m=float(chosen.path.mean()),
+                model=errors_of_ends(ends, chosen),
+                **figures,
+            )
+        )
     return tuple(judgement)
 
 
@@ -122,37 +122,29 @@ def errors_of_ends(ends: Array, chosen: Windows) -> EndErrors:
     return EndErrors(float(np.hypot(*apart[:, :2].T).mean()), float(heading))
 
 
-def bands_of_fixed(
-    model: TaylorModel, calibration: Calibration, training: Drive
-) -> dict[float, float]:
-    """Returns the bands [m] by horizon of a model that is not adjusted to any part of a drive."""
-    bands = dict[float, float]()
-    for horizon in hypotheses.BANDS_S:
-        far = measure_distances(model, calibration, training, horizon)
-        if len(far) >= FEWEST:
-            bands[horizon] = float(np.percentile(far, WITHIN))
-    return bands
-
-
-def bands_of(
+def estimate_bands(
     model: TaylorModel,
     calibration: Calibration,
     training: Drive,
-    derived: tuple[Samples, hypotheses.Base] | None,
+    derived: tuple[Samples, hypotheses.Base] | None = None,
+    fixed: bool = False,
 ) -> dict[float, float]:
     """Returns the distances [m] within which 95 % of predictions are expected to end, by horizon.
 
     Each fold of the training part is predicted by the model adjusted to the others. `derived` are
-    the samples of a motion derived from the poses, and the base that the model departed from.
+    the samples of a motion derived from the poses, and the base that the model departed from. A
+    `fixed` model is not adjusted, and predicts the whole part.
     """
     errors: dict[float, list[Array]] = {h: [] for h in hypotheses.BANDS_S}
-    for rest, part in training.folds(FOLDS):
-        if derived is None:
-            adjusted = readjust(model, calibration, rest)
-        else:
+    folds = [(training, training)] if fixed else training.folds(FOLDS)
+    for rest, part in folds:
+        adjusted: tuple[TaylorModel, Calibration] | None = model, calibration
+        if derived is not None:
             begin, end = part.recording.pose.t[[0, -1]] + calibration.clock_offset_s
             kept = (derived[0].t < begin) | (derived[0].t > end)
-            adjusted = _with_motion(model, calibration, training, *derived, kept)
+            adjusted = _adjust_motion(model, calibration, training, *derived, kept)
+        elif not fixed:
+            adjusted = readjust(model, calibration, rest)
         if adjusted is None:
             return {}
         for horizon, parts in errors.items():
@@ -175,7 +167,7 @@ def measure_distances(
     return distances(predict(model, calibration, part, chosen), chosen)
 
 
-def _with_motion(
+def _adjust_motion(
     model: TaylorModel,
     calibration: Calibration,
     training: Drive,

@@ -1,4 +1,7 @@
-"""Compiled sensitivities: poses at the ends of windows, and derivatives by the coefficients."""
+"""Compiled rollouts over windows: poses at their ends, and derivatives by the coefficients.
+
+`shoot` rolls out a model with its sensitivities, `roll_windows` a textbook.
+"""
 
 import math
 from dataclasses import replace
@@ -37,132 +40,12 @@ def make_used_terms(
     return terms, np.flatnonzero(free[used]).astype(np.int64)
 
 
-@kernel(allocates=True)
-def _product(row: Array, factors: NDArray[np.int64], count: int) -> float:
-    value = 1.0
-    for f in range(count):
-        value *= row[factors[f]]
-    return value
-
-
 @kernel
 def _sinc(half: float) -> float:
     if abs(half) > SMALL_TURN:
         return math.sin(half) / half
     square = half * half
     return 1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0))
-
-
-@kernel(allocates=True, inline=True)
-def _follow_derivatives(
-    now: Array,
-    values: Array,
-    dof: NDArray[np.int64],
-    free: NDArray[np.int64],
-    dx: float,
-    dy: float,
-    turn: float,
-    along_x: float,
-    along_y: float,
-    dt: float,
-) -> None:
-    """Propagates the derivatives (3, P) of a pose along one arc: (dx, dy, turn)."""
-    for p in range(now.shape[1]):
-        value = values[free[p]]
-        d = dof[free[p]]
-        lean = now[2, p]
-        if d == 2:
-            lean += 0.5 * dt * value
-        now[0, p] -= lean * dy
-        now[1, p] += lean * dx
-        if d == 0:
-            now[0, p] += along_x * value
-            now[1, p] += along_y * value
-        elif d == 1:
-            now[0, p] -= along_y * value
-            now[1, p] += along_x * value
-        else:
-            shorter = -turn / 12.0 * dt * value
-            now[0, p] += shorter * dx
-            now[1, p] += shorter * dy
-            now[2, p] += dt * value
-
-
-@kernel(allocates=True)
-def follow(
-    ends: Array,
-    moved: Array,
-    x: Array,
-    steps: NDArray[np.int64],
-    share: Array,
-    terms: Terms,
-    free: NDArray[np.int64],
-    dt: float,
-) -> None:
-    """Writes end poses (W, 3), and derivatives (W, 3, P) by the `free` (P,) of `terms`."""
-    # Body twists along courses of X (W, T, V + 1), whose last entry is 1, are integrated as in the
-    # simulator: whole `steps` (W,) of `dt` [s] and a `share` (W,) of one more; headings are
-    # unwrapped.
-    dof = terms.dof
-    coefficient = terms.coefficient
-    factors = terms.factors
-    count = terms.degree
-    params = moved.shape[2]
-    values = np.empty(dof.shape[0])
-    now = np.zeros((3, params))
-    before = np.zeros((3, params))
-    for w in range(x.shape[0]):
-        px = 0.0
-        py = 0.0
-        heading = 0.0
-        qx = 0.0
-        qy = 0.0
-        old = 0.0
-        now[:] = 0.0
-        last = steps[w] + (1 if share[w] > 0.0 else 0)
-        for n in range(last):
-            if n == steps[w]:
-                qx = px
-                qy = py
-                old = heading
-                before[:] = now
-            vx = 0.0
-            vy = 0.0
-            wz = 0.0
-            for k in range(dof.shape[0]):
-                values[k] = _product(x[w, n], factors[k], count[k])
-                rate = coefficient[k] * values[k]
-                if dof[k] == 0:
-                    vx += rate
-                elif dof[k] == 1:
-                    vy += rate
-                else:
-                    wz += rate
-            turn = wz * dt
-            sinc = _sinc(turn / 2.0)
-            c = math.cos(heading + turn / 2.0)
-            s = math.sin(heading + turn / 2.0)
-            along = dt * sinc
-            dx = along * (c * vx - s * vy)
-            dy = along * (s * vx + c * vy)
-            _follow_derivatives(
-                now, values, dof, free, dx, dy, turn, along * c, along * s, dt
-            )
-            px = px + dx
-            py = py + dy
-            heading = heading + turn
-        if share[w] > 0.0:
-            a = 1.0 - share[w]
-            b = share[w]
-            ends[w, 0] = a * qx + b * px
-            ends[w, 1] = a * qy + b * py
-            ends[w, 2] = a * old + b * heading
-            moved[w] = a * before + b * now
-        else:
-            ends[w, 0] = px
-            ends[w, 1] = py
-            ends[w, 2] = heading
-            moved[w] = now
 
 
 class Shot(NamedTuple):
@@ -339,8 +222,14 @@ def _step(
     dx = along * (c * rate[0] - s * rate[1])
     dy = along * (s * rate[0] + c * rate[1])
     if sloped:
+        shorter = -turn / 12.0 * dt
         _follow_pose(
-            scratch.pose_slope[lane], scratch.twist, dx, dy, along * c, along * s, dt
+            scratch.pose_slope[lane],
+            scratch.twist,
+            (dx, dy),
+            (along * c, along * s),
+            shorter,
+            dt,
         )
     pose[0] += dx
     pose[1] += dy
@@ -375,22 +264,26 @@ def _add(total: Array, factor: float, by: Array) -> None:
 def _follow_pose(
     pose: Array,
     twist: Array,
-    dx: float,
-    dy: float,
-    along_x: float,
-    along_y: float,
+    moved: tuple[float, float],
+    along: tuple[float, float],
+    shorter: float,
     dt: float,
 ) -> None:
+    """Propagates the derivatives (3, P) of a pose along an arc, from those of its twist (3, P)."""
     x = pose[0]
     y = pose[1]
     heading = pose[2]
     vx = twist[0]
     vy = twist[1]
     wz = twist[2]
+    dx, dy = moved
+    ax, ay = along
     for p in range(x.shape[0]):
-        x[p] += along_x * vx[p] - along_y * vy[p] - (heading[p] + 0.5 * dt * wz[p]) * dy
+        lean = heading[p] + 0.5 * dt * wz[p]
+        x[p] += ax * vx[p] - ay * vy[p] - lean * dy + shorter * wz[p] * dx
     for p in range(x.shape[0]):
-        y[p] += along_y * vx[p] + along_x * vy[p] + (heading[p] + 0.5 * dt * wz[p]) * dx
+        lean = heading[p] + 0.5 * dt * wz[p]
+        y[p] += ay * vx[p] + ax * vy[p] + lean * dx + shorter * wz[p] * dy
     for p in range(x.shape[0]):
         heading[p] += dt * wz[p]
 
@@ -455,3 +348,83 @@ def limp(states: Array, targets: Array, share: float, fall: float, rise: float) 
     for k in range(1, states.shape[0]):
         change = share * (targets[k - 1] - states[k - 1])
         states[k] = states[k - 1] + min(max(change, fall), rise)
+
+
+class BicycleGeometry(NamedTuple):
+    """Geometry of a robot that steers."""
+
+    used: bool
+    front_drive: bool
+    wheelbase: float  # [m]
+    understeer: float  # turn rates are divided by 1 + understeer * speed^2 [s^2/m^2]
+
+
+STRAIGHT = BicycleGeometry(False, False, 1.0, 0.0)
+
+
+@kernel
+def _limited(value: float, target: float, lag: float, limit: Array) -> float:
+    """Returns a target close enough that a first-order lag towards it stays within `limit` (2,)."""
+    gap = target - value
+    most: float = lag * (limit[0] if gap * value >= 0.0 else limit[1])
+    return value + most * math.tanh(gap / most)
+
+
+@kernel
+def _twist(state: Array, bicycle: BicycleGeometry) -> tuple[float, float, float]:
+    if not bicycle.used:
+        return state[0], state[1], state[2]
+    speed = state[0]
+    angle = state[2]
+    if bicycle.front_drive:
+        return speed * math.cos(angle), 0.0, speed * math.sin(angle) / bicycle.wheelbase
+    length = bicycle.wheelbase * (1.0 + bicycle.understeer * speed * speed)
+    return speed, 0.0, speed * math.tan(angle) / length
+
+
+@kernel
+def roll_windows(
+    ends: Array,
+    actuator: Array,
+    begin: Array,
+    stops: Array,
+    target: Array,
+    lag: Array,
+    limit: Array,
+    bicycle: BicycleGeometry,
+    dt: float,
+) -> None:
+    """Writes relative poses (W, H, 3) at ascending `stops` (W, H), in steps of `dt` after `begin`.
+
+    `actuator` (W, 3) holds the initial states and is overwritten: a body twist, or speed, 0 and
+    angle of a steered robot; `target` (G, 3) their targets on a grid, `begin` (W,) indices in it;
+    `lag` (3,) [s]; `limit` (2,) of the speed's acceleration and deceleration [m/s^2].
+    """
+    for w in range(len(begin)):
+        x = 0.0
+        y = 0.0
+        heading = 0.0
+        done = 0.0
+        state = actuator[w]
+        for h in range(stops.shape[1]):
+            while done < stops[w, h] - 1e-9:
+                share = min(1.0, stops[w, h] - done)
+                place = min(max(begin[w] + done, 0.0), len(target) - 2.0)
+                k = int(place)
+                for i in range(3):
+                    aim = target[k, i] + (place - k) * (target[k + 1, i] - target[k, i])
+                    if i == 0:
+                        aim = _limited(state[0], aim, lag[0], limit)
+                    state[i] = aim + (state[i] - aim) / (1.0 + share * dt / lag[i])
+                vx, vy, turn = _twist(state, bicycle)
+                span = share * dt
+                middle = heading + 0.5 * turn * span
+                c = math.cos(middle)
+                s = math.sin(middle)
+                x += span * (c * vx - s * vy)
+                y += span * (s * vx + c * vy)
+                heading += turn * span
+                done += share
+            ends[w, h, 0] = x
+            ends[w, h, 1] = y
+            ends[w, h, 2] = heading

@@ -79,7 +79,7 @@ def with_motion(
     columns = [
         twist[:, POSE_RATES.index(v.twist)]
         if v.twist
-        else _following(v, drive, calibration, grid)
+        else _infer_follower(v, drive, calibration, grid)
         for v in spec.state
     ]
     values = np.array(columns).reshape(len(columns), len(grid)).T
@@ -97,7 +97,7 @@ def as_smooth(command: Array, step: float, width: float) -> Array:
     )
 
 
-def _following(
+def _infer_follower(
     variable: StateVariable, drive: Drive, calibration: Calibration, t: Array
 ) -> Array:
     alone = drive.spec.model_copy(update={"state": (variable,)})

@@ -6,7 +6,7 @@
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from nics_drl_bridge.errors import FitError
 from nics_drl_bridge.identify import hypotheses, shooting, verdict
@@ -69,26 +69,25 @@ def refine_motion(drive: Drive, findings: Findings) -> Findings:
     best = hypotheses.chosen(findings.trials, order)
     terms = require_fit(findings).model
     calibration = findings.calibration
-    search = _search_model(base.draft, base, terms, best)
-    if search.draft.problem.mounted:
-        certain = hypotheses.with_certain_mounting(
-            search.draft, calibration, search.found
-        )
+    draft = base.draft
+    found, has_order = _search_model(draft, base, terms, best)
+    if draft.problem.mounted:
+        certain = hypotheses.with_certain_mounting(draft, calibration, found)
         if certain is not None:
-            errors = hypotheses.remounted(calibration, search.found).uncertainty
+            errors = hypotheses.remounted(calibration, found).uncertainty
             calibration = replace(calibration, uncertainty=errors)
-            search = _search_model(certain, base, terms, best)
-    draft = search.draft
-    calibration = _calibrate(search, calibration)
-    values = search.found.values.copy()
+            draft = certain
+            found, has_order = _search_model(draft, base, terms, best)
+    calibration = _calibrate(draft, found, calibration)
+    values = found.values.copy()
     if draft.problem.mounted:  # the calibration has the mounting now
         values[-3:] = 0.0
     draft = replace(draft, inputs=replace(draft.inputs, start=values))
     base = replace(base, draft=draft)
     calibration, sums = _separate_lags(base, calibration, drive.spec)
     model = replace(
-        search.found.model,
-        std_errors=hypotheses.standard_errors(search.found),
+        found.model,
+        std_errors=hypotheses.standard_errors(found),
         inputs=calibration.inputs,
     )
     return replace(
@@ -100,18 +99,9 @@ def refine_motion(drive: Drive, findings: Findings) -> Findings:
             _describe_refinement(draft.problem.longest_horizon_s),
             *sums,
             *hypotheses.about_forms(base, findings.trials, order),
-            *_list_unused_options(drive, best.order, search.has_order),
+            *_list_unused_options(drive, best.order, has_order),
         ),
     )
-
-
-@dataclass(frozen=True)
-class _Search:
-    """The best-predicting model of a draft."""
-
-    draft: hypotheses.Draft
-    found: shooting.Predictive
-    has_order: bool  # True if it has the terms of the chosen order
 
 
 def _search_model(
@@ -119,10 +109,11 @@ def _search_model(
     base: hypotheses.Base,
     terms: TaylorModel,
     best: hypotheses.Trial,
-) -> _Search:
+) -> tuple[shooting.Predictive, bool]:
     """Searches for the best-predicting model of the best order.
 
-    The textbook's terms alone are kept if the search for more diverges.
+    The textbook's terms alone are kept if the search for more diverges. Also returns whether the
+    model has the terms of the chosen order.
 
     Args:
         draft: the form of the model and its prediction problem.
@@ -133,16 +124,17 @@ def _search_model(
     if best.order:
         refined = draft.refined(base.found.model, terms, pull=best.pull)
         if not verdict.is_worse(draft.error_of(refined), draft.error_of(base.found)):
-            return _Search(draft, refined, has_order=True)
+            return refined, True
     textbook = draft.base(other=base.found.model)
-    return _Search(draft, textbook, has_order=best.order == 0)
+    return textbook, best.order == 0
 
 
-def _calibrate(search: _Search, calibration: Calibration) -> Calibration:
+def _calibrate(
+    draft: hypotheses.Draft, found: shooting.Predictive, calibration: Calibration
+) -> Calibration:
     """Returns a calibration with latency, input curves and mounting of a search."""
-    draft = search.draft
-    values = search.found.values
-    errors = search.found.named_errors(draft.inputs.names)
+    values = found.values
+    errors = found.named_errors(draft.inputs.names)
     calibration = replace(
         calibration,
         command_latency_s=draft.form.latency_at(draft.inputs, values),
@@ -150,7 +142,7 @@ def _calibrate(search: _Search, calibration: Calibration) -> Calibration:
         uncertainty=calibration.uncertainty | errors,
     )
     if draft.problem.mounted:
-        return hypotheses.remounted(calibration, search.found)
+        return hypotheses.remounted(calibration, found)
     return calibration
 
 

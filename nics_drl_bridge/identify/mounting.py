@@ -74,12 +74,14 @@ def mounting_of(
     if not (has_textbook(spec) or spec.takes_cmd_vel):
         return None  # its forward direction is unknown
     if spec.moves_sideways:
-        return jackknifed(drive, twists, timing.offset, partial(_by_commands, timing))
+        return jackknifed(
+            drive, twists, timing.offset, partial(_estimate_by_commands, timing)
+        )
     start, end = twists.on_clock(timing.offset)
     command = average_held(
         drive.recording.command, spec, start - timing.latency, end - timing.latency
     )
-    forward = _response(spec, command)[:, 0]
+    forward = _predict_twists(spec, command)[:, 0]
     _, noise = drive.pose_noise or (0.0, 0.0)
     mounting = mounting_without_lateral_motion(twists, forward, noise)
     if (
@@ -163,7 +165,7 @@ def with_slip(motion: TwistIntervals, plain: Mounting, spec: RobotSpec) -> Mount
     chi = np.stack([speed, turn, slip], axis=1)
     beta = np.linalg.lstsq(chi, along[:, 1], rcond=None)[0]
     sigma = standard_errors(chi, along[:, 1] - chi @ beta)
-    hidden = skids and _ways(speed * np.abs(turn)) < 2
+    hidden = skids and _count_ways(speed * np.abs(turn)) < 2
     if hidden or not CERTAIN * sigma[1] < spec.footprint_radius:
         return replace(
             plain, lever=np.zeros(2), lever_sigma=np.full(2, np.nan), slip=True
@@ -177,7 +179,7 @@ def with_slip(motion: TwistIntervals, plain: Mounting, spec: RobotSpec) -> Mount
     )
 
 
-def _ways(values: Array, certain: NDArray[np.bool_] | bool = True) -> int:
+def _count_ways(values: Array, certain: NDArray[np.bool_] | bool = True) -> int:
     """Counts the signs that values (n,) certainly have, ignoring a small fraction of all."""
     least = ONE_WAY * max(float(np.abs(values).mean()), STILL)
     return sum(
@@ -230,7 +232,7 @@ def mounting_without_lateral_motion(
     certain = np.abs(turn) > CERTAIN * np.sqrt(2.0) * noise / (
         motion.end - motion.start
     )
-    ways = _ways(turn, certain)
+    ways = _count_ways(turn, certain)
     if size[1] < max(DISTINCT * size[2], MIN_SECOND * size[0]):
         sigma = size[1] / size[0] / np.sqrt(len(rows))
         travel = float(np.arctan2(axes[0, 1], axes[0, 0]))
@@ -270,7 +272,7 @@ def lateral_lever(
     return -float(beta[1]), float(standard_errors(chi, along - chi @ beta)[1])
 
 
-def _by_commands(
+def _estimate_by_commands(
     timing: clocks.TimingEstimate, drive: Drive, twists: TwistIntervals
 ) -> Mounting | None:
     """Estimates an omnidirectional robot's mounting; None unless it moved along x, y and turned."""
@@ -278,7 +280,7 @@ def _by_commands(
     spec = drive.spec
     inferred = recording.state is None and any(v.twist for v in spec.state)
     if spec.state and not inferred:
-        command = _as_commands(
+        command = _convert_to_commands(
             clocks.expected_states(drive, twists, timing), drive, timing.latency
         )
     else:
@@ -286,7 +288,7 @@ def _by_commands(
         command = average_held(
             recording.command, spec, begin, begin + twists.end - twists.start
         )
-    response = _response(spec, command)  # of base_link, up to one factor
+    response = _predict_twists(spec, command)  # of base_link, up to one factor
     size = np.linalg.svd(response, compute_uv=False)
     if size[2] <= MIN_SECOND * size[0]:
         return None
@@ -305,14 +307,14 @@ def _by_commands(
     )
 
 
-def _response(spec: RobotSpec, command: Array) -> Array:
+def _predict_twists(spec: RobotSpec, command: Array) -> Array:
     """Returns twists (n, 3) up to factors; the third may be a steering angle."""
     if spec.takes_cmd_vel:
         return spec.to_fields(command)
     return compute_steady_twist(spec, command)
 
 
-def _as_commands(states: Array, drive: Drive, latency: float) -> Array:
+def _convert_to_commands(states: Array, drive: Drive, latency: float) -> Array:
     """Converts states (n, S) to the commands (n, C) that would sustain them."""
     stream = drive.recording.state
     command = drive.recording.command
@@ -321,7 +323,7 @@ def _as_commands(states: Array, drive: Drive, latency: float) -> Array:
         return states[:, np.argsort(followed(spec))]
     span = np.diff(stream.t)
     keep = (span > 0.0) & (span < clocks.LONG_STEP * np.median(span))
-    keep &= _fresh(command, stream.t[:-1] - latency)
+    keep &= _select_fresh(command, stream.t[:-1] - latency)
     rates = np.diff(stream.values, axis=0)[keep] / span[keep, None]
     before = stream.values[:-1][keep]
     begin = stream.t - latency
@@ -335,7 +337,7 @@ def _as_commands(states: Array, drive: Drive, latency: float) -> Array:
     return np.asarray(states @ ways @ np.linalg.pinv(steady).T)
 
 
-def _fresh(command: Stream, start: Array) -> NDArray[np.bool_]:
+def _select_fresh(command: Stream, start: Array) -> NDArray[np.bool_]:
     """Selects the times (n,) at which the command is known, outside gaps of regular rows."""
     span = np.diff(command.t)
     usual = float(np.median(span)) if len(span) else 0.0
@@ -373,13 +375,13 @@ def jackknifed(
     if len(parts) < BLOCKS:
         return whole
     rotation = wrap_angle(np.array([p.rotation - whole.rotation for p in parts]))
-    rotation_sigma = max(whole.rotation_sigma, float(_spread(rotation)))
+    rotation_sigma = max(whole.rotation_sigma, float(_measure_spread(rotation)))
     lever_sigma = np.maximum(
-        whole.lever_sigma, _spread(np.array([p.lever for p in parts]))
+        whole.lever_sigma, _measure_spread(np.array([p.lever for p in parts]))
     )
     return replace(whole, rotation_sigma=rotation_sigma, lever_sigma=lever_sigma)
 
 
-def _spread(values: Array) -> Array:
+def _measure_spread(values: Array) -> Array:
     """Returns standard errors (...) from estimates (B, ...) that each omit one block."""
     return np.asarray(np.sqrt((len(values) - 1.0) * values.var(axis=0)))

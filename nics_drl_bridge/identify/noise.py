@@ -50,7 +50,7 @@ def sensor_noise(drive: Drive) -> Noise:
     else:
         spread = [None, None]
     position, heading = (
-        _measured(std, unit, None if u is None else float(u))
+        _make_level(std, unit, None if u is None else float(u))
         for std, unit, u in zip(whole, ("m", "rad"), spread, strict=True)
     )
     return Noise(pose_position=position, pose_heading=heading)
@@ -64,13 +64,15 @@ def motion_noise(
     samples: Samples,
 ) -> Noise:
     """Adds drift, and odometry's noise from recorded or scaled wheel twists, to the sensor's."""
-    measured: dict[str, Any] = {"state_drift": _state_drift(drive, model, samples)}
+    measured: dict[str, Any] = {
+        "state_drift": _measure_state_drift(drive, model, samples)
+    }
     rest = odometry_residual(drive, calibration, model, samples)
     if rest is not None:
-        linear = (_level(rest[:, i], "m/s") for i in (0, 1))
+        linear = (_measure_level(rest[:, i], "m/s") for i in (0, 1))
         measured["odom_linear"] = max(linear, key=lambda level: level.std)
-        measured["odom_angular"] = _level(rest[:, 2], "rad/s")
-    measured |= _pose_drift(sensor, drive, calibration, model)
+        measured["odom_angular"] = _measure_level(rest[:, 2], "rad/s")
+    measured |= _measure_pose_drift(sensor, drive, calibration, model)
     measured |= claimed(sensor, drive.recording.pose.sigma)
     return sensor.model_copy(update=measured)
 
@@ -94,7 +96,7 @@ def claimed(sensor: Noise, sigma: Array | None) -> dict[str, Level]:
     return larger
 
 
-def _measured(std: float, unit: str, uncertainty: float | None) -> Level:
+def _make_level(std: float, unit: str, uncertainty: float | None) -> Level:
     return Level(std=std, unit=unit, source=MEASURED, uncertainty=uncertainty)
 
 
@@ -104,13 +106,13 @@ def level(variances: Array, unit: str) -> Level:
     means = np.array([part.mean() for part in np.array_split(variances, BLOCKS)])
     spread = float(means.std(ddof=1) / np.sqrt(BLOCKS))
     if std < NEGLIGIBLE:
-        return _measured(0.0, unit, 0.0)
-    return _measured(
+        return _make_level(0.0, unit, 0.0)
+    return _make_level(
         std, unit, spread / (2.0 * std) if std**2 > spread else float(np.sqrt(spread))
     )
 
 
-def _errors(
+def _predict_errors(
     drive: Drive, calibration: Calibration, model: TaylorModel, horizon: float
 ) -> tuple[open_loop.Windows, Array] | None:
     chosen = open_loop.windows(
@@ -122,21 +124,21 @@ def _errors(
     if state is None:
         ends = open_loop.predict(model, calibration, drive, chosen)
     else:  # restart from the measured state, so that its drift is not counted twice
-        course = open_loop.course_of(model, calibration, drive, chosen)
+        course = open_loop.trace_states(model, calibration, drive, chosen)
         begin = chosen.start_t + calibration.clock_offset_s
         t = begin[:, None] + model.dt * np.arange(course.x.shape[1])
         for i, column in enumerate(state.values.T):
             course.x[:, :, i] = np.interp(t, state.t, column)
-        relative = open_loop.relative_ends(course, model)[0]
+        relative = open_loop.predict_ends(course, model)[0]
         ends = open_loop.tracked_ends(chosen, calibration, relative)
     return chosen, geometry.between(ends, chosen.end)
 
 
-def _pose_drift(
+def _measure_pose_drift(
     sensor: Noise, drive: Drive, calibration: Calibration, model: TaylorModel
 ) -> dict[str, Level]:
     """Returns the drift of position and heading; none if too short or the model diverges."""
-    predicted = _errors(drive, calibration, model, HORIZON_S)
+    predicted = _predict_errors(drive, calibration, model, HORIZON_S)
     if predicted is None:
         return {}
     chosen, error = predicted
@@ -163,7 +165,7 @@ def drift_growth(
     """Returns horizons [s], errors per axis [m] and of heading [rad]; None if it is too short."""
     rows = []
     for horizon in GROWTH_S:
-        predicted = _errors(drive, calibration, model, horizon)
+        predicted = _predict_errors(drive, calibration, model, horizon)
         if predicted is None:
             break
         square = np.mean(predicted[1] ** 2, axis=0)
@@ -173,7 +175,7 @@ def drift_growth(
     return tuple(np.array(rows).T) if rows else None
 
 
-def _state_drift(
+def _measure_state_drift(
     drive: Drive, model: TaylorModel, samples: Samples
 ) -> dict[str, Level]:
     """Returns the drift of a measured state; assumed levels for an unmeasured one."""
@@ -235,10 +237,10 @@ def odometry_residual(
     return np.asarray(twist[inside] - expected)
 
 
-def _level(rest: Array, unit: str) -> Level:
+def _measure_level(rest: Array, unit: str) -> Level:
     """Returns a level that is robust against single outliers."""
     std, *parts = (
         float(np.percentile(np.abs(part - np.median(part)), WITHIN_SIGMA))
         for part in (rest, *np.array_split(rest, BLOCKS))
     )
-    return _measured(std, unit, float(np.std(parts, ddof=1) / np.sqrt(BLOCKS)))
+    return _make_level(std, unit, float(np.std(parts, ddof=1) / np.sqrt(BLOCKS)))

@@ -10,7 +10,7 @@ from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.calibration import Calibration, states_at
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.kernels import follow, make_used_terms
+from nics_drl_bridge.identify.kernels import Shot, make_used_terms, shoot, tangent
 from nics_drl_bridge.identify.signals import average_effect, followed
 from nics_drl_bridge.robot.kernels import SERIES, make_terms, simulate_rollouts
 from nics_drl_bridge.robot.taylor import TaylorModel
@@ -99,12 +99,8 @@ def predict(
     if drive.recording.state is None:
         relative = _by_one_rollout(model, calibration, drive, chosen)
     else:
-        poses, *_, step, share = _from_measured_states(
-            model, calibration, drive, chosen
-        )
-        row = np.arange(len(step))
-        share = share[:, None]
-        relative = (1.0 - share) * poses[row, step] + share * poses[row, step + 1]
+        course = trace_states(model, calibration, drive, chosen)
+        relative, _ = predict_ends(course, model)
     return tracked_ends(chosen, calibration, relative)
 
 
@@ -144,24 +140,6 @@ def _by_one_rollout(
         starts[:, i] = np.interp(start, grid, column)
         ends[:, i] = np.interp(end, grid, column)
     return geometry.between(starts, ends)
-
-
-def _from_measured_states(
-    model: TaylorModel, calibration: Calibration, drive: Drive, chosen: Windows
-) -> tuple[Array, Array, Array, NDArray[np.intp], Array]:
-    """Returns poses (W, T + 1, 3), states, commands, whole steps (W,), fraction (W,) of another."""
-    start, end = (
-        t + calibration.clock_offset_s for t in (chosen.start_t, chosen.end_t)
-    )
-    steps = int(np.ceil(float((end - start).max()) / model.dt - 1e-6)) + 1
-    begin = start[:, None] + model.dt * np.arange(steps) - calibration.command_latency_s
-    command = average_effect(
-        drive.recording.command, drive.spec, model.inputs, begin, begin + model.dt
-    )
-    poses, states = _roll(model, states_at(drive, calibration, start), command)
-    exact = (end - start) / model.dt
-    step = np.floor(exact + 1e-6).astype(np.intp)
-    return poses, states, command, step, np.clip(exact - step, 0.0, 1.0)
 
 
 def _roll(model: TaylorModel, state: Array, command: Array) -> tuple[Array, Array]:
@@ -214,25 +192,30 @@ class Course:
     """X over windows, step by step, of a drive whose state was measured."""
 
     chosen: Windows  # the windows
-    x: Array  # (W, T, V + 1) X during each step, and a last entry of 1
+    x: Array  # (W, T, V) X during each step
     steps: NDArray[np.intp]  # (W,) whole steps to the end of each window
     share: Array  # (W,) remaining fraction of one more step
 
 
-def course_of(
+def trace_states(
     model: TaylorModel, calibration: Calibration, drive: Drive, chosen: Windows
 ) -> Course:
     """Returns the course of X over windows, each started from its measured state."""
-    states, command, steps, share = _from_measured_states(
-        model, calibration, drive, chosen
-    )[1:]
-    x = np.concatenate(
-        [states[:, :-1], command, np.ones((*command.shape[:2], 1))], axis=2
+    start = chosen.start_t + calibration.clock_offset_s
+    exact = (chosen.end_t - chosen.start_t) / model.dt
+    count = int(np.ceil(float(exact.max()) - 1e-6)) + 1
+    begin = start[:, None] + model.dt * np.arange(count) - calibration.command_latency_s
+    command = average_effect(
+        drive.recording.command, drive.spec, model.inputs, begin, begin + model.dt
     )
+    _, states = _roll(model, states_at(drive, calibration, start), command)
+    steps = np.floor(exact + 1e-6).astype(np.intp)
+    share = np.clip(exact - steps, 0.0, 1.0)
+    x = np.concatenate([states[:, :-1], command], axis=2)
     return Course(chosen, np.ascontiguousarray(x), steps, share)
 
 
-def relative_ends(
+def predict_ends(
     course: Course, model: TaylorModel, free: NDArray[np.bool_] | None = None
 ) -> tuple[Array, Array]:
     """Returns relative ends (W, 3), unwrapped, their slopes (W, 3, P) by `free` coefficients."""
@@ -241,13 +224,26 @@ def relative_ends(
     used = (model.coefficients != 0.0) | free
     used[3:] = False
     terms, moving = make_used_terms(model, used, free)
-    ends = np.zeros((len(course.steps), 3))
-    moved = np.zeros((len(course.steps), 3, len(moving)))
-    follow(ends, moved, course.x, course.steps, course.share, terms, moving, model.dt)
-    return ends, moved
+    # X is known, so it takes the place of the commands of a robot without a state
+    terms = terms._replace(emf=terms.emf[:0])
+    count, length, variables = course.x.shape
+    shot = Shot(
+        state=np.zeros((count, 0)),
+        first=length * np.arange(count),
+        command=course.x.reshape(count * length, variables),
+        stop=np.stack([course.steps, course.steps + 1], axis=1),
+        end=np.zeros((count, 2, 3)),
+        slope=np.zeros((count, 2, 3, len(moving))),
+    )
+    scratch = tangent(0, variables, len(terms.dof), len(moving))
+    shoot(shot, terms, moving, model.dt, scratch)
+    share = course.share[:, None]
+    ends = (1.0 - share) * shot.end[:, 0] + share * shot.end[:, 1]
+    share = share[..., None]
+    return ends, (1.0 - share) * shot.slope[:, 0] + share * shot.slope[:, 1]
 
 
-def tracked_slopes(
+def differentiate_ends(
     course: Course, calibration: Calibration, ends: Array, moved: Array
 ) -> Array:
     """Returns derivatives (W, 3, P) of `tracked_ends`, from those of the relative poses."""

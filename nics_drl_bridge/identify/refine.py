@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.geometry import Array
@@ -29,17 +28,11 @@ from nics_drl_bridge.identify.statistics import (
     minimise,
     uncertainty,
 )
-from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec
+from nics_drl_bridge.identify.terms import FIRST_STATE, TWIST, VX, VY, Mask
+from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
 
-Mask = NDArray[np.bool_]
 NamedErrors = Mapping[str, Mapping[str, float]]  # by degree of freedom and term
-
-# rows of a model's coefficients: the twist, then the rates of the state
-TWIST = slice(0, 3)
-FIRST_STATE = 3
-VX = POSE_RATES.index("vx")
-VY = POSE_RATES.index("vy")
 
 HORIZONS_S = (1.0, 2.5, 5.0)
 MIN_WINDOWS = 10  # per horizon
@@ -210,7 +203,7 @@ def make_problem(
     courses: tuple[open_loop.Course, ...] = ()
     if drive.recording.state is not None:
         courses = tuple(
-            open_loop.course_of(model, calibration, drive, windows)
+            open_loop.trace_states(model, calibration, drive, windows)
             for windows in chosen
         )
     return Problem(drive, longest, tuple(chosen), courses)
@@ -242,7 +235,7 @@ def compute_errors(
     with np.errstate(all="ignore"):  # a trial step may diverge and is then rejected
         if problem.courses:
             ends = [
-                open_loop.relative_ends(course, model)[0] for course in problem.courses
+                open_loop.predict_ends(course, model)[0] for course in problem.courses
             ]
             predicted = open_loop.tracked_ends(
                 windows, calibration, np.concatenate(ends)
@@ -270,8 +263,8 @@ def differentiate_errors(
     """Returns the derivatives (n, P) of `compute_errors` for a measured state."""
     parts = []
     for course in problem.courses:
-        ends, moved = open_loop.relative_ends(course, model, free.coefficients)
-        slope = open_loop.tracked_slopes(course, calibration, ends, moved)
+        ends, moved = open_loop.predict_ends(course, model, free.coefficients)
+        slope = open_loop.differentiate_ends(course, calibration, ends, moved)
         if "rotation_rad" in free.names:
             by_rotation = _differentiate_by_rotation(course, calibration, ends)
             slope = np.concatenate([slope, by_rotation[:, :, None]], axis=2)

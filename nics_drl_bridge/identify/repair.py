@@ -19,7 +19,6 @@ from nics_drl_bridge.identify.signals import (
     moved_commands,
     unwrapped,
 )
-from nics_drl_bridge.identify.statistics import unexplained
 from nics_drl_bridge.identify.verdict import Doubt, Gap, Mistake
 from nics_drl_bridge.recording import recording as recordings
 from nics_drl_bridge.recording.mapping import UNITS
@@ -88,35 +87,35 @@ def repaired(drive: Drive) -> tuple[Drive, tuple[str, ...]]:
     """Drops rows, joins at jumps, clips commands; returns a sentence on each kind of fault."""
     notes: list[str] = []
     for repair in (
-        _without_repetitions,
-        _without_held_poses,
-        _without_held_end,
-        _without_jumps,
-        _joined,
-        _within_limits,
+        _drop_repetitions,
+        _drop_held_poses,
+        _cut_held_end,
+        _drop_outliers,
+        _join_at_jumps,
+        _clip_commands,
     ):
         drive = drive.part(repair(drive, notes))
     return drive, tuple(notes)
 
 
-def _with_rows(
+def _select_rows(
     recording: recordings.Recording, name: str, keep: NDArray[np.bool_]
 ) -> recordings.Recording:
     parts: Any = {name: recording.streams[name].rows(keep)}
     return replace(recording, **parts)
 
 
-def _without_repetitions(drive: Drive, notes: list[str]) -> recordings.Recording:
+def _drop_repetitions(drive: Drive, notes: list[str]) -> recordings.Recording:
     recording = drive.recording
     for name, stream in recording.streams.items():
         keep, note = select_new_rows(stream.t, stream.values, name)
         if note:
-            recording = _with_rows(recording, name, keep)
+            recording = _select_rows(recording, name, keep)
             notes.append(note)
     return recording
 
 
-def _without_held_poses(drive: Drive, notes: list[str]) -> recordings.Recording:
+def _drop_held_poses(drive: Drive, notes: list[str]) -> recordings.Recording:
     """Removes poses frozen where tracking was lost, which leaves a gap.
 
     A robot at rest also keeps its place, but continues from there.
@@ -145,7 +144,7 @@ def _without_held_poses(drive: Drive, notes: list[str]) -> recordings.Recording:
         finding = f"The pose keeps one value {span} and then leaps by {leap_m:.2f} m"
         cause = "as if tracking was lost: these rows were left out"
         notes.append(f"{finding}, {cause}.")  # another note reports the gap
-    return _with_rows(recording, "pose", ~held)
+    return _select_rows(recording, "pose", ~held)
 
 
 def _find_largest_speed(spec: RobotSpec) -> float:
@@ -154,7 +153,7 @@ def _find_largest_speed(spec: RobotSpec) -> float:
     return max(sizes, default=0.0)
 
 
-def _without_held_end(drive: Drive, notes: list[str]) -> recordings.Recording:
+def _cut_held_end(drive: Drive, notes: list[str]) -> recordings.Recording:
     """Ends a drive where its pose froze for good, though commands asked the robot to move.
 
     Only a pose that otherwise never repeats itself, as noise sees to, shows this by itself.
@@ -176,14 +175,14 @@ def _without_held_end(drive: Drive, notes: list[str]) -> recordings.Recording:
     finding = f"The pose keeps one value from {begin:.1f} s to its end, {end:.1f} s"
     cause = "though commands ask the robot to move, as if tracking was lost"
     notes.append(Gap(f"{finding}, {cause}: the drive ends there."))
-    return _with_rows(recording, "pose", np.arange(len(pose.t)) <= last)
+    return _select_rows(recording, "pose", np.arange(len(pose.t)) <= last)
 
 
-def _without_jumps(drive: Drive, notes: list[str]) -> recordings.Recording:
+def _drop_outliers(drive: Drive, notes: list[str]) -> recordings.Recording:
     recording = drive.recording
-    jumps = {"pose": _jumps_of_pose(drive)}
+    jumps = {"pose": _find_pose_jumps(drive)}
     if recording.state is not None and drive.spec.state:
-        jumps["state"] = _jumps_of_state(recording.state)
+        jumps["state"] = _find_state_jumps(recording.state)
     for name, jump in jumps.items():
         if not jump.any():
             continue
@@ -192,13 +191,13 @@ def _without_jumps(drive: Drive, notes: list[str]) -> recordings.Recording:
         if share > MOST:
             fault = f"{recording.source}: {name}: {share:.0%} of the rows {finding}"
             raise RecordingError(f"{fault}; look for two sources mixed in one stream.")
-        recording = _with_rows(recording, name, ~jump)
+        recording = _select_rows(recording, name, ~jump)
         rows = f"{name}: {int(jump.sum())} of {len(jump)} rows ({share:.1%})"
         notes.append(f"{rows} {finding}, and were left out as outliers.")
     return recording
 
 
-def _jumps_of_pose(drive: Drive) -> NDArray[np.bool_]:
+def _find_pose_jumps(drive: Drive) -> NDArray[np.bool_]:
     pose = drive.recording.pose
     spec = drive.spec
     t = drive.sample_t
@@ -208,22 +207,22 @@ def _jumps_of_pose(drive: Drive) -> NDArray[np.bool_]:
         span[:-NEIGHBOURS], t[NEIGHBOURS:] - t[:-NEIGHBOURS]
     )
     reach = np.maximum(REACH * _find_largest_speed(spec) * span, 1e-6)
-    out = [_stands_out(pose.values[:, i], reach) for i in (0, 1)]
+    out = [_select_outliers(pose.values[:, i], reach) for i in (0, 1)]
     turns = np.maximum(HEADING_REACH, reach / max(spec.footprint_radius, 1e-3) / 2.0)
-    return out[0] | out[1] | _stands_out(pose.values[:, 2], turns, turning=True)
+    return out[0] | out[1] | _select_outliers(pose.values[:, 2], turns, turning=True)
 
 
-def _jumps_of_state(state: recordings.Stream) -> NDArray[np.bool_]:
+def _find_state_jumps(state: recordings.Stream) -> NDArray[np.bool_]:
     out = np.zeros(len(state.t), dtype=np.bool_)
     for column in state.values.T:
         low, high = np.percentile(column, (5.0, 95.0))
-        out |= _stands_out(
+        out |= _select_outliers(
             column, np.full(len(column), max(STATE_SHARE * (high - low), 1e-9))
         )
     return out
 
 
-def _joined(drive: Drive, notes: list[str]) -> recordings.Recording:
+def _join_at_jumps(drive: Drive, notes: list[str]) -> recordings.Recording:
     """Moves all poses after a localiser jump to where the motion before it leads."""
     recording = drive.recording
     t = drive.sample_t
@@ -240,7 +239,7 @@ def _joined(drive: Drive, notes: list[str]) -> recordings.Recording:
     apart = np.stack(
         [np.hypot(*(moved - expected)[:, :2].T), np.abs((moved - expected)[:, 2])]
     )
-    jump = (apart > _greatest(drive, apart)).any(axis=0)
+    jump = (apart > _limit_steps(drive, apart)).any(axis=0)
     if not jump.any() or jump.mean() > MOST_JUMPS:
         return recording
     joined = pose.copy()
@@ -261,7 +260,7 @@ def _joined(drive: Drive, notes: list[str]) -> recordings.Recording:
     return replace(recording, pose=replace(recording.pose, values=joined))
 
 
-def _greatest(drive: Drive, apart: Array) -> Array:
+def _limit_steps(drive: Drive, apart: Array) -> Array:
     """Returns the allowed difference of steps (2, T), in m and rad, from those around them."""
     t = drive.sample_t
     pose = unwrapped(drive.recording.pose.values)
@@ -281,7 +280,7 @@ def _greatest(drive: Drive, apart: Array) -> Array:
     )
 
 
-def _stands_out(
+def _select_outliers(
     values: Array, least: Array, turning: bool = False
 ) -> NDArray[np.bool_]:
     """Selects values (T,) that differ equally from both sides, by `least` and `STEPS` changes."""
@@ -303,7 +302,7 @@ def _stands_out(
     )
 
 
-def _within_limits(drive: Drive, notes: list[str]) -> recordings.Recording:
+def _clip_commands(drive: Drive, notes: list[str]) -> recordings.Recording:
     """Clips commands to the robot's limits, unless the robot followed them beyond."""
     recording = drive.recording
     spec = drive.spec
@@ -315,7 +314,9 @@ def _within_limits(drive: Drive, notes: list[str]) -> recordings.Recording:
     if not beyond.any():
         return recording
     clipped = np.where(beyond, np.clip(values, low, high), values)
-    if _rates_left(recording, values) < _rates_left(recording, clipped):
+    if _measure_unexplained_rates(recording, values) < _measure_unexplained_rates(
+        recording, clipped
+    ):
         notes.append(
             "Commands were beyond the limits in the robot's YAML file, and the robot followed them "
             "there: widen the limits, or the simulator will not go so far."
@@ -330,7 +331,9 @@ def _within_limits(drive: Drive, notes: list[str]) -> recordings.Recording:
     return replace(recording, command=replace(recording.command, values=clipped))
 
 
-def _rates_left(recording: recordings.Recording, command: Array) -> float:
+def _measure_unexplained_rates(
+    recording: recordings.Recording, command: Array
+) -> float:
     """Returns the fraction of the state's rates that commands do not explain; 0 without a state."""
     state = recording.state
     if state is None or len(state.t) < 2:
@@ -393,7 +396,7 @@ def check_commands(
     if compared is None:
         return ()
     asked, driven, alike = compared
-    places = _places(spec)
+    places = _find_places(spec)
     if len(places) == 2:
         _check_swapped(drive, [0, 1], min(alike[0, 1], alike[1, 0]), np.trace(alike))
     commands = [(c.name, c.unit) for c in spec.command]
@@ -502,7 +505,8 @@ def _average_inputs(
     start, end, driven = _measure_twists(drive.dated.t, pose)
     state = recording.state
     if state is not None:
-        are_linear = {(v.unit, v.twist) for v in spec.state} == {("rad/s", None)}
+        are_wheels = {(v.unit, v.twist) for v in spec.state} == {("rad/s", None)}
+        are_linear = are_wheels or spec.moves_sideways
         source = state
         inside = (start >= state.t[0]) & (end <= state.t[-1])
     else:
@@ -538,7 +542,7 @@ def _check_swapped(
 def _check_sideways(drive: Drive, command: recordings.Stream) -> tuple[str, ...]:
     """Checks commands of a robot that moves sideways, whose pose sensor may be rotated."""
     spec = drive.spec
-    start, end, driven = _driven(drive)
+    start, end, driven = _measure_twists(drive.dated.t, drive.dated.values)
     keys = [c.cmd_vel or c.name for c in spec.command]
     if sorted(keys) != sorted(SIDEWAYS) or len(start) < MIN_COMPARED:
         return ()
@@ -573,11 +577,6 @@ def _check_sideways(drive: Drive, command: recordings.Stream) -> tuple[str, ...]
     return (Mistake(f"{finding}: {cause} {consequence}."),)
 
 
-def _driven(drive: Drive) -> tuple[Array, Array, Array]:
-    """Returns the ends (n,) of time spans [s], and the twist (n, 3) measured in each."""
-    return _measure_twists(drive.dated.t, drive.dated.values)
-
-
 def _measure_twists(t: Array, pose: Array) -> tuple[Array, Array, Array]:
     """Returns the ends (n,) of time spans [s], and the twist (n, 3) of poses (T, 3) in each."""
     start = np.arange(t[0], t[-1] - COMPARED_S, COMPARED_S / 2.0)
@@ -590,7 +589,7 @@ def _measure_twists(t: Array, pose: Array) -> tuple[Array, Array, Array]:
     return t[first], t[last], moved / (t[last] - t[first])[:, None]
 
 
-def _places(spec: RobotSpec) -> list[int]:
+def _find_places(spec: RobotSpec) -> list[int]:
     """Returns the indices of commands in speed and turn rate; none if any command is another."""
     keys = [c.cmd_vel or c.name for c in spec.command]
     return [PLACES[key] for key in keys] if {*keys} <= {*PLACES} else []
@@ -614,8 +613,8 @@ def _compare_commands(
     None if they can't be determined.
     """
     spec = drive.spec
-    places = _places(spec)
-    start, end, moved = _driven(drive)
+    places = _find_places(spec)
+    start, end, moved = _measure_twists(drive.dated.t, drive.dated.values)
     if len(start) < MIN_COMPARED or not (places or _has_known_wheels(spec)):
         return None
     # direction of travel, ahead or back
@@ -647,9 +646,8 @@ def check_axes(drive: Drive) -> None:
     noise = TRAVEL_NOISE * (drive.pose_noise or (0.0, 0.0))[0]
     apart = max(TRAVEL_SHARE * drive.spec.footprint_radius, noise, 1e-3)
     spaced = drive.dated.rows(recordings.select_along_path(values, apart))
-    if drive.spec.moves_sideways:
-        keys = _find_mirrored_heading(spaced, drive)
-    else:
+    keys = HeadingKeys.NONE
+    if not drive.spec.moves_sideways:
         keys = recordings.find_clockwise_keys(spaced.values)
     if keys is HeadingKeys.NONE:
         keys = _find_heading_by_inputs(spaced.values, drive)
@@ -668,20 +666,6 @@ def check_axes(drive: Drive) -> None:
     raise RecordingError(
         f"{recording.source}: pose: {fault}: {advice}; or {alternative} (REP-103)."
     )
-
-
-def _find_mirrored_heading(pose: recordings.Stream, drive: Drive) -> HeadingKeys:
-    """Finds if only mirrored headings make the measured state explain the poses."""
-    state = drive.recording.state
-    if state is None or state.clock != drive.recording.pose.clock:
-        return HeadingKeys.NONE
-    if not recordings.has_visible_axes(pose.values):
-        return HeadingKeys.NONE
-    as_recorded = _explained(pose.t, pose.values, state)
-    mirrored = _explained(pose.t, pose.values * np.array([1.0, 1.0, -1.0]), state)
-    if mirrored > max(recordings.MIN_MIRRORED, recordings.BETTER + as_recorded):
-        return HeadingKeys.MIRRORED
-    return HeadingKeys.NONE
 
 
 def _find_heading_by_inputs(spaced: Array, drive: Drive) -> HeadingKeys:
@@ -717,14 +701,3 @@ def _explain_velocity(drive: Drive, pose: Array) -> float:
         share = (rest**2).sum() / max(float((velocity**2).sum()), 1e-12)
         explained.append(1.0 - float(share))
     return max(explained)
-
-
-def _explained(t: Array, pose: Array, state: recordings.Stream) -> float:
-    """Returns the fraction (0 to 1) of the body velocity between poses that the state explains."""
-    span = np.diff(t)
-    keep = span > 0.0
-    velocity = (
-        geometry.log(geometry.between(pose[:-1], pose[1:]))[keep, :2] / span[keep, None]
-    )
-    means = interval_means(state.t, state.values, t[:-1][keep], t[1:][keep])
-    return 1.0 - float((unexplained(means, velocity) ** 2).mean())

@@ -169,7 +169,7 @@ def infer_states(
     dt = float(grid[1] - grid[0])
     follows = followed(spec)
     fall, rise, dead = motors or free_motors(len(follows))
-    command = _without_dead_zones(command, follows, dead)
+    command = _subtract_dead_zones(command, follows, dead)
     targets = np.empty((len(grid), len(follows)))
     for late in np.unique(latency):
         means = average_held(command, spec, grid - late, grid + dt - late)
@@ -190,7 +190,7 @@ def infer_states(
     return states
 
 
-def _without_dead_zones(
+def _subtract_dead_zones(
     command: Stream, follows: NDArray[np.intp], dead: Array
 ) -> Stream:
     """Returns commands that are smaller by the dead zones (S,) of the states that follow them."""

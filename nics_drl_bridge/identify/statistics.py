@@ -251,13 +251,17 @@ def cross_validated(chi: Array, target: Array) -> Array:
         others = np.concatenate([t for b, t in enumerate(triangles) if b != block])
         r = qr(others, mode="economic", check_finite=False)[1]
         for n in range(chi.shape[1] + 1):
-            beta = solve_triangular(_safe(r[:n, :n]), r[:n, -1]) if n else np.zeros(0)
+            beta = (
+                solve_triangular(_make_solvable(r[:n, :n]), r[:n, -1])
+                if n
+                else np.zeros(0)
+            )
             rest = unseen[:, -1] - unseen[:, :n] @ beta
             result[block, n] = float(rest @ rest) / len(rows[block])
     return result
 
 
-def _safe(r: Array) -> Array:
+def _make_solvable(r: Array) -> Array:
     """Makes a triangle solvable by dropping features that the other blocks did not excite."""
     diagonal = np.abs(np.diag(r))
     singular = diagonal <= 1e-10 * max(float(diagonal.max()), 1e-300)

@@ -48,8 +48,8 @@ def textbook_calibration(
         command_latency_s=latency,
         rotation_rad=-heading,
         lever_arm_m=(x, y),
-        responses=tuple(_responses(response, calibration, spec)),
-        inputs=tuple(_dead_zones(response, spec)),
+        responses=tuple(_update_responses(response, calibration, spec)),
+        inputs=tuple(_find_dead_zones(response, spec)),
         limits={},
         uncertainty={k: v for k, v in calibration.uncertainty.items() if k in kept},
     )
@@ -89,7 +89,7 @@ def actuated_spec(yardstick: Yardstick, drive: Drive) -> RobotSpec:
     """Returns a steered robot whose state is its speed and its steering angle."""
     response = yardstick.response
     spec = drive.spec
-    speed, steering = _places_of_bicycle(response)
+    speed, steering = _find_bicycle_commands(response)
     speed_gain = abs(float(response.gain[0, speed]))
     angle_gain = abs(float(response.gain[2, steering]))
     largest = np.maximum(spec.command_high, -spec.command_low)
@@ -139,7 +139,7 @@ def with_actuators(
     response = yardstick.response
     state = known_state(drive)
     forward = [v.twist for v in drive.spec.state].index("vx")
-    _, steering = _places_of_bicycle(response)
+    _, steering = _find_bicycle_commands(response)
     alone = spec.model_copy(update={"state": spec.state[1:]})
     command = drive.recording.command
     lag = response.lag_s[2:]
@@ -154,7 +154,7 @@ def with_actuators(
     return replace(drive.part(recording), spec=spec)
 
 
-def _places_of_bicycle(response: TextbookResponse) -> tuple[int, int]:
+def _find_bicycle_commands(response: TextbookResponse) -> tuple[int, int]:
     """Returns the indices of speed and steering among the commands of a bicycle."""
     speed = int(np.argmax(np.abs(response.gain[0])))
     return speed, 1 - speed
@@ -168,7 +168,7 @@ def _find_actuator(response: TextbookResponse, command: int) -> tuple[int, float
     return actuator, float(response.gain[actuator, command])
 
 
-def _responses(
+def _update_responses(
     response: TextbookResponse, calibration: Calibration, spec: RobotSpec
 ) -> Iterator[Response]:
     names = [c.name for c in spec.command]
@@ -177,7 +177,9 @@ def _responses(
         yield replace(follower, lag_s=float(response.lag_s[actuator]), gain=gain)
 
 
-def _dead_zones(response: TextbookResponse, spec: RobotSpec) -> Iterator[InputCurve]:
+def _find_dead_zones(
+    response: TextbookResponse, spec: RobotSpec
+) -> Iterator[InputCurve]:
     """Yields the dead zone of a speed command whose effect is below, or above, proportional."""
     if not response.bicycle.used or response.offset[0] == 0.0:
         return
@@ -208,7 +210,10 @@ class _Expansion:
 
     def rate_of(self, actuator: int) -> float:
         """Returns the rate [1/s] at which a step of the model brings an actuator to its target."""
-        lag = float(self.response.lag_s[actuator])
+        return self.rate_at(float(self.response.lag_s[actuator]))
+
+    def rate_at(self, lag: float) -> float:
+        """Returns that rate [1/s] at a lag [s]."""
         dt = self.like.dt
         return (1.0 - float(np.exp(-dt / lag))) / dt
 
@@ -217,10 +222,6 @@ class _Expansion:
         row = np.zeros(self.x.shape[1], dtype=np.int64)
         row[place] = 1
         return row
-
-    def command_place(self, command: int) -> int:
-        """Returns the index of a command among the variables."""
-        return self.states + command
 
     def add(self, dof: int, row: NDArray[np.int64], value: float) -> None:
         """Adds a term to a degree of freedom."""
@@ -246,46 +247,49 @@ class _Expansion:
         angle = gain * steering + self.response.offset[2]
         return np.asarray(np.clip(angle, -WIDEST_ANGLE, WIDEST_ANGLE))
 
-    def turn_rate(self, speed: Array, steering: Array) -> Array:
-        """Returns the turn rate (T,) of a bicycle for its speed and commanded steering."""
+    def add_bicycle(
+        self,
+        speed: NDArray[np.int64],
+        steering: NDArray[np.int64],
+        speeds: Array,
+        angles: Array,
+        turns: Sequence[NDArray[np.int64]],
+    ) -> None:
+        """Adds the twist of a bicycle by two variables, for its speeds and angles (T,)."""
         bicycle = self.response.bicycle
-        length = bicycle.wheelbase * (1.0 + bicycle.understeer * speed * speed)
-        return np.asarray(speed * np.tan(self.steered_angle(steering)) / length)
+        along = speeds
+        across = speeds * np.tan(angles)
+        if bicycle.front_drive:
+            along = speeds * np.cos(angles)
+            across = speeds * np.sin(angles)
+        length = bicycle.wheelbase * (1.0 + bicycle.understeer * speeds**2)
+        self.add_expanded(0, along, [speed, speed + 2 * steering])
+        self.add_expanded(2, across / length, turns)
 
-    def along(self, speed: Array, steering: Array) -> Array:
-        """Returns the speed (T,) along the body for that of the driven wheel."""
-        if not self.response.bicycle.front_drive:
-            return speed
-        return np.asarray(speed * np.cos(self.steered_angle(steering)))
-
-    def speed_target(self) -> Array:
-        """Returns the speeds (T,) that the drive's commands in effect ask for."""
-        place = int(np.argmax(np.abs(self.response.gain[0])))
-        effect = self.x[:, self.command_place(place)]
-        return np.asarray(self.response.gain[0, place] * effect)
-
-    def add_bicycle(self, speed: int, steering: int, target: Array) -> None:
-        """Adds the twist of a bicycle by two variables, for the targets (T,) of its speed."""
-        v = self.unit(speed)
+    def add_commanded_bicycle(self, place: int, steering: int, speeds: Array) -> None:
+        """Adds the twist of a bicycle by its speed, or its command, and its commanded angle."""
+        v = self.unit(place)
         steer = self.unit(steering)
-        commanded = self.x[:, steering]
-        rows = [v, v + 2 * steer] if self.response.bicycle.front_drive else [v]
-        self.add_expanded(0, self.along(target, commanded), rows)
-        rows = [v, v + steer, v + 2 * steer, v + 3 * steer, 3 * v + steer]
-        self.add_expanded(2, self.turn_rate(target, commanded), rows)
+        angles = self.steered_angle(self.x[:, steering])
+        turns = [v, v + steer, v + 2 * steer, v + 3 * steer, 3 * v + steer]
+        self.add_bicycle(v, steer, speeds, angles, turns)
+
+    def add_follower(self, state: int, rate: float, gains: Array) -> None:
+        """Adds the rate of a state that follows the commands by gains (C,)."""
+        self.add(3 + state, self.unit(state), -rate)
+        for command in np.flatnonzero(gains).tolist():
+            row = self.unit(self.states + command)
+            self.add(3 + state, row, rate * float(gains[command]))
 
     def add_twist_of_commands(self) -> None:
         """Adds the twist of a robot without a state."""
         if self.response.bicycle.used:
-            speed, steering = (
-                self.command_place(c) for c in _places_of_bicycle(self.response)
-            )
-            self.add_bicycle(speed, steering, self.speed_target())
+            speed, steering = _find_bicycle_commands(self.response)
+            target = self.response.gain[0, speed] * self.x[:, speed]
+            self.add_commanded_bicycle(speed, steering, target)
             return
-        for dof in range(3):
-            for command in np.flatnonzero(self.response.gain[dof]):
-                row = self.unit(self.command_place(int(command)))
-                self.add(dof, row, float(self.response.gain[dof, command]))
+        for dof, command in np.argwhere(self.response.gain).tolist():
+            self.add(dof, self.unit(command), float(self.response.gain[dof, command]))
 
     def add_twist_as_state(self) -> None:
         """Adds the rates of a robot whose state is its twist."""
@@ -296,80 +300,57 @@ class _Expansion:
             if part == 1 and not self.spec.moves_sideways:
                 continue
             self.add(part, self.unit(i), 1.0)
-            rate = self.rate_of(part)
-            dof = 3 + i
-            self.add(dof, self.unit(i), -rate)
-            for command in np.flatnonzero(self.response.gain[part]):
-                row = self.unit(self.command_place(int(command)))
-                self.add(dof, row, rate * float(self.response.gain[part, command]))
+            self.add_follower(i, self.rate_of(part), self.response.gain[part])
             if part == 0:
                 self.limits[i] = self.speed_limits()
 
     def add_actuators(self) -> None:
         """Adds the rates of a speed and a steering angle, and the twist by them."""
-        speed, steering = (
-            self.command_place(c) for c in _places_of_bicycle(self.response)
-        )
-        self.add(3, self.unit(0), -self.rate_of(0))
-        drives = self.rate_of(0) * float(self.response.gain[0, speed - self.states])
-        self.add(3, self.unit(speed), drives)
+        response = self.response
+        is_speed = np.arange(2) == _find_bicycle_commands(response)[0]
+        rate = self.rate_of(2)
+        self.add_follower(0, self.rate_of(0), np.where(is_speed, response.gain[0], 0.0))
         self.limits[0] = self.speed_limits()
-        gain = float(self.response.gain[2, steering - self.states])
-        self.add(4, self.unit(1), -self.rate_of(2))
-        self.add(4, self.unit(steering), self.rate_of(2) * gain)
-        constant = 0 * self.unit(0)
-        self.add(4, constant, self.rate_of(2) * float(self.response.offset[2]))
+        self.add_follower(1, rate, np.where(is_speed, 0.0, response.gain[2]))
+        self.add(4, 0 * self.unit(0), rate * float(response.offset[2]))
         v = self.unit(0)
         angle = self.unit(1)
-        bicycle = self.response.bicycle
-        angles = self.x[:, 1]
-        turning = np.sin(angles) if bicycle.front_drive else np.tan(angles)
-        along = np.cos(angles) if bicycle.front_drive else np.ones(len(angles))
-        length = bicycle.wheelbase * (1.0 + bicycle.understeer * self.x[:, 0] ** 2)
-        rows = [v + angle, 2 * v + angle, 3 * v + angle, v + 3 * angle]
-        self.add_expanded(0, self.x[:, 0] * along, [v, v + 2 * angle])
-        self.add_expanded(2, self.x[:, 0] * turning / length, rows)
+        turns = [v + angle, 2 * v + angle, 3 * v + angle, v + 3 * angle]
+        self.add_bicycle(v, angle, self.x[:, 0], self.x[:, 1], turns)
 
     def add_followers(self) -> None:
         """Adds the rates of states that follow commands one by one, and the twist by them."""
         names = [c.name for c in self.spec.command]
-        for i, variable in enumerate(self.spec.state):
-            command = names.index(str(variable.follows))
+        follow = [names.index(str(v.follows)) for v in self.spec.state]
+        for i, command in enumerate(follow):
             actuator, gain = _find_actuator(self.response, command)
-            rate = self.rate_of(actuator)
-            self.add(3 + i, self.unit(i), -rate)
-            self.add(3 + i, self.unit(self.command_place(command)), rate * gain)
+            gains = np.where(np.arange(len(names)) == command, gain, 0.0)
+            self.add_follower(i, self.rate_of(actuator), gains)
             if actuator == 0:
                 self.limits[i] = self.speed_limits()
             if not self.response.bicycle.used:
                 self.add(actuator, self.unit(i), 1.0)
         if self.response.bicycle.used:
-            follow = [names.index(str(v.follows)) for v in self.spec.state]
-            speed, steering = (
-                follow.index(c) for c in _places_of_bicycle(self.response)
-            )
-            self.add_bicycle(speed, steering, self.x[:, speed])
+            speed, steering = map(follow.index, _find_bicycle_commands(self.response))
+            self.add_commanded_bicycle(speed, steering, self.x[:, speed])
 
     def add_wheels(self) -> None:
         """Adds the rates of wheels, and the twist by them."""
+        gain = self.response.gain
         book = textbook(self.spec)
         per_command = book.target(np.eye(len(self.spec.command)))  # (C, S)
         per_wheel = book.twist(np.eye(self.states))  # (S, 3)
         steady = (per_command @ per_wheel).T  # (3, C)
-        lag = self.response.lag_s[self.response.gain.any(axis=1)].mean()
-        rate = (1.0 - float(np.exp(-self.like.dt / lag))) / self.like.dt
+        lag = float(self.response.lag_s[gain.any(axis=1)].mean())
         for wheel in range(self.states):
-            self.add(3 + wheel, self.unit(wheel), -rate)
-            for place in np.flatnonzero(per_command[:, wheel]):
-                row = self.unit(self.command_place(int(place)))
-                self.add(3 + wheel, row, rate * float(per_command[place, wheel]))
+            self.add_follower(wheel, self.rate_at(lag), per_command[:, wheel])
         for dof in range(3):
             power = float(steady[dof] @ steady[dof])
             if power > 0.0:
-                times = float(self.response.gain[dof] @ steady[dof]) / power
-                for turning in np.flatnonzero(per_wheel[:, dof]):
-                    share = times * float(per_wheel[turning, dof])
-                    self.add(dof, self.unit(int(turning)), share)
+                times = float(gain[dof] @ steady[dof]) / power
+                for wheel in np.flatnonzero(per_wheel[:, dof]).tolist():
+                    share = times * float(per_wheel[wheel, dof])
+                    self.add(dof, self.unit(wheel), share)
 
     def speed_limits(self) -> tuple[float, float]:
         """Returns the maximum fall and rise of the speed, infinite where none was found."""
@@ -395,6 +376,6 @@ class _Expansion:
             low=self.x.min(axis=0),
             high=self.x.max(axis=0),
             bounded=self.like.bounded,
-            inputs=tuple(_dead_zones(self.response, self.spec)),
+            inputs=tuple(_find_dead_zones(self.response, self.spec)),
             limits=self.limits,
         )

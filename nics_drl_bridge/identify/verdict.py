@@ -2,21 +2,34 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import FitError, RecordingError
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify.acceptance import THRESHOLDS
+from nics_drl_bridge.identify import followers
+from nics_drl_bridge.identify.acceptance import THRESHOLDS, shortfall
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.clocks import TimingEstimate
 from nics_drl_bridge.identify.drive import MAX_GAP_S, Drive
 from nics_drl_bridge.identify.excitation import Excitation, plausible
+from nics_drl_bridge.identify.findings import (
+    Findings,
+    require_fit,
+    require_model,
+    require_samples,
+)
 from nics_drl_bridge.identify.fit import Fit
 from nics_drl_bridge.identify.mounting import Mounting
-from nics_drl_bridge.identify.open_loop import HORIZON_S, OpenLoop, open_loop_error
+from nics_drl_bridge.identify.open_loop import (
+    HORIZON_S,
+    OpenLoop,
+    open_loop_error,
+    predict,
+    windows,
+)
 from nics_drl_bridge.identify.signals import moved_commands
 from nics_drl_bridge.identify.statistics import CERTAIN, errors_of
 from nics_drl_bridge.recording.recording import Recording, Samples, Stream
@@ -46,6 +59,13 @@ COARSE = 2.0 / 3.0
 ENDS = (1.0, 99.0)  # percentiles that bound the range of a state
 # correlation of yaw rate and steering below which the robot turns the wrong way
 MIRRORED = -0.5
+# horizons for which errors are compared recording by recording, and of their windows
+HORIZONS_OF_RECORDING_S = (5.0, 2.0, 1.0, 0.5)
+FEWEST_OF_RECORDING = 5  # minimum number of windows per recording
+SPACING_OF_RECORDING_S = 0.5
+# ratio to the errors of the other recordings from which one is reported as off
+ALONE = 2.5
+LEAST_SHARE = 0.02  # fraction of the path below which errors are ignored
 
 
 class Gap(str):
@@ -54,6 +74,10 @@ class Gap(str):
 
 class Doubt(str):
     """A sentence on something that looks wrong, but may be how the robot behaves."""
+
+
+class Alone(str):
+    """A sentence on a single recording with large errors."""
 
 
 class Mistake(str):
@@ -75,11 +99,11 @@ def describe_stamps(drive: Drive) -> Iterator[str]:
 def measure_time_without_pose(drive: Drive) -> float:
     """Returns the time in long gaps of the pose [s]."""
     t = drive.dated.t
-    spans = [float(t[row + 1] - t[row]) for row in _gap_rows(drive)]
+    spans = [float(t[row + 1] - t[row]) for row in _find_gap_rows(drive)]
     return sum(span for span in spans if span > THRESHOLDS.shortest_unseen_s)
 
 
-def _gap_rows(drive: Drive) -> list[int]:
+def _find_gap_rows(drive: Drive) -> list[int]:
     """Returns the poses that precede a gap, starting with the longest gap."""
     t = drive.dated.t
     span = np.diff(t)
@@ -95,7 +119,7 @@ def describe_gaps(drive: Drive) -> Iterator[str]:
     """Yields a sentence per gap in the pose: when, how long, how far the pose moved across it."""
     t = drive.dated.t
     pose = drive.dated.values
-    rows = _gap_rows(drive)
+    rows = _find_gap_rows(drive)
     for row in sorted(rows[:MOST_GAPS_LISTED]):
         moved = geometry.between(pose[row], pose[row + 1])
         span = t[row + 1] - t[row]
@@ -255,12 +279,12 @@ def refuse_unexcited(excitation: Excitation, spec: RobotSpec) -> None:
     sensed = [
         v.name for v in spec.state if v.twist is None and v.name in excitation.unmoved
     ]
-    still = _commands(excitation.unmoved, spec) or sensed
+    still = _list_commands(excitation.unmoved, spec) or sensed
     for names, fault, way in (
         (still, "never moved", "changing over the whole range"),
         (excitation.together, "always moved together", "each changing on its own"),
     ):
-        listed = _list(names)
+        listed = _join_names(names)
         if listed:
             raise FitError(
                 f"{listed} {fault}; drive with {listed} {way}, or allow a model without."
@@ -275,7 +299,7 @@ def list_missed(linear: Fit, spec: RobotSpec) -> tuple[str, ...]:
     )
 
 
-def _commands(names: Sequence[str], spec: RobotSpec) -> list[str]:
+def _list_commands(names: Sequence[str], spec: RobotSpec) -> list[str]:
     """Returns the names that are commands, which a driver can move."""
     return [c.name for c in spec.command if c.name in names]
 
@@ -300,11 +324,11 @@ def describe_unlearnt(
     if unmoved:
         finding = f"The model has no terms of {unmoved}, which never moved"
         yield Gap(f"{finding}: it is only valid for this drive's constant value.")
-    still = _commands(excitation.unmoved, spec)
+    still = _list_commands(excitation.unmoved, spec)
     missing = ", ".join(name for name in still if name not in followed)
     if missing:
         yield Gap(f"Drive with {missing} changing over the whole range to learn them.")
-    together = _list(excitation.together)
+    together = _join_names(excitation.together)
     if together:
         units = {c.unit for c in spec.command if c.name in excitation.together}
         shares = "all have a share of it" if len(units) == 1 else "one has all of it"
@@ -313,7 +337,7 @@ def describe_unlearnt(
         yield Gap(
             f"{together} {why}: {shares}, and {valid}; drive each on its own to learn."
         )
-    copies = _list(
+    copies = _join_names(
         [v.name for v in spec.state if v.name in linear.regression.dependent]
     )
     if copies:
@@ -324,7 +348,7 @@ def describe_unlearnt(
     moved = {
         name: count for name, count in levels.items() if name not in excitation.unmoved
     }
-    coarse = _list([name for name, count in moved.items() if count == FEW_LEVELS])
+    coarse = _join_names([name for name, count in moved.items() if count == FEW_LEVELS])
     if coarse:
         finding = "between them the model is a straight line, whatever the robot does"
         yield Gap(
@@ -347,7 +371,7 @@ def list_doubts_of_fit(linear: Fit, exact: bool) -> Iterator[str]:
             yield f"The terms of {dof} are {alike}: {useless}; {advice}."
     fitted = {dofs[d] for d in linear.regression.moving} - {"vy"} if exact else set()
     explained = zip(dofs, linear.r2, strict=True)
-    lost = _list(
+    lost = _join_names(
         [dof for dof, share in explained if share < UNEXPLAINED and dof in fitted]
     )
     if lost:
@@ -355,7 +379,7 @@ def list_doubts_of_fit(linear: Fit, exact: bool) -> Iterator[str]:
         yield f"The model explains less than half of {lost}: {why}; do not trust its predictions."
 
 
-def _list(names: Sequence[str]) -> str:
+def _join_names(names: Sequence[str]) -> str:
     """Joins names: `a`, `a and b`, `a, b and c`."""
     return " and ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))
 
@@ -486,3 +510,138 @@ def describe_refit(until: float, duration: float, worse: bool) -> str:
         return f"The model covers only the first {until:.1f} s: {why}."
     shown = f"errors on unseen data are those of a trial that had learnt the first {until:.1f} s"
     return f"The model was fitted to all {duration:.1f} s once it had been judged; {shown}."
+
+
+class ErrorOfRecording(NamedTuple):
+    """Mean errors of predictions within one recording."""
+
+    source: str
+    horizon_s: float
+    position_m: float
+    path_m: float  # mean length of the measured path
+
+    @property
+    def share(self) -> float:
+        """Error as a fraction of the path."""
+        return self.position_m / max(self.path_m, 1e-9)
+
+
+def errors_by_recording(
+    model: TaylorModel, calibration: Calibration, drive: Drive
+) -> list[ErrorOfRecording]:
+    """Predicts each recording of a drive over the longest horizon that fits into all of them."""
+    sources = [episode.source for episode in drive.recording.episodes]
+    for horizon in HORIZONS_OF_RECORDING_S:
+        chosen = windows(
+            drive, calibration, 0.0, drive.duration_s, horizon, SPACING_OF_RECORDING_S
+        )
+        if not len(chosen.start_t):
+            continue
+        sources_of_windows = np.array(sources)[
+            drive.recording.episode_at(chosen.start_t)
+        ]
+        if any(
+            (sources_of_windows == source).sum() < FEWEST_OF_RECORDING
+            for source in sources
+        ):
+            continue
+        ends = predict(model, calibration, drive, chosen)
+        error = np.hypot(*(ends - chosen.end)[:, :2].T)
+        return [
+            ErrorOfRecording(
+                source,
+                horizon,
+                float(error[sources_of_windows == source].mean()),
+                float(chosen.path[sources_of_windows == source].mean()),
+            )
+            for source in dict.fromkeys(sources)
+        ]
+    return []
+
+
+def about_recordings(
+    model: TaylorModel, calibration: Calibration, drive: Drive
+) -> Iterator[str]:
+    """Yields a sentence on the errors by recording, and one per recording that alone is off."""
+    if not drive.recording.episodes:
+        return
+    errors = errors_by_recording(model, calibration, drive)
+    if len(errors) < 2:
+        return
+    for error in errors:
+        others = [another for another in errors if another is not error]
+        usual = float(np.median([another.share for another in others]))
+        if error.share > max(ALONE * usual, LEAST_SHARE) and np.isfinite(usual):
+            ends = f"end {error.position_m:.3g} m off after {error.horizon_s:g} s"
+            shares = f"{error.share:.1%} of the path, those of the others {usual:.1%}"
+            finding = f"{error.source} alone is off: its predictions {ends} ({shares})"
+            causes = "its clocks, its mounting and the floor it was driven on"
+            yield Alone(f"{finding}; check {causes}, or leave it out.")
+    listed = ", ".join(f"{error.source} {error.share:.1%}" for error in errors)
+    yield f"By recording, errors after {errors[0].horizon_s:g} s as shares of the path: {listed}."
+
+
+def collect_notes(drive: Drive, findings: Findings) -> tuple[str, ...]:
+    """Collects all sentences on a drive and its model, the most serious first."""
+    fit = require_fit(findings)
+    model = require_model(findings)
+    spec = drive.spec
+    calibration = findings.calibration
+    beaten = [findings.replacement]
+    if not findings.replacement:
+        beaten = list(shortfall(findings.judgement))
+    doubts: Iterator[str] = iter(())
+    if findings.motion_width_s is None:
+        doubts = list_doubts_of_fit(fit, calibration.is_exact)
+    levels = count_levels(findings.training.recording.command, spec)
+    return (
+        *about_recordings(model, calibration, findings.whole),
+        *beaten,
+        *_explain_replacement(drive, findings),
+        *drive.recording.repairs,
+        *findings.repairs,
+        *describe_gaps(findings.whole),
+        *collect_calibration_notes(findings),
+        *findings.refinement,
+        *describe_mirror_image(require_samples(findings), spec, calibration),
+        *describe_unlearnt(fit, calibration, spec, levels),
+        *doubts,
+        *describe_untried(drive, findings.held_out, findings.judgement),
+        *findings.assumptions,
+    )
+
+
+def collect_calibration_notes(findings: Findings) -> tuple[str, ...]:
+    """Collects the sentences on stamps, clocks, mounting and responses."""
+    training = findings.training
+    calibration = findings.calibration
+    if findings.replacement:
+        # The latency is that of the fitted textbook, as are mounting and lags, which it explains.
+        calibration = replace(calibration, command_latency_s=findings.timing.latency)
+        return (
+            *describe_stamps(training),
+            *describe_clocks(training, calibration, findings.timing),
+        )
+    return (
+        *describe_stamps(training),
+        *describe_clocks(training, calibration, findings.timing),
+        *followers.about_sums(calibration),
+        *describe_mounting(training, calibration, findings.mounting),
+        *describe_responses(training, calibration, findings.timing),
+    )
+
+
+def list_plain_calibration_notes(findings: Findings) -> tuple[str, ...]:
+    """Returns these sentences as plain strings for a file, which has no kinds of sentences."""
+    return tuple(map(str, collect_calibration_notes(findings)))
+
+
+def _explain_replacement(drive: Drive, findings: Findings) -> Iterator[str]:
+    """Yields a sentence if a coarse sampling rate explains why a model lost to its textbook."""
+    if not findings.replacement or drive.recording.state is None:
+        return
+    whole = findings.whole
+    unmoved = require_fit(findings).unmoved
+    coarse = describe_coarsest_state(whole.recording, whole.spec, unmoved)
+    if coarse:
+        yield Gap(f"{coarse}.")

@@ -13,14 +13,10 @@ from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.kernels import STRAIGHT, BicycleGeometry, roll_windows
 from nics_drl_bridge.identify.open_loop import Windows, windows
 from nics_drl_bridge.identify.shooting import HEADING_ARM_M
 from nics_drl_bridge.identify.signals import average_held, unwrapped
-from nics_drl_bridge.identify.yardstick_kernels import (
-    STRAIGHT,
-    BicycleGeometry,
-    roll_windows,
-)
 from nics_drl_bridge.robot.kinds import compute_steady_twist
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.threads import one_blas_thread
@@ -81,10 +77,10 @@ class Yardstick:
     ) -> Array:
         """Predicts poses (W, 3) at windows' ends from twists (W, 3) at their starts, if known."""
         duration = (chosen.end_t - chosen.start_t)[:, None]
-        course = _course(drive, chosen.start_t + self.clock_offset_s, duration)
+        course = _sample_commands(drive, chosen.start_t + self.clock_offset_s, duration)
         twist = twists_before(drive, chosen.start_t) if twist is None else twist
         return geometry.compose(
-            chosen.start, _relative_ends(self.response, course, twist)[:, 0]
+            chosen.start, _predict_ends(self.response, course, twist)[:, 0]
         )
 
 
@@ -118,7 +114,7 @@ def twists_before(drive: Drive, at: Array) -> Array:
     return twist
 
 
-def _without_jumps(
+def _select_windows(
     drive: Drive, until_s: float, horizon: float, spacing: float
 ) -> tuple[Windows, Array]:
     """Selects windows without localiser jumps, and twists (W, 3) at their starts."""
@@ -141,7 +137,7 @@ class _Course(NamedTuple):
     command: Array  # (G, C) means over steps of the grid
 
 
-def _course(drive: Drive, start_t: Array, duration: Array) -> _Course:
+def _sample_commands(drive: Drive, start_t: Array, duration: Array) -> _Course:
     command = drive.recording.command
     grid = np.arange(command.t[0] - 1.0, command.t[-1] + 1.0, STEP_S)
     return _Course(
@@ -149,14 +145,14 @@ def _course(drive: Drive, start_t: Array, duration: Array) -> _Course:
     )
 
 
-def _relative_ends(response: TextbookResponse, course: _Course, twist: Array) -> Array:
+def _predict_ends(response: TextbookResponse, course: _Course, twist: Array) -> Array:
     """Returns poses (W, H, 3) of the tracked body relative to its start, given the twist there."""
     bicycle = response.bicycle
     mounting = response.mounting
     target = course.command @ response.gain.T
     begin = course.start_t - response.delay_s - course.grid_t[0]
     arm = np.array([mounting[1], -mounting[0], 0.0]) * twist[:, 2:]
-    actuator = _turned(twist, mounting[2]) + arm
+    actuator = _rotate_twists(twist, mounting[2]) + arm
     if bicycle.used:  # a command of zero means stop, whatever the offset
         more = np.maximum(np.abs(target[:, 0]) + response.offset[0], 0.0)
         target = np.stack(
@@ -189,7 +185,7 @@ def _relative_ends(response: TextbookResponse, course: _Course, twist: Array) ->
     return geometry.compose(back, geometry.compose(ends, mounting))
 
 
-def _turned(twist: Array, angle: float) -> Array:
+def _rotate_twists(twist: Array, angle: float) -> Array:
     return np.concatenate([geometry.rotate(twist[:, :2], angle), twist[:, 2:]], axis=1)
 
 
@@ -279,13 +275,13 @@ def structure_of(spec: RobotSpec) -> tuple[Array, BicycleGeometry] | None:
     return moves, BicycleGeometry(True, front, float(length), 0.0)
 
 
-def _first_guess(
+def _guess_response(
     drive: Drive, until_s: float, clock_offset: float, offsets: bool
 ) -> _Form:
     """Fits gains, lags, maybe offsets linearly to motions over `GUESS_S` at the best delay."""
     structure = structure_of(drive.spec)
     book, bicycle = structure or (np.ones((3, len(drive.spec.command))), STRAIGHT)
-    seen, before = _without_jumps(drive, until_s, GUESS_S, SPACING_S)
+    seen, before = _select_windows(drive, until_s, GUESS_S, SPACING_S)
     span = (seen.end_t - seen.start_t)[:, None]
     twist = geometry.log(geometry.between(seen.start, seen.end)) / span
     change = (twists_before(drive, seen.end_t) - before) / span
@@ -300,10 +296,10 @@ def _first_guess(
         if structure is not None:
             a, b = ((v[:, 0] + 1j * v[:, 1]) for v in (expected, twist))
             rotation = float(np.angle((a.conj() * b).sum()))
-        left, gain, offset, lag = _regressed(
+        left, gain, offset, lag = _regress_twists(
             u,
-            _turned(twist, -rotation),
-            _turned(change, -rotation),
+            _rotate_twists(twist, -rotation),
+            _rotate_twists(change, -rotation),
             book != 0.0,
             bicycle,
             offsets,
@@ -325,7 +321,7 @@ def _first_guess(
     return _Form(start, book != 0.0, mounted)
 
 
-def _regressed(
+def _regress_twists(
     u: Array,
     twist: Array,
     change: Array,
@@ -372,14 +368,14 @@ def fit_yardstick(
     have the same limit. Raises RecordingError if the part is too short for these horizons.
     """
     spacing = max(SPACING_S, (until_s - HORIZONS_S[-1]) / MOST_WINDOWS)
-    chosen, twist = _without_jumps(drive, until_s, HORIZONS_S[-1], spacing)
+    chosen, twist = _select_windows(drive, until_s, HORIZONS_S[-1], spacing)
     if not len(chosen.start_t):
         fault = f"the first {until_s:.1f} s contain no window of {HORIZONS_S[-1]:g} s"
         raise RecordingError(
             f"{drive.recording.source}: {fault}; record a longer drive."
         )
     horizons = np.tile(HORIZONS_S, (len(chosen.start_t), 1))
-    course = _course(drive, chosen.start_t + clock_offset_s, horizons)
+    course = _sample_commands(drive, chosen.start_t + clock_offset_s, horizons)
     at = chosen.start_t[:, None] + horizons
     pose = unwrapped(drive.dated.values)
     ends = np.stack(
@@ -389,7 +385,7 @@ def fit_yardstick(
 
     def fitted(form: _Form) -> tuple[float, TextbookResponse]:
         def residuals(theta: Array) -> Array:
-            error = _relative_ends(form.unpack(theta), course, twist) - measured
+            error = _predict_ends(form.unpack(theta), course, twist) - measured
             error[..., 2] = HEADING_ARM_M * geometry.wrap_angle(error[..., 2])
             rates = np.clip(error / horizons[..., None], -100.0, 100.0)
             return np.asarray(np.nan_to_num(rates)).ravel()
@@ -409,7 +405,7 @@ def fit_yardstick(
         return float(solution.cost), form.unpack(solution.x)
 
     guesses = [
-        _first_guess(drive, until_s, clock_offset_s, offsets)
+        _guess_response(drive, until_s, clock_offset_s, offsets)
         for offsets in (True, False)
     ]
     guesses = [replace(guess, one_limit=one_limit) for guess in guesses]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -11,10 +12,11 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.identify import identify as stages
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.notes import collect_calibration_notes
+from nics_drl_bridge.identify.verdict import collect_calibration_notes
 from nics_drl_bridge.recording.recording import Recording, Stream, check
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot.spec import RobotSpec, build_robot
+from nics_drl_bridge.robot.taylor import TaylorModel
 
 TICKS_PER_METRE = 70.0
 TRACK = 0.16
@@ -168,6 +170,15 @@ def with_wheels(recording: Recording, truth: Recording, swapped: bool) -> Record
     return replace(recording, wheels=Stream(state.t[::2], both[::2], "robot"))
 
 
+def with_values(recording: Recording, **values: np.ndarray) -> Recording:
+    """A recording with other values of the streams that are named."""
+    streams = {
+        name: replace(recording.streams[name], values=each)
+        for name, each in values.items()
+    }
+    return replace(recording, **streams)
+
+
 def without(recording: Recording, start: float, end: float) -> Recording:
     """Loses the poses between two times."""
     pose = recording.pose
@@ -239,3 +250,80 @@ def slipping_car(
     return spec, Recording(
         Stream(COMMAND_S * np.arange(count), command), Stream(t, pose)
     )
+
+
+def make_model(
+    spec: RobotSpec, terms: dict[str, dict[str, float]], **given: object
+) -> TaylorModel:
+    """A model by degree of freedom and term; a term is the names of its variables."""
+    names = list(dict.fromkeys(name for row in terms.values() for name in row))
+    powers = np.array(
+        [[name.split("*").count(v) for v in spec.variable_names] for name in names],
+        dtype=np.int64,
+    )
+    coefficients = np.zeros((len(spec.dof_names), len(names)))
+    for dof, row in terms.items():
+        for name, value in row.items():
+            coefficients[spec.dof_names.index(dof), names.index(name)] = value
+    reach = np.ones(len(spec.variable_names))
+    usual = {"dt": 0.01, "low": -reach, "high": reach}
+    return TaylorModel(
+        spec.variable_names,
+        spec.dof_names,
+        spec.dof_units,
+        powers,
+        coefficients,
+        **(usual | given),
+    )
+
+
+def follow_commands(
+    commands: np.ndarray,
+    target: Callable[[np.ndarray], np.ndarray],
+    twist: Callable[[np.ndarray], np.ndarray],
+    lag: float | np.ndarray,
+    dt: float = 0.02,
+    noise: tuple[float, float] = (0.0, 0.0),
+    seed: int = 0,
+) -> Recording:
+    """A drive of a robot whose state follows `target(commands)` and that moves by `twist(state)`.
+
+    Args:
+        commands: (T, C).
+        target: the state that commands lead to.
+        twist: the body twist of states.
+        lag: of the state [s].
+        dt: between two rows [s].
+        noise: of position [m] and heading [rad].
+        seed: of the noise.
+    """
+    fine = 10
+    goals = target(commands)
+    kept = np.exp(-np.arange(fine)[:, None] * dt / fine / lag)
+    state = np.zeros(goals.shape[1])
+    states = []
+    for goal in goals:
+        states.append(goal + (state - goal) * kept)
+        state = goal + (state - goal) * np.exp(-dt / lag)
+    moved = geometry.exp(twist(np.concatenate(states)) * dt / fine)
+    heading = np.cumsum(moved[:, 2]) - moved[:, 2]
+    step = geometry.rotate(moved[:, :2], heading)
+    path = np.concatenate([np.cumsum(step, axis=0) - step, heading[:, None]], axis=1)
+    poses = path[::fine]
+    rng = np.random.default_rng(seed)
+    poses = poses + rng.normal(size=poses.shape) * [noise[0], *noise]
+    t = dt * np.arange(len(commands))
+    return Recording(
+        Stream(t, commands), Stream(t, poses), Stream(t, np.array(states)[:, 0])
+    )
+
+
+def draw_commands(
+    spec: RobotSpec, count: int = 1500, hold: int = 25, seed: int = 0
+) -> np.ndarray:
+    """Random commands (count, C) within a robot's limits, each held for some rows."""
+    rng = np.random.default_rng(seed)
+    held = rng.uniform(
+        spec.command_low, spec.command_high, (-(-count // hold), len(spec.command))
+    )
+    return np.repeat(held, hold, axis=0)[:count]

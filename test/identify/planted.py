@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from identify.drives import with_values
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.spec import RobotSpec, build_robot
 
@@ -14,25 +15,10 @@ STEP_S = 0.005
 COMMAND_S = 0.05
 POSE_S = 0.02
 LATENCY_S = 0.06
-SPEED_LAG_S = 0.25
-STEERING_LAG_S = 0.08
-WHEELBASE_M = 0.3
 POSITION_NOISE_M = 0.001
 HEADING_NOISE_RAD = 0.002
-DURATION_S = 90.0
 
 Defect = Callable[[Recording], Recording]
-
-
-def car() -> RobotSpec:
-    """A car of which only the commands and the poses are recorded."""
-    given = {
-        "kind": "ackermann",
-        "footprint_radius": 0.25,
-        "parameters": {"wheelbase": WHEELBASE_M},
-    }
-    limits = {"speed_command": (-1.0, 2.0), "steering_command": (-0.5, 0.5)}
-    return build_robot(given, limits)
 
 
 def held_values(
@@ -41,48 +27,6 @@ def held_values(
     """Returns random values (count,) that are held for `every` rows."""
     levels = rng.uniform(low, high, count // every + 1)
     return np.repeat(levels, every)[:count]
-
-
-def sound_drive(seed: int = 0, duration: float = DURATION_S) -> Recording:
-    """A drive of the car without a defect."""
-    rng = np.random.default_rng(seed)
-    count = round(duration / STEP_S)
-    speed = held_values(rng, -0.6, 1.6, count, round(0.9 / STEP_S))
-    steering = held_values(rng, -0.45, 0.45, count, round(0.7 / STEP_S))
-    at_rest = np.arange(count) * STEP_S < 1.0
-    speed = np.where(at_rest, 0.0, speed)
-    steering = np.where(at_rest, 0.0, steering)
-    command = np.stack([speed, steering], axis=1)
-    poses = poses_of(command)
-    rows = round(POSE_S / STEP_S)
-    poses = poses[::rows]
-    noise = np.array([POSITION_NOISE_M, POSITION_NOISE_M, HEADING_NOISE_RAD])
-    poses = poses + noise * rng.normal(size=poses.shape)
-    t = STEP_S * np.arange(count)
-    told = round(COMMAND_S / STEP_S)
-    return Recording(
-        Stream(t[::told], command[::told]),
-        Stream(t[::rows], poses),
-        source="planted drive",
-    )
-
-
-def poses_of(command: np.ndarray) -> np.ndarray:
-    """Drives a car by commands (T, 2) at every step; returns its poses (T, 3)."""
-    told = round(COMMAND_S / STEP_S)
-    command = np.repeat(command[::told], told, axis=0)[: len(command)]
-    late = round(LATENCY_S / STEP_S)
-    acting = np.concatenate([np.zeros((late, 2)), command[: len(command) - late]])
-    poses = np.zeros((len(command), 3))
-    x = y = heading = speed = angle = 0.0
-    for k, (wanted_speed, wanted_angle) in enumerate(acting):
-        poses[k] = x, y, heading
-        x += STEP_S * speed * np.cos(heading)
-        y += STEP_S * speed * np.sin(heading)
-        heading += STEP_S * speed * np.tan(angle) / WHEELBASE_M
-        speed += STEP_S * (wanted_speed - speed) / SPEED_LAG_S
-        angle += STEP_S * (wanted_angle - angle) / STEERING_LAG_S
-    return poses
 
 
 def with_pose(
@@ -96,11 +40,6 @@ def with_pose(
     return replace(recording, pose=Stream(stamps, values, clock))
 
 
-def with_command(recording: Recording, values: np.ndarray) -> Recording:
-    """Returns a recording with other commands."""
-    return replace(recording, command=replace(recording.command, values=values))
-
-
 def scaled_pose(x: float = 1.0, y: float = 1.0, heading: float = 1.0) -> Defect:
     """Multiplies the columns of the pose."""
     return lambda drive: with_pose(drive, drive.pose.values * np.array([x, y, heading]))
@@ -108,8 +47,8 @@ def scaled_pose(x: float = 1.0, y: float = 1.0, heading: float = 1.0) -> Defect:
 
 def scaled_command(speed: float = 1.0, steering: float = 1.0) -> Defect:
     """Multiplies the columns of the command."""
-    return lambda drive: with_command(
-        drive, drive.command.values * np.array([speed, steering])
+    return lambda drive: with_values(
+        drive, command=drive.command.values * np.array([speed, steering])
     )
 
 
@@ -120,7 +59,7 @@ def swapped_axes(drive: Recording) -> Recording:
 
 def swapped_commands(drive: Recording) -> Recording:
     """Exchanges the columns of the command."""
-    return with_command(drive, drive.command.values[:, ::-1])
+    return with_values(drive, command=drive.command.values[:, ::-1])
 
 
 def ahead(seconds: float, clock: str = "robot") -> Defect:
@@ -140,14 +79,6 @@ def drifting(share: float) -> Defect:
 def frozen_pose(drive: Recording) -> Recording:
     """Repeats the first pose."""
     return with_pose(drive, np.tile(drive.pose.values[:1], (len(drive.pose.t), 1)))
-
-
-def frozen_commands(drive: Recording) -> Recording:
-    """Repeats a command that drives a circle."""
-    values = np.tile([0.8, 0.2], (len(drive.command.t), 1))
-    rows = round(POSE_S / STEP_S)
-    poses = poses_of(np.tile([0.8, 0.2], (rows * len(drive.pose.t), 1)))
-    return with_pose(with_command(drive, values), poses[::rows])
 
 
 def jump(at: float, by: float) -> Defect:
@@ -281,6 +212,6 @@ def scaled_wheels(left: float = 1.0, right: float = 1.0) -> Defect:
     def scaled(drive: Recording) -> Recording:
         assert drive.state is not None
         values = drive.state.values * np.array([left, right])
-        return replace(drive, state=replace(drive.state, values=values))
+        return with_values(drive, state=values)
 
     return scaled

@@ -9,7 +9,6 @@ from identify import planted
 from nics_drl_bridge import geometry
 from nics_drl_bridge.generator import generate, load_model, mount_lidar, save_model
 from nics_drl_bridge.identify.acceptance import (
-    THRESHOLDS,
     Outcome,
     Verdict,
     combined,
@@ -22,7 +21,6 @@ from nics_drl_bridge.identify.acceptance import (
 )
 from nics_drl_bridge.identify.conclusion import conclude
 from nics_drl_bridge.identify.identify import identify
-from nics_drl_bridge.identify.report import format_with_error
 from nics_drl_bridge.robot.taylor import EndErrors, HorizonErrors
 
 RADIUS_M = 0.2
@@ -154,21 +152,6 @@ def test_in_one_stretch_the_noise_is_that_of_a_single_window():
     assert noise == pytest.approx(difference.std())
 
 
-@pytest.mark.parametrize(
-    ("value", "error", "text"),
-    [
-        (4.63, 0.02, "(4.63 +- 0.02)"),
-        (0.312, 36.0, "(0.312 +- 36)"),
-        (3.2, 36.0, "(3.2 +- 36)"),
-        (1.6, 1.6, "(1.6 +- 1.6)"),
-        (0.00123, 0.5, "(0.00123 +- 0.5)"),
-        (1234.0, 500.0, "(1234 +- 500)"),
-    ],
-)
-def test_a_coefficient_is_printed_so_that_it_can_be_used(value, error, text):
-    assert format_with_error(value, error) == text
-
-
 @pytest.mark.slow
 def test_a_pose_that_has_nothing_to_do_with_the_commands_is_not_trained_on():
     """Noise makes a long path, of which the error is a small share."""
@@ -218,8 +201,3 @@ def test_the_written_textbook_is_that_of_the_trial_and_fitted_no_further(command
     assert found.trial.model is found.findings.model
     assert found.model.terms_kept == found.trial.model.terms_kept
     assert not any("fitted to all" in note for note in found.notes)
-
-
-def test_the_thresholds_are_in_order():
-    assert 0.0 < THRESHOLDS.good_error < THRESHOLDS.worst_error < 1.0
-    assert 0.0 < THRESHOLDS.worst_coverage < THRESHOLDS.good_coverage < 1.0

@@ -42,13 +42,6 @@ def test_a_command_that_acts_later_than_the_others_has_a_delay():
 
 
 @pytest.mark.slow
-def test_a_wide_steering_angle_does_not_bend_the_latency():
-    found = calibrate(servoed(seed=1, latency=0.06, steering_servo=MOTOR), tricycle())
-    assert found.command_latency_s == pytest.approx(0.06, abs=0.003)
-    assert [r.lag_s for r in found.responses] == pytest.approx([0.15, 0.15], abs=0.005)
-
-
-@pytest.mark.slow
 def test_of_latency_and_lag_that_noise_hides_the_sum_is_told(car):
     recording = drive(
         car, 4, 20.0, latency=0.05, noise=(0.003, 0.006), measured_state=False

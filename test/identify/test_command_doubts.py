@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
+from nics_drl_bridge.identify.acceptance import list_doubts_of_commands
 from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.command_doubts import doubts_of_commands
 from nics_drl_bridge.robot.taylor import EndErrors, HorizonErrors
 
 
@@ -13,7 +13,9 @@ def doubts(error: float, without: float = 1.0, latency: float = 0.1) -> list[str
     ends = EndErrors(error, 0.1), EndErrors(without, 0.1)
     judgement = (HorizonErrors(5.0, 9, 2.0, *ends),)
     return list(
-        doubts_of_commands(judgement, replace(Calibration(), command_latency_s=latency))
+        list_doubts_of_commands(
+            judgement, replace(Calibration(), command_latency_s=latency)
+        )
     )
 
 

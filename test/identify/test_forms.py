@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from identify.drives import slipping_car
+from identify.drives import make_model, slipping_car
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive, Settings
 from nics_drl_bridge.identify.findings import Findings, resample_drive
@@ -137,18 +137,7 @@ def test_values_become_curves_friction_limits_and_drag(found, samples):
         command="throttle", dead=0.12, least=-0.2, most=0.4, back=0.8
     )
     spec = found.training.spec
-    none = np.zeros((len(spec.dof_names), 1))
-    model = TaylorModel(
-        spec.variable_names,
-        spec.dof_names,
-        spec.dof_units,
-        np.zeros((1, len(spec.variable_names)), dtype=np.int64),
-        none,
-        0.01,
-        none[:5, 0],
-        none[:5, 0],
-    )
-    model = form.actuated(model, sought, values)
+    model = form.actuated(make_model(spec, {"vx": {"vx": 1.0}}), sought, values)
     assert model.friction.tolist() == [0.25, 0.0, 0.0]
     assert model.drag.tolist() == [0.15, 0.0, 0.0]
     assert model.back_emf[0].tolist() == [1.2, 0.0]
@@ -178,10 +167,7 @@ def test_only_a_command_that_drives_both_ways_may_have_a_gain_of_its_own_backwar
 
 
 def test_ends_and_limits_that_the_drive_never_reached_are_left_out(found, samples):
-    spec, size = found.training.spec, len(samples.x[0])
-    powers = np.eye(size, dtype=np.int64)[[3]]
-    gains = np.zeros((6, 1))
-    gains[3] = 5.0
+    spec = found.training.spec
     sent = found.training.recording.command.values[:, 0]
     asked = 5.0 * samples.x[:, 3]
 
@@ -191,18 +177,8 @@ def test_ends_and_limits_that_the_drive_never_reached_are_left_out(found, sample
         )
         limits = np.tile([-np.inf, np.inf], (3, 1))
         limits[0] = 2.0 * asked.min(), rise
-        model = TaylorModel(
-            spec.variable_names,
-            spec.dof_names,
-            spec.dof_units,
-            powers,
-            gains,
-            0.01,
-            np.zeros(size),
-            np.zeros(size),
-            inputs=(curve,),
-            limits=limits,
-        )
+        pushed = {"d_vx": {"throttle": 5.0}}
+        model = make_model(spec, pushed, inputs=(curve,), limits=limits)
         return reached(model, found.training, samples, {})
 
     beyond = written(1.1 * sent.max(), 2.0 * asked.max())
@@ -217,26 +193,14 @@ def test_ends_and_limits_that_the_drive_never_reached_are_left_out(found, sample
 
 def test_the_dead_zone_of_a_steering_is_none_of_the_drive():
     spec, _ = slipping_car(duration=1.0)
-    size = len(spec.variable_names)
-    powers = np.eye(size, dtype=np.int64)
-    model = TaylorModel(
-        spec.variable_names,
-        spec.dof_names,
-        spec.dof_units,
-        powers,
-        np.zeros((len(spec.dof_names), size)),
-        0.01,
-        np.zeros(size),
-        np.ones(size),
-        inputs=(
-            InputCurve(command="throttle", dead=0.1),
-            InputCurve(command="steering", dead=0.3),
-        ),
+    inputs = (
+        InputCurve(command="throttle", dead=0.1),
+        InputCurve(command="steering", dead=0.3),
     )
+    terms = {"d_vx": {"throttle": 9.0}, "d_wz": {"steering": 9.0}}
+    model = make_model(spec, terms, inputs=inputs)
     found = SimpleNamespace(model=model, drive=SimpleNamespace(spec=spec))
     assert Identified.dead_zone.fget(found) == 0.1
-    model.coefficients[3, spec.variable_names.index("throttle")] = 9.0
-    model.coefficients[5, spec.variable_names.index("steering")] = 9.0
     rubbing = replace(model, friction=np.array([0.9, 0.0, 9.0]))
     found.model = rubbing
     assert Identified.dead_zone.fget(found) == pytest.approx(0.2)

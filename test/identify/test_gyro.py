@@ -9,10 +9,8 @@ import pytest
 from skid_steer import BIAS, OVER_REPORTED, drive_skid_steer
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.identify.conclusion import conclude
 from nics_drl_bridge.identify.gyro import relative_to, turned_by_gyro
-from nics_drl_bridge.identify.identify import identify
-from nics_drl_bridge.identify.joined import join_recordings
+from nics_drl_bridge.identify.identify import join_recordings
 from nics_drl_bridge.identify.verdict import Mistake
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.spec import build_robot
@@ -146,42 +144,3 @@ def test_each_of_several_recordings_turns_by_its_own_bias():
     turned = np.diff(np.unwrap(joined.pose.values[:, 2]))
     true = sum(float(np.abs(np.diff(each.truth[:, 2])).sum()) for each in drives)
     assert float(np.abs(turned).sum()) == pytest.approx(true, rel=0.03)
-
-
-def heading_errors(model, drive, latency_s):
-    """Returns mean errors after 5 s, as shares of the turn: of headings, by a model alone."""
-    errors = []
-    turns = []
-    step = round(model.dt / 0.01)
-    for start in range(400, len(drive.t) - 600, 250):
-        pose = np.zeros(3)
-        state = np.zeros(len(model.dofs) - 3)
-        for k in range(start - 150, start, step):  # the state follows the commands
-            _, state = model.step(np.zeros(3), state, drive.command[k])
-        for k in range(start, start + 500, step):
-            late = max(k - round(latency_s / 0.01), 0)
-            pose, state = model.step(pose, state, drive.command[late])
-        true = geometry.between(drive.truth[start], drive.truth[start + 500])
-        turned = drive.truth[start + 500, 2] - drive.truth[start, 2]
-        errors.append(abs(geometry.wrap_angle(pose[2] - true[2])))
-        turns.append(abs(turned))
-    return float(np.sum(errors) / np.sum(turns))
-
-
-@pytest.mark.slow
-def test_the_model_turns_as_the_robot_truly_does(slipping):
-    unseen = drive_skid_steer(np.random.default_rng(11))
-    spec = build_robot(
-        ROBOT, {"forward_command": (-0.2, 0.8), "turn_command": (-1.0, 1.0)}
-    )
-    by_wheels = identify(recorded(slipping, gyro=False), spec)
-    by_gyro = identify(recorded(slipping), spec)
-    wrong = heading_errors(
-        by_wheels.model, unseen, by_wheels.calibration.command_latency_s
-    )
-    right = heading_errors(by_gyro.model, unseen, by_gyro.calibration.command_latency_s)
-    assert wrong > 0.2
-    assert right < 0.05
-    first = conclude(by_gyro).accuracy
-    assert "relative to odometry with its heading from the gyro" in first
-    assert "relative to odometry; nothing here shows" in conclude(by_wheels).accuracy

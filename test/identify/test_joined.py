@@ -8,27 +8,28 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nics_drl_bridge import geometry
+from identify.drives import draw_commands, follow_commands
 from nics_drl_bridge.errors import FitError
 from nics_drl_bridge.generator import generate, mount_lidar
 from nics_drl_bridge.identify import open_loop
-from nics_drl_bridge.identify.by_recording import Alone
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.conclusion import conclude
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.identify import identify
-from nics_drl_bridge.identify.joined import join_recordings
+from nics_drl_bridge.identify.identify import identify, join_recordings
 from nics_drl_bridge.identify.report import format_report
 from nics_drl_bridge.identify.shooting import Shooting
-from nics_drl_bridge.identify.verdict import describe_gaps, measure_time_without_pose
-from nics_drl_bridge.recording.recording import Recording, Stream
+from nics_drl_bridge.identify.verdict import (
+    Alone,
+    describe_gaps,
+    measure_time_without_pose,
+)
+from nics_drl_bridge.recording.recording import Recording
 from nics_drl_bridge.robot.spec import build_robot
 
 ROBOT = build_robot(
     {"kind": "differential", "footprint_radius": 0.2},
     {"forward_command": (-0.8, 0.8), "turn_command": (-1.5, 1.5)},
 )
-STEP = 0.02
 LAG_S = 0.1
 GAIN = np.array([0.9, 0.8])  # of forward and turn
 
@@ -43,24 +44,19 @@ def driven(
     clock_ahead: float = 0.0,
 ) -> Recording:
     """A differential robot that lags behind commands up to these [m/s, rad/s], seen at 50 Hz."""
-    rng = np.random.default_rng(seed)
-    count = round(seconds / STEP)
-    t = STEP * np.arange(count)
-    held = rng.uniform(-1.0, 1.0, (count // 40 + 1, 2)).repeat(40, axis=0)[:count]
-    command = held * np.array([forward, turn])
-    twist = np.zeros((count, 2))
-    pose = np.zeros((count, 3))
-    for k in range(1, count):
-        twist[k] = twist[k - 1] + (STEP / LAG_S) * (
-            gain * command[k - 1] - twist[k - 1]
-        )
-        arc = np.array([twist[k, 0], 0.0, twist[k, 1]]) * STEP
-        pose[k] = geometry.compose(pose[k - 1], geometry.exp(arc))
-    pose += rng.normal(0.0, [0.001, 0.001, 0.001], pose.shape)
-    clock = "mocap" if clock_ahead else "robot"
-    return Recording(
-        Stream(t, command), Stream(t + clock_ahead, pose, clock), source=source
+    held = draw_commands(ROBOT, round(seconds / 0.02), hold=40, seed=seed)
+    command = held * np.array([forward / 0.8, turn / 1.5])
+    made = follow_commands(
+        command,
+        lambda u: gain * u,
+        lambda state: np.insert(state, 1, 0.0, axis=1),
+        LAG_S,
+        noise=(0.001, 0.001),
+        seed=seed,
     )
+    clock = "mocap" if clock_ahead else "robot"
+    pose = replace(made.pose, t=made.pose.t + clock_ahead, clock=clock)
+    return replace(made, pose=pose, state=None, source=source)
 
 
 STRAIGHT = driven("straight.csv", 0.8, 0.0)
@@ -167,14 +163,4 @@ def test_a_recording_that_alone_is_off_is_named():
     assert named[0] in conclude(found).doubts
     assert "slippery.csv alone is off" in " ".join(
         format_report("three", found).split()
-    )
-
-
-@pytest.mark.slow
-def test_alike_recordings_are_listed_and_none_is_blamed():
-    good = [driven(f"good{k}.csv", 0.8, 1.5, seed=k) for k in range(2)]
-    found = identify(join_recordings(good, ROBOT), ROBOT)
-    assert not [note for note in found.notes if isinstance(note, Alone)]
-    assert any(
-        note.startswith("By recording, errors after 5 s") for note in found.notes
     )

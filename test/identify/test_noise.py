@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from robots import field
 
 from identify.drives import drive, slipping_car
 from nics_drl_bridge import geometry
@@ -14,11 +13,10 @@ from nics_drl_bridge.files import SUMS
 from nics_drl_bridge.generator import builtin_model, load_model, save_model
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.identify import identify
-from nics_drl_bridge.identify.noise import claimed, motion_noise, sensor_noise
+from nics_drl_bridge.identify.noise import claimed, sensor_noise
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot.noise import MEASURED, Level, Noise
-from nics_drl_bridge.sim.simulator import FastSimulator
 
 ODOMETRY = 0.03, 0.05  # m/s, rad/s
 DRIFT = 0.02, 0.03  # m/sqrt(s), rad/sqrt(s)
@@ -57,37 +55,6 @@ def drifting(spec, seed: int, duration: float = 150.0) -> Recording:
     )
 
 
-def driven(model, seconds: float, seed: int) -> Recording:
-    """A drive of the simulator of a model, recorded a hundred times a second."""
-    fast = replace(model, control_period=model.kinematics.dt)
-    simulator = FastSimulator(fast, field(400.0))
-    dt = fast.control_period
-    rng = np.random.default_rng(seed)
-    spec = model.robot
-    simulator.reset([seed], starts=np.zeros((1, 1, 3)))
-    rows: dict[str, list[np.ndarray]] = {
-        "pose": [],
-        "state": [],
-        "command": [],
-        "odometry": [],
-    }
-    for n in range(round(seconds / dt)):
-        if n % round(0.5 / dt) == 0:
-            command = rng.uniform(spec.command_low, spec.command_high)
-        for name, values in (
-            ("pose", simulator.data.pose),
-            ("state", simulator.data.state),
-        ):
-            rows[name].append(values[0, 0].copy())
-        rows["command"].append(command)
-        simulator.step(command[None, None])
-        rows["odometry"].append(simulator.data.twist[0, 0].copy())
-    t = dt * np.arange(len(rows["pose"]))
-    streams = {name: Stream(t, np.array(values)) for name, values in rows.items()}
-    streams["odometry"] = replace(streams["odometry"], t=t + dt)
-    return Recording(**streams, source="simulator")
-
-
 def levels(noise: Noise) -> np.ndarray:
     return np.array(
         [*noise.odometry, noise.position_drift.std, noise.heading_drift.std]
@@ -96,17 +63,10 @@ def levels(noise: Noise) -> np.ndarray:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.campaign)])
-def test_a_drive_of_known_noise_gives_it_back_and_so_does_its_simulator(
-    differential, seed
-):
+def test_a_drive_of_known_noise_gives_it_back(differential, seed):
     found = identify(drifting(differential, seed), differential)
     known = np.array([*ODOMETRY, *DRIFT])
     assert levels(found.noise) == pytest.approx(known, rel=TOLERANCE)
-    model = replace(
-        builtin_model("differential"), kinematics=found.model, noise=found.noise
-    )
-    again = identify(driven(model, 150.0, seed), differential)
-    assert levels(again.noise) == pytest.approx(levels(found.noise), rel=TOLERANCE)
 
 
 @pytest.mark.campaign
@@ -132,35 +92,12 @@ def test_noise_of_the_pose_is_no_drift_of_the_robot(differential):
     assert found.heading_drift.std < 0.009
 
 
-@pytest.mark.slow
-def test_the_drift_of_a_model_that_runs_away_is_assumed(car):
-    recording = drive(car, noise=(5e-4, 1e-3), measured_state=False)
-    found = identify(recording, car)
-    coefficients = found.model.coefficients.copy()
-    coefficients[3:] *= -20.0
-    unstable = replace(found.model, coefficients=coefficients)
-    with np.errstate(all="ignore"):
-        noise = motion_noise(
-            Noise(), found.drive, found.calibration, unstable, found.samples
-        )
-    assert found.noise.position_drift.measured
-    assert noise.position_drift == Noise().position_drift
-    assert not noise.heading_drift.measured
-
-
 def test_without_odometry_its_noise_is_assumed_and_the_report_says_so(differential):
     found = identify(record(differential, np.random.default_rng(0), 30.0), differential)
     assert not found.noise.odom_linear.measured
     assert found.noise.odometry == Noise().odometry
     lines = found.noise.sentences()
     assert sum(line.endswith("assumed") for line in lines) == 2
-
-
-def test_an_assumed_drift_is_expected_but_not_simulated(car):
-    noise = Noise()
-    assert (noise.drift(car) > 0.0).all()
-    assert not noise.simulated_drift(car).any()
-    assert NOISE.simulated_drift(car)[:3] == pytest.approx([DRIFT[0], *DRIFT])
 
 
 def test_the_levels_are_saved_with_unit_and_source(tmp_path):
@@ -198,18 +135,3 @@ def test_the_noise_of_a_pose_is_no_less_than_its_covariances_say():
     assert not told.pose_position.measured
     for none in (None, 1e-9 * sigma, np.nan * sigma):
         assert claimed(shown, none) == {}
-
-
-@pytest.mark.slow
-def test_covariances_leave_the_drift_that_was_measured():
-    spec, recording = slipping_car(duration=12.0)
-    pose = recording.pose
-    told = replace(pose, sigma=np.tile([0.5, 0.5, 0.26], (len(pose.t), 1)))
-    plain, with_claims = (
-        identify(each, spec).noise
-        for each in (recording, replace(recording, pose=told))
-    )
-    assert with_claims.pose == (0.5, 0.5, 0.26)
-    assert plain.position_drift.measured
-    assert plain.position_drift.std > 0.0
-    assert with_claims.position_drift == plain.position_drift

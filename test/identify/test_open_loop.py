@@ -10,11 +10,11 @@ from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.open_loop import (
-    course_of,
+    differentiate_ends,
     predict,
-    relative_ends,
+    predict_ends,
+    trace_states,
     tracked_ends,
-    tracked_slopes,
     windows,
 )
 
@@ -30,12 +30,12 @@ def courses(request):
     driven = Drive(drive(spec, duration=20.0), spec)
     chosen = windows(driven, MOUNTING, 0.0, 20.0, 1.0, 1.0)
     chosen = replace(chosen, end_t=chosen.start_t + request.param * 2.0)
-    return model, driven, chosen, course_of(model, MOUNTING, driven, chosen)
+    return model, driven, chosen, trace_states(model, MOUNTING, driven, chosen)
 
 
 def test_a_course_ends_where_the_prediction_does(courses):
     model, driven, chosen, course = courses
-    ends = tracked_ends(course.chosen, MOUNTING, relative_ends(course, model)[0])
+    ends = tracked_ends(course.chosen, MOUNTING, predict_ends(course, model)[0])
     expected = predict(model, MOUNTING, driven, chosen)
     assert ends == pytest.approx(expected, abs=1e-9)
 
@@ -46,8 +46,8 @@ def test_the_derivatives_are_those_of_finite_differences(courses):
     free = model.coefficients != 0.0
     free[3:] = False
     free[1, int(np.flatnonzero(~free[1])[0])] = True  # a term that is zero may move too
-    ends, moved = relative_ends(course, model, free)
-    slope = tracked_slopes(course, MOUNTING, ends, moved)
+    ends, moved = predict_ends(course, model, free)
+    slope = differentiate_ends(course, MOUNTING, ends, moved)
     for p, (d, k) in enumerate(np.argwhere(free)):
         sides = []
         for sign in (-1.0, 1.0):
@@ -56,7 +56,7 @@ def test_the_derivatives_are_those_of_finite_differences(courses):
             changed = replace(model, coefficients=coefficients)
             sides.append(
                 tracked_ends(
-                    course.chosen, MOUNTING, relative_ends(course, changed, free)[0]
+                    course.chosen, MOUNTING, predict_ends(course, changed, free)[0]
                 )
             )
         difference = sides[1] - sides[0]

@@ -180,10 +180,3 @@ def test_a_drive_is_told_what_it_is(name):
     make, causes = DRIVES[name]
     text = statements(make(), planted.wheeled())
     assert blamed(text) == causes, text
-
-
-@pytest.mark.slow
-def test_commands_that_never_change_are_named():
-    spec = planted.car()
-    text = statements(planted.frozen_commands(planted.sound_drive(duration=30.0)), spec)
-    assert blamed(text) == {"a command is frozen"}, text

@@ -1,22 +1,14 @@
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
-from dataclasses import replace
-from pathlib import Path
-
 import pytest
 
 from identify.drives import calibrate, without
-from nics_drl_bridge.errors import FitError
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.identify.open_loop import open_loop_error
 from nics_drl_bridge.recording.readers import read_recording
 
 CAMPAIGN = pytest.mark.campaign
-BENCHMARK = Path(__file__).resolve().parents[2] / "benchmarks" / "real_robot.py"
 
 
 @pytest.fixture(scope="module")
@@ -74,40 +66,6 @@ def test_its_model_is_short_and_steers_by_assumption_only(found):
         ("d_steering", "steering"),
         ("d_steering", "steering_command"),
     }
-
-
-def test_a_drive_of_constant_command_is_refused(real_drives, car):
-    with pytest.raises(FitError, match="no command ever changed"):
-        identify(read_recording(real_drives / "constant_drive_51s"), car)
-
-
-@pytest.mark.process
-@CAMPAIGN
-def test_the_benchmark_prints_one_json_object(real_drives):
-    run = subprocess.run(
-        [sys.executable, BENCHMARK, "--json", "--train-until", "25"],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    result = json.loads(run.stdout)
-    assert result["horizon_s"] == 5.0
-    assert result["mean_position_error_m"] < 0.05
-    assert {"mean_heading_error_rad", "mean_path_m"} <= set(result)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "ahead", [*(pytest.param(t, marks=CAMPAIGN) for t in (7.0, -7.0)), 1.7e9]
-)
-def test_its_errors_do_not_depend_on_what_the_motion_capture_calls_zero(
-    real_drives, car, ahead
-):
-    recording = read_recording(real_drives / "random_drive_45s")
-    pose = replace(recording.pose, t=recording.pose.t + ahead)
-    held_out = identify(replace(recording, pose=pose), car).held_out
-    assert held_out is not None
-    assert held_out.mean_position_error_m < 0.03
 
 
 @pytest.mark.slow

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 
-from identify.drives import drive
+from identify.drives import drive, make_model
 from nics_drl_bridge.identify.calibration import Calibration, Response, align
 from nics_drl_bridge.identify.drive import Drive, Settings
 from nics_drl_bridge.identify.fit import fit
@@ -15,8 +14,6 @@ from nics_drl_bridge.identify.refine import (
     refine_by_predictions,
     select_free_coefficients,
 )
-from nics_drl_bridge.robot.spec import RobotSpec
-from nics_drl_bridge.robot.taylor import TaylorModel
 
 FOLLOWS = Calibration(
     responses=(
@@ -26,32 +23,8 @@ FOLLOWS = Calibration(
 )
 
 
-def model_of(spec: RobotSpec, terms: dict[str, dict[str, float]]) -> TaylorModel:
-    """A model by degree of freedom and term; a term is the names of its variables."""
-    names = list(dict.fromkeys(name for row in terms.values() for name in row))
-    powers = np.array(
-        [[name.split("*").count(v) for v in spec.variable_names] for name in names],
-        dtype=np.int64,
-    )
-    coefficients = np.zeros((len(spec.dof_names), len(names)))
-    for dof, row in terms.items():
-        for name, value in row.items():
-            coefficients[spec.dof_names.index(dof), names.index(name)] = value
-    size = len(spec.variable_names)
-    return TaylorModel(
-        spec.variable_names,
-        spec.dof_names,
-        spec.dof_units,
-        powers,
-        coefficients,
-        0.01,
-        -np.ones(size),
-        np.ones(size),
-    )
-
-
 def test_a_state_without_a_term_of_its_command_alone_keeps_its_other_terms_free(car):
-    model = model_of(
+    model = make_model(
         car,
         {
             "vx": {"speed": 0.9},
@@ -72,7 +45,7 @@ def test_the_range_of_a_speed_is_scaled_with_the_speed(car):
         "d_speed": {"speed": -5.0, "speed_command": 5.0},
         "d_steering": {"steering": -8.0, "steering_command": 8.0},
     }
-    model = model_of(car, terms)
+    model = make_model(car, terms)
     scaled, calibration = apply_definitions(model, FOLLOWS, car)
     assert calibration.responses[0].gain == 0.5
     assert scaled.low.tolist() == [-0.5, -1.0, -1.0, -1.0]
@@ -82,12 +55,12 @@ def test_the_range_of_a_speed_is_scaled_with_the_speed(car):
 
 def test_lateral_motion_is_kept_where_a_state_measures_it(car):
     terms = {"vx": {"speed": 1.0}, "vy": {"steering": 0.3}}
-    kept, _ = apply_definitions(model_of(car, terms), Calibration(), car)
+    kept, _ = apply_definitions(make_model(car, terms), Calibration(), car)
     assert not kept.coefficients[1].any()
     speed, steering = car.state
     slip = steering.model_copy(update={"twist": "vy", "follows": None, "unit": "m/s"})
     slides = car.model_copy(update={"state": (speed, slip)})
-    kept, _ = apply_definitions(model_of(car, terms), Calibration(), slides)
+    kept, _ = apply_definitions(make_model(car, terms), Calibration(), slides)
     assert kept.coefficients[1].any()
 
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from identify import planted
-from identify.drives import drive, tricycle, without
+from identify.drives import drive, tricycle, with_values, without
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.identify.calibration import Calibration, align
@@ -24,19 +23,14 @@ from nics_drl_bridge.identify.repair import (
     repaired,
 )
 from nics_drl_bridge.identify.verdict import Gap, Mistake
-from nics_drl_bridge.recording.mapping import Mapping, load_mapping
-from nics_drl_bridge.recording.readers import read_robot_and_drive
 from nics_drl_bridge.recording.recording import (
     Recording,
     Samples,
     Stream,
     samples_on_one_clock,
 )
-from nics_drl_bridge.recording.topic_roles import TopicRoles
 from nics_drl_bridge.robot.spec import RobotSpec, build_robot, load_robot
 
-ROOT = Path(__file__).resolve().parents[2]
-JUMPING = ROOT.parent / "shared" / "recordings" / "f110_frictionmaps" / "DS1"
 ROBOTS = ("ackermann", "differential", "mecanum")
 
 
@@ -90,7 +84,7 @@ def test_a_drive_goes_on_after_a_jump_of_the_localiser_as_it_moved(name, jump):
     late = plain.pose.t > 12.0
     values = plain.pose.values.copy()
     values[late] = geometry.compose(np.array(jump), values[late])
-    jumped = Drive(replace(plain, pose=replace(plain.pose, values=values)), spec)
+    jumped = Drive(with_values(plain, pose=values), spec)
     found, (note,) = repaired(jumped)
     assert "jumps at 12.01 s (" in note
     assert "the drive is split there" in note
@@ -115,7 +109,7 @@ def held(recording: Recording, begin: float, end: float) -> Recording:
     values = recording.pose.values.copy()
     lost = (t > begin) & (t < end)
     values[lost] = values[np.flatnonzero(lost)[0] - 1]
-    return replace(recording, pose=replace(recording.pose, values=values))
+    return with_values(recording, pose=values)
 
 
 def test_a_pose_that_was_held_is_left_out_and_told(differential):
@@ -127,15 +121,6 @@ def test_a_pose_that_was_held_is_left_out_and_told(differential):
     assert np.diff(t).max() == pytest.approx(3.0, abs=0.1)
 
 
-@pytest.mark.slow
-def test_a_pose_that_was_held_is_a_gap_to_the_verdict_and_in_the_notes(differential):
-    plain = drive(differential, duration=20.0, noise=(5e-4, 1e-3))
-    found = identify(held(plain, 8.0, 11.0), differential)
-    (gap,) = (each for each in found.gaps if "The pose has a gap of" in each)
-    assert "a gap of 3.0 s, from 8.0 s to 11.0 s" in gap
-    assert any("missing for 3.0 s, 15%" in each for each in found.assessment.reasons)
-
-
 def test_a_drive_ends_where_its_pose_froze_though_commands_went_on(differential):
     plain = drive(differential, duration=20.0, noise=(5e-4, 1e-3))
     frozen = held(plain, 16.0, 99.0)
@@ -144,7 +129,7 @@ def test_a_drive_ends_where_its_pose_froze_though_commands_went_on(differential)
     assert "keeps one value from 16.0 s to its end, 20.0 s, though commands" in told
     assert mended.duration_s == pytest.approx(16.0, abs=0.05)
     values = np.where(frozen.command.t[:, None] > 16.0, 0.0, frozen.command.values)
-    parked = replace(frozen, command=replace(frozen.command, values=values))
+    parked = with_values(frozen, command=values)
     mended, notes = repaired(Drive(parked, differential))
     assert mended.recording is parked
     assert notes == ()
@@ -156,7 +141,7 @@ def test_a_robot_that_stood_and_goes_on_from_there_was_not_held(differential):
     values = plain.pose.values
     later = np.maximum(np.minimum(t, 8.0), t - 3.0)  # it stands from 8 s to 11 s
     stood = np.stack([np.interp(later, t, each) for each in values.T], axis=1)
-    paused = replace(plain, pose=replace(plain.pose, values=stood))
+    paused = with_values(plain, pose=stood)
     notes = repaired(Drive(paused, differential))[1]
     assert not any("keeps one value" in note for note in notes)
 
@@ -208,7 +193,7 @@ def test_a_reversed_command_of_a_robot_that_moves_sideways_is_told(place, rotati
     spec = load_robot("mecanum")
     plain = drive(spec, pose_clock_ahead=0.4, rotation=rotation, noise=(2e-3, 3e-3))
     values = plain.command.values * np.where(np.arange(3) == place, -1.0, 1.0)
-    turned = Drive(replace(plain, command=replace(plain.command, values=values)), spec)
+    turned = Drive(with_values(plain, command=values), spec)
     (note,) = check_commands(turned)
     assert isinstance(note, Mistake)
     assert note.startswith(
@@ -221,27 +206,6 @@ def test_poses_of_a_mount_that_is_turned_by_90_degrees_are_not_swapped_commands(
     spec = load_robot("mecanum")
     for rotation in (np.pi / 2, -np.pi / 2, np.pi):
         assert check_commands(Drive(drive(spec, rotation=rotation), spec)) == ()
-
-
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_a_turn_that_moves_the_pose_sensor_aside_is_no_reversed_command(seed):
-    random = np.random.default_rng(seed)
-    t = np.arange(0.0, 60.0, 0.02)
-    asked = np.repeat(random.uniform(-1.0, 1.0, (len(t) // 50, 3)), 50, axis=0) * [
-        0.5,
-        0.05,
-        1.0,
-    ]
-    asked[:, 1] += 0.15 * asked[:, 2]
-    heading = np.cumsum(asked[:, 2]) * 0.02
-    place = np.cumsum(geometry.rotate(asked[:, :2] * 0.02, heading), axis=0)
-    pose = geometry.compose(
-        np.column_stack([place, heading]), np.array([-0.4, 0.0, 0.0])
-    )
-    made = Recording(
-        Stream(t, asked, "robot"), Stream(t, pose, "robot"), source="drive"
-    )
-    assert check_commands(Drive(made, load_robot("mecanum"))) == ()
 
 
 def test_a_reversed_heading_is_refused_though_noise_hides_short_ways(differential):
@@ -278,27 +242,6 @@ def test_two_commands_a_quarter_of_a_period_apart_are_not_swapped(differential):
     assert check_commands(Drive(made, differential)) == ()
 
 
-@pytest.mark.skipif(not JUMPING.exists(), reason=f"no recording of others at {JUMPING}")
-@pytest.mark.parametrize("name", ["DS1", "DS3", "DS4"])
-def test_the_speed_and_steering_of_a_real_car_are_refused_if_they_are_swapped(name):
-    mapping = load_mapping(ROOT / "examples" / "recordings" / "f110_folder.yaml")
-    spec, plain = read_robot_and_drive(
-        JUMPING.parent / name, None, TopicRoles(), mapping
-    )
-    assert check_commands(Drive(plain, spec)) == ()
-    columns = dict(
-        zip(mapping.command, reversed(mapping.command.values()), strict=True)
-    )
-    swapped = mapping.model_copy(update={"command": columns})
-    spec, drive = read_robot_and_drive(
-        JUMPING.parent / name, None, TopicRoles(), swapped
-    )
-    with pytest.raises(
-        RecordingError, match="the column of `steering_command:` after `speed_"
-    ):
-        identify(drive, spec)
-
-
 def test_a_throttle_and_a_steering_that_are_swapped_are_refused_beyond_their_limits():
     limits = {"throttle": (-1.0, 1.0), "steering": (-1.0, 1.0)}
     kind = {"kind": "ackermann_throttle", "footprint_radius": 0.2}
@@ -316,19 +259,10 @@ def test_a_throttle_and_a_steering_that_are_swapped_are_refused_beyond_their_lim
 def test_a_speed_that_another_unit_explains_is_told(differential, column, unit, times):
     plain = drive(differential, latency=0.2)
     values = plain.command.values * np.where(np.arange(2) == column, times, 1.0)
-    other = replace(plain, command=replace(plain.command, values=values))
+    other = with_values(plain, command=values)
     (note,) = check_commands(Drive(other, differential))
     assert f"if they are in {unit}, write `unit: {unit}`" in note
     assert isinstance(note, Mistake)
-
-
-def test_commands_in_volts_and_poses_with_gaps_are_compared_without_harm(differential):
-    plain = without(drive(differential), 5.0, 9.0)
-    forward = differential.command[0].model_dump() | {"unit": "V"}
-    one = differential.model_dump() | {"state": (), "command": (forward,)}
-    command = replace(plain.command, values=plain.command.values[:, :1])
-    volts = Drive(replace(plain, command=command), RobotSpec.model_validate(one))
-    assert check_commands(volts) == check_commands(Drive(plain, differential)) == ()
 
 
 def test_wheels_in_rpm_are_told_if_their_radius_is_known():
@@ -338,9 +272,7 @@ def test_wheels_in_rpm_are_told_if_their_radius_is_known():
     unknown = build_robot(wheels)
     plain = drive(known, measured_state=False)
     assert check_commands(Drive(plain, known)) == ()
-    other = replace(
-        plain, command=replace(plain.command, values=plain.command.values * 9.55)
-    )
+    other = with_values(plain, command=plain.command.values * 9.55)
     assert "write `unit: rpm` beside `from:`" in check_commands(Drive(other, known))[0]
     assert check_commands(Drive(other, unknown)) == ()
 
@@ -387,103 +319,11 @@ def test_inputs_tell_a_clockwise_heading_of_a_point_ahead_of_the_axle(inputs):
         recording = replace(recording, state=None)
     check_axes(Drive(recording, spec))
     values = recording.pose.values * [1.0, 1.0, -1.0]
-    mirrored = replace(recording, pose=replace(recording.pose, values=values))
+    mirrored = with_values(recording, pose=values)
     with pytest.raises(
         RecordingError, match=r"heading counted clockwise write .*scale: -1\}"
     ):
         check_axes(Drive(mirrored, spec))
-
-
-@pytest.mark.parametrize(
-    ("k", "left", "right"), [(1, "Left_Tick", "Right_Tick"), (2, 13, 14)]
-)
-def test_the_defects_of_a_real_robot_with_encoders_are_named_in_turn(
-    shared_recordings, k, left, right
-):
-    file = shared_recordings / "differential_ticks" / f"Camera_Odo_Data_0{k}.txt"
-
-    def read(heading: int, sign: int) -> Drive:
-        given = {
-            "robot": {"kind": "differential_wheels", "footprint_radius": 0.2},
-            "time": {"from": "time", "unit": "ms"},
-            "pose": {
-                "x": "pose.x",
-                "y": "pose.y",
-                "heading": {"from": "pose.z", "scale": heading},
-                "unit": "cm",
-            },
-            "command": {
-                "left_wheel": {"from": left, "ticks_per_turn": 409600, "scale": sign},
-                "right_wheel": {"from": right, "ticks_per_turn": 409600},
-            },
-        }
-        mapping = Mapping.model_validate(given)
-        spec, recording = read_robot_and_drive(file, None, TopicRoles(), mapping)
-        return repaired(Drive(recording, spec))[0]
-
-    with pytest.raises(RecordingError, match="for a heading counted clockwise"):
-        check_axes(read(1, 1))
-    check_axes(read(-1, 1))
-    (told,) = check_encoders(read(-1, 1))
-    assert told.startswith("left_wheel turns backwards")
-    assert check_encoders(read(-1, -1)) == ()
-
-
-@pytest.mark.skipif(not JUMPING.exists(), reason=f"no recording of others at {JUMPING}")
-def test_the_jump_of_a_real_localiser_is_found_and_told():
-    mapping = ROOT / "examples" / "recordings" / "f110_folder.yaml"
-    spec, recording = read_robot_and_drive(JUMPING, None, TopicRoles(), mapping)
-    _, notes = repaired(Drive(recording, spec))
-    assert [note for note in notes if "jumps at 27.46 s (0.95 m, 0.12 rad)" in note]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ROBOTS)
-def test_an_exact_fit_survives_jumps_in_five_per_cent_of_the_rows(name):
-    spec = load_robot(name)
-    plain = drive(spec, duration=40.0)
-    clean = identify(plain, spec, alpha=0.99)
-    faulty = identify(with_jumps(plain), spec, alpha=0.99)
-    assert any("jump away" in note for note in faulty.notes)
-    same_motion(faulty, clean, 0.02)
-    assert (
-        faulty.held_out.mean_position_error_m
-        < clean.held_out.mean_position_error_m + 0.01
-    )
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["ackermann", "differential"])
-def test_a_noisy_fit_survives_jumps_in_five_per_cent_of_the_rows(name):
-    spec = load_robot(name)
-    plain = drive(spec, noise=(5e-4, 1e-3), rotation=0.3)
-    clean = identify(plain, spec)
-    faulty = identify(with_jumps(plain), spec)
-    same_motion(faulty, clean, 0.05)
-    assert (
-        faulty.held_out.mean_position_error_m
-        < clean.held_out.mean_position_error_m + 0.02
-    )
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ROBOTS)
-@pytest.mark.parametrize("apart", [False, True])
-def test_an_exact_fit_survives_ten_per_cent_of_the_rows_missing(name, apart):
-    """Either whole rows are missing, or each stream misses rows of its own."""
-    spec = load_robot(name)
-    rng = np.random.default_rng(1)
-    plain = drive(spec, duration=40.0)
-    count = len(plain.pose.t)
-    rows = rng.random(count) > 0.1
-    keep = {n: rng.random(count) > 0.1 if apart else rows for n in plain.streams}
-    for kept in keep.values():
-        kept[1000:1030] = False
-    clean = identify(plain, spec)
-    gappy = identify(some(plain, keep), spec)
-    assert gappy.calibration.is_exact
-    same_motion(gappy, clean, 0.02)
-    assert gappy.fit.rmse == pytest.approx(clean.fit.rmse, rel=0.3, abs=1e-6)
 
 
 @pytest.mark.slow
@@ -541,7 +381,7 @@ def test_a_stream_that_is_mixed_of_two_is_refused(car):
     values = recording.pose.values.copy()
     values[::5, :2] += 0.5
     with pytest.raises(RecordingError, match="two sources mixed"):
-        identify(replace(recording, pose=replace(recording.pose, values=values)), car)
+        identify(with_values(recording, pose=values), car)
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from identify.drives import slipping_car
+from identify.drives import make_model, slipping_car
 from nics_drl_bridge import geometry
 from nics_drl_bridge.identify.shooting import NOTHING_FREE, Inputs, Shooting, fitted
 from nics_drl_bridge.recording.recording import Samples
@@ -23,18 +23,14 @@ DELAY = 0.1
 def car() -> TaylorModel:
     """vx' = 4 throttle - 2 vx, wz' = 8 steering - 5 wz."""
     spec, _ = slipping_car(duration=1.0)
-    names = ("vx", "wz", "throttle", "steering")
-    powers = np.array(
-        [[n == name for n in spec.variable_names] for name in names], dtype=np.int64
-    )
-    rows = np.zeros((6, 4))
-    rows[0, 0] = rows[2, 1] = 1.0
-    rows[3] = [-2.0, 0.0, 4.0, 0.0]
-    rows[5] = [0.0, -5.0, 0.0, 8.0]
+    terms = {
+        "vx": {"vx": 1.0},
+        "wz": {"wz": 1.0},
+        "d_vx": {"vx": -2.0, "throttle": 4.0},
+        "d_wz": {"wz": -5.0, "steering": 8.0},
+    }
     box = np.zeros(5)
-    return TaylorModel(
-        spec.variable_names, spec.dof_names, spec.dof_units, powers, rows, DT, box, box
-    )
+    return make_model(spec, terms, dt=DT, low=box, high=box)
 
 
 def equally(start, end):
@@ -136,29 +132,6 @@ def test_predictions_are_seen_from_where_the_tracked_body_is(car, problem):
     mounting = values[1:]
     expected = geometry.between(mounting, geometry.compose(base, mounting))
     assert seen[..., :2] == pytest.approx(expected[..., :2])
-
-
-def test_windows_between_doubtful_poses_bend_nothing(car, problem):
-    samples = problem.samples
-    lost = samples.t > 0.5 * samples.t[-1]
-    wrong = samples.q.copy()
-    wrong[lost, :2] *= 1.5
-    free = np.zeros(car.coefficients.shape, dtype=np.bool_)
-    free[0] = car.coefficients[0] != 0.0
-
-    def doubtful(start, end):
-        return np.where(
-            (end > 0.5 * samples.t[-1])[..., None], 1e-6, equally(start, end)
-        )
-
-    known = replace(problem, samples=replace(samples, q=wrong), fixed=np.array([DELAY]))
-    off = [
-        np.abs(
-            fitted(each, car, free, NOTHING_FREE).model.coefficients - car.coefficients
-        ).max()
-        for each in (known, replace(known, trust=doubtful))
-    ]
-    assert off[1] < 0.05 * off[0]
 
 
 def test_nothing_free_leaves_the_model(car, problem):

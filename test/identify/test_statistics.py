@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from nics_drl_bridge.config import dump_yaml, parse_yaml, validate
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.identify.excitation import commands_together
 from nics_drl_bridge.identify.fit import fit, parse_alpha
@@ -20,7 +19,6 @@ from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.spec import load_robot
-from nics_drl_bridge.robot.taylor import NamedTaylorModel
 
 RATE = 9.5163
 KNOWN = {
@@ -93,19 +91,6 @@ def test_known_coefficients_lie_within_three_standard_errors(name):
     assert 0.4 < np.mean(short) < 0.95  # nor are they wide for nothing
 
 
-@pytest.mark.slow
-def test_the_known_product_of_a_car_lies_within_three_standard_errors():
-    spec = load_robot("ackermann")
-    inside = []
-    for seed in range(30):
-        model = fit(noisy_samples(spec, seed), spec, noisy=True, alpha=0.9).model
-        value = model.named.terms["wz"]["speed*steering"]
-        inside.append(
-            abs(value - 5.0) < 3.0 * model.named_errors["wz"]["speed*steering"]
-        )
-    assert np.mean(inside) > 0.9
-
-
 def test_errors_of_white_noise_are_the_textbooks():
     rng = np.random.default_rng(0)
     chi = rng.normal(size=(5000, 3)) * [1.0, 10.0, 0.1]
@@ -161,28 +146,6 @@ def test_auto_keeps_what_is_worth_it_at_every_order(order):
     for curve in result.curves:
         assert len(curve.error) == len(curve.terms) + 1
         assert curve.error[curve.kept] <= curve.error[0]
-
-
-def test_a_fourth_order_shows_the_cube_of_a_cars_steering():
-    spec = load_robot("ackermann")
-    drive = record(spec, np.random.default_rng(4), duration=30.0)
-    x = np.concatenate([drive.state.values, drive.command.values], axis=1)
-    dq = np.zeros((len(x), 5))
-    dq[:, 2] = x[:, 0] * np.tan(x[:, 1]) / 0.2
-    samples = Samples(drive.pose.t, np.zeros_like(dq), x, dq, 0.01)
-    rmse = [fit(samples, spec, order=order, alpha=1.0).rmse[2] for order in (2, 4)]
-    assert rmse[1] < 0.1 * rmse[0]
-
-
-def test_errors_and_quality_survive_yaml():
-    spec = load_robot("differential")
-    model = fit(noisy_samples(spec, 2), spec, noisy=True).model
-    named = model.named
-    assert set(named.standard_errors["vx"]) == set(named.terms["vx"])
-    text = dump_yaml(named.model_dump(exclude_none=True))
-    read = validate(parse_yaml(text, "model.yaml"), NamedTaylorModel, "model.yaml")
-    assert np.array_equal(read.model().std_errors, model.std_errors)
-    assert read == read.model().named == named
 
 
 def test_commands_that_move_apart_are_not_together():

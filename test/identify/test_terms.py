@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from identify.drives import MOTOR, servoed, slipping_car, tricycle
+from identify.drives import MOTOR, make_model, servoed, slipping_car, tricycle
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive, Settings
 from nics_drl_bridge.identify.findings import resample_drive
@@ -21,7 +21,6 @@ from nics_drl_bridge.identify.terms import (
     fit_motion_terms,
     has_slipping_tyres,
     list_reversed_variables,
-    merge_terms,
     select_motion_terms,
     select_terms_through_state,
     select_textbook_terms,
@@ -139,41 +138,6 @@ def test_only_cars_that_steer_in_front_slip_by_their_tyres(differential):
     assert not has_slipping_tyres(tricycle())
 
 
-def test_two_models_are_put_together_over_the_terms_of_both():
-    spec, _ = slipping_car(duration=1.0)
-    one, other = (model_of(spec, names) for names in (["vx", "throttle"], ["wz", "vx"]))
-    base, first = merge_terms(one, other)
-    at = {
-        taylor.format_term(row, spec.variable_names): k
-        for k, row in enumerate(base.powers)
-    }
-    assert set(at) == {"vx", "throttle", "wz"}
-    assert base.coefficients[0, [at["vx"], at["throttle"], at["wz"]]].tolist() == [
-        1.0,
-        2.0,
-        0.0,
-    ]
-    assert first[0, [at["vx"], at["throttle"], at["wz"]]].tolist() == [2.0, 0.0, 1.0]
-
-
-def model_of(spec, names):
-    powers = np.array(
-        [[n == name for n in spec.variable_names] for name in names]
-    ).astype(np.int64)
-    rows = np.tile(1.0 + np.arange(len(names)), (len(spec.dof_names), 1))
-    box = np.zeros(len(spec.variable_names))
-    return taylor.TaylorModel(
-        spec.variable_names,
-        spec.dof_names,
-        spec.dof_units,
-        powers,
-        rows,
-        0.01,
-        box,
-        box,
-    )
-
-
 def held_throttle(**given):
     spec, recording = slipping_car(throttle=0.25, friction=0.0, duration=20.0, **given)
     drive = Drive(recording, spec, Settings(train_until_s=20.0))
@@ -225,17 +189,13 @@ def test_wheels_that_always_move_together_share_what_they_do():
     wheels = np.column_stack([three, three[:, 0] + three[:, 1] - three[:, 2]])[
         :, [0, 2, 3, 1]
     ]
-    powers = np.eye(4, dtype=np.int64)[:3]  # the last wheel does nothing
-    alone = taylor.TaylorModel(
-        spec.variable_names,
-        spec.dof_names,
-        spec.dof_units,
-        powers,
-        rng.normal(size=(3, 3)),
-        0.05,
-        wheels.min(axis=0),
-        wheels.max(axis=0),
-    )
+    # the last wheel does nothing
+    acting = spec.variable_names[:3]
+    terms = {
+        dof: dict(zip(acting, rng.normal(size=3), strict=True))
+        for dof in spec.dof_names
+    }
+    alone = make_model(spec, terms, dt=0.05)
     still = np.zeros((400, 3))
     samples = samples_on_one_clock(0.05 * np.arange(400), still, still[:, :0], wheels)
     model = share_effects(alone, spec, samples)
@@ -244,10 +204,3 @@ def test_wheels_that_always_move_together_share_what_they_do():
         model.coefficients @ model.powers @ [1.0, -1.0, -1.0, 1.0]
     ) == pytest.approx(0.0)
     assert np.abs(model.coefficients).min() > 0.0
-
-
-@pytest.mark.slow
-def test_commands_that_move_on_their_own_share_nothing():
-    spec, samples = held_throttle()
-    model = fit_motion_terms(samples, spec, 2, select_textbook_terms).model
-    assert share_effects(model, spec, samples) is model

@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from identify.drives import drive
+from identify.drives import drive, with_values
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.open_loop import windows
 from nics_drl_bridge.identify.yardstick import fit_yardstick, kept_twist, twists_before
-from nics_drl_bridge.recording.readers import read_robot_and_drive
 from nics_drl_bridge.recording.recording import Recording, Stream
-from nics_drl_bridge.recording.topic_roles import TopicRoles
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
-ROOT = Path(__file__).resolve().parents[2]
-RECORDINGS = ROOT.parent / "shared" / "recordings"
 LEARNT_S = 20.0
 MOCAP = (0.0005, 0.001)
 
@@ -94,37 +89,12 @@ def test_a_drive_too_short_to_learn_from_is_refused():
         fit_yardstick(Drive(drive(spec, duration=6.0), spec), 4.0)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("source", "mapping", "hand_made"),
-    [
-        ("jetracer_dart/free_driving_104s.csv", "jetracer_csv", 0.171),
-        ("f110_frictionmaps/DS3", "f110_folder", 0.200),
-        ("f110_frictionmaps/DS4", "f110_folder", 0.248),
-    ],
-)
-def test_it_is_as_good_as_models_made_by_hand_on_real_drives(
-    source, mapping, hand_made
-):
-    if not (RECORDINGS / source).exists():
-        pytest.skip(f"the recordings of others are not at {RECORDINGS}")
-    mapping = ROOT / "examples" / "recordings" / f"{mapping}.yaml"
-    spec, recording = read_robot_and_drive(
-        RECORDINGS / source, None, TopicRoles(), mapping
-    )
-    driven = Drive(recording, spec)
-    learnt = 2.0 / 3.0 * driven.duration_s
-    chosen = windows(driven, Calibration(), learnt, driven.duration_s, 5.0, 0.1)
-    found = fit_yardstick(driven, learnt)
-    assert share(found.predict(driven, chosen), chosen) < 1.02 * hand_made
-
-
 @pytest.mark.parametrize("kind", ["ackermann", "differential"])
 def test_a_jump_of_the_localiser_does_not_lead_it_astray(kind):
     spec = load_robot(kind)
     clean = drive(spec, duration=30.0, noise=MOCAP)
     jumped = clean.pose.values + 50.0 * np.outer(clean.pose.t > 15.0, [1.0, 1.0, 0.0])
-    driven = Drive(replace(clean, pose=replace(clean.pose, values=jumped)), spec)
+    driven = Drive(with_values(clean, pose=jumped), spec)
     chosen = held_out(driven)
     assert share(fit_yardstick(driven, LEARNT_S).predict(driven, chosen), chosen) < 0.03
 
@@ -134,6 +104,6 @@ def test_a_robot_that_never_moved_has_one_too(values):
     spec = load_robot("ackermann")
     still = drive(spec, duration=20.0)
     pose = values * np.random.default_rng(0).normal(size=still.pose.values.shape)
-    driven = Drive(replace(still, pose=replace(still.pose, values=pose)), spec)
+    driven = Drive(with_values(still, pose=pose), spec)
     chosen = windows(driven, Calibration(), 5.0, 20.0, 5.0, 0.5)
     assert np.isfinite(fit_yardstick(driven, LEARNT_S).predict(driven, chosen)).all()
