@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import sys
 import warnings
-from functools import partial
 
 import numpy as np
 from measuring.held_body import RULE, Case, Tally, drive_freely, hold_bodies
@@ -59,11 +58,12 @@ LEAST_JUDGED = 0.5
 
 def zero_thresholds() -> None:
     """Lets any scan contradict odometry, in this process."""
-    settings = scan_motion.Settings(
-        min_path=0.0,
-        min_turn=0.0,
+    scan_motion.SETTINGS = scan_motion.Settings(
+        min_path=1e-9,
+        min_turn=1e-9,
         min_half=0.0,
         min_half_motion=0.0,
+        usual_half=1e-9,
         min_change=0.0,
         min_deviations=0.0,
         min_sectors=1,
@@ -73,7 +73,6 @@ def zero_thresholds() -> None:
         confirmed_s=0.0,
         max_changed=np.inf,
     )
-    scan_motion.watch_scan = partial(scan_motion.watch_scan, settings=settings)
 
 
 def summary(free: Tally, held: Tally) -> dict[str, object]:

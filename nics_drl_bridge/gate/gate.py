@@ -46,7 +46,12 @@ def decide(
     if state.clock_fault:
         now = state.now_s  # the last plausible time
     state, refused = intake.take(config, state, event, now)
-    state, answer, granted = _serve(config, state, event, now)
+    answer = ""
+    granted = False
+    if isinstance(event, inputs.Arm):
+        state, answer, granted = arming.arm(config, state, event, now)
+    elif isinstance(event, inputs.Reset):
+        state, answer, granted = arming.reset(state)
     is_tick = isinstance(event, inputs.Tick)
     publish = False
     is_shielded = False
@@ -61,17 +66,6 @@ def decide(
         is_shielded = state.shielded
     twist = limits.flush_denormals(config.cmd_vel(state.value))
     return state, Decision(twist, publish, cause, refused, answer, granted, is_shielded)
-
-
-def _serve(
-    config: GateConfig, state: GateState, event: inputs.Input, now: float
-) -> tuple[GateState, str, bool]:
-    """Arms or resets, if requested; returns also the answer, and whether it was granted."""
-    if isinstance(event, inputs.Arm):
-        return arming.arm(config, state, event, now)
-    if isinstance(event, inputs.Reset):
-        return arming.reset(state)
-    return state, "", False
 
 
 def _find_causes(
@@ -161,9 +155,8 @@ def latched(config: GateConfig, state: GateState, now: float) -> Cause | None:
 
 def disarmed(config: GateConfig, state: GateState, now: float) -> Cause | None:
     """The gate has not been armed."""
-    if state.armed:
-        return None
-    return Cause("disarmed", "", "call ~/arm to let commands pass")
+    remedy = "" if state.armed else "call ~/arm to let commands pass"
+    return stops.make_cause("disarmed", "", remedy)
 
 
 STOPS: tuple[Rule, ...] = (

@@ -191,9 +191,7 @@ def _take_reading(
     points = sensors[index].points if fault else reading.points
     sensors[index] = SensorState(arrivals, points)
     state = replace(state, sensors=tuple(sensors))
-    if fault:
-        return _refuse_stamp(state, reading.name, fault)
-    return state, ""
+    return _refuse_stamp(state, reading.name, fault) if fault else (state, "")
 
 
 def _refuse_stamp(state: GateState, topic: str, fault: str) -> Taken:

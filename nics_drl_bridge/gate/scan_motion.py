@@ -16,7 +16,6 @@
 
 import math
 from dataclasses import dataclass
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -42,7 +41,6 @@ FULL_CIRCLE = 2.0 * np.pi
 BEAM_COUNT_TOLERANCE = 1e-6  # tolerance of a number of beams
 # standard deviation of the median of n normal numbers, times sqrt(n): about sqrt(pi / 2)
 MEDIAN_FACTOR = 1.25
-TINY = 1e-9  # instead of a minimum motion that is set to zero
 
 
 @dataclass(frozen=True)
@@ -123,34 +121,30 @@ class Verdict(NamedTuple):
     """What two scans say about the motion in between.
 
     Attributes:
-        sectors: number of compared sectors.
         share: median fraction of the motion that they show; NaN if there are too few of them.
         held: they contradict odometry.
         reference: the older of the two scans; None if they were not compared.
     """
 
-    sectors: int
     share: float
     held: bool
     reference: ReducedScan | None = None
 
 
-UNDECIDED = Verdict(0, math.nan, False)
+UNDECIDED = Verdict(math.nan, False)
 
 
-def watch_scan(
-    config: GateConfig, state: GateState, scan: Scan, settings: Settings = SETTINGS
-) -> ScanMotion:
+def watch_scan(config: GateConfig, state: GateState, scan: Scan) -> ScanMotion:
     """Returns what recent scans show of the motion, after a new scan."""
     before = state.scan_motion
     if not _can_judge(config) or state.odometry is None:
         return ScanMotion()
     newest = ReducedScan(
         scan.stamp_ns,
-        extrapolate_pose(state.odometry, scan.stamp_ns, settings.longest_s),
-        _reduce_scan(config, scan.ranges, settings),
+        extrapolate_pose(state.odometry, scan.stamp_ns, SETTINGS.longest_s),
+        _reduce_scan(config, scan.ranges),
     )
-    oldest_ns = scan.stamp_ns - round(_compute_memory_s(config, settings) / S_PER_NS)
+    oldest_ns = scan.stamp_ns - round(_compute_memory_s(config) / S_PER_NS)
     kept = tuple(
         view for view in before.views if oldest_ns <= view.stamp_ns < scan.stamp_ns
     )
@@ -161,11 +155,11 @@ def watch_scan(
     # pause) is judged alone: tyres that slip at each start say nothing about the time in between.
     if state.push is not None:
         push_s = state.push.since_s
-        verdict = judge_motion(config, kept, newest, settings)
+        verdict = judge_motion(config, kept, newest)
         before_ns = before.held_since_ns if before.push_s == push_s else None
-        held_since_ns = _update_held_since(before_ns, verdict, scan.stamp_ns, settings)
-    held = _explain_contradiction(newest, verdict, held_since_ns, settings)
-    spacing_ns = round(settings.kept_every_s / S_PER_NS)
+        held_since_ns = _update_held_since(before_ns, verdict, scan.stamp_ns)
+    held = _explain_contradiction(newest, verdict, held_since_ns)
+    spacing_ns = round(SETTINGS.kept_every_s / S_PER_NS)
     if not kept or newest.stamp_ns - kept[-1].stamp_ns >= spacing_ns:
         kept = (*kept, newest)
     return ScanMotion(
@@ -193,20 +187,20 @@ def _can_judge(config: GateConfig) -> bool:
     return config.stop_when_held and len(config.beam_angles) >= 2
 
 
-def _compute_memory_s(config: GateConfig, settings: Settings) -> float:
+def _compute_memory_s(config: GateConfig) -> float:
     """Returns for how long scans are kept [s], which is longer for a slow lidar."""
     slow_s = min(
-        settings.slow_periods / config.scan_rate,
-        settings.slow_factor * settings.longest_s,
+        SETTINGS.slow_periods / config.scan_rate,
+        SETTINGS.slow_factor * SETTINGS.longest_s,
     )
-    return max(settings.longest_s, slow_s, settings.min_periods / config.scan_rate)
+    return max(SETTINGS.longest_s, slow_s, SETTINGS.min_periods / config.scan_rate)
 
 
 def _update_held_since(
-    before_ns: int | None, verdict: Verdict, now_ns: int, settings: Settings
+    before_ns: int | None, verdict: Verdict, now_ns: int
 ) -> int | None:
     """Returns the stamp since which scans have contradicted odometry; None if they do not."""
-    if before_ns is not None and (now_ns - before_ns) * S_PER_NS > settings.forgotten_s:
+    if before_ns is not None and (now_ns - before_ns) * S_PER_NS > SETTINGS.forgotten_s:
         before_ns = None
     if math.isnan(verdict.share):
         return before_ns
@@ -216,16 +210,13 @@ def _update_held_since(
 
 
 def _explain_contradiction(
-    newest: ReducedScan,
-    verdict: Verdict,
-    held_since_ns: int | None,
-    settings: Settings,
+    newest: ReducedScan, verdict: Verdict, held_since_ns: int | None
 ) -> str:
     """Returns a sentence once scans have contradicted odometry for long enough, else nothing."""
     reference = verdict.reference
-    if not verdict.held or held_since_ns is None or reference is None:
+    if held_since_ns is None or reference is None:
         return ""
-    if (newest.stamp_ns - held_since_ns) * S_PER_NS < settings.confirmed_s:
+    if (newest.stamp_ns - held_since_ns) * S_PER_NS < SETTINGS.confirmed_s:
         return ""
     x, y, turn = between(reference.pose, newest.pose).tolist()
     seconds = (newest.stamp_ns - reference.stamp_ns) * S_PER_NS
@@ -235,50 +226,51 @@ def _explain_contradiction(
 
 
 def judge_motion(
-    config: GateConfig,
-    kept: tuple[ReducedScan, ...],
-    newest: ReducedScan,
-    settings: Settings,
+    config: GateConfig, kept: tuple[ReducedScan, ...], newest: ReducedScan
 ) -> Verdict:
     """Judges whether the newest scan shows the motion that odometry shows since an earlier one."""
-    reference, lesser_half = _select_reference(kept, newest, settings)
+    reference, lesser_half = _select_reference(kept, newest)
     if reference is None:
         return UNDECIDED
-    strictness = min(1.0, lesser_half / max(settings.usual_half, TINY))
+    strictness = min(1.0, lesser_half / SETTINGS.usual_half)
     mount = np.array(config.mount)
     moved = between(compose(reference.pose, mount), compose(newest.pose, mount))
-    directions = get_directions(config, settings)
+    directions = get_directions(config)
     predicted = np.empty_like(reference.ranges)
-    kernels.predict_scan(reference.ranges, directions, moved, settings.gap, predicted)
-    sector = round(settings.sector / directions.step) or 1
+    kernels.predict_scan(reference.ranges, directions, moved, SETTINGS.gap, predicted)
+    sector = round(SETTINGS.sector / directions.step) or 1
     thresholds = Thresholds(
-        settings.min_change,
-        settings.min_deviations,
-        settings.visible_change,
-        settings.visible_deviations,
+        SETTINGS.min_change,
+        SETTINGS.min_deviations,
+        SETTINGS.visible_change,
+        SETTINGS.visible_deviations,
     )
-    noise = compute_noise(config, directions)
     observed, changed = kernels.compare_sectors(
-        reference.ranges, newest.ranges, predicted, sector, noise, thresholds
+        reference.ranges,
+        newest.ranges,
+        predicted,
+        sector,
+        compute_noise(config, directions),
+        thresholds,
     )
     is_compared = ~np.isnan(observed)
-    sectors = int(np.count_nonzero(is_compared))
-    if sectors < max(settings.min_sectors, 1):
-        return UNDECIDED._replace(sectors=sectors)
+    sectors = np.count_nonzero(is_compared)
+    if sectors < SETTINGS.min_sectors:
+        return UNDECIDED
     share = float(np.median(observed[is_compared]))
     contradicting = np.count_nonzero(
-        np.abs(observed[is_compared]) < strictness * settings.sector_share
+        np.abs(observed[is_compared]) < strictness * SETTINGS.sector_share
     )
     held = (
-        contradicting >= settings.min_contradicting * sectors
-        and abs(share) < strictness * settings.held_share
-        and np.median(changed[is_compared]) < settings.max_changed
+        contradicting >= SETTINGS.min_contradicting * sectors
+        and abs(share) < strictness * SETTINGS.held_share
+        and np.median(changed[is_compared]) < SETTINGS.max_changed
     )
-    return Verdict(sectors, share, bool(held), reference)
+    return Verdict(share, bool(held), reference)
 
 
 def _select_reference(
-    kept: tuple[ReducedScan, ...], newest: ReducedScan, settings: Settings
+    kept: tuple[ReducedScan, ...], newest: ReducedScan
 ) -> tuple[ReducedScan | None, float]:
     """Returns the scan to compare the newest one with, and the lesser half of the motion.
 
@@ -290,36 +282,36 @@ def _select_reference(
     chosen = None
     for index, scan in enumerate(kept[:-1]):
         turn = abs(_measure_turn(scan, newest))
-        if turn > settings.max_turn:
+        if turn > SETTINGS.max_turn:
             continue
         chosen = index
-        if turn <= settings.usual_turn:
+        if turn <= SETTINGS.usual_turn:
             break
     if chosen is None:
         return None, 0.0
     reference = kept[chosen]
     half_ns = (reference.stamp_ns + newest.stamp_ns) // 2
     middle = min(kept[chosen + 1 :], key=lambda scan: abs(scan.stamp_ns - half_ns))
-    motion = _measure_motion(reference, newest, settings)
+    motion = _measure_motion(reference, newest)
     lesser_half = min(
-        _measure_motion(reference, middle, settings),
-        _measure_motion(middle, newest, settings),
+        _measure_motion(reference, middle),
+        _measure_motion(middle, newest),
     )
-    is_usual = lesser_half >= settings.usual_half * motion
+    is_usual = lesser_half >= SETTINGS.usual_half * motion
     is_seen = (
-        lesser_half >= settings.min_half * motion
-        and lesser_half >= settings.min_half_motion
+        lesser_half >= SETTINGS.min_half * motion
+        and lesser_half >= SETTINGS.min_half_motion
     )
     if motion < 1.0 or not (is_usual or is_seen):
         return None, 0.0
-    return reference, lesser_half / max(motion, TINY)
+    return reference, lesser_half / motion
 
 
-def _measure_motion(old: ReducedScan, new: ReducedScan, settings: Settings) -> float:
+def _measure_motion(old: ReducedScan, new: ReducedScan) -> float:
     """Returns the motion that odometry shows between two scans, in multiples of the minimum."""
     path = math.hypot(*(new.pose[:2] - old.pose[:2]).tolist())
     turn = abs(_measure_turn(old, new))
-    return max(path / max(settings.min_path, TINY), turn / max(settings.min_turn, TINY))
+    return max(path / SETTINGS.min_path, turn / SETTINGS.min_turn)
 
 
 def _measure_turn(old: ReducedScan, new: ReducedScan) -> float:
@@ -327,35 +319,23 @@ def _measure_turn(old: ReducedScan, new: ReducedScan) -> float:
     return math.remainder(float(new.pose[2] - old.pose[2]), FULL_CIRCLE)
 
 
-def _reduce_scan(config: GateConfig, ranges: Ranges, settings: Settings) -> Ranges:
+def _reduce_scan(config: GateConfig, ranges: Ranges) -> Ranges:
     """Returns the median ranges (K,) of a scan (B,) around its directions."""
-    directions = get_directions(config, settings)
+    directions = get_directions(config)
     reduced = np.empty(directions.size, np.float32)
     kernels.reduce_scan(ranges, directions, reduced)
     return reduced
 
 
-def get_directions(config: GateConfig, settings: Settings = SETTINGS) -> Directions:
+def get_directions(config: GateConfig) -> Directions:
     """Returns the directions of a lidar's reduced scans."""
-    angles = config.beam_angles
-    return _make_directions(
-        len(angles),
-        float(angles[0]),
-        float(angles[1] - angles[0]),
-        settings.spacing,
-        settings.window,
-    )
-
-
-@cache
-def _make_directions(
-    beams: int, first: float, step: float, spacing: float, window: float
-) -> Directions:
-    """Returns directions about a spacing apart, for beams from `first` on at every `step` [rad]."""
-    size = min(beams, max(1, round(beams * step / spacing)))
+    beams = len(config.beam_angles)
+    first = float(config.beam_angles[0])
+    step = float(config.beam_angles[1] - config.beam_angles[0])
+    size = min(beams, max(1, round(beams * step / SETTINGS.spacing)))
     beams_per_direction = beams / size
     half_window = min(
-        int(window / step + BEAM_COUNT_TOLERANCE),
+        int(SETTINGS.window / step + BEAM_COUNT_TOLERANCE),
         (kernels.LARGEST_WINDOW - 1) // 2,
         (beams - 1) // 2,
     )
@@ -386,8 +366,8 @@ def warm_up(config: GateConfig) -> None:
     if not _can_judge(config):
         return
     ranges = np.ones(len(config.beam_angles), np.float32)
-    view = ReducedScan(0, np.zeros(3), _reduce_scan(config, ranges, SETTINGS))
+    view = ReducedScan(0, np.zeros(3), _reduce_scan(config, ranges))
     views = tuple(
         replace(view, stamp_ns=k, pose=np.array([0.1 * k, 0.0, 0.0])) for k in range(3)
     )
-    judge_motion(config, views[:2], views[2], SETTINGS)
+    judge_motion(config, views[:2], views[2])

@@ -81,16 +81,19 @@ def shield(config: GateConfig, state: GateState, motion: Motion, now: float) -> 
     passes at once only where the robot could also stop from `CREEP_SPEED`, and it becomes zero
     where the turn alone is safe.
     """
+    limiter = config.shield
     # Without a scan, the gate stops before it comes here.
-    if config.shield is None or config.limits is None or state.obstacles is None:
+    if limiter is None or config.limits is None or state.obstacles is None:
         return motion
     is_speed = config.limits.linear
     is_turn_rate = config.limits.turn
     speed = float(np.abs(motion.value[is_speed]).max(initial=0.0))
     turns = bool(motion.value[is_turn_rate].any())
-    turns_on_the_spot = turns and config.shield.wheelbase == 0.0
+    turns_on_the_spot = turns and limiter.wheelbase == 0.0
     if speed == 0.0 and not turns:
         return motion
+    sensor_points = [make_static(sensor.points) for sensor in state.sensors]
+    obstacles = np.concatenate([state.obstacles, *sensor_points])
 
     def scale_motion(speed_scale: float, turn_scale: float) -> Array:
         scales = np.where(
@@ -99,13 +102,13 @@ def shield(config: GateConfig, state: GateState, motion: Motion, now: float) -> 
         return motion.value * scales
 
     def can_stop(speed_scale: float, turn_scale: float) -> bool:
-        return _can_stop(config, state, scale_motion(speed_scale, turn_scale), now)
-
-    def can_stop_from_creep_speed(turn_scale: float) -> bool:
-        return can_stop(CREEP_SPEED / speed, turn_scale)
+        value = scale_motion(speed_scale, turn_scale)
+        return _can_stop_calmly(
+            config, limiter, value, obstacles
+        ) and _can_stop_suddenly(config, limiter, state, value, obstacles, now)
 
     is_creep = turns_on_the_spot and 0.0 < speed < CREEP_SPEED
-    if can_stop(1.0, 1.0) and (not is_creep or can_stop_from_creep_speed(1.0)):
+    if can_stop(1.0, 1.0) and (not is_creep or can_stop(CREEP_SPEED / speed, 1.0)):
         return motion
     # A steering angle is not scaled, so it goes on changing.
     slope = np.where(is_speed | is_turn_rate, 0.0, motion.slope)
@@ -119,7 +122,7 @@ def shield(config: GateConfig, state: GateState, motion: Motion, now: float) -> 
         speed_scale = _find_maximum_scale(lambda scale: can_stop(scale, scale))
         turn_scale = speed_scale
         would_creep = turns_on_the_spot and speed_scale * speed < CREEP_SPEED
-        if would_creep and speed > 0.0 and can_stop_from_creep_speed(0.0):
+        if would_creep and speed > 0.0 and can_stop(CREEP_SPEED / speed, 0.0):
             speed_scale = _find_maximum_scale(lambda scale: can_stop(scale, 0.0))
             turn_scale = 0.0
     value = scale_motion(speed_scale, turn_scale)
@@ -141,18 +144,6 @@ def _find_maximum_scale(can_stop: Callable[[float], bool]) -> float:
     return low
 
 
-def _can_stop(config: GateConfig, state: GateState, value: Array, now: float) -> bool:
-    """True if the robot can stop from a command (C,), in a calm stop and in a sudden one."""
-    shield = config.shield
-    if shield is None or state.obstacles is None:
-        return True
-    sensor_points = [make_static(sensor.points) for sensor in state.sensors]
-    obstacles = np.concatenate([state.obstacles, *sensor_points])
-    return _can_stop_calmly(config, shield, value, obstacles) and _can_stop_suddenly(
-        config, shield, state, value, obstacles, now
-    )
-
-
 def _can_stop_calmly(
     config: GateConfig, shield: ShieldConfig, value: Array, obstacles: Array
 ) -> bool:
@@ -163,8 +154,7 @@ def _can_stop_calmly(
         1.0 / config.scan_rate + (shield.hold_s + shield.latency_s) + shield.latency_s
     )
     stops = list_stops(shield, reaction_s, CALM_BRAKING, latencies=2.0)
-    static_obstacles = make_static(obstacles[:, :2])
-    return all(_is_free(static_obstacles, twists, stop) for stop in stops)
+    return _is_free(make_static(obstacles[:, :2]), twists, stops)
 
 
 def _can_stop_suddenly(
@@ -176,8 +166,11 @@ def _can_stop_suddenly(
     now: float,
 ) -> bool:
     """True if the robot can stop, whatever it does already, before what may approach."""
-    data_age_s = _compute_data_age(state, now)
-    unshown = _list_unshown_commands(shield, state, now, data_age_s)
+    arrivals = [state.scans, *(sensor.arrivals for sensor in state.sensors)]
+    data_age_s = max(0.0, *(compute_age(topic, now) for topic in arrivals))
+    # Those in force since the oldest data, or within a reaction before.
+    since_s = now - data_age_s - _get_longest_reaction(shield)
+    unshown = [command for _, command in _select_in_force(state.recent, since_s, now)]
     commands = np.array([*unshown, state.value, value])
     odometry = np.zeros(3)
     if state.odometry is not None:
@@ -185,29 +178,12 @@ def _can_stop_suddenly(
     twists = _span_twists(config, shield, commands, odometry)
     reaction_s = data_age_s + (shield.hold_s + shield.latency_s)
     stops = list_stops(shield, reaction_s, 1.0, latencies=1.0)
-    return all(_is_free(obstacles, twists, stop) for stop in stops)
+    return _is_free(obstacles, twists, stops)
 
 
-def _is_free(obstacles: Array, twists: Array, stop: Stop) -> bool:
-    """True if no obstacle (P, 3) comes too near in a stop from any of the twists (K, 3)."""
-    is_free: bool = shield_kernels.is_free(
-        obstacles, twists, stop.body, stop.reaction_s, stop.deceleration, STEP
-    )
-    return is_free
-
-
-def _compute_data_age(state: GateState, now: float) -> float:
-    """Returns the age of the oldest data that show obstacles [s], at least 0."""
-    arrivals = [state.scans, *(sensor.arrivals for sensor in state.sensors)]
-    return max(0.0, *(compute_age(topic, now) for topic in arrivals))
-
-
-def _list_unshown_commands(
-    shield: ShieldConfig, state: GateState, now: float, data_age_s: float
-) -> list[Array]:
-    """Returns the commands (C,) in force since the oldest data, or within a reaction before."""
-    since_s = now - data_age_s - _get_longest_reaction(shield)
-    return [command for _, command in _select_in_force(state.recent, since_s, now)]
+def _is_free(obstacles: Array, twists: Array, stops: list[Stop]) -> bool:
+    """True if no obstacle (P, 3) comes too near in any stop from any of the twists (K, 3)."""
+    return all(shield_kernels.is_free(obstacles, twists, *stop, STEP) for stop in stops)
 
 
 def append_command(

@@ -100,6 +100,8 @@ def is_free(
         longest_time = max(longest_time, rest_time)
         most_steps = max(most_steps, math.ceil(path / step))
     near = _select_near(obstacles, body, longest_path, longest_time)
+    if near.shape[0] == 0:
+        return True
     all_places = np.empty((most_steps + 1, 5))
     for k in range(twists.shape[0]):
         path, speed = _bound_path(twists[k], body, reaction, deceleration)
@@ -114,7 +116,7 @@ def is_free(
             2.0 * speed * step_time / deceleration
         )
         is_filled = False
-        if body.turn_deceleration > 0.0 and near.shape[0] > 0:
+        if body.turn_deceleration > 0.0:
             is_filled = True
             longest_step_time = _fill_places_of_separate_turn(
                 places, path, twists[k], speed, body, reaction, deceleration
@@ -195,9 +197,7 @@ def _select_near(
             continue
         clearance = compute_clearance(x, y, body)
         if clearance < reach:
-            near[count, X] = x
-            near[count, Y] = y
-            near[count, APPROACH] = approach
+            near[count, :REQUIRED] = obstacles[p]
             near[count, REQUIRED] = min(body.margin, clearance) - ROUNDING
             near[count, CLEARANCE] = clearance
             count += 1
@@ -262,11 +262,8 @@ def _fill_places_of_separate_turn(
     turn_reaction = reaction + body.turn_delay
     rest_time = _compute_rest_time(twist, braked_speed, body, reaction, deceleration)
     steps = len(places) - 1
-    places[0, X] = 0.0
-    places[0, Y] = 0.0
+    places[0] = 0.0
     places[0, COSINE] = 1.0
-    places[0, SINE] = 0.0
-    places[0, TIME] = 0.0
     time = 0.0
     drive_time = 0.0
     turn_time = 0.0

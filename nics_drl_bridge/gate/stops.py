@@ -195,10 +195,9 @@ def take_time(
             state, clock_fault=f"the steady clock went from {state.now_s} to {now} s"
         )
     still = state.still_ticks + 1 if now == state.now_s else 0
+    fault = ""
     if still >= FROZEN_INPUTS:
         fault = f"the steady clock stands still at {now} s"
-    else:
-        fault = ""
     ticked = state.tick_s
     awake = state.awake_s
     if ticked is not None and now - ticked > config.gap_s:
@@ -225,10 +224,9 @@ def own_clock(config: GateConfig, state: GateState, now: float) -> Cause | None:
 
 def watch_source(state: GateState, command: Command, now: float) -> GateState:
     """Records the publisher of a command, and whether another one commanded a moment ago."""
+    mixed = ""
     if command.publishers > 1:
         mixed = f"{command.publishers} nodes publish on {RAW}"
-    else:
-        mixed = ""
     if command.source:
         recent = now - state.source_s < SOURCE_S
         if recent and state.source != command.source:
