@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 
 from measuring import figures_lidar as lidar
 from measuring.plan import RUNS
@@ -14,7 +15,12 @@ def told(*rows: tuple[str, str, str]) -> Table:
     return Table(
         ("what", "script", "figure"),
         tuple(
-            (run, what, f"`{RUNS[run].script if run in RUNS else f'{run}.py'}`", text)
+            (
+                run,
+                what,
+                f"`{Path(RUNS[run].script).name if run in RUNS else f'{run}.py'}`",
+                text,
+            )
             for run, what, text in rows
         ),
     )

@@ -37,6 +37,8 @@ def row(
 
 
 HOUR = 3600.0
+CAMPAIGNS = "../test/campaigns/"
+"""Some campaigns give figures for the tables."""
 SHIPPED = ("ackermann", "differential", "mecanum", "jackal")
 RUNS: dict[str, Run] = {
     "barn": row("barn", "", "--policy straight", HOUR),
@@ -64,36 +66,40 @@ RUNS: dict[str, Run] = {
     ),
     "estimator": row("estimator", "", "--drives 5 --steps 20000"),
     "fig4_pointcloud": row("fig4_pointcloud", "", "--scans 12 --without-slam"),
-    "files": row("files", "", "--kills 5 --flips 20 --cuts 10 --changes 20"),
+    "files": row(
+        CAMPAIGNS + "files", "", "--kills 5 --flips 20 --cuts 10 --changes 20"
+    ),
     "first_hour": row("first_hour", "", "--roads recording", HOUR),
     "unknown_robot": row("unknown_robot", "--minutes 120", "--goals 3", 4 * HOUR),
     "gate_held": row("gate_held", "", "--hours 0.1 --holds 13", 2 * HOUR),
-    "gate_envelope": row("gate_envelope", "--steps 1000000", "--steps 5000"),
-    "gate_faults": row(
-        "gate_faults", "--load 2 --repeats 100", "--repeats 1", 4 * HOUR
+    "gate_envelope": row(
+        CAMPAIGNS + "gate_envelope", "--steps 1000000", "--steps 5000"
     ),
-    "gate_rules": row("gate_rules", timeout_s=2 * HOUR),
+    "gate_faults": row(
+        CAMPAIGNS + "gate_faults", "--load 2 --repeats 100", "--repeats 1", 4 * HOUR
+    ),
+    "gate_rules": row(CAMPAIGNS + "gate_rules", timeout_s=2 * HOUR),
     "generate_from_mujoco": row(
         "generate_from_mujoco", "", "--drives 1 --train 30", HOUR
     ),
     "lidar_complexity": row("lidar_complexity", "", "--most 16 --scans 64 --repeats 5"),
     "lidar_peers": row("lidar_peers", "", "--scans 128 --scenes 5 --repeats 2"),
     "node_endings": row(
-        "node_endings", "", "--times 1 --phases starting running", HOUR
+        CAMPAIGNS + "node_endings", "", "--times 1 --phases starting running", HOUR
     ),
     "node_first_lines": row(
-        "node_endings", "--loops 0 --phases starting", "--loops 0 --times 1"
+        CAMPAIGNS + "node_endings", "--loops 0 --phases starting", "--loops 0 --times 1"
     ),
-    "packet_loss": row("packet_loss", "", "--seconds 5"),
+    "packet_loss": row(CAMPAIGNS + "packet_loss", "", "--seconds 5"),
     "paper_fig7": row("paper_fig7", "", "--episodes 1"),
-    "parity": row("parity", "", "--steps 50"),
+    "parity": row(CAMPAIGNS + "parity", "", "--steps 50"),
     "real_drives": row("real_drives", "", "--only xtark_random_drive_45s", HOUR),
-    "ros_fleet": row("ros_fleet", "", "--seconds 2 --robots 2"),
+    "ros_fleet": row(CAMPAIGNS + "ros_fleet", "", "--seconds 2 --robots 2"),
     "ros_lockstep": row("ros_lockstep", "", "--chunks 5 --size 20"),
-    "shield": row("shield", "--episodes 3000", "--episodes 30", 2 * HOUR),
-    "soak": row("soak", "", "--minutes 0.2 --warm-up 0.1"),
-    "soak_env": row("soak_env", "", "--steps 200000"),
-    "standards": row("standards", "", "--parts leapp", HOUR),
+    "shield": row(CAMPAIGNS + "shield", "--episodes 3000", "--episodes 30", 2 * HOUR),
+    "soak": row(CAMPAIGNS + "soak", "", "--minutes 0.2 --warm-up 0.1"),
+    "soak_env": row(CAMPAIGNS + "soak_env", "", "--steps 200000"),
+    "standards": row(CAMPAIGNS + "standards", "", "--parts leapp", HOUR),
     **{
         f"table2_{name}": row(
             "table2_lidar", lidar, f"{lidar} --scans 512 --repeats 5".strip()
@@ -137,4 +143,7 @@ def runs_of(folder: Path) -> dict[str, Run]:
     for path in sorted(folder.glob("*.py")):
         rows = {name: run for name, run in RUNS.items() if run.script == path.name}
         found.update(rows or {path.stem: Run(path.name)})
+    for name, run in RUNS.items():
+        if run.script.startswith(CAMPAIGNS) and (folder / run.script).exists():
+            found[name] = run
     return found

@@ -138,7 +138,7 @@ def run_one(script: Path, arguments: Sequence[str], timeout_s: float) -> dict[st
             stdin=subprocess.DEVNULL,
             stdout=out,
             stderr=err,
-            cwd=script.parents[1],
+            cwd=SCRIPTS.parent,
             env={**os.environ, MARK: mark},
             start_new_session=True,
         )
@@ -263,7 +263,9 @@ def ask(arguments: Sequence[str] | None) -> argparse.Namespace:
     named = {name for name in given.only or () if name not in every}
     # A script that is run several times may be named itself.
     of = {
-        name: [each for each, run in every.items() if run.script == f"{name}.py"]
+        name: [
+            each for each, run in every.items() if Path(run.script).name == f"{name}.py"
+        ]
         for name in named
     }
     unknown = [name for name, found in of.items() if not found]

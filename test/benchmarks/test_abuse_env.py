@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from .runs import BENCHMARKS
+from .runs import CAMPAIGNS
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
@@ -13,8 +13,8 @@ pytestmark = [pytest.mark.ros, pytest.mark.timeout(300)]
 
 @pytest.fixture
 def abuse_env(monkeypatch):
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    from measuring import abuse_env
+    monkeypatch.syspath_prepend(str(CAMPAIGNS))
+    from parts import abuse_env
 
     return abuse_env
 

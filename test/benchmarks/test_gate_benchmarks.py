@@ -8,13 +8,13 @@ import sys
 
 import pytest
 
-from .runs import BENCHMARKS, asked, fails
+from .runs import CAMPAIGNS, asked, fails, path_of
 
 
 def result_of(script: str, *options: str) -> dict:
     """The one JSON object that a benchmark prints."""
     done = subprocess.run(
-        [sys.executable, str(BENCHMARKS / script), "--json", *options],
+        [sys.executable, str(path_of(script)), "--json", *options],
         capture_output=True,
         text=True,
         check=True,
@@ -113,7 +113,7 @@ def test_bars_of_a_fault_are_missed_by_what_is_no_number_late_unsafe_or_not_meas
     monkeypatch,
 ):
     pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    monkeypatch.syspath_prepend(str(CAMPAIGNS))
     import gate_faults
 
     good = {"n": 2, "p50_s": 0.2, "max_s": 0.3, "limit_s": 0.4, "unsafe_commands": 0}
@@ -126,7 +126,7 @@ def test_bars_of_a_fault_are_missed_by_what_is_no_number_late_unsafe_or_not_meas
 
 
 def test_a_rule_that_is_taken_out_is_missed_by_a_test(monkeypatch):
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    monkeypatch.syspath_prepend(str(CAMPAIGNS))
     import gate_rules
 
     names = gate_rules.names()

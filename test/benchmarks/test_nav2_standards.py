@@ -5,11 +5,10 @@ from pathlib import Path
 import pytest
 from domains import claimed_domain
 
-from .runs import asked
+from .runs import CAMPAIGNS, asked
 
 pytestmark = pytest.mark.process
 ROOT = Path(__file__).resolve().parents[2]
-BENCHMARKS = ROOT / "benchmarks"
 ARCHIVE = ROOT.parent / "shared" / "upstream" / "nav2_interfaces.tar.gz"
 
 
@@ -41,9 +40,9 @@ def test_paths_are_followed_and_every_name_of_nav2_is_served():
 def test_what_nodes_of_nav2_say_to_each_other_is_not_asked_of_the_robot(
     monkeypatch, tmp_path
 ):
-    monkeypatch.syspath_prepend(BENCHMARKS)
+    monkeypatch.syspath_prepend(CAMPAIGNS)
     pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
-    from measuring import nav2_names
+    from parts import nav2_names
 
     file = tmp_path / "nav2.yaml"
     file.write_text(
@@ -70,11 +69,11 @@ def test_what_nodes_of_nav2_say_to_each_other_is_not_asked_of_the_robot(
 def test_a_topic_whose_quality_of_service_does_not_fit_is_named(
     monkeypatch, topic, hears, durable, reliable, fault
 ):
-    monkeypatch.syspath_prepend(BENCHMARKS)
+    monkeypatch.syspath_prepend(CAMPAIGNS)
     pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
     from geometry_msgs.msg import Twist
-    from measuring import nav2_names
     from nav_msgs.msg import OccupancyGrid, Odometry
+    from parts import nav2_names
     from rclpy.node import Node
     from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from .runs import BENCHMARKS, asked, fails
+from .runs import CAMPAIGNS, asked, fails
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
@@ -31,7 +31,7 @@ def test_without_the_handler_of_its_own_a_node_ends_after_a_step_of_the_compiler
 
 
 def test_a_node_that_was_killed_or_took_too_long_is_named(monkeypatch):
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    monkeypatch.syspath_prepend(str(CAMPAIGNS))
     import node_endings
 
     good = {"reached_s": 3.0, "median_s": 0.1, "longest_s": 0.2, "failed": []}
@@ -47,7 +47,7 @@ def test_a_node_that_was_killed_or_took_too_long_is_named(monkeypatch):
 def test_a_first_line_that_comes_late_on_quiet_cores_is_named(
     monkeypatch, loops, count
 ):
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    monkeypatch.syspath_prepend(str(CAMPAIGNS))
     import node_endings
 
     late = {"reached_s": 1.2, "median_s": 0.1, "longest_s": 0.2, "failed": []}

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from .runs import BENCHMARKS, asked, fails
+from .runs import CAMPAIGNS, asked, fails
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
@@ -19,7 +19,7 @@ DIFFERENT = "max_abs_observation_difference"
 
 @pytest.fixture
 def parity(monkeypatch):
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    monkeypatch.syspath_prepend(str(CAMPAIGNS))
     import parity
 
     return parity

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from .runs import BENCHMARKS, asked, fails
+from .runs import CAMPAIGNS, asked, fails
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
@@ -40,7 +40,7 @@ def test_one_robot_that_nobody_hears_is_named():
 
 
 def test_a_rate_that_is_nan_is_missed(monkeypatch):
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    monkeypatch.syspath_prepend(str(CAMPAIGNS))
     import ros_fleet
 
     nan = float("nan")

@@ -7,7 +7,7 @@ import importlib
 import numpy as np
 import pytest
 
-from .runs import BENCHMARKS, asked, fails
+from .runs import CAMPAIGNS, asked, fails
 
 SHORT = ("--in-process", "--episodes", "18")
 
@@ -73,12 +73,12 @@ def test_a_shield_that_thinks_the_robot_stops_at_once_touches_something():
 
 @pytest.fixture
 def module(monkeypatch):
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    monkeypatch.syspath_prepend(str(CAMPAIGNS))
     return importlib.import_module
 
 
 def test_a_car_that_trembles_at_rest_was_walked_into(module):
-    places = module("measuring.shield_places")
+    places = module("parts.shield_places")
     place = places.Place("ackermann", "crowd")
     place.begin(places.Job("ram", 1, standing=True))
     for _ in range(80):
@@ -96,7 +96,7 @@ def test_a_car_that_trembles_at_rest_was_walked_into(module):
 
 
 def test_a_robot_that_drives_into_something_is_in_contact(module):
-    places = module("measuring.shield_places")
+    places = module("parts.shield_places")
     place = places.Place("mecanum", "arena")
     place.begin(places.Job("goal", 0))  # which has the time to come to a wall
     while not (place.outcome.contact or place.outcome.walked_into):
@@ -109,7 +109,7 @@ def test_a_robot_that_drives_into_something_is_in_contact(module):
     ("share", "met"), [(0.019, True), (0.021, False), (np.nan, False)]
 )
 def test_a_run_whose_robots_were_held_up_is_none(module, share, met):
-    outcome = module("measuring.shield_places").Outcome
+    outcome = module("parts.shield_places").Outcome
     shield = module("shield")
     kept_up = {"count": 3, "seconds": 100.0 * share, "of_s": 100.0, "repeated": 2}
     driven = [outcome("ram", path=3.0), outcome("goal", reached=True)]
@@ -123,7 +123,7 @@ def test_a_run_whose_robots_were_held_up_is_none(module, share, met):
 
 
 def test_the_shipped_values_keep_room_to_brake_at_all_speeds(module):
-    braking = module("measuring.braking")
+    braking = module("parts.braking")
     assert 0.1 in braking.SHARES
     for robot in ("ackermann", "differential", "mecanum"):
         assert 0.8 < braking.braking_used(robot, {}) <= 1.0

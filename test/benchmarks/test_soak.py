@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from .runs import BENCHMARKS, asked, fails
+from .runs import CAMPAIGNS, asked, fails
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
@@ -39,7 +39,7 @@ def test_a_file_that_each_episode_leaves_open_is_found():
 
 
 def test_a_figure_that_is_nan_misses_its_bar(monkeypatch):
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    monkeypatch.syspath_prepend(str(CAMPAIGNS))
     import soak
 
     names = [*soak.MOST, *soak.LEAST, *soak.LEAST_PER_MINUTE, "driven_in_episodes_m"]

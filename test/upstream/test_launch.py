@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip("ros2launch", reason="needs ros2: make test-upstream")
 
-from benchmarks.runs import BENCHMARKS
+from campaigns.registry import FOLDER
 from nodes.peer import Peer
 from rcl_interfaces.srv import GetParameters
 from rclpy.parameter import parameter_value_to_python
@@ -62,7 +62,7 @@ def told():
 @pytest.fixture
 def busy(monkeypatch):
     """Two busy loops beside the test."""
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    monkeypatch.syspath_prepend(str(FOLDER))
     from node_endings import busy
 
     with busy(2):

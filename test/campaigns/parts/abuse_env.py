@@ -23,10 +23,10 @@ import gymnasium
 import numpy as np
 from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
+from parts.abuse import Score
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
-from measuring.abuse import Score
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.errors import BridgeError

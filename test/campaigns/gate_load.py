@@ -28,11 +28,11 @@ from typing import Any
 
 import numpy as np
 import rclpy
+from campaign import answer, parser_of
 from geometry_msgs.msg import Twist, TwistStamped
-from measuring.processes import core_seconds
-from measuring.steady_robot import ODOM_HZ, PATIENCE_S, ROBOT, SteadyRobot
-from measuring.verdict import answer, parser_of
 from nav_msgs.msg import Odometry
+from parts.processes import core_seconds
+from parts.steady_robot import ODOM_HZ, PATIENCE_S, ROBOT, SteadyRobot
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Bool
 

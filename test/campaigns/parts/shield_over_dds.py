@@ -20,6 +20,7 @@ import numpy as np
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
+from parts.shield_places import SCAN_STEPS, SILENCE_S, STEP_S, Job, Outcome, Place
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.task import Future
@@ -27,7 +28,6 @@ from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
-from measuring.shield_places import SCAN_STEPS, SILENCE_S, STEP_S, Job, Outcome, Place
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.listener import open_context

@@ -27,7 +27,7 @@ from typing import Any
 import gymnasium
 import nav2_standards
 import numpy as np
-from measuring.verdict import answer, parser_of
+from campaign import answer, parser_of
 
 from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
@@ -71,7 +71,7 @@ def simulator(
 
 def conformance(domain_id: int, folder: Path, control: str | None) -> dict[str, Any]:
     """How many features are announced, and the sentences about those that fail."""
-    from measuring.conformance import Client, announced, failures
+    from parts.conformance import Client, announced, failures
 
     namespace = f"conformance_{os.getpid()}"
     with simulator(domain_id, folder / "conformance", namespace, "realtime"):

@@ -10,9 +10,9 @@ from typing import Any
 
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
+from parts.faulty_robot import ALL, Robot
 from sensor_msgs.msg import LaserScan
 
-from measuring.faulty_robot import ALL, Robot
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import conversions
 from nics_drl_bridge.nodes.processes import NodeProcess

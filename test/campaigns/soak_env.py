@@ -19,9 +19,9 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from measuring.processes import use_of
-from measuring.verdict import answer, parser_of
+from campaign import answer, parser_of
 from numpy.typing import NDArray
+from parts.processes import use_of
 
 from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv

@@ -11,7 +11,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from measuring.verdict import answer, parser_of
+from campaign import answer, parser_of
 
 from nics_drl_bridge.gate import arming, evidence, gate, intake
 
@@ -23,7 +23,7 @@ LEAST_RULES = 30
 """There are more; a run that found fewer has lost a table."""
 TESTS = "test/gate"
 OTHER_TEST = "test/gate/test_stopping.py"
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 TABLES = {
     "stop": (gate, "STOPS", lambda rule: rule.judge.__name__),
     "refusal": (intake, "REFUSALS", lambda rule: rule[1].__name__),

@@ -26,10 +26,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measuring.faults import FAULTS, LATE_S, Around
-from measuring.faulty_robot import ROBOT, SPEED, NoMotionError, Robot
-from measuring.gate_end import END, Ended, end_after_stops
-from measuring.verdict import answer, parser_of
+from campaign import answer, parser_of
+from parts.faults import FAULTS, LATE_S, Around
+from parts.faulty_robot import ROBOT, SPEED, NoMotionError, Robot
+from parts.gate_end import END, Ended, end_after_stops
 
 from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id

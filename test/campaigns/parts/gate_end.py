@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from geometry_msgs.msg import TwistStamped
+from parts.faulty_robot import Robot
 
-from measuring.faulty_robot import Robot
 from nics_drl_bridge.nodes import conversions
 from nics_drl_bridge.nodes.processes import NodeProcess
 

@@ -18,8 +18,8 @@ from unittest import mock
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from parts.gates import Gate, gate_config
 
-from measuring.gates import Gate, gate_config
 from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.files import write_bytes

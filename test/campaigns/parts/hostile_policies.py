@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import onnx
+from parts.attempt import Attempt, nics
 
-from measuring.attempt import Attempt, nics
 from nics_drl_bridge.policy import contract, onnx_graph
 from nics_drl_bridge.policy.contract import shipped
 from nics_drl_bridge.policy.policy_file import load_policy

@@ -14,9 +14,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from measuring.gates import Gate, gate_config
-from measuring.verdict import answer, parser_of
+from campaign import answer, parser_of
 from numpy.typing import NDArray
+from parts.gates import Gate, gate_config
 
 from nics_drl_bridge.config import find_config, parse_yaml, read_text
 from nics_drl_bridge.gate.inputs import Press

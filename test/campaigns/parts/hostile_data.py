@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from parts.attempt import Attempt, nics
+from parts.damaged_bags import samples
+from parts.gates import Gate, gate_config
 
-from measuring.attempt import Attempt, nics
-from measuring.damaged_bags import samples
-from measuring.gates import Gate, gate_config
 from nics_drl_bridge.config import dump_yaml, parse_yaml
 from nics_drl_bridge.extras.bags.info import read_bag_info
 from nics_drl_bridge.files import SUMS, hash_bytes, seal, write_sums

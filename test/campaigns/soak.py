@@ -22,11 +22,11 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from campaign import answer, parser_of
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
-from measuring.processes import Use, use_of
-from measuring.verdict import answer, parser_of
 from nav_msgs.msg import Odometry
+from parts.processes import Use, use_of
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from std_srvs.srv import Trigger

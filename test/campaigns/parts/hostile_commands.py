@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
+from parts.artefacts import SHORT_TRAINING
+from parts.attempt import Attempt, nics
 
-from measuring.artefacts import SHORT_TRAINING
-from measuring.attempt import Attempt, nics
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.sim.scenes import sample_scene

@@ -6,9 +6,9 @@ from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
+from parts.gates import Gate, Witness, gate_config
+from parts.shield_places import SCAN_STEPS, STEP_S, Job, Outcome, Place
 
-from measuring.gates import Gate, Witness, gate_config
-from measuring.shield_places import SCAN_STEPS, STEP_S, Job, Outcome, Place
 from nics_drl_bridge.gate.inputs import Command, Input, Odometry, Scan
 from nics_drl_bridge.gate.limits import load_limits
 from nics_drl_bridge.gate.state import GateConfig

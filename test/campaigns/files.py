@@ -12,9 +12,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from measuring import artefacts
-from measuring.damaged_bags import Score, damage_bags
-from measuring.verdict import answer, parser_of
+from campaign import answer, parser_of
+from parts import artefacts
+from parts.damaged_bags import Score, damage_bags
 
 CONTROLS = {
     "naive_writer": "the temporary file: what is written is written where it is to lie",

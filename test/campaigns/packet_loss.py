@@ -23,11 +23,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from campaign import answer, parser_of
 from geometry_msgs.msg import Twist, TwistStamped
-from measuring.faulty_robot import PERIOD_S, ROBOT, SPEED
-from measuring.lossy_link import Link, NoNamespacesError, link
-from measuring.verdict import answer, parser_of
 from nav_msgs.msg import Odometry
+from parts.faulty_robot import PERIOD_S, ROBOT, SPEED
+from parts.lossy_link import Link, NoNamespacesError, link
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from sensor_msgs.msg import LaserScan

@@ -12,8 +12,8 @@ from collections import Counter
 from collections.abc import Callable
 from importlib import import_module
 
-from measuring.abuse import BARS, Score
-from measuring.verdict import answer, parser_of
+from campaign import answer, parser_of
+from parts.abuse import BARS, Score
 
 from nics_drl_bridge.kernels import COMPILING
 
@@ -21,7 +21,7 @@ CONTROLS = {
     "credulous": "the checks of policies and of YAML",
     "no_guard": "what stops the robot when an exception leaves the env",
 }
-CAMPAIGNS = {"env": "measuring.abuse_env", "files": "measuring.abuse_files"}
+CAMPAIGNS = {"env": "parts.abuse_env", "files": "parts.abuse_files"}
 OF_CONTROL = {"credulous": "files", "no_guard": "env"}
 
 

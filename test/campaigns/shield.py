@@ -25,11 +25,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measuring import shield_in_process
-from measuring.adversaries import ADVERSARIES
-from measuring.braking import braking_used
-from measuring.shield_places import ADVERSARY_S, GOAL, Job, Outcome, Place
-from measuring.verdict import answer, parser_of
+from campaign import answer, parser_of
+from parts import shield_in_process
+from parts.adversaries import ADVERSARIES
+from parts.braking import braking_used
+from parts.shield_places import ADVERSARY_S, GOAL, Job, Outcome, Place
 
 from nics_drl_bridge.gate.state import GateConfig
 
@@ -109,7 +109,7 @@ def drive(
             found += shield_in_process.drive(place, config, some)
             sys.stderr.write(f"{place.robot} in {place.world}: {len(some)} episodes\n")
         return found, {}
-    from measuring import shield_over_dds  # needs ROS 2
+    from parts import shield_over_dds  # needs ROS 2
 
     given: dict[str, Any] = {"shield": False}
     if shield is not None:

@@ -17,13 +17,13 @@ import time
 from pathlib import Path
 from typing import Any
 
+from campaign import answer, parser_of
 from measuring.environments import inherit_for_newcomer
-from measuring.verdict import answer, parser_of
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 ROBOT = "differential"
 FORBIDDEN = ("torch", "stable_baselines3", "mujoco", "tensorboard")
-STAND_IN = Path(__file__).resolve().parent / "measuring" / "deployed_policy.py"
+STAND_IN = Path(__file__).resolve().parent / "parts" / "deployed_policy.py"
 INSTALL_S = 900
 DRIVE_S = 900
 CONTROLS = {

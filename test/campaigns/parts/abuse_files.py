@@ -9,10 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-
-from measuring import hostile_commands, hostile_configs, hostile_data, hostile_policies
-from measuring.abuse import Score
-from measuring.attempt import MOST_MEMORY, Attempt, Outcome, made
+from parts import hostile_commands, hostile_configs, hostile_data, hostile_policies
+from parts.abuse import Score
+from parts.attempt import MOST_MEMORY, Attempt, Outcome, made
 
 Source = Callable[[np.random.Generator, Path], Iterator[Attempt]]
 SOURCES: tuple[Source, ...] = (

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from parts.attempt import Attempt, nics
 
-from measuring.attempt import Attempt, nics
 from nics_drl_bridge.config import dump_yaml, parse_yaml, share_folder
 from nics_drl_bridge.gate.limits import load_limits
 from nics_drl_bridge.lidar.maps import load_map

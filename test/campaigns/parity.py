@@ -19,8 +19,8 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from campaign import answer, parser_of
 from measuring.standing import standing_action
-from measuring.verdict import answer, parser_of
 
 from nics_drl_bridge.env.registry import COOPERATIVE_REACHING, NAVIGATION, register_envs
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id

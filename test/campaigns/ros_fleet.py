@@ -26,8 +26,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from campaign import answer, parser_of
 from geometry_msgs.msg import Twist
-from measuring.verdict import answer, parser_of
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from sensor_msgs.msg import LaserScan

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measuring.verdict import answer, parser_of
+from campaign import answer, parser_of
 
 from nics_drl_bridge.lidar.scanner import make_scanner
 from nics_drl_bridge.lidar.spec import load_lidar
@@ -47,7 +47,7 @@ NEAR = 0.35  # from the goal at the end, by the truth [m]
 STARTED_S = 300.0
 BARE_S = 60.0
 ARCHIVE = (
-    Path(__file__).resolve().parents[2]
+    Path(__file__).resolve().parents[3]
     / "shared"
     / "upstream"
     / "nav2_interfaces.tar.gz"
@@ -93,8 +93,8 @@ def followed(
     domain_id: int, folder: Path, episodes: int, bare: bool = False
 ) -> dict[str, Any]:
     """Share of planned paths that are followed over DDS, and why the others were not."""
-    from measuring.nav2_stand_in import StandIn
     from nav2_msgs.action import FollowPath
+    from parts.nav2_stand_in import StandIn
     from rcl_interfaces.srv import SetParametersAtomically
     from rclpy.parameter import Parameter
     from std_srvs.srv import Trigger
@@ -154,7 +154,7 @@ def missing(
     domain_id: int, folder: Path, parameters: Path, bare: bool = False
 ) -> list[str]:
     """A line for each name of a parameter file of Nav2 that nobody serves."""
-    from measuring import nav2_names
+    from parts import nav2_names
     from rclpy.node import Node
     from tf2_msgs.msg import TFMessage
 

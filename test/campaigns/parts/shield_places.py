@@ -11,8 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-
-from measuring.adversaries import (
+from parts.adversaries import (
     ADVERSARIES,
     Adversary,
     Driver,
@@ -20,6 +19,7 @@ from measuring.adversaries import (
     Standing,
     Truth,
 )
+
 from nics_drl_bridge import geometry
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.lidar.exact_kernels import RADIUS, X, Y
