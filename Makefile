@@ -17,7 +17,7 @@ DURATIONS := --durations 50 --durations-min 1 --junitxml runs/tests.xml
 # Tests that `make test` leaves out, each with a target of its own; test/conftest.py says which they are.
 OTHER_RINGS := docs or package or campaign
 BENCHMARKS ?=
-QUICK ?=
+LONG ?=
 OUT ?=
 EXAMPLES ?=
 
@@ -134,8 +134,8 @@ test-docs: setup ## examples, notebooks, commands and Python of the pages, and t
 test-package: setup ## wheel and source archive, installations in fresh environments, without ROS 2
 	$(CLEAN_ENV) $(BIN)/python -m pytest $(PARALLEL) -m package $(PYTEST_ARGS)
 
-test-campaign: setup ## long proofs of promises, in hours: faults, abuse, soak, fleets, BARN
-	$(BIN)/python -m pytest $(PARALLEL) -m campaign $(PYTEST_ARGS)
+test-campaign: setup ## proofs of promises in their short forms, with their controls: faults, abuse, soak, fleets
+	$(BIN)/python -m pytest $(PARALLEL) -m campaign --durations 0 --durations-min 1 $(PYTEST_ARGS)
 
 test-all: test ## before a release: all rings, other distributions, clients and Ray
 	$(MAKE) test-docs test-package test-campaign \
@@ -218,7 +218,8 @@ UPSTREAM_LIES_THERE := $(wildcard $(UPSTREAM)/launch_ros.tar.gz)
 # Message packages without wheels are built from their sources.
 MESSAGES := .venv-messages
 MESSAGE_TESTS := test/nodes/test_device_node.py test/nodes/simulation_interfaces test/nodes/test_map_to_odom.py \
-	test/nodes/test_follow_path.py test/benchmarks/test_nav2_standards.py test/benchmarks/test_standards.py
+	test/nodes/test_follow_path.py test/campaigns/test_parts.py test/campaigns/test_campaigns.py::test_the_short_form_meets_all_bars[nav2_standards] \
+	test/campaigns/test_campaigns.py::test_the_short_form_meets_all_bars[standards]
 
 test-messages: setup $(MESSAGES)/.ready ## the tests that need tf2_msgs, ackermann_msgs, simulation_interfaces, nav2_msgs, built here
 	source $(MESSAGES)/setup.bash && $(CLEAN_ENV) PYTHONPATH="$$PYTHONPATH" \
@@ -288,13 +289,13 @@ $(AMENT)/.ready: Makefile
 	@touch $@
 
 # Runs to the end even if a benchmark fails; each result names machine, commit and load.
-benchmark: setup ## run every benchmark, write benchmarks/results.json: make benchmark [BENCHMARKS="parity files"] [QUICK=1] [OUT=file]
+benchmark: setup ## run every benchmark, in half an hour, write benchmarks/results.json: make benchmark [BENCHMARKS="parity barn"] [LONG=1] [OUT=file]
 	@if [ -e $(MESSAGES)/setup.bash ]; then source $(MESSAGES)/setup.bash; fi; \
-		cd benchmarks && ../$(BIN)/python -m measuring.run_all \
-		$(if $(BENCHMARKS),--only $(BENCHMARKS)) $(if $(QUICK),--quick) $(if $(OUT),--out "$(abspath $(OUT))")
+		$(BIN)/python benchmarks/bench.py run \
+		$(if $(BENCHMARKS),--only $(BENCHMARKS)) $(if $(LONG),--long) $(if $(OUT),--out "$(OUT)")
 
 tables: setup ## make the tables of README and docs from benchmarks/results.json
-	@cd benchmarks && ../$(BIN)/python -m measuring.tables
+	@$(BIN)/python benchmarks/bench.py tables
 
 docs: setup ## build the site of docs/ into build/docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import json
 import subprocess
 import sys
@@ -10,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
-CAMPAIGNS = BENCHMARKS.parent / "test" / "campaigns"
 
 
 def asked(
@@ -18,7 +16,7 @@ def asked(
 ) -> tuple[int, dict[str, Any]]:
     """The exit code of a benchmark and the one JSON object that it prints."""
     done = subprocess.run(
-        [sys.executable, str(path_of(script)), "--json", *options],
+        [sys.executable, str(BENCHMARKS / script), "--json", *options],
         capture_output=True,
         text=True,
         check=False,
@@ -28,23 +26,8 @@ def asked(
     return done.returncode, json.loads(done.stdout, parse_constant=_no_json)
 
 
-def path_of(script: str) -> Path:
-    """A script of the benchmarks or of the campaigns."""
-    return next(
-        path for folder in (BENCHMARKS, CAMPAIGNS) if (path := folder / script).exists()
-    )
-
-
 def _no_json(word: str) -> None:
     raise ValueError(f"{word} is no JSON")
-
-
-def controls_of(script: str) -> list[str]:
-    """The names of a benchmark's controls, read from its source."""
-    for node in ast.parse(path_of(script).read_text(encoding="utf-8")).body:
-        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "CONTROLS":
-            return list(ast.literal_eval(node.value))
-    return []
 
 
 def fails(

@@ -26,10 +26,6 @@ FORBIDDEN = ("torch", "stable_baselines3", "mujoco", "tensorboard")
 STAND_IN = Path(__file__).resolve().parent / "parts" / "deployed_policy.py"
 INSTALL_S = 900
 DRIVE_S = 900
-CONTROLS = {
-    "no_policy": "a policy file that is cut short",
-    "training_installed": "an environment in which training is installed",
-}
 
 
 def export(folder: Path) -> tuple[Path, Path]:
@@ -93,7 +89,7 @@ def measure(control: str | None, here: bool) -> dict[str, Any]:
     """Makes the environment, drives in it, and removes it.
 
     Args:
-        control: one of `CONTROLS`, or None.
+        control: its name, or None.
         here: takes the environment that runs this instead of a new one.
     """
     with tempfile.TemporaryDirectory() as temporary:
@@ -132,7 +128,7 @@ def missed(found: dict[str, Any]) -> list[str]:
 
 def main() -> None:
     """Prints what was found; 0 when the node drove without anything of training."""
-    parser = parser_of(__doc__, CONTROLS)
+    parser = parser_of(__doc__)
     parser.add_argument(
         "--here",
         action="store_true",
@@ -140,8 +136,7 @@ def main() -> None:
     )
     given = parser.parse_args()
     found = measure(given.control, given.here or given.control is not None)
-    table = "".join(f"{name:<20} {value}\n" for name, value in found.items())
-    answer(found, missed(found), table, given.json)
+    answer(found, missed(found), given.json)
 
 
 if __name__ == "__main__":

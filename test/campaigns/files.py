@@ -14,30 +14,12 @@ from typing import Any
 
 from campaign import answer, parser_of
 from parts import artefacts
-from parts.damaged_bags import Score, damage_bags
+from parts.damaged_bags import damage_bags
 
-CONTROLS = {
-    "naive_writer": "the temporary file: what is written is written where it is to lie",
-    "no_checksum": "the checksums of recordings, tables, policies and checkpoints",
-}
 BARS = ("torn", "accepted_corrupt", "tracebacks", "silent_partial")
 MEASURED = ("kills", "flips", "cuts", "changes")
 LEAST_DURING = 0.25
 """Share of the kills that have to hit a write."""
-
-
-def table_of(result: dict[str, Any], bags: Score) -> str:
-    """One line per artefact, and one for the bags."""
-    lines = [
-        f"{name}: {one['torn']} torn by {one['kills']} kills, {one['kills_during_a_write']} of "
-        f"them in a write; {one['accepted_corrupt']} of {one['flips']} read with a flipped bit"
-        for name, one in result["artefacts"].items()
-    ]
-    lines.append(
-        f"bags: {bags.refused} refused, {bags.accepted} read; {bags.tracebacks} tracebacks, "
-        f"{bags.silent_partial} read in part"
-    )
-    return "\n".join([*lines, *bags.told]) + "\n"
 
 
 def missed_of(result: dict[str, Any]) -> list[str]:
@@ -57,7 +39,7 @@ def missed_of(result: dict[str, Any]) -> list[str]:
 
 def main() -> None:
     """Prints a table, or one JSON object; ends with 1 when a damage was not found."""
-    parser = parser_of(__doc__, CONTROLS)
+    parser = parser_of(__doc__)
     parser.add_argument(
         "--kills", type=int, default=300, help="of the writer of each artefact"
     )
@@ -73,7 +55,7 @@ def main() -> None:
         bags = damage_bags(Path(folder), given.cuts, given.changes, given.seed)
     result |= {"tracebacks": bags.tracebacks, "silent_partial": bags.silent_partial}
     result |= {"cuts": given.cuts, "changes": given.changes, "told": bags.told}
-    answer(result, missed_of(result), table_of(result, bags), given.json)
+    answer(result, missed_of(result), given.json)
 
 
 if __name__ == "__main__":

@@ -34,11 +34,6 @@ from parts.gate_end import END, Ended, end_after_stops
 from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 
-CONTROLS = {
-    "slow_gate": "a gate that lets data get ten times as old",
-    "no_gate": "commands are relayed past the gate",
-    "standing": "the robot is never told to move",
-}
 WATCHED_S = 0.8
 MEDIAN_S = 0.30
 LOG_CHARACTERS = 500
@@ -239,7 +234,7 @@ def _ends(given: Any, control: str, told: Callable[[str], None]) -> Ended:
 
 def main() -> None:
     """Prints a table, or one JSON object; ends with 1 when a stop came late."""
-    parser = parser_of(__doc__, CONTROLS)
+    parser = parser_of(__doc__)
     parser.add_argument("--repeats", type=int, default=30)
     known = sorted([*FAULTS, END])
     parser.add_argument("--fault", action="append", choices=known, help="only this one")
@@ -267,16 +262,10 @@ def main() -> None:
         for name in faults
         for line in missed_by(name, summary[name], given.repeats)
     ]
-    table = "".join(
-        f"{name:<26}{one['n']:>3} times, zero after {one['p50_s']:.3f} s, "
-        f"{one['max_s']:.3f} s at worst, limit {one['limit_s']:.2f} s, "
-        f"unsafe commands {one['unsafe_commands']}\n"
-        for name, one in summary.items()
-    )
     if ended is not None:
-        summary[END], table = ended.summary(), table + ended.line
+        summary[END] = ended.summary()
         missed += ended.missed()
-    answer(summary, missed, table, given.json)
+    answer(summary, missed, given.json)
 
 
 if __name__ == "__main__":

@@ -41,10 +41,6 @@ from nics_drl_bridge.nodes import command_gate, gate_log, qos
 from nics_drl_bridge.nodes.processes import free_domain_id
 from nics_drl_bridge.nodes.start import start
 
-CONTROLS = {
-    "busy": "the gate reads each message and decides ten times",
-    "slow_disk": "the gate waits for a disk that does not answer, at its end",
-}
 GATE = "command_gate"
 TICK_HZ = 50
 MOST_RATIO = 1.1
@@ -250,7 +246,7 @@ def missed_bars(result: dict[str, Any]) -> list[str]:
 
 def main() -> None:
     """Prints a table, or one JSON object; ends with 1 when a bar was missed."""
-    parser = parser_of(__doc__, CONTROLS)
+    parser = parser_of(__doc__)
     parser.add_argument("--seconds", type=float, default=30.0, help="of driving")
     parser.add_argument(
         "--burst", type=float, default=15.0, help="of stops, before the end [s]"
@@ -268,15 +264,7 @@ def main() -> None:
     if rest:
         parser.error(f"unrecognized arguments: {' '.join(rest)}")
     result = measure(given.seconds, given.burst, given.control or "")
-    table = (
-        f"the gate takes {result['gate_share']:.1%} of a core, the bare node "
-        f"{result['bare_share']:.1%}: {result['ratio']:.2f} times as much, over "
-        f"{result['seconds']:.0f} s\n"
-        f"longest time between two commands {result['longest_gap_s']:.3f} s, in a burst of "
-        f"{result['stops']} stops {result['longest_gap_in_burst_s']:.3f} s\n"
-        f"{result['exit_s']:.2f} s from SIGINT to the end, files {result['files']}\n"
-    )
-    answer(result, missed_bars(result), table, given.json)
+    answer(result, missed_bars(result), given.json)
 
 
 if __name__ == "__main__":

@@ -15,10 +15,6 @@ from campaign import answer, parser_of
 
 from nics_drl_bridge.gate import arming, evidence, gate, intake
 
-CONTROLS = {
-    "no_tests": "no test that looks at the gate's rules is run",
-    "untested_rule": "a rule is looked for that no test covers",
-}
 LEAST_RULES = 30
 """There are more; a run that found fewer has lost a table."""
 TESTS = "test/gate"
@@ -88,7 +84,7 @@ def _inside(name: str, control: str, tests: str) -> int:
 
 def main() -> None:
     """Prints a table, or one JSON object; ends with 1 when a rule is not tested."""
-    parser = parser_of(__doc__, CONTROLS)
+    parser = parser_of(__doc__)
     parser.add_argument("--rule", action="append", help="only this one; else all")
     parser.add_argument("--tests", default=TESTS, help="that have to fail")
     parser.add_argument("--inside", help=argparse.SUPPRESS)
@@ -105,16 +101,14 @@ def main() -> None:
     if control == "untested_rule":
         asked = [name for name in known if name.endswith(_covers_nothing.__name__)]
     untested = []
-    table = ""
     for name in asked:
         found = tests_fail_without(name, control, given.tests)
         untested += [] if found else [name]
-        table += f"{name:<34}{'found' if found else 'NOT FOUND'}\n"
     missed = [f"no test misses the rule {name}, bar: one does" for name in untested]
     if len(known) < LEAST_RULES or not asked:
         missed.append(f"{len(known)} rules are known, {len(asked)} were looked at")
     result = {"rules": len(known), "looked_at": len(asked), "untested": untested}
-    answer(result, missed, table, given.json)
+    answer(result, missed, given.json)
 
 
 if __name__ == "__main__":

@@ -31,9 +31,6 @@ from nics_drl_bridge.sim.occupancy import occupancy, standing
 from nics_drl_bridge.sim.scenes import SetSampler
 from nics_drl_bridge.sim.world_set import load_worlds
 
-CONTROLS = {
-    "bare": "the map's obstacles, a controller that is known, and all nodes but the simulator"
-}
 BARS = {"map_agreement": 0.995, "follow_path_success": 0.95, "nav2_names_missing": 0}
 WORLDS = ("arena", "circles", "clutter", "corridor", "doorway", "room", "barn")
 ROBOT = "differential"
@@ -251,14 +248,13 @@ def missed_of(result: dict[str, Any]) -> list[str]:
 
 def main() -> None:
     """Prints the figures; ends with 1 where a bar was missed."""
-    parser = parser_of(__doc__, CONTROLS)
+    parser = parser_of(__doc__)
     parser.add_argument("--episodes", type=int, default=20, help="paths to follow")
     parser.add_argument("--parameters", type=Path, help="a parameter file of Nav2")
     given = parser.parse_args()
     result = figures(given.control is not None, given.episodes, given.parameters)
     missed = missed_of(result)
-    table = "".join(f"{name:<24}{result[name]}\n" for name in result)
-    answer(result, missed, table, given.json)
+    answer(result, missed, given.json)
 
 
 if __name__ == "__main__":

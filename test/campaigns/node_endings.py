@@ -28,7 +28,6 @@ from campaign import answer, parser_of
 from nics_drl_bridge.nodes.parameters import NODES
 from nics_drl_bridge.nodes.processes import free_domain_id
 
-CONTROLS = {"late": "the handler that ends a node within a step of native code"}
 LIMIT_S = 1.0
 PATIENCE_S = 60.0
 READY_S = 280.0
@@ -220,20 +219,9 @@ def row_of(name: str, each: dict[str, Any]) -> str:
     return f"{name:<28}{figures}\n"
 
 
-def table_of(result: dict[str, Any]) -> str:
-    """The figures, a node and phase in a line."""
-    heads = "".join(
-        f"{each:>12}" for each in ("reached [s]", "median [s]", "longest [s]")
-    )
-    head = f"{'':<28}{heads}{'bad':>5}\n"
-    return head + "".join(
-        row_of(name, each) for name, each in result["endings"].items()
-    )
-
-
 def options(words: Sequence[str] | None = None) -> argparse.Namespace:
     """The arguments."""
-    parser = parser_of(__doc__, CONTROLS)
+    parser = parser_of(__doc__)
     parser.add_argument(
         "--times", type=int, default=10, help="of each node in each phase"
     )
@@ -249,7 +237,7 @@ def main() -> None:
     """Prints a table, or one JSON object."""
     given = options()
     result = measure(given)
-    answer(result, missed_of(result), table_of(result), given.json)
+    answer(result, missed_of(result), given.json)
 
 
 if __name__ == "__main__":

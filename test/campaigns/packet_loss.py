@@ -40,12 +40,6 @@ from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.nodes.processes import NodeProcess
 
-CONTROLS = {
-    "no_gate": "the policy's last command is repeated to the base without the gate",
-    "standing": "nobody arms the gate: nothing moves",
-    "no_loss": "the network loses nothing",
-    "slow_robot": "the robot sends one scan in three",
-}
 LOSSES = (5, 20)
 SCAN_AGE_S, TOLERANCE_S = 0.35, 0.05
 """The gate's limit, and what its tick (0.02 s) and the way to the robot may add."""
@@ -323,7 +317,7 @@ def missed_bars(name: str, one: dict[str, Any]) -> list[str]:
 
 def main() -> None:
     """Prints a table, or one JSON object; ends with 1 when a bar was missed."""
-    parser = parser_of(__doc__, CONTROLS)
+    parser = parser_of(__doc__)
     parser.add_argument(
         "--seconds", type=float, default=60.0, help="of driving at each loss"
     )
@@ -350,11 +344,7 @@ def main() -> None:
         raise SystemExit(2) from None
     missed = [line for name, one in runs.items() for line in missed_bars(name, one)]
     unsafe = sum(one["unsafe_commands"] for one in runs.values())
-    table = "".join(
-        f"{name}: {', '.join(f'{key} {value}' for key, value in one.items())}\n"
-        for name, one in runs.items()
-    )
-    answer(runs | {"unsafe_commands": unsafe}, missed, table, given.json)
+    answer(runs | {"unsafe_commands": unsafe}, missed, given.json)
 
 
 if __name__ == "__main__":

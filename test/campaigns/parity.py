@@ -25,12 +25,6 @@ from measuring.standing import standing_action
 from nics_drl_bridge.env.registry import COOPERATIVE_REACHING, NAVIGATION, register_envs
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 
-CONTROLS = {
-    "nan": "a number of one observation",
-    "noise": "the last bit of one number",
-    "late": "one observation, of which the one before is told again",
-    "standing": "the commands: no robot drives",
-}
 SPOILT_STEP = 3
 DRIVEN_M = 0.2
 """Less is no drive."""
@@ -222,19 +216,9 @@ def bars(result: dict[str, Any]) -> list[str]:
     return missed
 
 
-def table(result: dict[str, Any], indent: str = "") -> str:
-    """For people."""
-    return "".join(
-        f"{indent}{key}\n" + table(value, indent + "  ")
-        if isinstance(value, dict)
-        else f"{indent}{key:<34}{value}\n"
-        for key, value in result.items()
-    )
-
-
 def main() -> None:
     """Prints a table, or one JSON object, and ends with 1 where a bar was missed."""
-    parser = parser_of(__doc__, CONTROLS)
+    parser = parser_of(__doc__)
     parser.add_argument("--steps", type=int, default=500)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--robot", help="one kind of robot alone, as ackermann")
@@ -249,7 +233,7 @@ def main() -> None:
         result = measure(
             robot, given.world, given.steps, given.seed, alone, given.control
         )
-    answer(result, bars(result), table(result), given.json)
+    answer(result, bars(result), given.json)
 
 
 if __name__ == "__main__":

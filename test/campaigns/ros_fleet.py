@@ -38,10 +38,6 @@ from nics_drl_bridge.nodes.executor import StandingExecutor
 from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 
-CONTROLS = {
-    "standing": "the commands: no robot drives",
-    "deaf": "the topics of one robot, which nobody receives",
-}
 SCAN_HZ = 10.0
 ODOM_HZ = 50.0
 SHARE = 0.99
@@ -300,7 +296,7 @@ def bars(run: Run) -> list[str]:
 
 def main() -> None:
     """Prints a table, or one JSON object, and ends with 1 where a bar was missed."""
-    parser = parser_of(__doc__, CONTROLS)
+    parser = parser_of(__doc__)
     parser.add_argument(
         "--seconds", type=float, default=10.0, help="to listen to each fleet"
     )
@@ -323,10 +319,7 @@ def main() -> None:
             else measure(robots, given.seconds, given.patience, given.control)
         )
         result = asdict(run)
-        table = "".join(
-            f"{key:<12}{value}\n" for key, value in result.items() if key != "each"
-        )
-        answer(result, bars(run), table, given.json)
+        answer(result, bars(run), given.json)
 
 
 if __name__ == "__main__":

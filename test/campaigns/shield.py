@@ -33,11 +33,6 @@ from parts.shield_places import ADVERSARY_S, GOAL, Job, Outcome, Place
 
 from nics_drl_bridge.gate.state import GateConfig
 
-CONTROLS = {
-    "no_shield": "the shield: it is off",
-    "standing": "the motion: every driver stays where it is",
-    "no_braking_distance": "what the robot needs to stop: the shield is told that it needs nothing",
-}
 ROBOTS = ("ackermann", "differential", "mecanum")
 WORLDS = ("arena", "clutter", "crowd")
 OUTLINED = "jackal"  # has an outline, and a lidar that does not look behind it
@@ -232,25 +227,9 @@ def missed(result: Mapping[str, Any], asked: int) -> list[str]:
     ]
 
 
-def table_of(result: Mapping[str, Any]) -> str:
-    """The figures for people."""
-    return (
-        f"{result['episodes']} episodes of adversaries {result['driven']} over "
-        f"{result['path_m']} m: {result['contacts']} contacts, {result['walked_into']} robots that "
-        f"stood were walked into, {result['latched']} latched stops; without the shield "
-        f"{result['contacts_without']} contacts in {result['tried_without']}\n"
-        f"goals reached: {result['goals_reached']} of {result['goals']} in {result['goal_s']} s on "
-        f"average, without the shield {result['goals_reached_without']} in "
-        f"{result['goal_without_s']} s\n"
-        f"held up for {100 * result['held_up_share']:.1f} % of the time, {result['repeated']} "
-        f"episodes driven again; {result['gate_paused']} with a gate that paused for too long\n"
-        f"braking takes {100 * result['braking']:.0f} % of the way that the shield keeps free\n"
-    )
-
-
 def main() -> None:
     """Prints figures, or one JSON object; ends with 1 when a bar was missed."""
-    parser = parser_of(__doc__, CONTROLS)
+    parser = parser_of(__doc__)
     parser.add_argument(
         "--episodes", type=int, default=300, help=f"of {ADVERSARY_S:g} s each"
     )
@@ -281,7 +260,7 @@ def main() -> None:
         max(braking_used(place.robot, plan.shield) for place in places), 3
     )
     result["load"] = round(os.getloadavg()[0], 1)
-    answer(result, missed(result, plan.episodes), table_of(result), given.json)
+    answer(result, missed(result, plan.episodes), given.json)
 
 
 if __name__ == "__main__":

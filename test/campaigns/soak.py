@@ -45,10 +45,6 @@ STEPS_PER_EPISODE = 20
 SAMPLE_S = 5.0
 PATIENCE_S = 90.0
 GOAL_AGAIN_S = 1.0
-CONTROLS = {
-    "standing": "the gate's consent: the robot in real time never moves",
-    "leak": "order: each episode leaves a file open",
-}
 MOST = {
     "unexplained_stops": 0,
     "rss_growth_mb": 10.0,
@@ -344,15 +340,14 @@ def bars(result: dict[str, Any]) -> list[str]:
 
 def main() -> None:
     """Prints a table, or one JSON object, and ends with 1 where a bar was missed."""
-    parser = parser_of(__doc__, CONTROLS)
+    parser = parser_of(__doc__)
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument(
         "--warm-up", type=float, default=1.0, help="minutes before it counts"
     )
     given = parser.parse_args()
     result = measure(given.minutes, given.warm_up, given.control)
-    table = "".join(f"{key:<28}{value}\n" for key, value in result.items())
-    answer(result, bars(result), table, given.json)
+    answer(result, bars(result), given.json)
 
 
 if __name__ == "__main__":

@@ -26,13 +26,6 @@ from parts.processes import use_of
 from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 
-CONTROLS = {
-    "stuck": "the poses of one world are put back after each step",
-    "blind": "one world goes on telling its first observation",
-    "endless": "the env's time limit is off",
-    "nan": "one number of an observation is none",
-    "leak": "1 MB more is held after each round; with --resets, a file more after each reset",
-}
 PAGE = 4096
 LIMIT = 300
 LONGEST_STILL = 20
@@ -281,30 +274,16 @@ def run_resets(resets: int, seed: int, control: str | None) -> dict[str, Any]:
     }
 
 
-def table_of(result: dict[str, Any]) -> str:
-    """One line per case, and the sum."""
-    text = f"{'case':<18}{'steps':>12}{'episodes':>10}{'longest':>9}{'still':>7}"
-    text += f"{'blind':>7}{'NaN':>5}\n"
-    for name, one in result["cases"].items():
-        text += f"{name:<18}{one['steps']:>12}{one['episodes']:>10}{one['longest']:>9}"
-        text += f"{one['still']:>7}{one['blind']:>7}{one['nans']:>5}\n"
-    return text + (
-        f"{result['steps']} steps in {result['seconds']:.0f} s; memory grew by "
-        f"{result['rss_growth_mb']:.1f} MB to {result['rss_end_mb']:.0f} MB\n"
-    )
-
-
 def main() -> None:
     """Prints a table, or one JSON object."""
-    parser = parser_of(__doc__, CONTROLS)
+    parser = parser_of(__doc__)
     add_options(parser)
     given = parser.parse_args()
     if given.resets:
         told = run_resets(given.resets, given.seed, given.control)
-        lines = "".join(f"{key:<16}{value}\n" for key, value in told.items())
-        answer(told, missed_of_resets(told), lines, given.json)
+        answer(told, missed_of_resets(told), given.json)
     result = run(given.steps, given.seed, given.cases, given.limit, given.control)
-    answer(result, missed_of(result), table_of(result), given.json)
+    answer(result, missed_of(result), given.json)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -1,10 +1,6 @@
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -16,7 +12,6 @@ from nics_drl_bridge.identify.open_loop import open_loop_error
 from nics_drl_bridge.recording.readers import read_recording
 
 CAMPAIGN = pytest.mark.campaign
-BENCHMARK = Path(__file__).resolve().parents[2] / "benchmarks" / "real_robot.py"
 
 
 @pytest.fixture(scope="module")
@@ -82,20 +77,6 @@ def test_a_drive_of_constant_command_is_refused(real_drives, car):
 
 
 @pytest.mark.process
-@CAMPAIGN
-def test_the_benchmark_prints_one_json_object(real_drives):
-    run = subprocess.run(
-        [sys.executable, BENCHMARK, "--json", "--train-until", "25"],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    result = json.loads(run.stdout)
-    assert result["horizon_s"] == 5.0
-    assert result["mean_position_error_m"] < 0.05
-    assert {"mean_heading_error_rad", "mean_path_m"} <= set(result)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "ahead", [*(pytest.param(t, marks=CAMPAIGN) for t in (7.0, -7.0)), 1.7e9]

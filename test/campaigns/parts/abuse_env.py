@@ -45,7 +45,6 @@ ROBOT = "ackermann"
 AHEAD = np.array([1.0, 0.0], np.float32)
 METHODS = ("command", "reset", "step_into")
 ERRORS = (ValueError, ZeroDivisionError, MemoryError, KeyboardInterrupt, SystemExit)
-CONTROLS = {"no_guard": "the zero that follows an exception"}
 Rng = np.random.Generator
 Throw = Callable[[BridgeEnv, Rng], None]
 
@@ -357,7 +356,7 @@ def campaign(seed: int, rounds: int, control: str | None = None) -> Score:
     Args:
         seed: of what is thrown, and from where.
         rounds: each takes some seconds.
-        control: of `CONTROLS`.
+        control: `no_guard`, or None.
 
     Raises:
         RuntimeError: the robot did not move, so that nothing was measured.

@@ -319,7 +319,7 @@ def measure(
     Args:
         kills, flips: of each artefact.
         seed: of all that is drawn.
-        control: see `CONTROLS` of `files.py`.
+        control: see the registry.
     """
     rng = np.random.default_rng(seed)
     by_artefact = {}

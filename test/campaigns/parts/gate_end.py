@@ -51,14 +51,6 @@ class Ended:
             "first_kept": self.first_kept,
         }
 
-    @property
-    def line(self) -> str:
-        """For the table."""
-        return (
-            f"{END:<26}{self.stops:>3} stops, ended after {self.exit_s:.3f} s, limit "
-            f"{LIMIT_S:.2f} s, first stop {'kept' if self.first_kept else 'LOST'}\n"
-        )
-
     def missed(self) -> list[str]:
         """A sentence for each bar that was missed."""
         missed = []

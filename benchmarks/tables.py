@@ -9,8 +9,6 @@ placeholders lead nowhere reads `not measured`.
 
 from __future__ import annotations
 
-import argparse
-import json
 import re
 import sys
 from collections import Counter
@@ -20,20 +18,13 @@ from statistics import harmonic_mean, mean
 from textwrap import shorten
 from typing import Any
 
-from measuring.figures import TABLES
-from measuring.run_all import MET, RESULTS
-from measuring.table import Table
+from bench import MET, RESULTS, ROOT, read_results
+from figures import PLACEHOLDER, TABLES, Table
 
-ROOT = RESULTS.parents[1]
 REGION = re.compile(r"<!-- results:([a-z0-9_]+) -->\n(.*?)<!-- /results -->", re.DOTALL)
-PLACEHOLDER = re.compile(
-    r"\{(?:(?P<how>max|min|sum|mean|harmonic_mean) )?(?:(?P<run>[a-z0-9_]+):)?(?P<path>[^{}|]+?)"
-    r"(?: x(?P<factor>[0-9.e+-]+))?(?:\|(?P<format>[^{}]*))?\}"
-)
 HOW = {"max": max, "min": min, "sum": sum, "mean": mean, "harmonic_mean": harmonic_mean}
 NOT_MEASURED = "not measured"
 OF_MISSED = "†"
-OF_QUICK = "‡"
 ELSEWHERE = "§"
 VERSIONS = ("numba", "numpy")
 MOST_TOLD = 3  # bars that a run missed; of more, one fewer and how many more there are
@@ -88,7 +79,7 @@ class Page:
     """The tables of one set of results."""
 
     def __init__(self, results: Mapping[str, Any]) -> None:
-        self.runs: Mapping[str, Any] = results.get("runs", {})
+        self.runs = results
         machines = Counter(map(machine_of, self.runs.values()))
         self.machines = [machine for machine, _ in machines.most_common()]
         """In words, that of most runs first."""
@@ -120,11 +111,10 @@ class Page:
         return machine_of(self.runs[run]) != self.machines[0]
 
     def marks(self, runs: set[str]) -> list[str]:
-        """Signs for a cell whose runs missed a bar, were short, or made on another machine."""
+        """Signs for a cell whose runs missed a bar, or were made on another machine."""
         known = [name for name in runs if name in self.runs]
         signs = {
             OF_MISSED: any(self.runs[name]["state"] != MET for name in known),
-            OF_QUICK: any(self.runs[name]["quick"] for name in known),
             ELSEWHERE: any(map(self.elsewhere, known)),
         }
         return [sign for sign, holds in signs.items() if holds]
@@ -142,7 +132,7 @@ class Page:
         return "\n".join(lines) + "\n"
 
     def notes(self, runs: set[str]) -> list[str]:
-        """A sentence for each run that missed a bar, broke or was short."""
+        """A sentence for each run that missed a bar or broke."""
         notes = []
         for name in sorted(runs & set(self.runs)):
             entry = self.runs[name]
@@ -156,8 +146,6 @@ class Page:
                 notes.append(
                     f"{OF_MISSED} `{entry['script']}` {entry['state']}: {wrong}"
                 )
-            if entry["quick"]:
-                notes.append(f"{OF_QUICK} `{entry['script']}`: a short run")
         away = sorted({name for name in runs & set(self.runs) if self.elsewhere(name)})
         if away:
             notes.append(f"{ELSEWHERE} on {', '.join(self.machines[1:])}")
@@ -182,7 +170,7 @@ class Page:
             else f"commit {entries[0]['commit']}"
         )
         days = sorted(e["started"][:10] for e in entries)
-        loads = [e["load_before"][0] for e in entries]
+        loads = [e["load"] for e in entries]
         versions = [f"Python {machine['python']}"]
         libraries = machine.get("libraries", {})
         versions += [
@@ -215,36 +203,20 @@ def documents() -> list[Path]:
     return [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
-def open_page(file: Path = RESULTS) -> Page:
-    """The tables of a file of results; of nothing when there is none."""
-    return Page(json.loads(file.read_text(encoding="utf-8")) if file.exists() else {})
-
-
-def main() -> None:
-    """Writes the tables, or says which are not as they should be."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument(
-        "--check", action="store_true", help="write nothing, end with 1 if unlike"
-    )
-    given = parser.parse_args()
-    page = open_page()
-    stale = []
+def write_tables(check: bool = False) -> int:
+    """Writes the tables of all documents, or only says which are stale; the exit code."""
+    page = Page(read_results(RESULTS))
+    stale = 0
     for path in documents():
         before = path.read_text(encoding="utf-8")
         after = rendered(before, page)
-        if after != before:
-            stale.append(path)
-            if not given.check:
-                path.write_text(after, encoding="utf-8")
-    for path in stale:
-        said = (
-            "is not what results.json gives; run `make tables`"
-            if given.check
-            else "written"
+        if after == before:
+            continue
+        stale += 1
+        if not check:
+            path.write_text(after, encoding="utf-8")
+        told = (
+            "is not what results.json gives; run `make tables`" if check else "written"
         )
-        sys.stdout.write(f"{path.relative_to(ROOT)}: {said}\n")
-    raise SystemExit(1 if given.check and stale else 0)
-
-
-if __name__ == "__main__":
-    main()
+        sys.stdout.write(f"{path.relative_to(ROOT)}: {told}\n")
+    return int(check and stale > 0)
