@@ -12,29 +12,24 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from campaign import answer, parser_of
+from campaign import answer, at_least, at_most, missed_bars, parser_of
 from parts import artefacts
 from parts.damaged_bags import damage_bags
 
-BARS = ("torn", "accepted_corrupt", "tracebacks", "silent_partial")
-MEASURED = ("kills", "flips", "cuts", "changes")
+BARS = {
+    **dict.fromkeys(
+        ("torn", "accepted_corrupt", "tracebacks", "silent_partial"), at_most(0)
+    ),
+    **dict.fromkeys(("kills", "flips", "cuts", "changes"), at_least(1)),
+}
 LEAST_DURING = 0.25
 """Share of the kills that have to hit a write."""
 
 
 def missed_of(result: dict[str, Any]) -> list[str]:
     """A sentence for each bar that is missed."""
-    missed = [f"{bar} {result[bar]}, the bar is 0" for bar in BARS if result[bar] != 0]
-    missed += [
-        f"{key} {result[key]}, the bar is 1" for key in MEASURED if not result[key] > 0
-    ]
-    during = result["kills_during_a_write"]
-    kills = result["kills"]
-    if not during >= LEAST_DURING * kills > 0:
-        missed.append(
-            f"kills_during_a_write {during} of {kills}, the bar is {100 * LEAST_DURING:.0f} %"
-        )
-    return missed
+    during = at_least(max(1, LEAST_DURING * result["kills"]))
+    return missed_bars(result, BARS | {"kills_during_a_write": during})
 
 
 def main() -> None:

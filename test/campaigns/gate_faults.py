@@ -13,7 +13,6 @@ zero.
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import signal
 import sys
@@ -26,10 +25,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from campaign import answer, parser_of
+from campaign import answer, at_least, at_most, missed_bars, parser_of
 from parts.faults import FAULTS, LATE_S, Around
 from parts.faulty_robot import ROBOT, SPEED, NoMotionError, Robot
 from parts.gate_end import END, Ended, end_after_stops
+from parts.processes import busy
 
 from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
@@ -75,22 +75,14 @@ class Result:
 
 def missed_by(name: str, one: dict[str, Any], wanted: int) -> list[str]:
     """A sentence for each bar that a fault's summary misses."""
-    missed = []
-    if one["n"] < wanted:
-        missed.append(
-            f"{name}: {one['n']} of {wanted} were measured: the robot did not move"
-        )
-    if not one["max_s"] <= one["limit_s"]:
-        missed.append(
-            f"{name}: zero after {one['max_s']} s at worst, limit {one['limit_s']} s"
-        )
-    if one["limit_s"] == LATE_S and not one["p50_s"] <= MEDIAN_S:
-        missed.append(
-            f"{name}: zero after {one['p50_s']} s in the median, bar {MEDIAN_S} s"
-        )
-    if one["unsafe_commands"] != 0:
-        missed.append(f"{name}: {one['unsafe_commands']} unsafe commands, bar 0")
-    return missed
+    bars = {
+        "n": at_least(wanted, "injections while the robot moved"),
+        "max_s": at_most(one["limit_s"], "time to zero [s]"),
+        "unsafe_commands": at_most(0),
+    }
+    if one["limit_s"] == LATE_S:
+        bars["p50_s"] = at_most(MEDIAN_S, "median time to zero [s]")
+    return missed_bars(one, bars, f"{name}: ")
 
 
 def inject(around: Around, name: str, result: Result, patience_s: float) -> None:
@@ -204,21 +196,6 @@ def _some(bench: Bench, name: str, repeats: int, result: Result) -> None:
                 return
 
 
-def _spin_for_ever() -> None:
-    while True:
-        pass
-
-
-def load(stack: ExitStack, count: int) -> None:
-    """Keeps so many cores busy until the stack ends."""
-    for _ in range(count):
-        process = multiprocessing.get_context("spawn").Process(
-            target=_spin_for_ever, daemon=True
-        )
-        process.start()
-        stack.callback(process.kill)
-
-
 def _ends(given: Any, control: str, told: Callable[[str], None]) -> Ended:
     """The end of a gate after many stops."""
     with ExitStack() as stack:
@@ -251,8 +228,7 @@ def main() -> None:
     def told(line: str) -> None:
         sys.stderr.write(f"{line}\n")
 
-    with ExitStack() as stack:
-        load(stack, given.load)
+    with busy(given.load):
         faults = [name for name in names if name != END]
         results = measure(faults, given.repeats, told, control)
         ended = _ends(given, control, told) if END in names else None

@@ -14,24 +14,21 @@ SIGINT: `exit_s` is how long it still lives. The first of those stops has to be 
 from __future__ import annotations
 
 import argparse
-import os
 import signal
 import subprocess
-import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import rclpy
-from campaign import answer, parser_of
+from campaign import answer, at_least, at_most, missed_bars, parser_of
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
-from parts.processes import core_seconds
+from parts.processes import core_seconds, part
 from parts.steady_robot import ODOM_HZ, PATIENCE_S, ROBOT, SteadyRobot
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Bool
@@ -43,14 +40,16 @@ from nics_drl_bridge.nodes.start import start
 
 GATE = "command_gate"
 TICK_HZ = 50
-MOST_RATIO = 1.1
-"""Of the gate's share of a core to that of a bare node that hears the same."""
-LONGEST_GAP_S = 0.2
-"""Between two commands; after such a one the gate itself stops."""
-LEAST_SENT, LEAST_MOVING = 0.9, 0.8
-"""Shares of the messages that were to be sent, and of the commands that came and moved."""
-LONGEST_EXIT_S = 2.0
-LEAST_STOPS = 3
+BARS = {
+    "ratio": at_most(1.1, "the gate's share of a core to the bare node's"),
+    "longest_gap_s": at_most(0.2, "time without a command [s]"),
+    "longest_gap_in_burst_s": at_most(0.2, "time without a command in the burst [s]"),
+    "sent": at_least(0.9, "invalid: share of the messages that were sent"),
+    "moving": at_least(0.8, "invalid: share of the commands that came and moved"),
+    "stops": at_least(3, "invalid: stops in the burst"),
+    "exit_s": at_most(2.0, "from SIGINT to the gate's end [s]"),
+}
+"""After a gap between two commands of more than 0.2 s the gate itself stops."""
 BUSY = 10
 HUNG_S = 4.0
 
@@ -103,22 +102,6 @@ def _often(call: Callable[..., Any]) -> Callable[..., Any]:
     return again
 
 
-@contextmanager
-def started(words: list[str], domain_id: int) -> Iterator[subprocess.Popen[bytes]]:
-    """This script as another process."""
-    environment = os.environ | {
-        "ROS_DOMAIN_ID": str(domain_id),
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-    }
-    with subprocess.Popen(
-        [sys.executable, __file__, *words], env=environment, stderr=subprocess.DEVNULL
-    ) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
-
-
 def gate(domain_id: int, folder: Path, control: str) -> Any:
     """The gate as a process, or a control's."""
     parameters = {
@@ -133,15 +116,9 @@ def gate(domain_id: int, folder: Path, control: str) -> Any:
         "stop_when_held": "false",  # the robot's scans do not show how it moves
     }
     given = [f"{name}:={value}" for name, value in parameters.items()]
-    return started(
-        [
-            "--part",
-            control or "gate",
-            "--ros-args",
-            *(word for one in given for word in ("-p", one)),
-        ],
-        domain_id,
-    )
+    words = ["--part", control or "gate", "--ros-args"]
+    words += [word for one in given for word in ("-p", one)]
+    return part(__file__, domain_id, *words, stderr=subprocess.DEVNULL)
 
 
 def measure(seconds: float, burst_s: float, control: str) -> dict[str, Any]:
@@ -150,7 +127,7 @@ def measure(seconds: float, burst_s: float, control: str) -> dict[str, Any]:
     with (
         tempfile.TemporaryDirectory() as name,
         gate(domain_id, Path(name), control) as real,
-        started(["--part", "bare"], domain_id) as bare,
+        part(__file__, domain_id, "--part", "bare", stderr=subprocess.DEVNULL) as bare,
     ):
         robot = SteadyRobot(domain_id)
         try:
@@ -215,35 +192,6 @@ def ended_after_a_burst(
     }
 
 
-def missed_bars(result: dict[str, Any]) -> list[str]:
-    """A sentence for each bar that was missed."""
-    missed = []
-    if not result["ratio"] <= MOST_RATIO:
-        missed.append(
-            f"the gate takes {result['ratio']} times what the bare node takes, bar {MOST_RATIO}"
-        )
-    for key in ("longest_gap_s", "longest_gap_in_burst_s"):
-        if not result[key] <= LONGEST_GAP_S:
-            missed.append(
-                f"{key}: no command for {result[key]} s, bar {LONGEST_GAP_S} s"
-            )
-    if not result["sent"] >= LEAST_SENT:
-        missed.append(f"invalid: only {result['sent']} of the messages were sent")
-    if not result["moving"] >= LEAST_MOVING:
-        missed.append(
-            f"invalid: only {result['moving']} of the commands came and moved"
-        )
-    if not result["stops"] >= LEAST_STOPS:
-        missed.append(f"invalid: only {result['stops']} stops in the burst")
-    if not result["exit_s"] <= LONGEST_EXIT_S:
-        missed.append(
-            f"the gate ended {result['exit_s']} s after SIGINT, bar {LONGEST_EXIT_S} s"
-        )
-    if not result["replayed"]:
-        missed.append("the first stop of the burst is not in the black box")
-    return missed
-
-
 def main() -> None:
     """Prints a table, or one JSON object; ends with 1 when a bar was missed."""
     parser = parser_of(__doc__)
@@ -264,7 +212,10 @@ def main() -> None:
     if rest:
         parser.error(f"unrecognized arguments: {' '.join(rest)}")
     result = measure(given.seconds, given.burst, given.control or "")
-    answer(result, missed_bars(result), given.json)
+    missed = missed_bars(result, BARS)
+    if not result["replayed"]:
+        missed.append("the first stop of the burst is not in the black box")
+    answer(result, missed, given.json)
 
 
 if __name__ == "__main__":

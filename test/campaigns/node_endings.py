@@ -18,12 +18,13 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from campaign import answer, parser_of
+from parts.processes import busy
 
 from nics_drl_bridge.nodes.parameters import NODES
 from nics_drl_bridge.nodes.processes import free_domain_id
@@ -78,22 +79,6 @@ if sys.argv[2] == "native":
     event.register("numba:compile", Long())
 start.start(sys.argv[3], sys.argv[3:])
 """
-LOOP = """
-while True:
-    pass
-"""
-
-
-@contextmanager
-def busy(loops: int) -> Iterator[None]:
-    """Runs busy loops beside the block."""
-    started = [subprocess.Popen([sys.executable, "-c", LOOP]) for _ in range(loops)]
-    try:
-        yield
-    finally:
-        for each in started:
-            each.kill()
-            each.wait()
 
 
 def ended(

@@ -23,13 +23,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from campaign import answer, parser_of
+from campaign import answer, at_least, at_most, missed_bars, parser_of
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from parts.faulty_robot import PERIOD_S, ROBOT, SPEED
 from parts.lossy_link import Link, NoNamespacesError, link
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
+from parts.spun_node import SpunNode
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
@@ -37,7 +36,6 @@ from std_srvs.srv import Trigger
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.nodes.processes import NodeProcess
 
 LOSSES = (5, 20)
@@ -56,25 +54,7 @@ NETWORK = {
 """Shared memory would go past the network."""
 
 
-class _End:
-    """A node that is spun by the caller."""
-
-    def __init__(self, name: str) -> None:
-        self._context = open_context()
-        self.node = Node(name, context=self._context, start_parameter_services=False)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self.node)
-
-    def spin(self) -> None:
-        self._executor.spin_once(timeout_sec=0.01)
-
-    def close(self) -> None:
-        self._executor.shutdown(timeout_sec=1.0)
-        self.node.destroy_node()
-        self._context.try_shutdown()
-
-
-class Stack(_End):
+class Stack(SpunNode):
     """A policy that answers each scan with the same command, and tells the gate it is located.
 
     Attributes:
@@ -112,7 +92,7 @@ class Stack(_End):
             self._past.publish(self._last)
 
 
-class Robot(_End):
+class Robot(SpunNode):
     """Sends what a robot sends, does what `cmd_vel` says, and arms the gate whenever it can.
 
     Attributes:
@@ -291,28 +271,24 @@ def measure(percent: int, seconds: float, cable: Link, control: str) -> dict[str
     }
 
 
-def missed_bars(name: str, one: dict[str, Any]) -> list[str]:
+def missed_of(name: str, one: dict[str, Any]) -> list[str]:
     """A sentence for each bar that a loss missed."""
-    missed = []
     low, high = (share * one["scans_asked"] for share in SENT_SHARES)
-    if not low <= one["scans_sent"] <= high:
-        missed.append(
-            f"invalid: the robot sent {one['scans_sent']} scans, not {one['scans_asked']}"
-        )
-    if not one["scans_arrived"] < one["scans_sent"]:
-        missed.append(
-            f"invalid: {one['scans_arrived']} of {one['scans_sent']} scans arrived, none was lost"
-        )
-    if not one["moving_commands"] > 0:
-        missed.append("invalid: nothing moved")
-    if not one["worst_age_s"] <= SCAN_AGE_S + TOLERANCE_S:  # NaN, too
-        missed.append(
-            f"the data behind a motion were {one['worst_age_s']} s old, bar "
-            f"{SCAN_AGE_S + TOLERANCE_S:.2f} s"
-        )
-    if one["unsafe_commands"] != 0:
-        missed.append(f"{one['unsafe_commands']} unsafe commands, bar 0")
-    return [f"{name}: {line}" for line in missed]
+    sent = "invalid: scans that the robot sent"
+    figures = one | {"most_sent": one["scans_sent"]}
+    bars = {
+        "scans_sent": at_least(low, sent),
+        "most_sent": at_most(high, sent),
+        "scans_arrived": at_most(
+            one["scans_sent"] - 1, "invalid: none was lost: scans that arrived"
+        ),
+        "moving_commands": at_least(1, "invalid: nothing moved: moving commands"),
+        "worst_age_s": at_most(
+            SCAN_AGE_S + TOLERANCE_S, "age of the data behind a motion [s]"
+        ),
+        "unsafe_commands": at_most(0),
+    }
+    return missed_bars(figures, bars, f"{name}: ")
 
 
 def main() -> None:
@@ -342,7 +318,7 @@ def main() -> None:
     except NoNamespacesError as error:
         sys.stderr.write(f"{error}\n")
         raise SystemExit(2) from None
-    missed = [line for name, one in runs.items() for line in missed_bars(name, one)]
+    missed = [line for name, one in runs.items() for line in missed_of(name, one)]
     unsafe = sum(one["unsafe_commands"] for one in runs.values())
     answer(runs | {"unsafe_commands": unsafe}, missed, given.json)
 

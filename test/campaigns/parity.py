@@ -19,7 +19,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from campaign import answer, parser_of
+from campaign import answer, at_least, at_most, missed_bars, parser_of
 from measuring.standing import standing_action
 
 from nics_drl_bridge.env.registry import COOPERATIVE_REACHING, NAVIGATION, register_envs
@@ -35,6 +35,7 @@ OF_CLOCKS = {"stamp_ns"}
 DIFFERENCE = "max_abs_observation_difference"
 LATE = "late_observations"
 DRIVEN = "driven_m"
+BARS = {DIFFERENCE: at_most(0), LATE: at_most(0), DRIVEN: at_least(DRIVEN_M)}
 ROBOTS = ("ackermann", "differential", "mecanum")
 FLEET = 4
 
@@ -202,20 +203,6 @@ def measure_all(
     }
 
 
-def bars(result: dict[str, Any]) -> list[str]:
-    """A sentence for each bar that was missed."""
-    missed = []
-    if not result[DIFFERENCE] <= 0.0:
-        missed.append(f"{DIFFERENCE} {result[DIFFERENCE]:g}: must be 0")
-    if not result[LATE] <= 0:
-        missed.append(f"{LATE} {result[LATE]}: must be 0")
-    if not result[DRIVEN] >= DRIVEN_M:
-        missed.append(
-            f"{DRIVEN} {result[DRIVEN]}: must be {DRIVEN_M} at least in every run"
-        )
-    return missed
-
-
 def main() -> None:
     """Prints a table, or one JSON object, and ends with 1 where a bar was missed."""
     parser = parser_of(__doc__)
@@ -233,7 +220,7 @@ def main() -> None:
         result = measure(
             robot, given.world, given.steps, given.seed, alone, given.control
         )
-    answer(result, bars(result), given.json)
+    answer(result, missed_bars(result, BARS), given.json)
 
 
 if __name__ == "__main__":

@@ -153,17 +153,17 @@ CAMPAIGNS: dict[str, Campaign] = {
         {
             "slow_gate": Control(
                 "the gate's ages: it lets data get ten times as old",
-                "scan_silent: zero after",
+                "scan_silent: time to zero [s]",
                 ONE_FAULT,
             ),
             "no_gate": Control(
                 "the gate: commands are relayed past it",
-                "scan_silent: zero after inf s",
+                "scan_silent: time to zero [s] inf",
                 ONE_FAULT,
             ),
             "standing": Control(
                 "the motion: the robot is never told to move",
-                "scan_silent: 0 of 1 were measured",
+                "scan_silent: injections while the robot moved 0",
                 ONE_FAULT,
             ),
         },
@@ -175,7 +175,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         {
             "busy": Control(
                 "haste: the gate reads each message and decides ten times",
-                "times what the bare node takes",
+                "the gate's share of a core",
             ),
             "slow_disk": Control(
                 "the disk: the gate waits for one that does not answer, at its end",
@@ -226,14 +226,14 @@ CAMPAIGNS: dict[str, Campaign] = {
         {
             "no_gate": Control(
                 "the gate: the policy's last command is repeated to the base",
-                "unsafe commands, bar 0",
+                "unsafe_commands",
                 "--seconds 6 --loss 40",
             ),
             "standing": Control(
                 "the motion: nobody arms the gate", "invalid: nothing moved"
             ),
             "no_loss": Control("the losses", "none was lost"),
-            "slow_robot": Control("two scans of three", "the robot sent "),
+            "slow_robot": Control("two scans of three", "scans that the robot sent"),
         },
         ("rclpy", "root"),
         attempts=REAL_TIME,
@@ -241,13 +241,15 @@ CAMPAIGNS: dict[str, Campaign] = {
     "parity": Campaign(
         "--steps 25 --robot ackermann",
         {
-            "nan": Control("a number of one observation", "inf: must be 0"),
+            "nan": Control(
+                "a number of one observation", "difference inf: must be at most 0"
+            ),
             "noise": Control("the last bit of one number", "difference "),
             "late": Control(
                 "one observation, of which the one before is told again",
                 "late_observations",
             ),
-            "standing": Control("the commands: no robot drives", "driven_m 0.0"),
+            "standing": Control("the commands: no robot drives", "driven_m 0:"),
         },
         ROS,
     ),
@@ -260,7 +262,7 @@ CAMPAIGNS: dict[str, Campaign] = {
             "standing": Control("the commands: no robot drives", ": driven_m 0"),
             "deaf": Control(
                 "the topics of one robot, which nobody receives",
-                "robot2 of 2: scan 0,",
+                "robot2 of 2: scan 0:",
                 "--robots 2 --seconds 2 --patience 15",
             ),
         },
@@ -292,7 +294,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         {
             "standing": Control(
                 "the gate's consent: the robot in real time never moves",
-                "driven_m 0.0: must be",
+                "driven_m 0:",
                 "--minutes 0.05 --warm-up 0.0",
             ),
             "leak": Control(

@@ -19,16 +19,15 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from campaign import answer, parser_of
+from campaign import answer, at_least, missed_bars, parser_of
 from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
+from parts.processes import core_seconds, part, use_of
 from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 
@@ -45,6 +44,11 @@ COMMAND_HZ = 10.0
 COMMAND = (0.3, 0.0, 0.3)
 DRIVEN_M = 0.1
 """Less is no drive: odometry drifts, and some are placed where they soon touch another one."""
+BARS = {
+    "scan": at_least(SHARE * SCAN_HZ),
+    "odom": at_least(SHARE * ODOM_HZ),
+    "driven_m": at_least(DRIVEN_M),
+}
 SIZES = (20, 24, 28, 32, 40, 48, 56, 64)
 SIDE_PER_ROBOT_M = 3.0
 SETTLE_S = 2.0
@@ -173,39 +177,6 @@ def world_file(folder: Path, robots: int) -> Path:
     return file
 
 
-def cpu_seconds(pid: int) -> float:
-    """Processor time that a process and all its threads have used."""
-    fields = (
-        Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
-    )
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
-def rss_mb(pid: int) -> float:
-    """Resident memory of a process."""
-    pages = int(Path(f"/proc/{pid}/statm").read_text(encoding="utf-8").split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
-
-
-@contextmanager
-def part(domain_id: int, *options: str) -> Iterator[subprocess.Popen[str]]:
-    """This script in a process of its own, as listener or commander."""
-    environment = {
-        "ROS_DOMAIN_ID": str(domain_id),
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-    }
-    with subprocess.Popen(
-        [sys.executable, __file__, *options],
-        env=os.environ | environment,
-        stdout=subprocess.PIPE,
-        text=True,
-    ) as process:
-        try:
-            yield process
-        finally:
-            process.terminate()
-
-
 def measure(robots: int, seconds: float, patience_s: float, control: str | None) -> Run:
     """Runs a fleet of `robots`, drives it, and listens to it for `seconds`."""
     domain_id = free_domain_id()
@@ -233,9 +204,17 @@ def measure(robots: int, seconds: float, patience_s: float, control: str | None)
             NodeProcess(
                 "simulator_node", Path(name), parameters, domain_id
             ) as simulator,
-            part(domain_id, "--part", "command", "--robots", driven),
+            part(__file__, domain_id, "--part", "command", "--robots", driven),
             part(
-                domain_id, "--part", "listen", "--robots", fleet, *options
+                __file__,
+                domain_id,
+                "--part",
+                "listen",
+                "--robots",
+                fleet,
+                *options,
+                stdout=subprocess.PIPE,
+                text=True,
             ) as listener,
         ):
             if (
@@ -245,11 +224,11 @@ def measure(robots: int, seconds: float, patience_s: float, control: str | None)
                 simulator.check()
                 raise RuntimeError("the listener ended without a result")
             simulator.check()
-            before = cpu_seconds(simulator.pid)
+            before = core_seconds(simulator.pid)
             began = time.monotonic()
             each = json.loads(listener.stdout.readline())
-            cores = (cpu_seconds(simulator.pid) - before) / (time.monotonic() - began)
-            memory = rss_mb(simulator.pid)
+            cores = (core_seconds(simulator.pid) - before) / (time.monotonic() - began)
+            memory = use_of(simulator.pid).rss_mb
     each = {
         name: {key: round(v, 3) for key, v in told.items()}
         for name, told in each.items()
@@ -281,16 +260,13 @@ def smaller(failed: Run, seconds: float, patience_s: float) -> Run:
     return failed
 
 
-def bars(run: Run) -> list[str]:
+def missed_of(run: Run) -> list[str]:
     """A sentence for each bar that was missed, with the robot that misses it most."""
     missed = []
-    least = {"scan": SHARE * SCAN_HZ, "odom": SHARE * ODOM_HZ, "driven_m": DRIVEN_M}
-    for key, bar in least.items():
-        figure, worst = min((told[key], name) for name, told in run.each.items())
-        if not figure >= bar:
-            missed.append(
-                f"{worst} of {run.robots}: {key} {figure:g}, must be {bar:g} at least"
-            )
+    for key, bar in BARS.items():
+        worst = min(run.each, key=lambda name, key=key: run.each[name][key])
+        where = f"{worst} of {run.robots}: "
+        missed += missed_bars(run.each[worst], {key: bar}, where)
     return missed
 
 
@@ -319,7 +295,7 @@ def main() -> None:
             else measure(robots, given.seconds, given.patience, given.control)
         )
         result = asdict(run)
-        answer(result, bars(run), given.json)
+        answer(result, missed_of(run), given.json)
 
 
 if __name__ == "__main__":

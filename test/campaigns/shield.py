@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from campaign import answer, parser_of
+from campaign import answer, at_least, at_most, missed_bars, parser_of
 from parts import shield_in_process
 from parts.adversaries import ADVERSARIES
 from parts.braking import braking_used
@@ -183,48 +183,23 @@ def _mean(values: Sequence[float]) -> float | None:
 
 def missed(result: Mapping[str, Any], asked: int) -> list[str]:
     """A sentence for each bar that was missed."""
-    tried = result["tried_without"]
-    reached = result["goals_reached_without"]
-    bars = [
-        ("contacts of robots in motion", result["contacts"], "at most", 0),
-        ("episodes driven", result["episodes"], "at least", max(asked, 1)),
-        ("path driven [m]", result["path_m"], "at least", LEAST_PATH * asked),
-        (
-            "share of the time for which the robots were held up",
-            result["held_up_share"],
-            "at most",
-            MOST_HELD_UP,
+    least_contacts = max(1.0, LEAST_CONTACTS_WITHOUT * result["tried_without"])
+    least_goals = max(1.0, LEAST_GOALS * result["goals_reached_without"])
+    bars = {
+        "contacts": at_most(0, "contacts of robots in motion"),
+        "episodes": at_least(max(asked, 1), "episodes driven"),
+        "path_m": at_least(LEAST_PATH * asked, "path driven [m]"),
+        "held_up_share": at_most(
+            MOST_HELD_UP, "share of the time for which the robots were held up"
         ),
-        (
-            "latched stops",
-            result["latched"],
-            "at most",
-            math.ceil(MOST_LATCHED * asked),
+        "latched": at_most(math.ceil(MOST_LATCHED * asked), "latched stops"),
+        "contacts_without": at_least(least_contacts, "contacts without the shield"),
+        "goals_reached": at_least(least_goals, "goals reached"),
+        "braking": at_most(
+            1.0, "braking distance in parts of what the shield keeps free"
         ),
-        (
-            "contacts without the shield",
-            result["contacts_without"],
-            "at least",
-            max(1.0, LEAST_CONTACTS_WITHOUT * tried),
-        ),
-        (
-            "goals reached",
-            result["goals_reached"],
-            "at least",
-            max(1.0, LEAST_GOALS * reached),
-        ),
-        (
-            "braking distance in parts of what the shield keeps free",
-            result["braking"],
-            "at most",
-            1.0,
-        ),
-    ]
-    return [
-        f"{what}: {value:g}, the bar is {side} {bar:g}"
-        for what, value, side, bar in bars
-        if not (value <= bar if side == "at most" else value >= bar)
-    ]
+    }
+    return missed_bars(result, bars)
 
 
 def main() -> None:

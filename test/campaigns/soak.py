@@ -22,19 +22,17 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from campaign import answer, parser_of
+from campaign import answer, at_least, at_most, missed_bars, parser_of
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from parts.processes import Use, use_of
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
+from parts.spun_node import SpunNode
 from std_srvs.srv import Trigger
 
 from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 
 ROBOT = "differential"
@@ -45,19 +43,20 @@ STEPS_PER_EPISODE = 20
 SAMPLE_S = 5.0
 PATIENCE_S = 90.0
 GOAL_AGAIN_S = 1.0
-MOST = {
-    "unexplained_stops": 0,
-    "rss_growth_mb": 10.0,
-    "fds_growth": 0,
-    "threads_growth": 0,
+BARS = {
+    "unexplained_stops": at_most(0),
+    "rss_growth_mb": at_most(10.0),
+    "fds_growth": at_most(0),
+    "threads_growth": at_most(0),
+    "resets": at_least(1),
+    "steps": at_least(1),
+    "driven_in_episodes_m": at_least(0.2),
 }
-LEAST = {"resets": 1, "steps": 1}
-LEAST_PER_MINUTE = {"driven_m": 2.0, "goals_reached": 1}
-DRIVEN_M = 0.2
-"""Least of the robot of the episodes, over all."""
+DRIVEN_M, GOALS_REACHED = 2.0, 1.0
+"""In each minute, at least."""
 
 
-class Drive:
+class Drive(SpunNode):
     """Arms the gate, sends goals one after the other, and counts the stops that the gate tells of.
 
     Args:
@@ -73,20 +72,17 @@ class Drive:
     def __init__(self, domain_id: int, armed: bool) -> None:
         self.driven_m = 0.0
         self._place = None
-        self._context = open_context(domain_id=domain_id)
-        self._node = Node("soak", context=self._context, start_parameter_services=False)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self._node)
+        super().__init__("soak", domain_id)
         self.goals = 0
         self.stops = {}
         self._sent_s = 0.0
         self.armed = armed
         self._asked_s = 0.0
         self._answer = None
-        self._goal = self._node.create_publisher(PoseStamped, "goal_pose", qos.COMMAND)
-        self._arm = self._node.create_client(Trigger, "command_gate/arm")
-        self._node.create_subscription(Odometry, "ground_truth", self._look, qos.SENSOR)
-        self._node.create_subscription(DiagnosticArray, "/diagnostics", self._read, 10)
+        self._goal = self.node.create_publisher(PoseStamped, "goal_pose", qos.COMMAND)
+        self._arm = self.node.create_client(Trigger, "command_gate/arm")
+        self.node.create_subscription(Odometry, "ground_truth", self._look, qos.SENSOR)
+        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._read, 10)
 
     def _look(self, message: Odometry) -> None:
         pose = conversions.odometry_from_ros(message)[0]
@@ -126,16 +122,10 @@ class Drive:
         ):
             self._asked_s, self._answer = now, self._arm.call_async(Trigger.Request())
 
-    def spin(self) -> None:
+    def go_on(self) -> None:
         """Handles what has come."""
         for _ in range(20):
-            self._executor.spin_once(timeout_sec=0.0)
-
-    def close(self) -> None:
-        """Leaves the graph."""
-        self._executor.shutdown(timeout_sec=1.0)
-        self._node.destroy_node()
-        self._context.try_shutdown()
+            self.spin(0.0)
 
 
 class Episodes:
@@ -248,7 +238,7 @@ def run(soak: Soak, seconds: float) -> list[dict[str, Use]]:
     end = time.monotonic() + seconds
     due = time.monotonic()
     while (now := time.monotonic()) < end:
-        soak.drive.spin()
+        soak.drive.go_on()
         soak.drive.arm()
         soak.episodes.go_on()
         if now > due:
@@ -318,24 +308,15 @@ def counts(soak: Soak) -> dict[str, float]:
     }
 
 
-def bars(result: dict[str, Any]) -> list[str]:
+def missed_of(result: dict[str, Any]) -> list[str]:
     """A sentence for each bar that was missed."""
     minutes = result["minutes"]
-    least = LEAST | {name: rate * minutes for name, rate in LEAST_PER_MINUTE.items()}
-    least["goals_reached"] = int(least["goals_reached"])  # of whole minutes
-    least["driven_in_episodes_m"] = DRIVEN_M
-    return [
-        *(
-            f"{name} {result[name]}: must be {bar} at most"
-            for name, bar in MOST.items()
-            if not result[name] <= bar
-        ),
-        *(
-            f"{name} {result[name]}: must be {bar:g} at least"
-            for name, bar in least.items()
-            if not result[name] >= bar
-        ),
-    ]
+    goals = int(GOALS_REACHED * minutes)  # of whole minutes
+    rates = {
+        "driven_m": at_least(DRIVEN_M * minutes),
+        "goals_reached": at_least(goals),
+    }
+    return missed_bars(result, BARS | rates)
 
 
 def main() -> None:
@@ -347,7 +328,7 @@ def main() -> None:
     )
     given = parser.parse_args()
     result = measure(given.minutes, given.warm_up, given.control)
-    answer(result, bars(result), given.json)
+    answer(result, missed_of(result), given.json)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -26,7 +25,6 @@ from parts.processes import use_of
 from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 
-PAGE = 4096
 LIMIT = 300
 LONGEST_STILL = 20
 """A free robot that is told to move at random stands no longer than so many steps."""
@@ -70,11 +68,6 @@ class Findings:
     longest: int = 0
     still: int = 0
     blind: int = 0
-
-
-def resident_mb() -> float:
-    """Memory of this process that is resident [MB]."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * PAGE / 1e6
 
 
 def not_finite(*arrays: NDArray[Any]) -> int:
@@ -172,7 +165,7 @@ def run(
             soak(case, math.ceil(steps / (ROUNDS * len(cases))), rng, control)
         if control == "leak":
             held.append(np.ones(2**17))
-        memory.append(resident_mb())
+        memory.append(use_of().rss_mb)
     stuck = {name: stuck_in(one, limit) for name, one in found.items()}
     return {
         "steps": sum(one.steps for one in found.values()),

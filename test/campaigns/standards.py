@@ -27,15 +27,15 @@ from typing import Any
 import gymnasium
 import nav2_standards
 import numpy as np
-from campaign import answer, parser_of
+from campaign import answer, at_most, missed_bars, parser_of
 
 from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 
 BARS = {
-    "sim_conformance_failed": 0,
-    "client_overhead": 0.1,
-    "leapp_max_abs_difference": 1e-6,
+    "sim_conformance_failed": at_most(0),
+    "client_overhead": at_most(0.1),
+    "leapp_max_abs_difference": at_most(1e-6),
 }
 ROBOT = "ackermann"
 WORLD = "circles"
@@ -190,11 +190,8 @@ def leapp(folder: Path, control: str | None) -> dict[str, float]:
 
 def missed_of(result: dict[str, Any]) -> list[str]:
     """A sentence for each bar that was missed."""
-    missed = [
-        f"{name} {result[name]}: must be {bar:g} at most"
-        for name, bar in BARS.items()
-        if name in result and not result[name] <= bar
-    ]
+    measured = {name: bar for name, bar in BARS.items() if name in result}
+    missed = missed_bars(result, measured)
     if "map_agreement" in result:
         missed += nav2_standards.missed_of(result)
     return [*missed, *result.get("failed", [])]

@@ -28,17 +28,17 @@ def ros_module(module):
 NAN = float("nan")
 
 
-def test_a_figure_that_is_nan_misses_every_bar(ros_module):
-    parity = ros_module("parity")
-    result = {parity.DIFFERENCE: NAN, parity.LATE: NAN, parity.DRIVEN: NAN}
-    assert len(parity.bars(result)) == 3
+def test_the_robot_of_a_fleet_that_was_heard_least_is_named(ros_module):
     fleet = ros_module("ros_fleet")
-    each = {"robot1": {"scan": NAN, "odom": NAN, "driven_m": NAN}}
-    assert len(fleet.bars(fleet.Run(1, NAN, NAN, NAN, 0.1, 1.0, each))) == 3
-    soak = ros_module("soak")
-    names = [*soak.MOST, *soak.LEAST, *soak.LEAST_PER_MINUTE, "driven_in_episodes_m"]
-    result = dict.fromkeys(names, NAN) | {"minutes": 1.0}
-    assert len(soak.bars(result)) == len(names)
+    each = {
+        "robot1": {"scan": 10.0, "odom": 50.0, "driven_m": 1.0},
+        "robot2": {"scan": 9.0, "odom": 50.0, "driven_m": 0.0},
+    }
+    missed = fleet.missed_of(fleet.Run(2, 9.0, 50.0, 0.0, 0.1, 1.0, each))
+    assert [line.split(": ")[:2] for line in missed] == [
+        ["robot2 of 2", "scan 9"],
+        ["robot2 of 2", "driven_m 0"],
+    ]
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
+from parts.spun_node import SpunNode
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -61,7 +62,7 @@ def hear(domain_id: int, out: Connection) -> None:
         executor.spin_once()
 
 
-class Robot:
+class Robot(SpunNode):
     """A robot's topics, whole or broken. It does what `cmd_vel` says, unless it is stuck.
 
     Commands are heard in a process of their own, as by a base: who publishes to a process that was
@@ -81,10 +82,7 @@ class Robot:
         self, domain_id: int, policy: bool, speed: float = SPEED, relayed: bool = False
     ) -> None:
         self._lidar = builtin_model(ROBOT).lidar
-        self._context = driver_context(domain_id)
-        self.node = Node("robot", context=self._context, start_parameter_services=False)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self.node)
+        super().__init__("robot", context=driver_context(domain_id))
         kinds = {
             "odom": Odometry,
             "scan": LaserScan,
@@ -190,15 +188,13 @@ class Robot:
         self, condition: Callable[[], object], seconds: float, what: str = ""
     ) -> None:
         """Lives on until something is the case; raises after the time, if it is to be named."""
-        end = time.monotonic() + seconds
-        self._listen()
-        while not condition():
-            if time.monotonic() > end:
-                if what:
-                    raise RuntimeError(f"not within {seconds} s: {what}")
-                return
-            self._executor.spin_once(timeout_sec=0.01)
+
+        def holds() -> object:
             self._listen()
+            return condition()
+
+        if not super().until(holds, seconds) and what:
+            raise RuntimeError(f"not within {seconds} s: {what}")
 
     def call(self, service: str) -> Trigger.Response:
         """Asks the gate for something."""
@@ -250,8 +246,6 @@ class Robot:
 
     def close(self) -> None:
         """Leaves the graph."""
-        self._executor.shutdown(timeout_sec=1.0)
-        self.node.destroy_node()
-        self._context.try_shutdown()
+        super().close()
         self._base.terminate()
         self._base.join()

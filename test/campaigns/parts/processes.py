@@ -1,10 +1,15 @@
-"""What a process uses, from /proc (Linux)."""
+"""Other processes, and what they use, from /proc (Linux)."""
 
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -44,3 +49,40 @@ def core_seconds(pid: int) -> float:
     user = int(fields[11])
     system = int(fields[12])
     return (user + system) / os.sysconf("SC_CLK_TCK")
+
+
+@contextmanager
+def busy(loops: int) -> Iterator[None]:
+    """Runs busy loops beside the block."""
+    words = [sys.executable, "-c", "while True: pass"]
+    started = [subprocess.Popen(words) for _ in range(loops)]
+    try:
+        yield
+    finally:
+        for each in started:
+            each.kill()
+            each.wait()
+
+
+@contextmanager
+def part(
+    script: str, domain_id: int, *words: str, **given: Any
+) -> Iterator[subprocess.Popen[Any]]:
+    """A script in a process of its own, in a ROS domain, until the end of the block.
+
+    Args:
+        script: its file.
+        domain_id: of ROS.
+        words: its arguments.
+        given: further arguments of `Popen`.
+    """
+    environment = os.environ | {
+        "ROS_DOMAIN_ID": str(domain_id),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+    }
+    command = [sys.executable, script, *words]
+    with subprocess.Popen(command, env=environment, **given) as process:
+        try:
+            yield process
+        finally:
+            process.kill()

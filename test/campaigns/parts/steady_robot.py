@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 
 import numpy as np
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
+from parts.spun_node import SpunNode
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
@@ -17,7 +15,6 @@ from std_srvs.srv import Trigger
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.nodes.wire import OdometryWriter, ScanWriter
 
 ROBOT = "ackermann"
@@ -27,7 +24,7 @@ ODOM_HZ = 50
 PATIENCE_S = 120.0
 
 
-class SteadyRobot:
+class SteadyRobot(SpunNode):
     """Publishes what a robot, its policy and its estimator do, and arms the gate.
 
     Attributes:
@@ -37,10 +34,7 @@ class SteadyRobot:
     """
 
     def __init__(self, domain_id: int) -> None:
-        self._context = open_context(domain_id=domain_id)
-        self.node = Node("robot", context=self._context, start_parameter_services=False)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self.node)
+        super().__init__("robot", domain_id)
         lidar = builtin_model(ROBOT).lidar
         self._ranges = np.full(lidar.beams, 2.0, np.float32)
         self._scans = ScanWriter(
@@ -104,15 +98,6 @@ class SteadyRobot:
         self._topics["cmd_vel_raw"].publish(command)
         self._stamp_ns = stamp_ns
 
-    def until(self, done: Callable[[], object], seconds: float) -> bool:
-        """Lives on until something is the case; whether it came to be."""
-        end = time.monotonic() + seconds
-        while not done():
-            if time.monotonic() > end:
-                return False
-            self._executor.spin_once(timeout_sec=0.05)
-        return True
-
     @property
     def moves(self) -> bool:
         """Whether the newest command moves it."""
@@ -138,9 +123,3 @@ class SteadyRobot:
     def listeners(self) -> int:
         """Of its scans."""
         return self._topics["scan"].get_subscription_count()
-
-    def close(self) -> None:
-        """Leaves the graph."""
-        self._executor.shutdown(timeout_sec=1.0)
-        self.node.destroy_node()
-        self._context.try_shutdown()
