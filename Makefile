@@ -19,7 +19,7 @@ OTHER_RINGS := docs or package or campaign
 # Message packages that `nox -s messages` builds; some benchmarks need them.
 MESSAGES := .nox/message_packages/setup.bash
 BENCHMARKS ?=
-QUICK ?=
+LONG ?=
 OUT ?=
 EXAMPLES ?=
 
@@ -136,8 +136,8 @@ test-docs: setup ## examples, notebooks, commands and Python of the pages, and t
 test-package: setup ## wheel and source archive, installations in fresh environments, without ROS 2
 	$(CLEAN_ENV) $(BIN)/python -m pytest $(PARALLEL) -m package $(PYTEST_ARGS)
 
-test-campaign: setup ## long proofs of promises, in hours: faults, abuse, soak, fleets, BARN
-	$(BIN)/python -m pytest $(PARALLEL) -m campaign $(PYTEST_ARGS)
+test-campaign: setup ## proofs of promises in their short forms, with their controls: faults, abuse, soak, fleets
+	$(BIN)/python -m pytest $(PARALLEL) -m campaign --durations 0 --durations-min 1 $(PYTEST_ARGS)
 
 test-all: test ## before a release: all rings, and the environments of noxfile.py
 	$(MAKE) test-docs test-package test-campaign
@@ -175,13 +175,13 @@ pytest: setup
 	else exit $$status; fi
 
 # Runs to the end even if a benchmark fails; each result names machine, commit and load.
-benchmark: setup ## run every benchmark, write benchmarks/results.json: make benchmark [BENCHMARKS="parity files"] [QUICK=1] [OUT=file]
+benchmark: setup ## run every benchmark, in half an hour, write benchmarks/results.json: make benchmark [BENCHMARKS="parity barn"] [LONG=1] [OUT=file]
 	@if [ -e $(MESSAGES) ]; then source $(MESSAGES); fi; \
-		cd benchmarks && ../$(BIN)/python -m measuring.run_all \
-		$(if $(BENCHMARKS),--only $(BENCHMARKS)) $(if $(QUICK),--quick) $(if $(OUT),--out "$(abspath $(OUT))")
+		$(BIN)/python benchmarks/bench.py run \
+		$(if $(BENCHMARKS),--only $(BENCHMARKS)) $(if $(LONG),--long) $(if $(OUT),--out "$(OUT)")
 
 tables: setup ## make the tables of README and docs from benchmarks/results.json
-	@cd benchmarks && ../$(BIN)/python -m measuring.tables
+	@$(BIN)/python benchmarks/bench.py tables
 
 docs: setup ## build the site of docs/ into build/docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict

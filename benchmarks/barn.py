@@ -1,7 +1,7 @@
 """How well is a robot driven through worlds that others made, among which teams are compared?
 
-The 250 public worlds of the BARN challenge (`nics_drl_bridge.sim.barn`), or those of a folder: a
-Jackal drives 10 m between cylinders, without a map. A run's score is the challenge's: success by
+A Jackal drives 10 m between cylinders, without a map, in the 250 public worlds of the challenge
+BARN (`nics_drl_bridge.sim.barn`). A run's score is the challenge's: success by
 T* / clip(T, 2 T*, 8 T*), where T* is the time that the shortest path takes at 2 m/s; 0.5 is the
 most. Success, collision and time are those of the simulator's true pose and contacts.
 """
@@ -9,7 +9,6 @@ most. Success, collision and time are those of the simulator's true pose and con
 from __future__ import annotations
 
 import argparse
-import csv
 import tempfile
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -18,9 +17,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measuring.shortest_path import shortest_path
+from bench import answer, parser_of
 from measuring.standing import Standing
-from measuring.verdict import answer, parser_of
 from numpy.typing import NDArray
 
 from nics_drl_bridge.commands.conditions import Conditions
@@ -31,7 +29,6 @@ from nics_drl_bridge.env.teaching import Teaching
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import BridgeError, ConfigError
 from nics_drl_bridge.generator import open_model
-from nics_drl_bridge.lidar.shapes import Circle
 from nics_drl_bridge.policy.evaluation import DRIFT_M, drive_worlds
 from nics_drl_bridge.policy.policies import POLICIES, open_policy
 from nics_drl_bridge.policy.stateful import Policy
@@ -39,7 +36,6 @@ from nics_drl_bridge.policy.train import POLICY, TrainOrder, run
 from nics_drl_bridge.policy.training_settings import load_training
 from nics_drl_bridge.sim import barn
 from nics_drl_bridge.sim.scenes import member_of
-from nics_drl_bridge.sim.sdf import read_sdf
 from nics_drl_bridge.sim.world import World
 from nics_drl_bridge.sim.world_set import BARN, AnyWorld, WorldSet, load_worlds
 
@@ -54,7 +50,6 @@ SPEED, GOAL_RADIUS, TIME_OUT_S = 2.0, 1.0, 100.0
 """[m/s], [m], [s]: of the challenge."""
 OPTIONS = {"goal_radius": GOAL_RADIUS - DRIFT_M, "contact_margin": -1.0}
 """An episode ends where the truth, too, is near enough to the goal, and at true contacts alone."""
-HEIGHT = 0.2  # of the lidar [m]
 FIRST_SEED = 1_000_000
 FOLDS = 5
 EVERY = 10
@@ -86,27 +81,17 @@ class Runs:
     time_s: Array
     score: Array
 
-    def figures(self, rows: Any = slice(None)) -> dict[str, float | None]:
-        """Shares, and the mean time of the successful runs; `rows` are some of the runs."""
-        success = self.success[rows]
-        collision = self.collision[rows]
-        time = self.time_s[rows][success]
+    def figures(self) -> dict[str, float | None]:
+        """Shares, and the mean time of the successful runs."""
+        time = self.time_s[self.success]
         return {
-            "success": float(success.mean()),
-            "believed": float(self.believed[rows].mean()),
-            "collision": float(collision.mean()),
-            "time_out": float((~success & ~collision).mean()),
+            "success": float(self.success.mean()),
+            "believed": float(self.believed.mean()),
+            "collision": float(self.collision.mean()),
+            "time_out": float((~self.success & ~self.collision).mean()),
             "time_s": float(time.mean()) if len(time) else None,
-            "score": float(self.score[rows].mean()),
+            "score": float(self.score.mean()),
         }
-
-    def told(self) -> dict[str, Any]:
-        """Figures of all runs, and of those in each world."""
-        each = {
-            str(n): self.figures(self.numbers == n)
-            for n in np.unique(self.numbers).tolist()
-        }
-        return {**self.figures(), "worlds": each}
 
 
 def length_of(path: Array) -> float:
@@ -115,74 +100,12 @@ def length_of(path: Array) -> float:
     return float(np.linalg.norm(np.diff(whole, axis=0), axis=1).sum())
 
 
-def courses(folder: Path | None) -> dict[int, Course]:
-    """The courses by number: those that come with the package, or those of a folder.
-
-    A folder has `world_N.world` files as Gazebo reads them, or `cylinders.csv` with the columns
-    world, x_m, y_m. Paths are those of a `reference_paths.csv` there, or the shortest ones that
-    are found. Raises ConfigError if there are none.
-    """
-    if folder is None:
-        return {
-            number: Course(barn.barn_world(number), length_of(barn.barn_path(number)))
-            for number in barn.barn_numbers()
-        }
-    given = {number: worlds(at) for number, at in read_cylinders(folder).items()}
-    known = read_csv(folder / "reference_paths.csv")
-    paths = {
-        n: known[n] if n in known else shortest_path(at) for n, (_, at) in given.items()
+def courses(every: int = 1) -> dict[int, Course]:
+    """One in so many courses, by number."""
+    return {
+        number: Course(barn.barn_world(number), length_of(barn.barn_path(number)))
+        for number in barn.barn_numbers()[::every]
     }
-    return {n: Course(world, length_of(paths[n])) for n, (world, _) in given.items()}
-
-
-def worlds(at: Array) -> tuple[World, Array]:
-    """A world of cylinders (K, 2), and these."""
-    usual = barn.barn_world(1)
-    (group,) = usual.obstacles
-    poses = tuple((x, y, 0.0) for x, y in at.tolist())
-    cylinders = group.model_copy(update={"at": poses})
-    return usual.model_copy(update={"obstacles": (cylinders,)}), at
-
-
-def read_cylinders(folder: Path) -> dict[int, Array]:
-    """The cylinders (K, 2) of each world of a folder, by its number."""
-    found = read_csv(folder / "cylinders.csv")
-    for file in folder.glob("*.world"):
-        number = int("".join(filter(str.isdigit, file.stem)) or -1)
-        groups = read_sdf(file, HEIGHT).obstacles
-        if any(
-            shape != Circle(radius=barn.RADIUS)
-            for group in groups
-            for shape in group.shapes
-        ):
-            wanted = f"cylinders with a radius of {barn.RADIUS:g} m, as the challenge has them"
-            raise ConfigError(
-                f"{file}: holds something else than {wanted}; leave it out."
-            )
-        found[number] = np.array([pose[:2] for group in groups for pose in group.at])
-    if not found:
-        raise ConfigError(
-            f"{folder}: holds neither cylinders.csv nor world files; name another."
-        )
-    return dict(sorted(found.items()))
-
-
-def read_csv(file: Path) -> dict[int, Array]:
-    """Points (P, 2) of each world in a file with the columns world, x_m, y_m; {} for no file."""
-    found: dict[int, list[tuple[float, float]]] = defaultdict(list)
-    if file.is_file():
-        with file.open(newline="") as lines:
-            for k, row in enumerate(csv.DictReader(lines), 2):
-                try:
-                    found[int(row["world"])].append(
-                        (float(row["x_m"]), float(row["y_m"]))
-                    )
-                except (KeyError, TypeError, ValueError):
-                    wanted = "numbers in the columns world, x_m, y_m"
-                    raise ConfigError(
-                        f"{file}: line {k} lacks {wanted}; correct it."
-                    ) from None
-    return {number: np.array(points) for number, points in found.items()}
 
 
 def seeds_of(world: AnyWorld, runs: int) -> NDArray[np.int64]:
@@ -240,9 +163,13 @@ def opened(name: str, control: str | None) -> tuple[Policy, Navigation]:
 
 
 def drive_folds(
-    settings: str, given: Mapping[int, Course], runs: int, control: str | None
+    settings: str,
+    given: Mapping[int, Course],
+    runs: int,
+    control: str | None,
+    folds: int = FOLDS,
 ) -> tuple[Runs, float]:
-    """Learns `FOLDS` policies, each from the other worlds than those that it then drives in.
+    """Learns policies, each from the other worlds than those that it then drives in.
 
     Returns the runs, and the time of the longest training [s].
     """
@@ -257,7 +184,7 @@ def drive_folds(
         raise ConfigError(
             f"--five-fold needs {FOLDS} worlds, not {len(numbers)}; name more."
         )
-    for fold in range(FOLDS):
+    for fold in range(folds):
         held = {number: given[number] for number in numbers[fold::FOLDS]}
         with tempfile.TemporaryDirectory() as folder:
             rest = {n: course for n, course in given.items() if n not in held}
@@ -325,21 +252,9 @@ def missed(
     return said
 
 
-def table_of(figures: Mapping[str, Mapping[str, Any]]) -> str:
-    """A line for each policy."""
-    names = ("success", "believed", "collision", "time_out", "time_s", "score")
-    text = f"{'':<24}" + "".join(f"{name:>11}" for name in names) + "\n"
-    for policy, told in figures.items():
-        values = (told[name] for name in names)
-        shown = "".join(f"{'-' if v is None else format(v, '.3g'):>11}" for v in values)
-        text += f"{Path(policy).name:<24}{shown}\n"
-    return text
-
-
 def main() -> None:
     """Prints a table, or one JSON object; ends with 1 when the first policy misses a bar."""
     parser = parser_of(__doc__, CONTROLS)
-    parser.add_argument("--worlds", type=Path, help="folder of other worlds")
     parser.add_argument("--in", dest="place", choices=tuple(BARS), default=FAST)
     parser.add_argument(
         "--policy", nargs="+", help="files or names; the shipped one, and planners"
@@ -352,6 +267,8 @@ def main() -> None:
         help="learn from four fifths of the worlds, judge in the others",
     )
     parser.add_argument("--runs", type=int, default=1, help="in each world")
+    parser.add_argument("--every", type=int, help="one in so many worlds")
+    parser.add_argument("--folds", type=int, default=FOLDS, choices=range(1, FOLDS + 1))
     given = parser.parse_args()
     if given.place != FAST and (given.control or given.five_fold):
         parser.error(
@@ -361,19 +278,20 @@ def main() -> None:
         runs, training_s = driven(given)
     except BridgeError as error:
         parser.error(str(error))
-    figures = {name: one.told() for name, one in runs.items()}
+    figures = {name: one.figures() for name, one in runs.items()}
     policy, first = next(iter(figures.items()))
     result = {**first, "policy": policy, "policies": figures, "training_s": training_s}
     said = missed(given.place, first, policy, training_s)
-    answer(result, said, table_of(figures), given.json)
+    answer(result, said, given.json)
 
 
 def driven(given: argparse.Namespace) -> tuple[dict[str, Runs], float | None]:
     """The runs of each policy, and how long one was learnt for it, if any was [s]."""
-    found = courses(given.worlds)
+    every = given.every or (1 if given.place == FAST else EVERY)
+    found = courses(every)
     if given.five_fold:
         runs, training_s = drive_folds(
-            given.five_fold, found, given.runs, given.control
+            given.five_fold, found, given.runs, given.control, given.folds
         )
         return {given.five_fold: runs}, training_s
     policies = given.policy or [ROBOT, *(name for name in POLICIES if name != "random")]
@@ -381,7 +299,6 @@ def driven(given: argparse.Namespace) -> tuple[dict[str, Runs], float | None]:
         return {
             n: drive_fast(n, found, given.runs, given.control) for n in policies
         }, None
-    found = dict(list(found.items())[::EVERY])
     return {name: drive_mujoco(name, found) for name in policies}, None
 
 

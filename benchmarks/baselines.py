@@ -9,8 +9,8 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+from bench import answer, parser_of
 from measuring.standing import Standing
-from measuring.verdict import answer, parser_of
 
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.generator import open_model
@@ -21,7 +21,6 @@ from nics_drl_bridge.policy.evaluation import (
     summarise,
 )
 from nics_drl_bridge.policy.policies import POLICIES, open_policy, shipped_policies
-from nics_drl_bridge.policy.train import line_of
 
 ROBOTS = ("differential", "ackermann", "mecanum")
 CONTROLS = {"standing": "every policy stands still"}
@@ -68,15 +67,13 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=500)
     given = parser.parse_args()
     figures = {}
-    table = ""
     for world in given.world:
         for robot in given.robot:
             own = [robot] if robot in shipped_policies() else []
             for name in [*own, *given.policy]:
                 summary = measure(robot, name, world, given.episodes, given.control)
                 figures[f"{world}/{robot}/{name}"] = dataclasses.asdict(summary)
-                table += f"{world}, {robot}, {name}: {line_of(summary)}\n"
-    answer(figures, missed(figures), table, given.json)
+    answer(figures, missed(figures), given.json)
 
 
 if __name__ == "__main__":

@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from bench import answer, parser_of
 from measuring.fields import field, side_of
 from measuring.rates import interleaved, medians
-from measuring.verdict import answer, parser_of
 
 from nics_drl_bridge import style
 from nics_drl_bridge.env.navigation import Navigation
@@ -248,22 +248,6 @@ def draw(result: dict[str, Any], file: Path) -> None:
     write_bytes(file, style.render_png(figure))
 
 
-def table_of(result: dict[str, Any]) -> str:
-    """One line per point."""
-    text = f"{'':<11}{'':>8}{'us per env step':>17}{'per robot':>12}\n"
-    for name in SWEEPS:
-        for k, (value, cost) in enumerate(
-            zip(result[name], result[f"{name}_us"], strict=True)
-        ):
-            one = (
-                f"{result['robots_us_per_robot'][k]:>12.2f}" if name == "robots" else ""
-            )
-            text += f"{name:<11}{value:>8}{cost:>17.2f}{one}\n"
-    return (
-        text + f"memory of the most members: {result['members_memory']:.2f} times one\n"
-    )
-
-
 def main() -> None:
     """Prints a table, or one JSON object; ends with 1 when a bar is missed."""
     parser = parser_of(__doc__, CONTROLS)
@@ -278,7 +262,7 @@ def main() -> None:
     result = run(given.repeats, given.ends_only, given.control)
     if given.picture:
         draw(result, given.picture)
-    answer(result, judge(result), table_of(result), given.json)
+    answer(result, judge(result), given.json)
 
 
 if __name__ == "__main__":

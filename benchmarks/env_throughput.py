@@ -19,15 +19,14 @@ envs are timed, beside the usual one: `share_of_usual` is what is left of its st
 from __future__ import annotations
 
 import os
-import tracemalloc
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import gymnasium
 import numpy as np
+from bench import answer, parser_of
 from measuring import peers
-from measuring.verdict import answer, parser_of
 from numpy.typing import NDArray
 
 from nics_drl_bridge.env.registry import NAVIGATION, register_envs
@@ -238,19 +237,6 @@ def cartpole_chunk() -> Callable[[], None]:
     return chunk
 
 
-def memory_per_env(worlds: int, case: Case) -> float:
-    """Bytes that one more world takes, of the vector env at work."""
-    taken = []
-    for count in (worlds, 2 * worlds):
-        tracemalloc.start()
-        env = Worlds(count, 1, case)
-        env.chunk()
-        taken.append(tracemalloc.get_traced_memory()[0])
-        tracemalloc.stop()
-        del env
-    return (taken[1] - taken[0]) / worlds
-
-
 def run(
     worlds: int, threads: int, repeats: int, rivals: tuple[str, ...], case: Case
 ) -> tuple[dict[str, Any], peers.Measured]:
@@ -309,7 +295,6 @@ def run(
         "write_limit_observations_per_s": write,
         "cartpole_steps_per_s": cartpole,
         "drove": {name: one.drove() for name, one in ours.items()},
-        "memory_bytes_per_env": memory_per_env(worlds, case),
     }
     if not case.is_usual:
         result["share_of_usual"] = rate["one"] / rate["usual"]
@@ -354,41 +339,6 @@ def judge(
     return missed
 
 
-def table_of(result: dict[str, Any]) -> str:
-    """The figures for people."""
-    row = "{:<56}{:>12}\n"
-    text = ""
-    equal = "times as fast as {} at equal work"
-    ten = "times as fast as {} with ten of its steps"
-    for title, key in ((equal, "equal_work"), (ten, "with_ten_scans")):
-        key = f"times_as_fast_{'at_' if key == 'equal_work' else ''}{key}"
-        for name, ratio in result[key].items():
-            text += row.format(title.format(name), f"{ratio:.3g}")
-    rates = {
-        "vector env, 1 thread": "single_thread_env_steps_per_s",
-        f"vector env, {result['threads']} threads": "all_threads_env_steps_per_s",
-        "gymnasium.make, odometry": "single_env_gym_steps_per_s",
-        "gymnasium.make, estimator": "single_env_with_estimator_steps_per_s",
-    }
-    for title, key in rates.items():
-        text += row.format(f"{title} [env-steps/s]", f"{result[key]:.3g}")
-    for name, one in result["peer_readings"].items():
-        for key, value in one.items():
-            text += row.format(f"{name}: {key}", f"{value:.3g}")
-    for name, reason in result["missing"].items():
-        text += f"{name}: {reason}\n"
-    if "share_of_usual" in result:
-        text += row.format(
-            "share of the usual env's rate", f"{result['share_of_usual']:.3g}"
-        )
-    if "times_as_long_as_clean" in result:
-        clean = result["times_as_long_as_clean"]
-        text += row.format(
-            "times as long as without the lidar's faults", f"{clean:.3g}"
-        )
-    return text + f"memory: {result['memory_bytes_per_env'] / 1e3:.1f} kB per world\n"
-
-
 def main() -> None:
     """Prints a table, or one JSON object; ends with 1 when a bar is missed."""
     parser = parser_of(__doc__, CONTROLS)
@@ -409,7 +359,7 @@ def main() -> None:
         given.repeats if rivals else 3 * given.repeats
     )  # a share is told to a few percent
     result, found = run(given.worlds, given.threads, repeats, rivals, case)
-    answer(result, judge(result, found, case), table_of(result), given.json)
+    answer(result, judge(result, found, case), given.json)
 
 
 if __name__ == "__main__":

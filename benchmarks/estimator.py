@@ -3,28 +3,25 @@
 Simulated drives of robots that drift, with noisy odometry and motion capture, both at 10 Hz, both
 100 ms late, 5 % of them lost. The odometry is compared with where the robot was at its stamp; the
 estimate, harder, with where the robot is when it is asked, 100 ms later. NEES is that of the pose
-at the newest measurement, once at the end of each drive. Then random steps, all of which
-have to leave the covariance finite, symmetric and positive definite.
+at the newest measurement, once at the end of each drive.
 """
 
 from __future__ import annotations
 
-import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from measuring.verdict import answer, parser_of
+from bench import answer, parser_of
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.generator import SimulatorModel, builtin_model
 from nics_drl_bridge.interface import RobotView
-from nics_drl_bridge.middleware.ekf import Estimator
-from nics_drl_bridge.middleware.measurement import ODOM, Kind
+from nics_drl_bridge.middleware.measurement import ODOM
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.robot.noise import Level, Noise
 from nics_drl_bridge.sim.simulator import FastSimulator
@@ -188,68 +185,8 @@ def summary(drives: list[Drive]) -> dict[str, Any]:
     }
 
 
-def random_steps(model: SimulatorModel, steps: int, seed: int) -> dict[str, Any]:
-    """Predicts and updates at random, and looks at the covariance after every step."""
-    rng = np.random.default_rng(seed)
-    estimator = Estimator(model)
-    now = 0
-    low = model.robot.command_low
-    high = model.robot.command_high
-    sound = True
-    for step in range(steps):
-        kind = int(rng.integers(5))
-        if kind == 0:
-            now += int(rng.integers(1, 3 * PERIOD))
-            estimator.predict(now)
-        elif kind == 1:
-            estimator.add_command(now, rng.uniform(low, high))
-        elif kind == 2:
-            estimator.update(
-                Kind.TWIST, rng.normal(size=3) * 10.0 ** rng.uniform(-3.0, 2.0)
-            )
-        elif kind == 3:
-            estimator.update(
-                Kind.YAW_RATE, float(rng.normal()), 10.0 ** rng.uniform(-6.0, 1.0)
-            )
-        else:
-            estimator.update(
-                Kind.POSE, rng.normal(size=3), 10.0 ** rng.uniform(-6.0, 3.0, 3)
-            )
-        mean = estimator.belief.mean
-        covariance = estimator.belief.covariance
-        sound = sound and bool(
-            np.isfinite(mean).all() and (covariance == covariance.T).all()
-        )
-        try:
-            np.linalg.cholesky(covariance)
-        except np.linalg.LinAlgError:
-            sound = False
-        if not sound:
-            return {"random_steps": step + 1, "finite_and_positive_definite": False}
-    return {"random_steps": steps, "finite_and_positive_definite": True}
-
-
-def cycle_us(model: SimulatorModel, cycles: int) -> float:
-    """Median time of what the single env asks of the middleware in a step [us]."""
-    middleware = Middleware(model)
-    times = []
-    middleware.reset(0, np.zeros(3))
-    ranges = np.ones(model.lidar.beams, np.float32)
-    command = 0.3 * model.robot.command_high
-    for k in range(cycles):
-        now = (k + 1) * PERIOD
-        twist = middleware.view(now).twist
-        begin = time.perf_counter()
-        middleware.command(k * PERIOD, command)
-        middleware.odometry(now, now, np.zeros(3), twist)
-        middleware.scan(now, now, ranges)
-        middleware.view(now)
-        times.append(time.perf_counter() - begin)
-    return float(np.median(times)) * 1e6
-
-
-def run(drives: int, steps: int, seed: int, control: str | None) -> dict[str, Any]:
-    """Drives every robot, then takes random steps with one after the other."""
+def run(drives: int, seed: int, control: str | None) -> dict[str, Any]:
+    """Drives every robot."""
     found = {}
     moving = control != "stands"
     make = MAKES.get(control, Middleware)
@@ -260,20 +197,14 @@ def run(drives: int, steps: int, seed: int, control: str | None) -> dict[str, An
         found[robot] = [
             drive(model, simulator, make(model), one, moving) for one in seeds
         ]
-    shares = [random_steps(noisy(r), -(-steps // len(ROBOTS)), seed) for r in ROBOTS]
     return {
         **summary([each for robot in ROBOTS for each in found[robot]]),
         "robots": {robot: summary(found[robot]) for robot in ROBOTS},
         "drives": drives * len(ROBOTS),
-        "random_steps": sum(share["random_steps"] for share in shares),
-        "finite_and_positive_definite": all(
-            share["finite_and_positive_definite"] for share in shares
-        ),
-        "cycle_us": cycle_us(noisy(ROBOTS[0]), 3000),
     }
 
 
-def missed(result: dict[str, Any], steps: int) -> list[str]:
+def missed(result: dict[str, Any]) -> list[str]:
     """A sentence for each bar that was missed."""
     said = _missed_share("all robots", result, SHARE)
     for robot, each in result["robots"].items():
@@ -287,12 +218,6 @@ def missed(result: dict[str, Any], steps: int) -> list[str]:
         said.append(
             f"NEES is {result['nees_mean']:.2f}, not within {low:.2f} to {high:.2f}"
         )
-    if not (
-        result["finite_and_positive_definite"] and result["random_steps"] >= steps > 0
-    ):
-        said.append(
-            f"the covariance was unsound after {result['random_steps']} random steps"
-        )
     return said
 
 
@@ -305,35 +230,14 @@ def _missed_share(who: str, figures: dict[str, Any], most: float) -> list[str]:
     ]
 
 
-def table_of(result: dict[str, Any]) -> str:
-    """The figures for people."""
-    row = "{:<14}{:>10}{:>10}{:>8}   {}\n"
-    text = row.format("", "raw [m]", "EKF [m]", "NEES", "95 % band")
-    for name, each in {**result["robots"], "all": result}.items():
-        low, high = each["nees_95_band"]
-        text += row.format(
-            name,
-            f"{each['raw_rmse_m']:.3f}",
-            f"{each['ekf_rmse_m']:.3f}",
-            f"{each['nees_mean']:.2f}",
-            f"{low:.2f} to {high:.2f}",
-        )
-    sound = "all" if result["finite_and_positive_definite"] else "NOT all"
-    return (
-        f"{text}{result['random_steps']} random steps, {sound} finite and positive definite; "
-        f"{result['cycle_us']:.0f} us for command, odometry, scan and view\n"
-    )
-
-
 def main() -> None:
     """Prints a table, or one JSON object."""
     parser = parser_of(__doc__, CONTROLS)
     parser.add_argument("--drives", type=int, default=100, help="of each robot")
-    parser.add_argument("--steps", type=int, default=1_000_000, help="random steps")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
-    result = run(given.drives, given.steps, given.seed, given.control)
-    answer(result, missed(result, given.steps), table_of(result), given.json)
+    result = run(given.drives, given.seed, given.control)
+    answer(result, missed(result), given.json)
 
 
 if __name__ == "__main__":

@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from bench import answer, parser_of
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from measuring import mujoco_rays
 from measuring.environments import NotInstalledError, python_with, run
-from measuring.verdict import answer, parser_of
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -303,22 +303,6 @@ def titles_of(result: dict[str, Any]) -> dict[str, str]:
     return titles
 
 
-def report(result: dict[str, Any]) -> str:
-    """The figures for people."""
-    text = f"{result['scans']} scans, {result['points']['exact']} points\n"
-    for name, apart in result["cloud_rmse_m"].items():
-        beams = result["range_rmse_m"][name]
-        text += f"{name:<8}cloud {apart:.2e} m RMSE from scan mode, beam by beam {beams:.2e} m\n"
-    if result["slam"] is not None:
-        before = result["slam"]["odometry_error_m"]
-        after = result["slam"]["path_error_m"]
-        text += (
-            f"yag-slam: path off by {after:.3f} m RMSE, odometry by {before:.3f} m\n"
-        )
-    text += "".join(f"{name}: {reason}\n" for name, reason in result["missing"].items())
-    return text + f"picture: {result['picture']}\n"
-
-
 def main() -> None:
     """Draws the picture; prints a few lines, or one JSON object."""
     parser = parser_of(__doc__, CONTROLS)
@@ -329,7 +313,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/fig4_pointcloud.png"))
     given = parser.parse_args()
     result = measure(given.scans, not given.without_slam, given.out, given.control)
-    answer(result, missed_of(result), report(result), given.json)
+    answer(result, missed_of(result), given.json)
 
 
 if __name__ == "__main__":

@@ -16,8 +16,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from cold_start import ROOT, environment, waited
-from measuring.verdict import answer, parser_of
+from bench import ROOT, answer, parser_of
+from measuring.environments import newcomer, wait_for
 from PIL import Image, ImageChops
 
 CONTROLS = {"untrained": "the learning: a policy is trained for 2,048 steps"}
@@ -78,7 +78,7 @@ def travelled(
         if control == "untrained" and words[1] == "train":
             words += ["--steps", "2048"]
         words[0] = str(clone / ".venv" / "bin" / "nics")
-        seconds, printed = waited(words, folder, around)
+        seconds, printed = wait_for(words, folder, around)
         taken = taken + seconds
         told = [*told, printed]
     return taken, told
@@ -87,9 +87,9 @@ def travelled(
 def measure(folder: Path, roads: Sequence[str], control: str | None) -> dict[str, Any]:
     """All figures, see the head of this file."""
     clone = folder / "clone"
-    around = environment(folder, control)
-    waited(["git", "clone", "--quiet", str(ROOT), str(clone)], folder, around)
-    setup_s, _ = waited(["make", "setup"], clone, around)
+    around = newcomer(folder)
+    wait_for(["git", "clone", "--quiet", str(ROOT), str(clone)], folder, around)
+    setup_s, _ = wait_for(["make", "setup"], clone, around)
     seconds = {}
     success = {}
     for name in roads:
@@ -133,17 +133,6 @@ def missed_of(result: dict[str, Any]) -> list[str]:
     )
 
 
-def table_of(result: dict[str, Any]) -> str:
-    """The figures, one in a line."""
-    text = f"{'make setup':<14}{result['setup_s']:>8.0f} s\n"
-    for name, seconds in result["seconds"].items():
-        share = result["success"].get(name)
-        text += f"{name:<14}{seconds:>8.0f} s" + (
-            "\n" if share is None else f"{share:>8.1%}\n"
-        )
-    return text
-
-
 def main() -> None:
     """Prints a table, or one JSON object."""
     parser = parser_of(__doc__, CONTROLS)
@@ -151,7 +140,7 @@ def main() -> None:
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         result = measure(Path(folder), given.roads, given.control)
-    answer(result, missed_of(result), table_of(result), given.json)
+    answer(result, missed_of(result), given.json)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from measuring.verdict import answer, parser_of
+from bench import answer, parser_of
 
 from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.extras.mujoco.simulator import MujocoRobot, record
@@ -220,16 +220,6 @@ def measure(name: str, given: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-def table(robots: dict[str, dict[str, float]]) -> str:
-    """One line per figure, one column per robot."""
-    rows = ["".join([f"{'':<34}", *(f"{name:>14}" for name in robots)])]
-    for key in next(iter(robots.values())):
-        rows.append(
-            "".join([f"{key:<34}", *(f"{r[key]:>14.4g}" for r in robots.values())])
-        )
-    return "\n".join(rows)
-
-
 def main() -> int:
     parser = parser_of(__doc__, CONTROLS)
     parser.add_argument(
@@ -249,7 +239,7 @@ def main() -> int:
     except BridgeError as error:
         print(error, file=sys.stderr)
         return 2
-    answer({"robots": robots}, missed_of(robots), table(robots) + "\n", given.json)
+    answer({"robots": robots}, missed_of(robots), given.json)
 
 
 if __name__ == "__main__":

@@ -2,8 +2,7 @@
 
 Ten polygons of 4 to 4,096 vertices around a lidar of 720 beams: five are convex, five are
 stars, all of the same size (the hull has the same perimeter, so they cover as many beams
-on average). And for a few corners, among ten obstacles and alone (`1 ...`): where is the exact
-scanner as fast as the baked one?
+on average).
 """
 
 from __future__ import annotations
@@ -14,21 +13,19 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from bench import answer, parser_of
 from measuring.rates import interleaved, shortest
-from measuring.scenes import BATCH, CIRCLE, OBSTACLES, SPEC, random_batch
-from measuring.verdict import answer, parser_of
+from measuring.scenes import BATCH, SPEC, random_batch
 
 from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.scanner import Scanner
-from nics_drl_bridge.lidar.shapes import Polygon, Segment, Shape, convex_hull
+from nics_drl_bridge.lidar.shapes import Polygon, Shape, convex_hull
 from nics_drl_bridge.lidar.table import Density
 
 CONTROLS = {"exact": "the exact scanner in place of the baked one"}
 VERTICES = tuple(2**power for power in range(2, 13))
 PERIMETER = 2.0 * np.pi * 0.2
-FEW = (3, 4, 5, 6, 8)
 BAR = 1.5
-AS_FAST = 1.1
 FASTER = 3.0
 WORK = 2**15
 """Vertices that an exact batch visits per obstacle; it bounds how long a batch takes."""
@@ -62,14 +59,13 @@ def scans_of(
     shapes: tuple[Shape, ...],
     density: Density,
     scans: int,
-    obstacles: int,
     control: str | None,
 ) -> dict[str, Scans]:
     """A batch of scans, exact and baked."""
     table = bake(SPEC, shapes, density)
     corners = max(1, int(np.diff(table.outlines.corner).mean()))
     sizes = {"exact": min(scans, max(8, WORK // corners)), "baked": scans}
-    batch = random_batch(shapes, scans, 0, obstacles=obstacles)
+    batch = random_batch(shapes, scans, 0)
     result = {}
     for name, size in sizes.items():
         scanner = Scanner(SPEC, table, "exact" if control == "exact" else name)
@@ -86,13 +82,12 @@ def costs(
     scans: int,
     repeats: int,
     control: str | None,
-    obstacles: int = OBSTACLES,
 ) -> dict[str, dict[str, float]]:
     """Time of one scan [us] by subject, exact and baked: the shortest, all of them in turn."""
     drawn = {
         (name, way): some
         for name, shapes in subjects.items()
-        for way, some in scans_of(shapes, density, scans, obstacles, control).items()
+        for way, some in scans_of(shapes, density, scans, control).items()
     }
     calls = {key: some.call for key, some in drawn.items()}
     seconds = shortest(interleaved(calls, repeats, warm=True))
@@ -129,11 +124,6 @@ def run(
         str(count): (polygon(count, 0, 0.0), polygon(count, 1, 0.5))
         for count in vertices
     }
-    few: dict[str, tuple[Shape, ...]] = {
-        "circle": (CIRCLE,),
-        "segment": (Segment(ends=((-0.2, 0.0), (0.2, 0.0))),),
-        **{f"{count} corners": (polygon(count, 0, 0.0),) for count in FEW},
-    }
     measured = costs(many, density, scans, repeats, control)
     baked = [each["baked"] for each in measured.values()]
     return {
@@ -141,37 +131,7 @@ def run(
         "exact_us": [each["exact"] for each in measured.values()],
         "baked_us": baked,
         "baked_end_to_end": max(baked) / min(baked),
-        "few": costs(few, density, scans, repeats, control),
-        "alone": costs(few, density, scans, repeats, control, obstacles=1),
     }
-
-
-def table_of(result: dict[str, Any]) -> str:
-    """The figures for people."""
-    row = "{:<12}{:>13}{:>13}{:>17}\n"
-    text = row.format("vertices", "exact [us]", "baked [us]", "exact / baked")
-    named = [
-        (str(count), {"exact": e, "baked": b})
-        for count, e, b in zip(
-            result["vertices"], result["exact_us"], result["baked_us"], strict=True
-        )
-    ]
-    alone = [(f"1 {name}", cost) for name, cost in result["alone"].items()]
-    for name, cost in [*named, *result["few"].items(), *alone]:
-        exact = cost["exact"]
-        baked = cost["baked"]
-        text += row.format(name, f"{exact:.2f}", f"{baked:.2f}", f"{exact / baked:.2f}")
-    ratio = result["baked_end_to_end"]
-    met = "met" if ratio <= BAR else "missed"
-    as_fast = [
-        name
-        for name, cost in [*result["few"].items(), *alone]
-        if cost["exact"] <= AS_FAST * cost["baked"]
-    ]
-    return text + (
-        f"baked by number of vertices, slowest / fastest: {ratio:.2f}, bar {BAR} {met}\n"
-        f"exact is as fast within 10 % for: {', '.join(as_fast) or 'none'}\n"
-    )
 
 
 def main() -> None:
@@ -191,7 +151,7 @@ def main() -> None:
     given = parser.parse_args()
     density = Density(distances=given.distances, rotations=given.rotations)
     result = run(given.most, given.scans, given.repeats, density, given.control)
-    answer(result, missed_of(result), table_of(result), given.json)
+    answer(result, missed_of(result), given.json)
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from bench import answer, parser_of
 from measuring.peers import (
     MODEL,
     PEERS,
@@ -23,7 +24,6 @@ from measuring.peers import (
     scenes,
 )
 from measuring.scenes import BATCH, CIRCLE, errors
-from measuring.verdict import answer, parser_of
 from numpy.typing import NDArray
 
 from nics_drl_bridge.lidar.bake import bake
@@ -141,32 +141,6 @@ def judge(result: dict[str, Any], found: Measured) -> list[str]:
     return missed + missed_by(found)
 
 
-def table_of(result: dict[str, Any]) -> str:
-    """The rates for people."""
-    row = "{:<9}{:>12}{:>18}{:>24}{:>28}\n"
-    text = row.format(
-        "",
-        "scans/s",
-        "baked is faster",
-        "RMSE against exact [m]",
-        "within a step / alone",
-    )
-    for name in ("baked", "exact", *PEERS):
-        if result[name] is None:
-            text += f"{name:<9}{result['missing'].get(name, 'not asked for')}\n"
-            continue
-        rmse = result["rmse_m"].get(name)
-        agreement = result["agreement"].get(name)
-        text += row.format(
-            name,
-            f"{result[name]:.3g}",
-            f"{result['baked'] / result[name]:.3g} x",
-            "" if rmse is None else f"{rmse:.1e}",
-            "" if agreement is None else f"{agreement:.2f}",
-        )
-    return text
-
-
 def main() -> None:
     """Prints a table, or one JSON object; ends with 1 when a bar is missed."""
     parser = parser_of(__doc__, CONTROLS)
@@ -181,7 +155,7 @@ def main() -> None:
     given = parser.parse_args()
     peers = () if given.without_peers else tuple(PEERS)
     result, found = run(given.scans, given.scenes, given.repeats, peers, given.control)
-    answer(result, judge(result, found), table_of(result), given.json)
+    answer(result, judge(result, found), given.json)
 
 
 if __name__ == "__main__":

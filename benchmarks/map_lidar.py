@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from measuring.verdict import answer, parser_of
+from bench import answer, parser_of
 from numba import njit
 from numpy.typing import NDArray
 from scipy import ndimage
@@ -179,21 +179,13 @@ def missed_of(result: dict[str, Any]) -> list[str]:
     return missed
 
 
-def table_of(result: dict[str, Any]) -> str:
-    """The figures for people."""
-    return "".join(
-        "".join(f"{key:<22}{value}\n" for key, value in row.items()) + "\n"
-        for row in result["rows"]
-    )
-
-
 def main() -> None:
     """Prints a table, or one JSON object."""
     parser = parser_of(__doc__, CONTROLS)
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     result = measure(given.seed, given.control)
-    answer(result, missed_of(result), table_of(result), given.json)
+    answer(result, missed_of(result), given.json)
 
 
 if __name__ == "__main__":

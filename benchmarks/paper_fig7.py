@@ -7,8 +7,8 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from bench import answer, parser_of
 from measuring.evaluations import Run, evaluations
-from measuring.verdict import answer, parser_of
 
 from nics_drl_bridge.commands.episodes import DDS, FAST, LABELS, MUJOCO
 
@@ -83,11 +83,7 @@ def main() -> None:
                     place: figures["deviation"][0] for place, figures in places.items()
                 },
             }
-    table = "".join(
-        f"{robot}: {one['picture']}; success {one['success']}; deviation {one['deviation_m']}\n"
-        for robot, one in told.items()
-    )
-    answer({"robots": told}, missed(told), table, given.json)
+    answer({"robots": told}, missed(told), given.json)
 
 
 if __name__ == "__main__":

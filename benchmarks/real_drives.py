@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from bench import answer, parser_of
 from measuring.drive_bars import (
     DRIVES,
     RECORDINGS,
@@ -26,7 +27,6 @@ from measuring.drive_bars import (
 )
 from measuring.foreign_robots import ROBOTS, foreign_drive
 from measuring.truths import Truth, compared
-from measuring.verdict import answer, parser_of
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BridgeError
@@ -185,28 +185,6 @@ def left_out(source: Path, mapping: Path, control: str | None) -> dict[str, Any]
     }
 
 
-def table(result: dict[str, Any]) -> str:
-    """The figures for people."""
-    lines = [
-        f"{'drive':<34} {'error':>9} {'of path':>8} {'textbook':>9} {'twist':>7} {'95 %':>6}"
-    ]
-    for name, told in (result["drives"] | result["own_robots"]).items():
-        if sentence := told.get("refused", told.get("crashed")):
-            lines.append(f"{name:<34} {sentence}")
-            continue
-        lines.append(
-            f"{name:<34} {told['error_m']:>7.3f} m {told['share_of_path']:>8.3f} "
-            f"{told['yardstick_share']:>9.3f} {told['constant_twist_share']:>7.3f} "
-            f"{told['coverage_95']:>6.1%}"
-        )
-        for key, row in told["truths"].items():
-            lines.append(f"    {key:<30} {row['found']:.4f}, true {row['true']}")
-    for name, told in result["left_out"].items():
-        error = f"{told['error_m']:.4f} m, {told['heading_error_rad']:.3f} rad"
-        lines.append(f"{name}, segments left out: {error}")
-    return "\n".join(lines) + "\n"
-
-
 def main() -> int:
     options = arguments()
     real = [name for name in options.only if name in DRIVES]
@@ -233,7 +211,7 @@ def main() -> int:
             result["own_robots"][name] = figures(
                 source, mapping, truth, options.control
             )
-    answer(result, missed_of(result), table(result), options.json)
+    answer(result, missed_of(result), options.json)
 
 
 if __name__ == "__main__":

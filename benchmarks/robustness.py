@@ -10,9 +10,7 @@ nothing of the perturbation; success is by the truth, and told beside what the r
 from __future__ import annotations
 
 import json
-import os
 import sys
-import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing
@@ -25,8 +23,8 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from bench import answer, parser_of
 from measuring.standing import Standing
-from measuring.verdict import answer, parser_of
 
 from nics_drl_bridge import style
 from nics_drl_bridge.commands.episodes import NAVIGATION
@@ -313,27 +311,11 @@ def measured_in(results: Path) -> dict[str, dict[str, list[float]]]:
     """The success of all robots in the results of runs: robot -> perturbation -> by multiple."""
     runs = json.loads(results.read_text(encoding="utf-8"))["runs"]
     return {
-        robot: own
+        robot: {each: list(some.values()) for each, some in own.items()}
         for name, run in sorted(runs.items())
         if name.startswith("robustness_") and run["result"]
         for robot, own in run["result"]["success"].items()
     }
-
-
-def table_of(
-    success: Mapping[str, Mapping[str, Sequence[float]]],
-    multiples: Sequence[float],
-    wall_s: float,
-) -> str:
-    """The figures for people."""
-    heads = "".join(f"{f'x {times:g}':>8}" for times in (0.0, *multiples))
-    lines = [f"{'':<26}{heads}   lost at x {DECLARED:g}"]
-    lost = losses(success, multiples)
-    for robot, own in success.items():
-        for each, some in own.items():
-            cells = "".join(f"{100 * share:>8.1f}" for share in some)
-            lines.append(f"{robot:<14}{each:<12}{cells}{lost[robot][each]:>10.1f}")
-    return "\n".join([*lines, f"{wall_s:.0f} s on {os.cpu_count()} cores"]) + "\n"
 
 
 def main() -> None:
@@ -369,7 +351,6 @@ def main() -> None:
             measured_in(given.of), given.picture or parser.error("--of needs --picture")
         )
         return
-    begin = time.perf_counter()
     multiples = tuple(sorted({DECLARED, *given.multiples}))
     job = partial(
         Job,
@@ -393,8 +374,7 @@ def main() -> None:
         "worst": worst(lost),
         "episodes": given.episodes * len(given.worlds),
     }
-    table = table_of(success, multiples, time.perf_counter() - begin)
-    answer(result, missed(success, multiples), table, given.json)
+    answer(result, missed(success, multiples), given.json)
 
 
 if __name__ == "__main__":

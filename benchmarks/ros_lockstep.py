@@ -31,9 +31,9 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from bench import answer, parser_of
 from geometry_msgs.msg import Twist
 from measuring.standing import standing_action
-from measuring.verdict import answer, parser_of
 from nav_msgs.msg import Odometry
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
@@ -323,8 +323,7 @@ def main() -> None:
         ENDS[given.end](given.namespace, given.executor)
         return
     result = measure(given.chunks, given.size, given.executor, given.control)
-    table = "".join(f"{key:<20}{value}\n" for key, value in result.items())
-    answer(result, bars(result, given.executor), table, given.json)
+    answer(result, bars(result, given.executor), given.json)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from measuring.verdict import answer, parser_of
+from bench import answer, parser_of
 from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
@@ -302,7 +302,7 @@ def main() -> None:
         "ackermann_order4_rmse_heading_rad": order4_heading(),
         "python_reference_steps_per_s": python_rate(subject("ackermann")),
     }
-    answer(result, missed_of(result), table(result), given.json)
+    answer(result, missed_of(result), given.json, table(result))
 
 
 if __name__ == "__main__":

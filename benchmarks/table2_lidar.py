@@ -13,9 +13,9 @@ import time
 from typing import Any
 
 import numpy as np
+from bench import answer, parser_of
 from measuring.rates import interleaved, medians
 from measuring.scenes import SCENES, Batch, batches, errors, nearest_row, scan
-from measuring.verdict import answer, parser_of
 
 from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.scanner import Scanner
@@ -214,7 +214,7 @@ def main() -> None:
     )
     given = parser.parse_args()
     result = run(load_lidar(given.lidar), given.scans, given.repeats, given.control)
-    answer(result, missed_of(result), table_of(result), given.json)
+    answer(result, missed_of(result), given.json, table_of(result))
 
 
 if __name__ == "__main__":

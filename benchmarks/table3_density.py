@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from bench import answer, parser_of
 from measuring.scenes import SCENES, SPEC, batches, errors, nearest_row, scan
-from measuring.verdict import answer, parser_of
 
 from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.table import Density
@@ -123,7 +123,7 @@ def main() -> None:
     parser.add_argument("--scans", type=int, default=4096, help="scans of each scene")
     given = parser.parse_args()
     result = run(given.scans, given.control)
-    answer(result, missed_of(result), table_of(result), given.json)
+    answer(result, missed_of(result), given.json, table_of(result))
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ another than the robot's, as `rplidar_a2`, by the same bars.
 
 from __future__ import annotations
 
-import os
 import tempfile
 import time
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measuring.verdict import answer, parser_of
+from bench import answer, parser_of
 from numpy.typing import NDArray
 
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
@@ -28,7 +27,7 @@ from nics_drl_bridge.policy.evaluation import (
     drive_worlds,
     summarise,
 )
-from nics_drl_bridge.policy.train import line_of, train
+from nics_drl_bridge.policy.train import train
 from nics_drl_bridge.policy.train_algorithms import act_of
 from nics_drl_bridge.policy.training_settings import TrainingSettings, load_training
 
@@ -178,18 +177,11 @@ def main() -> None:
     else:
         warmed_up(settings, given.episodes)
     runs = []
-    table = ""
     for seed in given.seeds or [given.seed]:
         run = measure(settings, seed, given.episodes)
         runs.append(run)
-        table += (
-            f"{given.robot}, seed {seed}: {line_of(run.summary)}\n"
-            f"  {run.steps:,} steps, {run.wall_s:.1f} s ({run.cpu_s:.1f} s of CPU), of which "
-            f"{100 * run.env_s / run.wall_s:.1f} % simulator; "
-            f"{run.steps / run.training_s:,.0f} steps/s of training; {os.cpu_count()} cores\n"
-        )
     figures = worst(runs)
-    answer(figures, missed(given.robot, figures), table, given.json)
+    answer(figures, missed(given.robot, figures), given.json)
 
 
 if __name__ == "__main__":

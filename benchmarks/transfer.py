@@ -10,16 +10,14 @@ are driven at a time, each in processes of its own.
 
 from __future__ import annotations
 
-import os
 import sys
 import tempfile
-import time
 from itertools import product
 from pathlib import Path
 from typing import Any
 
+from bench import answer, parser_of
 from measuring.evaluations import Run, evaluations
-from measuring.verdict import answer, parser_of
 
 from nics_drl_bridge.commands.conditions import Conditions
 from nics_drl_bridge.commands.episodes import DDS, FAST, LABELS, MUJOCO, PLACES
@@ -165,22 +163,6 @@ def _missed_belief(who: str, figures: dict[str, Any]) -> list[str]:
     return said
 
 
-def table_of(found: Found, wall_s: float) -> str:
-    """The figures for people."""
-    lines = []
-    for robot, worlds in found.items():
-        for world, places in worlds.items():
-            for place, figures in places.items():
-                share, low, high = (100 * value for value in figures["success"])
-                lines.append(
-                    f"{robot:<13}{world:<10}{LABELS[place]:<16}{share:5.1f} % ({low:.0f} to "
-                    f"{high:.0f}), collision {100 * figures['collision'][0]:.1f} %, believed "
-                    f"{100 * figures['believed'][0]:.1f} %, deviation "
-                    f"{figures['deviation'][0]:.2g} m"
-                )
-    return "\n".join([*lines, f"{wall_s:.0f} s on {os.cpu_count()} cores"]) + "\n"
-
-
 def main() -> None:
     """Prints a table, or one JSON object."""
     parser = parser_of(__doc__, CONTROLS)
@@ -200,14 +182,12 @@ def main() -> None:
         help=f"some of {', '.join(PLACES)}",
     )
     given = parser.parse_args()
-    begin = time.perf_counter()
     chosen = (given.robots, given.worlds, given.places)
     with tempfile.TemporaryDirectory() as folder:
         found = measure(*chosen, given.episodes, Path(folder), given.control)
     result = {name: shares(found, name) for name in SHARES}
     result |= {"points_from_fast": apart(found)}
-    table = table_of(found, time.perf_counter() - begin)
-    answer({**result, "episodes": given.episodes}, missed(found), table, given.json)
+    answer({**result, "episodes": given.episodes}, missed(found), given.json)
 
 
 if __name__ == "__main__":

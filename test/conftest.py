@@ -33,10 +33,7 @@ FILES = {
     "docs/test_fresh_clone.py": "package",
     "test_release.py": "package",
     "test_without_ros.py": "package",
-    "benchmarks/test_abuse.py": "campaign",
-    "benchmarks/test_abuse_env.py": "campaign",
     "benchmarks/test_barn.py": "campaign",
-    "benchmarks/test_node_endings.py": "campaign",
     "identify/test_drives_of_others.py": "campaign",
 }
 

@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 import venv
 from pathlib import Path
 
@@ -13,6 +14,7 @@ CACHE = (
     Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "nics_drl_bridge"
 )
 INSTALL_S = 600.0
+NEWCOMER_S = 1800.0
 OF_OUR_OWN = (
     "LD_LIBRARY_PATH",
     "_ROS_WHEELS_BOOTSTRAP_COMPLETE",
@@ -47,6 +49,40 @@ def inherit_for_newcomer() -> dict[str, str]:
         left_out -= {"LD_LIBRARY_PATH", "PYTHONPATH"}
     kept = {name: value for name, value in os.environ.items() if name not in left_out}
     return kept | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+
+
+def newcomer(folder: Path, site: str = "") -> dict[str, str]:
+    """The environment variables of a newcomer, with temporary files in a folder.
+
+    Args:
+        folder: of the newcomer.
+        site: Python that each of the newcomer's processes begins with.
+    """
+    kept = inherit_for_newcomer() | {"TMPDIR": str(folder)}
+    kept.pop("MAKEFLAGS", None)
+    if site:
+        (folder / "sitecustomize.py").write_text(site)
+        kept["PYTHONPATH"] = str(folder)
+    return kept
+
+
+def wait_for(
+    command: list[str], folder: Path, environment: dict[str, str]
+) -> tuple[float, str]:
+    """Runs a command that must not fail; returns how long it took [s] and what it printed."""
+    begin = time.monotonic()
+    done = subprocess.run(
+        command,
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=NEWCOMER_S,
+    )
+    if done.returncode:
+        end = done.stderr[-2000:]
+        raise RuntimeError(f"{' '.join(command)} ended with {done.returncode}:\n{end}")
+    return time.monotonic() - begin, done.stdout
 
 
 def python_with(name: str, requirements: tuple[str, ...]) -> Path:

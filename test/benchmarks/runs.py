@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import json
 import subprocess
 import sys
@@ -29,14 +28,6 @@ def asked(
 
 def _no_json(word: str) -> None:
     raise ValueError(f"{word} is no JSON")
-
-
-def controls_of(script: str) -> list[str]:
-    """The names of a benchmark's controls, read from its source."""
-    for node in ast.parse((BENCHMARKS / script).read_text(encoding="utf-8")).body:
-        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "CONTROLS":
-            return list(ast.literal_eval(node.value))
-    return []
 
 
 def fails(

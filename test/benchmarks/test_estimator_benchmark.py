@@ -7,8 +7,8 @@ import pytest
 from .runs import asked, fails
 
 SCRIPT = "estimator.py"
-SMALL = ("--drives", "11", "--steps", "3000")
-TINY = ("--drives", "3", "--steps", "300")
+SMALL = ("--drives", "11")
+TINY = ("--drives", "3")
 
 
 @pytest.fixture(scope="module")
@@ -32,13 +32,6 @@ def test_the_estimate_is_off_by_as_much_as_it_claims(result):
     low, high = result["nees_95_band"]
     assert low < result["nees_mean"] < high
     assert result["drives"] == 33
-
-
-@pytest.mark.campaign
-def test_every_random_step_leaves_the_covariance_positive_definite(result):
-    assert result["random_steps"] == 3_000
-    assert result["finite_and_positive_definite"] is True
-    assert result["cycle_us"] > 0.0
 
 
 @pytest.mark.campaign

@@ -77,23 +77,3 @@ def test_the_picture_is_of_goals_that_were_truly_reached(tmp_path):
     code, told = asked("paper_fig7.py", *words)
     assert (code, told["failures"]) == (0, [])
     assert (tmp_path / "fig7_differential.png").is_file()
-
-
-@pytest.mark.campaign
-@pytest.mark.ros
-@over_ros
-@no_torch
-def test_a_policy_file_that_is_cut_short_does_not_drive():
-    missed = fails("deploy_environment.py", "no_policy")
-    assert any("policy_node sent no command" in line for line in missed)
-
-
-@pytest.mark.campaign
-@pytest.mark.ros
-@over_ros
-@no_torch
-def test_where_training_is_installed_the_policy_drives_and_the_benchmark_fails_for_that_alone():
-    code, told = asked("deploy_environment.py", "--control", "training_installed")
-    assert (code, told["commands"] > 0) == (1, True)
-    (missed,) = told["failures"]
-    assert "of training there is torch" in missed

@@ -98,8 +98,6 @@ def test_complexity_names_a_cost_for_every_number_of_vertices():
     for key in ("exact_us", "baked_us"):
         assert len(result[key]) == 3
         assert min(result[key]) > 0.0
-    assert set(result["few"]) == set(result["alone"])
-    assert set(result["few"]) >= {"circle", "segment", "3 corners"}
 
 
 @pytest.mark.campaign

@@ -130,9 +130,11 @@ def test_the_picture_is_drawn_of_runs_robot_by_robot(robustness, tmp_path):
     if not shipped_policies():
         pytest.skip("no policy is shipped")
     names = shipped_policies()[:2]
+    kept = {
+        each: dict(zip("0123", some, strict=True)) for each, some in curves().items()
+    }
     runs = {
-        f"robustness_{name}": {"result": {"success": {name: curves()}}}
-        for name in names
+        f"robustness_{name}": {"result": {"success": {name: kept}}} for name in names
     }
     runs |= {"robustness_broken": {"result": None}, "parity": {"result": {"steps": 1}}}
     (tmp_path / "results.json").write_text(json.dumps({"runs": runs}))

@@ -2,8 +2,8 @@
 
 Each digest runs a part of the package on fixed seeds and keeps a few projections of all that came
 out on fixed random signs, so that one number that changes shows. In `test`,
-`PYTHONPATH=../benchmarks python -m digests.digests NAME...` records them again, for a change that
-is meant to change them.
+`PYTHONPATH=../benchmarks:campaigns python -m digests.digests NAME...` records them again, for a
+change that is meant to change them.
 """
 
 from __future__ import annotations
@@ -167,9 +167,9 @@ def numbers_of(data: Any) -> list[float]:
 
 def gate() -> Found:
     """What the gate decides about adversaries, moment by moment, with its shipped shield."""
-    from measuring import shield_in_process
-    from measuring.adversaries import ADVERSARIES
-    from measuring.shield_places import Job, Place
+    from parts import shield_in_process
+    from parts.adversaries import ADVERSARIES
+    from parts.shield_places import Job, Place
 
     found = {}
     for index, robot in enumerate(ROBOTS):
@@ -221,7 +221,11 @@ what matrix products in single precision give."""
 
 def main() -> None:
     """Records digests again: those that are named, or all."""
-    sys.path[:0] = [str(TEST), str(TEST.parent / "benchmarks")]
+    sys.path[:0] = [
+        str(TEST),
+        str(TEST / "campaigns"),
+        str(TEST.parent / "benchmarks"),
+    ]
     kept = json.loads(FILE.read_text()) if FILE.exists() else {}
     for name in sys.argv[1:] or DIGESTS:
         kept[name] = DIGESTS[name]()

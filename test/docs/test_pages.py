@@ -92,7 +92,7 @@ def test_every_command_that_a_page_shows_exists(page, line):
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_every_page_and_file_that_a_page_names_exists(page):
     named = re.findall(
-        r"`((?:docs|examples|config|benchmarks)/[\w/.-]+\.\w+)`", text_of(page)
+        r"`((?:docs|examples|config|benchmarks|test)/[\w/.-]+\.\w+)`", text_of(page)
     )
     named += [
         str((page.parent / to).resolve().relative_to(ROOT))

@@ -4,15 +4,15 @@ from pathlib import Path
 
 import pytest
 
-BENCHMARKS = Path(__file__).resolve().parents[3] / "benchmarks"
+CAMPAIGNS = Path(__file__).resolve().parents[2] / "campaigns"
 
 
 @pytest.fixture(scope="module")
 def client_of():
     """Makes clients of the standard, `client_of(domain_id)`; all are closed with the module."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(BENCHMARKS))
-        from measuring.conformance import Client
+        patch.syspath_prepend(str(CAMPAIGNS))
+        from parts.conformance import Client
 
         made = []
 

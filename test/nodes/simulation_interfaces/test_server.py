@@ -79,14 +79,14 @@ def client(connected):
 
 
 def test_every_feature_does_what_the_standard_says_and_every_other_is_refused(client):
-    from measuring.conformance import announced, failures
+    from parts.conformance import announced, failures
 
     assert len(announced(client)) == 30
     assert failures(client, "empty") == []
 
 
 def test_a_feature_that_is_claimed_but_not_there_is_noticed(client):
-    from measuring.conformance import failures
+    from parts.conformance import failures
 
     assert [line.split()[0] for line in failures(client, "empty", {"NAMED_POSES"})][:1]
 
@@ -94,7 +94,7 @@ def test_a_feature_that_is_claimed_but_not_there_is_noticed(client):
 @pytest.mark.slow
 def test_robots_in_mujoco_serve_the_same(launch, domain_id, client_of):
     pytest.importorskip("mujoco", reason="needs MuJoCo: the extra `mujoco`")
-    from measuring.conformance import failures
+    from parts.conformance import failures
 
     launch("mujoco_node", domain_id, world="empty")
     assert failures(client_of(domain_id), "empty") == []

@@ -1,0 +1,422 @@
+"""Runs the benchmarks, each to its end, and makes the tables of README and docs of what they found.
+
+    python benchmarks/bench.py run [--long] [--only NAME ...] [--out FILE] [--list]
+    python benchmarks/bench.py tables [--check]
+
+A benchmark prints one JSON object, whose `failures` are sentences about missed bars, and ends with
+1 if there are any. A run ends with its bars met, with some missed, or broken: crashed, hung, or
+without that object. `results.json` keeps the figures that the tables show, with machine, commit
+and load; it is rewritten after each run. `figures.py` has the tables, `plan.py` the runs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import platform
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import uuid
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, NoReturn
+
+SCRIPTS = Path(__file__).resolve().parent
+ROOT = SCRIPTS.parent
+RESULTS = SCRIPTS / "results.json"
+FAILURES = "failures"
+MET = "met"
+MISSED = "missed"
+BROKEN = "broken"
+MARK = "NICS_BENCHMARK_RUN"
+"""The environment variable by which the processes of a run are found again."""
+GRACE_S = 10.0
+LAST_WORDS = 2000
+LIBRARIES = ("numpy", "numba", "scipy", "gymnasium", "torch", "onnxruntime", "mujoco")
+
+
+# A benchmark: its arguments, its bars, its answer.
+
+
+@dataclass(frozen=True)
+class Bar:
+    """What a figure has to reach; NaN never does.
+
+    Attributes:
+        side: `at most` or `at least`.
+        value: of the bar.
+        what: the figure in words, where its name does not say it.
+    """
+
+    side: str
+    value: float
+    what: str = ""
+
+    def missed_by(self, name: str, figure: float) -> list[str]:
+        """A sentence if a figure misses it."""
+        if self.side == "at most":
+            met = figure <= self.value
+        else:
+            met = figure >= self.value
+        sentence = f"{self.what or name} {figure:g}: must be {self.side} {self.value:g}"
+        return [] if met else [sentence]
+
+
+def at_most(value: float, what: str = "") -> Bar:
+    return Bar("at most", value, what)
+
+
+def at_least(value: float, what: str = "") -> Bar:
+    return Bar("at least", value, what)
+
+
+def missed_bars(
+    figures: Mapping[str, Any], bars: Mapping[str, Bar], where: str = ""
+) -> list[str]:
+    """A sentence for each bar that a figure of its name misses.
+
+    Args:
+        figures: that were measured.
+        bars: by the names of figures, all of which have to be there.
+        where: stands before each sentence.
+    """
+    return [
+        f"{where}{line}"
+        for name, bar in bars.items()
+        for line in bar.missed_by(name, figures[name])
+    ]
+
+
+def parser_of(
+    doc: str | None,
+    controls: Mapping[str, str],
+    kind: type = argparse.ArgumentParser,
+) -> Any:
+    """A parser with `--json` and `--control`, described by the first line of a module.
+
+    Args:
+        doc: of the benchmark's module.
+        controls: name -> what is taken out; `--control` alone takes the first one.
+        kind: of the parser.
+    """
+    parser = kind(
+        description=(doc or "").splitlines()[0],
+        epilog="controls, which must fail: "
+        + "; ".join(f"{k}: {v}" for k, v in controls.items()),
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument(
+        "--control",
+        nargs="?",
+        const=next(iter(controls)),
+        choices=list(controls),
+        help="take out what is measured: the bars must then be missed",
+    )
+    return parser
+
+
+def table_of(result: Mapping[str, Any], indent: str = "") -> str:
+    """Figures for people, a line for each."""
+    return "".join(
+        f"{indent}{key}\n{table_of(value, indent + '  ')}"
+        if isinstance(value, Mapping)
+        else f"{indent}{key:<34}{value}\n"
+        for key, value in result.items()
+    )
+
+
+def answer(
+    result: Mapping[str, Any], missed: Sequence[str], as_json: bool, table: str = ""
+) -> NoReturn:
+    """Prints a result and the missed bars, and ends with 1 if there are any, else 0.
+
+    Args:
+        result: what was measured, as JSON can hold it; what is not finite becomes null.
+        missed: a sentence for each bar that was missed, with the figure and the bar.
+        as_json: whether to print one JSON object, with the sentences as `failures`.
+        table: the result for people, where it is another than a line for each figure.
+    """
+    if as_json:
+        told = finite({**result, FAILURES: list(missed)})
+        sys.stdout.write(json.dumps(told, allow_nan=False) + "\n")
+    else:
+        sys.stdout.write(table or table_of(result))
+        sys.stdout.write("".join(f"FAILED: {line}\n" for line in missed))
+    raise SystemExit(1 if missed else 0)
+
+
+def finite(value: Any) -> Any:
+    """The same with None for each number that JSON does not know: NaN and the infinities."""
+    if isinstance(value, Mapping):
+        return {key: finite(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+# A run: a benchmark in a process of its own, to its end.
+
+
+def describe_machine() -> dict[str, Any]:
+    """The machine, and the versions of what is measured with."""
+    libraries = {}
+    for name in LIBRARIES:
+        with suppress(PackageNotFoundError):
+            libraries[name] = version(name)
+    return {
+        "cpu": read_field("/proc/cpuinfo", "model name") or platform.machine(),
+        "cores": os.cpu_count(),
+        "memory_gb": round(
+            os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9, 1
+        ),
+        "system": f"{platform.system()} {platform.release()}",
+        "python": platform.python_version(),
+        "libraries": libraries,
+    }
+
+
+def read_field(file: str, key: str) -> str:
+    """The first value of a key in a file of /proc, or nothing where there is none."""
+    rows = (line.partition(":") for line in Path(file).read_text().splitlines())
+    return next((value.strip() for name, _, value in rows if name.strip() == key), "")
+
+
+def describe_commit(folder: Path) -> dict[str, Any]:
+    """The commit of a working tree, and whether more than results and text changed since."""
+    git = ["git", "-C", str(folder)]
+    left_out = (":(exclude)benchmarks/results.json", ":(exclude)*.md")
+    try:
+        commit = subprocess.run(
+            [*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True
+        )
+        changes = subprocess.run(
+            [*git, "status", "--porcelain", "-uno", "--", ".", *left_out],
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return {"commit": None, "dirty": None}
+    return {"commit": commit.stdout.strip()[:12], "dirty": bool(changes.stdout)}
+
+
+def find_processes(mark: str) -> list[int]:
+    """The living processes that a run has started, wherever they have gone since."""
+    wanted = f"{MARK}={mark}".encode()
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):  # it has ended, or is somebody else's
+            state = (folder / "stat").read_text().rpartition(")")[2].split()[0]
+            environment = (folder / "environ").read_bytes().split(b"\0")
+            if state != "Z" and wanted in environment:
+                found.append(int(folder.name))
+    return found
+
+
+def end_processes(mark: str) -> int:
+    """Ends what a run left behind; returns how many processes that were."""
+    left = find_processes(mark)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
+        for pid in find_processes(mark):
+            with suppress(ProcessLookupError):
+                os.kill(pid, number)
+        deadline = time.monotonic() + GRACE_S
+        while find_processes(mark) and time.monotonic() < deadline:
+            time.sleep(0.05)
+    return len(left)
+
+
+def judge(code: int | None, printed: str, last: str) -> dict[str, Any]:
+    """State, failures, result and error of a run.
+
+    Args:
+        code: exit code; None if it took too long.
+        printed: on standard output, whose last line is the JSON object.
+        last: words, for an error.
+    """
+    result = None
+    with suppress(ValueError, RecursionError, IndexError):
+        result = json.loads(printed.strip().splitlines()[-1])
+    failures = result.pop(FAILURES, None) if isinstance(result, dict) else None
+    error = None
+    if code is None:
+        error = "was ended, since it took too long"
+    elif code not in (0, 1):
+        error = f"ended with exit code {code}: {last}"
+    elif not isinstance(failures, list):
+        error = f"printed no JSON object with `failures`: {last}"
+    elif not result:
+        error = "measured nothing: its JSON object holds no figure"
+    failures = [str(each) for each in failures or ()] if error is None else []
+    state = MISSED if code or failures else MET
+    return {
+        "state": state if error is None else BROKEN,
+        "failures": failures,
+        "error": error,
+        "result": finite(result) if error is None else None,
+    }
+
+
+def run_one(script: Path, arguments: Sequence[str], timeout_s: float) -> dict[str, Any]:
+    """Runs a script to its end, or ends it; no process of it stays."""
+    mark = uuid.uuid4().hex
+    entry = {
+        "arguments": list(arguments),
+        "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "load": round(os.getloadavg()[0], 2),
+    }
+    began = time.monotonic()
+    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
+        process = subprocess.Popen(
+            [sys.executable, str(script), "--json", *arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=out,  # files, since a pipe can clog
+            stderr=err,
+            cwd=ROOT,
+            env={**os.environ, MARK: mark},
+            start_new_session=True,
+        )
+        code = None
+        try:
+            code = process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            pass
+        finally:
+            end_processes(mark)
+            process.wait()
+        printed, said = (read_all(file) for file in (out, err))
+    last = (said.strip() or printed.strip() or "no message")[-LAST_WORDS:]
+    seconds = round(time.monotonic() - began, 1)
+    return {**entry, "seconds": seconds, **judge(code, printed, last)}
+
+
+def read_all(file: Any) -> str:
+    """All that was written into a file."""
+    file.seek(0)
+    return str(file.read().decode("utf-8", errors="replace"))
+
+
+def write_results(runs: Mapping[str, Any], file: Path) -> None:
+    """Replaces the file at once or not at all."""
+    text = json.dumps({"runs": dict(sorted(runs.items()))}, indent=1, allow_nan=False)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    part = file.with_name(f".{file.name}.{os.getpid()}")
+    part.write_text(text + "\n", encoding="utf-8")
+    part.replace(file)
+
+
+def read_results(file: Path) -> dict[str, Any]:
+    """The runs of a file; ends with a sentence if it is none of ours."""
+    if not file.exists():
+        return {}
+    try:
+        runs = json.loads(file.read_text(encoding="utf-8"))["runs"]
+        return {
+            name: {**run, "machine": dict(run["machine"])} for name, run in runs.items()
+        }
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise SystemExit(
+            f"{file}: holds no results; remove it, or name another by --out."
+        ) from None
+
+
+def keep_figures(result: Any, paths: Sequence[Sequence[str]]) -> Any:
+    """The part of a result to which some path leads; what no table shows is left out."""
+    if () in {tuple(path) for path in paths} or not isinstance(result, Mapping | list):
+        return result
+    rows = enumerate(result) if isinstance(result, list) else result.items()
+    kept = {}
+    for key, value in rows:
+        inside = [path[1:] for path in paths if path[0] in (str(key), "*")]
+        if inside:
+            kept[str(key)] = keep_figures(value, inside)
+    return kept
+
+
+def summarize(name: str, entry: Mapping[str, Any]) -> str:
+    """A run in a line, with the first thing that is wrong with it."""
+    wrong = " ".join((entry["error"] or "; ".join(entry["failures"][:1])).split())
+    return f"{name:<30}{entry['state']:<8}{entry['seconds']:>8.1f} s  {wrong[:160]}\n"
+
+
+def run_all(given: argparse.Namespace, plan: Mapping[str, Any]) -> int:
+    """Runs what is asked for, one after the other, and writes the file after each."""
+    from figures import paths_of
+
+    entries = {
+        name: run for name, run in read_results(given.out).items() if name in plan
+    }
+    about = {"machine": describe_machine(), **describe_commit(ROOT)}
+    chosen = [name for name in plan if name in (given.only or plan)]
+    states = []
+    for name in chosen:
+        run = plan[name]
+        arguments = run.long if given.long else run.arguments
+        timeout_s = given.timeout or (
+            run.long_timeout_s if given.long else run.timeout_s
+        )
+        sys.stderr.write(f"{name}: {run.script} {' '.join(arguments)}\n")
+        entry = {
+            "script": Path(run.script).name,
+            **about,
+            **run_one(given.scripts / run.script, arguments, timeout_s),
+        }
+        paths = paths_of(name)
+        if paths and entry["result"]:
+            entry["result"] = keep_figures(entry["result"], paths)
+        entries[name] = entry
+        write_results(entries, given.out)
+        sys.stdout.write(summarize(name, entry))
+        states.append(entry["state"])
+    sys.stdout.write(
+        f"{states.count(MET)} of {len(states)} met their bars: {given.out}\n"
+    )
+    return int(states.count(MET) < len(states))
+
+
+def main() -> None:
+    """Runs benchmarks or makes tables."""
+    import tables
+    from plan import plan_of
+
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    commands = parser.add_subparsers(dest="command", required=True)
+    run = commands.add_parser("run", help="run benchmarks")
+    run.add_argument("--only", nargs="*", metavar="NAME", help="these; others are kept")
+    run.add_argument("--long", action="store_true", help="hours instead of minutes")
+    run.add_argument("--list", action="store_true", help="print the names of the runs")
+    run.add_argument("--out", type=Path, default=RESULTS, help="file of the results")
+    run.add_argument("--timeout", type=float, help="seconds for each")
+    run.add_argument("--scripts", type=Path, default=SCRIPTS, help="their folder")
+    made = commands.add_parser("tables", help="make the tables of README and docs")
+    made.add_argument("--check", action="store_true", help="say which are stale")
+    given = parser.parse_args()
+    if given.command == "tables":
+        raise SystemExit(tables.write_tables(given.check))
+    plan = plan_of(given.scripts)
+    unknown = [name for name in given.only or () if name not in plan]
+    if unknown:
+        parser.error(f"{unknown[0]!r} is no benchmark; there are {', '.join(plan)}.")
+    if given.list:
+        sys.stdout.write("".join(f"{name}\n" for name in plan))
+        return
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        code = run_all(given, plan)
+    except KeyboardInterrupt:
+        sys.stderr.write("interrupted; what was measured before is in the file\n")
+        code = 130
+    raise SystemExit(code)
+
+
+if __name__ == "__main__":
+    main()

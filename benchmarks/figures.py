@@ -1,0 +1,881 @@
+"""Every table of figures in README.md and docs/: a row for each figure. See tables.py."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+from plan import RUNS
+
+PLACEHOLDER = re.compile(
+    r"\{(?:(?P<how>max|min|sum|mean|harmonic_mean) )?(?:(?P<run>[a-z0-9_]+):)?(?P<path>[^{}|]+?)"
+    r"(?: x(?P<factor>[0-9.e+-]+))?(?:\|(?P<format>[^{}]*))?\}"
+)
+"""A figure in a cell: a path into the result of a run, by default that of the row."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of figures, before they are filled in.
+
+    Attributes:
+        head: its columns.
+        rows: the run that a row is of, and its cells, with placeholders.
+        notes: whether the marks are explained below the table.
+    """
+
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    notes: bool = True
+
+
+def told(*rows: tuple[str, str, str]) -> Table:
+    """Figures in words: run, what, figure."""
+    return Table(
+        ("what", "script", "figure"),
+        tuple(
+            (
+                run,
+                what,
+                f"`{Path(RUNS[run].script).name if run in RUNS else f'{run}.py'}`",
+                text,
+            )
+            for run, what, text in rows
+        ),
+    )
+
+
+ROBOTS = {
+    "ackermann": "Ackermann",
+    "differential": "differential",
+    "mecanum": "mecanum",
+}
+POLICIES = {**ROBOTS, "jackal": "Jackal"}
+WORLDS = (
+    "empty",
+    "arena",
+    "circles",
+    "doorway",
+    "clutter",
+    "corridor",
+    "crowd",
+    "room",
+)
+PERTURBATIONS = ("noise", "drop-out", "latency", "response", "drift", "footprint")
+FIGURES = told(
+    (
+        "table1_kinematics",
+        "kinematics, robot-steps per second on one thread",
+        "{min robots.*.steps_per_s_batched|.0e} to {max robots.*.steps_per_s_batched|.0e} batched, "
+        "{min robots.*.steps_per_s_single|.0e} to {max robots.*.steps_per_s_single|.0e} one robot; "
+        "errors below the paper's Table I (`docs/kinematics.md`)",
+    ),
+    (
+        "real_drives",
+        "a real car, 5 s open-loop predictions on 11 s segments of a 45 s drive, each held out in "
+        "turn",
+        "{left_out.xtark_random_drive_45s.error_m|.3f} m and "
+        "{left_out.xtark_random_drive_45s.heading_error_rad|.3f} rad over a path of "
+        "{left_out.xtark_random_drive_45s.path_m|.2f} m",
+    ),
+    (
+        "real_drives",
+        "real drives of others, each by one mapping file, 5 s open-loop on the unseen last third",
+        "off by {min drives.*.share_of_path x100|.0f} to {max drives.*.share_of_path|.0%} of the "
+        "path (`docs/kinematics.md`)",
+    ),
+    (
+        "generate_from_mujoco",
+        "robots in MuJoCo, real wheels on contact, 5 s open-loop on unseen drives",
+        "off by {min robots.*.position_error_over_path x100|.1f} to "
+        "{max robots.*.position_error_over_path|.1%} of the path; "
+        "{min robots.*.speed_up_batched|,.0f} times MuJoCo's speed or more, batched",
+    ),
+    (
+        "env_throughput",
+        "whole env steps on one thread beside other simulators at equal work: one scan of 720 "
+        "beams per control period, 10 circles, observation, reward, autoreset",
+        "{times_as_fast_at_equal_work.irsim_x|.0f} times irsim-x and "
+        "{times_as_fast_at_equal_work.ir_sim|,.0f} times ir-sim; with ten of their own steps per "
+        "control period, each with a scan, {times_as_fast_with_ten_scans.irsim_x|,.0f} and "
+        "{times_as_fast_with_ten_scans.ir_sim|,.0f} times",
+    ),
+    (
+        "env_throughput",
+        "env steps per second, same workload",
+        "{single_thread_env_steps_per_s|.1e} on one thread, {all_threads_env_steps_per_s|.1e} on "
+        "{threads}; {single_env_gym_steps_per_s|.1e} by `gymnasium.make`, "
+        "{single_env_with_estimator_steps_per_s|.1e} with the estimator",
+    ),
+    (
+        "env_throughput_lidar",
+        "the same on one thread with a Hokuyo UST-10LX: 1,081 beams up to 10 m, noise, millimetres",
+        "{single_thread_env_steps_per_s|.1e}, {share_of_usual|.0%} of the 720 beams' in that run; "
+        "{times_as_long_as_clean|.2f} times as long as without its faults; "
+        "{single_env_gym_steps_per_s|.1e} by `gymnasium.make`",
+    ),
+    (
+        "env_throughput_obstacles",
+        "the same on one thread among 260 circles instead of ten, as dense",
+        "{single_thread_env_steps_per_s|.1e}, {share_of_usual|.0%} of ten circles' in that run",
+    ),
+    (
+        "table2_lidar",
+        "scans per second among ten obstacles on one thread, RMSE",
+        "{min scenes.*.baked_scans_per_s|.1e} to {max scenes.*.baked_scans_per_s|.1e}, "
+        "{min scenes.*.rmse_m x1000|.1f} to {max scenes.*.rmse_m x1000|.1f} mm (`docs/lidar.md`)",
+    ),
+    (
+        "table2_hokuyo",
+        "the same with a Hokuyo UST-10LX, 1,081 beams up to 10 m",
+        "{min scenes.*.baked_scans_per_s|.1e} to {max scenes.*.baked_scans_per_s|.1e}, "
+        "{min scenes.*.rmse_m x1000|.1f} to {max scenes.*.rmse_m x1000|.1f} mm (`docs/lidar.md`)",
+    ),
+    (
+        "estimator",
+        "estimate with motion capture at 10 Hz, 100 ms late, 5 % lost, against raw odometry",
+        "RMSE {ekf_rmse_m|.3f} m against {raw_rmse_m|.2f} m; NEES {nees_mean|.1f}, 95 % band "
+        "{nees_95_band.0|.1f} to {nees_95_band.1|.1f} (`docs/middleware.md`)",
+    ),
+    (
+        "gate_faults",
+        "zero on `cmd_vel` after the last scan, policy dead, frozen or hung, e-stop; real "
+        "processes over DDS",
+        "{scan_silent.max_s|.2f} s, {policy_killed.max_s|.2f}, {policy_frozen.max_s|.2f} and "
+        "{policy_hung.max_s|.2f} s, {e_stop.max_s|.2f} s at worst of {scan_silent.n} each; "
+        "{sum *.unsafe_commands} unsafe commands",
+    ),
+    (
+        "gate_envelope",
+        "the gate's limits of speed, rate and jerk under random commands at random intervals",
+        "{violations} violations in {steps|,} commands",
+    ),
+    (
+        "shield",
+        "contacts of three robots with the shield in episodes of adversaries; without it",
+        "{contacts} in {episodes|,}; {contacts_without} in {tried_without}",
+    ),
+    *(
+        (
+            f"transfer_{robot}",
+            f"{title}: one policy file in process, over DDS, in MuJoCo over DDS, in shipped "
+            "worlds: true success, with a real lidar, mild randomisation, gate and shield",
+            "in process {min success.*.*.fast x100|.0f} to {max success.*.*.fast|.0%}; over DDS "
+            "{min points_from_fast.*.*.dds|+.1f} to {max points_from_fast.*.*.dds|+.1f} points, in "
+            "MuJoCo {min points_from_fast.*.*.mujoco_dds|+.0f} to "
+            "{max points_from_fast.*.*.mujoco_dds|+.0f} (`docs/evaluation.md`)",
+        )
+        for robot, title in POLICIES.items()
+    ),
+    *(
+        (
+            f"robustness_{robot}",
+            f"{title}: success that the shipped policy loses to one perturbation at its declared "
+            "range",
+            "{worst.points|.1f} points at worst, to {worst.perturbation} "
+            "(`docs/randomisation.md`)",
+        )
+        for robot, title in POLICIES.items()
+    ),
+    (
+        "barn_five_fold",
+        "the 250 worlds of the BARN challenge, a Jackal without a map, learnt from 200 and judged "
+        "in the others, in turn",
+        "{success|.1%} success, {collision|.1%} collisions, score {score|.3f} of 0.5 "
+        "(`docs/worlds.md`)",
+    ),
+    (
+        "parity",
+        "in process against DDS lock-step, three robots, and four in namespaces",
+        "difference {max_abs_observation_difference|.2g}, {late_observations} late observations in "
+        "{steps|,} steps",
+    ),
+    (
+        "standards",
+        "simulation_interfaces (conformance of what is announced; a step of a client of it alone "
+        "against one over our services), a Nav2 stand-in, LEAPP's own runner",
+        "{sim_features} features, {sim_conformance_failed} failed; {client_overhead x100|.0f} % "
+        "longer; {follow_path_success|.0%} of the planned paths driven; actions differ by "
+        "{leapp_max_abs_difference|.1g} (`docs/ros.md`)",
+    ),
+    (
+        "ros_lockstep",
+        "env steps over DDS in lock-step, 720 beams, estimator included",
+        "{steps_per_s|,.0f} per second, median {p50_ms|.2f} ms; a bare pair of rclpy nodes "
+        "exchanges the same messages {bare_echo_per_s|,.0f} times",
+    ),
+    *(
+        (
+            f"training_differential{lidar}",
+            told_of,
+            "; ".join(
+                f"{title} {{training_{robot}{lidar}:success_rate|.1%}} in "
+                f"{{training_{robot}{lidar}:wall_s|.0f}} s"
+                for robot, title in (
+                    ("differential", "differential"),
+                    ("mecanum", "mecanum"),
+                    ("ackermann", "car"),
+                )
+            )
+            + " with the evaluation",
+        )
+        for lidar, told_of in (
+            (
+                "",
+                "navigation learnt from nothing, 500 unseen episodes, the worst of three seeds",
+            ),
+            ("_rplidar", "the same with an RPLIDAR A2: 800 beams up to 12 m, noise"),
+        )
+    ),
+    (
+        "first_hour",
+        "what a new user waits for from a clean clone on: the first picture; a policy of a Burger "
+        "by its YAML file; the report of a recording; a policy of a task of one's own",
+        "picture {seconds.picture|.0f} s, {setup_s|.0f} s of them set-up; Burger "
+        "{seconds.robot|.0f} s, success {success.robot|.1%}; report {seconds.recording|.0f} s; "
+        "own task {seconds.task|.0f} s, success {success.task|.1%}",
+    ),
+)
+XTARK = "drives.xtark_random_drive_45s"
+SLIPPERY = "drives.f110_ds1"
+FIRST_SCREEN = Table(
+    ("", "here", "compared with"),
+    (
+        (
+            "env_throughput",
+            "navigation steps per second, one thread, 720 beams, 10 obstacles",
+            "{single_thread_env_steps_per_s x1e-3|.0f},000",
+            "{times_as_fast_at_equal_work.irsim_x|.0f} times as fast as irsim-x, "
+            "{times_as_fast_at_equal_work.ir_sim|,.0f} times ir-sim",
+        ),
+        (
+            "env_throughput_lidar",
+            "the same with a Hokuyo UST-10LX: 1,081 noisy beams",
+            "{single_thread_env_steps_per_s x1e-3|.0f},000",
+            "{times_as_long_as_clean|.2f} times the step time without noise",
+        ),
+        (
+            "training_differential",
+            "navigation learned from scratch, worst of three seeds: success, time",
+            "; ".join(
+                f"{title} {{training_{robot}:success_rate|.1%}}, "
+                f"{{training_{robot}:wall_s|.0f}} s"
+                for robot, title in ROBOTS.items()
+            ),
+            "`dynamic_window` planner: "
+            + ", ".join(
+                f"{{baselines:circles/{robot}/dynamic_window.success.value x100|.1f}}"
+                for robot in ROBOTS
+            )
+            + " %",
+        ),
+        (
+            "barn_five_fold",
+            "250 BARN worlds without a map, five-fold cross-validation",
+            "{success|.1%} success, {collision|.1%} collisions, score {score|.3f} of 0.5",
+            "the planners score: `mppi` {barn:policies.mppi.score|.3f}, `dynamic_window` "
+            "{barn:policies.dynamic_window.score|.3f}",
+        ),
+        (
+            "real_drives",
+            "eight real drives, predicted 5 s ahead on unseen data: best, worst",
+            f"off by {{{XTARK}.share_of_path x100|.1f}} and "
+            f"{{{SLIPPERY}.share_of_path|.1%}} of the path",
+            f"fitted textbook model {{{XTARK}.yardstick_share x100|.1f}} and "
+            f"{{{SLIPPERY}.yardstick_share|.1%}}, constant twist "
+            f"{{{XTARK}.constant_twist_share x100|.1f}} and "
+            f"{{{SLIPPERY}.constant_twist_share|.1%}}",
+        ),
+        (
+            "transfer_jackal",
+            "a Jackal in MuJoCo over ROS 2, eight worlds",
+            "{min success.*.*.mujoco_dds x100|.0f} to {max success.*.*.mujoco_dds|.0%} success",
+            "the same policy in process: {min success.*.*.fast x100|.0f} to "
+            "{max success.*.*.fast|.0%}",
+        ),
+        (
+            "parity",
+            "observations over ROS 2 in lock-step, {steps|,} steps",
+            "largest difference {max_abs_observation_difference|.2g}",
+            "the same steps in process",
+        ),
+        (
+            "shield",
+            "contacts with the shield in adversarial episodes",
+            "{contacts} in {episodes|,}",
+            "without the shield: {contacts_without} in {tried_without}",
+        ),
+    ),
+    notes=False,
+)
+SAFETY = told(
+    (
+        "gate_faults",
+        "faults around real processes over DDS at 10 Hz: policy killed, frozen, hung, scan and "
+        "odom silent, NaN in scans, clocks that jump, e-stop, and more",
+        "zero within {scan_silent.max_s|.2f} s of the last scan, {command_silent.max_s|.2f} s of "
+        "the last command ({command_frozen.max_s|.2f} s if it is repeated), "
+        "{policy_killed.max_s|.2f}, {policy_frozen.max_s|.2f} and {policy_hung.max_s|.2f} s of the "
+        "policy's death, freeze or hang ({scan_silent.n} times each), {e_stop.max_s|.2f} s of the "
+        "e-stop, {e_stop_silent.max_s|.2f} s of its last heartbeat; {sum *.unsafe_commands} unsafe "
+        "commands",
+    ),
+    (
+        "gate_envelope",
+        "random commands at intervals of 1 to 220 ms, three robots",
+        "{violations} violations of value, rate, jerk or zero in {steps|,} commands, in motion at "
+        "{in_motion|,} of them",
+    ),
+    (
+        "shield",
+        "episodes of adversaries, three robots",
+        "{contacts} contacts in {episodes|,} and {path_m x0.001|.1f} km; without the shield "
+        "{contacts_without} in {tried_without}",
+    ),
+)
+THROUGHPUT = Table(
+    ("", "ir-sim 2.12.0", "irsim-x 1.1.4"),
+    tuple(
+        (
+            "env_throughput",
+            title,
+            *(f"{{{path.format(name)}}}" for name in ("ir_sim", "irsim_x")),
+        )
+        for title, path in (
+            (
+                "one thread is as fast, at equal work: one scan per control period",
+                "times_as_fast_at_equal_work.{}|,.0f",
+            ),
+            (
+                "one thread is as fast, with ten of their own steps per control period",
+                "times_as_fast_with_ten_scans.{}|,.0f",
+            ),
+            ("a scan alone [ms]", "peer_readings.{}.scan_s x1000|.3g"),
+            (
+                "a scan within their step [ms]",
+                "peer_readings.{}.scan_within_step_s x1000|.3g",
+            ),
+            (
+                "their step, a motion and a scan [ms]",
+                "peer_readings.{}.step_s x1000|.3g",
+            ),
+            (
+                "control period with one scan [ms]",
+                "peer_readings.{}.period_with_one_scan_s x1000|.3g",
+            ),
+            (
+                "control period with ten scans [ms]",
+                "peer_readings.{}.period_with_ten_scans_s x1000|.3g",
+            ),
+        )
+    ),
+)
+REAL_LIDARS = Table(
+    (
+        "lidar",
+        "env steps per second, one thread",
+        "of the usual env's",
+        "step time, of a copy without faults",
+    ),
+    tuple(
+        (
+            f"env_throughput_{run}",
+            title,
+            "{single_thread_env_steps_per_s|.1e}",
+            "{share_of_usual|.0%}",
+            "{times_as_long_as_clean|.2f}",
+        )
+        for run, title in (
+            ("lidar", "Hokuyo UST-10LX"),
+            ("rplidar", "RPLIDAR A2"),
+            ("sick", "SICK TiM571"),
+        )
+    ),
+)
+SCALING = Table(
+    ("",) * 6,
+    tuple(
+        (
+            "env_scaling",
+            title,
+            *(f"{{{key}.{k}{how}}}" if k >= 0 else "" for k in indices),
+        )
+        for sizes, name, key, indices in (
+            ("worlds", "µs per env step", "worlds_us", (0, 2, 4, 5, 7)),
+            (
+                "robots in each world",
+                "µs per robot and step",
+                "robots_us_per_robot",
+                (0, 2, 4, 5, 6),
+            ),
+            ("obstacles", "µs per env step", "obstacles_us", (0, 1, 2, 3, 4)),
+            ("beams", "µs per env step", "beams_us", (0, 2, 4, 5, 6)),
+            ("members of the set", "µs per env step", "members_us", (0, 1, 2, 3, -1)),
+        )
+        for title, key, how in ((sizes, sizes.split()[0], ""), (name, key, "|.1f"))
+    ),
+)
+ESTIMATOR = Table(
+    ("robot", "odometry, RMSE [m]", "estimate, RMSE [m]", "mean NEES", "95 % band"),
+    tuple(
+        (
+            "estimator",
+            title,
+            f"{{{path}raw_rmse_m|.3f}}",
+            f"{{{path}ekf_rmse_m|.3f}}",
+            f"{{{path}nees_mean|.2f}}",
+            f"{{{path}nees_95_band.0|.2f}} to {{{path}nees_95_band.1|.2f}}",
+        )
+        for title, path in (
+            *((each, f"robots.{each}.") for each in ROBOTS),
+            ("all", ""),
+        )
+    ),
+)
+TRANSFER = Table(
+    ("success [%], collision, believed", "in process", "over DDS", "MuJoCo"),
+    tuple(
+        (
+            f"transfer_{robot}",
+            f"{title}, `{world}`",
+            *(
+                ", ".join(
+                    f"{{{share}.{at} x100|.0f}}"
+                    for share in ("success", "collision", "believed")
+                )
+                for at in (
+                    f"{robot}.{world}.{place}"
+                    for place in ("fast", "dds", "mujoco_dds")
+                )
+            ),
+        )
+        for robot, title in POLICIES.items()
+        for world in WORLDS
+    ),
+)
+ROBUSTNESS = Table(
+    (
+        "success [%] at 0, 1/2, 1, 2 times the range",
+        "declared range",
+        *POLICIES.values(),
+    ),
+    tuple(
+        (
+            "robustness_differential",
+            each,
+            f"{{declared.differential.{each}}}",
+            *(
+                ", ".join(
+                    f"{{robustness_{robot}:success.{robot}.{each}.{k} x100|.0f}}"
+                    for k in range(4)
+                )
+                for robot in POLICIES
+            ),
+        )
+        for each in PERTURBATIONS
+    ),
+)
+BASELINES = Table(
+    ("`circles`, success", "differential", "ackermann", "mecanum"),
+    tuple(
+        (
+            "baselines",
+            f"`{policy}`",
+            *(
+                f"{{{at}.success.value|.1%}} ({{{at}.success.low x100|.1f}} to "
+                f"{{{at}.success.high x100|.1f}}), collision {{{at}.collision.value|.1%}}"
+                for at in (
+                    f"circles/{robot}/{policy}"
+                    for robot in ("differential", "ackermann", "mecanum")
+                )
+            ),
+        )
+        for policy in ("dynamic_window", "mppi", "straight", "random")
+    ),
+)
+BARN = Table(
+    ("in the 250 worlds", "success", "collision", "time-out", "time", "score"),
+    tuple(
+        (
+            run,
+            who,
+            *(f"{{{at}{key}|.1%}}" for key in ("success", "collision", "time_out")),
+            f"{{{at}time_s|.1f}} s",
+            f"{{{at}score|.3f}}",
+        )
+        for run, at, who in (
+            ("barn", "", "the Jackal's policy, which was learnt from them"),
+            ("barn_five_fold", "", "learnt from four fifths, in the rest"),
+            (
+                "barn_mujoco",
+                "",
+                "the Jackal's policy in MuJoCo over DDS, every tenth world",
+            ),
+            ("barn", "policies.mppi.", "`mppi`"),
+            ("barn", "policies.dynamic_window.", "`dynamic_window`"),
+            ("barn", "policies.straight.", "`straight`"),
+        )
+    ),
+)
+TRAINING = Table(
+    (
+        "robot",
+        "lidar",
+        "success",
+        "collision",
+        "environment steps",
+        "time",
+        "steps per second",
+    ),
+    tuple(
+        (
+            f"training_{robot}{run}",
+            robot,
+            lidar,
+            "{success_rate|.1%} ({success_95ci.0 x100|.1f} to {success_95ci.1 x100|.1f})",
+            "{collision_rate|.1%}",
+            "{env_steps|,}",
+            "{wall_s|.0f} s",
+            "{steps_per_s|,.0f}",
+        )
+        for run, lidar in (("", "the paper's"), ("_rplidar", "RPLIDAR A2"))
+        for robot in ("differential", "mecanum", "ackermann")
+    ),
+)
+MUJOCO = Table(
+    ("robot", "error / path, mean", "worst unseen drive", "speed-up, batched", "alone"),
+    tuple(
+        (
+            "generate_from_mujoco",
+            title,
+            f"{{robots.{robot}.position_error_over_path|.3f}}",
+            f"{{robots.{robot}.worst_drive_error_over_path|.3f}}",
+            f"{{robots.{robot}.speed_up_batched|.1e}}",
+            f"{{robots.{robot}.speed_up_single|.1e}}",
+        )
+        for robot, title in (*ROBOTS.items(), ("jackal", "Jackal, skid-steer"))
+    ),
+)
+ERRORS = (
+    "{%s.error_m|.3f} m",
+    "{%s.share_of_path|.1%%}",
+    "{%s.yardstick_share|.1%%}",
+    "{%s.constant_twist_share|.1%%}",
+    "{%s.coverage_95|.0%%}",
+)
+REAL_DRIVES = Table(
+    (
+        "drive",
+        "error",
+        "of the path",
+        "fitted textbook",
+        "constant twist",
+        "95 % band holds",
+    ),
+    tuple(
+        ("real_drives", title, *(each % place for each in ERRORS))
+        for title, place in (
+            ("XTARK car, 45 s", "drives.xtark_random_drive_45s"),
+            ("JetRacer by throttle, up to 5 m/s", "drives.jetracer_free_driving_104s"),
+            ("JetRacer by throttle, slow", "drives.jetracer_random_driving_slow_63s"),
+            ("F1/10, slippery floor, DS1", "drives.f110_ds1"),
+            ("F1/10, slippery floor, DS3", "drives.f110_ds3"),
+            ("F1/10, slippery floor, DS4", "drives.f110_ds4"),
+            ("differential, ticks, 1", "drives.ticks_01"),
+            ("differential, ticks, 2", "drives.ticks_02"),
+            ("simulated skid-steer", "own_robots.skid_steer"),
+            ("simulated car by throttle", "own_robots.throttle_car"),
+            ("simulated tricycle", "own_robots.tricycle"),
+            ("simulated tricycle, slewed commands", "own_robots.slewed_tricycle"),
+            ("simulated omnidirectional", "own_robots.omni"),
+            ("simulated differential, ticks", "own_robots.ticks"),
+        )
+    ),
+)
+PAPER_STEPS = {
+    "ackermann": ("3.1e-9", "9.7e-6", "9.9e-5", "", "9.0e4", ""),
+    "differential": ("2.6e-7", "5.1e-9", "1.6e-16", "", "5.7e4", ""),
+    "mecanum": ("1.2e-17", "9.4e-18", "3.8e-17", "", "4.7e4", ""),
+}
+TABLE1 = Table(
+    (
+        "robot",
+        "",
+        "x [m]",
+        "y [m]",
+        "heading [rad]",
+        "terms",
+        "steps/s, one robot",
+        "steps/s, batched",
+    ),
+    tuple(
+        row
+        for robot, title in ROBOTS.items()
+        for row in (
+            (
+                "table1_kinematics",
+                title,
+                "here",
+                *(
+                    f"{{robots.{robot}.rmse_{each}|.1e}}"
+                    for each in ("x_m", "y_m", "heading_rad")
+                ),
+                f"{{robots.{robot}.terms_kept}} of {{robots.{robot}.terms_total}}",
+                f"{{robots.{robot}.steps_per_s_single|.1e}}",
+                f"{{robots.{robot}.steps_per_s_batched|.1e}}",
+            ),
+            ("table1_kinematics", "", "paper", *PAPER_STEPS[robot]),
+        )
+    ),
+)
+SHAPES = {
+    "circle": "circle, r 0.15 m",
+    "square": "square, 0.3 m",
+    "strip": "strip, 0.6 x 0.06 m",
+    "mixture": "mixture",
+}
+LIDAR_PEERS = Table(
+    (
+        "",
+        "scans/s",
+        "baked is faster",
+        "RMSE against our exact scan",
+        "its cost in a step / alone",
+    ),
+    (
+        ("lidar_peers", "baked", "{baked|.1e}", "", "{rmse_m.baked x1000|.1f} mm", ""),
+        ("lidar_peers", "exact", "{exact|.1e}", "", "", ""),
+        *(
+            (
+                "lidar_peers",
+                title,
+                f"{{{name}|,.0f}}",
+                f"{{times_as_fast_at_equal_work.{name}|,.0f}} times",
+                f"{{rmse_m.{name}|.1g}} m{further}",
+                f"{{agreement.{name}|.2f}}",
+            )
+            for name, title, further in (
+                ("ir_sim", "ir-sim 2.12.0", " (its circles are polygons)"),
+                ("irsim_x", "irsim-x 1.1.4", ""),
+            )
+        ),
+    ),
+)
+PAPER_SCANS = {
+    "circle": ("57", "330", "0.085", "0.0056"),
+    "square": ("3.6", "332", "0.089", "0.0067"),
+    "strip": ("4.2", "324", "0.105", "0.0099"),
+    "mixture": ("5.7", "339", "0.091", "0.0072"),
+}
+# The paper's average speeds are harmonic means of its four scenes, its errors arithmetic ones.
+PAPER_AVERAGE = ("5.65", "331", "0.0923", "0.00735")
+AVERAGE_SCENE = (
+    (
+        "table2_lidar",
+        "average",
+        "here",
+        "{harmonic_mean scenes.*.exact_scans_per_s|.1e}",
+        "{harmonic_mean scenes.*.baked_scans_per_s|.1e}",
+        "{mean scenes.*.rmse_m|.4f}",
+        "{mean scenes.*.area_rmse_m2|.4f}",
+        "{mean scenes.*.share_of_write_limit|.0%}",
+        "",
+    ),
+    (
+        "table2_lidar",
+        "",
+        "nearest row",
+        "",
+        "",
+        "{mean scenes.*.nearest_row_rmse_m|.3f}",
+        "{mean scenes.*.nearest_row_area_rmse_m2|.3f}",
+        "",
+        "",
+    ),
+    ("table2_lidar", "", "paper", *PAPER_AVERAGE, "", ""),
+)
+TABLE2 = Table(
+    (
+        "scene",
+        "",
+        "scan mode [1/s]",
+        "baked [1/s]",
+        "RMSE [m]",
+        "RMSE of the area [m²]",
+        "of the write limit",
+        "table",
+    ),
+    tuple(
+        row
+        for name, title in SHAPES.items()
+        for row in (
+            (
+                "table2_lidar",
+                title,
+                "here",
+                f"{{scenes.{name}.exact_scans_per_s|.1e}}",
+                f"{{scenes.{name}.baked_scans_per_s|.1e}}",
+                f"{{scenes.{name}.rmse_m|.4f}}",
+                f"{{scenes.{name}.area_rmse_m2|.4f}}",
+                f"{{scenes.{name}.share_of_write_limit|.0%}}",
+                f"{{table_bytes.{name} x1e-6|.2g}} MB",
+            ),
+            (
+                "table2_lidar",
+                "",
+                "nearest row",
+                "",
+                "",
+                f"{{scenes.{name}.nearest_row_rmse_m|.3f}}",
+                f"{{scenes.{name}.nearest_row_area_rmse_m2|.3f}}",
+                "",
+                "",
+            ),
+            ("table2_lidar", "", "paper", *PAPER_SCANS[name], "", ""),
+        )
+    )
+    + AVERAGE_SCENE,
+)
+TABLE2_HOKUYO = Table(
+    (
+        "scene",
+        "exact [1/s]",
+        "baked [1/s]",
+        "RMSE [m]",
+        "nearest row's",
+        "of the write limit",
+        "table",
+    ),
+    tuple(
+        (
+            "table2_hokuyo",
+            title,
+            f"{{scenes.{name}.exact_scans_per_s|.1e}}",
+            f"{{scenes.{name}.baked_scans_per_s|.1e}}",
+            f"{{scenes.{name}.rmse_m|.4f}}",
+            f"{{scenes.{name}.nearest_row_rmse_m|.3f}}",
+            f"{{scenes.{name}.share_of_write_limit|.0%}}",
+            f"{{table_bytes.{name} x1e-6|.2g}} MB",
+        )
+        for name, title in SHAPES.items()
+    ),
+)
+DENSITIES = ("100x240", "50x240", "100x120")
+TABLE3 = Table(
+    ("look-up", "distances x rotations", *SHAPES, "worse, on average"),
+    (
+        *(
+            (
+                "table3_density",
+                title if not k else "",
+                density.replace("x", " x "),
+                *(f"{{{path}{density}.{name}|{how}}}" for name in SHAPES),
+                f"{{times_worse.{key}.{density}|.2f}} times" if k else "",
+            )
+            for key, title, path, how in (
+                ("ours", "here", "", ".4f"),
+                ("nearest_row", "nearest row", "nearest_row.", ".3f"),
+            )
+            for k, density in enumerate(DENSITIES)
+        ),
+        ("table3_density", "paper", "50 x 240", "", "", "", "", "3.47 times"),
+        ("table3_density", "", "100 x 120", "", "", "", "", "little"),
+    ),
+)
+LIDAR_COMPLEXITY = Table(
+    ("vertices", *(str(2**power) for power in range(2, 13))),
+    tuple(
+        ("lidar_complexity", name, *(f"{{{name}_us.{k}|.2g}}" for k in range(11)))
+        for name in ("exact", "baked")
+    ),
+)
+MAPS = Table(
+    (
+        "720 beams, map of 20 m x 20 m at 0.05 m",
+        "range [m]",
+        "exact [scans/s]",
+        "baked [scans/s]",
+        "ratio",
+        "RMSE [mm]",
+    ),
+    tuple(
+        (
+            "map_lidar",
+            title,
+            f"{{rows.{k}.range_max_m|.0f}}",
+            f"{{rows.{k}.exact_scans_per_s|,}}",
+            f"{{rows.{k}.baked_scans_per_s|,}}",
+            f"{{rows.{k}.ratio|.1f}}",
+            f"{{rows.{k}.rmse_m x1000|.1g}}",
+        )
+        for k, title in enumerate((*("office",) * 2, *("as SLAM leaves it",) * 2))
+    ),
+)
+FIG4 = Table(
+    ("", "against scan mode", "[mm]"),
+    (
+        *(
+            ("fig4_pointcloud", title, what, f"{{{path} x1000|{how}}}")
+            for title, key, how in (
+                ("baked", "baked", ".1f"),
+                ("MuJoCo", "mujoco", ".1g"),
+            )
+            for what, path in (
+                ("RMSE of the cloud, to the nearest point", f"cloud_rmse_m.{key}"),
+                ("RMSE beam by beam", f"range_rmse_m.{key}"),
+            )
+        ),
+        (
+            "fig4_pointcloud",
+            "odometry",
+            "error of the path",
+            "{slam.odometry_error_m x1000|.0f}",
+        ),
+        (
+            "fig4_pointcloud",
+            "SLAM",
+            "error of the path",
+            "{slam.path_error_m x1000|.0f}",
+        ),
+    ),
+)
+TABLES: Mapping[str, Table] = {
+    "first_screen": FIRST_SCREEN,
+    "figures": FIGURES,
+    "safety": SAFETY,
+    "lidar_peers": LIDAR_PEERS,
+    "env_throughput": THROUGHPUT,
+    "real_lidars": REAL_LIDARS,
+    "env_scaling": SCALING,
+    "table1": TABLE1,
+    "table2": TABLE2,
+    "table2_hokuyo": TABLE2_HOKUYO,
+    "table3": TABLE3,
+    "lidar_complexity": LIDAR_COMPLEXITY,
+    "maps": MAPS,
+    "fig4": FIG4,
+    "estimator": ESTIMATOR,
+    "transfer": TRANSFER,
+    "robustness": ROBUSTNESS,
+    "barn": BARN,
+    "baselines": BASELINES,
+    "training": TRAINING,
+    "mujoco": MUJOCO,
+    "real_drives": REAL_DRIVES,
+}
+
+
+@cache
+def paths_of(run: str) -> tuple[tuple[str, ...], ...]:
+    """The paths to all figures of a run that some table shows."""
+    return tuple(
+        tuple(match["path"].split("."))
+        for table in TABLES.values()
+        for row in table.rows
+        for cell in row[1:]
+        for match in PLACEHOLDER.finditer(cell)
+        if (match["run"] or row[0]) == run
+    )

@@ -1,0 +1,249 @@
+"""Random commands at random intervals: does the gate ever exceed a limit?
+
+The whole gate decides, on an injected clock. What it publishes is judged by finite differences
+against the limits of the YAML file, by code that shares nothing with the gate: value (speed and
+steering), its rate (acceleration and steering rate), the rate's rate (jerk). A stop has to be
+exactly zero. Among the commands are NaN, inf and absurd ones, after which nothing may move; some
+ticks come late, and now and then somebody presses the emergency stop. A part of the steps is driven
+with limits drawn at random, from plausible ones to 1e-308 and 1e308; there what is published has to
+be numbers within them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from campaign import answer, parser_of
+from numpy.typing import NDArray
+from parts.gates import Gate, gate_config
+
+from nics_drl_bridge.config import find_config, parse_yaml, read_text
+from nics_drl_bridge.gate.inputs import Press
+from nics_drl_bridge.gate.limits import Limits
+from nics_drl_bridge.gate.state import Decision
+from nics_drl_bridge.lidar.spec import LidarSpec
+from nics_drl_bridge.robot.spec import RobotSpec, load_robot
+
+ROBOTS = ("ackermann", "differential", "mecanum")
+LIDAR = LidarSpec(
+    beams=8, angle_min=-3.0, angle_max=3.0, range_min=0.05, range_max=3.0, rate=10.0
+)
+SHORTEST_S = 1e-3
+LONGEST_S = 0.22
+TOLERANCE = 1e-6
+"""Of a finite difference: rounding of the published values, divided by the interval."""
+ODD = np.array([np.nan, np.inf, -np.inf, 1e300, -1e300, 1e3])
+LEAST_MOTION = 0.8
+"""Of the steps within shipped limits are to be in motion; a late tick stops it for 0.2 s."""
+RANDOM_SHARE, WITH_ONE = 4, 200
+"""One in so many steps has random limits, which are redrawn after so many steps."""
+FASTEST = 50.0
+"""What odometry shows at most [m/s, rad/s]."""
+Array = NDArray[np.float64]
+
+
+class Judge:
+    """Compares what is published with the limits of the file.
+
+    Attributes:
+        violations: how often a limit was exceeded, by its name.
+        sane: whether the newest command is one.
+        low, high: (C,) limits of the value.
+    """
+
+    def __init__(self, spec: RobotSpec, limits: Limits | None = None) -> None:
+        path = find_config(spec.name, "limits")
+        rows = parse_yaml(read_text(path), str(path))["commands"]
+        each = [rows[variable.name] for variable in spec.command]
+        self.low, self.high, self._rate, self._jerk = (
+            np.array([row[key] for row in each])
+            for key in ("min", "max", "rate", "jerk")
+        )
+        self._slopes = limits is None  # of others, rounding may be all there is
+        if limits is not None:
+            self.low = limits.low
+            self.high = limits.high
+        self._spec = spec
+        self._value = np.zeros(len(each))
+        self._slope = np.zeros(len(each))
+        self._time = -np.inf
+        self.sane = True
+        self.violations = dict.fromkeys(
+            ("value", "rate", "jerk", "stop", "odd", "unused"), 0
+        )
+
+    def see(self, decision: Decision, now: float) -> None:
+        """Judges one decision of the gate."""
+        if not decision.publish:
+            return
+        value = self._spec.from_cmd_vel(decision.twist)
+        unused = not np.array_equal(self._spec.to_cmd_vel(value), decision.twist)
+        self._count("unused", unused)
+        self._count("odd", not self.sane and decision.twist.any())
+        if decision.cause is not None:
+            self._count("stop", decision.twist.any())
+            self._value, self._slope, self._time = value, np.zeros_like(value), now
+            return
+        inside = (value >= self.low) & (value <= self.high)  # False for NaN
+        self._count("value", not inside.all())
+        if not self._slopes:
+            return
+        passed = now - self._time
+        slope = (value - self._value) / passed
+        self._count("rate", not (np.abs(slope) <= self._rate * (1 + TOLERANCE)).all())
+        change = np.abs(slope - self._slope) / passed
+        self._count("jerk", not (change <= self._jerk * (1 + TOLERANCE)).all())
+        self._value = value
+        self._slope = slope
+        self._time = now
+
+    def _count(self, name: str, violated: object) -> None:
+        self.violations[name] += bool(violated)
+
+
+def random_limits(spec: RobotSpec, shipped: Limits, rng: np.random.Generator) -> Limits:
+    """Limits of a robot: plausible ones, or of any size that a float has."""
+    widest = 1.0 if rng.random() < 0.5 else 308.0
+    low, high, rate, jerk = 10.0 ** rng.uniform(-widest, widest, (4, len(spec.command)))
+    return replace(shipped, low=-low, high=high, rate=rate, jerk=jerk)
+
+
+def drive(
+    spec: RobotSpec, steps: int, rng: np.random.Generator, control: str, random: bool
+) -> tuple[dict[str, int], int]:
+    """Violations by name of so many steps, and at how many of them the robot moved."""
+    config = gate_config(spec, LIDAR)
+    assert config.limits is not None
+    drawn = random_limits(spec, config.limits, rng) if random else None
+    limits = drawn or config.limits
+    judge = Judge(spec, drawn)
+    if control == "no_limits":
+        wide = {
+            key: 100.0 * getattr(limits, key) for key in ("low", "high", "rate", "jerk")
+        }
+        limits = replace(limits, **wide)
+    gate = Gate(replace(config, limits=limits), LIDAR)
+    ranges = np.ones(LIDAR.beams, np.float32)
+    pose = np.zeros(3)
+    twist = np.zeros(3)
+
+    def see(decision: Decision, now: float) -> None:
+        if control == "nan" and rng.random() < 1e-3:
+            decision = replace(decision, twist=np.full(3, np.nan))
+        judge.see(decision, now)
+
+    gate.witness = see
+    sensed = -np.inf
+    moving = 0
+    gaps = np.exp(rng.uniform(np.log(SHORTEST_S), np.log(LONGEST_S), steps))
+    whims = rng.random(steps)
+    for gap, whim in zip(gaps, whims, strict=True):
+        if not gate.state.armed:
+            gate.arm(ranges, pose)
+            sensed = gate.now
+        gate.now += float(gap)
+        pose = pose + twist * gap
+        if gate.now - sensed > 0.05:
+            ranges = rng.uniform(0.5, 2.5, LIDAR.beams).astype(np.float32)
+            gate.sense(ranges, pose, twist)
+            sensed = gate.now
+        if whim < 0.6:
+            wish = spec.to_cmd_vel(_wish(judge, whim, rng))
+            wish = np.zeros(3) if control == "standing" else wish
+            reach = 50.0 * np.maximum(-judge.low, judge.high)
+            asked = np.abs(spec.from_cmd_vel(wish)) < reach
+            judge.sane = bool(np.isfinite(wish).all() and asked.all())
+            gate.command(wish)
+        elif whim > 1.0 - 1e-4:
+            gate.give(Press())
+        decision = gate.tick()
+        if decision.publish:
+            twist = np.clip(np.nan_to_num(decision.twist), -FASTEST, FASTEST)
+        moving += bool(decision.twist.any())
+    return judge.violations, moving
+
+
+def _wish(judge: Judge, whim: float, rng: np.random.Generator) -> Array:
+    """A command (C,): within the limits, at them, beyond them, or nonsense."""
+    low = judge.low
+    high = judge.high
+    share = rng.random(len(low))
+    wish = low * share + high * (1.0 - share)
+    if whim < 0.2:
+        wish = np.where(rng.random(len(low)) < 0.5, low, high)
+    elif whim < 0.3:
+        wish = wish * rng.uniform(1.0, 9.0)
+    elif whim < 0.31:
+        wish[rng.integers(len(wish))] = rng.choice(ODD)
+    return np.asarray(wish)
+
+
+def _within_random_limits(
+    spec: RobotSpec, steps: int, rng: np.random.Generator, control: str
+) -> tuple[dict[str, int], int]:
+    """As `drive`, with other limits now and then."""
+    total: dict[str, int] = {}
+    moving = 0
+    for begin in range(0, steps, WITH_ONE):
+        with np.errstate(over="ignore", invalid="ignore"):
+            some, moved = drive(
+                spec, min(WITH_ONE, steps - begin), rng, control, random=True
+            )
+        total = {name: total.get(name, 0) + count for name, count in some.items()}
+        moving += moved
+    return total, moving
+
+
+def main() -> None:
+    """Prints a table, or one JSON object; ends with 1 after a violation."""
+    parser = parser_of(__doc__)
+    parser.add_argument("--steps", type=int, default=100_000)
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args()
+    total: dict[str, int] = {}
+    moving = 0
+    shipped_steps = 0
+    moved_random = 0
+    control = given.control or ""
+    for index, robot in enumerate(ROBOTS):
+        rng = np.random.default_rng([given.seed, index])
+        spec = load_robot(robot)
+        steps = given.steps // len(ROBOTS) + (index < given.steps % len(ROBOTS))
+        others = steps // RANDOM_SHARE
+        within, moved = drive(spec, steps - others, rng, control, random=False)
+        beyond, more = _within_random_limits(spec, others, rng, control)
+        moving = moving + moved
+        shipped_steps = shipped_steps + steps - others
+        moved_random = moved_random + more
+        both = {name: count + beyond.get(name, 0) for name, count in within.items()}
+        total = {name: total.get(name, 0) + count for name, count in both.items()}
+    result = {
+        "steps": given.steps,
+        "violations": sum(total.values()),
+        "in_motion": moving + moved_random,
+        "steps_within_shipped_limits": shipped_steps,
+        "in_motion_within_shipped_limits": moving,
+        "in_motion_with_random_limits": moved_random,
+        "by": total,
+    }
+    answer(result, missed_by(result), given.json)
+
+
+def missed_by(result: dict[str, object]) -> list[str]:
+    """A sentence for each bar that was missed."""
+    missed = []
+    by = result["by"]
+    steps = result["steps_within_shipped_limits"]
+    moving = result["in_motion_within_shipped_limits"]
+    if result["violations"] != 0:
+        missed.append(f"{result['violations']} violations, bar 0: {by}")
+    if not steps or not moving / steps >= LEAST_MOTION:  # type: ignore[operator]
+        missed.append(f"in motion at {moving} of {steps} steps, bar {LEAST_MOTION:.0%}")
+    if not result["in_motion_with_random_limits"]:
+        missed.append("with random limits the robot never moved: nothing was measured")
+    return missed
+
+
+if __name__ == "__main__":
+    main()

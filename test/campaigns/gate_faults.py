@@ -1,0 +1,248 @@
+"""Faults around a gate of real processes: how long until the robot is told to stop, and stays so?
+
+The gate, and for some faults the policy, are processes of their own, as on a vehicle; this one
+publishes what a robot publishes, over DDS and at 10 Hz, and breaks it while the robot is being told
+to move, at any phase. The worst time counts from the last good datum before the fault (or from the
+fault itself, where it is an event) to the arrival of a zero on `cmd_vel`; the median, from the
+fault. A command is unsafe when it moves the robot after the fault's limit, holds NaN or inf, or
+lies outside the limits of the robot. After a freeze of the gate itself its first word must be a
+zero.
+
+`end_after_stops` is another thing: good and NaN commands in turn, and then SIGINT.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from campaign import answer, at_least, at_most, missed_bars, parser_of
+from parts.faults import FAULTS, LATE_S, Around
+from parts.faulty_robot import ROBOT, SPEED, NoMotionError, Robot
+from parts.gate_end import END, Ended, end_after_stops
+from parts.processes import busy
+
+from nics_drl_bridge.errors import BackendError
+from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
+
+WATCHED_S = 0.8
+MEDIAN_S = 0.30
+LOG_CHARACTERS = 500
+MOST_IDLE = 3
+GATE = "command_gate"
+POLICY = "policy_node"
+PATIENCE_S = 60.0
+SHORT_PATIENCE_S = 8.0
+AGES = {"scan_age": 3.0, "odom_age": 3.0, "command_age": 3.0, "e_stop_silence": 2.5}
+"""Ten times the gate's own [s]."""
+
+
+@dataclass
+class Result:
+    """What one fault led to.
+
+    Attributes:
+        unsafe: commands that must not have been.
+        times: from the last good datum to zero [s].
+        after: from the fault to zero [s].
+    """
+
+    unsafe: int = 0
+    times: list[float] = field(default_factory=list)
+    after: list[float] = field(default_factory=list)
+
+    def summary(self, limit_s: float) -> dict[str, Any]:
+        """For the JSON object; NaN where nothing was measured."""
+        return {
+            "n": len(self.times),
+            "p50_s": round(float(np.median(self.after)), 4)
+            if self.after
+            else float("nan"),
+            "max_s": round(max(self.times), 4) if self.times else float("nan"),
+            "limit_s": limit_s,
+            "unsafe_commands": self.unsafe,
+        }
+
+
+def missed_by(name: str, one: dict[str, Any], wanted: int) -> list[str]:
+    """A sentence for each bar that a fault's summary misses."""
+    bars = {
+        "n": at_least(wanted, "injections while the robot moved"),
+        "max_s": at_most(one["limit_s"], "time to zero [s]"),
+        "unsafe_commands": at_most(0),
+    }
+    if one["limit_s"] == LATE_S:
+        bars["p50_s"] = at_most(MEDIAN_S, "median time to zero [s]")
+    return missed_bars(one, bars, f"{name}: ")
+
+
+def inject(around: Around, name: str, result: Result, patience_s: float) -> None:
+    """Drives, breaks something, and watches what the gate says."""
+    fault = FAULTS[name]
+    robot = around.robot
+    ways = [fault.inject] if callable(fault.inject) else fault.inject
+    robot.drive(patience_s)
+    robot.heard.clear()
+    broken = time.monotonic()
+    ways[len(result.times) % len(ways)](around)
+    robot.until(lambda: False, fault.limit_s + WATCHED_S)
+    good = robot.sent_s[fault.since] if fault.since else broken
+    moving = [when for when, twist in robot.heard if twist.any()]
+    zeros = [when for when, twist in robot.heard if not twist.any()]
+    if fault.first_word:  # it may drive on
+        moving = [when for when in moving if when < min(zeros, default=float("inf"))]
+    last = max(moving, default=broken)
+    stopped = min((when for when in zeros if when > last), default=float("inf"))
+    result.times.append(stopped - good)
+    result.after.append(stopped - broken)
+    low = np.array([0.0, 0.0, -0.5])
+    high = np.array([1.0, 0.0, 0.5])
+    wild = sum(not ((twist >= low) & (twist <= high)).all() for _, twist in robot.heard)
+    late = (
+        len(moving)
+        if fault.first_word
+        else sum(w - good > fault.limit_s for w in moving)
+    )
+    result.unsafe += int(wild) + int(late)
+
+
+class Bench:
+    """A gate, or what stands for it under a control, and a robot around it.
+
+    Args:
+        name: of the fault.
+        control: what is taken out; empty for nothing.
+        stack: ends it all.
+    """
+
+    def __init__(self, name: str, control: str, stack: ExitStack) -> None:
+        self.domain_id = free_domain_id()
+        self.folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        given: dict[str, Any] = {
+            "model": ROBOT,
+            "limits": ROBOT,
+            "e_stop_required": True,
+        }
+        given["black_box"] = str(self.folder / "black_box")
+        given["enable_stamped_cmd_vel"] = False
+        given["stop_when_held"] = False  # the robot's scans do not show how it moves
+        given |= AGES if control == "slow_gate" else {}
+        self.gate = None
+        if control != "no_gate":
+            process = NodeProcess(GATE, self.folder, given, self.domain_id)
+            self.gate = stack.enter_context(process)
+        policy = FAULTS[name].policy if name in FAULTS else False
+        speed = 0.0 if control == "standing" else SPEED
+        self.robot = Robot(self.domain_id, policy, speed, relayed=control == "no_gate")
+        stack.callback(self.robot.close)
+        self.goal = [0.0, 0.0] if control == "standing" else [1e6, 0.0]
+        self.patience_s = SHORT_PATIENCE_S if control == "standing" else PATIENCE_S
+
+
+def measure(
+    names: Sequence[str], repeats: int, told: Callable[[str], None], control: str = ""
+) -> dict[str, Result]:
+    """Injects each fault so often; a gate of its own for each fault."""
+    results = {name: Result() for name in names}
+    for name in names:
+        with ExitStack() as stack:
+            bench = Bench(name, control, stack)
+            idle = 0
+            while (known := len(results[name].times)) < repeats and idle < MOST_IDLE:
+                _some(bench, name, repeats, results[name])
+                told(f"{name}: {len(results[name].times)} of {repeats}")
+                idle = idle + 1 if known == len(results[name].times) else 0
+    return results
+
+
+def _some(bench: Bench, name: str, repeats: int, result: Result) -> None:
+    """One injection; or, if the policy outlives it, all of them with one policy."""
+    if not FAULTS[name].policy:
+        try:
+            inject(
+                Around(bench.robot, None, bench.gate), name, result, bench.patience_s
+            )
+        except NoMotionError as error:
+            sys.stderr.write(f"{name}: {error}\n")
+        return
+    given = {"model": ROBOT, "goal": bench.goal}
+    with NodeProcess(POLICY, bench.folder, given, bench.domain_id) as policy:
+        while len(result.times) < repeats:
+            try:
+                around = Around(bench.robot, policy, bench.gate)
+                inject(around, name, result, bench.patience_s)
+            except NoMotionError as error:
+                # Nothing was injected yet; who was killed may leave DDS ill.
+                told = policy.log.read_text(encoding="utf-8", errors="replace")[
+                    -LOG_CHARACTERS:
+                ]
+                sys.stderr.write(
+                    f"{name}: {error}; another policy is started. {told}\n"
+                )
+                return
+            try:
+                os.kill(policy.pid, signal.SIGCONT)
+                policy.check()
+            except (BackendError, ProcessLookupError):
+                return
+
+
+def _ends(given: Any, control: str, told: Callable[[str], None]) -> Ended:
+    """The end of a gate after many stops."""
+    with ExitStack() as stack:
+        bench = Bench(END, control, stack)
+        try:
+            return end_after_stops(
+                bench.robot, bench.gate, bench.folder, given.seconds, told
+            )
+        except NoMotionError as error:
+            told(f"{END}: {error}")
+            return Ended()
+
+
+def main() -> None:
+    """Prints a table, or one JSON object; ends with 1 when a stop came late."""
+    parser = parser_of(__doc__)
+    parser.add_argument("--repeats", type=int, default=30)
+    known = sorted([*FAULTS, END])
+    parser.add_argument("--fault", action="append", choices=known, help="only this one")
+    parser.add_argument(
+        "--load", type=int, default=0, help="keep so many cores busy besides"
+    )
+    parser.add_argument(
+        "--seconds", type=float, default=15.0, help=f"of commands for {END}"
+    )
+    given = parser.parse_args()
+    control = given.control or ""
+    names = given.fault or [*FAULTS, END]
+
+    def told(line: str) -> None:
+        sys.stderr.write(f"{line}\n")
+
+    with busy(given.load):
+        faults = [name for name in names if name != END]
+        results = measure(faults, given.repeats, told, control)
+        ended = _ends(given, control, told) if END in names else None
+    summary = {name: one.summary(FAULTS[name].limit_s) for name, one in results.items()}
+    missed = [
+        line
+        for name in faults
+        for line in missed_by(name, summary[name], given.repeats)
+    ]
+    if ended is not None:
+        summary[END] = ended.summary()
+        missed += ended.missed()
+    answer(summary, missed, given.json)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,222 @@
+"""How much of a core does the gate take, beside a bare rclpy node that hears the same?
+
+Around the real `command_gate` a robot publishes over DDS what a vehicle does: scans of 720 beams,
+commands and the emergency stop's heartbeat at 10 Hz, odometry and the estimate at 50 Hz. Beside it
+a bare node, made and spun as rclpy's examples do, has the same subscriptions with callbacks that do
+nothing, and publishes a constant at the gate's rate. Both hear the same messages in the same
+seconds, so that what else the machine does weighs on both; `ratio` is the gate's share of a core to
+that node's. Shares are of whole processes, threads of the middleware included, from /proc (Linux).
+
+Then good and NaN commands come in turn for some seconds, each a stop, and the gate is ended by
+SIGINT: `exit_s` is how long it still lives. The first of those stops has to be in the black box.
+"""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rclpy
+from campaign import answer, at_least, at_most, missed_bars, parser_of
+from geometry_msgs.msg import Twist, TwistStamped
+from nav_msgs.msg import Odometry
+from parts.processes import core_seconds, part
+from parts.steady_robot import ODOM_HZ, PATIENCE_S, ROBOT, SteadyRobot
+from sensor_msgs.msg import LaserScan
+from std_msgs.msg import Bool
+
+from nics_drl_bridge.gate.black_box import replay
+from nics_drl_bridge.nodes import command_gate, gate_log, qos
+from nics_drl_bridge.nodes.processes import free_domain_id
+from nics_drl_bridge.nodes.start import start
+
+GATE = "command_gate"
+TICK_HZ = 50
+BARS = {
+    "ratio": at_most(1.1, "the gate's share of a core to the bare node's"),
+    "longest_gap_s": at_most(0.2, "time without a command [s]"),
+    "longest_gap_in_burst_s": at_most(0.2, "time without a command in the burst [s]"),
+    "sent": at_least(0.9, "invalid: share of the messages that were sent"),
+    "moving": at_least(0.8, "invalid: share of the commands that came and moved"),
+    "stops": at_least(3, "invalid: stops in the burst"),
+    "exit_s": at_most(2.0, "from SIGINT to the gate's end [s]"),
+}
+"""After a gap between two commands of more than 0.2 s the gate itself stops."""
+BUSY = 10
+HUNG_S = 4.0
+
+
+def bare_node() -> None:
+    """The yardstick: hears what the gate hears and does nothing, until it is killed."""
+    rclpy.init()
+    node = rclpy.create_node("bare")
+    twists = node.create_publisher(Twist, "cmd_vel_of_nobody", qos.COMMAND)
+    for kind, topic, profile in (
+        (LaserScan, "scan", qos.SENSOR),
+        (Odometry, "odom", qos.SENSOR),
+        (Odometry, "odometry/filtered", qos.SENSOR),
+        (TwistStamped, "cmd_vel_raw", qos.COMMAND),
+        (Bool, "e_stop", qos.EVERY_COMMAND),
+    ):
+        node.create_subscription(kind, topic, lambda _: None, profile)
+    node.create_timer(1.0 / TICK_HZ, lambda: twists.publish(Twist()))
+    rclpy.spin(node)
+
+
+class FrozenWriter(gate_log.BoxWriter):
+    """A writer of the black box that does nothing, as if its disk hung."""
+
+    def _start(self) -> None:
+        super()._start()
+        self._process.send_signal(signal.SIGSTOP)
+
+
+def ill_gate(control: str, arguments: list[str]) -> None:
+    """A control's gate: the real one, but for what is taken out."""
+    if control == "busy":
+        command_gate.decide = _often(command_gate.decide)
+        for name in ("scan", "odometry", "estimate", "command", "e_stop"):
+            setattr(command_gate, name, _often(getattr(command_gate, name)))
+    else:
+        gate_log.BoxWriter = FrozenWriter
+        gate_log.CLOSING_S = HUNG_S
+    start(GATE, [GATE, *arguments])
+
+
+def _often(call: Callable[..., Any]) -> Callable[..., Any]:
+    """Something without effects, done again and again."""
+
+    def again(*given: Any) -> Any:
+        for _ in range(BUSY - 1):
+            call(*given)
+        return call(*given)
+
+    return again
+
+
+def gate(domain_id: int, folder: Path, control: str) -> Any:
+    """The gate as a process, or a control's."""
+    parameters = {
+        "model": ROBOT,
+        "limits": ROBOT,
+        "e_stop_required": "true",
+        "odom_rate": float(ODOM_HZ),
+        "black_box": str(folder),
+        "rate_tolerance": 0.6,
+        "shield": "false",
+        "enable_stamped_cmd_vel": "false",
+        "stop_when_held": "false",  # the robot's scans do not show how it moves
+    }
+    given = [f"{name}:={value}" for name, value in parameters.items()]
+    words = ["--part", control or "gate", "--ros-args"]
+    words += [word for one in given for word in ("-p", one)]
+    return part(__file__, domain_id, *words, stderr=subprocess.DEVNULL)
+
+
+def measure(seconds: float, burst_s: float, control: str) -> dict[str, Any]:
+    """Drives for a time and takes what both processes used of a core; then stops and ends."""
+    domain_id = free_domain_id()
+    with (
+        tempfile.TemporaryDirectory() as name,
+        gate(domain_id, Path(name), control) as real,
+        part(__file__, domain_id, "--part", "bare", stderr=subprocess.DEVNULL) as bare,
+    ):
+        robot = SteadyRobot(domain_id)
+        try:
+            if not robot.until(lambda: robot.listeners() >= 2, PATIENCE_S):
+                raise RuntimeError(
+                    f"not within {PATIENCE_S} s: the gate and the bare node"
+                )
+            robot.drive()
+            robot.until(lambda: False, 1.0)
+            shares = share_of_a_core(robot, (real.pid, bare.pid), seconds)
+            return shares | ended_after_a_burst(robot, real, burst_s, Path(name))
+        finally:
+            robot.close()
+
+
+def share_of_a_core(
+    robot: SteadyRobot, pids: tuple[int, int], seconds: float
+) -> dict[str, Any]:
+    """What the gate and the bare node use while commands pass."""
+    robot.heard.clear()
+    began = time.monotonic()
+    sent = robot.sent
+    used = [core_seconds(pid) for pid in pids]
+    robot.until(lambda: False, seconds)
+    lasted = time.monotonic() - began
+    sent = robot.sent - sent
+    of_gate, of_bare = (
+        (core_seconds(pid) - was) / lasted for pid, was in zip(pids, used, strict=True)
+    )
+    times = [began, *(when for when, _ in robot.heard), began + lasted]
+    return {
+        "seconds": round(lasted, 2),
+        "gate_share": round(of_gate, 4),
+        "bare_share": round(of_bare, 4),
+        "ratio": round(of_gate / of_bare, 3) if of_bare else float("nan"),
+        "longest_gap_s": round(float(np.diff(times).max()), 4),
+        "sent": round(sent / (lasted * ODOM_HZ), 3),
+        "moving": round(sum(moves for _, moves in robot.heard) / (lasted * TICK_HZ), 3),
+    }
+
+
+def ended_after_a_burst(
+    robot: SteadyRobot, real: subprocess.Popen[bytes], seconds: float, folder: Path
+) -> dict[str, Any]:
+    """Stops again and again, SIGINT, and what is in the black box then."""
+    robot.heard.clear()
+    robot.mad = True
+    robot.until(lambda: False, seconds)
+    times = [when for when, _ in robot.heard]
+    moving = [moves for _, moves in robot.heard]
+    real.send_signal(signal.SIGINT)
+    began = time.monotonic()
+    robot.until(lambda: real.poll() is not None, PATIENCE_S)
+    exit_s = time.monotonic() - began
+    files = sorted(folder.glob("*_command_malformed.jsonl"))
+    return {
+        "stops": sum(was and not moves for was, moves in pairwise(moving)),
+        "longest_gap_in_burst_s": round(float(np.diff(times).max()), 4),
+        "exit_s": round(exit_s, 3),
+        "files": len(list(folder.iterdir())),
+        "replayed": bool(files) and replay(files[0]).differing == (),
+    }
+
+
+def main() -> None:
+    """Prints a table, or one JSON object; ends with 1 when a bar was missed."""
+    parser = parser_of(__doc__)
+    parser.add_argument("--seconds", type=float, default=30.0, help="of driving")
+    parser.add_argument(
+        "--burst", type=float, default=15.0, help="of stops, before the end [s]"
+    )
+    parser.add_argument("--part", help=argparse.SUPPRESS)
+    given, rest = parser.parse_known_args()
+    if given.part == "bare":
+        bare_node()
+    elif given.part == "gate":
+        start(GATE, [GATE, *rest])
+    elif given.part is not None:
+        ill_gate(given.part, rest)
+    if given.part is not None:
+        return
+    if rest:
+        parser.error(f"unrecognized arguments: {' '.join(rest)}")
+    result = measure(given.seconds, given.burst, given.control or "")
+    missed = missed_bars(result, BARS)
+    if not result["replayed"]:
+        missed.append("the first stop of the burst is not in the black box")
+    answer(result, missed, given.json)
+
+
+if __name__ == "__main__":
+    main()

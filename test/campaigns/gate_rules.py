@@ -1,0 +1,115 @@
+"""Is every rule of the gate tested? Each is taken out in turn, and test/gate has to fail.
+
+A rule is a row of one of the gate's tables: stops, refusals, checks before arming, what shapes a
+motion, and what the shield takes for an obstacle. Each run is a process of its own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+from pathlib import Path
+
+from campaign import answer, parser_of
+
+from nics_drl_bridge.gate import arming, evidence, gate, intake
+
+LEAST_RULES = 30
+"""There are more; a run that found fewer has lost a table."""
+TESTS = "test/gate"
+OTHER_TEST = "test/gate/test_stopping.py"
+ROOT = Path(__file__).resolve().parents[2]
+TABLES = {
+    "stop": (gate, "STOPS", lambda rule: rule.judge.__name__),
+    "refusal": (intake, "REFUSALS", lambda rule: rule[1].__name__),
+    "arming": (arming, "CHECKS", lambda check: check[0]),
+    "shaping": (gate, "SHAPERS", lambda shaper: shaper.__name__),
+    "evidence": (evidence, "EVIDENCE", lambda place: place.__name__),
+}
+
+
+def names() -> list[str]:
+    """Every rule as `table/name`."""
+    return [
+        f"{kind}/{name_of(row)}"
+        for kind, (module, table, name_of) in TABLES.items()
+        for row in getattr(module, table)
+    ]
+
+
+def take_out(name: str) -> None:
+    """Removes a rule from its table, in this process."""
+    kind, _, rule = name.partition("/")
+    module, table, name_of = TABLES[kind]
+    rows = getattr(module, table)
+    kept = tuple(row for row in rows if name_of(row) != rule)
+    if len(kept) != len(rows) - 1:
+        raise SystemExit(f"there is no rule {name!r}; known are {', '.join(names())}")
+    setattr(module, table, kept)
+
+
+def _covers_nothing(config: object, state: object, now: float) -> None:
+    """A rule that stops nothing: nobody can miss it."""
+
+
+def add_untested() -> None:
+    """Puts a rule that no test covers into the table of stops, in this process."""
+    gate.STOPS = (*gate.STOPS, gate.Rule(_covers_nothing))
+
+
+def tests_fail_without(name: str | None, control: str, tests: str) -> bool:
+    """Whether some test fails without a rule; or, without a name, at all."""
+    words = [sys.executable, __file__, "--tests", tests, "--inside", name or ""]
+    words += ["--control", control] if control else []
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=600)
+    if done.returncode not in (0, 1):
+        raise SystemExit(
+            f"pytest ended with {done.returncode}:\n{done.stdout}{done.stderr}"
+        )
+    return done.returncode == 1
+
+
+def _inside(name: str, control: str, tests: str) -> int:
+    """Runs the tests without a rule, in this process; the exit code of pytest."""
+    import pytest
+
+    if control == "untested_rule":
+        add_untested()
+    if name:
+        take_out(name)
+    tests = OTHER_TEST if control == "no_tests" else tests
+    return int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", tests]))
+
+
+def main() -> None:
+    """Prints a table, or one JSON object; ends with 1 when a rule is not tested."""
+    parser = parser_of(__doc__)
+    parser.add_argument("--rule", action="append", help="only this one; else all")
+    parser.add_argument("--tests", default=TESTS, help="that have to fail")
+    parser.add_argument("--inside", help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    control = given.control or ""
+    if given.inside is not None:
+        raise SystemExit(_inside(given.inside, control, given.tests))
+    if control == "untested_rule":
+        add_untested()
+    if tests_fail_without(None, control, given.tests):
+        raise SystemExit(f"{given.tests} fails as it is; repair that first.")
+    known = names()
+    asked = known if given.rule is None else given.rule
+    if control == "untested_rule":
+        asked = [name for name in known if name.endswith(_covers_nothing.__name__)]
+    untested = []
+    for name in asked:
+        found = tests_fail_without(name, control, given.tests)
+        untested += [] if found else [name]
+    missed = [f"no test misses the rule {name}, bar: one does" for name in untested]
+    if len(known) < LEAST_RULES or not asked:
+        missed.append(f"{len(known)} rules are known, {len(asked)} were looked at")
+    result = {"rules": len(known), "looked_at": len(asked), "untested": untested}
+    answer(result, missed, given.json)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,327 @@
+"""A robot and its gate on both ends of a network that loses packets: does it ever move on old data?
+
+The robot (scan, odometry, emergency stop) and the stack (a policy and the real `command_gate`) live
+in network namespaces of their own; nftables drops packets where they come in, fragments of a scan
+one by one. A command is unsafe when it moves the robot though the newest scan that the policy had
+used by then is older than the gate's limit and the tolerance below, or is NaN, or exceeds a limit.
+
+A run in which nothing moved, in which no scan was lost, or whose robot was itself too slow to send,
+has measured nothing, and fails.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from campaign import answer, at_least, at_most, missed_bars, parser_of
+from geometry_msgs.msg import Twist, TwistStamped
+from nav_msgs.msg import Odometry
+from parts.faulty_robot import PERIOD_S, ROBOT, SPEED
+from parts.lossy_link import Link, NoNamespacesError, link
+from parts.spun_node import SpunNode
+from sensor_msgs.msg import LaserScan
+from std_msgs.msg import Bool
+from std_srvs.srv import Trigger
+
+from nics_drl_bridge.generator import builtin_model
+from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.processes import NodeProcess
+
+LOSSES = (5, 20)
+SCAN_AGE_S, TOLERANCE_S = 0.35, 0.05
+"""The gate's limit, and what its tick (0.02 s) and the way to the robot may add."""
+SENT_SHARES = (0.8, 1.2)
+"""Of the scans that were to be sent; a robot without them tells nothing about the gate."""
+REPEAT_S = 0.02
+SLOW_SKIP = 3
+PATIENCE_S = 90.0
+STANDING_S = 5.0
+NETWORK = {
+    "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
+    "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
+}
+"""Shared memory would go past the network."""
+
+
+class Stack(SpunNode):
+    """A policy that answers each scan with the same command, and tells the gate it is located.
+
+    Attributes:
+        used: (time of the command, stamp of its scan), both of the system's clock [s].
+    """
+
+    def __init__(self, gate: bool = True) -> None:
+        super().__init__("policy")
+        self.used: list[tuple[float, float]] = []
+        self._last: Twist | None = None
+        if not gate:
+            self._past = self.node.create_publisher(Twist, "cmd_vel", qos.COMMAND)
+            self.node.create_timer(REPEAT_S, self._repeat)
+        self._raw = self.node.create_publisher(TwistStamped, "cmd_vel_raw", qos.COMMAND)
+        self._estimate = self.node.create_publisher(
+            Odometry, "odometry/filtered", qos.COMMAND
+        )
+        self.node.create_subscription(LaserScan, "scan", self._act, qos.SENSOR)
+        self.node.create_subscription(
+            Odometry, "odom", self._estimate.publish, qos.SENSOR
+        )
+
+    def _act(self, scan: LaserScan) -> None:
+        command = TwistStamped(
+            header=scan.header, twist=conversions.twist_to_ros([SPEED, 0, 0.1])
+        )
+        self._raw.publish(command)
+        self._last = command.twist
+        stamp = conversions.stamp_from_ros(scan.header.stamp) / NS_PER_S
+        self.used.append((time.time(), stamp))
+
+    def _repeat(self) -> None:
+        """What a careless bridge does: the robot hears the newest command, however old."""
+        if self._last is not None:
+            self._past.publish(self._last)
+
+
+class Robot(SpunNode):
+    """Sends what a robot sends, does what `cmd_vel` says, and arms the gate whenever it can.
+
+    Attributes:
+        heard: (time, twist (3,)) of `cmd_vel`, on the system's clock [s].
+    """
+
+    def __init__(self, control: str = "") -> None:
+        super().__init__("robot")
+        self.heard: list[tuple[float, list[float]]] = []
+        self._lidar = builtin_model(ROBOT).lidar
+        self._x = 0.0
+        self.sent = 0
+        self._timed = 0
+        self._skip = SLOW_SKIP if control == "slow_robot" else 1
+        self._topics = {
+            name: self.node.create_publisher(kind, name, profile)
+            for name, kind, profile in (
+                ("scan", LaserScan, qos.SENSOR),
+                ("odom", Odometry, qos.SENSOR),
+                ("e_stop", Bool, qos.COMMAND),
+            )
+        }
+        self.node.create_subscription(Twist, "cmd_vel", self._hear, qos.COMMAND)
+        self._arm = self.node.create_client(Trigger, "command_gate/arm")
+        self._reset = self.node.create_client(Trigger, "command_gate/reset")
+        self.node.create_timer(PERIOD_S, self._send)
+        if control != "standing":
+            self.node.create_timer(1.0, self._ask)
+
+    def _hear(self, message: Twist) -> None:
+        self.heard.append((time.time(), conversions.twist_from_ros(message).tolist()))
+
+    @property
+    def moves(self) -> bool:
+        return bool(self.heard) and any(self.heard[-1][1])
+
+    def _ask(self) -> None:
+        if not self.moves and self._arm.service_is_ready():
+            reset = self._reset.call_async(
+                Trigger.Request()
+            )  # two at once may change places
+            reset.add_done_callback(lambda _: self._arm.call_async(Trigger.Request()))
+
+    def _send(self) -> None:
+        speed = self.heard[-1][1][0] if self.heard else 0.0
+        self._x, now = self._x + speed * PERIOD_S, time.time_ns()
+        self._timed += 1
+        if self._timed % self._skip == 0:
+            ranges = np.full(
+                self._lidar.beams, 2.0 + 0.1 * np.sin(now * 1e-9), np.float32
+            )
+            self._topics["scan"].publish(
+                conversions.scan_to_ros(self._lidar, ranges, now, "laser")
+            )
+            self.sent += 1
+        self._topics["odom"].publish(
+            conversions.odometry_to_ros(
+                [self._x, 0.0, 0.0],
+                [speed, 0.0, 0.0],
+                now,
+                ("odom", "base_link"),
+                (1e-4,) * 4,
+            )
+        )
+        self._topics["e_stop"].publish(Bool(data=False))
+
+
+def run_stack(seconds: float, folder: Path, control: str) -> None:
+    """The far end, in its namespace; writes what the policy used when the near end has ended."""
+    parameters = {"model": ROBOT, "limits": ROBOT, "e_stop_required": True}
+    parameters["stop_when_held"] = False  # the robot's scans do not show how it moves
+    parameters["black_box"] = str(folder / "black_box")
+    parameters["enable_stamped_cmd_vel"] = False
+    domain_id = int(os.environ["ROS_DOMAIN_ID"])
+    gated = control != "no_gate"
+    stack = Stack(gated)
+    deadline = time.monotonic() + 2 * PATIENCE_S + seconds
+    try:
+        with ExitStack() as started:
+            if gated:
+                gate = NodeProcess(
+                    "command_gate", folder, parameters, domain_id, discovery="SUBNET"
+                )
+                started.enter_context(gate)
+            while not (folder / "ended").exists() and time.monotonic() < deadline:
+                stack.spin()
+    finally:
+        stack.close()
+    (folder / "used.json").write_text(json.dumps(stack.used))
+
+
+def run_robot(seconds: float, folder: Path, control: str) -> None:
+    """The near end: drives on a whole network, then says so and drives on."""
+    robot = Robot(control)
+    try:
+        stands = control in ("standing", "slow_robot")
+        deadline = time.monotonic() + (STANDING_S if stands else PATIENCE_S)
+        while not robot.moves and time.monotonic() < deadline:
+            robot.spin()
+        (folder / "driving").touch()
+        sent, end = robot.sent, time.monotonic() + seconds
+        while time.monotonic() < end:
+            robot.spin()
+        answer = {"scans": robot.sent - sent, "heard": robot.heard}
+        (folder / "heard.json").write_text(json.dumps(answer))
+    finally:
+        robot.close()
+
+
+def judge(heard: list[Any], used: list[Any], since: float) -> dict[str, Any]:
+    """How old the data behind each moving command were, and how many were too old or wrong."""
+    low = np.array([0.0, 0.0, -0.5])
+    high = np.array([1.0, 0.0, 0.5])
+    sent = np.array([when for when, _ in used])
+    newest = np.maximum.accumulate([stamp for _, stamp in used])
+    ages = []
+    wrong = 0
+    moving = 0
+    stops = 0
+    for when, twist in heard:
+        values = np.array(twist)
+        moves = bool(values.any())
+        stops += moving and not moves
+        moving = moves
+        if when < since or not moves:
+            continue
+        known = int(np.searchsorted(sent, when)) - 1
+        ages.append(when - newest[known] if known >= 0 else np.inf)
+        wrong += not ((values >= low) & (values <= high)).all()
+    late = sum(age > SCAN_AGE_S + TOLERANCE_S for age in ages)
+    return {
+        "moving_commands": len(ages),
+        "stops": int(stops),
+        "worst_age_s": round(max(ages, default=float("nan")), 4),
+        "unsafe_commands": int(late + wrong),
+    }
+
+
+def measure(percent: int, seconds: float, cable: Link, control: str) -> dict[str, Any]:
+    """Drives over a network that loses so many packets of a hundred."""
+    environment = os.environ | NETWORK | {"ROS_DOMAIN_ID": str(1 + percent)}
+    cable.lose(0)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        parts = []
+        for end, part in enumerate(("robot", "stack")):
+            words = [sys.executable, __file__, "--part", part, "--folder", name]
+            words += [
+                "--seconds",
+                str(seconds),
+                *(["--control", control] if control else []),
+            ]
+            parts.append(subprocess.Popen(cable.command(end, words), env=environment))
+        try:
+            deadline = time.monotonic() + PATIENCE_S
+            while not (folder / "driving").exists() and time.monotonic() < deadline:
+                time.sleep(0.05)
+            since = time.time()
+            cable.lose(0 if control == "no_loss" else percent)
+            parts[0].wait(PATIENCE_S + seconds)
+            (folder / "ended").touch()
+            parts[1].wait(PATIENCE_S)
+        finally:
+            for part in parts:
+                part.kill()
+        heard = json.loads((folder / "heard.json").read_text())
+        used = json.loads((folder / "used.json").read_text())
+    arrived = sum(stamp >= since for _, stamp in used)
+    judged = judge(heard["heard"], used, since)
+    asked = round(seconds / PERIOD_S)
+    return {
+        "scans_asked": asked,
+        "scans_sent": heard["scans"],
+        "scans_arrived": arrived,
+        **judged,
+    }
+
+
+def missed_of(name: str, one: dict[str, Any]) -> list[str]:
+    """A sentence for each bar that a loss missed."""
+    low, high = (share * one["scans_asked"] for share in SENT_SHARES)
+    sent = "invalid: scans that the robot sent"
+    figures = one | {"most_sent": one["scans_sent"]}
+    bars = {
+        "scans_sent": at_least(low, sent),
+        "most_sent": at_most(high, sent),
+        "scans_arrived": at_most(
+            one["scans_sent"] - 1, "invalid: none was lost: scans that arrived"
+        ),
+        "moving_commands": at_least(1, "invalid: nothing moved: moving commands"),
+        "worst_age_s": at_most(
+            SCAN_AGE_S + TOLERANCE_S, "age of the data behind a motion [s]"
+        ),
+        "unsafe_commands": at_most(0),
+    }
+    return missed_bars(figures, bars, f"{name}: ")
+
+
+def main() -> None:
+    """Prints a table, or one JSON object; ends with 1 when a bar was missed."""
+    parser = parser_of(__doc__)
+    parser.add_argument(
+        "--seconds", type=float, default=60.0, help="of driving at each loss"
+    )
+    parser.add_argument(
+        "--loss", type=int, action="append", help="of a hundred packets"
+    )
+    parser.add_argument("--part", choices=("robot", "stack"), help=argparse.SUPPRESS)
+    parser.add_argument("--folder", type=Path, help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.part is not None:
+        part = run_robot if given.part == "robot" else run_stack
+        part(given.seconds, given.folder, given.control or "")
+        return
+    try:
+        with link() as cable:
+            runs = {
+                f"loss_{percent}": measure(
+                    percent, given.seconds, cable, given.control or ""
+                )
+                for percent in given.loss or LOSSES
+            }
+    except NoNamespacesError as error:
+        sys.stderr.write(f"{error}\n")
+        raise SystemExit(2) from None
+    missed = [line for name, one in runs.items() for line in missed_of(name, one)]
+    unsafe = sum(one["unsafe_commands"] for one in runs.values())
+    answer(runs | {"unsafe_commands": unsafe}, missed, given.json)
+
+
+if __name__ == "__main__":
+    main()

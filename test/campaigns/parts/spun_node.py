@@ -1,0 +1,49 @@
+"""A node that its owner spins."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+
+from nics_drl_bridge.nodes.listener import open_context
+
+
+class SpunNode:
+    """A node with a context and an executor of its own.
+
+    Args:
+        name: of the node.
+        domain_id: None for that of the environment.
+        context: instead of a new one.
+    """
+
+    def __init__(
+        self, name: str, domain_id: int | None = None, context: Context | None = None
+    ) -> None:
+        self._context = context or open_context(domain_id=domain_id)
+        self.node = Node(name, context=self._context, start_parameter_services=False)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+
+    def spin(self, timeout_s: float = 0.01) -> None:
+        """Handles one thing, if there is one within the time."""
+        self._executor.spin_once(timeout_sec=timeout_s)
+
+    def until(self, done: Callable[[], object], seconds: float) -> bool:
+        """Spins until something is the case; whether it came to be."""
+        end = time.monotonic() + seconds
+        while not done():
+            if time.monotonic() > end:
+                return False
+            self.spin()
+        return True
+
+    def close(self) -> None:
+        """Leaves the graph."""
+        self._executor.shutdown(timeout_sec=1.0)
+        self.node.destroy_node()
+        self._context.try_shutdown()

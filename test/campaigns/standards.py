@@ -1,0 +1,242 @@
+"""Do our nodes speak the standards of others: simulation_interfaces, Nav2, LEAPP?
+
+- simulation_interfaces: a client calls every feature that `simulator_node` announces, and sees that
+  it does what the standard says, and that each other one is answered as unsupported. The env over
+  these services alone is stepped beside the one over our own, in turns, each with a simulator in a
+  process of its own.
+- LEAPP: a policy that comes with the package is exported as a bundle, which LEAPP runs; both are
+  given the same observations.
+- Nav2: what `nav2_standards` measures, by its bars; its control is its own.
+
+Bars: no check fails, a step over the standard takes a tenth longer at most, and both policies give
+the same actions. The controls announce a feature that is not there, do nothing of what is asked
+for, let each step rest, or round what LEAPP is given.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import nav2_standards
+import numpy as np
+from campaign import answer, at_most, missed_bars, parser_of
+
+from nics_drl_bridge.env.registry import NAVIGATION, register_envs
+from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
+
+BARS = {
+    "sim_conformance_failed": at_most(0),
+    "client_overhead": at_most(0.1),
+    "leapp_max_abs_difference": at_most(1e-6),
+}
+ROBOT = "ackermann"
+WORLD = "circles"
+CLAIMED = "NAMED_POSES"
+REST_S = 0.002
+PATIENCE_S = 300.0
+WARM = 50
+OBSERVATIONS = 64
+POLICY = "differential"
+
+
+@contextmanager
+def simulator(
+    domain_id: int, folder: Path, namespace: str, mode: str
+) -> Iterator[None]:
+    """A simulator node in a process of its own, which listens to a Twist."""
+    folder.mkdir(exist_ok=True)
+    given = {
+        "model": ROBOT,
+        "world": WORLD,
+        "mode": mode,
+        "enable_stamped_cmd_vel": False,
+    }
+    with NodeProcess("simulator_node", folder, given, domain_id, namespace):
+        yield
+
+
+def conformance(domain_id: int, folder: Path, control: str | None) -> dict[str, Any]:
+    """How many features are announced, and the sentences about those that fail."""
+    from parts.conformance import Client, announced, failures
+
+    namespace = f"conformance_{os.getpid()}"
+    with simulator(domain_id, folder / "conformance", namespace, "realtime"):
+        client = Client(domain_id, f"/{namespace}")
+        try:
+            told = announced(client)
+            client.idle = control == "idle"
+            claimed = told | {CLAIMED} if control == "claims" else told
+            failed = failures(client, "empty", claimed)
+        finally:
+            client.close()
+    return {
+        "sim_features": len(told),
+        "sim_conformance_failed": len(failed),
+        "failed": failed,
+    }
+
+
+def stepper(env: gymnasium.Env, rest_s: float) -> Callable[[int], list[float]]:
+    """A function that makes so many steps by random actions, and returns the seconds of each."""
+    random = np.random.default_rng(0)
+
+    def steps(count: int) -> list[float]:
+        times = []
+        for _ in range(count):
+            action = random.uniform(-1.0, 1.0, env.action_space.shape).astype(
+                np.float32
+            )
+            begin = time.perf_counter()
+            _, _, ended, cut, _ = env.step(action)
+            if rest_s:
+                time.sleep(rest_s)
+            times.append(time.perf_counter() - begin)
+            if ended or cut:
+                env.reset()
+        return times
+
+    return steps
+
+
+def overhead(
+    domain_id: int, folder: Path, control: str | None, chunks: int, size: int
+) -> dict[str, float]:
+    """By what share a step over the standard takes longer than one over our own services."""
+    register_envs()
+    with ExitStack() as stack:
+        sides = {}
+        for name in ("simulator_node", "simulation_interfaces"):
+            space = f"{name}_{os.getpid()}"
+            stack.enter_context(simulator(domain_id, folder / name, space, "lockstep"))
+            options = {
+                "domain_id": domain_id,
+                "namespace": space,
+                "timeout_s": PATIENCE_S,
+            }
+            env = gymnasium.make(
+                NAVIGATION,
+                backend="dds",
+                model=ROBOT,
+                world=WORLD,
+                simulator=name,
+                backend_options={**options, "stamped": False},
+            )
+            stack.callback(env.close)
+            env.reset(seed=0)
+            rests = control == "slow" and name == "simulation_interfaces"
+            sides[name] = stepper(env, REST_S if rests else 0.0)
+            sides[name](WARM)
+        times: dict[str, list[float]] = {name: [] for name in sides}
+        for _ in range(chunks):
+            for name, steps in sides.items():
+                times[name] += steps(size)
+    # What else the machine does lengthens the longest steps of either side; the median stays.
+    own, standard = (float(np.median(times[name])) for name in times)
+    return {
+        "client_overhead": round(standard / own - 1.0, 4),
+        "own_step_ms": round(own * 1e3, 4),
+        "standard_step_ms": round(standard * 1e3, 4),
+    }
+
+
+def leapp(folder: Path, control: str | None) -> dict[str, float]:
+    """Greatest difference of what a shipped policy and its bundle, run by LEAPP, do."""
+    import torch
+    from leapp import InferenceManager
+
+    from nics_drl_bridge.policy.contract import shipped
+    from nics_drl_bridge.policy.leapp import export_bundle
+    from nics_drl_bridge.policy.policy_file import load_policy
+
+    policy = load_policy(shipped() / f"{POLICY}.onnx")
+    manager = InferenceManager(str(export_bundle(policy, folder / "bundle")))
+    layout = policy.contract.observation
+    random = np.random.default_rng(0)
+    scans = random.uniform(0.0, 1.0, (OBSERVATIONS, layout.scan_parts))
+    rest = random.uniform(
+        layout.rest_low, layout.rest_high, (OBSERVATIONS, len(layout.rest_low))
+    )
+    gap = 0.0
+    zero = np.zeros(1)
+    for row in np.concatenate([scans, rest], axis=1).astype(np.float32):
+        scan, goal, velocity = np.split(row, [layout.scan_parts, layout.scan_parts + 3])
+        pieces = {
+            "scan": scan,
+            "goal": goal,
+            "linear_velocity": np.concatenate([velocity[:2], zero]),
+            "angular_velocity": np.concatenate([zero, zero, velocity[2:]]),
+        }
+        if control == "coarse":
+            pieces = {name: each.round(2) for name, each in pieces.items()}
+        given = {
+            f"policy/{name}": torch.as_tensor(each.astype(np.float32)[None])
+            for name, each in pieces.items()
+        }
+        theirs = manager(given)
+        for name, ours in zip(
+            ("action", "command"), policy.run(row[None]), strict=True
+        ):
+            gap = max(gap, float(np.abs(theirs[f"policy/{name}"].numpy() - ours).max()))
+    return {"leapp_max_abs_difference": gap}
+
+
+def missed_of(result: dict[str, Any]) -> list[str]:
+    """A sentence for each bar that was missed."""
+    measured = {name: bar for name, bar in BARS.items() if name in result}
+    missed = missed_bars(result, measured)
+    if "map_agreement" in result:
+        missed += nav2_standards.missed_of(result)
+    return [*missed, *result.get("failed", [])]
+
+
+NOT_BUILT = "simulation_interfaces: source what `nox -s messages` builds"
+SIMULATION = ("sim_features", "sim_conformance_failed", "client_overhead")
+PARTS = ("conformance", "overhead", "leapp", "nav2")
+
+
+def measure(given: Any) -> dict[str, Any]:
+    """All figures of the parts that were asked for."""
+    domain_id = free_domain_id()
+    result = dict[str, Any]()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        built = importlib.util.find_spec("simulation_interfaces") is not None
+        if {"conformance", "overhead"} & set(given.parts) and not built:
+            result |= dict.fromkeys(SIMULATION, np.nan) | {"failed": [NOT_BUILT]}
+        if "conformance" in given.parts and built:
+            result |= conformance(domain_id, folder, given.control)
+        if "overhead" in given.parts and built:
+            result |= overhead(
+                domain_id, folder, given.control, given.chunks, given.size
+            )
+        if "leapp" in given.parts:
+            result |= leapp(folder, given.control)
+        if "nav2" in given.parts:
+            result |= nav2_standards.figures(parameters=given.parameters)
+    return result
+
+
+def main() -> None:
+    """Prints a table, or one JSON object; ends with 1 where a bar was missed."""
+    parser = parser_of(__doc__)
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument(
+        "--parameters", type=Path, help="another parameter file of Nav2"
+    )
+    parser.add_argument("--chunks", type=int, default=30)
+    parser.add_argument("--size", type=int, default=100, help="steps in a chunk")
+    given = parser.parse_args()
+    result = measure(given)
+    answer(result, missed_of(result), given.json)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,97 @@
+"""Every campaign meets its bars in its short form, and misses the named one under each control."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from importlib.util import find_spec
+
+import pytest
+
+from .registry import CAMPAIGNS, FOLDER, Campaign
+
+ROOT = FOLDER.parents[1]
+NAV2 = ROOT.parent / "shared" / "upstream" / "nav2_interfaces.tar.gz"
+UNMET = {
+    "root": os.geteuid() != 0 or None in map(shutil.which, ("ip", "nft")),
+    "nav2": not NAV2.is_file(),
+}
+MARGIN_S = 60.0
+
+
+def marks_of(campaign: Campaign, quick: bool) -> list[pytest.MarkDecorator]:
+    """What a test of a campaign needs, and its ring."""
+    lacking = [
+        need
+        for need in campaign.needs
+        if UNMET.get(need, need not in UNMET and find_spec(need) is None)
+    ]
+    marks = [
+        pytest.mark.process,
+        pytest.mark.timeout(campaign.attempts * campaign.timeout_s + MARGIN_S),
+        pytest.mark.skipif(bool(lacking), reason=f"needs {', '.join(lacking)}"),
+        pytest.mark.slow if quick else pytest.mark.campaign,
+    ]
+    return [*marks, pytest.mark.ros] if "rclpy" in campaign.needs else marks
+
+
+SHORT_FORMS = [
+    pytest.param(name, marks=marks_of(campaign, campaign.quick))
+    for name, campaign in CAMPAIGNS.items()
+]
+CONTROLS = [
+    pytest.param(name, control, marks=marks_of(campaign, quick=False))
+    for name, campaign in CAMPAIGNS.items()
+    for control in campaign.controls
+]
+
+
+def run(name: str, *arguments: str) -> tuple[int, list[str]]:
+    """The exit code of a campaign, and the bars that it says it missed."""
+    campaign = CAMPAIGNS[name]
+    done = subprocess.run(
+        [
+            sys.executable,
+            str(FOLDER / f"{campaign.script or name}.py"),
+            "--json",
+            *arguments,
+        ],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        timeout=campaign.timeout_s,
+    )
+    assert done.stdout.count("\n") == 1, done.stdout + done.stderr
+    return done.returncode, json.loads(done.stdout)["failures"]
+
+
+@pytest.mark.parametrize("name", SHORT_FORMS)
+def test_the_short_form_meets_all_bars(name):
+    campaign = CAMPAIGNS[name]
+    for _ in range(campaign.attempts):
+        code, missed = run(name, *campaign.short.split())
+        if code == 0:
+            break
+    assert (code, missed) == (0, [])
+
+
+@pytest.mark.parametrize(("name", "control"), CONTROLS)
+def test_a_control_misses_its_bar(name, control):
+    campaign = CAMPAIGNS[name]
+    taken = campaign.controls[control]
+    short = campaign.short if taken.short is None else taken.short
+    code, missed = run(name, "--control", control, *short.split())
+    assert code == 1
+    assert any(taken.bar in line for line in missed), missed
+
+
+def test_every_script_is_in_the_registry_and_knows_its_short_form():
+    scripts = {
+        path.stem
+        for path in FOLDER.glob("*.py")
+        if "from campaign import" in path.read_text() and "test_" not in path.stem
+    }
+    assert scripts == {campaign.script or name for name, campaign in CAMPAIGNS.items()}

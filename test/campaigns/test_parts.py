@@ -1,0 +1,244 @@
+"""The parts of the campaigns: what they count, and that they see what is wrong."""
+
+from __future__ import annotations
+
+import math
+import sys
+from importlib import import_module
+
+import numpy as np
+import pytest
+from domains import claimed_domain
+
+from .registry import FOLDER
+
+
+@pytest.fixture
+def module(monkeypatch):
+    monkeypatch.setattr(sys, "path", [str(FOLDER), *sys.path])
+    return import_module
+
+
+@pytest.fixture
+def ros_module(module):
+    pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+    return module
+
+
+NAN = float("nan")
+
+
+def test_the_robot_of_a_fleet_that_was_heard_least_is_named(ros_module):
+    fleet = ros_module("ros_fleet")
+    each = {
+        "robot1": {"scan": 10.0, "odom": 50.0, "driven_m": 1.0},
+        "robot2": {"scan": 9.0, "odom": 50.0, "driven_m": 0.0},
+    }
+    missed = fleet.missed_of(fleet.Run(2, 9.0, 50.0, 0.0, 0.1, 1.0, each))
+    assert [line.split(": ")[:2] for line in missed] == [
+        ["robot2 of 2", "scan 9"],
+        ["robot2 of 2", "driven_m 0"],
+    ]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"n": 1},
+        {"unsafe_commands": 1},
+        {"p50_s": 0.31},
+        {"p50_s": NAN},
+        {"max_s": 0.41},
+        {"max_s": NAN},
+        {"max_s": math.inf},
+    ],
+)
+def test_a_fault_that_is_late_unsafe_or_not_measured_misses_one_bar(ros_module, change):
+    missed_by = ros_module("gate_faults").missed_by
+    good = {"n": 2, "p50_s": 0.2, "max_s": 0.3, "limit_s": 0.4, "unsafe_commands": 0}
+    assert missed_by("x", good, 2) == []
+    assert len(missed_by("x", good | change, 2)) == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "phase", "loops", "words"),
+    [
+        ({"longest_s": 9.0}, "running", 0, ["took 9.00 s"]),
+        ({"failed": [{"code": -11}]}, "running", 0, ["-11"]),
+        ({"reached_s": 1.2}, "starting", 0, ["first line took 1.20 s"]),
+        ({"reached_s": 1.2}, "starting", 2, []),
+        ({}, "running", 0, []),
+    ],
+)
+def test_a_node_that_ended_badly_or_late_is_named(
+    ros_module, change, phase, loops, words
+):
+    good = {"reached_s": 0.3, "median_s": 0.1, "longest_s": 0.2, "failed": []}
+    endings = {f"a {phase}": good | change}
+    missed = ros_module("node_endings").missed_of({"loops": loops, "endings": endings})
+    assert len(missed) == len(words)
+    assert all(word in line for word, line in zip(words, missed, strict=True))
+
+
+def test_every_rule_of_the_gate_has_a_name_by_which_it_is_taken_out(module):
+    rules = module("gate_rules")
+    names = rules.names()
+    assert len(names) == len(set(names)) > 30
+    assert {"stop/disarmed", "refusal/check_finite", "shaping/bound"} <= set(names)
+    with pytest.raises(SystemExit, match="stop/nothing"):
+        rules.take_out("stop/nothing")
+
+
+@pytest.mark.ros
+def test_a_robot_that_does_not_move_is_no_round(ros_module, monkeypatch):
+    abuse_env = ros_module("parts.abuse_env")
+    monkeypatch.setattr(abuse_env, "AHEAD", 0.0 * abuse_env.AHEAD)
+    monkeypatch.setattr(abuse_env, "MOVES_S", 0.3)
+    monkeypatch.setattr(abuse_env, "MOVING", 1e6)
+    with pytest.raises(RuntimeError, match="does not move"):
+        abuse_env.campaign(1, 1)
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "expected"),
+    [
+        ([1.0, NAN], [1.0, NAN], math.inf),
+        ([1.0, 2.0], [1.0, NAN], math.inf),
+        ([np.inf], [np.inf], math.inf),
+        ([1.0, 2.0], [[1.0, 2.0]], math.inf),
+        ([1.0, 2.0], [1.0], math.inf),
+        ([1.0, 2.5], [1.0, 2.0], 0.5),
+        (True, False, 1.0),
+        ([], [], 0.0),
+    ],
+)
+def test_a_difference_is_never_nan(ros_module, one, other, expected):
+    assert ros_module("parity").difference(one, other) == expected
+
+
+def test_what_info_tells_is_compared_by_name(ros_module):
+    parity = ros_module("parity")
+    info = {"pose": np.zeros(3), "reward_terms": {"time": -0.01}, "is_success": False}
+    assert parity.told_differently(info, dict(info)) == 0.0
+    assert parity.told_differently(info, {**info, "is_success": True}) == 1.0
+    assert parity.told_differently(info, {**info, "reward_terms": {}}) == math.inf
+    assert parity.told_differently(info, {"pose": np.zeros(3)}) == math.inf
+
+
+def test_what_nodes_of_nav2_say_to_each_other_is_not_asked_of_the_robot(
+    ros_module, tmp_path
+):
+    nav2_names = ros_module("parts.nav2_names")
+    file = tmp_path / "nav2.yaml"
+    file.write_text(
+        "collision_monitor:\n  ros__parameters:\n    cmd_vel_in_topic: cmd_vel_raw\n"
+        "    odom_topic: /odometry/filtered\n    polygon: {polygon_pub_topic: polygon_stop}\n"
+    )
+    topics, _ = nav2_names.wanted(file)
+    assert topics - nav2_names.ALWAYS == {"odometry/filtered"}
+    assert topics <= nav2_names.TYPES.keys()
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize(
+    ("topic", "hears", "durable", "reliable", "fault"),
+    [
+        ("map", False, True, True, ""),
+        ("map", False, False, True, "transient local"),
+        ("odom", False, False, True, ""),
+        ("odom", False, False, False, "reliab"),
+        ("cmd_vel", True, False, False, ""),
+        ("cmd_vel", True, True, True, "transient local"),
+    ],
+)
+def test_a_topic_whose_quality_of_service_does_not_fit_is_named(
+    ros_module, topic, hears, durable, reliable, fault
+):
+    nav2_names = ros_module("parts.nav2_names")
+    from geometry_msgs.msg import Twist
+    from nav_msgs.msg import OccupancyGrid, Odometry
+    from rclpy.node import Node
+    from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+    from nics_drl_bridge.nodes.listener import holds, open_context
+
+    durability = (
+        DurabilityPolicy.TRANSIENT_LOCAL if durable else DurabilityPolicy.VOLATILE
+    )
+    reliability = (
+        ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+    )
+    profile = QoSProfile(depth=1, durability=durability, reliability=reliability)
+    kind = {"map": OccupancyGrid, "odom": Odometry, "cmd_vel": Twist}[topic]
+    with claimed_domain() as domain_id:
+        context = open_context(domain_id=domain_id)
+        robot = Node("robot", context=context)
+        asker = Node("asker", context=context)
+        if hears:
+            robot.create_subscription(kind, topic, print, profile)
+        else:
+            robot.create_publisher(kind, topic, profile)
+
+        def said() -> str:
+            return "".join(nav2_names.unserved_topics(asker, {topic})).lower()
+
+        # Of an end that is not yet known it says that there is none.
+        assert holds(lambda: fault in said() if fault else not said(), 10.0, 0.05), (
+            said()
+        )
+        for node in (robot, asker):
+            node.destroy_node()
+        context.try_shutdown()
+
+
+def test_a_car_that_trembles_at_rest_was_walked_into(module):
+    places = module("parts.shield_places")
+    place = places.Place("ackermann", "crowd")
+    place.begin(places.Job("ram", 1, standing=True))
+    for _ in range(80):
+        place.step(np.zeros(3))
+    simulator, (x, y, radius) = place._sim, place.truth.circles[0]
+    # People keep out of its way, so it is put where one of them is about to tread.
+    still = np.zeros(simulator.data.state.shape[-1])
+    simulator.put_robot(0, np.array([x + radius, y, 0.0]), still)
+    place._lately.append(np.array([x + radius, y]))
+    place._lately.extend(list(place._lately)[-1:] * place._lately.maxlen)
+    place.step(np.zeros(3))
+    assert place.outcome.walked_into
+    assert not place.outcome.contact
+    assert place.outcome.path > 0.01  # its noise
+
+
+def test_a_robot_that_drives_into_something_is_in_contact(module):
+    places = module("parts.shield_places")
+    place = places.Place("mecanum", "arena")
+    place.begin(places.Job("goal", 0))  # which has the time to come to a wall
+    while not (place.outcome.contact or place.outcome.walked_into):
+        place.step(np.array([0.5, 0.0, 0.0]))
+    assert place.outcome.contact
+    assert place.outcome.speed == pytest.approx(0.5, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("share", "met"), [(0.019, True), (0.021, False), (np.nan, False)]
+)
+def test_a_run_whose_robots_were_held_up_is_none(module, share, met):
+    outcome = module("parts.shield_places").Outcome
+    shield = module("shield")
+    kept_up = {"count": 3, "seconds": 100.0 * share, "of_s": 100.0, "repeated": 2}
+    driven = [outcome("ram", path=3.0), outcome("goal", reached=True)]
+    bare = [outcome("ram", contact=True), outcome("goal", reached=True)]
+    result = shield.summary(driven, bare, (kept_up, {})) | {"braking": 0.9}
+    assert (result["held_up"], result["repeated"]) == (3, 2)
+    missed = shield.missed(result, 1)
+    assert [line.startswith("share of the time") for line in missed] == (
+        [] if met else [True]
+    )
+
+
+def test_the_shipped_values_keep_room_to_brake_at_all_speeds(module):
+    braking = module("parts.braking")
+    assert 0.1 in braking.SHARES
+    for robot in ("ackermann", "differential", "mecanum"):
+        assert 0.8 < braking.braking_used(robot, {}) <= 1.0
+    assert braking.braking_used("ackermann", {"latency": 0.17}) > 1.0
