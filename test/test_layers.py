@@ -241,6 +241,7 @@ LIGHT = {
     "errors.py",
     "geometry.py",
     "interface.py",
+    "lidar/arrays.py",
     "robot/curve.py",
     "robot/taylor.py",
     "sim/state.py",
