@@ -179,6 +179,7 @@ LIGHT = {
     "errors.py",
     "geometry.py",
     "interface.py",
+    "lidar/arrays.py",
     "robot/curve.py",
     "robot/taylor.py",
     "sim/state.py",
