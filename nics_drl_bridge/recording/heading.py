@@ -223,13 +223,13 @@ def _estimate_bias(blocks: _Blocks) -> GyroBias:
     when = when[near]
     middle = float(when.mean())
     bias = float(rate.mean())
-    left = rate - bias
+    left = rate
     slope = 0.0
     if len(rate) >= FEWEST_TO_DRIFT and float(np.ptp(when)) >= DRIFT_SPAN_S:
         apart = when - middle
         power = float(apart @ apart)
         drift = float(apart @ rate) / power
-        drifted = left - drift * apart
+        drifted = rate - bias - drift * apart
         drift_std = max(float(drifted.std()), LEAST_BIAS_STD) / np.sqrt(power)
         if abs(drift) >= DRIFTS * drift_std:
             slope = drift
