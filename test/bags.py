@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
@@ -92,9 +92,21 @@ def pose_with_covariance(t: float | None, *place: float) -> Any:
 
 
 def odometry(t: float | None, *place: float) -> Any:
-    inner = new("geometry_msgs/PoseWithCovariance", pose(*place), np.zeros(36))
-    speed = new("geometry_msgs/TwistWithCovariance", twist(0.0, 0.0, 0.0), np.zeros(36))
-    return new(kinds.ODOMETRY, header(t, "odom"), "base_link", inner, speed)
+    return moving_odometry(t, place, (0.0, 0.0, 0.0))
+
+
+def moving_odometry(
+    t: float | None,
+    place: Sequence[float],
+    velocity: Sequence[float],
+    frames: tuple[str, str] = ("odom", "base_link"),
+    covariance: float = 0.0,
+) -> Any:
+    """Odometry with the same covariance everywhere in its matrices."""
+    known = np.full(36, covariance)
+    inner = new("geometry_msgs/PoseWithCovariance", pose(*place), known)
+    speed = new("geometry_msgs/TwistWithCovariance", twist(*velocity), known)
+    return new(kinds.ODOMETRY, header(t, frames[0]), frames[1], inner, speed)
 
 
 def scan(t: float | None, beams: int = 4, time_increment: float = 0.0) -> Any:

@@ -16,9 +16,14 @@ from nics_drl_bridge.commands.cli import main
 PATIENT_S = 1e6  # no line about long work between what a test reads
 
 
+def split_words(*words: object) -> list[str]:
+    """The words of a command line; a text may hold several of them."""
+    return [part for word in words for part in str(word).split()]
+
+
 def nics(*words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
     """Exit code and output of a command in a folder."""
-    argv = ["nics", *map(str, words)]
+    argv = ["nics", *split_words(*words)]
     out = io.StringIO()
     err = io.StringIO()
     here = os.getcwd()

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -39,6 +40,10 @@ FILES = {
     "identify/test_drives_of_others.py": "campaign",
 }
 
+# A run with `-m "not (a or b)"` leaves out whole files, before it imports what they need.
+LEFT_OUT = re.compile(r"not \((\w+(?: or \w+)*)\)")
+FILE_MARKS = re.compile(r"^pytestmark = (.*)$", re.MULTILINE)
+
 # rclpy's major version tells the distribution where no ROS 2 is sourced, as with wheels.
 DISTRIBUTIONS = {"3": "humble", "7": "jazzy", "9": "kilted"}
 # In a process of its own: importing rclpy from wheels restarts the interpreter.
@@ -62,6 +67,23 @@ def pytest_configure(config: pytest.Config) -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def left_out(config: pytest.Config) -> set[str]:
+    """The marks of tests that this run leaves out."""
+    match = LEFT_OUT.fullmatch(config.option.markexpr)
+    return set(match[1].split(" or ")) if match else set()
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Ignores a file of which every test is left out."""
+    if collection_path.suffix != ".py" or not left_out(config):
+        return None
+    marks = {FILES.get(os.path.relpath(collection_path, ROOT / "test"))}
+    match = FILE_MARKS.search(collection_path.read_text(encoding="utf-8"))
+    if match:
+        marks |= set(re.findall(r"pytest\.mark\.(\w+)", match[1]))
+    return True if marks & left_out(config) else None
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Marks every test with the ring of its file."""
@@ -71,7 +93,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(FILES[file])
 
 
-def pytest_report_header() -> str:
+def pytest_report_header(config: pytest.Config) -> str:
+    if "ros" in left_out(config):
+        return "ROS 2: its tests are left out"
     if find_spec("rclpy") is None:
         return "ROS 2: none, its tests skip"
     asked = subprocess.run(

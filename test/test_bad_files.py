@@ -112,17 +112,3 @@ def test_a_huge_configuration_or_an_endless_device_is_refused_without_reading_it
     endless.symlink_to("/dev/zero")
     with pytest.raises(ConfigError, match="is a device or a pipe, not a file"):
         load_robot(str(endless))
-
-
-@pytest.mark.parametrize("begin", [b"\xef\xbb\xbf", b""])
-def test_a_byte_order_mark_and_the_line_ends_of_windows_change_nothing(copy, begin):
-    path = copy("lidars/rplidar_a1.yaml")
-    wanted = load_lidar(str(path))
-    path.write_bytes(begin + path.read_bytes().replace(b"\n", b"\r\n"))
-    assert load_lidar(str(path)) == wanted
-
-
-def test_a_black_box_of_endless_brackets_is_refused(tmp_path):
-    path = tmp_path / "stop.jsonl"
-    path.write_text("[" * 100_000)
-    refused(replay, path)

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import ast
 import inspect
-from pathlib import Path
 
-import nics_drl_bridge
 from nics_drl_bridge.commands.cli import app
 from nics_drl_bridge.commands.episodes import model_name
-from nics_drl_bridge.config import list_shipped, parse_yaml, share_folder
+from nics_drl_bridge.config import parse_yaml, share_folder
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.pettingzoo_env import BridgeParallelEnv
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
@@ -47,29 +44,6 @@ def node_rows():
     ]
 
 
-def named_literally(tree):
-    """Defaults, alternatives and values of rows that are a shipped robot's name in the code."""
-    robots = set(list_shipped("robots"))
-    for node in ast.walk(tree):
-        held = []
-        if isinstance(node, ast.arguments):
-            held = [*node.defaults, *node.kw_defaults]
-        elif isinstance(node, ast.BoolOp):
-            held = node.values
-        elif isinstance(node, ast.Assign | ast.AnnAssign):
-            parts = (
-                node.value.elts if isinstance(node.value, ast.Tuple) else [node.value]
-            )
-            held = parts
-        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(
-            ("Row", ".get")
-        ):
-            held = node.args[1:2]
-        for each in held:
-            if isinstance(each, ast.Constant) and each.value in robots:
-                yield each.lineno, each.value
-
-
 def test_every_command_env_and_node_that_has_a_default_robot_has_the_same():
     functions = dict(commands_of(app)) | {
         each.__name__: each.__init__
@@ -99,13 +73,6 @@ def test_every_command_env_and_node_that_has_a_default_robot_has_the_same():
     assert {key: value for key, value in found.items() if value != DEFAULT_ROBOT} == {}
 
 
-def test_the_default_robot_is_shipped_with_all_that_a_first_run_needs():
-    for kind in ("robots", "limits"):
-        assert DEFAULT_ROBOT in list_shipped(kind)
-    assert f"navigation_{DEFAULT_ROBOT}" in list_shipped("training")
-    assert (share_folder() / "urdf" / f"{DEFAULT_ROBOT}.urdf").is_file()
-
-
 def test_the_shipped_parameters_of_nodes_name_the_default_robot():
     file = share_folder() / "config" / "nodes" / "bridge.yaml"
     given = parse_yaml(file.read_text(encoding="utf-8"), str(file))
@@ -117,14 +84,3 @@ def test_the_shipped_parameters_of_nodes_name_the_default_robot():
     }
     assert len(named) == 3
     assert set(named.values()) == {DEFAULT_ROBOT}
-
-
-def test_no_default_in_the_code_names_a_robot_itself():
-    package = Path(nics_drl_bridge.__file__).parent
-    found = [
-        f"{path.relative_to(package)}:{line}: {name}"
-        for path in sorted(package.rglob("*.py"))
-        if path != package / "robot" / "__init__.py"
-        for line, name in named_literally(ast.parse(path.read_text(encoding="utf-8")))
-    ]
-    assert found == []

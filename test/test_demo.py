@@ -15,7 +15,6 @@ from pathlib import Path
 
 import pytest
 from browser import CHROMIUM, Browser
-from command_line import nics
 from domains import claimed_domain
 
 DEADLINE_S = 300.0
@@ -167,32 +166,6 @@ def test_it_goes_the_whole_road_and_leaves_a_report(tmp_path):
 
 
 @needs_ros
-@pytest.mark.process
-@pytest.mark.campaign
-@pytest.mark.skipif(
-    find_spec("stable_baselines3") is None, reason="needs the extra train"
-)
-@pytest.mark.timeout(400)
-def test_it_deploys_the_policy_file_that_it_trained(tmp_path):
-    running, (here, there), text = whole_road("--train-steps", 9000, cwd=tmp_path)
-    assert here == there  # learned little, but drives the same
-    told = [
-        line for line in running.lines if re.match("  [0-9,]+ steps: success ", line)
-    ]
-    assert told[-1].startswith("  16,384 steps: ")  # rollouts of 8192 steps
-    assert "img" in section(text, "The policy")
-    assert "500 unseen episodes" in section(text, "The policy")
-    assert (
-        max(map(float, re.findall(DEVIATION, section(text, "Paths in the world"))))
-        < 1e-6
-    )
-    assert (tmp_path / "out" / "policy.onnx").is_file()
-    deployed = (tmp_path / "out" / "logs" / "realtime" / "policy_node.yaml").read_text()
-    assert "policy: out/policy.onnx" in deployed
-    assert sum(" took " in line for line in running.lines) == 6
-
-
-@needs_ros
 @pytest.mark.parametrize(
     ("phase", "pattern", "episodes", "policy"),
     [
@@ -230,28 +203,3 @@ def wait_for(condition, what):
     while not condition():
         assert time.monotonic() < deadline, f"no {what}"
         once.wait(0.01)
-
-
-@pytest.mark.skipif(find_spec("rclpy") is None, reason="needs ROS 2")
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("--recording", "drive"),
-        ("--robot", "ackerman"),
-        ("--world", "areena"),
-        pytest.param(("--out", "file"), marks=pytest.mark.slow),
-        pytest.param(("--policy", "dynamic_widow"), marks=pytest.mark.slow),
-    ],
-)
-def test_bad_input_ends_it_with_code_2_and_one_sentence(tmp_path, words):
-    (tmp_path / "drive").mkdir()
-    (tmp_path / "drive" / "cmd.csv").write_text("0.5,nan,0.0\n", encoding="utf-8")
-    (tmp_path / "drive" / "vrpn.csv").write_text("", encoding="utf-8")
-    (tmp_path / "file").write_text("mine", encoding="utf-8")
-    done = nics("demo", *words, cwd=tmp_path)
-    assert done.returncode == 2
-    (sentence,) = done.stderr.splitlines()
-    assert sentence.startswith("nics: ")
-    assert words[1].removesuffix("drive") in sentence
-    assert not list(tmp_path.rglob(".*"))
-    assert (tmp_path / "file").read_text(encoding="utf-8") == "mine"

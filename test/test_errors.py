@@ -15,14 +15,6 @@ def test_every_error_of_the_package_can_be_caught_as_a_bridge_error():
     assert all(issubclass(kind, BridgeError) for kind in kinds)
 
 
-def test_a_name_close_to_a_known_one_is_suggested():
-    assert suggest("ackerman", ["mecanum", "ackermann"]) == "did you mean 'ackermann'?"
-
-
-def test_without_a_close_name_all_known_ones_are_listed_in_order():
-    assert suggest("zzz", ["b", "a"]) == "valid are: 'a', 'b'"
-
-
 def test_stale_data_name_topic_age_and_limit():
     error = StaleDataError("scan", 1.25, 0.5)
     assert (error.topic, error.age_s) == ("scan", 1.25)
@@ -30,10 +22,6 @@ def test_stale_data_name_topic_age_and_limit():
     assert "topic 'scan'" in str(error)
     assert "within 0.500 s" in str(error)
     assert "1.250 s old" in str(error)
-
-
-def test_a_topic_that_never_spoke_is_told_from_a_late_one():
-    assert "nothing has ever arrived" in str(StaleDataError("odom", float("inf"), 0.5))
 
 
 @pytest.mark.parametrize(
@@ -45,3 +33,8 @@ def test_errors_travel_between_processes(error):
     assert type(copy) is type(error)
     assert str(copy) == str(error)
     assert vars(copy) == vars(error)
+
+
+def test_a_name_close_to_a_known_one_is_suggested_or_else_all_are_listed():
+    assert suggest("ackerman", ["mecanum", "ackermann"]) == "did you mean 'ackermann'?"
+    assert suggest("zzz", ["b", "a"]) == "valid are: 'a', 'b'"

@@ -9,14 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import nics
+from command_line import nics, split_words
 from domains import claimed_domain
 
 from nics_drl_bridge import defaults, geometry
-from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.policy.policies import shipped_policies
-from nics_drl_bridge.robot.spec import load_robot
 
 ROOT = Path(__file__).resolve().parents[1]
 PNG = b"\x89PNG"
@@ -27,7 +24,7 @@ needs_nodes = pytest.mark.skipif(bool(missing), reason=f"needs {' and '.join(mis
 
 def started(*words, cwd, domain_id):
     return subprocess.run(
-        [sys.executable, "-m", "nics_drl_bridge.commands.cli", *map(str, words)],
+        [sys.executable, "-m", "nics_drl_bridge.commands.cli", *split_words(*words)],
         cwd=cwd,
         env=os.environ | {"ROS_DOMAIN_ID": str(domain_id)},
         capture_output=True,
@@ -36,26 +33,24 @@ def started(*words, cwd, domain_id):
     )
 
 
+def driven(done, folder):
+    """What an evaluation into the folder `out` wrote."""
+    assert done.returncode == 0, done.stderr
+    file = folder / "out" / "evaluation.json"
+    return json.loads(file.read_text(encoding="utf-8"))
+
+
+BASELINE = "evaluate dynamic_window --model differential --episodes 2 --out out"
+
+
 @pytest.mark.ros
 @pytest.mark.process
 @pytest.mark.slow
 @needs_nodes
 def test_the_same_episodes_are_driven_in_three_worlds(tmp_path):
     with claimed_domain() as domain_id:
-        words = (
-            "evaluate",
-            "dynamic_window",
-            "--model",
-            "differential",
-            "--episodes",
-            2,
-        )
-        done = started(*words, "--out", "out", cwd=tmp_path, domain_id=domain_id)
-    assert done.returncode == 0, done.stderr
-    told = json.loads(
-        (tmp_path / "out" / "evaluation.json").read_text(encoding="utf-8")
-    )
-    places = told["policies"]["dynamic_window"]
+        done = started(BASELINE, cwd=tmp_path, domain_id=domain_id)
+    places = driven(done, tmp_path)["policies"]["dynamic_window"]
     assert list(places) == ["fast", "dds", "mujoco_dds"]
     for figures in places.values():
         assert [one["seed"] for one in figures["each"]] == [1_000_000, 1_000_001]
@@ -73,17 +68,8 @@ def test_the_same_episodes_are_driven_in_three_worlds(tmp_path):
 
 
 def test_an_evaluation_in_the_folder_of_another_says_that_it_replaces_it(tmp_path):
-    words = (
-        "evaluate",
-        "straight",
-        "--in",
-        "fast",
-        "--episodes",
-        "1",
-        "--world",
-        "empty",
-    )
-    first, second = (nics(*words, "--out", "out", cwd=tmp_path) for _ in range(2))
+    words = "evaluate straight --in fast --episodes 1 --world empty --out out"
+    first, second = (nics(words, cwd=tmp_path) for _ in range(2))
     assert (first.returncode, second.returncode) == (0, 0)
     assert "replaced" not in first.stderr
     assert "out: the evaluation.json that is there will be replaced" in second.stderr
@@ -94,38 +80,18 @@ def test_an_evaluation_in_the_folder_of_another_says_that_it_replaces_it(tmp_pat
 @pytest.mark.slow
 @needs_nodes
 def test_lidar_randomisation_and_gate_are_the_same_in_process_and_over_dds(tmp_path):
-    with claimed_domain() as domain_id:
-        words = (
-            "evaluate",
-            "dynamic_window",
-            "--model",
-            "differential",
-            "--episodes",
-            2,
-        )
-        under = (
-            "--lidar",
-            "rplidar_a2",
-            "--randomisation",
-            "mild",
-            "--gate",
-            "differential",
-        )
-        words = (*words, *under, "--in", "fast", "--in", "dds")
-        words = (*words, "--out", "out")
-        done = started(*words, cwd=tmp_path, domain_id=domain_id)
-    assert done.returncode == 0, done.stderr
-    told = json.loads(
-        (tmp_path / "out" / "evaluation.json").read_text(encoding="utf-8")
-    )
-    assert told["conditions"] == {
+    conditions = {
         "lidar": "rplidar_a2",
         "randomisation": "mild",
         "gate": "differential",
-        "steps": 300,
-        "task": {},
-        "kind": None,
     }
+    words = [f"--{name}={value}" for name, value in conditions.items()]
+    words += ["--in", "fast", "--in", "dds"]
+    with claimed_domain() as domain_id:
+        done = started(BASELINE, *words, cwd=tmp_path, domain_id=domain_id)
+    told = driven(done, tmp_path)
+    others = {"steps": 300, "task": {}, "kind": None}
+    assert told["conditions"] == conditions | others
     fast, dds = told["policies"]["dynamic_window"].values()
     assert dds["greatest_deviation"] < 1e-6
     results = [[one["result"] for one in place["each"]] for place in (fast, dds)]
@@ -146,48 +112,23 @@ def test_a_policy_of_a_task_of_ones_own_is_driven_by_the_file_of_the_task(tmp_pa
     task = make_task(kind, model, {"scan": 24})
     size = task.observation_space.shape[0]
     export_policy(network(size, 2), task, model, tmp_path / "patrol.onnx", None, {})
-    words = (
-        "evaluate",
-        "patrol.onnx",
-        "--in",
-        "fast",
-        "--world",
-        "empty",
-        "--episodes",
-        1,
-    )
-    done = nics(*words, cwd=tmp_path)
+    words = "evaluate patrol.onnx --in fast --world empty --episodes 1"
+    done = nics(words, cwd=tmp_path)
     assert done.returncode == 2
     assert "give --task path/to/file.py:Patrol" in done.stderr
-    done = nics(*words, "--task", kind, "--out", "out", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    told = json.loads(
-        (tmp_path / "out" / "evaluation.json").read_text(encoding="utf-8")
-    )
+    done = nics(words, "--task", kind, "--out out", cwd=tmp_path)
+    told = driven(done, tmp_path)
     assert told["conditions"]["kind"] == kind
     assert len(told["policies"]["patrol.onnx"]["fast"]["each"]) == 1
-    done = nics("evaluate", "straight", "--task", kind, "--in", "fast", cwd=tmp_path)
+    done = nics("evaluate straight --task", kind, "--in fast", cwd=tmp_path)
     assert "policy 'straight' only drives the task 'navigation'" in done.stderr
 
 
 @pytest.mark.slow
 def test_several_policies_drive_the_same_episodes_in_one_table(tmp_path):
-    words = (
-        "evaluate",
-        "dynamic_window",
-        "random",
-        "--in",
-        "fast",
-        "--episodes",
-        3,
-        "--seed",
-        7,
-    )
-    done = nics(*words, "--model", "ackermann", "--out", "out", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    told = json.loads(
-        (tmp_path / "out" / "evaluation.json").read_text(encoding="utf-8")
-    )
+    words = "evaluate dynamic_window random --in fast --episodes 3 --seed 7"
+    done = nics(words, "--model ackermann --out out", cwd=tmp_path)
+    told = driven(done, tmp_path)
     one, other = (policy["fast"]["each"] for policy in told["policies"].values())
     assert [each["goal"] for each in one] == [each["goal"] for each in other]
     assert [each["path"][0] for each in one] == [each["path"][0] for each in other]
@@ -196,117 +137,6 @@ def test_several_policies_drive_the_same_episodes_in_one_table(tmp_path):
         "trajectories_dynamic_window.png",
         "trajectories_random.png",
     }
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(
-    "differential" not in shipped_policies(), reason="no policy is shipped"
-)
-def test_a_shipped_policy_brings_its_own_robot(tmp_path):
-    words = (
-        "evaluate",
-        "differential",
-        "--in",
-        "fast",
-        "--episodes",
-        2,
-        "--out",
-        "out",
-    )
-    done = nics(*words, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    told = json.loads(
-        (tmp_path / "out" / "evaluation.json").read_text(encoding="utf-8")
-    )
-    assert told["robot"] == "differential"
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("dynamic_widow",), "dynamic_window"),
-        (("dynamic_window", "--in", "gazebo"), "--in 'gazebo'"),
-        (("dynamic_window", "--world", "areena", "--in", "fast"), "arena"),
-        (("nowhere.onnx",), "nowhere.onnx"),
-        (("dynamic_window", "--backend", "dds"), "add --hardware"),
-        (("dynamic_window", "--backend", "sim"), "--backend 'sim'"),
-        (("dynamic_window", "--shadow", "x", "--goal", "there"), "--goal 'there'"),
-        (("dynamic_window", "--gate", "diferential", "--in", "fast"), "differential"),
-        (("dynamic_window", "--lidar", "rplidar_a9", "--in", "fast"), "rplidar_a"),
-        (
-            ("dynamic_window", "--shadow", "nothing", "--lidar", "rplidar_a2"),
-            "leave out --lidar",
-        ),
-        (("dynamic_window", "--shadow", "nothing"), "nothing"),
-        (("dynamic_window", "--backend", "dds", "--hardware", "--in", "dds"), "--in"),
-        (
-            ("dynamic_window", "random", "--backend", "dds", "--hardware"),
-            "one policy at a time",
-        ),
-    ],
-)
-def test_bad_input_ends_it_with_one_sentence(tmp_path, words, said):
-    done = nics("evaluate", *words, cwd=tmp_path)
-    assert done.returncode == 2
-    *before, sentence = done.stderr.splitlines()
-    assert all(line.startswith(("driving", "opening")) for line in before)
-    assert sentence.startswith("nics: ")
-    assert said in sentence
-
-
-@pytest.mark.ros
-@pytest.mark.process
-@pytest.mark.slow
-@pytest.mark.campaign
-@needs_nodes
-def test_a_vehicle_is_driven_in_real_time_through_the_armed_gate(tmp_path, monkeypatch):
-    from nics_drl_bridge.commands import episodes as vehicle
-    from nics_drl_bridge.nodes.processes import NodeProcess, Witness
-
-    limits = {
-        one.name: {"min": one.min, "max": one.max, "rate": 20.0, "jerk": 400.0}
-        for one in load_robot("differential").command
-    }
-    file = tmp_path / "limits.yaml"
-    file.write_text(
-        dump_yaml({"robot": "differential", "commands": limits}), encoding="utf-8"
-    )
-    model = {"model": "differential"}
-    logs = tmp_path / "logs"
-    said = []
-    gate = model | {"limits": str(file), "black_box": str(tmp_path / "black_box")}
-    gate |= {"use_sim_time": True, "e_stop_required": False}
-    # What a busy machine does to rates and ages would be a finding; that is tested elsewhere.
-    monkeypatch.setattr(vehicle, "examine", lambda facts, expected: [])
-    out = tmp_path / "out"
-    order = vehicle.EvaluationOrder(
-        ["dynamic_window"], out, "differential", "empty", 1, 0
-    )
-    options = {"start": "present", "stale_after_s": DEADLINE_S}
-    with claimed_domain() as domain_id:
-        monkeypatch.setenv("ROS_DOMAIN_ID", str(domain_id))
-        monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-        world = model | {"world": "empty"}
-        with (
-            NodeProcess("simulator_node", logs, world, domain_id),
-            NodeProcess("middleware_node", logs, model, domain_id),
-            NodeProcess("command_gate", logs, gate, domain_id),
-        ):
-            with Witness(domain_id) as witness:  # it may be compiling
-                assert witness.sees(DEADLINE_S)
-            made = vehicle.drive_vehicle(
-                order, None, True, said.append, said.append, **options
-            )
-    assert "  command_gate is armed" in said
-    assert any("it will drive to" in line for line in said)
-    (driven,), (beside,) = made.runs.values()
-    assert driven.length > 0.3  # the gate let commands pass
-    assert list(driven.path[0]) == list(beside.path[0])
-    assert list(driven.goal) == list(beside.goal)
-    told = json.loads(
-        (tmp_path / "out" / "evaluation.json").read_text(encoding="utf-8")
-    )
-    assert list(told["policies"]["dynamic_window"]) == ["vehicle", "fast"]
 
 
 @pytest.fixture
@@ -400,16 +230,8 @@ def test_a_goal_in_map_far_from_where_the_vehicle_stands_is_refused_unconfirmed(
 def test_a_far_goal_is_refused_before_anything_is_waited_for_where_nobody_can_be_asked(
     tmp_path,
 ):
-    words = (
-        "evaluate",
-        "dynamic_window",
-        "--backend",
-        "dds",
-        "--hardware",
-        "--start",
-        "present",
-    )
-    done = nics(*words, "--goal", "20,0", "--model", "differential", cwd=tmp_path)
+    words = f"{BASELINE} --hardware --start present --goal 20,0"
+    done = nics(words, cwd=tmp_path)
     assert done.returncode == 2
     sentence = done.stderr.splitlines()[-1]
     assert "it will drive to 20.00 m ahead" in sentence
@@ -422,15 +244,8 @@ def test_a_far_goal_is_refused_before_anything_is_waited_for_where_nobody_can_be
 @needs_nodes
 def test_a_vehicle_that_does_not_fit_its_model_is_not_driven(tmp_path):
     with claimed_domain() as domain_id:  # nobody is there
-        words = (
-            "evaluate",
-            "dynamic_window",
-            "--backend",
-            "dds",
-            "--hardware",
-            "--yes",
-        )
-        done = started(*words, "--out", "out", cwd=tmp_path, domain_id=domain_id)
+        words = f"{BASELINE} --hardware --yes"
+        done = started(words, cwd=tmp_path, domain_id=domain_id)
     assert done.returncode == 2
     assert "the vehicle is not driven: " in done.stderr.splitlines()[-1]
     assert not (tmp_path / "out").exists()

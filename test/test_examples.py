@@ -54,13 +54,6 @@ def test_every_example_has_a_main_and_stands_in_the_docs_with_its_picture(
     assert 0 < picture.stat().st_size < MOST_BYTES
 
 
-def test_there_are_twelve_on_the_road():
-    road = (ROOT / "docs" / "examples.md").read_text(encoding="utf-8")
-    rows = re.findall(r"^## (\d+)\. (\w+)\.py$", road, re.MULTILINE)
-    assert [int(number) for number, _ in rows] == list(range(1, 13))
-    assert {name for _, name in rows} <= {example.stem for example in EXAMPLES}
-
-
 @pytest.mark.parametrize(
     "imports",
     [

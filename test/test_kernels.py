@@ -124,17 +124,6 @@ def test_a_class_of_arguments_may_get_another_name(package):
 
 
 @pytest.mark.slow
-def test_a_class_of_arguments_from_elsewhere_may_go(package):
-    named = "from typing import NamedTuple\n\nclass Pair(NamedTuple):\n    one: float\n"
-    (package / "low_kernels.py").write_text(LOW.replace("x + STEP", "x[0] + STEP"))
-    code = "from nics_drl_bridge import low_kernels, pairs; print(low_kernels.low(pairs.{}(1.0)))"
-    for name in ("Pair", "Couple"):
-        (package / "pairs.py").write_text(named.replace("Pair", name))
-        run = [sys.executable, "-B", "-c", code.format(name)]
-        subprocess.run(run, cwd=package.parent, check=True)
-
-
-@pytest.mark.slow
 def test_a_kernel_that_moves_within_its_file_leaves_nothing_behind(package):
     ask(package)
     before = len(list(package.rglob("*.nbi")))
@@ -178,27 +167,6 @@ def test_a_process_that_ends_while_it_saves_leaves_no_code_of_an_earlier_version
     monkeypatch.setattr(ended, "_save_data", lambda *_: None)
     ended.save("key", "new code")
     assert index(tmp_path, "2").load("key") is None
-
-
-def test_imports_are_read_in_every_spelling(tmp_path):
-    path = tmp_path / "some.py"
-    path.write_text(
-        "import nics_drl_bridge.geometry\n"
-        "from nics_drl_bridge import random_kernels as files\n"
-        "from nics_drl_bridge.robot import (\n    kernels,\n    spec as config,\n)\n"
-        "def f():\n    from nics_drl_bridge.errors import BridgeError\n"
-    )
-    found = {
-        each.relative_to(kernels.PACKAGE).as_posix()
-        for each in kernels.imports_of(path)
-    }
-    assert found == {
-        "geometry.py",
-        "random_kernels.py",
-        "robot/kernels.py",
-        "robot/spec.py",
-        "errors.py",
-    }
 
 
 def test_a_kernel_of_ones_own_is_made_of_the_files_beside_it(tmp_path):

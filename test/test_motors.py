@@ -13,7 +13,6 @@ from nics_drl_bridge.errors import ModelError
 from nics_drl_bridge.generator import SimulatorModel, load_model, save_model
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.kernels import Shot, shoot, tangent
 from nics_drl_bridge.identify.open_loop import predict, windows
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.lidar.bake import bake
@@ -23,7 +22,7 @@ from nics_drl_bridge.middleware.ekf import Estimator
 from nics_drl_bridge.middleware.kernels import MotionModel
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.curve import InputCurve
-from nics_drl_bridge.robot.kernels import SERIES, make_terms, run, simulate_rollouts
+from nics_drl_bridge.robot.kernels import SERIES, make_terms, simulate_rollouts
 from nics_drl_bridge.robot.noise import Noise
 from nics_drl_bridge.robot.spec import build_robot
 from nics_drl_bridge.robot.taylor import NamedTaylorModel, TaylorModel
@@ -123,31 +122,26 @@ def late(car, commands):
     return np.stack(list(ahead), axis=1)
 
 
+def rolled(car, every):
+    """Poses and states at the end of each step of commands (T, 2) in effect."""
+    poses = np.zeros((1, len(every) + 1, 3))
+    states = np.zeros((1, len(every) + 1, 2))
+    simulate_rollouts(poses, states, every[None], make_terms(car), SERIES, car.dt)
+    return poses[0], states[0]
+
+
 def test_the_drive_shows_every_stage(commands, path):
-    speed = path[1][:, 0]
     car = motors()
-    assert (speed == 0.0).sum() > 5
+    assert (path[1][:, 0] == 0.0).sum() > 5
     assert (np.abs(commands[:, 0]) < DEAD).any()
     assert (np.abs(commands[:, 0]) > 0.8).any()
-    raw = (
-        replace(car, inputs=()),
-        *(replace(car, **{k: np.zeros(2)}) for k in ("friction", "drag")),
-    )
-    free = replace(car, limits=np.tile([-np.inf, np.inf], (2, 1)))
-    swift = replace(
-        car, inputs=tuple(c.model_copy(update={"delay": 0.0}) for c in car.inputs)
-    )
-    for other in (*raw, free, swift, replace(car, back_emf=np.zeros((2, 2)))):
-        ends = rolled(other, commands)[0]
-        assert np.hypot(*(ends[-1] - path[0][-1])[:2]) > 0.02
-
-
-def rolled(car, commands):
-    poses = np.zeros((1, PERIODS * SUBSTEPS + 1, 3))
-    states = np.zeros((1, 601, 2))
-    every = car.apply_curves(late(car, commands))[None]
-    simulate_rollouts(poses, states, every, make_terms(car), SERIES, car.dt)
-    return poses[0, ::SUBSTEPS], states[0, ::SUBSTEPS]
+    nothing = dict.fromkeys(("friction", "drag"), np.zeros(2))
+    nothing |= {"inputs": (), "back_emf": np.zeros((2, 2))}
+    nothing |= {"limits": np.tile([-np.inf, np.inf], (2, 1))}
+    for stage, absent in nothing.items():
+        other = replace(car, **{stage: absent})
+        ends = rolled(other, other.apply_curves(late(other, commands)))[0]
+        assert np.hypot(*(ends[-1] - path[0][-1])[:2]) > 0.02, stage
 
 
 def assert_same_path(poses, expected):
@@ -157,9 +151,10 @@ def assert_same_path(poses, expected):
 
 
 def test_the_roll_out_of_an_identification_follows_the_model(commands, path):
-    poses, states = rolled(motors(), commands)
-    assert_same_path(poses, path[0])
-    assert np.allclose(states, path[1], rtol=0.0, atol=1e-12)
+    car = motors()
+    poses, states = rolled(car, car.apply_curves(late(car, commands)))
+    assert_same_path(poses[::SUBSTEPS], path[0])
+    assert np.allclose(states[::SUBSTEPS], path[1], rtol=0.0, atol=1e-12)
 
 
 def test_an_open_loop_prediction_of_a_recorded_drive_follows_the_model(commands, path):
@@ -244,59 +239,6 @@ def test_the_estimator_expects_the_twist_of_a_command_in_effect(model):
         )
 
 
-def test_a_batch_of_robots_moves_as_each_alone(commands, path):
-    car = motors()
-    count = 37
-    terms = make_terms(car)
-    lanes = terms._replace(coefficient=np.tile(terms.coefficient[:, None], count))
-    pose = np.zeros((6, count))
-    x = np.zeros((5, count))
-    dq = np.zeros((5, count))
-    pose[2] = 1.0
-    x[4] = 1.0
-    for command in late(car, commands):
-        x[2:4] = car.apply_curves(command)[:, None]
-        run(pose, x, dq, lanes, SERIES, car.dt, 1)
-    assert np.allclose(pose[:2, -1], path[0][-1, :2], rtol=0.0, atol=1e-9)
-    assert (pose == pose[:, :1]).all()
-
-
-def test_predictions_over_seconds_have_the_derivatives_that_differences_show(commands):
-    car = motors()
-    steps = 300
-    every = car.apply_curves(late(car, commands))
-    first = np.arange(0, 300, 50)
-    state = rolled_states(car, every)[first]
-    free = np.arange(car.terms_kept)
-
-    def ends(terms):
-        shot = Shot(
-            state,
-            first,
-            every,
-            np.full((len(first), 1), steps),
-            np.zeros((len(first), 1, 3)),
-            np.zeros((len(first), 1, 3, len(free))),
-        )
-        shoot(shot, terms, free, car.dt, tangent(2, 2, len(free), len(free)))
-        return shot.end[:, 0], shot.slope[:, 0]
-
-    terms = make_terms(car)
-    slight = 1e-7
-    end, slope = ends(terms)
-    for p in free:
-        aside = terms.coefficient + slight * (np.arange(len(free)) == p)
-        expected = (ends(terms._replace(coefficient=aside))[0] - end) / slight
-        assert np.allclose(slope[:, :, p], expected, rtol=1e-3, atol=1e-3), p
-
-
-def rolled_states(car, every):
-    poses = np.zeros((1, len(every) + 1, 3))
-    states = np.zeros((1, len(every) + 1, 2))
-    simulate_rollouts(poses, states, every[None], make_terms(car), SERIES, car.dt)
-    return states[0]
-
-
 def test_a_model_that_is_written_steps_as_it_did(model, tmp_path, commands):
     save_model(model, tmp_path / "car")
     read = load_model(tmp_path / "car")
@@ -314,21 +256,6 @@ def test_a_model_that_is_written_steps_as_it_did(model, tmp_path, commands):
     assert "inputs" not in replace(model, kinematics=replace(motors(), inputs=())).text
 
 
-def test_a_written_car_stands_still_at_a_throttle_in_its_dead_zone(model, tmp_path):
-    save_model(model, tmp_path / "car")
-    simulator = FastSimulator(load_model(tmp_path / "car"), field(20.0))
-    for throttle, moves in (
-        (0.9 * DEAD, False),
-        (-0.9 * DEAD, False),
-        (3.0 * DEAD, True),
-    ):
-        simulator.reset([0], starts=np.zeros((1, 1, 3)))
-        for _ in range(30):
-            simulator.step([[[throttle, 0.5]]])
-        assert bool(np.abs(simulator.data.pose[0, 0]).max() > 0.01) == moves
-        assert bool((simulator.data.pose[0, 0] == 0.0).all()) != moves
-
-
 def test_a_warning_is_of_the_command_that_was_sent(model):
     said: list[str] = []
     checked = CommandRange(motors(), CAR, said.append)
@@ -340,21 +267,18 @@ def test_a_warning_is_of_the_command_that_was_sent(model):
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("key", "value", "said"),
     [
-        ({"inputs": ({"command": "gas"},)}, "key 'inputs' has 'gas', not one of"),
-        (
-            {"inputs": ({"command": "throttle"},) * 2},
-            "key 'inputs' has a command twice",
-        ),
-        ({"friction": {"speed": 0.1}}, "key 'friction' has 'speed'"),
-        ({"drag": {"speed": 0.1}}, "key 'drag' has 'speed'"),
-        ({"back_emf": {"speed": {}}}, "key 'back_emf' has 'speed'"),
-        ({"back_emf": {"vx": {"gas": 0.1}}}, "key 'back_emf' has 'gas'"),
-        ({"limits": {"throttle": (-1.0, 1.0)}}, "key 'limits' has 'throttle'"),
+        ("inputs", ({"command": "gas"},), "'gas', not one of"),
+        ("inputs", ({"command": "throttle"},) * 2, "a command twice"),
+        ("friction", {"speed": 0.1}, "'speed'"),
+        ("drag", {"speed": 0.1}, "'speed'"),
+        ("back_emf", {"speed": {}}, "'speed'"),
+        ("back_emf", {"vx": {"gas": 0.1}}, "'gas'"),
+        ("limits", {"throttle": (-1.0, 1.0)}, "'throttle'"),
     ],
 )
-def test_a_stage_of_an_unknown_variable_is_one_sentence(change, says):
-    named = NamedTaylorModel.model_validate(motors().named.model_dump() | change)
-    with pytest.raises(ModelError, match=says):
-        named.model()
+def test_a_stage_of_an_unknown_variable_is_one_sentence(key, value, said):
+    changed = motors().named.model_dump() | {key: value}
+    with pytest.raises(ModelError, match=f"key '{key}' has {said}"):
+        NamedTaylorModel.model_validate(changed).model()

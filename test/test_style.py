@@ -1,40 +1,12 @@
 from __future__ import annotations
 
 import io
-import re
-from itertools import pairwise
-from pathlib import Path
 
 import matplotlib as mpl
 import pytest
-from matplotlib.colors import to_rgb
 from PIL import Image
 
-import nics_drl_bridge
 from nics_drl_bridge import style
-
-PACKAGE = Path(nics_drl_bridge.__file__).parent
-DRAWING = [*PACKAGE.rglob("*.py"), *(PACKAGE.parent / "benchmarks").glob("*.py")]
-
-
-def test_all_pictures_take_their_colours_from_the_style():
-    own = [
-        file.name
-        for file in DRAWING
-        if file.name != "style.py"
-        and re.search("[\"']#[0-9a-fA-F]{6}[\"']", file.read_text("utf-8"))
-    ]
-    assert own == []
-
-
-def test_measured_model_and_goal_differ_in_grey_too():
-    weights = 0.2126, 0.7152, 0.0722
-    colours = (style.MEASURED, style.MODEL, style.GOAL)
-    grey = sorted(
-        sum(w * c for w, c in zip(weights, to_rgb(each), strict=True))
-        for each in colours
-    )
-    assert min(b - a for a, b in pairwise(grey)) > 0.05
 
 
 def test_the_style_ends_with_the_picture():

@@ -31,16 +31,6 @@ def test_linear_algebra_has_one_thread_for_as_long_as_the_function_runs():
     assert blas_threads() == {2}
 
 
-def test_an_error_restores_the_threads_too():
-    @one_blas_thread
-    def fails():
-        raise FitError("no.")
-
-    with pytest.raises(FitError, match="no"):
-        fails()
-    assert blas_threads() == {2}
-
-
 @pytest.mark.parametrize("function", [fit, identify])
 def test_whatever_solves_many_small_systems_is_limited(function):
     seen = []

@@ -18,7 +18,6 @@ from nics_drl_bridge.commands.demo_run import (
     learn,
     make_sections,
 )
-from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import builtin_model, generate, mount_lidar
 from nics_drl_bridge.policy.evaluation import ConfidenceInterval, Episode, Summary, rate
@@ -59,19 +58,6 @@ def test_without_the_extra_the_shipped_policy_of_the_robot_drives(
     assert "needs the module 'torch'" in sentence
     assert f"driving with the policy {robot!r} instead" in sentence
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.slow
-def test_without_the_extra_a_robot_without_a_shipped_policy_gets_a_baseline(
-    tmp_path, without_torch
-):
-    robot = load_robot("differential").model_dump(mode="json") | {"name": "mine"}
-    (tmp_path / "mine.yaml").write_text(dump_yaml(robot))
-    model = builtin_model(str(tmp_path / "mine.yaml"))
-    learned = learn(
-        DemoPlan(tmp_path, str(tmp_path / "mine.yaml")), model, lambda _: None
-    )
-    assert learned.policy == "dynamic_window"
 
 
 def test_a_named_policy_is_taken_and_a_misspelt_one_refused(tmp_path):

@@ -13,6 +13,7 @@ import pytest
 pytest.importorskip("gymnasium")
 
 from nics_drl_bridge import extensions
+from nics_drl_bridge.commands import episodes
 from nics_drl_bridge.commands.conditions import NO_CONDITIONS, Conditions
 from nics_drl_bridge.commands.episodes import (
     FAST,
@@ -25,7 +26,7 @@ from nics_drl_bridge.commands.episodes import (
     select_places,
     shorten_name,
 )
-from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.middleware.uncertainty import Uncertainty
 from nics_drl_bridge.policy.evaluation import Episode
 from nics_drl_bridge.robot import DEFAULT_ROBOT
@@ -66,9 +67,6 @@ def test_a_robot_without_cmd_vel_is_driven_in_process_alone_and_that_is_said():
     )
     assert select_places(order(FAST), KART.robot, said.append) == [FAST]
     assert len(said) == 1
-
-
-def test_to_ask_for_topics_with_such_a_robot_is_refused():
     with pytest.raises(ConfigError, match="names no field of cmd_vel"):
         select_places(order(FAST, "dds"), KART.robot, print)
 
@@ -180,3 +178,19 @@ def test_the_end_of_a_vehicles_episode_is_told_as_believed_and_how_uncertain(
     )
     told = report_end(drive_of_a_vehicle(result, None))
     assert told == f"{word}, as believed; 2 steps, 0.60 m"
+
+
+@pytest.mark.parametrize("refusal", ["", "scan_silent"])
+def test_a_vehicle_is_driven_only_if_its_gate_can_be_armed(monkeypatch, refusal):
+    processes = pytest.importorskip("nics_drl_bridge.nodes.processes")
+    said = []
+    monkeypatch.setattr(processes.Witness, "__init__", lambda self: None)
+    monkeypatch.setattr(processes.Witness, "__exit__", lambda *_: None)
+    monkeypatch.setattr(processes.Witness, "arms", lambda *_: refusal)
+    episodes._arm(False, "ant", pytest.fail)
+    if refusal:
+        with pytest.raises(BackendError, match=r"ant/command_gate .*: scan_silent"):
+            episodes._arm(True, "ant", said.append)
+    else:
+        episodes._arm(True, "ant", said.append)
+        assert said == ["  ant/command_gate is armed"]

@@ -41,7 +41,7 @@ def test_an_example_uses_options_that_there_are(name):
 
 
 def test_units_survive_in_the_help_and_an_example_ends_it(tmp_path):
-    told = nics("record", "--help", cwd=tmp_path).stdout
+    told = nics("record --help", cwd=tmp_path).stdout
     assert "keep within [m]." in " ".join(told.split())
     assert told.rstrip().splitlines()[-1].strip().startswith("nics record --robot")
 
@@ -53,7 +53,7 @@ def test_no_line_of_a_list_of_commands_is_cut(words, tmp_path):
 
 
 def test_units_survive_in_the_heads_of_tables(tmp_path):
-    told = nics("list", "worlds", cwd=tmp_path).stdout
+    told = nics("list worlds", cwd=tmp_path).stdout
     assert "size [m]" in told
 
 

@@ -13,7 +13,6 @@ from nics_drl_bridge.generator import load_model
 from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.recording.mapping import UNITS, Mapping
 from nics_drl_bridge.recording.recording import load_recording
-from nics_drl_bridge.recording.write import write_drive
 from nics_drl_bridge.robot.spec import load_robot
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "recordings.md"
@@ -35,19 +34,19 @@ def folder(tmp_path_factory):
 
 
 def test_a_log_becomes_a_mapping_a_recording_and_a_model(folder, tmp_path):
-    done = nics("inspect", folder / "drive.csv", "--map", "my.yaml", cwd=tmp_path)
+    done = nics("inspect", folder / "drive.csv", "--map my.yaml", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "cmd_steering" in done.stdout
     assert "\nnot used: battery_volts\n" in done.stdout
     assert "# guessed" in (tmp_path / "my.yaml").read_text()
-    again = nics("inspect", folder / "drive.csv", "--map", "my.yaml", cwd=tmp_path)
+    again = nics("inspect", folder / "drive.csv", "--map my.yaml", cwd=tmp_path)
     assert "is there already" in again.stderr
 
     words = ("import", folder / "drive.csv", "--map", "my.yaml", "--out")
     done = nics(*words, "drive.npz", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "command" in done.stdout
-    told = json.loads(nics(*words, "again.npz", "--json", cwd=tmp_path).stdout)
+    told = json.loads(nics(*words, "again.npz --json", cwd=tmp_path).stdout)
     assert (told["recording"], told["robot"]["kind"]) == ("again.npz", "ackermann")
     (pose,) = (stream for stream in told["streams"] if stream["stream"] == "pose")
     assert pose["rate_hz"] == pytest.approx(
@@ -59,38 +58,13 @@ def test_a_log_becomes_a_mapping_a_recording_and_a_model(folder, tmp_path):
 
 
 @pytest.mark.slow
-def test_several_logs_become_one_simulator(tmp_path):
-    robot = load_robot("differential")
-    for k in range(2):
-        driven = textbook.record(robot, np.random.default_rng(k), duration=20.0)
-        write_drive(driven, tmp_path / f"{k}.npz", robot)
-    done = nics("generate", "0.npz", "1.npz", "--out", "my_robot", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    report = " ".join(load_model(tmp_path / "my_robot").report.split())
-    assert "2 drives were joined (0.npz, 1.npz)" in report
-    assert "held out from the fit (the last third of each drive)" in report
-
-
-def test_logs_of_two_robots_are_refused(tmp_path):
-    for name in ("differential", "ackermann"):
-        robot = load_robot(name)
-        driven = textbook.record(robot, np.random.default_rng(0), duration=10.0)
-        write_drive(driven, tmp_path / f"{name}.npz", robot)
-    done = nics(
-        "generate", "differential.npz", "ackermann.npz", "--out", "m", cwd=tmp_path
-    )
-    assert done.returncode == 2
-    assert "fit only drives of one robot together" in done.stderr
-
-
-@pytest.mark.slow
 def test_a_log_with_its_mapping_becomes_a_simulator(folder, tmp_path):
     (tmp_path / "my.yaml").write_text(
         "robot: ackermann\ntime: time\npose: {x: x, y: y, heading: yaw}\n"
         "command: {steering_command: cmd_steering, speed_command: cmd_speed}\n"
     )
-    words = ("--map", "my.yaml", "--out", "model", "--json")
-    done = nics("generate", folder / "drive.csv", *words, cwd=tmp_path)
+    words = "--map my.yaml --out model --json"
+    done = nics("generate", folder / "drive.csv", words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert load_model(tmp_path / "model").robot.name == "ackermann"
     told = json.loads(done.stdout)
@@ -98,44 +72,6 @@ def test_a_log_with_its_mapping_becomes_a_simulator(folder, tmp_path):
     assert any(equation.startswith("vx = ") for equation in told["equations"])
     assert told["accuracy"] in " ".join((tmp_path / told["report"]).read_text().split())
     assert all(each["model"]["position_m"] >= 0.0 for each in told["errors"])
-
-
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        (
-            ("import", "drive.csv", "--map", "none.yaml", "--out", "a.npz"),
-            "none.yaml: no such",
-        ),
-        (("import", "drive.csv", "--map", "my.yaml", "--out", "a"), "must end in .npz"),
-        (("generate", "drive.csv", "--out", "m"), "with --map; `nics inspect"),
-        (
-            (
-                "generate",
-                "drive.csv",
-                "--map",
-                "my.yaml",
-                "--topic",
-                "pose=/p",
-                "--out",
-                "m",
-            ),
-            "name the topics in the map",
-        ),
-        (("inspect", "nothing.csv"), "nothing.csv: no such file or folder"),
-    ],
-)
-def test_what_can_not_be_done_is_one_sentence(folder, tmp_path, words, sentence):
-    (tmp_path / "drive.csv").write_bytes((folder / "drive.csv").read_bytes())
-    (tmp_path / "my.yaml").write_text(
-        "time: 0\npose: {x: 1, y: 2, heading: 3}\ncommand: {v: 4}\n"
-    )
-    done = nics(*words, cwd=tmp_path)
-    assert done.returncode == 2
-    assert sentence in done.stderr
-    *progress, _ = done.stderr.splitlines()
-    assert all(line.endswith(" s)") for line in progress)  # of a slow machine
-    assert {path.name for path in tmp_path.iterdir()} == {"drive.csv", "my.yaml"}
 
 
 def test_the_mapping_and_the_units_of_the_docs_are_those_of_the_code():

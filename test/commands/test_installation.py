@@ -11,7 +11,7 @@ from nics_drl_bridge.commands.installation import EXTRAS, checks
 
 
 def test_the_doctor_tells_what_works_on_this_machine(tmp_path):
-    told = nics("doctor", "--install", "--json", cwd=tmp_path)
+    told = nics("doctor --install --json", cwd=tmp_path)
     assert told.returncode == 0, told.stderr
     parts = {each["part"]: each for each in json.loads(told.stdout)["checks"]}
     assert {

@@ -22,14 +22,3 @@ def test_what_comes_with_the_package_is_listed_by_name(what, tmp_path):
     )
     assert listed >= known
     assert all(name in table.stdout for name in known)
-
-
-def test_what_is_there_to_be_listed_is_told_in_plain_words(tmp_path):
-    assert (
-        "Choose from: robots, worlds, lidars, policies"
-        in nics("list", cwd=tmp_path).stderr
-    )
-    told = nics("list", "foo", cwd=tmp_path).stderr
-    assert told.startswith(
-        "nics: Invalid value for 'what': 'foo' is not one of 'robots',"
-    )

@@ -6,6 +6,7 @@ import errno
 import json
 import re
 import signal
+import subprocess
 import sys
 from pathlib import Path
 from unittest import mock
@@ -16,7 +17,9 @@ from command_line import nics
 from numba.core.caching import CacheImpl
 
 from nics_drl_bridge.commands import interrupts, start
+from nics_drl_bridge.commands.first_checks import check_settings
 from nics_drl_bridge.config import share_folder
+from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.recording.recording import save_recording
@@ -50,6 +53,10 @@ FILES = {
     "units.yaml": "robot: differential\npose: {x: x, y: x, heading: x, unit: [m, m, rad]}\n",
     "number.yaml": "robot: differential\npose: {x: x, y: x, heading: x, unit: 1}\n",
     "taken/note.txt": "mine\n",
+    "run/settings.yaml": "robot: ackermann\n",
+    "mine.py": "x = 1\n",
+    "good.yaml": "time: 0\npose: {x: 1, y: 2, heading: 3}\ncommand: {v: 4}\n",
+    "torn.npz": "PK\x03\x04",
     "robot/model.yaml": ROBOT,
     "robot/model/model.yaml": ROBOT,
 }
@@ -58,6 +65,7 @@ MISTAKES = {
     "genrate": "No such command 'genrate'",
     "generate drive.npz": "Missing option '--out'",
     "generate drive.npz --output m": "No such option: --output",
+    "bake " + "x" * 5000: "No such command",
     "evaluate": "Missing argument 'POLICY...'",
     "list robot": "'robot' is not one of 'robots', 'worlds'",
     "train --steps 0": "'--(steps|episodes)'",
@@ -74,6 +82,36 @@ MISTAKES = {
     "train --task navigate": "unknown task 'navigate'; did you mean 'navigation'?",
     "train --algorithm dqn": "input should be 'ppo' or 'sac', not 'dqn'",
     "train --engine sb4": "unknown engine 'sb4'; did you mean 'sb3'?",
+    "train navigation": "a task is given as --task navigation",
+    "train --task nowhere.py:Mine": "'nowhere.py': no such file",
+    "train --task mine.py": "defines no subclass",
+    "train --model ./nowhere": "./nowhere: no such folder",
+    "train --robot taken": "taken: holds no model.yaml",
+    "train --settings nowhere.yaml": "--settings nowhere.yaml: no such file",
+    "train --seeds -1": "seed -1: must be a whole number",
+    "train --seeds 1 1": "none twice",
+    f"train --seeds {2**64}": "seed 18446744073709551616: must be",
+    f"evaluate straight --in fast --seed {2**63}": "seed|'--seed'",
+    "train --out mine.py": "--out mine.py: is a file, not a folder",
+    "train --out /proc/run": "/proc",
+    "train --watch --engine ray": "worlds of other processes are not shown",
+    "record --out d.npz --robot diferential": "did you mean 'differential'",
+    "record --out d.txt": "unknown kind of recording '.txt'",
+    "record --out /proc/d.npz": "/proc",
+    "record --out drive.npz": "is there already",
+    "record --out d.npz --topics nowhere.yaml": "nowhere.yaml",
+    "record --out d.npz --preview --remap odom=x": "--remap 'odom=x': must be NAME:=OTHER",
+    "record --out d.npz --preview --seed -1": "seed -1",
+    "demo --recording empty --out d": "empty",
+    "demo --robot ackerman --out d": "did you mean 'ackermann'",
+    "demo --world areena --out d": "did you mean 'arena'",
+    "watch --ros --bag drive": "--bag does not go with --ros; leave out --bag, or --ros",
+    "watch straight --bag drive": "a policy does not go with --bag",
+    "watch straight --namespace ant": "--namespace: belongs to --ros",
+    "watch straight --episodes 3": "--episodes: belongs to --record",
+    "watch --record a.avi": "--record 'a.avi': ",
+    "watch --bag nowhere --world arena --world room": "a robot is in one",
+    "watch strait": "did you mean 'straight'",
     "evaluate diferential": "unknown policy 'diferential'; did you mean 'differential'?",
     "evaluate differential --in fasst": "there is no such simulator; did you mean 'fast'?",
     "evaluate differential --in fast --world circels": "did you mean 'circles'?",
@@ -113,6 +151,12 @@ MISTAKES = {
     "record --out d.npz --preview --speed 3": "speed",
     # Files that are not there, or are something else.
     "generate nothing.npz --out m": "nothing.npz: no such file",
+    "generate torn.npz --out m": "torn.npz",
+    "generate empty --out m": "cmd.csv.*vrpn.csv",
+    "generate drive.npz --out m --robot mecanum": "mecanum|drive.npz",
+    "generate drive.npz --out m --topic odom=/odom": "is no bag",
+    "import table.csv --map nowhere.yaml --out a.npz": "nowhere.yaml: no such",
+    "generate table.csv --map good.yaml --topic pose=/p --out m": "name the topics in the map",
     "generate text.txt --out m": "text.txt",
     "generate empty.csv --out m": "empty.csv",
     "generate table.csv --out m": "table.csv: .*map",
@@ -141,6 +185,7 @@ MISTAKES = {
     "world draw clutter --out /proc/clutter.png": "/proc",
     # Options that do not go together.
     "--sensor-kind mine.py list robots": "sensor 'mine.py': give path/to/file.py:ClassName",
+    "train --robot differential --out run": "run: contains a run with other settings",
     "train --resume": "--resume needs --out",
     "train --resume --out taken": "taken: contains no settings.yaml; name the folder of a run",
     "bag replay bag --out d.npz": "--out: belongs to --estimate; add that, or leave it out",
@@ -171,7 +216,12 @@ MISTAKES = {
     "evaluate differential --lidar hokuyo_ust_10lx --in fast": "needs more than this lidar "
     "sees: .* in base_link, the scan layout needs .*; use another lidar, or a policy trained for",
     "evaluate straight --in fast --out text.txt": "text.txt is a file, not a folder",
+    "evaluate straight --backend sim": "--backend 'sim'",
+    "evaluate straight --shadow bag --lidar rplidar_a2": "leave out --lidar",
+    "evaluate straight --backend dds --hardware --in dds": "--in",
+    "evaluate straight random --backend dds --hardware": "one policy at a time",
 }
+HEAVY = {"torch", "stable_baselines3", "rclpy", "matplotlib", "onnxruntime"}
 MODULES = {
     (
         "train",
@@ -205,6 +255,7 @@ def folder(drive, tmp_path):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text, encoding="utf-8")
     (tmp_path / "drive.npz").write_bytes(drive.read_bytes())
+    (tmp_path / "empty").mkdir()
     return tmp_path
 
 
@@ -224,7 +275,10 @@ def test_a_mistake_is_one_sentence(words, folder):
     assert re.search(MISTAKES[words], sentence), sentence
     after = {path for path in folder.rglob("*") if path.is_file()}
     assert after >= before
-    assert {file.relative_to(folder).parts[0] for file in after - before} <= {"runs"}
+    assert {file.relative_to(folder).parts[0] for file in after - before} <= {
+        "runs",
+        "__pycache__",
+    }
 
 
 @pytest.mark.parametrize("given", MODULES, ids=" without ".join)
@@ -240,7 +294,7 @@ def test_a_missing_module_is_one_sentence_with_what_to_install(
 def test_a_full_disk_is_one_sentence_and_leaves_nothing(folder):
     full = OSError(errno.ENOSPC, "No space left on device", "m/model.yaml")
     with mock.patch("nics_drl_bridge.files.write_text", side_effect=full):
-        done = nics("drive", "--robot", "differential", "--out", "m", cwd=folder)
+        done = nics("drive --robot differential --out m", cwd=folder)
     assert "m/model.yaml: No space left on device; choose another place" in sentence_of(
         done
     )
@@ -250,21 +304,39 @@ def test_a_full_disk_is_one_sentence_and_leaves_nothing(folder):
 @pytest.mark.parametrize("where", ["recording.textbook.record", "generator.save_model"])
 def test_ctrl_c_at_any_time_is_one_sentence(where, folder):
     with mock.patch(f"nics_drl_bridge.{where}", side_effect=KeyboardInterrupt):
-        done = nics("drive", "--robot", "differential", "--out", "m", cwd=folder)
+        done = nics("drive --robot differential --out m", cwd=folder)
     assert "interrupted" in sentence_of(done, code=130)
     assert not Path(folder / "m").exists()
 
 
-def test_a_run_with_other_settings_is_not_overwritten(folder):
-    (folder / "run").mkdir()
-    (folder / "run" / "settings.yaml").write_text(
-        "robot: ackermann\n", encoding="utf-8"
+@pytest.mark.parametrize("task", ["evil.py\\n", "navigaton"])
+def test_settings_for_an_unknown_task_are_refused_at_once(folder, task):
+    (folder / "tasks.yaml").write_text(f'task: "{task}"\n')
+    with pytest.raises(ConfigError, match="unknown task"):
+        check_settings("navigation", str(folder / "tasks.yaml"), {})
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(
+    "words", ["train --world corridr", "record --out d.npz --speed 3"]
+)
+def test_a_mistake_is_told_before_anything_heavy_is_loaded(words, tmp_path):
+    ask = (
+        "import sys\nfrom nics_drl_bridge.commands.cli import main\ntry:\n    main()\n"
+        f"except SystemExit as end:\n    print(end.code, set(sys.modules) & {HEAVY})\n"
     )
-    done = nics("train", "--robot", "differential", "--out", "run", cwd=folder)
-    assert (
-        "run: contains a run with other settings; choose another --out"
-        in sentence_of(done)
-    )
+    command = [sys.executable, "-c", ask, *words.split()]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.stdout == "2 set()\n", done.stderr
+
+
+@pytest.mark.parametrize(
+    "command",
+    ["train", "generate d.npz --out m", "evaluate straight", "world draw room"],
+)
+def test_robot_and_model_are_one_option_of_every_command(command, tmp_path):
+    done = nics(*command.split(), "--robot jackal --model=mecanum", cwd=tmp_path)
+    assert "--robot and --model are the same option" in sentence_of(done)
 
 
 @pytest.fixture
@@ -312,7 +384,7 @@ def test_ctrl_c_does_not_reach_the_processes_that_compile_ahead(tmp_path):
 
 def test_a_first_mapping_is_written_beside_json_too(folder):
     told = json.loads(
-        nics("inspect", "table.csv", "--map", "first.yaml", "--json", cwd=folder).stdout
+        nics("inspect table.csv --map first.yaml --json", cwd=folder).stdout
     )
     assert told["mapping"] == "first.yaml"
     assert "\nrobot: " in (folder / "first.yaml").read_text(encoding="utf-8")
@@ -322,7 +394,7 @@ def test_a_recording_of_this_package_gets_no_mapping_and_says_so(tmp_path):
     robot = load_robot("differential")
     driven = textbook.record(robot, np.random.default_rng(0), 5.0)
     write_drive(driven, tmp_path / "own.npz", robot)
-    said = nics("inspect", "own.npz", "--map", "my.yaml", cwd=tmp_path).stdout
+    said = nics("inspect own.npz --map my.yaml", cwd=tmp_path).stdout
     assert said.startswith(
         "own.npz: was written by this package, and needs no mapping: nics gen"
     )
@@ -332,6 +404,6 @@ def test_a_recording_of_this_package_gets_no_mapping_and_says_so(tmp_path):
 def test_columns_of_text_are_null_in_json(folder):
     rows = "".join(f"2024-01-01 10:00:00.{k},{k}.0\n" for k in range(3))
     (folder / "dates.csv").write_text(f"stamp,x\n{rows}", encoding="utf-8")
-    told = nics("inspect", "dates.csv", "--json", cwd=folder).stdout
+    told = nics("inspect dates.csv --json", cwd=folder).stdout
     (table,) = json.loads(told, parse_constant=pytest.fail)["tables"]
     assert [None, None] in [column[1:] for column in table["columns"]]

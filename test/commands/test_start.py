@@ -37,11 +37,6 @@ def test_ctrl_c_in_a_callback_of_llvm_comes_when_that_is_over(handled):
     assert time.monotonic() - begin < DEADLINE_S
 
 
-def test_ctrl_c_anywhere_else_comes_at_once(handled):
-    with pytest.raises(KeyboardInterrupt):
-        signal.raise_signal(signal.SIGINT)
-
-
 def children_of(process: int) -> list[int]:
     found = Path(f"/proc/{process}/task/{process}/children")
     return [int(child) for child in found.read_text().split()]
@@ -143,19 +138,3 @@ def test_a_command_that_is_interrupted_ends_with_130_whatever_the_moment(
         assert process.stdout.readline() == "began\n"
         process.send_signal(signal.SIGINT)
         assert process.wait(DEADLINE_S) == 130
-
-
-@pytest.mark.process
-@pytest.mark.skipif(sys.platform != "linux", reason="is about POSIX shells")
-def test_a_node_below_a_shell_that_ignores_ctrl_c_takes_it_again():
-    ignoring = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); "
-    run = "import subprocess, sys; from nics_drl_bridge.nodes.node_process import interruptible; "
-    ask = "import signal; print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)"
-    child = f"subprocess.run([sys.executable, '-c', {ask!r}], preexec_fn=interruptible)"
-    done = subprocess.run(
-        [sys.executable, "-c", f"{ignoring}{run}{child}"],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert done.stdout == "True\n"

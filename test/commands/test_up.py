@@ -10,11 +10,11 @@ import time
 from pathlib import Path
 
 import pytest
-from command_line import nics
+from command_line import nics, split_words
 from domains import claimed_domain
 
 from nics_drl_bridge.commands import up
-from nics_drl_bridge.nodes import starting
+from nics_drl_bridge.nodes import node_process, starting
 from nics_drl_bridge.nodes.starting import LAUNCHES, NodeStart
 
 NICS = [sys.executable, "-m", "nics_drl_bridge.commands.start"]
@@ -24,33 +24,39 @@ POLL_S = 0.05
 ARRIVE_S = 10.0
 ATTEMPTS = 6
 NODES = ("simulator_node", "command_gate", "middleware_node", "policy_node")
-HEAVY = "numpy numba scipy rclpy"
 
 
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (
-            ("simulaton",),
-            "nothing called 'simulaton' to start; did you mean 'simulation'?",
-        ),
-        (
-            ("simulation", "wrld:=arena"),
-            "unknown argument 'wrld'; did you mean 'world'?",
-        ),
-        (("simulation", "world=arena"), "'world=arena': write name:=value"),
-        (("simulation", "--world", "arena"), "'--world': write name:=value"),
-        (("simulation", "world:=a", "world:=b"), "'world' is given twice"),
-        (("simulation", "stamped:=maybe"), "'stamped' is 'maybe'; give true or false"),
-        (("vehicle", "e_stop_required:=false"), "unknown argument 'e_stop_required'"),
-        (("vehicle", "params_file:=none.yaml"), "none.yaml: no such file"),
+        ("up simulaton", "did you mean 'simulation'?"),
+        ("up simulation wrld:=arena", "unknown argument 'wrld'; did you mean 'world'?"),
+        ("up simulation world=arena", "'world=arena': write name:=value"),
+        ("up simulation --world arena", "'--world': write name:=value"),
+        ("up simulation world:=a world:=b", "'world' is given twice"),
+        ("up simulation stamped:=maybe", "'stamped' is 'maybe'; give true or false"),
+        ("up vehicle e_stop_required:=false", "unknown argument 'e_stop_required'"),
+        ("up vehicle params_file:=none.yaml", "none.yaml: no such file"),
+        ("up vehicle rviz:=true", "the ROS 2 package 'rviz2' is not installed here"),
+        ("arm --namespace 2nd", "namespace '2nd'"),
+        ("stop --namespace 2nd", "namespace '2nd'"),
     ],
 )
-def test_a_wrong_argument_is_one_sentence_and_starts_nothing(words, sentence, tmp_path):
-    done = nics("up", *words, cwd=tmp_path)
+def test_a_wrong_argument_is_one_sentence_and_starts_nothing(
+    words, sentence, tmp_path, monkeypatch
+):
+    for module in (starting, node_process):
+        monkeypatch.setattr(module, "prefix_of", lambda package: None)
+    done = nics(*words.split(), cwd=tmp_path)
     assert done.returncode == 2
     assert sentence in done.stderr
     assert done.stdout == ""
+
+
+@pytest.mark.parametrize("name", LAUNCHES)
+def test_every_launch_lists_its_arguments(name, tmp_path):
+    told = nics("up", name, "--show-args", cwd=tmp_path).stdout
+    assert all(f"{one.name}:=" in told for one in LAUNCHES[name]().arguments)
 
 
 @pytest.mark.parametrize(
@@ -68,23 +74,6 @@ def test_the_next_step_is_one_that_these_nodes_can_take(executables, step):
     told = up.describe_next_step(nodes)
     assert told.startswith(step)
     assert bool(told) == bool(step)
-
-
-@pytest.mark.process
-def test_a_wrong_argument_is_told_before_anything_heavy_is_loaded():
-    ask = (
-        "import sys\n"
-        "from nics_drl_bridge.commands import start\n"
-        "sys.argv = ['nics', 'up', 'simulation', 'wrld:=arena']\n"
-        "try:\n"
-        "    start.main()\n"
-        "except SystemExit as end:\n"
-        f"    print(end.code, set(sys.modules) & set('{HEAVY}'.split()))\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", ask], capture_output=True, text=True, check=True
-    )
-    assert done.stdout == "2 set()\n"
 
 
 @pytest.mark.ros
@@ -110,25 +99,6 @@ def test_a_command_to_a_running_robot_loads_no_simulator(words):
             text=True,
         )
     assert done.stdout == "2 {'rclpy'}\n", done.stderr
-
-
-@pytest.mark.parametrize("name", LAUNCHES)
-def test_every_launch_lists_its_arguments(name, tmp_path):
-    done = nics("up", name, "--show-args", cwd=tmp_path)
-    assert done.returncode == 0
-    assert all(
-        f"{argument.name}:=" in done.stdout for argument in LAUNCHES[name]().arguments
-    )
-
-
-def test_a_viewer_that_is_not_installed_is_one_sentence(tmp_path, monkeypatch):
-    monkeypatch.setattr(starting, "prefix_of", lambda package: None)
-    monkeypatch.setattr(
-        "nics_drl_bridge.nodes.node_process.prefix_of", lambda package: None
-    )
-    done = nics("up", "vehicle", "rviz:=true", cwd=tmp_path)
-    assert done.returncode == 2
-    assert "the ROS 2 package 'rviz2' is not installed here" in done.stderr
 
 
 class Up:
@@ -169,7 +139,7 @@ class Up:
             time.sleep(POLL_S)
 
     def tell(self, *words: object) -> subprocess.CompletedProcess[str]:
-        command = [*NICS, *map(str, words)]
+        command = [*NICS, *split_words(*words)]
         return subprocess.run(
             command, env=self.environment, capture_output=True, text=True
         )
@@ -214,7 +184,7 @@ def drives(up, witness, goal):
     for _ in range(ATTEMPTS):
         if witness.arrives(goal, 0.4, ARRIVE_S):
             return True
-        up.tell("arm", "--reset")
+        up.tell("arm --reset")
     return False
 
 
@@ -237,22 +207,22 @@ def test_a_simulation_is_armed_driven_stopped_and_ended_by_nics_alone(start):
         armed = up.tell("arm")
         assert armed.returncode == 0, armed.stderr
         assert "/command_gate is armed" in armed.stdout
-        goal = up.tell("goal", "1", "-0.5", "--wait", 90)
+        goal = up.tell("goal 1 -0.5 --wait 90")
         assert goal.returncode == 0, goal.stderr
         assert "drives to (1.00, -0.50) m in the map" in goal.stdout
         assert drives(up, witness, (1.0, -0.5)), up.text
         stopped = up.tell("stop")
         assert stopped.returncode == 0, stopped.stderr
         assert "/command_gate has stopped its robot" in stopped.stdout
-        refused = up.tell("arm", "--wait", 5)
+        refused = up.tell("arm --wait 5")
         assert refused.returncode == 1
         assert "refuses to arm" in refused.stderr
         assert "e_stop_released: e_stop_pressed" in refused.stderr
-        again = up.tell("arm", "--reset")
+        again = up.tell("arm --reset")
         assert again.returncode == 0, again.stderr
-        behind = up.tell("goal", "-1", "0", "--frame", "base_link")
+        behind = up.tell("goal -1 0 --frame base_link")
         assert behind.returncode == 0, behind.stderr
-        nowhere = up.tell("goal", "1", "0", "--frame", "kitchen", "--wait", 10)
+        nowhere = up.tell("goal 1 0 --frame kitchen --wait 10")
         assert nowhere.returncode == 1
         assert "a goal in the frame 'kitchen' is refused" in nowhere.stderr
     children = up.children
@@ -311,21 +281,12 @@ def test_where_nothing_runs_each_command_says_so(
 ):
     with claimed_domain() as domain_id:
         monkeypatch.setenv("ROS_DOMAIN_ID", str(domain_id))
-        done = nics(*words, "--wait", 0.5, cwd=tmp_path)
+        done = nics(*words, "--wait 0.5", cwd=tmp_path)
     assert done.returncode == 2
     assert f"no {what} was seen in namespace / of ROS domain {domain_id}" in done.stderr
 
 
-@pytest.mark.parametrize("command", ["arm", "stop"])
-def test_a_namespace_that_can_not_be_one_is_refused_without_ros(command, tmp_path):
-    done = nics(command, "--namespace", "2nd", cwd=tmp_path)
-    assert done.returncode == 2
-    assert "namespace '2nd'" in done.stderr
-
-
-def test_a_text_that_looks_like_a_number_reaches_a_node_as_a_text(tmp_path):
-    from nics_drl_bridge.nodes.node_process import command_of
-
+def test_a_node_gets_text_as_text_above_the_values_of_the_users_file(tmp_path):
     parameters = {
         "world": "7",
         "policy": "1e3",
@@ -333,10 +294,14 @@ def test_a_text_that_looks_like_a_number_reaches_a_node_as_a_text(tmp_path):
         "rate": 2.0,
         "on": True,
     }
-    node = NodeStart("nics_drl_bridge", "simulator_node", "", parameters)
-    words = command_of(node, tmp_path)
-    text = Path(words[words.index("--params-file") + 1]).read_text(encoding="utf-8")
+    node = NodeStart("nics_drl_bridge", "policy_node", "ant", parameters, "own.yaml")
+    words = node_process.command_of(node, tmp_path)
+    assert words[words.index("-r") + 1] == "__ns:=/ant"
+    files = [words[k + 1] for k, word in enumerate(words) if word == "--params-file"]
+    assert files[0] == "own.yaml"
+    text = Path(files[1]).read_text(encoding="utf-8")
     for line in (
+        '"/ant/policy_node":',
         '"world": "7"',
         '"policy": "1e3"',
         '- "true"',
@@ -344,16 +309,3 @@ def test_a_text_that_looks_like_a_number_reaches_a_node_as_a_text(tmp_path):
         '"on": true',
     ):
         assert line in text
-
-
-def test_values_of_an_argument_stand_above_those_of_the_users_file(tmp_path):
-    from nics_drl_bridge.nodes.node_process import command_of
-
-    node = NodeStart(
-        "nics_drl_bridge", "policy_node", "ant", {"policy": "mppi"}, "own.yaml"
-    )
-    words = command_of(node, tmp_path)
-    files = [words[k + 1] for k, word in enumerate(words) if word == "--params-file"]
-    assert files[0] == "own.yaml"
-    assert '"/ant/policy_node":' in Path(files[1]).read_text(encoding="utf-8")
-    assert words[words.index("-r") + 1] == "__ns:=/ant"

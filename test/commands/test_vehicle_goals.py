@@ -17,34 +17,48 @@ SCENE = SimpleNamespace(
 ELSEWHERE = np.array([18.0, 5.0, np.pi])
 
 
-def test_a_goal_from_where_it_stands_lays_the_map_there():
-    order = GoalOrder((2.0, 0.5), start="present")
-    episode = order.episode(SCENE)
-    assert order.lays_map
-    assert not order.needs_pose
-    assert episode.options["start"].tolist() == [0.0, 0.0, 0.0]
-    assert episode.options["goal"].tolist() == [2.0, 0.5]
-    assert episode.distance == pytest.approx(np.hypot(2.0, 0.5))
-    assert (
-        "2.00 m ahead and 0.50 m to the left of where it stands" in episode.sentence()
-    )
-
-
-def test_with_a_pose_sensor_a_goal_from_where_it_stands_is_composed_with_the_pose():
-    order = GoalOrder((2.0, -0.5), start="present", localised=True)
-    episode = order.episode(SCENE, ELSEWHERE)
-    assert not order.lays_map
-    assert episode.options["goal"] == pytest.approx([16.0, 5.5])
-    assert "2.00 m ahead and 0.50 m to the right" in episode.sentence()
-
-
-def test_a_goal_in_map_is_as_far_as_the_robot_stands_from_it():
-    order = GoalOrder((2.0, 0.5), "map", "present")
-    episode = order.episode(SCENE, ELSEWHERE)
-    assert order.needs_pose
-    assert episode.options["goal"].tolist() == [2.0, 0.5]
-    assert episode.distance == pytest.approx(np.hypot(16.0, 4.5))
-    assert "(2.00 m, 0.50 m) in map, 16.62 m from where it stands" in episode.sentence()
+@pytest.mark.parametrize(
+    ("order", "goal", "distance", "said"),
+    [
+        (
+            GoalOrder((2.0, 0.5), start="present"),
+            (2.0, 0.5),
+            np.hypot(2.0, 0.5),
+            "2.00 m ahead and 0.50 m to the left of where it stands",
+        ),
+        (
+            GoalOrder((2.0, -0.5), start="present", localised=True),
+            (16.0, 5.5),
+            np.hypot(2.0, 0.5),
+            "2.00 m ahead and 0.50 m to the right",
+        ),
+        (
+            GoalOrder((2.0, 0.5), "map", "present"),
+            (2.0, 0.5),
+            np.hypot(16.0, 4.5),
+            "(2.00 m, 0.50 m) in map, 16.62 m from where it stands",
+        ),
+        (
+            GoalOrder((2.0, 0.5)),
+            (2.0, 0.5),
+            np.hypot(1.0, 1.5),
+            "place the vehicle at (1.00 m, -1.00 m, 1.57 rad)",
+        ),
+        (
+            GoalOrder((2.0, 0.5), "robot"),
+            geometry.compose(SCENE.starts[0], (2.0, 0.5, 0.0))[:2],
+            np.hypot(2.0, 0.5),
+            "it will drive to (0.50 m, 1.00 m) in map",
+        ),
+    ],
+)
+def test_a_goal_lies_where_its_frame_and_the_start_say(order, goal, distance, said):
+    episode = order.episode(SCENE, ELSEWHERE if order.needs_pose else None)
+    assert order.lays_map == (order.start == "present" and not order.needs_pose)
+    assert episode.options["goal"] == pytest.approx(goal)
+    assert ("start" in episode.options) == order.lays_map
+    assert episode.distance == pytest.approx(distance)
+    assert said in episode.sentence()
 
 
 def test_without_a_goal_the_worlds_own_lies_as_in_its_episode_before_the_robot():
@@ -55,21 +69,6 @@ def test_without_a_goal_the_worlds_own_lies_as_in_its_episode_before_the_robot()
     assert episode.seen == pytest.approx([3.0, 0.0])
     localised = GoalOrder(start="present", localised=True).episode(SCENE, ELSEWHERE)
     assert localised.options["goal"] == pytest.approx([15.0, 5.0])
-
-
-@pytest.mark.parametrize("frame", [None, "map"])
-def test_where_the_start_is_awaited_goals_are_in_map(frame):
-    episode = GoalOrder((2.0, 0.5), frame).episode(SCENE)
-    assert episode.goal.tolist() == [2.0, 0.5]
-    assert episode.options.keys() == {"goal"}
-    assert "place the vehicle at (1.00 m, -1.00 m, 1.57 rad)" in episode.sentence()
-
-
-def test_where_the_start_is_awaited_a_goal_may_be_seen_from_it():
-    episode = GoalOrder((2.0, 0.5), "robot").episode(SCENE)
-    assert episode.goal == pytest.approx(
-        geometry.compose(SCENE.starts[0], (2.0, 0.5, 0.0))[:2]
-    )
 
 
 def test_the_ground_around_a_vehicle_is_open_and_wide_enough_for_its_goal():

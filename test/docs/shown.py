@@ -90,46 +90,28 @@ def bag(path: Path) -> None:
     env = BridgeEnv(model="differential", world="empty", estimator=True)
     data = env._backend.simulator.data
     rng = np.random.default_rng(2)
-    topics: dict[str, list[Any]] = {
-        "/odom": [],
-        "/scan": [],
-        "/cmd_vel": [],
-        "/mocap": [],
-    }
-    known = np.diag(np.full(6, 0.01)).ravel()
+    topics: dict[str, list[Any]] = {}
     nothing = np.zeros(0, np.float32)
     env.reset(seed=1)
     actions = np.repeat(rng.uniform(-0.8, 0.8, (60, 2)), 5, axis=0)
     for k, action in enumerate(actions, 1):
         t = 0.1 * k
         forward, _, turn = env.task.robot.to_cmd_vel(env.task.command(action))
-        place = bags.new(
-            "geometry_msgs/PoseWithCovariance", bags.pose(*data.odom[0, 0]), known
-        )
-        twist = bags.new(
-            "geometry_msgs/TwistWithCovariance", bags.twist(*data.twist[0, 0]), known
-        )
         fields = [float(value) for value in env.task.lidar.header]
+        laser = bags.header(t, "laser")
+        seen = data.ranges[0, 0].copy()
+        scan = bags.new("sensor_msgs/LaserScan", laser, *fields, seen, nothing)
+        velocity = data.twist[0, 0].tolist()
         said = {
-            "/odom": (
-                "nav_msgs/msg/Odometry",
-                bags.header(t, "odom"),
-                "base_link",
-                place,
-                twist,
+            "/odom": bags.moving_odometry(
+                t, data.odom[0, 0].tolist(), velocity, covariance=0.01
             ),
-            "/scan": (
-                "sensor_msgs/msg/LaserScan",
-                bags.header(t, "laser"),
-                *fields,
-                data.ranges[0, 0].copy(),
-                nothing,
-            ),
+            "/scan": scan,
+            "/cmd_vel": bags.twist(float(forward), 0.0, float(turn)),
+            "/mocap": bags.pose_stamped(t, *data.pose[0, 0].tolist()),
         }
         for topic, message in said.items():
-            topics[topic].append((t, bags.new(*message)))
-        topics["/cmd_vel"].append((t, bags.twist(float(forward), 0.0, float(turn))))
-        topics["/mocap"].append((t, bags.pose_stamped(t, *map(float, data.pose[0, 0]))))
+            topics.setdefault(topic, []).append((t, message))
         env.step(action)
     env.close()
     bags.write(path, topics)

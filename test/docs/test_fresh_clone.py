@@ -72,8 +72,3 @@ def test_a_block_that_installs_something_runs_in_a_fresh_clone(lines, tmp_path):
     )
     measured = "met their bars: " in done.stdout and " broken " not in done.stdout
     assert done.returncode == 0 or measured, done.stdout  # a speed may be missed here
-
-
-def test_the_blocks_of_the_first_pages_are_among_them():
-    pages = {name.rpartition("-")[0] for name in blocks()}
-    assert {"README", "start_robot", "start_training", "start_paper"} <= pages

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import yaml
 
-from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.world import World
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -47,18 +46,6 @@ def test_a_key_has_its_type_default_range_and_the_comment_at_its_field():
         in rows["`clearance`"]
     )
     assert "| text | required |" in rows["`name`"]
-
-
-def test_a_comment_above_a_field_is_its_meaning_too():
-    assert reference.meaning(RobotSpec, "angular_is").startswith(
-        "meaning of `angular.z`"
-    )
-
-
-def test_every_schema_within_a_file_has_a_table():
-    page = reference.page(reference.KINDS["world"])
-    for name in World.model_json_schema()["$defs"]:
-        assert f"## {name}\n" in page
 
 
 def test_every_page_of_the_reference_and_of_docs_is_in_the_navigation():

@@ -76,8 +76,3 @@ def test_the_python_of_a_page_runs_as_it_is_shown(page, tmp_path):
         check=False,
     )
     assert done.returncode == 0, done.stderr
-
-
-def test_what_is_supplied_or_left_out_is_shown_somewhere():
-    shown = {(page.name, k) for page in PAGES for k in range(len(blocks_of(page)))}
-    assert {*BEFORE, *ELSEWHERE, *SAVED} <= shown

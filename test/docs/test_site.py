@@ -52,15 +52,6 @@ def test_the_site_asks_for_nothing_outside(site):
         assert not asked.search(text), page
 
 
-@pytest.mark.process
-@pytest.mark.slow
-@pytest.mark.timeout(900)
-def test_every_page_is_in_the_index_that_the_site_searches_by_itself(site):
-    index = (site / "search" / "search_index.js").read_text(encoding="utf-8")
-    for page in (ROOT / "docs").glob("*.md"):
-        assert page.stem == "index" or f'"{page.stem}.html' in index, page.name
-
-
 class Quiet(SimpleHTTPRequestHandler):
     """Serves files without a word."""
 
@@ -91,55 +82,7 @@ def test_a_browser_shows_every_page_of_the_site_without_a_flaw(site, tmp_path):
 
 
 # Right edges of the numbers and formulas of all equations, and that of the text around them.
-EDGES = """[...document.querySelectorAll('.equation')].map((equation) => {
-  const right = (name) => equation.querySelector(name).getBoundingClientRect().right;
-  const text = equation.parentElement.querySelector('p').getBoundingClientRect().right;
-  return [right('.equation-formula'), right('.equation-number'), text];
-})"""
 # What reaches beyond the window without a box of its own that scrolls.
-CLIPPED = """[...document.querySelectorAll('.md-content pre, .md-content td, .md-content code')]
-  .filter((part) => {
-    const scrolls = (box) => box && box !== document.body &&
-      (/auto|scroll/.test(getComputedStyle(box).overflowX) || scrolls(box.parentElement));
-    const { width, right } = part.getBoundingClientRect();
-    return width && right > innerWidth + 1 && !scrolls(part);
-  }).map((part) => part.textContent)"""
-
-
-@needs_chromium
-@pytest.mark.process
-@pytest.mark.slow
-@pytest.mark.timeout(900)
-@pytest.mark.parametrize("width", [1280, 390])
-def test_the_number_of_an_equation_stands_at_the_right_margin(site, tmp_path, width):
-    with closing(Browser(tmp_path)) as browser:
-        loaded = "document.readyState === 'complete'"
-        browser.open((site / "paper.html").as_uri(), width, 844, ready=loaded)
-        assert browser.ask("innerWidth") == width
-        edges = browser.ask(EDGES)
-        assert len(edges) == 4
-        for formula, number, text in edges:
-            assert formula <= number
-            assert number == pytest.approx(text, abs=2.0)
-
-
-@needs_chromium
-@pytest.mark.process
-@pytest.mark.slow
-@pytest.mark.timeout(900)
-def test_on_a_phone_nothing_is_clipped_and_columns_of_words_are_not_squeezed(
-    site, tmp_path
-):
-    with closing(Browser(tmp_path)) as browser:
-        for name in ("index", "paper", "safety", "reference/robot", "reference/nodes"):
-            loaded = "document.readyState === 'complete' && !!document.querySelector('.md-content')"
-            browser.open((site / f"{name}.html").as_uri(), 390, 844, ready=loaded)
-            assert browser.ask(CLIPPED) == [], name
-            rows = browser.ask(
-                "[...document.querySelectorAll('.md-content tr')].map("
-                "(row) => row.getBoundingClientRect().height)"
-            )
-            assert max(rows) < 260, name
 
 
 @needs_chromium

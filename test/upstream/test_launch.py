@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import re
 import subprocess
-import time
 from contextlib import ExitStack
 
 import pytest
 
 pytest.importorskip("ros2launch", reason="needs ros2: make test-upstream")
 
-from benchmarks.runs import BENCHMARKS
 from nodes.peer import Peer
 from rcl_interfaces.srv import GetParameters
 from rclpy.parameter import parameter_value_to_python
@@ -40,8 +38,6 @@ FILES = [
     if nodes
     for suffix in SUFFIXES
 ]
-TIMES = 10
-MOMENTS_S = 4.0
 
 
 @pytest.fixture
@@ -59,16 +55,6 @@ def told():
         yield ask
 
 
-@pytest.fixture
-def busy(monkeypatch):
-    """Two busy loops beside the test."""
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    from node_endings import busy
-
-    with busy(2):
-        yield
-
-
 def arguments(file):
     command = ["ros2", "launch", PACKAGE, file, "--show-args"]
     return subprocess.run(command, check=True, capture_output=True, text=True).stdout
@@ -79,12 +65,6 @@ def test_a_launch_file_runs_and_ctrl_c_ends_all_of_it_well(launch, file):
     launched = launch(file)
     launched.runs(*NODES[file.partition(".")[0]])
     launched.ends_well()
-
-
-@pytest.mark.parametrize("suffix", SUFFIXES)
-def test_where_nothing_of_a_description_is_installed_it_ends_by_itself(launch, suffix):
-    launched = launch(f"description.launch.{suffix}", model="mecanum")
-    assert launched.wait() == 0, launched.text
 
 
 @pytest.mark.parametrize("name", NODES)
@@ -181,29 +161,3 @@ def test_an_argument_that_can_not_be_used_ends_it_with_a_sentence(
     assert launched.wait() == 1
     assert re.search(sentence, launched.text), launched.text
     assert "Traceback" not in launched.text
-
-
-def test_a_simulator_without_a_bridge_is_driven_by_whom_it_may_concern(launch):
-    launched = launch("simulator.launch.py", world="empty")
-    launched.runs("simulator_node")
-    assert launched.text.count("process started") == 1
-    launched.ends_well()
-
-
-@pytest.mark.campaign
-@pytest.mark.timeout(1200)
-@pytest.mark.parametrize("name", ["bridge", "fleet", "simulation", "vehicle"])
-def test_ctrl_c_ends_it_ten_times_beside_two_busy_loops(launch, busy, name):
-    """At moments from the start of the processes until all have been running for a while."""
-    took = []
-    for k in range(TIMES):
-        launched = launch(f"{name}.launch.{SUFFIXES[k % 2]}", world="empty")
-        launched.told("process started", times=len(NODES[name]))
-        launched.told(r"\]: starting", times=len(NODES[name]))
-        if k >= TIMES // 2:
-            launched.runs(*NODES[name])
-        time.sleep(MOMENTS_S * k / TIMES)
-        took.append(launched.ends_well())
-    print(
-        f"{name}: ended after {sorted(took)[TIMES // 2]:.2f} s, at most {max(took):.2f} s"
-    )

@@ -101,17 +101,6 @@ def test_ros2_node_and_param_show_the_nodes_and_what_they_were_given(running):
     assert "world" in running("param", "list", *asked[:1], *asked[2:])
 
 
-def test_ros2_service_and_topic_pub_arm_the_gate_and_send_the_robot_to_a_goal(running):
-    assert "success=True" in running(
-        "service", "call", "/command_gate/arm", "std_srvs/srv/Trigger"
-    )
-    goal = "{pose: {position: {x: 1.0}}}"
-    running(
-        "topic", "pub", "--once", "/goal_pose", "geometry_msgs/msg/PoseStamped", goal
-    )
-    assert "linear" in running("topic", "echo", "--once", "/cmd_vel")
-
-
 def test_ros2_lifecycle_takes_the_policy_through_its_states(running):
     look = ("--no-daemon", "--spin-time", SPIN_S)
     for change, state in (

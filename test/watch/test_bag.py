@@ -17,22 +17,13 @@ DURATION_S = 4.0
 STEP_S = 0.05
 
 
-def odometry(t):
-    inner = bags.new(
-        "geometry_msgs/PoseWithCovariance", bags.pose(0.5 * t, 0, 0), np.zeros(36)
-    )
-    twist = bags.new(
-        "geometry_msgs/TwistWithCovariance", bags.twist(0.5, 0, 0), np.zeros(36)
-    )
-    return bags.new(
-        "nav_msgs/msg/Odometry", bags.header(t, "odom"), "base_link", inner, twist
-    )
-
-
 def bag(folder, **topics):
     """Straight ahead with 0.5 m/s."""
     known = {
-        "/odom": [(t, odometry(t)) for t in bags.times(STEP_S, DURATION_S)],
+        "/odom": [
+            (t, bags.moving_odometry(t, (0.5 * t, 0.0, 0.0), (0.5, 0.0, 0.0)))
+            for t in bags.times(STEP_S, DURATION_S)
+        ],
         "/cmd_vel": [
             (t, bags.twist(0.5, 0.0, 0.0)) for t in bags.times(0.1, DURATION_S)
         ],

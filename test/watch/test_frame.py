@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 from robots import direct_model, field
+from scipy.stats import chi2
 
 from nics_drl_bridge.sim.world_set import load_worlds
 from nics_drl_bridge.watch.frame import (
@@ -22,24 +23,16 @@ def plain(**changes):
     return json.loads(json.dumps(Frame(1.5, (WorldFrame(shot(**changes)),)).plain()))
 
 
-def test_a_frame_goes_over_the_wire_in_thousandths():
-    frame = plain()
+def test_a_frame_goes_over_the_wire_in_thousandths_without_what_is_not_finite():
+    ranges = np.array([[0.5, np.inf, -np.inf, np.nan]], np.float32)
+    bodies = np.concatenate([np.zeros((1, 7)), shot().bodies])
+    frame = plain(ranges=ranges, bodies=bodies)
     (world,) = frame["worlds"]
     assert frame["time"] == 1.5
     assert world["poses"] == [[1000, 0, 1571]]
-    assert world["ranges"] == [[1000] * 72]
     assert world["goals"] == [[2000, 500]]
     assert (world["bodies"], world["kinds"]) == ([[1000, 1500, 0, 250]], [0])
-
-
-def test_beams_without_a_return_are_minus_one_and_absent_bodies_are_left_out():
-    ranges = np.array([[0.5, np.inf, -np.inf, np.nan]], np.float32)
-    (world,) = plain(ranges=ranges, bodies=np.zeros((2, 7)))["worlds"]
     assert world["ranges"] == [[500, -1, -1, -1]]
-    assert world["bodies"] == []
-
-
-def test_what_is_not_finite_never_becomes_text_that_is_no_json():
     assert round_to_thousandths([np.nan, np.inf, -np.inf]) == [0, 0, 0]
 
 
@@ -48,12 +41,9 @@ def test_the_ellipse_holds_95_percent_of_the_positions():
     covariance = np.zeros((1, 3, 3))
     covariance[0, :2, :2] = turn @ np.diag([0.09, 0.01]) @ turn.T
     large, small, angle = plain(covariance=covariance)["worlds"][0]["ellipses"][0]
-    drawn = np.random.default_rng(0).multivariate_normal(
-        [0, 0], covariance[0, :2, :2], 20_000
-    )
-    along = drawn @ np.array([np.cos(angle), np.sin(angle)]) / large
-    across = drawn @ np.array([-np.sin(angle), np.cos(angle)]) / small
-    assert (along**2 + across**2 < 1.0).mean() == pytest.approx(0.95, abs=0.01)
+    known = np.sqrt(chi2.ppf(0.95, 2))
+    assert (large, small) == pytest.approx((0.3 * known, 0.1 * known), abs=1e-4)
+    assert np.tan(angle) == pytest.approx(0.8 / 0.6, rel=1e-3)
 
 
 def test_a_trail_begins_anew_with_each_episode_and_never_grows_without_end():

@@ -1,16 +1,12 @@
 from __future__ import annotations
 
 import re
-import threading
 from contextlib import closing
 
 import numpy as np
-from browser import until
 from robots import direct_model, field
 
 from nics_drl_bridge.env.bridge_env import BridgeEnv
-from nics_drl_bridge.watch.human import HumanView
-from nics_drl_bridge.watch.server import Request
 from watch.rig import Client
 
 
@@ -35,19 +31,3 @@ def test_render_mode_human_tells_where_its_page_is_and_shows_each_step(
             client.next(
                 "frame", lambda frame: len(frame["worlds"][0]["trails"][0]) == 1
             )
-
-
-def test_the_pace_of_the_page_holds_the_program_until_the_next_step():
-    env = BridgeEnv(model=direct_model(), world=field(count=0))
-    env.reset(seed=0)
-    view = HumanView(direct_model(), field(count=0), fps=1000)
-    with closing(view), closing(Client(view._server)):
-        until(lambda: view._server.watched, "the page")
-        view._pace.take(Request(kind="pause", on=True))
-        drawing = threading.Thread(target=view.draw, args=(env.snapshot(),))
-        drawing.start()
-        drawing.join(0.5)
-        assert drawing.is_alive()
-        view._server._requests.put(Request(kind="step"))
-        drawing.join()
-        assert view._pace.paused

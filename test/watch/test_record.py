@@ -64,12 +64,6 @@ def test_worlds_stand_side_by_side_in_a_picture_of_even_sides():
     assert (whole[5:] == 255).all()
 
 
-@pytest.mark.parametrize("name", ["episode.avi", "episode", "gif"])
-def test_an_unknown_kind_of_file_is_one_sentence(tmp_path, name):
-    with pytest.raises(ConfigError, match=r"--record .*(valid are|did you mean)"):
-        check_file(tmp_path / name)
-
-
 def test_a_missing_library_is_one_sentence(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(ConfigError, match=r"pip install 'nics_drl_bridge\[video\]'"):

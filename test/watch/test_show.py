@@ -54,18 +54,14 @@ def test_a_paused_source_goes_on_step_by_step():
 
 def test_an_error_is_told_on_the_page_and_pauses_it():
     with shown(Counter(fails=1000)) as (_, client):
+        client.next("stage")
+        client.ask("world", name="other")
+        client.next("stage")
         client.ask("goal")
         assert client.next("notice")["text"] == "there is no goal."
         client.ask("speed", value=64.0)
         assert client.next("notice")["text"] == "this one is missing."
         client.next("frame", lambda frame: frame["paused"])
-
-
-def test_another_stage_is_sent_at_once():
-    with shown(Counter()) as (_, client):
-        client.next("stage")
-        client.ask("world", name="other")
-        client.next("stage")
 
 
 def test_a_page_that_was_closed_while_paused_holds_nobody_up():
@@ -83,14 +79,6 @@ def test_the_speed_stays_within_bounds(given, taken):
     pace = Tempo()
     pace.take(Request(kind="speed", value=given))
     assert pace.speed == taken
-
-
-def test_without_a_display_one_line_says_where_the_page_is(monkeypatch, capsys):
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    monkeypatch.setattr(module.sys, "platform", "linux")
-    open_page("http://127.0.0.1:1/")
-    assert capsys.readouterr().err == "watch: http://127.0.0.1:1/\n"
 
 
 def test_with_a_display_the_browser_opens_it(monkeypatch, capsys):
