@@ -40,16 +40,7 @@ def driven(done, folder):
     return json.loads(file.read_text(encoding="utf-8"))
 
 
-BASELINE = [
-    "evaluate",
-    "dynamic_window",
-    "--model",
-    "differential",
-    "--episodes",
-    "2",
-    "--out",
-    "out",
-]
+BASELINE = "evaluate dynamic_window --model differential --episodes 2 --out out"
 
 
 @pytest.mark.ros

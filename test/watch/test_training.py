@@ -73,4 +73,4 @@ def test_frames_are_far_apart_and_none_is_drawn_while_nobody_looks(server, monke
             view()
             clock[0] += 0.03
     assert len(sent) == 2
-    assert len(sent[-1].worlds[0].trails[0]) == 6  # its way has each step, though
+    assert len(sent[-1].worlds[0].trails[0]) == 7  # its way has each step, though
