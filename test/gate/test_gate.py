@@ -12,7 +12,6 @@ from nics_drl_bridge.gate.inputs import (
     Tick,
 )
 from nics_drl_bridge.gate.stops import FROZEN_INPUTS
-from nics_drl_bridge.geometry import Bicycle
 from nics_drl_bridge.interface import NS_PER_S
 
 WITHIN_S = 0.40
@@ -23,19 +22,6 @@ def test_a_gate_that_nobody_armed_lets_nothing_pass():
     rig.run(3.0)
     assert rig.rule == "disarmed"
     assert not any(twist.any() for _, twist in rig.published)
-
-
-def test_a_car_that_takes_turn_rates_is_limited_by_its_steering_angle():
-    rig = Rig(config(bicycle=Bicycle(0.2)))
-    rig.wish = np.array([0.5, 0.0, 0.3])
-    rig.drive()
-    assert rig.decision.twist.tolist() == pytest.approx([0.5, 0.0, 0.3])
-    assert rig.state.value.tolist() == pytest.approx([0.5, np.arctan(0.2 * 0.3 / 0.5)])
-    rig.wish = np.array([0.5, 0.0, 30.0])
-    rig.run(2.0)
-    assert rig.decision.twist[2] == pytest.approx(
-        0.5 * np.tan(rig.config.limits.high[1]) / 0.2
-    )
 
 
 def test_the_robot_drives_on_when_data_are_fresh_again():

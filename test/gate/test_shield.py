@@ -18,7 +18,6 @@ from nics_drl_bridge.gate.shield import CREEP_SPEED
 from nics_drl_bridge.gate.shield_kernels import is_free
 from nics_drl_bridge.gate.state import ShieldConfig, View
 from nics_drl_bridge.interface import NS_PER_S
-from nics_drl_bridge.robot.braking import TurnBraking
 
 CAR = ShieldConfig(
     latency_s=0.15,
@@ -174,21 +173,6 @@ def test_a_command_of_before_counts_until_the_scan_shows_what_became_of_it(
     state = replace(rig.state, recent=recent)
     _, decision = decide(rig.config, state, Tick(), rig.now + 0.02)
     assert (decision.twist[0] < straight - 0.1) == counts
-
-
-@pytest.mark.parametrize("turn", [None, TurnBraking(0.6, 2.0)])
-def test_commands_are_kept_for_as_long_as_the_robot_may_follow_them(turn):
-    """Through a stop, too."""
-    shield = replace(CAR, wheelbase=0.0, turn=turn)
-    rig = Faced(FAR, shield, robot="differential")
-    rig.settles(2.0)
-    fastest = rig.decision.twist[0]
-    rig.command((np.nan, 0.0, 0.0))
-    rig.run(0.04)
-    assert max(value[0] for _, value in rig.state.recent) == fastest
-    reach = rig.config.scan_age_s + (0.6 if turn else CAR.latency_s)
-    oldest = rig.state.recent[0][0]
-    assert rig.now - reach - 0.05 < oldest <= rig.now - reach + 0.02
 
 
 SHIELD = ShieldConfig(0.2, 2.0, 0.05, 0.2, 0.15, 0.2, obstacle_speed=1.0, range_max=3.0)

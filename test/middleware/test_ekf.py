@@ -93,19 +93,6 @@ def test_a_command_acts_one_latency_after_it_was_sent(latency):
         assert twist[0] == pytest.approx(float(moving))
 
 
-def test_looking_ahead_does_not_move_the_filter():
-    estimator = Estimator(builtin_model("ackermann"))
-    estimator.reset(0, np.zeros(3))
-    estimator.add_command(0, [0.8, 0.2])
-    estimator.predict(SECOND)
-    before = (estimator.time_ns, *estimator.look_ahead(SECOND), estimator.covariance)
-    ahead, _ = estimator.look_ahead(5 * SECOND)
-    assert np.linalg.norm(ahead[:2] - before[1][:2]) > 0.5
-    estimator.predict(SECOND // 2)  # an earlier time
-    after = (estimator.time_ns, *estimator.look_ahead(SECOND), estimator.covariance)
-    assert all(np.array_equal(a, b) for a, b in zip(before, after, strict=True))
-
-
 def simulated_drive(model, seconds, seed, pose_std=None, noise=1.0):
     """Errors (T, 3) of the estimate, of the odometry, and covariances, all in the robot's frame."""
     simulator = FastSimulator(model, field(60.0))

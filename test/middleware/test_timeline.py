@@ -130,39 +130,6 @@ def test_any_order_of_one_seconds_data_gives_the_same_estimate(seed):
     assert numbers(fed(model, shuffled))[1] == pytest.approx(expected, abs=1e-9)
 
 
-@pytest.mark.parametrize("latency", [0.0, 0.25])
-def test_a_late_command_counts_from_when_it_was_sent(latency):
-    model = direct_model(latency)
-    middleware = Middleware(model)
-    middleware.reset(0, np.zeros(3))
-    for tenth in range(1, 8):
-        middleware.odometry(tenth * SECOND // 10, 0, np.zeros(3), np.zeros(3))
-    assert middleware.estimator.look_ahead(SECOND)[0][0] == 0.0
-    assert middleware.command(SECOND // 10, [1.0, 0.0, 0.0])
-    assert middleware.estimator.look_ahead(SECOND)[0][0] == pytest.approx(
-        0.9 - latency, abs=1e-9
-    )
-
-
-def test_copies_change_nothing_even_late_ones():
-    model = builtin_model("mecanum")
-    rng = np.random.default_rng(2)
-    drive = messages(model, rng, seconds=2.0, latest_ns=1)
-    middleware = fed(model, drive)
-    before = numbers(middleware)
-    newest = drive[-1].stamp_ns
-    copies = [m for m in drive if m.stamp_ns >= newest - HISTORY_NS + 100 * MILLISECOND]
-    for copy in copies:
-        assert not feed(middleware, copy._replace(value=copy.value + 0.1)), copy
-    after = numbers(middleware)
-    assert after[0] == before[0]
-    assert np.array_equal(after[1], before[1])
-    rejected = middleware.health(0).rejected
-    for topic in ("odom", "imu", "pose", "cmd_vel"):
-        wanted = sum(m.topic == topic for m in copies)
-        assert rejected[topic, "duplicate"] == wanted > 5
-
-
 @pytest.fixture
 def timeline():
     estimator = Estimator(builtin_model("ackermann"))
