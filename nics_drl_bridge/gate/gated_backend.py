@@ -28,7 +28,6 @@ class GatedBackend:
     def __init__(
         self, backend: interface.Backend, model: SimulatorModel, limits: str
     ) -> None:
-        model.robot.require_cmd_vel()
         command_limits = load_limits(limits, model.robot)
         shield, _ = shield_config(model, command_limits, limits)
         self._backend = backend
@@ -38,9 +37,7 @@ class GatedBackend:
             model,
             command_limits,
             shield,
-            simulated=True,
             e_stop_required=False,
-            estimate_required=False,
         )
         if not self._period_ns * interface.S_PER_NS < GateConfig.gap_s:
             slow = f"commands come every {model.control_period:g} s, and it stops after"

@@ -32,8 +32,7 @@ REACH_BEYOND = 0.6
 # time after which ground is forgotten, except beside the robot [s]
 REMEMBERED_S = 30.0
 MEDIAN_BEAMS = 5  # neighbouring beams whose median counts, because a single one may err
-# A body without corners and extent, from which distances are those from the robot's origin.
-ORIGIN = Body(Outline(np.zeros((0, 2)), 0, 0), 0.0, 0.0, 0.0)
+NO_OUTLINE = Outline(np.zeros((0, 2)), 0, 0)  # of a body that is a circle
 
 
 def update_ground(
@@ -88,7 +87,8 @@ def observe_ground(
         since_ns = view.stamp_ns
         times = np.full((count, count), -np.inf, np.float32)
         free_radius = min(kept_radius, _find_nearest(view.ranges, lidar))
-        ground_kernels.mark_covered(times, grid, ORIGIN, free_radius, 0.0)
+        circle = body._replace(outline=NO_OUTLINE, radius=free_radius)
+        ground_kernels.mark_covered(times, grid, circle, 0.0)
     else:
         since_ns = before.since_ns
         columns_moved, rows_moved = np.subtract(corner, before.corner).tolist()
@@ -98,7 +98,7 @@ def observe_ground(
     is_seen = ground_kernels.mark_seen(
         times, grid, view.ranges, lidar, range_max, TOLERANCE, now
     )
-    ground_kernels.mark_covered(times, grid, body, 0.0, now)
+    ground_kernels.mark_covered(times, grid, body, now)
     unseen = ground_kernels.find_unseen(times, is_seen, grid)
     return Ground(since_ns, corner, times, unseen)
 

@@ -122,15 +122,13 @@ def _clear_returns(
 
 
 @kernel
-def mark_covered(
-    times: Ranges, grid: Grid, body: Body, distance: float, now: float
-) -> None:
-    """Notes that cells up to a distance [m] from the footprint are free."""
+def mark_covered(times: Ranges, grid: Grid, body: Body, now: float) -> None:
+    """Notes that the cells under the footprint are free."""
     for i in range(times.shape[0]):
         for j in range(times.shape[1]):
             x, y = _locate_cell(i, j, grid)
-            is_far = x * x + y * y > (body.radius + distance) ** 2
-            if not is_far and compute_clearance(x, y, body) <= distance:
+            is_far = x * x + y * y > body.radius**2
+            if not is_far and compute_clearance(x, y, body) <= 0.0:
                 times[i, j] = now
 
 

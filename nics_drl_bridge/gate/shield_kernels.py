@@ -63,8 +63,8 @@ class Body(NamedTuple):
     radius: float
     farthest_corner: float
     margin: float
-    lever: float = 0.0
-    order: float = 2.0
+    lever: float
+    order: float
     turn_delay: float = 0.0
     turn_deceleration: float = 0.0
 

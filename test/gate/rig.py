@@ -133,11 +133,15 @@ class Rig:
     def arm(self, publishers: int = 1):
         return self.give(Arm(publishers))
 
-    def drive(self, seconds: float = 1.0):
-        """Settles, is armed, and drives as told."""
+    def settle(self):
+        """Settles and is armed."""
         self.run(1.5)
         assert self.arm().granted, self.decision.answer
-        self.run(0.04)
+        return self
+
+    def drive(self, seconds: float = 1.0):
+        """Settles, is armed, and drives as told."""
+        self.settle().run(0.04)
         self.speed = float(self.wish[0])
         self.run(seconds)
         assert self.decision.cause is None, self.decision.cause

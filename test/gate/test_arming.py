@@ -23,12 +23,6 @@ def settled(seconds=1.5, without="", **changes):
     return rig
 
 
-def test_when_everything_is_well_it_is_armed():
-    rig = settled()
-    assert rig.arm().granted
-    assert rig.decision.answer == "armed"
-
-
 def test_a_gate_that_knows_nothing_names_every_check_that_fails():
     known = {name for name, _ in CHECKS}
     names = failed(Rig(config(limits=None, sensors=("rear",))), publishers=2)
@@ -58,37 +52,26 @@ def test_fresh_for_less_than_a_second_is_not_enough(topic):
     assert f"{topic}_fresh" in failed(settled(0.9))
 
 
-@pytest.mark.parametrize("topic", ["scan", "odom"])
-def test_a_gap_within_the_last_second_is_not_enough(topic):
-    rig = settled(2.0)
-    rig.run(0.4, without=topic)
-    rig.run(0.4)
-    assert f"{topic}_fresh" in failed(rig)
-
-
 @pytest.mark.parametrize(
-    ("declared", "right"), [(5.0, False), (10.0, True), (20.0, False)]
+    ("changes", "faults"),
+    [
+        ({}, set()),
+        ({"scan_rate": 5.0}, {"scan_rate"}),
+        ({"scan_rate": 20.0}, {"scan_rate"}),
+        ({"odom_rate": 5.0}, {"odom_rate"}),
+        ({"odom_rate": 20.0}, {"odom_rate"}),
+        ({"odom_rate": 5.0, "odom_rate_declared": False}, set()),
+        ({"odom_rate": 20.0, "odom_rate_declared": False}, {"odom_rate"}),
+    ],
 )
-@pytest.mark.parametrize("topic", ["scan", "odom"])
-def test_a_rate_other_than_declared_is_named(topic, declared, right):
-    rig = settled(**{f"{topic}_rate": declared})
-    if right:
-        assert rig.arm().granted
+def test_a_rate_other_than_declared_is_named(changes, faults):
+    """Where none is declared for odometry, more than is needed is as good."""
+    rig = settled(**changes)
+    if faults:
+        assert failed(rig) == faults
     else:
-        assert failed(rig) == {f"{topic}_rate"}
-
-
-@pytest.mark.parametrize(
-    ("needed", "right"), [(5.0, True), (10.0, True), (20.0, False)]
-)
-def test_where_no_rate_of_odometry_is_declared_more_than_is_needed_is_as_good(
-    needed, right
-):
-    rig = settled(odom_rate=needed, odom_rate_declared=False)
-    if right:
         assert rig.arm().granted
-    else:
-        assert failed(rig) == {"odom_rate"}
+        assert rig.decision.answer == "armed"
 
 
 def test_a_simulation_that_runs_at_double_speed_keeps_its_declared_rates():
@@ -101,13 +84,16 @@ def test_a_simulation_that_runs_at_double_speed_keeps_its_declared_rates():
     assert rig.arm().granted, rig.decision.answer
 
 
-@pytest.mark.parametrize("off_s", [3600.0, -3600.0, 0.6])
+@pytest.mark.parametrize("off_s", [3600.0, -3600.0, 0.55, -0.55, 0.45, -0.45])
 def test_stamps_of_scan_and_odometry_that_are_far_apart_are_named(off_s):
     rig = Rig()
     scan = rig.scan
     rig.scan = lambda: scan(stamp_ns=rig.stamp + round(off_s * NS_PER_S))
     rig.run(1.5)
-    assert failed(rig) == {"clocks_agree"}
+    if abs(off_s) < 0.5:
+        assert rig.arm().granted
+    else:
+        assert failed(rig) == {"clocks_agree"}
 
 
 def test_an_estimate_that_moves_while_odometry_stands_is_named():
@@ -126,11 +112,6 @@ def test_an_estimate_that_is_no_number_is_refused(bad):
     assert rig.give(Estimate(zeros, zeros, np.full((3, 3), bad))).refused
     assert rig.give(Estimate(zeros, zeros, np.diag([0.1, 0.1, -0.1]))).refused
     assert failed(rig) == {"estimator_converged"}
-
-
-def test_an_estimator_that_is_not_required_may_be_missing():
-    rig = settled(without="estimate", estimate_required=False)
-    assert rig.arm().granted
 
 
 @pytest.mark.parametrize("publishers", [0, 2])

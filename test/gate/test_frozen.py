@@ -1,17 +1,11 @@
 from __future__ import annotations
 
-import re
-
 import numpy as np
 import pytest
 
-from gate.rig import LIDAR, PERIOD_S, TICK_S, Rig, config, driving
+from gate.rig import LIDAR, TICK_S, Rig, config, driving
+from nics_drl_bridge.gate.frozen import is_at_rest
 from nics_drl_bridge.gate.inputs import Reset
-from nics_drl_bridge.generator import builtin_model
-from nics_drl_bridge.sim.simulator import FastSimulator
-from nics_drl_bridge.sim.world import load_world
-
-BEND = np.abs(LIDAR.angles)
 
 
 def room(x, size=(2.5, 1.5)):
@@ -42,51 +36,28 @@ class Looking(Rig):
         return super().scan(**changes)
 
 
-def looking():
-    return Looking().drive()
-
-
-def stopped_by_scan(rig):
-    rig.until_stopped(2.0)
-    assert rig.rule == "scan_frozen"
-
-
-def test_a_room_that_changes_as_the_robot_drives_is_fine():
-    rig = looking()
-    assert rig.run(3.0).cause is None
-
-
-def test_a_lidar_that_shows_two_pictures_in_turn_is_frozen():
-    rig = looking()
-    pictures = [rig.shown[-2], rig.shown[-1]]
-    rig.broken = lambda true: pictures[len(rig.shown) % 2]
-    stopped_by_scan(rig)
-
-
-def test_a_lidar_that_repeats_a_second_is_frozen():
-    rig = looking()
-    pictures = rig.shown[-10:]
-    rig.broken = lambda true: pictures[len(rig.shown) % 10]
+def assert_frozen(rig):
     rig.until_stopped(4.0)
     assert rig.rule == "scan_frozen"
 
 
-@pytest.mark.parametrize("beams", [1, 5])
-def test_a_lidar_that_is_frozen_but_for_a_few_beams_is_frozen(beams):
-    rig = looking()
-    held = rig.shown[-1]
+@pytest.mark.parametrize("count", [1, 2, 10])
+@pytest.mark.parametrize("flickering", [0, 5])
+def test_a_lidar_that_shows_a_few_pictures_in_turn_is_frozen(count, flickering):
+    rig = Looking().drive()
+    assert rig.run(3.0).cause is None
+    pictures = rig.shown[-count:]
 
     def broken(true):
-        shown = held.copy()
-        shown[:beams] += np.float32(1e-3 * len(rig.shown))
+        shown = pictures[len(rig.shown) % count].copy()
+        shown[:flickering] += np.float32(1e-3 * len(rig.shown))
         return shown
 
     rig.broken = broken
-    stopped_by_scan(rig)
+    assert_frozen(rig)
 
 
-@pytest.mark.parametrize("beams", [24, 36, 72])
-@pytest.mark.parametrize("flickers", [0, 12])
+@pytest.mark.parametrize(("beams", "flickers"), [(24, 12), (36, 0), (72, 12)])
 def test_a_lidar_of_few_beams_that_is_frozen_but_for_one_is_frozen(beams, flickers):
     every = LIDAR.beams // beams
     rig = Looking(config(beam_angles=LIDAR.angles[::every]))
@@ -104,20 +75,44 @@ def test_a_lidar_of_few_beams_that_is_frozen_but_for_one_is_frozen(beams, flicke
     assert rig.run(2.0).cause is None  # one that lives is fine
     held = rig.shown[-1][::every]
     rig.broken = broken
-    stopped_by_scan(rig)
+    assert_frozen(rig)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1.5])
 def test_a_frozen_scan_of_a_single_pole_is_frozen(angle):
-    rig = looking()
+    rig = Looking().drive()
     pole = np.full(LIDAR.beams, np.inf, np.float32)
     pole[np.argsort(np.abs(LIDAR.angles - angle))[:5]] = 1.5
     rig.broken = lambda true: pole
-    stopped_by_scan(rig)
+    assert_frozen(rig)
+
+
+def test_a_picture_counts_from_the_third_time_it_is_shown_and_once_there_is_odometry():
+    rig = Looking()
+    rig.broken = lambda true: room(0.0)
+    rig.run(0.5, without="odom")
+    assert rig.state.frozen == ""
+    rig.broken = None
+    rig.drive()
+    picture = rig.shown[-1]
+    rig.run(0.6)
+    for stopped in (False, True):  # for the second time, and for the third
+        rig.broken = lambda true: picture
+        rig.run(0.1)
+        rig.broken = None
+        assert (rig.rule == "scan_frozen") == stopped
+
+
+@pytest.mark.parametrize(("speed", "turn"), [(0.05, 0.0), (0.0, 0.1)])
+def test_a_robot_rests_below_its_bounds_and_not_at_them(speed, turn):
+    twist = np.array([speed, 0.0, turn])
+    assert not is_at_rest(config(), twist)
+    assert is_at_rest(config(), 0.999 * twist)
+    assert is_at_rest(config(odom_std=(0.01, 0.01)), twist)
 
 
 def test_between_two_long_walls_a_scan_without_noise_may_stay_the_same():
-    rig = looking()
+    rig = Looking().drive()
     walls = room(0.0, (np.inf, 0.75))
     walls[walls > LIDAR.range_max] = np.inf
     rig.broken = lambda true: walls
@@ -140,67 +135,20 @@ class Turning(Rig):
         return super().odom(**changes)
 
 
-def test_in_the_middle_of_a_round_room_a_scan_may_stay_the_same():
-    rig = Turning()
-    rig.run(1.5)
-    assert rig.arm().granted
-    assert rig.run(5.0).cause is None
-
-
 def test_a_frozen_scan_of_a_corner_is_frozen_for_a_robot_that_turns():
     rig = Turning()
     rig.ranges = room(0.4)
-    rig.run(1.5)
-    assert rig.arm().granted
+    rig.settle()
     rig.run(0.3)
-    stopped_by_scan(rig)
+    assert_frozen(rig)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("world", ["corridor", "arena", "doorway", "room"])
-@pytest.mark.parametrize("quantum", [0.0, 0.01])
-def test_no_drive_in_the_simulator_looks_frozen(world, quantum):
-    model = builtin_model("differential")
-    sim, given = FastSimulator(model, load_world(world)), config("differential")
-    sim.reset([3])
-    rig = Rig(given)
-    rng = np.random.default_rng(0)
-    command = np.zeros((1, 1, 2))
-    rig.frozen = True
-    known = 0
-
-    def sense():
-        nonlocal known
-        ranges = sim.data.ranges[0, 0]
-        if quantum:
-            ranges = (np.round(ranges / quantum) * quantum).astype(np.float32)
-        rig.pose, rig.ranges = sim.data.odom[0, 0].copy(), ranges.copy()
-        known += 1
-
-    for k in range(400):
-        if k % 15 == 0:
-            command[0, 0] = [rng.choice([0.2, 1.0]), rng.choice([0.0, 0.0, 1.0, -1.0])]
-        sim.step(command)
-        sense()
-        rig.now += PERIOD_S
-        rig.stamp += round(PERIOD_S * 1e9)
-        rig.odom()
-        rig.scan()
-        assert not rig.state.frozen
-    assert known == 400
-
-
-def told(rig, speed):
-    rig.wish = np.array([speed, 0.0, 0.0])
-
-
-@pytest.mark.parametrize("phase", range(0, 50, 17))
-@pytest.mark.parametrize("speed", [1.0, 0.3, 0.1])
+@pytest.mark.parametrize(("phase", "speed"), [(0, 1.0), (17, 0.3), (34, 0.1)])
 def test_a_robot_that_stops_following_is_stopped_within_a_second_at_any_phase(
     phase, speed
 ):
     rig = Rig()
-    told(rig, speed)
+    rig.wish = np.array([speed, 0.0, 0.0])
     rig.drive(1.0 + phase * TICK_S)
     rig.speed = 0.0
     assert rig.until_stopped(2.0) <= 1.0 + 2 * TICK_S
@@ -210,76 +158,24 @@ def test_a_robot_that_stops_following_is_stopped_within_a_second_at_any_phase(
     assert not rig.moves
 
 
-def test_a_robot_that_never_starts_is_stopped_a_second_after_it_was_told_to():
-    rig = Rig()
-    rig.run(1.5)
-    assert rig.arm().granted
-    rig.run(0.04)
-    began = rig.now
-    while rig.rule != "no_motion":
-        rig.run(TICK_S)
-        assert rig.now - began < 1.1
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("lag_s", [0.3, 0.7])
-def test_a_robot_that_follows_late_is_not_taken_for_stuck(lag_s):
-    rig = Rig(config("mecanum"))
-    rig.wish = np.array([0.5, 0.0, 0.0])
-    rig.run(1.5)
-    assert rig.arm().granted
-    late = [0.0] * round(lag_s / TICK_S)
-    rng = np.random.default_rng(0)
-    for k in range(800):
-        if k % 40 == 0:
-            rig.wish = np.array([rng.choice([-0.5, 0.0, 0.2, 0.5]), 0.0, 0.0])
-        rig.run(TICK_S)
-        late.append(float(rig.decision.twist[0]))
-        rig.speed = late.pop(0)
-        assert rig.decision.cause is None, (k, rig.decision.cause)
-
-
 @pytest.mark.parametrize("speed", [0.02, 0.04])
 def test_a_robot_that_creeps_as_it_is_told_is_fine(speed):
     rig = Rig()
-    told(rig, speed)
+    rig.wish = np.array([speed, 0.0, 0.0])
     rig.drive(5.0)
 
 
 def test_a_push_after_a_long_pause_has_its_second():
     rig = driving()
-    told(rig, 0.0)
+    rig.wish = np.array([0.0, 0.0, 0.0])
     rig.run(0.5)
     rig.speed = 0.0
     rig.run(5.0)
-    told(rig, 0.5)
+    rig.wish = np.array([0.5, 0.0, 0.0])
     rig.run(0.9)
     assert rig.decision.cause is None
     rig.run(0.3)
     assert rig.rule == "no_motion"
-
-
-@pytest.mark.parametrize("leap", [(3.0, 0.0, 0.0), (0.0, -0.6, 0.0), (0.0, 0.0, 2.0)])
-def test_odometry_that_teleports_is_refused_and_stops_the_robot_for_good(leap):
-    rig = driving()
-    rig.pose = rig.pose + np.array(leap)
-    rig.until_stopped(0.2)
-    assert rig.rule == "odom_jumped"
-    rig.speed = 0.0
-    rig.run(2.0)
-    assert not rig.moves
-    assert rig.give(Reset()).granted
-    assert rig.arm().granted
-
-
-def test_a_leap_beyond_all_numbers_is_told_in_a_few_digits():
-    rig = driving()
-    rig.pose = np.array([1e308, 0.0, 0.0])
-    rig.until_stopped(0.2)
-    assert rig.rule == "odom_jumped"
-    assert re.search(
-        r"its pose jumped by 1e\+308 m and 0 rad in", rig.decision.cause.line
-    )
 
 
 @pytest.mark.parametrize("armed", [True, False])
@@ -296,7 +192,7 @@ def test_a_simulator_that_is_reset_wants_the_gate_to_be_armed_anew_and_no_more(a
 
 def test_odometry_may_be_silent_and_have_driven_on_meanwhile():
     rig = driving()
-    told(rig, 1.0)
+    rig.wish = np.array([1.0, 0.0, 0.0])
     rig.speed = 1.0
     rig.run(0.32, without="odom")
     assert rig.run(0.4).cause is None
@@ -305,8 +201,7 @@ def test_odometry_may_be_silent_and_have_driven_on_meanwhile():
 def test_a_pose_beyond_half_a_turn_is_no_leap():
     rig = Turning()
     rig.pose = np.array([0.0, 0.0, np.pi - 0.25])
-    rig.run(1.5)
-    assert rig.arm().granted
+    rig.settle()
     rig.run(1.0)
     assert rig.pose[2] < 0.0
     assert rig.decision.cause is None

@@ -6,19 +6,14 @@ import pytest
 from gate.rig import TICK_S, Rig, config, driving
 from nics_drl_bridge.gate.inputs import (
     Command,
-    Estimate,
     EStop,
-    Odometry,
     Press,
     Reset,
-    Scan,
     Tick,
 )
 from nics_drl_bridge.gate.stops import FROZEN_INPUTS
-from nics_drl_bridge.geometry import Bicycle
 from nics_drl_bridge.interface import NS_PER_S
 
-EVERY_TOPIC = "scan odom estimate e_stop command"
 WITHIN_S = 0.40
 
 
@@ -29,43 +24,6 @@ def test_a_gate_that_nobody_armed_lets_nothing_pass():
     assert not any(twist.any() for _, twist in rig.published)
 
 
-def test_an_armed_gate_lets_the_command_pass():
-    rig = driving()
-    assert rig.decision.twist.tolist() == pytest.approx([0.5, 0.0, 0.1])
-
-
-def test_a_car_that_takes_turn_rates_is_limited_by_its_steering_angle():
-    rig = Rig(config(bicycle=Bicycle(0.2)))
-    rig.wish = np.array([0.5, 0.0, 0.3])
-    rig.drive()
-    assert rig.decision.twist.tolist() == pytest.approx([0.5, 0.0, 0.3])
-    assert rig.state.value.tolist() == pytest.approx([0.5, np.arctan(0.2 * 0.3 / 0.5)])
-    rig.wish = np.array([0.5, 0.0, 30.0])
-    rig.run(2.0)
-    assert rig.decision.twist[2] == pytest.approx(
-        0.5 * np.tan(rig.config.limits.high[1]) / 0.2
-    )
-
-
-@pytest.mark.parametrize(
-    ("silent", "rule", "topic"),
-    [
-        ("scan", "scan_silent", "scan"),
-        ("odom", "odom_silent", "odom"),
-        ("command", "command_silent", "cmd_vel_raw"),
-        ("e_stop", "e_stop_silent", "e_stop"),
-        (EVERY_TOPIC, "e_stop_silent", "e_stop"),
-    ],
-)
-def test_a_topic_that_falls_silent_stops_the_robot_in_time(silent, rule, topic):
-    rig = driving()
-    assert rig.until_stopped(WITHIN_S, without=silent) <= WITHIN_S
-    cause = rig.decision.cause
-    assert (cause.rule, cause.topic) == (rule, topic)
-    assert cause.age_s > cause.limit_s > 0.0
-    assert f"age={cause.age_s:.3f}s limit={cause.limit_s:.3f}s" in cause.line
-
-
 def test_the_robot_drives_on_when_data_are_fresh_again():
     rig = driving()
     rig.until_stopped(WITHIN_S, without="scan command")
@@ -73,23 +31,16 @@ def test_the_robot_drives_on_when_data_are_fresh_again():
     assert rig.moves
 
 
-def test_a_silent_e_stop_stays_a_stop_when_it_is_heard_again():
-    rig = driving()
+@pytest.mark.parametrize("required", [True, False])
+def test_an_e_stop_that_was_heard_and_falls_silent_counts_as_pressed(required):
+    rig = driving(e_stop_required=required)
     rig.until_stopped(WITHIN_S, without="e_stop")
+    rig.speed = 0.0
     rig.run(2.0)
     assert rig.rule == "e_stop_silent"
-    assert not rig.moves
-
-
-def test_an_e_stop_that_was_heard_and_falls_silent_counts_as_pressed_though_none_is_required():
-    rig = driving(e_stop_required=False)
-    rig.until_stopped(WITHIN_S, without="e_stop")
-    assert rig.rule == "e_stop_silent"
-    rig.speed = 0.0
-    rig.run(2.0, without="e_stop")
+    rig.run(1.0, without="e_stop")
     assert rig.give(Reset()).granted
     assert "e_stop_silent" in rig.arm().answer
-    assert not rig.moves
 
 
 def test_without_an_e_stop_required_one_that_was_never_heard_means_nothing():
@@ -125,16 +76,6 @@ def test_a_republisher_does_not_hide_a_policy_that_hangs():
     assert rig.rule == "scan_behind_old"
 
 
-@pytest.mark.parametrize("off_s", [-3600.0, 1e-9, 0.05, 3600.0])
-def test_a_command_that_names_a_scan_that_never_came_stops_the_robot(off_s):
-    rig = driving()
-    for _ in range(4):
-        rig.run(TICK_S, without="command")
-        rig.command(stamp=rig.stamp + round(off_s * NS_PER_S))
-    assert rig.rule == "scan_behind_unknown"
-    assert not rig.published[-1][1].any()
-
-
 def test_a_command_that_overtakes_its_scan_does_not_stop_the_robot():
     rig = driving()
     rig.run(0.06, without="scan command")
@@ -147,13 +88,6 @@ def test_a_command_that_overtakes_its_scan_does_not_stop_the_robot():
     rig.scan()
     assert rig.state.command.twist[0] == 0.3
     assert rig.tick().cause is None
-
-
-def test_a_command_whose_scan_never_came_does_not_undo_a_malformed_one():
-    rig = driving()
-    rig.command([np.nan, 0.0, 0.0])
-    rig.command(stamp=rig.stamp + 1)
-    assert rig.rule == "command_malformed"
 
 
 def test_a_command_that_waits_for_its_scan_does_not_undo_a_later_malformed_one():
@@ -183,68 +117,49 @@ def test_the_age_of_a_command_counts_from_its_arrival_although_its_scan_came_lat
     assert rig.state.command_s == arrival_s
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("place", [0, 1, 2])
-def test_a_command_that_is_no_number_stops_the_robot_at_once(bad, place):
-    rig = driving()
-    twist = rig.wish.copy()
-    twist[place] = bad
-    assert "NaN or inf" in rig.command(twist).refused
-    assert rig.rule == "command_malformed"
-    assert rig.decision.publish
-    assert not rig.moves
-
-
-@pytest.mark.parametrize("far", [1e300, -1e300, 50.0])
-def test_a_command_far_out_of_range_is_refused(far):
-    rig = driving()
-    assert "far out of range" in rig.command([far, 0.0, 0.0]).refused
-    assert not rig.moves
-
-
-def test_refused_commands_feed_no_watchdog():
+@pytest.mark.parametrize(
+    ("twist", "words"),
+    [
+        ([np.nan, 0.0, 0.1], "NaN or inf"),
+        ([0.5, -np.inf, 0.1], "NaN or inf"),
+        ([0.5, 0.0, np.inf], "NaN or inf"),
+        ([-1e300, 0.0, 0.0], "far out of range"),
+        ([0.5, 0.0, 50.0], "far out of range"),
+    ],
+)
+def test_a_broken_command_stops_the_robot_at_once_and_feeds_no_watchdog(twist, words):
     rig = driving()
     before = rig.state.command_s
     rig.now += TICK_S
-    rig.command([np.nan, 0.0, 0.0])
-    rig.command([1e9, 0.0, 0.0])
+    assert words in rig.command(twist).refused
+    assert rig.rule == "command_malformed"
+    assert rig.decision.publish
+    assert not rig.moves
     assert rig.state.command_s == before
 
 
 @pytest.mark.parametrize(
-    "changes",
+    ("topic", "changes"),
     [
-        {"ranges": np.ones(7, np.float32)},
-        {"ranges": np.full(720, np.nan, np.float32)},
-        {"angles": (0.0, 2 * np.pi / 720)},
-        {"angles": (-np.pi, 0.5)},
-        {"angles": (np.nan, np.nan)},
+        ("scan", {"ranges": np.ones(7, np.float32)}),
+        ("scan", {"ranges": np.full(720, np.nan, np.float32)}),
+        ("scan", {"angles": (0.0, 2 * np.pi / 720)}),
+        ("scan", {"angles": (-np.pi, 0.5)}),
+        ("scan", {"angles": (np.nan, np.nan)}),
+        ("odom", {"pose": np.array([np.nan, 0.0, 0.0])}),
+        ("odom", {"twist": np.array([0.0, np.inf, 0.0])}),
+        ("odom", {"twist": np.array([1e6, 0.0, 0.0])}),
     ],
 )
-def test_a_scan_that_is_none_of_this_lidar_is_refused_and_feeds_no_watchdog(changes):
+def test_data_that_are_none_of_this_robot_are_refused_and_feed_no_watchdog(
+    topic, changes
+):
     rig = driving()
-    rig.now = rig.now + TICK_S
-    rig.stamp = rig.stamp + 1
-    before = rig.state.scans
-    assert rig.scan(**changes).refused
-    assert rig.state.scans == before
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"pose": np.array([np.nan, 0.0, 0.0])},
-        {"twist": np.array([0.0, np.inf, 0.0])},
-        {"twist": np.array([1e6, 0.0, 0.0])},
-    ],
-)
-def test_odometry_that_is_no_number_is_refused_and_feeds_no_watchdog(changes):
-    rig = driving()
-    rig.now = rig.now + TICK_S
-    rig.stamp = rig.stamp + 1
-    before = rig.state.odometries
-    assert rig.odom(**changes).refused
-    assert rig.state.odometries == before
+    rig.now += TICK_S
+    rig.stamp += 1
+    before = (rig.state.scans, rig.state.odometries)
+    assert getattr(rig, topic)(**changes).refused
+    assert (rig.state.scans, rig.state.odometries) == before
 
 
 @pytest.mark.parametrize("jump_s", [3600.0, 10.0, 0.8, -10.0, -3600.0])
@@ -273,15 +188,6 @@ def test_stamps_that_freeze_are_no_new_data(topic):
     assert max(late) - rig.published[before][0] <= WITHIN_S
 
 
-def test_a_scan_that_arrives_late_is_as_old_as_it_is():
-    rig = driving()
-    rig.run(0.3, without="scan command")
-    rig.scan(stamp_ns=rig.stamp - round(0.3 * NS_PER_S) + 1)  # held back for 0.3 s
-    rig.command(stamp=rig.state.scans.stamps_ns[-1])
-    rig.run(0.08, without="scan command")
-    assert rig.rule == "scan_silent"
-
-
 @pytest.mark.parametrize("now", [np.nan, np.inf, -np.inf, 0.0, 99.0])
 def test_a_clock_that_tells_nonsense_or_runs_back_stops_the_robot(now):
     rig = driving()
@@ -294,16 +200,6 @@ def test_a_clock_that_stands_still_stops_the_robot():
     for _ in range(FROZEN_INPUTS + 5):
         rig.tick()
     assert rig.rule == "own_clock"
-
-
-def test_a_gate_that_was_asleep_starts_with_a_stop():
-    rig = driving()
-    rig.now += 0.22
-    rig.stamp += round(0.22 * NS_PER_S)
-    for wake in (lambda: rig.give(EStop(False)), rig.odom, rig.scan, rig.command):
-        wake()
-    assert rig.tick().cause.rule == "own_clock"
-    assert not rig.moves
 
 
 @pytest.mark.parametrize("first", ["scan", "odom", "command", "e_stop", "tick"])
@@ -329,38 +225,6 @@ def test_the_first_word_of_a_gate_that_was_asleep_is_a_zero_whatever_wakes_it(fi
     assert rig.moves
 
 
-def give_fault(rig, fault):
-    """One input that shows a fault, which the next input no longer does."""
-    later = rig.stamp + round(10.0 * NS_PER_S)
-    if fault == "stamps_jumped":
-        rig.scan(stamp_ns=later)
-    elif fault == "odom_jumped":
-        rig.odom(stamp_ns=rig.stamp + 1, pose=rig.pose + 50.0)
-    elif fault == "estimate_lost":
-        rig.give(Estimate(np.zeros(3), rig.pose + 50.0, rig.covariance.copy()))
-    else:
-        rig.give(Command(rig.stamp, rig.wish, "/one"))
-        rig.give(Command(rig.stamp, rig.wish, "/two"))
-
-
-@pytest.mark.parametrize(
-    "fault", ["stamps_jumped", "odom_jumped", "estimate_lost", "two_policies"]
-)
-def test_a_fault_that_latches_does_so_while_the_gates_clock_is_at_fault(fault):
-    rig = driving()
-    rig.now += 0.25  # the gate was asleep
-    rig.stamp += round(0.25 * NS_PER_S)
-    assert rig.tick().cause.rule == "own_clock"
-    assert rig.state.latched is None
-    give_fault(rig, fault)
-    assert rig.rule == "own_clock"
-    assert rig.state.latched.rule == fault
-    rig.speed = 0.0
-    rig.run(1.0)
-    assert rig.rule == fault
-    assert not rig.moves
-
-
 @pytest.mark.parametrize("simulated", [False, True])
 def test_data_that_queued_up_while_the_gate_was_asleep_latch_nothing(simulated):
     """The first of them are late, but not because the simulator lost time."""
@@ -380,25 +244,22 @@ def test_data_that_queued_up_while_the_gate_was_asleep_latch_nothing(simulated):
     assert rig.run(0.5).cause is None
 
 
-def test_a_gate_that_was_asleep_does_not_judge_how_long_the_others_were_silent():
-    rig = driving()
-    rig.now += 1.5
-    rig.tick()
-    assert rig.state.latched is None
-    rig.give(EStop(False))
-    rig.speed = 0.0
-    rig.run(0.5)
-    assert rig.state.latched is None
-
-
-def test_the_e_stop_stops_at_once_and_stays():
+def test_the_e_stop_stops_at_once_and_a_reset_alone_moves_nothing():
     rig = driving()
     decision = rig.give(EStop(True))
     assert decision.cause.rule == "e_stop_pressed"
     assert decision.publish
-    assert not decision.twist.any()
-    rig.run(2.0)
     assert not rig.moves
+    rig.speed = 0.0
+    rig.run(2.0)
+    assert rig.rule == "e_stop_pressed"
+    assert rig.give(Reset()).granted
+    rig.run(2.0)
+    assert rig.rule == "disarmed"
+    assert not rig.moves
+    assert rig.arm().granted
+    rig.run(0.5)
+    assert rig.moves
 
 
 def test_an_e_stop_pressed_by_a_call_stays_although_its_topic_says_released():
@@ -417,50 +278,12 @@ def test_a_call_is_no_heartbeat():
     assert "e_stop_silent" in rig.arm().answer
 
 
-def test_a_reset_alone_never_moves():
-    rig = driving()
-    rig.give(EStop(True))
-    rig.speed = 0.0
-    rig.run(2.0)
-    assert rig.give(Reset()).granted
-    rig.run(2.0)
-    assert rig.rule == "disarmed"
-    assert not rig.moves
-    assert rig.arm().granted
-    rig.run(0.5)
-    assert rig.moves
-
-
 def test_a_reset_does_not_release_an_e_stop_that_is_held():
     rig = driving()
     rig.give(EStop(True))
     assert not rig.give(Reset()).granted
     assert "still pressed" in rig.decision.answer
     assert rig.rule == "e_stop_pressed"
-
-
-def test_a_latched_stop_can_not_be_armed_away():
-    rig = driving()
-    rig.now += TICK_S
-    rig.scan(stamp_ns=rig.stamp + 10 * NS_PER_S)
-    rig.stamp += 10 * NS_PER_S
-    rig.speed = 0.0
-    rig.run(2.0)
-    assert rig.rule == "stamps_jumped"
-    assert not rig.arm().granted
-    assert "nothing_latched: call ~/reset first" in rig.decision.answer
-    rig.run(0.2)
-    assert not rig.moves
-
-
-def test_identical_scans_while_the_robot_moves_latch_a_stop():
-    rig = driving()
-    rig.frozen = True
-    rig.until_stopped(1.0)
-    assert rig.rule == "scan_frozen"
-    rig.frozen = False
-    rig.run(1.0)
-    assert not rig.moves
 
 
 def test_identical_scans_of_a_robot_that_stands_still_are_fine():
@@ -471,22 +294,6 @@ def test_identical_scans_of_a_robot_that_stands_still_are_fine():
     assert rig.arm().granted
     rig.run(3.0)
     assert rig.decision.cause is None
-
-
-def test_scans_without_any_return_may_be_identical():
-    rig = driving()
-    rig.frozen, rig.ranges = True, np.full(720, np.inf, np.float32)
-    assert rig.run(2.0).cause is None
-
-
-def test_no_motion_although_commanded_latches_a_stop():
-    rig = driving()
-    rig.speed = 0.0
-    assert rig.until_stopped(2.1) > 0.5
-    assert rig.rule == "no_motion"
-    rig.speed = 0.5
-    rig.run(1.0)
-    assert not rig.moves
 
 
 def test_odometry_whose_noise_looks_like_motion_does_not_hide_a_robot_that_is_stuck():
@@ -501,8 +308,7 @@ def test_odometry_whose_noise_looks_like_motion_does_not_hide_a_robot_that_is_st
 def test_a_robot_that_wags_need_not_get_anywhere():
     rig = Rig(config("differential"))
     rig.wish = np.array([0.0, 0.0, 1.0])
-    rig.run(1.5)
-    assert rig.arm().granted
+    rig.settle()
     for _ in range(20):
         rig.wish = -rig.wish
         assert rig.run(0.2).cause is None
@@ -521,45 +327,3 @@ def test_only_a_tick_publishes_a_motion():
     rig = driving()
     for event in (Command(rig.stamp, rig.wish), EStop(False)):
         assert not rig.give(event).publish
-
-
-def test_whatever_comes_in_what_goes_out_is_finite_within_limits_and_zero_when_stopped():
-    rng = np.random.default_rng(0)
-    odd = np.array([np.nan, np.inf, -np.inf, 1e308, 5e-324, 0.0, -1.0, 0.3])
-    for _ in range(4):
-        rig = driving()
-        low = rig.config.limits.low
-        high = rig.config.limits.high
-        for _ in range(150):
-            rig.run(TICK_S, without=str(rng.choice(["", "scan", "odom", "command"])))
-            stamp = int(rng.choice([rig.stamp, 0, -1, rig.stamp + 10**12]))
-            twist = np.where(
-                rng.random(3) < 0.2, rng.choice(odd, 3), rng.normal(size=3)
-            )
-            event = [
-                Command(stamp, twist),
-                Scan(
-                    stamp,
-                    rng.choice(odd[odd < 1e30], 720).astype(np.float32),
-                    (-np.pi, np.pi / 360),
-                ),
-                Odometry(stamp, twist, twist),
-                Tick(),
-            ][rng.integers(4)]
-            now = float(rng.choice([rig.now, np.nan, 0.0], p=[0.9, 0.05, 0.05]))
-            decision = rig.give(event, now)
-            value = decision.twist[list(rig.config.fields)]
-            assert np.isfinite(decision.twist).all()
-            assert (value >= low).all()
-            assert (value <= high).all()
-            assert decision.twist[1] == 0.0
-            if decision.cause is not None:
-                assert not decision.twist.any()
-
-
-def test_the_inputs_are_not_changed():
-    rig = driving()
-    twist = np.array([3.0, 0.0, 0.0])
-    rig.command(twist)
-    rig.tick()
-    assert twist.tolist() == [3.0, 0.0, 0.0]

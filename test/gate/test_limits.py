@@ -12,7 +12,6 @@ from gate.rig import TICK_S, Rig, config, driving
 from nics_drl_bridge.config import find_config, list_shipped
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.gate import gate
-from nics_drl_bridge.gate.inputs import Command
 from nics_drl_bridge.gate.limits import (
     Limits,
     follow,
@@ -39,11 +38,6 @@ def test_speeds_are_scaled_by_one_factor_so_that_the_curvature_stays(robot):
     out = saturate(command, limits)
     assert out / out[0] == pytest.approx(command / command[0])
     assert (np.abs(out) / limits.high).max() == pytest.approx(1.0)
-
-
-def test_a_car_keeps_its_steering_when_its_speed_is_cut():
-    assert saturate(np.array([3.0, 0.2]), LIMITS["ackermann"]).tolist() == [1.0, 0.2]
-    assert saturate(np.array([0.5, 0.9]), LIMITS["ackermann"]).tolist() == [0.5, 0.5]
 
 
 def test_what_a_robot_can_not_do_at_all_is_dropped_and_the_rest_stays():
@@ -99,34 +93,6 @@ def test_a_wish_that_lasts_is_reached_exactly_and_never_overshot(robot):
     assert np.abs(slope).max() < 1e-6
 
 
-def test_a_robot_that_speeds_up_is_on_its_curve_from_the_start():
-    limits = LIMITS["differential"]
-    wish = np.array([0.8, 0.8])
-    value = slope = np.zeros(2)
-    for _ in range(30):
-        value, slope = follow(value, slope, wish, 0.02, limits)
-        assert value[1] == pytest.approx(value[0], rel=0.2)
-
-
-def test_the_gate_speeds_up_within_rate_and_jerk_and_cuts_what_is_too_fast():
-    rig = Rig()
-    rig.wish = np.array([5.0, 0.0, 0.9])
-    rig.run(1.5)
-    assert rig.arm().granted
-    rig.run(0.6)
-    rig.speed = 1.0
-    rig.run(0.5)
-    assert rig.decision.twist.tolist() == [1.0, 0.0, 0.5]
-    moving = np.array([(time, *twist) for time, twist in rig.published])
-    dt = np.diff(moving[:, 0])
-    change = np.diff(moving[:, [1, 3]], axis=0)
-    assert (
-        np.abs(change) <= np.array([2.0, 4.0]) * dt[:, None] * (1 + TOLERANCE)
-    ).all()
-    jerk = np.abs(np.diff(change / dt[:, None], axis=0)) / dt[1:, None]
-    assert (jerk <= np.array([40.0, 80.0]) * (1 + TOLERANCE)).all()
-
-
 def test_a_motion_too_soon_after_the_last_is_not_published():
     rig = driving()
     rig.wish = np.array([0.1, 0.0, 0.0])
@@ -137,100 +103,41 @@ def test_a_motion_too_soon_after_the_last_is_not_published():
 
 
 @pytest.mark.parametrize(
-    ("change", "sentence"),
+    ("change", "words"),
     [
-        (
-            ("robot: ackermann", "robot: car"),
-            "the limits are for 'car', not for 'ackermann'",
-        ),
-        (
-            ("speed_command:", "sped_command:"),
-            "'commands.sped_command'; did you mean 'speed_comm",
-        ),
-        (("rate: 2.0, ", ""), "the key 'commands.speed_command.rate' is missing"),
-        ((", jerk: 40.0", ""), "the key 'commands.speed_command.jerk' is missing"),
-        (("max: 1.0", "max: .inf"), "finite"),
-        (("rate: 2.0", "rate: 0.0"), "greater than 0"),
+        (("robot: ackermann", "robot: car"), "key 'robot'"),
+        (("speed_command:", "sped_command:"), "'commands.sped_command'"),
+        (("  steering_command:", "  # "), "'commands.steering_command'"),
+        (("rate: 2.0, ", ""), "'commands.speed_command.rate'"),
+        (("max: 1.0", "max: .inf"), "'commands.speed_command.max'"),
+        (("rate: 2.0", "rate: 0.0"), "'commands.speed_command.rate'"),
         (("min: -0.5, max: 1.0", "min: 0.0, max: 0.0"), "min must be less than max"),
-        (("min: -0.5, max: 1.0", "min: 0.2, max: 1.0"), "less than or equal to 0"),
-        (
-            ("jerk: 40.0}", "jerk: 40.0, snap: 1.0}"),
-            "unknown key 'commands.speed_command.snap'",
-        ),
-        (
-            ("max: 1.0", "max: 10.0"),
-            "'commands.speed_command.max': 10 m/s is beyond the robot's own",
-        ),
-        (
-            ("min: -0.5, max: 1.0", "min: -0.6, max: 1.0"),
-            "'commands.speed_command.min': -0.6 m/s is beyond the robot's",
-        ),
+        (("min: -0.5, max: 1.0", "min: 0.2, max: 1.0"), "speed_command.min'"),
+        (("jerk: 40.0}", "jerk: 40.0, snap: 1.0}"), "speed_command.snap'"),
+        (("max: 1.0", "max: 10.0"), "speed_command.max': 10 m/s"),
+        (("min: -0.5", "min: -0.6"), "speed_command.min': -0.6 m/s"),
         (("max: 0.5", "max: 0.51"), "give at most 0.5"),
-        (
-            ("rate: 2.0", "rate: 1e308"),
-            "within a period of the gate, 0.02 s, and limits nothing",
-        ),
         (("rate: 2.0", "rate: 76.0"), "give at most 75"),
-        (
-            ("jerk: 40.0", "jerk: 1e308"),
-            "'commands.speed_command.jerk': 1e+308 m/s/s^2 crosses",
-        ),
-        (
-            ("rate: 2.0", "rate: 1e-4"),
-            "'commands.speed_command.rate': 0.0001 would never let it",
-        ),
-        (
-            ("jerk: 80.0", "jerk: 1e-300"),
-            "'commands.steering_command.jerk': 1e-300 would never",
-        ),
-        (
-            ("min: -0.5, max: 1.0", "min: -0.001, max: 0.001"),
-            "the robot could never move: none of its speeds",
-        ),
+        (("jerk: 40.0", "jerk: 3751.0"), "give at most 3750"),
+        (("rate: 2.0", "rate: 9e-4"), "speed_command.rate': 0.0009"),
+        (("jerk: 80.0", "jerk: 9e-5"), "steering_command.jerk': 9e-05"),
+        (("min: -0.5, max: 1.0", "min: -0.001, max: 0.0099"), "could never move"),
+        (("rate: 2.0, jerk: 40.0", "rate: 75.0, jerk: 3750.0"), ""),
+        (("rate: 2.0, jerk: 40.0", "rate: 0.001, jerk: 2e-4"), ""),
+        (("min: -0.5, max: 1.0", "min: -0.001, max: 0.01"), ""),
     ],
 )
-def test_a_wrong_file_of_limits_is_one_sentence(tmp_path, change, sentence):
+def test_a_file_of_limits_is_refused_for_the_key_that_is_wrong(tmp_path, change, words):
     text = find_config("ackermann", "limits").read_text(encoding="utf-8")
     path = tmp_path / "limits.yaml"
     assert change[0] in text
     path.write_text(text.replace(*change, 1), encoding="utf-8")
-    with pytest.raises(ConfigError, match=re.escape(sentence)):
+    if not words:
         load_limits(str(path), load_robot("ackermann"))
-
-
-def test_limits_that_leave_a_command_out_are_refused(tmp_path):
-    text = find_config("ackermann", "limits").read_text(encoding="utf-8")
-    path = tmp_path / "limits.yaml"
-    kept = [line for line in text.splitlines() if "steering_command" not in line]
-    path.write_text("\n".join(kept), encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"'commands\.steering_command' is missing"):
+        return
+    with pytest.raises(ConfigError, match=re.escape(words)) as told:
         load_limits(str(path), load_robot("ackermann"))
-
-
-def test_without_limits_nothing_is_armed():
-    rig = Rig(config(limits=None))
-    rig.run(1.5)
-    assert not rig.arm().granted
-    assert (
-        rig.decision.answer
-        == "limits_set: no limits are set, name their file in `limits`"
-    )
-
-
-@pytest.mark.parametrize(
-    ("wish", "speed", "turn"),
-    [(2.0, 1.0, 0.5), (0.5, 0.25, 2.0)],
-    ids=["too fast", "turns too fast"],
-)
-def test_the_gate_cuts_what_is_too_much_and_keeps_the_curve(wish, speed, turn):
-    rig = Rig(config("differential"))
-    rig.wish = np.array([wish, 0.0, wish * turn / speed])
-    rig.run(1.5)
-    assert rig.arm().granted
-    rig.run(0.4)
-    rig.speed = speed
-    rig.run(1.0)
-    assert rig.decision.twist == pytest.approx([speed, 0.0, turn])
+    assert str(path) in str(told.value)
 
 
 ABSURD = st.floats(1e-308, 1e308)
@@ -267,70 +174,22 @@ def test_whatever_the_limits_the_wish_and_the_interval_what_follows_is_a_number_
             assert np.isfinite(slope).all()
 
 
-@settings(max_examples=25, deadline=None)
-@given(limits=absurd_limits(), wish=st.tuples(TWIST, TWIST), dt=st.floats(1e-3, 0.2))
-def test_a_gate_with_absurd_limits_publishes_numbers_within_them(limits, wish, dt):
-    rig = Rig(config("differential", limits=limits))
-    rig.run(1.5)
-    assert rig.arm().granted
-    with np.errstate(all="ignore"):
-        for _ in range(4):
-            rig.give(
-                Command(
-                    rig.state.scans.stamps_ns[-1], np.array([wish[0], 0.0, wish[1]])
-                )
-            )
-            rig.now += dt
-            value = rig.tick().twist[[0, 2]]
-            assert is_within(value, limits)
-
-
-@pytest.mark.parametrize("jerk", [1e308, 1e300, 1e16])
-def test_a_jerk_beyond_all_bounds_lets_a_command_pass_within_its_rate(jerk):
-    shipped = LIMITS["ackermann"]
-    rig = Rig(config(limits=replace(shipped, jerk=np.full(2, jerk))))
-    rig.drive(0.1)
-    assert rig.decision.twist[0] > 0.0
-    assert all(np.isfinite(twist).all() for _, twist in rig.published)
-
-
-def test_limits_of_a_period_are_let_through_and_those_of_the_robot_itself(tmp_path):
-    text = find_config("ackermann", "limits").read_text(encoding="utf-8")
-    path = tmp_path / "limits.yaml"
-    path.write_text(text.replace("rate: 2.0, jerk: 40.0", "rate: 50.0, jerk: 2500.0"))
-    assert load_limits(str(path), load_robot("ackermann")).jerk[0] == 2500.0
-
-
-def test_a_motion_that_is_no_number_after_all_is_a_zero_that_stays(monkeypatch):
+@pytest.mark.parametrize("value", [np.nan, 1.1, -0.6, np.inf])
+def test_a_motion_that_is_unfit_after_all_is_a_zero_that_stays(monkeypatch, value):
     rig = driving()
 
     def broken(config, state, motion, now):
-        return replace(motion, value=np.array([np.nan, 0.0]))
+        return replace(motion, value=np.array([value, 0.0]))
 
-    shapers = gate.SHAPERS
-    monkeypatch.setattr(gate, "SHAPERS", (*shapers[:-1], broken, shapers[-1]))
-    decision = rig.run(TICK_S)
-    assert (rig.rule, decision.publish, decision.twist.tolist()) == (
-        "motion_unfit",
-        True,
-        [0.0] * 3,
-    )
-    monkeypatch.setattr(gate, "SHAPERS", shapers)
+    with monkeypatch.context() as patch:
+        patch.setattr(gate, "SHAPERS", (broken, gate.bound))
+        decision = rig.run(TICK_S)
+    assert rig.rule == "motion_unfit"
+    assert decision.publish
+    assert not rig.moves
     rig.run(1.0)
     assert rig.rule == "motion_unfit"
     assert not rig.moves
-
-
-@pytest.mark.parametrize("far", [1.1, -0.6, np.inf])
-def test_a_motion_beyond_its_limits_after_all_is_a_zero(monkeypatch, far):
-    rig = driving()
-
-    def broken(config, state, motion, now):
-        return replace(motion, value=np.array([far, 0.0]))
-
-    monkeypatch.setattr(gate, "SHAPERS", (broken, gate.SHAPERS[-1]))
-    assert not rig.run(TICK_S).twist.any()
-    assert rig.rule == "motion_unfit"
 
 
 @pytest.mark.parametrize("speed", [1e-310, -1e-310, 5e-324])
@@ -346,15 +205,3 @@ def test_a_denormal_speed_is_exactly_zero(speed):
         assert rig.decision.cause is None
         assert not rig.decision.twist.any()
         assert rig.state.value[0] == 0.0
-
-
-def test_a_denormal_that_the_shield_leaves_of_a_speed_is_exactly_zero(monkeypatch):
-    def leave(_, state, motion, now):
-        return replace(motion, value=np.full_like(motion.value, 1e-310))
-
-    rig = driving()
-    monkeypatch.setattr(gate, "SHAPERS", (*gate.SHAPERS[:-1], leave, gate.bound))
-    rig.speed = 0.0
-    rig.run(0.1)
-    assert rig.decision.publish
-    assert not rig.decision.twist.any()

@@ -2,56 +2,20 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from gate.recorded import WALLS, see
 from gate.rig import PERIOD_S, TICK_S, Rig, config
-from nics_drl_bridge.gate.black_box import Entry, replay, write
 from nics_drl_bridge.gate.inputs import Reset, Scan
-from nics_drl_bridge.gate.scan_motion import SETTINGS, get_directions, warm_up
-from nics_drl_bridge.gate.scan_motion_kernels import (
-    Noise,
-    Thresholds,
-    compare_sectors,
-    predict_scan,
-    reduce_scan,
-)
+from nics_drl_bridge.gate.scan_motion import warm_up
 from nics_drl_bridge.geometry import compose, exp
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
 
-ROOM = np.array(
-    [
-        [-3.0, -2.0, 3.0, -2.0],
-        [3.0, -2.0, 3.0, 2.5],
-        [3.0, 2.5, -3.0, 2.5],
-        [-3.0, 2.5, -3.0, -2.0],
-        [0.5, 1.2, 1.4, 1.2],
-        [-1.5, -0.8, -1.5, -1.4],
-    ]
-)
 CORRIDOR = np.array([[-500.0, -0.8, 500.0, -0.8], [500.0, 0.8, -500.0, 0.8]])
-NOWHERE = np.zeros((0, 4))
-
-
-def seen_from(pose, angles, walls):
-    """Ranges (B,) to the nearest of walls (W, 4) from a pose (3,)."""
-    bearings = angles + pose[2]
-    ux = np.cos(bearings)[:, None]
-    uy = np.sin(bearings)[:, None]
-    ax = walls[:, 0] - pose[0]
-    ay = walls[:, 1] - pose[1]
-    ex = walls[:, 2] - walls[:, 0]
-    ey = walls[:, 3] - walls[:, 1]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        across = ux * ey - uy * ex
-        along = (ax * ey - ay * ex) / across
-        share = (ax * uy - ay * ux) / across
-    hit = (along > 0.0) & (share >= 0.0) & (share <= 1.0)
-    return np.where(hit, along, np.inf).min(axis=1, initial=np.inf)
 
 
 class Scene(Rig):
@@ -60,7 +24,7 @@ class Scene(Rig):
     def __init__(
         self,
         lidar=None,
-        walls=ROOM,
+        walls=WALLS,
         period_s=PERIOD_S,
         twist=(0.5, 0.0, 0.1),
         **changes,
@@ -113,7 +77,7 @@ class Scene(Rig):
         walls = self.walls
         if self.people is not None:
             walls = np.concatenate([walls, self.people(self)])
-        ranges = seen_from(self.body, lidar.angles, walls)
+        ranges = see(self.body, lidar.angles, walls)
         std = lidar.noise_std + lidar.faults.noise_proportional * np.where(
             np.isfinite(ranges), ranges, 0.0
         )
@@ -146,50 +110,25 @@ def started(*given, **changes):
     return scene
 
 
-def with_beams(name, beams):
-    return load_lidar(name).model_copy(update={"beams": beams})
-
-
-LIDARS = {
-    "sick": load_lidar("sick_tim571"),
-    "hokuyo": load_lidar("hokuyo_ust_10lx"),
-    "rplidar": load_lidar("rplidar_a1"),
-    "180 beams": with_beams("hokuyo_ust_10lx", 180),
-    "90 beams": with_beams("sick_tim571", 90),
-}
-
-
-@pytest.mark.parametrize("lidar", LIDARS)
-@pytest.mark.parametrize("period_s", [0.2, 0.1, 0.02])
-@pytest.mark.parametrize("twist", [(0.5, 0.0, 0.0), (0.0, 0.0, 0.8), (0.3, 0.0, -0.5)])
+@pytest.mark.parametrize(
+    ("lidar", "period_s", "twist"),
+    [
+        ("sick_tim571", 0.2, (0.5, 0.0, 0.0)),
+        ("hokuyo_ust_10lx", 0.1, (0.0, 0.0, 0.8)),
+        ("rplidar_a1", 0.02, (0.3, 0.0, -0.5)),
+        ("paper_12m", 0.1, (0.5, 0.0, 0.0)),
+    ],
+)
 def test_a_body_that_is_held_while_its_wheels_spin_is_stopped_within_a_second(
     lidar, period_s, twist
 ):
-    scene = started(LIDARS[lidar], period_s=period_s, twist=twist)
+    scene = started(load_lidar(lidar), period_s=period_s, twist=twist)
     assert scene.stops_after(1.5) <= 1.0
     assert scene.rule == "body_held"
-    assert "the scans show none of it" in scene.decision.cause.line
 
 
-def test_the_message_reports_the_motion_between_the_two_scans_that_were_compared():
-    scene = started(twist=(0.0, 0.0, 1.5))
-    scene.stops_after(1.0)
-    assert scene.rule == "body_held"
-    turn, seconds = map(
-        float, re.findall(r"([\d.]+) rad in ([\d.]+) s", scene.decision.cause.line)[0]
-    )
-    assert turn <= SETTINGS.usual_turn
-    assert turn == pytest.approx(1.5 * seconds, abs=0.02)
-
-
-def test_a_body_that_is_held_from_the_start_is_stopped_within_a_second():
-    scene = Scene()
-    scene.run(1.5)
-    assert scene.arm().granted
-    scene.run(0.2)
-    assert scene.moves
-    assert scene.stops_after(1.0) <= 1.0
-    assert scene.rule == "body_held"
+def person(x, y, half=0.25):
+    return [[x - half, y, x + half, y], [x, y - half, x, y + half]]
 
 
 def test_the_stop_stays_until_the_gate_is_reset_and_armed():
@@ -204,29 +143,20 @@ def test_the_stop_stays_until_the_gate_is_reset_and_armed():
     assert scene.moves
 
 
-def test_without_the_rule_a_held_body_is_not_stopped():
-    scene = started()
-    scene.config = config(
-        "mecanum", beam_angles=scene.lidar.angles, range_max=scene.lidar.range_max
-    )
-    scene.held = True
-    assert scene.run(3.0).cause is None
-
-
-@pytest.mark.parametrize("scale", [(1.0, 1.0, 1.3), (1.1, 1.1, 1.0), (0.9, 0.9, 0.8)])
-@pytest.mark.parametrize("twist", [(0.3, 0.0, 0.0), (0.0, 0.0, 0.8), (0.1, 0.0, -0.5)])
+@pytest.mark.parametrize(
+    ("scale", "twist"),
+    [
+        ((1.0, 1.0, 1.3), (0.0, 0.0, 0.8)),
+        ((1.1, 1.1, 1.0), (0.3, 0.0, 0.0)),
+        ((0.9, 0.9, 0.8), (0.1, 0.0, -0.5)),
+    ],
+)
 def test_odometry_that_shows_too_much_or_too_little_does_not_stop_the_robot(
     scale, twist
 ):
     scene = started(twist=twist)
     scene.scale = np.array(scale)
     assert scene.run(4.0).cause is None
-
-
-def test_wheels_that_slip_as_a_turn_begins_do_not_stop_the_robot():
-    scene = started(twist=(0.2, 0.0, 0.1))
-    scene.scale = np.array([2.0, 1.0, 6.0])
-    assert scene.run(1.0).cause is None
 
 
 def test_wheels_that_slip_in_each_of_many_short_pushes_do_not_stop_the_robot():
@@ -255,40 +185,23 @@ def test_contradictions_of_two_pushes_do_not_add_up_though_no_scan_came_in_betwe
     assert scene.state.scan_motion.held_since_ns > first_ns
 
 
-def test_scans_from_before_the_stamps_jumped_back_are_not_compared():
-    scene = Scene()
-    scene.run(1.0)
-    scene.stamp -= 100 * NS_PER_S
-    scene.run(1.0)
-    stamps = [view.stamp_ns for view in scene.state.scan_motion.views]
-    assert len(stamps) > 2
-    assert max(stamps) <= scene.stamp
-
-
 @pytest.mark.parametrize(
-    "walls", [CORRIDOR, NOWHERE], ids=["corridor", "nothing in range"]
+    ("walls", "held", "people"),
+    [
+        (CORRIDOR, True, ()),
+        (np.zeros((0, 4)), True, ()),
+        (CORRIDOR, False, ((0.8, 0.0),)),
+        (WALLS, False, ((0.2, 0.7), (-0.3, -0.7))),
+    ],
+    ids=["corridor", "nothing in range", "follows a person", "between people"],
 )
-def test_where_a_motion_can_not_be_seen_nothing_is_decided(walls):
-    scene = started(walls=walls, twist=(0.5, 0.0, 0.0))
-    scene.held = True
-    assert scene.run(4.0).cause is None
-
-
-def person(x, y, half=0.25):
-    return [[x - half, y, x + half, y], [x, y - half, x, y + half]]
-
-
-def test_a_person_who_walks_ahead_through_a_corridor_as_fast_as_the_robot_does_not_stop_it():
-    scene = started(walls=CORRIDOR, twist=(0.5, 0.0, 0.0))
-    scene.people = lambda one: np.array(person(one.body[0] + 0.8, 0.0))
-    assert scene.run(4.0).cause is None
-
-
-def test_people_who_walk_along_on_both_sides_in_a_room_do_not_stop_it():
-    scene = started(twist=(0.3, 0.0, 0.0))
-    scene.people = lambda one: np.array(
-        person(one.body[0] + 0.2, 0.7) + person(one.body[0] - 0.3, -0.7)
-    )
+def test_where_the_scans_do_not_tell_the_motion_nothing_is_decided(walls, held, people):
+    scene = started(walls=walls, twist=(0.3, 0.0, 0.0))
+    if people:
+        scene.people = lambda one: np.array(
+            [line for x, y in people for line in person(one.body[0] + x, y)]
+        )
+    scene.held = held
     assert scene.run(4.0).cause is None
 
 
@@ -300,14 +213,6 @@ def test_people_who_walk_about_a_held_body_do_not_hide_it():
         + person(-0.8, 1.5 - 0.8 * (one.now - begun))
     )
     assert scene.stops_after(1.5) <= 1.0
-
-
-def test_a_robot_at_rest_is_never_taken_for_a_held_one():
-    scene = started()
-    scene.wish = np.zeros(3)
-    scene.run(3.0)
-    scene.scale = np.array([0.0, 0.0, 0.0])
-    assert scene.run(3.0).cause is None
 
 
 def stamp_too_late(scene, late_s):
@@ -341,7 +246,7 @@ def test_scans_that_are_older_than_their_stamps_do_not_stop_a_robot_that_starts_
 RAMPS = [(0.8, 0.0, 0.0), (0.6, 0.0, -0.6), (0.0, 0.0, 1.2)]
 
 
-@pytest.mark.parametrize("ramp_s", [0.4, 0.8, 1.6])
+@pytest.mark.parametrize("ramp_s", [0.4, 1.6])
 @pytest.mark.parametrize("twist", RAMPS)
 def test_scans_that_are_older_than_their_stamps_do_not_stop_a_robot_that_gains_speed(
     ramp_s, twist
@@ -371,64 +276,6 @@ def test_a_body_that_is_held_while_its_robot_gains_speed_is_stopped_within_a_sec
     assert scene.now - began <= 1.0
 
 
-def test_a_scan_is_reduced_to_medians_that_forget_lost_and_wrong_beams():
-    lidar = load_lidar("hokuyo_ust_10lx")
-    given = config("mecanum", beam_angles=lidar.angles)
-    directions = get_directions(given)
-    ranges = np.full(lidar.beams, 2.0, np.float32)
-    ranges[::7] = np.nan
-    ranges[3::11] = 0.5
-    out = np.empty(directions.size, np.float32)
-    reduce_scan(ranges, directions, out)
-    assert len(out) == 135
-    assert (out == 2.0).all()
-    ranges[:] = np.inf
-    reduce_scan(ranges, directions, out)
-    assert np.isnan(out).all()
-
-
-@pytest.mark.parametrize(
-    "moved", [(0.2, 0.0, 0.0), (0.0, -0.15, 0.0), (0.1, 0.05, 0.6), (0, 0, 3)]
-)
-@pytest.mark.parametrize("name", ["paper_12m", "hokuyo_ust_10lx"])
-def test_a_predicted_scan_is_what_is_seen_after_the_motion(moved, name):
-    lidar = load_lidar(name)
-    directions = get_directions(config("mecanum", beam_angles=lidar.angles))
-    count = directions.size
-    angles = directions.first + directions.step * np.arange(count)
-    walls = ROOM[:4]  # without corners that hide something
-    old = seen_from(np.array([0.3, 0.2, 0.1]), angles, walls)
-    new = seen_from(compose([0.3, 0.2, 0.1], moved), angles, walls)
-    predicted = np.empty(count, np.float32)
-    predict_scan(
-        old.astype(np.float32),
-        directions,
-        np.array(moved, float),
-        SETTINGS.gap,
-        predicted,
-    )
-    known = np.isfinite(predicted)
-    assert known.mean() > (0.9 if directions.full_circle else 0.4)
-    assert np.median(np.abs(predicted[known] - new[known])) < 2e-3
-
-
-def test_sectors_show_the_share_of_the_motion_that_took_place():
-    old = np.full(30, 2.0, np.float32)
-    predicted = old.copy()
-    predicted[:20] += 0.2
-    new = old + 0.5 * (predicted - old)
-    new[25] = np.nan
-    thresholds = Thresholds(0.03, 2.0, 0.04, 3.0)
-    shares, changed = compare_sectors(
-        old, new, predicted, 10, Noise(0.01, 0.0), thresholds
-    )
-    assert shares[:2] == pytest.approx(0.5, abs=1e-5)
-    assert np.isnan(shares[2])
-    assert changed.tolist() == [1.0, 1.0, 0.0]
-    noisy, _ = compare_sectors(old, new, predicted, 10, Noise(0.2, 0.0), thresholds)
-    assert np.isnan(noisy).all()
-
-
 @pytest.mark.parametrize("beams", [1, 2, 3, 24])
 def test_a_lidar_of_very_few_beams_decides_nothing_and_breaks_nothing(beams):
     lidar = LidarSpec(
@@ -444,22 +291,3 @@ def test_a_lidar_of_very_few_beams_decides_nothing_and_breaks_nothing(beams):
     scene.run(1.5)
     assert scene.arm().granted
     assert scene.run(1.0).cause is None
-
-
-def test_a_stop_of_a_held_body_is_replayed_to_the_bit(tmp_path):
-    scene = started()
-    entries = []
-    give = scene.give
-
-    def give_and_note(event, now=None):
-        before = scene.state
-        decision = give(event, now)
-        entries.append(Entry(scene.now, event, before, decision))
-        return decision
-
-    scene.give = give_and_note
-    scene.stops_after(1.0)
-    write(scene.config, tuple(entries), tmp_path / "held.jsonl")
-    found = replay(tmp_path / "held.jsonl")
-    assert found.differing == ()
-    assert "stopped by body_held" in "".join(found.story)

@@ -14,14 +14,13 @@ from nics_drl_bridge.gate.stopping import (
     get_wheelbase,
     require_possible,
     shield_config,
-    warn_of_age_limit,
 )
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.robot.noise import Noise
 from nics_drl_bridge.robot.spec import load_robot
 from nics_drl_bridge.sim.simulator import FastSimulator
 
-ROBOTS = ("ackermann", "differential", "mecanum")
+ROBOTS = ("ackermann", "differential", "mecanum")  # as their shipped limits say
 
 
 def shield_of(robot, file=None, **given):
@@ -42,16 +41,8 @@ def test_a_shipped_robot_has_measured_values_and_room_of_its_own(robot):
     assert shield.range_max == builtin_model(robot).lidar.range_max
     assert said.startswith("the shield is on: latency 0.2, deceleration 2, margin 0.05")
     assert f"limits/{robot}.yaml" in said
-
-
-def test_the_outline_of_a_robot_that_has_one_is_swept():
-    assert shield_of("jackal")[0].outline == load_robot("jackal").footprint
-    assert shield_of("differential")[0].outline == ()
-
-
-def test_what_is_given_goes_before_the_file():
-    shield, said = shield_of("mecanum", latency=0.7)
-    assert (shield.latency_s, shield.deceleration) == (0.7, 2.0)
+    given, said = shield_of(robot, latency=0.7)
+    assert given == replace(shield, latency_s=0.7)
     assert "but latency by parameter" in said
 
 
@@ -125,14 +116,6 @@ def test_the_way_that_is_kept_free_is_what_the_simulator_needs(at_the_rim, least
     assert stopping_distance(model, limits, 1.0) > least
 
 
-def test_a_robot_brakes_no_harder_than_its_model_can():
-    model = builtin_model("ackermann")
-    kinematics = replace(model.kinematics, limits=np.array([[-0.3, 0.4], [-0.1, 0.1]]))
-    slow = replace(model, kinematics=kinematics)
-    for limits in (load_limits("ackermann", model.robot), None):
-        assert 0.2 < shield_config(slow, limits)[0].deceleration < 0.33
-
-
 def test_wheels_that_brake_weakly_turn_the_robot_off_its_arc():
     model = builtin_model("jackal")
     weak = limited(model, 2.0)
@@ -172,89 +155,59 @@ def test_a_robot_that_does_not_stop_by_its_model_needs_to_be_told_how_it_stops(
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "sentence"),
+    ("name", "value"),
     [
-        (
-            "deceleration",
-            0.0,
-            "'shield_deceleration' is 0; it must be from 0.001 to 10000",
-        ),
-        ("latency", -0.1, "'shield_latency' is -0.1; it must be from 0 to 10"),
-        ("latency", 1e9, "'shield_latency' is 1e\\+09; it must be from 0 to 10"),
-        (
-            "obstacle_speed",
-            1e9,
-            "'shield_obstacle_speed' is 1e\\+09; it must be from 0 to 100",
-        ),
-        ("margin", float("inf"), "'shield_margin' is inf; it must be from 0 to 10"),
+        ("deceleration", 9e-4),
+        ("latency", -0.1),
+        ("latency", 10.1),
+        ("obstacle_speed", 101.0),
+        ("margin", np.inf),
     ],
 )
-def test_a_value_that_makes_no_sense_is_one_sentence(name, value, sentence):
-    with pytest.raises(ConfigError, match=sentence):
+def test_a_value_that_makes_no_sense_is_named(name, value):
+    with pytest.raises(ConfigError, match=rf"'shield_{name}' is {value:g};"):
         shield_of("ackermann", **{name: value})
 
 
-def test_a_limits_file_whose_shield_is_wrong_is_one_sentence(tmp_path):
+def test_a_limits_file_whose_shield_is_wrong_is_named_with_its_key(tmp_path):
     text = "robot: mecanum\ncommands: {}\nshield: {latency: 0.1, deceleration: -2.0}\n"
     (tmp_path / "my.yaml").write_text(text)
     with pytest.raises(ConfigError, match=r"my.yaml.*deceleration"):
         shield_of("mecanum", tmp_path / "my.yaml")
 
 
-def test_a_car_that_does_not_tell_its_wheelbase_needs_it_or_no_shield():
-    car = load_robot("ackermann").model_copy(update={"parameters": {}})
-    with pytest.raises(
-        ConfigError, match=r"'wheelbase' of a car; add it .* `shield: false`"
-    ):
-        get_wheelbase(car)
-
-
-def test_a_robot_that_is_told_volts_has_no_shield():
-    robot = load_robot("differential")
-    volts = robot.command[0].model_copy(update={"unit": "V"})
-    with pytest.raises(
-        ConfigError, match=r"'forward_command' is in 'V'; .* `shield: false`"
-    ):
-        get_wheelbase(robot.model_copy(update={"command": (volts, robot.command[1])}))
+def test_a_robot_that_no_shield_fits_may_drive_without_one():
+    model = builtin_model("ackermann")
+    volts = model.robot.command[0].model_copy(update={"unit": "V"})
+    single = model.lidar.model_copy(update={"beams": 1})
+    robots = (
+        ("wheelbase", model.robot.model_copy(update={"parameters": {}})),
+        ("'V'", model.robot.model_copy(update={"command": (volts,)})),
+    )
+    for words, robot in robots:
+        with pytest.raises(ConfigError, match=rf"{words}.*`shield: false`"):
+            get_wheelbase(robot)
+    with pytest.raises(ConfigError, match=r"has 1;.*`shield: false`"):
+        shield_config(replace(model, lidar=single), None)
 
 
 @pytest.mark.parametrize(
-    ("changes", "sentence"),
+    ("changes", "words"),
     [
-        (
-            {"scan_age_s": 0.05},
-            "'scan_age': 0.05 s: scan comes every 0.1 s .* could never move",
-        ),
-        ({"scan_age_s": 0.09}, "give more than 0.1"),
-        ({"odom_age_s": 0.05}, "'odom_age': 0.05 s"),
+        ({}, ""),
+        ({"scan_age_s": 0.09}, "'scan_age'.*give more than 0.1"),
+        ({"odom_age_s": 0.09}, "'odom_age': 0.09 s"),
         ({"scan_rate": 2.0}, "scan comes every 0.5 s"),
         ({"odom_rate": 1.5, "odom_age_s": 2.0}, "too seldom to be judged within 1 s"),
     ],
 )
-def test_a_setting_with_which_the_gate_is_never_armed_is_one_sentence(
-    changes, sentence
-):
+def test_a_setting_with_which_the_gate_is_never_armed_is_refused(changes, words):
     given = config(**changes)
-    with pytest.raises(ConfigError, match=sentence):
-        require_possible(given)
     rig = Rig(given)
-    rig.run(3.0)
-    assert not rig.arm().granted
-
-
-def test_the_settings_of_a_robot_that_drives_are_possible():
-    require_possible(config())
-    assert warn_of_age_limit(config(), 0.1) == ""
-
-
-def test_commands_that_are_too_old_before_the_next_one_comes_are_warned_of():
-    assert "give more than 0.1" in warn_of_age_limit(config(command_age_s=0.05), 0.1)
-
-
-def test_a_lidar_of_a_single_beam_is_no_lidar_for_a_shield():
-    model = builtin_model("differential")
-    single = replace(model, lidar=model.lidar.model_copy(update={"beams": 1}))
-    with pytest.raises(
-        ConfigError, match=r"lidar of 2 beams or more, .* has 1; .* `shield: false`"
-    ):
-        shield_config(single, load_limits("differential", model.robot))
+    rig.run(2.0)
+    assert rig.arm().granted == (not words)
+    if not words:
+        require_possible(given)
+        return
+    with pytest.raises(ConfigError, match=words):
+        require_possible(given)

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gate.rig import PERIOD_S, TICK_S, Rig, config, driving
+from gate.rig import PERIOD_S, TICK_S, Rig, config
 from nics_drl_bridge.gate.inputs import Reset
 from nics_drl_bridge.interface import NS_PER_S
 
@@ -33,43 +33,17 @@ def driven(pace=1.0, **changes):
     return rig
 
 
-@pytest.mark.parametrize("step_s", [0.35, 0.2, 0.05, 0.01])
-def test_stamps_that_run_ahead_of_time_latch_a_stop(step_s):
-    rig = driven(pace=1.0 + step_s / PERIOD_S)
+@pytest.mark.parametrize(
+    ("step_s", "simulated"), [(0.35, False), (0.05, True), (0.01, False)]
+)
+def test_stamps_that_run_ahead_of_time_latch_a_stop(step_s, simulated):
+    rig = driven(pace=1.0 + step_s / PERIOD_S, simulated=simulated)
     ahead = (rig.pace - 1.0) * rig.until_stopped(20.0)
     assert rig.rule == "stamps_jumped"
     assert ahead <= 0.1 + step_s + 0.02
     rig.pace = 1.0
     rig.run(2.0)
     assert not rig.moves
-
-
-@pytest.mark.parametrize("topic", ["scan", "odom"])
-def test_stamps_of_one_topic_that_run_ahead_are_named(topic):
-    rig = driving()
-    lead = [0.0]
-    send = getattr(rig, topic)
-
-    def ahead():
-        lead[0] += 0.35
-        return send(stamp_ns=rig.stamp + round(lead[0] * NS_PER_S))
-
-    setattr(rig, topic, ahead)
-    assert rig.until_stopped(0.4) <= 0.4
-    assert (rig.rule, rig.state.latched.topic) == ("stamps_jumped", topic)
-
-
-@pytest.mark.parametrize(
-    "pace", [0.9, 0.5, pytest.param(0.99, marks=pytest.mark.campaign)]
-)
-def test_data_whose_stamps_fall_behind_get_older_and_stop_the_robot_for_good(pace):
-    rig = driven(pace)
-    began = rig.now
-    known = len(rig.published)
-    rig.run(0.4 / (1.0 - pace) + 1.0)
-    last = max(time for time, twist in rig.published[known:] if twist.any())
-    assert (1.0 - pace - 1e-3) * (last - began) <= 0.36
-    assert rig.rule in ("scan_silent", "scan_behind_old", "odom_silent")
 
 
 @pytest.mark.slow
@@ -91,8 +65,10 @@ def test_a_delay_that_comes_and_stays_is_not_taken_for_the_new_normal():
     known = len(rig.published)
     rig.run(10.0)
     assert not any(twist.any() for _, twist in rig.published[known:])
-    rig.delay_s = 0.0
-    assert rig.run(0.5).cause is None
+    rig.speed = 0.0
+    assert rig.give(Reset()).granted
+    rig.settle().run(0.5)  # after a reset the present is the normal
+    assert rig.moves
 
 
 def test_jitter_does_not_stop_the_robot():
@@ -103,30 +79,12 @@ def test_jitter_does_not_stop_the_robot():
         assert rig.run(PERIOD_S).cause is None
 
 
-def test_after_a_reset_the_present_is_the_normal_again():
-    rig = driven()
-    rig.delay_s = 0.4
-    rig.run(1.0)
-    rig.speed = 0.0
-    assert rig.give(Reset()).granted
-    rig.run(1.5)
-    assert rig.arm().granted
-    rig.run(0.5)
-    assert rig.moves
-
-
 def test_a_simulator_that_falls_behind_real_time_goes_on_after_a_while():
     rig = driven(simulated=True)
     rig.stamp -= round(0.45 * NS_PER_S)
     rig.until_stopped(1.0)
     rig.run(3.0)
     assert rig.moves
-
-
-def test_a_simulator_that_runs_ahead_is_stopped_all_the_same():
-    rig = driven(pace=1.5, simulated=True)
-    rig.until_stopped(1.0)
-    assert rig.rule == "stamps_jumped"
 
 
 @pytest.mark.parametrize("pace", [2.0, 1.5, 0.6])

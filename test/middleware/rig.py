@@ -10,10 +10,6 @@ STILL = (np.zeros(3), np.zeros(3))
 RANGES = np.arange(72, dtype=np.float32)
 
 
-def refused(middleware):
-    return sum(middleware.cache.rejected.values())
-
-
 def state(middleware, now=20 * SECOND):
     view = middleware.view(now)
     return [view.pose, view.twist, view.ranges, middleware.estimator.covariance]

@@ -15,13 +15,12 @@ from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.interface import Start
 from nics_drl_bridge.middleware import kernels
 from nics_drl_bridge.middleware.ekf import Estimator
-from nics_drl_bridge.middleware.kernels import CommandLog, MotionModel
+from nics_drl_bridge.middleware.kernels import MotionModel
 from nics_drl_bridge.middleware.measurement import Acceptance, Kind, Measurement
-from nics_drl_bridge.robot.kernels import SERIES, allocate_scratch, make_terms, rates
+from nics_drl_bridge.robot.kernels import SERIES, make_terms
 from nics_drl_bridge.robot.noise import Level, Noise
 from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.simulator import FastSimulator
-from nics_drl_bridge.sim.world import load_world
 
 ROBOTS = ("ackermann", "differential", "mecanum")
 SECOND = 1_000_000_000
@@ -46,24 +45,6 @@ def random_mean(model, rng):
 
 def random_command(model, rng):
     return rng.uniform(model.robot.command_low, model.robot.command_high)
-
-
-@pytest.mark.parametrize("robot", ROBOTS)
-def test_the_derivative_of_the_rates_is_the_numerical_one(robot):
-    model = builtin_model(robot)
-    rng = np.random.default_rng(0)
-    terms = make_terms(model.kinematics)
-    for _ in range(10):
-        x, dq = allocate_scratch(model.kinematics)
-        x[:-1] = rng.uniform(-1.0, 1.0, len(x) - 1)
-
-        def of(inputs, dq=dq):
-            rates(dq, np.append(inputs, 1.0), terms)
-            return dq.copy()
-
-        jacobian = np.full((len(dq), len(x) - 1), np.nan)
-        kernels.compute_rates_jacobian(jacobian, x, terms)
-        assert jacobian == pytest.approx(numerical_jacobian(of, x[:-1]), abs=1e-6)
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
@@ -96,38 +77,6 @@ def test_the_transition_is_the_numerical_derivative_of_the_motion(robot, dt, ste
         assert derivative == pytest.approx(numerical_jacobian(of, start), abs=2e-5)
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
-def test_the_expected_twist_has_the_numerical_derivative(robot):
-    model = builtin_model(robot)
-    rng = np.random.default_rng(2)
-    motion = MotionModel(make_terms(model.kinematics), SERIES, 0, 0)
-    for _ in range(10):
-        mean = random_mean(model, rng)
-        command = random_command(model, rng)
-        log = CommandLog(np.zeros(1, np.int64), command[None])
-        twist, derivative = kernels.predict_twist(mean, 0, motion, log)
-        x = np.concatenate([mean[3:], command])
-        assert twist == pytest.approx(model.kinematics.rates(x)[:3], abs=1e-12)
-        expected = numerical_jacobian(
-            lambda m, known=log: kernels.predict_twist(m, 0, motion, known)[0], mean
-        )
-        assert derivative == pytest.approx(expected, abs=1e-6)
-
-
-def test_the_prediction_is_the_motion_of_the_model():
-    model = builtin_model("differential")
-    estimator = Estimator(model)
-    estimator.reset(0, [1.0, 2.0, 3.0])
-    estimator.add_command(0, [0.6, 1.5])
-    estimator.predict(SECOND)
-    pose = np.array([1.0, 2.0, 3.0])
-    state = np.zeros(2)
-    for _ in range(100):
-        pose, state = model.kinematics.step(pose, state, [0.6, 1.5])
-    found, _ = estimator.look_ahead(SECOND)
-    assert geometry.between(pose, found) == pytest.approx(np.zeros(3), abs=1e-6)
-
-
 @pytest.mark.parametrize("latency", [0.0, 0.03, 0.25])
 def test_a_command_acts_one_latency_after_it_was_sent(latency):
     estimator = Estimator(direct_model(latency))
@@ -142,41 +91,6 @@ def test_a_command_acts_one_latency_after_it_was_sent(latency):
         )
         moving = 0.1 + latency < now - 1e-9 <= 0.4 + latency
         assert twist[0] == pytest.approx(float(moving))
-
-
-def test_looking_ahead_does_not_move_the_filter():
-    estimator = Estimator(builtin_model("ackermann"))
-    estimator.reset(0, np.zeros(3))
-    estimator.add_command(0, [0.8, 0.2])
-    estimator.predict(SECOND)
-    before = (estimator.time_ns, *estimator.look_ahead(SECOND), estimator.covariance)
-    ahead, _ = estimator.look_ahead(5 * SECOND)
-    assert np.linalg.norm(ahead[:2] - before[1][:2]) > 0.5
-    after = (estimator.time_ns, *estimator.look_ahead(SECOND), estimator.covariance)
-    assert all(np.array_equal(a, b) for a, b in zip(before, after, strict=True))
-
-
-def test_an_earlier_time_changes_nothing():
-    estimator = Estimator(builtin_model("ackermann"))
-    estimator.reset(SECOND, [1.0, 2.0, 0.5])
-    covariance = estimator.covariance
-    estimator.predict(SECOND // 2)
-    assert estimator.time_ns == SECOND
-    assert np.array_equal(estimator.covariance, covariance)
-    assert estimator.look_ahead(0)[0] == pytest.approx([1.0, 2.0, 0.5])
-
-
-@pytest.mark.parametrize(("believed", "measured"), [(3.13, -3.13), (-3.13, 3.13)])
-def test_a_heading_is_corrected_the_short_way_round(believed, measured):
-    estimator = Estimator(direct_model())
-    estimator.reset(0, [0.0, 0.0, believed])
-    estimator.predict(SECOND)
-    for _ in range(50):
-        estimator.update(Kind.POSE, [0.0, 0.0, measured], [0.01, 0.01, 0.01])
-        heading = estimator.look_ahead(SECOND)[0][2]
-        assert -np.pi <= heading < np.pi
-        assert abs(heading) > 3.12
-    assert abs(geometry.wrap_angle(heading - measured)) < 0.002
 
 
 def simulated_drive(model, seconds, seed, pose_std=None, noise=1.0):
@@ -212,49 +126,41 @@ def simulated_drive(model, seconds, seed, pose_std=None, noise=1.0):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("robot", ROBOTS)
-def test_with_measured_poses_the_estimate_stays_at_the_truth(robot):
+@pytest.mark.parametrize(("robot", "noise"), [("ackermann", 1.0), ("mecanum", 4.0)])
+def test_with_measured_poses_the_estimate_stays_at_the_truth(robot, noise):
+    """Even if the noise is four times as large as it was told."""
+    std = 0.02
     model = builtin_model(robot)
-    for seed in range(3):
-        errors, _, covariances = simulated_drive(model, 30, seed, pose_std=0.02)
-        assert np.abs(errors[100:]).max() < 0.1
-        assert np.sqrt((errors[100:, :2] ** 2).mean()) < 0.03
-        assert np.linalg.eigvalsh(covariances).min() > 0.0
+    errors, _, covariances = simulated_drive(model, 30, 1, std, noise)
+    assert np.abs(errors[100:]).max() < 0.1 * noise
+    assert np.sqrt((errors[100:, :2] ** 2).mean()) < 2.0 * std
+    assert np.linalg.eigvalsh(covariances).min() > 0.0
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("robot", ROBOTS)
-def test_the_estimate_by_odometry_alone_errs_no_more_than_it_claims(robot):
-    model = builtin_model(robot)
-    for seed in range(3):
-        errors, _, covariances = simulated_drive(model, 20, seed)
-        heading = np.sqrt(covariances[:, 2, 2])
-        away = np.sqrt(covariances[:, 0, 0] + covariances[:, 1, 1])
-        assert (np.abs(errors[:, 2]) < 4.0 * heading).all()
-        assert (np.linalg.norm(errors[:, :2], axis=1) < 4.0 * away).all()
-
-
-def test_a_wrong_belief_about_the_pose_is_mended_by_measurements():
+@pytest.mark.parametrize(
+    ("std", "truth", "seconds"),
+    [(1e-3, (0.5, -0.3, 2.9), 60), ((100.0, 100.0, np.pi), (40.0, -70.0, 2.9), 1)],
+    ids=["wrong", "unknown"],
+)
+def test_a_wrong_or_unknown_start_is_mended_by_measured_poses(std, truth, seconds):
     estimator = Estimator(builtin_model("ackermann"))
-    estimator.reset(0, [0.0, 0.0, 0.0])
-    truth = np.array([0.5, -0.3, 2.9])
-    for second in range(1, 61):
+    estimator.reset(0, np.zeros(3), std)
+    for second in range(1, seconds + 1):
         estimator.predict(second * SECOND)
-        estimator.update(Kind.POSE, truth, [0.01, 0.01, 0.01])
-    assert geometry.between(
-        truth, estimator.look_ahead(60 * SECOND)[0]
-    ) == pytest.approx(np.zeros(3), abs=0.01)
+        estimator.update(Kind.POSE, truth, [0.01] * 3)
+    found = estimator.look_ahead(estimator.time_ns)[0]
+    assert geometry.between(np.array(truth), found) == pytest.approx(0.0, abs=0.01)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("robot", ["ackermann", "mecanum"])
+@pytest.mark.parametrize("robot", ["mecanum"])
 def test_the_covariance_stays_positive_definite_over_thousands_of_random_steps(robot):
     model = builtin_model(robot)
     rng = np.random.default_rng(3)
     estimator = Estimator(model)
     now = 0
     estimator.reset(now, np.zeros(3))
-    for step in range(10_000):
+    for step in range(3_000):
         now += int(rng.integers(1, PERIOD))
         kind = step % 4 if step % 7 else 4
         if kind < 2:
@@ -280,7 +186,7 @@ NOISY = Noise(
     position_drift=Level(std=0.03, unit="m/sqrt(s)", source="measured"),
     heading_drift=Level(std=0.03, unit="rad/sqrt(s)", source="measured"),
 )
-RUNS = 60
+RUNS = 30
 
 
 def noisy_model(robot):
@@ -322,87 +228,35 @@ def test_the_estimate_is_as_uncertain_as_it_claims(robot, pose_std):
     assert low < np.mean(nees) < high
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
-def test_a_model_that_is_a_little_wrong_does_not_lead_the_estimate_astray(robot):
-    model = builtin_model(robot)
-    wrong = Randomisation(name="wrong", kinematics={"scale": [0.95, 1.05]})
-    backend = SimBackend(
-        model, load_world("empty"), estimator=True, randomisation=wrong
-    )
-    start = np.array([0.0, -1.0, 0.0])
-    command = np.zeros(len(model.robot.command))
-    command[0], command[-1] = 0.5, 0.3 if model.robot.steers else 0.5
-    for seed in range(3):
-        backend.reset(Start(seed, start))
-        for _ in range(100):
-            view, info = backend.step(command)
-        assert not info["true_collision"]
-        assert np.hypot(*(view.pose - info["true_pose"])[:2]) < 0.1
+SCALED = {"scale": [0.95, 1.05]}
+NOISY_WHEELS = {"odom_linear": (0.04, 0.04), "odom_angular": (0.04, 0.04)}
+WRONG = [
+    ("ackermann", {"kinematics": SCALED}, 0.03),
+    ("differential", {"kinematics": SCALED, "action_latency": (0.5, 0.5)}, 0.03),
+    ("mecanum", {"kinematics": SCALED, "action_latency": (0.5, 0.5)}, 0.03),
+    (
+        "ackermann",
+        {"kinematics": {"response": [0.8, 0.8]}, "action_latency": (1.0, 1.0)},
+        0.1,
+    ),
+    ("differential", {"odometry": NOISY_WHEELS}, 0.1),
+]
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
-def test_a_wrong_model_leaves_the_estimate_where_odometry_is(robot):
+@pytest.mark.parametrize(("robot", "changes", "bound"), WRONG)
+def test_a_wrong_model_leaves_the_estimate_where_odometry_is(robot, changes, bound):
+    """Its terms, its response or its noise may be wrong; it reverses now and then."""
     model = builtin_model(robot)
-    rng = np.random.default_rng(7)
-    wrong = Randomisation(
-        name="wrong", kinematics={"scale": [0.95, 1.05]}, action_latency=(0.5, 0.5)
-    )
+    wrong = Randomisation(name="wrong", **changes)
     backend = SimBackend(model, field(60.0), estimator=True, randomisation=wrong)
     backend.reset(Start(0, np.array([0.0, 0.0, 1.0])))
-    for step in range(150):
-        if step % 7 == 0:
-            command = random_command(model, rng)
-        view, _ = backend.step(command)
-    odometry = backend.simulator.data.odom[0, 0]
-    assert np.abs(geometry.between(odometry, view.pose)).max() < 0.03
-
-
-@pytest.mark.parametrize("robot", ROBOTS)
-def test_odometry_of_four_times_the_noise_that_was_told_is_followed(robot):
-    model = builtin_model(robot)
     rng = np.random.default_rng(7)
-    told = zip(("odom_linear", "odom_angular"), model.noise.odometry, strict=True)
-    rough = Randomisation(
-        name="rough", odometry={name: (4.0 * std, 4.0 * std) for name, std in told}
-    )
-    backend = SimBackend(model, field(60.0), estimator=True, randomisation=rough)
-    backend.reset(Start(0, np.array([0.0, 0.0, 1.0])))
-    away = []
     for step in range(150):
         if step % 7 == 0:
             command = random_command(model, rng)
         view, _ = backend.step(command)
-        away.append(geometry.between(backend.simulator.data.odom[0, 0], view.pose))
-    assert np.abs(away).max() < 0.1
-
-
-@pytest.mark.parametrize("glitch", [0.2, 1.0, 1e9])
-def test_odometry_with_glitches_is_not_given_up_for_a_wrong_model(glitch):
-    """The robot is slower than its model; each twentieth twist is off to the side."""
-    estimator = Estimator(builtin_model("differential"))
-    odom = np.zeros(3)
-    twist = np.zeros(3)
-    estimator.reset(0, odom)
-    rng = np.random.default_rng(0)
-    for k in range(1, 300):
-        estimator.add_command((k - 1) * PERIOD, [0.5, 0.3])
-        twist = twist + 0.6 * (np.array([0.3, 0.0, 0.18]) - twist)
-        way = (twist + rng.normal(0.0, 0.01, 3)) * 0.1
-        odom = geometry.compose(odom, way)
-        seen = way / 0.1 + [0.0, glitch if k % 20 == 0 else 0.0, 0.0]
-        stepped(estimator, k * PERIOD, seen, odom)
-        assert (
-            np.abs(geometry.between(odom, estimator.look_ahead(k * PERIOD)[0])).max()
-            < 0.05
-        )
-
-
-@pytest.mark.slow
-def test_poses_of_four_times_the_noise_that_was_told_still_mend_the_estimate():
-    model = builtin_model("differential")
-    told = 0.02
-    errors, _, _ = simulated_drive(model, 60, 1, told, noise=4.0)
-    assert np.sqrt((errors[100:, :2] ** 2).mean()) < 2.0 * told
+        odometry = backend.simulator.data.odom[0, 0]
+        assert np.abs(geometry.between(odometry, view.pose)).max() < bound
 
 
 def stepped(estimator, stamp, twist, odom):
@@ -420,16 +274,6 @@ def test_a_way_that_belies_the_twists_is_left_out():
     assert np.hypot(*moved[:2]) > 0.9 * np.hypot(*twist[:2])
 
 
-def test_a_twist_that_is_no_twist_of_the_robot_takes_no_way_with_it():
-    estimator = Estimator(model := builtin_model("differential"))
-    estimator.clone_state(np.zeros(3), np.zeros(3))
-    estimator.add_command(0, model.robot.command_high)
-    stepped(estimator, PERIOD, [0.0, 0.15, 0.0], np.zeros(3))
-    assert estimator.belief.outliers[Kind.TWIST] == 1
-    stepped(estimator, 2 * PERIOD, np.zeros(3), np.zeros(3))
-    assert np.abs(estimator.look_ahead(2 * PERIOD)[0]).max() < 0.01
-
-
 def test_an_outlier_after_a_silence_is_where_the_next_way_begins():
     """A way from before the silence, which nothing bridged, must not come back."""
     estimator = Estimator(builtin_model("differential"))
@@ -440,26 +284,6 @@ def test_an_outlier_after_a_silence_is_where_the_next_way_begins():
     before = estimator.look_ahead(late)[0]
     stepped(estimator, late + PERIOD, np.zeros(3), [500.0, 0.0, 0.0])
     assert estimator.look_ahead(late + PERIOD)[0] == pytest.approx(before, abs=0.05)
-
-
-@pytest.mark.parametrize("response", [0.8, 1.2])
-def test_a_car_that_obeys_later_than_its_model_is_where_odometry_is(response):
-    """At a reversal the model is far off, and steering can't be told from a twist near zero."""
-    late = Randomisation(
-        name="late",
-        kinematics={"response": [response, response]},
-        action_latency=(1.0, 1.0),
-    )
-    given = {"estimator": True, "randomisation": late}
-    backend = SimBackend(builtin_model("ackermann"), field(60.0), **given)
-    for seed in range(3):
-        backend.reset(Start(seed, np.zeros(3)))
-        for step in range(60):
-            view, _ = backend.step(
-                np.array([-0.5, -0.5] if step % 30 < 8 else [1.0, 0.5])
-            )
-        odometry = backend.simulator.data.odom[0, 0]
-        assert np.abs(geometry.between(odometry, view.pose)).max() < 0.1
 
 
 @pytest.mark.parametrize("heading", [0.0, 0.3])
@@ -476,36 +300,8 @@ def test_the_way_goes_on_from_a_pose_that_was_measured_in_between(heading):
     assert estimator.look_ahead(PERIOD)[0] == pytest.approx(ahead, abs=0.01)
 
 
-def test_a_robot_that_is_stuck_is_noticed_at_once():
-    estimator = Estimator(builtin_model("ackermann"))
-    estimator.reset(0, np.zeros(3))
-    estimator.add_command(0, [0.8, 0.0])
-    for step in range(1, 21):
-        estimator.predict(step * PERIOD)
-        estimator.update(Kind.TWIST, np.zeros(3))
-    pose, twist = estimator.look_ahead(20 * PERIOD)
-    assert abs(twist[0]) < 0.1
-    assert abs(pose[0]) < 0.8  # the command alone leads to 1.5 m
-
-
-def test_the_noise_of_the_pose_is_that_of_the_model():
-    model = noisy_model("differential")
-    spread = []
-    for std in (0.01, 0.1):
-        level = Level(std=std, unit="m", source="measured")
-        noise = model.noise.model_copy(update={"pose_position": level})
-        estimator = Estimator(replace(model, noise=noise))
-        estimator.reset(0, np.zeros(3))
-        estimator.predict(10 * SECOND)
-        estimator.update(Kind.POSE, np.zeros(3))
-        spread.append(np.sqrt(estimator.covariance[0, 0]))
-    assert spread[0] == pytest.approx(0.01, rel=0.2)
-    assert spread[1] > 3.0 * spread[0]
-
-
-@pytest.mark.parametrize("robot", ["ackermann", "differential", "mecanum"])
-def test_a_twist_is_weighed_as_filterpy_weighs_it(robot):
-    estimator = driven(robot)
+def test_a_twist_is_weighed_as_filterpy_weighs_it():
+    estimator = driven()
     expected, derivative = estimator._predict_measurement(Kind.TWIST)
     noise = estimator._noise[Kind.TWIST]
     weight, covariance = kernels.compute_update(estimator.covariance, derivative, noise)
@@ -513,11 +309,6 @@ def test_a_twist_is_weighed_as_filterpy_weighs_it(robot):
     own.update(expected, lambda _: derivative, lambda _: expected, R=noise)
     np.testing.assert_allclose(weight, own.K, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(covariance, own.P, rtol=1e-9, atol=1e-15)
-
-
-def test_the_same_data_give_the_same_bits():
-    one, other = (simulated_drive(builtin_model("mecanum"), 3, 5) for _ in range(2))
-    assert all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
 
 
 def driven(robot="ackermann", seconds=2):
@@ -534,88 +325,47 @@ def driven(robot="ackermann", seconds=2):
     return estimator
 
 
-def test_a_twist_that_the_robot_can_not_have_is_refused_and_changes_nothing():
-    estimator = driven()
-    before = estimator.belief
-    verdict = estimator.update(Kind.TWIST, [50.0, 0.0, 0.0])
-    assert verdict.outcome is Acceptance.OUTLIER
-    assert verdict.nis > 1000.0
-    after = estimator.belief
-    assert np.array_equal(before.mean, after.mean)
-    assert np.array_equal(before.covariance, after.covariance)
-    assert after.outliers == (1, 0, 0)
+def assert_same_belief(estimator, before):
+    assert np.array_equal(estimator.belief.mean, before.mean)
+    assert np.array_equal(estimator.belief.covariance, before.covariance)
 
 
 def test_a_twist_that_is_slower_than_expected_is_news_at_once():
     estimator = driven()
-    assert estimator.update(Kind.TWIST, [0.0, 0.0, 0.0]).outcome is Acceptance.NEWS
+    assert estimator.update(Kind.TWIST, np.zeros(3)).outcome is Acceptance.NEWS
     assert estimator.belief.outliers == (0, 0, 0)
     assert abs(estimator.look_ahead(estimator.time_ns)[1][0]) < 0.01
 
 
 def test_impossible_twists_are_believed_from_the_third_in_a_row_until_one_fits_again():
     estimator = driven()
-    outcomes = [estimator.update(Kind.TWIST, [0.5, 0.8, 0.0]).outcome for _ in range(5)]
+    before = estimator.belief
+    pose = estimator.look_ahead(estimator.time_ns)[0]
+    outcomes = []
+    for count in range(1, 6):
+        outcomes.append(estimator.update(Kind.TWIST, [0.5, 0.8, 0.0]).outcome)
+        if count < 3:
+            assert_same_belief(estimator, before)
+            assert estimator.belief.outliers == (count, 0, 0)
     assert outcomes == [Acceptance.OUTLIER] * 2 + [Acceptance.JUMP] * 3
-    assert (
-        estimator.update(Kind.TWIST, [0.5, 0.0, 0.0]).outcome is not Acceptance.OUTLIER
-    )
+    assert np.array_equal(estimator.look_ahead(estimator.time_ns)[0], pose)
+    fitting = estimator.update(Kind.TWIST, [0.5, 0.0, 0.0]).outcome
+    assert fitting is not Acceptance.OUTLIER
     assert estimator.belief.outliers == (0, 0, 0)
     assert estimator.update(Kind.TWIST, [0.5, 0.8, 0.0]).outcome is Acceptance.OUTLIER
 
 
-def test_impossible_twists_do_not_move_the_pose():
-    estimator = driven()
-    before = estimator.look_ahead(estimator.time_ns)[0]
-    for _ in range(10):
-        estimator.update(Kind.TWIST, [500.0, 300.0, -40.0])
-    assert np.array_equal(estimator.look_ahead(estimator.time_ns)[0], before)
-
-
-@pytest.mark.parametrize("value", [1e9, 1e200, 1e308])
-def test_what_is_beyond_all_bounds_is_never_believed_however_often_it_comes(value):
-    estimator = driven()
-    before = estimator.belief
-    for _ in range(20):
-        assert (
-            estimator.update(Kind.TWIST, [value, 0.0, 0.0]).outcome
-            is Acceptance.OUTLIER
-        )
-        assert (
-            estimator.update(Kind.POSE, [0.0, -value, 0.0]).outcome
-            is Acceptance.OUTLIER
-        )
-        assert estimator.update(Kind.YAW_RATE, value).outcome is Acceptance.OUTLIER
-    assert np.array_equal(estimator.belief.mean, before.mean)
-    assert np.array_equal(estimator.belief.covariance, before.covariance)
-
-
-@pytest.mark.parametrize("robot", ["ackermann", "differential", "mecanum"])
-@pytest.mark.parametrize("value", [1e3, 1e100, 1e308, -1e308])
-def test_absurd_commands_leave_the_filter_sound(robot, value):
-    estimator = driven(robot)
-    for k in range(1, 60):
-        now = estimator.time_ns
-        estimator.add_command(now, np.full(len(estimator._log.commands[0]), value))
-        estimator.predict(now + k * PERIOD)
-        estimator.update(Kind.TWIST, np.zeros(3))
-        assert np.isfinite(
-            np.concatenate(estimator.look_ahead(now + 90 * SECOND))
-        ).all()
-        assert np.isfinite(np.concatenate(estimator.look_ahead(now + 9 * SECOND))).all()
-        np.linalg.cholesky(estimator.covariance)
-
-
 def test_a_pose_far_off_is_refused_and_the_fifth_in_a_row_is_taken_as_a_jump():
     estimator = driven()
-    before = estimator.belief
     far = [30.0, 2.0, -3.0]
-    for _ in range(4):
-        assert (
-            estimator.update(Kind.POSE, far, [0.02] * 3).outcome is Acceptance.OUTLIER
-        )
-        assert np.array_equal(estimator.belief.mean, before.mean)
-        assert np.array_equal(estimator.belief.covariance, before.covariance)
+    good = estimator.look_ahead(estimator.time_ns)[0]
+    for _ in range(2):  # outliers are counted in a row only
+        assert estimator.update(Kind.POSE, good, [0.02] * 3).outcome is Acceptance.USED
+        before = estimator.belief
+        for _ in range(4):
+            judged = estimator.update(Kind.POSE, far, [0.02] * 3)
+            assert judged.outcome is Acceptance.OUTLIER
+            assert_same_belief(estimator, before)
     assert estimator.update(Kind.POSE, far, [0.02] * 3).outcome is Acceptance.JUMP
     pose, twist = estimator.look_ahead(estimator.time_ns)
     assert pose == pytest.approx(far)
@@ -626,6 +376,42 @@ def test_a_pose_far_off_is_refused_and_the_fifth_in_a_row_is_taken_as_a_jump():
     assert estimator.update(Kind.POSE, far, [0.02] * 3).outcome is Acceptance.USED
 
 
+def test_a_yaw_rate_moves_nothing_by_itself_and_is_refused_beyond_the_robots_reach():
+    estimator = driven()
+    before = estimator.belief
+    assert estimator.update(Kind.YAW_RATE, 0.03, 0.01).outcome is Acceptance.USED
+    assert estimator.update(Kind.YAW_RATE, 40.0).outcome is Acceptance.OUTLIER
+    assert_same_belief(estimator, before)
+
+
+@pytest.mark.parametrize("value", [1e9, 1e200, 1e308])
+def test_what_is_beyond_all_bounds_is_never_believed_however_often_it_comes(value):
+    estimator = driven()
+    before = estimator.belief
+    for _ in range(20):
+        for kind, measured in (
+            (Kind.TWIST, [value, 0.0, 0.0]),
+            (Kind.POSE, [0.0, -value, 0.0]),
+            (Kind.YAW_RATE, value),
+        ):
+            assert estimator.update(kind, measured).outcome is Acceptance.OUTLIER
+    assert_same_belief(estimator, before)
+
+
+@pytest.mark.parametrize(("robot", "value"), [("ackermann", 1e3), ("mecanum", -1e308)])
+def test_absurd_commands_leave_the_filter_sound(robot, value):
+    estimator = driven(robot)
+    for k in range(1, 20):
+        now = estimator.time_ns
+        estimator.add_command(now, np.full(len(estimator._log.commands[0]), value))
+        estimator.predict(now + k * PERIOD)
+        estimator.update(Kind.TWIST, np.zeros(3))
+        for ahead_s in (9, 90):
+            found = np.concatenate(estimator.look_ahead(now + ahead_s * SECOND))
+            assert np.isfinite(found).all()
+        np.linalg.cholesky(estimator.covariance)
+
+
 @pytest.mark.parametrize(("believed", "measured"), [(3.13, -3.14), (-3.13, 3.14)])
 def test_a_heading_beyond_the_seam_is_near_and_no_outlier(believed, measured):
     estimator = Estimator(builtin_model("differential"))
@@ -634,32 +420,6 @@ def test_a_heading_beyond_the_seam_is_near_and_no_outlier(believed, measured):
     assert verdict.outcome is Acceptance.USED
     assert verdict.nis == pytest.approx((2.0 * np.pi - 6.27) ** 2 / (2 * 0.02**2))
     assert abs(estimator.look_ahead(0)[0][2]) > 3.13
-
-
-def test_outliers_are_counted_in_a_row_only():
-    estimator = driven()
-    good = estimator.look_ahead(estimator.time_ns)[0]
-    far = [30.0, 2.0, 1.0]
-    for _ in range(5):
-        for _ in range(4):
-            assert (
-                estimator.update(Kind.POSE, far, [0.02] * 3).outcome
-                is Acceptance.OUTLIER
-            )
-        assert estimator.update(Kind.POSE, good, [0.02] * 3).outcome is Acceptance.USED
-
-
-@pytest.mark.parametrize("robot", ["ackermann", "differential"])
-def test_a_yaw_rate_moves_nothing_by_itself_and_is_refused_beyond_the_robots_reach(
-    robot,
-):
-    estimator = driven(robot)
-    before = estimator.belief
-    assert estimator.update(Kind.YAW_RATE, 0.03, 0.01).outcome is Acceptance.USED
-    for _ in range(50):
-        assert estimator.update(Kind.YAW_RATE, 40.0).outcome is Acceptance.OUTLIER
-    assert np.array_equal(estimator.belief.mean, before.mean)
-    assert np.array_equal(estimator.belief.covariance, before.covariance)
 
 
 @pytest.mark.slow
@@ -677,19 +437,6 @@ def test_a_gate_refuses_one_good_measurement_in_a_thousand():
             is Acceptance.OUTLIER
         )
     assert 8 <= refused <= 36  # 20 are expected; 99.9 % of such counts
-
-
-def test_an_unknown_start_is_mended_by_the_first_pose():
-    estimator = Estimator(builtin_model("differential"))
-    estimator.reset(0, np.zeros(3), [100.0, 100.0, np.pi])
-    estimator.predict(SECOND)
-    assert (
-        estimator.update(Kind.POSE, [40.0, -70.0, 2.0], [0.01] * 3).outcome
-        is Acceptance.USED
-    )
-    assert estimator.look_ahead(SECOND)[0] == pytest.approx(
-        [40.0, -70.0, 2.0], abs=1e-3
-    )
 
 
 def test_a_covariance_that_rounding_made_indefinite_is_mended():

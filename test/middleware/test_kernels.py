@@ -18,14 +18,6 @@ def in_effect(log, time):
     return log.commands[kernels.find_command(log, time)].tolist()
 
 
-def test_before_the_first_command_there_is_none():
-    log = make_log([0.0, 0.0])
-    assert in_effect(log, 10**18) == [0.0, 0.0]
-    log = logged(log, 100, [1.0, 2.0], 0)
-    assert in_effect(log, 100) == [0.0, 0.0]
-    assert in_effect(log, 101) == [1.0, 2.0]
-
-
 def test_the_order_of_adding_does_not_matter():
     rng = np.random.default_rng(0)
     times = rng.permutation(1000)[:100] * 10

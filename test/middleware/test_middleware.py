@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from functools import partial
 
 import numpy as np
 import pytest
 from robots import direct_model
 
-from middleware.rig import PERIOD, RANGES, SECOND, STILL, assert_same, refused, state
+from middleware.rig import PERIOD, RANGES, SECOND, STILL, assert_same, state
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.middleware.middleware import Middleware, TopicCache, rehearse
 
@@ -26,111 +27,113 @@ def test_a_pose_that_is_set_stays_when_the_next_odometry_comes():
     assert np.diag(middleware.estimator.covariance)[:3].max() < 1e-3
 
 
-def test_before_any_datum_the_view_says_that_nothing_is_known(middleware):
-    view = middleware.view(SECOND)
-    assert view.pose == pytest.approx([1.0, 2.0, 0.5])
-    assert np.isnan(view.ranges).all()
-    assert view.ranges.dtype == np.float32
-    assert view.scan_age_s == view.odom_age_s == np.inf
-
-
 def test_the_view_holds_the_newest_data_with_their_ages(middleware):
-    assert middleware.scan(SECOND + PERIOD, 0, RANGES)
+    ranges = RANGES.copy()
+    ranges[:3] = np.inf, -np.inf, np.nan
+    assert middleware.scan(SECOND + PERIOD, 0, ranges)
     assert middleware.odometry(SECOND + 2 * PERIOD, 0, *STILL)
     view = middleware.view(SECOND + 5 * PERIOD)
-    assert np.array_equal(view.ranges, RANGES)
+    assert np.array_equal(view.ranges, ranges, equal_nan=True)
     assert view.stamp_s == pytest.approx(1.2)
     assert (view.scan_age_s, view.odom_age_s) == pytest.approx((0.4, 0.3))
 
 
+def give(middleware, topic, stamp=SECOND + PERIOD, value=0.0, arrival=None):
+    """Hands over a datum, whose numbers are all the same."""
+    arrival = SECOND if arrival is None else arrival
+    if topic == "scan":
+        return middleware.scan(stamp, arrival, RANGES)
+    if topic == "odom":
+        return middleware.odometry(stamp, arrival, np.zeros(3), np.full(3, value))
+    if topic == "pose":
+        return middleware.pose(stamp, arrival, np.full(3, value))
+    if topic == "imu":
+        return middleware.imu(stamp, arrival, value)
+    return middleware.command(stamp, np.full(3, value), arrival)
+
+
+ZEROS = np.zeros(3)
+LOPSIDED = [[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+EARLY = SECOND + PERIOD
+REFUSED = [
+    ("odom", "NaN or inf", lambda m: m.odometry(EARLY, 0, [0, 0, np.nan], ZEROS)),
+    ("odom", "NaN or inf", lambda m: m.odometry(EARLY, 0, ZEROS, [np.inf, 0, 0])),
+    ("cmd_vel", "NaN or inf", lambda m: give(m, "cmd_vel", value=np.nan)),
+    ("pose", "NaN or inf", lambda m: give(m, "pose", value=-np.inf)),
+    ("imu", "NaN or inf", lambda m: give(m, "imu", value=np.nan)),
+    ("scan", "shape (71,), not (72,)", lambda m: m.scan(EARLY, 0, RANGES[1:])),
+    ("scan", "shape (1, 72), not (72,)", lambda m: m.scan(EARLY, 0, RANGES[None])),
+    ("cmd_vel", "shape (2,), not (3,)", lambda m: m.command(EARLY, [1.0, 0.0])),
+    (
+        "pose",
+        "covariance: NaN or inf",
+        lambda m: m.pose(EARLY, 0, ZEROS, np.diag([1.0, np.nan, 1.0])),
+    ),
+    (
+        "pose",
+        "covariance: not symmetric",
+        lambda m: m.pose(EARLY, 0, ZEROS, LOPSIDED),
+    ),
+    (
+        "pose",
+        "covariance: not positive definite",
+        lambda m: m.pose(EARLY, 0, ZEROS, np.diag([1.0, -1e-3, 1.0])),
+    ),
+    (
+        "imu",
+        "covariance: not positive definite",
+        lambda m: m.imu(EARLY, 0, 0.0, -1.0),
+    ),
+    *(
+        (topic, "stamp is not an integer", partial(give, topic=topic, stamp=1.5))
+        for topic in ("scan", "odom", "pose", "imu")
+    ),
+]
+
+
+@pytest.mark.parametrize(("topic", "reason", "hand_over"), REFUSED)
+def test_what_can_not_be_true_is_refused_counted_and_changes_nothing(
+    middleware, topic, reason, hand_over
+):
+    before = state(middleware)
+    assert not hand_over(middleware)
+    assert middleware.cache.rejected == {(topic, reason): 1}
+    assert_same(before, state(middleware))
+
+
+OLD = "not after the reset"
+
+
 @pytest.mark.parametrize(
-    ("stamp", "reason"),
+    ("topic", "stamp", "reason"),
     [
-        (SECOND - 1, "not after the reset"),
-        (SECOND, "not after the reset"),
-        (SECOND + PERIOD, "older than 1 s"),
-        (3 * SECOND, "duplicate"),
+        ("odom", SECOND - 1, OLD),
+        ("odom", SECOND, OLD),
+        ("odom", SECOND + PERIOD, "older than 1 s"),
+        ("odom", 3 * SECOND, "duplicate"),
+        ("scan", 3 * SECOND - 1, "out of order"),
+        ("scan", 3 * SECOND, "duplicate"),
     ],
 )
-def test_old_and_repeated_odometry_is_refused_counted_and_changes_nothing(
-    middleware, stamp, reason
+def test_old_and_repeated_data_are_refused(middleware, topic, stamp, reason):
+    assert give(middleware, topic, 3 * SECOND, 0.4)
+    before = state(middleware)
+    assert not give(middleware, topic, stamp, 9.0)
+    assert middleware.cache.rejected == {(topic, reason): 1}
+    assert_same(before, state(middleware))
+
+
+@pytest.mark.parametrize("topic", ["scan", "odom", "pose", "imu", "cmd_vel"])
+def test_data_from_the_future_are_refused_but_not_the_robots_own_commands(
+    middleware, topic
 ):
-    middleware.odometry(3 * SECOND, 0, [0, 0, 0], [0.4, 0.0, 0.1])
+    give(middleware, "odom", SECOND, arrival=50 * SECOND)
     before = state(middleware)
-    assert not middleware.odometry(stamp, 0, [9.0, 9.0, 9.0], [9.0, 9.0, 9.0])
-    assert middleware.cache.rejected == {("odom", reason): 1}
+    assert not give(middleware, topic, 3 * SECOND + 1, arrival=51 * SECOND)
+    assert middleware.cache.rejected == {(topic, "more than 1 s in the future"): 1}
     assert_same(before, state(middleware))
-
-
-@pytest.mark.parametrize("stamp", [SECOND + PERIOD, SECOND + 2 * PERIOD])
-def test_old_and_repeated_scans_are_refused_and_counted(middleware, stamp):
-    middleware.scan(SECOND + 2 * PERIOD, 0, RANGES)
-    assert not middleware.scan(stamp, 0, RANGES + 1)
-    assert refused(middleware) == 1
-    assert np.array_equal(middleware.view(2 * SECOND).ranges, RANGES)
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("place", range(6))
-def test_odometry_that_is_no_number_never_enters(middleware, value, place):
-    numbers = np.zeros(6)
-    numbers[place] = value
-    before = state(middleware)
-    assert not middleware.odometry(SECOND + PERIOD, 0, numbers[:3], numbers[3:])
-    assert middleware.cache.rejected == {("odom", "NaN or inf"): 1}
-    assert_same(before, state(middleware))
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_commands_that_are_no_numbers_never_enter(middleware, value):
-    before = state(middleware)
-    middleware.command(SECOND, [value, 0.0, 0.0])
-    assert middleware.cache.rejected == {("cmd_vel", "NaN or inf"): 1}
-    assert_same(before, state(middleware))
-    middleware.odometry(SECOND + PERIOD, 0, *STILL)
-    assert np.isfinite(state(middleware)[0]).all()
-
-
-def test_after_bad_data_good_ones_count_in_full(middleware):
-    clean = Middleware(direct_model())
-    clean.reset(SECOND, [1.0, 2.0, 0.5])
-    rng = np.random.default_rng(0)
-    for step in range(1, 60):
-        twist = rng.normal(size=3)
-        now = SECOND + step * PERIOD
-        middleware.odometry(now, 0, np.zeros(3), np.full(3, np.nan))
-        for one in (clean, middleware):
-            one.command(now - PERIOD, twist)
-            one.odometry(now, 0, np.zeros(3), twist)
-        middleware.odometry(now - PERIOD, 0, np.zeros(3), np.full(3, 5.0))
-    assert refused(middleware) == 2 * 59
-    assert_same(state(clean), state(middleware))
-
-
-@pytest.mark.parametrize("shape", [(71,), (0,), (1, 72)])
-def test_a_scan_of_another_lidar_is_refused(middleware, shape):
-    assert not middleware.scan(SECOND + PERIOD, 0, np.zeros(shape, np.float32))
-    assert refused(middleware) == 1
-    assert np.isnan(middleware.view(2 * SECOND).ranges).all()
-
-
-def test_ranges_without_return_pass_as_they_are(middleware):
-    ranges = np.full(72, np.inf, np.float32)
-    ranges[:2] = -np.inf, np.nan
-    assert middleware.scan(SECOND + PERIOD, 0, ranges)
-    assert np.array_equal(middleware.view(2 * SECOND).ranges, ranges, equal_nan=True)
-
-
-def test_a_reset_forgets_everything(middleware):
-    middleware.scan(9 * SECOND, 0, RANGES)
-    middleware.command(9 * SECOND, [1.0, 0.0, 0.0])
-    middleware.odometry(9 * SECOND, 0, [0, 0, 0], [1.0, 0.0, 0.0])
-    middleware.odometry(9 * SECOND, 0, [0, 0, 0], [1.0, 0.0, 0.0])
-    middleware.reset(SECOND, [1.0, 2.0, 0.5])
-    fresh = Middleware(direct_model())
-    fresh.reset(SECOND, [1.0, 2.0, 0.5])
-    assert_same(state(fresh), state(middleware))
-    assert refused(middleware) == 0
+    assert give(middleware, topic, 3 * SECOND, arrival=51 * SECOND)
+    assert middleware.command(9 * SECOND, [1.0, 0.0, 0.0])
 
 
 def test_asking_for_a_view_changes_nothing(middleware):
@@ -140,18 +143,6 @@ def test_asking_for_a_view_changes_nothing(middleware):
     for later in (3, 50, 2):
         middleware.view(later * SECOND)
     assert_same(before, state(middleware, 2 * SECOND))
-
-
-def test_late_odometry_counts_but_the_newest_stays_the_newest(middleware):
-    middleware.odometry(3 * SECOND, 7, [3.0, 0.0, 0.0], [0.0, 0.0, 0.0])
-    assert middleware.odometry(3 * SECOND - PERIOD, 9, [2.0, 0.0, 0.0], [0.0, 0.0, 0.0])
-    newest = middleware.cache.newest["odom"]
-    assert (newest.stamp_ns, newest.arrival_ns, newest.value[0][0]) == (
-        3 * SECOND,
-        7,
-        3.0,
-    )
-    assert middleware.health(9).topics["odom"].received == 2
 
 
 def test_health_tells_rates_ages_refusals_and_innovations(middleware):
@@ -184,16 +175,6 @@ def test_health_tells_rates_ages_refusals_and_innovations(middleware):
     assert np.isnan(health.topics["scan"].innovation)
     assert health.rejected == {("pose", "outlier"): 1}
     assert health.replayed == 20  # of equal stamps, the yaw rate counts after the twist
-
-
-def test_without_data_nothing_is_healthy_or_ill(middleware):
-    health = middleware.health(SECOND)
-    assert (health.topics, health.rejected, health.noticed, health.replayed) == (
-        {},
-        {},
-        {},
-        0,
-    )
 
 
 def test_a_rehearsal_ends_with_a_robot_that_stands_still_in_the_open():
@@ -248,45 +229,6 @@ def test_after_a_change_of_lidar_only_scans_of_its_beams_are_taken(middleware):
     assert middleware.view(SECOND + PERIOD).ranges.tolist() == [1.0] * 7
 
 
-SENSORS = {
-    "odom": lambda m, stamp, value: m.odometry(
-        stamp, 0, np.zeros(3), np.full(3, value)
-    ),
-    "pose": lambda m, stamp, value: m.pose(stamp, 0, np.full(3, value)),
-    "imu": lambda m, stamp, value: m.imu(stamp, 0, value),
-}
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("topic", ["pose", "imu"])
-def test_poses_and_yaw_rates_that_are_no_numbers_never_enter(middleware, topic, value):
-    before = state(middleware)
-    assert not SENSORS[topic](middleware, SECOND + PERIOD, value)
-    assert middleware.cache.rejected == {(topic, "NaN or inf"): 1}
-    assert_same(before, state(middleware))
-
-
-NO_COVARIANCES = {
-    "NaN or inf": np.diag([1.0, np.nan, 1.0]),
-    "not symmetric": [[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
-    "not positive definite": np.diag([1.0, -1e-3, 1.0]),
-}
-
-
-@pytest.mark.parametrize("fault", NO_COVARIANCES)
-def test_a_pose_whose_covariance_is_none_never_enters(middleware, fault):
-    before = state(middleware)
-    assert not middleware.pose(SECOND + PERIOD, 0, np.zeros(3), NO_COVARIANCES[fault])
-    assert middleware.cache.rejected == {("pose", f"covariance: {fault}"): 1}
-    assert_same(before, state(middleware))
-
-
-@pytest.mark.parametrize("variance", [np.nan, -1.0])
-def test_a_yaw_rate_whose_variance_is_none_never_enters(middleware, variance):
-    assert not middleware.imu(SECOND + PERIOD, 0, 0.0, variance)
-    assert refused(middleware) == 1
-
-
 def test_a_covariance_of_zeros_means_that_of_the_model(middleware):
     other = Middleware(direct_model())
     other.reset(SECOND, [1.0, 2.0, 0.5])
@@ -295,71 +237,17 @@ def test_a_covariance_of_zeros_means_that_of_the_model(middleware):
     assert_same(state(middleware), state(other))
 
 
-@pytest.mark.parametrize("kind", ["scan", *SENSORS])
-@pytest.mark.parametrize("stamp", [float("nan"), float("inf"), None, "1"])
-def test_a_stamp_that_is_no_whole_number_is_refused(middleware, kind, stamp):
-    before = state(middleware)
-    if kind == "scan":
-        assert not middleware.scan(stamp, 0, RANGES)
-    else:
-        assert not SENSORS[kind](middleware, stamp, 0.0)
-    assert middleware.cache.rejected == {(kind, "stamp is not an integer"): 1}
-    assert_same(before, state(middleware))
-
-
-@pytest.mark.parametrize("kind", ["scan", *SENSORS])
-def test_data_from_the_future_never_enter(middleware, kind):
-    middleware.odometry(SECOND, 50 * SECOND, *STILL)
-    before = state(middleware)
-    late = 3 * SECOND + 1
-    due = 3 * SECOND
-    for stamp, used in ((late, False), (due, True)):
-        if kind == "scan":
-            given = middleware.scan(stamp, 51 * SECOND, RANGES)
-        elif kind == "odom":
-            given = middleware.odometry(stamp, 51 * SECOND, *STILL)
-        elif kind == "pose":
-            given = middleware.pose(stamp, 51 * SECOND, [1.0, 2.0, 0.5])
-        else:
-            given = middleware.imu(stamp, 51 * SECOND, 0.0)
-        assert given == used
-        assert middleware.cache.rejected == {(kind, "more than 1 s in the future"): 1}
-        if not used:
-            assert_same(before, state(middleware))
-
-
-def test_a_command_from_the_future_never_enters_but_ones_own_needs_no_check(middleware):
-    middleware.odometry(SECOND, 50 * SECOND, *STILL)
-    assert not middleware.command(9 * SECOND, [1.0, 0.0, 0.0], 50 * SECOND)
-    assert middleware.cache.rejected == {("cmd_vel", "more than 1 s in the future"): 1}
-    assert middleware.command(9 * SECOND, [1.0, 0.0, 0.0])
-
-
-def test_a_command_of_another_robot_is_refused(middleware):
-    assert not middleware.command(SECOND, [1.0, 0.0])
-    assert middleware.cache.rejected == {("cmd_vel", "shape (2,), not (3,)"): 1}
-
-
-@pytest.mark.parametrize("jump", [-500, 3600])
-def test_a_clock_that_was_set_is_followed_and_the_robot_stays_where_it_was(
-    middleware, jump
-):
-    for k in range(1, 31):
-        middleware.odometry(SECOND + k * PERIOD, k * PERIOD, *STILL)
-    middleware.scan(4 * SECOND, 3 * SECOND, RANGES)
-    for k in range(31, 41):
-        assert not middleware.odometry(
-            (1 + jump) * SECOND + k * PERIOD, k * PERIOD, *STILL
-        )
-    for k in range(41, 51):
-        assert middleware.odometry((1 + jump) * SECOND + k * PERIOD, k * PERIOD, *STILL)
-    assert middleware.scan((1 + jump) * SECOND + 50 * PERIOD, 50 * PERIOD, RANGES)
-    assert middleware.newest_ns == (1 + jump) * SECOND + 50 * PERIOD
-    health = middleware.health(50 * PERIOD)
-    assert health.noticed == {"clock: jump": 1}
-    assert sum(health.rejected.values()) == 10
-    view = middleware.view(middleware.newest_ns)
-    assert view.pose == pytest.approx([1.0, 2.0, 0.5])
+def test_a_cache_keeps_the_newest_of_each_topic():
+    cache = TopicCache()
+    assert cache.age_s("scan", 5) == np.inf
+    kept = [cache.put("scan", stamp, stamp + 1, stamp) for stamp in (5, 5, 3, SECOND)]
+    assert kept == [True, False, False, True]
+    assert cache.newest["scan"] == (SECOND, SECOND + 1, 1, SECOND)
+    assert cache.put("odom", 4, 0, None)
+    assert cache.newest["odom"].sequence == 0
+    assert cache.rejected == {("scan", "duplicate"): 1, ("scan", "out of order"): 1}
+    assert cache.age_s("scan", 5 * SECOND // 2) == pytest.approx(1.5)
+    assert not TopicCache().newest
 
 
 def test_data_of_a_sensor_whose_clock_is_off_do_not_move_that_of_the_robot(middleware):
@@ -368,54 +256,3 @@ def test_data_of_a_sensor_whose_clock_is_off_do_not_move_that_of_the_robot(middl
         assert not middleware.pose(k * PERIOD - 3 * SECOND, k * PERIOD, [9.0, 9.0, 0.0])
         assert not middleware.imu(SECOND * 1000, k * PERIOD, 0.0)
     assert "clock: jump" not in middleware.health(0).noticed
-
-
-def test_only_newer_data_replace_the_newest():
-    cache = TopicCache()
-    assert cache.put("scan", 100, 101, "a")
-    assert cache.put("scan", 200, 201, "b")
-    assert not cache.put("scan", 150, 202, "late")
-    assert not cache.put("scan", 200, 203, "copy")
-    held = cache.newest["scan"]
-    assert (held.value, held.stamp_ns, held.arrival_ns, held.sequence) == (
-        "b",
-        200,
-        201,
-        1,
-    )
-
-
-def test_refusals_are_counted_by_topic_and_reason():
-    cache = TopicCache()
-    for stamp in (5, 5, 5, 3, 9):
-        cache.put("scan", stamp, 0, None)
-    cache.put("odom", 4, 0, None)
-    cache.put("odom", 1, 0, None)
-    assert cache.rejected == {
-        ("scan", "duplicate"): 2,
-        ("scan", "out of order"): 1,
-        ("odom", "out of order"): 1,
-    }
-
-
-def test_topics_do_not_disturb_each_other():
-    cache = TopicCache()
-    cache.put("scan", 1000, 0, "s")
-    assert cache.put("odom", 10, 0, "o")
-    assert cache.newest["odom"].sequence == 0
-
-
-def test_age_counts_from_the_stamp_and_is_infinite_without_data():
-    cache = TopicCache()
-    assert cache.age_s("scan", 5) == float("inf")
-    cache.put("scan", 1_000_000_000, 1_900_000_000, None)
-    assert cache.age_s("scan", 2_500_000_000) == pytest.approx(1.5)
-
-
-def test_two_caches_share_nothing():
-    one = TopicCache()
-    other = TopicCache()
-    one.put("scan", 1, 1, None)
-    one.reject("scan", "reason")
-    assert not other.newest
-    assert not other.rejected

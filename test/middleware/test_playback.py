@@ -93,14 +93,6 @@ def test_an_estimate_of_the_command_line_is_that_of_the_library(bag):
     assert told["estimates"] == len(made.pose)
 
 
-def test_the_storage_makes_no_difference(tmp_path):
-    made = {
-        estimate(bags.write(tmp_path / kind, drive(), kind), MODEL, {}).digest
-        for kind in ("mcap", "sqlite3")
-    }
-    assert len(made) == 1
-
-
 def test_an_estimate_is_written_exactly(bag, tmp_path):
     made = estimate(bag, MODEL, {})
     write_estimate(made, tmp_path / "estimate.npz")
@@ -140,9 +132,3 @@ def test_a_bag_that_gives_no_estimate_is_refused(tmp_path, changed, topics, said
     bag = bags.write(tmp_path / "bag", drive(**changed))
     with pytest.raises(RecordingError, match=said):
         estimate(bag, MODEL, topics)
-
-
-def test_a_bag_without_odometry_lists_its_topics(tmp_path):
-    bag = bags.write(tmp_path / "bag", {"/pose": drive()["/pose"]})
-    with pytest.raises(RecordingError, match=r"has no odometry.*/pose"):
-        estimate(bag, MODEL, {})

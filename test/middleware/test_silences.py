@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from robots import direct_model
 
-from middleware.rig import PERIOD, SECOND, assert_same, state
+from middleware.rig import PERIOD, SECOND
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.middleware.belief import JITTER_S, find_max_speeds
 from nics_drl_bridge.middleware.ekf import LONGEST_GAP_S
@@ -27,7 +27,7 @@ def started():
     return middleware
 
 
-@pytest.mark.parametrize("jump_s", [-500.0, -30.0, 30.0, 3600.0])
+@pytest.mark.parametrize("jump_s", [-500.0, 30.0])
 def test_after_a_jump_it_begins_at_the_last_pose_and_may_be_anywhere_in_reach(jump_s):
     middleware = started()
     driven(middleware)
@@ -42,17 +42,8 @@ def test_after_a_jump_it_begins_at_the_last_pose_and_may_be_anywhere_in_reach(ju
     assert np.sqrt(belief.covariance[0, 0]) == pytest.approx(far / np.sqrt(3), rel=0.02)
     truth = np.array([1.0, 2.0]) + 3.0 * np.array([np.cos(0.5), np.sin(0.5)])
     assert np.hypot(*(truth - last)) < 3.0 * np.sqrt(belief.covariance[0, 0])
-
-
-@pytest.mark.parametrize("jump_s", [-500.0, 3600.0])
-def test_after_a_jump_the_estimate_goes_on_by_odometry(jump_s):
-    middleware = started()
-    driven(middleware)
-    shift_ns = round(jump_s * SECOND)
-    driven(middleware, 10, shift_ns, begin=20)
-    before = middleware.estimator.belief.mean[:2].copy()
     driven(middleware, 20, shift_ns, begin=30)
-    moved = np.hypot(*(middleware.estimator.belief.mean[:2] - before))
+    moved = np.hypot(*(middleware.estimator.belief.mean[:2] - last))
     assert moved == pytest.approx(2.0, abs=0.05)
     view = middleware.view(middleware.estimator.time_ns)
     assert view.twist[0] == pytest.approx(1.0, abs=0.05)
@@ -70,15 +61,6 @@ def test_data_that_come_late_or_after_a_gap_or_in_a_burst_are_no_jump():
         middleware.odometry(
             stamp, stamp + max(late, held), [0.1 * k, 0.0, 0.0], [1.0, 0.0, 0.0]
         )
-    assert "clock: jump" not in middleware.health(0).noticed
-
-
-def test_a_robot_whose_wheels_spin_while_it_stands_sets_no_clock():
-    middleware = started()
-    driven(middleware)
-    for k in range(21, 60):
-        stamp = SECOND + k * PERIOD + (3 * PERIOD if k >= 40 else 0)
-        middleware.odometry(stamp, stamp, [2.0, 0.0, 0.0], [1.0, 0.0, 0.0])
     assert "clock: jump" not in middleware.health(0).noticed
 
 
@@ -120,26 +102,3 @@ def test_what_no_robot_can_have_driven_in_a_silence_is_not(pose):
     belief = silent(15.0, pose=pose).estimator.belief
     assert np.abs(belief.mean[:3]).max() < 0.1
     assert np.sqrt(belief.covariance[0, 0]) > 3.0
-
-
-def test_the_end_of_a_silence_may_come_in_any_order():
-    end = 16 * SECOND
-    data = [
-        lambda m: m.odometry(end, end, [3.0, 1.0, 0.4], [0.5, 0.0, 0.0]),
-        lambda m: m.imu(end - PERIOD, end, 0.0),
-        lambda m: m.odometry(end + PERIOD, end, [3.05, 1.0, 0.4], [0.5, 0.0, 0.0]),
-        lambda m: m.imu(end - 2 * PERIOD, end, 0.0),
-    ]
-    found = []
-    for order in ([3, 1, 0, 2], [0, 1, 2, 3], [2, 0, 3, 1], [2, 3, 1, 0]):
-        middleware = Middleware(builtin_model("differential"))
-        middleware.reset(SECOND, np.zeros(3))
-        middleware.odometry(2 * SECOND, 2 * SECOND, np.zeros(3), np.zeros(3))
-        assert all(data[k](middleware) for k in order)
-        found.append(state(middleware))
-    for other in found[1:]:
-        assert_same(found[0], other)
-
-
-def test_the_maximum_speeds_are_those_of_the_fastest_command():
-    assert find_max_speeds(direct_model()) == pytest.approx((np.hypot(2.0, 2.0), 2.0))

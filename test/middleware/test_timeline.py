@@ -10,13 +10,12 @@ from robots import direct_model
 
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.middleware.ekf import Estimator
-from nics_drl_bridge.middleware.measurement import Acceptance, Kind, Measurement
+from nics_drl_bridge.middleware.measurement import Kind, Measurement
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.middleware.timeline import (
     BEFORE_START,
     CLOCK_JUMP,
     DUPLICATE,
-    FUTURE_NS,
     HISTORY_NS,
     TOO_OLD,
     Stamps,
@@ -25,7 +24,6 @@ from nics_drl_bridge.middleware.timeline import (
 
 SECOND = 1_000_000_000
 MILLISECOND = 1_000_000
-ROBOTS = ("ackermann", "differential", "mecanum")
 
 
 class Message(NamedTuple):
@@ -99,14 +97,10 @@ def numbers(middleware):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("robot", "seed"), [(robot, k) for k, robot in enumerate(ROBOTS)]
-)
-def test_data_that_arrive_out_of_order_give_the_estimate_of_the_right_order(
-    robot, seed
-):
+@pytest.mark.parametrize("robot", ["ackermann", "mecanum"])
+def test_data_that_arrive_out_of_order_give_the_estimate_of_the_right_order(robot):
     model = builtin_model(robot)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     drive = messages(model, rng)
     late = sorted(drive, key=lambda m: m.stamp_ns + m.underway_ns)
     assert late != drive
@@ -126,7 +120,7 @@ def test_data_that_arrive_out_of_order_give_the_estimate_of_the_right_order(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_any_order_of_one_seconds_data_gives_the_same_estimate(seed):
     model = builtin_model("ackermann")
     rng = np.random.default_rng(100 + seed)
@@ -134,54 +128,6 @@ def test_any_order_of_one_seconds_data_gives_the_same_estimate(seed):
     _, expected = numbers(fed(model, drive))
     shuffled = [drive[k] for k in rng.permutation(len(drive))]
     assert numbers(fed(model, shuffled))[1] == pytest.approx(expected, abs=1e-9)
-
-
-def test_of_equal_stamps_the_order_of_arrival_does_not_matter():
-    model = builtin_model("differential")
-    rng = np.random.default_rng(7)
-    at_once = [
-        Message("pose", SECOND, rng.normal(size=3) * 0.05, 0),
-        Message("imu", SECOND, np.array([0.2]), 0),
-        Message("odom", SECOND, np.array([0.1, 0.0, 0.1]), 0),
-    ]
-    results = [
-        numbers(fed(model, [at_once[k] for k in order]))[1]
-        for order in ([0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0])
-    ]
-    assert all(np.array_equal(results[0], other) for other in results)
-
-
-@pytest.mark.parametrize("latency", [0.0, 0.25])
-def test_a_late_command_counts_from_when_it_was_sent(latency):
-    model = direct_model(latency)
-    middleware = Middleware(model)
-    middleware.reset(0, np.zeros(3))
-    for tenth in range(1, 8):
-        middleware.odometry(tenth * SECOND // 10, 0, np.zeros(3), np.zeros(3))
-    assert middleware.estimator.look_ahead(SECOND)[0][0] == 0.0
-    assert middleware.command(SECOND // 10, [1.0, 0.0, 0.0])
-    assert middleware.estimator.look_ahead(SECOND)[0][0] == pytest.approx(
-        0.9 - latency, abs=1e-9
-    )
-
-
-def test_copies_change_nothing_even_late_ones():
-    model = builtin_model("mecanum")
-    rng = np.random.default_rng(2)
-    drive = messages(model, rng, seconds=2.0, latest_ns=1)
-    middleware = fed(model, drive)
-    before = numbers(middleware)
-    newest = drive[-1].stamp_ns
-    copies = [m for m in drive if m.stamp_ns >= newest - HISTORY_NS + 100 * MILLISECOND]
-    for copy in copies:
-        assert not feed(middleware, copy._replace(value=copy.value + 0.1)), copy
-    after = numbers(middleware)
-    assert after[0] == before[0]
-    assert np.array_equal(after[1], before[1])
-    rejected = middleware.health(0).rejected
-    for topic in ("odom", "imu", "pose", "cmd_vel"):
-        wanted = sum(m.topic == topic for m in copies)
-        assert rejected[topic, "duplicate"] == wanted > 5
 
 
 @pytest.fixture
@@ -193,57 +139,6 @@ def timeline():
 
 def twist(speed=0.0):
     return Measurement(Kind.TWIST, np.array([speed, 0.0, 0.0]))
-
-
-@pytest.mark.parametrize(
-    ("stamp", "reason"),
-    [
-        (4 * SECOND - 1, TOO_OLD),
-        (4 * SECOND, None),
-        (4 * SECOND + 1, None),
-        (5 * SECOND, DUPLICATE),
-        (SECOND, BEFORE_START),
-        (0, BEFORE_START),
-    ],
-)
-def test_what_is_later_than_a_second_is_refused_with_the_reason(
-    timeline, stamp, reason
-):
-    for k in range(1, 9):
-        assert timeline.measure(SECOND + k * SECOND // 2, twist()) is None
-    assert timeline.newest_ns == 5 * SECOND
-    assert timeline.measure(stamp, Measurement(Kind.TWIST, np.zeros(3))) in (
-        reason,
-        DUPLICATE,
-    )
-    if reason and reason is not DUPLICATE:
-        assert timeline.measure(stamp, twist()) == reason
-
-
-@pytest.mark.parametrize(
-    ("stamp", "reason"),
-    [
-        (SECOND - 1, BEFORE_START),
-        (2 * SECOND, TOO_OLD),
-        (5 * SECOND, None),
-        (9 * SECOND, None),
-    ],
-)
-def test_commands_that_are_too_late_are_refused_with_the_reason(
-    timeline, stamp, reason
-):
-    for k in range(1, 5):
-        timeline.measure(SECOND + k * SECOND, twist())
-    assert timeline.command(stamp, [0.5, 0.0]) == reason
-    if not reason:
-        assert timeline.command(stamp, [0.2, 0.0]) == DUPLICATE
-
-
-def test_the_past_is_as_long_as_a_second_and_no_longer(timeline):
-    for k in range(1, 1001):
-        timeline.measure(SECOND + k * 10 * MILLISECOND, twist())
-    assert len(timeline._entries) == 102
-    assert timeline.outcomes[Kind.TWIST, Acceptance.USED] == 1000
 
 
 def test_a_late_command_after_a_silence_finds_the_commands_before_it():
@@ -268,62 +163,55 @@ def test_a_late_command_after_a_silence_finds_the_commands_before_it():
     assert found[2] == pytest.approx(0.005, abs=1e-6)
 
 
-def heard(stamp=100 * SECOND, arrival=7 * SECOND, **options):
-    stamps = Stamps(**options)
-    assert stamps.find_fault(stamp, arrival) is None
-    stamps.accept(stamp, arrival)
-    return stamps
+@pytest.mark.parametrize(
+    ("kind", "stamp", "reason"),
+    [
+        ("twist", 0, BEFORE_START),
+        ("twist", SECOND, BEFORE_START),
+        ("twist", 4 * SECOND - 1, TOO_OLD),
+        ("twist", 4 * SECOND + 1, None),
+        ("twist", 5 * SECOND, DUPLICATE),
+        ("command", SECOND - 1, BEFORE_START),
+        ("command", 2 * SECOND, TOO_OLD),
+        ("command", 5 * SECOND, None),
+        ("command", 9 * SECOND, None),
+    ],
+)
+def test_what_is_too_late_is_refused_with_the_reason(timeline, kind, stamp, reason):
+    for k in range(1, 9):
+        assert timeline.measure(SECOND + k * SECOND // 2, twist()) is None
+    assert timeline.newest_ns == 5 * SECOND
+    if kind == "twist":
+        assert timeline.measure(stamp, twist()) == reason
+        return
+    assert timeline.command(stamp, [0.5, 0.0]) == reason
+    if not reason:
+        assert timeline.command(stamp, [0.2, 0.0]) == DUPLICATE
 
 
 @pytest.mark.parametrize("offset", [-(10**18), 0, 10**18])
-def test_the_first_stamp_shows_how_the_clocks_lie(offset):
-    stamps = heard(100 * SECOND + offset)
-    assert stamps.find_fault(101 * SECOND + offset, 8 * SECOND) is None
-    assert (
-        "in the future" in stamps.find_fault(109 * SECOND + offset, 8 * SECOND).reason
-    )
-
-
-@pytest.mark.parametrize("elapsed", [0, 1, SECOND, 60 * SECOND])
-def test_a_stamp_may_be_ahead_of_what_is_due_by_the_tolerance(elapsed):
-    stamps = heard()
-    due = 100 * SECOND + elapsed + FUTURE_NS
-    assert stamps.find_fault(due, 7 * SECOND + elapsed) is None
-    assert (
-        stamps.find_fault(due + 1, 7 * SECOND + elapsed).reason
-        == "more than 1 s in the future"
-    )
-
-
-def test_a_receivers_clock_that_is_set_back_makes_nothing_come_from_the_future():
-    assert heard().find_fault(100 * SECOND + FUTURE_NS, 0) is None
-
-
-def test_a_simulation_with_long_periods_may_outrun_the_receivers_clock():
-    stamps = heard(period_ns=3 * SECOND)
-    assert stamps.find_fault(103 * SECOND, 7 * SECOND) is None
-    assert (
-        stamps.find_fault(107 * SECOND, 7 * SECOND).reason
-        == "more than 6 s in the future"
-    )
-
-
-def test_old_stamps_do_not_change_what_is_due():
-    stamps = heard()
-    stamps.accept(50 * SECOND, 9 * SECOND)
-    assert stamps.find_fault(102 * SECOND, 7 * SECOND) is not None
+@pytest.mark.parametrize(
+    ("period_s", "passed_s", "ahead_s"), [(0, 0, 1), (0, 60, 61), (3, 1, 7), (0, -7, 1)]
+)
+def test_a_stamp_may_be_ahead_of_what_is_due_by_a_second_or_two_periods(
+    offset, period_s, passed_s, ahead_s
+):
+    """The first one shows how the clocks lie; one may be set back."""
+    stamps = Stamps(period_ns=period_s * SECOND)
+    first = 100 * SECOND + offset
+    assert stamps.find_fault(first, 7 * SECOND) is None
+    stamps.accept(first, 7 * SECOND)
+    stamps.accept(first - 50 * SECOND, 9 * SECOND)  # an old one changes nothing
+    now = (7 + passed_s) * SECOND
+    assert stamps.find_fault(first + ahead_s * SECOND, now) is None
+    fault = stamps.find_fault(first + ahead_s * SECOND + 1, now)
+    assert fault.may_be_clock
+    assert fault.reason == f"more than {max(1, 2 * period_s)} s in the future"
 
 
 def test_a_row_of_refusals_means_that_the_clock_was_set():
-    stamps = heard()
-    assert [stamps.refuse() for _ in range(CLOCK_JUMP)] == [False] * (
-        CLOCK_JUMP - 1
-    ) + [True]
-
-
-def test_one_datum_that_is_used_ends_the_row():
-    stamps = heard()
-    for _ in range(CLOCK_JUMP - 1):
-        assert not stamps.refuse()
-    stamps.accept(101 * SECOND, 8 * SECOND)
-    assert not stamps.refuse()
+    stamps = Stamps()
+    row = [False] * (CLOCK_JUMP - 1)
+    assert [stamps.refuse() for _ in row] == row
+    stamps.accept(101 * SECOND, 8 * SECOND)  # ends the row
+    assert [stamps.refuse() for _ in [*row, True]] == [*row, True]
