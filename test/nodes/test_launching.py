@@ -1,7 +1,5 @@
 """Launch descriptions start what `nics up` starts; `make test-upstream` has `launch`."""
 
-from __future__ import annotations
-
 import pytest
 
 pytest.importorskip("launch_ros", reason="needs launch: make test-upstream")
