@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import pytest
 
 from nics_drl_bridge.interface import NS_PER_S

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import pytest
 
 from nics_drl_bridge.nodes.e_stop_queue import (

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import math
 import tarfile
 from types import SimpleNamespace
@@ -27,9 +25,9 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import conversions, policy_node, qos
 from nics_drl_bridge.nodes.follow_path import FOLLOW, NAVIGATE, PathActions
-from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.nodes.policy_node import PolicyNode
 from nics_drl_bridge.nodes.runner import unknown
+from nodes.peer import pose_of
 
 pytestmark = pytest.mark.ros
 SUCCEEDED = 4
@@ -37,6 +35,7 @@ CANCELED = 5
 ABORTED = 6
 ARCHIVE = ROOT.parent / "shared" / "upstream" / "nav2_interfaces.tar.gz"
 CODES = FollowPath.Result
+CONTROLLER = ("-r", "__node:=controller_server")
 
 
 class Tree:
@@ -64,7 +63,7 @@ class Tree:
 
     @property
     def pose(self):
-        return conversions.odometry_from_ros(self.truths[-1])[0]
+        return pose_of(self.truths[-1])
 
     def until(self, done, what):
         """Waits; a command of zero makes up for a message that was lost."""
@@ -313,23 +312,20 @@ def test_a_node_that_ends_while_others_are_asked_is_none_that_leads():
     not ARCHIVE.is_file(), reason="the sources of Nav2 do not lie there"
 )
 def test_nav2s_own_parameter_file_is_taken_under_the_name_of_its_controller_server(
-    domain_id, tmp_path
+    make_node, tmp_path
 ):
     name = "navigation2/nav2_bringup/params/nav2_params.yaml"
     with tarfile.open(ARCHIVE) as archive:
         archive.extract(name, tmp_path, filter="data")
-    words = ["--params-file", str(tmp_path / name), "-r", "__node:=controller_server"]
-    context = open_context(["node", "--ros-args", *words], domain_id)
-    node = PolicyNode(context)
+    words = ("--params-file", str(tmp_path / name), *CONTROLLER)
+    node = make_node(words=words, kind=PolicyNode)
     assert unknown(node) == []
     goal, progress = node._nav2.checks("general_goal_checker", "progress_checker")
     assert goal.xy_goal_tolerance == 0.25
     assert progress.movement_time_allowance == 10.0
-    node.destroy_node()
-    context.try_shutdown()
 
 
-def test_the_progress_checker_of_humble_is_taken_by_its_own_name(domain_id, tmp_path):
+def test_the_progress_checker_of_humble_is_taken_by_its_own_name(make_node, tmp_path):
     file = tmp_path / "humble.yaml"
     file.write_text(
         "controller_server:\n  ros__parameters:\n    progress_checker_plugin: progress\n"
@@ -338,20 +334,15 @@ def test_the_progress_checker_of_humble_is_taken_by_its_own_name(domain_id, tmp_
         "      movement_time_allowance: 7.0\n",
         encoding="utf-8",
     )
-    words = ["--params-file", str(file), "-r", "__node:=controller_server"]
-    context = open_context(["node", "--ros-args", *words], domain_id)
-    node = PolicyNode(context)
+    words = ("--params-file", str(file), *CONTROLLER)
+    node = make_node(words=words, kind=PolicyNode)
     assert unknown(node) == []
     assert node._nav2.names["progress_checker"] == ("progress",)
-    assert (
-        node._nav2.checks("general_goal_checker", "progress")[1].movement_time_allowance
-        == 7.0
-    )
-    node.destroy_node()
-    context.try_shutdown()
+    _, progress = node._nav2.checks("general_goal_checker", "progress")
+    assert progress.movement_time_allowance == 7.0
 
 
-def test_checkers_go_by_their_plugins_and_unknown_headings_do_not_count(domain_id):
+def test_checkers_go_by_their_plugins_and_unknown_headings_do_not_count(make_node):
     words = [
         "goal_checker_plugins:=[exact,near]",
         "near.plugin:=nav2_controller::PositionGoalChecker",
@@ -361,33 +352,22 @@ def test_checkers_go_by_their_plugins_and_unknown_headings_do_not_count(domain_i
         "turning.required_movement_angle:=0.1",
         "action_server_result_timeout:=10.0",
     ]
-    given = [part for word in words for part in ("-p", word)]
-    context = open_context(["node", "--ros-args", *given], domain_id)
-    node = PolicyNode(context)
+    node = make_node(*words, kind=PolicyNode)
     assert unknown(node) == []
     found = [
         node._nav2.checks(*names) for names in (("exact", "slow"), ("near", "turning"))
     ]
     assert [goal.yaw_goal_tolerance for goal, _ in found] == [0.25, math.inf]
-    assert [progress.required_movement_angle for _, progress in found] == [
-        math.inf,
-        0.1,
-    ]
-    node.destroy_node()
-    context.try_shutdown()
+    angles = [progress.required_movement_angle for _, progress in found]
+    assert angles == [math.inf, 0.1]
 
 
 @pytest.mark.parametrize(
     "kind", ["controller", "goal_checker", "progress_checker", "path_handler"]
 )
-def test_an_empty_list_of_plugins_is_one_sentence(domain_id, kind):
-    words = ["-p", f"{kind}_plugins:=[]"]
-    context = open_context(["node", "--ros-args", *words], domain_id)
-    with pytest.raises(
-        ConfigError, match=f"parameter '{kind}_plugins' is empty; give one name"
-    ):
-        PolicyNode(context)
-    context.try_shutdown()
+def test_an_empty_list_of_plugins_is_one_sentence(make_node, kind):
+    with pytest.raises(ConfigError, match=f"parameter '{kind}_plugins' is empty"):
+        make_node(f"{kind}_plugins:=[]", kind=PolicyNode)
 
 
 def test_a_policy_begins_anew_with_another_goal_and_not_with_another_way_to_it(

@@ -1,7 +1,5 @@
 """Launch descriptions start what `nics up` starts; `nox -s upstream` has `launch`."""
 
-from __future__ import annotations
-
 import pytest
 
 pytest.importorskip("launch_ros", reason="needs launch: nox -s upstream")

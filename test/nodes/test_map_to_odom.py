@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -16,7 +14,7 @@ from nics_drl_bridge.nodes.map_to_odom import (
     transform_from_ros,
     transform_to_ros,
 )
-from nodes.peer import stamp_ns
+from nodes.peer import odometry, pose_of, stamp_ns
 
 pytestmark = pytest.mark.ros
 TFS = conversions.message_type("tf2_msgs/msg/TFMessage")
@@ -43,15 +41,9 @@ def placed(launch, meet, domain_id):
     def drive(x):
         """An odometry at x [m], every tenth of a second at 0.2 m/s, and the estimate after it."""
         stamp = next(numbers) * 100_000_000
-        pose = [x, 0.0, 0.0]
-        twist = [0.2, 0.0, 0.0]
-        odom.publish(
-            conversions.odometry_to_ros(
-                pose, twist, stamp, ("odom", "base_link"), (1e-4,) * 4
-            )
-        )
+        odom.publish(odometry(stamp, [x, 0.0, 0.0], [0.2, 0.0, 0.0]))
         if peer.within(5.0, lambda: filtered and stamp_ns(filtered[-1]) >= stamp):
-            return conversions.odometry_from_ros(filtered[-1])[0]
+            return pose_of(filtered[-1])
         return None
 
     peer.until(lambda: drive(0.0) is not None, "the first estimate")

@@ -1,7 +1,5 @@
 """Clients without ROS 2 read what a node publishes, and drive it."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

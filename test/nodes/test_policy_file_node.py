@@ -1,7 +1,5 @@
 """policy_node with a policy file, where nothing of training can be imported, and other lidars."""
 
-from __future__ import annotations
-
 import array
 import os
 import time
@@ -12,7 +10,6 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 pytest.importorskip("torch", reason="needs the extra 'train'")
 
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, TwistStamped
 from lifecycle_msgs.srv import ChangeState
 from nav_msgs.msg import Odometry
@@ -27,7 +24,7 @@ from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.policy.policies import open_policy
 from nics_drl_bridge.policy.policy_file import load_policy
 from nics_drl_bridge.policy.train_export import export_policy
-from nodes.peer import stamp_ns
+from nodes.peer import odometry, stamp_ns
 
 pytestmark = pytest.mark.ros
 
@@ -67,7 +64,6 @@ class Robot:
     def __init__(self, peer):
         self.peer = peer
         self.raw = peer.listen(TwistStamped, "cmd_vel_raw", qos.EVERY_COMMAND)
-        self.told = peer.listen(DiagnosticArray, "/diagnostics")
         self.scans = peer.speak(LaserScan, "scan")
         self.odometry = peer.speak(Odometry, "odom")
 
@@ -75,11 +71,7 @@ class Robot:
         """Publishes a scan and an odometry of now or a stamp; returns it [ns]."""
         now = stamp or time.time_ns()
         scan.header.stamp = conversions.stamp_to_ros(now)
-        self.odometry.publish(
-            conversions.odometry_to_ros(
-                np.zeros(3), np.zeros(3), now, ("odom", "base_link"), (1e-3,) * 4
-            )
-        )
+        self.odometry.publish(odometry(now))
         self.scans.publish(scan)
         return now
 
@@ -143,8 +135,8 @@ def test_it_commands_what_the_file_does_in_process(driving, file, model):
 
 @pytest.mark.parametrize(
     ("angles", "backwards"),
-    [(around(360), False), (around(1440), True), (around(720) + np.pi, False)],
-    ids=["coarser", "finer-clockwise", "from-zero"],
+    [(around(1440), True), (around(720) + np.pi, False)],
+    ids=["finer-clockwise", "from-zero"],
 )
 def test_scans_of_another_lidar_give_the_same_command(
     driving, file, model, angles, backwards
@@ -152,23 +144,6 @@ def test_scans_of_another_lidar_give_the_same_command(
     robot, _ = driving
     command = robot.hears(scan_of(angles, backwards))
     assert command == pytest.approx(wanted(file, model), abs=0.02)
-
-
-def test_it_acts_no_faster_than_its_control_period(driving, model):
-    robot, _ = driving
-    robot.hears(scan_of(model.lidar.angles))
-    known = len(robot.raw)
-    began = time.monotonic()
-    robot.hears(scan_of(model.lidar.angles), count=10)
-    periods = (time.monotonic() - began) / model.control_period
-    assert len(robot.raw) - known <= periods + 3
-
-
-def facts(robot):
-    """What the policy's diagnostics said last."""
-    mine = "policy_node: policy"
-    found = [s for m in robot.told for s in m.status if s.name.endswith(mine)]
-    return {value.key: value.value for value in found[-1].values} if found else {}
 
 
 def test_a_foreign_policy_commands_what_it_does_in_process(
@@ -183,12 +158,6 @@ def test_a_foreign_policy_commands_what_it_does_in_process(
     assert np.abs(expected[[0, 2]]).min() > 0.01
     assert command == pytest.approx(expected, abs=1e-4)
     node.check()
-
-
-def test_its_diagnostics_count_inferences(driving):
-    robot, _ = driving
-    robot.peer.until(lambda: int(facts(robot).get("answered", 0)) > 0, "diagnostics")
-    assert facts(robot)["late"] == "0"
 
 
 def test_scans_that_cannot_fill_its_sectors_are_refused_in_one_sentence_once(
@@ -210,23 +179,6 @@ def test_scans_that_cannot_fill_its_sectors_are_refused_in_one_sentence_once(
     assert log.count("scan is not used") == 1
     assert "looks from -57.3 to 57.3 deg" in log
     assert len(robot.raw) > known
-
-
-@pytest.mark.parametrize(
-    ("parameters", "words"),
-    [
-        ({"policy": "none.onnx"}, "none.onnx: field 'file'"),
-        ({"policy": "dynamic_widow"}, "did you mean 'dynamic_window'"),
-        ({"rate": -1.0}, "rate -1.0"),
-    ],
-)
-def test_what_cannot_be_driven_ends_it_with_one_sentence(
-    launch, meet, domain_id, parameters, words
-):
-    node = launch("policy_node", domain_id, **parameters)
-    assert node._process.wait(60) == 2
-    assert words in node.log.read_text(encoding="utf-8")
-    assert "Traceback" not in node.log.read_text(encoding="utf-8")
 
 
 def test_inferences_that_are_late_every_time_command_zero(

@@ -1,7 +1,4 @@
-from __future__ import annotations
-
 import itertools
-import signal
 import threading
 import time
 from types import SimpleNamespace
@@ -25,6 +22,7 @@ from nics_drl_bridge.nodes import conversions, qos, realtime_backend
 from nics_drl_bridge.nodes.link import EpisodeServices
 from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
 from nics_drl_bridge.sim.world import load_world
+from nodes.peer import odometry
 
 pytestmark = pytest.mark.ros
 
@@ -68,19 +66,10 @@ def vehicle(meet, domain_id, model):
     def stand(pose, twist=(0.0, 0.0, 0.0), stamp=None, scans=True):
         stamp = next(stamps) if stamp is None else stamp
         ranges = np.full(model.lidar.beams, 2.0, np.float32)
-        frames = ("odom", "base_link")
-        variance = (1e-4,) * 4
-        odom.publish(conversions.odometry_to_ros(pose, twist, stamp, frames, variance))
+        odom.publish(odometry(stamp, pose, twist))
         if scans:
             scan.publish(conversions.scan_to_ros(model.lidar, ranges, stamp, "laser"))
-        measured = PoseStamped()
-        measured.header.stamp = conversions.stamp_to_ros(stamp)
-        measured.pose.position.x, measured.pose.position.y = (
-            float(pose[0]),
-            float(pose[1]),
-        )
-        measured.pose.orientation = conversions.heading_to_ros(pose[2])
-        sensor.publish(measured)
+        sensor.publish(conversions.pose_to_ros(pose, stamp, "map"))
 
     return SimpleNamespace(peer=peer, domain_id=domain_id, stand=stand)
 
@@ -127,24 +116,6 @@ def test_silence_of_a_topic_is_named_with_its_age_and_a_reset_goes_on(
     peer.call(SetBool, "simulator_node/pause", SetBool.Request(data=False))
     assert caught.value.topic in ("scan", "odom")
     assert caught.value.age_s > 2.0
-    assert backend.reset(START).pose == pytest.approx(START.pose, abs=0.2)
-    backend.step(FORWARD)
-
-
-@pytest.mark.process
-@pytest.mark.campaign
-def test_a_simulator_that_hangs_is_silent_until_it_wakes(
-    connect, launch_process, domain_id
-):
-    simulator = launch_process("simulator_node", domain_id, mode="realtime")
-    backend = connect(stale_after_s=2.0, domain_id=domain_id)
-    backend.reset(START)
-    simulator._process.send_signal(signal.SIGSTOP)
-    try:
-        with pytest.raises(StaleDataError, match=r"no fresh data within 2.000 s"):
-            drive_on(backend)
-    finally:
-        simulator._process.send_signal(signal.SIGCONT)
     assert backend.reset(START).pose == pytest.approx(START.pose, abs=0.2)
     backend.step(FORWARD)
 
@@ -352,17 +323,23 @@ def test_the_topic_that_is_missing_is_named_not_one_that_is_silent_longer():
     assert caught.value.topic == "scan"
 
 
-def test_a_map_is_laid_only_around_the_present_pose_without_a_pose_sensor(connect):
-    with pytest.raises(ConfigError, match="lays_map needs start='present'"):
-        connect(lays_map=True)
-    with pytest.raises(ConfigError, match="lays_map is for a robot without a pose"):
-        connect(lays_map=True, start="present", pose_type="PoseStamped")
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"lays_map": True}, "lays_map needs start='present'"),
+        (
+            {"lays_map": True, "start": "present", "pose_type": "PoseStamped"},
+            "lays_map is for a robot without a pose",
+        ),
+        ({"stale_after": 1.0}, r"backend_options.*stale_after_s"),
+        ({"pose_type": "Pose", "timeout_s": 0.1}, "pose_type"),
+    ],
+)
+def test_a_wrong_option_is_one_sentence(connect, options, reason):
+    with pytest.raises(ConfigError, match=reason):
+        connect(**options)
 
 
-def test_a_wrong_option_is_one_sentence(connect, model, domain_id):
-    with pytest.raises(ConfigError, match=r"backend_options.*stale_after_s"):
-        connect(stale_after=1.0)
-    with pytest.raises(ConfigError, match="pose_type"):
-        connect(pose_type="Pose", timeout_s=0.1)
+def test_without_a_robot_the_missing_topic_is_named(connect, domain_id):
     with pytest.raises(BackendError, match=r"no publisher of /odom.*mode:=realtime"):
         connect(domain_id=domain_id, timeout_s=0.3)

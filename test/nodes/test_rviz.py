@@ -1,7 +1,5 @@
 """The picture of a robot in RViz, without RViz."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

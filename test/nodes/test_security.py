@@ -1,7 +1,5 @@
 """The policies of sros2 allow what the nodes do, and nothing besides."""
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Further sensors over ROS 2: published, transformed, awaited, observed and guarded."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import socket
 
 from nics_drl_bridge.nodes.transport import domains_in_use, multicast_port, ports_of

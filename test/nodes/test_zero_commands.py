@@ -1,7 +1,5 @@
 """Whatever ends a process that drives a robot, a zero command is the last that is heard of it."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -17,6 +15,7 @@ from nav_msgs.msg import Odometry
 from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge.nodes import conversions, qos
+from nodes.peer import odometry
 
 pytestmark = [pytest.mark.ros, pytest.mark.process]
 
@@ -68,18 +67,12 @@ def robot(meet, domain_id, model):
     peer = meet(domain_id)
     odom = peer.node.create_publisher(Odometry, "odom", qos.SENSOR_RELIABLE)
     scan = peer.node.create_publisher(LaserScan, "scan", qos.SENSOR_RELIABLE)
-    ranges, stamps = (
-        np.full(model.lidar.beams, 2.0, np.float32),
-        iter(range(10**9, 10**12, 10**8)),
-    )
+    ranges = np.full(model.lidar.beams, 2.0, np.float32)
+    stamps = iter(range(10**9, 10**12, 10**8))
 
     def tell():
         stamp = next(stamps)
-        frames = ("odom", "base_link")
-        variance = (1e-4,) * 4
-        pose = np.array([5.0, 5.0, 0.0])
-        twist = np.zeros(3)
-        odom.publish(conversions.odometry_to_ros(pose, twist, stamp, frames, variance))
+        odom.publish(odometry(stamp, [5.0, 5.0, 0.0]))
         scan.publish(conversions.scan_to_ros(model.lidar, ranges, stamp, "laser"))
         return False
 
@@ -125,9 +118,7 @@ def said(process, text, told=""):
         ("step", "stepped", [signal.SIGINT] * 5, -signal.SIGINT),
         ("step", "stepped", [signal.SIGTERM], 128 + signal.SIGTERM),
         many("step", "stepped", [signal.SIGHUP], 128 + signal.SIGHUP),
-        ("exit", "stepped", [], 0),
-        many("step", "stepped", [signal.SIGINT], -signal.SIGINT),
-        many("reset", "off its start", [signal.SIGINT], -signal.SIGINT),
+        many("exit", "stepped", [], 0),
         many("reset", "off its start", [signal.SIGINT] * 5, -signal.SIGINT),
         many("error_in_step", "stepped", [], 1),
         many("error_in_reset", "off its start", [], 1),
@@ -188,7 +179,6 @@ except KeyboardInterrupt:
 @pytest.mark.parametrize(
     ("what", "signals", "code"),
     [
-        ("interrupted", [signal.SIGINT], -signal.SIGINT),
         ("lives_on", [signal.SIGINT], None),
         many("interrupted", [signal.SIGINT] * 3, -signal.SIGINT),
         many("terminated", [signal.SIGTERM], 128 + signal.SIGTERM),
@@ -267,13 +257,7 @@ def test_a_policy_that_raises_leaves_a_zero_command_behind(robot, domain_id, err
             assert process.returncode == 2
             assert "Traceback" not in said
             name = error.partition("(")[0]
-            told = [
-                line
-                for line in said.splitlines()
-                if f"'dynamic_window' raised {name}" in line
-            ]
-            assert len(told) == 1
-            assert "the robot is stopped" in told[0]
+            assert said.count(f"'dynamic_window' raised {name}") == 1
     finally:
         process.kill()
         process.wait()

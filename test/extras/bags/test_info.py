@@ -1,6 +1,3 @@
-from __future__ import annotations
-
-import re
 import shutil
 
 import numpy as np
@@ -19,11 +16,6 @@ from nics_drl_bridge.robot.spec import load_robot
 CAR = load_robot("ackermann")
 
 
-def storage_file(bag):
-    (file,) = (p for p in bag.iterdir() if p.name != "metadata.yaml")
-    return file
-
-
 @pytest.fixture(scope="module")
 def pristine(tmp_path_factory):
     bag = tmp_path_factory.mktemp("pristine") / "sealed"
@@ -31,24 +23,19 @@ def pristine(tmp_path_factory):
     return bag
 
 
-@pytest.fixture
-def sealed(pristine, tmp_path):
-    """A bag with checksums."""
-    return shutil.copytree(pristine, tmp_path / "sealed")
-
-
 MANY = (pytest.param(seed, marks=pytest.mark.campaign) for seed in range(5, 60))
 
 
 @pytest.mark.parametrize("seed", [*range(5), *MANY])
-def test_any_flipped_bit_of_a_sealed_file_is_found(sealed, seed):
-    file = storage_file(sealed)
+def test_any_flipped_bit_of_a_bag_with_checksums_is_found(pristine, tmp_path, seed):
+    bag = shutil.copytree(pristine, tmp_path / "sealed")
+    (file,) = bag.glob("*.mcap")
     data = bytearray(file.read_bytes())
     rng = np.random.default_rng(seed)
     data[rng.integers(len(data))] ^= 1 << int(rng.integers(8))
     file.write_bytes(data)
     with pytest.raises(RecordingError):
-        read_bag_info(sealed)
+        read_bag_info(bag)
 
 
 def test_info_tells_rates_gaps_and_clocks(tmp_path):
@@ -74,13 +61,3 @@ def test_stamps_of_several_clocks_are_told(tmp_path):
     bag = bags.write(tmp_path / "bag", {"/pose": poses})
     (pose,) = read_bag_info(bag).topics
     assert pose.clock == "several"
-
-
-def test_sentences_of_damage_name_the_place(sealed):
-    file = storage_file(sealed)
-    data = bytearray(file.read_bytes())
-    data[100] ^= 1
-    file.write_bytes(data)
-    with pytest.raises(RecordingError) as caught:
-        read_bag_info(sealed)
-    assert re.search(r"sealed\.mcap is damaged at byte \d+", str(caught.value))

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from shapely.geometry import Polygon
@@ -19,23 +17,9 @@ ANGLES = np.linspace(0.0, 2.0 * np.pi, 10, endpoint=False)
 STAR = [
     (r * np.cos(a), r * np.sin(a)) for a, r in zip(ANGLES, [1.0, 0.3] * 5, strict=True)
 ]
-COMB = [
-    [0, 0],
-    [5, 0],
-    [5, 3],
-    [4, 3],
-    [4, 1],
-    [3, 1],
-    [3, 3],
-    [2, 3],
-    [2, 1],
-    [1, 1],
-    [1, 3],
-    [0, 3],
-]
 
 
-@pytest.mark.parametrize("corners", [L_SHAPE, STAR, COMB])
+@pytest.mark.parametrize("corners", [L_SHAPE, STAR])
 def test_convex_parts_fill_a_concave_outline_without_overlap(corners):
     outline = np.array(corners, dtype=np.float64)
     parts = [Polygon(part) for part in split_convex(outline)]

@@ -1,7 +1,5 @@
 """An older version of the standard's messages stops nobody."""
 
-from __future__ import annotations
-
 import sys
 from types import ModuleType, SimpleNamespace
 
