@@ -170,6 +170,22 @@ CAMPAIGNS: dict[str, Campaign] = {
         ROS,
         attempts=REAL_TIME,
     ),
+    "gate_held": Campaign(
+        "--hours 0.1 --holds 20 --case 0",
+        {
+            "rule_off": Control(
+                "the rule: `stop_when_held` is false",
+                "of the held bodies were stopped in time",
+                "--hours 0.01 --holds 4 --case 7",
+            ),
+            "zero_thresholds": Control(
+                "the rule's thresholds: any scan contradicts odometry",
+                "robots that drove freely were stopped by body_held",
+                "--hours 0.01 --holds 4 --case 7",
+            ),
+        },
+        quick=True,
+    ),
     "gate_load": Campaign(
         "--seconds 4 --burst 4",
         {
@@ -371,6 +387,20 @@ CAMPAIGNS: dict[str, Campaign] = {
         },
         ("leapp", "rclpy", "torch"),
         "standards",
+    ),
+    "unknown_robot": Campaign(
+        "--goals 10",
+        {
+            "no_gyro": Control(
+                "the gyro, so that the estimator believes slipping wheels", "success"
+            ),
+            "no_gate_rule": Control(
+                "the rule that compares scans with odometry, so that a held body goes on",
+                "a held body",
+            ),
+        },
+        ("rclpy", "dartpy"),
+        timeout_s=3500.0,
     ),
 }
 

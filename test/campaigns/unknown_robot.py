@@ -1,6 +1,6 @@
 """A robot that nobody here modelled, driven by the documented commands.
 
-The robot is a skid-steer in DART (`measuring/dart_skid_steer.py`): a real process behind ROS 2
+The robot is a skid-steer in DART (`parts/dart_skid_steer.py`): a real process behind ROS 2
 topics, with wheel odometry that believes in turns that slip, and a gyro. It is recorded in an open
 place, a simulator is generated, a policy is trained, and then gate, estimator and policy drive it
 to goals among pillars. Each goal is given relative to the robot, and judged by the true pose, which
@@ -28,8 +28,8 @@ from typing import Any
 import numpy as np
 import rclpy
 import yaml
+from campaign import answer, parser_of
 from geometry_msgs.msg import PoseStamped, TwistStamped
-from measuring.verdict import answer, parser_of
 from numpy.typing import NDArray
 from rclpy.node import Node
 from std_msgs.msg import Bool
@@ -40,10 +40,6 @@ from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 
 Array = NDArray[np.float64]
 
-CONTROLS = {
-    "no_gyro": "the robot has no gyro, so that its estimator believes the slipping wheels",
-    "no_gate_rule": "the gate does not compare scans with odometry, so that a held body goes on",
-}
 SUCCESS_BAR = 0.95
 HELD_BAR_S = 1.0
 # The task ends at this distance from the goal by the estimate; the rest is for its drift [m].
@@ -125,7 +121,7 @@ LIMITS = {
 
 def arguments() -> argparse.Namespace:
     """Returns the options of the command line."""
-    parser = parser_of(__doc__, CONTROLS)
+    parser = parser_of(__doc__)
     parser.add_argument("--goals", type=int, default=40)
     parser.add_argument(
         "--seed", type=int, default=0, help="of goals, noise and the training"
@@ -182,7 +178,7 @@ class Workshop:
     @contextmanager
     def driver(self, place: str) -> Iterator[None]:
         """The robot's own driver in a place, until the end of the block."""
-        command = [sys.executable, "-m", "measuring.dart_skid_steer"]
+        command = [sys.executable, "-m", "parts.dart_skid_steer"]
         command += ["--place", str(self.folder / place), "--seed", str(self._seed)]
         if not self._with_imu:
             command.append("--no-imu")
@@ -575,7 +571,7 @@ def main() -> None:
     options = arguments()
     with tempfile.TemporaryDirectory() as temporary:
         result = measure(options, (options.folder or Path(temporary)).resolve())
-    answer(result, missed_of(result), table_of(result), options.json)
+    answer(result, missed_of(result), options.json, table_of(result))
 
 
 if __name__ == "__main__":

@@ -8,19 +8,18 @@ import sys
 import numpy as np
 import pytest
 
-from .runs import BENCHMARKS, asked, fails
+from .registry import FOLDER
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 pytest.importorskip("dartpy", reason="needs DART: dartpy is not installed")
 
-SCRIPT = "unknown_robot.py"
 ARENA = {"size": [8.0, 8.0], "pillars": [[2.0, 0.0, 0.3], [-1.0, 2.5, 0.2]]}
 
 
 @pytest.fixture
 def dart(monkeypatch):
-    monkeypatch.setattr(sys, "path", [str(BENCHMARKS), *sys.path])
-    from measuring import dart_skid_steer
+    monkeypatch.setattr(sys, "path", [str(FOLDER), *sys.path])
+    from parts import dart_skid_steer
 
     return dart_skid_steer
 
@@ -80,21 +79,3 @@ def test_its_lidar_sees_walls_and_pillars_where_they_are(dart, place):
     np.testing.assert_allclose(
         ranges, [4.0, far, 4.0, far, 1.7, far, 4.0, far], atol=1e-9
     )
-
-
-@pytest.mark.ros
-@pytest.mark.campaign
-@pytest.mark.timeout(3600)
-def test_it_is_driven_to_its_goals_by_the_documented_commands():
-    code, result = asked(SCRIPT, "--goals", "10", timeout_s=3500.0)
-    assert (code, result["failures"]) == (0, [])
-
-
-@pytest.mark.ros
-@pytest.mark.campaign
-@pytest.mark.timeout(3600)
-@pytest.mark.parametrize("control", ["no_gyro", "no_gate_rule"])
-def test_without_gyro_or_without_the_rule_for_held_bodies_a_bar_is_missed(control):
-    missed = fails(SCRIPT, control, "--goals", "10", timeout_s=3500.0)
-    wanted = {"no_gyro": "success", "no_gate_rule": "a held body"}[control]
-    assert any(line.startswith(wanted) for line in missed)

@@ -13,16 +13,12 @@ import sys
 import warnings
 
 import numpy as np
-from measuring.held_body import RULE, Case, Tally, drive_freely, hold_bodies
-from measuring.verdict import answer, parser_of
+from campaign import answer, parser_of
+from parts.held_body import RULE, Case, Tally, drive_freely, hold_bodies
 
 from nics_drl_bridge.gate import scan_motion
 from nics_drl_bridge.gate.state import GateConfig, replace
 
-CONTROLS = {
-    "rule_off": "the rule: `stop_when_held` is false",
-    "zero_thresholds": "the rule's thresholds: any scan contradicts odometry",
-}
 CASES = (
     Case("jackal", "crowd", turn_scale=1.3),
     Case("jackal", "room", driver="random", rate=20.0, turn_scale=1.3),
@@ -116,7 +112,7 @@ def missed(result: dict[str, object], hours: float, holds: int) -> list[str]:
 
 def main() -> None:
     """Prints figures, or one JSON object; ends with 1 when a bar was missed."""
-    parser = parser_of(__doc__, CONTROLS)
+    parser = parser_of(__doc__)
     parser.add_argument(
         "--hours", type=float, default=10.0, help="of free driving, all together"
     )
@@ -155,7 +151,7 @@ def main() -> None:
         f"{result['held']} held bodies: {result['stopped_in_time']} stopped within {WITHIN_S:g} s, "
         f"after {result['median_s']} s in the median\n"
     )
-    answer(result, missed(result, given.hours, holds * len(cases)), table, given.json)
+    answer(result, missed(result, given.hours, holds * len(cases)), given.json, table)
 
 
 if __name__ == "__main__":
