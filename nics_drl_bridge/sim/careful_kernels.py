@@ -13,12 +13,10 @@ import numpy as np
 
 from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.lidar.arrays import Array
 from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SHAPE, SIN, X, Y
 from nics_drl_bridge.robot import kernels as robot
 from nics_drl_bridge.sim import contact_kernels as contacts
 from nics_drl_bridge.sim import impact_kernels as impact
-from nics_drl_bridge.sim.collision_kernels import edge_of_wall
 from nics_drl_bridge.sim.impact_kernels import (
     AFTER,
     DEPTH,
@@ -32,7 +30,9 @@ from nics_drl_bridge.sim.impact_kernels import (
 from nics_drl_bridge.sim.state import (
     DRIFT_STATE,
     DRIFT_X,
-    Part,
+    Array,
+    Dynamics,
+    Nearby,
     Single,
     State,
     Surroundings,
@@ -44,11 +44,10 @@ MOST_MOVES = 1000
 
 
 @kernel
-def compute_rates(n: int, m: int, j: int, part: Part) -> None:
-    """Write to `Single.dq` the rates of robot m in substep j, by the command then in effect."""
-    data = part.data
-    motion = part.motion
-    single = part.scratch.single
+def compute_rates(
+    n: int, m: int, j: int, data: State, motion: Dynamics, single: Single
+) -> None:
+    """Write to `single.dq` the rates of robot m in substep j, by the command then in effect."""
     size = data.state.shape[2]
     sent = data.history.shape[2]
     for s in range(size):
@@ -83,34 +82,48 @@ def _fly(body: Array, base: Array, flight: Array, time: float, series: Array) ->
 
 
 @kernel
-def _first_touch(m: int, begin: float, until: float, moving: Moving) -> None:
-    near = moving.nearby.near
+def _first_touch(
+    m: int,
+    begin: float,
+    until: float,
+    scene: Surroundings,
+    nearby: Nearby,
+    events: Array,
+    moving: Moving,
+) -> None:
+    near = nearby.near
     world = moving.world
-    walls = moving.scene.walls
-    meets = moving.nearby.meets[m]
-    event = moving.events[m]
+    meets = nearby.meets[m]
+    event = events[m]
     me = moving.first + m
     event[TIME] = until
-    if event[DEPTH] < 0.0:
-        return
-    if meets & contacts.BODIES:
+    if meets & contacts.BODIES and event[DEPTH] >= 0.0:
         listed = near[m, 0] <= contacts.SEVERAL
         for i in range(near[m, 0] if listed else world.shape[0]):
             k = near[m, 1 + i] if listed else i
             if k != me and world[k, RADIUS] > 0.0:
                 impact.touch_body(event, me, k, begin, moving)
-    if meets & contacts.WALLS:
-        for w in range(walls.shape[0]):
-            side = edge_of_wall(walls[w])
-            impact.touch_edge(event, me, -1, side, 0.0, begin, moving)
-    if meets & contacts.MAP:
-        impact.touch_map(event, me, begin, moving)
+    for w in range(
+        scene.walls.shape[0] if meets & contacts.WALLS and event[DEPTH] >= 0.0 else 0
+    ):
+        wall = scene.walls[w]
+        side = impact.Edge(wall[0], wall[1], wall[2], wall[3])
+        impact.touch_edge(event, me, -1, side, 0.0, begin, moving)
+    if meets & contacts.MAP and event[DEPTH] >= 0.0:
+        impact.touch_map(event, me, scene.grid, begin, moving)
 
 
 @kernel
-def _leave(m: int, until: float, single: Single, moving: Moving) -> None:
+def _leave(
+    m: int,
+    until: float,
+    scene: Surroundings,
+    nearby: Nearby,
+    single: Single,
+    moving: Moving,
+) -> None:
     world = moving.world
-    events = moving.events
+    events = single.events
     me = moving.first + m
     flight = moving.flights[me]
     path = (
@@ -120,12 +133,13 @@ def _leave(m: int, until: float, single: Single, moving: Moving) -> None:
     moves = int(
         min(max(math.ceil(path * until / (SMALL * world[me, RADIUS])), 1), MOST_MOVES)
     )
-    flight[STOP] = 0.0
-    events[m, AFTER] = events[m, DEPTH]
+    flight[STOP], events[m, AFTER] = 0.0, events[m, DEPTH]
     for i in range(1, moves + 1):
         time = until if i == moves else until * i / moves
         _fly(single.trial, world[me], flight, time, moving.series)
-        depth, _ = contacts.contact(single.trial, m, single.spare, 0.0, moving)
+        depth, _ = contacts.contact(
+            single.trial, m, world, scene, nearby, single.spare, 0.0
+        )
         if depth < events[m, AFTER]:
             break
         events[m, AFTER] = depth
@@ -146,11 +160,18 @@ def _within(p: int, b: int, until: float, moving: Moving) -> bool:
 
 @kernel
 def _hold(
-    m: int, nx: float, ny: float, px: float, py: float, time: float, moving: Moving
+    m: int,
+    nx: float,
+    ny: float,
+    px: float,
+    py: float,
+    time: float,
+    events: Array,
+    moving: Moving,
 ) -> None:
     """Stop the point (px, py) of robot m from moving against n, where it approaches something."""
     flight = moving.flights[moving.first + m]
-    event = moving.events[m]
+    event = events[m]
     slides = (
         event[impact.PRESSED] != 0.0
         and event[DEPTH] >= 0.0
@@ -163,18 +184,23 @@ def _hold(
 
 
 @kernel
-def _settle(until: float, moving: Moving) -> None:
-    """Stop bodies at their contacts within a substep, in order of time."""
+def _settle(
+    until: float,
+    scene: Surroundings,
+    nearby: Nearby,
+    events: Array,
+    touched: Array,
+    moving: Moving,
+) -> None:
+    """Stop bodies at their contacts within a substep, in order of time; mark `touched` (M,)."""
     flights = moving.flights
     first = moving.first
-    events = moving.events
-    touched = moving.touched
-    meets = moving.nearby.meets
+    meets = nearby.meets
     robots = events.shape[0]
     for m in range(robots):
         events[m, TIME] = until
         if meets[m] != contacts.FREE:
-            _first_touch(m, 0.0, until, moving)
+            _first_touch(m, 0.0, until, scene, nearby, events, moving)
     for _ in range(2 * moving.world.shape[0] + 2 + impact.MOST_HOLDS * robots):
         m = 0
         for p in range(1, robots):
@@ -195,12 +221,12 @@ def _settle(until: float, moving: Moving) -> None:
         if own_rate >= SHARE * (own_rate + other_rate):
             px = touch[impact.OWN_X]
             py = touch[impact.OWN_Y]
-            _hold(m, nx, ny, px, py, time, moving)
+            _hold(m, nx, ny, px, py, time, events, moving)
         if k >= 0 and other_rate >= SHARE * (own_rate + other_rate):
             if k >= first:
                 px = touch[impact.OTHERS_X]
                 py = touch[impact.OTHERS_Y]
-                _hold(k - first, -nx, -ny, px, py, time, moving)
+                _hold(k - first, -nx, -ny, px, py, time, events, moving)
             else:
                 flights[k, STOP] = min(flights[k, STOP], time)
         for p in range(robots):
@@ -209,20 +235,26 @@ def _settle(until: float, moving: Moving) -> None:
                 or _within(p, first + m, until, moving)
                 or (k >= 0 and _within(p, k, until, moving))
             ):
-                _first_touch(p, time, until, moving)
+                _first_touch(p, time, until, scene, nearby, events, moving)
 
 
 @kernel
-def _arrive(n: int, any_moves: bool, moving: Moving, part: Part) -> None:
-    bodies = moving.world
-    velocity = part.data.velocity[n]
-    origin = part.scratch.single.origin
-    meets = moving.nearby.meets
-    for m in range(meets.shape[0]):
-        if meets[m] != contacts.FREE:
-            me = moving.first + m
+def _arrive(
+    n: int,
+    any_moves: bool,
+    motion: Dynamics,
+    data: State,
+    nearby: Nearby,
+    single: Single,
+    moving: Moving,
+) -> None:
+    bodies = data.bodies[n]
+    velocity = data.velocity[n]
+    origin = single.origin
+    for m in range(nearby.meets.shape[0]):
+        if nearby.meets[m] != contacts.FREE:
+            me = velocity.shape[0] + m
             body = bodies[me]
-            event = moving.events[m]
             flight = moving.flights[me]
             x, y, c, s = impact.pose_at(me, flight[STOP], moving)
             body[HEADING] += flight[TURN] * (flight[STOP] - flight[impact.FROM])
@@ -230,38 +262,30 @@ def _arrive(n: int, any_moves: bool, moving: Moving, part: Part) -> None:
             body[Y] = y
             body[COS] = c
             body[SIN] = s
-            if flight[STOP] < part.motion.dt or flight[impact.HOLDS] > 0.0:
-                event[impact.PRESSED] = 1.0
-            if event[DEPTH] < 0.0:
-                event[DEPTH] = event[AFTER]
+            if flight[STOP] < motion.dt or flight[impact.HOLDS] > 0.0:
+                single.events[m, impact.PRESSED] = 1.0
+            if single.events[m, DEPTH] < 0.0:
+                single.events[m, DEPTH] = single.events[m, AFTER]
     for k in range(velocity.shape[0] if any_moves else 0):
-        stop = moving.flights[k, STOP]
-        if stop < part.motion.dt:
+        stop = single.flights[k, STOP]
+        if stop < motion.dt:
             origin[k, 0] = bodies[k, X] + velocity[k, 0] * stop
             origin[k, 1] = bodies[k, Y] + velocity[k, 1] * stop
             origin[k, 2] = robot.wrap(bodies[k, HEADING] + velocity[k, 2] * stop)
-            contacts.put_body(part.data.bodies, n, k, origin[k])
+            contacts.put_body(data.bodies, n, k, origin[k])
             velocity[k, :] = 0.0
 
 
-@kernel(view=True)
-def _make_moving(n: int, scene: Surroundings, part: Part) -> Moving:
-    data = part.data
-    single = part.scratch.single
-    return Moving(
-        data.bodies[n],
-        single.flights,
-        data.velocity.shape[1],
-        scene,
-        part.scratch.nearby,
-        single.events,
-        data.collided[n],
-        part.motion.series,
-    )
-
-
 @kernel
-def move_carefully(n: int, any_moves: bool, scene: Surroundings, part: Part) -> None:
+def move_carefully(
+    n: int,
+    any_moves: bool,
+    data: State,
+    scene: Surroundings,
+    motion: Dynamics,
+    nearby: Nearby,
+    single: Single,
+) -> None:
     """Move the robots of one world that may meet something by one period, up to their contacts.
 
     A robot in contact is marked and stops for the rest of the substep. Later it slides and
@@ -270,18 +294,19 @@ def move_carefully(n: int, any_moves: bool, scene: Surroundings, part: Part) -> 
     stopped by a robot keeps its mean velocity over the period; `any_moves` is true if any obstacle
     moves.
     """
-    data = part.data
-    motion = part.motion
-    single = part.scratch.single
+    events = single.events
+    touched = data.collided[n]
     dt = motion.dt
     first = data.velocity.shape[1]
-    meets = part.scratch.nearby.meets
-    moving = _make_moving(n, scene, part)
+    meets = nearby.meets
+    moving = Moving(
+        data.bodies[n], single.flights, first, scene.outlines, motion.series
+    )
     for m in range(meets.shape[0]):
         single.flights[first + m, :] = 0.0
         if meets[m] != contacts.FREE:
             contacts.put_body(data.bodies, n, first + m, data.pose[n, m])
-            _check_overlap(m, single, moving)
+            _check_overlap(m, scene, nearby, single, touched, moving)
     for j in range(motion.substeps):
         if any_moves:
             contacts.move_obstacles(
@@ -293,13 +318,15 @@ def move_carefully(n: int, any_moves: bool, scene: Surroundings, part: Part) -> 
             single.flights[k, STOP] = dt
         for m in range(meets.shape[0]):
             if meets[m] != contacts.FREE:
-                compute_rates(n, m, j, part)
+                compute_rates(n, m, j, data, motion, single)
                 flight = single.flights[first + m]
                 dq = single.dq
-                flight[VX] = dq[0]
-                flight[VY] = dq[1]
-                flight[TURN] = dq[2]
-                flight[STOP] = dt
+                flight[VX], flight[VY], flight[TURN], flight[STOP] = (
+                    dq[0],
+                    dq[1],
+                    dq[2],
+                    dt,
+                )
                 flight[impact.FROM] = flight[impact.HOLDS] = 0.0
                 for s in range(data.state.shape[2]):
                     now = data.state[n, m, s]
@@ -307,10 +334,10 @@ def move_carefully(n: int, any_moves: bool, scene: Surroundings, part: Part) -> 
                     data.state[n, m, s] = robot.advance_state(
                         now, dq[3 + s], dt, bounds
                     )
-                if single.events[m, DEPTH] < 0.0:
-                    _leave(m, dt, single, moving)
-        _settle(dt, moving)
-        _arrive(n, any_moves, moving, part)
+                if events[m, DEPTH] < 0.0:
+                    _leave(m, dt, scene, nearby, single, moving)
+        _settle(dt, scene, nearby, events, touched, moving)
+        _arrive(n, any_moves, motion, data, nearby, single, moving)
     if any_moves:
         period = motion.substeps * dt
         contacts.move_obstacles(data.bodies, single.origin, data.velocity, n, period)
@@ -322,19 +349,27 @@ def move_carefully(n: int, any_moves: bool, scene: Surroundings, part: Part) -> 
 
 
 @kernel
-def _check_overlap(m: int, single: Single, moving: Moving) -> None:
-    event = moving.events[m]
+def _check_overlap(
+    m: int,
+    scene: Surroundings,
+    nearby: Nearby,
+    single: Single,
+    touched: Array,
+    moving: Moving,
+) -> None:
+    events = single.events
     body = moving.world[moving.first + m]
-    limit = 4.0 * impact.SLACK
-    depth, whom = contacts.contact(body, m, single.spare, limit, moving)
-    event[impact.PRESSED] = depth <= 2.0 * impact.SLACK
-    event[DEPTH] = (
+    depth, whom = contacts.contact(
+        body, m, moving.world, scene, nearby, single.spare, 4.0 * impact.SLACK
+    )
+    events[m, impact.PRESSED] = depth <= 2.0 * impact.SLACK
+    events[m, DEPTH] = (
         min(depth, -np.finfo(np.float64).tiny) if depth <= impact.NOTHING else 0.0
     )
     if depth < 0.0:
-        moving.touched[m] = 1
+        touched[m] = 1
         if whom >= moving.first:
-            moving.touched[whom - moving.first] = 1
+            touched[whom - moving.first] = 1
 
 
 @kernel
@@ -352,21 +387,27 @@ def _average_velocities(n: int, period: float, data: State, single: Single) -> N
 
 
 @kernel
-def drift_carefully(n: int, scene: Surroundings, part: Part) -> None:
+def drift_carefully(
+    n: int,
+    data: State,
+    scene: Surroundings,
+    motion: Dynamics,
+    nearby: Nearby,
+    single: Single,
+) -> None:
     """Let the robots of one world drift, one after the other, up to their contacts."""
-    data = part.data
-    moving = _make_moving(n, scene, part)
-    meets = moving.nearby.meets
-    flights = moving.flights
-    touched = moving.touched
-    first = moving.first
+    pose = data.pose
+    collided = data.collided
+    meets = nearby.meets
+    flights = single.flights
+    events = single.events
+    first = data.velocity.shape[1]
+    moving = Moving(data.bodies[n], flights, first, scene.outlines, motion.series)
     stood = False
-    for m in range(meets.shape[0]):
-        pose = data.pose[n, m]
-        event = moving.events[m]
-        if touched[m] != 0:
+    for m in range(pose.shape[1]):
+        if collided[n, m] != 0:
             continue
-        ahead, aside, turn = draw_drift(n, m, part)
+        ahead, aside, turn = draw_drift(n, m, data, motion)
         if ahead == 0.0 and aside == 0.0 and turn == 0.0:
             continue
         stop = 1.0
@@ -375,45 +416,49 @@ def drift_carefully(n: int, scene: Surroundings, part: Part) -> None:
             if not stood:
                 flights[:] = 0.0
                 stood = True
-            contacts.put_body(data.bodies, n, first + m, pose)
+            contacts.put_body(data.bodies, n, first + m, pose[n, m])
             flight[VX] = ahead
             flight[VY] = aside
             flight[TURN] = turn
             flight[STOP] = 1.0
-            event[DEPTH] = 0.0
-            _first_touch(m, 0.0, 1.0, moving)
+            events[m, DEPTH] = 0.0
+            _first_touch(m, 0.0, 1.0, scene, nearby, events, moving)
             flight[STOP] = 0.0
-            if event[TIME] < 1.0:
-                stop = event[TIME]
-                touched[m] = 1
-                if event[impact.WITH] >= first:
-                    touched[int(event[impact.WITH]) - first] = 1
-        pose[0], pose[1], _, _ = robot.move(
-            pose[0],
-            pose[1],
-            math.cos(pose[2]),
-            math.sin(pose[2]),
+            if events[m, TIME] < 1.0:
+                stop = events[m, TIME]
+                collided[n, m] = 1
+                if events[m, impact.WITH] >= first:
+                    collided[n, int(events[m, impact.WITH]) - first] = 1
+        x, y, _, _ = robot.move(
+            pose[n, m, 0],
+            pose[n, m, 1],
+            math.cos(pose[n, m, 2]),
+            math.sin(pose[n, m, 2]),
             ahead,
             aside,
             turn * stop,
             stop,
-            moving.series,
+            motion.series,
         )
-        pose[2] = robot.wrap(pose[2] + turn * stop)
+        pose[n, m, 0], pose[n, m, 1], pose[n, m, 2] = (
+            x,
+            y,
+            robot.wrap(pose[n, m, 2] + turn * stop),
+        )
         if meets[m] != contacts.FREE:
-            contacts.put_body(data.bodies, n, first + m, pose)
+            contacts.put_body(data.bodies, n, first + m, pose[n, m])
 
 
 @kernel
-def draw_drift(n: int, m: int, part: Part) -> tuple[float, float, float]:
+def draw_drift(
+    n: int, m: int, data: State, motion: Dynamics
+) -> tuple[float, float, float]:
     """Draw the drift of robot m in a period: ahead, left [m] and turn [rad]; move its state.
 
     The drift grows with root time. Draws are uniform, up to sqrt(3) standard deviations, because
     that is cheap; over some periods they add up to a normal distribution. The state stays within
     the bounds of the model.
     """
-    data = part.data
-    motion = part.motion
     noise = data.noise[n, m]
     seed = data.seeds[n]
     counter = data.steps[n] * data.pose.shape[1] + m

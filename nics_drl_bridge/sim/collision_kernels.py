@@ -13,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.lidar.arrays import Array
 from nics_drl_bridge.lidar.exact_kernels import (
     COS,
     RADIUS,
@@ -23,7 +22,7 @@ from nics_drl_bridge.lidar.exact_kernels import (
     X,
     Y,
 )
-from nics_drl_bridge.sim.state import MapField
+from nics_drl_bridge.sim.state import Array, MapField
 
 # Outlines this near touch; their depth then decides about an overlap [m]
 TOUCHING = 1e-12
@@ -39,15 +38,6 @@ class Outline(NamedTuple):
     end: int
 
 
-class Edge(NamedTuple):
-    """A straight line between two points [m]; both are the same for the centre of a circle."""
-
-    ax: float
-    ay: float
-    bx: float
-    by: float
-
-
 @kernel
 def outline_of(body: Array, outlines: OutlineArrays) -> Outline:
     """Return the outline of a body's shape, in the body's frame."""
@@ -58,31 +48,19 @@ def outline_of(body: Array, outlines: OutlineArrays) -> Outline:
 @kernel
 def is_round(body: Array, outlines: OutlineArrays) -> bool:
     """True for a circle."""
-    outline = outline_of(body, outlines)
-    return bool(outline.begin == outline.end)
+    shape = int(body[SHAPE])
+    return outlines.first[shape] == outlines.first[shape + 1]
 
 
 @kernel
-def edge_before(v: int, outline: Outline) -> Edge:
-    """Return the edge of an outline that ends at corner v."""
-    corners = outline.corners
-    u = v - 1 if v > outline.begin else outline.end - 1
-    return Edge(corners[u, 0], corners[u, 1], corners[v, 0], corners[v, 1])
-
-
-@kernel
-def edge_of_wall(wall: Array) -> Edge:
-    """Return a straight wall (4,) as an edge."""
-    return Edge(wall[0], wall[1], wall[2], wall[3])
-
-
-@kernel
-def from_edge(x: float, y: float, edge: Edge) -> tuple[float, float]:
-    """Return the vector to (x, y) from the nearest point of an edge."""
-    ex = edge.bx - edge.ax
-    ey = edge.by - edge.ay
-    dx = x - edge.ax
-    dy = y - edge.ay
+def from_segment(
+    x: float, y: float, ax: float, ay: float, bx: float, by: float
+) -> tuple[float, float]:
+    """Return the vector to (x, y) from the nearest point of the segment (ax, ay) to (bx, by)."""
+    ex = bx - ax
+    ey = by - ay
+    dx = x - ax
+    dy = y - ay
     along = dx * ex + dy * ey
     if along > 0.0:
         share = min(along / (ex * ex + ey * ey), 1.0)
@@ -91,75 +69,105 @@ def from_edge(x: float, y: float, edge: Edge) -> tuple[float, float]:
 
 
 @kernel
-def edge_distance2(x: float, y: float, edge: Edge) -> float:
-    """Square of the distance from (x, y) to an edge [m^2]."""
-    dx, dy = from_edge(x, y, edge)
+def segment_distance2(
+    x: float, y: float, ax: float, ay: float, bx: float, by: float
+) -> float:
+    """Square of the distance from (x, y) to the segment from (ax, ay) to (bx, by) [m^2]."""
+    dx, dy = from_segment(x, y, ax, ay, bx, by)
     return dx * dx + dy * dy
 
 
 @kernel
-def _is_left(x: float, y: float, edge: Edge) -> bool:
-    area = (edge.bx - edge.ax) * (y - edge.ay) - (edge.by - edge.ay) * (x - edge.ax)
-    return area > 0.0
+def _side(ax: float, ay: float, bx: float, by: float, x: float, y: float) -> float:
+    return (bx - ax) * (y - ay) - (by - ay) * (x - ax)
 
 
 @kernel
-def cross(p: Edge, q: Edge) -> bool:
-    """True if two edges cross."""
-    return _is_left(q.ax, q.ay, p) != _is_left(q.bx, q.by, p) and _is_left(
-        p.ax, p.ay, q
-    ) != _is_left(p.bx, p.by, q)
+def cross(
+    ax: float,
+    ay: float,
+    bx: float,
+    by: float,
+    px: float,
+    py: float,
+    qx: float,
+    qy: float,
+) -> bool:
+    """True if the segments from a to b and from p to q cross."""
+    return (_side(ax, ay, bx, by, px, py) > 0.0) != (
+        _side(ax, ay, bx, by, qx, qy) > 0.0
+    ) and (_side(px, py, qx, qy, ax, ay) > 0.0) != (_side(px, py, qx, qy, bx, by) > 0.0)
 
 
 @kernel
-def _edges_distance2(p: Edge, q: Edge) -> float:
-    """Square of the distance between two edges [m^2]; -1 if they cross."""
-    if cross(p, q):
+def _edges_distance2(
+    ax: float,
+    ay: float,
+    bx: float,
+    by: float,
+    px: float,
+    py: float,
+    qx: float,
+    qy: float,
+) -> float:
+    """Square of the distance between two segments [m^2]; -1 if they cross."""
+    if cross(ax, ay, bx, by, px, py, qx, qy):
         return -1.0
     return min(
-        edge_distance2(p.ax, p.ay, q),
-        edge_distance2(p.bx, p.by, q),
-        edge_distance2(q.ax, q.ay, p),
-        edge_distance2(q.bx, q.by, p),
+        segment_distance2(ax, ay, px, py, qx, qy),
+        segment_distance2(bx, by, px, py, qx, qy),
+        segment_distance2(px, py, ax, ay, bx, by),
+        segment_distance2(qx, qy, ax, ay, bx, by),
     )
 
 
 @kernel
 def outline_point(x: float, y: float, outline: Outline) -> float:
     """Signed distance from (x, y) to an outline; negative inside."""
-    is_segment = outline.end - outline.begin == 2
-    begin = outline.begin + 1 if is_segment else outline.begin
+    corners = outline.corners
+    begin = outline.begin
+    end = outline.end
     least = np.inf
     inside = False
-    for v in range(begin, outline.end):
-        edge = edge_before(v, outline)
-        least = min(least, edge_distance2(x, y, edge))
-        if (edge.ay > y) != (edge.by > y) and x < edge.ax + (y - edge.ay) / (
-            edge.by - edge.ay
-        ) * (edge.bx - edge.ax):
+    ax = corners[end - 1, 0]
+    ay = corners[end - 1, 1]
+    if end - begin == 2:
+        bx = corners[begin, 0]
+        by = corners[begin, 1]
+        return math.sqrt(segment_distance2(x, y, bx, by, ax, ay))
+    for v in range(begin, end):
+        bx = corners[v, 0]
+        by = corners[v, 1]
+        least = min(least, segment_distance2(x, y, ax, ay, bx, by))
+        if (ay > y) != (by > y) and x < ax + (y - ay) / (by - ay) * (bx - ax):
             inside = not inside
-    return -math.sqrt(least) if inside and not is_segment else math.sqrt(least)
+        ax = bx
+        ay = by
+    return -math.sqrt(least) if inside else math.sqrt(least)
 
 
 @kernel
-def _next_cut(edge: Edge, after: float, q: Outline) -> float:
-    """Next cut of an edge by outline q, as a fraction of the edge."""
+def _next_cut(
+    ax: float, ay: float, ex: float, ey: float, after: float, q: Outline
+) -> float:
+    """Next cut of the edge from (ax, ay) along (ex, ey) by outline q, as a fraction of the edge."""
     least = 1.0
-    ex = edge.bx - edge.ax
-    ey = edge.by - edge.ay
+    cx = q.corners[q.end - 1, 0]
+    cy = q.corners[q.end - 1, 1]
     for w in range(q.begin, q.end):
-        other = edge_before(w, q)
-        fx = other.bx - other.ax
-        fy = other.by - other.ay
-        dx = other.ax - edge.ax
-        dy = other.ay - edge.ay
+        dx = q.corners[w, 0]
+        dy = q.corners[w, 1]
+        fx = dx - cx
+        fy = dy - cy
         cross = ex * fy - ey * fx
         if cross != 0.0:
-            at = (dx * fy - dy * fx) / cross
+            at = ((cx - ax) * fy - (cy - ay) * fx) / cross
             if after + ON_EDGE < at < least:
-                along = (dx * ey - dy * ex) / cross
+                along = ((cx - ax) * ey - (cy - ay) * ex) / cross
                 if -ON_EDGE <= along <= 1.0 + ON_EDGE:
                     least = at
+        cx = dx
+        cy = dy
     return least
 
 
@@ -168,27 +176,23 @@ def _deepest(p: Outline, q: Outline) -> float:
     depth = 0.0
     if q.end - q.begin == 2:
         return depth
+    ax = p.corners[p.end - 1, 0]
+    ay = p.corners[p.end - 1, 1]
     for v in range(p.begin, p.end):
-        edge = edge_before(v, p)
-        ex = edge.bx - edge.ax
-        ey = edge.by - edge.ay
-        depth = max(depth, -outline_point(edge.bx, edge.by, q))
+        bx = p.corners[v, 0]
+        by = p.corners[v, 1]
+        ex = bx - ax
+        ey = by - ay
+        depth = max(depth, -outline_point(bx, by, q))
         at = 0.0
         while at < 1.0:
-            cut = _next_cut(edge, at, q)
+            cut = _next_cut(ax, ay, ex, ey, at, q)
             middle = 0.5 * (at + cut)
-            x = edge.ax + middle * ex
-            y = edge.ay + middle * ey
-            depth = max(depth, -outline_point(x, y, q))
+            depth = max(depth, -outline_point(ax + middle * ex, ay + middle * ey, q))
             at = cut
+        ax = bx
+        ay = by
     return depth
-
-
-@kernel
-def _begins_inside(p: Outline, q: Outline) -> bool:
-    """True if the first corner of an outline is inside another one."""
-    corner = p.corners[p.begin]
-    return q.end - q.begin > 2 and outline_point(corner[0], corner[1], q) < 0.0
 
 
 @kernel
@@ -199,16 +203,36 @@ def _outline_gap(
     least = limit * limit
     crossing = False
     touching = False
+    ax = q.corners[q.end - 1, 0]
+    ay = q.corners[q.end - 1, 1]
     for v in range(q.begin, q.end):
-        edge = edge_before(v, q)
+        bx = q.corners[v, 0]
+        by = q.corners[v, 1]
         near = reach + math.sqrt(least)
-        if edge_distance2(x, y, edge) <= near * near:
+        if segment_distance2(x, y, ax, ay, bx, by) <= near * near:
+            cx = p.corners[p.end - 1, 0]
+            cy = p.corners[p.end - 1, 1]
             for w in range(p.begin, p.end):
-                distance2 = _edges_distance2(edge, edge_before(w, p))
+                dx = p.corners[w, 0]
+                dy = p.corners[w, 1]
+                distance2 = _edges_distance2(ax, ay, bx, by, cx, cy, dx, dy)
                 crossing = crossing or distance2 < 0.0
                 touching = touching or distance2 <= TOUCHING * TOUCHING
                 least = min(least, max(distance2, 0.0))
-    if not (crossing or touching or _begins_inside(p, q) or _begins_inside(q, p)):
+                cx = dx
+                cy = dy
+        ax = bx
+        ay = by
+    overlapping = crossing or touching
+    if not overlapping and q.end - q.begin > 2:
+        overlapping = (
+            outline_point(p.corners[p.begin, 0], p.corners[p.begin, 1], q) < 0.0
+        )
+    if not overlapping and p.end - p.begin > 2:
+        overlapping = (
+            outline_point(q.corners[q.begin, 0], q.corners[q.begin, 1], p) < 0.0
+        )
+    if not overlapping:
         return math.sqrt(least)
     depth = max(_deepest(p, q), _deepest(q, p))
     if depth > 0.0:
@@ -262,7 +286,7 @@ def wall_gap(
     body: Array, wall: Array, outlines: OutlineArrays, limit: float, spare: Array
 ) -> float:
     """Signed clearance of a body and a straight wall."""
-    distance2 = edge_distance2(body[X], body[Y], edge_of_wall(wall))
+    distance2 = segment_distance2(body[X], body[Y], wall[0], wall[1], wall[2], wall[3])
     far = body[RADIUS] + max(limit, 0.0)
     if distance2 > far * far:
         return limit
@@ -272,8 +296,10 @@ def wall_gap(
     for v in range(2):
         dx = wall[2 * v] - body[X]
         dy = wall[2 * v + 1] - body[Y]
-        spare[v, 0] = body[COS] * dx + body[SIN] * dy
-        spare[v, 1] = body[COS] * dy - body[SIN] * dx
+        spare[v, 0], spare[v, 1] = (
+            body[COS] * dx + body[SIN] * dy,
+            body[COS] * dy - body[SIN] * dx,
+        )
     x = 0.5 * (spare[0, 0] + spare[1, 0])
     y = 0.5 * (spare[0, 1] + spare[1, 1])
     reach = math.hypot(spare[0, 0] - x, spare[0, 1] - y)

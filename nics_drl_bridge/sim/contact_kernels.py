@@ -9,13 +9,11 @@ sorted once per episode.
 import math
 
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.lidar.arrays import Array
 from nics_drl_bridge.lidar.cell_kernels import BodyCells, around
 from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SIN, X, Y
 from nics_drl_bridge.robot.kernels import wrap
 from nics_drl_bridge.sim import collision_kernels as collision
-from nics_drl_bridge.sim.impact_kernels import Moving
-from nics_drl_bridge.sim.state import Nearby, State, Surroundings
+from nics_drl_bridge.sim.state import Array, Nearby, State, Surroundings
 
 # Bit flags of what a robot may meet
 FREE = 0
@@ -84,8 +82,10 @@ def find_near(
     near[m, 0] = count
     meets = BODIES if count > 0 else FREE
     for w in range(walls.shape[0]):
-        edge = collision.edge_of_wall(walls[w])
-        if collision.edge_distance2(x, y, edge) <= own_reach * own_reach:
+        d2 = collision.segment_distance2(
+            x, y, walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3]
+        )
+        if d2 <= own_reach * own_reach:
             meets |= WALLS
             break
     if (
@@ -98,18 +98,21 @@ def find_near(
 
 @kernel
 def contact(
-    body: Array, m: int, spare: Array, limit: float, moving: Moving
+    body: Array,
+    m: int,
+    world: Array,
+    scene: Surroundings,
+    nearby: Nearby,
+    spare: Array,
+    limit: float,
 ) -> tuple[float, int]:
     """Clearance [m], up to `limit`, of robot m placed as `body` (7,), and nearest body or -1."""
-    world = moving.world
-    scene = moving.scene
-    nearby = moving.nearby
     outlines = scene.outlines
     near = nearby.near
     least = limit
     whom = -1
     if nearby.meets[m] & BODIES:
-        me = moving.first + m
+        me = world.shape[0] - near.shape[0] + m
         listed = near[m, 0] <= SEVERAL
         for i in range(near[m, 0] if listed else world.shape[0]):
             k = near[m, 1 + i] if listed else i

@@ -14,22 +14,20 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.lidar.arrays import Array
 from nics_drl_bridge.lidar.exact_kernels import (
     COS,
     HEADING,
     RADIUS,
     SIN,
+    OutlineArrays,
     X,
     Y,
 )
 from nics_drl_bridge.robot.kernels import move
 from nics_drl_bridge.sim import collision_kernels as collision
-from nics_drl_bridge.sim.collision_kernels import Edge
-from nics_drl_bridge.sim.state import Nearby, Surroundings
+from nics_drl_bridge.sim.state import Array, MapField
 
 VX, VY, TURN, STOP, FROM, WISH_X, WISH_Y, WISH_TURN, HOLDS, FIRST_HOLD = range(10)
 """Columns of `flights`: velocity [m/s, m/s, rad/s]; time of its stop in the substep [s]; time at
@@ -71,16 +69,22 @@ MOST_LOOKS = 2000
 
 
 class Moving(NamedTuple):
-    """The bodies of one world within a substep, and what they may touch."""
+    """The bodies of one world within a substep."""
 
     world: Array  # (K + M, 7) obstacles, then robots, as the substep begins
     flights: Array  # (K + M, FLIGHT) their motion; robots in their own frame, all else in the map
     first: int  # index of the first robot
-    scene: Surroundings
-    nearby: Nearby
-    events: Array  # (M, EVENT) the first contact of each robot
-    touched: NDArray[np.uint8]  # (M,) 1 for robots that touched something
+    outlines: OutlineArrays
     series: Array  # see `robot.kernels`
+
+
+class Edge(NamedTuple):
+    """A straight line between two points [m]; both are the same for the centre of a circle."""
+
+    ax: float
+    ay: float
+    bx: float
+    by: float
 
 
 class Placed(NamedTuple):
@@ -152,17 +156,17 @@ def speed_at(b: int, time: float, flights: Array) -> float:
 @kernel
 def _between(p: Edge, q: Edge) -> tuple[float, float]:
     """Return the vector from the nearest point of q to that of p; zero where they cross."""
-    nx, ny = collision.from_edge(p.ax, p.ay, q)
+    nx, ny = collision.from_segment(p.ax, p.ay, q.ax, q.ay, q.bx, q.by)
     if p.ax == p.bx and p.ay == p.by:
         return nx, ny
-    if collision.cross(p, q):
+    if collision.cross(p.ax, p.ay, p.bx, p.by, q.ax, q.ay, q.bx, q.by):
         return 0.0, 0.0
     for x, y, edge, sign in (
         (p.bx, p.by, q, 1.0),
         (q.ax, q.ay, p, -1.0),
         (q.bx, q.by, p, -1.0),
     ):
-        ox, oy = collision.from_edge(x, y, edge)
+        ox, oy = collision.from_segment(x, y, edge.ax, edge.ay, edge.bx, edge.by)
         if ox * ox + oy * oy < nx * nx + ny * ny:
             nx = sign * ox
             ny = sign * oy
@@ -180,21 +184,25 @@ def _root(gap: float, rate: float, bend: float) -> float:
 
 @kernel
 def _in_map(edge: Edge, x: float, y: float, c: float, s: float) -> Edge:
+    ax = edge.ax
+    ay = edge.ay
+    bx = edge.bx
+    by = edge.by
     return Edge(
-        x + c * edge.ax - s * edge.ay,
-        y + s * edge.ax + c * edge.ay,
-        x + c * edge.bx - s * edge.by,
-        y + s * edge.bx + c * edge.by,
+        x + c * ax - s * ay,
+        y + s * ax + c * ay,
+        x + c * bx - s * by,
+        y + s * bx + c * by,
     )
 
 
 @kernel
 def _reach(edge: Edge) -> float:
-    return math.sqrt(
-        max(
-            edge.ax * edge.ax + edge.ay * edge.ay, edge.bx * edge.bx + edge.by * edge.by
-        )
-    )
+    ax = edge.ax
+    ay = edge.ay
+    bx = edge.bx
+    by = edge.by
+    return math.sqrt(max(ax * ax + ay * ay, bx * bx + by * by))
 
 
 @kernel
@@ -255,8 +263,8 @@ def _corner(nx: float, ny: float, body: Placed, rate: float) -> tuple[float, flo
     second = _rate(nx, ny, body, edge.bx, edge.by) == rate
     nearer = nx * edge.bx + ny * edge.by < nx * edge.ax + ny * edge.ay
     if second and (nearer or not first):
-        return edge.bx, edge.by
-    return edge.ax, edge.ay
+        return (edge.bx, edge.by)
+    return (edge.ax, edge.ay)
 
 
 @kernel
@@ -382,12 +390,14 @@ def _edges(outline: collision.Outline) -> int:
 
 @kernel
 def _edge_of(v: int, outline: collision.Outline) -> Edge:
-    if outline.begin == outline.end:
+    corners = outline.corners
+    begin = outline.begin
+    end = outline.end
+    if begin == end:
         return Edge(0.0, 0.0, 0.0, 0.0)
-    after = outline.begin + v + 1
-    end = after if after < outline.end else outline.begin
-    edge: Edge = collision.edge_before(end, outline)
-    return edge
+    i = begin + v
+    j = begin + (v + 1 if begin + v + 1 < end else 0)
+    return Edge(corners[i, 0], corners[i, 1], corners[j, 0], corners[j, 1])
 
 
 @kernel
@@ -415,9 +425,12 @@ def touch_edge(
     far = world[a, RADIUS] + round_b + speed * (event[TIME] - begin)
     if speed == 0.0 and (begin >= flights[a, STOP] or flights[a, TURN] == 0.0):
         return
-    if collision.edge_distance2(x, y, placed) > far * far:
+    if (
+        collision.segment_distance2(x, y, placed.ax, placed.ay, placed.bx, placed.by)
+        > far * far
+    ):
         return
-    outline = collision.outline_of(world[a], moving.scene.outlines)
+    outline = collision.outline_of(world[a], moving.outlines)
     round_a = world[a, RADIUS] if outline.begin == outline.end else 0.0
     for v in range(_edges(outline)):
         edge = _edge_of(v, outline)
@@ -435,7 +448,7 @@ def touch_body(event: Array, a: int, b: int, begin: float, moving: Moving) -> No
     far = world[a, RADIUS] + world[b, RADIUS] + speed * (event[TIME] - begin)
     if (x - ox) * (x - ox) + (y - oy) * (y - oy) > far * far:
         return
-    outline = collision.outline_of(world[b], moving.scene.outlines)
+    outline = collision.outline_of(world[b], moving.outlines)
     round_b = world[b, RADIUS] if outline.begin == outline.end else 0.0
     for v in range(_edges(outline)):
         touch_edge(event, a, b, _edge_of(v, outline), round_b, begin, moving)
@@ -448,9 +461,10 @@ def _solid(distances: Array, i: int, j: int) -> bool:
 
 
 @kernel
-def touch_map(event: Array, a: int, begin: float, moving: Moving) -> None:
-    """Do the same as `touch_edge` for the sides of the solid cells of the map."""
-    grid = moving.scene.grid
+def touch_map(
+    event: Array, a: int, grid: MapField, begin: float, moving: Moving
+) -> None:
+    """Do the same as `touch_edge` for the sides of the solid cells of a map."""
     distances = grid.distances
     world = moving.world
     size = grid.cell

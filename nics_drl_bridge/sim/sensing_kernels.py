@@ -17,8 +17,8 @@ import math
 from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import fault_kernels, scan_kernels
-from nics_drl_bridge.lidar.arrays import Array
-from nics_drl_bridge.lidar.cell_kernels import around, limit_found
+from nics_drl_bridge.lidar.baked_kernels import LidarArrays
+from nics_drl_bridge.lidar.cell_kernels import BodyCells, around
 from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SIN, X, Y
 from nics_drl_bridge.lidar.fixture_kernels import fixtures_around
 from nics_drl_bridge.robot.kernels import move, wrap
@@ -30,8 +30,11 @@ from nics_drl_bridge.sim.state import (
     ODOM_TWIST,
     POSE,
     TRUE_TWIST,
-    Part,
+    Array,
+    Dynamics,
+    Scratch,
     State,
+    WorldSetArrays,
 )
 
 # Obstacles of a late scan are moved back by their velocity for so long at most [s]: a pedestrian
@@ -52,7 +55,13 @@ def record_start(n: int, m: int, data: State) -> None:
 
 @kernel
 def measure_odometry(
-    n: int, m: int, start: Array, end: Array, twist: Array, part: Part
+    n: int,
+    m: int,
+    data: State,
+    start: Array,
+    end: Array,
+    twist: Array,
+    motion: Dynamics,
 ) -> None:
     """Measure the odometry of robot m of world n, at the end of a period.
 
@@ -61,13 +70,12 @@ def measure_odometry(
     Args:
         n: the world.
         m: the robot.
+        data: the state, whose `past`, `odom` and `twist` are written.
         start: (3,) pose by the wheels at the start of the period.
         end: (3,) pose by the wheels at the end of the period.
         twist: (3,) or more; body twist by the wheels at the end of the period.
-        part: whose `data.past`, `odom` and `twist` are written.
+        motion: length of the period.
     """
-    data = part.data
-    motion = part.motion
     steps = data.steps[n]
     rows = data.past.shape[2]
     substeps = motion.substeps
@@ -170,44 +178,57 @@ def interpolate_past(
 
 
 @kernel(inline=True)
-def scan_or_wait(n: int, waiting_count: int, part: Part) -> int:
+def scan_or_wait(
+    n: int,
+    waiting_count: int,
+    data: State,
+    world_set: WorldSetArrays,
+    lidar: LidarArrays,
+    motion: Dynamics,
+    scratch: Scratch,
+) -> int:
     """Scan world n, unless `scan_together` can; return how many worlds now wait for that."""
-    data = part.data
     any_late = False
     for m in range(data.age.shape[1]):
         is_skewed = data.faults[n, m, fault_kernels.SKEW] != 0.0
         any_late = any_late or data.age[n, m] > 0 or is_skewed
     if any_late:
         for m in range(data.pose.shape[1]):
-            _scan_from_past(n, m, part)
+            _scan_from_past(n, m, data, world_set, lidar, motion, scratch)
         return waiting_count
-    part.scratch.scans.waiting[waiting_count] = n
+    scratch.scans.waiting[waiting_count] = n
     return waiting_count + 1
 
 
 @kernel
-def scan_together(waiting_count: int, part: Part) -> None:
+def scan_together(
+    waiting_count: int,
+    data: State,
+    world_set: WorldSetArrays,
+    lidar: LidarArrays,
+    scratch: Scratch,
+) -> None:
     """Scan the worlds that wait, as they stand."""
-    data = part.data
-    scans = part.scratch.scans
+    scans = scratch.scans
     scan_kernels.scan_worlds(
         data.ranges,
         data.pose,
         scans.waiting[:waiting_count],
         data.bodies,
         data.velocity.shape[1],
-        part.world_set.fixtures,
-        part.lidar,
-        part.scratch.cells,
+        world_set.fixtures,
+        lidar,
+        scratch.cells,
         scans.lanes,
     )
 
 
 @kernel
-def distort_scans(first_world: int, end_world: int, part: Part) -> None:
+def distort_scans(
+    first_world: int, end_world: int, data: State, lidar: LidarArrays
+) -> None:
     """Apply the faults of each robot's lidar to the scans of worlds [first_world, end_world)."""
-    data = part.data
-    limits = part.lidar.range_min, part.lidar.range_max
+    limits = lidar.range_min, lidar.range_max
     robots = data.ranges.shape[1]
     for n in range(first_world, end_world):
         for m in range(robots):
@@ -218,15 +239,20 @@ def distort_scans(first_world: int, end_world: int, part: Part) -> None:
 
 
 @kernel
-def _scan_from_past(n: int, m: int, part: Part) -> None:
+def _scan_from_past(
+    n: int,
+    m: int,
+    data: State,
+    world_set: WorldSetArrays,
+    lidar: LidarArrays,
+    motion: Dynamics,
+    scratch: Scratch,
+) -> None:
     """Scan from where robot m of world n was when its reported scan was taken.
 
     With skew, each group of beams is scanned from its own pose during the sweep.
     """
-    data = part.data
-    lidar = part.lidar
-    motion = part.motion
-    scans = part.scratch.scans
+    scans = scratch.scans
     steps = data.steps[n]
     substeps = motion.substeps
     skew = data.faults[n, m, fault_kernels.SKEW]
@@ -241,15 +267,18 @@ def _scan_from_past(n: int, m: int, part: Part) -> None:
     reach = lidar.range_max + math.hypot(lidar.mount[0], lidar.mount[1])
     if skew != 0.0:
         reach += math.hypot(twist[0], twist[1]) * lidar.sweep_time
-    count = _gather_bodies(n, m, lag, reach, part)
+    count = _gather_bodies(n, m, lag, reach, data, world_set, motion, scratch)
     # this robot as the only one of an only world, which has the bodies that were gathered
     bodies = scans.bodies[:count].reshape((1, count, BODY_COLUMNS))
-    listed = limit_found(scans.no_cells, count)
+    listed = scans.no_cells
+    listed = BodyCells(
+        listed.first, listed.then, listed.ordered, listed.frame, listed.found[:count]
+    )
     beams = data.ranges.shape[2]
     first_range = (n * data.ranges.shape[1] + m) * beams
     ranges = data.ranges.reshape(-1)[first_range : first_range + beams]
     ranges = ranges.reshape((1, 1, beams))
-    fixtures = fixtures_around(n, part.world_set.fixtures)
+    fixtures = fixtures_around(n, world_set.fixtures)
     groups = 1 if skew == 0.0 else scans.slice_poses.shape[0]
     if groups > 1:
         moving = (steps * substeps - lag) * motion.dt
@@ -279,18 +308,24 @@ def _scan_from_past(n: int, m: int, part: Part) -> None:
 
 
 @kernel
-def _gather_bodies(n: int, m: int, lag: int, reach: float, part: Part) -> int:
+def _gather_bodies(
+    n: int,
+    m: int,
+    lag: int,
+    reach: float,
+    data: State,
+    world_set: WorldSetArrays,
+    motion: Dynamics,
+    scratch: Scratch,
+) -> int:
     """Copy the bodies around `scans.pose`, as they were `lag` substeps ago; return their number.
 
     Robots are interpolated in the past. Of obstacles no past is kept: they are moved back by their
     present velocity. That is exact within the period, and beyond it while they keep their velocity;
     the extrapolation ends at `FURTHEST_BACK`.
     """
-    data = part.data
-    world_set = part.world_set
-    motion = part.motion
-    scans = part.scratch.scans
-    cells = part.scratch.cells
+    scans = scratch.scans
+    cells = scratch.cells
     velocity = data.velocity
     pose = scans.pose[0, 0]
     obstacle_count = velocity.shape[1]

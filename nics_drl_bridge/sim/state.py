@@ -14,7 +14,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.lidar.arrays import Array, Integers, Singles
+from nics_drl_bridge.lidar.arrays import Array as Array
+from nics_drl_bridge.lidar.arrays import Integers as Integers
+from nics_drl_bridge.lidar.arrays import Singles
 from nics_drl_bridge.lidar.baked_kernels import LidarArrays
 from nics_drl_bridge.lidar.cell_kernels import BodyCells
 from nics_drl_bridge.lidar.exact_kernels import OutlineArrays

@@ -2,7 +2,7 @@
 
 `step_worlds` queues the commands, then takes the worlds in blocks, one lane for each robot:
 
-1. It saves the robots' poses, and `_begin_period_of_world` steers the obstacles.
+1. `_begin_period_of_block` saves the robots' poses, and chooses the velocities of the obstacles.
 2. `move_freely` moves all robots of the block side by side, as if nothing stood in their way.
 3. `_move_world` moves the obstacles. A robot that may meet something is moved carefully instead,
    from where it stood. All robots then drift.
@@ -26,7 +26,7 @@ import numpy as np
 
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import cell_kernels as cells
-from nics_drl_bridge.lidar.arrays import Array, Integers
+from nics_drl_bridge.lidar.baked_kernels import LidarArrays
 from nics_drl_bridge.lidar.fixture_kernels import cells_of, walls_of
 from nics_drl_bridge.robot.kernels import (
     apply_curve,
@@ -54,10 +54,12 @@ from nics_drl_bridge.sim.state import (
     LANE_Y,
     POSE,
     TRUE_TWIST,
+    Array,
+    Dynamics,
+    Integers,
     Lanes,
     MapField,
     Movers,
-    Part,
     Scratch,
     State,
     Surroundings,
@@ -72,7 +74,16 @@ SCANNED_TOGETHER = 48
 @kernel(allocates=True)
 def step_worlds(packed: Any, commands: Array, first_world: int) -> None:
     """Step n worlds of a part, from `first_world` on, under commands (n, M, C) for one period."""
-    _step_unpacked(packed.content, commands, first_world)
+    part = packed.content
+    _step_unpacked(
+        part.data,
+        part.world_set,
+        part.lidar,
+        part.motion,
+        part.scratch,
+        commands,
+        first_world,
+    )
 
 
 @kernel(allocates=True)
@@ -87,9 +98,11 @@ def begin_episodes(packed: Any, chosen: Integers) -> None:
         if part.world_set.moves:
             obstacles.reset_marks(chosen[i], data, scene.movers.plans)
         _sort_bodies(chosen[i], data, scene, part.scratch)
-    sensing.scan_together(chosen.shape[0], part)
+    sensing.scan_together(
+        chosen.shape[0], data, part.world_set, part.lidar, part.scratch
+    )
     for n in chosen:
-        sensing.distort_scans(n, n + 1, part)
+        sensing.distort_scans(n, n + 1, data, part.lidar)
 
 
 @kernel(allocates=True)
@@ -105,8 +118,9 @@ def sort_worlds(packed: Any, first_world: int, end_world: int) -> None:
 def begin_period(packed: Any) -> None:
     """Begin a period of worlds whose robots another engine moves."""
     part = packed.content
+    speeds = part.scratch.nearby.speeds
     for n in range(part.data.pose.shape[0]):
-        _begin_period_of_world(n, part)
+        _begin_period_of_world(n, part.data, part.world_set, part.motion, speeds)
 
 
 @kernel(allocates=True)
@@ -128,6 +142,9 @@ def end_period(
     """
     part = packed.content
     data = part.data
+    world_set = part.world_set
+    motion = part.motion
+    scratch = part.scratch
     first_robot = data.velocity.shape[1]
     waiting_count = 0
     for n in range(data.pose.shape[0]):
@@ -136,53 +153,65 @@ def end_period(
         for m in range(data.pose.shape[1]):
             contacts.put_body(data.bodies, n, first_robot + m, data.pose[n, m])
             sensing.measure_odometry(
-                n, m, wheel_start[n, m], wheel_end[n, m], wheel_twist[n, m], part
+                n,
+                m,
+                data,
+                wheel_start[n, m],
+                wheel_end[n, m],
+                wheel_twist[n, m],
+                motion,
             )
             # The lidar is where the robot truly is, not where the wheels say.
             for i in range(3):
                 past[m, POSE + i] = data.pose[n, m, i]
                 past[m, TRUE_TWIST + i] = true_twist[n, m, i]
-        _sort_bodies(n, data, get_surroundings(n, part.world_set), part.scratch)
-        waiting_count = sensing.scan_or_wait(n, waiting_count, part)
-    sensing.scan_together(waiting_count, part)
-    sensing.distort_scans(0, data.pose.shape[0], part)
+        _sort_bodies(n, data, get_surroundings(n, world_set), scratch)
+        waiting_count = sensing.scan_or_wait(
+            n, waiting_count, data, world_set, part.lidar, motion, scratch
+        )
+    sensing.scan_together(waiting_count, data, world_set, part.lidar, scratch)
+    sensing.distort_scans(0, data.pose.shape[0], data, part.lidar)
 
 
 @kernel
-def _step_unpacked(part: Part, commands: Array, first_world: int) -> None:
+def _step_unpacked(
+    data: State,
+    world_set: WorldSetArrays,
+    lidar: LidarArrays,
+    motion: Dynamics,
+    scratch: Scratch,
+    commands: Array,
+    first_world: int,
+) -> None:
     """Step some worlds, see `step_worlds`.
 
     Scans of several worlds are made together, because one lidar's scan is too short to keep the
     processor busy. This is not done in `step_worlds` itself: there numba would count references to
     the part's arrays, which takes longer than the step.
     """
-    data = part.data
     robots = data.pose.shape[1]
     end_world = first_world + commands.shape[0]
-    _queue_commands(data.history, commands, first_world, part.motion.terms.curves)
-    worlds_per_block = part.scratch.lanes.pose.shape[1] // robots
+    _queue_commands(data.history, commands, first_world, motion.terms.curves)
+    worlds_per_block = scratch.lanes.pose.shape[1] // robots
     for block_begin in range(first_world, end_world, worlds_per_block):
         block_end = min(block_begin + worlds_per_block, end_world)
-        for n in range(block_begin, block_end):
-            for m in range(robots):
-                lane = (n - block_begin) * robots + m
-                for i in range(3):
-                    part.scratch.scans.start_poses[lane, i] = data.pose[n, m, i]
-            _begin_period_of_world(n, part)
-        move_freely(block_begin, block_end, part)
+        _begin_period_of_block(block_begin, block_end, data, world_set, motion, scratch)
+        move_freely(block_begin, block_end, data, motion, scratch.lanes)
         waiting_count = np.int64(0)
         first_to_distort = block_begin
         for n in range(block_begin, block_end):
             data.steps[n] += 1
             first_lane = (n - block_begin) * robots
-            scene = get_surroundings(n, part.world_set)
-            _move_world(n, first_lane, scene, part)
-            _measure_world(n, first_lane, scene, part)
-            waiting_count = sensing.scan_or_wait(n, waiting_count, part)
+            scene = get_surroundings(n, world_set)
+            _move_world(n, first_lane, data, scene, motion, scratch)
+            _measure_world(n, first_lane, data, scene, motion, scratch)
+            waiting_count = sensing.scan_or_wait(
+                n, waiting_count, data, world_set, lidar, motion, scratch
+            )
             is_last = n + 1 == block_end
             if is_last or (n + 1 - first_to_distort) * robots >= SCANNED_TOGETHER:
-                sensing.scan_together(waiting_count, part)
-                sensing.distort_scans(first_to_distort, n + 1, part)
+                sensing.scan_together(waiting_count, data, world_set, lidar, scratch)
+                sensing.distort_scans(first_to_distort, n + 1, data, lidar)
                 waiting_count = np.int64(0)
                 first_to_distort = n + 1
 
@@ -203,15 +232,38 @@ def _queue_commands(
 
 
 @kernel(inline=True)
-def _begin_period_of_world(n: int, part: Part) -> None:
-    """Record the start of an episode that begins; choose the velocities of the obstacles."""
-    data = part.data
+def _begin_period_of_block(
+    first_world: int,
+    end_world: int,
+    data: State,
+    world_set: WorldSetArrays,
+    motion: Dynamics,
+    scratch: Scratch,
+) -> None:
+    """Keep the robots' poses in worlds [first_world, end_world), and steer the obstacles."""
     robots = data.pose.shape[1]
-    speeds = part.scratch.nearby.speeds
+    start_poses = scratch.scans.start_poses
+    for n in range(first_world, end_world):
+        for m in range(robots):
+            lane = (n - first_world) * robots + m
+            for i in range(3):
+                start_poses[lane, i] = data.pose[n, m, i]
+        _begin_period_of_world(n, data, world_set, motion, scratch.nearby.speeds)
+
+
+@kernel(inline=True)
+def _begin_period_of_world(
+    n: int, data: State, world_set: WorldSetArrays, motion: Dynamics, speeds: Array
+) -> None:
+    """Record the start of an episode that begins; choose the velocities of the obstacles.
+
+    `speeds` (M, 2) is scratch memory for the velocities of the robots in `map`.
+    """
+    robots = data.pose.shape[1]
     if data.steps[n] == 0:
         for m in range(robots):
             sensing.record_start(n, m, data)
-    if part.world_set.moves:
+    if world_set.moves:
         row = data.steps[n] % data.past.shape[2]
         for m in range(robots):
             vx = data.past[n, m, row, TRUE_TWIST]
@@ -220,26 +272,27 @@ def _begin_period_of_world(n: int, part: Part) -> None:
             s = math.sin(data.pose[n, m, 2])
             speeds[m, 0] = c * vx - s * vy
             speeds[m, 1] = s * vx + c * vy
-        scene = get_surroundings(n, part.world_set)
-        period = part.motion.dt * part.motion.substeps
-        obstacles.steer(n, data, scene, period, speeds)
+        scene = get_surroundings(n, world_set)
+        obstacles.steer(n, data, scene, motion.dt * motion.substeps, speeds)
 
 
 @kernel
-def move_freely(first_world: int, end_world: int, part: Part) -> None:
+def move_freely(
+    first_world: int, end_world: int, data: State, motion: Dynamics, lanes: Lanes
+) -> None:
     """Move the robots of worlds [first_world, end_world) for one period, as if nothing stood there.
 
     The result is in the lanes: robot m of world n is in lane (n - first_world) M + m. The period is
     integrated from one change of a command to the next.
     """
-    motion = part.motion
-    lanes = part.scratch.lanes
-    _fill_lanes(first_world, end_world, part)
+    _fill_lanes(first_world, end_world, data, motion, lanes)
     terms = replace_coefficients(motion.terms, lanes.coefficient)
-    lane_count = (end_world - first_world) * part.data.pose.shape[1]
+    lane_count = (end_world - first_world) * data.pose.shape[1]
     substep = 0
     while substep < motion.substeps:
-        next_change = _apply_commands(substep, first_world, lane_count, part)
+        next_change = _apply_commands(
+            substep, first_world, lane_count, data, motion, lanes
+        )
         run(
             lanes.pose,
             lanes.x,
@@ -253,11 +306,10 @@ def move_freely(first_world: int, end_world: int, part: Part) -> None:
 
 
 @kernel(inline=True)
-def _fill_lanes(first_world: int, end_world: int, part: Part) -> None:
+def _fill_lanes(
+    first_world: int, end_world: int, data: State, motion: Dynamics, lanes: Lanes
+) -> None:
     """Copy poses, states and coefficients of robots to the lanes; note when commands change."""
-    data = part.data
-    motion = part.motion
-    lanes = part.scratch.lanes
     robots = data.pose.shape[1]
     pose = lanes.pose
     for n in range(first_world, end_world):
@@ -281,14 +333,18 @@ def _fill_lanes(first_world: int, end_world: int, part: Part) -> None:
 
 
 @kernel(inline=True)
-def _apply_commands(substep: int, first_world: int, lane_count: int, part: Part) -> int:
+def _apply_commands(
+    substep: int,
+    first_world: int,
+    lane_count: int,
+    data: State,
+    motion: Dynamics,
+    lanes: Lanes,
+) -> int:
     """Put the commands that take effect at a substep into the lanes; return the next such substep.
 
     If no command changes any more, that is the end of the period.
     """
-    data = part.data
-    motion = part.motion
-    lanes = part.scratch.lanes
     robots = data.pose.shape[1]
     size = data.state.shape[2]
     substeps = motion.substeps
@@ -310,19 +366,24 @@ def _apply_commands(substep: int, first_world: int, lane_count: int, part: Part)
 
 
 @kernel
-def _move_world(n: int, first_lane: int, scene: Surroundings, part: Part) -> None:
+def _move_world(
+    n: int,
+    first_lane: int,
+    data: State,
+    scene: Surroundings,
+    motion: Dynamics,
+    scratch: Scratch,
+) -> None:
     """Move robots and obstacles of world n, after `move_freely`.
 
     A robot that can meet nothing in this period takes its free motion from the lanes. If any robot
     may meet something, these robots and the obstacles are moved carefully, from contact to contact.
     """
-    data = part.data
-    scratch = part.scratch
     lanes = scratch.lanes
     nearby = scratch.nearby
     single = scratch.single
     robots = data.pose.shape[1]
-    period = part.motion.dt * part.motion.substeps
+    period = motion.dt * motion.substeps
     for m in range(robots):
         # Each component is uniform, so at most sqrt(3) of its standard deviations.
         sum_of_deviations = data.noise[n, m, DRIFT_X] + data.noise[n, m, DRIFT_Y]
@@ -349,12 +410,12 @@ def _move_world(n: int, first_lane: int, scene: Surroundings, part: Part) -> Non
                 single.origin[k, i] = data.bodies[n, k, i]
                 single.period_start[k, i] = data.bodies[n, k, i]
     if any_meets:
-        move_carefully(n, obstacles_move, scene, part)
+        move_carefully(n, obstacles_move, data, scene, motion, nearby, single)
     elif obstacles_move:
         contacts.move_obstacles(data.bodies, single.origin, data.velocity, n, period)
     for m in range(robots):
         data.pose[n, m, 2] = wrap(data.pose[n, m, 2])
-    drift_carefully(n, scene, part)
+    drift_carefully(n, data, scene, motion, nearby, single)
 
 
 @kernel(inline=True)
@@ -368,18 +429,23 @@ def _take_free_motion(n: int, m: int, lane: int, data: State, lanes: Lanes) -> N
 
 
 @kernel(inline=True)
-def _measure_world(n: int, first_lane: int, scene: Surroundings, part: Part) -> None:
+def _measure_world(
+    n: int,
+    first_lane: int,
+    data: State,
+    scene: Surroundings,
+    motion: Dynamics,
+    scratch: Scratch,
+) -> None:
     """Put the robots' bodies at their present poses, and measure their odometry."""
-    data = part.data
-    scratch = part.scratch
     frame = scratch.cells.frame
     first_robot = data.velocity.shape[1]
     for m in range(data.pose.shape[1]):
         pose = data.pose[n, m]
         start = scratch.scans.start_poses[first_lane + m]
         contacts.put_body(data.bodies, n, first_robot + m, pose)
-        compute_rates(n, m, part.motion.substeps - 1, part)
-        sensing.measure_odometry(n, m, start, pose, scratch.single.dq, part)
+        compute_rates(n, m, motion.substeps - 1, data, motion, scratch.single)
+        sensing.measure_odometry(n, m, data, start, pose, scratch.single.dq, motion)
         # The cells must know how far any body may be from where it was sorted.
         if scene.crowded:
             dx = pose[0] - start[0]
