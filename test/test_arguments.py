@@ -9,6 +9,7 @@ from nics_drl_bridge.arguments import (
     check_arguments,
     check_count,
     check_path,
+    format_value,
 )
 from nics_drl_bridge.errors import BridgeError, ConfigError
 
@@ -79,3 +80,7 @@ def test_what_is_no_path_is_refused_by_all_that_opens_one(
     with pytest.raises(BridgeError) as caught:
         getattr(nics_drl_bridge, f"load_{name}")(value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_large_object_is_quoted_by_its_type() -> None:
+    assert format_value([1.0] * 1000) == "of type list"
