@@ -155,7 +155,7 @@ class FaultyDrive:
         self.words = ()
         self.lines = []
         self.decisions = []
-        self.sums = []
+        self.sums = [projected(flatten(self.state))]
 
     def give(self, event):
         now = 128.0 + self.units * UNIT_S

@@ -17,6 +17,7 @@ from nics_drl_bridge.gate import (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RECORDS)
 def test_the_gate_decides_and_computes_what_it_did_before(name):
     """A change on purpose is recorded anew, see `recorded`."""
