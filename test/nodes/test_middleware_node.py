@@ -1,7 +1,4 @@
-from __future__ import annotations
-
 import contextlib
-import itertools
 import json
 import math
 from dataclasses import replace
@@ -9,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import builtin_model, save_model
 from nics_drl_bridge.interface import NS_PER_S
 
@@ -23,12 +21,10 @@ from std_srvs.srv import Trigger
 
 from nics_drl_bridge.middleware.measurement import Health, Rejection, TopicHealth
 from nics_drl_bridge.nodes import conversions
-from nics_drl_bridge.nodes.middleware_node import silence
-from nodes.peer import stamp_ns
+from nics_drl_bridge.nodes.middleware_node import MiddlewareNode, silence
+from nodes.peer import odometry, pose_of, stamp_ns
 
 pytestmark = pytest.mark.ros
-
-VARIANCE = (1e-4,) * 4
 
 
 @pytest.fixture(scope="module")
@@ -93,47 +89,26 @@ def driven(launch, meet, module_domain_id, tmp_path_factory):
     middleware.check()
 
 
-def test_the_estimate_follows_the_robot(driven):
-    _, _, step, begin, _ = driven
+def test_the_estimate_follows_the_robot_and_names_its_frames_and_its_doubt(driven):
+    _, said, step, begin, _ = driven
     begin()
     errors = []
     for k in range(40):
         estimate, truth = step(0.6, 0.3 * math.sin(0.3 * k))
         assert stamp_ns(estimate) == stamp_ns(truth)
         believed, twist = conversions.odometry_from_ros(estimate)
-        true = conversions.odometry_from_ros(truth)[0]
+        true = pose_of(truth)
         errors.append(math.dist(believed[:2], true[:2]))
     assert max(errors) < 0.15  # over a drive of 2.3 m
     assert twist[0] == pytest.approx(0.6, abs=0.1)
-
-
-def test_the_estimate_names_its_frames_and_its_doubt(driven):
-    _, _, step, begin, _ = driven
-    begin()
-    first, _ = step(0.5)
-    for _ in range(10):
-        last, _ = step(0.5)
-    assert (last.header.frame_id, last.child_frame_id) == ("site", "car")
-    doubts = [np.diag(np.reshape(m.pose.covariance, (6, 6))) for m in (first, last)]
-    assert (doubts[0] > 0.0).all()
-    assert doubts[1][0] > doubts[0][0]
-
-
-def test_the_estimates_twist_is_doubted_more_than_not_at_all_and_less_than_the_odometry(
-    driven,
-):
-    _, said, step, begin, _ = driven
-    begin()
-    for _ in range(10):
-        last, _ = step(0.5)
-    twist, measured = (
-        np.diag(np.reshape(m.twist.covariance, (6, 6)))[[0, 5]]
-        for m in (last, said["odom"][-1])
-    )
+    assert (estimate.header.frame_id, estimate.child_frame_id) == ("site", "car")
+    before = said["odometry/filtered"][-40]
+    doubts = [np.reshape(m.pose.covariance, (6, 6)) for m in (before, estimate)]
+    assert doubts[1][0, 0] > doubts[0][0, 0] > 0.0
+    covariances = [m.twist.covariance for m in (estimate, said["odom"][-1])]
+    twist, measured = (np.diag(np.reshape(c, (6, 6)))[[0, 5]] for c in covariances)
     assert (twist > 0.0).all()
-    assert (
-        twist < measured + 1e-6 + 1e-12
-    ).all()  # no twist is trusted to less than 1e-3
+    assert (twist <= measured + 1.1e-6).all()  # no twist is trusted to less than 1e-3
 
 
 def test_a_command_of_nan_does_not_reach_the_estimate(driven):
@@ -147,23 +122,10 @@ def test_a_command_of_nan_does_not_reach_the_estimate(driven):
     assert np.isfinite([*pose, *twist]).all()
 
 
-def test_diagnostics_come_once_a_second(driven):
-    peer, said, _, _, _ = driven
-    heard = said["/diagnostics"]
-
-    def stamps():  # of this node's; the simulator tells of itself there too
-        own = [one for one in heard if "middleware_node" in one.status[0].name]
-        return [conversions.stamp_from_ros(one.header.stamp) for one in own]
-
-    known = len(stamps())
-    peer.until(lambda: len(stamps()) > known + 3, "diagnoses")
-    assert np.diff(stamps()[-3:]) * 1e-9 == pytest.approx(1.0, abs=0.5)
-
-
 def test_what_it_can_not_use_is_counted_in_the_diagnostics(
     launch, meet, domain_id, model
 ):
-    launch("middleware_node", domain_id, namespace="car")
+    middleware = launch("middleware_node", domain_id, namespace="car")
     peer = meet(domain_id, "car")
     diagnostics = peer.listen(DiagnosticArray, "/diagnostics")
     filtered = peer.listen(Odometry, "odometry/filtered")
@@ -180,11 +142,7 @@ def test_what_it_can_not_use_is_counted_in_the_diagnostics(
 
     def drive(x, second):
         stamp = int(second * NS_PER_S)
-        odom.publish(
-            conversions.odometry_to_ros(
-                [x, 0.0, 0.0], [0.0, 0.0, 0.0], stamp, ("odom", "car"), VARIANCE
-            )
-        )
+        odom.publish(odometry(stamp, [x, 0.0, 0.0]))
 
     def counts():
         return {pair.key: pair.value for pair in status().values}
@@ -192,9 +150,7 @@ def test_what_it_can_not_use_is_counted_in_the_diagnostics(
     drive(math.nan, 1)  # must not become where the map is
     drive(1.0, 2)
     peer.until(lambda: filtered, "an estimate")
-    assert conversions.odometry_from_ros(filtered[-1])[0] == pytest.approx(
-        [1.0, 0.0, 0.0]
-    )
+    assert pose_of(filtered[-1]) == pytest.approx([1.0, 0.0, 0.0])
     ranges = np.ones(model.lidar.beams, np.float32)
     for stamp, beams in ((3, model.lidar.beams), (3, model.lidar.beams), (4, 7)):
         message = conversions.scan_to_ros(
@@ -229,16 +185,16 @@ def test_what_it_can_not_use_is_counted_in_the_diagnostics(
     assert counts().keys() == wanted.keys() | told
     assert status().level == DiagnosticStatus.OK
     assert status().message == "receiving"
-
+    log = middleware.read_text()
+    assert log.count("rejected data, counted in /diagnostics: ") >= 1
+    assert log.count("scan: shape (7,), not (720,)") == 1
     # After a reset an odometry from before counts, as after a restart of the robot.
     assert peer.call(Trigger, "middleware_node/reset").success
     drive(5.0, 1)
     peer.until(
         lambda: stamp_ns(filtered[-1]) == NS_PER_S, "an estimate after the reset"
     )
-    assert conversions.odometry_from_ros(filtered[-1])[0] == pytest.approx(
-        [5.0, 0.0, 0.0]
-    )
+    assert pose_of(filtered[-1]) == pytest.approx([5.0, 0.0, 0.0])
 
 
 @pytest.fixture
@@ -261,11 +217,7 @@ def sensed(launch, meet, domain_id):
     def stand(tenths, deadline_s=30.0):
         """An odometry of a robot that stands; returns the estimate after it."""
         stamp = tenths * NS_PER_S // 10
-        speakers["odom"].publish(
-            conversions.odometry_to_ros(
-                [1.0, 0.0, 0.0], [0.0, 0.0, 0.0], stamp, ("odom", "base_link"), VARIANCE
-            )
-        )
+        speakers["odom"].publish(odometry(stamp, [1.0, 0.0, 0.0]))
         heard = said["filtered"]
         peer.until(
             lambda: heard and stamp_ns(heard[-1]) == stamp,
@@ -328,7 +280,7 @@ def test_pose_and_gyro_correct_the_estimate_and_are_told_of_in_the_diagnostics(s
     speakers["imu"].publish(measured_rate(0.0, 11))
     peer.until(lambda: {"pose received", "imu received"} <= facts().keys(), "both")
     told = stand(12)
-    pose = conversions.odometry_from_ros(told)[0]
+    pose = pose_of(told)
     assert pose == pytest.approx([30.0, -20.0, 2.0], abs=1e-3)
     assert 0.05**2 < told.pose.covariance[0] < 0.06**2
 
@@ -345,14 +297,12 @@ def test_pose_and_gyro_correct_the_estimate_and_are_told_of_in_the_diagnostics(s
     speakers["imu"].publish(measured_rate(40.0, 14))
     wanted = {"rejected, pose: outlier": "1", "rejected, imu: outlier": "1"}
     peer.until(lambda: wanted.items() <= facts().items(), f"the counts {wanted}")
-    pose = conversions.odometry_from_ros(stand(15))[0]
+    pose = pose_of(stand(15))
     assert pose == pytest.approx([30.0, -20.0, 2.0], abs=1e-3)
     # A pose that was measured before the newest odometry still counts.
     speakers["pose"].publish(measured_pose(30.1, -20.0, 2.0, 12, 0.02))
     peer.until(lambda: facts()["pose received"] == "3", "a late pose")
-    assert conversions.odometry_from_ros(stand(16))[0][0] == pytest.approx(
-        30.085, abs=0.005
-    )
+    assert pose_of(stand(16))[0] == pytest.approx(30.085, abs=0.005)
 
 
 def test_odometry_turns_by_the_gyro_if_the_model_was_made_with_one(
@@ -380,15 +330,8 @@ def test_odometry_turns_by_the_gyro_if_the_model_was_made_with_one(
             gyro.publish(message)
         speak.heading += 0.1 * 1.6 * rate
         stamp = hundredths * NS_PER_S // 100
-        wheels.publish(
-            conversions.odometry_to_ros(
-                [0.0, 0.0, speak.heading],
-                [0.0, 0.0, 1.6 * rate],
-                stamp,
-                ("odom", "base_link"),
-                VARIANCE,
-            )
-        )
+        pose = [0.0, 0.0, speak.heading]
+        wheels.publish(odometry(stamp, pose, [0.0, 0.0, 1.6 * rate]))
         return stamp
 
     speak.heading = 0.0
@@ -404,15 +347,9 @@ def test_odometry_turns_by_the_gyro_if_the_model_was_made_with_one(
         peer.until(
             lambda s=stamp: stamp_ns(filtered[-1]) == s, f"the estimate at {stamp}"
         )
-    heading = conversions.odometry_from_ros(filtered[-1])[0][2]
+    heading = pose_of(filtered[-1])[2]
     assert heading == pytest.approx(1.0, abs=0.06)
     middleware.check()
-
-
-def test_a_pose_type_that_does_not_exist_is_refused_with_the_nearest(launch, domain_id):
-    middleware = launch("middleware_node", domain_id, pose_type="PoseStampd")
-    assert middleware.wait() == 2
-    assert "'PoseStampd'; did you mean 'PoseStamped'" in middleware.read_text()
 
 
 def test_topics_whose_data_are_refused_are_told_apart_from_silent_ones():
@@ -435,33 +372,7 @@ def test_topics_whose_data_are_refused_are_told_apart_from_silent_ones():
     assert not silence(Health(dict.fromkeys(expected, heard), counts), expected, before)
 
 
-def test_data_that_are_refused_are_told_of_in_its_log_once(
-    launch, meet, domain_id, model
-):
-    middleware = launch("middleware_node", domain_id)
-    peer = meet(domain_id)
-    diagnostics = peer.listen(DiagnosticArray, "/diagnostics")
-    scan, sent = peer.speak(LaserScan, "scan"), itertools.count(1)
-
-    def refused():
-        message = conversions.scan_to_ros(
-            model.lidar, np.ones(7, np.float32), 0, "laser"
-        )
-        message.header.stamp = conversions.stamp_to_ros(next(sent) * NS_PER_S // 10)
-        scan.publish(message)
-        told = [status.message for each in diagnostics for status in each.status]
-        return (
-            sum(
-                "scan: " in each and "refused, the last: shape (7,)" in each
-                for each in told
-            )
-            > 2
-        )
-
-    peer.until(refused, "what is refused, several times")
-    assert (
-        middleware.read_text().count(
-            "rejected data, counted in /diagnostics: scan: shape (7,)"
-        )
-        == 1
-    )
+def test_a_pose_type_that_does_not_exist_is_refused_with_the_nearest(make_node):
+    node = make_node("pose_type:=PoseStampd", kind=MiddlewareNode)
+    with pytest.raises(ConfigError, match="'PoseStampd'; did you mean 'PoseStamped'"):
+        node.configure()

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import itertools
 import math
 
@@ -10,15 +8,13 @@ pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import LaserScan
 
-from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.nodes.policy_node import PolicyNode
-from nodes.peer import stamp_ns
+from nodes.peer import odometry, pose_of, stamp_ns
 
 pytestmark = pytest.mark.ros
 
@@ -68,14 +64,8 @@ def test_each_command_is_stamped_with_the_scan_it_was_computed_from(driving):
     assert len(answers) >= 5
     assert len(answers - scans) <= 1  # best effort
     assert (np.diff(commands) > 0).all()  # one for each scan at most
+    assert all(raw.twist == Twist() for raw in said["cmd_vel_raw"])  # without a goal
     assert said["cmd_vel_raw"][-1].header.frame_id == "car"
-
-
-def test_without_a_goal_it_stands_still(driving):
-    _, said, _, _ = driving
-    assert [raw.twist for raw in said["cmd_vel_raw"]] == [Twist()] * len(
-        said["cmd_vel_raw"]
-    )
 
 
 def test_a_goal_by_topic_is_driven_to_and_stopped_at(driving):
@@ -85,7 +75,7 @@ def test_a_goal_by_topic_is_driven_to_and_stopped_at(driving):
     goals.publish(goal)
     peer.until(lambda: speed(said) > 0.1, "driving")
     peer.until(lambda: speed(said) == 0.0, "a stop")
-    truth = conversions.odometry_from_ros(said["ground_truth"][-1])[0]
+    truth = pose_of(said["ground_truth"][-1])
     assert math.dist(truth[:2], (0.0, 0.5)) < 0.5
     known = len(said["cmd_vel_raw"])
     peer.until(lambda: len(said["cmd_vel_raw"]) >= known + 10, "10 more commands")
@@ -96,7 +86,7 @@ def test_a_goal_in_the_robots_frame_lies_ahead_of_it_and_one_in_no_known_frame_i
     driving,
 ):
     peer, said, goals, policy = driving
-    before = conversions.odometry_from_ros(said["ground_truth"][-1])[0]
+    before = pose_of(said["ground_truth"][-1])
     ahead = PoseStamped()
     ahead.header.frame_id, ahead.pose.position.x = "car", 1.2
     goals.publish(ahead)
@@ -106,31 +96,9 @@ def test_a_goal_in_the_robots_frame_lies_ahead_of_it_and_one_in_no_known_frame_i
     peer.until(lambda: "'kitchen' is refused" in policy.log.read_text(), "a refusal")
     assert "The previous goal stays" in policy.log.read_text()
     peer.until(lambda: speed(said) == 0.0, "a stop")
-    truth = conversions.odometry_from_ros(said["ground_truth"][-1])[0]
+    truth = pose_of(said["ground_truth"][-1])
     wanted = before[:2] + 1.2 * np.array([math.cos(before[2]), math.sin(before[2])])
     assert math.dist(truth[:2], wanted) < 0.5
-
-
-def test_a_goal_that_is_no_number_stops_it_and_the_next_one_moves_it(driving):
-    peer, said, goals, _ = driving
-    goal = PoseStamped()
-    goal.pose.position.x = 2.0
-    goals.publish(goal)
-    peer.until(lambda: speed(said) > 0.1, "driving")
-    goal.pose.position.x = math.nan
-    goals.publish(goal)
-    peer.until(lambda: speed(said) == 0.0, "a stop")
-
-
-def test_it_leaves_a_zero_command_behind(driving):
-    peer, said, goals, policy = driving
-    goal = PoseStamped()
-    goal.pose.position.x, goal.pose.position.y = 2.0, -1.0
-    goals.publish(goal)
-    peer.until(lambda: speed(said) > 0.1, "driving")
-    assert policy.close() == 0
-    peer.until(lambda: said["cmd_vel_raw"][-1].twist == Twist(), "a zero command")
-    assert "Traceback" not in policy.log.read_text(encoding="utf-8")
 
 
 def test_with_a_pose_sensor_it_waits_until_it_knows_where_in_the_map_it_is(
@@ -173,11 +141,7 @@ def test_it_goes_on_after_a_simulation_has_set_the_clock_back(
     def drives():
         """A tenth of a second of a robot that stands; True once it is commanded to drive."""
         stamp = next(tenths) * NS_PER_S // 10
-        frames = ("odom", "base_link")
-        spread = (1e-4,) * 4
-        odom.publish(
-            conversions.odometry_to_ros(np.zeros(3), np.zeros(3), stamp, frames, spread)
-        )
+        odom.publish(odometry(stamp))
         scans.publish(conversions.scan_to_ros(model.lidar, ranges, stamp, "laser"))
         peer.within(0.05, lambda: False)
         return commands and commands[-1].twist.linear.x > 0.0
@@ -192,17 +156,18 @@ def test_it_goes_on_after_a_simulation_has_set_the_clock_back(
 
 
 @pytest.mark.parametrize(
-    "goal", [[math.nan, 1.0], [1e308, 0.0], [0.0, -math.inf], [1.0]]
+    ("given", "reason"),
+    [
+        (["goal:=[.nan, 1.0]"], r"^parameter 'goal': must be \[x, y\] within 1e8 m"),
+        (["goal:=[300000000.0, 0.0]"], "parameter 'goal'"),
+        (["goal:=[1.0]"], "parameter 'goal'"),
+        (["rate:=-1.0"], "rate -1.0"),
+        (["deadline:=0.0"], "deadline 0.0"),
+        (["policy:=none.onnx"], "none.onnx: field 'file'"),
+    ],
 )
-def test_a_goal_that_is_no_place_is_refused_when_it_is_configured(goal, domain_id):
-    context = open_context(["node", "--ros-args", "-p", "autostart:=false"], domain_id)
-    node = PolicyNode(context)
-    try:
-        node.set_parameters([Parameter("goal", value=goal)])
-        with pytest.raises(
-            ConfigError, match=r"^parameter 'goal': must be \[x, y\] within 1e8 m"
-        ):
-            node.configure()
-    finally:
-        node.destroy_node()
-        context.try_shutdown()
+def test_a_parameter_that_can_not_be_used_is_refused_when_it_is_configured(
+    make_node, given, reason
+):
+    with pytest.raises(BridgeError, match=reason):
+        make_node(*given, kind=PolicyNode).configure()

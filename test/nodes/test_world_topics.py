@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import math
 from collections import Counter
 
@@ -13,13 +11,11 @@ from nav_msgs.msg import OccupancyGrid, Odometry
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
-from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.conversions import initial_pose
 from nics_drl_bridge.sim.occupancy import occupancy, standing
 from nics_drl_bridge.sim.scenes import SceneSampler
 from nics_drl_bridge.sim.world_set import load_worlds
-from nodes.peer import stamp_ns
+from nodes.peer import pose_of, stamp_ns
 
 pytestmark = pytest.mark.ros
 SEED = 5
@@ -34,7 +30,7 @@ def at(x, y, heading=0.0, frame="map"):
 
 
 def stands_at(truths):
-    return conversions.odometry_from_ros(truths[-1])[0]
+    return pose_of(truths[-1])
 
 
 @pytest.fixture(scope="module")
@@ -90,13 +86,15 @@ def test_the_map_of_the_episode_comes_to_whoever_joins_however_late(simulated, m
         assert found.origin == pytest.approx(grid.origin)
 
 
-def test_the_map_of_the_next_episode_comes_by_itself(simulated, model):
-    peer = simulated[0]
+def test_the_map_of_the_next_episode_comes_by_itself_with_its_time(simulated, model):
+    peer, _, truths, *_ = simulated
     maps = peer.listen(OccupancyGrid, "map", qos.LATCHED)
     peer.until(lambda: maps, "the map")
     begin_another_episode(simulated, SEED + 1)
     new = wanted(model, SEED + 1).cells.tobytes()
     peer.until(lambda: maps[-1].data.tobytes() == new, "the map of the next episode")
+    period_ns = 100_000_000  # of the odometry, and so of a step
+    assert (stamp_ns(maps[-1]) - stamp_ns(truths[0])) % period_ns == 0
 
 
 def test_the_clock_ticks_at_50_hz_in_real_time_and_never_back(simulated):
@@ -131,30 +129,16 @@ def test_the_clock_ticks_so_often_also_in_slow_motion(launch, meet, domain_id):
     )
 
 
-def test_the_map_has_the_simulated_time(simulated):
-    peer, _, truths, *_ = simulated
-    maps = peer.listen(OccupancyGrid, "map", qos.LATCHED)
-    peer.until(lambda: maps, "the map")
-    known = maps[-1].header.stamp
-    begin_another_episode(simulated, SEED + 2)
-    peer.until(lambda: maps[-1].header.stamp != known, "another map")
-    period_ns = 100_000_000  # of the odometry, and so of a step
-    first = stamp_ns(truths[0])
-    assert (stamp_ns(maps[-1]) - first) % period_ns == 0
-
-
 def test_an_initial_pose_puts_the_robot_there_and_its_odometry_goes_on(simulated):
     peer, _, truths, odoms, poses = simulated
-    before = conversions.odometry_from_ros(odoms[-1])[0]
+    before = pose_of(odoms[-1])
     poses.publish(at(0.4, -2.2, 1.0, "site"))
     peer.until(
         lambda: math.dist(stands_at(truths)[:2], (0.4, -2.2)) < 0.01, "the robot there"
     )
     assert stands_at(truths)[2] == pytest.approx(1.0, abs=0.01)
     peer.another(odoms, "odometry")
-    assert conversions.odometry_from_ros(odoms[-1])[0] == pytest.approx(
-        before, abs=0.05
-    )
+    assert pose_of(odoms[-1]) == pytest.approx(before, abs=0.05)
 
 
 def test_an_initial_pose_that_can_not_be_used_is_refused_with_a_sentence(simulated):
@@ -169,10 +153,3 @@ def test_an_initial_pose_that_can_not_be_used_is_refused_with_a_sentence(simulat
         peer.until(lambda text=sentence: text in simulator.log.read_text(), sentence)
     peer.another(truths, "truth")
     assert stands_at(truths) == pytest.approx(stood, abs=0.05)
-
-
-def test_a_quaternion_of_zeros_is_no_pose():
-    message = at(1.0, 1.0)
-    message.pose.pose.orientation.w = 0.0
-    with pytest.raises(ConfigError, match="unit length"):
-        initial_pose(message, "map")
