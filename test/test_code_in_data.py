@@ -19,8 +19,9 @@ from robots import direct_model
 from nics_drl_bridge.config import share_folder
 from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.env.sim_backend import make_backend
-from nics_drl_bridge.errors import BridgeError
+from nics_drl_bridge.errors import BridgeError, ConfigError
 from nics_drl_bridge.files import SUMS, write_sums
+from nics_drl_bridge.gate.limits import load_limits
 from nics_drl_bridge.generator import load_model, open_model, save_model
 from nics_drl_bridge.lidar.sensor import add_sensor_kind, load_sensor, sensor_of_data
 from nics_drl_bridge.policy.contract import _task_hash
@@ -30,6 +31,7 @@ from nics_drl_bridge.policy.policy_file import load_policy
 from nics_drl_bridge.policy.train import settings_of
 from nics_drl_bridge.policy.train_checkpoint import read_checkpoint
 from nics_drl_bridge.policy.training_settings import load_training
+from nics_drl_bridge.recording.mapping import load_mapping
 from nics_drl_bridge.recording.messages import collect_types
 from nics_drl_bridge.recording.recording import load_recording
 from nics_drl_bridge.robot.spec import load_robot
@@ -133,8 +135,10 @@ def run_of_a_task(trap, place):
     return folder
 
 
-def foreign_mapping(trap, place):
-    data = {"kind": "foreign policy", "network": "n.onnx", "robot": place}
+def foreign_mapping(trap, key, place):
+    data = {"kind": "foreign policy", "network": "n.onnx", "robot": "differential"} | {
+        key: place
+    }
     data |= {
         "inputs": {"x": {"parts": [{"of": "scan"}]}},
         "outputs": {"forward": {"of": "y"}},
@@ -149,9 +153,19 @@ def leapp_bundle(trap, place):
     return write(trap.folder, "bundle.yaml", json.dumps(data))
 
 
+def resume_a_run(trap, place):
+    run_of_a_task(trap, place)
+    done = nics("train", "--resume", "--out", "run", cwd=trap.folder)
+    assert done.returncode == 2, done.stderr
+    raise ConfigError(done.stderr)
+
+
 WAYS = {
     "a sensor of a model": lambda t, p: load_model(
         model_with_a_sensor(t, p("TrapSensor"))
+    ),
+    "a model by name": lambda t, p: open_model(
+        str(model_with_a_sensor(t, p("TrapSensor")))
     ),
     "a sensor's own file": lambda t, p: load_sensor(
         write(t.folder, "rear.yaml", f"{{kind: '{p('TrapSensor')}', name: rear}}")
@@ -162,7 +176,15 @@ WAYS = {
     "the task of a policy": lambda t, p: open_policy(
         str(policy_with_a_task(t, p("Trap"))), direct_model()
     ),
-    "the robot of a mapping": lambda t, p: load_any(foreign_mapping(t, p("Trap"))),
+    "the robot of a mapping": lambda t, p: load_any(
+        foreign_mapping(t, "robot", p("Trap"))
+    ),
+    "the network of a mapping": lambda t, p: load_any(
+        foreign_mapping(t, "network", p("Trap"))
+    ),
+    "the scan of a mapping": lambda t, p: load_any(
+        foreign_mapping(t, "scan", p("Trap"))
+    ),
     "a network of a bundle": lambda t, p: import_policy(leapp_bundle(t, p("Trap"))),
     "the textbook of a robot": lambda t, p: load_robot(
         robot_with(t, "textbook", p("KIND"))
@@ -176,8 +198,18 @@ WAYS = {
     "the task of a run": lambda t, p: open_named_task(
         settings_of(run_of_a_task(t, p("Trap")))
     ),
+    "a resumed run": lambda t, p: resume_a_run(t, p("Trap")),
     "a backend": lambda t, p: make_backend(
         p("Trap"), direct_model(), load_world("arena")
+    ),
+    "limits": lambda t, p: load_limits(
+        write(t.folder, "l.yaml", f"based_on: '{p('Trap')}'\n"), direct_model().robot
+    ),
+    "a world": lambda t, p: load_world(
+        write(t.folder, "w.yaml", f"kind: '{p('Trap')}'\n")
+    ),
+    "a mapping": lambda t, p: load_mapping(
+        write(t.folder, "m.yaml", f"kind: '{p('Trap')}'\n")
     ),
 }
 
@@ -195,6 +227,20 @@ def test_a_name_in_a_file_of_data_runs_nothing(trap, way, place):
     assert not trap.canary.exists()
     assert MODULE not in sys.modules
     assert "\n" not in str(refused.value).strip()
+
+
+def test_a_module_of_the_system_is_never_imported_by_name():
+    sys.modules.pop("antigravity", None)
+    for name in ("os:system", "antigravity", "antigravity:fly_to"):
+        with pytest.raises(ConfigError, match="sensor"):
+            load_model_sensor(name)
+    assert "antigravity" not in sys.modules
+
+
+def load_model_sensor(kind):
+    from nics_drl_bridge.lidar.sensor import sensor_of_data
+
+    return sensor_of_data({"kind": kind, "name": "rear"})
 
 
 # Objects of Python, which would be made as they are read.
@@ -284,14 +330,7 @@ def definition_format():
 
 
 def test_a_sensor_of_ones_own_is_given_by_the_caller_and_named_by_files(trap):
-    listing = "list robots"
-    kinds = [f"{trap.file}:{name}" for name in ("TrapSensor", "Trap")]
-    done, refused = (
-        nics("--sensor-kind", kind, listing, cwd=trap.folder) for kind in kinds
-    )
-    assert (done.returncode, refused.returncode) == (0, 2)
-    assert "is not a subclass of lidar.sensor.Sensor" in refused.stderr
-    kind = add_sensor_kind(kinds[0])
+    kind = add_sensor_kind(f"{trap.file}:TrapSensor")
     assert trap.canary.exists()
     rear = {
         "name": "rear",
@@ -299,6 +338,18 @@ def test_a_sensor_of_ones_own_is_given_by_the_caller_and_named_by_files(trap):
     }
     sensor = sensor_of_data({"kind": "TrapSensor", **rear})
     assert type(sensor) is kind
+    assert sensor.kind == "TrapSensor", "a model that is written names no path"
+
+
+def test_the_command_line_imports_a_kind_of_sensor(trap):
+    done = nics(
+        "--sensor-kind", f"{trap.file}:TrapSensor", "list", "robots", cwd=trap.folder
+    )
+    assert done.returncode == 0, done.stderr
+    assert trap.canary.exists()
+    done = nics("--sensor-kind", f"{trap.file}:Trap", "list", "robots", cwd=trap.folder)
+    assert done.returncode == 2
+    assert "is not a subclass of lidar.sensor.Sensor" in done.stderr
 
 
 def test_a_task_of_ones_own_is_opened_where_the_caller_names_it(trap):
@@ -313,11 +364,25 @@ def test_a_task_of_ones_own_is_opened_where_the_caller_names_it(trap):
     assert type(task).__name__ == "Trap"
 
 
+def test_settings_of_a_task_of_ones_own_are_read_where_the_caller_names_it(trap):
+    place = f"{trap.file}:Trap"
+    file = write(trap.folder, "settings.yaml", f"task: '{place}'\nsteps: 77\n")
+    with pytest.raises(
+        ConfigError, match=r"name it yourself: --task path/to/file\.py:ClassName"
+    ):
+        load_training(file)
+    settings = load_training(file, task=place)
+    assert (settings.task, settings.steps) == (place, 77)
+    assert settings_of(run_of_a_task(trap, place), place).task == place
+
+
 def test_a_run_of_a_task_of_ones_own_is_resumed_where_the_caller_names_it(trap):
     place = f"{trap.file}:Trap"
     run_of_a_task(trap, place)
-    done = nics("train --resume --out run", cwd=trap.folder)
-    assert "name it yourself: --task path/to/file.py:ClassName" in done.stderr
-    assert not trap.canary.exists()
-    done = nics("train --resume --out run --task", place, cwd=trap.folder)
+    done = nics("train", "--resume", "--out", "run", cwd=trap.folder)
+    assert (
+        "is a program, which a data file must not start; name it yourself"
+        in done.stderr
+    )
+    done = nics("train", "--resume", "--out", "run", "--task", place, cwd=trap.folder)
     assert "run: contains no checkpoint of these seeds" in done.stderr

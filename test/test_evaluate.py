@@ -13,7 +13,9 @@ from command_line import nics, split_words
 from domains import claimed_domain
 
 from nics_drl_bridge import defaults, geometry
+from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.robot.spec import load_robot
 
 ROOT = Path(__file__).resolve().parents[1]
 PNG = b"\x89PNG"
@@ -249,3 +251,58 @@ def test_a_vehicle_that_does_not_fit_its_model_is_not_driven(tmp_path):
     assert done.returncode == 2
     assert "the vehicle is not driven: " in done.stderr.splitlines()[-1]
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.ros
+@pytest.mark.process
+@pytest.mark.slow
+@pytest.mark.campaign
+@needs_nodes
+def test_a_vehicle_is_driven_in_real_time_through_the_armed_gate(tmp_path, monkeypatch):
+    from nics_drl_bridge.commands import episodes as vehicle
+    from nics_drl_bridge.nodes.processes import NodeProcess, Witness
+
+    limits = {
+        one.name: {"min": one.min, "max": one.max, "rate": 20.0, "jerk": 400.0}
+        for one in load_robot("differential").command
+    }
+    file = tmp_path / "limits.yaml"
+    file.write_text(
+        dump_yaml({"robot": "differential", "commands": limits}), encoding="utf-8"
+    )
+    model = {"model": "differential"}
+    logs = tmp_path / "logs"
+    said = []
+    gate = model | {"limits": str(file), "black_box": str(tmp_path / "black_box")}
+    gate |= {"use_sim_time": True, "e_stop_required": False}
+    # What a busy machine does to rates and ages would be a finding; that is tested elsewhere.
+    monkeypatch.setattr(vehicle, "examine", lambda facts, expected: [])
+    out = tmp_path / "out"
+    order = vehicle.EvaluationOrder(
+        ["dynamic_window"], out, "differential", "empty", 1, 0
+    )
+    options = {"start": "present", "stale_after_s": DEADLINE_S}
+    with claimed_domain() as domain_id:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(domain_id))
+        monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        world = model | {"world": "empty"}
+        with (
+            NodeProcess("simulator_node", logs, world, domain_id),
+            NodeProcess("middleware_node", logs, model, domain_id),
+            NodeProcess("command_gate", logs, gate, domain_id),
+        ):
+            with Witness(domain_id) as witness:  # it may be compiling
+                assert witness.sees(DEADLINE_S)
+            made = vehicle.drive_vehicle(
+                order, None, True, said.append, said.append, **options
+            )
+    assert "  command_gate is armed" in said
+    assert any("it will drive to" in line for line in said)
+    (driven,), (beside,) = made.runs.values()
+    assert driven.length > 0.3  # the gate let commands pass
+    assert list(driven.path[0]) == list(beside.path[0])
+    assert list(driven.goal) == list(beside.goal)
+    told = json.loads(
+        (tmp_path / "out" / "evaluation.json").read_text(encoding="utf-8")
+    )
+    assert list(told["policies"]["dynamic_window"]) == ["vehicle", "fast"]

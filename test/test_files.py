@@ -397,3 +397,26 @@ def test_a_changed_file_is_named_and_an_editable_one_may_lose_its_line(listed):
         with pytest.raises(ModelError, match=f"{name}: does not match its checksum"):
             check_sums(listed, NAMES, editable="sub/none")
         write_sums(listed)
+
+
+FULL = """
+import resource, sys
+from pathlib import Path
+from nics_drl_bridge.files import write_bytes
+resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
+try:
+    write_bytes(Path(sys.argv[1]), bytes(100_000))
+except OSError as error:
+    print(error.strerror)
+"""
+
+
+@pytest.mark.process
+def test_a_disk_that_takes_no_more_leaves_the_old_file_and_no_other(tmp_path):
+    path = tmp_path / "file"
+    write_bytes(path, b"old")
+    run = subprocess.run(
+        [sys.executable, "-c", FULL, str(path)], capture_output=True, text=True
+    )
+    assert run.stdout == "File too large\n", run.stderr
+    assert tree(tmp_path) == {"file": b"old"}

@@ -77,3 +77,11 @@ def test_a_terminal_is_told_again_and_again_and_its_line_is_removed_at_the_end()
     assert "\n" not in terminal.getvalue()
     assert terminal.getvalue().endswith("\r\x1b[K")
     assert kernels.COMPILING.tell == STATUS.show
+
+
+def test_the_estimate_ends_with_the_last_kernel_and_never_says_zero() -> None:
+    for left in range(4):
+        text = kernels.estimate(left, 400, 1.0)
+        assert " 0 " not in text
+    assert "up to 1 kernel: about 1 s" in kernels.estimate(1, 400, 1.0)
+    assert kernels.estimate(0, 400, 1.0).endswith("the last kernels")

@@ -53,6 +53,7 @@ TURN_SPACING = 0.03  # between two turns that are tried, at most [rad]
 MIN_TURNS = 14  # minimum number of turns that are tried
 PATH_SPACING = 0.05  # between two lesser motions that are tried, at most [m]
 MIN_LESSER = 4  # minimum number of lesser motions that are tried
+MAX_LESSER = 20  # maximum number of them, whatever odometry shows
 COMPARED_BEAMS = 200  # number of beams that suffice for that
 # Another motion than odometry's must let this fraction of all compared beams agree, and this
 # fraction more than odometry does.
@@ -183,7 +184,7 @@ def _lessen_motion(motion: Array) -> Array:
     """Returns motions (n, 3) that are fractions of one, from none on: of wheels that spin."""
     arc = log(motion)
     path = math.hypot(arc[0], arc[1])
-    count = max(MIN_LESSER, math.ceil(path / PATH_SPACING))
+    count = min(max(MIN_LESSER, math.ceil(path / PATH_SPACING)), MAX_LESSER)
     fractions = np.arange(count) / count
     return exp(fractions[:, None] * arc)
 

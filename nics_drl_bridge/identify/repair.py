@@ -19,6 +19,7 @@ from nics_drl_bridge.identify.signals import (
     moved_commands,
     unwrapped,
 )
+from nics_drl_bridge.identify.statistics import unexplained
 from nics_drl_bridge.identify.verdict import Doubt, Gap, Mistake
 from nics_drl_bridge.recording import recording as recordings
 from nics_drl_bridge.recording.mapping import UNITS
@@ -646,8 +647,9 @@ def check_axes(drive: Drive) -> None:
     noise = TRAVEL_NOISE * (drive.pose_noise or (0.0, 0.0))[0]
     apart = max(TRAVEL_SHARE * drive.spec.footprint_radius, noise, 1e-3)
     spaced = drive.dated.rows(recordings.select_along_path(values, apart))
-    keys = HeadingKeys.NONE
-    if not drive.spec.moves_sideways:
+    if drive.spec.moves_sideways:
+        keys = _find_mirrored_heading(spaced, drive)
+    else:
         keys = recordings.find_clockwise_keys(spaced.values)
     if keys is HeadingKeys.NONE:
         keys = _find_heading_by_inputs(spaced.values, drive)
@@ -666,6 +668,20 @@ def check_axes(drive: Drive) -> None:
     raise RecordingError(
         f"{recording.source}: pose: {fault}: {advice}; or {alternative} (REP-103)."
     )
+
+
+def _find_mirrored_heading(pose: recordings.Stream, drive: Drive) -> HeadingKeys:
+    """Finds if only mirrored headings make the measured state explain the poses."""
+    state = drive.recording.state
+    if state is None or state.clock != drive.recording.pose.clock:
+        return HeadingKeys.NONE
+    if not recordings.has_visible_axes(pose.values):
+        return HeadingKeys.NONE
+    as_recorded = _explained(pose.t, pose.values, state)
+    mirrored = _explained(pose.t, pose.values * np.array([1.0, 1.0, -1.0]), state)
+    if mirrored > max(recordings.MIN_MIRRORED, recordings.BETTER + as_recorded):
+        return HeadingKeys.MIRRORED
+    return HeadingKeys.NONE
 
 
 def _find_heading_by_inputs(spaced: Array, drive: Drive) -> HeadingKeys:
@@ -701,3 +717,14 @@ def _explain_velocity(drive: Drive, pose: Array) -> float:
         share = (rest**2).sum() / max(float((velocity**2).sum()), 1e-12)
         explained.append(1.0 - float(share))
     return max(explained)
+
+
+def _explained(t: Array, pose: Array, state: recordings.Stream) -> float:
+    """Returns the fraction (0 to 1) of the body velocity between poses that the state explains."""
+    span = np.diff(t)
+    keep = span > 0.0
+    velocity = (
+        geometry.log(geometry.between(pose[:-1], pose[1:]))[keep, :2] / span[keep, None]
+    )
+    means = interval_means(state.t, state.values, t[:-1][keep], t[1:][keep])
+    return 1.0 - float((unexplained(means, velocity) ** 2).mean())

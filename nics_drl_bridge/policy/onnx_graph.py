@@ -127,10 +127,10 @@ Fault = tuple[str, str]  # faulty field and the reason
 def read_network(file: Path, source: str, field: str) -> bytes:
     """Reads a network's file, which `field` of the source names. Raises PolicyError."""
     name = "" if str(file) == source else f"{file.name!r} "
-    if not file.is_file():
-        reason = f"{name}does not exist or is not a file; check its path."
-        raise PolicyError(source, field, reason)
     try:
+        if not file.is_file():
+            reason = f"{name}does not exist or is not a file; check its path."
+            raise PolicyError(source, field, reason)
         size = file.stat().st_size
         if size <= SIZE_LIMIT:
             return file.read_bytes()

@@ -158,11 +158,14 @@ def _do(about: dict[str, Any], data: bytes) -> None:
         check_policy_graph(data, needs, source)
         session = open_session(data, source)
         run_session(session, needs, seen, source)
-        # Measure as many observations as are ever run at once.
+        # Measure as many observations as are ever run at once: fewer ran, so memory would be lacking.
         tensors = [np.resize(seen, (needs.most_rows, shape[1]))]
         if needs.first_state is not None:
             tensors.append(np.tile(needs.first_state, (needs.most_rows, 1)))
-        run_rows(session, source, *tensors)
+        try:
+            run_rows(session, source, *tensors)
+        except PolicyError as error:
+            raise MemoryError from error
 
 
 def _limit(memory: int) -> None:

@@ -4,7 +4,7 @@
 
 1. `_frame_of`: choose the cells. They are aligned with the world's own map if it has one, cover the
    field, its walls and the map, and leave a border of one cell around them.
-2. Occupy every cell whose centre lies outside a walled field.
+2. `_enclose`: occupy every cell whose centre lies outside a walled field.
 3. `_copy_map`: copy the world's own map. Each of its cells becomes a square of smaller cells.
 4. `_mark_line`: occupy the cells along each wall, found by points much closer than a cell.
 5. `_fill`: occupy the cells whose centre lies in an obstacle. A part thinner than a cell may
@@ -65,8 +65,7 @@ def occupancy(
     cells = np.full(frame.size, FREE, np.int8)
     made = GridMap(cells, frame.cell, tuple(origin.tolist()))
     if world.size is not None:
-        centres = made.cell_to_world(_cell_indices(cells))
-        cells[(np.abs(centres) > np.divide(world.size, 2.0)).any(axis=-1)] = OCCUPIED
+        _enclose(made, np.array(world.size) / 2.0)
     if world.grid is not None:
         _copy_map(made, world.grid, frame.first)
     for wall in np.array(world.walls, np.float64).reshape(-1, 2, 2):
@@ -110,6 +109,22 @@ def _frame_of(world: World, cell: float) -> _Frame:
     end = np.ceil(high / cell - ROUNDING).astype(int) + 1
     columns, rows = end - first
     return _Frame(pose, first, (int(rows), int(columns)), cell)
+
+
+def _enclose(made: GridMap, half: Array) -> None:
+    """Occupy everything outside a field, given half its size (2,) [m]."""
+    is_turned = made.origin[2] != 0.0
+    if is_turned:
+        centres = made.cell_to_world(_cell_indices(made.cells))
+        made.cells[(np.abs(centres) > half).any(axis=-1)] = OCCUPIED
+        return
+    # x depends on the column alone, and y on the row alone
+    rows = np.arange(made.cells.shape[0])
+    columns = np.arange(made.cells.shape[1])
+    x = made.cell_to_world(np.stack([0 * columns, columns], axis=-1))[:, 0]
+    y = made.cell_to_world(np.stack([rows, 0 * rows], axis=-1))[:, 1]
+    made.cells[np.abs(y) > half[1]] = OCCUPIED
+    made.cells[:, np.abs(x) > half[0]] = OCCUPIED
 
 
 def _cell_indices(cells: NDArray[Any]) -> NDArray[np.int_]:

@@ -63,3 +63,11 @@ def test_what_is_malformed_is_refused(name, points, reason):
     assert (
         reason in rig.give(SensorReading(rig.stamp + 1, name, np.array(points))).refused
     )
+
+
+def test_its_jump_in_time_latches():
+    rig = Backed(wish=(0.5, 0.0, 0.0)).drive()
+    rig.give(SensorReading(rig.stamp - 10**10, "rear", np.zeros((0, 2))))
+    assert (rig.rule, rig.decision.cause.topic) == ("stamps_jumped", "rear")
+    rig.run(1.0)
+    assert rig.state.latched is not None

@@ -7,11 +7,14 @@ from gate.rig import TICK_S, Rig, config, driving
 from nics_drl_bridge.gate.inputs import (
     Command,
     EStop,
+    Odometry,
     Press,
     Reset,
+    Scan,
     Tick,
 )
 from nics_drl_bridge.gate.stops import FROZEN_INPUTS
+from nics_drl_bridge.geometry import Bicycle
 from nics_drl_bridge.interface import NS_PER_S
 
 WITHIN_S = 0.40
@@ -327,3 +330,59 @@ def test_only_a_tick_publishes_a_motion():
     rig = driving()
     for event in (Command(rig.stamp, rig.wish), EStop(False)):
         assert not rig.give(event).publish
+
+
+def test_a_scan_that_arrives_late_is_as_old_as_it_is():
+    rig = driving()
+    rig.run(0.3, without="scan command")
+    rig.scan(stamp_ns=rig.stamp - round(0.3 * NS_PER_S) + 1)  # held back for 0.3 s
+    rig.command(stamp=rig.state.scans.stamps_ns[-1])
+    rig.run(0.08, without="scan command")
+    assert rig.rule == "scan_silent"
+
+
+def test_a_car_that_takes_turn_rates_is_limited_by_its_steering_angle():
+    rig = Rig(config(bicycle=Bicycle(0.2)))
+    rig.wish = np.array([0.5, 0.0, 0.3])
+    rig.drive()
+    assert rig.decision.twist.tolist() == pytest.approx([0.5, 0.0, 0.3])
+    assert rig.state.value.tolist() == pytest.approx([0.5, np.arctan(0.2 * 0.3 / 0.5)])
+    rig.wish = np.array([0.5, 0.0, 30.0])
+    rig.run(2.0)
+    assert rig.decision.twist[2] == pytest.approx(
+        0.5 * np.tan(rig.config.limits.high[1]) / 0.2
+    )
+
+
+def test_whatever_comes_in_what_goes_out_is_finite_within_limits_and_zero_when_stopped():
+    rng = np.random.default_rng(0)
+    odd = np.array([np.nan, np.inf, -np.inf, 1e308, 5e-324, 0.0, -1.0, 0.3])
+    for _ in range(4):
+        rig = driving()
+        low = rig.config.limits.low
+        high = rig.config.limits.high
+        for _ in range(150):
+            rig.run(TICK_S, without=str(rng.choice(["", "scan", "odom", "command"])))
+            stamp = int(rng.choice([rig.stamp, 0, -1, rig.stamp + 10**12]))
+            twist = np.where(
+                rng.random(3) < 0.2, rng.choice(odd, 3), rng.normal(size=3)
+            )
+            event = [
+                Command(stamp, twist),
+                Scan(
+                    stamp,
+                    rng.choice(odd[odd < 1e30], 720).astype(np.float32),
+                    (-np.pi, np.pi / 360),
+                ),
+                Odometry(stamp, twist, twist),
+                Tick(),
+            ][rng.integers(4)]
+            now = float(rng.choice([rig.now, np.nan, 0.0], p=[0.9, 0.05, 0.05]))
+            decision = rig.give(event, now)
+            value = decision.twist[list(rig.config.fields)]
+            assert np.isfinite(decision.twist).all()
+            assert (value >= low).all()
+            assert (value <= high).all()
+            assert decision.twist[1] == 0.0
+            if decision.cause is not None:
+                assert not decision.twist.any()

@@ -291,3 +291,13 @@ def test_a_lidar_of_very_few_beams_decides_nothing_and_breaks_nothing(beams):
     scene.run(1.5)
     assert scene.arm().granted
     assert scene.run(1.0).cause is None
+
+
+def test_scans_from_before_the_stamps_jumped_back_are_not_compared():
+    scene = Scene()
+    scene.run(1.0)
+    scene.stamp -= 100 * NS_PER_S
+    scene.run(1.0)
+    stamps = [view.stamp_ns for view in scene.state.scan_motion.views]
+    assert len(stamps) > 2
+    assert max(stamps) <= scene.stamp

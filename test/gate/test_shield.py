@@ -8,15 +8,13 @@ import pytest
 from gate.recorded import see
 from gate.rig import LIDAR, Rig, config
 from nics_drl_bridge import geometry
-from nics_drl_bridge.gate.evidence import (
-    find_movers,
-)
+from nics_drl_bridge.gate.evidence import add_view, find_movers, find_obstacles
 from nics_drl_bridge.gate.footprint import get_body
 from nics_drl_bridge.gate.gate import decide
-from nics_drl_bridge.gate.inputs import Tick
+from nics_drl_bridge.gate.inputs import Odometry, Scan, Tick
 from nics_drl_bridge.gate.shield import CREEP_SPEED
 from nics_drl_bridge.gate.shield_kernels import is_free
-from nics_drl_bridge.gate.state import ShieldConfig, View
+from nics_drl_bridge.gate.state import ShieldConfig, View, begin
 from nics_drl_bridge.interface import NS_PER_S
 
 CAR = ShieldConfig(
@@ -290,3 +288,45 @@ def test_a_robot_is_at_rest_before_somebody_who_walks_up_to_it_is_there(told):
         rig.ranges = see(rig.pose, LIDAR.angles, walls).astype(np.float32)
         rig.run(0.02)
     assert (rig.speed > 0.01) != told
+
+
+def test_views_from_before_the_stamps_jumped_back_are_dropped():
+    state = begin(GIVEN)
+    for stamp in (100 * NS_PER_S, NS_PER_S, 11 * NS_PER_S // 10):
+        state = replace(state, odometry=Odometry(stamp, np.zeros(3), np.zeros(3)))
+        scan = Scan(stamp, np.full(LIDAR.beams, 1.0, np.float32), (0.0, 0.01))
+        state = replace(state, views=add_view(GIVEN, state, scan))
+    assert [view.stamp_ns for view in state.views] == [NS_PER_S, 11 * NS_PER_S // 10]
+
+
+def test_a_view_is_from_where_the_robot_was_when_it_was_scanned():
+    odometry = Odometry(
+        5 * NS_PER_S, np.array([1.0, 2.0, np.pi / 2]), np.array([1.0, 0.0, 0.0])
+    )
+    state = replace(begin(GIVEN), odometry=odometry)
+    scan = Scan(
+        5 * NS_PER_S + NS_PER_S // 10, np.ones(LIDAR.beams, np.float32), (0.0, 0.01)
+    )
+    assert add_view(GIVEN, state, scan)[-1].pose == pytest.approx([1.0, 2.1, np.pi / 2])
+    assert add_view(config(), state, scan) == ()
+
+
+def test_unknown_beams_are_a_wall_on_the_outline_and_blind_directions_are_none():
+    corners = ((0.25, 0.2), (-0.25, 0.2), (-0.25, -0.2), (0.25, -0.2))
+    some = slice(180, 540)  # of 720, those to the front
+    for unseen, front in (
+        (slice(0), False),
+        (slice(None), True),
+        (slice(0, 90), False),
+    ):
+        given = config(
+            shield=replace(CAR, outline=corners), beam_angles=LIDAR.angles[some]
+        )
+        seen = np.full(360, np.inf, np.float32)
+        seen[unseen] = np.nan
+        wall = find_obstacles(given, seen, ())[:, :2]
+        assert (np.abs(wall) == (0.25, 0.2)).any(axis=1).all()
+        assert (len(wall) > 0) == (unseen != slice(0))
+        assert (wall[:, 0] == 0.25).any() == front
+        assert (wall[:, 0] >= -0.05).all()
+        assert front or (wall[:, 1] < 0.0).all()

@@ -21,6 +21,7 @@ from nics_drl_bridge.identify.acceptance import (
 )
 from nics_drl_bridge.identify.conclusion import conclude
 from nics_drl_bridge.identify.identify import identify
+from nics_drl_bridge.identify.report import format_with_error
 from nics_drl_bridge.robot.taylor import EndErrors, HorizonErrors
 
 RADIUS_M = 0.2
@@ -201,3 +202,18 @@ def test_the_written_textbook_is_that_of_the_trial_and_fitted_no_further(command
     assert found.trial.model is found.findings.model
     assert found.model.terms_kept == found.trial.model.terms_kept
     assert not any("fitted to all" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "text"),
+    [
+        (4.63, 0.02, "(4.63 +- 0.02)"),
+        (0.312, 36.0, "(0.312 +- 36)"),
+        (3.2, 36.0, "(3.2 +- 36)"),
+        (1.6, 1.6, "(1.6 +- 1.6)"),
+        (0.00123, 0.5, "(0.00123 +- 0.5)"),
+        (1234.0, 500.0, "(1234 +- 500)"),
+    ],
+)
+def test_a_coefficient_is_printed_so_that_it_can_be_used(value, error, text):
+    assert format_with_error(value, error) == text

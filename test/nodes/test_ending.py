@@ -33,11 +33,10 @@ def make(context):
 runner.run_node(make)
 ending.leave(0)
 """
-ENDS = [signal.SIGHUP, signal.SIGRTMAX]
+ENDS = [signal.SIGHUP, signal.SIGQUIT, signal.SIGALRM, signal.SIGRTMAX]
 FURTHER_ENDS = [
     signal.SIGINT,
     signal.SIGTERM,
-    signal.SIGQUIT,
     signal.SIGUSR1,
     signal.SIGUSR2,
     signal.SIGALRM,
@@ -102,7 +101,7 @@ def test_a_lost_terminal_does_not_end_what_was_started_by_nohup(domain_id):
     assert "stopped\n" in process.communicate(timeout=DEADLINE_S)[0]
 
 
-@pytest.mark.parametrize("number", [signal.SIGUSR1, rarely(signal.SIGQUIT)])
+@pytest.mark.parametrize("number", [signal.SIGHUP, rarely(signal.SIGQUIT)])
 def test_a_gate_that_lets_a_robot_drive_leaves_a_zero_behind(
     launch_process, meet, domain_id, model, tmp_path, number
 ):

@@ -4,6 +4,7 @@ import hashlib
 import json
 
 import numpy as np
+import onnx
 import pytest
 import torch
 import yaml
@@ -382,3 +383,20 @@ def test_a_bundle_of_others_needs_a_robot_and_a_folder_a_bundle(tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(PolicyError, match="contains 0 bundle descriptions"):
         import_policy(tmp_path / "empty")
+
+
+def test_a_changed_export_is_refused(tmp_path):
+    policy, _ = made(tmp_path, "plain")
+    file = export_bundle(policy, tmp_path / "bundle")
+    network = tmp_path / "bundle" / "policy.onnx"
+    model = onnx.load(network)
+    model.graph.initializer[-1].raw_data = bytes(
+        len(model.graph.initializer[-1].raw_data)
+    )
+    write_bytes(network, model.SerializeToString(deterministic=True))
+    data = described(file)
+    digest = hashlib.sha256(network.read_bytes()).hexdigest()
+    data["models"]["policy"]["parameters"]["sha256sum"] = digest
+    write_text(file, dump_yaml(data))
+    with pytest.raises(PolicyError, match="changed"):
+        policy_of(import_policy(file), tmp_path / "back.onnx")

@@ -8,7 +8,7 @@ import pytest
 
 from nics_drl_bridge import generator
 from nics_drl_bridge.identify.identify import identify
-from nics_drl_bridge.identify.report import format_report
+from nics_drl_bridge.identify.report import format_report, format_with_error
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.report.fit_page import fit_tile, write_fit_page
 from nics_drl_bridge.report.fit_pictures import fit_pictures, write_pictures
@@ -92,3 +92,18 @@ def test_what_pruning_would_have_kept_is_not_told_of_a_motion(found):
         assert part not in text
     assert f"Kept {identified.model.terms_kept} terms, step" in text
     assert "accuracy" not in fit_pictures(spec, by_motion)
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "text"),
+    [
+        (4.63123, 0.0213, "(4.63 +- 0.02)"),
+        (123.4, 17.0, "(123 +- 17)"),
+        (0.025, 9.7e-5, "(0.025000 +- 0.000097)"),
+        (1234.0, 230.0, "(1234 +- 230)"),
+        (5.0, 1e-9, "5"),
+        (5.0, None, "5"),
+    ],
+)
+def test_a_number_has_the_digits_that_its_error_leaves(value, error, text):
+    assert format_with_error(value, error) == text
