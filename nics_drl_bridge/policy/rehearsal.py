@@ -158,7 +158,7 @@ def _do(about: dict[str, Any], data: bytes) -> None:
         check_policy_graph(data, needs, source)
         session = open_session(data, source)
         run_session(session, needs, seen, source)
-        # Measure as many observations as are ever run at once: fewer ran, so memory would be lacking.
+        # Measure as many observations as are ever run at once. Fewer ran: only memory can lack.
         tensors = [np.resize(seen, (needs.most_rows, shape[1]))]
         if needs.first_state is not None:
             tensors.append(np.tile(needs.first_state, (needs.most_rows, 1)))
