@@ -15,7 +15,8 @@ from .registry import FOLDER
 
 @pytest.fixture
 def module(monkeypatch):
-    monkeypatch.setattr(sys, "path", [str(FOLDER), *sys.path])
+    folders = [FOLDER, FOLDER.parents[1] / "benchmarks"]
+    monkeypatch.setattr(sys, "path", [*map(str, folders), *sys.path])
     return import_module
 
 
