@@ -11,7 +11,7 @@ pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
 from geometry_msgs.msg import PoseStamped, TwistStamped
 from nav_msgs.msg import Odometry
-from sensor_msgs.msg import LaserScan
+from sensor_msgs.msg import Imu, LaserScan
 from std_srvs.srv import SetBool
 
 from nics_drl_bridge.env.registry import NAVIGATION
@@ -118,6 +118,13 @@ def test_silence_of_a_topic_is_named_with_its_age_and_a_reset_goes_on(
     assert caught.value.age_s > 2.0
     assert backend.reset(START).pose == pytest.approx(START.pose, abs=0.2)
     backend.step(FORWARD)
+
+
+@pytest.mark.parametrize(("imu", "listeners"), [("gyro", 1), ("none", 0)])
+def test_the_imu_that_is_named_is_heard(connect, vehicle, imu, listeners):
+    gyro = vehicle.peer.node.create_publisher(Imu, "gyro", qos.SENSOR_RELIABLE)
+    connect(domain_id=vehicle.domain_id, imu=imu)
+    assert gyro.get_subscription_count() == listeners
 
 
 def test_a_simulator_whose_services_are_found_late_is_no_vehicle(connect, monkeypatch):

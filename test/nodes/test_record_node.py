@@ -186,7 +186,7 @@ def test_a_simulator_that_is_faster_than_the_clock_is_noticed(
 class Nics:
     """`nics record` in a process of its own, in a folder."""
 
-    def __init__(self, folder, domain_id, *options):
+    def __init__(self, folder, domain_id, *options, errors=subprocess.STDOUT):
         self._said = folder / "said"
         environment = {
             "ROS_DOMAIN_ID": str(domain_id),
@@ -199,7 +199,7 @@ class Nics:
                 cwd=folder,
                 env=os.environ | environment,
                 stdout=log,
-                stderr=subprocess.STDOUT,
+                stderr=errors,
             )
 
     @property
@@ -216,8 +216,8 @@ def nics(tmp_path, domain_id):
     """Starts `nics record`; it has ended after the test."""
     started = []
 
-    def start(*options):
-        started.append(Nics(tmp_path, domain_id, *options))
+    def start(*options, **errors):
+        started.append(Nics(tmp_path, domain_id, *options, **errors))
         return started[-1]
 
     yield start
