@@ -5,10 +5,10 @@ approach, `obstacle_speed` for a mover and 0 for all else. `find_obstacles` coll
 steps:
 
 1. Compare the newest scan with earlier ones: a beam that ends where an earlier one saw free space
-   ends on a mover, which may approach. All other obstacles are static. The motion in between is
-   that of odometry, corrected if another one clearly fits both scans better: wheels slip when a
-   skid-steer turns, and spin when its body is held. With uncorrected odometry, standing things
-   would seem to move then.
+   ends on a mover, which may approach. All other obstacles are static. A wrong motion in between
+   makes standing things seem to move, and wheels do slip (of a skid-steer in turns) and spin (of a
+   body that is held). So odometry's motion is replaced by another one if that clearly fits both
+   scans better. `scan_motion` judges by itself, over a longer time, whether a body is held.
 2. Place an obstacle at the end of each beam that returns.
 3. Place one at the minimum range of each beam that was too close to measure.
 4. Place a wall on the footprint wherever too many beams are unknown.
@@ -46,21 +46,21 @@ TOLERANCE = 0.03
 DEVIATIONS = 3.0
 # The motion between two scans: odometry is believed in smaller turns and shorter paths, because
 # their errors are within the angle and the distance over which beams are compared.
-MIN_SLIP_TURN = evidence_kernels.COMPARED_ANGLE
-MIN_SLIP_PATH = TOLERANCE
+MIN_CHECKED_TURN = evidence_kernels.COMPARED_ANGLE
+MIN_CHECKED_PATH = TOLERANCE
 MAX_TURN_FRACTION = 1.3  # of the turns that are tried, over odometry's
 TURN_SPACING = 0.03  # between two turns that are tried, at most [rad]
 MIN_TURNS = 14  # minimum number of turns that are tried
 PATH_SPACING = 0.05  # between two lesser motions that are tried, at most [m]
 MIN_LESSER = 4  # minimum number of lesser motions that are tried
 MAX_LESSER = 20  # maximum number of them, whatever odometry shows
-COMPARED_BEAMS = 200  # number of beams that suffice for that
-# Another motion than odometry's must let this fraction of all compared beams agree, and this
-# fraction more than odometry does.
+COMPARED_BEAMS = 200  # number of beams that suffice to compare motions
+# Another motion than odometry's must let this fraction of all compared beams agree, and more beams
+# than odometry's does, by this fraction of all compared ones.
 MIN_AGREEING = 0.3
 MIN_GAIN = 0.05
-# The beams that agree by that motion alone must show in so many sectors of an eighth of a circle,
-# each with so many beams: a person who walks around the robot must not pass for a turn.
+# The beams that agree by that motion, but not by odometry's, must lie in so many sectors of an
+# eighth of a circle, each with so many beams: a person who walks around the robot is no turn of it.
 SECTORS = 8
 MIN_SECTORS = 4
 MIN_SECTOR_BEAMS = 2
@@ -95,7 +95,7 @@ def find_obstacles(
 def find_movers(
     config: GateConfig, shield: ShieldConfig, views: tuple[View, ...]
 ) -> Flags:
-    """Returns which beams (B,) of the newest view end on movers; a neighbour has to agree."""
+    """Returns which beams (B,) of the newest view end on movers; a beam beside has to, too."""
     newest = views[-1]
     entered = np.zeros(len(newest.ranges), np.bool_)
     if shield.obstacle_speed == 0.0:
@@ -138,11 +138,11 @@ def estimate_motion(
     """
     by_odometry = between(old.pose, new.pose)
     path = math.hypot(by_odometry[0], by_odometry[1])
-    if path <= MIN_SLIP_PATH and abs(by_odometry[2]) <= MIN_SLIP_TURN:
+    if path <= MIN_CHECKED_PATH and abs(by_odometry[2]) <= MIN_CHECKED_TURN:
         return by_odometry
     stride = math.ceil(len(new.ranges) / COMPARED_BEAMS)
-    returns = np.isfinite(new.ranges[::stride])
-    compared = len(returns)
+    is_return = np.isfinite(new.ranges[::stride])
+    compared = len(is_return)
 
     def find_agreeing(motion: Array) -> Flags:
         agreeing = np.empty(compared, np.bool_)
@@ -156,12 +156,12 @@ def estimate_motion(
         np.count_nonzero(agreeing_by_odometry) + MIN_GAIN * compared,
         MIN_AGREEING * compared,
     )
-    if np.count_nonzero(returns) < needed:
+    if np.count_nonzero(is_return) < needed:
         return by_odometry  # no motion can be better
     motions = np.concatenate([_vary_turn(by_odometry), _lessen_motion(by_odometry)])
     agreeing = np.stack([find_agreeing(motion) for motion in motions])
     counts = np.count_nonzero(agreeing, axis=1)
-    best = int(np.argmax(counts))
+    best = int(np.argmax(counts))  # of several, the turn nearest to odometry's
     gained = np.flatnonzero(agreeing[best] & ~agreeing_by_odometry) * stride
     if counts[best] < needed or _count_sectors(gained, lidar) < MIN_SECTORS:
         return by_odometry

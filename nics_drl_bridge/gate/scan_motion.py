@@ -4,14 +4,16 @@
 
 1. Reduce it to the median ranges in a few directions.
 2. Choose an earlier scan as the reference: the oldest since which the robot has not turned far. If
-   odometry shows too little motion since then, nothing is decided.
+   odometry shows too little motion since then, or nearly all of it in one half of the time, nothing
+   is decided.
 3. Predict the new scan from the reference and that motion.
-4. Compare it sector by sector. Where the prediction differs clearly from the reference, the new
-   scan must have changed. The scans contradict odometry if most sectors show little of the motion,
-   their median hardly any, and in the median sector few ranges changed visibly: the wheels spin but
-   the body stands. A scene that looks the same after the motion, such as a long corridor, decides
-   nothing.
-5. Report a held body (rule `body_held`) once scans have contradicted odometry for some time.
+4. Compare it sector by sector, wherever the prediction differs clearly from the reference. The
+   share of a sector is the part of the predicted change that the new scan shows: 1 if odometry is
+   right, 0 if the body stands. A scene that looks the same after the motion, such as a long
+   corridor, decides nothing.
+5. The scans contradict odometry if most sectors show a small share, their median hardly any, and in
+   the median sector few ranges changed visibly.
+6. Report a held body (rule `body_held`) once scans have contradicted odometry for some time.
 """
 
 import math
@@ -47,9 +49,9 @@ MEDIAN_FACTOR = 1.25
 class Settings:
     """When scans contradict odometry.
 
-    Usual shares of the motion: 0.77 for a skid-steer robot whose odometry turns 30 % too far, 0.5
-    on ice. Tyres that break loose may show a tenth of a turn for half a second; such a robot is not
-    held, because it also drives and so its ranges change.
+    Usual shares: 0.77 for a skid-steer robot whose odometry turns 30 % too far, 0.5 on ice. Tyres
+    that break loose may show a share of 0.1 in a turn of half a second; such a robot is not held,
+    because it also drives and so its ranges change.
 
     Attributes:
         spacing: angle between the directions of a reduced scan [rad].
@@ -63,12 +65,14 @@ class Settings:
         kept_every_s: minimum time between scans that are kept [s].
         min_path: minimum path by odometry since the reference [m], unless the turn suffices.
         min_turn: minimum turn by odometry since the reference [rad], unless the path suffices.
-        min_half: minimum fraction of the motion in either half of that time. Otherwise a robot that
-            has just started would look held if its scans were stamped up to 0.25 s too late: they
-            would show the motion of one half alone. With less than `usual_half`, a contradiction
-            needs shares that are smaller in proportion.
-        usual_half: fraction of the motion in either half for which the shares below hold.
-        min_half_motion: minimum motion in either half, in multiples of the minimum motion.
+        min_half: minimum fraction of the motion in each half of the time since the reference. Scans
+            stamped up to 0.25 s too late miss about the second half: of a robot that has just
+            started they show only the first, and it would look held.
+        usual_half: with less than this fraction in one half, the limits of the shares below shrink
+            in proportion. It must be greater than `held_share`: scans of a free robot stamped too
+            late, which moved 3 cm and then 17 cm, show a share of 0.15, and the limit is 0.12.
+        min_half_motion: in that case, each half must also have this motion, in multiples of the
+            minimum motion: noise would hide a smaller one.
         usual_turn: a younger reference is preferred if the robot turned further than this [rad].
         max_turn: no reference is used if it turned further: a room may repeat itself [rad].
         min_change: root mean square of the predicted changes of a sector that is compared [m].
@@ -121,7 +125,7 @@ class Verdict(NamedTuple):
     """What two scans say about the motion in between.
 
     Attributes:
-        share: median fraction of the motion that they show; NaN if there are too few of them.
+        share: median fraction of the motion that they show; NaN if nothing is decided.
         held: they contradict odometry.
         reference: the older of the two scans; None if they were not compared.
     """
@@ -229,10 +233,11 @@ def judge_motion(
     config: GateConfig, kept: tuple[ReducedScan, ...], newest: ReducedScan
 ) -> Verdict:
     """Judges whether the newest scan shows the motion that odometry shows since an earlier one."""
-    reference, lesser_half = _select_reference(kept, newest)
+    reference, lesser_fraction = _select_reference(kept, newest)
     if reference is None:
         return UNDECIDED
-    strictness = min(1.0, lesser_half / SETTINGS.usual_half)
+    # Scans stamped too late show at least this fraction of a free robot's motion; see `usual_half`.
+    share_scale = min(1.0, lesser_fraction / SETTINGS.usual_half)
     mount = np.array(config.mount)
     moved = between(compose(reference.pose, mount), compose(newest.pose, mount))
     directions = get_directions(config)
@@ -259,11 +264,11 @@ def judge_motion(
         return UNDECIDED
     share = float(np.median(observed[is_compared]))
     contradicting = np.count_nonzero(
-        np.abs(observed[is_compared]) < strictness * SETTINGS.sector_share
+        np.abs(observed[is_compared]) < share_scale * SETTINGS.sector_share
     )
     held = (
         contradicting >= SETTINGS.min_contradicting * sectors
-        and abs(share) < strictness * SETTINGS.held_share
+        and abs(share) < share_scale * SETTINGS.held_share
         and np.median(changed[is_compared]) < SETTINGS.max_changed
     )
     return Verdict(share, bool(held), reference)
@@ -272,10 +277,9 @@ def judge_motion(
 def _select_reference(
     kept: tuple[ReducedScan, ...], newest: ReducedScan
 ) -> tuple[ReducedScan | None, float]:
-    """Returns the scan to compare the newest one with, and the lesser half of the motion.
+    """Returns the scan to compare the newest one with; None if odometry shows too little motion.
 
-    The scan is None if odometry shows too little motion. The half is that of the time since the
-    scan in which the robot moved less, as a fraction of the motion.
+    Returns also the fraction of the motion since then in that half of the time with less of it.
     """
     # The oldest scan since which the robot has not turned further than usual; without one, the
     # youngest that is of any use. The last one is left out: a scan has to lie in between.
@@ -290,21 +294,21 @@ def _select_reference(
     if chosen is None:
         return None, 0.0
     reference = kept[chosen]
-    half_ns = (reference.stamp_ns + newest.stamp_ns) // 2
-    middle = min(kept[chosen + 1 :], key=lambda scan: abs(scan.stamp_ns - half_ns))
+    middle_ns = (reference.stamp_ns + newest.stamp_ns) // 2
+    middle = min(kept[chosen + 1 :], key=lambda scan: abs(scan.stamp_ns - middle_ns))
     motion = _measure_motion(reference, newest)
-    lesser_half = min(
+    lesser_motion = min(
         _measure_motion(reference, middle),
         _measure_motion(middle, newest),
     )
-    is_usual = lesser_half >= SETTINGS.usual_half * motion
-    is_seen = (
-        lesser_half >= SETTINGS.min_half * motion
-        and lesser_half >= SETTINGS.min_half_motion
+    is_usual = lesser_motion >= SETTINGS.usual_half * motion
+    is_enough = (
+        lesser_motion >= SETTINGS.min_half * motion
+        and lesser_motion >= SETTINGS.min_half_motion
     )
-    if motion < 1.0 or not (is_usual or is_seen):
+    if motion < 1.0 or not (is_usual or is_enough):
         return None, 0.0
-    return reference, lesser_half / motion
+    return reference, lesser_motion / motion
 
 
 def _measure_motion(old: ReducedScan, new: ReducedScan) -> float:
