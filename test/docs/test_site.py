@@ -81,10 +81,6 @@ def test_a_browser_shows_every_page_of_the_site_without_a_flaw(site, tmp_path):
         server.shutdown()
 
 
-# Right edges of the numbers and formulas of all equations, and that of the text around them.
-# What reaches beyond the window without a box of its own that scrolls.
-
-
 @needs_chromium
 @pytest.mark.process
 @pytest.mark.slow

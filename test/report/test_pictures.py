@@ -181,3 +181,9 @@ def test_a_drive_is_drawn():
     robot = load_robot("mecanum")
     png = drive_picture(DrivePlan(robot, duration=20.0).preview(), robot)
     assert len(pixels_of(decoded(png), MEASURED)) > 100
+
+
+@pytest.mark.parametrize("draw", DRAWINGS.values(), ids=DRAWINGS)
+@pytest.mark.parametrize("size", [(200.0, 200.0), (4.0, 40.0)])
+def test_no_word_is_cut_off_in_a_large_or_high_picture(draw, size):
+    assert ink_at_the_edges(draw(field_of(*size))) == 0
