@@ -1,9 +1,6 @@
 """Mounting: position and rotation of the tracked body on the robot."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +11,11 @@ from nics_drl_bridge.identify import clocks
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive, TwistIntervals
 from nics_drl_bridge.identify.signals import average_held, followed, speed_index
-from nics_drl_bridge.identify.statistics import CERTAIN, standard_errors
+from nics_drl_bridge.identify.statistics import (
+    CERTAIN,
+    clustered_errors,
+    standard_errors,
+)
 from nics_drl_bridge.identify.terms import has_slipping_tyres, list_reversed_variables
 from nics_drl_bridge.recording.recording import Stream
 from nics_drl_bridge.robot import taylor
@@ -74,9 +75,7 @@ def mounting_of(
     if not (has_textbook(spec) or spec.takes_cmd_vel):
         return None  # its forward direction is unknown
     if spec.moves_sideways:
-        return jackknifed(
-            drive, twists, timing.offset, partial(_estimate_by_commands, timing)
-        )
+        return _estimate_by_commands(drive, timing)
     start, end = twists.on_clock(timing.offset)
     command = average_held(
         drive.recording.command, spec, start - timing.latency, end - timing.latency
@@ -273,11 +272,12 @@ def lateral_lever(
 
 
 def _estimate_by_commands(
-    timing: clocks.TimingEstimate, drive: Drive, twists: TwistIntervals
+    drive: Drive, timing: clocks.TimingEstimate
 ) -> Mounting | None:
     """Estimates an omnidirectional robot's mounting; None unless it moved along x, y and turned."""
     recording = drive.recording
     spec = drive.spec
+    twists = drive.twists
     inferred = recording.state is None and any(v.twist for v in spec.state)
     if spec.state and not inferred:
         command = _convert_to_commands(
@@ -288,21 +288,39 @@ def _estimate_by_commands(
         command = average_held(
             recording.command, spec, begin, begin + twists.end - twists.start
         )
-    response = _predict_twists(spec, command)  # of base_link, up to one factor
-    size = np.linalg.svd(response, compute_uv=False)
+    # of base_link, up to one factor
+    return mounting_by_expected_twists(twists, _predict_twists(spec, command))
+
+
+def mounting_by_expected_twists(
+    motion: TwistIntervals, expected: Array
+) -> Mounting | None:
+    """Estimates the mounting by twists (n, 3) of `base_link` that are known up to one factor.
+
+    Its errors treat blocks of the drive as independent, because slip and delays last for a while.
+    """
+    size = np.linalg.svd(expected, compute_uv=False)
     if size[2] <= MIN_SECOND * size[0]:
         return None
-    gain, *_ = np.linalg.lstsq(response, twists.twist, rcond=None)
-    rest = twists.twist - response @ gain
-    spread = np.stack([standard_errors(response, column) for column in rest.T], axis=1)
-    rotation = float(np.arctan2(gain[0, 1] - gain[1, 0], gain[0, 0] + gain[1, 1]))
+    gain = np.linalg.lstsq(expected, motion.twist, rcond=None)[0]
+    rest = motion.twist - expected @ gain
+    edges = np.linspace(motion.start[0], motion.end[-1], BLOCKS + 1)
+    block = np.searchsorted(edges[1:-1], motion.start, "right")
+    errors = [clustered_errors(expected, column, block) for column in rest.T]
+    sigma = np.stack(errors, axis=1)  # of the gain
+    sine = gain[0, 1] - gain[1, 0]  # both times twice the factor
+    cosine = gain[0, 0] + gain[1, 1]
+    sine_sigma = np.hypot(sigma[0, 1], sigma[1, 0])
+    cosine_sigma = np.hypot(sigma[0, 0], sigma[1, 1])
+    rotation = float(np.arctan2(sine, cosine))
+    rotation_sigma = np.hypot(cosine * sine_sigma, sine * cosine_sigma)
+    rotation_sigma /= sine**2 + cosine**2
     across = rotate(gain[2, :2], -rotation) / gain[2, 2]  # (-lever_y, lever_x)
-    scale = float(np.hypot(gain[0, 0], gain[0, 1]))
     return Mounting(
-        float(wrap_angle(rotation)),
+        rotation,
         np.array([across[1], -across[0]]),
-        float(spread[0, 1] / scale),
-        np.full(2, float(spread[2, 0] / abs(gain[2, 2]))),
+        float(rotation_sigma),
+        np.full(2, float(sigma[2, :2].max() / abs(gain[2, 2]))),
         2,
     )
 
@@ -347,41 +365,3 @@ def _select_fresh(command: Stream, start: Array) -> NDArray[np.bool_]:
     return np.asarray(
         np.append(span, 0.0)[np.clip(row, 0, None)] < clocks.LONG_STEP * usual
     )
-
-
-Estimate = Callable[[Drive, TwistIntervals], Mounting | None]
-
-
-def jackknifed(
-    drive: Drive, twists: TwistIntervals, offset: float, estimate: Estimate
-) -> Mounting | None:
-    """Estimates a mounting with jackknife uncertainty; the twists' clock is `offset` behind."""
-    whole = estimate(drive, twists)
-    if whole is None:
-        return None
-    edges = np.linspace(twists.start[0], twists.end[-1], BLOCKS + 1)
-    parts = []
-    for begin, end in pairwise(edges):
-        rows = (twists.end <= begin) | (twists.start >= end)
-        rest = drive
-        state = drive.recording.state
-        if state is not None:
-            outside = (state.t < begin + offset) | (state.t > end + offset)
-            rest = drive.part(replace(drive.recording, state=state.rows(outside)))
-        kept = TwistIntervals(twists.start[rows], twists.end[rows], twists.twist[rows])
-        part = estimate(rest, kept)
-        if part is not None:
-            parts.append(part)
-    if len(parts) < BLOCKS:
-        return whole
-    rotation = wrap_angle(np.array([p.rotation - whole.rotation for p in parts]))
-    rotation_sigma = max(whole.rotation_sigma, float(_measure_spread(rotation)))
-    lever_sigma = np.maximum(
-        whole.lever_sigma, _measure_spread(np.array([p.lever for p in parts]))
-    )
-    return replace(whole, rotation_sigma=rotation_sigma, lever_sigma=lever_sigma)
-
-
-def _measure_spread(values: Array) -> Array:
-    """Returns standard errors (...) from estimates (B, ...) that each omit one block."""
-    return np.asarray(np.sqrt((len(values) - 1.0) * values.var(axis=0)))

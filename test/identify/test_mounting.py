@@ -3,36 +3,32 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from identify.drives import drive
-from nics_drl_bridge.identify.drive import Drive, TwistIntervals
+from nics_drl_bridge import geometry
+from nics_drl_bridge.identify.drive import TwistIntervals
 from nics_drl_bridge.identify.mounting import (
-    Mounting,
     by_instruments,
-    jackknifed,
+    mounting_by_expected_twists,
     mounting_without_lateral_motion,
     with_slip,
 )
 from nics_drl_bridge.robot.spec import build_robot
 
 
-def mean_of_twists(_, twists: TwistIntervals) -> Mounting:
-    """An estimate whose uncertainty is known: the mean of what is in the twists."""
-    first, second, turn = twists.twist.mean(axis=0)
-    return Mounting(float(turn), np.array([first, second]), 0.0, np.zeros(2), True)
-
-
-def test_what_lasts_for_a_block_widens_the_uncertainty(mecanum):
-    driven = Drive(drive(mecanum, duration=40.0), mecanum)
-    twists = driven.twists
-    slip = np.repeat(
-        np.random.default_rng(0).normal(size=8), -(-len(twists.start) // 8)
-    )
-    alike = TwistIntervals(
-        twists.start, twists.end, np.tile(slip[: len(twists.start), None], 3)
-    )
-    found = jackknifed(driven, alike, 0.0, mean_of_twists)
-    assert found is not None
-    assert found.rotation_sigma == pytest.approx(slip.std() / np.sqrt(7.0), rel=0.3)
+def test_what_lasts_for_a_block_widens_the_uncertainty():
+    rng = np.random.default_rng(0)
+    n = np.arange(800.0)
+    expected = rng.normal(size=(800, 3))
+    noise = 0.1 * rng.normal(size=(800, 3))
+    sigma = []
+    for slip in (0.0, 0.3):
+        lasting = slip * np.repeat(rng.normal(size=(8, 3)), 100, axis=0)
+        lasting = lasting * expected.sum(axis=1, keepdims=True)
+        turned = geometry.rotate(expected[:, :2], 0.4)
+        twist = np.column_stack([turned, expected[:, 2]]) + lasting + noise
+        found = mounting_by_expected_twists(TwistIntervals(n, n + 1.0, twist), expected)
+        sigma.append([found.rotation_sigma, *found.lever_sigma])
+        assert abs(found.rotation - 0.4) < 3.0 * found.rotation_sigma
+    assert (np.divide(*sigma[::-1]) > 3.0).all()
 
 
 def test_a_robot_that_keeps_its_heading_and_goes_anywhere_tells_nothing_of_its_mounting():
