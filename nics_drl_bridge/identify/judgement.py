@@ -27,7 +27,7 @@ from nics_drl_bridge.identify.yardstick import (
     Yardstick,
     fit_yardstick,
     kept_twist,
-    twists_before,
+    twists_at,
 )
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.taylor import EndErrors, HorizonErrors, TaylorModel
@@ -72,7 +72,7 @@ def judged(
         if not len(chosen.start_t):
             break
         ends = predict(model, calibration, drive, chosen)
-        twist = twists_before(drive, chosen.start_t)
+        twist = twists_at(drive, chosen.start_t)
         yardsticks = {
             "kept_twist": kept_twist(drive, chosen, twist),
             "standing": chosen.start,

@@ -69,13 +69,7 @@ def with_motion(
     """
     recording = drive.recording
     spec = drive.spec
-    step = float(grid[1] - grid[0])
-    pose = unwrapped(poses_at(drive, calibration, grid, 0.5 * width))
-    rows = 2 * max(2, round(width / step)) + 1
-    rates = scipy.signal.savgol_filter(pose, rows, 2, deriv=1, delta=step, axis=0)
-    twist = np.concatenate(
-        [geometry.rotate(rates[:, :2], -pose[:, 2]), rates[:, 2:]], axis=1
-    )
+    twist = body_twists(drive, calibration, grid, width)
     columns = [
         twist[:, POSE_RATES.index(v.twist)]
         if v.twist
@@ -86,6 +80,21 @@ def with_motion(
     return drive.part(
         replace(recording, state=Stream(grid, values, recording.command.clock))
     )
+
+
+def body_twists(
+    drive: Drive, calibration: Calibration, grid: Array, width: float
+) -> Array:
+    """Returns the twists (T, 3) of `base_link` at uniform times (T,) on the commands' clock.
+
+    They are slopes of parabolas through the poses within a half-width [s] on both sides.
+    """
+    step = float(grid[1] - grid[0])
+    pose = unwrapped(poses_at(drive, calibration, grid, 0.5 * width))
+    rows = 2 * max(2, round(width / step)) + 1
+    rates = scipy.signal.savgol_filter(pose, rows, 2, deriv=1, delta=step, axis=0)
+    forward = geometry.rotate(rates[:, :2], -pose[:, 2])
+    return np.concatenate([forward, rates[:, 2:]], axis=1)
 
 
 def as_smooth(command: Array, step: float, width: float) -> Array:

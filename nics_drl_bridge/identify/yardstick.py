@@ -1,6 +1,7 @@
 """Yardsticks for a model: a robot that keeps its twist, and the fitted textbook kinematics."""
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.kernels import STRAIGHT, BicycleGeometry, roll_windows
+from nics_drl_bridge.identify.motion import body_twists, half_width
 from nics_drl_bridge.identify.open_loop import Windows, windows
 from nics_drl_bridge.identify.shooting import HEADING_ARM_M
 from nics_drl_bridge.identify.signals import average_held, unwrapped
@@ -25,11 +27,7 @@ HORIZONS_S = (1.0, 2.5, 5.0)  # horizons at which the fit compares predictions
 STEP_S = 0.02
 SPACING_S = 0.1
 MOST_WINDOWS = 200
-# poses that determine the twist at a window's start: time span and number
-BEFORE_S = 0.2
-FEWEST = 4
-# maximum standard error of a start speed that is taken from a parabola
-STEADY_M_S = 0.05
+MIN_GRID = 40  # minimum number of steps over which twists are measured
 LOSS_SCALE = 0.2  # scale of the soft L1 loss [m/s]
 MOST_EVALUATIONS = 60
 TOLERANCE = 1e-4
@@ -78,7 +76,7 @@ class Yardstick:
         """Predicts poses (W, 3) at windows' ends from twists (W, 3) at their starts, if known."""
         duration = (chosen.end_t - chosen.start_t)[:, None]
         course = _sample_commands(drive, chosen.start_t + self.clock_offset_s, duration)
-        twist = twists_before(drive, chosen.start_t) if twist is None else twist
+        twist = twists_at(drive, chosen.start_t) if twist is None else twist
         return geometry.compose(
             chosen.start, _predict_ends(self.response, course, twist)[:, 0]
         )
@@ -86,32 +84,29 @@ class Yardstick:
 
 def kept_twist(drive: Drive, chosen: Windows, twist: Array | None = None) -> Array:
     """Predicts poses (W, 3) at windows' ends for a robot that keeps the twist at their starts."""
-    twist = twists_before(drive, chosen.start_t) if twist is None else twist
+    twist = twists_at(drive, chosen.start_t) if twist is None else twist
     moved = twist * (chosen.end_t - chosen.start_t)[:, None]
     return geometry.compose(chosen.start, geometry.exp(moved))
 
 
-def twists_before(drive: Drive, at: Array) -> Array:
-    """Estimates twists (W, 3) of the tracked body at times (W,) of poses, from those just before.
+def twists_at(drive: Drive, at: Array) -> Array:
+    """Estimates twists (W, 3) of the tracked body at times (W,) of poses.
 
-    Uses parabolas, which do not lag, or lines for noisy poses, which are four times as steady.
+    A yardstick starts from the same information as a model whose state is its motion: parabolas
+    through the poses on both sides.
     """
+    grid, twist = _measure_twists(drive)
+    return np.stack([np.interp(at, grid, column) for column in twist.T], axis=-1)
+
+
+@lru_cache(maxsize=4)
+def _measure_twists(drive: Drive) -> tuple[Array, Array]:
+    """Returns uniform times (T,) on the pose's clock, and twists (T, 3) of the tracked body."""
     t = drive.dated.t
-    pose = unwrapped(drive.dated.values)
-    last = np.searchsorted(t, at + 1e-9) - 1
-    first = np.minimum(np.searchsorted(t, at - BEFORE_S - 1e-9), last - FEWEST + 1)
-    noise = (drive.pose_noise or (0.0, 0.0))[0]
-    count = float(np.median(last - first + 1))
-    degree = 2 if noise * np.sqrt(192.0 / count) / BEFORE_S < STEADY_M_S else 1
-    twist = np.zeros((len(at), 3))
-    for w, (a, b) in enumerate(zip(np.maximum(first, 0), last + 1, strict=True)):
-        if b - a > degree and t[b - 1] > t[a]:
-            rate, place = np.polyfit(
-                t[a:b] - t[b - 1], pose[a:b] - pose[b - 1], degree
-            )[-2:]
-            heading = pose[b - 1, 2] + place[2] if degree == 2 else pose[a:b, 2].mean()
-            twist[w] = [*geometry.rotate(rate[:2], -heading), rate[2]]
-    return twist
+    width = half_width(drive)
+    count = max(int((t[-1] - t[0]) / STEP_S), MIN_GRID)
+    grid = np.linspace(t[0], t[-1], count + 1)
+    return grid, body_twists(drive, Calibration(), grid, width)
 
 
 def _select_windows(
@@ -122,7 +117,7 @@ def _select_windows(
     if not len(chosen.start_t):
         return chosen, np.zeros((0, 3))
     brief = windows(drive, Calibration(), 0.0, until_s, GUESS_S, SPACING_S)
-    twist = twists_before(drive, chosen.start_t)
+    twist = twists_at(drive, chosen.start_t)
     fastest = JUMP * np.percentile(brief.path, 90) / GUESS_S
     moved = np.hypot(*(chosen.end - chosen.start)[:, :2].T) / horizon
     calm = np.maximum(moved, np.hypot(twist[:, 0], twist[:, 1])) <= fastest
@@ -284,7 +279,7 @@ def _guess_response(
     seen, before = _select_windows(drive, until_s, GUESS_S, SPACING_S)
     span = (seen.end_t - seen.start_t)[:, None]
     twist = geometry.log(geometry.between(seen.start, seen.end)) / span
-    change = (twists_before(drive, seen.end_t) - before) / span
+    change = (twists_at(drive, seen.end_t) - before) / span
     command = drive.recording.command
     one_clock = command.clock == drive.recording.pose.clock
     candidates = []

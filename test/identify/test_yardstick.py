@@ -12,7 +12,7 @@ from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.open_loop import windows
-from nics_drl_bridge.identify.yardstick import fit_yardstick, kept_twist, twists_before
+from nics_drl_bridge.identify.yardstick import fit_yardstick, kept_twist, twists_at
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
@@ -75,7 +75,7 @@ def test_a_robot_that_keeps_its_twist_is_predicted_by_it():
         Recording(Stream(t[:1], np.array([[0.5, 0.5]])), Stream(t, pose)), spec
     )
     chosen = windows(driven, Calibration(), 1.0, 10.0, 5.0, 0.1)
-    assert twists_before(driven, chosen.start_t) == pytest.approx(
+    assert twists_at(driven, chosen.start_t) == pytest.approx(
         np.tile([0.5, 0.0, 0.5], (len(chosen.start_t), 1)), abs=1e-3
     )
     assert share(kept_twist(driven, chosen), chosen) < 1e-3
