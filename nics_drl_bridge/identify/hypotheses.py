@@ -153,16 +153,27 @@ class Draft:
         """Yields the model of each hypothesis, fitted to the rows inside (T,)."""
         samples = self.problem.samples.rows(inside)
         base = self.base(inside).model
-        linear: dict[int, TaylorModel] = {}
+        starts: dict[int, TaylorModel] = {}  # of the searches, by order
         for order, pull in asked:
             if not order:
                 yield (order, pull), base
                 continue
-            if order not in linear:
+            if order not in starts:
                 fit = terms.fit_motion_terms(samples, self.spec, order)
-                linear[order] = fit.model
-            refined = self.refined(base, linear[order], inside, EVALUATIONS, pull)
+                starts[order] = fit.model
+            refined = self.refined(base, starts[order], inside, EVALUATIONS, pull)
+            starts[order] = refined.model  # near the best model of the next pull
             yield (order, pull), refined.model
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A part of a model that was tried, for the report."""
+
+    name: str
+    # mean error after `HORIZON_S` on parts that the fit did not see, as a fraction of the path
+    error: float
+    kept: bool
 
 
 @dataclass(frozen=True)
@@ -171,6 +182,7 @@ class Base:
 
     draft: Draft  # its inputs start from the values found
     found: shooting.Predictive
+    candidates: tuple[Candidate, ...] = ()  # forms that were tried, in this order
 
 
 def base_of(
@@ -197,59 +209,96 @@ def base_of(
         inputs = replace(inputs, start=predictive.values)
         return Base(replace(draft, inputs=inputs, problem=problem), predictive)
 
-    def error_of(base: Base) -> float:
-        return base.draft.tried((TEXTBOOK,))[0].level
+    def cross_validate(base: Base) -> Trial:
+        return base.draft.tried((TEXTBOOK,))[0]
 
     if former is not None:
-        return fitted(replace(former.draft.form, curves=calibration.inputs))
+        refitted = fitted(replace(former.draft.form, curves=calibration.inputs))
+        return replace(refitted, candidates=former.candidates)
     best = fitted(forms.Form(calibration.inputs))
-    error = error_of(best)
+    trial = cross_validate(best)
+    start = "textbook with input curves" if calibration.inputs else "textbook"
+    candidates = [Candidate(start, trial.error, kept=True)]
     if len(calibration.inputs) > len(clear):
         plain = fitted(forms.Form(clear))
-        plain_error = error_of(plain)
-        if plain_error < error or np.isinf(plain_error):  # too short to judge
+        plain_trial = cross_validate(plain)
+        # an infinite level: too short to judge
+        is_better = plain_trial.level < trial.level or np.isinf(plain_trial.level)
+        candidates = [
+            Candidate("textbook", plain_trial.error, kept=True),
+            Candidate("input curves", trial.error, kept=not is_better),
+        ]
+        if is_better:
             best = plain
-            error = plain_error
-    for change, worth in changes(drive, calibration, samples):
+            trial = plain_trial
+    for name, change, worth in changes(drive, calibration, samples):
         form = change(best.draft.form)
         if form == best.draft.form:
             continue
         changed = fitted(form, best)
-        changed_error = error_of(changed)
-        if changed_error < worth * error:
+        changed_trial = cross_validate(changed)
+        is_better = changed_trial.level < worth * trial.level
+        candidates.append(Candidate(name, changed_trial.error, kept=is_better))
+        if is_better:
             best = changed
-            error = changed_error
-    return best
+            trial = changed_trial
+    return replace(best, candidates=tuple(candidates))
 
 
 def changes(
     drive: Drive, calibration: Calibration, samples: Samples
-) -> Iterator[tuple[Callable[[forms.Form], forms.Form], float]]:
-    """Yields changes to the form of a motion, and the fraction to which each must cut the error."""
+) -> Iterator[tuple[str, Callable[[forms.Form], forms.Form], float]]:
+    """Yields changes to the form of a motion by name, and the fraction to cut the error to."""
     # Drag and friction are hard to distinguish, so both are tried, then each without the other.
     speeds = tuple(v.name for v in drive.spec.state if v.twist == "vx")
     late = forms.likely_delays(drive, calibration, samples)
+    delays = "a delay of each command"
     if late:  # first, because a wrong delay hides other effects and is hidden by them
-        yield lambda form: replace(form, delays=late), WORTH
+        yield delays, lambda form: replace(form, delays=late), WORTH
     if terms.has_slipping_tyres(drive.spec):
-        yield lambda form: replace(form, tyres=True), WORTH
+        yield "tyres that slip", lambda form: replace(form, tyres=True), WORTH
     if speeds:
-        yield lambda form: replace(form, drag=speeds, friction=speeds), WORTH
-        yield lambda form: replace(form, drag=()), 1.0 / WORTH
-        yield lambda form: replace(form, friction=()), 1.0 / WORTH
+        drag = "drag and back-EMF"
+        friction = "dry friction"
+        both = f"{drag}, and {friction}"
+        yield both, lambda form: replace(form, drag=speeds, friction=speeds), WORTH
+        without = f"without {drag}"
+        yield without, lambda form: replace(form, drag=()), 1.0 / WORTH
+        without = f"without {friction}"
+        yield without, lambda form: replace(form, friction=()), 1.0 / WORTH
     if late:
-        yield lambda form: replace(form, delays=late), WORTH
+        yield delays, lambda form: replace(form, delays=late), WORTH
     if speeds:
-        yield lambda form: forms.with_dead(form, drive, samples), WORTH
-        yield lambda form: replace(form, limits=speeds), WORTH
+        yield "a dead zone", lambda form: forms.with_dead(form, drive, samples), WORTH
+        limits = "limits of acceleration"
+        yield limits, lambda form: replace(form, limits=speeds), WORTH
         others = tuple(
             v.name for v in drive.spec.state if v.twist and not drive.spec.steers
         )
         if others:
-            yield lambda form: replace(form, limits=others), WORTH
+            all_limits = f"limits of {', '.join(others)}"
+            yield all_limits, lambda form: replace(form, limits=others), WORTH
         backwards = forms.two_way(drive, samples)
         if backwards:
-            yield lambda form: forms.with_back(form, backwards), WORTH
+            gain = "a gain of its own backwards"
+            yield gain, lambda form: forms.with_back(form, backwards), WORTH
+
+
+def list_candidates(
+    base: Base | None, trials: Sequence[Trial], order: Order = "auto"
+) -> Iterator[Candidate]:
+    """Yields all candidates that were tried: forms of the textbook, then orders of terms."""
+    if base is not None:
+        yield from base.candidates
+    if not trials:
+        return
+    best = chosen(trials, order)
+    for trial in trials:
+        if trial.order:
+            name = f"terms up to order {trial.order}"
+            if trial.pull:
+                name += f", pulled by {trial.pull:g}"
+            yield Candidate(name, trial.error, trial is best)
 
 
 def hypotheses(order: Order) -> tuple[Hypothesis, ...]:

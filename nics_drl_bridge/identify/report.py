@@ -9,6 +9,7 @@ import numpy as np
 
 from nics_drl_bridge.identify.conclusion import conclude
 from nics_drl_bridge.identify.fit import Alpha
+from nics_drl_bridge.identify.hypotheses import list_candidates
 from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.identify.signals import moved_commands
 from nics_drl_bridge.identify.statistics import Curve
@@ -27,6 +28,10 @@ MOUNTING_VALUES = ("rotation_rad", "lever_arm_x_m", "lever_arm_y_m")
 TEXTBOOK_VALUES = ("command_latency_s", *MOUNTING_VALUES)
 DEAD_ZONE = "dead zone on both sides of 0"
 EAGER = "does more than in proportion, by minus"
+CANDIDATES = (
+    "Candidates, mean error after 5 s on parts that their fits did not see, as a fraction of the "
+    "path, * for those kept:"
+)
 # minimum digits of a coefficient, with which the printed equations predict like the model
 LEAST_DIGITS = 3
 # fraction of the error of standing still above which a model hardly helps
@@ -39,6 +44,9 @@ def format_report(source: str, identified: Identified) -> str:
     motor_effects = list(list_motor_effects(identified))
     if motor_effects:
         sections["Effect of the motors (standard uncertainties):"] = motor_effects
+    candidates = list(_describe_candidates(identified))
+    if candidates:
+        sections[CANDIDATES] = candidates
     sections |= _describe_fit(identified)
     apart = f"after {identified.train_until_s:.1f} s"
     if identified.recording.episodes:
@@ -206,6 +214,18 @@ def format_with_error(value: float, error: float | None) -> str:
         return f"({value:.{LEAST_DIGITS}g} +- {error:.2g})"
     digits = max(0, by_error)
     return f"({value:.{digits}f} +- {error:.{digits}f})"
+
+
+def _describe_candidates(identified: Identified) -> Iterator[str]:
+    """Yields a line per candidate that was tried in the trial; none if a textbook was written."""
+    findings = identified.findings
+    if findings.replacement:
+        return
+    order = identified.drive.settings.order
+    for candidate in list_candidates(findings.base, findings.trials, order):
+        if np.isfinite(candidate.error):
+            mark = " *" if candidate.kept else ""
+            yield f"{candidate.name:<36} {candidate.error:7.2%}{mark}"
 
 
 def _describe_fit(identified: Identified) -> dict[str, Iterable[str]]:

@@ -40,7 +40,9 @@ DRIFT_M_S = 0.01  # drift of good predictions: noise counts as this much time
 # step of finite differences by the values of inputs, relative to their scale
 DIFFERENCE = 0.02
 EVALUATIONS = 60
-TOLERANCE = 1e-6
+# relative improvement of the loss below which a search ends: hundreds of searches rank models whose
+# errors differ by per cent
+TOLERANCE = 1e-4
 # minimum distance of a start value from its bounds, as a fraction of its range
 INSIDE = 0.05
 LEAST_SCALE = 0.02  # scale of the loss, below which errors count by their squares [m/s]

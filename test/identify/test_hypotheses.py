@@ -18,8 +18,10 @@ from nics_drl_bridge.identify.hypotheses import (
     chosen,
     hypotheses,
     lags_of,
+    list_candidates,
 )
 from nics_drl_bridge.identify.identify import STAGES, fit_terms, identify, run
+from nics_drl_bridge.identify.report import format_report
 
 
 def base(**given):
@@ -69,6 +71,14 @@ def test_a_car_that_slips_is_predicted_and_its_lever_is_not_bent_by_the_slip():
         for n in found.notes
     )
     assert any("can't be separated from the lags" in note for note in found.notes)
+    candidates = list(list_candidates(found.findings.base, found.findings.trials))
+    kept = [candidate.name for candidate in candidates if candidate.kept]
+    assert kept[0].startswith("textbook")
+    assert "tyres that slip" in kept
+    errors = [candidate.error for candidate in candidates if candidate.kept]
+    assert errors[-1] < 0.5 * errors[0]
+    report = format_report("here", found)
+    assert f"  tyres that slip{' ' * 21}" in report
 
 
 def trial(order, error):
