@@ -10,7 +10,7 @@ from typing import Any
 from registry import FOLDER, campaigns_of
 
 ROOT = FOLDER.parents[1]
-sys.path.append(str(ROOT / "benchmarks"))
+sys.path += [str(ROOT / "benchmarks"), str(ROOT / "test")]
 
 import bench  # noqa: E402
 from bench import answer, at_least, at_most, missed_bars  # noqa: E402
