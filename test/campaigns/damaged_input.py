@@ -32,7 +32,7 @@ BARS = {
     "good": at_least(1, "no good input was tried"),
 }
 CHECKSUMS = (
-    "recording.recording._check_seal",
+    "files.check_sealed",
     "generator.check_sums",
     "lidar.table.check_sums",
     "policy.onnx_graph.check_seal",
