@@ -33,7 +33,7 @@ BARS = {
 }
 CHECKSUMS = (
     "files.check_sealed",
-    "generator.check_sums",
+    "files.check_sums",
     "lidar.table.check_sums",
     "policy.onnx_graph.check_seal",
     "policy.contract._check_unchanged",

@@ -7,26 +7,16 @@ campaign proves is taken out, so that it has to miss the bar that is named here.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 FOLDER = Path(__file__).resolve().parent
+ROOT = FOLDER.parents[1]
+sys.path += [str(ROOT / "benchmarks"), str(ROOT / "test")]
 
-
-@dataclass(frozen=True)
-class Control:
-    """What makes a campaign fail.
-
-    Attributes:
-        what: is taken out.
-        bar: words of the bar that must be missed.
-        short: arguments, where they are others than those of the short form.
-    """
-
-    what: str
-    bar: str
-    short: str | None = None
+from bench import Control  # noqa: E402
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 from __future__ import annotations
 
 import io
-import os
 import json
+import os
 from dataclasses import replace
 
 import numpy as np
