@@ -27,8 +27,8 @@ FILE = Path(__file__).with_name("digests.json")
 ROBOTS = ("ackermann", "differential", "mecanum")
 WORLDS = {
     "ackermann": ("arena", "crowd"),
-    "differential": ("clutter", "room"),
-    "mecanum": ("arena", "clutter"),
+    "differential": ("clutter", "crowd"),
+    "mecanum": ("arena", "room"),
 }
 
 
