@@ -3,10 +3,12 @@
     python benchmarks/bench.py run [--long] [--only NAME ...] [--out FILE] [--list]
     python benchmarks/bench.py tables [--check]
 
-A benchmark prints one JSON object, whose `failures` are sentences about missed bars, and ends with
-1 if there are any. A run ends with its bars met, with some missed, or broken: crashed, hung, or
-without that object. `results.json` keeps the figures that the tables show, with machine, commit
-and load; it is rewritten after each run. `figures.py` has the tables, `plan.py` the runs.
+A file holds the benchmarks of one question, each with a name, as `python benchmarks/paper.py
+table2_lidar --help`. A benchmark prints one JSON object, whose `failures` are sentences about
+missed bars, and ends with 1 if there are any. A run ends with its bars met, with some missed, or
+broken: crashed, hung, or without that object. `results.json` keeps the figures that the tables
+show, with machine, commit and load; it is rewritten after each run. `figures.py` has the tables,
+`RUNS` the runs.
 """
 
 from __future__ import annotations
@@ -22,9 +24,9 @@ import sys
 import tempfile
 import time
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -69,6 +71,61 @@ class Bar:
             met = figure >= self.value
         sentence = f"{self.what or name} {figure:g}: must be {self.side} {self.value:g}"
         return [] if met else [sentence]
+
+
+@dataclass(frozen=True)
+class Control:
+    """What makes a benchmark or a campaign fail.
+
+    Attributes:
+        what: is taken out.
+        bar: words of the bar that must be missed.
+        short: arguments, where they are others than those of the short form.
+    """
+
+    what: str
+    bar: str
+    short: str | None = None
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """One of the benchmarks of a file.
+
+    Attributes:
+        measure: takes the arguments and returns the figures; its docstring says what is measured.
+        judge: returns a sentence for each bar that the figures miss.
+        controls: by their names.
+        options: settings of further arguments, by their names.
+        short: arguments of a short form; None where there is none.
+        unsettled: words of the bars that the short form does not settle.
+        needs: modules to import.
+    """
+
+    measure: Callable[[argparse.Namespace], dict[str, Any]]
+    judge: Callable[[dict[str, Any]], list[str]]
+    controls: Mapping[str, Control]
+    options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    short: str | None = ""
+    unsettled: tuple[str, ...] = ()
+    needs: tuple[str, ...] = ()
+
+
+def run_benchmark(benchmarks: Mapping[str, Benchmark]) -> NoReturn:
+    """Runs the benchmark that the first argument names, or the only one, by the other arguments."""
+    words = sys.argv[1:]
+    if len(benchmarks) == 1:
+        words = [*benchmarks, *words]
+    if not words or words[0] not in benchmarks:
+        raise SystemExit(f"name a benchmark: {', '.join(benchmarks)}")
+    chosen = benchmarks[words[0]]
+    controls = {key: control.what for key, control in chosen.controls.items()}
+    parser = parser_of(chosen.measure.__doc__, controls)
+    for option, settings in chosen.options.items():
+        parser.add_argument(f"--{option}", **settings)
+    given = parser.parse_args(words[1:])
+    result = chosen.measure(given)
+    answer(result, chosen.judge(result), given.json)
 
 
 def at_most(value: float, what: str = "") -> Bar:
@@ -163,6 +220,126 @@ def finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+# The runs. `make benchmark` takes half an hour on two cores; LONG=1 takes hours and gives the
+# figures of the tables. Some campaigns give figures, too; they run in their folder.
+
+CAMPAIGNS = "../test/campaigns/"
+LONG_TIMEOUT_S = 4 * 3600.0
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run of a script.
+
+    Attributes:
+        script: its file, from the folder of the benchmarks.
+        benchmark: of that file; empty for a script of one.
+        arguments: within half an hour for all runs.
+        long: those of the long version.
+        timeout_s: after which a run is ended [s].
+    """
+
+    script: str
+    benchmark: str = ""
+    arguments: tuple[str, ...] = ()
+    long: tuple[str, ...] = ()
+    timeout_s: float = 600.0
+    long_timeout_s: float = LONG_TIMEOUT_S
+
+
+def make_run(what: str, arguments: str = "", long: str | None = None) -> Run:
+    """A run of `SCRIPT BENCHMARK`, with arguments as one would type them."""
+    script, _, benchmark = what.partition(" ")
+    words = tuple(arguments.split())
+    longer = words if long is None else tuple(long.split())
+    return Run(f"{script}.py", benchmark, words, longer)
+
+
+LEARNERS = ("differential", "ackermann", "mecanum")
+SHIPPED = (*LEARNERS, "jackal")
+LIDARS = {
+    "lidar": "hokuyo_ust_10lx",
+    "rplidar": "rplidar_a2",
+    "sick": "sick_tim571",
+}
+RUNS: dict[str, Run] = {
+    "barn": make_run("policies barn", "--every 5", ""),
+    "barn_five_fold": make_run("policies barn", "--five-fold --folds 1", "--five-fold"),
+    "barn_mujoco": make_run("policies barn", "--in mujoco_dds --policy jackal"),
+    "baselines": make_run("policies baselines", "--episodes 50", "--episodes 200"),
+    "env_scaling": make_run("speed env_scaling"),
+    "env_throughput": make_run("speed env_throughput", "--repeats 3", ""),
+    **{
+        f"env_throughput_{name}": make_run(
+            "speed env_throughput", f"--lidar {lidar} --repeats 3", f"--lidar {lidar}"
+        )
+        for name, lidar in LIDARS.items()
+    },
+    "env_throughput_obstacles": make_run(
+        "speed env_throughput", "--obstacles 260 --repeats 3", "--obstacles 260"
+    ),
+    "estimator": make_run("fidelity estimator", "--drives 30", ""),
+    "fig4_pointcloud": make_run("paper fig4_pointcloud", "--scans 60", ""),
+    "first_hour": make_run("first_hour"),
+    "gate_envelope": make_run(
+        CAMPAIGNS + "gate_envelope", "--steps 30000", "--steps 1000000"
+    ),
+    "gate_faults": make_run(
+        CAMPAIGNS + "gate_faults", "--repeats 1", "--load 2 --repeats 100"
+    ),
+    "generate_from_mujoco": make_run("fidelity generate_from_mujoco", "--drives 3", ""),
+    "lidar_complexity": make_run("paper lidar_complexity", "--repeats 20", ""),
+    "lidar_peers": make_run("speed lidar_peers"),
+    "paper_fig7": make_run("paper paper_fig7", "--episodes 1", ""),
+    "parity": make_run(CAMPAIGNS + "parity"),
+    "ros_lockstep": make_run("speed ros_lockstep", "--chunks 40", ""),
+    "shield": make_run(
+        CAMPAIGNS + "shield", "--in-process --episodes 300", "--episodes 3000"
+    ),
+    "standards": make_run(CAMPAIGNS + "standards", "--chunks 10", ""),
+    "table1_kinematics": make_run("paper table1_kinematics"),
+    "table3_density": make_run("paper table3_density"),
+    "map_lidar": make_run("speed map_lidar"),
+    "real_drives": make_run("fidelity real_drives"),
+    "table2_lidar": make_run("paper table2_lidar"),
+    "table2_hokuyo": make_run("paper table2_lidar", "--lidar hokuyo_ust_10lx"),
+    **{
+        f"training_{robot}{name}": make_run(
+            "policies training",
+            f"--robot {robot}{lidar} --seeds 0",
+            f"--robot {robot}{lidar} --seeds 0 1 2",
+        )
+        for name, lidar in (("", ""), ("_rplidar", " --lidar rplidar_a2"))
+        for robot in LEARNERS
+    },
+    **{
+        f"robustness_{robot}": make_run(
+            "policies robustness", f"--robots {robot} --episodes 1", f"--robots {robot}"
+        )
+        for robot in SHIPPED
+    },
+    **{
+        f"transfer_{robot}": make_run(
+            "policies transfer", f"--robots {robot} --episodes 3", f"--robots {robot}"
+        )
+        for robot in SHIPPED
+    },
+}
+
+
+NO_SCRIPTS = ("bench.py", "figures.py")
+
+
+def plan_of(folder: Path) -> dict[str, Run]:
+    """Every run of the scripts in a folder, by name; a script without a row is run as it is."""
+    found = {name: run for name, run in RUNS.items() if (folder / run.script).exists()}
+    known = {*NO_SCRIPTS, *(run.script for run in RUNS.values())}
+    for path in sorted(folder.glob("*.py")):
+        if path.name not in known:
+            found[path.stem] = Run(path.name)
+    return found
+
+
 # A run: a benchmark in a process of its own, to its end.
 
 
@@ -222,14 +399,14 @@ def find_processes(mark: str) -> list[int]:
     return found
 
 
-def end_processes(mark: str) -> int:
+def end_processes(mark: str, grace_s: float = GRACE_S) -> int:
     """Ends what a run left behind; returns how many processes that were."""
     left = find_processes(mark)
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
         for pid in find_processes(mark):
             with suppress(ProcessLookupError):
                 os.kill(pid, number)
-        deadline = time.monotonic() + GRACE_S
+        deadline = time.monotonic() + grace_s
         while find_processes(mark) and time.monotonic() < deadline:
             time.sleep(0.05)
     return len(left)
@@ -266,7 +443,9 @@ def judge(code: int | None, printed: str, last: str) -> dict[str, Any]:
     }
 
 
-def run_one(script: Path, arguments: Sequence[str], timeout_s: float) -> dict[str, Any]:
+def run_one(
+    script: Path, arguments: Sequence[str], timeout_s: float, grace_s: float
+) -> dict[str, Any]:
     """Runs a script to its end, or ends it; no process of it stays."""
     mark = uuid.uuid4().hex
     entry = {
@@ -277,7 +456,7 @@ def run_one(script: Path, arguments: Sequence[str], timeout_s: float) -> dict[st
     began = time.monotonic()
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
         process = subprocess.Popen(
-            [sys.executable, str(script), "--json", *arguments],
+            [sys.executable, str(script), *arguments, "--json"],
             stdin=subprocess.DEVNULL,
             stdout=out,  # files, since a pipe can clog
             stderr=err,
@@ -291,7 +470,7 @@ def run_one(script: Path, arguments: Sequence[str], timeout_s: float) -> dict[st
         except subprocess.TimeoutExpired:
             pass
         finally:
-            end_processes(mark)
+            end_processes(mark, grace_s)
             process.wait()
         printed, said = (read_all(file) for file in (out, err))
     last = (said.strip() or printed.strip() or "no message")[-LAST_WORDS:]
@@ -364,11 +543,12 @@ def run_all(given: argparse.Namespace, plan: Mapping[str, Any]) -> int:
         timeout_s = given.timeout or (
             run.long_timeout_s if given.long else run.timeout_s
         )
-        sys.stderr.write(f"{name}: {run.script} {' '.join(arguments)}\n")
+        words = (*filter(None, [run.benchmark]), *arguments)
+        sys.stderr.write(f"{name}: {run.script} {' '.join(words)}\n")
         entry = {
             "script": Path(run.script).name,
             **about,
-            **run_one(given.scripts / run.script, arguments, timeout_s),
+            **run_one(given.scripts / run.script, words, timeout_s, given.grace),
         }
         paths = paths_of(name)
         if paths and entry["result"]:
@@ -385,8 +565,7 @@ def run_all(given: argparse.Namespace, plan: Mapping[str, Any]) -> int:
 
 def main() -> None:
     """Runs benchmarks or makes tables."""
-    import tables
-    from plan import plan_of
+    from figures import write_tables
 
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     commands = parser.add_subparsers(dest="command", required=True)
@@ -396,12 +575,15 @@ def main() -> None:
     run.add_argument("--list", action="store_true", help="print the names of the runs")
     run.add_argument("--out", type=Path, default=RESULTS, help="file of the results")
     run.add_argument("--timeout", type=float, help="seconds for each")
+    run.add_argument(
+        "--grace", type=float, default=GRACE_S, help="seconds between signals that end"
+    )
     run.add_argument("--scripts", type=Path, default=SCRIPTS, help="their folder")
     made = commands.add_parser("tables", help="make the tables of README and docs")
     made.add_argument("--check", action="store_true", help="say which are stale")
     given = parser.parse_args()
     if given.command == "tables":
-        raise SystemExit(tables.write_tables(given.check))
+        raise SystemExit(write_tables(given.check))
     plan = plan_of(given.scripts)
     unknown = [name for name in given.only or () if name not in plan]
     if unknown:

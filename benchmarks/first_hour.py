@@ -8,24 +8,33 @@ not committed is not in the clone. Typing and reading are not in the times.
 
 from __future__ import annotations
 
+import argparse
 import json
-import os
 import shlex
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from bench import ROOT, answer, parser_of
+from bench import (
+    ROOT,
+    Benchmark,
+    Control,
+    at_least,
+    at_most,
+    missed_bars,
+    run_benchmark,
+)
 from measuring.environments import newcomer, wait_for
 from PIL import Image, ImageChops
 
-CONTROLS = {"untrained": "the learning: a policy is trained for 2,048 steps"}
-BARS = {"picture": 180.0, "robot": 600.0, "recording": 600.0, "task": 600.0}
-"""Longest time [s], the set-up included in that of the picture; a reader may type for 5 minutes
-on top of that of the robot."""
-SUCCESS, MOVED = {"robot": 0.9, "task": 0.5}, 20
-"""Least success, and least extent of what differs between first and last picture [pixels]."""
+LONGEST_S = {"picture": 180.0, "robot": 600.0, "recording": 600.0, "task": 600.0}
+"""The set-up is included in the time of the picture; a reader may type for 5 minutes on top of that
+of the robot."""
+SUCCESS = {"robot": 0.9, "task": 0.5}
+EXTENTS = {
+    "moved_pixels": at_least(20, "picture: extent of what moves [pixels]"),
+    "report_bytes": at_least(1, "recording: size of the report"),
+}
 BURGER = """name: my_robot
 kind: differential
 footprint: [[0.04, 0.1], [-0.1, 0.1], [-0.1, -0.1], [0.04, -0.1]]
@@ -84,64 +93,60 @@ def travelled(
     return taken, told
 
 
-def measure(folder: Path, roads: Sequence[str], control: str | None) -> dict[str, Any]:
-    """All figures, see the head of this file."""
-    clone = folder / "clone"
-    around = newcomer(folder)
-    wait_for(["git", "clone", "--quiet", str(ROOT), str(clone)], folder, around)
-    setup_s, _ = wait_for(["make", "setup"], clone, around)
-    seconds = {}
-    success = {}
-    for name in roads:
-        seconds[name], told = travelled(name, clone, folder / name, around, control)
-        if name in SUCCESS:
-            (world,) = json.loads(told[-1])["seeds"][0]["worlds"].values()
-            success[name] = world["success"]["value"]
-    result = {
-        "seconds": seconds,
-        "setup_s": setup_s,
-        "success": success,
-        "cores": os.cpu_count(),
-    }
-    if "picture" in roads:
-        seconds["picture"] += setup_s
-        result["moved_pixels"] = moved(folder / "picture" / "moving.gif")
-    if "recording" in roads:
-        report = folder / "recording" / "my_robot" / "report.html"
-        result["report_bytes"] = report.stat().st_size if report.is_file() else 0
+def measure(given: argparse.Namespace) -> dict[str, Any]:
+    """How far does a newcomer get within the first hour, from a clean clone?
+
+    See the head of this file.
+    """
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        clone = folder / "clone"
+        around = newcomer(folder)
+        wait_for(["git", "clone", "--quiet", str(ROOT), str(clone)], folder, around)
+        setup_s, _ = wait_for(["make", "setup"], clone, around)
+        result: dict[str, Any] = {"seconds": {}, "setup_s": setup_s, "success": {}}
+        for road in given.roads:
+            home = folder / road
+            seconds, told = travelled(road, clone, home, around, given.control)
+            result["seconds"][road] = seconds
+            if road in SUCCESS:
+                (world,) = json.loads(told[-1])["seeds"][0]["worlds"].values()
+                result["success"][road] = world["success"]["value"]
+        if "picture" in given.roads:
+            result["seconds"]["picture"] += setup_s
+            result["moved_pixels"] = moved(folder / "picture" / "moving.gif")
+        if "recording" in given.roads:
+            report = folder / "recording" / "my_robot" / "report.html"
+            result["report_bytes"] = report.stat().st_size if report.is_file() else 0
     return result
 
 
-def missed_of(result: dict[str, Any]) -> list[str]:
-    """The bars that were missed."""
-    missed = [
-        f"{name}: took {result['seconds'][name]:.0f} s, bar {bar:g} at most"
-        for name, bar in BARS.items()
-        if not result["seconds"].get(name, 0.0) <= bar
+def judge(result: dict[str, Any]) -> list[str]:
+    longest = {name: at_most(LONGEST_S[name]) for name in result["seconds"]}
+    success = {name: at_least(SUCCESS[name]) for name in result["success"]}
+    extents = {name: bar for name, bar in EXTENTS.items() if name in result}
+    return [
+        *missed_bars(result["seconds"], longest, "time [s], "),
+        *missed_bars(result["success"], success, "success, "),
+        *missed_bars(result, extents),
     ]
-    missed += [
-        f"{name}: success {result['success'][name]:.1%}, bar {bar:.0%} at least"
-        for name, bar in SUCCESS.items()
-        if not result["success"].get(name, 1.0) >= bar
-    ]
-    if not (differ := result.get("moved_pixels", MOVED)) >= MOVED:
-        missed.append(f"picture: {differ} pixels differ, so that nothing moves")
-    return (
-        missed
-        if result.get("report_bytes", 1)
-        else [*missed, "recording: there is no report"]
+
+
+BENCHMARKS = {
+    "first_hour": Benchmark(
+        measure,
+        judge,
+        {
+            "untrained": Control(
+                "the learning: a policy is trained for 2,048 steps",
+                "success, robot",
+                "--roads robot",
+            )
+        },
+        {"roads": {"nargs": "+", "choices": list(ROADS), "default": list(ROADS)}},
+        short=None,
     )
-
-
-def main() -> None:
-    """Prints a table, or one JSON object."""
-    parser = parser_of(__doc__, CONTROLS)
-    parser.add_argument("--roads", nargs="+", choices=list(ROADS), default=list(ROADS))
-    given = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        result = measure(Path(folder), given.roads, given.control)
-    answer(result, missed_of(result), given.json)
-
+}
 
 if __name__ == "__main__":
-    main()
+    run_benchmark(BENCHMARKS)

@@ -33,7 +33,7 @@ FILES = {
     "docs/test_fresh_clone.py": "package",
     "test_release.py": "package",
     "test_without_ros.py": "package",
-    "benchmarks/test_barn.py": "campaign",
+    "benchmarks/test_benchmarks.py": "campaign",
     "identify/test_drives_of_others.py": "campaign",
 }
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+from bench import at_most, missed_bars
 
 from measuring.truths import Truth
 
@@ -86,47 +88,46 @@ OWN = Bars(share=0.03, of_yardstick=None)
 OWN_BARS = {"tricycle": Bars(share=0.02, of_yardstick=None)}  # by the automatic order
 
 
-def missed_of(result: Mapping[str, Any]) -> list[str]:
-    """A sentence for each bar that is missed."""
+def judge_drives(result: Mapping[str, Any]) -> list[str]:
+    """Returns a sentence for each bar that is missed."""
     missed = []
     for name, told in result["drives"].items():
-        missed += missed_by(name, told, DRIVES[name].bars)
-        if told["lines_of_mapping"] > MOST_LINES:
-            missed.append(f"{name}: a mapping of {told['lines_of_mapping']} lines")
+        missed += judge_drive(name, told, DRIVES[name].bars)
+        lines = {"lines_of_mapping": at_most(MOST_LINES)}
+        missed += missed_bars(told, lines, f"{name}: ")
     for name, told in result["left_out"].items():
-        if not told["error_m"] <= SEGMENT_ERROR_M:
-            error = f"off by {told['error_m']:.4f} m on segments left out"
-            missed.append(f"{name}: {error}, bar {SEGMENT_ERROR_M:g} m")
+        left_out = {"error_m": at_most(SEGMENT_ERROR_M)}
+        missed += missed_bars(told, left_out, f"{name}, segments left out: ")
     for name, told in result["own_robots"].items():
-        missed += missed_by(name, told, OWN_BARS.get(name, OWN))
+        missed += judge_drive(name, told, OWN_BARS.get(name, OWN))
     return missed
 
 
-def missed_by(name: str, told: Mapping[str, Any], bars: Bars) -> Iterator[str]:
-    """Yields a sentence for each bar that one drive misses."""
+def judge_drive(name: str, told: Mapping[str, Any], limits: Bars) -> list[str]:
+    """Returns a sentence for each bar that one drive misses."""
     if "crashed" in told:
-        yield f"{name}: crashed: {told['crashed']}"
-        return
+        return [f"{name}: crashed: {told['crashed']}"]
     if "refused" in told:
-        if not bars.may_refuse:
-            yield f"{name}: was refused: {told['refused']}"
-        return
-    share = told["share_of_path"]
-    textbook = told["yardstick_share"]
-    kept = told["constant_twist_share"]
-    if bars.share is not None and not share <= bars.share:
-        yield f"{name}: off by {share:.3f} of the path, bar {bars.share:g}"
-    if bars.error_m is not None and not told["error_m"] <= bars.error_m:
-        yield f"{name}: off by {told['error_m']:.4f} m, bar {bars.error_m:g} m"
-    if bars.of_yardstick is not None and not share <= bars.of_yardstick * textbook:
-        bar = f"bar {bars.of_yardstick:g} of its {textbook:.3f}"
-        yield f"{name}: off by {share:.3f} of the path, the fitted textbook's {bar}"
-    if not share < kept:
-        yield f"{name}: off by {share:.3f} of the path, a robot that keeps its twist by {kept:.3f}"
-    if not COVERAGE[0] <= told["coverage_95"] <= COVERAGE[1]:
-        held = f"{told['coverage_95']:.1%} of the ends, bar {COVERAGE[0]:.0%} to {COVERAGE[1]:.0%}"
-        yield f"{name}: the 95 % band holds {held}"
+        return [] if limits.may_refuse else [f"{name}: was refused: {told['refused']}"]
+    shares = [told["constant_twist_share"]]
+    if limits.share is not None:
+        shares.append(limits.share)
+    if limits.of_yardstick is not None:
+        shares.append(limits.of_yardstick * told["yardstick_share"])
+    bars = {"share_of_path": at_most(min(shares))}
+    if limits.error_m is not None:
+        bars["error_m"] = at_most(limits.error_m)
+    missed = missed_bars(told, bars, f"{name}: ")
+    low, high = COVERAGE
+    if not low <= told["coverage_95"] <= high:
+        missed.append(
+            f"{name}: the 95 % band holds {told['coverage_95']:.1%} of the ends, "
+            f"bar {low:.0%} to {high:.0%}"
+        )
     for key, row in told["truths"].items():
         if not row["near"]:
             sigma = f" +- {row['sigma']:.4f}" if "sigma" in row else ""
-            yield f"{name}: {key} {row['found']:.4f}{sigma}, true {row['true']}"
+            missed.append(
+                f"{name}: {key} {row['found']:.4f}{sigma}, true {row['true']}"
+            )
+    return missed

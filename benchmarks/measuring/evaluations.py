@@ -36,7 +36,7 @@ class Run:
     places: Sequence[str] = ()
 
 
-def evaluations(
+def evaluate_all(
     runs: Mapping[str, Run],
     tell: Callable[[str, dict[str, Any]], None] = lambda *_: None,
 ) -> dict[str, dict[str, Any]]:

@@ -11,22 +11,26 @@ import math
 
 import numpy as np
 
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
 
 SKID_STEER, THROTTLE_CAR, TRICYCLE, OMNI, TICKS = range(5)
 GRAVITY = 9.81
 STATES = 8
+Twist = tuple[float, float, float]
 
 
 @kernel
-def _grip(slip_x, slip_y, friction, load, softness):  # type: ignore[no-untyped-def]
+def _grip(
+    slip_x: float, slip_y: float, friction: float, load: float, softness: float
+) -> tuple[float, float]:
     """Friction of a wheel, opposite to its slip [m/s], that saturates at friction * load [N]."""
     share = friction * load / math.sqrt(slip_x**2 + slip_y**2 + softness**2)
     return -share * slip_x, -share * slip_y
 
 
 @kernel
-def _skid_steer(s, u, p, out):  # type: ignore[no-untyped-def]
+def _drive_skid_steer(s: Array, u: Array, p: Array, out: Array) -> Twist:
     """Four wheels that skid: forces of friction on a body with mass."""
     mass, inertia, front, rear, half_track, friction, softness, lag = p[:8]
     vx = s[3]
@@ -54,7 +58,7 @@ def _skid_steer(s, u, p, out):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _throttle_car(s, u, p, out):  # type: ignore[no-untyped-def]
+def _drive_throttle_car(s: Array, u: Array, p: Array, out: Array) -> Twist:
     """A motor whose pull falls with the speed, a dead zone, drag; a servo, understeer, slip."""
     (
         dead,
@@ -86,7 +90,7 @@ def _throttle_car(s, u, p, out):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _tricycle(s, u, p, out):  # type: ignore[no-untyped-def]
+def _drive_tricycle(s: Array, u: Array, p: Array, out: Array) -> Twist:
     """A driven, steered front wheel: a motor of first order, a damped servo of second."""
     wheelbase, motor, stiffness, damping = p[:4]
     out[3] = (u[0] - s[3]) / motor
@@ -96,7 +100,7 @@ def _tricycle(s, u, p, out):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _omni(s, u, p, out):  # type: ignore[no-untyped-def]
+def _drive_omni(s: Array, u: Array, p: Array, out: Array) -> Twist:
     """Three wheels at 120 degrees, each with a motor of its own lag, on unequal radii."""
     arm = p[0]
     vx = 0.0
@@ -117,26 +121,28 @@ def _omni(s, u, p, out):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _ticks(s, u, p, out):  # type: ignore[no-untyped-def]
+def _drive_ticks(s: Array, u: Array, p: Array, out: Array) -> Twist:
     """Two driven wheels whose turned angles [rad] are the last two states."""
     left, right, base, lag = p[:4]
-    out[3], out[4] = (u[0] - s[3]) / lag, (u[1] - s[4]) / lag
-    out[5], out[6] = s[3], s[4]
+    out[3] = (u[0] - s[3]) / lag
+    out[4] = (u[1] - s[4]) / lag
+    out[5] = s[3]
+    out[6] = s[4]
     return 0.5 * (left * s[3] + right * s[4]), 0.0, (right * s[4] - left * s[3]) / base
 
 
 @kernel
-def _rates(kind, s, u, p, out):  # type: ignore[no-untyped-def]
+def _compute_rates(kind: int, s: Array, u: Array, p: Array, out: Array) -> None:
     if kind == SKID_STEER:
-        vx, vy, turn = _skid_steer(s, u, p, out)
+        vx, vy, turn = _drive_skid_steer(s, u, p, out)
     elif kind == THROTTLE_CAR:
-        vx, vy, turn = _throttle_car(s, u, p, out)
+        vx, vy, turn = _drive_throttle_car(s, u, p, out)
     elif kind == TRICYCLE:
-        vx, vy, turn = _tricycle(s, u, p, out)
+        vx, vy, turn = _drive_tricycle(s, u, p, out)
     elif kind == OMNI:
-        vx, vy, turn = _omni(s, u, p, out)
+        vx, vy, turn = _drive_omni(s, u, p, out)
     else:
-        vx, vy, turn = _ticks(s, u, p, out)
+        vx, vy, turn = _drive_ticks(s, u, p, out)
     c = math.cos(s[2])
     sn = math.sin(s[2])
     out[0] = c * vx - sn * vy
@@ -145,7 +151,7 @@ def _rates(kind, s, u, p, out):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def integrate(states, command, kind, p, dt):  # type: ignore[no-untyped-def]
+def integrate(states: Array, command: Array, kind: int, p: Array, dt: float) -> None:
     """Fills states (T + 1, 8) of which the first is given, under commands (T, C) of `dt` [s]."""
     k1 = np.zeros(STATES)
     k2 = np.zeros(STATES)
@@ -154,8 +160,8 @@ def integrate(states, command, kind, p, dt):  # type: ignore[no-untyped-def]
     for t in range(len(command)):
         s = states[t]
         u = command[t]
-        _rates(kind, s, u, p, k1)
-        _rates(kind, s + 0.5 * dt * k1, u, p, k2)
-        _rates(kind, s + 0.5 * dt * k2, u, p, k3)
-        _rates(kind, s + dt * k3, u, p, k4)
+        _compute_rates(kind, s, u, p, k1)
+        _compute_rates(kind, s + 0.5 * dt * k1, u, p, k2)
+        _compute_rates(kind, s + 0.5 * dt * k2, u, p, k3)
+        _compute_rates(kind, s + dt * k3, u, p, k4)
         states[t + 1] = s + dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)

@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+from bench import at_least, at_most, missed_bars
 
 from measuring.environments import NotInstalledError, clean, python_with
 from nics_drl_bridge.defaults import EPISODE_STEPS
@@ -64,10 +65,16 @@ WORLD = World.model_validate(
         "goal_distance": [2.0, 4.0],
     }
 )
-GREATEST_DISAGREEMENT = 0.20
-"""Of the cost of a scan within a step with that of a scan alone, as a share of the latter."""
-LEAST_MOVED_M, LEAST_CHANGED = 0.01, 100
-"""Of a robot in a control period: how far it moves, and how many of its beams change."""
+AGREEMENT = {
+    "agreement": at_most(
+        0.2, "agreement: a scan within a step and one alone cost the same but for"
+    )
+}
+DRIVEN = {  # of a robot in a control period
+    "moved_m_per_period": at_least(0.01),
+    "beams_changed_per_period": at_least(100),
+    "episodes": at_least(1),
+}
 
 
 class PeerFailedError(Exception):
@@ -134,13 +141,13 @@ class Peer:
         return {**found, **self.drove}
 
 
-def scenes(count: int) -> list[Scene]:
+def make_scenes(count: int) -> list[Scene]:
     """The scenes that everybody goes through, one for each episode."""
     footprint = MODEL.robot.footprint_radius
     return [sample_scene(WORLD, footprint, seed) for seed in range(count)]
 
 
-def task_of(drawn: Sequence[Scene], alone: str) -> dict[str, Any]:
+def describe_task(drawn: Sequence[Scene], alone: str) -> dict[str, Any]:
     """What a peer is told.
 
     Args:
@@ -174,7 +181,7 @@ def task_of(drawn: Sequence[Scene], alone: str) -> dict[str, Any]:
     }
 
 
-def started(name: str, task: Mapping[str, Any]) -> Peer:
+def start_peer(name: str, task: Mapping[str, Any]) -> Peer:
     """A peer that has scanned each scene once.
 
     Raises:
@@ -223,6 +230,15 @@ class Measured:
     missing: dict[str, str]
     failed: dict[str, str]
 
+    def describe(self) -> dict[str, Any]:
+        """Returns what every benchmark tells about the peers, under the same keys."""
+        return {
+            "agreement": {name: one["agreement"] for name, one in self.peers.items()},
+            "peer_readings": self.peers,
+            "missing": self.missing,
+            "failed": self.failed,
+        }
+
 
 def measure(
     calls: Mapping[str, Callable[[], object]],
@@ -238,7 +254,7 @@ def measure(
     try:
         for name in names:
             try:
-                peers[name] = started(name, task_of(drawn, alone))
+                peers[name] = start_peer(name, describe_task(drawn, alone))
                 found.ranges[name] = peers[name].ranges
             except NotInstalledError as error:
                 found.missing[name] = str(error)
@@ -270,41 +286,16 @@ def measure(
     return found
 
 
-def block_of(found: Measured) -> dict[str, Any]:
-    """What every benchmark tells about the peers, under the same keys."""
-    return {
-        "agreement": {name: one["agreement"] for name, one in found.peers.items()},
-        "peer_readings": found.peers,
-        "missing": {**found.missing, **found.failed},
-    }
-
-
-def missed_by(found: Measured) -> list[str]:
-    """The bars of the peers that were missed."""
-    missed = list(found.failed.values())
-    for name, one in found.peers.items():
-        if not abs(one["agreement"] - 1.0) <= GREATEST_DISAGREEMENT:
-            missed.append(
-                f"agreement of {name}: a scan within its step costs {one['agreement']:.2f} times a "
-                f"scan alone, bar 1 +- {GREATEST_DISAGREEMENT}"
-            )
-        missed += missed_by_robots(name, one)
+def judge(result: Mapping[str, Any]) -> list[str]:
+    """Returns the bars of the peers that were missed; those that can't be installed miss none."""
+    missed = list(result["failed"].values())
+    for name, one in result["peer_readings"].items():
+        apart = abs(one["agreement"] - 1.0)
+        missed += missed_bars({"agreement": apart}, AGREEMENT, f"{name}: ")
+        missed += judge_robots(name, one)
     return missed
 
 
-def missed_by_robots(who: str, drove: Mapping[str, float]) -> list[str]:
-    """The bars that robots miss which stand still or see nothing."""
-    missed = []
-    if not drove["moved_m_per_period"] >= LEAST_MOVED_M:
-        missed.append(
-            f"motion of {who}: its robots moved {drove['moved_m_per_period']:.4f} m in a control "
-            f"period on average, bar {LEAST_MOVED_M} m"
-        )
-    if not drove["beams_changed_per_period"] >= LEAST_CHANGED:
-        missed.append(
-            f"scans of {who}: {drove['beams_changed_per_period']:.1f} beams changed in a control "
-            f"period on average, bar {LEAST_CHANGED}"
-        )
-    if not drove["episodes"] >= 1:
-        missed.append(f"episodes of {who}: none ended, bar 1")
-    return missed
+def judge_robots(who: str, drove: Mapping[str, float]) -> list[str]:
+    """Returns the bars that robots miss which stand still or see nothing."""
+    return missed_bars(drove, DRIVEN, f"{who}: ")

@@ -366,6 +366,8 @@ def load_recording(path: str | Path) -> Recording:
 
 def is_recording(path: Path) -> bool:
     """True for a file that `save_recording` wrote."""
+    if not path.is_file():  # reading a pipe might never end
+        return False
     try:
         with np.load(path, allow_pickle=False) as arrays:
             return "meta" in arrays.files and "pose_t" in arrays.files

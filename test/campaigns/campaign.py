@@ -7,13 +7,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from registry import FOLDER, campaigns_of
-
-ROOT = FOLDER.parents[1]
-sys.path.append(str(ROOT / "benchmarks"))
-
-import bench  # noqa: E402
-from bench import answer, at_least, at_most, missed_bars  # noqa: E402
+import bench
+from bench import answer, at_least, at_most, missed_bars
+from registry import ROOT, campaigns_of
 
 __all__ = ["ROOT", "answer", "at_least", "at_most", "missed_bars", "parser_of"]
 

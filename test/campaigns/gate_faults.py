@@ -7,8 +7,6 @@ fault itself, where it is an event) to the arrival of a zero on `cmd_vel`; the m
 fault. A command is unsafe when it moves the robot after the fault's limit, holds NaN or inf, or
 lies outside the limits of the robot. After a freeze of the gate itself its first word must be a
 zero.
-
-`end_after_stops` is another thing: good and NaN commands in turn, and then SIGINT.
 """
 
 from __future__ import annotations
@@ -18,7 +16,7 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,7 +26,6 @@ import numpy as np
 from campaign import answer, at_least, at_most, missed_bars, parser_of
 from parts.faults import FAULTS, LATE_S, Around
 from parts.faulty_robot import ROBOT, SPEED, NoMotionError, Robot
-from parts.gate_end import END, Ended, end_after_stops
 from parts.processes import busy
 
 from nics_drl_bridge.errors import BackendError
@@ -140,7 +137,7 @@ class Bench:
         if control != "no_gate":
             process = NodeProcess(GATE, self.folder, given, self.domain_id)
             self.gate = stack.enter_context(process)
-        policy = FAULTS[name].policy if name in FAULTS else False
+        policy = FAULTS[name].policy
         speed = 0.0 if control == "standing" else SPEED
         self.robot = Robot(self.domain_id, policy, speed, relayed=control == "no_gate")
         stack.callback(self.robot.close)
@@ -148,9 +145,7 @@ class Bench:
         self.patience_s = SHORT_PATIENCE_S if control == "standing" else PATIENCE_S
 
 
-def measure(
-    names: Sequence[str], repeats: int, told: Callable[[str], None], control: str = ""
-) -> dict[str, Result]:
+def measure(names: Sequence[str], repeats: int, control: str = "") -> dict[str, Result]:
     """Injects each fault so often; a gate of its own for each fault."""
     results = {name: Result() for name in names}
     for name in names:
@@ -159,7 +154,7 @@ def measure(
             idle = 0
             while (known := len(results[name].times)) < repeats and idle < MOST_IDLE:
                 _some(bench, name, repeats, results[name])
-                told(f"{name}: {len(results[name].times)} of {repeats}")
+                sys.stderr.write(f"{name}: {len(results[name].times)} of {repeats}\n")
                 idle = idle + 1 if known == len(results[name].times) else 0
     return results
 
@@ -196,51 +191,26 @@ def _some(bench: Bench, name: str, repeats: int, result: Result) -> None:
                 return
 
 
-def _ends(given: Any, control: str, told: Callable[[str], None]) -> Ended:
-    """The end of a gate after many stops."""
-    with ExitStack() as stack:
-        bench = Bench(END, control, stack)
-        try:
-            return end_after_stops(
-                bench.robot, bench.gate, bench.folder, given.seconds, told
-            )
-        except NoMotionError as error:
-            told(f"{END}: {error}")
-            return Ended()
-
-
 def main() -> None:
     """Prints a table, or one JSON object; ends with 1 when a stop came late."""
     parser = parser_of(__doc__)
     parser.add_argument("--repeats", type=int, default=30)
-    known = sorted([*FAULTS, END])
-    parser.add_argument("--fault", action="append", choices=known, help="only this one")
+    parser.add_argument(
+        "--fault", action="append", choices=sorted(FAULTS), help="only this one"
+    )
     parser.add_argument(
         "--load", type=int, default=0, help="keep so many cores busy besides"
     )
-    parser.add_argument(
-        "--seconds", type=float, default=15.0, help=f"of commands for {END}"
-    )
     given = parser.parse_args()
-    control = given.control or ""
-    names = given.fault or [*FAULTS, END]
-
-    def told(line: str) -> None:
-        sys.stderr.write(f"{line}\n")
-
+    names = given.fault or list(FAULTS)
     with busy(given.load):
-        faults = [name for name in names if name != END]
-        results = measure(faults, given.repeats, told, control)
-        ended = _ends(given, control, told) if END in names else None
+        results = measure(names, given.repeats, given.control or "")
     summary = {name: one.summary(FAULTS[name].limit_s) for name, one in results.items()}
     missed = [
         line
-        for name in faults
-        for line in missed_by(name, summary[name], given.repeats)
+        for name, one in summary.items()
+        for line in missed_by(name, one, given.repeats)
     ]
-    if ended is not None:
-        summary[END] = ended.summary()
-        missed += ended.missed()
     answer(summary, missed, given.json)
 
 

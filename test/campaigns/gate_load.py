@@ -14,6 +14,7 @@ SIGINT: `exit_s` is how long it still lives. The first of those stops has to be 
 from __future__ import annotations
 
 import argparse
+import math
 import signal
 import subprocess
 import tempfile
@@ -28,8 +29,8 @@ import rclpy
 from campaign import answer, at_least, at_most, missed_bars, parser_of
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
+from parts.faulty_robot import PATIENCE_S, ROBOT, Robot
 from parts.processes import core_seconds, part
-from parts.steady_robot import ODOM_HZ, PATIENCE_S, ROBOT, SteadyRobot
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Bool
 
@@ -40,6 +41,9 @@ from nics_drl_bridge.nodes.start import start
 
 GATE = "command_gate"
 TICK_HZ = 50
+ODOM_HZ = 50
+MAD_S = 0.5
+"""Commands are NaN for so long, then good for so long."""
 BARS = {
     "ratio": at_most(1.1, "the gate's share of a core to the bare node's"),
     "longest_gap_s": at_most(0.2, "time without a command [s]"),
@@ -129,7 +133,7 @@ def measure(seconds: float, burst_s: float, control: str) -> dict[str, Any]:
         gate(domain_id, Path(name), control) as real,
         part(__file__, domain_id, "--part", "bare", stderr=subprocess.DEVNULL) as bare,
     ):
-        robot = SteadyRobot(domain_id)
+        robot = Robot(domain_id, odom_hz=ODOM_HZ)
         try:
             if not robot.until(lambda: robot.listeners() >= 2, PATIENCE_S):
                 raise RuntimeError(
@@ -144,16 +148,16 @@ def measure(seconds: float, burst_s: float, control: str) -> dict[str, Any]:
 
 
 def share_of_a_core(
-    robot: SteadyRobot, pids: tuple[int, int], seconds: float
+    robot: Robot, pids: tuple[int, int], seconds: float
 ) -> dict[str, Any]:
     """What the gate and the bare node use while commands pass."""
     robot.heard.clear()
     began = time.monotonic()
-    sent = robot.sent
+    sent = robot.sent["odom"]
     used = [core_seconds(pid) for pid in pids]
     robot.until(lambda: False, seconds)
     lasted = time.monotonic() - began
-    sent = robot.sent - sent
+    sent = robot.sent["odom"] - sent
     of_gate, of_bare = (
         (core_seconds(pid) - was) / lasted for pid, was in zip(pids, used, strict=True)
     )
@@ -165,19 +169,27 @@ def share_of_a_core(
         "ratio": round(of_gate / of_bare, 3) if of_bare else float("nan"),
         "longest_gap_s": round(float(np.diff(times).max()), 4),
         "sent": round(sent / (lasted * ODOM_HZ), 3),
-        "moving": round(sum(moves for _, moves in robot.heard) / (lasted * TICK_HZ), 3),
+        "moving": round(
+            sum(twist.any() for _, twist in robot.heard) / (lasted * TICK_HZ), 3
+        ),
     }
 
 
 def ended_after_a_burst(
-    robot: SteadyRobot, real: subprocess.Popen[bytes], seconds: float, folder: Path
+    robot: Robot, real: subprocess.Popen[bytes], seconds: float, folder: Path
 ) -> dict[str, Any]:
     """Stops again and again, SIGINT, and what is in the black box then."""
+
+    def spoil(message: TwistStamped) -> TwistStamped:
+        if time.monotonic() // MAD_S % 2:
+            message.twist.linear.x = math.nan
+        return message
+
     robot.heard.clear()
-    robot.mad = True
+    robot.change["cmd_vel_raw"] = spoil
     robot.until(lambda: False, seconds)
     times = [when for when, _ in robot.heard]
-    moving = [moves for _, moves in robot.heard]
+    moving = [bool(twist.any()) for _, twist in robot.heard]
     real.send_signal(signal.SIGINT)
     began = time.monotonic()
     robot.until(lambda: real.poll() is not None, PATIENCE_S)

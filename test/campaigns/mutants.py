@@ -32,13 +32,11 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise, zip_longest
 from pathlib import Path
-from queue import Queue
 from typing import Any, NamedTuple
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -463,7 +461,6 @@ class Laboratory:
         # The real recordings lie beside the repository.
         (folder / "shared").symlink_to(root.parent / "shared")
         self.isolated = self._can_isolate()
-        self._running = set[subprocess.Popen[bytes]]()
         self._check_import(self.snapshot)
 
     def _can_isolate(self) -> bool:
@@ -499,22 +496,18 @@ class Laboratory:
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
             )
-            self._running.add(process)
             code: int | None = None
             try:
                 with suppress(subprocess.TimeoutExpired):
                     code = process.wait(timeout_s)
             finally:
-                _end_session(process)
-                self._running.discard(process)
+                # `unshare` ends all that left the session with itself.
+                with suppress(ProcessLookupError):
+                    os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
             output.seek(0)
             text = output.read().decode(errors="replace")
         return code, text, time.monotonic() - begun
-
-    def stop(self) -> None:
-        """Ends all that is running."""
-        for process in tuple(self._running):
-            _end_session(process)
 
     def warm_up(self) -> None:
         """Compiles all kernels of the snapshot, most of which were copied."""
@@ -548,8 +541,9 @@ class Laboratory:
             failed = self.run_tests(self.snapshot, failed, CLEAN_TIMEOUT_S).failed
         return Clean(run.seconds, failed)
 
-    def run_mutant(self, mutant: Mutant, clean: Clean, tree: Path) -> dict[str, Any]:
+    def run_mutant(self, mutant: Mutant, clean: Clean) -> dict[str, Any]:
         """Writes a mutant into a copy of the snapshot and returns how its tests ended."""
+        tree = self.folder / "tree"
         copy_snapshot(self.snapshot, tree)
         file = tree / mutant.file
         source = file.read_bytes()
@@ -589,27 +583,14 @@ def judge(run: Run) -> str:
     return SURVIVED if run.code in (0, NO_TESTS) else KILLED
 
 
-def _end_session(process: subprocess.Popen[bytes]) -> None:
-    """Ends a process and those of its session; `unshare` ends all others with itself."""
-    with suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
-
-
 def summarise(records: Sequence[dict[str, Any]], rooms: Sequence[str]) -> str:
-    """Returns a table of the outcomes per room, and the mutants that survived."""
-    row = "{:<12}{:>9}{:>10}{:>11}{:>8}{:>13}"
-    head = row.format("room", KILLED, SURVIVED, TIMED_OUT, "found", "median time")
-    lines = [head]
+    """Returns a line for the outcomes in each room, and the mutants that survived."""
+    lines = []
     for room in [*rooms, "all"]:
-        own = [x for x in records if room in (x["room"], "all")]
-        counts = Counter(x["outcome"] for x in own)
-        found = counts[KILLED] + counts[TIMED_OUT]
-        fraction = f"{100 * found / len(own):.0f} %" if own else "-"
-        times = sorted(x["seconds"] for x in own)
-        median = f"{times[len(times) // 2]:.0f} s" if own else "-"
-        numbers = [counts[x] for x in (KILLED, SURVIVED, TIMED_OUT)]
-        lines.append(row.format(room, *numbers, fraction, median))
+        outcomes = [x["outcome"] for x in records if room in (x["room"], "all")]
+        found = len(outcomes) - outcomes.count(SURVIVED)
+        timed_out = f"{outcomes.count(TIMED_OUT)} by a time-out"
+        lines.append(f"{room:<12}{found} of {len(outcomes)} found, {timed_out}")
     for x in records:
         if x["outcome"] == SURVIVED:
             place = f"{x['file']}:{x['line']} {x['function']} ({x['kind']})"
@@ -646,32 +627,6 @@ def read_records(out: Path, run: dict[str, Any], resume: bool) -> list[dict[str,
     return records
 
 
-def run_mutants(
-    laboratory: Laboratory, mutants: Sequence[Mutant], clean: Clean, workers: int
-) -> Iterator[dict[str, Any]]:
-    """Yields the record of each mutant of one room when its tests have ended."""
-    trees: Queue[Path] = Queue()
-    for number in range(workers):
-        trees.put(laboratory.folder / f"tree-{number}")
-
-    def run(mutant: Mutant) -> dict[str, Any]:
-        tree = trees.get()
-        try:
-            return laboratory.run_mutant(mutant, clean, tree)
-        finally:
-            trees.put(tree)
-
-    with ThreadPoolExecutor(workers) as pool:
-        futures = [pool.submit(run, mutant) for mutant in mutants]
-        try:
-            for future in as_completed(futures):
-                yield future.result()
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            laboratory.stop()
-            raise
-
-
 def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--seed", type=int, default=54, help="of the draw")
@@ -681,7 +636,6 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--out", type=Path, default=ROOT / "runs" / "mutants.jsonl")
     parser.add_argument("--resume", action="store_true", help="continue --out")
-    parser.add_argument("--workers", type=int, default=1, help="mutants at a time")
     parser.add_argument("--control", choices=CONTROLS, help="instead of mutants")
     parser.add_argument("--list", action="store_true", help="list the mutants only")
     return parser.parse_args(arguments)
@@ -724,7 +678,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             laboratory.warm_up()
             for room in asked.rooms:
                 own = [mutant for mutant in mutants if mutant.room == room]
-                test_room(laboratory, room, own, records, write, asked.workers)
+                test_room(laboratory, room, own, records, write)
     keys = {mutant.key for mutant in mutants}
     results = [x for x in records if x["record"] == "mutant" and key_of(x) in keys]
     print(summarise(results, asked.rooms))
@@ -738,7 +692,6 @@ def test_room(
     mutants: Sequence[Mutant],
     records: Sequence[dict[str, Any]],
     write: Callable[[dict[str, Any]], None],
-    workers: int,
 ) -> None:
     """Runs those mutants of a room that have no record yet."""
     done = {key_of(record) for record in records if record["record"] == "mutant"}
@@ -755,7 +708,8 @@ def test_room(
         f"{room}: {clean.seconds:.0f} s, fail without a mutant: {clean.failed}",
         flush=True,
     )
-    for record in run_mutants(laboratory, left, clean, workers):
+    for mutant in left:
+        record = laboratory.run_mutant(mutant, clean)
         write({"record": "mutant", **record})
         place = f"{record['file']}:{record['line']} {record['kind']}"
         print(f"{record['outcome']:<10} {record['seconds']:>6} s  {place}", flush=True)

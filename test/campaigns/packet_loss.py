@@ -18,7 +18,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from contextlib import ExitStack
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -26,14 +27,12 @@ import numpy as np
 from campaign import answer, at_least, at_most, missed_bars, parser_of
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
-from parts.faulty_robot import PERIOD_S, ROBOT, SPEED
+from parts.faulty_robot import PERIOD_S, ROBOT, SPEED, Robot
 from parts.lossy_link import Link, NoNamespacesError, link
 from parts.spun_node import SpunNode
 from sensor_msgs.msg import LaserScan
-from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
-from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.processes import NodeProcess
@@ -45,6 +44,7 @@ SENT_SHARES = (0.8, 1.2)
 """Of the scans that were to be sent; a robot without them tells nothing about the gate."""
 REPEAT_S = 0.02
 SLOW_SKIP = 3
+GATE = ("reset", "arm")
 PATIENCE_S = 90.0
 STANDING_S = 5.0
 NETWORK = {
@@ -92,74 +92,6 @@ class Stack(SpunNode):
             self._past.publish(self._last)
 
 
-class Robot(SpunNode):
-    """Sends what a robot sends, does what `cmd_vel` says, and arms the gate whenever it can.
-
-    Attributes:
-        heard: (time, twist (3,)) of `cmd_vel`, on the system's clock [s].
-    """
-
-    def __init__(self, control: str = "") -> None:
-        super().__init__("robot")
-        self.heard: list[tuple[float, list[float]]] = []
-        self._lidar = builtin_model(ROBOT).lidar
-        self._x = 0.0
-        self.sent = 0
-        self._timed = 0
-        self._skip = SLOW_SKIP if control == "slow_robot" else 1
-        self._topics = {
-            name: self.node.create_publisher(kind, name, profile)
-            for name, kind, profile in (
-                ("scan", LaserScan, qos.SENSOR),
-                ("odom", Odometry, qos.SENSOR),
-                ("e_stop", Bool, qos.COMMAND),
-            )
-        }
-        self.node.create_subscription(Twist, "cmd_vel", self._hear, qos.COMMAND)
-        self._arm = self.node.create_client(Trigger, "command_gate/arm")
-        self._reset = self.node.create_client(Trigger, "command_gate/reset")
-        self.node.create_timer(PERIOD_S, self._send)
-        if control != "standing":
-            self.node.create_timer(1.0, self._ask)
-
-    def _hear(self, message: Twist) -> None:
-        self.heard.append((time.time(), conversions.twist_from_ros(message).tolist()))
-
-    @property
-    def moves(self) -> bool:
-        return bool(self.heard) and any(self.heard[-1][1])
-
-    def _ask(self) -> None:
-        if not self.moves and self._arm.service_is_ready():
-            reset = self._reset.call_async(
-                Trigger.Request()
-            )  # two at once may change places
-            reset.add_done_callback(lambda _: self._arm.call_async(Trigger.Request()))
-
-    def _send(self) -> None:
-        speed = self.heard[-1][1][0] if self.heard else 0.0
-        self._x, now = self._x + speed * PERIOD_S, time.time_ns()
-        self._timed += 1
-        if self._timed % self._skip == 0:
-            ranges = np.full(
-                self._lidar.beams, 2.0 + 0.1 * np.sin(now * 1e-9), np.float32
-            )
-            self._topics["scan"].publish(
-                conversions.scan_to_ros(self._lidar, ranges, now, "laser")
-            )
-            self.sent += 1
-        self._topics["odom"].publish(
-            conversions.odometry_to_ros(
-                [self._x, 0.0, 0.0],
-                [speed, 0.0, 0.0],
-                now,
-                ("odom", "base_link"),
-                (1e-4,) * 4,
-            )
-        )
-        self._topics["e_stop"].publish(Bool(data=False))
-
-
 def run_stack(seconds: float, folder: Path, control: str) -> None:
     """The far end, in its namespace; writes what the policy used when the near end has ended."""
     parameters = {"model": ROBOT, "limits": ROBOT, "e_stop_required": True}
@@ -186,17 +118,29 @@ def run_stack(seconds: float, folder: Path, control: str) -> None:
 
 def run_robot(seconds: float, folder: Path, control: str) -> None:
     """The near end: drives on a whole network, then says so and drives on."""
-    robot = Robot(control)
+    skip = SLOW_SKIP if control == "slow_robot" else 1
+    robot = Robot(None, policy=True, skip=skip, sensors=qos.SENSOR)
+    robot.silent.add("odometry/filtered")  # the stack has an estimate of its own
+
+    def drive_until(done: Callable[[], bool], patience_s: float) -> None:
+        """Arms the gate whenever the robot stands."""
+        end = time.monotonic() + patience_s
+        while not robot.until(done, min(1.0, end - time.monotonic())):
+            if time.monotonic() > end:
+                return
+            with suppress(TimeoutError):
+                for service in () if robot.moves or control == "standing" else GATE:
+                    robot.call_service(Trigger, f"command_gate/{service}", 1.0)
+
     try:
         stands = control in ("standing", "slow_robot")
-        deadline = time.monotonic() + (STANDING_S if stands else PATIENCE_S)
-        while not robot.moves and time.monotonic() < deadline:
-            robot.spin()
+        drive_until(lambda: robot.moves, STANDING_S if stands else PATIENCE_S)
         (folder / "driving").touch()
-        sent, end = robot.sent, time.monotonic() + seconds
-        while time.monotonic() < end:
-            robot.spin()
-        answer = {"scans": robot.sent - sent, "heard": robot.heard}
+        sent = robot.sent["scan"]
+        drive_until(lambda: False, seconds)
+        offset_s = time.time() - time.monotonic()
+        heard = [(when + offset_s, twist.tolist()) for when, twist in robot.heard]
+        answer = {"scans": robot.sent["scan"] - sent, "heard": heard}
         (folder / "heard.json").write_text(json.dumps(answer))
     finally:
         robot.close()

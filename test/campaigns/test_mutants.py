@@ -121,14 +121,6 @@ def test_a_seed_draws_the_same_mutants_after_a_change_of_other_places(tree):
     assert before == after != other
 
 
-def test_seeds_differ_in_the_places_of_a_kind_that_they_draw_first(tree):
-    firsts = set()
-    for seed in range(20):
-        drawn = mutants.draw(tree, seed, ("gate",), len(KINDS))
-        firsts.add(next(mutant.key for mutant in drawn if mutant.kind == "constant"))
-    assert len(firsts) > 2
-
-
 def test_a_larger_draw_contains_the_smaller_one_and_rooms_have_equal_parts():
     few = mutants.draw(ROOT, 54, ("gate", "env"), 9)
     many = mutants.draw(ROOT, 54, ("gate", "env"), 30)
@@ -181,17 +173,14 @@ def test_an_interrupted_run_is_continued_unless_seed_or_code_have_changed(tmp_pa
 
 
 def test_the_summary_counts_a_time_out_as_found_and_shows_survivors(tree):
-    drawn = mutants.draw(tree, 7, ("gate",), 4)
-    outcomes = (KILLED, TIMED_OUT, KILLED, SURVIVED)
+    drawn = mutants.draw(tree, 7, ("gate",), 3)
     records = [
-        mutant.describe(SOURCE.encode()) | {"outcome": outcome, "seconds": 5.0}
-        for mutant, outcome in zip(drawn, outcomes, strict=True)
+        mutant.describe(SOURCE.encode()) | {"outcome": outcome}
+        for mutant, outcome in zip(drawn, (KILLED, TIMED_OUT, SURVIVED), strict=True)
     ]
-    _, gate, _, place, before, after = mutants.summarise(records, ["gate"]).split("\n")
-    assert gate.split() == ["gate", "2", "1", "1", "75", "%", "5", "s"]
-    assert place.startswith(f"{drawn[3].file}:{records[3]['line']} ")
-    assert before.split("- ")[1] == records[3]["before"]
-    assert after.split("+ ")[1] == records[3]["after"]
+    gate, _, place, *_ = mutants.summarise(records, ["gate"]).split("\n")
+    assert gate.split()[:4] == ["gate", "2", "of", "3"]
+    assert place.startswith(f"{drawn[2].file}:{records[2]['line']} ")
 
 
 @pytest.mark.campaign

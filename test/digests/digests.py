@@ -25,16 +25,20 @@ from .simulations import barn, scans, team
 TEST = Path(__file__).resolve().parents[1]
 FILE = Path(__file__).with_name("digests.json")
 ROBOTS = ("ackermann", "differential", "mecanum")
-WORLDS = ("arena", "clutter", "crowd", "room")
+WORLDS = {
+    "ackermann": ("arena", "crowd"),
+    "differential": ("clutter", "crowd"),
+    "mecanum": ("arena", "room"),
+}
 
 
 def worlds() -> Found:
-    """Bits of N worlds: the vector env of each robot and world, with and without randomisation."""
+    """Bits of N worlds: the vector env of each robot, with and without randomisation."""
     from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 
     found = {}
-    for robot in ROBOTS:
-        for world in WORLDS:
+    for robot, names in WORLDS.items():
+        for world in names:
             random = "strong" if world == "clutter" else None
             env = BridgeVectorEnv(
                 6, robot, world, randomisation=random, max_episode_steps=40
@@ -84,33 +88,33 @@ def single() -> Found:
 
 def table_1() -> Found:
     """What Table I fits: coefficients, terms kept and errors of the textbook robots."""
-    import table1_kinematics as table
+    import paper
 
     from nics_drl_bridge.identify.fit import fit
 
     found = {}
     for name in ROBOTS:
-        robot = table.subject(name)
-        model = fit(table.drive(robot, 0), robot.spec).model
-        rmse = np.concatenate(table.errors(model, robot, 1))
+        robot = paper.make_subject(name)
+        model = fit(paper.drive(robot, 0), robot.spec).model
+        rmse = np.concatenate(paper.find_errors(model, robot, 1))
         found[name] = projected(np.concatenate([model.coefficients.ravel(), rmse]))
     return found
 
 
 def table_2() -> Found:
     """Errors of the baked scans of Table II, and the scans themselves."""
-    import table2_lidar as table
+    import paper
 
     found = {}
-    for name, shapes in table.SCENES.items():
-        baked = table.bake(table.load_lidar("paper"), shapes, table.DENSITY)
-        drawn = table.batches(shapes, 64)
-        exact = [table.scan(baked, "exact", batch) for batch in drawn]
-        fast = [table.scan(baked, "baked", batch) for batch in drawn]
+    for name, shapes in paper.SCENES.items():
+        baked = paper.bake(paper.SPEC, shapes, paper.DENSITY)
+        drawn = paper.batches(shapes, 64)
+        exact = [paper.scan(baked, "exact", batch) for batch in drawn]
+        fast = [paper.scan(baked, "baked", batch) for batch in drawn]
         found[name] = projected(
             np.concatenate([np.ravel(each) for each in (*exact, *fast)])
         )
-        found[f"{name} errors"] = [float(each) for each in table.errors(fast, exact)]
+        found[f"{name} errors"] = [float(each) for each in paper.errors(fast, exact)]
     return found
 
 
@@ -141,12 +145,9 @@ def identified() -> Found:
     }.items():
         for robot in ROBOTS:
             spec = load_robot(robot)
-            if robot != "ackermann" and "measured_state" in disturbed:
-                continue  # its wheels follow no single command
-            given = {key: value for key, value in disturbed.items() if key != "lever"}
-            if robot == "ackermann":
-                given = disturbed
-            result = identify(drive(spec, **given), spec, alpha=0.99)
+            if robot != "ackermann" and disturbed:
+                continue
+            result = identify(drive(spec, **disturbed), spec, alpha=0.99)
             for each, of in ((result.trial, ""), (result, ", all data")):
                 numbers = [
                     *each.model.coefficients.ravel(),

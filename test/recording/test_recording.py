@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -267,6 +268,12 @@ def test_a_file_that_is_too_large_is_not_read(tmp_path):
         file.truncate(MOST_BYTES + 1)
     with pytest.raises(RecordingError, match="larger than 256 MB"):
         load_recording(path)
+
+
+@pytest.mark.timeout(10)
+def test_a_pipe_is_no_recording_and_nobody_waits_for_its_writer(tmp_path):
+    os.mkfifo(tmp_path / "drive.npz")
+    assert not recordings.is_recording(tmp_path / "drive.npz")
 
 
 @pytest.mark.parametrize("unknown", [0.0, np.nan, np.inf])

@@ -16,6 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.kernels import COMPILING
 
 OWN_TIME_S = 2.0
@@ -32,6 +33,10 @@ PROGRESS = re.compile(
 )  # where a step takes long
 
 
+class ReadOtherwiseError(Exception):
+    """An input was read without a word, but not as what it was."""
+
+
 @dataclass(frozen=True)
 class Attempt:
     """What is handed to whom.
@@ -40,8 +45,8 @@ class Attempt:
         kind: of input, as `policy`.
         told: what is wrong with it, in words that reproduce it.
         act: hands it over; raises what the entry point raises.
-        verdict: `bad` if it has to be refused, `good` if it has to be taken, `any` if either is
-            right as long as it is one of the two.
+        verdict: `bad` if it has to be refused, `good` if it has to be taken, `same` if it has to be
+            refused or read as it was, `any` if it may be refused or taken.
     """
 
     kind: str
@@ -55,7 +60,7 @@ class Outcome:
     """What came of an attempt.
 
     Attributes:
-        end: `accepted`, `refused`, `traceback`, or `hang`.
+        end: `accepted`, `changed`, `refused`, `traceback`, or `hang`.
         words: of the refusal or the traceback.
         own_s: processor time that it took [s].
         memory: that it took at its peak, beyond what the libraries had taken [bytes].
@@ -67,7 +72,7 @@ class Outcome:
     memory: int
 
 
-def made(attempt: Attempt) -> Outcome:
+def make(attempt: Attempt) -> Outcome:
     """Makes an attempt in a forked process, which is killed when it takes too long."""
     reading, writing = os.pipe()
     begin = time.monotonic()
@@ -116,32 +121,28 @@ def _answer(attempt: Attempt, writing: int) -> None:
 
 
 def _end_of(act: Callable[[], object]) -> tuple[str, str]:
-    from nics_drl_bridge.errors import BridgeError
-
     try:
         act()
+    except ReadOtherwiseError:
+        return "changed", ""
     except BridgeError as error:
-        return _judged(str(error))
+        sentence = str(error)
+        if "\n" not in sentence and 0 < len(sentence) <= LONGEST_SENTENCE:
+            return "refused", sentence
+        told = f"no sentence, but {len(sentence)} characters: {sentence[:300]!r}"
+        return "traceback", told
     except BaseException:  # noqa: BLE001 - these are what is counted
         return "traceback", traceback.format_exc()[-1500:]
     return "accepted", ""
 
 
-def _judged(sentence: str) -> tuple[str, str]:
-    if "\n" in sentence or not 0 < len(sentence) <= LONGEST_SENTENCE:
-        return (
-            "traceback",
-            f"no sentence, but {len(sentence)} characters: {sentence[:300]!r}",
-        )
-    return "refused", sentence
-
-
-def nics(*words: object) -> Callable[[], None]:
+def nics(folder: Path, *words: object) -> Callable[[], None]:
     """An act: a command of `nics`. Raises BridgeError where it ends with its sentence."""
 
     def act() -> None:
         from nics_drl_bridge.commands.cli import main
-        from nics_drl_bridge.errors import BridgeError
+
+        os.chdir(folder)
 
         with tempfile.TemporaryFile("w+", errors="replace") as said:
             os.dup2(said.fileno(), 1)
@@ -156,22 +157,10 @@ def nics(*words: object) -> Callable[[], None]:
             sys.stderr.flush()
             said.seek(0)
             text = said.read()
-        if code == EXIT_BAD_INPUT:
-            told = PROGRESS.sub("", text)
-            raise (
-                BridgeError(told.rstrip("\n"))
-                if _is_sentence(told)
-                else ValueError(text[:2000])
-            )
+        told = PROGRESS.sub("", text)
+        if code == EXIT_BAD_INPUT and told.startswith("nics: "):
+            raise BridgeError(told.removesuffix("\n"))
         if code not in (0, None, 1):
             raise ValueError(f"exit code {code}: {text[:2000]}")
 
     return act
-
-
-def _is_sentence(text: str) -> bool:
-    return (
-        text.startswith("nics: ")
-        and text.count("\n") == 1
-        and len(text) <= LONGEST_SENTENCE
-    )

@@ -1,4 +1,4 @@
-"""A robot's topics around a gate, whole or broken, published over DDS at 10 Hz."""
+"""A robot's topics around a gate, whole or broken, published over DDS."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from parts.spun_node import SpunNode
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.qos import QoSProfile
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
@@ -26,7 +27,7 @@ from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import conversions, qos
 
 ROBOT = "ackermann"
-PERIOD_S = 0.1
+PERIOD_S = 0.1  # between scans, commands and heartbeats of the emergency stop
 SPEED = 0.5
 PATIENCE_S = 60.0
 MOTION_S = 10.0
@@ -39,15 +40,15 @@ class NoMotionError(RuntimeError):
     """The gate was armed, but no command that moves the robot came."""
 
 
-def driver_context(domain_id: int) -> Context:
+def driver_context(domain_id: int | None) -> Context:
     """A context as a driver of somebody else's has it: as ROS 2 makes it, with shared memory."""
-    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     context = Context()
     context.init(None, domain_id=domain_id)
     return context
 
 
-def hear(domain_id: int, out: Connection) -> None:
+def hear(domain_id: int | None, out: Connection) -> None:
     """The base's end of `cmd_vel`: tells when each command came [s] and which; never ends."""
     context = driver_context(domain_id)
     node = Node("base", context=context, start_parameter_services=False)
@@ -68,6 +69,15 @@ class Robot(SpunNode):
     Commands are heard in a process of their own, as by a base: who publishes to a process that was
     killed may be held up for a second by the middleware, and would hear the stop late.
 
+    Args:
+        domain_id: of ROS; None for that of the environment.
+        policy: whether a policy of its own commands; this robot's own is silent then.
+        speed: that its own policy commands [m/s].
+        relayed: whether commands go past the gate.
+        odom_hz: how often odometry and estimate come, a multiple of 10.
+        skip: only one in so many scans, heartbeats and commands is sent.
+        sensors: quality of service of scan and odometry.
+
     Attributes:
         silent: topics that say nothing.
         change: alters messages by topic before they are sent.
@@ -76,33 +86,38 @@ class Robot(SpunNode):
         last: the message that each topic sent last; of `cmd_vel_raw`, also what the policy sent.
         republished: whether the last command of the policy is sent again and again, as it was.
         sent_s: when each topic sent a good one last [s].
+        sent: how many messages each topic has sent.
     """
 
     def __init__(
-        self, domain_id: int, policy: bool, speed: float = SPEED, relayed: bool = False
+        self,
+        domain_id: int | None,
+        policy: bool = False,
+        speed: float = SPEED,
+        relayed: bool = False,
+        odom_hz: int = 10,
+        skip: int = 1,
+        sensors: QoSProfile = qos.COMMAND,
     ) -> None:
         self._lidar = builtin_model(ROBOT).lidar
         super().__init__("robot", context=driver_context(domain_id))
         kinds = {
-            "odom": Odometry,
-            "scan": LaserScan,
-            "e_stop": Bool,
-            "cmd_vel_raw": TwistStamped,
-            "odometry/filtered": Odometry,
+            "odom": (Odometry, sensors),
+            "scan": (LaserScan, sensors),
+            "e_stop": (Bool, qos.COMMAND),
+            "cmd_vel_raw": (TwistStamped, qos.COMMAND),
+            "odometry/filtered": (Odometry, qos.COMMAND),
         }
         self._topics = {
-            name: self.node.create_publisher(kind, name, qos.COMMAND)
-            for name, kind in kinds.items()
+            name: self.node.create_publisher(kind, name, profile)
+            for name, (kind, profile) in kinds.items()
         }
         self.heard: list[tuple[float, np.ndarray]] = []
         self._policy = policy
         self._speed = speed
         self._relayed = relayed
-        self._past = (
-            self.node.create_publisher(Twist, "cmd_vel", qos.COMMAND)
-            if relayed
-            else None
-        )
+        if relayed:
+            self._past = self.node.create_publisher(Twist, "cmd_vel", qos.COMMAND)
         spawning = multiprocessing.get_context("spawn")
         self._ear, out = spawning.Pipe(duplex=False)
         self._base = spawning.Process(target=hear, args=(domain_id, out), daemon=True)
@@ -110,15 +125,14 @@ class Robot(SpunNode):
         self.node.create_subscription(
             TwistStamped, "cmd_vel_raw", self._hear_policy, qos.COMMAND
         )
-        self._clients = {
-            service: self.node.create_client(Trigger, f"command_gate/{service}")
-            for service in ("arm", "reset", "e_stop")
-        }
-        self.node.create_timer(PERIOD_S, self._send)
+        self._every = skip * round(odom_hz * PERIOD_S)
+        self._ticks = 0
+        self.node.create_timer(1.0 / odom_hz, self._send)
         self._offset_ns = time.time_ns() - time.monotonic_ns()
         self._now_ns = 0
         self._x = 0.0
         self.sent_s = dict.fromkeys(ALL, 0.0)
+        self.sent = dict.fromkeys(ALL, 0)
         self.last: dict[str, Any] = {}
         self.mend()
 
@@ -129,10 +143,6 @@ class Robot(SpunNode):
         self.stuck = False
         self.republished = False
         self.jump_ns = 0
-
-    def _listen(self) -> None:
-        while self._ear.poll():
-            self.heard.append(self._ear.recv())
 
     def _hear_policy(self, message: TwistStamped) -> None:
         if self._policy and not self.republished:
@@ -151,11 +161,14 @@ class Robot(SpunNode):
             ("odom", "base_link"),
             (1e-4,) * 4,
         )
+        self._say("odom", odometry)
+        self._say("odometry/filtered", odometry)
+        self._ticks += 1
+        if self._ticks % self._every:
+            return
         ranges = np.full(
             self._lidar.beams, 2.0 + 0.1 * np.sin(self._now_ns * 1e-9), np.float32
         )
-        self._say("odom", odometry)
-        self._say("odometry/filtered", odometry)
         self._say("scan", conversions.scan_to_ros(self._lidar, ranges, stamp, "laser"))
         self._say("e_stop", Bool(data=False))
         if self._policy:
@@ -167,7 +180,7 @@ class Robot(SpunNode):
         if "scan" in self.last:  # what a policy acts on is the scan that it got
             command.header.stamp = self.last["scan"].header.stamp
         self._say("cmd_vel_raw", command)
-        if self._past is not None and "cmd_vel_raw" in self.last:
+        if self._relayed and "cmd_vel_raw" in self.last:
             self._past.publish(self.last["cmd_vel_raw"].twist)
 
     def _say(self, name: str, message: Any) -> None:
@@ -178,31 +191,30 @@ class Robot(SpunNode):
         elif not self.jump_ns:
             self.sent_s[name] = time.monotonic()
         self._topics[name].publish(message)
+        self.sent[name] += 1
         self.last[name] = message
 
     def press(self) -> None:
         """Presses the emergency stop, by its topic."""
         self._topics["e_stop"].publish(Bool(data=True))
 
-    def until(
-        self, condition: Callable[[], object], seconds: float, what: str = ""
-    ) -> None:
-        """Lives on until something is the case; raises after the time, if it is to be named."""
+    def until(self, done: Callable[[], object], seconds: float) -> bool:
+        """Lives on until something is the case, or the time is over; whether it came to be."""
 
         def holds() -> object:
-            self._listen()
-            return condition()
+            while self._ear.poll():
+                self.heard.append(self._ear.recv())
+            return done()
 
-        if not super().until(holds, seconds) and what:
-            raise RuntimeError(f"not within {seconds} s: {what}")
+        return super().until(holds, seconds)
 
     def call(self, service: str) -> Trigger.Response:
         """Asks the gate for something."""
-        client = self._clients[service]
-        self.until(client.service_is_ready, PATIENCE_S, service)
-        future = client.call_async(Trigger.Request())
-        self.until(future.done, PATIENCE_S, service)
-        return future.result()
+        return self.call_service(Trigger, f"command_gate/{service}", PATIENCE_S)
+
+    def listeners(self) -> int:
+        """Of its scans."""
+        return self._topics["scan"].get_subscription_count()
 
     @property
     def moves(self) -> bool:
@@ -234,15 +246,15 @@ class Robot(SpunNode):
 
     def _arm(self) -> None:
         self.call("reset")
-        answers = [""]
 
-        def armed() -> bool:
+        def is_armed() -> bool:
             self.until(lambda: False, PERIOD_S)
-            response = self.call("arm")
-            answers.append(response.message)
-            return bool(response.success)
+            return bool(self.call("arm").success)
 
-        self.until(armed, PATIENCE_S, f"arming ({answers[-1]})")
+        if not self.until(is_armed, PATIENCE_S):
+            raise NoMotionError(
+                f"not within {PATIENCE_S} s: {self.call('arm').message}"
+            )
 
     def close(self) -> None:
         """Leaves the graph."""

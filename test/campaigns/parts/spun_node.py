@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from typing import Any
 
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
@@ -28,6 +29,7 @@ class SpunNode:
         self.node = Node(name, context=self._context, start_parameter_services=False)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
+        self._clients: dict[str, Any] = {}
 
     def spin(self, timeout_s: float = 0.01) -> None:
         """Handles one thing, if there is one within the time."""
@@ -41,6 +43,19 @@ class SpunNode:
                 return False
             self.spin()
         return True
+
+    def call_service(
+        self, kind: Any, name: str, patience_s: float, request: Any = None
+    ) -> Any:
+        """Returns the answer of a service. Raises TimeoutError."""
+        if name not in self._clients:
+            self._clients[name] = self.node.create_client(kind, name)
+        client = self._clients[name]
+        ready = self.until(client.service_is_ready, patience_s)
+        future = client.call_async(kind.Request() if request is None else request)
+        if not (ready and self.until(future.done, patience_s)):
+            raise TimeoutError(f"not within {patience_s:g} s: {name}")
+        return future.result()
 
     def close(self) -> None:
         """Leaves the graph."""

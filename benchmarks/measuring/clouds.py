@@ -1,9 +1,4 @@
-"""The paper's Fig. 4: what a robot sees on a fixed path among four obstacles.
-
-The point clouds of the exact scanner (the paper's scan mode), of the baked one and of MuJoCo's
-rays, laid over each other in the world, and a map that yag-slam makes of the baked scans and a
-drifting odometry. yag-slam is LGPL: it gets an environment of its own, made at first use.
-"""
+"""The path of the paper's Fig. 4 among its obstacles: point clouds, a map by SLAM, the picture."""
 
 from __future__ import annotations
 
@@ -12,32 +7,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bench import answer, parser_of
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from measuring import mujoco_rays
-from measuring.environments import NotInstalledError, python_with, run
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from measuring.environments import python_with, run
 from nics_drl_bridge import geometry
-from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.files import write_bytes
-from nics_drl_bridge.lidar.scanner import Scanner, make_scanner
 from nics_drl_bridge.lidar.shapes import Circle, Polygon, Rectangle, Shape
-from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
-from nics_drl_bridge.style import DARK, MEASURED, MODEL, OTHER, make_panels, render_png
+from nics_drl_bridge.lidar.spec import LidarSpec
+from nics_drl_bridge.style import DARK, MEASURED, MODEL, OTHER, make_panels
 
-CONTROLS = {
-    "shifted": "the baked scans are taken 0.1 m beside",
-    "nan": "one range of the baked scans is none",
-}
-BARS_M = {
-    "cloud": {"baked": 0.01, "mujoco": 1e-4},
-    "range": {"baked": 0.05, "mujoco": 1e-4},
-}
-SLAM_PART = 0.5
-"""SLAM leaves no more than this part of the odometry's error."""
 Array = NDArray[np.float64]
 HERE = Path(__file__).resolve().parent
 SLAM = (
@@ -72,7 +52,7 @@ DRIFT = np.array([1.02, 1.0, 1.04])
 ODOMETRY_NOISE = np.array([0.004, 0.002, 0.004])
 
 
-def path(scans: int) -> Array:
+def make_path(scans: int) -> Array:
     """(N, 3) poses on an ellipse around the middle of the room, a little more than once."""
     t = np.linspace(-0.5 * np.pi, (2.0 * LAPS - 0.5) * np.pi, scans)
     x = 2.7 * np.cos(t)
@@ -80,7 +60,7 @@ def path(scans: int) -> Array:
     return np.stack([x, y, np.arctan2(1.8 * np.cos(t), -2.7 * np.sin(t))], axis=1)
 
 
-def drifting(poses: Array, seed: int) -> Array:
+def let_drift(poses: Array, seed: int) -> Array:
     """(N, 3) the path as an odometry that overrates speed and turning, and is noisy."""
     moves = geometry.log(geometry.between(poses[:-1], poses[1:]))
     noise = np.random.default_rng(seed).normal(size=moves.shape) * ODOMETRY_NOISE
@@ -90,7 +70,7 @@ def drifting(poses: Array, seed: int) -> Array:
     return np.array(odometry)
 
 
-def cloud(spec: LidarSpec, poses: Array, ranges: NDArray[np.float32]) -> Array:
+def make_cloud(spec: LidarSpec, poses: Array, ranges: NDArray[np.float32]) -> Array:
     """(P, 2) where the returns of all scans lie in the world [m]."""
     angles = poses[:, 2:] + spec.angles
     x = poses[:, :1] + ranges * np.cos(angles)
@@ -99,12 +79,12 @@ def cloud(spec: LidarSpec, poses: Array, ranges: NDArray[np.float32]) -> Array:
     return np.stack([x[seen], y[seen]], axis=1)
 
 
-def cloud_rmse(points: Array, reference: Array) -> float:
+def find_cloud_rmse(points: Array, reference: Array) -> float:
     """Root mean square distance of points to their nearest neighbours in a reference [m]."""
     return float(np.sqrt((cKDTree(reference).query(points)[0] ** 2).mean()))
 
 
-def slam(
+def make_map(
     spec: LidarSpec, ranges: NDArray[np.float32], odometry: Array
 ) -> dict[str, Array]:
     """Poses and map of yag-slam. Raises NotInstalledError where it can't be had."""
@@ -116,45 +96,23 @@ def slam(
         np.savez(
             asked, ranges=ranges, odometry=odometry, angles=spec.angles, limits=limits
         )
-        run(python, HERE / "measuring" / "yag_slam_map.py", str(asked), str(answered))
+        run(python, HERE / "yag_slam_map.py", str(asked), str(answered))
         with np.load(answered) as found:
             return dict(found)
 
 
-def beam_rmse(ranges: NDArray[np.float32], exact: NDArray[np.float32]) -> float:
+def find_beam_rmse(ranges: NDArray[np.float32], exact: NDArray[np.float32]) -> float:
     """Root mean square over the beams that return in both [m]; NaN where a range is none."""
     known = np.isfinite(exact) & ~np.isinf(ranges)
     return float(np.sqrt(np.mean((ranges[known] - exact[known]) ** 2.0)))
 
 
-def missed_of(result: dict[str, Any]) -> list[str]:
-    """The bars that were missed; what could not be installed is none."""
-    missed = [
-        f"{name}: {kind} RMSE {result[f'{kind}_rmse_m'][name]:.2e} m, bar {bar:g}"
-        for kind, bars in BARS_M.items()
-        for name, bar in bars.items()
-        if name in result["cloud_rmse_m"] and not result[f"{kind}_rmse_m"][name] <= bar
-    ]
-    missed += [
-        f"{name}: no point" for name, count in result["points"].items() if not count > 0
-    ]
-    if result["slam"] is not None:
-        after = result["slam"]["path_error_m"]
-        before = result["slam"]["odometry_error_m"]
-        if not after <= SLAM_PART * before:
-            missed.append(
-                f"yag-slam: the path is off by {after:.3f} m, bar {SLAM_PART:g} of the "
-                f"odometry's {before:.3f}"
-            )
-    return missed
-
-
-def path_error(poses: Array, truth: Array) -> float:
+def find_path_error(poses: Array, truth: Array) -> float:
     """Root mean square distance from the true path [m]."""
     return float(np.sqrt(((poses[:, :2] - truth[:, :2]) ** 2).sum(axis=1).mean()))
 
 
-def outline(shape: Shape, pose: Array) -> Array:
+def make_outline(shape: Shape, pose: Array) -> Array:
     """(V, 2) a closed line around an obstacle [m]."""
     t = np.linspace(0.0, 2.0 * np.pi, 60)
     corners = shape.outline
@@ -163,7 +121,7 @@ def outline(shape: Shape, pose: Array) -> Array:
     return geometry.rotate(np.concatenate([corners, corners[:1]]), pose[2]) + pose[:2]
 
 
-def panel(axes: Axes, title: str, truth: Array) -> None:
+def prepare_panel(axes: Axes, title: str, truth: Array) -> None:
     """What all four have in common."""
     axes.set_title(title)
     axes.set_aspect("equal")
@@ -201,21 +159,24 @@ def draw_map(
     axes.plot(*found["poses"][:, :2].T, color=MEASURED, lw=1.2, label="path by SLAM")
 
 
-def picture(
-    truth: Array, clouds: dict[str, Array | None], titles: dict[str, str], mapped: Any
+def draw(
+    truth: Array, clouds: dict[str, Array], result: dict[str, Any], mapped: Any
 ) -> Figure:
-    """Four panels."""
+    """Draws the clouds and the map in four panels."""
+    titles = make_titles(result)
     figure, grid = make_panels(2, 2, (11.0, 8.6), sharex=True, sharey=True)
-    for axes, (name, points) in zip(grid, clouds.items(), strict=False):
-        panel(axes, titles[name], truth)
-        if points is not None:
-            draw_cloud(axes, points)
-    panel(grid[3], titles["slam"], truth)
+    for axes, name in zip(grid, ("exact", "baked", "mujoco"), strict=False):
+        prepare_panel(axes, titles[name], truth)
+        if name in clouds:
+            draw_cloud(axes, clouds[name])
+    prepare_panel(grid[3], titles["slam"], truth)
     if mapped is not None:
         draw_map(grid[3], *mapped)
     for axes in grid:
         for shape, pose in zip(OBSTACLES, POSES, strict=True):
-            axes.plot(*outline(shape, pose).T, color=DARK, lw=0.5, alpha=0.5, zorder=1)
+            axes.plot(
+                *make_outline(shape, pose).T, color=DARK, lw=0.5, alpha=0.5, zorder=1
+            )
     grid[3].legend(loc="lower right", bbox_to_anchor=(0.95, 0.08))
     for axes in grid[2:]:
         axes.set_xlabel("x [m]")
@@ -224,64 +185,7 @@ def picture(
     return figure
 
 
-def measure(
-    scans: int, with_slam: bool, out: Path, control: str | None
-) -> dict[str, Any]:
-    """Scans the path, compares the clouds, makes the map and the picture."""
-    spec = load_lidar("paper_12m")
-    truth = path(scans)
-    baked = make_scanner(spec, OBSTACLES, "baked")
-    exact = Scanner(spec, baked.table, "exact")
-    bodies = np.broadcast_to(exact.place(OBSTACLES, POSES), (scans, len(OBSTACLES), 7))
-    beside = truth.copy()
-    beside[:, 0] += 0.1 if control == "shifted" else 0.0
-    ranges = {
-        "exact": exact.scan(truth, bodies, WALLS),
-        "baked": baked.scan(beside, bodies, WALLS),
-    }
-    if control == "nan":
-        ranges["baked"][0, 0] = np.nan
-    missing = {}
-    try:
-        ranges["mujoco"] = mujoco_rays.scan(spec, truth, OBSTACLES, POSES, WALLS)
-    except ConfigError as error:
-        missing["mujoco"] = str(error)
-    clouds = {name: cloud(spec, truth, each) for name, each in ranges.items()}
-    others = [name for name in ranges if name != "exact"]
-    result: dict[str, Any] = {
-        "scans": scans,
-        "points": {name: len(points) for name, points in clouds.items()},
-        "cloud_rmse_m": {
-            name: cloud_rmse(clouds[name], clouds["exact"]) for name in others
-        },
-        "range_rmse_m": {
-            name: beam_rmse(ranges[name], ranges["exact"]) for name in others
-        },
-        "slam": None,
-    }
-    odometry = drifting(truth, 0)
-    mapped = None
-    if with_slam:
-        try:
-            found = slam(spec, ranges["baked"], odometry)
-        except NotInstalledError as error:
-            missing["slam"] = str(error)
-        else:
-            rebuilt = cloud(spec, found["poses"], ranges["baked"])
-            mapped = (found, rebuilt, odometry)
-            result["slam"] = {
-                "odometry_error_m": path_error(odometry, truth),
-                "path_error_m": path_error(found["poses"], truth),
-                "cloud_rmse_m": cloud_rmse(rebuilt, clouds["exact"]),
-            }
-    titles = titles_of(result)
-    panels = {name: clouds.get(name) for name in ("exact", "baked", "mujoco")}
-    figure = picture(truth, panels, titles, mapped)
-    write_bytes(out, render_png(figure))
-    return {**result, "missing": missing, "picture": str(out)}
-
-
-def titles_of(result: dict[str, Any]) -> dict[str, str]:
+def make_titles(result: dict[str, Any]) -> dict[str, str]:
     """What stands above each panel."""
     titles = {
         "exact": f"a) scan mode: {result['points']['exact']:,} points of {result['scans']} scans"
@@ -301,20 +205,3 @@ def titles_of(result: dict[str, Any]) -> dict[str, str]:
             f"d) yag-slam from b): path off by {after:.0f} mm, odometry {before:.0f} mm"
         )
     return titles
-
-
-def main() -> None:
-    """Draws the picture; prints a few lines, or one JSON object."""
-    parser = parser_of(__doc__, CONTROLS)
-    parser.add_argument("--scans", type=int, default=200, help="scans along the path")
-    parser.add_argument(
-        "--without-slam", action="store_true", help="install nothing, draw no map"
-    )
-    parser.add_argument("--out", type=Path, default=Path("runs/fig4_pointcloud.png"))
-    given = parser.parse_args()
-    result = measure(given.scans, not given.without_slam, given.out, given.control)
-    answer(result, missed_of(result), given.json)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,20 +1,10 @@
-"""How many env steps per second go over ROS 2 in lock-step, beside a bare pair of nodes?
+"""A bare pair of nodes that exchange messages, and an env that steps in lock-step over topics.
 
-The env is that of `gymnasium.make`: a command to a simulator node in a process of its own, its
-720-beam scan among ten obstacles and its odometry back, the estimator, observation and reward. The
-bare echo is what ROS 2 itself allows: two processes of rclpy's own executor, by the transports that
-it chooses, that exchange the same messages, made once, and do nothing else; with
-`--executor standing` they are processes of this package's executor, whose wait set stands, and with
-`--executor events` of rclpy's experimental one. Both are
-measured in turns, chunk by chunk, so that whatever else the machine does falls on both.
-
-Bars: 0.7 env steps for each exchange of the bare pair of rclpy's executor (of standing ones 0.5),
-and the robot drives. The controls let the env rest in each step, or let it command nothing.
+python -m measuring.echoes NAMESPACE near|far
 """
 
 from __future__ import annotations
 
-import argparse
 import array
 import json
 import os
@@ -24,55 +14,29 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import gymnasium
 import numpy as np
-from bench import answer, parser_of
 from geometry_msgs.msg import Twist
-from measuring.standing import standing_action
 from nav_msgs.msg import Odometry
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 
+from measuring.peers import WORLD
+from measuring.standing import standing_action
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.env.registry import NAVIGATION, register_envs
-from nics_drl_bridge.nodes.executor import StandingExecutor
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
-from nics_drl_bridge.sim.world import World
 
+BENCHMARKS = Path(__file__).resolve().parents[1]
 ROBOT = "ackermann"
 BEAMS = 720
-WORLD = {
-    "name": "ten circles",
-    "size": [6.0, 6.0],
-    "obstacles": [
-        {"shapes": [{"kind": "circle", "radius": 0.15}], "count": 10, "gap": 0.3}
-    ],
-    "clearance": 0.3,
-    "goal_distance": [2.0, 4.0],
-}
 DEPTH = 10
 PATIENCE_S = 60.0
-CONTROLS = {
-    "slow": "speed: a step rests",
-    "standing": "the commands: the robot does not drive",
-}
 REST_S = 0.003
-DRIVEN_M = 0.1
-RATIOS = {"rclpy": 0.7, "standing": 0.5, "events": 0.5}
-"""The least, by the executor of the bare pair."""
-EXECUTORS: dict[str, Any] = {
-    "rclpy": SingleThreadedExecutor,
-    "standing": StandingExecutor,
-}
-if find_spec("rclpy.experimental"):  # since Kilted
-    EXECUTORS["events"] = import_module("rclpy.experimental").EventsExecutor
 Exchange = Callable[[], Callable[[], object] | None]
 Chunk = Callable[[int], list[float]]
 
@@ -80,13 +44,13 @@ Chunk = Callable[[int], list[float]]
 class Bare:
     """One node and an executor, in a process that has nothing else."""
 
-    def __init__(self, name: str, namespace: str, executor: str) -> None:
+    def __init__(self, name: str, namespace: str) -> None:
         context = Context()
         context.init(None)
         self.node = Node(
             name, namespace=namespace, context=context, start_parameter_services=False
         )
-        self._executor = EXECUTORS[executor](context=context)
+        self._executor = SingleThreadedExecutor(context=context)
         self._executor.add_node(self.node)
 
     def spin_until(self, done: Callable[[], bool]) -> None:
@@ -98,9 +62,9 @@ class Bare:
             self._executor.spin_once(timeout_sec=1.0)
 
 
-def far_end(namespace: str, executor: str) -> None:
+def run_far_end(namespace: str) -> None:
     """Answers each Twist by an Odometry and a LaserScan, until its parent is gone."""
-    end = Bare("far_end", namespace, executor)
+    end = Bare("far_end", namespace)
     parent = os.getppid()
     odometry, scan = Odometry(), LaserScan()
     scan.ranges = array.array("f", [1.0] * BEAMS)
@@ -116,9 +80,9 @@ def far_end(namespace: str, executor: str) -> None:
         end._executor.spin_once(timeout_sec=1.0)
 
 
-def near_end(namespace: str, executor: str) -> None:
+def run_near_end(namespace: str) -> None:
     """Makes as many round trips as each line on standard input says, and prints their seconds."""
-    end = Bare("near_end", namespace, executor)
+    end = Bare("near_end", namespace)
     received: list[object] = []
     end.node.create_subscription(Odometry, "odom", received.append, DEPTH)
     end.node.create_subscription(LaserScan, "scan", received.append, DEPTH)
@@ -141,33 +105,26 @@ def near_end(namespace: str, executor: str) -> None:
         1.0
     )  # the first answers may be lost, while the far end does not yet know of it
     for line in sys.stdin:
-        sys.stdout.write(json.dumps(timed(exchange, int(line))) + "\n")
+        sys.stdout.write(json.dumps(time_each(exchange, int(line))) + "\n")
         sys.stdout.flush()
 
 
-ENDS = {"far": far_end, "near": near_end}
+ENDS = {"far": run_far_end, "near": run_near_end}
 
 
 @contextmanager
-def bare_echo(domain_id: int, executor: str) -> Iterator[Chunk]:
+def open_echo(domain_id: int) -> Iterator[Chunk]:
     """A function that makes round trips between two processes, as ROS 2 makes them by itself."""
     namespace = f"bare_{os.getpid()}"
-    order = [
-        sys.executable,
-        __file__,
-        "--executor",
-        executor,
-        "--namespace",
-        namespace,
-        "--end",
-    ]
+    order = [sys.executable, "-m", "measuring.echoes", namespace]
     environment = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"} | os.environ
     environment["ROS_DOMAIN_ID"] = str(domain_id)
     with (
-        subprocess.Popen([*order, "far"], env=environment) as far,
+        subprocess.Popen([*order, "far"], env=environment, cwd=BENCHMARKS) as far,
         subprocess.Popen(
             [*order, "near"],
             env=environment,
+            cwd=BENCHMARKS,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
@@ -193,7 +150,7 @@ class Driving:
 
     Args:
         env: that has been reset.
-        control: of `CONTROLS`.
+        control: `slow`, `standing` or None.
 
     Attributes:
         driven_m: by the robot's own estimate [m].
@@ -229,13 +186,11 @@ class Driving:
 
 
 @contextmanager
-def lockstep_env(
-    domain_id: int, folder: Path, control: str | None
-) -> Iterator[Driving]:
+def open_env(domain_id: int, folder: Path, control: str | None) -> Iterator[Driving]:
     """An env that drives in lock-step with a simulator in a process of its own."""
     register_envs()
     file = folder / "world.yaml"
-    file.write_text(dump_yaml(World.model_validate(WORLD).model_dump(mode="json")))
+    file.write_text(dump_yaml(WORLD.model_dump(mode="json")))
     parameters = {"model": ROBOT, "world": str(file), "mode": "lockstep"}
     namespace = f"lockstep_{os.getpid()}"  # whoever else may be in that domain
     with NodeProcess("simulator_node", folder, parameters, domain_id, namespace):
@@ -256,7 +211,7 @@ def lockstep_env(
         env.close()
 
 
-def timed(exchange: Exchange, count: int) -> list[float]:
+def time_each(exchange: Exchange, count: int) -> list[float]:
     """Seconds of each of so many exchanges; what one gives to be called after it is not timed."""
     times = []
     for _ in range(count):
@@ -268,21 +223,20 @@ def timed(exchange: Exchange, count: int) -> list[float]:
     return times
 
 
-def measure(
-    chunks: int, size: int, executor: str, control: str | None
-) -> dict[str, float]:
-    """Steps and echoes per second over all chunks, and how long a step takes."""
+def measure_in_turns(chunks: int, size: int, control: str | None) -> dict[str, float]:
+    """Returns steps and echoes per second over all chunks, and how long a step takes."""
     domain_id = free_domain_id()
     with (
         tempfile.TemporaryDirectory() as folder,
-        lockstep_env(domain_id, Path(folder), control) as driving,
-        bare_echo(domain_id, executor) as echo,
+        open_env(domain_id, Path(folder), control) as driving,
+        open_echo(domain_id) as echo,
     ):
-        timed(driving.step, size), echo(size)  # as warm as they get
+        time_each(driving.step, size)  # as warm as they get
+        echo(size)
         steps = []
         echoes = []
         for _ in range(chunks):
-            steps += timed(driving.step, size)
+            steps += time_each(driving.step, size)
             echoes += echo(size)
     rate = len(steps) / sum(steps)
     bare = len(echoes) / sum(echoes)
@@ -297,34 +251,5 @@ def measure(
     }
 
 
-def bars(result: dict[str, float], executor: str) -> list[str]:
-    """A sentence for each bar that was missed."""
-    missed = []
-    least = RATIOS[executor]
-    if not result["ratio"] >= least:
-        missed.append(f"ratio {result['ratio']}: must be {least} at least")
-    if not result["driven_m"] >= DRIVEN_M:
-        missed.append(f"driven_m {result['driven_m']}: must be {DRIVEN_M} at least")
-    return missed
-
-
-def main() -> None:
-    """Prints a table, or one JSON object, and ends with 1 where a bar was missed."""
-    parser = parser_of(__doc__, CONTROLS)
-    parser.add_argument("--chunks", type=int, default=150)
-    parser.add_argument("--size", type=int, default=100, help="steps in a chunk")
-    parser.add_argument(
-        "--executor", choices=EXECUTORS, default="rclpy", help="of the bare pair"
-    )
-    parser.add_argument("--end", choices=ENDS, help=argparse.SUPPRESS)
-    parser.add_argument("--namespace", help=argparse.SUPPRESS)
-    given = parser.parse_args()
-    if given.end:
-        ENDS[given.end](given.namespace, given.executor)
-        return
-    result = measure(given.chunks, given.size, given.executor, given.control)
-    answer(result, bars(result, given.executor), given.json)
-
-
 if __name__ == "__main__":
-    main()
+    ENDS[sys.argv[2]](sys.argv[1])

@@ -1,0 +1,837 @@
+"""Policies: how long they take to learn, where they still drive, and how well beside planners.
+
+python benchmarks/policies.py training | baselines | barn
+python benchmarks/policies.py transfer | robustness
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from bench import Benchmark, Control, at_least, at_most, missed_bars, run_benchmark
+from measuring import perturbations
+from measuring.evaluations import Run, evaluate_all
+from measuring.perturbations import PERTURBATIONS
+from measuring.standing import Standing
+from numpy.typing import NDArray
+
+from nics_drl_bridge.commands.conditions import Conditions
+from nics_drl_bridge.commands.episodes import (
+    DDS,
+    FAST,
+    LABELS,
+    MUJOCO,
+    NAVIGATION,
+    PLACES,
+    drive_in,
+)
+from nics_drl_bridge.config import dump_yaml
+from nics_drl_bridge.env.sim_backend import SimBackend
+from nics_drl_bridge.env.teaching import Teaching
+from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+from nics_drl_bridge.errors import BridgeError, ConfigError
+from nics_drl_bridge.gate.gated_backend import GatedBackend
+from nics_drl_bridge.generator import open_model
+from nics_drl_bridge.policy.evaluation import (
+    DRIFT_M,
+    FIRST_SEED,
+    Summary,
+    drive_all,
+    drive_worlds,
+    successes,
+    summarise,
+)
+from nics_drl_bridge.policy.policies import POLICIES, open_policy, shipped_policies
+from nics_drl_bridge.policy.stateful import Policy
+from nics_drl_bridge.policy.training_settings import TrainingSettings, load_training
+from nics_drl_bridge.robot.spec import load_robot
+from nics_drl_bridge.sim import barn
+from nics_drl_bridge.sim.scenes import member_of
+from nics_drl_bridge.sim.simulator import EpisodeSampler
+from nics_drl_bridge.sim.world import World, load_world
+from nics_drl_bridge.sim.world_set import BARN, AnyWorld, WorldSet, load_worlds
+
+Array = NDArray[np.float64]
+Given = argparse.Namespace
+Result = dict[str, Any]
+ROBOTS = ("differential", "ackermann", "mecanum")
+STANDS = Control("the driving: the policy stands still", "success")
+
+# Learning
+
+LEARNING_WORLD = "circles"
+LONGEST_S = {"differential": 15.0, "ackermann": 45.0, "mecanum": 25.0}
+LEARNING_BARS = {
+    "success_rate": at_least(0.95, "success after training"),
+    # The share of the time that goes to the simulator has no bar: it steps on one core while the
+    # other learns.
+    "steps_per_s": at_least(100_000.0, "environment steps per second of training"),
+}
+
+
+def shorten(settings: TrainingSettings) -> TrainingSettings:
+    """Returns the same settings, but for one rollout only."""
+    short = settings.ppo.rollout * settings.num_envs
+    return settings.model_copy(update={"steps": short})
+
+
+def learn(settings: TrainingSettings, seed: int, episodes: int) -> Result:
+    """Trains with one seed and drives unseen episodes; returns the figures."""
+    from nics_drl_bridge.policy.train import train
+    from nics_drl_bridge.policy.train_algorithms import act_of
+
+    model = open_model(settings.robot, settings.lidar)
+    begin = time.perf_counter()
+    with tempfile.TemporaryDirectory() as folder:
+        trained = train(settings, seed, Path(folder))
+    env = BridgeVectorEnv(
+        episodes,
+        model,
+        LEARNING_WORLD,
+        settings.task,
+        settings.task_options,
+        settings.max_episode_steps,
+    )
+    act = act_of(trained.algorithm)
+    outcomes = drive_worlds(env, act, range(FIRST_SEED, FIRST_SEED + episodes))
+    wall_s = time.perf_counter() - begin
+    told = summarise(outcomes, model.control_period)
+    return {
+        "success_rate": told.success.value,
+        "success_95ci": [told.success.low, told.success.high],
+        "believed_rate": told.believed.value,
+        "collision_rate": told.collision.value,
+        "wall_s": wall_s,
+        "env_steps": trained.steps,
+        "steps_per_s": trained.steps / trained.wall_s,
+    }
+
+
+def measure_training(given: Given) -> Result:
+    """How long does it take to learn to navigate, from nothing?
+
+    Trains a shipped robot among ten random obstacles with the shipped settings, then drives unseen
+    episodes there. Wall time counts from the first random weight to the last evaluated episode;
+    the kernels are compiled before. Of several seeds, the figures are of the one with the least
+    success, with the longest time and the lowest speed of all. `--lidar` learns and drives with
+    another than the robot's, as `rplidar_a2`, by the same bars.
+    """
+    settings = load_training(f"navigation_{given.robot}")
+    settings = settings.model_copy(update={"lidar": given.lidar or settings.lidar})
+    if given.control == "untrained":
+        settings = shorten(settings)
+    else:
+        learn(shorten(settings), 0, min(given.episodes, 20))  # compiles, fills caches
+    runs = [learn(settings, seed, given.episodes) for seed in given.seeds]
+    worst = min(runs, key=lambda one: one["success_rate"])
+    longest = {name: max(one[name] for one in runs) for name in ("wall_s", "env_steps")}
+    slowest = min(one["steps_per_s"] for one in runs)
+    return {**worst, **longest, "steps_per_s": slowest, "robot": given.robot}
+
+
+def judge_training(result: Result) -> list[str]:
+    longest = {"wall_s": at_most(LONGEST_S[result["robot"]])}
+    return missed_bars(result, LEARNING_BARS | longest, f"{result['robot']}: ")
+
+
+# Planners and shipped policies
+
+FLOORS = {"dynamic_window": 0.7, "mppi": 0.7, "straight": 0.05}
+FLOORS |= dict.fromkeys(ROBOTS, 0.8)  # shipped policies go by the names of their robots
+DRIVING = (*ROBOTS, "dynamic_window", "mppi")
+LEAST_PATH_M = 1.0
+
+
+def drive_episodes(
+    robot: str, name: str, world: str, episodes: int, control: str | None
+) -> Summary:
+    """Drives by a policy of that name, in a world."""
+    model = open_model(robot)
+    policy, task = open_policy(name, model)
+    if control == "standing":
+        policy = Standing(task)
+    env = BridgeVectorEnv(episodes, model, world, task)
+    seeds = range(FIRST_SEED, FIRST_SEED + episodes)
+    return summarise(drive_worlds(env, policy.act, seeds), model.control_period)
+
+
+def measure_baselines(given: Given) -> Result:
+    """How well do policies that need no training navigate, beside those that come trained?
+
+    Every policy by name, and the shipped policy file of each robot if there is one, drives the
+    same unseen episodes: the evaluation protocol of `nics train`.
+    """
+    figures = {}
+    for world, robot in product(given.world, given.robot):
+        own = [robot] if robot in shipped_policies() else []
+        for name in [*own, *given.policy]:
+            summary = drive_episodes(robot, name, world, given.episodes, given.control)
+            figures[f"{world}/{robot}/{name}"] = dataclasses.asdict(summary)
+    return figures
+
+
+def judge_baselines(result: Result) -> list[str]:
+    missed = []
+    for place, told in result.items():
+        world, _, name = place.split("/")
+        values = {key: told[key]["value"] for key in ("success", "length")}
+        floor = FLOORS.get(name, 0.0) if world == LEARNING_WORLD else 0.0
+        bars = {"success": at_least(floor)}
+        if name in DRIVING:
+            bars["length"] = at_least(LEAST_PATH_M, "successful path [m]")
+        missed += missed_bars(values, bars, f"{place}: ")
+    return missed if result else ["no policy was driven"]
+
+
+# BARN
+
+BARN_ROBOT = "jackal"
+BARN_BARS = {
+    FAST: {
+        "success": at_least(0.95),
+        "collision": at_most(0.02),
+        "score": at_least(0.45),
+    },
+    MUJOCO: {"score": at_least(0.40)},
+}
+TRAINING_S = at_most(600.0, "a training, on two cores, took [s]")
+SPEED = 2.0  # of the challenge [m/s]
+GOAL_RADIUS = 1.0  # of the challenge [m]
+TIME_OUT_S = 100.0  # of the challenge
+# An episode ends where the truth, too, is near enough to the goal, and at true contacts alone.
+OPTIONS = {"goal_radius": GOAL_RADIUS - DRIFT_M, "contact_margin": -1.0}
+FOLDS = 5
+EVERY = 10  # in MuJoCo every tenth world is driven, in real time or slower
+
+
+@dataclass(frozen=True)
+class Course:
+    """A world and the length of its shortest path, from start to goal [m]."""
+
+    world: World
+    length: float
+
+    @property
+    def best_s(self) -> float:
+        """T*, the time that the shortest path takes at full speed [s]."""
+        return self.length / SPEED
+
+
+@dataclass(frozen=True)
+class BarnRuns:
+    """Runs of one policy (R,), each in one of the courses."""
+
+    success: NDArray[np.bool_]
+    believed: NDArray[np.bool_]
+    collision: NDArray[np.bool_]
+    time_s: Array
+    score: Array
+
+    def describe(self) -> dict[str, float | None]:
+        """Returns shares, and the mean time of the successful runs."""
+        times = self.time_s[self.success]
+        return {
+            "success": float(self.success.mean()),
+            "believed": float(self.believed.mean()),
+            "collision": float(self.collision.mean()),
+            "time_out": float((~self.success & ~self.collision).mean()),
+            "time_s": float(times.mean()) if len(times) else None,
+            "score": float(self.score.mean()),
+        }
+
+
+Courses = Mapping[int, Course]
+
+
+def list_courses(every: int = 1) -> dict[int, Course]:
+    """Returns one in so many courses, by number."""
+    courses = {}
+    for number in barn.barn_numbers()[::every]:
+        path = [barn.START[:2], *barn.barn_path(number), barn.GOAL]
+        length = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
+        courses[number] = Course(barn.barn_world(number), float(length))
+    return courses
+
+
+def find_seeds(world: AnyWorld, runs: int) -> NDArray[np.int64]:
+    """Finds seeds (P * runs,) of episodes, of which `runs` are in each world, one after another."""
+    found: dict[int, list[int]] = defaultdict(list)
+    seed = FIRST_SEED
+    while sum(map(len, found.values())) < runs * len(world.members):
+        member = member_of(world, seed)
+        if len(found[member]) < runs:
+            found[member].append(seed)
+        seed += 1
+    return np.array([found[p] for p in range(len(world.members))]).ravel()
+
+
+def score_runs(
+    courses: Courses,
+    runs: int,
+    flags: Sequence[Sequence[bool]],
+    time_s: Sequence[float],
+) -> BarnRuns:
+    """Scores the runs in each of the courses, one course after another.
+
+    Flags are those of `BarnRuns`: success, what the robot believed, and collision.
+    """
+    best = np.repeat([course.best_s for course in courses.values()], runs)
+    score = np.asarray(flags[0]) * best / np.clip(time_s, 2.0 * best, 8.0 * best)
+    return BarnRuns(*np.asarray(flags, np.bool_), np.asarray(time_s, np.float64), score)
+
+
+def drive_fast(
+    name: str, courses: Courses, runs: int, control: str | None = None
+) -> BarnRuns:
+    """Drives in the fast simulator, all worlds side by side."""
+    model = open_model(BARN_ROBOT)
+    policy: Policy
+    policy, task = open_policy(name, model)
+    task = replace(task, **OPTIONS)
+    if control == "standing":
+        policy = Standing(task)
+    world = WorldSet("courses", tuple(course.world for course in courses.values()))
+    seeds = find_seeds(world, runs)
+    steps = round(TIME_OUT_S / model.control_period)
+    env = BridgeVectorEnv(len(seeds), model, world, task, max_episode_steps=steps)
+    env.teach(Teaching(contact=0.0))  # which ends an episode at a true contact
+    out = drive_worlds(env, policy.act, seeds.tolist())
+    flags = out.success, out.believed, out.collision
+    return score_runs(courses, runs, flags, out.steps * model.control_period)
+
+
+def drive_folds(
+    settings: str, courses: Courses, runs: int, folds: int = FOLDS
+) -> tuple[BarnRuns, float]:
+    """Learns policies, each from the other worlds than those that it then drives in.
+
+    Returns the runs, and the time of the longest training [s].
+    """
+    chosen = load_training(settings)
+    if BARN not in chosen.worlds:
+        raise ConfigError(
+            f"{settings}: --five-fold replaces the world {BARN!r}, which it lacks."
+        )
+    if len(courses) < FOLDS:
+        raise ConfigError(
+            f"--five-fold needs {FOLDS} worlds, not {len(courses)}; name more."
+        )
+    from nics_drl_bridge.policy.train import POLICY, TrainOrder, run
+
+    driven = []
+    longest_s = 0.0
+    for fold in range(folds):
+        held = {number: courses[number] for number in list(courses)[fold::FOLDS]}
+        with tempfile.TemporaryDirectory() as folder:
+            rest = {n: course for n, course in courses.items() if n not in held}
+            others = save_worlds(rest, Path(folder, "worlds"))
+            worlds = {
+                others if world == BARN else world: copies
+                for world, copies in chosen.worlds.items()
+            }
+            learned = chosen.model_copy(update={"worlds": worlds})
+            order = TrainOrder(learned, (fold,), Path(folder, "run"), 1)
+            longest_s = max(longest_s, *(one.trained.wall_s for one in run(order)))
+            policy = str(order.out / f"seed_{fold}" / POLICY)
+            driven.append(drive_fast(policy, held, runs))
+    parts = zip(*(vars(one).values() for one in driven), strict=True)
+    return BarnRuns(*(np.concatenate(part) for part in parts)), longest_s
+
+
+def save_worlds(courses: Courses, folder: Path) -> str:
+    """Writes the worlds into a folder; returns its name."""
+    folder.mkdir()
+    for number, course in courses.items():
+        text = dump_yaml(course.world.model_dump(mode="json", exclude_none=True))
+        Path(folder, f"{number:04d}.yaml").write_text(text)
+    return str(folder)
+
+
+def drive_mujoco(name: str, courses: Courses) -> BarnRuns:
+    """Drives in MuJoCo over DDS, one world after the other."""
+    period = open_model(BARN_ROBOT).control_period
+    conditions = Conditions(steps=round(TIME_OUT_S / period), task=OPTIONS)
+    with tempfile.TemporaryDirectory() as folder:
+        worlds = save_worlds(courses, Path(folder, "worlds"))
+        seeds = find_seeds(load_worlds(worlds), 1).tolist()
+        told = (Path(folder), lambda _: None)
+        episodes = drive_in(
+            MUJOCO, name, BARN_ROBOT, worlds, seeds, *told, conditions=conditions
+        )
+    results = np.array([one.result for one in episodes])
+    believed = [one.believed_success for one in episodes]
+    flags = results == "success", believed, results == "collision"
+    return score_runs(courses, 1, flags, [period * one.steps for one in episodes])
+
+
+def drive_courses(given: Given) -> tuple[dict[str, BarnRuns], float | None]:
+    """Returns the runs of each policy, and how long one was learnt for it, if any was [s]."""
+    fast = given.place == FAST
+    if not fast and (given.control or given.five_fold):
+        raise ConfigError(
+            "a control stands, and --five-fold learns, in fast alone; leave out --in."
+        )
+    courses = list_courses(given.every or (1 if fast else EVERY))
+    if given.five_fold:
+        runs, training_s = drive_folds(
+            given.five_fold, courses, given.runs, given.folds
+        )
+        return {given.five_fold: runs}, training_s
+    names = given.policy or [BARN_ROBOT, *(one for one in POLICIES if one != "random")]
+    if fast:
+        return {
+            name: drive_fast(name, courses, given.runs, given.control) for name in names
+        }, None
+    return {name: drive_mujoco(name, courses) for name in names}, None
+
+
+def measure_barn(given: Given) -> Result:
+    """How well is a robot driven through worlds that others made, among which teams are compared?
+
+    A Jackal drives 10 m between cylinders, without a map, in the 250 public worlds of the
+    challenge BARN (`nics_drl_bridge.sim.barn`). A run's score is the challenge's: success by
+    T* / clip(T, 2 T*, 8 T*), where T* is the time that the shortest path takes at 2 m/s; 0.5 is
+    the most. Success, collision and time are those of the simulator's true pose and contacts.
+    """
+    try:
+        runs, training_s = drive_courses(given)
+    except BridgeError as error:
+        sys.stderr.write(f"{error}\n")
+        raise SystemExit(2) from None
+    figures = {name: one.describe() for name, one in runs.items()}
+    policy, first = next(iter(figures.items()))
+    about = {"policy": policy, "place": given.place, "training_s": training_s}
+    return {**first, **about, "policies": figures}
+
+
+def judge_barn(result: Result) -> list[str]:
+    bars = dict(BARN_BARS[result["place"]])
+    if result["training_s"] is not None:
+        bars["training_s"] = TRAINING_S
+    return missed_bars(result, bars, f"{result['policy']}: ")
+
+
+# Transfer
+
+TRANSFER_FLOORS = {
+    **dict.fromkeys(("circles", "doorway", "arena", "empty"), 0.97),
+    **dict.fromkeys(("clutter", "corridor", "crowd", "room"), 0.95),
+}
+"""Least success in process, by world: what fails everywhere alike has not been transferred."""
+MOST_BELIEVED = 0.05  # part of the episodes that may be successes to the robot alone
+APART_POINTS = {
+    DDS: 2.0,
+    MUJOCO: 4.0,
+}  # how far the success may be from that in process
+TRANSFER_LIDAR = "rplidar_a2"
+TRANSFER_SEED = 2_000_000
+ROUNDING = 1e-9
+Found = dict[str, dict[str, dict[str, Any]]]
+
+
+def get_conditions(robot: str) -> Conditions:
+    """Returns those of a deployment: a real lidar, mild randomisation, the robot's limits."""
+    lidar = None if load_robot(robot).lidar else TRANSFER_LIDAR
+    return Conditions(lidar, "mild", robot)
+
+
+def get_shares(found: Found, name: str) -> dict[str, Any]:
+    """Returns one share of the episodes, robot -> world -> place -> its value."""
+    return {
+        robot: {
+            world: {place: each[name][0] for place, each in places.items()}
+            for world, places in worlds.items()
+        }
+        for robot, worlds in found.items()
+    }
+
+
+def measure_transfer(given: Given) -> Result:
+    """Does a policy drive as well where it was not trained, in every shipped world?
+
+    The shipped policy of each robot, one file, drives the same episodes in three places: the fast
+    simulator in process, the fast simulator over DDS, and the robot's machine in MuJoCo over DDS.
+    The conditions are those of a deployment: a real lidar, mild randomisation, the gate and its
+    shield. What counts is where the robot truly ended and whether it truly touched something; what
+    the robot itself took for a success is told beside it. Two worlds are driven at a time, each in
+    processes of its own.
+    """
+
+    def tell(name: str, figures: dict[str, Any]) -> None:
+        shares = (
+            f"{place} {100 * each['success'][0]:.1f} %"
+            for place, each in figures.items()
+        )
+        sys.stderr.write(f"{name}: {', '.join(shares)}\n")
+
+    found: Found = {robot: {} for robot in given.robots}
+    with tempfile.TemporaryDirectory() as folder:
+        runs = {
+            f"{robot}/{world}": Run(
+                robot,
+                robot,
+                world,
+                given.episodes,
+                TRANSFER_SEED,
+                Path(folder) / robot / world,
+                given.control,
+                get_conditions(robot),
+                given.places,
+            )
+            for robot, world in product(given.robots, given.worlds)
+        }
+        for name, figures in evaluate_all(runs, tell).items():
+            robot, world = name.split("/")
+            found[robot][world] = figures
+    keys = ("success", "collision", "believed", "length")
+    result: Result = {name: get_shares(found, name) for name in keys}
+    result["points_from_fast"] = {
+        robot: {world: find_points(places) for world, places in worlds.items()}
+        for robot, worlds in result["success"].items()
+    }
+    return result
+
+
+def find_points(places: Mapping[str, float]) -> dict[str, float]:
+    """Returns the success in each place less that in process [points]."""
+    return {
+        place: round(100.0 * (each - places[FAST]), 3)
+        for place, each in places.items()
+        if place != FAST and FAST in places
+    }
+
+
+def judge_transfer(result: Result) -> list[str]:
+    missed = []
+    for robot, worlds in result["success"].items():
+        for world, places in worlds.items():
+            who = f"{robot} in {world}"
+            floor = at_least(TRANSFER_FLOORS[world] - ROUNDING, "success in process")
+            missed += missed_bars(places, {FAST: floor} if FAST in places else {}, who)
+            points = {
+                place: abs(each)
+                for place, each in result["points_from_fast"][robot][world].items()
+            }
+            bars = {
+                place: at_most(
+                    APART_POINTS[place] + ROUNDING, f" {LABELS[place]}: points off"
+                )
+                for place in points
+            }
+            missed += missed_bars(points, bars, who)
+            for place, success in places.items():
+                length = result["length"][robot][world][place]
+                figures = {
+                    "alone": result["believed"][robot][world][place] - success,
+                    "length": np.nan if length is None else length,
+                }
+                bars = {
+                    "alone": at_most(
+                        MOST_BELIEVED + ROUNDING, "successes to the robot alone"
+                    ),
+                    "length": at_least(LEAST_PATH_M, "successful path [m]"),
+                }
+                missed += missed_bars(figures, bars, f"{who} {LABELS[place]}: ")
+    return missed if any(result["success"].values()) else ["no robot was driven"]
+
+
+# Robustness
+
+MULTIPLES = (0.5, 1.0, 2.0)
+DECLARED = 1.0
+ROBUST_WORLDS = ("circles", "doorway", "clutter", "corridor", "crowd", "room")
+ROBUST_SEED = 3_000_000
+AT_ONCE = 2
+TENFOLD = 10.0
+LEAST_UNPERTURBED = at_least(0.95 - ROUNDING, "success without a perturbation")
+MOST_LOST = 5.0  # points lost to one perturbation at its declared range
+Curves = Mapping[str, Mapping[str, Sequence[float]]]
+
+
+@dataclass(frozen=True)
+class Job:
+    """The episodes of one policy in one world, with each perturbation at each of the multiples."""
+
+    robot: str
+    world: str
+    episodes: int
+    perturbations: tuple[str, ...]
+    multiples: tuple[float, ...]
+    control: str | None
+
+
+def count_reached(job: Job, perturbation: str | None, times: float) -> tuple[int, int]:
+    """Counts episodes that succeed under a perturbation, or none, truly and to the robot."""
+    model = perturbations.open_real_model(job.robot)
+    world = load_world(job.world)
+    driver: Policy
+    driver, task = open_policy(job.robot, model)
+    if job.control == "standing":
+        driver = Standing(task)
+    times *= TENFOLD if job.control == "tenfold" else 1.0
+    larger = perturbation == "footprint"
+    drawn = None
+    simulated = model
+    if larger:
+        simulated = perturbations.grow_footprint(
+            model, 1.0 + times * perturbations.FOOTPRINT
+        )
+    elif perturbation is not None:
+        whole = perturbations.load_declared(job.robot)
+        noise = model.lidar.noise_std
+        drawn = perturbations.single_out(whole, perturbation, times, noise)
+    backend = SimBackend(simulated, world, estimator=True, randomisation=drawn)
+    if larger:  # in the scenes of the robot that it is believed to be
+        backend.simulator.episodes = EpisodeSampler(model, world)
+    gated = GatedBackend(backend, model, job.robot)
+    env = gymnasium.make(NAVIGATION, backend=gated, model=model, world=world, task=task)
+    with closing(env):
+        driven = drive_all(env, driver, range(ROBUST_SEED, ROBUST_SEED + job.episodes))
+    return successes(driven), sum(one.believed_success for one in driven)
+
+
+def count_curves(job: Job) -> tuple[Job, dict[str, NDArray[np.int64]]]:
+    """Counts under each perturbation (1 + multiples, 2), the first without any."""
+    nothing = count_reached(job, None, 0.0)
+    return job, {
+        each: np.array(
+            [nothing, *(count_reached(job, each, times) for times in job.multiples)]
+        )
+        for each in job.perturbations
+    }
+
+
+def measure_robustness(given: Given) -> Result:
+    """How much success does a shipped policy lose to each perturbation alone?
+
+    Each shipped policy drives the same episodes of several worlds without any perturbation, and
+    with one of them at parts and multiples of its declared range: with the greatest value that the
+    randomisation of its training draws. The footprint is no part of that, and time constants need
+    not be; they are declared in measuring/perturbations.py. Lidar, gate, shield and estimator are
+    those of a deployment, and know nothing of the perturbation; success is by the truth, and told
+    beside what the robots believed. `--of RESULTS` only draws the picture of earlier runs.
+    """
+    if given.of:
+        runs = json.loads(given.of.read_text(encoding="utf-8"))["runs"]
+        perturbations.draw(collect_curves(runs), given.picture, MULTIPLES)
+        raise SystemExit(0)
+    multiples = tuple(sorted({DECLARED, *given.multiples}))
+    make = partial(
+        Job,
+        episodes=given.episodes,
+        perturbations=tuple(given.only),
+        multiples=multiples,
+        control=given.control,
+    )
+    jobs = [make(*each) for each in product(given.robots, given.worlds)]
+    counts: dict[str, dict[str, Any]] = {
+        robot: dict.fromkeys(given.only, 0) for robot in given.robots
+    }
+    with ProcessPoolExecutor(AT_ONCE, mp_context=get_context("spawn")) as pool:
+        for job, found in pool.map(count_curves, jobs):
+            told = {each: some.tolist() for each, some in found.items()}
+            sys.stderr.write(f"{job.robot} in {job.world}: {told} of {job.episodes}\n")
+            for each, some in found.items():
+                counts[job.robot][each] = counts[job.robot][each] + some
+    episodes = given.episodes * len(given.worlds)
+    success, believed = (
+        {
+            robot: {
+                each: (some[:, k] / episodes).tolist() for each, some in own.items()
+            }
+            for robot, own in counts.items()
+        }
+        for k in range(2)
+    )
+    if given.picture:
+        perturbations.draw(success, given.picture, multiples)
+    lost = find_losses(success, multiples)
+    return {
+        "declared": {
+            robot: perturbations.describe(perturbations.load_declared(robot))
+            for robot in success
+        },
+        "multiples": [0.0, *multiples],
+        "success": success,
+        "believed": believed,
+        "lost_points": lost,
+        "worst": find_worst(lost),
+        "episodes": episodes,
+    }
+
+
+def collect_curves(runs: Mapping[str, Any]) -> dict[str, dict[str, list[float]]]:
+    """Returns the success of all robots in results: robot -> perturbation -> by multiple."""
+    return {
+        robot: {each: list(some.values()) for each, some in own.items()}
+        for name, run in sorted(runs.items())
+        if name.startswith("robustness_") and run["result"]
+        for robot, own in run["result"]["success"].items()
+    }
+
+
+def find_losses(
+    success: Curves, multiples: Sequence[float]
+) -> dict[str, dict[str, float]]:
+    """Returns points of success lost at the declared range: robot -> perturbation -> value."""
+    at = 1 + multiples.index(DECLARED)
+    return {
+        robot: {
+            each: round(100.0 * (some[0] - some[at]), 3) for each, some in own.items()
+        }
+        for robot, own in success.items()
+    }
+
+
+def find_worst(lost: Mapping[str, Mapping[str, float]]) -> Result:
+    """Returns the greatest loss of all, and to what."""
+    losses = (
+        (value, robot, each)
+        for robot, own in lost.items()
+        for each, value in own.items()
+    )
+    points, robot, each = max(losses)
+    return {"points": points, "robot": robot, "perturbation": each}
+
+
+def judge_robustness(result: Result) -> list[str]:
+    missed = []
+    for robot, own in result["success"].items():
+        first = {"success": next(iter(own.values()))[0]}
+        missed += missed_bars(first, {"success": LEAST_UNPERTURBED}, f"{robot}: ")
+        bars = {
+            each: at_most(MOST_LOST + ROUNDING, f"points lost to {each}")
+            for each in own
+        }
+        missed += missed_bars(result["lost_points"][robot], bars, f"{robot}: ")
+    return missed if any(result["success"].values()) else ["no policy was driven"]
+
+
+EPISODES: dict[str, Any] = {"type": int, "default": 500}
+SHIPPED = shipped_policies()
+OF_SHIPPED = {"nargs": "+", "choices": SHIPPED, "default": SHIPPED}
+BENCHMARKS = {
+    "training": Benchmark(
+        measure_training,
+        judge_training,
+        {
+            "untrained": Control(
+                "the learning: a net that has learnt from a single rollout",
+                "success after training",
+                "--episodes 20",
+            )
+        },
+        {
+            "robot": {"choices": sorted(LONGEST_S), "default": "differential"},
+            "lidar": {"help": "instead of the robot's own, a shipped one or a file"},
+            "seeds": {"type": int, "nargs": "+", "default": [0]},
+            "episodes": EPISODES,
+        },
+        short=None,
+        needs=("torch",),
+    ),
+    "baselines": Benchmark(
+        measure_baselines,
+        judge_baselines,
+        {"standing": STANDS},
+        {
+            "world": {"nargs": "+", "default": [LEARNING_WORLD]},
+            "robot": {"nargs": "+", "choices": ROBOTS, "default": ROBOTS},
+            "policy": {"nargs": "+", "default": list(POLICIES)},
+            "episodes": EPISODES,
+        },
+        short="--robot differential --policy dynamic_window --episodes 20",
+    ),
+    "barn": Benchmark(
+        measure_barn,
+        judge_barn,
+        {"standing": STANDS},
+        {
+            "in": {"dest": "place", "choices": tuple(BARN_BARS), "default": FAST},
+            "policy": {"nargs": "+", "help": "files or names; by default the shipped"},
+            "five-fold": {
+                "metavar": "SETTINGS",
+                "nargs": "?",
+                "const": f"shipped_{BARN_ROBOT}",
+                "help": "learn from four fifths of the worlds, judge in the others",
+            },
+            "runs": {"type": int, "default": 1, "help": "in each world"},
+            "every": {"type": int, "help": "one in so many worlds"},
+            "folds": {"type": int, "default": FOLDS, "choices": range(1, FOLDS + 1)},
+        },
+        short="--every 25 --policy jackal",
+    ),
+    "transfer": Benchmark(
+        measure_transfer,
+        judge_transfer,
+        {
+            "lying": Control("the truth: a robot says it is there", "the robot alone"),
+            "standing": STANDS,
+        },
+        {
+            "episodes": {"type": int, "default": 100, "help": "in each place"},
+            "robots": OF_SHIPPED,
+            "worlds": {
+                "nargs": "+",
+                "choices": list(TRANSFER_FLOORS),
+                "default": list(TRANSFER_FLOORS),
+            },
+            "in": {
+                "nargs": "+",
+                "dest": "places",
+                "choices": PLACES,
+                "default": list(PLACES),
+            },
+        },
+        short="--episodes 1 --robots differential --worlds circles",
+        unsettled=("",),
+        needs=("rclpy", "mujoco"),
+    ),
+    "robustness": Benchmark(
+        measure_robustness,
+        judge_robustness,
+        {
+            "tenfold": Control("the range: perturbations are ten times it", "drift"),
+            "standing": STANDS,
+        },
+        {
+            "episodes": {"type": int, "default": 40, "help": "in each world"},
+            "robots": OF_SHIPPED,
+            "worlds": {
+                "nargs": "+",
+                "choices": ROBUST_WORLDS,
+                "default": list(ROBUST_WORLDS),
+            },
+            "only": {
+                "nargs": "+",
+                "choices": PERTURBATIONS,
+                "default": list(PERTURBATIONS),
+            },
+            "multiples": {"nargs": "+", "type": float, "default": MULTIPLES},
+            "picture": {"type": Path, "help": "draw the curves into this file"},
+            "of": {"type": Path, "help": "draw the picture of these results only"},
+        },
+        short="--episodes 2 --robots differential --worlds circles --only drift",
+        unsettled=("",),
+    ),
+}
+
+if __name__ == "__main__":
+    run_benchmark(BENCHMARKS)

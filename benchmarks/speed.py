@@ -1,0 +1,834 @@
+"""Speed beside peers: environments, scans among obstacles and in maps, steps over ROS 2.
+
+python benchmarks/speed.py env_throughput | env_scaling
+python benchmarks/speed.py lidar_peers | map_lidar
+python benchmarks/speed.py ros_lockstep
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import time
+import tracemalloc
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from bench import Benchmark, Control, at_least, at_most, missed_bars, run_benchmark
+from measuring import peers
+from measuring.grids import MAPS, RESOLUTION, draw_poses, scan_map
+from measuring.rates import interleaved, medians
+from measuring.scenes import BATCH, CIRCLE, errors
+from numpy.typing import NDArray
+
+from nics_drl_bridge import style
+from nics_drl_bridge.env.navigation import Navigation
+from nics_drl_bridge.env.registry import NAVIGATION, register_envs
+from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+from nics_drl_bridge.files import write_bytes
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.lidar import map_kernels
+from nics_drl_bridge.lidar.bake import bake
+from nics_drl_bridge.lidar.exact_kernels import beams_of
+from nics_drl_bridge.lidar.faults import LidarFaults
+from nics_drl_bridge.lidar.maps import OCCUPIED, GridMap
+from nics_drl_bridge.lidar.scanner import Renderer, Scanner
+from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
+from nics_drl_bridge.lidar.table import LidarTable
+from nics_drl_bridge.sim.scenes import Scene, sample_scene
+from nics_drl_bridge.sim.world import World
+from nics_drl_bridge.sim.world_set import AnyWorld, WorldSet
+
+Given = argparse.Namespace
+Result = dict[str, Any]
+TIMES_SLOWER = 10  # under the control `slow`
+
+# Environments beside peers
+
+FEW_BEAMS = 8
+# How many times a peer's rate with one scan per control period ours is on one thread, at least.
+AT_EQUAL_WORK = {"ir_sim": 900.0, "irsim_x": 70.0}
+SHARES = {
+    "share_of_write_limit": at_least(
+        0.01, "share of the rate at which observations alone can be written"
+    ),
+    "share_of_cartpole": at_least(0.04, "share of CartPole's rate, single env"),
+    "share_of_cartpole_with_estimator": at_least(
+        0.007, "share of CartPole's rate, single env with the estimator"
+    ),
+}
+OF_USUAL = {"lidar": 0.75, "obstacles": 0.65}  # of the usual env's steps per second
+CLEAN = at_most(1.3, "times as long as without the lidar's faults")
+SCENES = 50  # that the peers go through, one for each episode
+ACTIONS = 64
+CHUNK = 50
+SINGLE_CHUNK = 500
+WRITES = 50
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is timed; the usual one by default."""
+
+    lidar: str | None = None  # name or file
+    obstacles: int = peers.CIRCLES
+    control: str | None = None
+    clean: bool = False  # without the faults of the lidar
+
+    @property
+    def is_usual(self) -> bool:
+        """True if peers do the same."""
+        return self.lidar is None and self.obstacles == peers.CIRCLES
+
+    @property
+    def model(self) -> SimulatorModel:
+        """The robot, whose lidar may be next to blind."""
+        lidar = peers.MODEL.lidar if self.lidar is None else load_lidar(self.lidar)
+        if self.control == "blind":
+            lidar = lidar.model_copy(update={"beams": FEW_BEAMS})
+        if self.clean:
+            lidar = lidar.model_copy(update={"noise_std": 0.0, "faults": LidarFaults()})
+        if lidar == peers.MODEL.lidar:
+            return peers.MODEL
+        table = bake(lidar, peers.MODEL.table.shapes)
+        return replace(peers.MODEL, lidar=lidar, table=table)
+
+    @property
+    def world(self) -> World:
+        """The field, as much larger as there are more obstacles."""
+        side = (peers.WORLD.size or (0.0,))[0] * (self.obstacles / peers.CIRCLES) ** 0.5
+        (group,) = peers.WORLD.obstacles
+        more = group.model_copy(update={"count": self.obstacles})
+        changes = {"size": (side, side), "obstacles": (more,)}
+        return peers.WORLD.model_copy(update=changes)
+
+    def make_actions(self, space: gymnasium.Space[Any]) -> NDArray[np.float32]:
+        """Returns random actions (ACTIONS, ...), or those of no motion."""
+        size = (ACTIONS, *(space.shape or ()))
+        if self.control == "standing":
+            low = peers.MODEL.robot.command_low
+            high = peers.MODEL.robot.command_high
+            rest = -(low + high) / (high - low)
+            return np.broadcast_to(rest, size).astype(np.float32)
+        return np.random.default_rng(0).uniform(-1.0, 1.0, size).astype(np.float32)
+
+
+class Worlds:
+    """The vector env at work."""
+
+    def __init__(self, worlds: int, threads: int, case: Case) -> None:
+        further: dict[str, Any] = {} if threads == 1 else {"threads": threads}
+        self.beams = case.model.lidar.beams
+        self.env = BridgeVectorEnv(worlds, case.model, case.world, **further)
+        self.seen, _ = self.env.reset(seed=0)
+        self.actions = case.make_actions(self.env.action_space)
+        self.times = TIMES_SLOWER if case.control == "slow" else 1
+        self.steps = CHUNK * worlds
+
+    @property
+    def places(self) -> NDArray[np.float64]:
+        """Where the robots are (N, 2) [m]."""
+        return self.env.simulator.data.pose[:, 0, :2].copy()
+
+    def step(self, k: int) -> int:
+        """Steps all worlds; returns how many episodes ended."""
+        self.seen, _, ended, cut, _ = self.env.step(self.actions[k % ACTIONS])
+        return int((ended | cut).sum())
+
+    def run_chunk(self) -> None:
+        """Makes a chunk of steps."""
+        for k in range(CHUNK * self.times):
+            self.env.step(self.actions[k % ACTIONS])
+
+
+class Alone:
+    """Likewise the env of `gymnasium.make`, with the wrappers that it adds, reset when it ends."""
+
+    def __init__(self, estimator: bool, case: Case) -> None:
+        self.beams = case.model.lidar.beams
+        self.env = gymnasium.make(
+            NAVIGATION, model=case.model, world=case.world, estimator=estimator
+        )
+        self.actions = case.make_actions(self.env.action_space)
+        self.times = TIMES_SLOWER if case.control == "slow" else 1
+        self.steps = SINGLE_CHUNK
+        self.places = np.zeros((1, 2))
+        self._reset()
+
+    def _reset(self) -> None:
+        seen, _ = self.env.reset(seed=0)
+        self.seen = seen[None]
+
+    def step(self, k: int) -> int:
+        """Steps the env; returns whether an episode ended."""
+        seen, _, ended, cut, info = self.env.step(self.actions[k % ACTIONS])
+        self.seen = seen[None]
+        self.places = info["true_pose"][None, :2].copy()
+        if ended or cut:
+            self.env.reset()
+        return int(ended or cut)
+
+    def run_chunk(self) -> None:
+        """Makes a chunk of steps."""
+        for k in range(SINGLE_CHUNK * self.times):
+            _, _, ended, cut, _ = self.env.step(self.actions[k % ACTIONS])
+            if ended or cut:
+                self.env.reset()
+
+
+def watch_chunk(one: Worlds | Alone) -> dict[str, float]:
+    """Returns what shows that robots move and see, in one more chunk."""
+    moved = 0.0
+    changed = 0.0
+    episodes = 0
+    periods = one.steps // len(one.seen)
+    begun = len(one.seen)
+    for k in range(periods):
+        seen = one.seen[:, : one.beams]
+        places = one.places
+        ended = one.step(k)
+        if begun < len(seen):  # the median leaves out those whose episode began
+            moved += float(np.median(np.hypot(*(one.places - places).T)))
+        begun = ended
+        episodes += ended
+        changed += np.count_nonzero(one.seen[:, : one.beams] != seen) / len(seen)
+    return {
+        "moved_m_per_period": moved / periods,
+        "beams_changed_per_period": changed / periods,
+        "episodes": episodes,
+    }
+
+
+def write_chunk(seen: NDArray[np.float32], out: NDArray[np.float32]) -> None:
+    """Writes as many bytes as the observations of some steps have."""
+    for _ in range(WRITES):
+        np.copyto(out, seen)
+
+
+def step_cartpole(env: gymnasium.Env[Any, Any]) -> None:
+    """Steps a single env that calculates next to nothing."""
+    for k in range(SINGLE_CHUNK):
+        _, _, ended, cut, _ = env.step(k % 2)
+        if ended or cut:
+            env.reset()
+
+
+def measure_throughput(given: Given) -> Result:
+    """How many steps per second does an environment give, alone and thousands at once?
+
+    The navigation task of the differential robot: 10 kinematic substeps per step, a lidar of 720
+    beams among ten circles, observation, reward, autoreset, random actions. Beside the vector env
+    on one thread and on all, and the single env of `gymnasium.make` without and with the
+    estimator, two other simulators do the same task in the same scenes, all timed in turn.
+
+    `times_as_fast_at_equal_work` is our vector env on one thread against them with one scan per
+    control period, as ours has; `times_as_fast_with_ten_scans` against ten of their own steps,
+    each of which scans: see measuring/peers.py. (irsim-x can also step many robots at once, but
+    all in one scene, without a new one as each episode ends.) Bars are ratios within the run: to
+    the peers, to writing as many bytes as the observations have, and to Gymnasium's CartPole.
+
+    With another `--lidar`, or more `--obstacles`, in a field as crowded, only our envs are timed,
+    beside the usual one: `share_of_usual` is what is left of its steps per second.
+    `times_as_long_as_clean` compares a lidar with its copy that has neither noise nor other
+    faults.
+    """
+    case = Case(given.lidar, given.obstacles, given.control)
+    usual = Case()
+    rivals = () if given.without_peers or not case.is_usual else tuple(peers.PEERS)
+    # A share is told to a few percent only by more of them.
+    repeats = given.repeats if rivals else 3 * given.repeats
+    register_envs()
+    ours: dict[str, Worlds | Alone] = {
+        "one": Worlds(given.worlds, 1, case),
+        "all": Worlds(given.worlds, given.threads, case),
+        "plain": Alone(False, case),
+        "estimator": Alone(True, case),
+    }
+    if not case.is_usual:
+        ours["usual"] = Worlds(given.worlds, 1, usual)
+    if case.lidar is not None:
+        same = None if case.control == "slow" else case.control
+        clean = replace(case, clean=True, control=same)
+        ours["clean"] = Worlds(given.worlds, 1, clean)
+    cartpole = gymnasium.make("CartPole-v1")
+    cartpole.reset(seed=0)
+    written = np.zeros((given.worlds, case.model.lidar.beams + 6), np.float32)
+    calls: dict[str, Callable[[], object]] = {
+        **{name: one.run_chunk for name, one in ours.items()},
+        "write": partial(write_chunk, written, np.ones_like(written)),
+        "cartpole": partial(step_cartpole, cartpole),
+    }
+    found = peers.measure(calls, rivals, peers.make_scenes(SCENES), repeats)
+    rate = {name: one.steps / found.seconds[name] for name, one in ours.items()}
+    rate["all"] = ours["all"].steps / found.wall["all"]
+    write = WRITES * given.worlds / found.seconds["write"]
+    step = SINGLE_CHUNK / found.seconds["cartpole"]
+    result: Result = {
+        "single_thread_env_steps_per_s": rate["one"],
+        "all_threads_env_steps_per_s": rate["all"],
+        "threads": given.threads,
+        "single_env_gym_steps_per_s": rate["plain"],
+        "single_env_with_estimator_steps_per_s": rate["estimator"],
+        **found.describe(),
+        "share_of_write_limit": rate["one"] / write,
+        "share_of_cartpole": rate["plain"] / step,
+        "share_of_cartpole_with_estimator": rate["estimator"] / step,
+        "drove": {name: watch_chunk(one) for name, one in ours.items()},
+    }
+    for key, scans in (("at_equal_work", "one_scan"), ("with_ten_scans", "ten_scans")):
+        result[f"times_as_fast_{key}"] = {
+            name: rate["one"] * one[f"period_with_{scans}_s"]
+            for name, one in found.peers.items()
+        }
+    if not case.is_usual:
+        result["share_of_usual"] = rate["one"] / rate["usual"]
+        kept = [
+            least
+            for name, least in OF_USUAL.items()
+            if getattr(case, name) != getattr(usual, name)
+        ]
+        result["least_share_of_usual"] = math.prod(kept)
+    if case.lidar is not None:
+        result["times_as_long_as_clean"] = rate["clean"] / rate["one"]
+    return result
+
+
+def judge_throughput(result: Result) -> list[str]:
+    bars = dict(SHARES)
+    if "share_of_usual" in result:
+        left = "left of the usual env's speed"
+        bars = {"share_of_usual": at_least(result["least_share_of_usual"], left)}
+    if "times_as_long_as_clean" in result:
+        bars["times_as_long_as_clean"] = CLEAN
+    missed = missed_bars(result, bars) + judge_equal_work(result, AT_EQUAL_WORK)
+    for name, drove in result["drove"].items():
+        missed += peers.judge_robots(f"our env {name!r}", drove)
+    return missed
+
+
+def judge_equal_work(result: Result, least: Mapping[str, float]) -> list[str]:
+    """Returns a sentence for each peer that we are not so many times as fast as, or that failed."""
+    ratios = result["times_as_fast_at_equal_work"]
+    bars = {name: at_least(least[name]) for name in ratios}
+    missed = missed_bars(ratios, bars, "times as fast at equal work: ")
+    return missed + peers.judge(result)
+
+
+# Environments as something grows
+
+MOST_TIMES = {"worlds": 0.5, "robots": 4.0, "obstacles": 12.0, "beams": 12.0}
+MOST_TIMES["members"] = 1.15
+MOST_MEMORY = 1.5  # of the last set, with all its copies, to that of the first one
+WORLDS = 256
+OBSTACLES = 10
+SIDE = 8.0
+BEAMS = 720
+SWEEPS: dict[str, tuple[int, ...]] = {
+    "worlds": (1, 4, 16, 64, 256, 1024, 4096, 16384),
+    "robots": (1, 2, 4, 8, 16, 32, 64),
+    "obstacles": (1, 4, 16, 64, 256),
+    "beams": (36, 90, 180, 360, 720, 1440, 2048),
+    "members": (1, 5, 25, 250),
+}
+AREA_PER_ROBOT = 12.0  # [m^2]
+AREA_PER_OBSTACLE = 4.0  # [m^2]
+FEWEST = 40  # steps of which the median is taken, at least, unless fewer are asked for
+ALONE = (
+    1024  # steps of a call, at most, where each world is stepped by a call of its own
+)
+ROBOT_STEPS = 256  # robots of all worlds together while their number in each grows
+
+
+@dataclass(frozen=True)
+class Crowd(Navigation):
+    """The navigation task for each of several robots, which see each other by lidar alone.
+
+    So the observation of a robot is as long in a world of 64 as in a world of its own.
+    """
+
+    team: int = 1
+
+    @property
+    def robots(self) -> int:
+        """M."""
+        return self.team
+
+
+def make_field(obstacles: int, side: float) -> World:
+    """Returns a square field of `side` [m] with so many circles."""
+    circles = {"shapes": [{"kind": "circle", "radius": peers.RADIUS}], "gap": 0.0}
+    return World.model_validate(
+        {
+            "name": "field",
+            "size": (side, side),
+            "obstacles": [{**circles, "count": obstacles}],
+            "clearance": 0.3,
+            "goal_distance": (1.0, side),
+        }
+    )
+
+
+def make_members(count: int) -> list[World]:
+    """Returns worlds whose circles stand where a seed each puts them in the usual field."""
+    usual = make_field(OBSTACLES, SIDE)
+    (group,) = usual.obstacles
+    found = []
+    for seed in range(count):
+        bodies = sample_scene(usual, peers.MODEL.robot.footprint_radius, seed).bodies
+        at = tuple((x, y, 0.0) for x, y in bodies[:, :2].tolist())
+        stands = group.model_copy(update={"count": None, "at": at})
+        changes = {"name": f"field_{seed}", "obstacles": (stands,)}
+        found.append(usual.model_copy(update=changes))
+    return found
+
+
+def make_env(
+    worlds: int = WORLDS,
+    robots: int = 1,
+    world: AnyWorld | None = None,
+    beams: int = BEAMS,
+) -> BridgeVectorEnv:
+    """Returns worlds of robots that have to reach goals."""
+    model = peers.MODEL
+    if beams != model.lidar.beams:
+        changed = model.lidar.model_copy(update={"beams": beams})
+        lidar = LidarSpec.model_validate(changed.model_dump())
+        model = replace(model, lidar=lidar, table=bake(lidar, model.table.shapes))
+    return BridgeVectorEnv(
+        worlds,
+        model,
+        world or make_field(OBSTACLES, SIDE),
+        task=Crowd,
+        task_options={"team": robots},
+        copy=False,
+        max_episode_steps=300,
+    )
+
+
+def make_point(name: str, value: int) -> BridgeVectorEnv:
+    """Returns the environment of one point of a curve."""
+    if name == "worlds":
+        return make_env(value)
+    if name == "robots":
+        side = max(SIDE, math.sqrt(value * AREA_PER_ROBOT))
+        field = make_field(OBSTACLES, side)
+        return make_env(max(1, ROBOT_STEPS // value), value, field)
+    if name == "obstacles":
+        side = max(SIDE, math.sqrt(value * AREA_PER_OBSTACLE))
+        return make_env(world=make_field(value, side))
+    if name == "members":
+        return make_env(world=WorldSet("fields", tuple(make_members(value))))
+    return make_env(beams=value)
+
+
+def make_apart(count: int) -> list[BridgeVectorEnv]:
+    """Returns a vector env for each world of a set, in which together as many copies are."""
+    copies = max(1, WORLDS // count)
+    return [make_env(copies, world=world) for world in make_members(count)]
+
+
+def make_stepper(
+    env: BridgeVectorEnv, times: int, in_pairs: bool
+) -> Callable[[], None]:
+    """Returns a call that steps an environment, by the same random actions again and again.
+
+    Args:
+        env: which.
+        times: steps of a call.
+        in_pairs: whether each robot of a world looks at each other in each substep, one by one.
+    """
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    actions = [env.action_space.sample() for _ in range(16)]
+    count = [0]
+    looks = env.model.timing[1] if in_pairs and env.robots > 1 else 0
+
+    def step() -> None:
+        for _ in range(times):
+            env.step(actions[count[0] % len(actions)])
+            count[0] += 1
+            for _ in range(looks):
+                for world in env.simulator.data.pose[:, :, :2].tolist():
+                    min(math.dist(one, other) for one in world for other in world)
+
+    return step
+
+
+def measure_curve(
+    name: str, values: Sequence[int], repeats: int, control: str | None
+) -> list[float]:
+    """Returns the cost of an env step at each point of a curve [us]."""
+    costs = []
+    for value in values:
+        alone = control == "slow" and name == "worlds"
+        times = min(value, ALONE) if alone else 1
+        if (name, control) == ("members", "apart"):
+            envs = make_apart(value)
+        else:
+            envs = [make_point(name, 1 if alone else value)]
+        stepped = sum(env.num_envs for env in envs) * times
+        often = max(min(repeats, FEWEST), repeats // stepped)
+        steps = [make_stepper(env, times, control == "quadratic") for env in envs]
+        calls = {value: lambda steps=steps: [step() for step in steps]}
+        seconds = medians(interleaved(calls, often, clock=time.process_time))
+        costs.append(1e6 * seconds[value] / stepped)
+        for env in envs:
+            env.close()
+    return costs
+
+
+def measure_memory(control: str | None) -> float:
+    """Returns how many times the memory of a set of one the set of most takes, with its copies."""
+    taken = []
+    for value in (SWEEPS["members"][0], SWEEPS["members"][-1]):
+        tracemalloc.start()
+        apart = control == "apart"
+        envs = make_apart(value) if apart else [make_point("members", value)]
+        for env in envs:
+            env.reset(seed=0)
+        taken.append(tracemalloc.get_traced_memory()[0])
+        tracemalloc.stop()
+    return taken[1] / taken[0]
+
+
+def measure_scaling(given: Given) -> Result:
+    """What does an env step cost with more worlds, robots, obstacles, beams, and worlds in a set?
+
+    Navigation on one thread: differential robots, 10 kinematic substeps, observation, reward and
+    autoreset, random actions. Unless it is what grows: 256 worlds of one robot, 10 circles on
+    8 x 8 m, 720 beams. Robots and obstacles get a field that grows with them, so that as many as
+    before are in range; what then grows faster than their number is the search for them.
+    `members` are the worlds of a set, each with its own ten circles at fixed places, among which
+    the 256 episodes are.
+    """
+    result: Result = {}
+    for name, sizes in SWEEPS.items():
+        result[name] = [sizes[0], sizes[-1]] if given.ends_only else list(sizes)
+        result[f"{name}_us"] = measure_curve(
+            name, result[name], given.repeats, given.control
+        )
+    per_robot = np.array(result["robots_us"]) / np.array(result["robots"])
+    result["robots_us_per_robot"] = per_robot.tolist()
+    result["members_memory"] = measure_memory(given.control)
+    costs = {name: _costs_of(result, name) for name in SWEEPS}
+    result["end_to_end"] = {name: each[-1] / each[0] for name, each in costs.items()}
+    if given.picture:
+        draw_curves(result, given.picture)
+    return result
+
+
+def _costs_of(result: Result, name: str) -> list[float]:
+    return result["robots_us_per_robot" if name == "robots" else f"{name}_us"]
+
+
+def judge_scaling(result: Result) -> list[str]:
+    bars = {
+        name: at_most(most, f"{name}: {result[name][-1]} cost, times {result[name][0]}")
+        for name, most in MOST_TIMES.items()
+    }
+    taken = at_most(MOST_MEMORY, f"members: {result['members'][-1]} take, times")
+    missed = missed_bars(result["end_to_end"], bars)
+    return missed + missed_bars(result, {"members_memory": taken})
+
+
+def draw_curves(result: Result, file: Path) -> None:
+    """Draws the curves side by side, on logarithmic axes."""
+    figure, grid = style.make_panels(1, len(SWEEPS), (12.0, 3.2), sharey=True)
+    for axes, name in zip(grid, SWEEPS, strict=True):
+        axes.loglog(result[name], _costs_of(result, name), "o-")
+        axes.set_xlabel(name)
+        axes.set_ylabel(f"us per {'robot and' if name == 'robots' else 'env'} step")
+        axes.grid(visible=True, which="both")
+    write_bytes(file, style.render_png(figure))
+
+
+# Scans beside peers
+
+RENDERERS: tuple[Renderer, ...] = ("baked", "exact")
+SCANS_AT_EQUAL_WORK = {"ir_sim": 2500.0, "irsim_x": 15.0}
+SCANS_WRITTEN = at_least(0.02, "share of the rate at which ranges can be written")
+# Against our exact scan [m]; the circles of ir-sim are polygons.
+SCAN_RMSE_M = {"baked": 0.01, "ir_sim": 0.03, "irsim_x": 0.01}
+HALF = 0.5 * peers.MODEL.lidar.angle_increment
+# Their beams are spread from the first to the last symmetrically; so are these, full circle or not.
+SPREAD = LidarSpec.model_validate(
+    {
+        **peers.MODEL.lidar.model_dump(),
+        "angle_min": peers.MODEL.lidar.angle_min + HALF,
+        "angle_max": peers.MODEL.lidar.angle_max + HALF,
+    }
+)
+
+
+class Scans:
+    """A batch of scans, each in a scene of its own."""
+
+    def __init__(self, table: LidarTable, drawn: list[Scene]) -> None:
+        self.table = table
+        self.starts = np.array([scene.starts[0] for scene in drawn])
+        poses = np.zeros((len(drawn), drawn[0].bodies.shape[0], 3))
+        poses[..., :2] = [scene.bodies[:, :2] for scene in drawn]
+        placed = Scanner(SPREAD, table).place((CIRCLE,) * poses.shape[1], poses)
+        self.scene = (placed, peers.WORLD.all_walls())
+        self.out = np.empty((len(drawn), SPREAD.beams), np.float32)
+
+    def render(self, renderer: Renderer, times: int = 1, turned: float = 0.0) -> Any:
+        """Renders the batch some times, every lidar turned [rad]; returns ranges (N, B) [m]."""
+        scanner = Scanner(SPREAD, self.table, renderer)
+        starts = self.starts + np.array([0.0, 0.0, turned])
+        for _ in range(times):
+            scanner.scan(starts, *self.scene, out=self.out)
+        return self.out.copy()
+
+
+def measure_lidar_peers(given: Given) -> Result:
+    """How fast are other simulators at the same scan: 720 beams among ten circles and four walls?
+
+    ir-sim and irsim-x scan at the starts of the scenes of env_throughput, as the scanner does,
+    exact and baked, and every scan is compared with our exact one. What is timed is a scan alone,
+    the very call that their step makes, in turn with ours: `times_as_fast_at_equal_work`. What a
+    scan costs within their step is told beside it, and has to agree: see measuring/peers.py.
+    """
+    rivals = () if given.without_peers else tuple(peers.PEERS)
+    table = bake(SPREAD, (CIRCLE,))
+    batch = Scans(table, peers.make_scenes(given.scans))
+    times = TIMES_SLOWER if given.control == "slow" else 1
+    calls: dict[str, Callable[[], object]] = {
+        name: partial(batch.render, name, times) for name in RENDERERS
+    }
+    calls["write"] = partial(batch.out.fill, 1.0)
+    drawn = peers.make_scenes(given.scenes)
+    alone = "scan_by_the_lidar" if given.control == "other_way" else "scan"
+    found = peers.measure(calls, rivals, drawn, given.repeats, alone)
+    rate = {name: given.scans / seconds for name, seconds in found.seconds.items()}
+    theirs = {name: 1.0 / one["scan_s"] for name, one in found.peers.items()}
+    few = Scans(table, drawn)
+    turned = SPREAD.angle_increment if given.control == "shifted" else 0.0
+    exact = few.render("exact", turned=turned)
+    ranges = {"baked": few.render("baked"), **found.ranges}
+    return {
+        "times_as_fast_at_equal_work": {
+            name: rate["baked"] / one for name, one in theirs.items()
+        },
+        "baked": rate["baked"],
+        "exact": rate["exact"],
+        **theirs,
+        "rmse_m": {name: errors([each], [exact])[0] for name, each in ranges.items()},
+        **found.describe(),
+        "share_of_write_limit": rate["baked"] / rate["write"],
+    }
+
+
+def judge_lidar_peers(result: Result) -> list[str]:
+    bars = {name: at_most(SCAN_RMSE_M[name]) for name in result["rmse_m"]}
+    missed = missed_bars(result, {"share_of_write_limit": SCANS_WRITTEN})
+    missed += missed_bars(result["rmse_m"], bars, "RMSE [m]: ")
+    return missed + judge_equal_work(result, SCANS_AT_EQUAL_WORK)
+
+
+# Scans in maps
+
+MAP_LIDARS = ("paper", "paper_12m")
+# Times the walk's speed, RMSE, and the fraction of beams that may be off by 1 mm.
+MAP_BARS = {
+    "ratio": at_least(3.0, "times the walk's speed"),
+    "rmse_m": at_most(1e-5, "RMSE [m]"),
+    "beams_off": at_most(1e-5, "fraction of the beams that are off by 1 mm"),
+}
+
+
+def measure_maps(given: Given) -> Result:
+    """Static maps: how much faster are jumps over free squares than walking from cell to cell?
+
+    Two generated maps of 20 m x 20 m at 0.05 m: an office, and the same as a SLAM would leave it,
+    with ragged edges and specks. One thread; ranges beyond range_max count as range_max.
+    """
+    rows = []
+    for name, make in MAPS.items():
+        grid = GridMap((make(given.seed) * OCCUPIED).astype(np.int8), RESOLUTION)
+        map_kernels.free_squares(grid.blocked)  # compiles
+        begin = time.perf_counter()
+        squares, _ = grid.arrays
+        bake_s = time.perf_counter() - begin
+        poses = draw_poses(grid, given.seed + 1)
+        for lidar in MAP_LIDARS:
+            spec = load_lidar(lidar)
+            directions = np.ascontiguousarray(spec.directions.T)
+            beams = beams_of(
+                directions, spec.angle_min, spec.angle_increment, spec.full_circle
+            )
+            about = (spec.range_max, grid.arrays)
+            exact, exact_speed = scan_map(beams, poses, *about, True)
+            beside = poses.copy()
+            beside[:, 0] += RESOLUTION if given.control == "shifted" else 0.0
+            walk = given.control == "slow"
+            baked, baked_speed = scan_map(beams, beside, *about, walk)
+            if given.control == "nan":
+                baked[0, 0] = np.nan
+            error = baked.astype(np.float64) - exact
+            rows.append(
+                {
+                    "map": name,
+                    "range_max_m": spec.range_max,
+                    "exact_scans_per_s": round(exact_speed),
+                    "baked_scans_per_s": round(baked_speed),
+                    "ratio": baked_speed / exact_speed,
+                    "rmse_m": float(np.sqrt((error**2).mean())),
+                    "beams_off": float((np.abs(error) > 1e-3).mean()),
+                    "table_bytes": squares.nbytes,
+                    "bake_s": bake_s,
+                }
+            )
+    return {"rows": rows}
+
+
+def judge_maps(result: Result) -> list[str]:
+    return [
+        line
+        for row in result["rows"]
+        for line in missed_bars(
+            row, MAP_BARS, f"{row['map']}, {row['range_max_m']:g} m: "
+        )
+    ]
+
+
+# Steps over ROS 2
+
+LOCKSTEP_BARS = {
+    "ratio": at_least(0.5),
+    "driven_m": at_least(0.1),
+}
+
+
+def measure_lockstep(given: Given) -> Result:
+    """How many env steps per second go over ROS 2 in lock-step, beside a bare pair of nodes?
+
+    The env is that of `gymnasium.make`: a command to a simulator node in a process of its own, its
+    720-beam scan among ten obstacles and its odometry back, the estimator, observation and reward.
+    The bare echo is what ROS 2 itself allows: two processes of rclpy's own executor, by the
+    transports that it chooses, that exchange the same messages, made once, and do nothing else.
+    Both are measured in turns, chunk by chunk, so that what else the machine does falls on both.
+    """
+    from measuring.echoes import measure_in_turns
+
+    return measure_in_turns(given.chunks, given.size, given.control)
+
+
+def judge_lockstep(result: Result) -> list[str]:
+    return missed_bars(result, LOCKSTEP_BARS)
+
+
+REPEATED: dict[str, Any] = {"type": int, "default": 10, "help": "timed rounds"}
+WITHOUT_PEERS = {"action": "store_true", "help": "install nothing"}
+BENCHMARKS = {
+    "env_throughput": Benchmark(
+        measure_throughput,
+        judge_throughput,
+        {
+            "slow": Control("the speed: each env step that counts is ten", "share of"),
+            "standing": Control(
+                "the motion: the robots stand still",
+                "our env 'one': moved_m_per_period",
+            ),
+            "blind": Control(
+                "the scan: the lidar has 8 beams",
+                "our env 'one': beams_changed_per_period",
+            ),
+        },
+        {
+            "worlds": {"type": int, "default": 2048, "help": "of the vector env"},
+            "threads": {"type": int, "default": os.cpu_count() or 1},
+            "repeats": REPEATED,
+            "lidar": {"help": "name or file of another lidar; without peers"},
+            "obstacles": {"type": int, "default": peers.CIRCLES, "help": "no peers"},
+            "without-peers": WITHOUT_PEERS,
+        },
+        short="--worlds 64 --threads 1 --repeats 1 --without-peers",
+        unsettled=("share of ", "left of ", "times as long"),
+    ),
+    "env_scaling": Benchmark(
+        measure_scaling,
+        judge_scaling,
+        {
+            "quadratic": Control(
+                "the search for what is near: each robot looks at each other, in Python",
+                "robots: 64 cost",
+            ),
+            "slow": Control(
+                "the batch: worlds are stepped one after the other",
+                "worlds: 16384 cost",
+            ),
+            "apart": Control(
+                "the set: each of its worlds is a vector env of its own",
+                "members: 250 take",
+            ),
+        },
+        {
+            "repeats": {"type": int, "default": 20_000, "help": "env steps of a point"},
+            "picture": {"type": Path, "help": "draw the curves into this file"},
+            "ends-only": {"action": "store_true", "help": "two points of each curve"},
+        },
+        short="--ends-only --repeats 5",
+        unsettled=(" cost",),
+    ),
+    "lidar_peers": Benchmark(
+        measure_lidar_peers,
+        judge_lidar_peers,
+        {
+            "shifted": Control(
+                "the same scan: the exact one is turned by one beam", "RMSE [m]: baked"
+            ),
+            "slow": Control(
+                "the speed: each scan that counts is ten", "share of the rate"
+            ),
+            "other_way": Control(
+                "one way of measuring: a scan alone is asked of their lidar",
+                "agreement",
+                "--scans 32 --scenes 4 --repeats 2",
+            ),
+        },
+        {
+            "scans": {"type": int, "default": BATCH, "help": "of one of our batches"},
+            "scenes": {"type": int, "default": 50, "help": "for the peers"},
+            "repeats": REPEATED,
+            "without-peers": WITHOUT_PEERS,
+        },
+        short="--scans 64 --scenes 4 --repeats 2 --without-peers",
+        unsettled=("share of",),
+    ),
+    "map_lidar": Benchmark(
+        measure_maps,
+        judge_maps,
+        {
+            "shifted": Control("a cell: the map that is jumped through", "RMSE"),
+            "slow": Control("the jumps: the walk stands in", "the walk's speed"),
+            "nan": Control("one range", "RMSE [m] nan"),
+        },
+        {"seed": {"type": int, "default": 0}},
+        unsettled=("the walk's speed",),
+    ),
+    "ros_lockstep": Benchmark(
+        measure_lockstep,
+        judge_lockstep,
+        {
+            "slow": Control("speed: a step rests", "ratio 0."),
+            "standing": Control("the commands: the robot does not drive", "driven_m 0"),
+        },
+        {
+            "chunks": {"type": int, "default": 150},
+            "size": {"type": int, "default": 100, "help": "steps in a chunk"},
+        },
+        short="--chunks 2 --size 20",
+        unsettled=("ratio",),
+        needs=("rclpy",),
+    ),
+}
+
+if __name__ == "__main__":
+    run_benchmark(BENCHMARKS)

@@ -1,0 +1,376 @@
+"""The parts of the benchmarks: what they draw, count and refuse."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+from textwrap import dedent
+
+import numpy as np
+import pytest
+from docs.test_pages import INDENTED, ROOT, check_options, text_of
+from PIL import Image
+
+from nics_drl_bridge.config import list_shipped
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.generator import builtin_model
+from nics_drl_bridge.lidar.bake import bake
+from nics_drl_bridge.policy.policies import shipped_policies
+from nics_drl_bridge.recording.readers import read_recording
+from nics_drl_bridge.robot.spec import load_robot
+from nics_drl_bridge.robot.taylor import TaylorModel
+from nics_drl_bridge.sim.randomisation import Sampler, load_randomisation
+
+BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
+NAN = float("nan")
+
+
+@pytest.fixture(autouse=True)
+def path(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+
+
+# Drives of robots of other simulators
+
+
+@pytest.fixture
+def foreign(path):
+    return import_module("measuring.foreign_robots")
+
+
+@pytest.mark.parametrize("name", ["omni", "ticks"])  # encoders overflow
+def test_the_csv_of_a_foreign_robot_reads_as_its_recording(foreign, tmp_path, name):
+    drive = foreign.foreign_drive(foreign.ROBOTS[name], seed=1, duration_s=30.0)
+    read = read_recording(tmp_path / name, mapping=drive.write(tmp_path / name))
+    own = drive.recording()
+    assert read.pose.values == pytest.approx(own.pose.values)
+    assert read.command.values == pytest.approx(own.command.values)
+    assert read.command.t == pytest.approx(own.command.t)
+
+
+@pytest.mark.parametrize(("share", "moves"), [(0.95, False), (1.1, True)])
+def test_a_throttle_car_stands_below_its_dead_zone(foreign, share, moves):
+    car = foreign.ROBOTS["throttle_car"]
+    reach = share * car.dead_zone
+    commands = {"throttle": (reach, 1.0001 * reach), "steering": (0.0, 0.0)}
+    drive = foreign.foreign_drive(replace(car, commands=commands), 1, 20.0)
+    assert (np.ptp(drive.pose.values[:, 0]) > 0.1) == moves
+
+
+def test_a_command_acts_after_its_latency(foreign):
+    robot = replace(foreign.ROBOTS["omni"], latency_s=0.3)
+    drive = foreign.foreign_drive(robot, 1, 5.0)
+    told = drive.command.t[np.abs(drive.command.values).max(axis=1) > 0.2][0]
+    moved = np.hypot(*(drive.pose.values - drive.pose.values[0])[:, :2].T) > 0.005
+    assert 0.3 < drive.pose.t[moved][0] - told < 0.5
+
+
+def test_wheels_are_found_in_a_model_that_moves_by_them():
+    left, right, base = 0.1, 0.11, 0.4
+    coefficients = np.zeros((5, 4))
+    coefficients[0, 0] = coefficients[2, 1] = 1.0
+    coefficients[3] = np.array([-1.0, 0.0, left / 2.0, right / 2.0]) / 0.2
+    coefficients[4] = np.array([0.0, -1.0, -left / base, right / base]) / 0.2
+    model = TaylorModel(
+        ("vx", "wz", "left", "right"),
+        ("vx", "vy", "wz", "d_vx", "d_wz"),
+        ("",) * 5,
+        np.eye(4, dtype=np.int64),
+        coefficients,
+        0.01,
+        -np.ones(4),
+        np.ones(4),
+    )
+    found = import_module("measuring.truths").wheels_of(model)
+    expected = {"left_m": left, "right_m": right, "base_m": base}
+    assert found == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"share_of_path": 0.04},
+        {"yardstick_share": 0.01},
+        {"constant_twist_share": 0.01},
+        {"error_m": NAN},
+        {"coverage_95": 0.8},
+        {"coverage_95": NAN},
+        {"truths": {"dead_zone": {"true": 0.1, "found": 0.2, "near": False}}},
+        {"refused": "too short."},
+        {"crashed": "ValueError: x"},
+    ],
+    ids=str,
+)
+def test_a_drive_misses_a_bar_by_one_figure(change):
+    bars = import_module("measuring.drive_bars")
+    limits = bars.Bars(share=0.03, error_m=0.03)
+    shares = {"share_of_path": 0.02, "yardstick_share": 0.03}
+    good = {**shares, "error_m": 0.02, "constant_twist_share": 0.5}
+    good |= {"coverage_95": 0.95, "truths": {}}
+    assert bars.judge_drive("one", good, limits) == []
+    assert len(bars.judge_drive("one", good | change, limits)) == 1
+
+
+def test_every_mapping_that_is_shown_has_its_drive():
+    bars = import_module("measuring.drive_bars")
+    found = [*bars.EXAMPLES.glob("*.yaml"), *bars.SHIPPED.glob("*.yaml")]
+    # One is a link to a shipped one.
+    mappings = {drive.mapping for drive in bars.DRIVES.values()}
+    assert mappings == {path.resolve() for path in found}
+
+
+# Scenes of the lidar
+
+
+@pytest.fixture
+def scenes(path):
+    return import_module("measuring.scenes")
+
+
+def test_random_scenes_keep_clear_of_the_lidar(scenes):
+    for shapes in scenes.SCENES.values():
+        batch = scenes.random_batch(shapes, 300, 1)
+        for k, shape in enumerate(batch.shapes):
+            assert scenes.gap(shape, batch.poses[:, k]).min() > scenes.SPEC.range_min
+        far = np.hypot(*batch.poses[..., :2].reshape(-1, 2).T).max()
+        assert far <= scenes.SPEC.range_max
+
+
+def test_the_nearest_row_is_half_a_grid_step_away_at_most(scenes):
+    table = bake(scenes.SPEC, scenes.SCENES["strip"])
+    batch = scenes.random_batch(scenes.SCENES["strip"], 300, 1)
+    snapped = scenes.nearest_row(batch, table)
+    distance = np.hypot(batch.poses[..., 0], batch.poses[..., 1])
+    row = np.hypot(snapped.poses[..., 0], snapped.poses[..., 1])
+    beam = np.arctan2(snapped.poses[..., 1], snapped.poses[..., 0])
+    beyond = distance < scenes.STRIP.radius
+    assert beyond.any()
+    assert np.array_equal(snapped.poses[beyond], batch.poses[beyond])
+    apart = (table.grid[0, 0] - scenes.STRIP.radius) / (table.density.distances - 1)
+    turn = 2.0 * np.pi / table.density.rotations
+    rotation = snapped.poses[..., 2] - beam
+    for value, step in (
+        (row - scenes.STRIP.radius, apart),
+        (beam, scenes.SPEC.angle_increment),
+        (rotation, turn),
+    ):
+        parts = value[~beyond] / step
+        assert np.abs(parts - np.rint(parts)).max() < 1e-3
+    assert np.abs(row - distance)[~beyond].max() <= 0.5001 * apart
+
+
+def test_errors_count_no_return_as_the_greatest_range(scenes):
+    nothing = np.full((1, scenes.SPEC.beams), np.inf, np.float32)
+    near = np.full((1, scenes.SPEC.beams), 2.0, np.float32)
+    expected = (1.0, np.pi * (9.0 - 4.0))
+    assert scenes.errors([nothing], [near]) == pytest.approx(expected)
+
+
+# Peers
+
+
+@pytest.mark.parametrize(
+    "text", ["import sys\nsys.exit('no lidar')\n", "print('{\"ranges\": [[1.0]]}')\n"]
+)
+def test_a_peer_that_crashes_or_ends_is_a_missed_bar_and_no_hang(
+    monkeypatch, tmp_path, text
+):
+    peers = import_module("measuring.peers")
+    broken = tmp_path / "irsim_peer.py"
+    broken.write_text(text)
+    monkeypatch.setattr(peers, "SCRIPT", broken)
+    monkeypatch.setattr(peers, "python_with", lambda *_: sys.executable)
+    found = peers.measure({}, ["ir_sim"], peers.make_scenes(1), 1)
+    (missed,) = peers.judge(found.describe())
+    assert missed.startswith("ir_sim failed")
+
+
+def test_another_case_is_of_another_lidar_or_as_dense_with_more_obstacles():
+    speed = import_module("speed")
+    assert speed.Case().is_usual
+    case = speed.Case(lidar="hokuyo_ust_10lx")
+    assert (case.is_usual, case.world) == (False, speed.peers.WORLD)
+    assert case.model.lidar.beams == 1081
+    clean = replace(case, clean=True).model.lidar
+    assert (clean.beams, clean.noise_std, clean.faults.quantisation) == (1081, 0.0, 0.0)
+    case = speed.Case(obstacles=40)
+    assert case.model is speed.peers.MODEL
+    assert case.world.obstacles[0].counts == (40, 40)
+    assert case.world.size == pytest.approx((12.0, 12.0))
+
+
+# Policies
+
+
+@pytest.fixture
+def policies(path):
+    return import_module("policies")
+
+
+def test_a_score_is_half_for_twice_the_best_time_and_falls_with_more(policies):
+    course = policies.list_courses(100)[1]
+    times = [course.best_s * k for k in (1.0, 2.0, 4.0, 20.0, 2.0)]
+    flags = [True, True, True, True, False]
+    courses = dict.fromkeys(range(5), course)
+    told = policies.score_runs(courses, 1, [flags, flags, [False] * 5], times)
+    np.testing.assert_allclose(told.score, [0.5, 0.5, 0.25, 0.125, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ("navigation_differential", "replaces the world 'barn'"),
+        ("shipped_jackal", "needs 5 worlds, not 3"),
+    ],
+)
+def test_folds_that_leave_out_nothing_are_refused(policies, settings, words):
+    with pytest.raises(ConfigError, match=words):
+        policies.drive_folds(settings, dict.fromkeys(range(3)), 1)
+
+
+def test_every_world_that_comes_with_the_package_is_driven(policies):
+    assert set(policies.TRANSFER_FLOORS) == set(list_shipped("worlds"))
+
+
+def test_a_robot_drives_with_its_own_lidar_or_a_real_one_behind_its_own_gate(policies):
+    assert policies.get_conditions("jackal").lidar is None
+    given = policies.get_conditions("mecanum")
+    assert (given.lidar, given.gate) == ("rplidar_a2", "mecanum")
+
+
+@pytest.mark.parametrize(
+    ("places", "believed", "length", "bars"),
+    [
+        ((0.97, 0.95, 0.93), 0.0, 5.0, 0),
+        ((0.95, 0.95, 0.95), 0.0, 5.0, 1),
+        ((0.97, 0.94, 0.97), 0.0, 5.0, 1),
+        ((0.97, 0.97, 0.92), 0.0, 5.0, 1),
+        ((0.97, 0.97, 0.97), 0.06, 5.0, 3),
+        ((0.97, 0.97, 0.97), 0.0, None, 3),
+        ((NAN, 0.97, 0.97), 0.0, 5.0, 4),
+    ],
+)
+def test_success_has_a_floor_and_may_be_two_and_four_points_off(
+    policies, places, believed, length, bars
+):
+    shares = dict(zip(("fast", "dds", "mujoco_dds"), places, strict=True))
+    told = {place: share + believed for place, share in shares.items()}
+    figures = {
+        "success": shares,
+        "believed": told,
+        "length": dict.fromkeys(shares, length),
+        "points_from_fast": policies.find_points(shares),
+    }
+    result = {key: {"jackal": {"circles": one}} for key, one in figures.items()}
+    assert len(policies.judge_transfer(result)) == bars
+
+
+MILD = load_randomisation("mild")
+DRAWN = {
+    "noise": lambda d: d.faults[..., 0],
+    "drop-out": lambda d: d.faults[..., 2],
+    "latency": lambda d: d.delay + d.age,
+    "response": lambda d: d.response,
+    "drift": lambda d: d.noise[..., 2:5],
+}
+
+
+@pytest.mark.parametrize("name", DRAWN)
+def test_a_perturbation_alone_has_the_greatest_declared_value(name):
+    single_out = import_module("measuring.perturbations").single_out
+    model = builtin_model("differential")
+    once, twice = (single_out(MILD, name, times) for times in (1.0, 2.0))
+    assert once != twice
+    drawn = Sampler(once, model).draw([1, 2, 3])
+    whole = Sampler(MILD, model).draw(range(200))
+    assert DRAWN[name](drawn).min() >= DRAWN[name](whole).max() - 1e-12
+    plain = Sampler(single_out(MILD, "footprint", 0.0), model).draw([1, 2, 3])
+    for other, one in DRAWN.items():
+        if other not in (name, "response"):
+            assert (one(drawn) == one(plain)).all()
+
+
+def test_noise_and_time_constants_do_not_fall_below_what_a_robot_has():
+    single_out = import_module("measuring.perturbations").single_out
+    for times, slow in ((1.0, 1.25), (2.0, 1.5)):
+        response = single_out(MILD, "response", times).kinematics.response
+        assert response == (slow, slow)
+    assert single_out(MILD, "noise", 1.0, 0.03).lidar.noise_std == (0.03, 0.03)
+
+
+@pytest.mark.parametrize("robot", ["mecanum", "jackal"])
+def test_a_larger_footprint_is_the_same_outline_scaled(robot):
+    model = builtin_model(robot)
+    larger = import_module("measuring.perturbations").grow_footprint(model, 1.1).robot
+    assert larger.footprint_radius == pytest.approx(1.1 * model.robot.footprint_radius)
+    assert (larger.footprint is None) == (model.robot.footprint is None)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not shipped_policies(), reason="no policy is shipped")
+def test_the_picture_is_drawn_of_runs_robot_by_robot(policies, tmp_path):
+    names = shipped_policies()[:2]
+    curve = dict(zip("0123", (0.97, 0.97, 0.9, 0.0), strict=True))
+    kept = dict.fromkeys(policies.PERTURBATIONS, curve)
+    runs = {
+        f"robustness_{name}": {"result": {"success": {name: kept}}} for name in names
+    }
+    runs |= {"robustness_broken": {"result": None}, "parity": {"result": {"steps": 1}}}
+    curves = policies.collect_curves(json.loads(json.dumps(runs)))
+    assert list(curves) == names
+    policies.perturbations.draw(
+        curves, tmp_path / "new" / "curves.png", (0.5, 1.0, 2.0)
+    )
+    with Image.open(tmp_path / "new" / "curves.png") as picture:
+        assert 550 < picture.height < 700  # two rows of three
+    lost = policies.find_losses(curves, (0.5, 1.0, 2.0))
+    assert policies.find_worst(lost)["points"] == pytest.approx(7.0)
+
+
+@pytest.mark.skipif("jackal" not in shipped_policies(), reason="needs the policy")
+def test_a_larger_footprint_is_driven_in_the_scenes_of_the_robot_it_is_believed_to_be(
+    policies,
+):
+    # Of so large a robot there would be no scene: the door's cells are narrower.
+    job = policies.Job("jackal", "doorway", 1, ("footprint",), (2.0,), None)
+    assert policies.count_reached(job, "footprint", 2.0) == (1, 1)
+
+
+# The first hour
+
+
+def test_a_picture_moves_if_its_ends_differ(tmp_path):
+    moved = import_module("first_hour").moved
+    still, shifted = (Image.new("RGB", (100, 80), "white") for _ in range(2))
+    still.paste("black", (10, 10, 20, 20))
+    shifted.paste("black", (60, 30, 70, 40))
+    for last, extent in ((shifted, 60), (still.copy(), 0)):
+        still.save(tmp_path / "a.gif", save_all=True, append_images=[shifted, last])
+        assert moved(tmp_path / "a.gif") == extent
+
+
+def test_the_roads_are_those_of_the_pages(tmp_path):
+    first_hour = import_module("first_hour")
+    for lines in first_hour.ROADS.values():
+        for line in lines:
+            check_options(shlex.split(line)[1:])
+    text = text_of(ROOT / "docs" / "robots.md")
+    (shown,) = [block for block in INDENTED.findall(text) if "name: my_robot" in block]
+    (tmp_path / "page.yaml").write_text(dedent(shown))
+    (tmp_path / "road.yaml").write_text(first_hour.BURGER)
+    assert load_robot(tmp_path / "page.yaml") == load_robot(tmp_path / "road.yaml")
+
+
+def test_an_environment_that_cant_be_installed_is_told_in_a_sentence(
+    monkeypatch, tmp_path
+):
+    environments = import_module("measuring.environments")
+    monkeypatch.setattr(environments, "CACHE", tmp_path)
+    monkeypatch.setattr(environments.venv, "create", lambda *_, **__: None)
+    with pytest.raises(environments.NotInstalledError, match="can't be installed"):
+        environments.python_with("nothing", ("no-such-project==1.0",))
+    assert not list(tmp_path.rglob(".ready"))

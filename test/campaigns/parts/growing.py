@@ -1,0 +1,357 @@
+"""Small inputs that would take much memory or time, or run code, if they were believed."""
+
+from __future__ import annotations
+
+import io
+import itertools
+import json
+import os
+import zipfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+
+from nics_drl_bridge.config import dump_yaml
+from nics_drl_bridge.files import hash_bytes, seal, write_sums
+from nics_drl_bridge.lidar.table import ARRAYS
+from nics_drl_bridge.policy import onnx_graph
+
+Bomb = Callable[[Path, int], None]
+"""Puts a bomb of some size, from 1 to 8, in the place of a whole input."""
+Open = Callable[[Path], Any]
+Save = Callable[[Path, Any], None]
+CODE = b"cos\nsystem\n(S'true'\ntR."
+
+
+# Arrays whose headers promise more than there is.
+
+
+def _npy(kind: str, shape: str, data: bytes = b"") -> bytes:
+    head = f"{{'descr': {kind}, 'fortran_order': False, 'shape': {shape}, }}".encode()
+    head += b" " * (-(len(head) + 11) % 64) + b"\n"
+    return b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head + data
+
+
+HEADERS: dict[str, Callable[[int], bytes]] = {
+    "rows": lambda size: _npy("'<f8'", f"({10 ** (6 + 2 * size)},)"),
+    "columns": lambda size: _npy("'<f4'", f"({2**32}, {2**32 + size})"),
+    "pickled code": lambda size: _npy("'|O'", "(3,)", CODE),
+    "brackets": lambda size: _npy("'<f8'", "(" * (3000 * size)),
+    "letters": lambda size: _npy(f"'<U{2**27 * size}'", "()"),
+    "zeros": lambda size: _npy("'<f8'", f"({120_000_000 + size},)", bytes(960_000_000)),
+}
+
+
+def _replace_array(make: Callable[[int], bytes]) -> Bomb:
+    """Replaces an array of a recording, whose checksum fits."""
+
+    def write(path: Path, size: int) -> None:
+        with zipfile.ZipFile(io.BytesIO(path.read_bytes())) as whole:
+            parts = {name: whole.read(name) for name in whole.namelist()}
+        name = sorted(parts)[size % len(parts)]
+        buffer = io.BytesIO()
+        with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+            for each, data in parts.items():
+                archive.writestr(each, make(size) if each == name else data)
+        path.write_bytes(seal(buffer.getvalue()))
+
+    return write
+
+
+def _replace_file(make: Callable[[int], bytes]) -> Bomb:
+    """Replaces an array of a table, whose checksums fit."""
+
+    def write(path: Path, size: int) -> None:
+        (path / f"{ARRAYS[size % len(ARRAYS)]}.npy").write_bytes(make(size))
+        write_sums(path)
+
+    return write
+
+
+RECORDINGS = {name: _replace_array(make) for name, make in HEADERS.items()}
+TABLES = {
+    name: _replace_file(make) for name, make in HEADERS.items() if name != "zeros"
+}
+
+
+# Lines of CSV, JSON and pickles.
+
+
+def _replace_row(make: Callable[[int], str]) -> Bomb:
+    def write(path: Path, size: int) -> None:
+        file = path / ("cmd.csv", "vrpn.csv")[size % 2]
+        rows = file.read_text(encoding="utf-8").split("\n")
+        rows[len(rows) * size // 9] = make(size)
+        file.write_text("\n".join(rows), encoding="utf-8")
+
+    return write
+
+
+CSVS = {
+    "digits": _replace_row(lambda size: "1" * (7_000_000 * size)),
+    "columns": _replace_row(lambda size: "0.5," * (1_000_000 * size)),
+    "an open quote": _replace_row(lambda size: '"' + "a\n" * (100_000 * size)),
+    "a large number": _replace_row(lambda size: f"{'9' * 5000},0,0"),
+    "control characters": _replace_row(lambda size: "\x00,\x1b[2J,x"),
+}
+
+
+def grow_boxes(open_box: Open, save_box: Save) -> Mapping[str, Bomb]:
+    """Returns bombs of black boxes, by name."""
+
+    def replace_scan(kind: str) -> Bomb:
+        def write(path: Path, size: int) -> None:
+            lines = open_box(path)
+            shape = [10 ** (4 + 2 * size)]
+            array = {"kind": "array", "type": kind, "shape": shape, "data": ""}
+            lines[1]["given"] = {"kind": "Scan", "ranges": array}
+            save_box(path, lines)
+
+        return write
+
+    def nest(path: Path, size: int) -> None:
+        first, second, *rest = path.read_text().splitlines(keepends=True)[:-1]
+        record = json.dumps(json.loads(second) | {"given": 0})
+        depth = 2000 * size
+        second = record.replace('"given": 0', f'"given": {"[" * depth}{"]" * depth}')
+        text = "".join([first, f"{second}\n", *rest])
+        sums = json.dumps({"sha256": hash_bytes(text.encode())})
+        path.write_text(f"{text}{sums}\n")
+
+    return {
+        "numbers": replace_scan("<f8"),
+        "letters": replace_scan("<U100000000"),
+        "brackets": nest,
+    }
+
+
+def grow_checkpoints() -> Mapping[str, Bomb]:
+    """Returns bombs of checkpoints, by name."""
+
+    def save(make: Callable[[Any], object]) -> Bomb:
+        def write(path: Path, size: int) -> None:
+            import torch
+
+            buffer = io.BytesIO()
+            torch.save(make(torch), buffer)
+            path.write_bytes(seal(buffer.getvalue()))
+
+        return write
+
+    def inflate(path: Path, size: int) -> None:
+        buffer = io.BytesIO()
+        with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("archive/data.pkl", bytes(900_000_000))
+            archive.writestr("archive/version", b"3\n")
+        path.write_bytes(seal(buffer.getvalue()))
+
+    return {
+        "text": save(lambda torch: {"format": "x" * 10**6, "about": "[" * 10**6}),
+        "code": save(lambda torch: {"format": Path("x"), "about": print}),
+        "numbers": save(lambda torch: torch.zeros(1).expand(2**40)),
+        "zeros": inflate,
+    }
+
+
+# Networks in front of the true one.
+
+
+def _chain(length: int, make: Callable[[str, str], Any]) -> list[Any]:
+    names = ["observation", *(f"x_{k}" for k in range(length))]
+    return [make(a, b) for a, b in itertools.pairwise(names)]
+
+
+def _double(axis: int) -> Callable[[int], tuple[list[Any], dict[str, Any]]]:
+    def make(size: int) -> tuple[list[Any], dict[str, Any]]:
+        return _chain(16 + size, lambda a, b: _node("Concat", [a, a], b, axis=axis)), {}
+
+    return make
+
+
+def _node(kind: str, inputs: list[str], output: str, **settings: Any) -> Any:
+    return onnx.helper.make_node(kind, inputs, [output], **settings)
+
+
+def _fill(kind: str, **settings: Any) -> Callable[[int], Any]:
+    def make(size: int) -> tuple[list[Any], dict[str, Any]]:
+        sizes = np.array([10**4 * size, 10**5], np.int64)
+        return [_node(kind, ["x_sizes"], "x_0", **settings)], {"sizes": sizes}
+
+    return make
+
+
+GRAPHS: dict[str, Callable[[int], tuple[list[Any], dict[str, Any]]]] = {
+    "columns": _double(1),
+    "rows": _double(0),
+    "operators": lambda size: (
+        _chain(1000 + 3000 * size, lambda a, b: _node("Tanh", [a], b)),
+        {},
+    ),
+    "gathered": lambda size: (
+        _chain(3, lambda a, b: _node("Gather", [a, "x_index"], b, axis=1)),
+        {"index": np.zeros(400_000 * size, np.int64)},
+    ),
+    "a wide product": lambda size: (
+        [_node("Mul", ["x_thin", "x_turned"], "x_0")],
+        {
+            "thin": np.zeros((8000 * size, 1), np.float32),
+            "turned": np.zeros((1, 8000 * size), np.float32),
+        },
+    ),
+    "a square": lambda size: (
+        [
+            _node("Transpose", ["observation"], "x_t", perm=[1, 0]),
+            _node("MatMul", ["observation", "x_t"], "x_0"),
+        ],
+        {},
+    ),
+    "a mismatch": lambda size: (
+        [_node("MatMul", ["observation", "x_wrong"], "x_0")],
+        {"wrong": np.zeros((1000 + size, 4), np.float32)},
+    ),
+    "ConstantOfShape": _fill("ConstantOfShape"),
+    "RandomNormal": _fill("RandomNormal", shape=[10**5, 10**5]),
+    "Loop": _fill("Loop"),
+    "Expand": _fill("Expand"),
+}
+
+
+def grow_policies(open_contract: Open, save_contract: Save) -> Mapping[str, Bomb]:
+    """Returns bombs of policies whose checksums fit, by name."""
+
+    def put_before(make: Callable[[int], tuple[list[Any], dict[str, Any]]]) -> Bomb:
+        def write(path: Path, size: int) -> None:
+            proto = onnx.load(path)
+            data = open_contract(path)
+            nodes, arrays = make(size)
+            own = list(proto.graph.node)
+            del proto.graph.node[:]
+            proto.graph.node.extend([*nodes, *own])
+            proto.graph.initializer.extend(
+                onnx.numpy_helper.from_array(value, f"x_{name}")
+                for name, value in arrays.items()
+            )
+            path.write_bytes(proto.SerializeToString())
+            save_contract(path, data)
+
+        return write
+
+    def replace_bytes(make: Callable[[int], bytes]) -> Bomb:
+        return lambda path, size: path.write_bytes(make(size)) and None
+
+    def tell(make: Callable[[int], str]) -> Bomb:
+        def write(path: Path, size: int) -> None:
+            proto = onnx.load(path)
+            del proto.metadata_props[:]
+            onnx.helper.set_model_props(proto, {onnx_graph.KEY: make(size)})
+            path.write_bytes(onnx_graph.sealed(proto.SerializeToString()))
+
+        return write
+
+    def nest(size: int) -> bytes:
+        nested = b""
+        for _ in range(300 * size):
+            nested = _field(1, _field(5, _field(6, nested)))
+        return _field(7, nested)
+
+    return {
+        **{name: put_before(make) for name, make in GRAPHS.items()},
+        "empty operators": replace_bytes(
+            lambda size: _field(7, _field(1, b"") * (800_000 * size))
+        ),
+        "weights": replace_bytes(
+            lambda size: _field(7, _field(5, _field(4, bytes(4_000_000 * size))))
+        ),
+        "nested graphs": replace_bytes(nest),
+        "a contract of brackets": tell(lambda size: "[" * (500_000 * size)),
+        "a nested contract": tell(lambda size: '{"a":' * (300_000 * size)),
+        "a long contract": tell(lambda size: f'"{"z" * (4_000_000 * size)}"'),
+    }
+
+
+def _field(number: int, content: bytes) -> bytes:
+    """A field of a message of protocol buffers."""
+    size = len(content)
+    length = b""
+    while size >= 0x80:
+        length = length + bytes([size & 0x7F | 0x80])
+        size = size >> 7
+    return bytes([number << 3 | 2]) + length + bytes([size]) + content
+
+
+# Worlds and maps.
+
+
+def _group(**keys: Any) -> list[dict[str, Any]]:
+    return [{"shapes": [{"kind": "circle", "radius": 0.1}], "count": 3, **keys}]
+
+
+def _shape(kind: str, **keys: Any) -> list[dict[str, Any]]:
+    return _group(shapes=[{"kind": kind, **keys}])
+
+
+def _large(size: int) -> float:
+    return 10.0 ** (7 + 37 * size)
+
+
+def _world(make: Callable[[int], dict[str, Any]]) -> Bomb:
+    def write(path: Path, size: int) -> None:
+        world = {"name": "w", "size": [6.0, 6.0], "goal_distance": [1.0, 4.0]}
+        path.write_text(dump_yaml(world | make(size)), encoding="utf-8")
+
+    return write
+
+
+WORLDS = {
+    "copies": _world(lambda n: {"obstacles": _group(count=10 ** (4 + n))}),
+    "a range of copies": _world(lambda n: {"obstacles": _group(count=[0, 10**12])}),
+    "groups": _world(lambda n: {"obstacles": _group(count=9000) * (5 * n)}),
+    "a huge field": _world(lambda n: {"size": [_large(n), _large(n)]}),
+    "a long field": _world(lambda n: {"size": [_large(n), 1e-3]}),
+    "a tiny field": _world(lambda n: {"size": [10.0 ** (-40 * n)] * 2}),
+    "a huge shape": _world(lambda n: {"obstacles": _shape("circle", radius=_large(n))}),
+    "a tiny shape": _world(
+        lambda n: {"obstacles": _shape("rectangle", size=[10.0 ** (-40 * n)] * 2)}
+    ),
+    "walls": _world(lambda n: {"walls": [[0, 0, 1, k] for k in range(30_000)]}),
+    "a long wall": _world(lambda n: {"walls": [[0.0, 0.0, _large(n), _large(n)]]}),
+    "a gap": _world(lambda n: {"obstacles": _group(gap=_large(n))}),
+    "a far goal": _world(lambda n: {"goal_distance": [1.0, -_large(n)]}),
+    "a clearance": _world(lambda n: {"clearance": _large(n)}),
+    "places beyond": _world(lambda n: {"starts": {"regions": [[_large(n)] * 4]}}),
+}
+
+
+def _picture(make: Callable[[Path, int], object]) -> Bomb:
+    """Replaces the picture of a map."""
+
+    def write(path: Path, size: int) -> None:
+        image = path.parent / "room.pgm"
+        image.unlink()
+        make(image, size)
+
+    return write
+
+
+MAPS = {
+    "a pipe": _picture(lambda image, size: os.mkfifo(image)),
+    "an endless device": _picture(lambda image, size: image.symlink_to("/dev/zero")),
+    "a loop": _picture(lambda image, size: image.symlink_to(image)),
+    "a folder": _picture(lambda image, size: image.mkdir()),
+    "pixels": _picture(
+        lambda image, size: image.write_bytes(
+            b"P5\n%d %d\n255\n" % (9000 * size, 2**31) + bytes(1000)
+        )
+    ),
+    "pixels of a PNG": _picture(
+        lambda image, size: image.write_bytes(
+            b"\x89PNG\r\n\x1a\n\0\0\0\x0dIHDR"
+            + (9000 * size).to_bytes(4, "big") * 2
+            + b"\x08\0\0\0\0"
+            + bytes(50)
+        )
+    ),
+}
