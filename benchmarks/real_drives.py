@@ -41,9 +41,8 @@ from nics_drl_bridge.identify.open_loop import (
     windows,
 )
 from nics_drl_bridge.identify.yardstick import fit_yardstick, kept_twist
-from nics_drl_bridge.recording.readers import read_robot_and_drive
+from nics_drl_bridge.recording.readers import open_drive
 from nics_drl_bridge.recording.recording import Recording
-from nics_drl_bridge.recording.topic_roles import TopicRoles
 
 CONTROLS = {
     "standing": "a model that says the robot stands",
@@ -134,7 +133,7 @@ def figures(
     ]
     told: dict[str, Any] = {"lines_of_mapping": len(lines)}
     try:
-        spec, recording = read_robot_and_drive(source, None, TopicRoles(), mapping)
+        spec, recording = open_drive(source, None, mapping)
         found = identify(under(control, recording), spec, alpha="auto")
         told |= judged(found, recording, control)
     except BridgeError as error:
@@ -152,7 +151,7 @@ def figures(
 
 def left_out(source: Path, mapping: Path, control: str | None) -> dict[str, Any]:
     """Returns mean errors on segments of a drive, each predicted by a model of all others."""
-    spec, recording = read_robot_and_drive(source, None, TopicRoles(), mapping)
+    spec, recording = open_drive(source, None, mapping)
     recording = under(control, recording)
     since = recording.pose.t - recording.pose.t[0]
     errors = []

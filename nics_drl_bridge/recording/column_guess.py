@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.recording.imu_axis import AXES, UpAxis, find_up_axis
+from nics_drl_bridge.recording.imu_axis import AXES, UpAxis, find_table_axis
 from nics_drl_bridge.recording.names import split_words, word_set
 from nics_drl_bridge.recording.survey import Survey, TableSurvey, split_unit
 from nics_drl_bridge.recording.table import Column, is_text
@@ -195,9 +195,7 @@ def _find_message_axis(table: TableSurvey) -> UpAxis:
     names = [f"linear_acceleration.{axis}" for axis in AXES]
     if not all(name in table.data for name in names):
         return UpAxis()
-    return find_up_axis(
-        np.array([float(np.nanmedian(table.get_numbers(name))) for name in names])
-    )
+    return find_table_axis(table.get_numbers)
 
 
 def _find_in_columns(tables: Sequence[TableSurvey]) -> Iterator[Place]:

@@ -6,13 +6,11 @@ import pytest
 from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.recording.mapping import Mapping, load_mapping
 from nics_drl_bridge.recording.readers import (
-    build_mapped_robot,
+    open_drive,
     read_recording,
-    read_robot_and_drive,
     reorder_variables,
 )
 from nics_drl_bridge.recording.recording import load_recording, save_recording
-from nics_drl_bridge.recording.topic_roles import TopicRoles
 from nics_drl_bridge.robot.spec import load_robot
 
 from .tables import MAP, drive, read, write
@@ -323,7 +321,7 @@ def test_commands_come_in_the_order_of_the_robot(tmp_path, columns):
     pose = {"x": "x", "y": "y", "heading": "yaw"}
     given = {"robot": "ackermann", "time": "t", "command": car, "pose": pose}
     mapping = Mapping.model_validate(given)
-    spec, found = read_robot_and_drive(path, None, TopicRoles(), mapping)
+    spec, found = open_drive(path, None, mapping)
     assert spec.name == "ackermann"
     assert found.variables == spec.variable_names
     assert np.allclose(found.command.values[0], [0.5, 0.25])
@@ -332,7 +330,7 @@ def test_commands_come_in_the_order_of_the_robot(tmp_path, columns):
     ):
         reorder_variables(read(path), load_robot("ackermann"))
     with pytest.raises(ConfigError, match="names no robot; add `robot:` to it"):
-        build_mapped_robot(Mapping.model_validate(given | {"robot": None}), read(path))
+        open_drive(path, None, Mapping.model_validate(given | {"robot": None}))
 
 
 LORRY = "kind: tricycle\nfootprint_radius: 0.9\nparameters: {wheelbase: 1.2}\n"
@@ -350,8 +348,8 @@ def test_a_robots_file_is_the_same_robot_however_it_is_named(tmp_path, columns):
     one, other = (
         Mapping.model_validate(given | {"robot": each}) for each in ("car", robot)
     )
-    spec, _ = read_robot_and_drive(path, robot, TopicRoles(), one)
-    assert spec == read_robot_and_drive(path, None, TopicRoles(), other)[0]
+    spec, _ = open_drive(path, robot, one)
+    assert spec == open_drive(path, None, other)[0]
     assert spec.command_high.tolist() == [1.5, 0.3]  # as recorded
 
 
@@ -359,17 +357,13 @@ def test_an_imported_drive_keeps_its_robot_as_text(tmp_path, columns):
     (tmp_path / "lorry.yaml").write_text(LORRY)
     given = MAP | {"command": STEERED, "robot": str(tmp_path / "lorry.yaml")}
     mapping = Mapping.model_validate(given)
-    spec, drive = read_robot_and_drive(
-        write(tmp_path / "log.csv", columns), None, TopicRoles(), mapping
-    )
+    spec, drive = open_drive(write(tmp_path / "log.csv", columns), None, mapping)
     save_recording(drive, tmp_path / "drive.npz")
     (tmp_path / "lorry.yaml").unlink()
-    back, again = read_robot_and_drive(tmp_path / "drive.npz", None, TopicRoles(), None)
+    back, again = open_drive(tmp_path / "drive.npz")
     assert back == spec
     assert same(drive, again)
-    bare, _ = read_robot_and_drive(
-        tmp_path / "drive.npz", "ackermann", TopicRoles(), None
-    )
+    bare, _ = open_drive(tmp_path / "drive.npz", "ackermann")
     assert bare.name == "ackermann"
 
 
@@ -557,8 +551,8 @@ def test_a_unit_of_another_kind_than_the_command_s_is_refused(
         },
     }
     with pytest.raises(ConfigError, match=says):
-        read_robot_and_drive(path, None, TopicRoles(), Mapping.model_validate(given))
+        open_drive(path, None, Mapping.model_validate(given))
     scaled = given | {
         "command": given["command"] | {"steering_command": value | {"scale": 0.5}}
     }
-    read_robot_and_drive(path, None, TopicRoles(), Mapping.model_validate(scaled))
+    open_drive(path, None, Mapping.model_validate(scaled))

@@ -9,7 +9,7 @@ import os
 import numpy as np
 
 from nics_drl_bridge.errors import ConfigError, RecordingError
-from nics_drl_bridge.recording.readers import read_recording, read_robot_and_drive
+from nics_drl_bridge.recording.readers import open_drive, read_recording
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.recording.topic_roles import TopicRoles
@@ -77,7 +77,7 @@ def test_a_drive_comes_back_from_a_file_and_from_a_bag(tmp_path, name):
     path = check_out(tmp_path / name)
     write_drive(drive, path, CAR)
     if path.suffix == ".npz":  # which tells its robot, too
-        spec, _ = read_robot_and_drive(path, None, TopicRoles(), None)
+        spec, _ = open_drive(path, None, None)
         assert spec == CAR
     back = read_recording(path, CAR)
     assert back.command.values == pytest.approx(drive.command.values)

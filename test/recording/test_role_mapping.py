@@ -7,16 +7,13 @@ pytest.importorskip("rosbags", reason="needs the extra 'bags'")
 import bags
 import numpy as np
 
-from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.recording.bag_file import Message, open_bag
-from nics_drl_bridge.recording.bag_reader import (
-    extract_state,
-    extract_wheels,
-    gather_joints,
-    measure_latency,
-)
+from nics_drl_bridge.recording.bag_table import measure_latency
+from nics_drl_bridge.recording.mapping import Mapping
 from nics_drl_bridge.recording.readers import read_recording
 from nics_drl_bridge.recording.recording import load_recording, save_recording
+from nics_drl_bridge.recording.role_mapping import read_joint_streams
 from nics_drl_bridge.recording.topic_roles import TopicRoles
 from nics_drl_bridge.robot.spec import build_robot, load_robot
 
@@ -77,18 +74,28 @@ def test_a_twist_tells_a_turn_rate_where_the_robot_takes_one(tmp_path, kind, ang
     assert np.allclose(recording.command.values, [0.5, angle])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 @pytest.mark.parametrize("kind", POSES)
-def test_every_kind_of_pose_is_read(tmp_path, kind, storage):
+def test_every_kind_of_pose_is_read(tmp_path, kind):
     pose = [(t, POSES[kind](t, *bags.place_at(t))) for t in bags.times()]
     topics = {"/cmd_vel": bags.commands(), "/where": pose}
-    recording = read(tmp_path, topics, storage=storage, pose="/where")
+    recording = read(tmp_path, topics, pose="/where")
     assert np.allclose(recording.pose.values[:, :2], PLACES[:, :2])
     assert np.allclose(
         np.exp(1j * recording.pose.values[:, 2]), np.exp(1j * PLACES[:, 2])
     )
     assert np.allclose(recording.pose.t, bags.times())
+
+
+def test_a_mapping_may_name_a_topic_of_commands(tmp_path):
+    bag = bags.write(tmp_path / "bag", bags.drive())
+    mapping = Mapping.model_validate({"command": "/cmd_vel", "pose": "/pose"})
+    by_roles = read_recording(bag, CAR)
+    mapped = read_recording(bag, CAR, mapping=mapping)
+    for name, stream in by_roles.streams.items():
+        assert np.array_equal(stream.values, mapped.streams[name].values)
+        assert np.array_equal(stream.t, mapped.streams[name].t)
+    with pytest.raises(ConfigError, match="only of a known robot"):
+        read_recording(bag, mapping=mapping)
 
 
 def test_steering_angles_are_refused_for_a_robot_that_has_none(tmp_path):
@@ -182,24 +189,29 @@ def test_the_imu_is_read(tmp_path):
 
 
 @pytest.mark.parametrize("topic", ["/cmd_vel", "/pose", "/imu"])
-def test_a_message_with_nan_is_named(tmp_path, topic):
-    topics = bags.drive() | {
-        "/imu": [(t, bags.imu(t, 0.1, 0.2, 0.3)) for t in bags.times()]
-    }
-    bad = {
-        "/cmd_vel": bags.twist(np.nan, 0.0, 0.0),
-        "/pose": bags.pose_stamped(7 * bags.STEP_S, np.inf, 0.0, 0.0),
-        "/imu": bags.imu(7 * bags.STEP_S, 0.0, np.nan, 0.0),
-    }
-    topics[topic][7] = (topics[topic][7][0], bad[topic])
-    assert f"topic '{topic}': message 7 holds NaN or inf" in refused(tmp_path, topics)
+def test_an_infinite_number_is_refused_and_nan_left_out(tmp_path, topic):
+    imu = [(t, bags.imu(t, 0.1, 0.2, 0.3)) for t in bags.times()]
+    for name, bad in (("inf", np.inf), ("nan", np.nan)):
+        topics = bags.drive() | {"/imu": imu.copy()}
+        messages = {
+            "/cmd_vel": bags.twist(bad, 0.0, 0.0),
+            "/pose": bags.pose_stamped(7 * bags.STEP_S, bad, 0.0, 0.0),
+            "/imu": bags.imu(7 * bags.STEP_S, 0.0, bad, 0.0),
+        }
+        topics[topic][7] = (topics[topic][7][0], messages[topic])
+        (tmp_path / name).mkdir()
+        if name == "inf":
+            assert f"topic '{topic}': message 7" in refused(tmp_path / name, topics)
+        else:
+            told = " ".join(read(tmp_path / name, topics).repairs)
+            assert "rows have no value, and were left out" in told
 
 
-@pytest.mark.parametrize("length", [0.0, np.nan, 1e200])
-def test_a_quaternion_that_is_none_is_named(tmp_path, length):
+@pytest.mark.parametrize("length", [0.5, 1e100])
+def test_a_quaternion_that_is_none_is_refused(tmp_path, length):
     topics = bags.drive()
     topics["/pose"][3][1].pose.orientation.w = length
-    assert "message 3: the quaternion has the length" in refused(tmp_path, topics)
+    assert "the quaternion has the length" in refused(tmp_path, topics)
 
 
 def test_quaternions_with_w_first_are_suspected_as_such(tmp_path):
@@ -252,128 +264,96 @@ def test_odometry_named_beside_a_pose_shows_its_twist(tmp_path):
 
 
 MECANUM = load_robot("mecanum")
+ARM = (("elbow",), (0.0,), (1.0,))
+BOTH = ("left_wheel", "right_wheel")
 
 
-def table(*messages):
-    """Joints of messages (names, positions, velocities)."""
+def joints(*messages, spec=CART, **roles):
+    """State and wheels of messages (names, positions, velocities)."""
     kind = "sensor_msgs/msg/JointState"
     made = [
         Message(k, bags.new(kind, bags.header(k), names, position, velocity, ()))
         for k, (names, position, velocity) in enumerate(messages)
     ]
-    return gather_joints("/joint_states", made)
-
-
-def roles(**given) -> TopicRoles:
-    return TopicRoles.model_validate(given)
-
-
-def refuse(joints, spec, **given) -> str:
-    with pytest.raises(RecordingError) as caught:
-        extract_state(joints, spec, roles(**given), "drive")
-    return str(caught.value)
+    given = TopicRoles.model_validate(roles)
+    streams = read_joint_streams("/joint_states", made, spec, given, "drive")
+    return {name: data.values.tolist() for name, data in streams.items()}
 
 
 @pytest.mark.parametrize(
     "names",
     [
-        ("left_wheel", "right_wheel"),
+        BOTH,
         ("wheel_left_joint", "wheel_right_joint"),
         ("base/Left_Wheel", "base/Right_Wheel"),
     ],
 )
 def test_wheels_are_known_by_the_words_of_their_names(names):
-    joints = table((names, (0.0, 0.0), (1.0, 2.0)), (names, (0.1, 0.2), (3.0, 4.0)))
-    state = extract_state(joints, CART, roles(), "drive")
-    assert state.values.tolist() == [[1.0, 2.0], [3.0, 4.0]]
-    assert extract_wheels(joints, roles(), "drive").values.tolist() == [
-        [1.0, 2.0],
-        [3.0, 4.0],
-    ]
+    found = joints((names, (0.0, 0.0), (1.0, 2.0)), (names, (0.1, 0.2), (3.0, 4.0)))
+    assert found["state"] == found["wheels"] == [[1.0, 2.0], [3.0, 4.0]]
 
 
 def test_wheels_in_another_order_are_put_in_the_robots():
     names = [
         f"{end}_{side}_wheel" for end in ("rear", "front") for side in ("right", "left")
     ]
-    joints = table((names, np.zeros(4), (4.0, 3.0, 2.0, 1.0)))
-    assert extract_state(joints, MECANUM, roles(), "drive").values.tolist() == [
-        [1.0, 2.0, 3.0, 4.0]
-    ]
+    found = joints((names, np.zeros(4), (4.0, 3.0, 2.0, 1.0)), spec=MECANUM)
+    assert found["state"] == [[1.0, 2.0, 3.0, 4.0]]
 
 
-def test_angles_are_positions_and_speeds_are_velocities_unless_the_mapping_says_otherwise():
-    joints = table((("rack", "motor"), (0.3, 7.0), (9.0, 0.5)))
-    named = roles(state={"speed": "motor", "steering": "rack"})
-    assert extract_state(joints, CAR, named, "drive").values.tolist() == [[0.5, 0.3]]
-    motor = {"joint": "motor", "field": "position", "scale": 0.1}
-    named = roles(state={"speed": motor, "steering": "rack"})
-    assert np.allclose(extract_state(joints, CAR, named, "drive").values, [[0.7, 0.3]])
+@pytest.mark.parametrize(
+    ("speed", "state"),
+    [
+        ("motor", [0.5, 0.3]),
+        ({"joint": "motor", "field": "position", "scale": 0.1}, [0.7, 0.3]),
+    ],
+)
+def test_angles_are_positions_and_speeds_are_velocities_unless_the_roles_say_otherwise(
+    speed, state
+):
+    message = (("rack", "motor"), (0.3, 7.0), (9.0, 0.5))
+    found = joints(message, spec=CAR, state={"speed": speed, "steering": "rack"})
+    assert np.allclose(found["state"], [state])
 
 
 def test_messages_about_other_joints_are_left_out():
-    arm = (("elbow",), (0.0,), (1.0,))
-    both = ("left_wheel", "right_wheel")
-    joints = table(arm, (both, (), (1.0, 2.0)), arm, (both, (), (np.nan, 2.0)))
-    state = extract_state(joints, CART, roles(), "drive")
-    assert state.values.tolist() == [[1.0, 2.0]]
-    assert state.receive_ns.tolist() == [1]
+    found = joints(ARM, (BOTH, (), (1.0, 2.0)), ARM, (BOTH, (), (np.nan, 2.0)))
+    assert found["state"] == [[1.0, 2.0]]
 
 
-def test_a_state_that_follows_its_command_need_not_be_measured():
-    assert (
-        extract_state(table((("elbow",), (0.0,), (1.0,))), CAR, roles(), "drive")
-        is None
-    )
-
-
-def test_a_component_of_the_twist_is_told_by_the_pose():
+def test_what_follows_its_command_or_is_told_by_the_pose_need_not_be_measured():
     husky = build_robot({"kind": "skid_steer", "footprint_radius": 0.6})
-    assert (
-        extract_state(table((("elbow",), (0.0,), (1.0,))), husky, roles(), "drive")
-        is None
-    )
+    assert joints(ARM, spec=CAR) == joints(ARM, spec=husky) == {}
 
 
-def test_a_state_that_must_be_measured_and_is_not_is_named():
-    sentence = refuse(table((("elbow",), (0.0,), (1.0,))), CART)
-    assert "no joint is known for the state 'left_wheel'" in sentence
-    assert (
-        "are elbow: name it in the topics file, as in state: {left_wheel: JOINT}."
-        in sentence
-    )
-
-
-def test_joints_that_could_each_be_it_are_not_guessed():
-    names = ("front_left_wheel", "rear_left_wheel", "right_wheel")
-    assert "'left_wheel'" in refuse(table((names, (), (1.0, 1.0, 1.0))), CART)
-
-
-def test_joints_without_velocity_are_refused():
-    names = ("left_wheel", "right_wheel")
-    for velocity in ((), (np.nan, np.nan)):
-        sentence = refuse(table((names, (0.0, 0.0), velocity)), CART)
-        assert (
-            "no message tells the position or velocity that is needed of left_wheel"
-            in sentence
-        )
-        assert (
-            extract_wheels(table((names, (0.0, 0.0), velocity)), roles(), "drive")
-            is None
-        )
-
-
-def test_names_that_are_not_there_come_with_the_nearest():
-    joints = table((("wheel_l", "wheel_r"), (), (1.0, 1.0)))
-    sentence = refuse(joints, CART, state={"left_wheel": "weel_l"})
-    assert sentence == (
-        "drive: topic '/joint_states' has no joint 'weel_l'; did you mean 'wheel_l'?"
-    )
-    assert "has no state 'left_weel'" in refuse(
-        joints, CART, state={"left_weel": "wheel_l"}
-    )
-    with pytest.raises(RecordingError, match="has no joint 'left'"):
-        extract_wheels(joints, roles(wheels=["left", "wheel_r"]), "drive")
+@pytest.mark.parametrize(
+    ("message", "roles", "words"),
+    [
+        (ARM, {}, ("'left_wheel'", "are elbow:")),
+        (
+            (("front_left_wheel", "rear_left_wheel", "right_wheel"), (), (1, 1, 1)),
+            {},
+            ("'left_wheel'",),
+        ),
+        ((BOTH, (0.0, 0.0), (np.nan, np.nan)), {}, ("left_wheel",)),
+        ((BOTH, (0.0, 0.0), ()), {}, ("left_wheel",)),
+        (
+            (("wheel_l", "wheel_r"), (), (1.0, 1.0)),
+            {"state": {"left_wheel": "weel_l"}},
+            ("'weel_l'", "'wheel_l'"),
+        ),
+        (
+            (("wheel_l", "wheel_r"), (), (1.0, 1.0)),
+            {"state": {"left_weel": "wheel_l"}},
+            ("no state 'left_weel'",),
+        ),
+        ((BOTH, (), (1.0, 1.0)), {"wheels": ["left", BOTH[1]]}, ("'left'",)),
+    ],
+)
+def test_joints_that_do_not_fit_are_refused_with_what_there_is(message, roles, words):
+    with pytest.raises(RecordingError) as caught:
+        joints(message, **roles)
+    assert all(word in str(caught.value) for word in ("drive: topic", *words))
 
 
 LEAST_S = 0.012
