@@ -170,6 +170,16 @@ references of a controller:
   t, x_m=x, y_m=y, psi_rad=yaw, v_ref_m_s=v, omega_ref_rad_s=w, v_m_s=speed,
   omega_rad_s=rate
   -> x_m; psi_rad; forward_command=v_ref_m_s, turn_command=omega_ref_rad_s
+mecanum by its wheels:
+  t, x, y, yaw, fl_cmd=v, fr_cmd=w, rl_cmd=speed, rr_cmd=rate
+  -> x; yaw; front_left_wheel=fl_cmd, front_right_wheel=fr_cmd, rear_left_wheel=rl_cmd,
+     rear_right_wheel=rr_cmd
+revolutions:
+  t, x, y, yaw, rpm_left=v, rpm_right=w
+  -> x; yaw; left_wheel=rpm_left, right_wheel=rpm_right
+fields of a twist:
+  t, x, y, yaw, cmd_vel.linear.x=v, cmd_vel.linear.y=zero, cmd_vel.angular.z=w
+  -> x; yaw; forward_command=cmd_vel.linear.x, turn_command=cmd_vel.angular.z
 mecanum:
   t, x, y, yaw, cmd_vx=v, cmd_vy=noise, cmd_wz=w, vx=speed, vy=zero, wz=rate
   -> x; yaw; vx=cmd_vx, vy=cmd_vy, wz=cmd_wz
@@ -379,6 +389,8 @@ def test_they_are_refused_by_number_and_by_short_names_too(tmp_path, which, name
         ("v [m s^-1]", "m/s"),
         ("w (deg/s)", "deg/s"),
         ("speed_kmh", "km/h"),
+        ("left_rpm", "rpm"),
+        ("motor_rpm_left_cmd", "rpm"),
         ("v_m_s", "m/s"),
         ("acc (m/s^2)", "m/s^2"),
         ("heading (°)", "deg"),
