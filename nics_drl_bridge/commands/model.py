@@ -189,7 +189,7 @@ def inspect(
         )
     if as_json:
         facts = {
-            "tables": [asdict(table) for table in tables],
+            "tables": [table.facts for table in tables],
             "doubts": doubts,
             "mapping": written,
             "needs_mapping": not why,
