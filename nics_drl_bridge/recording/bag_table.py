@@ -1,5 +1,6 @@
 """Topics of a bag as tables: any numeric field of any message type."""
 
+import json
 import re
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -241,23 +242,13 @@ class Bag(Source):
 def list_topics_used(mapping: mapped.Mapping, topics: Sequence[str]) -> dict[str, bool]:
     """Returns the topics that a mapping names, and whether `ROBOT_STREAMS` use them."""
     used: dict[str, bool] = {}
-
-    def walk(part: Any, is_robots: bool) -> None:
-        if isinstance(part, dict):
-            for key, value in part.items():
-                walk(value, is_robots or key in ROBOT_STREAMS)
-                walk(key, is_robots)
-        elif isinstance(part, (list, tuple)):
-            for item in part:
-                walk(item, is_robots)
-        elif isinstance(part, str):
-            names = {part[:k] for k, sign in enumerate(part) if sign == ":"}
-            names.add(part)
-            for topic in topics:
-                if topic in names or topic.removeprefix("/") in names:
-                    used[topic] = used.get(topic, False) or is_robots
-
-    walk(mapping.model_dump(by_alias=True, exclude={"robot"}, exclude_none=True), False)
+    parts = mapping.model_dump(by_alias=True, exclude={"robot"}, exclude_none=True)
+    for key, part in parts.items():
+        text = json.dumps(part, ensure_ascii=False)
+        for topic in topics:
+            name = re.escape(topic.removeprefix("/"))
+            if re.search(f'"/?{name}[":]', text):
+                used[topic] = used.get(topic, False) or key in ROBOT_STREAMS
     return used
 
 

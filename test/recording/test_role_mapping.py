@@ -7,20 +7,20 @@ pytest.importorskip("rosbags", reason="needs the extra 'bags'")
 import bags
 import numpy as np
 
+from nics_drl_bridge.config import parse_yaml
 from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.recording.bag_file import Message, open_bag
-from nics_drl_bridge.recording.bag_table import measure_latency
+from nics_drl_bridge.recording.bag_table import Bag, measure_latency, select_transforms
 from nics_drl_bridge.recording.mapping import Mapping
 from nics_drl_bridge.recording.readers import read_recording
 from nics_drl_bridge.recording.recording import load_recording, save_recording
-from nics_drl_bridge.recording.role_mapping import read_joint_streams
+from nics_drl_bridge.recording.role_mapping import read_joint_streams, write_mapping
 from nics_drl_bridge.recording.topic_roles import TopicRoles
 from nics_drl_bridge.robot.spec import build_robot, load_robot
 
 CAR = load_robot("ackermann")
 CART = load_robot("differential")
 PLACES = np.array([bags.place_at(t) for t in bags.times()])
-NAMES = ["rear_left_wheel_joint", "front_left_steering_joint"]
 
 
 def read(tmp_path, topics, spec=CAR, storage="mcap", **roles):
@@ -53,8 +53,9 @@ POSES = {
 }
 
 
-@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-@pytest.mark.parametrize("kind", COMMANDS)
+@pytest.mark.parametrize(
+    ("kind", "storage"), [*((kind, "mcap") for kind in COMMANDS), ("Twist", "sqlite3")]
+)
 def test_every_kind_of_command_is_read(tmp_path, kind, storage):
     command = [(t, COMMANDS[kind](t)) for t in bags.times(0.1)]
     recording = read(
@@ -104,101 +105,91 @@ def test_steering_angles_are_refused_for_a_robot_that_has_none(tmp_path):
     assert "holds steering angles" in refused(tmp_path, topics, CART)
 
 
-def several_bodies():
-    """What a robot's /tf holds: odometry, a wheel, and the motion capture's view of two bodies."""
-    return [
-        (
-            t,
-            bags.transforms(
-                bags.transform(t, (0.0, 0.0, 0.0), "odom", "base_link"),
-                bags.transform(t, (0.0, 0.1, t), "base_link", "wheel"),
-                bags.transform(t, bags.place_at(t), "/mocap", "base_link"),
-                bags.transform(t, (5.0, 5.0, 0.0), "mocap", "ball"),
-            ),
-        )
-        for t in bags.times()
-    ]
-
-
-def test_the_robot_is_found_among_the_transforms_of_many(tmp_path):
-    topics = {"/cmd_vel": bags.commands(), "/tf": several_bodies()}
-    recording = read(
-        tmp_path, topics, pose="/tf", frame="mocap", child_frame="/base_link"
-    )
-    assert np.allclose(recording.pose.values[:, :2], PLACES[:, :2])
+BODIES = bags.transforms(
+    bags.transform(0.0, (0.0, 0.0, 0.0), "odom", "base_link"),
+    bags.transform(0.0, (0.0, 0.1, 0.2), "base_link", "wheel"),
+    bags.transform(0.0, (1.0, 2.0, 0.0), "/mocap", "base_link"),
+    bags.transform(0.0, (5.0, 5.0, 0.0), "mocap", "ball"),
+)
 
 
 @pytest.mark.parametrize(
-    ("named", "sentence"),
+    ("frames", "content", "fault"),
     [
-        ({}, "holds several transforms;"),
-        (
-            {"child_frame": "base_link"},
-            "holds several transforms with the given names;",
-        ),
-        ({"child_frame": "robot"}, "holds no transform with the given names;"),
-        ({"frame": "map"}, "holds no transform with the given names;"),
+        (("mocap", "/base_link"), BODIES, ""),
+        ((None, None), BODIES, "several transforms;"),
+        ((None, "base_link"), BODIES, "several transforms with the given names;"),
+        ((None, "robot"), BODIES, "no transform with the given names;"),
+        (("map", None), BODIES, "no transform with the given names;"),
+        ((None, None), bags.transforms(), "no transform"),
     ],
 )
-def test_transforms_that_could_be_of_several_bodies_are_listed(
-    tmp_path, named, sentence
-):
-    topics = {"/cmd_vel": bags.commands(), "/tf": several_bodies()}
-    told = refused(tmp_path, topics, pose="/tf", **named)
-    assert sentence in told
-    assert "mocap -> ball, mocap -> base_link, odom -> base_link" in told
+def test_the_robot_is_found_among_transforms_or_all_are_listed(frames, content, fault):
+    messages = [Message(k, content) for k in range(3)]
+    if not fault:
+        found = select_transforms("drive", messages, *frames)
+        assert [m.content.transform.translation.x for m in found] == [1.0] * 3
+        return
+    with pytest.raises(RecordingError, match=f"drive holds {fault}") as caught:
+        select_transforms("drive", messages, *frames)
+    listed = "mocap -> ball, mocap -> base_link, odom -> base_link"
+    assert (listed in str(caught.value)) == (content is BODIES)
 
 
-def test_messages_without_any_transform_are_refused(tmp_path):
-    nothing = [(t, bags.transforms()) for t in bags.times()]
-    topics = {"/cmd_vel": bags.commands(), "/tf": nothing}
-    assert "holds no transform" in refused(tmp_path, topics, pose="/tf")
-
-
-def moving_joints(t: float):
-    """A car's joints: the wheel of 5 cm at 0.5 m/s, and the steering."""
-    return bags.joints(t, NAMES, (10.0 * t, 0.1), (10.0, 0.0))
-
-
-def test_the_state_is_read_from_the_joints_that_the_mapping_names(tmp_path):
-    topics = bags.drive() | {
-        "/joint_states": [(t, moving_joints(t)) for t in bags.times()]
+def test_roles_write_a_mapping_with_the_joints_and_the_gyro(tmp_path):
+    names = ["rear_left_wheel_joint", "front_left_steering_joint"]
+    joints = bags.joints(0.0, names, (0.0, 0.1), (10.0, 0.0))
+    topics = {
+        "/cmd_vel": [(0.0, bags.twist(0.5, 0.0, 0.1))],
+        "/where": [(0.0, bags.pose_stamped(0.0, 0.0, 0.0, 0.0))],
+        "/odom": [(0.0, bags.odometry(0.0, 0.0, 0.0, 0.0))],
+        "/joint_states": [(0.0, joints)],
+        "/imu": [(0.0, bags.imu(0.0, 0.1, 0.2, 0.3))],
     }
-    speed = {"joint": NAMES[0], "field": "velocity", "scale": 0.05}
-    state = read(tmp_path, topics, state={"speed": speed, "steering": NAMES[1]}).state
-    assert state is not None
-    assert np.allclose(state.values, [0.5, 0.1])
-
-
-def test_wheel_speeds_are_read_from_the_joints_that_the_mapping_names(tmp_path):
-    joints = [
-        (t, bags.joints(t, ["a", "b"], (0.0, 0.0), (9.0, 11.0))) for t in bags.times()
-    ]
-    wheels = read(
-        tmp_path, bags.drive() | {"/joint_states": joints}, wheels=["b", "a"]
-    ).wheels
-    assert wheels is not None
-    assert np.allclose(wheels.values, [11.0, 9.0])
-
-
-def test_the_imu_is_read(tmp_path):
-    imu = [(t, bags.imu(t, 0.1, 0.2, 0.3)) for t in bags.times()]
-    read_back = read(tmp_path, bags.drive() | {"/imu": imu}).imu
-    assert read_back is not None
-    assert np.allclose(read_back.values, [0.1, 0.2, 0.3])
-
-
-@pytest.mark.parametrize("topic", ["/cmd_vel", "/pose", "/imu"])
-def test_an_infinite_number_is_refused_and_nan_left_out(tmp_path, topic):
-    imu = [(t, bags.imu(t, 0.1, 0.2, 0.3)) for t in bags.times()]
-    for name, bad in (("inf", np.inf), ("nan", np.nan)):
-        topics = bags.drive() | {"/imu": imu.copy()}
-        messages = {
-            "/cmd_vel": bags.twist(bad, 0.0, 0.0),
-            "/pose": bags.pose_stamped(7 * bags.STEP_S, bad, 0.0, 0.0),
-            "/imu": bags.imu(7 * bags.STEP_S, 0.0, bad, 0.0),
+    speed = {"joint": names[0], "field": "velocity", "scale": 0.05}
+    roles = TopicRoles.model_validate(
+        {
+            "pose": "/where",
+            "odom": "/odom",
+            "state": {"speed": speed, "steering": names[1]},
+            "wheels": names,
+            "stamps": "receive",
         }
-        topics[topic][7] = (topics[topic][7][0], messages[topic])
+    )
+    bag = bags.write(tmp_path / "bag", topics)
+    with open_bag(bag) as file:
+        mapping = write_mapping(roles, Bag(file), CAR)
+    assert mapping == Mapping.model_validate(
+        parse_yaml(
+            f"""
+            time: arrival
+            pose: {{in: /where, covariance: ""}}
+            command: /cmd_vel
+            state:
+              speed: {{from: "/joint_states:velocity[{names[0]}]", scale: 0.05, unit: m/s}}
+              steering: {{from: "/joint_states:position[{names[1]}]", unit: rad}}
+            wheels: {{in: /joint_states, left: "velocity[{names[0]}]", right: "velocity[{names[1]}]"}}
+            odometry:
+              {{in: /odom, vx: twist.twist.linear.x, vy: twist.twist.linear.y, wz: twist.twist.angular.z}}
+            imu:
+              in: /imu
+              ax: linear_acceleration.x
+              ay: linear_acceleration.y
+              yaw_rate: angular_velocity.z
+            """,  # noqa: E501
+            "mapping",
+        )
+    )
+
+
+@pytest.mark.parametrize("topic", ["/cmd_vel", "/pose"])
+def test_an_infinite_number_is_refused_and_nan_left_out(tmp_path, topic):
+    for name, bad in (("inf", np.inf), ("nan", np.nan)):
+        topics = bags.drive()
+        message = bags.twist(bad, 0.0, 0.0)
+        if topic == "/pose":
+            message = bags.pose_stamped(7 * bags.STEP_S, bad, 0.0, 0.0)
+        topics[topic][7] = (topics[topic][7][0], message)
         (tmp_path / name).mkdir()
         if name == "inf":
             assert f"topic '{topic}': message 7" in refused(tmp_path / name, topics)
@@ -252,15 +243,6 @@ def test_topics_for_what_is_no_bag_are_refused(tmp_path):
     (tmp_path / "drive.npz").write_bytes(b"")
     with pytest.raises(RecordingError, match="leave out --topics and --topic"):
         read_recording(tmp_path / "drive.npz", CAR, TopicRoles(pose="/pose"))
-
-
-def test_odometry_named_beside_a_pose_shows_its_twist(tmp_path):
-    odometry = [(t, bags.odometry(t, *bags.place_at(t))) for t in bags.times()]
-    topics = {"/cmd_vel": bags.commands(), "/pose": bags.poses(), "/odom": odometry}
-    recording = read(tmp_path, topics, odom="/odom")
-    assert recording.odometry is not None
-    assert recording.odometry.values.shape == (len(odometry), 3)
-    assert np.allclose(recording.pose.values[:, :2], PLACES[:, :2])
 
 
 MECANUM = load_robot("mecanum")
