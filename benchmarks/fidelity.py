@@ -40,9 +40,8 @@ from nics_drl_bridge.identify.yardstick import fit_yardstick, kept_twist
 from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.middleware.measurement import ODOM
 from nics_drl_bridge.middleware.middleware import Middleware
-from nics_drl_bridge.recording.readers import read_robot_and_drive
+from nics_drl_bridge.recording.readers import open_drive
 from nics_drl_bridge.recording.recording import Recording
-from nics_drl_bridge.recording.topic_roles import TopicRoles
 from nics_drl_bridge.robot.kernels import SERIES, make_terms, run, simulate_rollouts
 from nics_drl_bridge.robot.noise import Level, Noise
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
@@ -115,7 +114,7 @@ def measure_drive(
         "lines_of_mapping": sum(line[:1] not in ("#", "") for line in lines)
     }
     try:
-        spec, recording = read_robot_and_drive(source, None, TopicRoles(), mapping)
+        spec, recording = open_drive(source, None, mapping)
         found = identify(_take_out(control, recording), spec, alpha="auto")
         told |= judge_model(found, recording, control)
     except BridgeError as error:
@@ -132,7 +131,7 @@ def measure_drive(
 
 def leave_out(source: Path, mapping: Path, control: str | None) -> Result:
     """Returns mean errors on segments of a drive, each predicted by a model of all others."""
-    spec, recording = read_robot_and_drive(source, None, TopicRoles(), mapping)
+    spec, recording = open_drive(source, None, mapping)
     recording = _take_out(control, recording)
     drive = Drive(recording, spec)
     since = recording.pose.t - recording.pose.t[0]

@@ -39,9 +39,8 @@ from nics_drl_bridge.policy.policies import (
 )
 from nics_drl_bridge.policy.training_settings import load_training
 from nics_drl_bridge.recording import textbook
-from nics_drl_bridge.recording.readers import read_recording, read_robot_and_drive
+from nics_drl_bridge.recording.readers import open_drive, read_recording
 from nics_drl_bridge.recording.recording import Recording, save_recording
-from nics_drl_bridge.recording.topic_roles import TopicRoles
 from nics_drl_bridge.report import html, pictures
 from nics_drl_bridge.report.fit_page import (
     fit_tile,
@@ -178,7 +177,7 @@ def run(plan: DemoPlan, say: Say) -> str:
 def _record_or_read(plan: DemoPlan, say: Say) -> tuple[RobotSpec, Recording]:
     """Reads the plan's drive and its robot, or records a drive of a textbook robot."""
     if plan.recording is not None:
-        return read_robot_and_drive(plan.recording, plan.robot, TopicRoles(), None)
+        return open_drive(plan.recording, plan.robot)
     robot = load_robot(plan.robot or DEFAULT_ROBOT)
     file = plan.out / "recording.npz"
     say(f"recording a drive of the textbook {robot.name!r} robot")

@@ -189,7 +189,7 @@ def inspect(
         )
     if as_json:
         facts = {
-            "tables": [asdict(table) for table in tables],
+            "tables": [table.facts for table in tables],
             "doubts": doubts,
             "mapping": written,
             "needs_mapping": not why,
@@ -324,7 +324,7 @@ def generate(
     from nics_drl_bridge.identify.fit import parse_alpha, parse_order
     from nics_drl_bridge.lidar.sensor import load_sensor
     from nics_drl_bridge.lidar.spec import load_lidar
-    from nics_drl_bridge.recording.readers import read_robot_and_drives
+    from nics_drl_bridge.recording.readers import choose_mapping, open_drives
     from nics_drl_bridge.recording.topic_roles import load_topic_roles
     from nics_drl_bridge.sim.world import load_world
 
@@ -336,9 +336,9 @@ def generate(
     sensors = tuple(load_sensor(file) for file in sensor or ())
     shapes = load_world(world).shapes
     named = ", ".join(map(str, recording))
-    roles = load_topic_roles(topics, topic or ())
+    chosen = choose_mapping(load_topic_roles(topics, topic or ()), mapping)
     with console.show_progress(f"reading {named}"):
-        spec, drives = read_robot_and_drives(recording, robot, roles, mapping)
+        spec, drives = open_drives(recording, robot, chosen)
     pairs = zip(drives, names_of_sources(recording), strict=True)
     drives = [replace(drive, source=name) for drive, name in pairs]
     with console.show_progress("generating"):

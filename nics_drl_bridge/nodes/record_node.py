@@ -28,7 +28,6 @@ from nics_drl_bridge.nodes import conversions, qos, runner
 from nics_drl_bridge.nodes.command_types import deaf_subscribers, heard_stamped
 from nics_drl_bridge.nodes.parameters import IMU, drive
 from nics_drl_bridge.recording.bag_file import Message
-from nics_drl_bridge.recording.bag_reader import read_joint_streams
 from nics_drl_bridge.recording.excite import PERIOD_S, STILL_S, DrivePlan
 from nics_drl_bridge.recording.imu_axis import GyroReader
 from nics_drl_bridge.recording.messages import (
@@ -38,6 +37,7 @@ from nics_drl_bridge.recording.messages import (
     read_twist,
 )
 from nics_drl_bridge.recording.recording import Recording
+from nics_drl_bridge.recording.role_mapping import read_joint_streams
 from nics_drl_bridge.recording.stamping import Nanoseconds, TopicData, stamp_streams
 from nics_drl_bridge.recording.topic_roles import (
     TopicRoles,

@@ -194,13 +194,10 @@ def _list_files(folder: Path, room: Path) -> list[Path]:
 
 
 def _check_storage(file: Path) -> None:
-    from nics_drl_bridge.recording.mcap import DamageError, check_mcap
+    from nics_drl_bridge.recording.mcap import check_mcap
 
     if file.suffix != DATABASE:
-        try:
-            check_mcap(file)
-        except DamageError as damage:
-            raise ValueError(f"{file.name} is damaged at {damage}") from None
+        check_mcap(file)
         return
     journal = file.with_name(f"{file.name}-wal")
     if journal.is_file() and journal.stat().st_size > 0:

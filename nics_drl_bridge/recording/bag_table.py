@@ -1,8 +1,10 @@
 """Topics of a bag as tables: any numeric field of any message type."""
 
+import json
 import re
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -12,17 +14,23 @@ from nics_drl_bridge.interface import S_PER_NS
 from nics_drl_bridge.recording import mapping as mapped
 from nics_drl_bridge.recording import topic_roles as roles
 from nics_drl_bridge.recording.bag_file import BagFile, Message, read_times
-from nics_drl_bridge.recording.bag_reader import measure_latency, select_transforms
+from nics_drl_bridge.recording.messages import get_frames
+from nics_drl_bridge.recording.pose_source import guess_source_by_names
 from nics_drl_bridge.recording.recording import Stream
 from nics_drl_bridge.recording.stamping import (
     ROBOT_STREAMS,
+    SAME_CLOCK_S,
     TopicData,
     has_continuous_headers,
     stamp_streams,
 )
 from nics_drl_bridge.recording.table import Column, Source, Table
-from nics_drl_bridge.robot.noise import Latency
+from nics_drl_bridge.robot.noise import Delay, Latency
 
+SCAN = "sensor_msgs/msg/LaserScan"
+FEWEST_MESSAGES = 20  # that show a delay
+PERCENTILES = (5.0, 50.0, 95.0)
+SPANNED = 0.9  # fraction of a uniform distribution between the outer percentiles
 LONGEST_ARRAY = 64  # elements of longer arrays are not listed
 # Message types that are not read as columns of numbers
 SCENES = re.compile(r"/(Compressed)?Image$|/PointCloud2?$|/LaserScan$")
@@ -87,6 +95,25 @@ def make_field_reader(path: str) -> Callable[[Any], Any]:
     return read
 
 
+def make_message_table(place: str, messages: Sequence[Message], **other: Any) -> Table:
+    """Makes a table of the fields of messages; `other` fields of the table may be given."""
+    # Messages about joints may each hold other ones.
+    kinds = {_list_sizes(message.content): message.content for message in messages}
+    fields = chain.from_iterable(map(list_fields, kinds.values()))
+    names = tuple(dict.fromkeys(fields))
+    column = partial(read_column, place, names, messages)
+    return Table(place, names, column, "message {}".format, **other)
+
+
+def _list_sizes(message: Any) -> Any:
+    """Returns the names in a message, with the lengths of its arrays; None without names."""
+    names = getattr(message, NAMES, None)
+    if not isinstance(names, list):
+        return None
+    sizes = [len(v) for v in vars(message).values() if isinstance(v, np.ndarray)]
+    return (*names, *sizes)
+
+
 def read_column(
     place: str, names: Sequence[str], messages: Sequence[Message], which: str | int
 ) -> Column:
@@ -120,45 +147,60 @@ def read_column(
 class Bag(Source):
     """The topics of an open bag as tables; of transforms, only those between two frames."""
 
-    def __init__(self, bag: BagFile, mapping: mapped.Mapping | None) -> None:
+    def __init__(self, bag: BagFile) -> None:
         topics = [
             topic
             for topic, kind in sorted(bag.types.items())
             if topic not in bag.empty and not SCENES.search(kind)
         ]
         super().__init__(bag.place, [t for t in topics if bag.can_decode(t)])
-        self._bag = bag
+        self.file = bag
         self._frames: tuple[str | None, str | None] = (None, None)
         # topics that are stamped together, and whether they come from the robot's computer
         self._used: dict[str, bool] = {}
-        if mapping is not None:
-            self._frames = mapping.pose.frames
-            self._used = list_topics_used(mapping, self.names)
         self._messages: dict[str, Sequence[Message]] = {}
         self._notes: dict[str, list[str]] = {}  # by topic
         self._stamps: dict[tuple[str, ...], Stream] = {}
 
+    def use(self, mapping: mapped.Mapping) -> None:
+        """Stamps the topics of a mapping together; has to be called before they are read."""
+        self._frames = mapping.pose.frames
+        self._used = list_topics_used(mapping, self.names)
+
     @property
     def latency(self) -> Latency:
         """Delays of scan and odometry, as far as the bag shows them."""
-        return measure_latency(self._bag)
+        types = self.file.types
+        odometry = [
+            topic
+            for topic in self._used
+            if types[topic] == roles.ODOMETRY
+            and guess_source_by_names((topic,), types[topic]) == "odometry"
+        ]
+        return measure_latency(self.file, odometry[0] if len(odometry) == 1 else None)
 
     def read(self, name: str) -> Table:
         """Reads a topic."""
         messages = self._read_messages(name)
-        place = f"{self.place}: topic {name!r}"
-        names = tuple(dict.fromkeys(list_fields(messages[0].content)))
-        column = partial(read_column, place, names, messages)
-        stamps = partial(self._stamp_rows, name)
-        notes = self._notes.setdefault(name, [])
-        kind = self._bag.types[name]
-        return Table(place, names, column, "message {}".format, notes, stamps, kind)
+        return make_message_table(
+            f"{self.place}: topic {name!r}",
+            messages,
+            notes=self._notes.setdefault(name, []),
+            stamps=partial(self._stamp_rows, name),
+            kind=self.file.types[name],
+        )
+
+    def add_note(self, topic: str, note: str) -> None:
+        """Adds a sentence on what was done to a topic."""
+        self._notes.setdefault(topic, []).append(note)
 
     def _read_messages(self, topic: str) -> Sequence[Message]:
         if topic not in self._messages:
-            messages: Sequence[Message] = self._bag.read_messages(topic)
-            if self._bag.types[topic] == roles.TRANSFORMS:
-                messages = select_transforms(self._bag, topic, messages, *self._frames)
+            messages: Sequence[Message] = self.file.read_messages(topic)
+            if self.file.types[topic] == roles.TRANSFORMS:
+                messages = select_transforms(
+                    f"{self.place}: topic {topic!r}", messages, *self._frames
+                )
             self._messages[topic] = messages
         return self._messages[topic]
 
@@ -193,28 +235,99 @@ class Bag(Source):
                 stamps = "header"
                 origin = "headers, which go on together"
             note = f"{error.reason}; all messages were stamped by their {origin}."
-            self._notes.setdefault(topic, []).append(note)
+            self.add_note(topic, note)
             return stamp_streams(data, stamps, self.place, robot)[topic]
 
 
 def list_topics_used(mapping: mapped.Mapping, topics: Sequence[str]) -> dict[str, bool]:
     """Returns the topics that a mapping names, and whether `ROBOT_STREAMS` use them."""
     used: dict[str, bool] = {}
-
-    def walk(part: Any, is_robots: bool) -> None:
-        if isinstance(part, dict):
-            for key, value in part.items():
-                walk(value, is_robots or key in ROBOT_STREAMS)
-                walk(key, is_robots)
-        elif isinstance(part, (list, tuple)):
-            for item in part:
-                walk(item, is_robots)
-        elif isinstance(part, str):
-            names = {part[:k] for k, sign in enumerate(part) if sign == ":"}
-            names.add(part)
-            for topic in topics:
-                if topic in names or topic.removeprefix("/") in names:
-                    used[topic] = used.get(topic, False) or is_robots
-
-    walk(mapping.model_dump(by_alias=True, exclude={"robot"}, exclude_none=True), False)
+    parts = mapping.model_dump(by_alias=True, exclude={"robot"}, exclude_none=True)
+    for key, part in parts.items():
+        text = json.dumps(part, ensure_ascii=False)
+        for topic in topics:
+            name = re.escape(topic.removeprefix("/"))
+            if re.search(f'"/?{name}[":]', text):
+                used[topic] = used.get(topic, False) or key in ROBOT_STREAMS
     return used
+
+
+def select_transforms(
+    place: str,
+    messages: Sequence[Message],
+    frame: str | None,
+    child: str | None,
+) -> list[Message]:
+    """Returns the transforms between two frames, by default between the only two.
+
+    Raises RecordingError if no pair of frames fits, or several do.
+    """
+    transforms: dict[tuple[str, str], list[Message]] = {}
+    for message in messages:
+        for transform in getattr(message.content, "transforms", (message.content,)):
+            pair = get_frames(transform)
+            part = Message(message.receive_ns, transform)
+            transforms.setdefault(pair, []).append(part)
+    pairs = [
+        (parent, child_frame)
+        for parent, child_frame in transforms
+        if frame is None or frame.strip("/") == parent
+        if child is None or child.strip("/") == child_frame
+    ]
+    if len(pairs) == 1:
+        return transforms[pairs[0]]
+    problem = "no transform"
+    if pairs:
+        problem = "several transforms"
+    if frame or child:
+        problem += " with the given names"
+    frames = ", ".join(sorted(" -> ".join(pair) for pair in transforms)) or "none"
+    raise RecordingError(
+        f"{place} holds {problem}; write those of the robot into "
+        "the topics file or the map, as in `frame: world` and `child_frame: "
+        f"base_link`; it holds {frames}."
+    )
+
+
+def measure_latency(bag: BagFile, odom: str | None = None) -> Latency:
+    """Measures the delays of scan and odometry on the recorder's own clock, if a bag shows them."""
+    odom = odom or _find_topic(bag, roles.ODOMETRY, "odom")
+    return Latency(
+        scan=_measure_delay(bag, _find_topic(bag, SCAN, "scan")),
+        odom=_measure_delay(bag, odom),
+    )
+
+
+def _find_topic(bag: BagFile, kind: str, name: str) -> str | None:
+    """Returns the only topic of a type, or the only one of several with the usual name."""
+    topics = [
+        topic
+        for topic, topic_kind in bag.types.items()
+        if topic_kind == kind and topic not in bag.empty
+    ]
+    if len(topics) > 1:
+        topics = [topic for topic in topics if re.search(rf"(^|/){name}$", topic)]
+    if len(topics) != 1:
+        return None
+    return topics[0]
+
+
+def _measure_delay(bag: BagFile, topic: str | None) -> Delay | None:
+    if topic is None:
+        return None
+    messages = bag.read_messages(topic)
+    receive_ns, stamps_ns = read_times(messages)
+    if len(messages) < FEWEST_MESSAGES or stamps_ns is None or not stamps_ns.all():
+        return None
+    delay = (receive_ns - stamps_ns) * S_PER_NS
+    if hasattr(messages[0].content, "ranges"):
+        # A scan's stamp is the time of its first beam.
+        for k, message in enumerate(messages):
+            scan = message.content
+            increment = max(0.0, float(scan.time_increment))
+            delay[k] -= increment * max(len(scan.ranges) - 1, 0)
+    low, middle, high = np.percentile(delay, PERCENTILES)
+    if not SAME_CLOCK_S[0] <= middle <= SAME_CLOCK_S[1]:
+        return None
+    jitter = float(high - low) / SPANNED
+    return Delay(least=max(0.0, float(middle) - jitter / 2.0), jitter=jitter)

@@ -6,33 +6,29 @@ from typing import NamedTuple
 import numpy as np
 
 from nics_drl_bridge.geometry import Array, east_and_north
-from nics_drl_bridge.recording.column_guess import (
-    Place,
-    Switch,
-    guess_episode,
-    guess_switches,
-    guess_yaw_rate,
-    write_imu_line,
-)
-from nics_drl_bridge.recording.command_guess import (
+from nics_drl_bridge.recording.guesses import (
+    GLOBE,
     TICKS,
     Candidate,
     CommandGuess,
+    PoseGuess,
+    Switch,
     find_look_alikes,
     guess_command,
+    guess_episode,
+    guess_pose,
+    guess_switches,
+    guess_yaw_rate,
+    is_used,
+    write_imu_line,
+    write_value,
 )
 from nics_drl_bridge.recording.mapped import POSES
 from nics_drl_bridge.recording.mapping import UNITS
 from nics_drl_bridge.recording.motion_check import find_doubts
 from nics_drl_bridge.recording.names import split_words, write_reference
-from nics_drl_bridge.recording.pose_guess import (
-    GLOBE,
-    PoseGuess,
-    guess_pose,
-    list_used_columns,
-)
 from nics_drl_bridge.recording.recording import compute_heading, find_implausible_pose
-from nics_drl_bridge.recording.survey import Survey, TableSurvey, split_unit
+from nics_drl_bridge.recording.survey import Field, TableSurvey
 
 GUESSED = "# guessed"
 NO_COMMAND = (
@@ -55,14 +51,9 @@ class _Guesses(NamedTuple):
     pose: PoseGuess | None
     guess: CommandGuess
     switches: tuple[Switch, ...]
-    gyro: Place | None
-    episode: Place | None
+    gyro: Field | None
+    episode: Field | None
     common_time: str | None  # the stamps of most tables, for the whole mapping
-
-    @property
-    def is_single(self) -> bool:
-        """True if there is only one table, so that references need not name it."""
-        return len(self.tables) == 1
 
 
 class MappingDraft(NamedTuple):
@@ -90,13 +81,13 @@ def propose_mapping(tables: Sequence[TableSurvey]) -> MappingDraft:
     poses = None
     if pose is not None:
         units = _name_units(pose)
-        pose_lines = _write_pose(pose, units, len(tables) == 1, common_time)
+        pose_lines = _write_pose(pose, units, common_time)
         poses = _compute_poses(pose, units)
     switches: tuple[Switch, ...] = ()
     if guess.listed:
         switches = guess_switches(tables)
     gyro = guess_yaw_rate(tables)
-    if gyro and any(gyro.key == command.key for command in guess.listed.values()):
+    if gyro and any(gyro is command.column for command in guess.listed.values()):
         gyro = None
     episode = guess_episode(tables)
     guesses = _Guesses(tables, pose, guess, switches, gyro, episode, common_time)
@@ -111,13 +102,12 @@ def propose_mapping(tables: Sequence[TableSurvey]) -> MappingDraft:
             f"time: {{rate: 50}}  {GUESSED}: no stamps were found; rows a second"
         )
     if episode is not None:
-        lines.append(f"episode: {episode.refer_to(guesses.is_single)}  {GUESSED}")
+        lines.append(f"episode: {episode.reference}  {GUESSED}")
     lines += pose_lines
     lines += _write_clock(pose, guess.listed)
     lines += _write_commands(guesses)
     if gyro is not None:
-        line = write_imu_line(gyro, guesses.is_single, common_time)
-        lines.append(f"{line}  {GUESSED}")
+        lines.append(f"{write_imu_line(gyro, common_time)}  {GUESSED}")
     return MappingDraft(doubts, lines, [*_list_unused(guesses)])
 
 
@@ -158,10 +148,7 @@ def _write_commands(guesses: _Guesses) -> Iterator[str]:
     guess = guesses.guess
     when = ""
     if guesses.switches:
-        flags = [
-            f"{switch.refer_to(guesses.is_single)}: {switch.on}"
-            for switch in guesses.switches
-        ]
+        flags = [switch.condition for switch in guesses.switches]
         when = f"when: {{{', '.join(flags)}}}"
     if guess.commands:
         if guess.of_wheels:
@@ -170,31 +157,24 @@ def _write_commands(guesses: _Guesses) -> Iterator[str]:
         else:
             yield "command:"
         for name, candidate in guess.commands.items():
-            value = _write_value(name, candidate, when, guesses)
+            value = _write_command(name, candidate, when, guesses.common_time)
             yield f"  {name}: {value}  {GUESSED}{_write_remark(candidate)}"
         for name, candidate in guess.candidates.items():
-            yield f"#  or {name}: {_write_value(name, candidate, when, guesses)}"
+            yield f"#  or {name}: {_write_command(name, candidate, when, guesses.common_time)}"
     elif guess.candidates:
         yield "command:  # none is certain: uncomment what was sent to the robot"
         for name, candidate in guess.candidates.items():
-            yield f"#  {name}: {_write_value(name, candidate, when, guesses)}"
+            yield f"#  {name}: {_write_command(name, candidate, when, guesses.common_time)}"
     else:
         yield f"command:  # {NO_COMMAND}"
 
 
-def _write_value(name: str, candidate: Candidate, when: str, guesses: _Guesses) -> str:
-    """Returns a command as written in a mapping: a column, or a column with more keys."""
-    time = candidate.table.time
-    reference = candidate.refer_to(guesses.is_single)
+def _write_command(name: str, candidate: Candidate, when: str, time: str | None) -> str:
     keys = [*_write_unit_keys(name, candidate.column)]
     # A switch cuts off the motor; the steering stays as it is.
     if when and "steer" not in name:
         keys.append(when)
-    if time not in (guesses.common_time, None):
-        keys.append(f"time: {time}")
-    if not keys:
-        return reference
-    return f"{{from: {reference}, {', '.join(keys)}}}"
+    return write_value(candidate.column, keys, time)
 
 
 def _write_remark(candidate: Candidate) -> str:
@@ -204,8 +184,8 @@ def _write_remark(candidate: Candidate) -> str:
     return NEEDS_TURN * (is_counter and candidate.meaning != "steering")
 
 
-def _write_unit_keys(name: str, column: Survey) -> Iterator[str]:
-    unit = split_unit(column.name)[1]
+def _write_unit_keys(name: str, column: Field) -> Iterator[str]:
+    unit = column.unit
     if not TICKS.isdisjoint(split_words(column.name)):
         yield "unit: ticks"
         if "steer" in name:
@@ -226,9 +206,9 @@ def _write_clock(
         return
     t = pose.table.t
     stamps = [
-        (candidate.table.unit, np.sort(candidate.table.t))
-        for candidate in commands.values()
-        if candidate.table.t is not None
+        (table.unit, np.sort(table.t))
+        for table in (candidate.column.table for candidate in commands.values())
+        if table.t is not None
     ]
     if not stamps:
         return
@@ -244,23 +224,17 @@ def _write_clock(
 def _list_unused(guesses: _Guesses) -> Iterator[str]:
     """Yields a text for each table with the columns of values that the draft does not use."""
     guess = guesses.guess
-    places = [
-        *guess.commands.values(),
-        *guess.candidates.values(),
-        *guesses.switches,
-        guesses.gyro,
-        guesses.episode,
-    ]
-    used = [place.key for place in places if place is not None]
+    candidates = [*guess.commands.values(), *guess.candidates.values()]
+    used = [candidate.column for candidate in candidates]
+    used += [switch.column for switch in guesses.switches]
     for table in guesses.tables:
-        used_here = list_used_columns(table, guesses.pose)
         unused = []
         for column in table.columns:
             is_value = NO_VALUES.isdisjoint(split_words(column.name))
-            is_used = (id(table), column.name) in used or column.name in used_here
-            if is_value and not is_used:
+            is_named = column in (*used, guesses.gyro, guesses.episode)
+            if is_value and not is_named and not is_used(column, guesses.pose):
                 unused.append(f"{column.name}{_explain_unused(column)}")
-        place = f"{table.name}: " * (not guesses.is_single)
+        place = "" if table.is_single else f"{table.name}: "
         listed = ", ".join(unused[:MOST_LISTED])
         if len(unused) > MOST_LISTED:
             listed += f" and {len(unused) - MOST_LISTED} more"
@@ -268,8 +242,8 @@ def _list_unused(guesses: _Guesses) -> Iterator[str]:
             yield f"not used: {place}{listed}"
 
 
-def _explain_unused(column: Survey) -> str:
-    if column.low < column.high:
+def _explain_unused(column: Field) -> str:
+    if column.moves:
         return ""
     if column.low == column.high:
         return " (constant)"
@@ -277,21 +251,21 @@ def _explain_unused(column: Survey) -> str:
 
 
 def _write_pose(
-    pose: PoseGuess, units: Mapping[str, str], is_single: bool, common_time: str | None
+    pose: PoseGuess, units: Mapping[str, str], common_time: str | None
 ) -> list[str]:
     table = pose.table
-    if table.stamps is None and pose.x in (form[0].format("x") for form in POSES[:4]):
+    is_known = pose.x.name in (form[0].format("x") for form in POSES[:4])
+    if table.stamps is None and is_known:
         return [f"pose: {table.name}  {GUESSED}"]  # a message whose fields are known
     lines = [f"pose:  {GUESSED}"]
-    if not is_single:
+    if not table.is_single:
         lines.append(f"  in: {write_reference(table.name)}")
-    lines.append(f"  x: {write_reference(pose.x)}")
-    lines.append(f"  y: {write_reference(pose.y)}")
+    names = [write_reference(column.name) for column in pose.columns]
+    lines += [f"  x: {names[0]}", f"  y: {names[1]}"]
     if pose.heading is not None:
-        lines.append(f"  heading: {write_reference(pose.heading)}")
+        lines.append(f"  heading: {names[2]}")
     else:
-        columns = ", ".join(map(write_reference, pose.quaternion))
-        lines.append(f"  quaternion: [{columns}]")
+        lines.append(f"  quaternion: [{', '.join(names[2:])}]")
     if table.time not in (common_time, None):
         lines.append(f"  time: {table.time}")
     for key, unit in units.items():
@@ -302,10 +276,10 @@ def _write_pose(
 def _name_units(pose: PoseGuess) -> dict[str, str]:
     """Returns the units that the names of a pose's columns show, unless they are m and rad."""
     units = {
-        "unit": split_unit(pose.x)[1],
-        "heading_unit": split_unit(pose.heading or "")[1],
+        "unit": pose.x.unit,
+        "heading_unit": None if pose.heading is None else pose.heading.unit,
     }
-    if not {*GLOBE}.isdisjoint(split_words(pose.x)):
+    if not {*GLOBE}.isdisjoint(split_words(pose.x.name)):
         units["unit"] = "deg"
     named = {}
     for key, unit in units.items():
@@ -324,7 +298,7 @@ def _compute_poses(
     table = pose.table
     if table.t is None:
         return None
-    columns = [table.get_numbers(name) for name in pose.columns]
+    columns = [column.numbers for column in pose.columns]
     # The columns may be of several streams.
     if any(len(column) != len(table.t) for column in columns):
         return None

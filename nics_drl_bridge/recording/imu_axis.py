@@ -1,5 +1,6 @@
 """Finds by gravity which axis of an IMU points up: it may be mounted on its side or upside down."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -40,6 +41,12 @@ def find_up_axis(acceleration: Array) -> UpAxis:
     if abs(acceleration[index]) < UPRIGHT * size:
         return UpAxis()
     return UpAxis(index, 1.0 if acceleration[index] > 0.0 else -1.0)
+
+
+def find_table_axis(read: Callable[[str], Array]) -> UpAxis:
+    """Returns the axis of an IMU's messages that points up; `read` reads one of their fields."""
+    means = [np.nanmedian(read(f"linear_acceleration.{axis}")) for axis in AXES]
+    return find_up_axis(np.array(means))
 
 
 def to_array(vector: Any) -> Array:

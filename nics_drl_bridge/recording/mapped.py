@@ -40,6 +40,7 @@ from nics_drl_bridge.recording.values import (
     combine_series,
     get_unit,
 )
+from nics_drl_bridge.robot.spec import RobotSpec
 
 QUATERNION_TOLERANCE = 0.05
 MOST_TILT_DEG = 40.0  # maximum median tilt of a robot that drives on wheels
@@ -50,32 +51,48 @@ MIN_POSE_S = 1.0
 MOST_RATIO = 100.0  # maximum ratio of the durations of two streams of a drive
 
 
-def read_mapped(source: Source, mapping: Mapping) -> Recording:
-    """Reads a recording by its mapping. Raises ConfigError or RecordingError if they do not fit."""
+def read_mapped(
+    source: Source, mapping: Mapping, spec: RobotSpec | None = None
+) -> Recording:
+    """Reads a recording by its mapping. Raises ConfigError or RecordingError if they do not fit.
+
+    Only the messages of a `command_topic` need the robot.
+    """
     if mapping.episode is None:
-        return _read_drive(source, mapping)[0]
+        return _read_drive(source, mapping, spec)[0]
     plain = mapping.model_copy(update={"episode": None})
     episodes = split_table(source, mapping)
     if not episodes:
-        recording, origin_s = _read_drive(source, plain)
+        recording, origin_s = _read_drive(source, plain, spec)
         return split_by_time(source, mapping, recording, origin_s)
     drives = []
     for episode in episodes:
         try:
-            drives.append(replace(_read_drive(episode, plain)[0], source=episode.place))
+            drive, _ = _read_drive(episode, plain, spec)
+            drives.append(replace(drive, source=episode.place))
         except RecordingError as error:
             raise RecordingError(f"episode {episode.episode}: {error}") from None
     return replace(join(drives), source=source.place)
 
 
-def _read_drive(source: Source, mapping: Mapping) -> tuple[Recording, float]:
+def _read_drive(
+    source: Source, mapping: Mapping, spec: RobotSpec | None
+) -> tuple[Recording, float]:
     """Returns a drive, and the time that was subtracted from the stamps of its pose [s]."""
     reader = MappedReader(source, mapping)
     _check_commands(reader, mapping.command)
-    streams = {
-        "pose": read_pose(reader, mapping.pose),
-        "command": _read_values(reader, "command", mapping.command, held=True),
-    }
+    streams = {"pose": read_pose(reader, mapping.pose, spec)}
+    commands = tuple(mapping.command)
+    if mapping.command_topic is None:
+        streams["command"] = _read_values(reader, "command", mapping.command, held=True)
+    else:
+        if spec is None:
+            raise ConfigError(
+                f"{source.place}: command: the messages of {mapping.command_topic!r} "
+                "are commands only of a known robot; give --robot, or a RobotSpec."
+            )
+        streams["command"] = _read_command_topic(reader, mapping.command_topic, spec)
+        commands = tuple(variable.name for variable in spec.command)
     if mapping.state:
         streams["state"] = _read_values(reader, "state", mapping.state, held=False)
     for name in ("wheels", "imu", "odometry"):
@@ -91,11 +108,11 @@ def _read_drive(source: Source, mapping: Mapping) -> tuple[Recording, float]:
     recording = Recording(
         **cast(Any, streams),
         source=source.place,
-        variables=(*mapping.state, *mapping.command),
+        variables=(*mapping.state, *commands),
         latency=source.latency,
         measured_by=mapping.pose.measured_by or _guess_pose_source(source, mapping),
     )
-    widths = {"command": len(mapping.command), "state": len(mapping.state), "wheels": 2}
+    widths = {"command": len(commands), "state": len(mapping.state), "wheels": 2}
     check_streams(recording, widths)
     shifted: Any = _shift_to_zero(streams, mapping.clock or schema.ROBOT_CLOCK, reader)
     origin_s = float(streams["pose"].t[0] - shifted["pose"].t[0])
@@ -170,11 +187,13 @@ def _check_kind(name: str, value: Value, kinds: Sequence[str]) -> None:
         )
 
 
-def _check_units(reader: MappedReader, pose: Stream) -> None:
+def _check_units(reader: MappedReader, pose: Stream, spec: RobotSpec | None) -> None:
     """Refuses poses that only a wrong unit explains (RecordingError)."""
     mapping = reader.mapping
     radius = 0.0
-    if isinstance(mapping.robot, dict):
+    if spec is not None:
+        radius = spec.footprint_radius
+    elif isinstance(mapping.robot, dict):
         given_radius = mapping.robot.get("footprint_radius")
         if isinstance(given_radius, (int, float)):
             radius = float(given_radius)
@@ -208,7 +227,46 @@ def _read_measured(reader: MappedReader, name: str, stream: Measured) -> Stream:
     return replace(measured, values=values)
 
 
-def read_pose(reader: MappedReader, pose: PoseSource) -> Stream:
+COMMANDS = (
+    ("twist.linear.x", "twist.linear.y", "twist.angular.z"),
+    ("linear.x", "linear.y", "angular.z"),
+    ("drive.speed", "drive.steering_angle"),
+    ("speed", "steering_angle"),
+)
+"""Fields of messages that are commands: velocities, or speed and steering angle."""
+
+
+def _read_command_topic(reader: MappedReader, topic: str, spec: RobotSpec) -> Stream:
+    """Reads the commands (T, C) of a robot from velocities or Ackermann drives."""
+    table, _ = reader.locate("", topic)
+    fields = next((form for form in COMMANDS if {*form} <= {*table.names}), None)
+    if fields is None:
+        raise RecordingError(
+            f"{table.place}: its messages are no commands of a known form; name each "
+            "command in the mapping."
+        )
+    is_steered = len(fields) == 2
+    for variable in spec.command:
+        if is_steered and variable.turns and not variable.steers:
+            raise RecordingError(
+                f"{table.place}: holds steering angles [rad], but {variable.name!r} of "
+                f"robot {spec.name!r} is in {variable.unit}; choose the robot that "
+                "drove, or another topic."
+            )
+    values = {
+        field: Value.model_validate({"from": f"{topic}:{field}"}) for field in fields
+    }
+    stream = _read_values(reader, "command", values, held=True)
+    if not is_steered:
+        return replace(stream, values=spec.from_cmd_vel(stream.values))
+    speed, angle = stream.values.T
+    rows = np.stack([speed, np.zeros_like(speed), angle], axis=1)
+    return replace(stream, values=spec.from_fields(rows))
+
+
+def read_pose(
+    reader: MappedReader, pose: PoseSource, spec: RobotSpec | None = None
+) -> Stream:
     """Reads poses, with their deviations if a covariance is mapped."""
     if pose.x is None:
         pose = _complete_pose(reader, pose)
@@ -234,12 +292,12 @@ def read_pose(reader: MappedReader, pose: PoseSource) -> Stream:
             east, north = east_and_north(parts[0].values, parts[1].values)
             parts = [parts[0]._replace(values=east), parts[1]._replace(values=north)]
             factors = [1.0, 1.0]
-    _check_units(reader, combine_series("pose", parts, held=False))
+    _check_units(reader, combine_series("pose", parts, held=False), spec)
     # A heading can be interpolated only once it is unwrapped.
     parts[2] = parts[2]._replace(values=np.unwrap(parts[2].values))
     stream = combine_series("pose", parts, held=False)
     stream.values[:, 2] = wrap_angle(stream.values[:, 2])
-    if pose.covariance is None:
+    if not pose.covariance:
         return stream
     sigma = _read_deviations(reader, pose, pose.covariance, stream.t)
     if sigma is not None:

@@ -336,6 +336,8 @@ class Mapping(Schema):
     # pose of the tracked body; a topic alone stands for its `in`
     pose: Annotated[PoseSource, _expand_reference("in")]
     command: dict[str, AValue]  # commands, by the robot's names for them
+    # instead of them, written `command: /topic`: velocities or Ackermann drives of a bag
+    command_topic: str | None = None
     # measured states, by their names
     state: dict[str, AValue] = Field(default_factory=dict)
     wheels: WheelSource | None = None  # wheel speeds, if they were recorded
@@ -347,7 +349,12 @@ class Mapping(Schema):
     @model_validator(mode="before")
     @classmethod
     def _require_commands(cls, data: Any) -> Any:
-        if isinstance(data, dict) and data.get("command", True) in (None, {}):
+        if not isinstance(data, dict):
+            return data
+        command = data.get("command", True)
+        if isinstance(command, str) and command:
+            return {**data, "command": {}, "command_topic": command}
+        if command in (None, {}, "") and "command_topic" not in data:
             raise ValueError(NO_COMMAND_NAMED)
         return data
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.recording.command_guess import Candidate, CommandGuess
+from nics_drl_bridge.recording.guesses import Candidate, CommandGuess
 
 STEP_S = 0.1
 SMOOTHED = 3  # steps over which measured rates are averaged
@@ -38,7 +38,7 @@ def find_doubts(guess: CommandGuess, stamps: Array, poses: Array) -> Iterator[st
         likeness = _compute_likeness(command, t, signal, lags)
         if likeness is None:
             continue
-        name = f"{command.table.name}:{command.column.name}"
+        name = f"{command.column.table.name}:{command.column.name}"
         best = int(np.argmax(likeness))
         lag = lags[best]
         if likeness[best] < LEAST_CORRELATION:
@@ -80,10 +80,10 @@ def _compute_likeness(
     candidate: Candidate, t: Array, signal: Array, lags: Array
 ) -> Array | None:
     """Returns the correlation of a signal (K,) at t (K,) with a command, for each lag (L,) [s]."""
-    table = candidate.table
     column = candidate.column
-    values = table.get_numbers(column.name)
-    if table.t is None or len(table.t) != len(values) or column.low == column.high:
+    table = column.table
+    values = column.numbers
+    if table.t is None or len(table.t) != len(values) or not column.moves:
         return None
     order = np.argsort(table.t, kind="stable")
     stamps = table.t[order]

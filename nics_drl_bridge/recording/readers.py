@@ -1,10 +1,10 @@
-"""Readers of recordings: `FORMATS` recognises a recording and names the function that reads it."""
+"""Opens a drive: a bag, a table, an archive or a folder of tables, by a mapping or by roles."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +12,6 @@ from nics_drl_bridge.arguments import check_path
 from nics_drl_bridge.config import check_no_device, find_config
 from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.recording.bag_file import is_bag, open_bag
-from nics_drl_bridge.recording.bag_reader import load_bag
 from nics_drl_bridge.recording.bag_table import Bag
 from nics_drl_bridge.recording.mapped import read_mapped
 from nics_drl_bridge.recording.mapping import Mapping, load_mapping
@@ -22,6 +21,7 @@ from nics_drl_bridge.recording.recording import (
     is_recording,
     load_recording,
 )
+from nics_drl_bridge.recording.role_mapping import write_mapping
 from nics_drl_bridge.recording.table import Source
 from nics_drl_bridge.recording.table_files import Files
 from nics_drl_bridge.recording.topic_roles import TopicRoles, assign
@@ -35,22 +35,164 @@ FILES = ("cmd.csv", "vrpn.csv")
 WHEELS = ("L_wheel.csv", "R_wheel.csv")
 # Maximum size of each of these; with --map, tables may be larger
 MAX_FILE_BYTES = 64 * 2**20
+AnyMapping = Mapping | TopicRoles | str | Path | None
 
 
-class Format(NamedTuple):
-    """A format of recordings; the reader gets path, robot and roles of topics."""
+def open_drive(
+    source: str | Path,
+    robot: RobotSpec | str | None = None,
+    mapping: AnyMapping = None,
+) -> tuple[RobotSpec, Recording]:
+    """Opens a drive with its robot, by a mapping, its file, or the roles of a bag's topics.
 
-    name: str
-    recognises: Callable[[Path], bool]
-    read: Callable[[Path, RobotSpec | None, TopicRoles], Recording]
-    has_topics: bool = False
+    The robot is the named one, that of the mapping or of the drive, or the default; command ranges
+    that it omits are as recorded. Raises RecordingError or ConfigError if the drive is missing or
+    unreadable, or if it does not fit robot or mapping.
+    """
+    path = Path(source)
+    if isinstance(mapping, (str, Path)):
+        mapping = load_mapping(mapping)
+    is_mapped = isinstance(mapping, Mapping)
+    if robot is None and not is_mapped and path.exists() and is_bag(path):
+        robot = DEFAULT_ROBOT
+    drive, known = _read(path, robot, mapping)
+    if known is None and is_mapped:
+        raise ConfigError(
+            "the mapping names no robot; add `robot:` to it, or give --robot."
+        )
+    spec = _build_with_ranges(known, drive)
+    if isinstance(mapping, Mapping):
+        _check_units(mapping, spec)
+    return spec, reorder_variables(drive, spec)
 
 
-def _holds(path: Path, files: tuple[str, ...]) -> bool:
-    return all((path / name).is_file() for name in files)
+def open_drives(
+    sources: Sequence[Path], robot: str | None = None, mapping: AnyMapping = None
+) -> tuple[RobotSpec, list[Recording]]:
+    """Opens drives of one robot, whose ranges cover all of them."""
+    twice = [path for path in sources if sources.count(path) > 1]
+    if twice:
+        raise RecordingError(f"{twice[0]}: is given twice; give each recording once.")
+    specs = []
+    drives = []
+    for path in sources:
+        spec, drive = open_drive(path, robot, mapping)
+        specs.append(spec)
+        drives.append(drive)
+    first = specs[0]
+    for path, spec in zip(sources, specs, strict=True):
+        has_variables = spec.variable_names == first.variable_names
+        if not has_variables or spec.textbook != first.textbook:
+            raise RecordingError(
+                f"{path}: is a drive of {spec.name!r}, {sources[0]} of {first.name!r}; "
+                "fit only drives of one robot together."
+            )
+    if len(specs) > 1:
+        commands = _merge_ranges([spec.command for spec in specs])
+        states = _merge_ranges([spec.state for spec in specs])
+        first = first.model_copy(update={"command": commands, "state": states})
+    return first, [check(drive, first) for drive in drives]
 
 
-def _load_folder(path: Path, *_: object) -> Recording:
+def read_recording(
+    path: str | Path,
+    spec: RobotSpec | None = None,
+    topics: TopicRoles | None = None,
+    mapping: Mapping | str | Path | None = None,
+) -> Recording:
+    """Reads a drive by a mapping or its file, else without one; a bag then needs its robot.
+
+    Raises RecordingError or ConfigError if the recording is missing or unreadable, or does not fit
+    robot or mapping.
+    """
+    check_path("recording", path)
+    chosen = choose_mapping(topics, mapping)
+    if spec is not None:
+        return open_drive(path, spec, chosen)[1]
+    if isinstance(chosen, (str, Path)):
+        chosen = load_mapping(chosen)
+    return _read(Path(path), None, chosen)[0]
+
+
+def choose_mapping(
+    topics: TopicRoles | None, mapping: Mapping | str | Path | None
+) -> AnyMapping:
+    """Returns the mapping, else the roles of topics. Raises ConfigError if both are given."""
+    if mapping is None:
+        return topics
+    if topics not in (None, TopicRoles()):
+        raise ConfigError(
+            "--topics and --topic do not go with --map; name the topics in the map."
+        )
+    return mapping
+
+
+Robot = RobotSpec | str | dict[str, Any] | None
+
+
+def _read(
+    path: Path, robot: RobotSpec | str | None, mapping: Mapping | TopicRoles | None
+) -> tuple[Recording, Robot]:
+    """Returns a drive, and the robot as far as it is known: built, or only its definition."""
+    has_bag = path.exists() and is_bag(path)
+    if isinstance(mapping, TopicRoles) and mapping != TopicRoles() and not has_bag:
+        raise RecordingError(
+            f"{path}: is no bag; leave out --topics and --topic, which are for bags "
+            "only."
+        )
+    if is_recording(path):
+        drive = load_recording(path)
+        named = mapping.robot if isinstance(mapping, Mapping) else None
+        return drive, robot or named or drive.robot
+    if isinstance(mapping, Mapping):
+        return _read_by_mapping(path, robot, mapping)
+    if has_bag:
+        return _read_by_roles(path, robot, mapping or TopicRoles())
+    if _holds(path, FILES):
+        return _read_folder(path, robot)
+    if path.suffix == ".npz":
+        return load_recording(path), robot  # which names its fault
+    if not path.exists():
+        raise RecordingError(f"{path}: no such file or folder; check the path.")
+    raise RecordingError(
+        f"{path}: is neither a bag nor a folder with {' and '.join(FILES)} nor an .npz "
+        f"file; say what is what in it with --map; `nics inspect {path.name} --map "
+        "my.yaml` begins one."
+    )
+
+
+def _read_by_mapping(
+    path: Path, robot: RobotSpec | str | None, mapping: Mapping
+) -> tuple[Recording, Robot]:
+    definition = mapping.robot
+    if isinstance(robot, str):
+        definition = robot
+    known: Robot = robot or definition
+    if mapping.command_topic is not None and known is not None:
+        known = known if isinstance(known, RobotSpec) else build_robot(known)
+    spec = known if isinstance(known, RobotSpec) else None
+    with open_source(path, mapping) as source:
+        drive = read_mapped(source, mapping, spec)
+    if definition is not None:
+        drive = replace(drive, robot=read_definition(definition))
+    return drive, known
+
+
+def _read_by_roles(
+    path: Path, robot: RobotSpec | str | None, roles: TopicRoles
+) -> tuple[Recording, Robot]:
+    """Reads a bag by the mapping that the roles of its topics stand for."""
+    if robot is None:
+        raise RecordingError(f"{path}: is a bag; say of which robot, with a RobotSpec.")
+    spec = robot if isinstance(robot, RobotSpec) else build_robot(robot)
+    with open_bag(path) as file:
+        bag = Bag(file)
+        mapping = write_mapping(roles, bag, spec)
+        bag.use(mapping)
+        return read_mapped(bag, mapping, spec), spec
+
+
+def _read_folder(path: Path, robot: RobotSpec | str | None) -> tuple[Recording, Robot]:
     """Reads a folder by its shipped mapping; wheels may be missing, and its robot may be any."""
     file = find_config(FOLDER, "recordings")
     mapping = load_mapping(file)
@@ -65,59 +207,16 @@ def _load_folder(path: Path, *_: object) -> Recording:
             )
     try:
         with open_source(path) as source:
-            return replace(read_mapped(source, mapping), variables=())
+            drive = replace(read_mapped(source, mapping), variables=())
     except RecordingError as error:
         raise RecordingError(
             f"{error} The mapping is {file}; choose another with --map."
         ) from None
+    return drive, robot or mapping.robot
 
 
-FORMATS = (
-    Format("a bag", lambda p: p.exists() and is_bag(p), load_bag, has_topics=True),
-    Format(
-        f"a folder with {' and '.join(FILES)}", lambda p: _holds(p, FILES), _load_folder
-    ),
-    Format(
-        "an .npz file",
-        lambda p: p.suffix == ".npz",
-        lambda path, *_: load_recording(path),
-    ),
-)
-"""The first format that recognises a path reads it."""
-
-
-def read_recording(
-    path: str | Path,
-    spec: RobotSpec | None = None,
-    topics: TopicRoles | None = None,
-    mapping: Mapping | str | Path | None = None,
-) -> Recording:
-    """Reads a recording by a mapping or its file, else in one of `FORMATS`; a bag needs its robot.
-
-    Raises RecordingError or ConfigError if the recording is missing or unreadable, or does not fit
-    robot or mapping.
-    """
-    check_path("recording", path)
-    path = Path(path)
-    topics = topics or TopicRoles()
-    if mapping is not None and not is_recording(path):
-        return _read_by_mapping(path, spec, topics, mapping)
-    recognised = [form for form in FORMATS if form.recognises(path)]
-    file_format = next(iter(recognised), None)
-    if topics != TopicRoles() and not (file_format and file_format.has_topics):
-        raise RecordingError(
-            f"{path}: is no bag; leave out --topics and --topic, which are for bags "
-            "only."
-        )
-    if file_format is not None:
-        return file_format.read(path, spec, topics)
-    if not path.exists():
-        raise RecordingError(f"{path}: no such file or folder; check the path.")
-    names = " nor ".join(form.name for form in FORMATS)
-    raise RecordingError(
-        f"{path}: is neither {names}; say what is what in it with --map; `nics inspect "
-        f"{path.name} --map my.yaml` begins one."
-    )
+def _holds(path: Path, files: tuple[str, ...]) -> bool:
+    return all((path / name).is_file() for name in files)
 
 
 def explain_no_mapping(path: Path) -> str:
@@ -137,27 +236,6 @@ def explain_no_mapping(path: Path) -> str:
         topics[role] for role in ("cmd_vel", "pose", "odom") if role in topics
     )
     return f"has topics of known names and types ({used})"
-
-
-def _read_by_mapping(
-    path: Path,
-    spec: RobotSpec | None,
-    topics: TopicRoles,
-    mapping: Mapping | str | Path,
-) -> Recording:
-    if topics != TopicRoles():
-        raise ConfigError(
-            "--topics and --topic do not go with --map; name the topics in the map."
-        )
-    mapping = _load_if_path(mapping)
-    with open_source(path, mapping) as source:
-        recording = read_mapped(source, mapping)
-    if mapping.robot is not None:
-        recording = replace(recording, robot=read_definition(mapping.robot))
-    if spec is None:
-        return recording
-    _check_units(mapping, spec)
-    return reorder_variables(recording, spec)
 
 
 def _check_units(mapping: Mapping, spec: RobotSpec) -> None:
@@ -180,70 +258,6 @@ def _check_units(mapping: Mapping, spec: RobotSpec) -> None:
                 )
 
 
-def _load_if_path(mapping: Mapping | str | Path) -> Mapping:
-    return mapping if isinstance(mapping, Mapping) else load_mapping(mapping)
-
-
-def read_robot_and_drive(
-    path: Path,
-    robot: str | None,
-    topics: TopicRoles,
-    mapping: Mapping | str | Path | None,
-) -> tuple[RobotSpec, Recording]:
-    """Reads a drive with its robot: the named one, the mapping's, the drive's, or the default."""
-    if mapping is not None:
-        mapping = _load_if_path(mapping)
-        if robot is not None:
-            mapping = mapping.model_copy(update={"robot": robot})
-        drive = read_recording(path, None, topics, mapping)
-        spec = build_mapped_robot(mapping, drive)
-        _check_units(mapping, spec)
-        return spec, reorder_variables(drive, spec)
-    if not is_recording(path):
-        definition: str | dict[str, Any] | None = robot
-        # It may be a folder that is read by its shipped mapping.
-        if not robot and _holds(path, FILES) and not is_bag(path):
-            definition = load_mapping(find_config(FOLDER, "recordings")).robot
-        spec = build_robot(definition or DEFAULT_ROBOT)
-        return spec, read_recording(path, spec, topics)
-    drive = read_recording(path, None, topics)
-    spec = _build_with_ranges(
-        robot or drive.robot or DEFAULT_ROBOT, drive, drive.variables
-    )
-    return spec, drive if drive.robot is None else reorder_variables(drive, spec)
-
-
-def read_robot_and_drives(
-    paths: Sequence[Path],
-    robot: str | None,
-    topics: TopicRoles,
-    mapping: Mapping | str | Path | None,
-) -> tuple[RobotSpec, list[Recording]]:
-    """Reads drives of one robot, whose ranges cover all of them."""
-    twice = [path for path in paths if paths.count(path) > 1]
-    if twice:
-        raise RecordingError(f"{twice[0]}: is given twice; give each recording once.")
-    specs = []
-    drives = []
-    for path in paths:
-        spec, drive = read_robot_and_drive(path, robot, topics, mapping)
-        specs.append(spec)
-        drives.append(drive)
-    first = specs[0]
-    for path, spec in zip(paths, specs, strict=True):
-        has_variables = spec.variable_names == first.variable_names
-        if not has_variables or spec.textbook != first.textbook:
-            raise RecordingError(
-                f"{path}: is a drive of {spec.name!r}, {paths[0]} of {first.name!r}; "
-                "fit only drives of one robot together."
-            )
-    if len(specs) > 1:
-        commands = _merge_ranges([spec.command for spec in specs])
-        states = _merge_ranges([spec.state for spec in specs])
-        first = first.model_copy(update={"command": commands, "state": states})
-    return first, [check(drive, first) for drive in drives]
-
-
 def _merge_ranges(drives: Sequence[Sequence[Any]]) -> tuple[Any, ...]:
     """Returns variables whose ranges cover those of all drives."""
     merged = []
@@ -254,28 +268,15 @@ def _merge_ranges(drives: Sequence[Sequence[Any]]) -> tuple[Any, ...]:
     return tuple(merged)
 
 
-def build_mapped_robot(
-    mapping: Mapping | str | Path, recording: Recording
-) -> RobotSpec:
-    """Returns the robot of a mapping; command ranges that it omits are as recorded."""
-    mapping = _load_if_path(mapping)
-    robot = mapping.robot or recording.robot
-    if robot is None:
-        raise ConfigError(
-            "the mapping names no robot; add `robot:` to it, or give --robot."
-        )
-    variables = recording.variables or tuple(mapping.command)
-    return _build_with_ranges(robot, recording, variables)
-
-
-def _build_with_ranges(
-    robot: str | dict[str, Any], recording: Recording, variables: tuple[str, ...]
-) -> RobotSpec:
-    """Returns a robot; command ranges that it omits are as recorded."""
+def _build_with_ranges(robot: Robot, recording: Recording) -> RobotSpec:
+    """Returns a robot; command ranges that its definition omits are as recorded."""
+    if isinstance(robot, RobotSpec):
+        return robot
     low, high = (f(recording.command.values, axis=0).tolist() for f in (np.min, np.max))
-    names = variables[-len(low) :]
+    names = recording.variables[-len(low) :]
     return build_robot(
-        robot, dict(zip(names, zip(low, high, strict=True), strict=False))
+        robot or DEFAULT_ROBOT,
+        dict(zip(names, zip(low, high, strict=True), strict=False)),
     )
 
 
@@ -298,8 +299,8 @@ def reorder_variables(recording: Recording, spec: RobotSpec) -> Recording:
         if set(recorded) != set(names):
             raise ConfigError(
                 f"{recording.source}: the {part} is {', '.join(recorded)}, that of the "
-                f"robot {spec.name!r} is {', '.join(names)}; use the robot's names in "
-                "the mapping."
+                f"robot {spec.name!r} is {', '.join(names)}; choose the robot that "
+                "drove, or use its names in the mapping."
             )
         order = [recorded.index(name) for name in names]
         made[part] = replace(stream, values=stream.values[:, order])
@@ -315,4 +316,7 @@ def open_source(path: Path, mapping: Mapping | None = None) -> Iterator[Source]:
         yield Files(path)
         return
     with open_bag(path) as file:
-        yield Bag(file, mapping)
+        bag = Bag(file)
+        if mapping is not None:
+            bag.use(mapping)
+        yield bag

@@ -32,7 +32,7 @@ MAX_LATE = 0.01  # fraction of messages that may arrive after one with a later s
 # fraction that may lack a stamp at the start, because a simulation has no time yet
 MAX_UNSTAMPED = 0.05
 # Streams from one computer, and so on one clock
-ROBOT_STREAMS = ("command", "state", "wheels", "imu")
+ROBOT_STREAMS = ("command", "command_topic", "state", "wheels", "imu")
 
 SPLIT = (
     ("s", "ns"),

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -98,17 +98,58 @@ def split_unit(name: str) -> tuple[list[str], str | None]:
     return words, None
 
 
-class Survey(NamedTuple):
-    """A column: its name and its range."""
+@dataclass(frozen=True, eq=False)
+class Field:
+    """A column of a table: its name, and the range of its numbers."""
 
+    table: "TableSurvey" = field(repr=False)
     name: str  # as a mapping refers to it within its table
     low: float  # NaN for text
     high: float
 
     @property
+    def is_number(self) -> bool:
+        """True if it holds numbers."""
+        return bool(np.isfinite(self.low))
+
+    @property
+    def moves(self) -> bool:
+        """True if its numbers differ."""
+        return self.low < self.high
+
+    @property
     def is_place_on_earth(self) -> bool:
         """True if it looks like a latitude or longitude."""
         return is_place_on_earth(self.name, self.low, self.high)
+
+    @property
+    def words(self) -> list[str]:
+        """Words of its name without the unit; for `data`, those of the table's name."""
+        words = split_unit(self.name)[0]
+        if words == ["data"]:
+            return split_words(self.table.name)
+        return words
+
+    @property
+    def unit(self) -> str | None:
+        """Unit that its name states."""
+        return split_unit(self.name)[1]
+
+    @property
+    def values(self) -> Column:
+        """Values (T,)."""
+        return self.table.data[self.name]
+
+    @property
+    def numbers(self) -> Array:
+        """Values (T,) as numbers."""
+        return np.asarray(self.values, dtype=np.float64)
+
+    @property
+    def reference(self) -> str:
+        """How a mapping refers to it; in a single table, its name suffices."""
+        table = "" if self.table.is_single else f"{self.table.name}:"
+        return write_reference(f"{table}{self.name}")
 
 
 @dataclass
@@ -117,13 +158,22 @@ class TableSurvey:
 
     name: str
     rows: int
-    columns: list[Survey]
+    columns: list[Field] = field(default_factory=list)
     stamps: str | None = None  # column of the stamps; None if they come with the rows
     unit: str | None = None  # unit of the stamps, unless seconds
     findings: list[str] = field(default_factory=list)
     t: Array | None = None  # (T,) [s]
     data: dict[str, Column] = field(default_factory=dict)
     kind: str = ""  # message type, of a topic
+    is_single: bool = True  # False if there are other tables
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """The survey as plain data."""
+        facts = {name: getattr(self, name) for name in ("name", "rows", "stamps")}
+        facts |= {"unit": self.unit, "findings": self.findings, "kind": self.kind}
+        columns = [(c.name, c.low, c.high) for c in self.columns]
+        return {**facts, "columns": columns, "regularity": self.regularity}
 
     @property
     def time(self) -> str | None:
@@ -139,9 +189,9 @@ class TableSurvey:
         return text
 
     @property
-    def numbers(self) -> list[Survey]:
+    def numbers(self) -> list[Field]:
         """The columns that hold numbers."""
-        return [column for column in self.columns if np.isfinite(column.low)]
+        return [column for column in self.columns if column.is_number]
 
     @property
     def stamp_columns(self) -> list[str]:
@@ -160,23 +210,6 @@ class TableSurvey:
             return []
         return list(_describe_regularity(self.t, _select_numbers(self.data)))
 
-    def get_numbers(self, column: str) -> Array:
-        """Returns the values (T,) of a column of numbers."""
-        return np.asarray(self.data[column], dtype=np.float64)
-
-    def list_words(self, column: str) -> list[str]:
-        """Returns the words of a column's name; for `data`, the words of the table's name."""
-        words = split_unit(column)[0]
-        if words == ["data"]:
-            return split_words(self.name)
-        return words
-
-    def refer_to(self, column: str, is_single: bool) -> str:
-        """Returns how a mapping refers to a column; in a single table, its name suffices."""
-        if is_single:
-            return write_reference(column)
-        return write_reference(f"{self.name}:{column}")
-
 
 def inspect_tables(source: Source) -> list[TableSurvey]:
     """Surveys every table of a source. Raises RecordingError if none is readable."""
@@ -186,11 +219,13 @@ def inspect_tables(source: Source) -> list[TableSurvey]:
         try:
             tables.append(_inspect_table(name, source.get_table(name)))
         except RecordingError as error:  # one unreadable table leaves the others
-            tables.append(TableSurvey(name, 0, [], findings=[str(error)]))
+            tables.append(TableSurvey(name, 0, findings=[str(error)]))
             first_error = first_error or error
     if first_error is not None and not any(table.columns for table in tables):
         raise first_error
     _correct_units(tables)
+    for survey in tables:
+        survey.is_single = len(tables) == 1
     return tables
 
 
@@ -213,23 +248,20 @@ def _correct_units(tables: Sequence[TableSurvey]) -> None:
 
 
 def _inspect_table(name: str, table: Table) -> TableSurvey:
-    columns = []
-    data = {}
+    survey = TableSurvey(name, 0, findings=list(table.notes), kind=table.kind)
     for k, title in enumerate(table.names[:MOST_COLUMNS]):
         column_name = title
         if not title or table.names.count(title) > 1:
             column_name = str(k)
         column = table.column(column_name)
-        data[column_name] = column
-        columns.append(Survey(column_name, *_find_range(column)))
-    rows = max((len(column) for column in data.values()), default=0)
-    survey = TableSurvey(name, rows, columns, findings=list(table.notes), data=data)
-    survey.kind = table.kind
+        survey.data[column_name] = column
+        survey.columns.append(Field(survey, column_name, *_find_range(column)))
+    survey.rows = max((len(column) for column in survey.data.values()), default=0)
     stream = table.stamps("")
     if stream is not None:
         survey.t = stream.t
         return survey
-    survey.stamps, raw = _guess_stamps(data)
+    survey.stamps, raw = _guess_stamps(survey.data)
     if survey.stamps is not None and raw is not None:
         raw = raw[np.isfinite(raw)]
         survey.unit = guess_time_unit(raw) or _guess_unit_by_name(survey.stamps, raw)

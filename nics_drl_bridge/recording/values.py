@@ -29,7 +29,7 @@ from nics_drl_bridge.recording.table import (
     read_numbers,
 )
 
-ZONE = re.compile(r"(Z|[+-]\d\d:?\d\d)$")
+ZONE = re.compile(r"(?:Z|([+-])(\d\d):?(\d\d))$")  # of a date: its offset from UTC
 CLOCK = re.compile(r"\d\d:\d\d:\d\d")  # a time of day
 AT_ONCE = 0.25  # rows closer than this fraction of the mean step come at once
 MOST_LISTED = 20  # maximum number of tables listed in an error
@@ -356,7 +356,10 @@ def _match_table(wanted: str, names: Sequence[str]) -> str | None:
 
 
 def parse_dates(column: Column) -> Array | None:
-    """Returns seconds since 1970 of dates like 2024-05-01 12:00:00.5; None for other text."""
+    """Returns seconds since 1970 of dates like 2024-05-01 12:00:00.5; None for other text.
+
+    Dates with an offset such as +02:00 count as what they are in UTC, others as UTC.
+    """
     text = [ZONE.sub("", str(date)).replace("/", "-") for date in column]
     if text and CLOCK.match(text[0]):
         text = [f"1970-01-01T{time}" for time in text]
@@ -364,8 +367,18 @@ def parse_dates(column: Column) -> Array | None:
         ns = np.array(text, dtype="datetime64[ns]").astype(np.int64)
     except ValueError:
         return None
+    ns -= np.array([_read_offset(str(date)) for date in column]) * NS_PER_S
     # This is exact to a quarter of a microsecond.
     return stamping.join_stamps(ns // NS_PER_S, ns % NS_PER_S)
+
+
+def _read_offset(date: str) -> int:
+    """Returns the offset from UTC that a date states [s]."""
+    zone = ZONE.search(date)
+    if zone is None or zone[1] is None:
+        return 0
+    offset = 3600 * int(zone[2]) + 60 * int(zone[3])
+    return -offset if zone[1] == "-" else offset
 
 
 def _derive_rate(counter: Series, held: bool) -> Series:

@@ -77,7 +77,7 @@ def write_bag(
     spec: RobotSpec,
     storage: Storage = defaults.BAG_STORAGE,
 ) -> None:
-    """Writes a recording as a bag that `load_bag` reads back; for errors see `open_bag_sink`."""
+    """Writes a recording as a bag that `open_drive` reads back; for errors see `open_bag_sink`."""
     # Commands become `/cmd_vel`, state or wheels `/joint_states`, the IMU `/imu`. The pose becomes
     # `/odom`, or `/pose` if it has its own clock or odometry was recorded as well.
     with open_bag_sink(path, storage) as sink:

@@ -6,9 +6,8 @@ import pytest
 from command_line import nics
 
 from nics_drl_bridge.generator import load_model
-from nics_drl_bridge.recording.readers import read_robot_and_drive
+from nics_drl_bridge.recording.readers import open_drive
 from nics_drl_bridge.recording.recording import load_recording
-from nics_drl_bridge.recording.topic_roles import TopicRoles
 from nics_drl_bridge.robot.spec import load_robot
 
 NARROW = """
@@ -42,7 +41,7 @@ def test_a_robots_file_becomes_a_model_and_a_recording_by_a_textbook_drive(tmp_p
     assert load_recording(tmp_path / "drive.npz").command.t[-1] == pytest.approx(
         20.0, abs=0.1
     )
-    spec, _ = read_robot_and_drive(tmp_path / "drive.npz", None, TopicRoles(), None)
+    spec, _ = open_drive(tmp_path / "drive.npz", None, None)
     assert spec == load_robot(tmp_path / "mine.yaml")  # a recording tells its robot
     words = "drive --robot mine.yaml --out again --duration 10 --json"
     told = json.loads(nics(words, cwd=tmp_path).stdout)

@@ -11,9 +11,8 @@ from nics_drl_bridge.identify.conclusion import conclude
 from nics_drl_bridge.identify.identify import Identified, identify
 from nics_drl_bridge.recording.guess import propose_mapping
 from nics_drl_bridge.recording.mapping import Mapping
-from nics_drl_bridge.recording.readers import open_source, read_robot_and_drive
+from nics_drl_bridge.recording.readers import open_drive, open_source
 from nics_drl_bridge.recording.survey import inspect_tables
-from nics_drl_bridge.recording.topic_roles import TopicRoles
 
 
 @cache
@@ -22,7 +21,7 @@ def identify_by_draft(path: Path) -> Identified:
     with open_source(path) as source:
         text = propose_mapping(inspect_tables(source)).text
     mapping = Mapping.model_validate(parse_yaml(text, "draft"))
-    spec, recording = read_robot_and_drive(path, None, TopicRoles(), mapping)
+    spec, recording = open_drive(path, None, mapping)
     return identify(recording, spec, order="auto", alpha="auto")
 
 

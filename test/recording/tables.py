@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from nics_drl_bridge.config import parse_yaml
 from nics_drl_bridge.recording.mapping import Mapping
 from nics_drl_bridge.recording.readers import read_recording
 from nics_drl_bridge.recording.recording import Recording
@@ -45,7 +46,12 @@ def write(
     return path
 
 
-def read(path: Path, **changes: Any) -> Recording:
-    """Reads a recording by `MAP` with other keys; None removes one."""
-    given = {key: value for key, value in (MAP | changes).items() if value is not None}
-    return read_recording(path, mapping=Mapping.model_validate(given))
+def read(path: Path, changes: str = "") -> Recording:
+    """Reads a recording by `MAP` with other keys, in YAML; null removes one."""
+    return read_recording(path, mapping=change_map(changes))
+
+
+def change_map(changes: str) -> Mapping:
+    """Returns `MAP` with other keys, in YAML; null removes one."""
+    given = MAP | (parse_yaml(changes, "changes") if changes else {})
+    return Mapping.model_validate({k: v for k, v in given.items() if v is not None})

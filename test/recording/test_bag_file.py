@@ -102,13 +102,7 @@ def test_a_compressed_file_without_its_folder_is_refused(tmp_path, storage):
     assert "unpack it with `zstd -d`" in refused(storage_file(bag))
 
 
-@pytest.mark.parametrize("version", [8, 9])
-def test_the_metadata_of_each_version_is_read(tmp_path, version):
-    bag = bags.write(tmp_path / "bag", bags.drive(), version=version)
-    assert len(read_recording(bag, CAR).command.t) == len(bags.commands())
-
-
-@pytest.mark.parametrize("version", [4, 5, 6, 7])
+@pytest.mark.parametrize("version", [4, 6, 7, 8])
 def test_the_metadata_of_older_distributions_is_read(bag, version):
     with metadata(bag) as told:
         told["version"] = version
@@ -116,16 +110,11 @@ def test_the_metadata_of_older_distributions_is_read(bag, version):
             if version < since:
                 told.pop(key, None)
         for topic in told["topics_with_message_count"]:
-            topic["topic_metadata"]["offered_qos_profiles"] = ""
+            if version < 8:
+                topic["topic_metadata"]["offered_qos_profiles"] = ""
             if version < 7:
                 topic["topic_metadata"].pop("type_description_hash")
     assert len(read_recording(bag, CAR).command.t) == len(bags.commands())
-
-
-def test_metadata_of_the_future_are_refused(bag):
-    with metadata(bag) as told:
-        told["version"] = 99
-    assert "99" in refused(bag)
 
 
 def test_a_bag_in_several_files_is_read_whole(tmp_path):
@@ -144,7 +133,7 @@ def test_a_bag_in_several_files_is_read_whole(tmp_path):
     assert "holds 2 bag files and no metadata.yaml" in refused(bag)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.7, 0.99])
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.99])
 @pytest.mark.parametrize("alone", [False, True])
 def test_a_cut_file_is_refused(bag, share, alone):
     file = storage_file(bag)
@@ -211,12 +200,6 @@ def test_a_path_that_sqlite_can_not_open_is_no_damage(pristine, tmp_path, sign):
         assert "rename the folder" in refused(bag)
 
 
-def test_a_summary_that_contradicts_itself_is_refused(bag):
-    with metadata(bag) as told:
-        told["message_count"] += 1
-    assert "add up to" in refused(bag)
-
-
 @pytest.mark.parametrize("text", ["", "a: [", "just: this\n", "\x00"])
 def test_damaged_metadata_is_refused(bag, text):
     (bag / "metadata.yaml").write_text(text, encoding="utf-8")
@@ -243,16 +226,38 @@ def test_a_damaged_bag_of_ros_1_comes_with_the_way_to_mend_it(tmp_path):
     assert "rosbag reindex" in refused(tmp_path / "drive.bag")
 
 
-def renamed(told, k, name):
+def rename(told, k, name):
     told["topics_with_message_count"][k]["topic_metadata"]["name"] = name
 
 
-@pytest.mark.parametrize("name", [None, "", 7])
-@pytest.mark.parametrize("k", [0, 1])
-def test_a_summary_that_lost_the_name_of_a_topic_is_refused(bag, k, name):
+def count(told, k, more):
+    told["topics_with_message_count"][k]["message_count"] += more
+
+
+def add_total(told):
+    told["message_count"] += 1
+
+
+def move_messages(told):
+    count(told, 0, -3)
+    count(told, 1, 3)
+
+
+@pytest.mark.parametrize(
+    ("change", "fault"),
+    [
+        (lambda told: told.update(version=99), "99"),
+        (add_total, "add up to"),
+        (move_messages, "messages in its files"),
+        (lambda told: rename(told, 0, None), "lost the name of a topic"),
+        (lambda told: rename(told, 1, ""), "lost the name of a topic"),
+        (lambda told: rename(told, 1, 7), "lost the name of a topic"),
+    ],
+)
+def test_a_summary_that_contradicts_itself_or_the_files_is_refused(bag, change, fault):
     with metadata(bag) as told:
-        renamed(told, k, name)
-    assert "lost the name of a topic" in refused(bag)
+        change(told)
+    assert fault in refused(bag)
 
 
 @pytest.mark.parametrize("storage", STORAGES)
@@ -266,16 +271,8 @@ def test_a_topic_that_only_the_summary_or_only_the_file_has_is_refused(
         names = [
             one["topic_metadata"]["name"] for one in told["topics_with_message_count"]
         ]
-        renamed(told, names.index("/extra"), "/other")
+        rename(told, names.index("/extra"), "/other")
     assert "topic '/extra' of type" in refused(bag)
-
-
-def test_messages_that_the_summary_gives_to_another_topic_are_refused(bag):
-    with metadata(bag) as told:
-        one, other = told["topics_with_message_count"][:2]
-        one["message_count"] -= 3
-        other["message_count"] += 3
-    assert "messages in its files" in refused(bag)
 
 
 BOMB = "k0: &k0 {x: 1}\n" + "".join(

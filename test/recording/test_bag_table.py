@@ -24,10 +24,10 @@ FOREIGN = "my_car_msgs/msg/Drive"
 DEFINITION = "std_msgs/Header header\nfloat32[3] motor\nbool armed\nstring mode\n"
 
 
-def read(path, **given):
-    return read_recording(
-        path, mapping=Mapping.model_validate({"pose": "/pose"} | given)
-    )
+def read(path, text):
+    """Reads a bag by a mapping in YAML, with the pose of /pose."""
+    given = {"pose": "/pose"} | parse_yaml(text, "mapping")
+    return read_recording(path, mapping=Mapping.model_validate(given))
 
 
 def ros_1_bag(path: Path) -> Path:
@@ -75,65 +75,52 @@ def foreign_bag(path: Path) -> Path:
 
 
 def test_a_bag_of_ros_1_is_read_by_any_number_in_it(tmp_path):
-    found = read(
-        ros_1_bag(tmp_path / "drive.bag"), command={"throttle": "/throttle:data"}
-    )
+    path = ros_1_bag(tmp_path / "drive.bag")
+    found = read(path, "command: {throttle: '/throttle:data'}")
     assert np.allclose(found.command.values[:, 0], 0.5 + np.array(bags.times())[::5])
     assert np.allclose(found.pose.values[-1], bags.place_at(bags.times()[-1]))
     # Poses by header, the rest by arrival: of one clock, as the headers are 3 ms older only.
     assert found.command.t[0] - found.pose.t[0] == pytest.approx(0.003)
     assert found.command.clock == found.pose.clock
-
-
-def test_a_bag_of_ros_1_is_read_by_roles_of_topics_too(tmp_path):
     with pytest.raises(RecordingError, match="no topic is known to hold the commands"):
-        read_recording(ros_1_bag(tmp_path / "drive.bag"), load_robot("ackermann"))
-    with open_bag(tmp_path / "drive.bag") as bag:
+        read_recording(path, load_robot("ackermann"))
+    with open_bag(path) as bag:
         (_, first), *_ = bag.read_serialized("/pose")
     x = bags.STORE.deserialize_cdr(first, bags.kinds.POSE).pose.position.x
     assert x == pytest.approx(0.0)
 
 
 def test_types_that_only_the_bag_knows_are_read_by_field_index_and_flag(tmp_path):
-    value = {
-        "from": "/drive:motor[2]",
-        "when": {"/drive:armed": True, "/drive:mode": "AUTO"},
-    }
-    found = read(
-        foreign_bag(tmp_path / "bag"), command={"a": value, "b": "drive:motor.1"}
-    )
+    path = foreign_bag(tmp_path / "bag")
+    when = "{'/drive:armed': true, '/drive:mode': AUTO}"
+    value = f"{{from: '/drive:motor[2]', when: {when}}}"
+    found = read(path, f"command: {{a: {value}, b: 'drive:motor.1'}}")
     t = np.array(bags.times())
     assert np.allclose(found.command.values[:, 0], np.where(t > 1.0, 2.0 * t, 0.0))
     assert np.allclose(found.command.values[:, 1], t)
-
-
-@pytest.mark.parametrize(
-    ("command", "sentence"),
-    [
-        ("/drive:motor", "'motor' is no single number; say which, as 'motor[0]'"),
-        ("/drive:moter[1]", "has no 'moter[1]'; did you mean 'motor[1]'?"),
-        ("/driv:motor[1]", "has no '/driv'; did you mean '/drive'?"),
-    ],
-)
-def test_a_wrong_field_or_topic_is_named(tmp_path, command, sentence):
-    with pytest.raises(RecordingError) as refused:
-        read(foreign_bag(tmp_path / "bag"), command={"a": command})
-    assert sentence in str(refused.value)
+    for command, sentence in (
+        ("/drive:motor", "say which, as 'motor[0]'"),
+        ("/drive:moter[1]", "did you mean 'motor[1]'?"),
+        ("/driv:motor[1]", "did you mean '/drive'?"),
+    ):
+        with pytest.raises(RecordingError) as refused:
+            read(path, f"command: {{a: '{command}'}}")
+        assert sentence in str(refused.value)
 
 
 def test_joints_are_found_by_name_whatever_their_order_and_where_one_is_missing(
     tmp_path,
 ):
     def joints(k, t):
-        names = [["left", "right"], ["right", "left"], ["left"]][k % 3]
+        names = [["left"], ["right", "left"], ["left", "right"]][k % 3]
         velocity = [t if name == "left" else -t for name in names]
         return bags.joints(t, names, [0.0] * len(names), velocity)
 
     rows = [(t, joints(k, t)) for k, t in enumerate(bags.times())]
     bag = bags.write(tmp_path / "bag", {"/pose": bags.poses(), "/joints": rows})
-    wheels = {"left": "/joints:velocity[left]", "right": "/joints:velocity[right]"}
-    found = read(bag, command=wheels)
-    t = np.array(bags.times())
+    wheels = "left: '/joints:velocity[left]', right: '/joints:velocity[right]'"
+    found = read(bag, f"command: {{{wheels}}}")
+    t = np.array(bags.times())[1:]
     held = np.where(np.arange(len(t)) % 3 == 2, t - bags.STEP_S, t)
     assert np.allclose(found.command.values, np.stack([t, -held], axis=1))
     assert (
@@ -149,67 +136,53 @@ def test_transforms_are_poses_between_two_frames(tmp_path):
 
     rows = [(t, both(t)) for t in bags.times()]
     bag = bags.write(tmp_path / "bag", {"/tf": rows, "/cmd_vel": bags.commands()})
-    command = {"v": "/cmd_vel:linear.x"}
-    found = read(bag, command=command, pose={"in": "/tf", "child_frame": "car"})
+    mapping = "command: {v: '/cmd_vel:linear.x'}\npose: %s"
+    found = read(bag, mapping % "{in: /tf, child_frame: car}")
     assert np.allclose(found.pose.values[-1], bags.place_at(bags.times()[-1]))
     with pytest.raises(RecordingError, match="holds several transforms"):
-        read(bag, command=command, pose="/tf")
+        read(bag, mapping % "/tf")
 
 
-def test_all_times_may_be_those_of_arrival(tmp_path):
-    bag = bags.write(
-        tmp_path / "bag", {"/pose": bags.poses(offset=5.0), "/v": bags.commands()}
-    )
-    command = {"v": "/v:linear.x"}
-    clocks = read(bag, command=command)
-    assert (
-        clocks.pose.clock != clocks.command.clock
-    )  # the headers are of a foreign clock
-    arrived = read(bag, command=command, time="arrival")
-    assert arrived.pose.clock == arrived.command.clock
+COMMAND = "command: {v: '/v:linear.x'}\n"
+MOCAP = "pose: {in: /pose, clock: mocap}"
+BY_HEADER = "pose: {in: /pose, time: header}"
 
 
-@pytest.mark.parametrize("offset", [0.0, 5.0])
-def test_a_clock_that_the_mapping_names_decides(tmp_path, offset):
-    bag = bags.write(
-        tmp_path / "bag", {"/pose": bags.poses(offset=offset), "/v": bags.commands()}
-    )
-    command = {"v": "/v:linear.x"}
-    own = read(bag, command=command, pose={"in": "/pose", "clock": "mocap"})
-    assert (own.pose.clock, own.command.clock) == ("mocap", "robot")
-    same = read(bag, command=command, pose={"in": "/pose", "clock": "robot"})
-    assert (same.pose.clock, same.command.clock) == ("robot", "robot")
-
-
-@pytest.mark.parametrize("offset", [0.0, 5.0])
-def test_a_pose_by_header_goes_with_commands_that_have_none(tmp_path, offset):
-    bag = bags.write(
-        tmp_path / "bag", {"/pose": bags.poses(offset=offset), "/v": bags.commands()}
-    )
-    given = {"command": {"v": "/v:linear.x"}, "pose": {"in": "/pose", "time": "header"}}
-    found = read(bag, **given)
-    assert (found.pose.clock == found.command.clock) == (offset == 0.0)
-    same = read(bag, **given, clock="robot")
-    assert same.pose.clock == same.command.clock == "robot"
+@pytest.mark.parametrize(
+    ("offset", "mapping", "clocks"),
+    [
+        (5.0, "", ("header", "robot")),  # the headers are of a foreign clock
+        (5.0, "time: arrival", ("robot", "robot")),
+        (0.0, MOCAP, ("mocap", "robot")),
+        (5.0, MOCAP, ("mocap", "robot")),
+        (5.0, MOCAP.replace("mocap", "robot"), ("robot", "robot")),
+        (0.0, BY_HEADER, ("robot", "robot")),
+        (5.0, BY_HEADER, ("header", "robot")),
+        (5.0, f"{BY_HEADER}\nclock: robot", ("robot", "robot")),
+    ],
+)
+def test_pose_and_commands_are_on_the_clock_that_mapping_or_headers_say(
+    tmp_path, offset, mapping, clocks
+):
+    topics = {"/pose": bags.poses(offset=offset), "/v": bags.commands()}
+    bag = bags.write(tmp_path / "bag", topics)
+    found = read(bag, COMMAND + mapping)
+    assert (found.pose.clock, found.command.clock) == clocks
     assert np.allclose(np.diff(found.pose.t), bags.STEP_S)
     if offset == 0.0:
         assert found.command.t[0] - found.pose.t[0] == pytest.approx(0.002)
-    with pytest.raises(
-        RecordingError, match="topic '/v': its messages have no header stamps"
-    ):
-        read(bag, **given, time="header")
+    if mapping == BY_HEADER:
+        with pytest.raises(RecordingError, match="have no header stamps"):
+            read(bag, f"{COMMAND}{mapping}\ntime: header")
 
 
 def test_the_covariance_of_a_message_gives_deviations(tmp_path):
     rows = [(t, bags.pose_with_covariance(t, *bags.place_at(t))) for t in bags.times()]
     topics = {"/pose": rows, "/v": bags.commands()}
-    command = {"v": "/v:linear.x"}
-    assert (
-        read(bags.write(tmp_path / "none", topics), command=command).pose.sigma is None
-    )
+    assert read(bags.write(tmp_path / "none", topics), COMMAND).pose.sigma is None
     for _, message in rows:
         message.pose.covariance[[0, 7, 35]] = 0.01, 0.04, 0.09
-    found = read(bags.write(tmp_path / "some", topics), command=command)
+    found = read(bags.write(tmp_path / "some", topics), COMMAND)
     assert np.allclose(found.pose.sigma, [0.1, 0.2, 0.3])
 
 
@@ -226,44 +199,28 @@ def test_a_bag_is_surveyed_to_a_first_mapping(tmp_path):
 
 
 def test_a_bag_whose_headers_were_set_back_is_stamped_by_arrival_and_says_so(tmp_path):
-    store = bags.STORE
-    with Writer(
-        tmp_path / "set", version=9, storage_plugin=StoragePlugin.MCAP
-    ) as writer:
-        poses = writer.add_connection("/pose", bags.kinds.POSE, typestore=store)
-        speed = writer.add_connection("/speed", "std_msgs/msg/Float32", typestore=store)
-        for t in bags.times():
-            stamp = t - (30.0 if t > 1.0 else 0.0)
-            pose = bags.pose_stamped(stamp, *bags.place_at(t))
-            writer.write(poses, bags.ns(t), store.serialize_cdr(pose, bags.kinds.POSE))
-            value = store.types["std_msgs/msg/Float32"](t)
-            raw = store.serialize_cdr(value, "std_msgs/msg/Float32")
-            writer.write(speed, bags.ns(t), raw)
-    found = read(tmp_path / "set", command={"v": "/speed:data"})
+    poses = [
+        (t, bags.pose_stamped(t - 30.0 * (t > 1.0), *bags.place_at(t)))
+        for t in bags.times()
+    ]
+    bag = bags.write(tmp_path / "set", {"/pose": poses, "/v": bags.commands()})
+    found = read(bag, COMMAND)
     assert np.allclose(np.diff(found.pose.t), np.diff(bags.times()))
     assert any("stamped by their arrival" in note for note in found.repairs)
     with pytest.raises(RecordingError, match="run backwards"):
-        read(tmp_path / "set", command={"v": "/speed:data"}, time="header")
+        read(bag, f"{COMMAND}time: header")
 
 
 @pytest.mark.parametrize("rate", [0.2, 5.0])
 def test_a_bag_of_simulated_time_at_another_rate_is_stamped_by_its_headers_and_says_so(
     tmp_path, rate
 ):
-    store = bags.STORE
-    with Writer(
-        tmp_path / "set", version=9, storage_plugin=StoragePlugin.MCAP
-    ) as writer:
-        topics = ("/pose", "/target")
-        poses = [
-            writer.add_connection(t, bags.kinds.POSE, typestore=store) for t in topics
-        ]
-        for t in bags.times():
-            message = bags.pose_stamped(100.0 + t, *bags.place_at(t))
-            raw = store.serialize_cdr(message, bags.kinds.POSE)
-            for topic in poses:
-                writer.write(topic, bags.ns(t / rate), raw)
-    found = read(tmp_path / "set", command={"v": "/target:pose.position.x"})
+    rows = [
+        (t / rate, bags.pose_stamped(100.0 + t, *bags.place_at(t)))
+        for t in bags.times()
+    ]
+    bag = bags.write(tmp_path / "set", {"/pose": rows, "/target": rows})
+    found = read(bag, "command: {v: '/target:pose.position.x'}")
     assert np.allclose(np.diff(found.pose.t), np.diff(bags.times()))
     assert any(
         "stamped by their headers, which go on together" in note

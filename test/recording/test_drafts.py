@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -52,522 +53,187 @@ def motion() -> dict[str, np.ndarray]:
         "noise": rng.normal(size=COUNT),
         "left": np.floor(np.cumsum(speed - 0.2 * rate) * 400.0),
         "right": np.floor(np.cumsum(speed + 0.2 * rate) * 400.0),
+        "lat": 47.5 + y * 9e-6,
+        "lon": 8.7 + x * 13e-6,
+        "row": np.arange(COUNT),
+        "ns": t * 1e9 + 1.4e18,
+        "ms": t * 1e3,
+        "x_mm": x * 1e3,
+        "y_mm": y * 1e3,
+        "yaw_deg": np.degrees(wrapped),
+        "w_deg": np.degrees(w),
+        "high": rng.normal(size=COUNT) + 1.5,
     }
 
 
 M = motion()
-XYZ = {
-    "tx": "x",
-    "ty": "y",
-    "tz": "zero",
-    "qx": "zero",
-    "qy": "zero",
-    "qz": "qz",
-    "qw": "qw",
-}
-LAT = 47.5 + M["y"] * 9e-6
-LON = 8.7 + M["x"] * 13e-6
-# Columns: by the name of a signal of `motion`, or as they are. Then the columns that are to be
-# guessed for x, for the heading or quaternion, and as commands; None and {} for a blank.
-TABLES: dict[str, tuple[dict[str, Any], str | None, Any, dict[str, str]]] = {
-    "issue": (
-        {
-            "time": "t",
-            "x(m)": "x",
-            "y(m)": "y",
-            "phi(rad)": "yaw",
-            "cmd_vel_x": "v",
-            "cmd_vel_omega": "w",
-        },
-        "x(m)",
-        "phi(rad)",
-        {"forward_command": "cmd_vel_x", "turn_command": "cmd_vel_omega"},
-    ),
-    "kitti oxts": (
-        {
-            "lat": LAT,
-            "lon": LON,
-            "alt": "zero",
-            "roll": "noise",
-            "pitch": "noise",
-            "yaw": "yaw",
-            "vn": "speed",
-            "ve": "speed",
-            "vf": "speed",
-            "vl": "zero",
-            "vu": "zero",
-            "ax": "noise",
-            "ay": "noise",
-            "az": "noise",
-            "wx": "noise",
-            "wy": "noise",
-            "wz": "rate",
-        },
-        "lon",
-        "yaw",
-        {},
-    ),
-    "tum": ({"timestamp": "t", **XYZ}, "tx", ["qx", "qy", "qz", "qw"], {}),
-    "euroc": (
-        {
-            "#timestamp": M["t"] * 1e9 + 1.4e18,
-            "p_RS_R_x [m]": "x",
-            "p_RS_R_y [m]": "y",
-            "p_RS_R_z [m]": "zero",
-            "q_RS_w []": "qw",
-            "q_RS_x []": "zero",
-            "q_RS_y []": "zero",
-            "q_RS_z []": "qz",
-            "v_RS_R_x [m s^-1]": "speed",
-            "v_RS_R_y [m s^-1]": "zero",
-            "w_RS_S_z [rad s^-1]": "rate",
-        },
-        "p_RS_R_x [m]",
-        ["q_RS_x []", "q_RS_y []", "q_RS_z []", "q_RS_w []"],
-        {},
-    ),
-    "euroc imu": (
-        {
-            "timestamp [ns]": M["t"] * 1e9,
-            "w_RS_S_x [rad s^-1]": "noise",
-            "w_RS_S_y [rad s^-1]": "noise",
-            "w_RS_S_z [rad s^-1]": "rate",
-            "a_RS_S_x [m s^-2]": "noise",
-            "a_RS_S_y [m s^-2]": "noise",
-        },
-        None,
-        None,
-        {},
-    ),
-    "odometry only": (
-        {
-            "t": "t",
-            "odom_x": "x",
-            "odom_y": "y",
-            "odom_theta": "yaw",
-            "odom_v": "speed",
-            "odom_w": "rate",
-        },
-        "odom_x",
-        "odom_theta",
-        {},
-    ),
-    "bare v and w": (
-        {"t": "t", "x": "x", "y": "y", "theta": "yaw", "v": "speed", "w": "rate"},
-        "x",
-        "theta",
-        {},
-    ),
-    "truth beside odometry and slam": (
-        {
-            "t": "t",
-            "gt_x": "x",
-            "gt_y": "y",
-            "gt_yaw": "yaw",
-            "odom_x": "noise",
-            "odom_y": "noise",
-            "odom_yaw": "noise",
-            "slam_x": "x",
-            "slam_y": "y",
-            "slam_yaw": "yaw",
-            "cmd_v": "v",
-            "cmd_w": "w",
-        },
-        "gt_x",
-        "gt_yaw",
-        {"forward_command": "cmd_v", "turn_command": "cmd_w"},
-    ),
-    "slam positions": (
-        {
-            "t": "t",
-            "orb_x": "x",
-            "orb_y": "y",
-            "orb_z": "zero",
-            "lio_x": "x",
-            "lio_y": "y",
-        },
-        None,
-        None,
-        {},
-    ),
-    "rostopic echo of odometry": (
-        {
-            "%time": M["t"] * 1e9 + 1.6e18,
-            "field.header.seq": np.arange(COUNT),
-            "field.pose.pose.position.x": "x",
-            "field.pose.pose.position.y": "y",
-            "field.pose.pose.position.z": "zero",
-            "field.pose.pose.orientation.x": "zero",
-            "field.pose.pose.orientation.y": "zero",
-            "field.pose.pose.orientation.z": "qz",
-            "field.pose.pose.orientation.w": "qw",
-            "field.pose.covariance0": "noise",
-            "field.twist.twist.linear.x": "speed",
-            "field.twist.twist.angular.z": "rate",
-            "field.twist.covariance0": "noise",
-        },
-        "field.pose.pose.position.x",
-        [f"field.pose.pose.orientation.{axis}" for axis in "xyzw"],
-        {},
-    ),
-    "lidar beams": (
-        {
-            "t": "t",
-            "x": "x",
-            "y": "y",
-            "yaw": "yaw",
-            "cmd_vel": "v",
-            **{f"range_{k}": "noise" for k in range(12)},
-            **{f"scan[{k}]": "noise" for k in range(4)},
-        },
-        "x",
-        "yaw",
-        {},
-    ),
-    "covariances": (
-        {
-            "t": "t",
-            "pose_x": "x",
-            "pose_y": "y",
-            "pose_yaw": "yaw",
-            "cov_xx": "noise",
-            "cov_yy": "noise",
-            "cov_yawyaw": "noise",
-            "sigma_v": "noise",
-            "cmd_covariance": "noise",
-        },
-        "pose_x",
-        "pose_yaw",
-        {},
-    ),
-    "f1tenth": (
-        {
-            "t": "t",
-            "pose_x": "x",
-            "pose_y": "y",
-            "pose_theta": "yaw",
-            "speed": "speed",
-            "steering_angle": "w",
-            "cmd_speed": "v",
-            "cmd_steering_angle": "w",
-        },
-        "pose_x",
-        "pose_theta",
-        {"speed_command": "cmd_speed", "steering_command": "cmd_steering_angle"},
-    ),
-    "f1tenth, measured only": (
-        {
-            "t": "t",
-            "pose_x": "x",
-            "pose_y": "y",
-            "pose_theta": "yaw",
-            "speed": "speed",
-            "steering_angle": "w",
-        },
-        "pose_x",
-        "pose_theta",
-        {},
-    ),
-    "jetracer": (
-        {
-            "t": "t",
-            "vicon x": "x",
-            "vicon y": "y",
-            "vicon yaw": "yaw",
-            "W (IMU)": "rate",
-            "vel encoder": "speed",
-            "throttle": "v",
-            "steering": "w",
-        },
-        "vicon x",
-        "vicon yaw",
-        {"throttle": "throttle", "steering": "steering"},
-    ),
-    "agv": (
-        {
-            "time_ms": M["t"] * 1e3,
-            "agv_x_mm": M["x"] * 1e3,
-            "agv_y_mm": M["y"] * 1e3,
-            "agv_heading_deg": np.degrees(M["yaw"]),
-            "act_speed": "speed",
-            "set_speed": "v",
-            "set_steer_deg": np.degrees(M["w"]),
-            "act_steer_deg": np.degrees(M["w"]),
-            "battery_voltage": "noise",
-            "motor_current": "noise",
-        },
-        "agv_x_mm",
-        "agv_heading_deg",
-        {"speed_command": "set_speed", "steering_command": "set_steer_deg"},
-    ),
-    "encoder ticks": (
-        {
-            "t": "t",
-            "cam_x": "x",
-            "cam_y": "y",
-            "cam_theta": "yaw",
-            "left_ticks": "left",
-            "right_ticks": "right",
-        },
-        "cam_x",
-        "cam_theta",
-        {"left_wheel": "left_ticks", "right_wheel": "right_ticks"},
-    ),
-    "ticks beside commands": (
-        {
-            "t": "t",
-            "x": "x",
-            "y": "y",
-            "yaw": "yaw",
-            "left_ticks": "left",
-            "right_ticks": "right",
-            "v_cmd": "v",
-            "w_cmd": "w",
-        },
-        "x",
-        "yaw",
-        {"forward_command": "v_cmd", "turn_command": "w_cmd"},
-    ),
-    "gps track": (
-        {
-            "time": "t",
-            "latitude": LAT,
-            "longitude": LON,
-            "altitude": "noise",
-            "speed": "speed",
-            "hdop": "noise",
-            "satellites": "noise",
-        },
-        None,
-        None,
-        {},
-    ),
-    "gps and imu": (
-        {"time": "t", "lat": LAT, "lon": LON, "imu_yaw": "yaw", "imu_gyro_z": "rate"},
-        None,
-        None,
-        {},
-    ),
-    "phone imu": (
-        {
-            "Time (s)": "t",
-            "Acceleration x (m/s^2)": "noise",
-            "Acceleration y (m/s^2)": "noise",
-            "Acceleration z (m/s^2)": "noise",
-            "Gyroscope z (rad/s)": "rate",
-        },
-        None,
-        None,
-        {},
-    ),
-    "goals": (
-        {
-            "t": "t",
-            "x": "x",
-            "y": "y",
-            "yaw": "yaw",
-            "goal_x": "noise",
-            "goal_y": "noise",
-            "goal_yaw": "noise",
-            "target_x": "noise",
-            "target_y": "noise",
-        },
-        "x",
-        "yaw",
-        {},
-    ),
-    "sonars": (
-        {
-            "t": "t",
-            "x": "x",
-            "y": "y",
-            "yaw": "yaw",
-            "left": "noise",
-            "right": "noise",
-            "front_left": "noise",
-            "front_right": "noise",
-        },
-        "x",
-        "yaw",
-        {},
-    ),
-    "wheel speeds, measured": (
-        {
-            "t": "t",
-            "x": "x",
-            "y": "y",
-            "yaw": "yaw",
-            "wheel_speed_left [rad/s]": "v",
-            "wheel_speed_right [rad/s]": "w",
-        },
-        "x",
-        "yaw",
-        {
-            "left_wheel": "wheel_speed_left [rad/s]",
-            "right_wheel": "wheel_speed_right [rad/s]",
-        },
-    ),
-    "references of a controller": (
-        {
-            "t": "t",
-            "x_m": "x",
-            "y_m": "y",
-            "psi_rad": "yaw",
-            "v_ref_m_s": "v",
-            "omega_ref_rad_s": "w",
-            "v_m_s": "speed",
-            "omega_rad_s": "rate",
-        },
-        "x_m",
-        "psi_rad",
-        {"forward_command": "v_ref_m_s", "turn_command": "omega_ref_rad_s"},
-    ),
-    "mecanum": (
-        {
-            "t": "t",
-            "x": "x",
-            "y": "y",
-            "yaw": "yaw",
-            "cmd_vx": "v",
-            "cmd_vy": "noise",
-            "cmd_wz": "w",
-            "vx": "speed",
-            "vy": "zero",
-            "wz": "rate",
-        },
-        "x",
-        "yaw",
-        {"vx": "cmd_vx", "vy": "cmd_vy", "wz": "cmd_wz"},
-    ),
-    "motors of a skid-steer": (
-        {
-            "t": "t",
-            "x": "x",
-            "y": "y",
-            "yaw": "yaw",
-            "motor_left_cmd": "v",
-            "motor_right_cmd": "w",
-            "motor_left_current": "noise",
-            "motor_right_current": "noise",
-        },
-        "x",
-        "yaw",
-        {"left_wheel": "motor_left_cmd", "right_wheel": "motor_right_cmd"},
-    ),
-    "yaw rate of a command": (
-        {
-            "t": "t",
-            "x": "x",
-            "y": "y",
-            "yaw": "yaw",
-            "commanded_velocity": "v",
-            "commanded_yaw_rate": "w",
-            "yaw_rate": "rate",
-        },
-        "x",
-        "yaw",
-        {"forward_command": "commanded_velocity", "turn_command": "commanded_yaw_rate"},
-    ),
-    "pulses beside encoders": (
-        {
-            "t": "t",
-            "x": "x",
-            "y": "y",
-            "yaw": "yaw",
-            "PWM_L": "v",
-            "PWM_R": "w",
-            "enc_L": "left",
-            "enc_R": "right",
-        },
-        "x",
-        "yaw",
-        {"left_wheel": "PWM_L", "right_wheel": "PWM_R"},
-    ),
-    "uncertainties": (
-        {
-            "t": "t",
-            "x": "x",
-            "y": "y",
-            "yaw": "yaw",
-            "v_rms": "noise",
-            "omega_sd": "noise",
-            "speed_uncertainty": "noise",
-            "cmd_v_covar": "noise",
-        },
-        "x",
-        "yaw",
-        {},
-    ),
-    "ranges to both sides": (
-        {
-            "t": "t",
-            "x": "x",
-            "y": "y",
-            "yaw": "yaw",
-            "left_distance": "noise",
-            "right_distance": "noise",
-            "obstacle_speed": "noise",
-            "obstacle_turn": "noise",
-        },
-        "x",
-        "yaw",
-        {},
-    ),
-    "two commands of one meaning": (
-        {
-            "t": "t",
-            "x": "x",
-            "y": "y",
-            "yaw": "yaw",
-            "cmd_v_raw": "v",
-            "cmd_v_limited": "speed",
-            "cmd_w": "w",
-        },
-        "x",
-        "yaw",
-        {},
-    ),
-    "actions of a policy": (
-        {
-            "t": "t",
-            "x": "x",
-            "y": "y",
-            "yaw": "yaw",
-            "action_0": "v",
-            "action_1": "w",
-            "reward": "noise",
-        },
-        "x",
-        "yaw",
-        {},
-    ),
-    "drone": (
-        {
-            "t": "t",
-            "x": "x",
-            "y": "y",
-            "z": M["noise"] + 1.5,
-            "roll_cmd": "noise",
-            "thrust_cmd": "noise",
-        },
-        None,
-        None,
-        {},
-    ),
-    "nothing moves": (
-        {
-            "t": "t",
-            "x": "zero",
-            "y": "zero",
-            "yaw": "zero",
-            "cmd_v": "zero",
-            "cmd_w": "zero",
-        },
-        None,
-        None,
-        {},
-    ),
-}
+# Columns, by the signals of `motion`; then those that are to be guessed for x, as heading or
+# quaternion, and as commands.
+TABLES = """
+issue:
+  time=t, x(m)=x, y(m)=y, phi(rad)=yaw, cmd_vel_x=v, cmd_vel_omega=w
+  -> x(m); phi(rad); forward_command=cmd_vel_x, turn_command=cmd_vel_omega
+kitti oxts:
+  lat, lon, alt=zero, roll=noise, pitch=noise, yaw, vn=speed, ve=speed, vf=speed,
+  vl=zero, vu=zero, ax=noise, ay=noise, az=noise, wx=noise, wy=noise, wz=rate
+  -> lon; yaw;
+tum:
+  timestamp=t, tx=x, ty=y, tz=zero, qx=zero, qy=zero, qz, qw
+  -> tx; qx, qy, qz, qw;
+euroc:
+  #timestamp=ns, p_RS_R_x [m]=x, p_RS_R_y [m]=y, p_RS_R_z [m]=zero, q_RS_w []=qw,
+  q_RS_x []=zero, q_RS_y []=zero, q_RS_z []=qz, v_RS_R_x [m s^-1]=speed, v_RS_R_y [m
+  s^-1]=zero, w_RS_S_z [rad s^-1]=rate
+  -> p_RS_R_x [m]; q_RS_x [], q_RS_y [], q_RS_z [], q_RS_w [];
+euroc imu:
+  timestamp [ns]=ns, w_RS_S_x [rad s^-1]=noise, w_RS_S_y [rad s^-1]=noise, w_RS_S_z
+  [rad s^-1]=rate, a_RS_S_x [m s^-2]=noise, a_RS_S_y [m s^-2]=noise
+  -> ; ;
+odometry only:
+  t, odom_x=x, odom_y=y, odom_theta=yaw, odom_v=speed, odom_w=rate
+  -> odom_x; odom_theta;
+bare v and w:
+  t, x, y, theta=yaw, v=speed, w=rate
+  -> x; theta;
+truth beside odometry and slam:
+  t, gt_x=x, gt_y=y, gt_yaw=yaw, odom_x=noise, odom_y=noise, odom_yaw=noise,
+  slam_x=x, slam_y=y, slam_yaw=yaw, cmd_v=v, cmd_w=w
+  -> gt_x; gt_yaw; forward_command=cmd_v, turn_command=cmd_w
+slam positions:
+  t, orb_x=x, orb_y=y, orb_z=zero, lio_x=x, lio_y=y
+  -> ; ;
+rostopic echo of odometry:
+  %time=ns, field.header.seq=row, field.pose.pose.position.x=x,
+  field.pose.pose.position.y=y, field.pose.pose.position.z=zero,
+  field.pose.pose.orientation.x=zero, field.pose.pose.orientation.y=zero,
+  field.pose.pose.orientation.z=qz, field.pose.pose.orientation.w=qw,
+  field.pose.covariance0=noise, field.twist.twist.linear.x=speed,
+  field.twist.twist.angular.z=rate, field.twist.covariance0=noise
+  -> field.pose.pose.position.x; field.pose.pose.orientation.x,
+     field.pose.pose.orientation.y, field.pose.pose.orientation.z,
+     field.pose.pose.orientation.w;
+lidar beams:
+  t, x, y, yaw, cmd_vel=v, range_0=noise, range_1=noise, scan[0]=noise,
+  scan[1]=noise
+  -> x; yaw;
+covariances:
+  t, pose_x=x, pose_y=y, pose_yaw=yaw, cov_xx=noise, cov_yy=noise, cov_yawyaw=noise,
+  sigma_v=noise, cmd_covariance=noise
+  -> pose_x; pose_yaw;
+f1tenth:
+  t, pose_x=x, pose_y=y, pose_theta=yaw, speed, steering_angle=w, cmd_speed=v,
+  cmd_steering_angle=w
+  -> pose_x; pose_theta; speed_command=cmd_speed,
+     steering_command=cmd_steering_angle
+f1tenth, measured only:
+  t, pose_x=x, pose_y=y, pose_theta=yaw, speed, steering_angle=w
+  -> pose_x; pose_theta;
+jetracer:
+  t, vicon x=x, vicon y=y, vicon yaw=yaw, W (IMU)=rate, vel encoder=speed,
+  throttle=v, steering=w
+  -> vicon x; vicon yaw; throttle=throttle, steering=steering
+agv:
+  time_ms=ms, agv_x_mm=x_mm, agv_y_mm=y_mm, agv_heading_deg=yaw_deg,
+  act_speed=speed, set_speed=v, set_steer_deg=w_deg, act_steer_deg=w_deg,
+  battery_voltage=noise, motor_current=noise
+  -> agv_x_mm; agv_heading_deg; speed_command=set_speed,
+     steering_command=set_steer_deg
+encoder ticks:
+  t, cam_x=x, cam_y=y, cam_theta=yaw, left_ticks=left, right_ticks=right
+  -> cam_x; cam_theta; left_wheel=left_ticks, right_wheel=right_ticks
+ticks beside commands:
+  t, x, y, yaw, left_ticks=left, right_ticks=right, v_cmd=v, w_cmd=w
+  -> x; yaw; forward_command=v_cmd, turn_command=w_cmd
+gps track:
+  time=t, latitude=lat, longitude=lon, altitude=noise, speed, hdop=noise,
+  satellites=noise
+  -> ; ;
+gps and imu:
+  time=t, lat, lon, imu_yaw=yaw, imu_gyro_z=rate
+  -> ; ;
+phone imu:
+  Time (s)=t, Acceleration x (m/s^2)=noise, Acceleration y (m/s^2)=noise,
+  Acceleration z (m/s^2)=noise, Gyroscope z (rad/s)=rate
+  -> ; ;
+goals:
+  t, x, y, yaw, goal_x=noise, goal_y=noise, goal_yaw=noise, target_x=noise,
+  target_y=noise
+  -> x; yaw;
+sonars:
+  t, x, y, yaw, left=noise, right=noise, front_left=noise, front_right=noise
+  -> x; yaw;
+wheel speeds, measured:
+  t, x, y, yaw, wheel_speed_left [rad/s]=v, wheel_speed_right [rad/s]=w
+  -> x; yaw; left_wheel=wheel_speed_left [rad/s], right_wheel=wheel_speed_right
+     [rad/s]
+references of a controller:
+  t, x_m=x, y_m=y, psi_rad=yaw, v_ref_m_s=v, omega_ref_rad_s=w, v_m_s=speed,
+  omega_rad_s=rate
+  -> x_m; psi_rad; forward_command=v_ref_m_s, turn_command=omega_ref_rad_s
+mecanum by its wheels:
+  t, x, y, yaw, fl_cmd=v, fr_cmd=w, rl_cmd=speed, rr_cmd=rate
+  -> x; yaw; front_left_wheel=fl_cmd, front_right_wheel=fr_cmd, rear_left_wheel=rl_cmd,
+     rear_right_wheel=rr_cmd
+revolutions:
+  t, x, y, yaw, rpm_left=v, rpm_right=w
+  -> x; yaw; left_wheel=rpm_left, right_wheel=rpm_right
+fields of a twist:
+  t, x, y, yaw, cmd_vel.linear.x=v, cmd_vel.linear.y=zero, cmd_vel.angular.z=w
+  -> x; yaw; forward_command=cmd_vel.linear.x, turn_command=cmd_vel.angular.z
+mecanum:
+  t, x, y, yaw, cmd_vx=v, cmd_vy=noise, cmd_wz=w, vx=speed, vy=zero, wz=rate
+  -> x; yaw; vx=cmd_vx, vy=cmd_vy, wz=cmd_wz
+motors of a skid-steer:
+  t, x, y, yaw, motor_left_cmd=v, motor_right_cmd=w, motor_left_current=noise,
+  motor_right_current=noise
+  -> x; yaw; left_wheel=motor_left_cmd, right_wheel=motor_right_cmd
+yaw rate of a command:
+  t, x, y, yaw, commanded_velocity=v, commanded_yaw_rate=w, yaw_rate=rate
+  -> x; yaw; forward_command=commanded_velocity, turn_command=commanded_yaw_rate
+pulses beside encoders:
+  t, x, y, yaw, PWM_L=v, PWM_R=w, enc_L=left, enc_R=right
+  -> x; yaw; left_wheel=PWM_L, right_wheel=PWM_R
+uncertainties:
+  t, x, y, yaw, v_rms=noise, omega_sd=noise, speed_uncertainty=noise,
+  cmd_v_covar=noise
+  -> x; yaw;
+ranges to both sides:
+  t, x, y, yaw, left_distance=noise, right_distance=noise, obstacle_speed=noise,
+  obstacle_turn=noise
+  -> x; yaw;
+two commands of one meaning:
+  t, x, y, yaw, cmd_v_raw=v, cmd_v_limited=speed, cmd_w=w
+  -> x; yaw;
+actions of a policy:
+  t, x, y, yaw, action_0=v, action_1=w, reward=noise
+  -> x; yaw;
+drone:
+  t, x, y, z=high, roll_cmd=noise, thrust_cmd=noise
+  -> ; ;
+nothing moves:
+  t, x=zero, y=zero, yaw=zero, cmd_v=zero, cmd_w=zero
+  -> ; ;
+"""
+
+
+def read_tables() -> dict[str, tuple[dict[str, np.ndarray], str, list[str], Any]]:
+    """Columns, x, heading or quaternion, and commands of each of `TABLES`."""
+    tables = {}
+    for table in re.split(r"\n(?=\w)", TABLES.strip()):
+        style, columns, guesses = re.split(
+            ": | -> ", " ".join(table.split()), maxsplit=2
+        )
+        x, turned, commands = (part.strip() for part in guesses.split(";"))
+        signals = {}
+        for column in columns.split(", "):
+            name, _, signal = column.partition("=")
+            signals[name] = M[signal or name]
+        named = dict(pair.split("=") for pair in commands.split(", ") if pair)
+        tables[style] = signals, x, turned.split(", "), named
+    return tables
+
+
+STYLES = read_tables()
 
 
 def drafted(path) -> tuple[str, dict[str, Any]]:
@@ -577,20 +243,17 @@ def drafted(path) -> tuple[str, dict[str, Any]]:
 
 
 def column_of(value: Any) -> str:
-    return value["from"] if isinstance(value, dict) else value
+    return value["from"] if isinstance(value, dict) else (value or "")
 
 
-@pytest.mark.parametrize("style", TABLES)
+@pytest.mark.parametrize("style", STYLES)
 def test_a_draft_of_a_table_is_right_or_blank(tmp_path, style):
-    columns, x, turned, commands = TABLES[style]
-    filled = {name: M[c] if isinstance(c, str) else c for name, c in columns.items()}
-    path = write(tmp_path / "log.csv", filled)
+    columns, x, turned, commands = STYLES[style]
+    path = write(tmp_path / "log.csv", columns)
     text, draft = drafted(path)
-    assert draft["pose"]["x"] == x, text
-    found = draft["pose"].get("quaternion") or draft["pose"].get("heading")
-    assert (
-        found if isinstance(found, list) or found is None else column_of(found)
-    ) == turned
+    pose = draft["pose"]
+    found = pose.get("quaternion") or [column_of(pose.get("heading"))]
+    assert (pose["x"] or "", found) == (x, turned), text
     guessed = {
         name: column_of(value) for name, value in (draft["command"] or {}).items()
     }
@@ -623,9 +286,8 @@ def test_columns_of_a_tracker_are_taken_before_odometry_whatever_the_file_is_cal
 
 @pytest.mark.parametrize("style", ["uncertainties", "ranges to both sides"])
 def test_what_can_not_have_been_sent_is_no_candidate(tmp_path, style):
-    columns, *_ = TABLES[style]
-    filled = {name: M[column] for name, column in columns.items()}
-    assert "\n#  " not in drafted(write(tmp_path / "log.csv", filled))[0]
+    columns, *_ = STYLES[style]
+    assert "\n#  " not in drafted(write(tmp_path / "log.csv", columns))[0]
 
 
 def test_columns_without_a_name_are_candidates(tmp_path):
@@ -667,8 +329,8 @@ def test_columns_that_no_word_explains_are_candidates(tmp_path):
 
 
 def test_a_blank_lists_the_candidates_as_comments_that_can_be_uncommented(tmp_path):
-    columns, *_ = TABLES["bare v and w"]
-    path = write(tmp_path / "log.csv", {name: M[c] for name, c in columns.items()})
+    columns, *_ = STYLES["bare v and w"]
+    path = write(tmp_path / "log.csv", columns)
     text, draft = drafted(path)
     assert draft["command"] is None
     assert "#  forward_command: v\n#  turn_command: w\n" in text
@@ -706,7 +368,7 @@ def test_places_on_earth_and_covariances_are_refused_as_commands(tmp_path, colum
     ("which", "name"), [(4, "latitude"), ("lat", "lat"), (4, "cov_xx")]
 )
 def test_they_are_refused_by_number_and_by_short_names_too(tmp_path, which, name):
-    columns = {"t": M["t"], "x": M["x"], "y": M["y"], "yaw": M["yaw"], name: LAT}
+    columns = {"t": M["t"], "x": M["x"], "y": M["y"], "yaw": M["yaw"], name: M["lat"]}
     path = write(tmp_path / "log.csv", columns)
     given = {
         "time": "t",
@@ -727,6 +389,8 @@ def test_they_are_refused_by_number_and_by_short_names_too(tmp_path, which, name
         ("v [m s^-1]", "m/s"),
         ("w (deg/s)", "deg/s"),
         ("speed_kmh", "km/h"),
+        ("left_rpm", "rpm"),
+        ("motor_rpm_left_cmd", "rpm"),
         ("v_m_s", "m/s"),
         ("acc (m/s^2)", "m/s^2"),
         ("heading (°)", "deg"),
@@ -825,10 +489,8 @@ def test_a_command_that_no_latency_explains_is_said_on_top(tmp_path, shift, word
 
 
 def test_a_right_command_raises_no_doubt(tmp_path):
-    columns, *_ = TABLES["issue"]
-    text, _ = drafted(
-        write(tmp_path / "log.csv", {name: M[c] for name, c in columns.items()})
-    )
+    columns, *_ = STYLES["issue"]
+    text, _ = drafted(write(tmp_path / "log.csv", columns))
     assert "# doubt" not in text
 
 

@@ -9,7 +9,7 @@ import pytest
 from nics_drl_bridge.config import parse_yaml
 from nics_drl_bridge.recording import topic_roles as kinds
 from nics_drl_bridge.recording.guess import propose_mapping
-from nics_drl_bridge.recording.survey import Survey, TableSurvey
+from nics_drl_bridge.recording.survey import Field, TableSurvey
 
 from .test_drafts import COUNT, M
 
@@ -18,10 +18,10 @@ FLOAT = "std_msgs/msg/Float64"
 
 def topic(name: str, kind: str, columns: dict[str, Any]) -> TableSurvey:
     data = {field: M[c] if isinstance(c, str) else c for field, c in columns.items()}
-    survey = [
-        Survey(field, float(c.min()), float(c.max())) for field, c in data.items()
-    ]
-    return TableSurvey(name, COUNT, survey, t=M["t"], data=data, kind=kind)
+    table = TableSurvey(name, COUNT, t=M["t"], data=data, kind=kind, is_single=False)
+    for field, c in data.items():
+        table.columns.append(Field(table, field, float(c.min()), float(c.max())))
+    return table
 
 
 def twist(name: str, v: str = "v", w: str = "w") -> TableSurvey:

@@ -11,8 +11,7 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.config import share_folder
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.recording.mapping import Value, load_mapping
-from nics_drl_bridge.recording.readers import read_recording, read_robot_and_drive
-from nics_drl_bridge.recording.topic_roles import TopicRoles
+from nics_drl_bridge.recording.readers import open_drive, read_recording
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples" / "recordings"
 SHIPPED = share_folder() / "config" / "recordings" / "xtark_folder.yaml"
@@ -29,7 +28,7 @@ SOURCES = {
 
 def imported(shared_recordings, name, k=0):
     path = shared_recordings / SOURCES[name][k]
-    return read_robot_and_drive(path, None, TopicRoles(), EXAMPLES / f"{name}.yaml")
+    return open_drive(path, None, EXAMPLES / f"{name}.yaml")
 
 
 def test_each_example_is_of_a_real_recording():

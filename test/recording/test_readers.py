@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.recording.readers import read_recording, read_robot_and_drive
+from nics_drl_bridge.recording.readers import open_drive, read_recording
 from nics_drl_bridge.recording.recording import Recording, Stream, save_recording
-from nics_drl_bridge.recording.topic_roles import TopicRoles
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 
@@ -61,7 +60,7 @@ def test_a_folder_tells_its_robot_and_a_drive_that_tells_none_is_of_the_default(
     folder, tmp_path
 ):
     def robot_of(path, named=None):
-        return read_robot_and_drive(path, named, TopicRoles(), None)[0].name
+        return open_drive(path, named, None)[0].name
 
     assert robot_of(folder) == "ackermann"
     assert robot_of(folder, "tricycle") == "tricycle"

@@ -43,11 +43,24 @@ def car():
     return load_robot("ackermann")
 
 
-def spoilt(recording, name, row, value):
+def spoilt(recording, name, change):
+    """The recording after a change of the stamps and values of a stream."""
     stream = getattr(recording, name)
-    values = stream.values.copy()
-    values[row, 0] = value
-    return replace(recording, **{name: replace(stream, values=values)})
+    t, values = change(stream.t.copy(), stream.values.copy())
+    return replace(recording, **{name: replace(stream, t=t, values=values)})
+
+
+def put_value(value):
+    def change(t, values):
+        values[7, 0] = value
+        return t, values
+
+    return change
+
+
+def swap_stamps(t, values):
+    t[[10, 11]] = t[[11, 10]]
+    return t, values
 
 
 def test_a_path_or_a_name_where_the_object_is_meant_is_told(recording, car):
@@ -78,15 +91,6 @@ def test_the_rates_of_samples_are_the_twist_of_the_exact_arc():
     assert np.array_equal(samples.t, t[:-1])
 
 
-def test_chosen_rows_stay_together():
-    t = np.arange(6) * 0.1
-    samples = samples_on_one_clock(t, np.zeros((6, 3)), t[:, None], np.zeros((6, 1)))
-    few = samples.rows(samples.t > 0.25)
-    assert np.allclose(few.t, [0.3, 0.4])
-    assert np.allclose(few.x[:, 0], few.t)
-    assert len(few.q) == len(few.dq) == 2
-
-
 def test_a_good_recording_passes(recording, car):
     assert check(recording, car) is recording
     assert set(recording.streams) == {"command", "pose", "state", "wheels"}
@@ -96,51 +100,32 @@ def test_a_good_recording_passes(recording, car):
     }
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("name", ["command", "pose", "state", "wheels"])
-def test_what_is_no_number_is_refused_with_stream_and_row(recording, car, name, value):
-    with pytest.raises(RecordingError, match=f"here: {name}: row 7 holds NaN or inf"):
-        check(spoilt(recording, name, 7, value), car)
+FAULTS = {
+    "command": [(put_value(np.nan), "row 7 holds NaN or inf")],
+    "pose": [
+        (put_value(np.inf), "row 7 holds NaN or inf"),
+        (lambda t, values: (t[:1], values[:1]), "has 1 samples"),
+        (lambda t, values: (t * np.nan, values), "row 0 holds NaN"),
+        (lambda t, values: (t, values[:, :2]), r"has the shape \(50, 2\) where"),
+        (
+            lambda t, values: (t, values + np.arange(50)[:, None] * 4.0 % 360.0),
+            "it must be in radians",
+        ),
+    ],
+    "state": [(put_value(-np.inf), "row 7 holds NaN or inf")],
+    "wheels": [(swap_stamps, "time runs backwards at row 11")],
+}
 
 
-def test_a_stamp_that_is_no_number_is_refused(recording, car):
-    t = recording.pose.t.copy()
-    t[3] = np.nan
-    with pytest.raises(RecordingError, match="pose: row 3 holds NaN"):
-        check(replace(recording, pose=replace(recording.pose, t=t)), car)
-
-
-def test_time_that_runs_backwards_is_refused_with_its_row(recording, car):
-    t = recording.command.t.copy()
-    t[[10, 11]] = t[[11, 10]]
-    with pytest.raises(RecordingError, match="command: time runs backwards at row 11"):
-        check(replace(recording, command=replace(recording.command, t=t)), car)
-
-
-def test_equal_stamps_are_allowed(recording, car):
-    t = recording.pose.t.copy()
-    t[5] = t[4]
-    check(replace(recording, pose=replace(recording.pose, t=t)), car)
-
-
-def test_a_recording_of_another_robot_is_refused(recording):
-    with pytest.raises(
-        RecordingError, match=r"command: has the shape \(50, 2\) where \(50, 3\)"
-    ):
-        check(recording, load_robot("mecanum"))
-
-
-def test_a_recording_of_one_sample_is_refused(recording, car):
-    short = Stream(recording.pose.t[:1], recording.pose.values[:1])
-    with pytest.raises(RecordingError, match="pose: has 1 samples"):
-        check(replace(recording, pose=short), car)
-
-
-def test_headings_in_degrees_are_refused(recording, car):
-    values = recording.pose.values.copy()
-    values[:, 2] = np.arange(50) * 4.0 % 360.0  # 4 degrees a sample
-    with pytest.raises(RecordingError, match="it must be in radians"):
-        check(replace(recording, pose=replace(recording.pose, values=values)), car)
+@pytest.mark.parametrize(
+    ("name", "change", "fault"),
+    [(name, *fault) for name, faults in FAULTS.items() for fault in faults],
+)
+def test_a_fault_of_a_stream_is_told_with_its_name_and_row(
+    recording, car, name, change, fault
+):
+    with pytest.raises(RecordingError, match=f"here: {name}: .*{fault}"):
+        check(spoilt(recording, name, change), car)
 
 
 def test_a_saved_recording_reads_back_to_the_same_bits(recording, tmp_path):
@@ -165,60 +150,34 @@ def packed(arrays):
     return buffer.getvalue()
 
 
-def test_numpy_reads_a_recording_whose_checksum_follows_the_archive(
-    recording, tmp_path
-):
-    path = tmp_path / "drive.npz"
-    save_recording(recording, path)
-    with np.load(path, allow_pickle=False) as arrays:
-        assert np.array_equal(arrays["pose"], recording.pose.values)
-    assert b"sha256 " in path.read_bytes()[-80:]
+def described(**meta):
+    return seal(packed({"meta": np.array(json.dumps(meta)), "command": np.zeros(2)}))
 
 
-@pytest.mark.parametrize(
-    "version", [*(f"nics_drl_bridge/recording/{n}" for n in (1, 2, 3)), "other/1"]
-)
-@pytest.mark.parametrize("seal", [seal, bytes])
-def test_another_format_is_one_sentence_that_says_what_to_do(tmp_path, version, seal):
-    meta = {"format": version, "source": "", "clocks": {}}
+BAD_FILES = {
+    "older": (described(format="nics_drl_bridge/recording/3", clocks={}), "record it"),
+    "bare": (described(format=FORMAT), "is not a recording of this package"),
+    "no stamps": (
+        described(format=FORMAT, clocks={"command": "robot"}),
+        "is not a recording of this package",
+    ),
+    "no clocks": (described(format=FORMAT, clocks=["command"]), "is not a recording"),
+    "no meta": (seal(packed({"a": np.zeros(2)})), "is not a recording"),
+    "pickled": (
+        packed({"meta": np.array([{"format": FORMAT}], dtype=object)}),
+        r"can't be read as \.npz",
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", BAD_FILES)
+def test_a_file_of_another_form_is_refused(tmp_path, fault):
+    content, words = BAD_FILES[fault]
     path = tmp_path / "a.npz"
-    path.write_bytes(seal(packed({"meta": np.array(json.dumps(meta))})))
-    with pytest.raises(RecordingError) as refused:
+    with pytest.raises(RecordingError, match="no such file"):
         load_recording(path)
-    assert str(refused.value) == (
-        f"{path}: format {version!r} is not {FORMAT!r}; "
-        "record it again or use the version of the package that wrote it."
-    )
-
-
-@pytest.mark.parametrize(
-    "meta",
-    [
-        {"format": FORMAT},
-        {"format": FORMAT, "clocks": {"command": "robot"}},
-        {"format": FORMAT, "clocks": {"nonsense": "robot"}},
-        {"format": FORMAT, "clocks": ["command"]},
-        [1, 2],
-        None,
-    ],
-)
-def test_a_file_that_lacks_a_part_is_refused(tmp_path, meta):
-    path = tmp_path / "a.npz"
-    arrays = {"meta": np.array(json.dumps(meta)), "command": np.zeros((2, 2))}
-    path.write_bytes(seal(packed({**arrays, "command_t": np.zeros(2)})))
-    with pytest.raises(RecordingError, match="is not a recording of this package"):
-        load_recording(path)
-
-
-def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(RecordingError, match=r"nowhere.npz: no such file"):
-        load_recording(tmp_path / "nowhere.npz")
-
-
-def test_a_recording_is_never_unpickled(tmp_path):
-    path = tmp_path / "a.npz"
-    np.savez(path, meta=np.array([{"format": FORMAT}], dtype=object))
-    with pytest.raises(RecordingError, match=r"can't be read as \.npz"):
+    path.write_bytes(content)
+    with pytest.raises(RecordingError, match=words):
         load_recording(path)
 
 
@@ -227,9 +186,9 @@ def test_every_flipped_bit_and_every_cut_is_refused(recording, tmp_path):
     save_recording(recording, path)
     content = path.read_bytes()
     rng = np.random.default_rng(2)
-    for trial in range(300):
+    for trial in range(60):
         damaged = bytearray(content)
-        if trial < 50:
+        if trial < 10:
             damaged = damaged[: rng.integers(len(content))]
         else:
             damaged[rng.integers(len(content))] ^= 1 << rng.integers(8)

@@ -19,25 +19,18 @@ def test_arrays_of_an_archive_are_columns_those_of_a_matrix_by_index(tmp_path, c
     pose = np.stack([columns["x"], columns["y"], columns["yaw"]], axis=1)
     few = {"ct": columns["t"][::5], "c": columns["v"][::5]}
     np.savez(tmp_path / "log.npz", t=columns["t"], pose=pose, **few)
-    found = read(
-        tmp_path / "log.npz",
-        pose={"x": "pose[0]", "y": "pose[1]", "heading": "pose[2]"},
-        command={"v": {"from": "c", "time": "ct"}},
-    )
+    changes = "pose: {x: 'pose[0]', y: 'pose[1]', heading: 'pose[2]'}\ncommand: {v: %s}"
+    found = read(tmp_path / "log.npz", changes % "{from: c, time: ct}")
     assert np.allclose(found.pose.values[:, 0], columns["x"])
     assert found.command.values.shape == (40, 1)
     with pytest.raises(RecordingError, match="has 200 stamps for 40 values"):
-        read(
-            tmp_path / "log.npz",
-            command={"v": "c"},
-            pose={"x": 1, "y": 2, "heading": 3},
-        )
+        read(tmp_path / "log.npz", changes % "c")
 
 
 def test_a_matrix_has_numbers_and_records_have_names(tmp_path, columns):
     np.save(tmp_path / "matrix.npy", np.stack(list(columns.values()), axis=1))
-    pose = {"x": 1, "y": 2, "heading": 3}
-    plain = read(tmp_path / "matrix.npy", time=0, pose=pose, command={"v": 4, "w": 5})
+    by_number = "{time: 0, pose: {x: 1, y: 2, heading: 3}, command: {v: 4, w: 5}}"
+    plain = read(tmp_path / "matrix.npy", by_number)
     records = np.rec.fromarrays(list(columns.values()), names=list(columns))
     np.save(tmp_path / "records.npy", np.asarray(records))
     assert np.array_equal(read(tmp_path / "records.npy").pose.values, plain.pose.values)
@@ -71,7 +64,7 @@ def test_parquet_is_read_with_its_stamps(tmp_path, columns):
     parquet.write_table(
         pyarrow.table(columns | {"date": dates}), tmp_path / "log.parquet"
     )
-    found = read(tmp_path / "log.parquet", time="date")
+    found = read(tmp_path / "log.parquet", "time: date")
     assert np.allclose(found.pose.t, columns["t"], atol=1e-6)
 
 

@@ -5,6 +5,7 @@ import pytest
 
 from nics_drl_bridge.recording import stamping
 from nics_drl_bridge.recording.recording import guess_time_unit
+from nics_drl_bridge.recording.values import parse_dates
 
 T = 100.0 + np.arange(300) * 0.02
 
@@ -111,3 +112,21 @@ def test_a_counter_is_told_from_commands_that_jump_to_and_fro():
     assert stamping.describe_counter(-np.maximum.accumulate(raw)) == "went on by 549980"
     full = np.where(np.arange(400) % 100 < 50, -127.0, 127.0)
     assert stamping.describe_counter(full + np.arange(400) % 2) == ""
+
+
+@pytest.mark.parametrize(
+    ("dates", "seconds"),
+    [
+        (["2024-05-01 02:59:59+02:00", "2024-05-01T02:00:00+0100"], [-1.0, 0.0]),
+        (["2024/05/01 01:00:00Z", "2024-05-01 00:00:00-01:30"], [0.0, 1800.0]),
+        (["12:00:00.5", "12:00:01"], [0.5, 1.0]),
+    ],
+)
+def test_the_utc_offset_of_a_date_counts(dates, seconds):
+    start = 12 * 3600.0 if len(dates[1]) < 10 else 1_714_525_200.0
+    found = parse_dates(np.array(dates))
+    assert found == pytest.approx(start + np.array(seconds), abs=1e-6)
+
+
+def test_other_text_is_no_date():
+    assert parse_dates(np.array(["AUTO", "MANUAL"])) is None

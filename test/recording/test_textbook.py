@@ -6,7 +6,6 @@ from scipy.integrate import solve_ivp
 from steps import integrate
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.robot.spec import load_robot
@@ -34,19 +33,6 @@ def test_a_car_on_a_constant_steer_drives_a_circle_of_the_textbook_radius():
         assert geometry.wrap_angle(pose[2] - angle) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_a_car_that_starts_lags_behind_its_command_as_a_first_order_system():
-    car = load_robot("ackermann")
-    lag = car.parameters["speed_lag"]
-    pose, state = integrate(
-        textbook(car), np.zeros(3), np.zeros(2), np.array([0.6, 0.0]), 0.37
-    )
-    assert state[0] == pytest.approx(0.6 * (1.0 - np.exp(-0.37 / lag)), rel=1e-9)
-    assert pose[0] == pytest.approx(
-        0.6 * (0.37 - lag * (1.0 - np.exp(-0.37 / lag))), abs=1e-6
-    )
-    assert pose[1:] == pytest.approx([0.0, 0.0])
-
-
 @pytest.mark.parametrize("name", ["differential", "mecanum"])
 @pytest.mark.parametrize("share", [(1.0, 0.0), (0.0, 1.0), (0.3, -0.8)])
 def test_wheels_turn_so_that_the_body_moves_as_commanded(name, share):
@@ -55,17 +41,6 @@ def test_wheels_turn_so_that_the_body_moves_as_commanded(name, share):
     command[[0, -1]] = share
     twist = textbook(spec).twist(steady(spec, command))
     assert twist == pytest.approx(spec.to_cmd_vel(command), abs=1e-12)
-
-
-def test_a_differential_robot_turns_on_the_spot_with_wheels_against_each_other():
-    spec = load_robot("differential")
-    left, right = steady(spec, [0.0, 1.5])
-    assert left == pytest.approx(-right)
-    assert right == pytest.approx(1.5 * 0.2 / 2.0 / 0.05)
-    pose, _ = integrate(
-        textbook(spec), np.zeros(3), np.array([left, right]), np.array([0.0, 1.5]), 1.0
-    )
-    assert pose == pytest.approx([0.0, 0.0, 1.5])
 
 
 def test_mecanum_wheels_move_the_body_sideways():
@@ -103,7 +78,7 @@ def test_the_motion_solves_the_differential_equation(name):
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-@pytest.mark.parametrize("dt", [0.001, 0.01, 0.025])
+@pytest.mark.parametrize("dt", [0.01, 0.025])
 def test_a_recorded_drive_is_what_integration_gives_step_by_step(name, dt):
     spec = load_robot(name)
     book = textbook(spec)
@@ -153,12 +128,3 @@ def test_only_terms_of_the_structure_move_the_body(name):
     twist = book.twist(states)
     for d, dof in enumerate(("vx", "vy", "wz")):
         assert (np.abs(twist[:, d]).max() > 1e-6) == bool(book.structure[dof])
-
-
-def test_a_missing_parameter_is_named():
-    car = load_robot("ackermann")
-    spoilt = car.model_copy(update={"parameters": {"wheelbase": 0.2}})
-    with pytest.raises(
-        ConfigError, match="ackermann kinematics need the parameter 'speed_lag'"
-    ):
-        textbook(spoilt)

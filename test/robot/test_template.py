@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nics_drl_bridge.config import list_shipped
+from nics_drl_bridge.config import list_shipped, parse_yaml
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.robot.kinds import find_kind, list_kinds, textbook
 from nics_drl_bridge.robot.spec import (
@@ -24,9 +24,6 @@ SLIPPING = (
     "omnidirectional",
     "skid_steer",
 )
-
-
-WIDE = {"kind": "mecanum", "footprint_radius": 0.3}
 
 
 def made(kind, ranges=None, **given):
@@ -162,14 +159,6 @@ def test_sizes_come_from_a_footprint_too():
     assert robot.parameters["half_width"] == pytest.approx(0.6 * 0.5)
 
 
-def test_a_file_may_say_it_in_a_few_words_too(tmp_path):
-    file = tmp_path / "husky.yaml"
-    file.write_text("kind: skid_steer\nname: husky\nfootprint_radius: 0.6\n")
-    robot = load_robot(file)
-    assert (robot.name, robot.textbook) == ("husky", "skid_steer")
-    assert build_robot(str(file)) == robot
-
-
 def test_a_file_without_a_name_is_a_robot_of_the_files_name(tmp_path):
     file = tmp_path / "husky.yaml"
     file.write_text("kind: skid_steer\nfootprint_radius: 0.6\n")
@@ -178,69 +167,36 @@ def test_a_file_without_a_name_is_a_robot_of_the_files_name(tmp_path):
         build_robot({"kind": "skid_steer", "footprint_radius": 0.6}).name
         == "skid_steer"
     )
-    shipped = [load_robot(name).name for name in list_shipped("robots")]
-    assert shipped == list_shipped("robots")
+    for name in list_shipped("robots"):
+        robot = load_robot(name)
+        assert robot.name == name
+        assert build_robot(robot.model_dump()) == robot
 
 
-def test_the_content_of_a_file_is_a_robot_too():
-    assert build_robot(load_robot("mecanum").model_dump()) == load_robot("mecanum")
+BAD = """
+{kind: tank} -> robot: key 'kind': there is no 'tank'; valid are: 'ackermann',
+{kind: free} -> commands of a robot of the kind 'free' are not known
+{kind: mecanum, footprint_radius: wide} -> key 'footprint_radius'
+{kind: mecanum} -> the key 'footprint_radius' is missing
+{kind: mecanum, textbook: mecanum} -> a `kind` and a `textbook`
+{kind: mecanum, footprint_radius: 0.3, command: 3} -> key 'command'
+{kind: mecanum, footprint_radius: 0.3, state: none} -> key 'state'
+{kind: mecanum, footprint_radius: 0.3, parameters: [1]} -> key 'parameters'
+{kind: mecanum, footprint_radius: 0.3, wheels: 4} -> unknown key 'wheels'
+{kind: mecanum, footprint: [[0, 0], [1, 1]]} -> entries must be at least 3, not 2.
+{kind: mecanum, footprint_radius: 0.3, command: [{name: [v]}]} -> key 'command.0.name'
+{kind: mecanum, footprint_radius: 0.3, state: [{name: vx, twist: [vx]}]} -> key 'state.0.twist
+{kind: ackermann, name: kart} -> 'speed', 'steering', not 'gas', 'wheel'
+{kind: ackermann_throttle, name: kart} -> are 'throttle', 'steering', not 'gas', 'wheel'
+"""
 
 
-@pytest.mark.parametrize(
-    ("given", "ranges", "sentence"),
-    [
-        (
-            {"kind": "tank"},
-            None,
-            "robot: key 'kind': there is no 'tank'; valid are: 'ackermann', ",
-        ),
-        (
-            {"kind": "free"},
-            None,
-            "commands of a robot of the kind 'free' are not known; name them",
-        ),
-        (
-            {"kind": "mecanum", "footprint_radius": "wide"},
-            None,
-            "key 'footprint_radius'",
-        ),
-        ({"kind": "mecanum"}, None, "the key 'footprint_radius' is missing; add it."),
-        (
-            {"kind": "mecanum", "textbook": "mecanum"},
-            None,
-            "a `kind` and a `textbook`; remove one",
-        ),
-        ({**WIDE, "command": 3}, None, "key 'command'"),
-        ({**WIDE, "state": "none"}, None, "key 'state'"),
-        ({**WIDE, "parameters": [1]}, None, "key 'parameters'"),
-        ({**WIDE, "wheels": 4}, None, "unknown key 'wheels'"),
-        (
-            {"kind": "mecanum", "footprint": [[0, 0], [1, 1]]},
-            None,
-            "key 'footprint': number of entries must be at least 3, not 2.",
-        ),
-        ({**WIDE, "command": [{"name": ["v"]}]}, None, "key 'command.0.name'"),
-        (
-            {**WIDE, "state": [{"name": "vx", "twist": ["vx"]}]},
-            None,
-            "key 'state.0.twist",
-        ),
-        (
-            {"kind": "ackermann", "name": "kart"},
-            {"forward_command": (0, 1), "turn_command": (0, 1)},
-            "'speed', 'steering', not 'forward_command', 'turn_command'; use these names",
-        ),
-        (
-            {"kind": "ackermann_throttle", "name": "kart"},
-            {"gas": (0, 1), "wheel": (0, 1)},
-            "robot 'kart': commands of the kind 'ackermann_throttle' are 'throttle', 'steering', "
-            "not 'gas', 'wheel'; use these names",
-        ),
-    ],
-)
-def test_what_is_no_robot_is_refused_in_one_sentence(given, ranges, sentence):
+@pytest.mark.parametrize("case", BAD.strip().splitlines())
+def test_what_is_no_robot_is_refused_in_one_sentence(case):
+    text, sentence = case.split(" -> ")
+    ranges = {"gas": (0.0, 1.0), "wheel": (0.0, 1.0)} if "kart" in text else None
     with pytest.raises(ConfigError) as caught:
-        build_robot(given, ranges)
+        build_robot(parse_yaml(text, "case"), ranges)
     assert sentence in str(caught.value)
     assert "\n" not in str(caught.value)
 
