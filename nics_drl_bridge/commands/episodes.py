@@ -206,10 +206,11 @@ def read_contracts(
     files = [policy for policy in policies if is_policy_file(policy)]
     if not files:
         return {}
-    from nics_drl_bridge.policy.foreign import load_any  # needs onnx; baselines don't
+    # needs onnx; baselines don't
+    from nics_drl_bridge.policy.policy_file import load_policy
 
     opened = None if model is None else open_model(model)
-    return {policy: load_any(policy, opened).contract for policy in files}
+    return {policy: load_policy(policy, opened).contract for policy in files}
 
 
 @dataclass(frozen=True)

@@ -101,6 +101,9 @@ class Contract(Schema):
     state: StateEntry | None = None
     # maximum number of observations per run; None: no maximum
     batch: Literal[1] | None = None
+    # a foreign network between numpy functions: the meaning of its inputs and outputs, see
+    # `extras.foreign_policies`
+    foreign: dict[str, Any] | None = None
     actions: Literal["continuous", "discrete"]
     control_period: float = Field(gt=0.0, le=10.0)  # time between commands [s]
     # time limit of the training episodes; older files lack it
@@ -130,12 +133,13 @@ def contract_of(
     graph_sha256: str,
     provenance: Mapping[str, Any],
     state: tuple[int, float] | None = None,
-    batch: Literal[1] | None = None,
+    foreign: Mapping[str, Any] | None = None,
     max_episode_steps: int | None = None,
 ) -> str:
     """Returns a policy's contract as JSON; `state` is the size and start value of its state.
 
-    Raises ConfigError if an entry has a wrong type.
+    A `foreign` network takes one observation at a time. Raises ConfigError if an entry has a wrong
+    type.
     """
     entry = task_entry(task)
     observation = observation_entry(task)
@@ -161,8 +165,8 @@ def contract_of(
     if state is not None:
         gap = GAP_PERIODS * model.control_period
         data["state"] = {"size": state[0], "start": state[1], "longest_gap": gap}
-    if batch is not None:
-        data["batch"] = batch
+    if foreign is not None:
+        data |= {"batch": 1, "foreign": dict(foreign)}
     if max_episode_steps is not None:
         data["max_episode_steps"] = max_episode_steps
     data["checksums"] = checksums(data)

@@ -1,11 +1,12 @@
-"""Opens a policy's graph in onnxruntime after all checks; imports little, see `rehearsal`."""
+"""Opens a policy's graph in onnxruntime and checks it; imports little, see `rehearsal`."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+import onnx
 from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ConfigError, PolicyError
@@ -14,55 +15,41 @@ from nics_drl_bridge.policy import onnx_graph
 Rows = NDArray[np.float32]
 
 
-@dataclass(frozen=True)
-class GraphNeeds:
-    """What a policy file states about its graph, as plain data."""
+def check_network(data: bytes, source: str, runs: bool) -> None:
+    """Checks the form of a network; if it `runs`, also its sizes, and runs it on zeros.
 
-    observation: int  # size of an observation
-    commands: int  # number of commands
-    discrete: bool  # True: each action is an integer
-    batch: int | None  # maximum number of observations per run; None: no maximum
-    graph_sha256: str
-    # size and start value of the state; None: the policy has no state
-    state: tuple[int, float] | None = None
-
-    @property
-    def widths(self) -> dict[str, int | None]:
-        """Widths of inputs and outputs; None: integers, one per row."""
-        widths: dict[str, int | None] = {
-            onnx_graph.INPUT: self.observation,
-            onnx_graph.COMMAND: self.commands,
-            onnx_graph.ACTION: None if self.discrete else self.commands,
-        }
-        if self.state is not None:
-            ends = (onnx_graph.STATE_IN, onnx_graph.STATE_OUT)
-            widths |= dict.fromkeys(ends, self.state[0])
-        return widths
-
-    @property
-    def most_rows(self) -> int:
-        """Maximum number of observations per run."""
-        return onnx_graph.MOST_ROWS if self.batch is None else self.batch
-
-    @property
-    def first_state(self) -> Rows | None:
-        """State (S,) at the start of an episode; None without a state."""
-        return None if self.state is None else np.full(*self.state, np.float32)
-
-
-def check_policy_graph(data: bytes, needs: GraphNeeds, source: str) -> None:
-    """Checks the graph of a policy file before any of it runs. Raises PolicyError."""
-    model = onnx_graph.parsed(data, source)
+    An open first dimension of its inputs is the number of observations, of which as many are run as
+    are ever run at once. The cost of all this is known only afterwards; see `rehearsal`. Raises
+    PolicyError.
+    """
+    model = onnx_graph.parse(data, source)
     onnx_graph.check_graph(model, source)
-    onnx_graph.check_ends(model, needs.widths, source, needs.batch)
-    if onnx_graph.graph_hash(model) != needs.graph_sha256:
-        reason = "does not match the graph, which was changed after the export."
-        raise PolicyError(source, "graph_sha256", reason)
-    onnx_graph.check_shapes(model, source, needs.most_rows)
+    if not runs:
+        return
+    fixed = onnx_graph.fix_rows(model, onnx_graph.MOST_ROWS)
+    onnx_graph.check_sizes(_fold(fixed, source), source)
+    feeds = {}
+    for value in onnx_graph.inputs_of(fixed):
+        tensor = value.type.tensor_type
+        shape = [dimension.dim_value for dimension in tensor.shape.dim]
+        dtype = onnx.helper.tensor_dtype_to_np_dtype(tensor.elem_type)
+        feeds[value.name] = np.zeros(shape, dtype)
+    run_network(open_session(data, source), source, feeds)
 
 
-def open_session(data: bytes, source: str) -> Any:
-    """Opens a session on one thread. Raises ConfigError without onnxruntime, or PolicyError."""
+def _fold(model: Any, source: str) -> Any:
+    """Returns the model after onnxruntime has computed all that its inputs' values don't change."""
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "folded.onnx"
+        open_session(model.SerializeToString(), source, file)
+        return onnx.load(file)
+
+
+def open_session(data: bytes, source: str, folded: Path | None = None) -> Any:
+    """Opens a session on one thread. Raises ConfigError without onnxruntime, or PolicyError.
+
+    `folded` is a file for the graph after the optimisations that keep its operators.
+    """
     try:
         import onnxruntime
     except ImportError:
@@ -74,44 +61,48 @@ def open_session(data: bytes, source: str) -> Any:
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
     options.log_severity_level = 4
+    if folded is not None:
+        levels = onnxruntime.GraphOptimizationLevel
+        options.graph_optimization_level = levels.ORT_ENABLE_BASIC
+        options.optimized_model_filepath = str(folded)
     try:
         return onnxruntime.InferenceSession(
             data, options, providers=["CPUExecutionProvider"]
         )
     except Exception as error:  # noqa: BLE001 - the runtime's errors have no common base class
-        raise cannot_run(source, error) from None
+        raise _cannot_run(source, error) from None
 
 
-def cannot_run(source: str, error: Exception) -> PolicyError:
-    """Returns the error for a graph that the runtime refuses."""
+def run_network(
+    session: Any, source: str, feeds: dict[str, NDArray[Any]]
+) -> list[NDArray[Any]]:
+    """Runs a network on its inputs by name; returns its outputs. Raises PolicyError."""
+    try:
+        return list(session.run(None, feeds))
+    except Exception as error:  # noqa: BLE001 - the runtime's errors have no common base class
+        raise _cannot_run(source, error) from None
+
+
+def _cannot_run(source: str, error: Exception) -> PolicyError:
     reason = f"onnxruntime can't run it ({onnx_graph.quote(error)})."
     return PolicyError(source, "graph", reason)
-
-
-def run_in_turn(
-    run: Callable[..., Sequence[NDArray[Any]]], seen: Rows, needs: GraphNeeds
-) -> list[NDArray[Any]]:
-    """Computes actions and commands for observations (T, O), step by step if there is a state."""
-    state = [] if needs.first_state is None else [needs.first_state[None]]
-    size = 1 if state else needs.most_rows
-    parts = []
-    for first in range(0, len(seen), size):
-        action, command, *state = run(seen[first : first + size], *state)
-        parts.append((action, command))
-    return [np.concatenate(rows) for rows in zip(*parts, strict=True)]
 
 
 def run_rows(session: Any, source: str, *tensors: Rows) -> list[NDArray[Any]]:
     """Runs observations (n, O), and states (n, S) if there are any. Raises PolicyError."""
     names = (onnx_graph.INPUT, onnx_graph.STATE_IN)
-    try:
-        return list(session.run(None, dict(zip(names, tensors, strict=False))))
-    except Exception as error:  # noqa: BLE001 - the runtime's errors have no common base class
-        raise cannot_run(source, error) from None
+    return run_network(session, source, dict(zip(names, tensors, strict=False)))
 
 
-def run_session(
-    session: Any, needs: GraphNeeds, seen: Rows, source: str
+def run_in_turn(
+    run: Callable[..., Sequence[NDArray[Any]]], seen: Rows, state: Rows | None
 ) -> list[NDArray[Any]]:
-    """Runs observations (T, O) like `run_in_turn`. Raises PolicyError."""
-    return run_in_turn(partial(run_rows, session, source), seen, needs)
+    """Computes actions and commands for observations (T, O), one by one from a state (S,)."""
+    if state is None:
+        return list(run(seen)[:2])
+    states = [state[None]]
+    steps = []
+    for row in seen:
+        action, command, *states = run(row[None], *states)
+        steps.append((action, command))
+    return [np.concatenate(rows) for rows in zip(*steps, strict=True)]

@@ -327,11 +327,9 @@ def make_policy(
     if not is_policy_file(name):
         return POLICIES[name](task, model)
     # Only policy files need onnxruntime.
-    from nics_drl_bridge.policy.foreign import (
-        load_any,
-    )
+    from nics_drl_bridge.policy.policy_file import load_policy
 
-    policy = load_any(name, model)
+    policy = load_policy(name, model)
     policy.check_fits(model, task)
     return _acting(policy)
 
@@ -349,9 +347,9 @@ def open_policy(
             raise ConfigError(f"policy {name!r} {reason}.")
         task = Navigation(model.robot, model.lidar)
         return POLICIES[name](task, model), task
-    from nics_drl_bridge.policy.foreign import load_any
+    from nics_drl_bridge.policy.policy_file import load_policy
 
-    policy = load_any(name, model)
+    policy = load_policy(name, model)
     opened: Any = policy.make_task(model, kind)  # any task, if `kind` names its class
     if kind is None and not isinstance(opened, Navigation):
         reason = f"is {policy.contract.task.name!r}; only policies of 'navigation' can be driven."

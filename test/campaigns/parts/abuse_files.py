@@ -85,10 +85,9 @@ def _take_checks_out() -> None:
 
     vars(config).update(_Loader=yaml.SafeLoader, MAX_BYTES=10**9)
     vars(onnx_graph).update(
-        check_wire=_believe,
         check_graph=_believe,
         check_seal=_believe,
-        check_shapes=_believe,
+        check_sizes=_believe,
         CONTRACT_LIMIT=10**9,
     )
 

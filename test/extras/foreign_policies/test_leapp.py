@@ -10,19 +10,28 @@ import torch
 import yaml
 from command_line import nics
 from onnx import helper
+from policy.policy_rig import (
+    SECTORS,
+    export,
+    export_remembering,
+    opened_here,  # noqa: F401
+    sequence,
+)
 from robots import direct_model
 
+from extras.foreign_policies import nets
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.errors import BridgeError, ConfigError, PolicyError
+from nics_drl_bridge.extras.foreign_policies import (
+    export_bundle,
+    import_policy,
+    leapp_import,
+)
 from nics_drl_bridge.files import write_bytes, write_text
-from nics_drl_bridge.policy import leapp_bundle
 from nics_drl_bridge.policy.contract import shipped
-from nics_drl_bridge.policy.foreign import import_policy, load_any
-from nics_drl_bridge.policy.leapp import export_bundle
 from nics_drl_bridge.policy.policy_file import load_policy, policy_of
-from policy import foreign_nets
-from policy.policy_rig import SECTORS, export, export_remembering, sequence
 
+pytestmark = pytest.mark.usefixtures("opened_here")
 KINDS = ("plain", "discrete", "beams", "remembering")
 
 
@@ -114,7 +123,7 @@ def test_nics_policy_exports_and_imports_what_is_shipped(tmp_path):
 
 # Bundles of others.
 
-OPSET = foreign_nets.OPSET
+OPSET = nets.OPSET
 
 
 def tensor(name, shape, kind=None, names=None):
@@ -125,7 +134,7 @@ def tensor(name, shape, kind=None, names=None):
 
 def parts():
     """Two networks, a scaling and a policy with a state that counts, and what they mean."""
-    first = foreign_nets.model_of(
+    first = nets.model_of(
         [
             helper.make_node(
                 "Concat", ["scan", "way", "linear", "angular"], ["seen"], axis=1
@@ -139,7 +148,7 @@ def parts():
     weights = (
         np.random.default_rng(0).normal(0.0, 0.2, (SECTORS + 8, 4)).astype(np.float32)
     )
-    second = foreign_nets.model_of(
+    second = nets.model_of(
         [
             helper.make_node("MatMul", ["features", "weights"], ["raw"]),
             helper.make_node("Add", ["raw", "hidden_in"], ["sum"]),
@@ -296,9 +305,9 @@ def test_a_bundle_of_others_is_driven_by_a_mapping_too(tmp_path):
     bundle = write_foreign(tmp_path)
     model = direct_model()
     path = tmp_path / "mapping.yaml"
-    mapping = leapp_bundle.mapping_of(leapp_bundle.read_bundle(bundle), model)
+    mapping = leapp_import.mapping_of(leapp_import.read_bundle(bundle), model)
     write_text(path, dump_yaml(mapping))
-    mine = load_any(path, model)
+    mine = load_policy(path, model)
     theirs = policy_of(import_policy(bundle, model), tmp_path / "ours.onnx")
     row = sequence(mine.make_task(model), 1)[0]
     state = np.zeros(5, np.float32)
@@ -352,7 +361,7 @@ REFUSED = {
     ),
     "no such node": (
         lambda data, _: data["pipeline"].update(outputs={"polici": ["linear"]}),
-        "no network has the output 'polici/linear'",
+        "names no node 'polici'; did you mean 'policy'",
     ),
     "frequency": (
         lambda data, _: data["pipeline"]["configs"].update(frequency=50.0),
