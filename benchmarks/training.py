@@ -20,7 +20,6 @@ from bench import answer, parser_of
 from numpy.typing import NDArray
 
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
-from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.policy.evaluation import (
     FIRST_SEED,
     Summary,
@@ -29,7 +28,11 @@ from nics_drl_bridge.policy.evaluation import (
 )
 from nics_drl_bridge.policy.train import train
 from nics_drl_bridge.policy.train_algorithms import act_of
-from nics_drl_bridge.policy.training_settings import TrainingSettings, load_training
+from nics_drl_bridge.policy.training_settings import (
+    TrainingSettings,
+    load_training,
+    open_training,
+)
 
 WORLD = "circles"
 BARS = {
@@ -80,11 +83,11 @@ class Run:
 
 def measure(settings: TrainingSettings, seed: int, episodes: int) -> Run:
     """Trains with one seed and drives unseen episodes."""
-    model = open_model(settings.robot, settings.lidar)
+    model, worlds = open_training(settings)
     begin = time.perf_counter()
     cpu = time.process_time()
     with tempfile.TemporaryDirectory() as folder:
-        trained = train(settings, seed, Path(folder))
+        trained = train(model, worlds, settings, seed, Path(folder))
     env = BridgeVectorEnv(
         episodes,
         model,

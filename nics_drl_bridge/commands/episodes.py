@@ -27,9 +27,9 @@ from nics_drl_bridge.nodes.parameters import NO_POSE
 from nics_drl_bridge.policy import evaluation
 from nics_drl_bridge.policy.contract import Contract
 from nics_drl_bridge.policy.evaluation import Episode, Tally, drive, drive_all
-from nics_drl_bridge.policy.pace import pace_of
 from nics_drl_bridge.policy.policies import is_policy_file, open_policy
 from nics_drl_bridge.policy.stateful import Policy
+from nics_drl_bridge.policy.training_settings import pace_of
 from nics_drl_bridge.report.doctor import examine
 from nics_drl_bridge.report.doctor_facts import derive_expected
 from nics_drl_bridge.report.pictures import draw_trajectories

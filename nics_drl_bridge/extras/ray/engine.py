@@ -32,7 +32,7 @@ from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, NUM_ENV_STEPS_SAMPLED
 from stable_baselines3.common.logger import configure
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.generator import SimulatorModel, open_model
+from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.policy import train, train_algorithms
 from nics_drl_bridge.policy.train_checkpoint import (
@@ -43,7 +43,6 @@ from nics_drl_bridge.policy.train_checkpoint import (
 )
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import TrainingSettings
-from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
 FORMAT = "nics_drl_bridge/ray_checkpoint/1"
 # loss parameters, as in Stable-Baselines3
@@ -253,6 +252,8 @@ def _count_runners(runners: int | None, cpus: int, worlds: int) -> int:
 
 
 def train_on_ray(
+    model: SimulatorModel,
+    worlds: train.Worlds,
     settings: TrainingSettings,
     seed: int,
     folder: Path,
@@ -279,9 +280,8 @@ def train_on_ray(
     content = read_checkpoint(path, FORMAT) if resumed else None
     if content is not None:
         train.check_same(content["about"], about, path)
-    algorithm = _build_algorithm(
-        settings, seed, 0 if content is None else content["steps"], runners
-    )
+    done = 0 if content is None else content["steps"]
+    algorithm = _build_algorithm(model, worlds, settings, seed, done, runners)
     try:
         learning = Learning(algorithm, settings, seed, path, runners)
         if content is not None:
@@ -391,19 +391,22 @@ class Learning:
 
 
 def _build_algorithm(
-    settings: TrainingSettings, seed: int, done: int, runners: int
+    model: SimulatorModel,
+    worlds: train.Worlds,
+    settings: TrainingSettings,
+    seed: int,
+    done: int,
+    runners: int,
 ) -> PPO:
     torch.set_num_threads(settings.threads)
-    model = open_model(settings.robot, settings.lidar)
-    scenes = {name: load_worlds(name) for name in settings.worlds}
     rng = np.random.default_rng(seed)
-    env = train.make_train_env(settings, model, scenes)
+    env = train.make_train_env(model, worlds, settings)
     train_algorithms.check_serves(settings, env.envs[0])
     env.seed(int(rng.integers(train.SEEDS)))
     normaliser = train_algorithms.observed(env, rng)
     spaces = env.observation_space, env.action_space
     env.close()
-    make = ray.put(functools.partial(select_worlds, settings, model, scenes))
+    make = ray.put(functools.partial(select_worlds, model, worlds, settings))
     env_config = {"make": make, "seed": (seed, done), "threads": settings.threads}
     env_config["rollout"] = settings.ppo.rollout
     config = _make_config(settings, seed, done, normaliser, spaces).env_runners(
@@ -418,9 +421,9 @@ def _build_algorithm(
 
 
 def select_worlds(
-    settings: TrainingSettings,
     model: SimulatorModel,
-    scenes: Mapping[str, AnyWorld],
+    worlds: train.Worlds,
+    settings: TrainingSettings,
     runner: int,
     runners: int,
 ) -> TrainVecEnv:
@@ -428,7 +431,7 @@ def select_worlds(
     names = [name for name, count in settings.worlds.items() for _ in range(count)]
     counts = dict(Counter(names[runner::runners]))
     return train.make_train_env(
-        settings.model_copy(update={"worlds": counts}), model, scenes
+        model, worlds, settings.model_copy(update={"worlds": counts})
     )
 
 
