@@ -28,10 +28,8 @@ COMMAND = "command"
 # additional input and output of a policy with a state
 STATE_IN = "state_in"
 STATE_OUT = "state_out"
-# recurrent operators over sequences whose length the graph fixes
-RECURRENT = frozenset({"GRU", "LSTM", "RNN"})
-OPERATORS = RECURRENT | frozenset(
-    {
+OPERATORS = frozenset(
+    [
         "Abs",
         "Add",
         "ArgMax",
@@ -49,6 +47,7 @@ OPERATORS = RECURRENT | frozenset(
         "Erf",
         "Exp",
         "Flatten",
+        "GRU",
         "Gather",
         "Gelu",
         "Gemm",
@@ -56,6 +55,7 @@ OPERATORS = RECURRENT | frozenset(
         "HardSigmoid",
         "HardSwish",
         "Identity",
+        "LSTM",
         "LayerNormalization",
         "LeakyRelu",
         "Log",
@@ -67,13 +67,14 @@ OPERATORS = RECURRENT | frozenset(
         "Mish",
         "Mul",
         "Neg",
-        "Pow",
         "PRelu",
+        "Pow",
+        "RNN",
+        "Reciprocal",
         "ReduceMax",
         "ReduceMean",
         "ReduceMin",
         "ReduceSum",
-        "Reciprocal",
         "Relu",
         "Reshape",
         "Selu",
@@ -92,7 +93,7 @@ OPERATORS = RECURRENT | frozenset(
         "Tanh",
         "Transpose",
         "Unsqueeze",
-    }
+    ]
 )
 """Operators of networks: no loops, branches, random numbers or data-dependent sizes."""
 FLOATS = frozenset({TensorProto.FLOAT, TensorProto.DOUBLE, TensorProto.FLOAT16})

@@ -277,7 +277,6 @@ def unchecked() -> Any:
         "generator.check_sums",
         "lidar.table.check_sums",
         "policy.onnx_graph.check_seal",
-        "policy.contract._check_unchanged",
         "policy.train_checkpoint.check_sealed",
     ):
         fits.enter_context(mock.patch(f"nics_drl_bridge.{place}", return_value=True))

@@ -55,7 +55,6 @@ def _signed(proto: Any, data: dict[str, Any] | None = None) -> bytes:
     if data is None:
         data = json.loads(onnx_graph.metadata(proto, "file"))
     data["graph_sha256"] = onnx_graph.graph_hash(proto)
-    data["checksums"] = contract.checksums(data)
     return _with_contract(proto, json.dumps(data))
 
 
