@@ -68,6 +68,12 @@ class StateEntry(Schema):
     longest_gap: float = Field(gt=0.0)
 
 
+def decode_rows(text: str) -> Rows:
+    """Decodes an array (16, ...) of golden pairs. Raises ValueError if it is damaged."""
+    data = base64.b64decode(text, validate=True)
+    return np.frombuffer(data, "<f4").reshape(GOLDEN, -1)
+
+
 class GoldenEntry(Schema):
     """Sixteen input-output pairs that the graph must reproduce; float32, little endian, base64.
 
@@ -78,10 +84,16 @@ class GoldenEntry(Schema):
     actions: str  # (16, C) actions, or (16, 1) discrete ones
     commands: str  # (16, C) commands in SI units
 
+    @field_validator("observations", "actions", "commands")
+    @classmethod
+    def _whole(cls, text: str) -> str:
+        if not np.isfinite(decode_rows(text)).all():
+            raise ValueError("must be finite numbers")
+        return text
+
     def rows(self, name: str) -> Rows:
-        """Returns one of the arrays, (16, ...). Raises ValueError if it is damaged."""
-        data = base64.b64decode(getattr(self, name), validate=True)
-        return np.frombuffer(data, "<f4").reshape(GOLDEN, -1)
+        """Returns one of the arrays, (16, ...)."""
+        return decode_rows(getattr(self, name))
 
 
 class Contract(Schema):
@@ -281,14 +293,3 @@ def _check_agreement(contract: Contract, source: str) -> None:
         raise PolicyError(
             source, "task.sha256", "does not match the task and observation."
         )
-    commands = len(contract.robot.command)
-    actions = 1 if contract.actions == "discrete" else commands
-    sizes = {"observations": observation.size, "commands": commands, "actions": actions}
-    for name, size in sizes.items():
-        try:
-            rows = contract.golden.rows(name)
-        except ValueError:
-            raise PolicyError(source, f"golden.{name}", "is damaged.") from None
-        if rows.shape != (GOLDEN, size) or not np.isfinite(rows).all():
-            reason = f"must have shape ({GOLDEN}, {size}) and finite numbers, not {rows.shape}."
-            raise PolicyError(source, f"golden.{name}", reason)

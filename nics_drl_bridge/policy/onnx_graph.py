@@ -276,41 +276,6 @@ def inputs_of(model: Any) -> list[Any]:
     return [value for value in model.graph.input if value.name not in weights]
 
 
-def check_ends(
-    model: Any, widths: dict[str, int | None], source: str, batch: int | None
-) -> None:
-    """Raises PolicyError unless inputs and outputs have these widths; None means integers (n,).
-
-    Their first dimension is the number of observations, `batch`; None: any number.
-    """
-    inputs = inputs_of(model)
-    if STATE_IN not in widths and STATE_IN in [end.name for end in inputs]:
-        reason = "is missing, although the graph needs one; export the policy again."
-        raise PolicyError(source, "state", reason)
-    for kind, ends, order in (
-        ("inputs", inputs, [INPUT, STATE_IN]),
-        ("outputs", model.graph.output, [ACTION, COMMAND, STATE_OUT]),
-    ):
-        names = [name for name in order if name in widths]
-        if [end.name for end in ends] != names:
-            reason = f"are {[end.name for end in ends]}, not {names}; export the policy again."
-            raise PolicyError(source, f"graph.{kind}", reason)
-    for end in (*inputs, *model.graph.output):
-        tensor = end.type.tensor_type
-        width = widths[end.name]
-        kind = TensorProto.INT64 if width is None else TensorProto.FLOAT
-        sizes = [
-            d.dim_value if d.HasField("dim_value") else None for d in tensor.shape.dim
-        ]
-        wanted = [batch] if width is None else [batch, width]
-        if tensor.elem_type != kind or sizes != wanted:
-            name = TensorProto.DataType.Name(tensor.elem_type)
-            reason = (
-                f"is {name} of shape {sizes}, but {wanted} is needed; export again."
-            )
-            raise PolicyError(source, f"graph.{end.name}", reason)
-
-
 def fix_rows(model: Any, rows: int) -> Any:
     """Returns a model for `rows` observations at once, without the shapes that it states itself."""
     bare = onnx.ModelProto()

@@ -210,29 +210,34 @@ def policy_of(data: bytes, path: Path) -> PolicyFile:
     if onnx_graph.graph_hash(model) != contract.graph_sha256:
         reason = "does not match the graph, which was changed after the export."
         raise PolicyError(source, "graph_sha256", reason)
-    if contract.foreign is None:
-        onnx_graph.check_ends(model, _widths_of(contract), source, contract.batch)
     session = open_session(data, source)
-    run = partial(run_rows, session, source)
-    if contract.foreign is not None:
+    if contract.foreign is None:
+        _check_ends(contract, session, source)
+        run = partial(run_rows, session, source)
+    else:
         run = foreign_policies().adapt(contract, session, source)
     policy = PolicyFile(path, contract, run)
     _check_golden(policy, source)
     return policy
 
 
-def _widths_of(contract: Contract) -> dict[str, int | None]:
-    """Returns the widths of the graph's inputs and outputs; None: integers, one per row."""
-    commands = len(contract.robot.command)
-    widths: dict[str, int | None] = {
-        onnx_graph.INPUT: contract.observation.size,
-        onnx_graph.COMMAND: commands,
-        onnx_graph.ACTION: None if contract.actions == "discrete" else commands,
-    }
+def _check_ends(contract: Contract, session: Any, source: str) -> None:
+    """Raises PolicyError for other inputs or outputs; the golden pairs show their widths."""
+    kind = "tensor(float)"
+    action = "tensor(int64)" if contract.actions == "discrete" else kind
+    inputs = [(onnx_graph.INPUT, kind)]
+    outputs = [(onnx_graph.ACTION, action), (onnx_graph.COMMAND, kind)]
     if contract.state is not None:
-        ends = (onnx_graph.STATE_IN, onnx_graph.STATE_OUT)
-        widths |= dict.fromkeys(ends, contract.state.size)
-    return widths
+        inputs.append((onnx_graph.STATE_IN, kind))
+        outputs.append((onnx_graph.STATE_OUT, kind))
+    for name, ends, wanted in (
+        ("inputs", session.get_inputs(), inputs),
+        ("outputs", session.get_outputs(), outputs),
+    ):
+        found = [(end.name, end.type) for end in ends]
+        if found != wanted:
+            reason = f"are {found}, not {wanted}; export the policy again."
+            raise PolicyError(source, f"graph.{name}", reason)
 
 
 def _check_golden(policy: PolicyFile, source: str) -> None:
@@ -242,7 +247,11 @@ def _check_golden(policy: PolicyFile, source: str) -> None:
     action, command = run_in_turn(policy.run, golden.rows("observations"), start)
     computed = {"actions": action.reshape(len(command), -1), "commands": command}
     for name, rows in computed.items():
-        gap = np.abs(rows - golden.rows(name)).max()
+        wanted = golden.rows(name)
+        if rows.shape != wanted.shape:
+            reason = f"have shape {wanted.shape}, but the graph's outputs {rows.shape}."
+            raise PolicyError(source, f"golden.{name}", reason)
+        gap = np.abs(rows - wanted).max()
         if not gap <= GOLDEN_TOLERANCE:
             reason = f"differ by {gap:.3g} from the graph's outputs on this machine; not used."
             raise PolicyError(source, f"golden.{name}", reason)

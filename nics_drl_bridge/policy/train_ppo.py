@@ -7,12 +7,14 @@ rollout, so results do not depend on which of them is faster. If collecting fini
 and critic learn on one core each for the rest of the update.
 """
 
+from __future__ import annotations
+
 import copy
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -23,7 +25,6 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.policy import train_algorithms, train_kernels
 from nics_drl_bridge.policy.train_checkpoint import RECENT, Watch
 from nics_drl_bridge.policy.train_kernels import LOG_NORM, Batch, Net
-from nics_drl_bridge.policy.train_rollout import Driven, Transitions
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import PpoSettings, TrainingSettings
 from nics_drl_bridge.threads import one_blas_thread, run_parts
@@ -33,6 +34,33 @@ Ended = list[tuple[bool, bool]]  # (success, collision) of ended episodes
 VALUE_WEIGHT = 0.5
 GRADIENT_LIMIT = 0.5
 ADAM_EPSILON = 1e-5
+
+
+class Driven(NamedTuple):
+    """A rollout as collected: T steps of N worlds."""
+
+    seen: torch.Tensor  # (T + 1, N, O) normalised observations
+    actions: torch.Tensor  # (T, N, C), or (T, N) discrete
+    log_probs: torch.Tensor  # (T, N) of the actions when they were drawn
+    rewards: torch.Tensor  # (T, N)
+    done: torch.Tensor  # (T, N) 1 at ends of episodes
+    cut: torch.Tensor  # (K,) indices t N + n of the truncated episodes
+    final: torch.Tensor  # (K, O) last observations of these episodes
+
+
+class Transitions(NamedTuple):
+    """R = T N transitions: T steps of N worlds, step by step."""
+
+    seen: torch.Tensor  # (R, O) normalised observations
+    actions: torch.Tensor  # (R, C), or (R,) discrete
+    log_probs: torch.Tensor  # (R,) of the actions when they were drawn
+    advantages: torch.Tensor  # (R,)
+    returns: torch.Tensor  # (R,) targets of the critic
+
+    def batches(self, size: int, generator: torch.Generator) -> Iterator[Transitions]:
+        """Yields batches of `size` transitions in random order; the last may be smaller."""
+        for rows in torch.randperm(len(self.seen), generator=generator).split(size):
+            yield Transitions(*(field[rows] for field in self))
 
 
 class Networks(torch.nn.Module):

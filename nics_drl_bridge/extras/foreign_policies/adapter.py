@@ -34,6 +34,7 @@ DTYPES = {
     "tensor(int32)": np.int32,
     "tensor(bool)": np.bool_,
 }
+AFTER_SCAN = 6  # elements of an observation after the scan: goal and velocity
 Entries = dict[str, Array]
 """Content of a state by name, each (K,)."""
 
@@ -93,8 +94,9 @@ class Adapter:
         self._output_sizes = {name: made.size for name, made in outputs.items()}
         self._check_inputs()
         self._commands = self._check_commands()
+        _, entries = self._step(np.zeros(scan_parts + AFTER_SCAN), {})
         # size of each entry of the state, in order
-        self._state_sizes = dict(self._list_state())
+        self._state_sizes = {name: entries[name].size for name in self._list_kept()}
 
     @property
     def state_size(self) -> int:
@@ -108,25 +110,45 @@ class Adapter:
         for name, size in self._state_sizes.items():
             past[name] = state[0][0, first : first + size].astype(float)
             first += size
-        following: Entries = {"begun": np.ones(1)}
-        seen = observation[0].astype(float)
-        feeds = {
-            name: self._feed(name, seen, past, following) for name in self._empty_inputs
-        }
-        outputs = self._run_network(feeds)
-        for name, kept in self._mapping.states.items():
-            following[f"state {name}"] = outputs[kept.next].ravel()
-        for name, made in outputs.items():
-            following[f"output {name}"] = made.ravel()
+        begun = bool(past) and past["begun"][0] > 0.0
+        values, following = self._step(
+            observation[0].astype(float), past if begun else {}
+        )
         low = self._robot.command_low
         high = self._robot.command_high
-        command = np.clip(self._command(outputs, following), low, high)
+        command = np.clip(values, low, high)
         action = np.clip(2.0 * (command - low) / (high - low) - 1.0, -1.0, 1.0)
         rows = [action, command]
         if state:
             entries = [following[name] for name in self._state_sizes]
             rows.append(np.concatenate([np.zeros(0), *entries]))
         return [row.astype(np.float32)[None] for row in rows]
+
+    def _step(self, seen: Array, past: Entries) -> tuple[Array, Entries]:
+        """Returns the command (C,), and what the next step may use; `past` is {} at first."""
+        following: Entries = {"begun": np.ones(1)}
+        feeds = {
+            name: self._feed(name, seen, past, following) for name in self._empty_inputs
+        }
+        outputs = self._run_network(feeds)
+        for name, state in self._mapping.states.items():
+            following[f"state {name}"] = outputs[state.next].ravel()
+        for name, made in outputs.items():
+            following[f"output {name}"] = made.ravel()
+        return self._command(outputs, following), following
+
+    def _list_kept(self) -> list[str]:
+        """Returns the names of what a step uses of the one before."""
+        kept = [f"state {name}" for name in self._mapping.states]
+        for name, mapped in self._mapping.inputs.items():
+            for k, part in enumerate(mapped.parts):
+                if part.history > 1:
+                    kept.append(f"history {name} {k}")
+                if part.output is not None:
+                    kept.append(f"output {part.output}")
+                elif part.of.startswith("last."):
+                    kept.append("twist")
+        return list(dict.fromkeys(["begun", *kept])) if kept else []
 
     def _run_network(self, feeds: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
         outputs = run_network(self._session, self._source, dict(feeds))
@@ -271,26 +293,6 @@ class Adapter:
     def _size_of(self, part: InputPart) -> int:
         return part_size(part, self._scan_parts, self._output_sizes)
 
-    def _list_state(self) -> Iterator[tuple[str, int]]:
-        """Yields name and size of each entry of the state."""
-        entries: list[tuple[str, int]] = [
-            (f"state {name}", self._empty_inputs[name].size)
-            for name in self._mapping.states
-        ]
-        for name, mapped in self._mapping.inputs.items():
-            for k, part in enumerate(mapped.parts):
-                if part.of.startswith("last.") and part.output is None:
-                    entries.append(("twist", len(TWIST)))
-                if part.output is not None:
-                    size = self._output_sizes[part.output]
-                    entries.append((f"output {part.output}", size))
-                if part.history > 1:
-                    kept = self._size_of(part) // part.history * (part.history - 1)
-                    entries.append((f"history {name} {k}", kept))
-        if entries:
-            yield "begun", 1  # 0 in the first step, then 1
-        yield from entries
-
     # Inputs.
 
     def _feed(
@@ -304,10 +306,9 @@ class Adapter:
                 for k, part in enumerate(mapped.parts)
             ]
             values = scale(np.concatenate(rows), mapped)
-        elif past["begun"][0]:
-            values = past[f"state {name}"]
         else:
-            values = np.resize(self._mapping.states[name].start, empty.size)
+            start = np.resize(self._mapping.states[name].start, empty.size)
+            values = past.get(f"state {name}", start)
         return values.reshape(empty.shape).astype(empty.dtype)
 
     def _part(
@@ -321,7 +322,7 @@ class Adapter:
         row = scale(self._quantity(part, seen, past), part)
         if part.history == 1:
             return row
-        earlier = past[key] if past["begun"][0] else np.tile(row, part.history - 1)
+        earlier = past.get(key, np.tile(row, part.history - 1))
         rows = np.concatenate([earlier, row])  # oldest first
         following[key] = rows[len(row) :]
         if part.newest_first:
@@ -337,12 +338,13 @@ class Adapter:
         if part.of == "constant":
             return np.atleast_1d(np.asarray(part.value, float))
         if part.output is not None:
-            return past[f"output {part.output}"]
+            nothing = np.zeros(self._output_sizes[part.output])
+            return past.get(f"output {part.output}", nothing)
         kind, _, which = part.of.partition(".")
         if kind == "velocity":
             return np.array([velocity[TWIST.index(which)]])
         if kind == "last":
-            return past["twist"][[TWIST.index(which)]]
+            return past.get("twist", np.zeros(3))[[TWIST.index(which)]]
         goal = {
             "distance": distance,
             "bearing": np.arctan2(sine, cosine),
