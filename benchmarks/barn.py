@@ -30,10 +30,10 @@ from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import BridgeError, ConfigError
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.policy.evaluation import DRIFT_M, drive_worlds
+from nics_drl_bridge.policy.file.stateful import Policy
 from nics_drl_bridge.policy.policies import POLICIES, open_policy
-from nics_drl_bridge.policy.stateful import Policy
-from nics_drl_bridge.policy.train import POLICY, TrainOrder, run
-from nics_drl_bridge.policy.training_settings import load_training
+from nics_drl_bridge.policy.train.run import POLICY, TrainOrder, run
+from nics_drl_bridge.policy.train.settings import load_training
 from nics_drl_bridge.sim import barn
 from nics_drl_bridge.sim.scenes import member_of
 from nics_drl_bridge.sim.world import World

@@ -36,7 +36,7 @@ from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.policy.evaluation import drive_all, successes
 from nics_drl_bridge.policy.policies import open_policy, shipped_policies
-from nics_drl_bridge.policy.training_settings import load_training
+from nics_drl_bridge.policy.train.settings import load_training
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
 from nics_drl_bridge.sim.simulator import EpisodeSampler

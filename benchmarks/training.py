@@ -26,9 +26,9 @@ from nics_drl_bridge.policy.evaluation import (
     drive_worlds,
     summarise,
 )
-from nics_drl_bridge.policy.train import train
-from nics_drl_bridge.policy.train_algorithms import act_of
-from nics_drl_bridge.policy.training_settings import (
+from nics_drl_bridge.policy.train.algorithms import act_of
+from nics_drl_bridge.policy.train.run import train
+from nics_drl_bridge.policy.train.settings import (
     TrainingSettings,
     load_training,
     open_training,

@@ -25,12 +25,12 @@ from nics_drl_bridge.files import SUMS, write_sums
 from nics_drl_bridge.gate.limits import load_limits
 from nics_drl_bridge.generator import load_model, open_model, save_model
 from nics_drl_bridge.lidar.sensor import add_sensor_kind, load_sensor, sensor_of_data
-from nics_drl_bridge.policy.contract import _task_hash
+from nics_drl_bridge.policy.file.contract import _task_hash
+from nics_drl_bridge.policy.file.policy_file import load_policy
 from nics_drl_bridge.policy.policies import open_policy
-from nics_drl_bridge.policy.policy_file import load_policy
-from nics_drl_bridge.policy.train import settings_of
-from nics_drl_bridge.policy.train_checkpoint import read_checkpoint
-from nics_drl_bridge.policy.training_settings import load_training
+from nics_drl_bridge.policy.train.checkpoint import read_checkpoint
+from nics_drl_bridge.policy.train.run import settings_of
+from nics_drl_bridge.policy.train.settings import load_training
 from nics_drl_bridge.recording.mapping import load_mapping
 from nics_drl_bridge.recording.messages import collect_types
 from nics_drl_bridge.recording.recording import load_recording

@@ -36,7 +36,7 @@ from nics_drl_bridge.policy.policies import (
     open_policy,
     shipped_policies,
 )
-from nics_drl_bridge.policy.training_settings import (
+from nics_drl_bridge.policy.train.settings import (
     Fitted,
     Opened,
     fit_settings,
@@ -244,7 +244,11 @@ def derive_settings(plan: DemoPlan, model: SimulatorModel) -> Fitted:
 
 
 def _train_policy(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
-    from nics_drl_bridge.policy.train import SeedResult, export, train  # needs torch
+    from nics_drl_bridge.policy.train.run import (  # needs torch
+        SeedResult,
+        export,
+        train,
+    )
 
     settings, notes, opened = derive_settings(plan, model)
     curve = list[pictures.Point]()

@@ -49,7 +49,7 @@ def doctor(
         _tell_installation(as_json)
         return
     from nics_drl_bridge.generator import open_model
-    from nics_drl_bridge.policy.policy_file import load_policy
+    from nics_drl_bridge.policy.file.policy_file import load_policy
     from nics_drl_bridge.report.doctor import examine
     from nics_drl_bridge.report.doctor_facts import (
         collect_facts_of_bag,

@@ -33,7 +33,7 @@ def info(
     as_json: JsonOption = False,
 ) -> None:
     """Checks a policy file and shows its training and requirements."""
-    from nics_drl_bridge.policy.policy_file import load_policy, summary
+    from nics_drl_bridge.policy.file.policy_file import load_policy, summary
 
     facts = summary(load_policy(file))
     print_line(
@@ -57,7 +57,7 @@ def export(
     as_json: JsonOption = False,
 ) -> None:
     """Converts a policy file to another format: Isaac's LEAPP."""
-    from nics_drl_bridge.policy.policy_file import foreign_policies, load_policy
+    from nics_drl_bridge.policy.file.policy_file import foreign_policies, load_policy
 
     written = str(foreign_policies().export_bundle(load_policy(file), leapp))
     print_line(as_json, f"wrote {written}", file=written)
@@ -80,8 +80,8 @@ def import_(
 ) -> None:
     """Makes a policy file from a policy trained elsewhere."""
     from nics_drl_bridge.generator import open_model
-    from nics_drl_bridge.policy.contract import SUFFIX
-    from nics_drl_bridge.policy.policy_file import foreign_policies, policy_of
+    from nics_drl_bridge.policy.file.contract import SUFFIX
+    from nics_drl_bridge.policy.file.policy_file import foreign_policies, policy_of
 
     if out.suffix != SUFFIX:
         raise ConfigError(

@@ -22,7 +22,7 @@ from nics_drl_bridge.files import format_json
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 DEFAULT_EPISODES = 500
-# PPO engines in this process, see `training_settings.PpoSettings`
+# PPO engines in this process, see `policy.train.settings.PpoSettings`
 OWN = ("lean", "sb3")
 
 
@@ -113,7 +113,7 @@ def train(
         check_settings(task, settings, named)
     extensions.require("training", *extensions.TRAINING)
     with console.show_progress("loading PyTorch"):
-        from nics_drl_bridge.policy import train as train_run
+        from nics_drl_bridge.policy.train import run as train_run
 
     task_of_user = task if ":" in task else None
     opened = None
@@ -197,7 +197,7 @@ def _load_settings(
     task: str, settings: str | None, named: dict[str, Any]
 ) -> tuple[Any, Any]:
     """Returns the settings of a training, and what they name; prints what was adapted."""
-    from nics_drl_bridge.policy.training_settings import settings_for
+    from nics_drl_bridge.policy.train.settings import settings_for
 
     chosen = settings_for(task, settings, named)
     for line in chosen.notes:
@@ -223,7 +223,7 @@ def _open_learner(
     engine: str | None, address: str | None, runners: int | None, worlds: int
 ) -> Iterator[Any]:
     if engine is None or engine in OWN:
-        from nics_drl_bridge.policy.train import train as learn
+        from nics_drl_bridge.policy.train.run import train as learn
 
         yield learn
     else:
@@ -261,7 +261,7 @@ def _run(
     as_json: bool,
     note: Callable[[str], None] = lambda _: None,
 ) -> None:
-    from nics_drl_bridge.policy.train import line_of
+    from nics_drl_bridge.policy.train.run import line_of
 
     def told(progress: Any) -> None:
         what = f"seed {progress.seed}: {progress.line}"

@@ -18,7 +18,7 @@ from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.middleware.uncertainty import Uncertainty, compute_uncertainty_gain
-from nics_drl_bridge.policy.stateful import Policy, begin
+from nics_drl_bridge.policy.file.stateful import Policy, begin
 from nics_drl_bridge.seeds import check_seeds
 
 Flags = NDArray[np.bool_]

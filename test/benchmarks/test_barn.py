@@ -11,7 +11,7 @@ import pytest
 
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.policy.training_settings import load_training
+from nics_drl_bridge.policy.train.settings import load_training
 
 from .runs import BENCHMARKS, asked, fails
 

@@ -64,8 +64,8 @@ def dynamic_window() -> Found:
 
 def training() -> Found:
     """The weights of the actor, layer by layer, after a few updates of the lean engine."""
-    from nics_drl_bridge.policy.train import train
-    from nics_drl_bridge.policy.training_settings import (
+    from nics_drl_bridge.policy.train.run import train
+    from nics_drl_bridge.policy.train.settings import (
         TrainingSettings,
         open_training,
     )

@@ -17,7 +17,7 @@ from nics_drl_bridge.lidar.further_lidar import FurtherLidar
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.sensor import add_sensor_kind, load_sensor, sensor_of_data
 from nics_drl_bridge.lidar.table import LidarTable
-from nics_drl_bridge.policy.contract import contract_of, read_contract
+from nics_drl_bridge.policy.file.contract import contract_of, read_contract
 from nics_drl_bridge.sim.simulator import FastSimulator
 
 SONAR = '''

@@ -21,9 +21,9 @@ from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.policy.file.policy_file import load_policy
 from nics_drl_bridge.policy.policies import open_policy
-from nics_drl_bridge.policy.policy_file import load_policy
-from nics_drl_bridge.policy.train_export import export_policy
+from nics_drl_bridge.policy.train.export import export_policy
 from nodes.peer import odometry, stamp_ns
 
 pytestmark = pytest.mark.ros

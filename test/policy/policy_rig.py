@@ -13,9 +13,9 @@ from robots import direct_model, lidar
 
 from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.errors import PolicyError
-from nics_drl_bridge.policy import onnx_graph, rehearsal
-from nics_drl_bridge.policy.onnx_session import check_network
-from nics_drl_bridge.policy.train_export import export_policy
+from nics_drl_bridge.policy.file import onnx_graph, rehearsal
+from nics_drl_bridge.policy.file.onnx_session import check_network
+from nics_drl_bridge.policy.train.export import export_policy
 
 SECTORS = 24
 

@@ -9,9 +9,9 @@ import onnx
 import pytest
 
 from nics_drl_bridge.errors import PolicyError
-from nics_drl_bridge.policy import onnx_graph, policy_file
-from nics_drl_bridge.policy.onnx_session import run_rows
-from nics_drl_bridge.policy.policy_file import load_policy
+from nics_drl_bridge.policy.file import onnx_graph, policy_file
+from nics_drl_bridge.policy.file.onnx_session import run_rows
+from nics_drl_bridge.policy.file.policy_file import load_policy
 from policy.policy_rig import (
     SECTORS,
     bytes_of,

@@ -13,10 +13,10 @@ from robots import DIRECT
 
 from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.errors import ConfigError, PolicyError
-from nics_drl_bridge.policy import onnx_graph
-from nics_drl_bridge.policy.contract import GoldenEntry
+from nics_drl_bridge.policy.file import onnx_graph
+from nics_drl_bridge.policy.file.contract import GoldenEntry
+from nics_drl_bridge.policy.file.policy_file import load_policy
 from nics_drl_bridge.policy.policies import make_policy
-from nics_drl_bridge.policy.policy_file import load_policy
 from policy.policy_rig import (
     SECTORS,
     bytes_of,
@@ -416,7 +416,7 @@ sys.meta_path.insert(0, Block())
 @pytest.mark.process
 def test_it_loads_where_nothing_of_training_is_installed(file):
     code = (
-        "from nics_drl_bridge.policy.policy_file import load_policy\n"
+        "from nics_drl_bridge.policy.file.policy_file import load_policy\n"
         f"print(load_policy({str(file)!r}).contract.robot.name)"
     )
     done = subprocess.run(

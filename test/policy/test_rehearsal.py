@@ -14,8 +14,8 @@ from extras.foreign_policies.nets import write
 from onnx import helper, numpy_helper
 
 from nics_drl_bridge.errors import PolicyError
-from nics_drl_bridge.policy import onnx_graph, rehearsal
-from nics_drl_bridge.policy.policy_file import load_policy
+from nics_drl_bridge.policy.file import onnx_graph, rehearsal
+from nics_drl_bridge.policy.file.policy_file import load_policy
 from policy.policy_rig import bytes_of, export, signed
 
 MOST_RSS = 1000 * 2**10  # of any process [kB]; without a limit it is 8.8 GB
@@ -24,7 +24,7 @@ MEASURE = """
 import resource, sys, time
 from pathlib import Path
 from nics_drl_bridge.errors import PolicyError
-from nics_drl_bridge.policy.policy_file import load_policy
+from nics_drl_bridge.policy.file.policy_file import load_policy
 begun = time.process_time()
 for path in sys.argv[1:]:
     try:

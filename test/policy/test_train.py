@@ -10,10 +10,10 @@ from robots import direct_model, field
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import seal
-from nics_drl_bridge.policy import train as training
-from nics_drl_bridge.policy.train import CHECKPOINT, TrainOrder, evaluate, run
-from nics_drl_bridge.policy.train_checkpoint import FORMAT, read_checkpoint
-from nics_drl_bridge.policy.training_settings import TrainingSettings
+from nics_drl_bridge.policy.train import run as training
+from nics_drl_bridge.policy.train.checkpoint import FORMAT, read_checkpoint
+from nics_drl_bridge.policy.train.run import CHECKPOINT, TrainOrder, evaluate, run
+from nics_drl_bridge.policy.train.settings import TrainingSettings
 
 MODEL = direct_model(odometry=(0.02, 0.02))
 WORLD = field(count=2)
@@ -118,7 +118,7 @@ def test_an_interrupted_training_comes_to_the_same_weights(
             raise BrokenOffError
 
     # Told of every rollout, whatever the clock says.
-    monkeypatch.setattr("nics_drl_bridge.policy.train_checkpoint.TOLD_S", 0.0)
+    monkeypatch.setattr("nics_drl_bridge.policy.train.checkpoint.TOLD_S", 0.0)
     with pytest.raises(BrokenOffError):
         train(chosen, 1, tmp_path / "broken", interrupt)
     assert 0 < steps_in(tmp_path / "broken" / CHECKPOINT) < 1000

@@ -22,7 +22,7 @@ from nics_drl_bridge.extras.foreign_policies.mapping import (
     Scaled,
 )
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.policy.onnx_session import Rows, run_network
+from nics_drl_bridge.policy.file.onnx_session import Rows, run_network
 from nics_drl_bridge.robot.spec import RobotSpec
 
 FIELDS = dict(zip(TWIST, ("linear.x", "linear.y", "angular.z"), strict=True))

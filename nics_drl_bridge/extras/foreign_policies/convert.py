@@ -17,16 +17,16 @@ from nics_drl_bridge.extras.foreign_policies.mapping import ForeignPolicy
 from nics_drl_bridge.files import hash_bytes
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.lidar.sectors import layout_of
-from nics_drl_bridge.policy import onnx_graph, rehearsal
-from nics_drl_bridge.policy.contract import (
+from nics_drl_bridge.policy.file import onnx_graph, rehearsal
+from nics_drl_bridge.policy.file.contract import (
     MAPPINGS,
     SUFFIX,
     Contract,
     contract_of,
     golden_observations,
 )
-from nics_drl_bridge.policy.onnx_session import open_session, run_in_turn
-from nics_drl_bridge.policy.policy_file import PERIOD_TOLERANCE, Run
+from nics_drl_bridge.policy.file.onnx_session import open_session, run_in_turn
+from nics_drl_bridge.policy.file.policy_file import PERIOD_TOLERANCE, Run
 
 
 @dataclass(frozen=True)

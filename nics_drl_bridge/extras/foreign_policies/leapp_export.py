@@ -25,9 +25,9 @@ from nics_drl_bridge.files import (
     write_text,
     write_whole_folder,
 )
-from nics_drl_bridge.policy import onnx_graph
-from nics_drl_bridge.policy.contract import Contract
-from nics_drl_bridge.policy.policy_file import PolicyFile
+from nics_drl_bridge.policy.file import onnx_graph
+from nics_drl_bridge.policy.file.contract import Contract
+from nics_drl_bridge.policy.file.policy_file import PolicyFile
 
 NODE = "policy"
 CONFIG_VERSION = "1.3"  # version of the format

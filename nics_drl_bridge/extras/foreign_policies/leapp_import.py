@@ -22,7 +22,7 @@ from nics_drl_bridge.extras.foreign_policies.leapp_export import (
 from nics_drl_bridge.extras.foreign_policies.mapping import ForeignState
 from nics_drl_bridge.files import hash_bytes
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.policy import onnx_graph, rehearsal
+from nics_drl_bridge.policy.file import onnx_graph, rehearsal
 
 ZERO = "constant"  # quantity for components that a planar robot does not have
 LINEAR = {"x": "velocity.forward", "y": "velocity.left", "z": ZERO}

@@ -34,15 +34,16 @@ from stable_baselines3.common.logger import configure
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import Array
-from nics_drl_bridge.policy import train, train_algorithms
-from nics_drl_bridge.policy.train_checkpoint import (
+from nics_drl_bridge.policy.train import algorithms
+from nics_drl_bridge.policy.train import run as train
+from nics_drl_bridge.policy.train.checkpoint import (
     RECENT,
     Progress,
     read_checkpoint,
     write_content,
 )
-from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
-from nics_drl_bridge.policy.training_settings import TrainingSettings
+from nics_drl_bridge.policy.train.settings import TrainingSettings
+from nics_drl_bridge.policy.train.vec_env import TrainVecEnv
 
 FORMAT = "nics_drl_bridge/ray_checkpoint/1"
 # loss parameters, as in Stable-Baselines3
@@ -172,8 +173,8 @@ class ActorCritic(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
         seen = self.observation_space
         hidden = list(chosen["hidden"])
         normaliser = chosen["normaliser"]
-        self.actor = train_algorithms.Actor(seen, self.action_space, hidden, normaliser)
-        self.critic = train_algorithms.layers_of([int(seen.shape[0]), *hidden, 1], 1.0)
+        self.actor = algorithms.Actor(seen, self.action_space, hidden, normaliser)
+        self.critic = algorithms.layers_of([int(seen.shape[0]), *hidden, 1], 1.0)
         if not self.actor.discrete:
             spread = torch.full(self.action_space.shape, float(chosen["log_std"]))
             self.log_std = torch.nn.Parameter(spread)
@@ -261,7 +262,7 @@ def train_on_ray(
     resumed: bool = False,
     runners: int = 1,
 ) -> train.Trained:
-    """Trains like `policy.train.train`, on the connected cluster.
+    """Trains like `policy.train.run.train`, on the connected cluster.
 
     Raises ConfigError, also if no runner answers.
     """
@@ -401,9 +402,9 @@ def _build_algorithm(
     torch.set_num_threads(settings.threads)
     rng = np.random.default_rng(seed)
     env = train.make_train_env(model, worlds, settings)
-    train_algorithms.check_serves(settings, env.envs[0])
+    algorithms.check_serves(settings, env.envs[0])
     env.seed(int(rng.integers(train.SEEDS)))
-    normaliser = train_algorithms.observed(env, rng)
+    normaliser = algorithms.observed(env, rng)
     spaces = env.observation_space, env.action_space
     env.close()
     make = ray.put(functools.partial(select_worlds, model, worlds, settings))
@@ -445,7 +446,7 @@ def _make_config(
     chosen = settings.ppo
     left = max(settings.steps - done, 1)
     rate = chosen.learning_rate
-    now = rate * max(1.0 - done / settings.steps, train_algorithms.LEAST_RATE)
+    now = rate * max(1.0 - done / settings.steps, algorithms.LEAST_RATE)
     network = {
         "hidden": settings.hidden,
         "normaliser": normaliser,
@@ -460,7 +461,7 @@ def _make_config(
         )
         .learners(num_learners=0)
         .training(
-            lr=[[0, now], [left, rate * train_algorithms.LEAST_RATE]],
+            lr=[[0, now], [left, rate * algorithms.LEAST_RATE]],
             train_batch_size_per_learner=chosen.rollout * settings.num_envs,
             minibatch_size=chosen.batch,
             num_epochs=chosen.epochs,

@@ -81,7 +81,7 @@ def _take_checks_out() -> None:
     import yaml
 
     from nics_drl_bridge import config
-    from nics_drl_bridge.policy import onnx_graph
+    from nics_drl_bridge.policy.file import onnx_graph
 
     vars(config).update(_Loader=yaml.SafeLoader, MAX_BYTES=10**9)
     vars(onnx_graph).update(

@@ -28,11 +28,11 @@ from nics_drl_bridge.gate.inputs import Tick
 from nics_drl_bridge.generator import builtin_model, load_model, save_model
 from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.lidar.table import LidarTable
-from nics_drl_bridge.policy.policy_file import load_policy
-from nics_drl_bridge.policy.train import CHECKPOINT, train
-from nics_drl_bridge.policy.train_checkpoint import read_checkpoint
-from nics_drl_bridge.policy.train_export import export_policy
-from nics_drl_bridge.policy.training_settings import TrainingSettings
+from nics_drl_bridge.policy.file.policy_file import load_policy
+from nics_drl_bridge.policy.train.checkpoint import read_checkpoint
+from nics_drl_bridge.policy.train.export import export_policy
+from nics_drl_bridge.policy.train.run import CHECKPOINT, train
+from nics_drl_bridge.policy.train.settings import TrainingSettings
 from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.recording.recording import load_recording, save_recording
 from nics_drl_bridge.robot.spec import load_robot
@@ -276,8 +276,8 @@ def unchecked() -> Any:
         "recording.recording._check_seal",
         "generator.check_sums",
         "lidar.table.check_sums",
-        "policy.onnx_graph.check_seal",
-        "policy.train_checkpoint.check_sealed",
+        "policy.file.onnx_graph.check_seal",
+        "policy.train.checkpoint.check_sealed",
     ):
         fits.enter_context(mock.patch(f"nics_drl_bridge.{place}", return_value=True))
     return fits

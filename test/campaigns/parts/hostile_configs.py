@@ -17,7 +17,7 @@ from nics_drl_bridge.lidar.maps import load_map
 from nics_drl_bridge.lidar.scanner import make_scanner
 from nics_drl_bridge.lidar.shapes import Circle
 from nics_drl_bridge.lidar.spec import load_lidar
-from nics_drl_bridge.policy.training_settings import load_training
+from nics_drl_bridge.policy.train.settings import load_training
 from nics_drl_bridge.recording.topic_roles import load_topic_roles
 from nics_drl_bridge.robot.spec import load_robot
 from nics_drl_bridge.sim.randomisation import load_randomisation

@@ -31,7 +31,7 @@ from nics_drl_bridge.generator import (
 )
 from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.lidar.table import ARRAYS, LidarTable
-from nics_drl_bridge.policy.train_checkpoint import read_checkpoint
+from nics_drl_bridge.policy.train.checkpoint import read_checkpoint
 from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.recording.readers import read_recording
 from nics_drl_bridge.recording.recording import save_recording

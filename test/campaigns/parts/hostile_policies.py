@@ -12,9 +12,9 @@ import numpy as np
 import onnx
 from parts.attempt import Attempt, nics
 
-from nics_drl_bridge.policy import contract, onnx_graph
-from nics_drl_bridge.policy.contract import shipped
-from nics_drl_bridge.policy.policy_file import load_policy
+from nics_drl_bridge.policy.file import contract, onnx_graph
+from nics_drl_bridge.policy.file.contract import shipped
+from nics_drl_bridge.policy.file.policy_file import load_policy
 
 Rng = np.random.Generator
 node = onnx.helper.make_node

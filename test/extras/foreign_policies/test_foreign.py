@@ -17,8 +17,8 @@ from nics_drl_bridge.extras.foreign_policies import import_policy
 from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.policy.evaluation import drive_worlds
+from nics_drl_bridge.policy.file.policy_file import load_policy
 from nics_drl_bridge.policy.policies import open_policy
-from nics_drl_bridge.policy.policy_file import load_policy
 
 pytestmark = pytest.mark.usefixtures("opened_here")
 CORNERS = (0.0, 1e-4, np.pi / 2, 3.1415, -1e-4, -1.6, -3.1415)

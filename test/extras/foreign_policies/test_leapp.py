@@ -28,8 +28,8 @@ from nics_drl_bridge.extras.foreign_policies import (
     leapp_import,
 )
 from nics_drl_bridge.files import write_bytes, write_text
-from nics_drl_bridge.policy.contract import shipped
-from nics_drl_bridge.policy.policy_file import load_policy, policy_of
+from nics_drl_bridge.policy.file.contract import shipped
+from nics_drl_bridge.policy.file.policy_file import load_policy, policy_of
 
 pytestmark = pytest.mark.usefixtures("opened_here")
 KINDS = ("plain", "discrete", "beams", "remembering")

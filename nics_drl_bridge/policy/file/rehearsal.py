@@ -14,7 +14,7 @@ import sys
 
 from nics_drl_bridge.errors import PolicyError
 from nics_drl_bridge.files import hash_bytes
-from nics_drl_bridge.policy.onnx_session import check_network
+from nics_drl_bridge.policy.file.onnx_session import check_network
 
 MEMORY = 512 * 2**20  # limit, in addition to what the libraries use [bytes]
 # additional limit per byte of the file: a network is in memory several times

@@ -16,10 +16,10 @@ from nics_drl_bridge.errors import ConfigError, PolicyError, suggest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.sectors import plan_of
 from nics_drl_bridge.lidar.spec import LidarSpec
-from nics_drl_bridge.policy import contract as contracts
-from nics_drl_bridge.policy import onnx_graph, rehearsal
-from nics_drl_bridge.policy.contract import MAPPINGS, Contract, Rows, leaves
-from nics_drl_bridge.policy.onnx_session import open_session, run_in_turn, run_rows
+from nics_drl_bridge.policy.file import contract as contracts
+from nics_drl_bridge.policy.file import onnx_graph, rehearsal
+from nics_drl_bridge.policy.file.contract import MAPPINGS, Contract, Rows, leaves
+from nics_drl_bridge.policy.file.onnx_session import open_session, run_in_turn, run_rows
 from nics_drl_bridge.robot.spec import RobotSpec
 
 GOLDEN_TOLERANCE = 1e-5

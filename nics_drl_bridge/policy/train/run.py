@@ -21,8 +21,6 @@ from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError, shorten
 from nics_drl_bridge.files import format_json, write_text
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.policy import train_algorithms as algorithms
-from nics_drl_bridge.policy import train_checkpoint as checkpoints
 from nics_drl_bridge.policy.evaluation import (
     FIRST_SEED,
     Outcomes,
@@ -30,18 +28,20 @@ from nics_drl_bridge.policy.evaluation import (
     drive_worlds,
     summarise,
 )
-from nics_drl_bridge.policy.train_algorithms import Actor, Sb3Training
-from nics_drl_bridge.policy.train_export import export_policy
-from nics_drl_bridge.policy.train_ppo import LeanPpo
-from nics_drl_bridge.policy.train_stop import Stop
-from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
-from nics_drl_bridge.policy.training_settings import (
+from nics_drl_bridge.policy.train import algorithms as algorithms
+from nics_drl_bridge.policy.train import checkpoint as checkpoints
+from nics_drl_bridge.policy.train.algorithms import Actor, Sb3Training
+from nics_drl_bridge.policy.train.export import export_policy
+from nics_drl_bridge.policy.train.ppo import LeanPpo
+from nics_drl_bridge.policy.train.settings import (
     Opened,
     TrainingSettings,
     is_code,
     open_training,
     read_settings,
 )
+from nics_drl_bridge.policy.train.stop import Stop
+from nics_drl_bridge.policy.train.vec_env import TrainVecEnv
 from nics_drl_bridge.seeds import check_seeds
 from nics_drl_bridge.sim.world_set import AnyWorld
 

@@ -10,7 +10,7 @@ import onnx
 from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ConfigError, PolicyError
-from nics_drl_bridge.policy import onnx_graph
+from nics_drl_bridge.policy.file import onnx_graph
 
 Rows = NDArray[np.float32]
 

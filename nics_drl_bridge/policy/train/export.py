@@ -15,7 +15,7 @@ from nics_drl_bridge.env.task import Task
 from nics_drl_bridge.errors import ConfigError, PolicyError
 from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.policy.contract import (
+from nics_drl_bridge.policy.file.contract import (
     GOLDEN,
     SUFFIX,
     Rows,
@@ -27,8 +27,8 @@ with extensions.require_modules("the export of a policy"):
     import onnx
     import torch
 
-    from nics_drl_bridge.policy import onnx_graph, policy_file, rehearsal
-    from nics_drl_bridge.policy.onnx_session import (
+    from nics_drl_bridge.policy.file import onnx_graph, policy_file, rehearsal
+    from nics_drl_bridge.policy.file.onnx_session import (
         check_network,
         open_session,
         run_in_turn,
