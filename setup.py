@@ -52,7 +52,7 @@ EXTRAS = {
     # RLlib holds Gymnasium at a version of its own: for an environment apart, as `nox -s ray`
     # builds one, and no part of `dev`.
     "distributed": ["ray[rllib]>=2.60,<2.61"],
-    "deploy": ["onnx>=1.16", "onnxruntime>=1.18"],
+    "deploy": ["onnx>=1.16", "onnxruntime>=1.18", "safetensors>=0.4"],
     # Isaac's runner of policy bundles, which the tests hold ours against; reading and writing them
     # needs `deploy` alone. A library of its pictures has wheels for this platform only.
     "leapp": [f"leapp>=0.7.2; {ROS_WHEELS_EXIST}"],
@@ -157,6 +157,7 @@ setup(
         ],
         # For tools that list environments; gymnasium itself stopped reading this in 1.0.
         "gymnasium.envs": [f"NicsBridge = {PACKAGE}.env.registry:register_envs"],
+        f"{PACKAGE}.adapters": [f"foreign = {PACKAGE}.extras.foreign_policies"],
         f"{PACKAGE}.backends": [
             f"sim = {PACKAGE}.env.sim_backend:SimBackend",
             f"dds = {PACKAGE}.nodes.backends:dds_backend",

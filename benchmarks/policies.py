@@ -58,9 +58,13 @@ from nics_drl_bridge.policy.evaluation import (
     successes,
     summarise,
 )
+from nics_drl_bridge.policy.file.stateful import Policy
 from nics_drl_bridge.policy.policies import POLICIES, open_policy, shipped_policies
-from nics_drl_bridge.policy.stateful import Policy
-from nics_drl_bridge.policy.training_settings import TrainingSettings, load_training
+from nics_drl_bridge.policy.train.settings import (
+    TrainingSettings,
+    load_training,
+    open_training,
+)
 from nics_drl_bridge.robot.spec import load_robot
 from nics_drl_bridge.sim import barn
 from nics_drl_bridge.sim.scenes import member_of
@@ -94,13 +98,13 @@ def shorten(settings: TrainingSettings) -> TrainingSettings:
 
 def learn(settings: TrainingSettings, seed: int, episodes: int) -> Result:
     """Trains with one seed and drives unseen episodes; returns the figures."""
-    from nics_drl_bridge.policy.train import train
-    from nics_drl_bridge.policy.train_algorithms import act_of
+    from nics_drl_bridge.policy.train.algorithms import act_of
+    from nics_drl_bridge.policy.train.run import train
 
-    model = open_model(settings.robot, settings.lidar)
+    model, worlds = open_training(settings)
     begin = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
-        trained = train(settings, seed, Path(folder))
+        trained = train(model, worlds, settings, seed, Path(folder))
     env = BridgeVectorEnv(
         episodes,
         model,
@@ -333,7 +337,7 @@ def drive_folds(
         raise ConfigError(
             f"--five-fold needs {FOLDS} worlds, not {len(courses)}; name more."
         )
-    from nics_drl_bridge.policy.train import POLICY, TrainOrder, run
+    from nics_drl_bridge.policy.train.run import POLICY, TrainOrder, run
 
     driven = []
     longest_s = 0.0

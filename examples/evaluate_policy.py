@@ -9,7 +9,7 @@ from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.policy.evaluation import drive_all, drive_worlds, summarise
 from nics_drl_bridge.policy.policies import open_policy
-from nics_drl_bridge.policy.train import line_of
+from nics_drl_bridge.policy.train.run import line_of
 from nics_drl_bridge.report.pictures import draw_trajectories
 from nics_drl_bridge.sim.world import load_world
 

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from nics_drl_bridge.policy import train
-from nics_drl_bridge.policy.training_settings import chosen_settings
+from nics_drl_bridge.policy.train import run as train
+from nics_drl_bridge.policy.train.settings import chosen_settings
 from nics_drl_bridge.report.pictures import Point, draw_training_curve
 
 STEPS = 120_000  # half a minute; `nics demo` takes 800,000

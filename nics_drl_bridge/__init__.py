@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from nics_drl_bridge.env.make import make, make_vec
     from nics_drl_bridge.generator import generate, load_model, open_model, save_model
-    from nics_drl_bridge.policy.policy_file import load_policy
+    from nics_drl_bridge.policy.file.policy_file import load_policy
     from nics_drl_bridge.recording.readers import read_recording
     from nics_drl_bridge.recording.recording import load_recording, save_recording
     from nics_drl_bridge.robot.spec import load_robot
@@ -53,7 +53,7 @@ __all__ = [
 _NAMES = {
     "env.make": ("make", "make_vec"),
     "generator": ("generate", "load_model", "open_model", "save_model"),
-    "policy.policy_file": ("load_policy",),
+    "policy.file.policy_file": ("load_policy",),
     "recording.readers": ("read_recording",),
     "recording.recording": ("load_recording", "save_recording"),
     "robot.spec": ("load_robot",),

@@ -43,6 +43,7 @@ INSTALL = {
     "pettingzoo": "multi",
     "ray": "train,distributed",
     "rosbags": "bags",
+    "safetensors": "deploy",
     "stable_baselines3": "train",
     "tensorboard": "train",
     "torch": "train",

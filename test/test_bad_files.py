@@ -15,8 +15,8 @@ from nics_drl_bridge.gate.limits import load_limits
 from nics_drl_bridge.lidar.maps import load_map
 from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.lidar.table import LidarTable
-from nics_drl_bridge.policy.policy_file import load_policy
-from nics_drl_bridge.policy.training_settings import load_training
+from nics_drl_bridge.policy.file.policy_file import load_policy
+from nics_drl_bridge.policy.train.settings import load_training
 from nics_drl_bridge.recording.recording import load_recording
 from nics_drl_bridge.recording.topic_roles import load_topic_roles
 from nics_drl_bridge.robot.spec import load_robot

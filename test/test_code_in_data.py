@@ -20,17 +20,17 @@ from nics_drl_bridge.config import share_folder
 from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.env.sim_backend import make_backend
 from nics_drl_bridge.errors import BridgeError, ConfigError
+from nics_drl_bridge.extras.foreign_policies import import_policy
 from nics_drl_bridge.files import SUMS, write_sums
 from nics_drl_bridge.gate.limits import load_limits
 from nics_drl_bridge.generator import load_model, open_model, save_model
 from nics_drl_bridge.lidar.sensor import add_sensor_kind, load_sensor, sensor_of_data
-from nics_drl_bridge.policy.contract import _task_hash
-from nics_drl_bridge.policy.foreign import import_policy, load_any
+from nics_drl_bridge.policy.file.contract import _task_hash
+from nics_drl_bridge.policy.file.policy_file import load_policy
 from nics_drl_bridge.policy.policies import open_policy
-from nics_drl_bridge.policy.policy_file import load_policy
-from nics_drl_bridge.policy.train import settings_of
-from nics_drl_bridge.policy.train_checkpoint import read_checkpoint
-from nics_drl_bridge.policy.training_settings import load_training
+from nics_drl_bridge.policy.train.checkpoint import read_checkpoint
+from nics_drl_bridge.policy.train.run import settings_of
+from nics_drl_bridge.policy.train.settings import load_training
 from nics_drl_bridge.recording.mapping import load_mapping
 from nics_drl_bridge.recording.messages import collect_types
 from nics_drl_bridge.recording.recording import load_recording
@@ -176,13 +176,13 @@ WAYS = {
     "the task of a policy": lambda t, p: open_policy(
         str(policy_with_a_task(t, p("Trap"))), direct_model()
     ),
-    "the robot of a mapping": lambda t, p: load_any(
+    "the robot of a mapping": lambda t, p: load_policy(
         foreign_mapping(t, "robot", p("Trap"))
     ),
-    "the network of a mapping": lambda t, p: load_any(
+    "the network of a mapping": lambda t, p: load_policy(
         foreign_mapping(t, "network", p("Trap"))
     ),
-    "the scan of a mapping": lambda t, p: load_any(
+    "the scan of a mapping": lambda t, p: load_policy(
         foreign_mapping(t, "scan", p("Trap"))
     ),
     "a network of a bundle": lambda t, p: import_policy(leapp_bundle(t, p("Trap"))),

@@ -11,7 +11,7 @@ from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.pettingzoo_env import BridgeParallelEnv
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.nodes.parameters import NODES
-from nics_drl_bridge.policy.training_settings import TrainingSettings, chosen_settings
+from nics_drl_bridge.policy.train.settings import TrainingSettings, chosen_settings
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 NAMES = ("robot", "model")

@@ -107,7 +107,7 @@ def test_a_policy_of_a_task_of_ones_own_is_driven_by_the_file_of_the_task(tmp_pa
 
     from nics_drl_bridge.env.registry import make_task
     from nics_drl_bridge.generator import builtin_model
-    from nics_drl_bridge.policy.train_export import export_policy
+    from nics_drl_bridge.policy.train.export import export_policy
 
     kind = f"{ROOT / 'examples' / 'own_task.py'}:Patrol"
     model = builtin_model("differential")

@@ -107,9 +107,9 @@ def test_nics_says_in_one_sentence_what_a_command_needs(tmp_path):
     ("module", "what", "library", "extra"),
     [
         ("env.pettingzoo_env", "BridgeParallelEnv", "pettingzoo", "multi"),
-        ("policy.train_vec_env", "TrainVecEnv", "stable_baselines3", "train"),
-        ("policy.train_export", "the export of a policy", "onnx", "deploy"),
-        ("policy.train_export", "the export of a policy", "torch", "train"),
+        ("policy.train.vec_env", "TrainVecEnv", "stable_baselines3", "train"),
+        ("policy.train.export", "the export of a policy", "onnx", "deploy"),
+        ("policy.train.export", "the export of a policy", "torch", "train"),
     ],
 )
 def test_a_module_whose_extra_is_missing_names_it(module, what, library, extra):

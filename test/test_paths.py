@@ -18,8 +18,8 @@ from nics_drl_bridge.generator import (
 from nics_drl_bridge.lidar.maps import load_map
 from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.lidar.table import LidarTable
-from nics_drl_bridge.policy.policy_file import load_policy
-from nics_drl_bridge.policy.training_settings import load_training
+from nics_drl_bridge.policy.file.policy_file import load_policy
+from nics_drl_bridge.policy.train.settings import load_training
 from nics_drl_bridge.recording.readers import read_recording
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.recording.write import check_out, write_drive

@@ -15,7 +15,7 @@ from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.spec import load_lidar
-from nics_drl_bridge.policy.training_settings import load_training
+from nics_drl_bridge.policy.train.settings import load_training
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
 

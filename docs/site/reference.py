@@ -17,12 +17,12 @@ from pydantic import BaseModel
 from typer.main import get_command
 
 from nics_drl_bridge.commands.cli import app
+from nics_drl_bridge.extras.foreign_policies.mapping import ForeignPolicy
 from nics_drl_bridge.gate.limits import LimitsFile
 from nics_drl_bridge.lidar.maps import MapFile
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.nodes.parameters import NODES, STAMPED, Row
-from nics_drl_bridge.policy.foreign_mapping import ForeignPolicy
-from nics_drl_bridge.policy.training_settings import TrainingSettings
+from nics_drl_bridge.policy.train.settings import TrainingSettings
 from nics_drl_bridge.recording.mapping import Mapping
 from nics_drl_bridge.recording.topic_roles import TopicRoles
 from nics_drl_bridge.robot.spec import RobotSpec, list_kinds

@@ -30,14 +30,19 @@ from nics_drl_bridge.policy.evaluation import (
     deviation,
     successes,
 )
-from nics_drl_bridge.policy.pace import Fitted, fitted, pace_of
 from nics_drl_bridge.policy.policies import (
     check_policy_file,
     is_policy_file,
     open_policy,
     shipped_policies,
 )
-from nics_drl_bridge.policy.training_settings import load_training
+from nics_drl_bridge.policy.train.settings import (
+    Fitted,
+    Opened,
+    fit_settings,
+    load_training,
+    pace_of,
+)
 from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.recording.readers import open_drive, read_recording
 from nics_drl_bridge.recording.recording import Recording, save_recording
@@ -233,13 +238,18 @@ def derive_settings(plan: DemoPlan, model: SimulatorModel) -> Fitted:
     worlds = {plan.world: chosen.num_envs}
     steps = plan.train_steps or chosen.steps
     changes = {"robot": str(plan.model), "worlds": worlds, "steps": steps}
-    return fitted(chosen.model_copy(update=changes), model, inherited=True)
+    opened = Opened(model, {plan.world: load_world(plan.world)})
+    return fit_settings(chosen.model_copy(update=changes), opened, inherited=True)
 
 
 def _train_policy(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
-    from nics_drl_bridge.policy.train import SeedResult, export, train  # needs torch
+    from nics_drl_bridge.policy.train.run import (  # needs torch
+        SeedResult,
+        export,
+        train,
+    )
 
-    settings, notes = derive_settings(plan, model)
+    settings, notes, opened = derive_settings(plan, model)
     curve = list[pictures.Point]()
     for line in notes:
         say(line)
@@ -255,12 +265,11 @@ def _train_policy(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
         if progress.steps * LINES // settings.steps > before * LINES // settings.steps:
             say(f"  {progress.steps:,} steps: {progress.line}")
 
-    trained = train(settings, TRAINING_SEED, plan.out / "training", tell)
+    trained = train(*opened, settings, TRAINING_SEED, plan.out / "training", tell)
     result = SeedResult(TRAINING_SEED, trained, {})
     file = plan.out / "policy.onnx"
-    export(
-        settings, result, f"nics demo --robot {plan.robot or model.robot.name}", file
-    )
+    command = f"nics demo --robot {plan.robot or model.robot.name}"
+    export(model, settings, result, command, file)
     steps = (
         f"{trained.steps:,} steps, {trained.stepping_s:.0f} s of {trained.wall_s:.0f} s"
     )

@@ -49,7 +49,7 @@ def doctor(
         _tell_installation(as_json)
         return
     from nics_drl_bridge.generator import open_model
-    from nics_drl_bridge.policy.foreign import load_any
+    from nics_drl_bridge.policy.file.policy_file import load_policy
     from nics_drl_bridge.report.doctor import examine
     from nics_drl_bridge.report.doctor_facts import (
         collect_facts_of_bag,
@@ -63,7 +63,7 @@ def doctor(
             "--model and --policy: give one of them, what the robot must fit."
         )
     else:
-        contract = load_any(policy).contract
+        contract = load_policy(policy).contract
         expected = derive_expected(contract, contract.scan)
     if bag is not None:
         facts = collect_facts_of_bag(bag, namespace, imu)

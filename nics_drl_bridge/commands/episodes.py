@@ -25,11 +25,11 @@ from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import Backend
 from nics_drl_bridge.nodes.parameters import NO_POSE
 from nics_drl_bridge.policy import evaluation
-from nics_drl_bridge.policy.contract import Contract
 from nics_drl_bridge.policy.evaluation import Episode, Tally, drive, drive_all
-from nics_drl_bridge.policy.pace import pace_of
+from nics_drl_bridge.policy.file.contract import Contract
+from nics_drl_bridge.policy.file.stateful import Policy
 from nics_drl_bridge.policy.policies import is_policy_file, open_policy
-from nics_drl_bridge.policy.stateful import Policy
+from nics_drl_bridge.policy.train.settings import pace_of
 from nics_drl_bridge.report.doctor import examine
 from nics_drl_bridge.report.doctor_facts import derive_expected
 from nics_drl_bridge.report.pictures import draw_trajectories
@@ -206,10 +206,11 @@ def read_contracts(
     files = [policy for policy in policies if is_policy_file(policy)]
     if not files:
         return {}
-    from nics_drl_bridge.policy.foreign import load_any  # needs onnx; baselines don't
+    # needs onnx; baselines don't
+    from nics_drl_bridge.policy.file.policy_file import load_policy
 
     opened = None if model is None else open_model(model)
-    return {policy: load_any(policy, opened).contract for policy in files}
+    return {policy: load_policy(policy, opened).contract for policy in files}
 
 
 @dataclass(frozen=True)

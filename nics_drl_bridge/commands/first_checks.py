@@ -107,7 +107,7 @@ def check_settings(task: str, settings: str | None, changes: dict[str, Any]) -> 
         file = find_config(settings, "training")
         if not file.is_file():
             raise ConfigError(f"--settings {file}: no such file; check the path.")
-    from nics_drl_bridge.policy.training_settings import chosen_settings
+    from nics_drl_bridge.policy.train.settings import chosen_settings
 
     check_task(chosen_settings(task, settings, changes).task)
 

@@ -33,10 +33,9 @@ def info(
     as_json: JsonOption = False,
 ) -> None:
     """Checks a policy file and shows its training and requirements."""
-    from nics_drl_bridge.policy.foreign import load_any
-    from nics_drl_bridge.policy.policy_file import summary
+    from nics_drl_bridge.policy.file.policy_file import load_policy, summary
 
-    facts = summary(load_any(file))
+    facts = summary(load_policy(file))
     print_line(
         as_json,
         "\n".join(f"{name:<18} {value}" for name, value in _format_lines(facts)),
@@ -58,10 +57,9 @@ def export(
     as_json: JsonOption = False,
 ) -> None:
     """Converts a policy file to another format: Isaac's LEAPP."""
-    from nics_drl_bridge.policy.foreign import load_any
-    from nics_drl_bridge.policy.leapp import export_bundle
+    from nics_drl_bridge.policy.file.policy_file import foreign_policies, load_policy
 
-    written = str(export_bundle(load_any(file), leapp))
+    written = str(foreign_policies().export_bundle(load_policy(file), leapp))
     print_line(as_json, f"wrote {written}", file=written)
 
 
@@ -82,15 +80,15 @@ def import_(
 ) -> None:
     """Makes a policy file from a policy trained elsewhere."""
     from nics_drl_bridge.generator import open_model
-    from nics_drl_bridge.policy.contract import SUFFIX
-    from nics_drl_bridge.policy.foreign import import_policy
-    from nics_drl_bridge.policy.policy_file import policy_of
+    from nics_drl_bridge.policy.file.contract import SUFFIX
+    from nics_drl_bridge.policy.file.policy_file import foreign_policies, policy_of
 
     if out.suffix != SUFFIX:
         raise ConfigError(
             f"--out {out}: a policy file ends with {SUFFIX!r}; change the name."
         )
-    data = import_policy(source, None if robot is None else open_model(robot))
+    model = None if robot is None else open_model(robot)
+    data = foreign_policies().import_policy(source, model)
     # Raises before an unusable file is written.
     contract = policy_of(data, out).contract
     write_bytes(out, data)

@@ -22,7 +22,7 @@ from nics_drl_bridge.files import format_json
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 DEFAULT_EPISODES = 500
-# PPO engines in this process, see `training_settings.PpoSettings`
+# PPO engines in this process, see `policy.train.settings.PpoSettings`
 OWN = ("lean", "sb3")
 
 
@@ -113,13 +113,14 @@ def train(
         check_settings(task, settings, named)
     extensions.require("training", *extensions.TRAINING)
     with console.show_progress("loading PyTorch"):
-        from nics_drl_bridge.policy import train as train_run
+        from nics_drl_bridge.policy.train import run as train_run
 
     task_of_user = task if ":" in task else None
+    opened = None
     if resume and out is not None:
         chosen = train_run.settings_of(out, task_of_user)
     else:
-        chosen = _load_settings(task, settings, named)
+        chosen, opened = _load_settings(task, settings, named)
     folder = out or Path("runs") / chosen.title
     command = shlex.join(["nics", *sys.argv[1:]])
     started = train_run.seeds_of(folder) if resume and not seeds else []
@@ -140,7 +141,8 @@ def train(
         report_interruption(folder, resume_command, train_run.seeds_of),
         _open_learner(engine, address, env_runners, chosen.num_envs) as learn,
     ):
-        (_run_watched if watch else _run)(train_run, order, learn, as_json)
+        run = partial(train_run.run, opened=opened)
+        (_run_watched if watch else _run)(run, order, learn, as_json)
 
 
 def make_resume_command(
@@ -191,14 +193,16 @@ def _to_plain(result: Any) -> dict[str, Any]:
     }
 
 
-def _load_settings(task: str, settings: str | None, named: dict[str, Any]) -> Any:
-    """Returns the settings of a training; prints what was adapted to the robot."""
-    from nics_drl_bridge.policy.pace import settings_for
+def _load_settings(
+    task: str, settings: str | None, named: dict[str, Any]
+) -> tuple[Any, Any]:
+    """Returns the settings of a training, and what they name; prints what was adapted."""
+    from nics_drl_bridge.policy.train.settings import settings_for
 
     chosen = settings_for(task, settings, named)
     for line in chosen.notes:
         typer.echo(line, err=True)
-    return chosen.settings
+    return chosen.settings, chosen.opened
 
 
 def check_engine(engine: str | None, of_clusters: dict[str, Any]) -> None:
@@ -219,7 +223,7 @@ def _open_learner(
     engine: str | None, address: str | None, runners: int | None, worlds: int
 ) -> Iterator[Any]:
     if engine is None or engine in OWN:
-        from nics_drl_bridge.policy.train import train as learn
+        from nics_drl_bridge.policy.train.run import train as learn
 
         yield learn
     else:
@@ -227,7 +231,9 @@ def _open_learner(
             yield learn
 
 
-def _run_watched(train_run: Any, order: Any, learn: Any, as_json: bool) -> None:
+def _run_watched(
+    run: Callable[..., Any], order: Any, learn: Any, as_json: bool
+) -> None:
     """Like `_run`, with a live page, which costs nothing while it is closed."""
     from nics_drl_bridge.watch.server import PageServer
     from nics_drl_bridge.watch.show import open_page
@@ -245,16 +251,18 @@ def _run_watched(train_run: Any, order: Any, learn: Any, as_json: bool) -> None:
         def note(what: str) -> None:
             views[-1].note = what
 
-        _run(train_run, order, partial(learn, on_env=on_env), as_json, note)
+        _run(run, order, partial(learn, on_env=on_env), as_json, note)
 
 
 def _run(
-    train_run: Any,
+    run: Callable[..., Any],
     order: Any,
     learn: Any,
     as_json: bool,
     note: Callable[[str], None] = lambda _: None,
 ) -> None:
+    from nics_drl_bridge.policy.train.run import line_of
+
     def told(progress: Any) -> None:
         what = f"seed {progress.seed}: {progress.line}"
         if not math.isnan(progress.held_out):
@@ -270,14 +278,14 @@ def _run(
             f"seed {result.seed}: {trained.steps:,} steps in {trained.wall_s:.0f} s"
         )
         for world, summary in result.summaries.items():
-            typer.echo(f"  {world}: {train_run.line_of(summary)}")
+            typer.echo(f"  {world}: {line_of(summary)}")
 
     with console.show_progress("starting the worlds") as tell:
 
         def evaluating(world: str) -> None:
             tell(f"evaluating in {world}", 0, 0)
 
-        results = train_run.run(order, told, done, learn, evaluating)
+        results = run(order, told, done, learn, evaluating)
     folder = order.out
     if as_json:
         typer.echo(

@@ -161,7 +161,7 @@ class BridgeVectorEnv(
 
     @property
     def changing(self) -> dict[str, NDArray[Any]]:
-        """Arrays that change from step to step, by name; see `policy.train_checkpoint`."""
+        """Arrays that change from step to step, by name; see `policy.train.checkpoint`."""
         own = {
             "ended": self.ended,
             "over": self._over,

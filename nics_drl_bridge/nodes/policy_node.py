@@ -26,9 +26,9 @@ from nics_drl_bridge.nodes.nav2_parameters import ControllerParameters
 from nics_drl_bridge.nodes.parameters import policy
 from nics_drl_bridge.nodes.robot_topics import RobotTopics
 from nics_drl_bridge.nodes.runner import ACTIVE, UNCONFIGURED
+from nics_drl_bridge.policy.file.stateful import begin, resume
 from nics_drl_bridge.policy.pacing import ActionPace, Answer, Deadline
 from nics_drl_bridge.policy.policies import open_policy
-from nics_drl_bridge.policy.stateful import begin, resume
 
 POLLS = (
     0.1  # time between two checks whether to act, as a fraction of the control period

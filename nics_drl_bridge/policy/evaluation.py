@@ -1,7 +1,7 @@
 """Evaluation: runs episodes, judges them by the ground truth, and tallies the results."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +18,7 @@ from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.middleware.uncertainty import Uncertainty, compute_uncertainty_gain
-from nics_drl_bridge.policy.stateful import Policy, begin
+from nics_drl_bridge.policy.file.stateful import Policy, begin
 from nics_drl_bridge.seeds import check_seeds
 
 Flags = NDArray[np.bool_]
@@ -82,34 +82,61 @@ class Episode:
         }
 
 
+def _drive_steps(
+    env: Any, policy: Any, seed: Any, options: Any = None, on_start: Any = None
+) -> Iterator[tuple[Any, Any, dict[str, Any]]]:
+    """Runs an episode, or one in each world of a vector env, until all have ended.
+
+    Yields rewards, ends and `info` after the reset and after each step. `policy` may be a method
+    `act`. Raises ConfigError for an action that is not finite.
+    """
+    act = getattr(policy, "act", policy)
+    observation, info = env.reset(seed=seed, options=options)
+    if on_start is not None:
+        on_start()
+    begin(policy)
+    yield 0.0, False, info
+    running: Any = True
+    step = 0
+    while np.any(running):
+        step += 1
+        action = act(observation)
+        if not np.isfinite(action).all():
+            problem = f"the policy's action in step {step} contains NaN or inf"
+            raise ConfigError(f"{problem}; train it again.")
+        observation, reward, terminated, truncated, info = env.step(action)
+        ended = np.logical_or(terminated, truncated)
+        yield reward, ended, info
+        running = running & ~ended
+
+
 def drive(
     env: gymnasium.Env[Any, Any],
     policy: Policy,
     seed: int,
     options: dict[str, Any] | None = None,
-    on_start: Callable[[], None] = lambda: None,
+    on_start: Callable[[], None] | None = None,
     touched: Callable[[], bool] | None = None,
 ) -> Episode:
     """Runs one episode to its end; halts the robot if the policy or a callback raises."""
     try:
-        observation, info = env.reset(seed=seed, options=options)
-        on_start()
-        begin(policy)
-        goal, bodies = info.get("goal"), info["bodies"]
+        steps = _drive_steps(env, policy, seed, options, on_start)
+        _, _, info = next(steps)
+        goal = info.get("goal")
+        bodies = info["bodies"]
         if goal is None:  # a user's task may not expose its goal
             goal = env.get_wrapper_attr("scene").goals[0]
-        paths, estimates, total, ended = [info["start"]], [info["pose"]], 0.0, False
+        paths = [info["start"]]
+        estimates = [info["pose"]]
+        total = 0.0
         covariances: list[Array] = []
-        while not ended:
-            action = _answer(policy.act, observation, len(paths))
-            observation, reward, terminated, truncated, info = env.step(action)
+        for reward, _, info in steps:
             paths.append(info.get("true_pose", info["pose"]))
             estimates.append(info["pose"])
             covariance = info.get("covariance")
             if covariance is not None and np.shape(covariance) == (3, 3):
                 covariances = [*covariances[:1], covariance]
             total += float(reward)
-            ended = bool(terminated or truncated)
         collided = "collision" if np.any(info.get("collision", False)) else "time-out"
         believed = "success" if np.all(info.get("is_success", False)) else collided
         driven = np.array(paths), np.array(estimates), goal, bodies, total
@@ -135,15 +162,6 @@ def drive(
             with uninterrupted():
                 env.unwrapped.halt()
         raise
-
-
-def _answer(act: Act, observation: NDArray[np.float32], step: int) -> NDArray[Any]:
-    action = act(observation)
-    if not np.isfinite(action).all():
-        raise ConfigError(
-            f"the policy's action in step {step} contains NaN or inf; train it again."
-        )
-    return action
 
 
 def truly_near(task: Any, poses: Array, goals: Array) -> Flags:
@@ -223,22 +241,21 @@ def _drive_once(
 ) -> tuple[Any, ...]:
     """Runs one episode in each world; returns the fields of `Outcomes` except seeds, each (N,)."""
     count = env.num_envs
-    observation, info = env.reset(seed=list(seeds))
-    begin(act)
+    driven = _drive_steps(env, act, list(seeds))
+    _, _, info = next(driven)
     previous = np.reshape(info["start"], (count, -1, 3))[..., :2]
     success, collision, believed = np.zeros((3, count), np.bool_)
-    steps, (length, reward) = np.zeros(count, np.int64), np.zeros((2, count))
+    steps = np.zeros(count, np.int64)
+    length, reward = np.zeros((2, count))
     running = np.ones(count, np.bool_)
-    while running.any():
-        action = _answer(act, observation, int(steps.max()) + 1)
-        observation, gain, terminated, truncated, info = env.step(action)
+    for gain, over, info in driven:
         position = np.reshape(info["true_pose"], (count, -1, 3))[..., :2]
         moved = np.hypot(*np.moveaxis(position - previous, -1, 0)).mean(axis=-1)
         previous = position
         length += np.where(running, moved, 0.0)
         reward += np.where(running, gain, 0.0)
         steps += running
-        ended = running & (terminated | truncated)
+        ended = running & over
         seen = _robots(info, "collision").any(axis=1)
         hit = _robots(
             info, "true_collision" if "true_collision" in info else "collision"

@@ -16,23 +16,23 @@ from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.errors import ConfigError, PolicyError, suggest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.policy import dynamic_window_kernels as kernels
-from nics_drl_bridge.policy.contract import MAPPINGS, SUFFIX, shipped
-from nics_drl_bridge.policy.local_map import (
+from nics_drl_bridge.policy.file.contract import MAPPINGS, SUFFIX, shipped
+from nics_drl_bridge.policy.file.stateful import Policy, Stateful
+from nics_drl_bridge.policy.planners import dynamic_window_kernels as kernels
+from nics_drl_bridge.policy.planners.local_map import (
     MOST_M,
     outline_of,
     rays_of,
     scratch_of,
     split_observation,
 )
-from nics_drl_bridge.policy.local_map_kernels import (
+from nics_drl_bridge.policy.planners.local_map_kernels import (
     Clearance,
     FootprintDiscs,
     MapScratch,
     ScanRays,
 )
-from nics_drl_bridge.policy.mppi import Mppi
-from nics_drl_bridge.policy.stateful import Policy, Stateful
+from nics_drl_bridge.policy.planners.mppi import Mppi
 from nics_drl_bridge.robot.braking import Braking, find_braking
 from nics_drl_bridge.robot.kinds import (
     compute_steady_twist,
@@ -43,7 +43,7 @@ from nics_drl_bridge.robot.kinds import (
 from nics_drl_bridge.robot.spec import RobotSpec
 
 if TYPE_CHECKING:
-    from nics_drl_bridge.policy.policy_file import PolicyFile
+    from nics_drl_bridge.policy.file.policy_file import PolicyFile
 
 
 # The margin is wider than in `Mppi`, because the dynamic window chooses from few twists.
@@ -312,7 +312,7 @@ def is_policy_file(name: str) -> bool:
 
 def check_policy_file(name: str) -> None:
     """Raises PolicyError or ConfigError unless a policy file can be read, for whatever robot."""
-    from nics_drl_bridge.policy.policy_file import load_policy
+    from nics_drl_bridge.policy.file.policy_file import load_policy
 
     if name.endswith(MAPPINGS):
         read_text(name)
@@ -327,11 +327,9 @@ def make_policy(
     if not is_policy_file(name):
         return POLICIES[name](task, model)
     # Only policy files need onnxruntime.
-    from nics_drl_bridge.policy.foreign import (
-        load_any,
-    )
+    from nics_drl_bridge.policy.file.policy_file import load_policy
 
-    policy = load_any(name, model)
+    policy = load_policy(name, model)
     policy.check_fits(model, task)
     return _acting(policy)
 
@@ -349,9 +347,9 @@ def open_policy(
             raise ConfigError(f"policy {name!r} {reason}.")
         task = Navigation(model.robot, model.lidar)
         return POLICIES[name](task, model), task
-    from nics_drl_bridge.policy.foreign import load_any
+    from nics_drl_bridge.policy.file.policy_file import load_policy
 
-    policy = load_any(name, model)
+    policy = load_policy(name, model)
     opened: Any = policy.make_task(model, kind)  # any task, if `kind` names its class
     if kind is None and not isinstance(opened, Navigation):
         reason = f"is {policy.contract.task.name!r}; only policies of 'navigation' can be driven."

@@ -16,7 +16,7 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.lidar.sectors import ScanLayout, plan_of, reader_of
 from nics_drl_bridge.lidar.spec import LidarSpec, ScanHeader
-from nics_drl_bridge.policy.contract import Contract
+from nics_drl_bridge.policy.file.contract import Contract
 from nics_drl_bridge.recording import messages
 from nics_drl_bridge.recording.bag_file import is_bag, open_bag
 from nics_drl_bridge.recording.imu_axis import GyroReader

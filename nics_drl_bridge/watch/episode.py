@@ -15,8 +15,8 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import wrap_angle
 from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, SHAPE, X, Y
 from nics_drl_bridge.lidar.shapes import Circle, Rectangle, Shape
+from nics_drl_bridge.policy.file.stateful import Policy, begin
 from nics_drl_bridge.policy.policies import POLICIES, actions_of, shipped_policies
-from nics_drl_bridge.policy.stateful import Policy, begin
 from nics_drl_bridge.seeds import check_seeds
 from nics_drl_bridge.sim.scenes import scaled
 from nics_drl_bridge.sim.world import Obstacles, World, check_place

@@ -106,7 +106,7 @@ def test_every_run_has_arguments_that_its_benchmark_knows():
 def test_each_fold_learns_anew_and_is_judged_in_worlds_that_it_did_not_see(tmp_path):
     pytest.importorskip("torch", reason="needs the extra train")
     from nics_drl_bridge.config import dump_yaml
-    from nics_drl_bridge.policy.training_settings import load_training
+    from nics_drl_bridge.policy.train.settings import load_training
 
     shipped = load_training("shipped_jackal")
     given = {"worlds": {"barn": 4, "circles": 2}, "steps": 192, "hidden": (8,)}

@@ -35,12 +35,11 @@ CHECKSUMS = (
     "files.check_sealed",
     "files.check_sums",
     "lidar.table.check_sums",
-    "policy.onnx_graph.check_seal",
-    "policy.contract._check_unchanged",
-    "policy.train_checkpoint.check_sealed",
+    "policy.file.onnx_graph.check_seal",
+    "policy.train.checkpoint.check_sealed",
 )
 CHECKS = tuple(
-    f"policy.onnx_graph.check_{name}" for name in ("wire", "graph", "seal", "shapes")
+    f"policy.file.onnx_graph.check_{name}" for name in ("graph", "seal", "sizes")
 )
 
 

@@ -34,7 +34,7 @@ def export(folder: Path) -> tuple[Path, Path]:
 
     from nics_drl_bridge.env.registry import make_task
     from nics_drl_bridge.generator import open_model, save_model
-    from nics_drl_bridge.policy.train_export import export_policy
+    from nics_drl_bridge.policy.train.export import export_policy
 
     torch.manual_seed(0)
     model = open_model(ROBOT)

@@ -152,9 +152,9 @@ def leapp(folder: Path, control: str | None) -> dict[str, float]:
     import torch
     from leapp import InferenceManager
 
-    from nics_drl_bridge.policy.contract import shipped
-    from nics_drl_bridge.policy.leapp import export_bundle
-    from nics_drl_bridge.policy.policy_file import load_policy
+    from nics_drl_bridge.extras.foreign_policies import export_bundle
+    from nics_drl_bridge.policy.file.contract import shipped
+    from nics_drl_bridge.policy.file.policy_file import load_policy
 
     policy = load_policy(shipped() / f"{POLICY}.onnx")
     manager = InferenceManager(str(export_bundle(policy, folder / "bundle")))

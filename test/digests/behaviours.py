@@ -64,12 +64,15 @@ def dynamic_window() -> Found:
 
 def training() -> Found:
     """The weights of the actor, layer by layer, after a few updates of the lean engine."""
-    from nics_drl_bridge.policy.train import train
-    from nics_drl_bridge.policy.training_settings import TrainingSettings
+    from nics_drl_bridge.policy.train.run import train
+    from nics_drl_bridge.policy.train.settings import (
+        TrainingSettings,
+        open_training,
+    )
 
     settings = TrainingSettings.model_validate(TRAINING)
     with tempfile.TemporaryDirectory() as folder:
-        actor = train(settings, 5, Path(folder)).algorithm
+        actor = train(*open_training(settings), settings, 5, Path(folder)).algorithm
     return {
         name: joined([weights.detach().numpy()])
         for name, weights in actor.named_parameters()

@@ -17,7 +17,7 @@ AGENT = """
 import gymnasium
 import nics_drl_bridge
 from nics_drl_bridge.policy.policies import make_policy
-from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
+from nics_drl_bridge.policy.train.vec_env import TrainVecEnv
 from stable_baselines3 import PPO
 
 envs = gymnasium.make_vec("NicsBridge/Navigation-v0", num_envs=2, autoreset_mode="SameStep")

@@ -10,10 +10,10 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 pytest.importorskip("torch", reason="needs the extra 'train'")
 
+from extras.foreign_policies import nets
 from geometry_msgs.msg import PoseStamped, TwistStamped
 from lifecycle_msgs.srv import ChangeState
 from nav_msgs.msg import Odometry
-from policy import foreign_nets
 from policy.policy_rig import export_remembering, network
 from sensor_msgs.msg import LaserScan
 
@@ -21,9 +21,9 @@ from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.policy.file.policy_file import load_policy
 from nics_drl_bridge.policy.policies import open_policy
-from nics_drl_bridge.policy.policy_file import load_policy
-from nics_drl_bridge.policy.train_export import export_policy
+from nics_drl_bridge.policy.train.export import export_policy
 from nodes.peer import odometry, stamp_ns
 
 pytestmark = pytest.mark.ros
@@ -149,7 +149,7 @@ def test_scans_of_another_lidar_give_the_same_command(
 def test_a_foreign_policy_commands_what_it_does_in_process(
     launch, meet, domain_id, model, tmp_path
 ):
-    foreign = foreign_nets.write(tmp_path, "three", robot=None)
+    foreign = nets.write(tmp_path, "three", robot=None)
     node = launch(
         "policy_node", domain_id, policy=str(foreign), goal=GOAL, deadline=5.0
     )

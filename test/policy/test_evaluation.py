@@ -30,8 +30,8 @@ from nics_drl_bridge.policy.evaluation import (
     summarise,
     tallies,
 )
+from nics_drl_bridge.policy.file.stateful import Stateful
 from nics_drl_bridge.policy.policies import make_policy
-from nics_drl_bridge.policy.stateful import Stateful
 
 LIMIT = 40
 MODEL = direct_model(odometry=(0.02, 0.02))
@@ -324,7 +324,7 @@ def test_nothing_observed_leaves_everything_open():
 
 @pytest.mark.parametrize("arrived", [0, 1, 2])
 def test_a_summary_shows_neither_nan_nor_inf_and_is_json_that_others_read(arrived):
-    train = pytest.importorskip("nics_drl_bridge.policy.train")
+    train = pytest.importorskip("nics_drl_bridge.policy.train.run")
     success = np.arange(3) < arrived
     steps = np.full(3, 7)
     figures = steps, steps * 0.1, steps * 1.0

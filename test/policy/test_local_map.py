@@ -11,8 +11,8 @@ from shapely.geometry import Point, Polygon
 from shapely.prepared import prep
 
 from nics_drl_bridge.geometry import compute_depths
-from nics_drl_bridge.policy.local_map import CELL_M, outline_of, scratch_of
-from nics_drl_bridge.policy.local_map_kernels import (
+from nics_drl_bridge.policy.planners.local_map import CELL_M, outline_of, scratch_of
+from nics_drl_bridge.policy.planners.local_map_kernels import (
     Clearance,
     ScanRays,
     astray,

@@ -13,8 +13,16 @@ from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
-from nics_drl_bridge.policy.pace import fitted, kin, pace_of, settings_for, top_speed
-from nics_drl_bridge.policy.training_settings import TrainingSettings, load_training
+from nics_drl_bridge.policy.train.settings import (
+    Opened,
+    TrainingSettings,
+    fit_settings,
+    kin,
+    load_training,
+    pace_of,
+    settings_for,
+    top_speed,
+)
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 from nics_drl_bridge.sim.world_set import load_worlds
 
@@ -36,6 +44,11 @@ def slow(model, speed=0.22):
     data = model.robot.model_dump(mode="json")
     data["command"][0] |= {"min": -speed, "max": speed}
     return replace(model, robot=RobotSpec.model_validate(data))
+
+
+def fitted(settings, model, inherited):
+    worlds = {name: load_worlds(name) for name in settings.worlds}
+    return fit_settings(settings, Opened(model, worlds), inherited)[:2]
 
 
 @pytest.mark.parametrize("name", LEARNT)
@@ -149,7 +162,9 @@ def test_a_lidar_that_fills_no_layout_gets_sectors_over_its_own_view(
 
 @pytest.mark.slow
 def test_an_own_robot_trains_with_the_settings_of_its_kin_and_says_so():
-    settings, told = settings_for("navigation", None, BURGER | {"world": ["doorway"]})
+    settings, told, _ = settings_for(
+        "navigation", None, BURGER | {"world": ["doorway"]}
+    )
     own = load_training("own_differential")
     assert (settings.hidden, settings.teaching) == (own.hidden, own.teaching)
     assert (
@@ -159,6 +174,6 @@ def test_an_own_robot_trains_with_the_settings_of_its_kin_and_says_so():
 
 
 def test_a_shipped_robot_trains_with_its_own_settings_unchanged():
-    settings, told = settings_for("navigation", None, {"robot": "differential"})
+    settings, told, _ = settings_for("navigation", None, {"robot": "differential"})
     assert settings == load_training("navigation_differential")
     assert told == ()

@@ -20,13 +20,13 @@ from nics_drl_bridge.generator import builtin_model, open_model
 from nics_drl_bridge.interface import RobotView, Start
 from nics_drl_bridge.policy import policies
 from nics_drl_bridge.policy.evaluation import drive_all, drive_worlds, successes
+from nics_drl_bridge.policy.file.stateful import Stateful, begin, resume
 from nics_drl_bridge.policy.policies import (
     POLICIES,
     DynamicWindow,
     RandomActions,
     make_policy,
 )
-from nics_drl_bridge.policy.stateful import Stateful, begin, resume
 from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.kinds import compute_steady_twist
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot

@@ -10,10 +10,10 @@ from robots import direct_model, field
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import seal
-from nics_drl_bridge.policy import train as training
-from nics_drl_bridge.policy.train import CHECKPOINT, TrainOrder, evaluate, run, train
-from nics_drl_bridge.policy.train_checkpoint import FORMAT, read_checkpoint
-from nics_drl_bridge.policy.training_settings import TrainingSettings
+from nics_drl_bridge.policy.train import run as training
+from nics_drl_bridge.policy.train.checkpoint import FORMAT, read_checkpoint
+from nics_drl_bridge.policy.train.run import CHECKPOINT, TrainOrder, evaluate, run
+from nics_drl_bridge.policy.train.settings import TrainingSettings
 
 MODEL = direct_model(odometry=(0.02, 0.02))
 WORLD = field(count=2)
@@ -23,16 +23,10 @@ class BrokenOffError(Exception):
     """As a user's Ctrl-C."""
 
 
-@pytest.fixture(autouse=True)
-def _small_world(monkeypatch):
+def train(settings, *rest, **more):
     """Trains a robot of few beams in a small field, whatever names the settings hold."""
-    monkeypatch.setattr(training, "open_model", lambda *_: MODEL)
-    made = training.BridgeVectorEnv
-    monkeypatch.setattr(
-        training,
-        "BridgeVectorEnv",
-        lambda n, model, _, *rest, **more: made(n, model, WORLD, *rest, **more),
-    )
+    worlds = dict.fromkeys(settings.worlds, WORLD)
+    return training.train(MODEL, worlds, settings, *rest, **more)
 
 
 def test_a_policy_of_a_shipped_robot_does_not_name_a_folder_of_that_name(
@@ -44,7 +38,7 @@ def test_a_policy_of_a_shipped_robot_does_not_name_a_folder_of_that_name(
     for robot in ("differential", "./differential"):
         (tmp_path / "differential").mkdir(exist_ok=True)
         result = training.SeedResult(0, training.Trained(None, 0, 0.0, 0.0), {})
-        training.export(settings(robot=robot), result, "", tmp_path / "p.onnx")
+        training.export(MODEL, settings(robot=robot), result, "", tmp_path / "p.onnx")
     assert [one.get("model") for one in told] == [None, str(tmp_path / "differential")]
 
 
@@ -80,9 +74,11 @@ def weights(algorithm):
 
 def test_robots_are_larger_while_they_learn_and_only_then():
     learning = settings(teaching={"margin": 0.07}, randomisation=None)
-    grown = training.make_train_env(learning).envs[0].model.robot.footprint_radius
+    worlds = dict.fromkeys(learning.worlds, WORLD)
+    env = training.make_train_env(MODEL, worlds, learning)
+    grown = env.envs[0].model.robot.footprint_radius
     assert grown == pytest.approx(MODEL.robot.footprint_radius + 0.07)
-    judged = training._env_of(learning, "one", 2, MODEL)
+    judged = training._env_of(MODEL, WORLD, learning, 2)
     assert judged.model.robot.footprint_radius == MODEL.robot.footprint_radius
 
 
@@ -101,15 +97,12 @@ EARLY = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "changes", [{"teaching": TEACHING}, EARLY], ids=["all", "stop"]
-)
-@pytest.mark.parametrize(
-    ("engine", "actions"),
+    ("engine", "actions", "changes"),
     [
-        ("lean", "continuous"),
-        ("lean", "discrete"),
-        ("sb3", "continuous"),
-        ("sac", "continuous"),
+        ("lean", "continuous", {"teaching": TEACHING}),
+        ("lean", "discrete", EARLY),
+        ("sb3", "continuous", EARLY),
+        ("sac", "continuous", {"teaching": TEACHING}),
     ],
 )
 def test_an_interrupted_training_comes_to_the_same_weights(
@@ -125,7 +118,7 @@ def test_an_interrupted_training_comes_to_the_same_weights(
             raise BrokenOffError
 
     # Told of every rollout, whatever the clock says.
-    monkeypatch.setattr("nics_drl_bridge.policy.train_checkpoint.TOLD_S", 0.0)
+    monkeypatch.setattr("nics_drl_bridge.policy.train.checkpoint.TOLD_S", 0.0)
     with pytest.raises(BrokenOffError):
         train(chosen, 1, tmp_path / "broken", interrupt)
     assert 0 < steps_in(tmp_path / "broken" / CHECKPOINT) < 1000
@@ -139,23 +132,17 @@ def test_an_interrupted_training_comes_to_the_same_weights(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", ["lean", "sb3"])
-def test_a_little_training_reaches_more_goals_than_none(engine, tmp_path):
+def test_a_little_training_reaches_more_goals_than_none(tmp_path):
     def successes(steps):
         chosen = settings(
             worlds={"one": 32},
             steps=steps,
             hidden=[32, 32],
             randomisation=None,
-            ppo={
-                "engine": "sb3" if engine == "sb3" else "lean",
-                "rollout": 32,
-                "batch": 256,
-                "learning_rate": 2e-3,
-            },
+            ppo={"rollout": 32, "batch": 256, "learning_rate": 2e-3},
         )
         algorithm = train(chosen, 0, tmp_path / str(steps)).algorithm
-        return evaluate(algorithm, chosen, "one", 100).success.mean()
+        return evaluate(algorithm, MODEL, WORLD, chosen, 100).success.mean()
 
     assert successes(40_000) > successes(1024) + 0.2
 

@@ -7,9 +7,9 @@ import torch
 from robots import direct_model
 
 from nics_drl_bridge.env.registry import make_task
-from nics_drl_bridge.policy.policy_file import load_policy
-from nics_drl_bridge.policy.train_algorithms import Actor, Normaliser, act_of
-from nics_drl_bridge.policy.train_export import export_policy
+from nics_drl_bridge.policy.file.policy_file import load_policy
+from nics_drl_bridge.policy.train.algorithms import Actor, Normaliser, act_of
+from nics_drl_bridge.policy.train.export import export_policy
 
 MODEL = direct_model()
 

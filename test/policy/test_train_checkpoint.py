@@ -6,7 +6,7 @@ from robots import direct_model, field
 
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.policy.train_checkpoint import restore, snapshot
+from nics_drl_bridge.policy.train.checkpoint import restore, snapshot
 
 MODEL = direct_model(odometry=(0.02, 0.02), latency=0.05)
 

@@ -9,7 +9,7 @@ from stable_baselines3 import PPO, SAC
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.errors import ConfigError, PolicyError
-from nics_drl_bridge.policy.train_export import export_policy
+from nics_drl_bridge.policy.train.export import export_policy
 from policy.policy_rig import (
     SECTORS,
     export,

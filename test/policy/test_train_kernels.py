@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from nics_drl_bridge.policy.train_kernels import Net, backward, forward
+from nics_drl_bridge.policy.train.kernels import Net, backward, forward
 
 
 @pytest.mark.parametrize("widths", [(5, 3), (7, 16, 2), (4, 8, 6, 1)])

@@ -12,11 +12,11 @@ from stable_baselines3.common.callbacks import ConvertCallback
 from stable_baselines3.common.logger import Logger
 
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
-from nics_drl_bridge.policy import train_ppo
-from nics_drl_bridge.policy.train_algorithms import Normaliser
-from nics_drl_bridge.policy.train_ppo import LeanPpo, Transitions, advantages_of
-from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
-from nics_drl_bridge.policy.training_settings import TrainingSettings
+from nics_drl_bridge.policy.train import ppo as train_ppo
+from nics_drl_bridge.policy.train.algorithms import Normaliser
+from nics_drl_bridge.policy.train.ppo import LeanPpo, Transitions, advantages_of
+from nics_drl_bridge.policy.train.settings import TrainingSettings
+from nics_drl_bridge.policy.train.vec_env import TrainVecEnv
 
 # fewer steps in an episode than in a rollout
 STEPS = 12

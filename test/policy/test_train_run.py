@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from nics_drl_bridge.commands.cli import app
-from nics_drl_bridge.policy.policy_file import load_policy
+from nics_drl_bridge.policy.file.policy_file import load_policy
 
 REACH = """
 from dataclasses import dataclass

@@ -7,11 +7,11 @@ import pytest
 from robots import direct_model, field
 
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
-from nics_drl_bridge.policy import train_stop
 from nics_drl_bridge.policy.evaluation import FIRST_SEED
-from nics_drl_bridge.policy.train import SEEDS
-from nics_drl_bridge.policy.train_stop import HELD_OUT_SEED, Stop
-from nics_drl_bridge.policy.training_settings import StopSettings
+from nics_drl_bridge.policy.train import stop as train_stop
+from nics_drl_bridge.policy.train.run import SEEDS
+from nics_drl_bridge.policy.train.settings import StopSettings
+from nics_drl_bridge.policy.train.stop import HELD_OUT_SEED, Stop
 
 GIVEN = StopSettings(success=0.9, every=100, episodes=10)
 

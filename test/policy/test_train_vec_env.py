@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from nics_drl_bridge.env.registry import ENVIRONMENTS
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
+from nics_drl_bridge.policy.train.vec_env import TrainVecEnv
 
 LIMIT = 30
 

@@ -7,7 +7,7 @@ from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.gate.limits import Stopping
 from nics_drl_bridge.generator import open_model
-from nics_drl_bridge.policy.training_settings import (
+from nics_drl_bridge.policy.train.settings import (
     TrainingSettings,
     chosen_settings,
     load_training,

@@ -32,18 +32,18 @@ from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, NUM_ENV_STEPS_SAMPLED
 from stable_baselines3.common.logger import configure
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.generator import SimulatorModel, open_model
+from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import Array
-from nics_drl_bridge.policy import train, train_algorithms
-from nics_drl_bridge.policy.train_checkpoint import (
+from nics_drl_bridge.policy.train import algorithms
+from nics_drl_bridge.policy.train import run as train
+from nics_drl_bridge.policy.train.checkpoint import (
     RECENT,
     Progress,
     read_checkpoint,
     write_content,
 )
-from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
-from nics_drl_bridge.policy.training_settings import TrainingSettings
-from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
+from nics_drl_bridge.policy.train.settings import TrainingSettings
+from nics_drl_bridge.policy.train.vec_env import TrainVecEnv
 
 FORMAT = "nics_drl_bridge/ray_checkpoint/1"
 # loss parameters, as in Stable-Baselines3
@@ -173,8 +173,8 @@ class ActorCritic(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
         seen = self.observation_space
         hidden = list(chosen["hidden"])
         normaliser = chosen["normaliser"]
-        self.actor = train_algorithms.Actor(seen, self.action_space, hidden, normaliser)
-        self.critic = train_algorithms.layers_of([int(seen.shape[0]), *hidden, 1], 1.0)
+        self.actor = algorithms.Actor(seen, self.action_space, hidden, normaliser)
+        self.critic = algorithms.layers_of([int(seen.shape[0]), *hidden, 1], 1.0)
         if not self.actor.discrete:
             spread = torch.full(self.action_space.shape, float(chosen["log_std"]))
             self.log_std = torch.nn.Parameter(spread)
@@ -253,6 +253,8 @@ def _count_runners(runners: int | None, cpus: int, worlds: int) -> int:
 
 
 def train_on_ray(
+    model: SimulatorModel,
+    worlds: train.Worlds,
     settings: TrainingSettings,
     seed: int,
     folder: Path,
@@ -260,7 +262,7 @@ def train_on_ray(
     resumed: bool = False,
     runners: int = 1,
 ) -> train.Trained:
-    """Trains like `policy.train.train`, on the connected cluster.
+    """Trains like `policy.train.run.train`, on the connected cluster.
 
     Raises ConfigError, also if no runner answers.
     """
@@ -279,9 +281,8 @@ def train_on_ray(
     content = read_checkpoint(path, FORMAT) if resumed else None
     if content is not None:
         train.check_same(content["about"], about, path)
-    algorithm = _build_algorithm(
-        settings, seed, 0 if content is None else content["steps"], runners
-    )
+    done = 0 if content is None else content["steps"]
+    algorithm = _build_algorithm(model, worlds, settings, seed, done, runners)
     try:
         learning = Learning(algorithm, settings, seed, path, runners)
         if content is not None:
@@ -391,19 +392,22 @@ class Learning:
 
 
 def _build_algorithm(
-    settings: TrainingSettings, seed: int, done: int, runners: int
+    model: SimulatorModel,
+    worlds: train.Worlds,
+    settings: TrainingSettings,
+    seed: int,
+    done: int,
+    runners: int,
 ) -> PPO:
     torch.set_num_threads(settings.threads)
-    model = open_model(settings.robot, settings.lidar)
-    scenes = {name: load_worlds(name) for name in settings.worlds}
     rng = np.random.default_rng(seed)
-    env = train.make_train_env(settings, model, scenes)
-    train_algorithms.check_serves(settings, env.envs[0])
+    env = train.make_train_env(model, worlds, settings)
+    algorithms.check_serves(settings, env.envs[0])
     env.seed(int(rng.integers(train.SEEDS)))
-    normaliser = train_algorithms.observed(env, rng)
+    normaliser = algorithms.observed(env, rng)
     spaces = env.observation_space, env.action_space
     env.close()
-    make = ray.put(functools.partial(select_worlds, settings, model, scenes))
+    make = ray.put(functools.partial(select_worlds, model, worlds, settings))
     env_config = {"make": make, "seed": (seed, done), "threads": settings.threads}
     env_config["rollout"] = settings.ppo.rollout
     config = _make_config(settings, seed, done, normaliser, spaces).env_runners(
@@ -418,9 +422,9 @@ def _build_algorithm(
 
 
 def select_worlds(
-    settings: TrainingSettings,
     model: SimulatorModel,
-    scenes: Mapping[str, AnyWorld],
+    worlds: train.Worlds,
+    settings: TrainingSettings,
     runner: int,
     runners: int,
 ) -> TrainVecEnv:
@@ -428,7 +432,7 @@ def select_worlds(
     names = [name for name, count in settings.worlds.items() for _ in range(count)]
     counts = dict(Counter(names[runner::runners]))
     return train.make_train_env(
-        settings.model_copy(update={"worlds": counts}), model, scenes
+        model, worlds, settings.model_copy(update={"worlds": counts})
     )
 
 
@@ -442,7 +446,7 @@ def _make_config(
     chosen = settings.ppo
     left = max(settings.steps - done, 1)
     rate = chosen.learning_rate
-    now = rate * max(1.0 - done / settings.steps, train_algorithms.LEAST_RATE)
+    now = rate * max(1.0 - done / settings.steps, algorithms.LEAST_RATE)
     network = {
         "hidden": settings.hidden,
         "normaliser": normaliser,
@@ -457,7 +461,7 @@ def _make_config(
         )
         .learners(num_learners=0)
         .training(
-            lr=[[0, now], [left, rate * train_algorithms.LEAST_RATE]],
+            lr=[[0, now], [left, rate * algorithms.LEAST_RATE]],
             train_batch_size_per_learner=chosen.rollout * settings.num_envs,
             minibatch_size=chosen.batch,
             num_epochs=chosen.epochs,

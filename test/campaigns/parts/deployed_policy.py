@@ -64,7 +64,7 @@ def drive(name: str, policy: str, folder: Path) -> int:
 def main() -> None:
     """Drives, and asks `nics policy info`."""
     name, policy = sys.argv[1:]
-    from nics_drl_bridge.policy.policy_file import load_policy, summary
+    from nics_drl_bridge.policy.file.policy_file import load_policy, summary
 
     facts = summary(load_policy(policy))
     with tempfile.TemporaryDirectory() as folder:

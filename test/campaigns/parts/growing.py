@@ -17,7 +17,7 @@ import onnx
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.files import hash_bytes, seal, write_sums
 from nics_drl_bridge.lidar.table import ARRAYS
-from nics_drl_bridge.policy import onnx_graph
+from nics_drl_bridge.policy.file import onnx_graph
 
 Bomb = Callable[[Path, int], None]
 """Puts a bomb of some size, from 1 to 8, in the place of a whole input."""

@@ -41,9 +41,13 @@ from nics_drl_bridge.lidar.scanner import make_scanner
 from nics_drl_bridge.lidar.shapes import Circle
 from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.lidar.table import LidarTable
-from nics_drl_bridge.policy import contract, onnx_graph
-from nics_drl_bridge.policy.policy_file import load_policy
-from nics_drl_bridge.policy.training_settings import TrainingSettings, load_training
+from nics_drl_bridge.policy.file import onnx_graph
+from nics_drl_bridge.policy.file.policy_file import load_policy
+from nics_drl_bridge.policy.train.settings import (
+    TrainingSettings,
+    load_training,
+    open_training,
+)
 from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.recording.bag_file import open_bag
 from nics_drl_bridge.recording.readers import read_recording
@@ -166,7 +170,7 @@ def _save_box(path: Path, lines: Any) -> None:
 def _policy_bytes(version: int) -> bytes:
     import torch
 
-    from nics_drl_bridge.policy.train_export import export_policy
+    from nics_drl_bridge.policy.train.export import export_policy
 
     model = builtin_model("differential")
     task = make_task("navigation", model, {"scan": 36})
@@ -186,7 +190,6 @@ def _save_contract(path: Path, data: Any) -> None:
     proto = onnx.load(path)
     if isinstance(data, dict):
         data["graph_sha256"] = onnx_graph.graph_hash(proto)
-        data["checksums"] = contract.checksums(data)
     del proto.metadata_props[:]
     onnx.helper.set_model_props(proto, {onnx_graph.KEY: json.dumps(data)})
     path.write_bytes(onnx_graph.sealed(proto.SerializeToString(deterministic=True)))
@@ -194,15 +197,16 @@ def _save_contract(path: Path, data: Any) -> None:
 
 @lru_cache
 def _checkpoint_bytes(version: int) -> bytes:
-    from nics_drl_bridge.policy.train import CHECKPOINT, train
+    from nics_drl_bridge.policy.train.run import CHECKPOINT, train
 
     with tempfile.TemporaryDirectory() as folder:
-        train(TrainingSettings.model_validate(TRAINING), version, Path(folder))
+        settings = TrainingSettings.model_validate(TRAINING)
+        train(*open_training(settings), settings, version, Path(folder))
         return (Path(folder) / CHECKPOINT).read_bytes()
 
 
 def _read_checkpoint(path: Path) -> object:
-    from nics_drl_bridge.policy.train_checkpoint import read_checkpoint
+    from nics_drl_bridge.policy.train.checkpoint import read_checkpoint
 
     return read_checkpoint(path)["about"]["seed"]
 

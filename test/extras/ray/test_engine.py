@@ -11,8 +11,8 @@ import pytest
 from typer.testing import CliRunner
 
 from nics_drl_bridge.commands.cli import app
-from nics_drl_bridge.policy.policy_file import load_policy
-from nics_drl_bridge.policy.training_settings import TrainingSettings
+from nics_drl_bridge.policy.file.policy_file import load_policy
+from nics_drl_bridge.policy.train.settings import TrainingSettings, open_training
 
 pytest.importorskip(
     "ray", reason="needs Ray, in an environment of its own; run 'nox -s ray'"
@@ -26,8 +26,8 @@ from nics_drl_bridge.extras.ray.engine import (
     select_worlds,
     train_on_ray,
 )
-from nics_drl_bridge.policy.train import CHECKPOINT, TrainOrder, run
-from nics_drl_bridge.policy.train_checkpoint import read_checkpoint
+from nics_drl_bridge.policy.train.checkpoint import read_checkpoint
+from nics_drl_bridge.policy.train.run import CHECKPOINT, TrainOrder, run
 
 pytestmark = pytest.mark.timeout(
     600
@@ -124,7 +124,7 @@ def acts_alone(path: Path) -> bool:
     """Whether a policy file acts in a process that loads neither Ray nor PyTorch."""
     code = (
         "import sys, numpy as np\n"
-        "from nics_drl_bridge.policy.policy_file import load_policy\n"
+        "from nics_drl_bridge.policy.file.policy_file import load_policy\n"
         "policy = load_policy(sys.argv[1])\n"
         "action = policy.act(np.zeros(policy.contract.observation.size, np.float32))\n"
         "assert np.isfinite(action).all() and np.abs(action).max() <= 1.0\n"
@@ -155,7 +155,9 @@ def test_a_killed_worker_is_begun_anew_and_an_interrupted_run_goes_on_where_it_w
         raise BrokenOffError
 
     with connect(cluster.address, RUNNERS, worlds=9) as runners:
-        learn = partial(train_on_ray, endless, 0, tmp_path, runners=runners)
+        learn = partial(
+            train_on_ray, *open_training(endless), endless, 0, tmp_path, runners=runners
+        )
         with pytest.raises(BrokenOffError):
             learn(until_it_is_back)
         kept = read_checkpoint(tmp_path / CHECKPOINT, FORMAT)["steps"]
@@ -205,10 +207,8 @@ def test_what_can_not_be_trained_gives_one_sentence(
 
 
 def test_env_runners_share_all_worlds_among_them():
-    from nics_drl_bridge.generator import open_model
-
     shares = [
-        select_worlds(settings(), open_model("differential"), {}, k, 4).num_envs
+        select_worlds(*open_training(settings()), settings(), k, 4).num_envs
         for k in range(4)
     ]
     assert shares == [3, 2, 2, 2]

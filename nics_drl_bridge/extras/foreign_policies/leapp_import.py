@@ -1,25 +1,28 @@
 """Reads LEAPP bundles, ours and foreign: joins their networks, and derives their mapping."""
 
-import json
 import math
-import struct
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import onnx
+import safetensors.numpy
 from pydantic import BaseModel, ConfigDict, Field
+from safetensors import SafetensorError
 
 from nics_drl_bridge.config import parse_yaml, read_text, validate
 from nics_drl_bridge.errors import PolicyError, suggest
+from nics_drl_bridge.extras.foreign_policies.leapp_export import (
+    BEAMS,
+    SECTORS,
+    Data,
+    restored,
+)
+from nics_drl_bridge.extras.foreign_policies.mapping import ForeignState
 from nics_drl_bridge.files import hash_bytes
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.policy import onnx_graph, rehearsal
-from nics_drl_bridge.policy.foreign_graph import Network
-from nics_drl_bridge.policy.foreign_mapping import ForeignState
-from nics_drl_bridge.policy.leapp import BEAMS, SECTORS, Data, restored
+from nics_drl_bridge.policy.file import onnx_graph, rehearsal
 
 ZERO = "constant"  # quantity for components that a planar robot does not have
 LINEAR = {"x": "velocity.forward", "y": "velocity.left", "z": ZERO}
@@ -119,9 +122,9 @@ class Bundle:
         return restored(models[0]) if len(models) == 1 else None
 
     @cached_property
-    def network(self) -> Network:
-        """All networks joined into one. Raises PolicyError if they do not fit together."""
-        return Network(_merged(self), self._states())
+    def network(self) -> Any:
+        """All networks joined into one ModelProto. Raises PolicyError if they do not fit."""
+        return _join(self)
 
     @cached_property
     def inputs(self) -> dict[str, Tensor]:
@@ -133,8 +136,9 @@ class Bundle:
         """Entries of the external outputs."""
         return self._entries("outputs", self.description.pipeline.outputs)
 
-    def name_of(self, end: str) -> str:
-        """Returns the name of `node/output` or `node/input` in the joined network."""
+    @cached_property
+    def ends(self) -> set[str]:
+        """All `node/input` and `node/output` that are external or fed back."""
         pipeline = self.description.pipeline
         ends = set[str]()
         for names_by_node in (pipeline.inputs, pipeline.outputs):
@@ -142,9 +146,13 @@ class Bundle:
                 ends.update(f"{node}/{name}" for name in names)
         for source, targets in pipeline.feedback_flow.items():
             ends.update((source, *targets))
+        return ends
+
+    def name_of(self, end: str) -> str:
+        """Returns the name of one of the `ends` in the joined network: short if unambiguous."""
         short = end.partition("/")[2]
-        namesakes = sum(name.endswith(f"/{short}") for name in ends)
-        return end if namesakes > 1 else short
+        namesakes = sum(name.endswith(f"/{short}") for name in self.ends)
+        return short if namesakes == 1 else end
 
     def _entries(self, side: str, ends: dict[str, list[str]]) -> dict[str, Tensor]:
         entries = {}
@@ -165,7 +173,9 @@ class Bundle:
                 entries[self.name_of(f"{node}/{name}")] = tensors[name]
         return entries
 
-    def _states(self) -> dict[str, ForeignState]:
+    @cached_property
+    def states(self) -> dict[str, ForeignState]:
+        """The states that the bundle feeds back, by input."""
         pipeline = self.description.pipeline
         if pipeline.initial_values is None:
             start = {}
@@ -183,23 +193,16 @@ class Bundle:
         """Returns the flattened arrays of a safetensors file, by `node/input`."""
         data = _read(self, name, "pipeline.initial_values")
         try:
-            (size,) = struct.unpack_from("<Q", data)
-            head = json.loads(data[8 : 8 + size])
-            kinds = {"F32": "<f4", "F64": "<f8", "I64": "<i8", "I32": "<i4"}
-            arrays = {}
-            for key, entry in head.items():
-                if key != "__metadata__":
-                    begin, end = entry["data_offsets"]
-                    values = np.frombuffer(
-                        data[8 + size :][begin:end], kinds[entry["dtype"]]
-                    )
-                    arrays[key] = tuple(values.astype(float).tolist())
-        except (struct.error, ValueError, KeyError, TypeError, AttributeError):
+            arrays = safetensors.numpy.load(data)
+        except (SafetensorError, KeyError, TypeError, ValueError):
             reason = (
                 f"{name!r} is not a valid safetensors file; export the bundle again."
             )
             raise self.fault("pipeline.initial_values", reason) from None
-        return arrays
+        return {
+            key: tuple(array.astype(float).ravel().tolist())
+            for key, array in arrays.items()
+        }
 
     def fault(self, place: str, reason: str) -> PolicyError:
         """Makes the error for a place in the YAML file."""
@@ -244,9 +247,8 @@ def read_bundle(path: Path) -> Bundle:
             reason = f"does not match {parameters.model_path!r}, which was changed or damaged."
             raise bundle.fault(f"{place}.sha256sum", reason)
         file = str(path.parent / parameters.model_path)
-        rehearsal.rehearse("network", data, file)
-        models[name] = onnx_graph.parsed(data, file)
-        onnx_graph.check_graph(models[name], file)
+        rehearsal.rehearse(data, file, runs=False)
+        models[name] = onnx_graph.parse(data, file)
     return Bundle(path, description, models, hash_bytes("".join(digests).encode()))
 
 
@@ -259,68 +261,36 @@ def _read(bundle: Bundle, name: str, place: str) -> bytes:
     return onnx_graph.read_network(file, str(bundle.path), place)
 
 
-def _merged(bundle: Bundle) -> Any:
-    """Joins all nodes in order into one graph, with Identity nodes as connections."""
-    description = bundle.description
-    pipeline = bundle.description.pipeline
-    graph = onnx.GraphProto(name="bundle")
-    newest = 0
-    opsets: dict[int, Any] = {}
-    ready: set[str] = set()
-    infos: dict[str, Any] = {}
-    source_of = {
-        t: source for source, targets in pipeline.data_flow.items() for t in targets
-    }
-    outside = {
-        f"{node}/{name}" for node, names in pipeline.inputs.items() for name in names
-    }
-    outside |= {
-        target for targets in pipeline.feedback_flow.values() for target in targets
-    }
-    for name in description.models:
-        model = onnx.compose.add_prefix(bundle.models[name], f"{name}/")
-        for needed in onnx_graph.inputs_of(model):
-            if needed.name in outside:
-                source = bundle.name_of(needed.name)
-                graph_input = onnx.ValueInfoProto()
-                graph_input.CopyFrom(needed)
-                graph_input.name = source
-                graph.input.append(graph_input)
-            else:
-                source = source_of.get(needed.name, "")
-                if source not in ready:
-                    reason = f"no earlier node supplies {needed.name!r}; connect it."
-                    raise bundle.fault("pipeline.data_flow", reason)
-            if source != needed.name:
-                graph.node.append(
-                    onnx.helper.make_node("Identity", [source], [needed.name])
-                )
-        graph.node.extend(model.graph.node)
-        graph.initializer.extend(model.graph.initializer)
-        infos |= {tensor.name: tensor for tensor in model.graph.output}
-        ready |= infos.keys()
-        opsets |= {opset.version: opset for opset in onnx_graph.opsets_of(model)}
-        newest = max(newest, model.ir_version)
-    if len(opsets) != 1:
-        reason = f"have opsets {sorted(opsets)}; export all networks with the same one."
-        raise bundle.fault("models", reason)
-    ends = {
-        f"{node}/{name}" for node, names in pipeline.outputs.items() for name in names
-    }
-    for end in sorted(ends | pipeline.feedback_flow.keys()):
-        if end not in infos:
-            raise bundle.fault(
-                "pipeline.outputs", f"no network has the output {end!r}."
-            )
-        infos[end].name = bundle.name_of(end)
-        graph.output.append(infos[end])
-        if infos[end].name != end:
-            graph.node.append(
-                onnx.helper.make_node("Identity", [end], [infos[end].name])
-            )
-    return onnx.helper.make_model(
-        graph, opset_imports=list(opsets.values()), ir_version=newest
+def _join(bundle: Bundle) -> Any:
+    """Connects all networks, in order; their inputs and outputs get the names of the bundle."""
+    flow = bundle.description.pipeline.data_flow
+    joined, *others = (
+        onnx.compose.add_prefix(model, f"{name}/")
+        for name, model in bundle.models.items()
     )
+    for model in others:
+        inputs = {end.name for end in model.graph.input}
+        pairs = [
+            (out, end) for out, ends in flow.items() for end in ends if end in inputs
+        ]
+        outputs = [end.name for end in (*joined.graph.output, *model.graph.output)]
+        try:
+            joined = onnx.compose.merge_models(joined, model, pairs, outputs=outputs)
+        except (ValueError, onnx.checker.ValidationError) as error:
+            reason = f"the networks can't be connected ({onnx_graph.quote(error)})."
+            raise bundle.fault("pipeline.data_flow", reason) from None
+    graph = joined.graph
+    for value in onnx_graph.inputs_of(joined):
+        if value.name not in bundle.ends:
+            reason = f"no earlier node supplies {value.name!r}; connect it."
+            raise bundle.fault("pipeline.data_flow", reason)
+    names = {end: bundle.name_of(end) for end in bundle.ends}
+    for value in (*graph.input, *graph.output):
+        value.name = names.get(value.name, value.name)
+    for node in graph.node:
+        node.input[:] = [names.get(name, name) for name in node.input]
+        node.output[:] = [names.get(name, name) for name in node.output]
+    return joined
 
 
 # The mapping of a foreign bundle, as far as the bundle states it.
@@ -344,7 +314,7 @@ def mapping_of(bundle: Bundle, model: SimulatorModel) -> Data:
         "outputs": {},
     }
     for name, entry in bundle.inputs.items():
-        if name in bundle.network.states:
+        if name in bundle.states:
             continue
         data["inputs"][name] = {"parts": _parts(bundle, name, entry, data)}
     for name, entry in bundle.outputs.items():

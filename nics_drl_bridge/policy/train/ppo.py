@@ -7,12 +7,14 @@ rollout, so results do not depend on which of them is faster. If collecting fini
 and critic learn on one core each for the rest of the update.
 """
 
+from __future__ import annotations
+
 import copy
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -20,12 +22,11 @@ from numpy.typing import NDArray
 from stable_baselines3.common.logger import Logger
 
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.policy import train_algorithms, train_kernels
-from nics_drl_bridge.policy.train_checkpoint import RECENT, Watch
-from nics_drl_bridge.policy.train_kernels import LOG_NORM, Batch, Net
-from nics_drl_bridge.policy.train_rollout import Driven, Transitions
-from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
-from nics_drl_bridge.policy.training_settings import PpoSettings, TrainingSettings
+from nics_drl_bridge.policy.train import algorithms, kernels
+from nics_drl_bridge.policy.train.checkpoint import RECENT, Watch
+from nics_drl_bridge.policy.train.kernels import LOG_NORM, Batch, Net
+from nics_drl_bridge.policy.train.settings import PpoSettings, TrainingSettings
+from nics_drl_bridge.policy.train.vec_env import TrainVecEnv
 from nics_drl_bridge.threads import one_blas_thread, run_parts
 
 Ended = list[tuple[bool, bool]]  # (success, collision) of ended episodes
@@ -35,15 +36,42 @@ GRADIENT_LIMIT = 0.5
 ADAM_EPSILON = 1e-5
 
 
+class Driven(NamedTuple):
+    """A rollout as collected: T steps of N worlds."""
+
+    seen: torch.Tensor  # (T + 1, N, O) normalised observations
+    actions: torch.Tensor  # (T, N, C), or (T, N) discrete
+    log_probs: torch.Tensor  # (T, N) of the actions when they were drawn
+    rewards: torch.Tensor  # (T, N)
+    done: torch.Tensor  # (T, N) 1 at ends of episodes
+    cut: torch.Tensor  # (K,) indices t N + n of the truncated episodes
+    final: torch.Tensor  # (K, O) last observations of these episodes
+
+
+class Transitions(NamedTuple):
+    """R = T N transitions: T steps of N worlds, step by step."""
+
+    seen: torch.Tensor  # (R, O) normalised observations
+    actions: torch.Tensor  # (R, C), or (R,) discrete
+    log_probs: torch.Tensor  # (R,) of the actions when they were drawn
+    advantages: torch.Tensor  # (R,)
+    returns: torch.Tensor  # (R,) targets of the critic
+
+    def batches(self, size: int, generator: torch.Generator) -> Iterator[Transitions]:
+        """Yields batches of `size` transitions in random order; the last may be smaller."""
+        for rows in torch.randperm(len(self.seen), generator=generator).split(size):
+            yield Transitions(*(field[rows] for field in self))
+
+
 class Networks(torch.nn.Module):
     """Actor and critic on normalised observations, and the spread of continuous actions."""
 
     def __init__(
-        self, actor: train_algorithms.Actor, hidden: tuple[int, ...], log_std: float
+        self, actor: algorithms.Actor, hidden: tuple[int, ...], log_std: float
     ) -> None:
         super().__init__()
         self.actor = actor
-        self.critic = train_algorithms.layers_of(
+        self.critic = algorithms.layers_of(
             [actor.layers[0].in_features, *hidden, 1], 1.0, torch.nn.ReLU
         )
         outputs = actor.layers[-1].out_features
@@ -185,11 +213,9 @@ class Learner:
         spread_arrays = spread.detach().numpy(), spread.grad.numpy()
         bounds = np.float32(self.ppo.clip), np.float32(self.ppo.entropy)
         jobs: list[Callable[[], Any]] = [
+            partial(kernels.actor_gradients, actor, arrays, *spread_arrays, *bounds),
             partial(
-                train_kernels.actor_gradients, actor, arrays, *spread_arrays, *bounds
-            ),
-            partial(
-                train_kernels.critic_gradients,
+                kernels.critic_gradients,
                 critic,
                 arrays,
                 np.float32(VALUE_WEIGHT),
@@ -270,14 +296,14 @@ class LeanPpo:
         seed: int,
         normaliser: tuple[Array, Array],
     ) -> None:
-        train_algorithms.check_serves(settings, env.envs[0])
+        algorithms.check_serves(settings, env.envs[0])
         torch.set_num_threads(settings.threads)
         torch.manual_seed(seed)
         self._total = settings.steps
         self._ppo = settings.ppo
         hidden = settings.hidden
         spaces = env.observation_space, env.action_space
-        actor = train_algorithms.Actor(*spaces, hidden, normaliser, torch.nn.ReLU)
+        actor = algorithms.Actor(*spaces, hidden, normaliser, torch.nn.ReLU)
         self.networks = Networks(actor, hidden, self._ppo.log_std)
         seeds = np.random.SeedSequence(seed).generate_state(2)
         self.collector = Collector(env, self.networks, self._ppo, int(seeds[0]))
@@ -297,7 +323,7 @@ class LeanPpo:
             self._take(watch, *self.collector.collect())
         while self._rollout:
             watch.keep(self.steps)
-            if watch.ends(self.steps, train_algorithms.act_of(self.policy), logger):
+            if watch.ends(self.steps, algorithms.act_of(self.policy), logger):
                 watch.report(self.steps, self._successes, logger)
                 return
             loss = self._advance(self._rollout, watch)
@@ -308,7 +334,7 @@ class LeanPpo:
     def _advance(self, rollout: Driven, watch: Watch) -> float:
         """Learns from a rollout while the next one is collected."""
         left = 1.0 - self.steps / self._total
-        rate = self._ppo.learning_rate * max(left, train_algorithms.LEAST_RATE)
+        rate = self._ppo.learning_rate * max(left, algorithms.LEAST_RATE)
         self.steps += self._ppo.rollout * self.collector.env.num_envs
         self.collector.networks.load_state_dict(self.networks.state_dict())
         learner = self.learner

@@ -6,18 +6,21 @@ import numpy as np
 import onnx
 import onnxruntime
 import pytest
+from policy.policy_rig import opened_here  # noqa: F401
 
+from extras.foreign_policies import nets
+from extras.foreign_policies.nets import FAR, SECTORS, UNITS, write, write_mapping
 from nics_drl_bridge.commands.episodes import FAST, EvaluationOrder, evaluate
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import BridgeError, ConfigError, PolicyError
+from nics_drl_bridge.extras.foreign_policies import import_policy
 from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.policy.evaluation import drive_worlds
-from nics_drl_bridge.policy.foreign import import_policy, load_any
+from nics_drl_bridge.policy.file.policy_file import load_policy
 from nics_drl_bridge.policy.policies import open_policy
-from policy import foreign_nets
-from policy.foreign_nets import FAR, SECTORS, UNITS, write, write_mapping
 
+pytestmark = pytest.mark.usefixtures("opened_here")
 CORNERS = (0.0, 1e-4, np.pi / 2, 3.1415, -1e-4, -1.6, -3.1415)
 """Bearings at which a part of the graph that computes them changes [rad]."""
 TWISTS = np.array([[0, 0], [0.5, 0], [0.3, 1.0], [0.3, -1.0], [0, 0.7]])
@@ -47,7 +50,7 @@ def seen(steps: int = 16):
 
 def commands_of(path, robot, rows):
     """What the policy commands in SI, observation after observation of an episode."""
-    policy = load_any(path, robot)
+    policy = load_policy(path, robot)
     kept = policy.contract.state
     state = None
     commands = []
@@ -73,9 +76,7 @@ def test_a_whole_number_chooses_a_command(tmp_path, robot):
 @pytest.mark.parametrize("limits", [(-1.0, -1.0), (3.0, 3.0)])
 def test_a_whole_number_that_chooses_nothing_is_no_command(tmp_path, robot, limits):
     path = write(tmp_path, "chooser")
-    write_bytes(
-        tmp_path / "net.onnx", foreign_nets.chooser(*limits).SerializeToString()
-    )
+    write_bytes(tmp_path / "net.onnx", nets.chooser(*limits).SerializeToString())
     with pytest.raises(PolicyError, match="returns NaN or inf"):
         open_policy(str(path), robot)
 
@@ -83,7 +84,7 @@ def test_a_whole_number_that_chooses_nothing_is_no_command(tmp_path, robot, limi
 def test_an_evaluation_keeps_what_was_driven_before_a_command_that_is_none(tmp_path):
     path = write(tmp_path, "chooser")
     # Beyond the last command from 5 m on, farther than where policies are tried as they are opened.
-    network = foreign_nets.chooser(0.0, 3.0)
+    network = nets.chooser(0.0, 3.0)
     write_bytes(tmp_path / "net.onnx", network.SerializeToString())
     world = tmp_path / "far.yaml"
     world.write_text("name: far\nsize: [16.0, 16.0]\ngoal_distance: [6.0, 7.0]\n")
@@ -123,7 +124,7 @@ def test_a_network_of_three_inputs_commands_what_it_gives(tmp_path, robot):
 def test_a_flat_vector_has_its_own_order_numbers_and_history(tmp_path, robot):
     rows, bearing = seen()
     found = commands_of(write(tmp_path, "flat"), robot, rows)
-    net, (mean, std) = session(tmp_path), foreign_nets.flat_numbers()
+    net, (mean, std) = session(tmp_path), nets.flat_numbers()
     before = None
     turn = 0.0
     for row, angle, command in zip(rows, bearing, found, strict=True):
@@ -188,9 +189,9 @@ def test_sizes_that_follow_from_shapes_are_known(tmp_path, robot):
     weights["weights"] = np.float32([[0.1, -0.1, 9.0, 9.0], [0.3, 0.1, 9.0, 9.0]])
     # An input may be an output, too.
     ends = {"action": ["n", "half"], "goal": ["n", 2]}
-    made = foreign_nets.model_of(nodes, {"goal": ["n", 2]}, ends, weights)
+    made = nets.model_of(nodes, {"goal": ["n", 2]}, ends, weights)
     write_bytes(tmp_path / "net.onnx", made.SerializeToString())
-    data = foreign_nets.three_mapping()
+    data = nets.three_mapping()
     data["inputs"] = {"goal": {"parts": [{"of": "goal.x"}, {"of": "goal.y"}]}}
     turn = {"of": "goal", "index": 1, "clip": [-0.5, 0.5]}
     data["outputs"] = {"forward": {"of": "action", "clip": [0.0, 0.4]}, "turn": turn}
@@ -222,7 +223,7 @@ def test_it_becomes_a_policy_file(tmp_path, robot):
         commands_of(file, None, rows).tolist()
         == commands_of(path, robot, rows).tolist()
     )
-    assert load_any(file).contract.robot == robot.robot
+    assert load_policy(file).contract.robot.name == robot.robot.name
 
 
 # What is refused: one sentence with the place, what is wrong, and what to do.
@@ -279,7 +280,7 @@ SPOILT = {
     "divide": (changed("inputs/scan/divide", 0.0), "must not be 0"),
     "numbers": (
         changed("inputs/scan/divide", [1.0, 2.0]),
-        "has 2 numbers, but 24 elements are scaled",
+        "has 2 numbers, but 24 are needed",
     ),
     "limits": (changed("inputs/scan/limits", [1.0, 0.0]), "must be [minimum, maximum]"),
     "constant": (changed("inputs/goal/parts/0/value", 1.0), "has no `value:`"),
@@ -300,7 +301,7 @@ SPOILT = {
 def test_what_does_not_fit_is_refused_in_one_sentence(tmp_path, robot, name):
     spoil, words = SPOILT[name]
     write(tmp_path, "three")
-    data = foreign_nets.three_mapping()
+    data = nets.three_mapping()
     spoil(data)
     with pytest.raises(BridgeError) as refused:
         open_policy(str(write_mapping(tmp_path, data)), robot)
@@ -312,7 +313,7 @@ def test_a_network_that_gives_no_numbers_or_hides_others_operators_is_refused(
     tmp_path, robot
 ):
     path = write(tmp_path, "three")
-    whole = foreign_nets.three()
+    whole = nets.three()
     for node, words in (
         (onnx.helper.make_node("Log", ["bent"], ["left"]), "returns NaN or inf"),
         (onnx.helper.make_node("Tanh", ["bent"], ["left"], domain="evil"), "evil.Tanh"),
@@ -328,6 +329,6 @@ def test_a_network_that_gives_no_numbers_or_hides_others_operators_is_refused(
 def test_without_a_robot_it_says_how_to_name_one(tmp_path):
     path = write(tmp_path, "flat")
     with pytest.raises(ConfigError, match="names no robot; add `robot:`"):
-        load_any(path)
+        load_policy(path)
     write(tmp_path, "three")
-    assert load_any(path).contract.robot.name == "differential"
+    assert load_policy(path).contract.robot.name == "differential"

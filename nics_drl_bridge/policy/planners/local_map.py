@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.geometry import Array, compute_depths
-from nics_drl_bridge.policy import local_map_kernels as kernels
+from nics_drl_bridge.policy.planners import local_map_kernels as kernels
 from nics_drl_bridge.robot.spec import RobotSpec
 
 CELL_M = 0.05  # side of the cells of distances

@@ -6,28 +6,15 @@ harm, and opened here only if that succeeds. Files are remembered by content, so
 fraction of a second once per process.
 """
 
-import base64
 import json
 import math
 import os
 import subprocess
 import sys
-from dataclasses import asdict
-from typing import Any
-
-import numpy as np
 
 from nics_drl_bridge.errors import PolicyError
 from nics_drl_bridge.files import hash_bytes
-from nics_drl_bridge.policy import onnx_graph
-from nics_drl_bridge.policy.onnx_session import (
-    GraphNeeds,
-    Rows,
-    check_policy_graph,
-    open_session,
-    run_rows,
-    run_session,
-)
+from nics_drl_bridge.policy.file.onnx_session import check_network
 
 MEMORY = 512 * 2**20  # limit, in addition to what the libraries use [bytes]
 # additional limit per byte of the file: a network is in memory several times
@@ -41,37 +28,30 @@ _CODE = "import sys; sys.path[:] = {path!r}; import {module} as one; one.main()"
 _remembered: dict[str, None] = {}
 
 
-def rehearse_policy(data: bytes, needs: GraphNeeds, seen: Rows, source: str) -> None:
-    """Opens a policy file in another process and runs observations (T, O). Raises PolicyError."""
-    rows = np.ascontiguousarray(seen, "<f4")
-    text = base64.b64encode(rows.tobytes()).decode()
-    rehearse("policy", data, source, needs=asdict(needs), seen=[*rows.shape, text])
+def rehearse(data: bytes, source: str, runs: bool = True) -> None:
+    """Does `onnx_session.check_network` in another process. Raises PolicyError."""
+    digest = _digest_of(data, runs)
+    if digest in _remembered:
+        return
+    refusal = _answer_of(json.dumps(runs).encode() + b"\n" + data)
+    if refusal is not None:
+        raise PolicyError(source, *refusal)
+    _remember(digest)
 
 
 def remember(data: bytes) -> None:
     """Marks a policy file as rehearsed: this process made its graph, or rehearsed its parts."""
-    _remembered[_digest_of("policy", data)] = None
+    _remember(_digest_of(data, runs=True))
+
+
+def _digest_of(data: bytes, runs: bool) -> str:
+    return hash_bytes(bytes([runs]) + data)
+
+
+def _remember(digest: str) -> None:
+    _remembered[digest] = None
     if len(_remembered) > MOST_REMEMBERED:
         del _remembered[next(iter(_remembered))]
-
-
-def _digest_of(step: str, data: bytes) -> str:
-    return hash_bytes(step.encode() + b"\0" + data)
-
-
-def rehearse(step: str, data: bytes, source: str, **settings: Any) -> None:
-    """Does a step of opening a network in another process. Raises PolicyError.
-
-    The step `network` parses and checks it, `folding` folds its shapes, `policy` also runs it.
-    """
-    digest = _digest_of(step, data)
-    if digest in _remembered:
-        return
-    head = json.dumps({"step": step, **settings}).encode()
-    refusal = _answer_of(head + b"\n" + data)
-    if refusal is not None:
-        raise PolicyError(source, *refusal)
-    _remembered[digest] = None
 
 
 def _answer_of(request: bytes) -> tuple[str, str] | None:
@@ -119,14 +99,11 @@ def main() -> None:
 
     request = sys.stdin.buffer.read()
     head, _, data = request.partition(b"\n")
-    about = json.loads(head)
     del request
-    if about["step"] == "folding":
-        from nics_drl_bridge.policy import graph_folding  # noqa: F401 - before the limits
     _limit(MEMORY + MEMORY_OF_SIZE * len(data))
     answer = None
     try:
-        _do(about, data)
+        check_network(data, "policy", json.loads(head))
     except Exception as error:
         if _is_of_memory(error):
             os._exit(EXIT_MEMORY)
@@ -136,36 +113,6 @@ def main() -> None:
     sys.stdout.write(json.dumps(answer))
     sys.stdout.flush()
     os._exit(0)  # skip the slow and needless teardown of the session
-
-
-def _do(about: dict[str, Any], data: bytes) -> None:
-    source = "policy"
-    if about["step"] == "network":
-        onnx_graph.check_graph(onnx_graph.parsed(data, source), source)
-    elif about["step"] == "folding":
-        from nics_drl_bridge.policy.graph_folding import fold_shapes
-
-        model = onnx_graph.parsed(data, source)
-        try:
-            fold_shapes(model.graph, about["opset"])
-        except Exception as error:
-            reason = f"its shapes do not fit ({onnx_graph.quote(error)})."
-            raise PolicyError(source, "network", reason) from error
-    else:
-        needs = GraphNeeds(**about["needs"])
-        *shape, text = about["seen"]
-        seen = np.frombuffer(base64.b64decode(text), "<f4").reshape(shape)
-        check_policy_graph(data, needs, source)
-        session = open_session(data, source)
-        run_session(session, needs, seen, source)
-        # Measure as many observations as are ever run at once. Fewer ran: only memory can lack.
-        tensors = [np.resize(seen, (needs.most_rows, shape[1]))]
-        if needs.first_state is not None:
-            tensors.append(np.tile(needs.first_state, (needs.most_rows, 1)))
-        try:
-            run_rows(session, source, *tensors)
-        except PolicyError as error:
-            raise MemoryError from error
 
 
 def _limit(memory: int) -> None:

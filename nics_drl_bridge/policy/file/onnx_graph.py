@@ -17,13 +17,6 @@ from nics_drl_bridge.files import hash_bytes
 KEY = "nics_drl_bridge"  # key of the metadata entry with the contract
 SEAL = "sha256"  # key of the metadata entry at the file's end: the checksum of everything before it
 SIZE_LIMIT = 32 * 2**20
-# maximum number of fields in all messages; each weight array counts as one
-MOST_PARTS = 50_000
-MOST_NESTED = 16  # maximum nesting of messages; an exported graph needs six levels
-# maximum size of packed integers in one field, such as a shape [bytes]
-MOST_PACKED = 2**20
-MOST_NODES = 1000  # maximum number of nodes; an exported network has a few dozen
-MOST_DIMENSIONS = 8  # maximum number of dimensions of an array of weights
 # maximum size of the contract [bytes], mostly golden observations
 CONTRACT_LIMIT = 4 * 2**20
 # maximum number of observations per run; a file is first opened with as many, see `rehearsal`
@@ -35,10 +28,8 @@ COMMAND = "command"
 # additional input and output of a policy with a state
 STATE_IN = "state_in"
 STATE_OUT = "state_out"
-# recurrent operators over sequences whose length the graph fixes
-RECURRENT = frozenset({"GRU", "LSTM", "RNN"})
-OPERATORS = RECURRENT | frozenset(
-    {
+OPERATORS = frozenset(
+    [
         "Abs",
         "Add",
         "ArgMax",
@@ -56,6 +47,7 @@ OPERATORS = RECURRENT | frozenset(
         "Erf",
         "Exp",
         "Flatten",
+        "GRU",
         "Gather",
         "Gelu",
         "Gemm",
@@ -63,6 +55,7 @@ OPERATORS = RECURRENT | frozenset(
         "HardSigmoid",
         "HardSwish",
         "Identity",
+        "LSTM",
         "LayerNormalization",
         "LeakyRelu",
         "Log",
@@ -74,13 +67,14 @@ OPERATORS = RECURRENT | frozenset(
         "Mish",
         "Mul",
         "Neg",
-        "Pow",
         "PRelu",
+        "Pow",
+        "RNN",
+        "Reciprocal",
         "ReduceMax",
         "ReduceMean",
         "ReduceMin",
         "ReduceSum",
-        "Reciprocal",
         "Relu",
         "Reshape",
         "Selu",
@@ -99,13 +93,11 @@ OPERATORS = RECURRENT | frozenset(
         "Tanh",
         "Transpose",
         "Unsqueeze",
-    }
+    ]
 )
 """Operators of networks: no loops, branches, random numbers or data-dependent sizes."""
 FLOATS = frozenset({TensorProto.FLOAT, TensorProto.DOUBLE, TensorProto.FLOAT16})
-INTEGERS = frozenset({TensorProto.INT64, TensorProto.INT32})
-# types whose size in memory equals their size in the file
-NUMBERS = FLOATS | INTEGERS | {TensorProto.BOOL}
+NUMBERS = FLOATS | {TensorProto.INT64, TensorProto.INT32, TensorProto.BOOL}
 # For integers, division by zero, or of the minimum by -1, crashes the process.
 DIVIDING = frozenset({"Div", "ReduceMean"})
 OTHER_FORMATS = (
@@ -116,11 +108,6 @@ OTHER_FORMATS = (
     (b"\x1f\x8b", "a gzip file"),
 )
 """First bytes of training frameworks' files, which are never opened here."""
-# protobuf wire types
-_VARINT = 0
-_BYTES = 2
-_FIXED = {1: 8, 5: 4}  # fixed-size wire types and their sizes [bytes]
-_LONGEST_VARINT = 10
 Fault = tuple[str, str]  # faulty field and the reason
 
 
@@ -141,59 +128,25 @@ def read_network(file: Path, source: str, field: str) -> bytes:
     raise PolicyError(source, field, f"{name}has {sizes}; not opened.")
 
 
-def parsed(data: bytes, source: str) -> Any:
-    """Parses any ModelProto and checks only its form. Raises PolicyError."""
-    _check_form(data, source)
+def check_format(data: bytes, source: str) -> None:
+    """Raises PolicyError for a file of a training framework."""
+    for start, kind in OTHER_FORMATS:
+        if data.startswith(start):
+            reason = f"is {kind}, which is not a policy; export the policy with `export_policy`."
+            raise PolicyError(source, "file", reason)
+
+
+def parse(data: bytes, source: str) -> Any:
+    """Parses any ModelProto; content of others only after `rehearsal`. Raises PolicyError."""
+    check_format(data, source)
     try:
         model = onnx.load_model_from_string(data)
         if not model.HasField("graph"):
             raise ValueError
     except (DecodeError, ValueError, TypeError):
-        raise _no_policy(source, "is not an ONNX model, or is truncated") from None
+        reason = "is not an ONNX model, or is truncated; export or copy it again."
+        raise PolicyError(source, "file", reason) from None
     return model
-
-
-def _check_form(data: bytes, source: str) -> None:
-    """Raises PolicyError for another format, or for bytes that fail `check_wire`."""
-    for start, kind in OTHER_FORMATS:
-        if data.startswith(start):
-            reason = f"is {kind}, which is not a policy; export the policy with `export_policy`."
-            raise PolicyError(source, "file", reason)
-    try:
-        check_wire(data)
-    except WireError as error:
-        raise _no_policy(source, str(error)) from None
-
-
-def _no_policy(source: str, what: str) -> PolicyError:
-    return PolicyError(source, "file", f"{what}; export or copy it again.")
-
-
-def metadata_in(data: bytes, source: str) -> str:
-    """Returns the text of the contract in a file, without parsing the rest. Raises PolicyError."""
-    _check_form(data, source)
-    bare = onnx.ModelProto()
-    field = onnx.ModelProto.DESCRIPTOR.fields_by_name["metadata_props"]
-    view = memoryview(data)
-    start = 0
-    has_graph = False
-    while start < len(data):
-        key, start = _varint(view, start, len(data))
-        size, start = _size_of(view, start, len(data), key & 7)
-        number = key >> 3
-        end = start + size
-        if key & 7 == _BYTES and number == field.number:
-            try:
-                bare.metadata_props.add().ParseFromString(bytes(view[start:end]))
-            except DecodeError:
-                raise _no_policy(
-                    source, "is not an ONNX model, or is truncated"
-                ) from None
-        has_graph |= number == onnx.ModelProto.GRAPH_FIELD_NUMBER
-        start = end
-    if not has_graph:
-        raise _no_policy(source, "is not an ONNX model, or is truncated")
-    return metadata(bare, source)
 
 
 def metadata(model: Any, source: str) -> str:
@@ -228,72 +181,15 @@ def sealed(data: bytes) -> bytes:
 
 def check_seal(data: bytes, source: str) -> None:
     """Raises PolicyError unless a file is bit-identical to the one that was written."""
-    size = len(sealed(b""))
-    if data != sealed(data[:-size]):
+    check_format(data, source)
+    seal = sealed(b"")
+    mark = seal[: -len(hash_bytes(b""))]
+    if not data[-len(seal) :].startswith(mark):
+        reason = "does not end with the checksum of a policy file, so it is none or truncated"
+        raise PolicyError(source, "file", f"{reason}; export or copy it again.")
+    if data != sealed(data[: -len(seal)]):
         reason = "does not match the file, which was changed or damaged; copy or export it again."
         raise PolicyError(source, SEAL, reason)
-
-
-class WireError(ValueError):
-    """Bytes that are not a message, or whose message would be too large once parsed."""
-
-
-def check_wire(data: bytes) -> None:
-    """Raises WireError unless the bytes are a ModelProto with few fields and little nesting."""
-    view = memoryview(data)
-    parts = 0
-    ahead: list[tuple[int, int, Any, int]] = [
-        (0, len(data), onnx.ModelProto.DESCRIPTOR, 1)
-    ]
-    while ahead:
-        start, end, kind, depth = ahead.pop()
-        if depth > MOST_NESTED:
-            raise WireError(f"is nested more than {MOST_NESTED} levels deep")
-        while start < end:
-            parts += 1
-            if parts > MOST_PARTS:
-                raise WireError(f"has more than {MOST_PARTS} fields")
-            key, start = _varint(view, start, end)
-            size, start = _size_of(view, start, end, key & 7)
-            begin = start
-            start = start + size
-            if start > end:
-                raise WireError("is truncated")
-            field = kind.fields_by_number.get(key >> 3)
-            if field is None or key & 7 != _BYTES:
-                continue
-            if field.message_type is not None:
-                ahead.append((begin, start, field.message_type, depth + 1))
-            elif size > MOST_PACKED and field.type in (
-                field.TYPE_INT64,
-                field.TYPE_UINT64,
-                field.TYPE_INT32,
-                field.TYPE_UINT32,
-                field.TYPE_ENUM,
-            ):
-                # Variable-length numbers take more memory once parsed.
-                raise WireError(
-                    f"has {size} bytes of {field.name!r}, which are not weights"
-                )
-
-
-def _size_of(view: memoryview, start: int, end: int, wire: int) -> tuple[int, int]:
-    if wire == _BYTES:
-        return _varint(view, start, end)
-    if wire == _VARINT:
-        return _varint(view, start, end)[1] - start, start
-    if wire not in _FIXED:
-        raise WireError("is not an ONNX model")
-    return _FIXED[wire], start
-
-
-def _varint(view: memoryview, start: int, end: int) -> tuple[int, int]:
-    value = 0
-    for k in range(min(_LONGEST_VARINT, end - start)):
-        value |= (view[start + k] & 0x7F) << (7 * k)
-        if view[start + k] < 0x80:
-            return value, start + k + 1
-    raise WireError("is not an ONNX model, or is truncated")
 
 
 def check_graph(model: Any, source: str) -> None:
@@ -316,14 +212,10 @@ def quote(error: Exception) -> str:
 
 def _graph_faults(model: Any) -> Iterator[Fault]:
     graph = model.graph
-    if len(graph.node) > MOST_NODES:
-        reason = f"has {len(graph.node)} operators, more than {MOST_NODES}; not run."
-        yield "graph.node", reason
     for tensor in _tensors(graph):
         name = f"weights.{tensor.name}"
-        if tensor.data_type not in NUMBERS or len(tensor.dims) > MOST_DIMENSIONS:
-            reason = f"is not a numeric array of at most {MOST_DIMENSIONS} dimensions; not run."
-            yield name, reason
+        if tensor.data_type not in NUMBERS:
+            yield name, "is not an array of ordinary numbers; not run."
         location = next(
             (entry.value for entry in tensor.external_data if entry.key), ""
         )
@@ -384,54 +276,28 @@ def inputs_of(model: Any) -> list[Any]:
     return [value for value in model.graph.input if value.name not in weights]
 
 
-def opsets_of(model: Any) -> list[Any]:
-    """Returns the sets of standard operators that a model imports."""
-    return [opset for opset in model.opset_import if opset.domain in STANDARD]
+def fix_rows(model: Any, rows: int) -> Any:
+    """Returns a model for `rows` observations at once, without the shapes that it states itself."""
+    bare = onnx.ModelProto()
+    bare.CopyFrom(model)
+    del bare.graph.value_info[:]
+    for value in inputs_of(bare):
+        first = value.type.tensor_type.shape.dim[:1]
+        if first and not first[0].dim_value:
+            first[0].dim_value = rows
+    for value in bare.graph.output:
+        value.type.tensor_type.ClearField("shape")
+    return bare
 
 
-def check_ends(
-    model: Any, widths: dict[str, int | None], source: str, batch: int | None
-) -> None:
-    """Raises PolicyError unless inputs and outputs have these widths; None means integers (n,).
+def check_sizes(model: Any, source: str) -> None:
+    """Raises PolicyError for sizes that depend on the observation, or divisions of integers.
 
-    Their first dimension is the number of observations, `batch`; None: any number.
-    """
-    inputs = inputs_of(model)
-    if STATE_IN not in widths and STATE_IN in [end.name for end in inputs]:
-        reason = "is missing, although the graph needs one; export the policy again."
-        raise PolicyError(source, "state", reason)
-    for kind, ends, order in (
-        ("inputs", inputs, [INPUT, STATE_IN]),
-        ("outputs", model.graph.output, [ACTION, COMMAND, STATE_OUT]),
-    ):
-        names = [name for name in order if name in widths]
-        if [end.name for end in ends] != names:
-            reason = f"are {[end.name for end in ends]}, not {names}; export the policy again."
-            raise PolicyError(source, f"graph.{kind}", reason)
-    for end in (*inputs, *model.graph.output):
-        tensor = end.type.tensor_type
-        width = widths[end.name]
-        kind = TensorProto.INT64 if width is None else TensorProto.FLOAT
-        sizes = [
-            d.dim_value if d.HasField("dim_value") else None for d in tensor.shape.dim
-        ]
-        wanted = [batch] if width is None else [batch, width]
-        if tensor.elem_type != kind or sizes != wanted:
-            name = TensorProto.DataType.Name(tensor.elem_type)
-            reason = (
-                f"is {name} of shape {sizes}, but {wanted} is needed; export again."
-            )
-            raise PolicyError(source, f"graph.{end.name}", reason)
-
-
-def check_shapes(model: Any, source: str, rows: int) -> None:
-    """Raises PolicyError for shapes that do not fit, or depend on the `rows` observations of a run.
-
-    Also refuses divisions of integers.
+    The inputs have known shapes, and what depends on these alone is folded already.
     """
     try:
         graph = onnx.shape_inference.infer_shapes(
-            _without_shapes(model, rows), strict_mode=True, data_prop=True
+            model, strict_mode=True, data_prop=True
         ).graph
     except Exception as error:  # noqa: BLE001 - a damaged graph raises anything
         raise PolicyError(
@@ -452,16 +318,3 @@ def check_shapes(model: Any, source: str, rows: int) -> None:
         if not known.issuperset(node.output):
             reason = f"the output size of {node.op_type} can't be known before it runs."
             raise PolicyError(source, "graph.node", reason)
-
-
-def _without_shapes(model: Any, rows: int) -> Any:
-    """Returns the model for `rows` observations, without the shapes that it states itself."""
-    bare = onnx.ModelProto()
-    bare.CopyFrom(model)
-    graph = bare.graph
-    del graph.value_info[:]
-    for value in inputs_of(bare):
-        value.type.tensor_type.shape.dim[0].dim_value = rows
-    for value in graph.output:
-        value.type.tensor_type.ClearField("shape")
-    return bare

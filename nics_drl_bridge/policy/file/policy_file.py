@@ -1,13 +1,14 @@
 """Policy files: an `.onnx` with network, normaliser, commands and contract; never a pickle."""
 
-from collections.abc import Mapping
-from functools import cached_property
+from collections.abc import Callable, Mapping
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge import extensions
 from nics_drl_bridge.arguments import check_path
 from nics_drl_bridge.env.registry import TASKS, make_task
 from nics_drl_bridge.env.task import Task
@@ -15,20 +16,16 @@ from nics_drl_bridge.errors import ConfigError, PolicyError, suggest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.sectors import plan_of
 from nics_drl_bridge.lidar.spec import LidarSpec
-from nics_drl_bridge.policy import contract as contracts
-from nics_drl_bridge.policy import onnx_graph, rehearsal
-from nics_drl_bridge.policy.contract import Contract, Rows, leaves
-from nics_drl_bridge.policy.onnx_session import (
-    GraphNeeds,
-    check_policy_graph,
-    open_session,
-    run_in_turn,
-    run_rows,
-)
+from nics_drl_bridge.policy.file import contract as contracts
+from nics_drl_bridge.policy.file import onnx_graph, rehearsal
+from nics_drl_bridge.policy.file.contract import MAPPINGS, Contract, Rows, leaves
+from nics_drl_bridge.policy.file.onnx_session import open_session, run_in_turn, run_rows
 from nics_drl_bridge.robot.spec import RobotSpec
 
 GOLDEN_TOLERANCE = 1e-5
 PERIOD_TOLERANCE = 1e-9
+Run = Callable[..., list[NDArray[Any]]]
+"""Maps observations (n, O), and states (n, S) if any, to actions, commands and next states."""
 ROBOT = {"command", "footprint", "footprint_radius"}
 LIDAR = {"beams", "angle_min", "angle_max", "range_max", "mount"}
 
@@ -36,10 +33,10 @@ LIDAR = {"beams", "angle_min", "angle_max", "range_max", "mount"}
 class PolicyFile:
     """A loaded and checked policy, with the path of its file and its contract."""
 
-    def __init__(self, path: Path, contract: Contract, session: Any) -> None:
+    def __init__(self, path: Path, contract: Contract, run: Run) -> None:
         self.path = path
         self.contract = contract
-        self._session = session
+        self._run_network = run
 
     def act(self, observation: Rows) -> NDArray[Any]:
         """Returns the action (C,) in [-1, 1], or () discrete, for (O,); or n actions for (n, O)."""
@@ -81,7 +78,7 @@ class PolicyFile:
         return [part[0] if rows.ndim == 1 else part for part in whole]
 
     def _run(self, rows: Rows, *state: Rows) -> list[NDArray[Any]]:
-        out = run_rows(self._session, str(self.path), rows, *state)
+        out = self._run_network(rows, *state)
         if any(len(part) != len(rows) for part in out):
             reason = (
                 f"returns {[part.shape for part in out]} for {len(rows)} observations."
@@ -173,10 +170,16 @@ class PolicyFile:
                     raise PolicyError(str(self.path), path, reason)
 
 
-def load_policy(path: str | Path) -> PolicyFile:
-    """Loads and checks a policy file, by path or shipped name. Raises PolicyError."""
+def load_policy(path: str | Path, model: SimulatorModel | None = None) -> PolicyFile:
+    """Loads and checks a policy file, by path or shipped name, or a foreign policy's YAML file.
+
+    `model` is the robot of a foreign policy; None: the one that its YAML file names. Raises
+    PolicyError, and ConfigError for a wrong YAML file.
+    """
     check_path("policy", path)
     file = Path(path)
+    if str(path).endswith(MAPPINGS):
+        return policy_of(foreign_policies().import_policy(file, model), file)
     suffix = contracts.SUFFIX
     if not (str(path).endswith(suffix) or file.is_file()):
         file = contracts.shipped() / f"{path}{suffix}"
@@ -190,41 +193,65 @@ def load_policy(path: str | Path) -> PolicyFile:
     return policy_of(onnx_graph.read_network(file, str(file), "file"), file)
 
 
+def foreign_policies() -> Any:
+    """Returns the module that runs, imports and exports policies of other programs."""
+    return extensions.load("adapters", "foreign")
+
+
 def policy_of(data: bytes, path: Path) -> PolicyFile:
     """Makes a policy from a file's content; see `load_policy`."""
     source = str(path)
-    contract = contracts.read_contract(onnx_graph.metadata_in(data, source), source)
-    # Last, because the checks above give a more specific reason for a changed file.
     onnx_graph.check_seal(data, source)
-    needs = _needs_of(contract)
-    seen = contract.golden.rows("observations")
     # Shipped policies are trusted like the package's code.
     if path.parent != contracts.shipped():
-        rehearsal.rehearse_policy(data, needs, seen, source)
-    check_policy_graph(data, needs, source)
-    policy = PolicyFile(path, contract, open_session(data, source))
-    _check_golden(policy, needs, source)
+        rehearsal.rehearse(data, source)
+    model = onnx_graph.parse(data, source)
+    contract = contracts.read_contract(onnx_graph.metadata(model, source), source)
+    if onnx_graph.graph_hash(model) != contract.graph_sha256:
+        reason = "does not match the graph, which was changed after the export."
+        raise PolicyError(source, "graph_sha256", reason)
+    session = open_session(data, source)
+    if contract.foreign is None:
+        _check_ends(contract, session, source)
+        run = partial(run_rows, session, source)
+    else:
+        run = foreign_policies().adapt(contract, session, source)
+    policy = PolicyFile(path, contract, run)
+    _check_golden(policy, source)
     return policy
 
 
-def _needs_of(contract: Contract) -> GraphNeeds:
-    state = contract.state
-    return GraphNeeds(
-        contract.observation.size,
-        len(contract.robot.command),
-        contract.actions == "discrete",
-        contract.batch,
-        contract.graph_sha256,
-        None if state is None else (state.size, state.start),
-    )
+def _check_ends(contract: Contract, session: Any, source: str) -> None:
+    """Raises PolicyError for other inputs or outputs; the golden pairs show their widths."""
+    kind = "tensor(float)"
+    action = "tensor(int64)" if contract.actions == "discrete" else kind
+    inputs = [(onnx_graph.INPUT, kind)]
+    outputs = [(onnx_graph.ACTION, action), (onnx_graph.COMMAND, kind)]
+    if contract.state is not None:
+        inputs.append((onnx_graph.STATE_IN, kind))
+        outputs.append((onnx_graph.STATE_OUT, kind))
+    for name, ends, wanted in (
+        ("inputs", session.get_inputs(), inputs),
+        ("outputs", session.get_outputs(), outputs),
+    ):
+        found = [(end.name, end.type) for end in ends]
+        if found != wanted:
+            reason = f"are {found}, not {wanted}; export the policy again."
+            raise PolicyError(source, f"graph.{name}", reason)
 
 
-def _check_golden(policy: PolicyFile, needs: GraphNeeds, source: str) -> None:
+def _check_golden(policy: PolicyFile, source: str) -> None:
     golden = policy.contract.golden
-    action, command = run_in_turn(policy.run, golden.rows("observations"), needs)
+    state = policy.contract.state
+    start = None if state is None else np.full(state.size, state.start, np.float32)
+    action, command = run_in_turn(policy.run, golden.rows("observations"), start)
     computed = {"actions": action.reshape(len(command), -1), "commands": command}
     for name, rows in computed.items():
-        gap = np.abs(rows - golden.rows(name)).max()
+        wanted = golden.rows(name)
+        if rows.shape != wanted.shape:
+            reason = f"have shape {wanted.shape}, but the graph's outputs {rows.shape}."
+            raise PolicyError(source, f"golden.{name}", reason)
+        gap = np.abs(rows - wanted).max()
         if not gap <= GOLDEN_TOLERANCE:
             reason = f"differ by {gap:.3g} from the graph's outputs on this machine; not used."
             raise PolicyError(source, f"golden.{name}", reason)

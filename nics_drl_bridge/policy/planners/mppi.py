@@ -14,15 +14,15 @@ from nics_drl_bridge.env.task import still
 from nics_drl_bridge.generator import BUILTIN_SEED, CONTROL_PERIOD_S, SimulatorModel
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.identify import identify
-from nics_drl_bridge.policy import mppi_kernels as kernels
-from nics_drl_bridge.policy.local_map import (
+from nics_drl_bridge.policy.planners import mppi_kernels as kernels
+from nics_drl_bridge.policy.planners.local_map import (
     MOST_M,
     outline_of,
     rays_of,
     scratch_of,
     split_observation,
 )
-from nics_drl_bridge.policy.local_map_kernels import (
+from nics_drl_bridge.policy.planners.local_map_kernels import (
     Clearance,
     FootprintDiscs,
     MapScratch,

@@ -20,9 +20,7 @@ from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError, shorten
 from nics_drl_bridge.files import format_json, write_text
-from nics_drl_bridge.generator import SimulatorModel, open_model
-from nics_drl_bridge.policy import train_algorithms as algorithms
-from nics_drl_bridge.policy import train_checkpoint as checkpoints
+from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.policy.evaluation import (
     FIRST_SEED,
     Outcomes,
@@ -30,16 +28,20 @@ from nics_drl_bridge.policy.evaluation import (
     drive_worlds,
     summarise,
 )
-from nics_drl_bridge.policy.train_algorithms import Actor, Sb3Training
-from nics_drl_bridge.policy.train_export import export_policy
-from nics_drl_bridge.policy.train_ppo import LeanPpo
-from nics_drl_bridge.policy.train_stop import Stop
-from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
-from nics_drl_bridge.policy.training_settings import (
+from nics_drl_bridge.policy.train import algorithms as algorithms
+from nics_drl_bridge.policy.train import checkpoint as checkpoints
+from nics_drl_bridge.policy.train.algorithms import Actor, Sb3Training
+from nics_drl_bridge.policy.train.export import export_policy
+from nics_drl_bridge.policy.train.ppo import LeanPpo
+from nics_drl_bridge.policy.train.settings import (
+    Opened,
     TrainingSettings,
     is_code,
+    open_training,
     read_settings,
 )
+from nics_drl_bridge.policy.train.stop import Stop
+from nics_drl_bridge.policy.train.vec_env import TrainVecEnv
 from nics_drl_bridge.seeds import check_seeds
 from nics_drl_bridge.sim.world_set import AnyWorld
 
@@ -54,6 +56,7 @@ TRIED = 8  # number of worlds, and of steps, in the trial run of a task
 # maximum seed of numpy's global generator, which Stable-Baselines3 uses
 GREATEST_SEED = 2**32 - 1
 Tell = checkpoints.Tell
+Worlds = Mapping[str, AnyWorld]  # by their names in the settings
 
 
 @dataclass(frozen=True)
@@ -67,6 +70,8 @@ class Trained:
 
 
 def train(
+    model: SimulatorModel,
+    worlds: Worlds,
     settings: TrainingSettings,
     seed: int,
     folder: Path,
@@ -82,8 +87,8 @@ def train(
     path = folder / CHECKPOINT
     content = checkpoints.read_checkpoint(path) if resumed else None
     about: dict[str, Any] = {"seed": seed, "settings": settings.model_dump(mode="json")}
-    model = open_model(settings.robot, settings.lidar)
-    env, stop = make_train_env(settings, model), _stop_of(settings, model)
+    env = make_train_env(model, worlds, settings)
+    stop = _stop_of(model, worlds, settings)
     on_env(env)
     engine = LeanPpo if settings.lean else Sb3Training
     if content is None:
@@ -129,12 +134,9 @@ def refuse_diverged(training: LeanPpo | Sb3Training, bound: float = math.inf) ->
 
 
 def make_train_env(
-    settings: TrainingSettings,
-    model: SimulatorModel | None = None,
-    scenes: Mapping[str, AnyWorld] | None = None,
+    model: SimulatorModel, worlds: Worlds, settings: TrainingSettings
 ) -> TrainVecEnv:
-    """Makes one env of all worlds of the settings; model and worlds may be passed if loaded."""
-    model = model or open_model(settings.robot, settings.lidar)
+    """Makes one env of all worlds of the settings."""
     margin = settings.teaching.margin
     if margin:
         model = replace(model, robot=model.robot.grow_footprint(margin))
@@ -142,7 +144,7 @@ def make_train_env(
         BridgeVectorEnv(
             count,
             model,
-            (scenes or {}).get(world, world),
+            worlds[world],
             settings.task,
             settings.task_options,
             settings.max_episode_steps,
@@ -203,34 +205,31 @@ def check_same(old: dict[str, Any], new: dict[str, Any], path: Path) -> None:
 
 def evaluate(
     algorithm: BaseAlgorithm | Actor,
+    model: SimulatorModel,
+    world: AnyWorld,
     settings: TrainingSettings,
-    world: str,
     episodes: int,
-    model: SimulatorModel | None = None,
 ) -> Outcomes:
     """Runs the evaluation protocol's episodes in a world with an algorithm's policy."""
-    env = _env_of(
-        settings, world, episodes, model or open_model(settings.robot, settings.lidar)
-    )
-    return drive_worlds(
-        env, algorithms.act_of(algorithm), range(FIRST_SEED, FIRST_SEED + episodes)
-    )
+    env = _env_of(model, world, settings, episodes)
+    seeds = range(FIRST_SEED, FIRST_SEED + episodes)
+    return drive_worlds(env, algorithms.act_of(algorithm), seeds)
 
 
-def _stop_of(settings: TrainingSettings, model: SimulatorModel) -> Stop:
+def _stop_of(model: SimulatorModel, worlds: Worlds, settings: TrainingSettings) -> Stop:
     """Makes the early stop of a training, with separate worlds."""
     stop = settings.stop
     if stop is None:
         return Stop(None, {})
     envs = {
-        world: _env_of(settings, world, stop.episodes, model)
-        for world in settings.worlds
+        name: _env_of(model, worlds[name], settings, stop.episodes)
+        for name in settings.worlds
     }
     return Stop(stop, envs)
 
 
 def _env_of(
-    settings: TrainingSettings, world: str, episodes: int, model: SimulatorModel
+    model: SimulatorModel, world: AnyWorld, settings: TrainingSettings, episodes: int
 ) -> BridgeVectorEnv:
     """Makes copies of a world for an evaluation, one per episode, without teaching."""
     return BridgeVectorEnv(
@@ -245,7 +244,9 @@ def _env_of(
 
 
 # signature of `train`
-Learn = Callable[[TrainingSettings, int, Path, Tell, bool], Trained]
+Learn = Callable[
+    [SimulatorModel, Worlds, TrainingSettings, int, Path, Tell, bool], Trained
+]
 
 
 @dataclass(frozen=True)
@@ -276,15 +277,17 @@ def run(
     done: Callable[[SeedResult], None] = lambda _: None,
     learn: Learn = train,
     evaluating: Callable[[str], None] = lambda _: None,
+    opened: Opened | None = None,
 ) -> list[SeedResult]:
     """Trains and evaluates seed after seed.
 
-    Raises ConfigError if a run already exists in the folder or, to resume, if there is none.
+    `opened` is what the settings name, if it is open already. Raises ConfigError if a run already
+    exists in the folder or, to resume, if there is none.
     """
     _check(order.settings, order.seeds, order.out, order.resumed)
     settings = order.settings
-    model = open_model(order.settings.robot, order.settings.lidar)
-    trial = _env_of(settings, next(iter(settings.worlds)), TRIED, model)
+    model, worlds = opened or open_training(settings)
+    trial = _env_of(model, worlds[next(iter(settings.worlds))], settings, TRIED)
     algorithms.check_serves(settings, trial)
     trial.reset(seed=FIRST_SEED)
     # Refuse a task that returns non-finite numbers before creating a folder.
@@ -297,14 +300,15 @@ def run(
         for seed in order.seeds:
             folder = order.out / f"seed_{seed}"
             begun = (folder / CHECKPOINT).is_file()
-            trained = learn(settings, seed, folder, tell, order.resumed and begun)
+            resumed = order.resumed and begun
+            trained = learn(model, worlds, settings, seed, folder, tell, resumed)
             summaries = {}
-            for world in settings.worlds:
-                evaluating(world)
+            for name in settings.worlds:
+                evaluating(name)
                 driven = evaluate(
-                    trained.algorithm, settings, world, order.episodes, model
+                    trained.algorithm, model, worlds[name], settings, order.episodes
                 )
-                summaries[world] = summarise(driven, model.control_period)
+                summaries[name] = summarise(driven, model.control_period)
             result = SeedResult(seed, trained, summaries)
             plain: dict[str, Any] = {"training_steps": trained.steps}
             plain |= {
@@ -312,7 +316,7 @@ def run(
                 for world, summary in summaries.items()
             }
             write_text(folder / EVALUATION, format_json(plain, 2) + "\n")
-            export(settings, result, order.command, folder / POLICY)
+            export(model, settings, result, order.command, folder / POLICY)
             done(result)
             results.append(result)
     return results
@@ -338,10 +342,13 @@ def _alone(out: Path) -> Iterator[None]:
 
 
 def export(
-    settings: TrainingSettings, result: SeedResult, command: str, path: Path
+    model: SimulatorModel,
+    settings: TrainingSettings,
+    result: SeedResult,
+    command: str,
+    path: Path,
 ) -> None:
     """Writes the policy file `*.onnx`, with the user's command line and the success rates."""
-    model = open_model(settings.robot, settings.lidar)
     task = make_task(settings.task, model, settings.task_options)
     rates = {
         f"success in {world}": summary.success.value

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.policy import local_map_kernels as maps
-from nics_drl_bridge.policy.local_map_kernels import (
+from nics_drl_bridge.policy.planners import local_map_kernels as maps
+from nics_drl_bridge.policy.planners.local_map_kernels import (
     Clearance,
     FootprintDiscs,
     MapScratch,

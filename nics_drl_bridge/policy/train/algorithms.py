@@ -25,9 +25,9 @@ from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.policy.evaluation import Act
-from nics_drl_bridge.policy.train_checkpoint import RECENT, Watch, tensors
-from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
-from nics_drl_bridge.policy.training_settings import TrainingSettings
+from nics_drl_bridge.policy.train.checkpoint import RECENT, Watch, tensors
+from nics_drl_bridge.policy.train.settings import TrainingSettings
+from nics_drl_bridge.policy.train.vec_env import TrainVecEnv
 
 LEAST_RATE = 0.02  # final fraction of PPO's learning rate
 LEAST_STD = 0.05

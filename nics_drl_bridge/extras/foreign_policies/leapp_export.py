@@ -7,16 +7,14 @@ back.
 
 import base64
 import hashlib
-import json
-import struct
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import onnx
+import safetensors.numpy
 from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
-from numpy.typing import NDArray
 from onnx import TensorProto
 
 from nics_drl_bridge.config import dump_yaml
@@ -27,10 +25,9 @@ from nics_drl_bridge.files import (
     write_text,
     write_whole_folder,
 )
-from nics_drl_bridge.policy import onnx_graph
-from nics_drl_bridge.policy.contract import Contract
-from nics_drl_bridge.policy.graph_builder import Builder
-from nics_drl_bridge.policy.policy_file import PolicyFile
+from nics_drl_bridge.policy.file import onnx_graph
+from nics_drl_bridge.policy.file.contract import Contract
+from nics_drl_bridge.policy.file.policy_file import PolicyFile
 
 NODE = "policy"
 CONFIG_VERSION = "1.3"  # version of the format
@@ -54,6 +51,9 @@ class Piece(NamedTuple):
 
 def export_bundle(policy: PolicyFile, folder: str | Path) -> Path:
     """Writes a policy file as a bundle; returns its YAML file. Errors: see `write_whole_folder`."""
+    if policy.contract.foreign is not None:
+        reason = "is a foreign policy, whose network alone is not enough to drive."
+        raise PolicyError(str(policy.path), "foreign", reason)
     content = policy.path.read_bytes()
     place = Path(folder)
     marker = f"{place.resolve().name}.yaml"
@@ -72,8 +72,8 @@ def export_bundle(policy: PolicyFile, folder: str | Path) -> Path:
         state = policy.contract.state
         if state is not None:
             start = np.full((1, state.size), state.start, np.float32)
-            data = _safetensors(f"{NODE}/{onnx_graph.STATE_IN}", start)
-            write_bytes(temporary / start_values, data)
+            arrays = {f"{NODE}/{onnx_graph.STATE_IN}": start}
+            write_bytes(temporary / start_values, safetensors.numpy.save(arrays))
         write_text(
             temporary / marker, dump_yaml(_described(policy, pieces, made, place))
         )
@@ -120,13 +120,14 @@ def _pieces(policy: PolicyFile) -> list[Piece]:
 
 def _split(model: Any, pieces: Iterable[Piece]) -> None:
     """Replaces the observation input of a graph by separate inputs and a concatenation."""
-    build = Builder(OURS)
     batch = model.graph.input[0].type.tensor_type.shape.dim[0]
     entry = model.metadata_props.add()
     entry.key = TAKEN
     entry.value = base64.b64encode(model.graph.input[0].SerializeToString()).decode()
     rows = []
     infos = []
+    nodes = []
+    weights = []
     others = list(model.graph.input)[1:]
     for piece in pieces:
         infos.append(
@@ -134,15 +135,19 @@ def _split(model: Any, pieces: Iterable[Piece]) -> None:
         )
         infos[-1].type.tensor_type.shape.dim[0].CopyFrom(batch)
         infos[-1].type.tensor_type.shape.dim[1].dim_value = piece.width
-        whole = len(piece.kept) == piece.width
-        rows.append(piece.name if whole else build.pick(piece.name, piece.kept))
-    build.join(rows, name=onnx_graph.INPUT)
-    nodes = list(model.graph.node)
-    weights = list(model.graph.initializer)
+        rows.append(piece.name)
+        if len(piece.kept) < piece.width:
+            rows[-1] = f"{OURS}{piece.name}"
+            places = f"{rows[-1]}_places"
+            kept = np.array(piece.kept, np.int64)
+            weights.append(onnx.numpy_helper.from_array(kept, places))
+            ends = ([piece.name, places], [rows[-1]])
+            nodes.append(onnx.helper.make_node("Gather", *ends, axis=1))
+    nodes.append(onnx.helper.make_node("Concat", rows, [onnx_graph.INPUT], axis=1))
     for held, values in (
         (model.graph.input, [*infos, *others]),
-        (model.graph.node, [*build.nodes, *nodes]),
-        (model.graph.initializer, [*build.weights, *weights]),
+        (model.graph.node, [*nodes, *model.graph.node]),
+        (model.graph.initializer, [*weights, *model.graph.initializer]),
     ):
         del held[:]
         held.extend(values)
@@ -248,15 +253,3 @@ def _outputs(contract: Contract) -> list[Data]:
 
 def _tensor(name: str, shape: list[int], dtype: str = "float32", **facts: Any) -> Data:
     return {"name": name, "dtype": dtype, "shape": shape, "type": "tensor", **facts}
-
-
-def _safetensors(name: str, array: NDArray[np.float32]) -> bytes:
-    """Encodes an array in the safetensors format: header length, JSON header, numbers."""
-    facts = {
-        "dtype": "F32",
-        "shape": list(array.shape),
-        "data_offsets": [0, array.nbytes],
-    }
-    text = json.dumps({name: facts}).encode()
-    text += b" " * (-len(text) % 8)
-    return struct.pack("<Q", len(text)) + text + array.astype("<f4").tobytes()

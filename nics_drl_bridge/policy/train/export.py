@@ -3,6 +3,7 @@
 import io
 import warnings
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from nics_drl_bridge.env.task import Task
 from nics_drl_bridge.errors import ConfigError, PolicyError
 from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.policy.contract import (
+from nics_drl_bridge.policy.file.contract import (
     GOLDEN,
     SUFFIX,
     Rows,
@@ -26,12 +27,12 @@ with extensions.require_modules("the export of a policy"):
     import onnx
     import torch
 
-    from nics_drl_bridge.policy import onnx_graph, policy_file, rehearsal
-    from nics_drl_bridge.policy.onnx_session import (
-        GraphNeeds,
+    from nics_drl_bridge.policy.file import onnx_graph, policy_file, rehearsal
+    from nics_drl_bridge.policy.file.onnx_session import (
+        check_network,
         open_session,
         run_in_turn,
-        run_session,
+        run_rows,
     )
 
 Normaliser = tuple[ArrayLike, ArrayLike, float]
@@ -130,43 +131,35 @@ def export_policy(
         )
     deployed = Deployed(actor_of(model), task, normaliser).eval().cpu()
     graph = _graph(deployed, task)
-    needs = GraphNeeds(
-        task.observation_space.shape[0],
-        len(task.robot.command),
-        deployed.discrete,
-        None,
-        onnx_graph.graph_hash(graph),
-        deployed.state,
-    )
-    golden = _golden(deployed, graph, needs, golden_observations(task), str(file))
+    golden = _golden(deployed, graph, golden_observations(task), str(file))
     text = contract_of(
         task,
         simulator_model,
         golden,
-        needs.graph_sha256,
+        onnx_graph.graph_hash(graph),
         provenance or {},
         deployed.state,
         max_episode_steps=max_episode_steps,
     )
     onnx.helper.set_model_props(graph, {onnx_graph.KEY: text})
     data = onnx_graph.sealed(graph.SerializeToString(deterministic=True))
-    rehearsal.remember(data)  # safe: this process made the network
+    check_network(data, str(file), runs=True)  # here: this process made the network
+    rehearsal.remember(data)
     policy = policy_file.policy_of(data, file)
     write_bytes(file, data)
     return policy
 
 
-def _golden(
-    deployed: Deployed, graph: Any, needs: GraphNeeds, seen: Rows, source: str
-) -> dict[str, Rows]:
+def _golden(deployed: Deployed, graph: Any, seen: Rows, source: str) -> dict[str, Rows]:
     session = open_session(graph.SerializeToString(), source)
 
     def compute(*tensors: Rows) -> list[Rows]:
         with torch.no_grad():
             return [part.numpy() for part in deployed(*map(torch.as_tensor, tensors))]
 
-    out = run_session(session, needs, seen, source)
-    wanted = run_in_turn(compute, seen, needs)
+    start = None if deployed.state is None else np.full(*deployed.state, np.float32)
+    out = run_in_turn(partial(run_rows, session, source), seen, start)
+    wanted = run_in_turn(compute, seen, start)
     for name, ours, theirs in zip(("actions", "commands"), out, wanted, strict=True):
         error = float(np.abs(ours - theirs).max())
         if not error <= policy_file.GOLDEN_TOLERANCE:

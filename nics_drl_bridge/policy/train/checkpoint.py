@@ -20,9 +20,9 @@ from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import check_sealed, seal, write_bytes
 from nics_drl_bridge.policy.evaluation import Act
-from nics_drl_bridge.policy.train_stop import Stop
-from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
-from nics_drl_bridge.policy.training_settings import TrainingSettings
+from nics_drl_bridge.policy.train.settings import TrainingSettings
+from nics_drl_bridge.policy.train.stop import Stop
+from nics_drl_bridge.policy.train.vec_env import TrainVecEnv
 
 FORMAT = "nics_drl_bridge/checkpoint/3"
 MOST_BYTES = 4 * 2**30  # maximum size of a file, which includes SAC's whole buffer

@@ -10,7 +10,7 @@ from typing import Any
 
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.policy.evaluation import Act, drive_worlds
-from nics_drl_bridge.policy.training_settings import StopSettings
+from nics_drl_bridge.policy.train.settings import StopSettings
 
 # first seed of these episodes, beyond the seeds of training and of the protocol
 HELD_OUT_SEED = 2**41

@@ -32,7 +32,7 @@ class Net(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """Transitions to learn from, see `train_rollout.Transitions`."""
+    """Transitions to learn from, see `ppo.Transitions`."""
 
     seen: NDArray[np.float32]  # (n, O)
     actions: NDArray[np.float32]  # (n, C), or (n, 1) indices of discrete ones

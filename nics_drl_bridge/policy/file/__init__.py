@@ -1,0 +1,1 @@
+"""Policy files: contract, graph, and how they are opened and run."""

@@ -1,0 +1,108 @@
+"""Opens a policy's graph in onnxruntime and checks it; imports little, see `rehearsal`."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import onnx
+from numpy.typing import NDArray
+
+from nics_drl_bridge.errors import ConfigError, PolicyError
+from nics_drl_bridge.policy.file import onnx_graph
+
+Rows = NDArray[np.float32]
+
+
+def check_network(data: bytes, source: str, runs: bool) -> None:
+    """Checks the form of a network; if it `runs`, also its sizes, and runs it on zeros.
+
+    An open first dimension of its inputs is the number of observations, of which as many are run as
+    are ever run at once. The cost of all this is known only afterwards; see `rehearsal`. Raises
+    PolicyError.
+    """
+    model = onnx_graph.parse(data, source)
+    onnx_graph.check_graph(model, source)
+    if not runs:
+        return
+    fixed = onnx_graph.fix_rows(model, onnx_graph.MOST_ROWS)
+    onnx_graph.check_sizes(_fold(fixed, source), source)
+    feeds = {}
+    for value in onnx_graph.inputs_of(fixed):
+        tensor = value.type.tensor_type
+        shape = [dimension.dim_value for dimension in tensor.shape.dim]
+        dtype = onnx.helper.tensor_dtype_to_np_dtype(tensor.elem_type)
+        feeds[value.name] = np.zeros(shape, dtype)
+    run_network(open_session(data, source), source, feeds)
+
+
+def _fold(model: Any, source: str) -> Any:
+    """Returns the model after onnxruntime has computed all that its inputs' values don't change."""
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "folded.onnx"
+        open_session(model.SerializeToString(), source, file)
+        return onnx.load(file)
+
+
+def open_session(data: bytes, source: str, folded: Path | None = None) -> Any:
+    """Opens a session on one thread. Raises ConfigError without onnxruntime, or PolicyError.
+
+    `folded` is a file for the graph after the optimisations that keep its operators.
+    """
+    try:
+        import onnxruntime
+    except ImportError:
+        fix = "pip install 'nics_drl_bridge[deploy]'."
+        raise ConfigError(
+            f"a policy file needs the module 'onnxruntime'; {fix}"
+        ) from None
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
+    options.log_severity_level = 4
+    if folded is not None:
+        levels = onnxruntime.GraphOptimizationLevel
+        options.graph_optimization_level = levels.ORT_ENABLE_BASIC
+        options.optimized_model_filepath = str(folded)
+    try:
+        return onnxruntime.InferenceSession(
+            data, options, providers=["CPUExecutionProvider"]
+        )
+    except Exception as error:  # noqa: BLE001 - the runtime's errors have no common base class
+        raise _cannot_run(source, error) from None
+
+
+def run_network(
+    session: Any, source: str, feeds: dict[str, NDArray[Any]]
+) -> list[NDArray[Any]]:
+    """Runs a network on its inputs by name; returns its outputs. Raises PolicyError."""
+    try:
+        return list(session.run(None, feeds))
+    except Exception as error:  # noqa: BLE001 - the runtime's errors have no common base class
+        raise _cannot_run(source, error) from None
+
+
+def _cannot_run(source: str, error: Exception) -> PolicyError:
+    reason = f"onnxruntime can't run it ({onnx_graph.quote(error)})."
+    return PolicyError(source, "graph", reason)
+
+
+def run_rows(session: Any, source: str, *tensors: Rows) -> list[NDArray[Any]]:
+    """Runs observations (n, O), and states (n, S) if there are any. Raises PolicyError."""
+    names = (onnx_graph.INPUT, onnx_graph.STATE_IN)
+    return run_network(session, source, dict(zip(names, tensors, strict=False)))
+
+
+def run_in_turn(
+    run: Callable[..., Sequence[NDArray[Any]]], seen: Rows, state: Rows | None
+) -> list[NDArray[Any]]:
+    """Computes actions and commands for observations (T, O), one by one from a state (S,)."""
+    if state is None:
+        return list(run(seen)[:2])
+    states = [state[None]]
+    steps = []
+    for row in seen:
+        action, command, *states = run(row[None], *states)
+        steps.append((action, command))
+    return [np.concatenate(rows) for rows in zip(*steps, strict=True)]

@@ -1,0 +1,1 @@
+"""Planners: the local map, and model predictive path integral control."""

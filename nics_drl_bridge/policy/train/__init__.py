@@ -1,0 +1,1 @@
+"""Training: settings, engines, checkpoints, and the export to a policy file."""
