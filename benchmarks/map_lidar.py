@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from nics_drl_bridge.lidar import map_kernels
-from nics_drl_bridge.lidar.exact_kernels import LidarPose, beams_of
+from nics_drl_bridge.lidar.beams import INF, LidarPose, beams_of, finish
 from nics_drl_bridge.lidar.maps import OCCUPIED, GridMap
 from nics_drl_bridge.lidar.scan_kernels import scan_lanes
 from nics_drl_bridge.lidar.spec import load_lidar
@@ -98,11 +98,19 @@ def poses(grid: GridMap, seed: int) -> NDArray[np.float64]:
 def run(out, beams, at, range_max, arrays, walk, lanes):
     """Scans from poses `at`, walking or jumping."""
     for n in range(at.shape[0]):
-        out[n] = np.inf
+        lanes.scan[:] = INF
         x, y, c, s = at[n]
-        map_kernels.map_into(
-            out[n], beams, LidarPose(x, y, c, s), range_max, arrays, walk, lanes
+        map_kernels.scan_map(
+            lanes.scan,
+            beams,
+            LidarPose(x, y, c, s, 0.0),
+            range_max,
+            arrays,
+            walk,
+            lanes.singles,
+            lanes.integers,
         )
+        finish(out[n], lanes.scan, 0.0, range_max)
 
 
 def timed(*arguments: Any) -> tuple[NDArray[np.float32], float]:
@@ -129,16 +137,15 @@ def measure(seed: int, control: str | None) -> dict[str, Any]:
         for lidar in LIDARS:
             spec = load_lidar(lidar)
             directions = np.ascontiguousarray(spec.directions.T)
-            beams = beams_of(
-                directions, spec.angle_min, spec.angle_increment, spec.full_circle
-            )
+            beams = beams_of(directions, spec.angle_min, spec.angle_increment)
+            lanes = scan_lanes(spec.beams)
             at = poses(grid, seed + 1)
             arguments = (beams, at, spec.range_max, grid.arrays)
-            exact, exact_speed = timed(*arguments, True, scan_lanes())
+            exact, exact_speed = timed(*arguments, True, lanes)
             if control == "shifted":
                 moved = np.column_stack([at[:, :1] + RESOLUTION, at[:, 1:]])
                 arguments = (beams, moved, spec.range_max, grid.arrays)
-            baked, baked_speed = timed(*arguments, control == "slow", scan_lanes())
+            baked, baked_speed = timed(*arguments, control == "slow", lanes)
             if control == "nan":
                 baked[0, 0] = np.nan
             error = baked.astype(np.float64) - exact

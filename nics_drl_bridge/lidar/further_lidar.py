@@ -50,7 +50,7 @@ class FurtherLidar(Sensor):
         faults = self.lidar.fault_parameters
 
         def render(out: Readings, worlds: Integers) -> None:
-            lanes = scan_kernels.scan_lanes()
+            lanes = scan_kernels.scan_lanes(self.size)
             cells = body_cells(0, state.bodies.shape[1])
             scan_kernels.scan_worlds(
                 out,

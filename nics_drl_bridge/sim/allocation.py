@@ -292,6 +292,6 @@ def _allocate_scratch(
             twist=np.zeros(3),
             only_world=np.zeros(1, np.int64),
             no_cells=body_cells(0, bodies + 1),
-            lanes=scan_kernels.scan_lanes(),
+            lanes=scan_kernels.scan_lanes(model.lidar.beams),
         ),
     )

@@ -17,10 +17,10 @@ import math
 from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import fault_kernels, scan_kernels
-from nics_drl_bridge.lidar.baked_kernels import LidarArrays
 from nics_drl_bridge.lidar.cell_kernels import BodyCells, around
 from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SIN, X, Y
-from nics_drl_bridge.lidar.fixture_kernels import fixtures_around
+from nics_drl_bridge.lidar.map_kernels import fixtures_around
+from nics_drl_bridge.lidar.scan_kernels import LidarArrays
 from nics_drl_bridge.robot.kernels import move, wrap
 from nics_drl_bridge.sim.state import (
     BODY_COLUMNS,

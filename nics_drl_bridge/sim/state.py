@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 from nics_drl_bridge.lidar.arrays import Array as Array
 from nics_drl_bridge.lidar.arrays import Integers as Integers
 from nics_drl_bridge.lidar.arrays import Singles
-from nics_drl_bridge.lidar.baked_kernels import LidarArrays
 from nics_drl_bridge.lidar.cell_kernels import BodyCells
 from nics_drl_bridge.lidar.exact_kernels import OutlineArrays
-from nics_drl_bridge.lidar.fixture_kernels import Fixtures
-from nics_drl_bridge.lidar.scan_kernels import ScanLanes
+from nics_drl_bridge.lidar.map_kernels import Fixtures
+from nics_drl_bridge.lidar.scan_kernels import LidarArrays, ScanLanes
 from nics_drl_bridge.robot.kernels import Terms
 
 # Columns of `State.noise`: standard deviations of the odometry's linear velocity [m/s] and turn

@@ -26,8 +26,8 @@ import numpy as np
 
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import cell_kernels as cells
-from nics_drl_bridge.lidar.baked_kernels import LidarArrays
-from nics_drl_bridge.lidar.fixture_kernels import cells_of, walls_of
+from nics_drl_bridge.lidar.map_kernels import cells_of, walls_of
+from nics_drl_bridge.lidar.scan_kernels import LidarArrays
 from nics_drl_bridge.robot.kernels import (
     apply_curve,
     find_delayed_command,

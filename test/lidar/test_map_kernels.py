@@ -7,7 +7,7 @@ from robots import lidar
 
 from nics_drl_bridge.geometry import rotate
 from nics_drl_bridge.lidar import map_kernels
-from nics_drl_bridge.lidar.exact_kernels import LidarPose, beams_of
+from nics_drl_bridge.lidar.beams import LidarPose, beams_of
 from nics_drl_bridge.lidar.maps import NO_MAP, GridMap
 from nics_drl_bridge.lidar.scan_kernels import scan_lanes
 
@@ -23,18 +23,25 @@ def directions(beams=BEAMS):
 def scan(kernel, grid, pose, range_max=100.0, rays=None, before=np.inf):
     """A scan (B,) from x, y, heading."""
     rays = directions() if rays is None else np.asarray(rays, dtype=np.float64)
-    out = np.full(len(rays), before, np.float32)
+    lanes = scan_lanes(len(rays))
+    out = lanes.scan.view(np.float32)
+    out[:] = before
     c = np.cos(pose[2])
     s = np.sin(pose[2])
     arrays = grid if isinstance(grid, tuple) else grid.arrays
-    beams = beams_of(
-        np.ascontiguousarray(rays.T), -np.pi, 2.0 * np.pi / len(rays), True
+    beams = beams_of(np.ascontiguousarray(rays.T), -np.pi, 2.0 * np.pi / len(rays))
+    lidar = LidarPose(*map(float, pose[:2]), c, s, float(pose[2]))
+    map_kernels.scan_map(
+        lanes.scan,
+        beams,
+        lidar,
+        range_max,
+        arrays,
+        kernel == "exact",
+        lanes.singles,
+        lanes.integers,
     )
-    lidar = LidarPose(*map(float, pose[:2]), c, s)
-    map_kernels.map_into(
-        out, beams, lidar, range_max, arrays, kernel == "exact", scan_lanes()
-    )
-    return out
+    return out[: len(rays)]
 
 
 def random_map(seed):

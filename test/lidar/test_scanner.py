@@ -11,13 +11,12 @@ from lidar_scenes import (
     random_shapes,
     ring,
 )
-from plain_scan import scan_robot
 from robots import lidar
 
 from nics_drl_bridge.errors import ConfigError, ModelError
 from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.maps import GridMap
-from nics_drl_bridge.lidar.scan_kernels import LANES
+from nics_drl_bridge.lidar.scan_kernels import MOST_FOUND
 from nics_drl_bridge.lidar.scanner import RENDERERS, Scanner, make_scanner
 from nics_drl_bridge.lidar.shapes import SQUARE, STRIP, Circle, Polygon, Rectangle
 from nics_drl_bridge.lidar.table import Density
@@ -255,29 +254,18 @@ def baked_scanner():
 
 
 @pytest.mark.slow
-def test_a_world_of_more_bodies_than_lanes_is_the_minimum_of_its_parts_to_the_bit(
+def test_a_world_of_more_bodies_than_wait_to_be_fused_is_the_minimum_of_its_parts_to_the_bit(
     baked_scanner,
 ):
-    count = 2 * LANES + 5
+    count = 2 * MOST_FOUND + 5
     robots, bodies = many_bodies(baked_scanner, 3, count)
     whole = baked_scanner.scan(robots, bodies)
-    for part in (7, LANES - 1, LANES, LANES + 1):
+    for part in (1, 7, MOST_FOUND - 1, MOST_FOUND):
         pieces = [
             baked_scanner.scan(robots, bodies[:, k : k + part])
             for k in range(0, count, part)
         ]
         assert np.array_equal(whole, np.minimum.reduce(pieces))
-
-
-@pytest.mark.slow
-def test_many_looked_up_at_once_are_each_looked_up_alone_to_the_bit(baked_scanner):
-    robots, bodies = many_bodies(baked_scanner, 20, 9)
-    walls = np.array([[-3.0, -2.0, 3.0, -2.5]])
-    alone = np.empty(72, np.float32)
-    together = baked_scanner.scan(robots, bodies, walls)
-    for robot, around, scan in zip(robots, bodies, together, strict=True):
-        scan_robot(alone, robot, around, -1, walls, baked_scanner.arguments)
-        assert alone.tobytes() == scan.tobytes()
 
 
 @pytest.mark.parametrize("renderer", RENDERERS)
