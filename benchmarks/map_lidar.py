@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from nics_drl_bridge.lidar import map_kernels
-from nics_drl_bridge.lidar.beams import INF, LidarPose, beams_of, finish
+from nics_drl_bridge.lidar.beam_kernels import INF, LidarPose, beams_of, finish
 from nics_drl_bridge.lidar.maps import OCCUPIED, GridMap
 from nics_drl_bridge.lidar.scan_kernels import scan_lanes
 from nics_drl_bridge.lidar.spec import load_lidar

@@ -7,7 +7,7 @@ import numpy as np
 
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.arrays import Array, Integers, ShortIntegers, Singles
-from nics_drl_bridge.lidar.beams import INF, Beams, beams_of
+from nics_drl_bridge.lidar.beam_kernels import INF, Beams, beams_of
 from nics_drl_bridge.lidar.exact_kernels import scan_circle, scan_polygon, turned
 
 EDGE = 1e-6  # ranges at an edge are taken this far inside it, as a fraction of the whole width
@@ -69,7 +69,7 @@ class ShapeAhead(NamedTuple):
 
 @kernel
 def scan_ahead(scan: ShortIntegers, beams: Beams, shape: ShapeAhead) -> None:
-    """Fuse a shape into a scan (B,), see `beams`."""
+    """Fuse a shape into a scan (B,), see `beam_kernels`."""
     if shape.corners.shape[0] == 0:
         scan_circle(scan, beams, shape.distance, 0.0, shape.radius)
     else:

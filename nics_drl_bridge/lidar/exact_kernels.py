@@ -1,7 +1,7 @@
 """Compiled exact scanner: the ranges of one object in one scan.
 
-Each function lowers the ranges of the beams that hit its object in a scan, see `beams`; applied one
-after the other, they compute the minimum of Eq. 4. Positions are in the lidar's frame.
+Each function lowers the ranges of the beams that hit its object in a scan, see `beam_kernels`;
+applied one after the other, they compute the minimum of Eq. 4. Positions are in the lidar's frame.
 """
 
 import math
@@ -11,7 +11,7 @@ import numpy as np
 
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.arrays import Array, Integers, ShortIntegers
-from nics_drl_bridge.lidar.beams import (
+from nics_drl_bridge.lidar.beam_kernels import (
     TWO_PI,
     Beams,
     LidarPose,

@@ -31,7 +31,7 @@ import numpy as np
 
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.arrays import Array, ShortIntegers, Singles
-from nics_drl_bridge.lidar.beams import (
+from nics_drl_bridge.lidar.beam_kernels import (
     TWO_PI,
     Beams,
     LidarPose,

@@ -22,7 +22,7 @@ from nics_drl_bridge.lidar.arrays import (
     ShortIntegers,
     Singles,
 )
-from nics_drl_bridge.lidar.beams import Beams, LidarPose, lower
+from nics_drl_bridge.lidar.beam_kernels import Beams, LidarPose, lower
 
 LANES = 48  # beams that jump together: several vector registers hide the latency of look-ups
 SINGLES = 7
@@ -74,13 +74,6 @@ def grid_of(n: int, fixtures: Fixtures) -> GridArrays:
     """Map of one copy, without squares if there is none."""
     p = fixtures.member[n]
     return GridArrays(cells_of(fixtures.squares, fixtures.maps[p]), fixtures.frames[p])
-
-
-@kernel(view=True)
-def fixtures_around(n: int, fixtures: Fixtures) -> Fixtures:
-    """Fixtures of one copy, as if it were the only copy."""
-    s = fixtures
-    return Fixtures(s.member[n : n + 1], s.walls, s.first, s.squares, s.maps, s.frames)
 
 
 @kernel(view=True)
@@ -191,7 +184,7 @@ def scan_map(
     singles: Singles,
     wholes: ShortIntegers,
 ) -> None:
-    """Fuse a map into a scan (B + LANES,), see `beams`: walks if `exact`, else jumps.
+    """Fuse a map into a scan (B + LANES,), see `beam_kernels`: walks if `exact`, else jumps.
 
     `singles` (SINGLES * LANES,) and `wholes` (INTEGERS * LANES,) are scratch memory.
     """

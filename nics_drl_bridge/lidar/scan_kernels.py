@@ -5,10 +5,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.lidar import cell_kernels, map_kernels
+from nics_drl_bridge.lidar import map_kernels
 from nics_drl_bridge.lidar.arrays import Array, Integers, ShortIntegers, Singles
-from nics_drl_bridge.lidar.beams import INF, Beams, LidarPose, finish, locate_lidar
-from nics_drl_bridge.lidar.cell_kernels import BodyCells
+from nics_drl_bridge.lidar.beam_kernels import (
+    INF,
+    Beams,
+    LidarPose,
+    finish,
+    locate_lidar,
+)
 from nics_drl_bridge.lidar.exact_kernels import (
     RADIUS,
     SHAPE,
@@ -26,7 +31,6 @@ from nics_drl_bridge.lidar.lookup_kernels import (
     look_up_body,
 )
 from nics_drl_bridge.lidar.map_kernels import Fixtures, grid_of, walls_of
-
 
 # Look-ups that wait to be fused: while one waits for memory, the next ones go on.
 MOST_FOUND = 64
@@ -50,7 +54,7 @@ class LidarArrays(NamedTuple):
 class ScanLanes(NamedTuple):
     """Scratch memory of the scans of one thread."""
 
-    scan: ShortIntegers  # the scan while it is made, see `beams`
+    scan: ShortIntegers  # the scan while it is made, see `beam_kernels`
     found: Any  # (MOST_FOUND,) of `LOOK_UP`
     singles: Singles  # of `map_kernels`
     integers: ShortIntegers
@@ -72,10 +76,10 @@ def scan_worlds(
     robot_poses: Array,
     chosen: Integers,
     bodies: Array,
+    nearby: ShortIntegers,
     first_robot: int,
     fixtures: Fixtures,
     lidar: LidarArrays,
-    cells: BodyCells,
     lanes: ScanLanes,
 ) -> None:
     """Scan from all robots of some worlds.
@@ -85,38 +89,74 @@ def scan_worlds(
         robot_poses: (N, M, 3).
         chosen: (n,) the worlds to scan.
         bodies: (N, K, 7).
+        nearby: indices of the bodies to consider.
         first_robot: index of the first robot's own body, which the other robots' follow; -1 if
             robots have no bodies.
         fixtures: walls and maps of the worlds.
         lidar: the lidar of every robot.
-        cells: which bodies are near a place.
         lanes: scratch memory.
     """
-    scan = lanes.scan
     for n in chosen:
         for m in range(robot_poses.shape[1]):
-            for i in range(scan.shape[0]):
-                scan[i] = INF
-            pose = locate_lidar(robot_poses[n, m], lidar.mount)
             own_body = -1
             if first_robot >= 0:
                 own_body = first_robot + m
-            nearby = cell_kernels.around(n, pose.x, pose.y, lidar.range_max, cells)
-            fuse_bodies(pose, bodies[n], cells.found[:nearby], own_body, lidar, lanes)
-            walls = walls_of(n, fixtures)
-            scan_walls(scan, lidar.beams, pose, walls, lidar.range_max)
-            if fixtures.squares.size > 0:
-                map_kernels.scan_map(
-                    scan,
-                    lidar.beams,
-                    pose,
-                    lidar.range_max,
-                    grid_of(n, fixtures),
-                    lidar.exact,
-                    lanes.singles,
-                    lanes.integers,
-                )
-            finish(ranges[n, m], scan, lidar.range_min, lidar.range_max)
+            pose = locate_lidar(robot_poses[n, m], lidar.mount)
+            scan_robot(
+                ranges[n, m],
+                n,
+                pose,
+                bodies[n],
+                nearby,
+                own_body,
+                fixtures,
+                lidar,
+                lanes,
+            )
+
+
+@kernel
+def scan_robot(
+    ranges: Singles,
+    n: int,
+    pose: LidarPose,
+    bodies: Array,
+    nearby: ShortIntegers,
+    own_body: int,
+    fixtures: Fixtures,
+    lidar: LidarArrays,
+    lanes: ScanLanes,
+) -> None:
+    """Scan from one robot of the world n.
+
+    Args:
+        ranges: (B,) the scan [m], which is overwritten.
+        n: the world in `fixtures`.
+        pose: of the lidar.
+        bodies: (K, 7) of the world.
+        nearby: indices of the bodies to consider.
+        own_body: index of the robot's own body, which it does not see; -1 for none.
+        fixtures: walls and maps.
+        lidar: the lidar.
+        lanes: scratch memory.
+    """
+    scan = lanes.scan
+    for i in range(scan.shape[0]):
+        scan[i] = INF
+    fuse_bodies(pose, bodies, nearby, own_body, lidar, lanes)
+    scan_walls(scan, lidar.beams, pose, walls_of(n, fixtures), lidar.range_max)
+    if fixtures.squares.size > 0:
+        map_kernels.scan_map(
+            scan,
+            lidar.beams,
+            pose,
+            lidar.range_max,
+            grid_of(n, fixtures),
+            lidar.exact,
+            lanes.singles,
+            lanes.integers,
+        )
+    finish(ranges, scan, lidar.range_min, lidar.range_max)
 
 
 @kernel
@@ -128,16 +168,7 @@ def fuse_bodies(
     lidar: LidarArrays,
     lanes: ScanLanes,
 ) -> None:
-    """Fuse bodies (K, 7) of one world into a scan.
-
-    Args:
-        pose: of the lidar.
-        bodies: (K, 7).
-        nearby: indices of the bodies to consider.
-        own_body: index of the robot's own body, which it does not see; -1 for none.
-        lidar: the lidar.
-        lanes: scratch memory, with the scan.
-    """
+    """Fuse the visible bodies (K, 7) of one world into a scan, see `scan_robot`."""
     count = 0
     rows = lidar.table.rows
     for k in nearby:

@@ -13,8 +13,7 @@ from nics_drl_bridge.errors import ConfigError, ModelError, suggest
 from nics_drl_bridge.lidar import scan_kernels
 from nics_drl_bridge.lidar.arrays import Array, Singles
 from nics_drl_bridge.lidar.bake import bake
-from nics_drl_bridge.lidar.beams import beams_of
-from nics_drl_bridge.lidar.cell_kernels import body_cells
+from nics_drl_bridge.lidar.beam_kernels import beams_of
 from nics_drl_bridge.lidar.exact_kernels import SHAPE
 from nics_drl_bridge.lidar.lookup_error import lookup_distances
 from nics_drl_bridge.lidar.map_kernels import Fixtures
@@ -159,16 +158,15 @@ class Scanner:
         member = np.zeros(len(poses), np.int64)
         first = np.array([0, len(walls)])
         around = self._without_walls._replace(member=member, walls=walls, first=first)
-        cells = body_cells(0, bodies.shape[1])
         scan_kernels.scan_worlds(
             out[:, None],
             poses[:, None],
             worlds,
             bodies,
+            np.arange(bodies.shape[1], dtype=np.int32),
             -1,
             around,
             self.arguments,
-            cells,
             lanes,
         )
         return out
