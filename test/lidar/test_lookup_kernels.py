@@ -5,7 +5,7 @@ import pytest
 from lidar_scenes import convex, star
 
 from nics_drl_bridge.lidar import lookup_kernels as kernels
-from nics_drl_bridge.lidar.beams import arctan2
+from nics_drl_bridge.lidar.beam_kernels import arctan2
 from nics_drl_bridge.lidar.shapes import convex_hull
 
 

@@ -7,7 +7,7 @@ from robots import lidar
 
 from nics_drl_bridge.geometry import rotate
 from nics_drl_bridge.lidar import map_kernels
-from nics_drl_bridge.lidar.beams import LidarPose, beams_of
+from nics_drl_bridge.lidar.beam_kernels import LidarPose, beams_of
 from nics_drl_bridge.lidar.maps import NO_MAP, GridMap
 from nics_drl_bridge.lidar.scan_kernels import scan_lanes
 
@@ -82,7 +82,7 @@ def test_scans_of_random_maps_agree_with_plane_geometry(kernel):
     seen = 0
     solid = 0
     outside = 0
-    for seed in range(150):
+    for seed in range(70):
         grid, rng = random_map(seed)
         pose = random_pose(grid, rng)
         expected, clear = by_shapely(grid, pose)
@@ -93,8 +93,8 @@ def test_scans_of_random_maps_agree_with_plane_geometry(kernel):
         inside = 0 <= row < grid.cells.shape[0] and 0 <= column < grid.cells.shape[1]
         outside += not inside
         solid += inside and grid.blocked[row, column]
-    assert seen > 1800
-    assert min(solid, outside) > 5
+    assert seen > 800
+    assert min(solid, outside) > 2
 
 
 def test_both_ways_agree_from_the_corners_edges_and_centres_of_cells():
