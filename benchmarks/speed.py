@@ -35,7 +35,7 @@ from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar import map_kernels
 from nics_drl_bridge.lidar.bake import bake
-from nics_drl_bridge.lidar.exact_kernels import beams_of
+from nics_drl_bridge.lidar.beam_kernels import beams_of
 from nics_drl_bridge.lidar.faults import LidarFaults
 from nics_drl_bridge.lidar.maps import OCCUPIED, GridMap
 from nics_drl_bridge.lidar.scanner import Renderer, Scanner
@@ -660,9 +660,7 @@ def measure_maps(given: Given) -> Result:
         for lidar in MAP_LIDARS:
             spec = load_lidar(lidar)
             directions = np.ascontiguousarray(spec.directions.T)
-            beams = beams_of(
-                directions, spec.angle_min, spec.angle_increment, spec.full_circle
-            )
+            beams = beams_of(directions, spec.angle_min, spec.angle_increment)
             about = (spec.range_max, grid.arrays)
             exact, exact_speed = scan_map(beams, poses, *about, True)
             beside = poses.copy()

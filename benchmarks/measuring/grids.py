@@ -13,7 +13,7 @@ from scipy import ndimage
 
 from measuring.rates import interleaved, shortest
 from nics_drl_bridge.lidar import map_kernels
-from nics_drl_bridge.lidar.exact_kernels import LidarPose
+from nics_drl_bridge.lidar.beam_kernels import INF, LidarPose, finish
 from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.scan_kernels import scan_lanes
 
@@ -94,11 +94,19 @@ def run(
 ) -> None:
     """Scans from poses `at`, walking or jumping."""
     for n in range(at.shape[0]):
-        out[n] = np.inf
+        lanes.scan[:] = INF
         x, y, c, s = at[n]
-        map_kernels.map_into(
-            out[n], beams, LidarPose(x, y, c, s), range_max, arrays, walk, lanes
+        map_kernels.scan_map(
+            lanes.scan,
+            beams,
+            LidarPose(x, y, c, s, 0.0),
+            range_max,
+            arrays,
+            walk,
+            lanes.singles,
+            lanes.integers,
         )
+        finish(out[n], lanes.scan, 0.0, range_max)
 
 
 def scan_map(
@@ -106,6 +114,7 @@ def scan_map(
 ) -> tuple[NDArray[np.float32], float]:
     """Returns scans, and scans per second of the best of some runs."""
     out = np.empty((len(at), beams.directions.shape[1]), np.float32)
-    call = partial(run, out, beams, at, range_max, arrays, walk, scan_lanes())
+    lanes = scan_lanes(beams.directions.shape[1])
+    call = partial(run, out, beams, at, range_max, arrays, walk, lanes)
     seconds = shortest(interleaved({"scan": call}, REPEATS))["scan"]
     return np.minimum(out, range_max), len(at) / seconds

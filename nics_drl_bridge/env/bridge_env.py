@@ -136,8 +136,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         self._view: RobotView | None = None  # always a batch of one, which tasks expect
         self._shape = (1, self.robots, self.task.observation_space.shape[0])
         self._each = (1, self.robots, *(self.task.action_space.shape or ()))
-        self._still = still(self.model.robot)
-        self._rest = np.tile(self._still, (self.robots, 1))
+        self._rest = np.tile(still(self.model.robot), (self.robots, 1))
         self._seed = 0
         self._episode = -1
         self._rehearsed = False
@@ -187,10 +186,9 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         episodes = Episodes(np.array([episode]), starts[None], self.scene.goals[None])
         if not self._rehearsed:
             self._rehearse(episodes)
-        memory = self.task.begun(episodes)
-        guard.override(memory, options, "start")
-        if options and "goal" in options:
-            guard.check_places("goal", memory["goal"], [self.scene], self.world)
+        memory = guard.begin_task(
+            self.task, episodes, options, [self.scene], self.world, "start"
+        )
         self._view = self._lifted(
             self._backend.reset(Start(episode, self._row(starts)))
         )
@@ -218,7 +216,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         view = RobotView(starts.copy(), 0.0 * starts, free, 0.0, 0.0, 0.0, sensed)
         memory = self.task.begun(episodes)
         with suppress(ConfigError):  # the task may refuse the made-up view
-            self.task.step_into(np.empty(self._shape, np.float32), view, view, memory)
+            self.task.take_step(np.empty(self._shape, np.float32), view, view, memory)
         self._rehearsed = True
 
     @refused_after_close
@@ -250,24 +248,20 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         if before is None:
             raise gymnasium.error.ResetNeeded("call reset() before step().")
         given = guard.check_action(action, self.action_space, "action")
-        made = self.task.command(given.reshape(self._each))[0]
-        command = self._row(guard.check_command(made, self._rest.shape))
-        waiting = self.robots > 1 and bool(self.ended.any())
-        if waiting:
-            command = np.where(self.ended[:, None], self._still, command)
+        command = self._row(
+            self.task.drive(given.reshape(self._each), self.ended[None])[0]
+        )
         seen, facts = self._backend.step(command)
         self._command = command
         self._facts = facts
         self._steps = self._steps + 1
         view = self._lifted(seen)
         out = np.empty(self._shape, np.float32)
-        outcome = self.task.step_into(out, before, view, self.memory)
+        outcome = self.task.take_step(out, before, view, self.memory)
+        if self.robots > 1:
+            outcome = outcome.stop_rewards(self.ended[None])
         terms = {name: term[0] for name, term in outcome.terms.items()}
-        if waiting:
-            terms = {
-                name: np.where(self.ended, 0.0, term) for name, term in terms.items()
-            }
-        self.ended = (self.ended & waiting) | outcome.ended[0]
+        self.ended = outcome.ended[0]
         self._view = view
         for name, values in outcome.info.items():
             row = self._row(values[0])

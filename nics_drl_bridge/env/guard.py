@@ -106,6 +106,25 @@ def override(
         give(memory[name], name, value)
 
 
+def begin_task(
+    task: Any,
+    episodes: Any,
+    options: Mapping[str, Any] | None,
+    scenes: Iterable[Scene],
+    world: AnyWorld,
+    *of_env: str,
+) -> dict[str, NDArray[Any]]:
+    """Returns the memory of a Task in starting Episodes, with values of `reset(options=...)`.
+
+    Options in `of_env` belong to the env.
+    """
+    memory: dict[str, NDArray[Any]] = task.begun(episodes)
+    override(memory, options, *of_env)
+    if options and "goal" in options:
+        check_places("goal", memory["goal"], scenes, world)
+    return memory
+
+
 def give(rows: NDArray[Any], name: str, value: Any) -> None:
     """Writes a value of `reset(options=...)` into rows (n, ...). Raises ConfigError."""
     try:

@@ -4,14 +4,13 @@ import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import takewhile
 from typing import Any, ClassVar, Literal
 
 import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nics_drl_bridge.env import kernels
+from nics_drl_bridge.env import guard, kernels
 from nics_drl_bridge.env.kernels import LIMIT, ScanScale
 from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.interface import Array, RobotView
@@ -41,7 +40,7 @@ right, as in the paper's code (efc-robot/MultiVehicleEnv). A robot that can't re
 instead if it can."""
 SIDEWAYS = ((0, 1, 0), (0, -1, 0))  # two more for a robot that moves sideways
 PARTS = ("update", "observation", "judge", "reward", "end", "info")
-"""Methods of a step; a class that overrides one does not use its base's one-pass step."""
+"""Methods of a step, see `Task.take_step`."""
 CONTACT_ANGLE = math.radians(4.0)  # 2 cm at a distance of 0.3 m
 # Defaults that the shipped tasks share.
 GOAL_RADIUS_M = 0.3
@@ -69,6 +68,13 @@ class Outcome:
     ended: Flags
     info: dict[str, NDArray[Any]]
 
+    def stop_rewards(self, ended: Flags) -> "Outcome":
+        """Returns the outcome without rewards for robots that had `ended` before the step."""
+        if not ended.any():
+            return self
+        terms = {name: np.where(ended, 0.0, term) for name, term in self.terms.items()}
+        return Outcome(terms, ended | self.ended, self.info)
+
 
 @dataclass(frozen=True)
 class Sight:
@@ -90,7 +96,7 @@ class Task(ABC):
     `bearing` and `distance` instead of numpy's trigonometric functions.
     """
 
-    # True if a method uses `before.ranges`; if False, they may be the new ranges, to save a copy
+    # True if a method uses `before.ranges`; see `needs_last_scan`
     keeps_last_scan: ClassVar[bool] = True
     # True if the task observes the additional `sensors`
     observes_sensors: ClassVar[bool] = False
@@ -109,14 +115,6 @@ class Task(ABC):
     scan: ScanLayout | None = None
     # additional sensors, whose fractions end each observation
     sensors: tuple[Sensor, ...] = ()
-
-    def __init_subclass__(cls, **given: Any) -> None:
-        super().__init_subclass__(**given)
-        own = takewhile(lambda each: "step_into" not in vars(each), cls.__mro__)
-        if any(part in vars(each) for each in own for part in PARTS):
-            cls.step_into = Task.step_into  # type: ignore[method-assign]  # without the overrides
-            if "keeps_last_scan" not in vars(cls):
-                cls.keeps_last_scan = True
 
     def __post_init__(self) -> None:
         if self.actions not in ("continuous", "discrete"):
@@ -194,10 +192,48 @@ class Task(ABC):
             self.robot.pass_through_cmd_vel(out) if self.robot.takes_turn_rate else out
         )
 
+    def drive(self, actions: ArrayLike, ended: Flags) -> Array:
+        """Returns the checked commands (n, M, C) of actions; robots that have ended stand still."""
+        shape = (*ended.shape, len(self.robot.command))
+        command = guard.check_command(self.command(actions), shape)
+        if self.robots > 1 and ended.any():
+            command = np.where(ended[..., None], still(self.robot), command)
+        return command
+
+    def _covers_all(self, declared: str) -> bool:
+        """Returns True if no class below the one that declares a name overrides one of `PARTS`."""
+        for base in type(self).__mro__:
+            if declared in vars(base):
+                return True
+            if any(part in vars(base) for part in PARTS):
+                return False
+        return False
+
+    @cached_property
+    def is_fused(self) -> bool:
+        """True if `step_into` of the task's class does all parts of a step in its own way."""
+        return self._covers_all("step_into")
+
+    @cached_property
+    def needs_last_scan(self) -> bool:
+        """False if `before.ranges` may be the new ranges, to save a copy."""
+        return self.keeps_last_scan or not self._covers_all("keeps_last_scan")
+
+    def take_step(
+        self, out: Observation, before: RobotView, after: RobotView, memory: Memory
+    ) -> Outcome:
+        """Returns the outcome of a step and writes the observation, for an env.
+
+        `step_into` of a class is left out if a subclass overrides a part that it would not call.
+        """
+        if self.is_fused:
+            return self.step_into(out, before, after, memory)
+        return Task.step_into(self, out, before, after, memory)
+
     def step_into(
         self, out: Observation, before: RobotView, after: RobotView, memory: Memory
     ) -> Outcome:
-        """Returns the outcome of a step and writes the observation, possibly in one pass."""
+        """Takes a step through its parts; a class may override it to do them in one pass."""
         kept = dict(memory)
         self.update(before, after, memory)
         if memory.keys() != kept.keys():

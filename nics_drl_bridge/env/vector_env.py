@@ -23,7 +23,6 @@ from nics_drl_bridge.env.task import (
     Memory,
     Outcome,
     Task,
-    still,
     team_space,
     total,
 )
@@ -135,7 +134,6 @@ class BridgeVectorEnv(
         )
         self._teacher: Teacher | None = None
         self._each = (num_envs, self.robots, *(self.task.action_space.shape or ()))
-        self._still = still(self.model.robot)
         self._period_ns = round(self.model.control_period * NS_PER_S)
         self._allocate()
 
@@ -229,12 +227,10 @@ class BridgeVectorEnv(
             self._teacher.begin(worlds, scenes)
         self._bodies[worlds] = scenes.bodies
         self._starts[worlds] = self.simulator.data.pose[worlds]
-        fresh = self.task.begun(
-            Episodes(seeds, self._starts[worlds], self.simulator.goals[worlds])
+        episodes = Episodes(seeds, self._starts[worlds], self.simulator.goals[worlds])
+        fresh = guard.begin_task(
+            self.task, episodes, options, scenes, self.world, "start", "reset_mask"
         )
-        guard.override(fresh, options, "start", "reset_mask")
-        if options and "goal" in options:
-            guard.check_places("goal", fresh["goal"], scenes, self.world)
         for name, rows in fresh.items():
             if name not in self.memory:
                 self.memory[name] = np.zeros(
@@ -298,32 +294,27 @@ class BridgeVectorEnv(
     ) -> Outcome:
         data = self.simulator.data
         ended = self.ended[part]
-        command = guard.check_command(
-            self.task.command(actions), (*ended.shape, len(self._still))
-        )
-        if self.robots > 1 and ended.any():
-            command = np.where(ended[..., None], self._still, command)
+        command = self.task.drive(actions, ended)
         ranges = data.ranges[part]
         before = RobotView(
             data.odom[part].copy(),
             data.twist[part].copy(),
-            ranges.copy() if self.task.keeps_last_scan else ranges,
+            ranges.copy() if self.task.needs_last_scan else ranges,
             0.0,
             0.0,
             0.0,
         )
         self.simulator.step_part(part, command)
         memory = {name: rows[part] for name, rows in self.memory.items()}
-        outcome = self.task.step_into(out[part], before, self._view(part), memory)
+        outcome = self.task.take_step(out[part], before, self._view(part), memory)
         if self._teacher is not None:
             outcome = self._teacher.judge(part, outcome)
-        terms = outcome.terms
-        if self.robots > 1 and ended.any():
-            terms = {name: np.where(ended, 0.0, term) for name, term in terms.items()}
-        self._reward[part] = sum(terms.values(), np.zeros(ended.shape))
+        if self.robots > 1:
+            outcome = outcome.stop_rewards(ended)
+        self._reward[part] = sum(outcome.terms.values(), np.zeros(ended.shape))
         self.ended[part] = ended | outcome.ended
         self._begin(part.start + np.flatnonzero(begun[part]), out)
-        return Outcome(terms, outcome.ended, outcome.info)
+        return outcome
 
     def _end_at_once(
         self,

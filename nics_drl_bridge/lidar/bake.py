@@ -108,7 +108,7 @@ def grid_of(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> Gr
     turns = np.arange(-parts // 2, parts * count - parts // 2 + 1) * unit / parts
     edges = np.zeros((len(turns), density.distances, 2))
     hints = np.zeros(edges.shape, np.int64)
-    bake_kernels.silhouettes(hull, round_radius, distances, turns, edges, hints)
+    bake_kernels.find_edges(hull, round_radius, distances, turns, edges, hints)
     cell = np.zeros((count, density.distances, 6), np.int64)
     low = _reach_of(edges[..., 0], parts, np.minimum) / spec.angle_increment
     high = _reach_of(edges[..., 1], parts, np.maximum) / spec.angle_increment
@@ -218,7 +218,7 @@ def _fill(table: LidarTable, grids: Sequence[Grid]) -> None:
                 np.int64
             )
             layout = np.stack([start, grid.cell[t, :, 0], grid.cell[t, :, 1]])
-            bake_kernels.rows_of_turn(
+            bake_kernels.fill_rows_of_turn(
                 table.rows,
                 layout,
                 shape,

@@ -1,19 +1,20 @@
 """Compiled inner loops of baking: scans of a shape on the lidar's main axis."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.lidar import exact_kernels
-from nics_drl_bridge.lidar.arrays import Array, Integers, Singles
-from nics_drl_bridge.lidar.exact_kernels import Beams
+from nics_drl_bridge.lidar.arrays import Array, Integers, ShortIntegers, Singles
+from nics_drl_bridge.lidar.beam_kernels import INF, Beams, beams_of
+from nics_drl_bridge.lidar.exact_kernels import scan_circle, scan_polygon, turned
 
 EDGE = 1e-6  # ranges at an edge are taken this far inside it, as a fraction of the whole width
 
 
 @kernel(allocates=True)
-def silhouettes(
+def find_edges(
     hull: Array,
     radius: float,
     distances: Array,
@@ -34,14 +35,14 @@ def silhouettes(
                 half = math.asin(min(radius / distances[d], 1.0))
                 edges[t, d, 0] = -half
                 edges[t, d, 1] = half
-                hints[t, d] = 0
                 continue
-            rx, ry = exact_kernels.turned(distances[d], 0.0, c, s, hull[0])
+            rx, ry = turned(distances[d], 0.0, c, s, hull[0])
             lx = rx
             ly = ry
-            right = left = 0
+            right = 0
+            left = 0
             for v in range(1, hull.shape[0]):
-                x, y = exact_kernels.turned(distances[d], 0.0, c, s, hull[v])
+                x, y = turned(distances[d], 0.0, c, s, hull[v])
                 if rx * y - ry * x < 0.0:
                     rx = x
                     ry = y
@@ -50,74 +51,75 @@ def silhouettes(
                     lx = x
                     ly = y
                     left = v
-            edges[t, d, 0], edges[t, d, 1] = math.atan2(ry, rx), math.atan2(ly, lx)
+            edges[t, d, 0] = math.atan2(ry, rx)
+            edges[t, d, 1] = math.atan2(ly, lx)
             hints[t, d, 0] = right
             hints[t, d, 1] = left
 
 
-@kernel(allocates=True)
-def along(
-    angle: float, corners: Array, radius: float, distance: float, cos: float, sin: float
-) -> np.float32:
-    """Range to a shape straight ahead in one direction [rad]; see `row`."""
-    ray = np.empty((2, 1))
-    out = np.full(1, np.inf, np.float32)
-    ray[0, 0], ray[1, 0] = math.cos(angle), math.sin(angle)
-    beams = exact_kernels.beams_of(ray, angle, 1.0, False)
-    if corners.shape[0] == 0:
-        exact_kernels.circle(out, beams, distance, 0.0, radius, np.inf)
+class ShapeAhead(NamedTuple):
+    """A shape straight ahead of the lidar."""
+
+    corners: Array  # (V, 2) of its outline [m]; none of a circle
+    radius: float  # [m]
+    distance: float  # of its origin [m]
+    c: float  # cosine and sine of its rotation
+    s: float
+
+
+@kernel
+def scan_ahead(scan: ShortIntegers, beams: Beams, shape: ShapeAhead) -> None:
+    """Fuse a shape into a scan (B,), see `beam_kernels`."""
+    if shape.corners.shape[0] == 0:
+        scan_circle(scan, beams, shape.distance, 0.0, shape.radius)
     else:
-        exact_kernels.polygon(out, beams, distance, 0.0, cos, sin, corners)
-        if not np.isfinite(out[0]):  # a wall seen edge-on
-            for v in range(corners.shape[0]):
-                x, y = exact_kernels.turned(distance, 0.0, cos, sin, corners[v])
-                out[0] = min(out[0], math.hypot(x, y))
-    return out[0]
+        scan_polygon(scan, beams, shape.distance, 0.0, shape.c, shape.s, shape.corners)
 
 
 @kernel(allocates=True)
-def row(
-    fine: Singles,
-    beams: Beams,
-    corners: Array,
-    radius: float,
-    distance: float,
-    cos: float,
-    sin: float,
-    edge: Array,
+def find_range(angle: float, shape: ShapeAhead) -> np.float32:
+    """Find the range to a shape in one direction [rad]."""
+    direction = np.array([[math.cos(angle)], [math.sin(angle)]])
+    scan = np.full(1, INF, np.int32)
+    scan_ahead(scan, beams_of(direction, angle, 1.0), shape)
+    nearest = scan.view(np.float32)[0]
+    if not np.isfinite(nearest):  # a wall seen edge-on
+        for v in range(shape.corners.shape[0]):
+            x, y = turned(shape.distance, 0.0, shape.c, shape.s, shape.corners[v])
+            nearest = min(nearest, np.float32(math.hypot(x, y)))
+    return nearest
+
+
+@kernel(allocates=True)
+def fill_row(
+    fine: Singles, start: int, step: float, shape: ShapeAhead, edges: Array
 ) -> None:
-    """Write ranges (P,) [m] of a shape straight ahead, continued beyond its edges (2,) [rad]."""
+    """Write ranges (P,) [m] of a shape, continued beyond its edges (2,) [rad].
+
+    The points are at the angles `start`, `start + 1`... times `step` [rad].
+    """
     fine[:] = np.inf
-    if corners.shape[0] == 0:
-        exact_kernels.circle(fine, beams, distance, 0.0, radius, np.inf)
-    else:
-        exact_kernels.polygon(fine, beams, distance, 0.0, cos, sin, corners)
-    count = fine.shape[0]
-    first = min(max(math.ceil((edge[0] - beams.first) / beams.step), 0), count - 1)
-    last = max(min(math.floor((edge[1] - beams.first) / beams.step), count - 1), 0)
-    while first < last and not np.isfinite(fine[first]):
+    first = max(math.ceil(edges[0] / step) - start, 0)
+    last = min(math.floor(edges[1] / step) - start, fine.shape[0] - 1)
+    if first <= last:
+        angles = (start + np.arange(first, last + 1)) * step
+        directions = np.stack((np.cos(angles), np.sin(angles)))
+        scan = fine.view(np.int32)[first : last + 1]
+        scan_ahead(scan, beams_of(directions, angles[0], step), shape)
+    while first <= last and not np.isfinite(fine[first]):
         first += 1
     while last > first and not np.isfinite(fine[last]):
         last -= 1
-    # the shape is thinner than the spacing of the points, so no point hits it
-    if not np.isfinite(fine[first]):
-        fine[:] = along((edge[0] + edge[1]) / 2.0, corners, radius, distance, cos, sin)
+    if first > last:  # the shape is thinner than the spacing of the points
+        fine[:] = find_range((edges[0] + edges[1]) / 2.0, shape)
         return
-    inside = EDGE * (edge[1] - edge[0])
-    fine[:first] = along(edge[0] + inside, corners, radius, distance, cos, sin)
-    fine[last + 1 :] = along(edge[1] - inside, corners, radius, distance, cos, sin)
+    inside = EDGE * (edges[1] - edges[0])
+    fine[:first] = find_range(edges[0] + inside, shape)
+    fine[last + 1 :] = find_range(edges[1] - inside, shape)
 
 
 @kernel(allocates=True)
-def into_phases(rows: Singles, fine: Singles, width: int, phases: int) -> None:
-    """Sort points (width * phases,) so that those of one phase are contiguous."""
-    for phase in range(phases):
-        for k in range(width):
-            rows[phase * width + k] = fine[k * phases + phase]
-
-
-@kernel(allocates=True)
-def rows_of_turn(
+def fill_rows_of_turn(
     rows: Singles,
     layout: Integers,
     shape: tuple[Array, float],
@@ -130,20 +132,18 @@ def rows_of_turn(
     """Write the rows of one rotation [rad] into the table's ranges (R,) float32 [m].
 
     The layout (3, D) holds, per distance, the start of its row, its first beam relative to the
-    bearing, and its width in beams. `shape` are corners and radius, see `row`; edges are (D, 2),
-    beams are a `step` apart [rad], with `phases` points each.
+    bearing, and its width in beams. `shape` are corners and radius, see `ShapeAhead`; edges are
+    (D, 2), beams are a `step` apart [rad], with `phases` points each.
     """
     c = math.cos(turn)
     s = math.sin(turn)
     corners, radius = shape
     for d in range(distances.shape[0]):
         start = layout[0, d]
-        begin = layout[1, d]
-        width = layout[2, d]
-        points = width * phases
-        angles = (begin * phases + np.arange(points)) * (step / phases)
-        directions = np.stack((np.cos(angles), np.sin(angles)))
+        points = layout[2, d] * phases
         fine = np.empty(points, np.float32)
-        beams = exact_kernels.beams_of(directions, angles[0], step / phases, False)
-        row(fine, beams, corners, radius, distances[d], c, s, edges[d])
-        into_phases(rows[start : start + points], fine, width, phases)
+        ahead = ShapeAhead(corners, radius, distances[d], c, s)
+        fill_row(fine, layout[1, d] * phases, step / phases, ahead, edges[d])
+        # All points of one phase, then those of the next.
+        by_phase = fine.reshape((layout[2, d], phases)).T
+        rows[start : start + points] = np.ascontiguousarray(by_phase).reshape(-1)

@@ -8,7 +8,6 @@ import numpy as np
 
 from nics_drl_bridge.lidar import fault_kernels, scan_kernels
 from nics_drl_bridge.lidar.arrays import Array, Integers
-from nics_drl_bridge.lidar.cell_kernels import body_cells
 from nics_drl_bridge.lidar.scanner import make_scanner
 from nics_drl_bridge.lidar.sensor import Readings, Render, SensedWorlds, Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec, from_device, to_device
@@ -50,17 +49,16 @@ class FurtherLidar(Sensor):
         faults = self.lidar.fault_parameters
 
         def render(out: Readings, worlds: Integers) -> None:
-            lanes = scan_kernels.scan_lanes()
-            cells = body_cells(0, state.bodies.shape[1])
+            lanes = scan_kernels.scan_lanes(self.size)
             scan_kernels.scan_worlds(
                 out,
                 state.pose,
                 worlds,
                 state.bodies,
+                np.arange(state.bodies.shape[1], dtype=np.int32),
                 around.first,
                 around.fixtures,
                 lidar,
-                cells,
                 lanes,
             )
             seeds = state.seeds ^ salt

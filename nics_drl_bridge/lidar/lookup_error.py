@@ -29,9 +29,8 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.lidar import scan_kernels
 from nics_drl_bridge.lidar.arrays import Array, Mask
-from nics_drl_bridge.lidar.baked_kernels import LidarArrays
-from nics_drl_bridge.lidar.cell_kernels import body_cells
 from nics_drl_bridge.lidar.maps import stack_fixtures
+from nics_drl_bridge.lidar.scan_kernels import LidarArrays
 from nics_drl_bridge.lidar.shapes import place
 
 # Rings around the lidar, placements in each, bands of range; rings and bands grow geometrically.
@@ -138,12 +137,12 @@ def _compare(bodies: Array, exact: LidarArrays, baked: LidarArrays) -> _Errors:
     robots = np.tile([-mount[0], -mount[1], 0.0], (PLACES, 1, 1))
     scans = np.empty((2, PLACES, 1, directions.shape[1]), np.float32)
     worlds = np.arange(PLACES)
-    lanes = scan_kernels.scan_lanes()
-    cells = body_cells(0, bodies.shape[1])
+    lanes = scan_kernels.scan_lanes(directions.shape[1])
+    nearby = np.arange(bodies.shape[1], dtype=np.int32)
     empty = stack_fixtures([np.zeros((0, 4))], [None], np.zeros(PLACES, np.int64))
     for ranges, sensor in zip(scans, (exact, baked), strict=True):
         scan_kernels.scan_worlds(
-            ranges, robots, worlds, bodies, -1, empty, sensor, cells, lanes
+            ranges, robots, worlds, bodies, nearby, -1, empty, sensor, lanes
         )
     exact_ranges, baked_ranges = scans[:, :, 0].astype(np.float64)
     both = np.isfinite(exact_ranges) & np.isfinite(baked_ranges)

@@ -9,21 +9,28 @@ most 3e-7, and a beam within 1e-6 cells of a corner may pass on its other side.
 """
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.lidar.arrays import Array, Mask, Singles
-from nics_drl_bridge.lidar.exact_kernels import Beams, LidarPose
-
-if TYPE_CHECKING:
-    from nics_drl_bridge.lidar.scan_kernels import ScanLanes
+from nics_drl_bridge.lidar.arrays import (
+    Array,
+    Integers,
+    Mask,
+    ShortIntegers,
+    Singles,
+)
+from nics_drl_bridge.lidar.beam_kernels import Beams, LidarPose, lower
 
 LANES = 48  # beams that jump together: several vector registers hide the latency of look-ups
-DU, DV, PER_U, PER_V, U, V, T = (np.uintp(k * LANES) for k in range(7))
-COLUMN, ROW, ASIDE, ABOVE, QUADRANT, SIDE = (np.uintp(k * LANES) for k in range(6))
+SINGLES = 7
+INTEGERS = 6
+DU, DV, PER_U, PER_V, U, V, T = (np.uintp(k * LANES) for k in range(SINGLES))
+COLUMN, ROW, ASIDE, ABOVE, QUADRANT, SIDE = (
+    np.uintp(k * LANES) for k in range(INTEGERS)
+)
 """Offsets of the quantities of a lane: direction, its inverses, place in the lidar's cell and
 distance [cells]; column and row relative to the lidar, index increments of one column and one row,
 the quadrant's bit shift, and the side of the free square."""
@@ -42,6 +49,40 @@ class GridArrays(NamedTuple):
     squares: NDArray[np.uint32]
     # (5,) x, y [m], cosine, sine of its origin, resolution [m]
     frame: Array
+
+
+class Fixtures(NamedTuple):
+    """Walls and maps of P worlds, stored one after the other, for N simulated copies."""
+
+    member: Integers  # (N,) world of each copy
+    walls: Array  # (W, 4) x1, y1, x2, y2 of all worlds [m]
+    first: Integers  # (P + 1,) first wall of each world
+    squares: NDArray[np.uint32]  # of all maps, see `GridArrays`
+    maps: Integers  # (P, 3) first square, rows and columns of each map
+    frames: Array  # (P, 5) of each map
+
+
+@kernel(view=True)
+def walls_of(n: int, fixtures: Fixtures) -> Array:
+    """Walls (W, 4) of one copy."""
+    p = fixtures.member[n]
+    return fixtures.walls[fixtures.first[p] : fixtures.first[p + 1]]
+
+
+@kernel(view=True)
+def grid_of(n: int, fixtures: Fixtures) -> GridArrays:
+    """Map of one copy, without squares if there is none."""
+    p = fixtures.member[n]
+    return GridArrays(cells_of(fixtures.squares, fixtures.maps[p]), fixtures.frames[p])
+
+
+@kernel(view=True)
+def cells_of(cells: NDArray[np.uint32], place: Integers) -> NDArray[np.uint32]:
+    """Cells (rows, columns) of one map among those of many: first cell, rows, columns."""
+    first = place[0]
+    rows = place[1]
+    columns = place[2]
+    return cells[first : first + rows * columns].reshape((rows, columns))
 
 
 @kernel(allocates=True)
@@ -68,14 +109,14 @@ def free_squares(blocked: Mask) -> NDArray[np.uint32]:
     return squares
 
 
-@kernel(allocates=True)
+@kernel
 def _line(at: float, step: float, cell: int) -> float:
     if step == 0.0:
         return np.inf
     return (cell + (1 if step > 0.0 else 0) - at) / step
 
 
-@kernel(allocates=True)
+@kernel
 def _entry(at: float, step: float, size: int) -> tuple[float, float]:
     """Distances along a beam at which it enters and leaves [0, size] on one axis [cells]."""
     if step == 0.0:
@@ -87,7 +128,7 @@ def _entry(at: float, step: float, size: int) -> tuple[float, float]:
     return min(to_start, to_end), max(to_start, to_end)
 
 
-@kernel(allocates=True)
+@kernel
 def walk(
     squares: NDArray[np.uint32], u: float, v: float, du: float, dv: float, limit: float
 ) -> float:
@@ -133,16 +174,20 @@ def walk(
 
 
 @kernel
-def map_into(
-    out: Singles,
+def scan_map(
+    scan: ShortIntegers,
     beams: Beams,
     lidar: LidarPose,
     range_max: float,
     grid: GridArrays,
     exact: bool,
-    lanes: "ScanLanes",
+    singles: Singles,
+    wholes: ShortIntegers,
 ) -> None:
-    """Fuse a map (`GridArrays`) into a scan (B,) float32 [m]: walks if `exact`, else jumps."""
+    """Fuse a map into a scan (B + LANES,), see `beam_kernels`: walks if `exact`, else jumps.
+
+    `singles` (SINGLES * LANES,) and `wholes` (INTEGERS * LANES,) are scratch memory.
+    """
     squares = grid.squares
     frame = grid.frame
     if squares.size == 0:
@@ -156,30 +201,40 @@ def map_into(
     s = lidar.s * frame[2] - lidar.c * frame[3]
     x = math.floor(u)
     y = math.floor(v)
+    count = beams.directions.shape[1]
     limit = range_max / cell * SLACK
     inside = 0.0 <= x < squares.shape[1] - 2 and 0.0 <= y < squares.shape[0] - 2
     if exact or not inside or squares[int(y) + 1, int(x) + 1] == 0:
-        for i in range(out.shape[0]):
+        for i in range(count):
             a = beams.directions[0, i]
             b = beams.directions[1, i]
-            value = cell * walk(squares, u, v, c * a - s * b, s * a + c * b, limit)
-            if value < out[i]:
-                out[i] = value
+            steps = walk(squares, u, v, c * a - s * b, s * a + c * b, limit)
+            lower(scan, i, cell * steps)
         return
     start = (int(y) + 1) * squares.shape[1] + int(x) + 1
-    for first in range(0, out.shape[0], LANES):
-        last = min(first + LANES, out.shape[0])
-        _begin(beams.directions, first, u - x, v - y, c, s, squares.shape[1], lanes)
-        while _jump(squares.reshape(-1), start, np.float32(limit), lanes):
+    for first in range(0, count, LANES):
+        _begin(
+            beams.directions,
+            first,
+            u - x,
+            v - y,
+            c,
+            s,
+            squares.shape[1],
+            singles,
+            wholes,
+        )
+        while _jump(squares.reshape(-1), start, np.float32(limit), singles, wholes):
             pass
         _end(
-            out[first:last],
+            scan[first : first + LANES],
             int(x),
             int(y),
             squares.shape,
             np.float32(limit),
             cell,
-            lanes,
+            singles,
+            wholes,
         )
 
 
@@ -192,7 +247,8 @@ def _begin(
     c: float | np.float32,
     s: float | np.float32,
     columns: int,
-    lanes: "ScanLanes",
+    singles: Singles,
+    wholes: ShortIntegers,
 ) -> None:
     """Put the beams from `first` on into lanes, each mirrored so that it points right and up."""
     c = np.float32(c)
@@ -201,8 +257,6 @@ def _begin(
     v = np.float32(v)
     unit = np.float32(1.0)
     zero = np.float32(0.0)
-    singles = lanes.singles
-    wholes = lanes.integers
     for j in range(LANES):
         # idle lanes repeat the last beam
         k = np.uintp(j)
@@ -231,11 +285,13 @@ def _begin(
 
 @kernel
 def _jump(
-    flat: NDArray[np.uint32], start: int, limit: np.float32, lanes: "ScanLanes"
+    flat: NDArray[np.uint32],
+    start: int,
+    limit: np.float32,
+    singles: Singles,
+    wholes: ShortIntegers,
 ) -> np.bool_:
     """Move each lane to the end of its free square; True if any moved."""
-    singles = lanes.singles
-    wholes = lanes.integers
     # separate from the loop below, so that LLVM can vectorise that loop
     for j in range(LANES):
         k = np.uintp(j)
@@ -274,19 +330,17 @@ def _jump(
 
 @kernel
 def _end(
-    out: Singles,
+    scan: ShortIntegers,
     x: int,
     y: int,
     shape: tuple[int, int],
     limit: np.float32,
     resolution: float,
-    lanes: "ScanLanes",
+    singles: Singles,
+    wholes: ShortIntegers,
 ) -> None:
     """Fuse the lanes that ended at a solid cell, not in the border around the map."""
-    singles = lanes.singles
-    wholes = lanes.integers
-    ranges = out.view(np.int32)
-    for j in range(out.shape[0]):
+    for j in range(LANES):
         k = np.uintp(j)
         column = x + wholes[k + COLUMN] * wholes[k + ASIDE]
         row = y + (wholes[k + ROW] if wholes[k + ABOVE] > 0 else -wholes[k + ROW])
@@ -294,6 +348,5 @@ def _end(
             (column >= 0) & (column < shape[1] - 2) & (row >= 0) & (row < shape[0] - 2)
         )
         t = singles[k + T]
-        value = np.float32(resolution) * t if hit & (t < limit) else np.float32(np.inf)
-        # see `exact_kernels._cross`
-        ranges[j] = min(ranges[j], np.float32(value).view(np.int32))
+        distance = np.float32(resolution) * t
+        lower(scan, k, distance if hit & (t < limit) else np.float32(np.inf))

@@ -21,7 +21,7 @@ from nics_drl_bridge.files import write_bytes, write_text
 from nics_drl_bridge.geometry import rotate
 from nics_drl_bridge.lidar import map_kernels
 from nics_drl_bridge.lidar.arrays import Array, Integers, Mask, Singles
-from nics_drl_bridge.lidar.fixture_kernels import Fixtures
+from nics_drl_bridge.lidar.map_kernels import Fixtures
 from nics_drl_bridge.lidar.shapes import Coordinate
 
 FREE = 0

@@ -13,12 +13,12 @@ from nics_drl_bridge.errors import ConfigError, ModelError, suggest
 from nics_drl_bridge.lidar import scan_kernels
 from nics_drl_bridge.lidar.arrays import Array, Singles
 from nics_drl_bridge.lidar.bake import bake
-from nics_drl_bridge.lidar.baked_kernels import LidarArrays
-from nics_drl_bridge.lidar.cell_kernels import body_cells
-from nics_drl_bridge.lidar.exact_kernels import SHAPE, beams_of
-from nics_drl_bridge.lidar.fixture_kernels import Fixtures
+from nics_drl_bridge.lidar.beam_kernels import beams_of
+from nics_drl_bridge.lidar.exact_kernels import SHAPE
 from nics_drl_bridge.lidar.lookup_error import lookup_distances
+from nics_drl_bridge.lidar.map_kernels import Fixtures
 from nics_drl_bridge.lidar.maps import GridMap, stack_fixtures
+from nics_drl_bridge.lidar.scan_kernels import LidarArrays
 from nics_drl_bridge.lidar.shapes import BODY, Shape, place
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.lidar.table import LidarTable
@@ -86,7 +86,6 @@ class Scanner:
                 np.ascontiguousarray(spec.directions.T),
                 spec.angle_min,
                 spec.angle_increment,
-                spec.full_circle,
             ),
             spec.range_min,
             spec.range_max,
@@ -155,20 +154,19 @@ class Scanner:
             out[:] = self.scan(poses, bodies, walls)
             return out
         worlds = np.arange(len(poses))
-        lanes = scan_kernels.scan_lanes()
+        lanes = scan_kernels.scan_lanes(self.spec.beams)
         member = np.zeros(len(poses), np.int64)
         first = np.array([0, len(walls)])
         around = self._without_walls._replace(member=member, walls=walls, first=first)
-        cells = body_cells(0, bodies.shape[1])
         scan_kernels.scan_worlds(
             out[:, None],
             poses[:, None],
             worlds,
             bodies,
+            np.arange(bodies.shape[1], dtype=np.int32),
             -1,
             around,
             self.arguments,
-            cells,
             lanes,
         )
         return out

@@ -17,7 +17,7 @@ from nics_drl_bridge import extensions
 from nics_drl_bridge.config import Schema, parse_yaml, read_text, validate
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.lidar.arrays import Array, Integers, Singles
-from nics_drl_bridge.lidar.fixture_kernels import Fixtures
+from nics_drl_bridge.lidar.map_kernels import Fixtures
 from nics_drl_bridge.lidar.scanner import Renderer
 from nics_drl_bridge.lidar.shapes import Shape
 

@@ -24,7 +24,7 @@ from nics_drl_bridge.files import (
     write_whole_folder,
 )
 from nics_drl_bridge.lidar.arrays import Array, Integers, ShortIntegers, Singles
-from nics_drl_bridge.lidar.baked_kernels import TABLE_SHAPE, TableArrays
+from nics_drl_bridge.lidar.lookup_kernels import FEWEST, TABLE_SHAPE, TableArrays
 from nics_drl_bridge.lidar.shapes import Circle, Outlines, Shape
 from nics_drl_bridge.lidar.spec import LidarSpec, without_sensor_model
 
@@ -146,11 +146,10 @@ class LidarTable:
         shapes["round_radius"] = np.where(circles, outlines.radii, 0.0)
         shift = self.density.phases.bit_length() - 1
         cell = self.cell.astype(np.int32)
-        # Extent of the row, corners on the right and on the left: see `unpack_extent` and
-        # `unpack_corners`.
+        # Extent of the row, corners on the right and on the left: see `TableArrays.cells`.
         pairs = (cell[:, [0, 3, 5]] << 16) | (cell[:, [1, 2, 4]] & MOST_WIDE)
         cells = np.column_stack([self.start, pairs])
-        missing = max(32 - padding(self.beam_angle), 0)  # at least two blocks are read
+        missing = max(FEWEST - padding(self.beam_angle), 0)
         if missing:
             rows = np.append(self.rows, np.zeros(missing, np.float32))
         else:

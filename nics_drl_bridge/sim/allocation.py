@@ -12,13 +12,13 @@ from nics_drl_bridge.files import hash_bytes
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar import scan_kernels
 from nics_drl_bridge.lidar.arrays import Array, Integers
-from nics_drl_bridge.lidar.cell_kernels import BodyCells, body_cells
 from nics_drl_bridge.lidar.exact_kernels import OutlineArrays
 from nics_drl_bridge.lidar.maps import GridMap, joined, stack_fixtures
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.shapes import BODY
 from nics_drl_bridge.robot.kernels import SERIES, allocate_scratch, make_terms
 from nics_drl_bridge.sim import state as records
+from nics_drl_bridge.sim.cell_kernels import BodyCells, body_cells
 from nics_drl_bridge.sim.contact_kernels import SEVERAL
 from nics_drl_bridge.sim.impact_kernels import EVENT, FLIGHT
 from nics_drl_bridge.sim.obstacles import Motion, plan_arrays
@@ -286,12 +286,11 @@ def _allocate_scratch(
             start_poses=np.zeros((lanes, 3)),
             waiting=np.zeros(worlds, np.int64),
             bodies=np.zeros((bodies + 1, BODY)),
-            pose=np.zeros((1, 1, 3)),
+            pose=np.zeros(3),
             slice_poses=np.zeros((SLICES, 3)),
-            slice_ranges=np.zeros((1, 1, model.lidar.beams), np.float32),
+            slice_ranges=np.zeros(model.lidar.beams, np.float32),
             twist=np.zeros(3),
-            only_world=np.zeros(1, np.int64),
-            no_cells=body_cells(0, bodies + 1),
-            lanes=scan_kernels.scan_lanes(),
+            everybody=np.arange(bodies + 1, dtype=np.int32),
+            lanes=scan_kernels.scan_lanes(model.lidar.beams),
         ),
     )

@@ -9,10 +9,10 @@ sorted once per episode.
 import math
 
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.lidar.cell_kernels import BodyCells, around
 from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SIN, X, Y
 from nics_drl_bridge.robot.kernels import wrap
 from nics_drl_bridge.sim import collision_kernels as collision
+from nics_drl_bridge.sim.cell_kernels import BodyCells, around
 from nics_drl_bridge.sim.state import Array, Nearby, State, Surroundings
 
 # Bit flags of what a robot may meet

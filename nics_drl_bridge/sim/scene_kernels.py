@@ -11,9 +11,8 @@ from typing import Any, NamedTuple
 
 from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.lidar import cell_kernels, exact_kernels
+from nics_drl_bridge.lidar import exact_kernels
 from nics_drl_bridge.lidar.arrays import Array, Integers, Mask, ShortIntegers
-from nics_drl_bridge.lidar.cell_kernels import BodyCells
 from nics_drl_bridge.lidar.exact_kernels import (
     COS,
     HEADING,
@@ -25,7 +24,9 @@ from nics_drl_bridge.lidar.exact_kernels import (
     Y,
 )
 from nics_drl_bridge.random_kernels import uniform_of
+from nics_drl_bridge.sim import cell_kernels
 from nics_drl_bridge.sim import collision_kernels as collision
+from nics_drl_bridge.sim.cell_kernels import BodyCells
 from nics_drl_bridge.sim.state import MapField
 
 TRIES = 2000

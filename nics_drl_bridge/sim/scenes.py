@@ -13,7 +13,6 @@ from scipy import ndimage
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.lidar.arrays import Array, Integers, ShortIntegers
-from nics_drl_bridge.lidar.cell_kernels import FEWEST, body_cells
 from nics_drl_bridge.lidar.maps import OCCUPIED, GridMap
 from nics_drl_bridge.lidar.shapes import (
     BODY,
@@ -26,6 +25,7 @@ from nics_drl_bridge.lidar.shapes import (
 )
 from nics_drl_bridge.seeds import check_seeds
 from nics_drl_bridge.sim import scene_kernels as kernels
+from nics_drl_bridge.sim.cell_kernels import FEWEST, body_cells
 from nics_drl_bridge.sim.obstacles import Motion
 from nics_drl_bridge.sim.packing_kernels import pack
 from nics_drl_bridge.sim.scene_kernels import FreeSpace, ScenePlan, SceneScratch

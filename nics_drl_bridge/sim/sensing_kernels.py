@@ -16,12 +16,12 @@ import math
 
 from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.lidar import fault_kernels, scan_kernels
-from nics_drl_bridge.lidar.baked_kernels import LidarArrays
-from nics_drl_bridge.lidar.cell_kernels import BodyCells, around
+from nics_drl_bridge.lidar import fault_kernels
+from nics_drl_bridge.lidar.beam_kernels import locate_lidar
 from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SIN, X, Y
-from nics_drl_bridge.lidar.fixture_kernels import fixtures_around
+from nics_drl_bridge.lidar.scan_kernels import LidarArrays, scan_robot
 from nics_drl_bridge.robot.kernels import move, wrap
+from nics_drl_bridge.sim.cell_kernels import around
 from nics_drl_bridge.sim.state import (
     BODY_COLUMNS,
     ODOM,
@@ -209,18 +209,22 @@ def scan_together(
     scratch: Scratch,
 ) -> None:
     """Scan the worlds that wait, as they stand."""
-    scans = scratch.scans
-    scan_kernels.scan_worlds(
-        data.ranges,
-        data.pose,
-        scans.waiting[:waiting_count],
-        data.bodies,
-        data.velocity.shape[1],
-        world_set.fixtures,
-        lidar,
-        scratch.cells,
-        scans.lanes,
-    )
+    cells = scratch.cells
+    for n in scratch.scans.waiting[:waiting_count]:
+        for m in range(data.pose.shape[1]):
+            pose = locate_lidar(data.pose[n, m], lidar.mount)
+            count = around(n, pose.x, pose.y, lidar.range_max, cells)
+            scan_robot(
+                data.ranges[n, m],
+                n,
+                pose,
+                data.bodies[n],
+                cells.found[:count],
+                data.velocity.shape[1] + m,
+                world_set.fixtures,
+                lidar,
+                scratch.scans.lanes,
+            )
 
 
 @kernel
@@ -256,7 +260,7 @@ def _scan_from_past(
     steps = data.steps[n]
     substeps = motion.substeps
     skew = data.faults[n, m, fault_kernels.SKEW]
-    pose = scans.pose[0, 0]
+    pose = scans.pose
     twist = scans.twist
     past = data.past[n, m]
     lag = limit_lag(data.age[n, m], steps, past.shape[0], substeps)
@@ -268,43 +272,35 @@ def _scan_from_past(
     if skew != 0.0:
         reach += math.hypot(twist[0], twist[1]) * lidar.sweep_time
     count = _gather_bodies(n, m, lag, reach, data, world_set, motion, scratch)
-    # this robot as the only one of an only world, which has the bodies that were gathered
-    bodies = scans.bodies[:count].reshape((1, count, BODY_COLUMNS))
-    listed = scans.no_cells
-    listed = BodyCells(
-        listed.first, listed.then, listed.ordered, listed.frame, listed.found[:count]
-    )
-    beams = data.ranges.shape[2]
-    first_range = (n * data.ranges.shape[1] + m) * beams
-    ranges = data.ranges.reshape(-1)[first_range : first_range + beams]
-    ranges = ranges.reshape((1, 1, beams))
-    fixtures = fixtures_around(n, world_set.fixtures)
+    nearby = scans.everybody[:count]
+    ranges = data.ranges[n, m]
+    beams = ranges.shape[0]
     groups = 1 if skew == 0.0 else scans.slice_poses.shape[0]
     if groups > 1:
         moving = (steps * substeps - lag) * motion.dt
         fault_kernels.slice_poses(
             scans.slice_poses, pose, twist, lidar.sweep_time, skew, moving
         )
-    # One call for both cases, because `scan_worlds` is large and compiled for each call.
+    # One call for both cases, because `scan_robot` is large and compiled for each call.
     for group in range(groups):
         out = ranges if groups == 1 else scans.slice_ranges
         if groups > 1:
             for i in range(3):
                 pose[i] = scans.slice_poses[group, i]
-        scan_kernels.scan_worlds(
+        scan_robot(
             out,
-            scans.pose,
-            scans.only_world,
-            bodies,
+            n,
+            locate_lidar(pose, lidar.mount),
+            scans.bodies,
+            nearby,
             -1,
-            fixtures,
+            world_set.fixtures,
             lidar,
-            listed,
             scans.lanes,
         )
         if groups > 1:
             for i in range(group * beams // groups, (group + 1) * beams // groups):
-                ranges[0, 0, i] = scans.slice_ranges[0, 0, i]
+                ranges[i] = scans.slice_ranges[i]
 
 
 @kernel
@@ -327,7 +323,7 @@ def _gather_bodies(
     scans = scratch.scans
     cells = scratch.cells
     velocity = data.velocity
-    pose = scans.pose[0, 0]
+    pose = scans.pose
     obstacle_count = velocity.shape[1]
     candidates = data.bodies.shape[1]
     # The cells of a crowd hold the present positions.

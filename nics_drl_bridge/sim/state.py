@@ -16,13 +16,12 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.lidar.arrays import Array as Array
 from nics_drl_bridge.lidar.arrays import Integers as Integers
-from nics_drl_bridge.lidar.arrays import Singles
-from nics_drl_bridge.lidar.baked_kernels import LidarArrays
-from nics_drl_bridge.lidar.cell_kernels import BodyCells
+from nics_drl_bridge.lidar.arrays import ShortIntegers, Singles
 from nics_drl_bridge.lidar.exact_kernels import OutlineArrays
-from nics_drl_bridge.lidar.fixture_kernels import Fixtures
-from nics_drl_bridge.lidar.scan_kernels import ScanLanes
+from nics_drl_bridge.lidar.map_kernels import Fixtures
+from nics_drl_bridge.lidar.scan_kernels import LidarArrays, ScanLanes
 from nics_drl_bridge.robot.kernels import Terms
+from nics_drl_bridge.sim.cell_kernels import BodyCells
 
 # Columns of `State.noise`: standard deviations of the odometry's linear velocity [m/s] and turn
 # rate [rad/s]; then of the drift of x, y [m/sqrt(s)], heading [rad/sqrt(s)], each state variable.
@@ -186,14 +185,11 @@ class Scans(NamedTuple):
     start_poses: Array  # (L, 3) poses of the robots at the start of the period
     waiting: Integers  # (n,) worlds that are scanned together
     bodies: Array  # (K + M + 1, 7) bodies that one robot may see, as they were
-    pose: Array  # (1, 1, 3) pose that one robot scans from
+    pose: Array  # (3,) pose that one robot scans from
     twist: Array  # (3,) twist of that robot during the sweep
     slice_poses: Array  # (G, 3) poses during a sweep
-    slice_ranges: Singles  # (1, 1, B) scan from one of these poses
-    only_world: (
-        Integers  # (1,) zero: index of the only world in the arrays of one robot
-    )
-    no_cells: BodyCells  # of no worlds: all bodies are searched
+    slice_ranges: Singles  # (B,) scan from one of these poses
+    everybody: ShortIntegers  # (K + M + 1,) indices of `bodies`
     lanes: ScanLanes  # of the look-up of bodies
 
 

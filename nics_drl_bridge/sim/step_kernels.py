@@ -25,9 +25,8 @@ from typing import Any
 import numpy as np
 
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.lidar import cell_kernels as cells
-from nics_drl_bridge.lidar.baked_kernels import LidarArrays
-from nics_drl_bridge.lidar.fixture_kernels import cells_of, walls_of
+from nics_drl_bridge.lidar.map_kernels import cells_of, walls_of
+from nics_drl_bridge.lidar.scan_kernels import LidarArrays
 from nics_drl_bridge.robot.kernels import (
     apply_curve,
     find_delayed_command,
@@ -35,6 +34,7 @@ from nics_drl_bridge.robot.kernels import (
     run,
     wrap,
 )
+from nics_drl_bridge.sim import cell_kernels as cells
 from nics_drl_bridge.sim import contact_kernels as contacts
 from nics_drl_bridge.sim import obstacle_kernels as obstacles
 from nics_drl_bridge.sim import sensing_kernels as sensing

@@ -7,7 +7,7 @@ from robots import lidar
 
 from nics_drl_bridge.geometry import rotate
 from nics_drl_bridge.lidar import map_kernels
-from nics_drl_bridge.lidar.exact_kernels import LidarPose, beams_of
+from nics_drl_bridge.lidar.beam_kernels import LidarPose, beams_of
 from nics_drl_bridge.lidar.maps import NO_MAP, GridMap
 from nics_drl_bridge.lidar.scan_kernels import scan_lanes
 
@@ -23,18 +23,25 @@ def directions(beams=BEAMS):
 def scan(kernel, grid, pose, range_max=100.0, rays=None, before=np.inf):
     """A scan (B,) from x, y, heading."""
     rays = directions() if rays is None else np.asarray(rays, dtype=np.float64)
-    out = np.full(len(rays), before, np.float32)
+    lanes = scan_lanes(len(rays))
+    out = lanes.scan.view(np.float32)
+    out[:] = before
     c = np.cos(pose[2])
     s = np.sin(pose[2])
     arrays = grid if isinstance(grid, tuple) else grid.arrays
-    beams = beams_of(
-        np.ascontiguousarray(rays.T), -np.pi, 2.0 * np.pi / len(rays), True
+    beams = beams_of(np.ascontiguousarray(rays.T), -np.pi, 2.0 * np.pi / len(rays))
+    lidar = LidarPose(*map(float, pose[:2]), c, s, float(pose[2]))
+    map_kernels.scan_map(
+        lanes.scan,
+        beams,
+        lidar,
+        range_max,
+        arrays,
+        kernel == "exact",
+        lanes.singles,
+        lanes.integers,
     )
-    lidar = LidarPose(*map(float, pose[:2]), c, s)
-    map_kernels.map_into(
-        out, beams, lidar, range_max, arrays, kernel == "exact", scan_lanes()
-    )
-    return out
+    return out[: len(rays)]
 
 
 def random_map(seed):
@@ -75,7 +82,7 @@ def test_scans_of_random_maps_agree_with_plane_geometry(kernel):
     seen = 0
     solid = 0
     outside = 0
-    for seed in range(150):
+    for seed in range(70):
         grid, rng = random_map(seed)
         pose = random_pose(grid, rng)
         expected, clear = by_shapely(grid, pose)
@@ -86,8 +93,8 @@ def test_scans_of_random_maps_agree_with_plane_geometry(kernel):
         inside = 0 <= row < grid.cells.shape[0] and 0 <= column < grid.cells.shape[1]
         outside += not inside
         solid += inside and grid.blocked[row, column]
-    assert seen > 1800
-    assert min(solid, outside) > 5
+    assert seen > 800
+    assert min(solid, outside) > 2
 
 
 def test_both_ways_agree_from_the_corners_edges_and_centres_of_cells():

@@ -120,7 +120,7 @@ def test_all_kinds_of_pgm_give_the_same_map(save, image):
 @pytest.mark.parametrize("kind", ["I;16", "RGBA", "P"])
 def test_no_kind_of_image_takes_many_bytes_for_a_pixel(save, tmp_path, kind):
     """A few kilobytes of PNG hold millions of pixels."""
-    side = 3000
+    side = 2000
     path = save(name="map.png")
     Image.new(kind, (side, side)).save(tmp_path / "map.png")
     tracemalloc.start()

@@ -11,13 +11,12 @@ from lidar_scenes import (
     random_shapes,
     ring,
 )
-from plain_scan import scan_robot
 from robots import lidar
 
 from nics_drl_bridge.errors import ConfigError, ModelError
 from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.maps import GridMap
-from nics_drl_bridge.lidar.scan_kernels import LANES
+from nics_drl_bridge.lidar.scan_kernels import MOST_FOUND
 from nics_drl_bridge.lidar.scanner import RENDERERS, Scanner, make_scanner
 from nics_drl_bridge.lidar.shapes import SQUARE, STRIP, Circle, Polygon, Rectangle
 from nics_drl_bridge.lidar.table import Density
@@ -73,26 +72,25 @@ def rmse(spec, one, other):
 def test_exact_scans_of_random_scenes_agree_with_plane_geometry(name):
     spec = SENSORS[name]
     compared = 0
-    for seed in range(40):
-        if seed % 20 == 0:
+    for seed in range(24):
+        if seed % 12 == 0:
             shapes = random_shapes(seed)
-            scanner = Scanner(spec, bake(spec, shapes, COARSE), "exact")
+            scanner = make_scanner(spec, shapes, "exact")
         scene = random_scene(seed, shapes, far=1e4 if seed % 3 == 0 else 0.0)
         expected, clear = by_plane_geometry(spec, scene)
         found = scan(scanner, scene)
         assert found[clear] == pytest.approx(expected[clear], abs=1e-3), seed
         compared += np.isfinite(expected[clear]).sum()
-    assert compared > 4 * spec.beams
+    assert compared > 2 * spec.beams
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("renderer", RENDERERS)
-def test_a_lidar_inside_or_beside_any_shape_sees_what_plane_geometry_says(renderer):
+def test_a_lidar_inside_or_beside_any_shape_sees_what_plane_geometry_says():
     spec = lidar(beams=90, range_min=0.0)
     for seed in range(36):
         rng = np.random.default_rng(seed)
         shape = (*random_shapes(seed), ring(rng, 40))[seed % 12]
-        scanner = Scanner(spec, bake(spec, [shape], COARSE), renderer)
+        scanner = Scanner(spec, bake(spec, [shape], COARSE), "baked")
         pose = poses_around(rng, rng.uniform(0.0, 0.999, 1) * shape.radius)
         scene = Scene(np.array([0.0, 0.0, 0.5]), (shape,), pose, np.zeros((0, 4)))
         expected, clear = by_plane_geometry(spec, scene)
@@ -106,7 +104,7 @@ def test_baked_scans_of_random_scenes_are_near_the_exact_ones(name):
     spec = SENSORS[name]
     if spec.beams > 1000:
         spec = lidar(beams=720)  # beams as narrow as these show the same
-    table = bake(spec, random_shapes(0), Density())
+    table = bake(spec, random_shapes(0)[::2], Density())
     scenes = [random_scene(seed, table.shapes) for seed in range(30)]
     baked, exact = (
         np.array([scan(Scanner(spec, table, way), scene) for scene in scenes])
@@ -122,7 +120,13 @@ def test_baked_scans_of_random_scenes_are_near_the_exact_ones(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("density", [Density(), Density(distances=20, rotations=24)])
+@pytest.mark.parametrize(
+    "density",
+    [
+        Density(distances=20, rotations=24),
+        pytest.param(Density(), marks=pytest.mark.campaign),
+    ],
+)
 @pytest.mark.parametrize("corners", [8, pytest.param(200, marks=pytest.mark.campaign)])
 @pytest.mark.parametrize("make", POLYGONS)
 def test_silhouettes_of_any_polygon_are_exact_at_any_density(make, corners, density):
@@ -147,11 +151,11 @@ def test_the_papers_scenes_are_off_by_less_than_3_mm(shape):
     assert rmse(spec, baked, exact) < 0.003
 
 
-@pytest.mark.parametrize("beams", [1, 7, 36, 360])
+@pytest.mark.parametrize("beams", [1, 36, 360])
 def test_few_beams_are_baked_as_finely_as_many(beams):
     spec = lidar(beams=beams)
     rng = np.random.default_rng(0)
-    area = rng.uniform(STRIP.radius**2, (spec.range_max + STRIP.radius) ** 2, (400, 10))
+    area = rng.uniform(STRIP.radius**2, (spec.range_max + STRIP.radius) ** 2, (200, 10))
     poses = poses_around(rng, np.sqrt(area))
     coarse, fine = (
         rmse(spec, *both_ways(spec, bake(spec, [STRIP], density), [STRIP] * 10, poses))
@@ -180,11 +184,10 @@ def test_a_wall_in_line_with_the_lidar_hides_nothing():
     assert np.isposinf(seen).all()  # but for rounding in line
 
 
-@pytest.mark.parametrize("beams", [40, 1100])
-def test_a_wall_met_at_a_flat_angle_is_as_exact_as_another(beams):
-    scanner = make_scanner(lidar(beams=beams, range_max=25.0), ())
+def test_a_wall_met_at_a_flat_angle_is_as_exact_as_another():
+    scanner = make_scanner(lidar(beams=40, range_max=25.0), ())
     rng = np.random.default_rng(1)
-    for beam in range(0, beams, beams // 40):
+    for beam in range(40):
         along = rng.uniform(-3.0, 3.0)
         off = rng.uniform(0.01, 0.2)
         heading = along + np.arcsin(off / 20.0) - scanner.spec.angles[beam]
@@ -194,10 +197,9 @@ def test_a_wall_met_at_a_flat_angle_is_as_exact_as_another(beams):
         assert seen[beam] == pytest.approx(20.0, abs=2e-5)
 
 
-@pytest.mark.parametrize("renderer", RENDERERS)
-def test_a_closed_room_returns_on_every_beam(renderer):
+def test_a_closed_room_returns_on_every_beam():
     room = Rectangle(size=(2.0, 2.0))
-    scanner = make_scanner(lidar(beams=500), [room], renderer)
+    scanner = make_scanner(lidar(beams=500), [room], "exact")
     sides = [[-1, -1, 1, -1], [1, -1, 1, 1], [1, 1, -1, 1], [-1, 1, -1, -1]]
     for pose in np.random.default_rng(2).uniform(-0.9, 0.9, (20, 3)):
         assert np.isfinite(scanner.scan(pose, [], sides)).all()
@@ -206,11 +208,9 @@ def test_a_closed_room_returns_on_every_beam(renderer):
         ).all()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("renderer", RENDERERS)
-def test_a_scan_in_a_batch_is_the_scan_alone_to_the_bit(renderer):
+def test_a_scan_in_a_batch_is_the_scan_alone_to_the_bit():
     shapes = random_shapes(3)[:5]
-    scanner = make_scanner(lidar(beams=180), shapes, renderer)
+    scanner = make_scanner(lidar(beams=180), shapes)
     scenes = [random_scene(seed, shapes) for seed in range(20)]
     bodies = np.stack([scanner.place(scene.shapes, scene.poses) for scene in scenes])
     robots = np.stack([scene.robot for scene in scenes])
@@ -224,13 +224,13 @@ def test_a_scan_in_a_batch_is_the_scan_alone_to_the_bit(renderer):
 
 
 @pytest.mark.parametrize("view", [4.0, 2.0 * np.pi])
-@pytest.mark.parametrize("beams", [1, 47, 48, 49, 1081])
+@pytest.mark.parametrize("beams", [1, 49, 1081])
 def test_any_number_of_walls_is_met_by_any_number_of_beams(beams, view):
     low = -0.5 * view
     spec = lidar(beams=beams, angle_min=low, angle_max=-low, range_max=6.0)
     scanner = make_scanner(spec, ())
     rng = np.random.default_rng(beams)
-    for count in (1, 7, 8, 9, 20):
+    for count in (1, 2, 20):
         robot = rng.uniform(-1.0, 1.0, 3)
         walls = rng.uniform(-5.0, 5.0, (count, 4))
         scene = Scene(robot, (), np.zeros((0, 3)), walls)
@@ -240,49 +240,24 @@ def test_any_number_of_walls_is_met_by_any_number_of_beams(beams, view):
         assert clear.mean() > 0.9 or beams < 50
 
 
-def many_bodies(scanner, worlds, count):
-    """Robots (N, 3), and bodies (N, K, 7) of all shapes in turn around them."""
+def test_a_world_of_more_bodies_than_wait_to_be_fused_is_the_minimum_of_its_parts():
+    count = 2 * MOST_FOUND + 5
+    scanner = make_scanner(lidar(beams=72), random_shapes(5)[:4], "baked")
+    shapes = [scanner.table.shapes[k % 4] for k in range(count)]
     rng = np.random.default_rng(count)
-    shapes = scanner.table.shapes
-    poses = rng.uniform(-1.0, 1.0, (worlds, count, 3)) * [4.0, 4.0, np.pi]
-    bodies = scanner.place([shapes[k % len(shapes)] for k in range(count)], poses)
-    return rng.uniform(-1.0, 1.0, (worlds, 3)), bodies
-
-
-@pytest.fixture(scope="module")
-def baked_scanner():
-    return make_scanner(lidar(beams=72), random_shapes(5)[:6], "baked")
-
-
-@pytest.mark.slow
-def test_a_world_of_more_bodies_than_lanes_is_the_minimum_of_its_parts_to_the_bit(
-    baked_scanner,
-):
-    count = 2 * LANES + 5
-    robots, bodies = many_bodies(baked_scanner, 3, count)
-    whole = baked_scanner.scan(robots, bodies)
-    for part in (7, LANES - 1, LANES, LANES + 1):
+    poses = rng.uniform(-1.0, 1.0, (3, count, 3)) * [4.0, 4.0, np.pi]
+    bodies = scanner.place(shapes, poses)
+    robots = rng.uniform(-1.0, 1.0, (3, 3))
+    whole = scanner.scan(robots, bodies)
+    for part in (1, MOST_FOUND - 1, MOST_FOUND):
         pieces = [
-            baked_scanner.scan(robots, bodies[:, k : k + part])
-            for k in range(0, count, part)
+            scanner.scan(robots, bodies[:, k : k + part]) for k in range(0, count, part)
         ]
         assert np.array_equal(whole, np.minimum.reduce(pieces))
 
 
-@pytest.mark.slow
-def test_many_looked_up_at_once_are_each_looked_up_alone_to_the_bit(baked_scanner):
-    robots, bodies = many_bodies(baked_scanner, 20, 9)
-    walls = np.array([[-3.0, -2.0, 3.0, -2.5]])
-    alone = np.empty(72, np.float32)
-    together = baked_scanner.scan(robots, bodies, walls)
-    for robot, around, scan in zip(robots, bodies, together, strict=True):
-        scan_robot(alone, robot, around, -1, walls, baked_scanner.arguments)
-        assert alone.tobytes() == scan.tobytes()
-
-
-@pytest.mark.parametrize("renderer", RENDERERS)
-def test_nobody_nothing_and_a_body_without_radius_can_be_scanned(renderer):
-    scanner = make_scanner(lidar(beams=20), (SQUARE, DISC), renderer)
+def test_nobody_nothing_and_a_body_without_radius_can_be_scanned():
+    scanner = make_scanner(lidar(beams=20), (SQUARE, DISC))
     assert scanner.scan(np.zeros((0, 3)), np.zeros((0, 4, 7))).shape == (0, 20)
     assert np.isposinf(scanner.scan(np.zeros((5, 3)), np.zeros((5, 0, 7)))).all()
     bodies = scanner.place([SQUARE, DISC], [(0.1, 0.0, 0.0), (1.0, 0.0, 0.0)])
@@ -291,9 +266,10 @@ def test_nobody_nothing_and_a_body_without_radius_can_be_scanned(renderer):
     assert np.isposinf(scanner.scan(HERE, bodies)).all()
 
 
-@pytest.mark.parametrize("renderer", RENDERERS)
-@pytest.mark.parametrize("wrong", [np.nan, np.inf])
-@pytest.mark.parametrize("column", [0, 2])
+@pytest.mark.parametrize("renderer", ["baked", "exact"])
+@pytest.mark.parametrize(
+    ("wrong", "column"), [(np.nan, 0), (np.inf, 0), (np.nan, 2), (np.inf, 2)]
+)
 @pytest.mark.filterwarnings("error")
 def test_a_pose_that_is_no_number_neither_hangs_nor_harms_the_others(
     renderer, wrong, column

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nics_drl_bridge.lidar import cell_kernels as kernels
+from nics_drl_bridge.sim import cell_kernels as kernels
 
 RADIUS = 5
 

@@ -1,0 +1,335 @@
+"""The look-up of a body in the table (Eq. 3), and its fusion into a scan (Eq. 4).
+
+Eq. 3: a scan depends only on the pose of the body relative to the lidar. The body is at the
+distance d and the bearing b from the lidar, and its rotation relative to the line of sight is
+phi = heading - b. A beam at the angle a has the range
+
+    r(a) = R(d, phi, a - b),
+
+where R(d, phi, .) is the scan of the shape straight ahead at the distance d, rotated by phi. The
+table holds R at grid distances d_i and grid rotations phi_j as rows of points at the angles c_p. A
+look-up takes the nearest grid rotation phi_j. It finds i and p with d_i <= d < d_(i+1) and
+c_p <= a - b < c_(p+1), where c_p is p fractions of a beam away from the bearing, and blends
+linearly over distance and angle:
+
+    r_i(a) = (1 - v) R(d_i, phi_j, c_p) + v R(d_i, phi_j, c_(p+1))    v: weight of the next point
+    r(a)   = (1 - w) r_i(a) + w r_(i+1)(a)                            w: weight of the far row
+
+Rotations are not blended. Instead, the exact silhouettes of the body, its outermost directions to
+the right and to the left, decide which beams hit: a plain look-up errs most where it puts an edge
+on the wrong side of a beam. Beams between the silhouettes have the range r(a), others `inf`.
+
+Eq. 4: a beam's range in the scan is the minimum of r(a) over all bodies.
+
+`look_up_body` finds i, j, p, v and w in this order; `fuse_look_ups` blends r(a) for each beam.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.lidar.arrays import Array, ShortIntegers, Singles
+from nics_drl_bridge.lidar.beam_kernels import (
+    TWO_PI,
+    Beams,
+    LidarPose,
+    arctan2,
+    beams_within,
+    lower,
+    span_beams,
+)
+from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SHAPE, SIN, X, Y
+
+TABLE_SHAPE = np.dtype(
+    [  # one shape of the table
+        ("distances_per_metre", np.float64),  # grid distances
+        ("rotations", np.float64),  # grid rotations in a full turn, 0 for a circle
+        # A period is the smallest rotation after which the shape looks the same.
+        ("periods_per_rotation", np.float64),
+        ("first_cell", np.int64),
+        ("cells_per_period", np.int64),
+        ("second_hull", np.int64),  # first corner of the second copy of its hull
+        ("corners_per_period", np.int64),
+        ("corners", np.int64),  # of the hull
+        ("round_radius", np.float64),  # radius of a circle [m], 0 for other shapes
+    ]
+)
+# Columns of `TableArrays.cells`.
+ROW_START, ROW_EXTENT, RIGHT_CORNERS, LEFT_CORNERS = range(4)
+# Sides of a shape as seen from the lidar.
+RIGHT, LEFT = 1.0, -1.0
+# Beams are fused in blocks of so many, at least two: a varying number mispredicts a branch.
+BLOCK = 16
+FEWEST = 2 * BLOCK
+
+
+class TableArrays(NamedTuple):
+    """A `table.LidarTable` for the kernels."""
+
+    shapes: Any  # (H,) of `TABLE_SHAPE`
+    distances: int  # grid distances of each shape
+    # (cells, 4) of each grid distance at each grid rotation: where its row starts in `rows`; the
+    # row's first beam, counted from the bearing, and its width in beams, as two shorts; the corners
+    # for the right and the left silhouette, see `find_silhouette`
+    cells: ShortIntegers
+    rows: Singles  # (R,) ranges [m]; in a row all points of one phase, then those of the next
+    shift: int  # log2 of the phases, which are the points per beam
+    hulls: Array  # (sum V, 2) corners [m], see `shapes.Outlines`; each hull twice
+
+
+LOOK_UP = np.dtype(
+    [  # beams of a scan that hit one body, and where the table has their ranges
+        ("first", np.int64),  # the first beam
+        ("hits", np.int32),  # number of beams
+        # indices in `TableArrays.rows` of the points around the first beam
+        ("near", np.int64),
+        ("near_next", np.int64),
+        ("far", np.int64),
+        ("far_next", np.int64),
+        ("next_weight", np.float32),  # v
+        ("far_weight", np.float32),  # w
+    ]
+)
+
+
+@kernel(contracts=True, inline=True)
+def look_up_body(
+    body: Array,
+    lidar: LidarPose,
+    beams: Beams,
+    table: TableArrays,
+    found: Any,
+    count: int,
+) -> int:
+    """Look up a body (7,), and append what `found` (L,) needs to fuse it: see `LOOK_UP`.
+
+    Returns the `count` of what was found so far. Two places more must be left before: a body across
+    the seam between the last beam and the first takes both.
+    """
+    # d, b, and the place of (d, phi) in the table
+    dx = body[X] - lidar.x
+    dy = body[Y] - lidar.y
+    distance = math.sqrt(dx * dx + dy * dy)
+    bearing = arctan2(dy, dx)
+    shape = table.shapes[np.uintp(np.int32(body[SHAPE]))]
+    cell = find_cell(distance, body[HEADING] - bearing, body[RADIUS], shape, table)
+    near = table.cells[np.uintp(cell.place)]
+    far = table.cells[np.uintp(cell.place + 1)]
+    # The silhouettes, and the beams between them
+    view = ShapeView(
+        distance * distance,
+        body[COS] * dx + body[SIN] * dy,
+        body[SIN] * dx - body[COS] * dy,
+    )
+    hulls = table.hulls
+    right = find_silhouette(view, near[RIGHT_CORNERS], cell.hull, hulls, shape, RIGHT)
+    left = find_silhouette(view, near[LEFT_CORNERS], cell.hull, hulls, shape, LEFT)
+    span = span_beams(bearing - lidar.heading + right, left - right, beams)
+    centre = span.right - right / beams.step
+    # c_p and c_(p+1) of the first beam, in both rows
+    beam_count = beams.directions.shape[1]
+    turned_by = 0.0
+    for _ in range(2):
+        first, end = beams_within(span, turned_by, beam_count)
+        hits = np.int32(end - first)
+        exact_point = (first + turned_by - centre) * (1 << table.shift)
+        point = np.floor(exact_point)
+        part = found[np.uintp(count)]
+        part.first = first
+        part.hits = hits
+        part.near, part.near_next = find_points(near, np.int64(point), hits, table)
+        part.far, part.far_next = find_points(far, np.int64(point), hits, table)
+        part.next_weight = np.float32(exact_point - point)
+        part.far_weight = cell.far_weight
+        count += hits > 0
+        turned_by = span.full_turn
+        if span.left < turned_by:
+            break
+    return count
+
+
+@kernel(contracts=True)
+def fuse_look_ups(scan: ShortIntegers, rows: Singles, found: Any) -> None:
+    """Lower the beams of a scan (B + FEWEST,) to what was found (L,): r(a), and Eq. 4.
+
+    Whole blocks of beams are fused, also beyond the last beam.
+    """
+    for m in range(found.shape[0]):
+        part = found[m]
+        first = np.uintp(part.first)
+        near = np.uintp(part.near)
+        near_next = np.uintp(part.near_next)
+        far = np.uintp(part.far)
+        far_next = np.uintp(part.far_next)
+        hits = part.hits
+        next_weight = part.next_weight
+        far_weight = part.far_weight
+        for k in range(max((hits + BLOCK - 1) & -BLOCK, FEWEST)):
+            j = np.uintp(k)
+            near_range = rows[near + j]
+            far_range = rows[far + j]
+            near_range += next_weight * (rows[near_next + j] - near_range)
+            far_range += next_weight * (rows[far_next + j] - far_range)
+            distance = near_range + far_weight * (far_range - near_range)
+            is_hit = np.int32(k) < hits
+            lower(scan, first + j, distance if is_hit else np.float32(np.inf))
+
+
+class TableCell(NamedTuple):
+    """A place in the table: a grid distance and the nearest grid rotation."""
+
+    # Index in `TableArrays.cells`; the next cell is that of the next grid distance.
+    place: int
+    hull: int  # index in `TableArrays.hulls` from which the cell's corners are counted
+    far_weight: np.float32  # weight of the row of the next grid distance
+
+
+@kernel(contracts=True, inline=True)
+def find_cell(
+    distance: float, rotation: float, radius: float, shape: Any, table: TableArrays
+) -> TableCell:
+    """Find the cell of the grid distance below and of the nearest grid rotation.
+
+    Args:
+        distance: d [m].
+        rotation: phi [rad].
+        radius: of the circle around the body [m], the first grid distance.
+        shape: its `TABLE_SHAPE`.
+        table: the table.
+    """
+    # i and j number the grid distances and the grid rotations, see the formula above.
+    exact_i = (distance - radius) * shape.distances_per_metre
+    last_i = np.int32(table.distances - 2)
+    i = np.int32(max(min(np.int32(exact_i), last_i), np.int32(0)))
+    turns = rotation * (1.0 / TWO_PI)
+    turns -= np.floor(turns)
+    j = np.int32(turns * shape.rotations + 0.5)
+    j = np.int32(max(min(j, np.int32(shape.rotations)), np.int32(0)))
+    # Only one period of the rotational symmetry is in the table.
+    period = np.int32((j + 0.5) * shape.periods_per_rotation)
+    first = shape.first_cell - period * shape.cells_per_period
+    return TableCell(
+        first + j * table.distances + i,
+        shape.second_hull - period * shape.corners_per_period,
+        np.float32(exact_i - i),
+    )
+
+
+class ShapeView(NamedTuple):
+    """A shape relative to the line of sight, which points from the lidar to its origin."""
+
+    distance2: float  # square of the distance of its origin [m^2]
+    cos: float  # cosine of its rotation from the line of sight, times the distance [m]
+    sin: float  # sine of that rotation, times the distance [m]
+
+
+@kernel(contracts=True, inline=True)
+def view_corner(view: ShapeView, corner: Array) -> tuple[float, float]:
+    """Return a corner (2,) of a shape along and across the line of sight, times the distance."""
+    x = corner[0]
+    y = corner[1]
+    return view.distance2 + view.cos * x - view.sin * y, view.sin * x + view.cos * y
+
+
+@kernel(contracts=True, inline=True)
+def find_silhouette(
+    view: ShapeView, packed: int, hull: int, hulls: Array, shape: Any, side: float
+) -> float:
+    """Find the direction of a silhouette from the bearing [rad].
+
+    Args:
+        view: of the shape.
+        packed: two corners of the hull, as shorts, either of which may be the silhouette in a cell.
+            If there are more than two, the second is negative: minus the first stride of
+            `climb_hull`, which starts at the first.
+        hull: `TableCell.hull`.
+        hulls: see `TableArrays.hulls`.
+        shape: its `TABLE_SHAPE`.
+        side: `RIGHT` or `LEFT`.
+    """
+    first = packed & 0xFFFF
+    second = packed >> 16
+    if shape.round_radius > 0.0:
+        tangent2 = view.distance2 - shape.round_radius * shape.round_radius
+        along = math.sqrt(max(tangent2, 0.0))
+        across = -side * shape.round_radius
+    elif second < 0:
+        along, across = climb_hull(
+            view, first, -second, hull, hulls, shape.corners, side
+        )
+    else:
+        along, across = view_corner(view, hulls[np.uintp(hull + first)])
+        along2, across2 = view_corner(view, hulls[np.uintp(hull + second)])
+        is_outer = side * (along * across2 - across * along2) < 0.0
+        along = along2 if is_outer else along
+        across = across2 if is_outer else across
+    direction: float = arctan2(across, along)
+    return direction
+
+
+@kernel(contracts=True)
+def climb_hull(
+    view: ShapeView,
+    first: int,
+    stride: int,
+    hull: int,
+    hulls: Array,
+    corners: int,
+    side: float,
+) -> tuple[float, float]:
+    """Climb from corner to corner to a silhouette; return that corner, see `view_corner`.
+
+    Seen from outside, the direction of the corners rises and falls once around the hull, so that a
+    local optimum is the global one. Only shapes with many corners need it, at short distances.
+
+    Args:
+        view: of the shape.
+        first: the corner to start from.
+        stride: corners in the first steps; it is halved until it is 0.
+        hull: index of the hull's corner 0 in `hulls`.
+        hulls: (sum V, 2) corners of all hulls [m].
+        corners: number of corners of the hull.
+        side: `RIGHT` or `LEFT`.
+    """
+    best = first
+    along, across = view_corner(view, hulls[np.uintp(hull + best)])
+    while stride > 0:
+        for _ in range(corners):
+            has_moved = False
+            for step in (stride, corners - stride):
+                candidate = best + step
+                candidate -= corners if candidate >= corners else 0
+                along2, across2 = view_corner(view, hulls[np.uintp(hull + candidate)])
+                if side * (along * across2 - across * along2) < 0.0:
+                    best = candidate
+                    along = along2
+                    across = across2
+                    has_moved = True
+            if not has_moved:
+                break
+        stride >>= 1
+    return along, across
+
+
+@kernel(inline=True)
+def find_points(
+    cell: ShortIntegers, point: int, hits: int, table: TableArrays
+) -> tuple[int, int]:
+    """Find where a point of a row is in `TableArrays.rows`, and the next one.
+
+    Those of the further beams follow one by one. With the last phase of a beam, the next point is
+    the first phase of the next beam.
+    """
+    phases = 1 << table.shift
+    row_beam = cell[ROW_EXTENT] >> 16
+    width = cell[ROW_EXTENT] & 0xFFFF
+    beam = point >> table.shift
+    phase = point & (phases - 1)
+    # The row covers all beams that hit but for rounding: stay within it.
+    skipped = max(min(beam - row_beam, width - hits - 1), 0)
+    place = cell[ROW_START] + phase * width + skipped
+    is_last_phase = phase + 1 == phases
+    next_place = place - phase * width + 1 if is_last_phase else place + width
+    return place, next_place
