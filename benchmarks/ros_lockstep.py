@@ -3,13 +3,11 @@
 The env is that of `gymnasium.make`: a command to a simulator node in a process of its own, its
 720-beam scan among ten obstacles and its odometry back, the estimator, observation and reward. The
 bare echo is what ROS 2 itself allows: two processes of rclpy's own executor, by the transports that
-it chooses, that exchange the same messages, made once, and do nothing else; with
-`--executor standing` they are processes of this package's executor, whose wait set stands, and with
-`--executor events` of rclpy's experimental one. Both are
+it chooses, that exchange the same messages, made once, and do nothing else. Both are
 measured in turns, chunk by chunk, so that whatever else the machine does falls on both.
 
-Bars: 0.7 env steps for each exchange of the bare pair of rclpy's executor (of standing ones 0.5),
-and the robot drives. The controls let the env rest in each step, or let it command nothing.
+Bars: 0.5 env steps for each exchange of the bare pair, and the robot drives. The controls let
+the env rest in each step, or let it command nothing.
 """
 
 from __future__ import annotations
@@ -24,10 +22,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -42,7 +37,6 @@ from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.env.registry import NAVIGATION, register_envs
-from nics_drl_bridge.nodes.executor import StandingExecutor
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 from nics_drl_bridge.sim.world import World
 
@@ -65,14 +59,7 @@ CONTROLS = {
 }
 REST_S = 0.003
 DRIVEN_M = 0.1
-RATIOS = {"rclpy": 0.7, "standing": 0.5, "events": 0.5}
-"""The least, by the executor of the bare pair."""
-EXECUTORS: dict[str, Any] = {
-    "rclpy": SingleThreadedExecutor,
-    "standing": StandingExecutor,
-}
-if find_spec("rclpy.experimental"):  # since Kilted
-    EXECUTORS["events"] = import_module("rclpy.experimental").EventsExecutor
+RATIO = 0.5  # minimum
 Exchange = Callable[[], Callable[[], object] | None]
 Chunk = Callable[[int], list[float]]
 
@@ -80,13 +67,13 @@ Chunk = Callable[[int], list[float]]
 class Bare:
     """One node and an executor, in a process that has nothing else."""
 
-    def __init__(self, name: str, namespace: str, executor: str) -> None:
+    def __init__(self, name: str, namespace: str) -> None:
         context = Context()
         context.init(None)
         self.node = Node(
             name, namespace=namespace, context=context, start_parameter_services=False
         )
-        self._executor = EXECUTORS[executor](context=context)
+        self._executor = SingleThreadedExecutor(context=context)
         self._executor.add_node(self.node)
 
     def spin_until(self, done: Callable[[], bool]) -> None:
@@ -98,9 +85,9 @@ class Bare:
             self._executor.spin_once(timeout_sec=1.0)
 
 
-def far_end(namespace: str, executor: str) -> None:
+def far_end(namespace: str) -> None:
     """Answers each Twist by an Odometry and a LaserScan, until its parent is gone."""
-    end = Bare("far_end", namespace, executor)
+    end = Bare("far_end", namespace)
     parent = os.getppid()
     odometry, scan = Odometry(), LaserScan()
     scan.ranges = array.array("f", [1.0] * BEAMS)
@@ -116,9 +103,9 @@ def far_end(namespace: str, executor: str) -> None:
         end._executor.spin_once(timeout_sec=1.0)
 
 
-def near_end(namespace: str, executor: str) -> None:
+def near_end(namespace: str) -> None:
     """Makes as many round trips as each line on standard input says, and prints their seconds."""
-    end = Bare("near_end", namespace, executor)
+    end = Bare("near_end", namespace)
     received: list[object] = []
     end.node.create_subscription(Odometry, "odom", received.append, DEPTH)
     end.node.create_subscription(LaserScan, "scan", received.append, DEPTH)
@@ -149,14 +136,12 @@ ENDS = {"far": far_end, "near": near_end}
 
 
 @contextmanager
-def bare_echo(domain_id: int, executor: str) -> Iterator[Chunk]:
+def bare_echo(domain_id: int) -> Iterator[Chunk]:
     """A function that makes round trips between two processes, as ROS 2 makes them by itself."""
     namespace = f"bare_{os.getpid()}"
     order = [
         sys.executable,
         __file__,
-        "--executor",
-        executor,
         "--namespace",
         namespace,
         "--end",
@@ -268,15 +253,13 @@ def timed(exchange: Exchange, count: int) -> list[float]:
     return times
 
 
-def measure(
-    chunks: int, size: int, executor: str, control: str | None
-) -> dict[str, float]:
+def measure(chunks: int, size: int, control: str | None) -> dict[str, float]:
     """Steps and echoes per second over all chunks, and how long a step takes."""
     domain_id = free_domain_id()
     with (
         tempfile.TemporaryDirectory() as folder,
         lockstep_env(domain_id, Path(folder), control) as driving,
-        bare_echo(domain_id, executor) as echo,
+        bare_echo(domain_id) as echo,
     ):
         timed(driving.step, size), echo(size)  # as warm as they get
         steps = []
@@ -297,12 +280,11 @@ def measure(
     }
 
 
-def bars(result: dict[str, float], executor: str) -> list[str]:
+def bars(result: dict[str, float]) -> list[str]:
     """A sentence for each bar that was missed."""
     missed = []
-    least = RATIOS[executor]
-    if not result["ratio"] >= least:
-        missed.append(f"ratio {result['ratio']}: must be {least} at least")
+    if not result["ratio"] >= RATIO:
+        missed.append(f"ratio {result['ratio']}: must be {RATIO} at least")
     if not result["driven_m"] >= DRIVEN_M:
         missed.append(f"driven_m {result['driven_m']}: must be {DRIVEN_M} at least")
     return missed
@@ -313,17 +295,14 @@ def main() -> None:
     parser = parser_of(__doc__, CONTROLS)
     parser.add_argument("--chunks", type=int, default=150)
     parser.add_argument("--size", type=int, default=100, help="steps in a chunk")
-    parser.add_argument(
-        "--executor", choices=EXECUTORS, default="rclpy", help="of the bare pair"
-    )
     parser.add_argument("--end", choices=ENDS, help=argparse.SUPPRESS)
     parser.add_argument("--namespace", help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.end:
-        ENDS[given.end](given.namespace, given.executor)
+        ENDS[given.end](given.namespace)
         return
-    result = measure(given.chunks, given.size, given.executor, given.control)
-    answer(result, bars(result, given.executor), given.json)
+    result = measure(given.chunks, given.size, given.control)
+    answer(result, bars(result), given.json)
 
 
 if __name__ == "__main__":

@@ -8,11 +8,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from rclpy.context import Context
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 
 from nics_drl_bridge.errors import BackendError
-from nics_drl_bridge.nodes.executor import StandingExecutor
 from nics_drl_bridge.nodes.transport import OF_THIS_PROCESS
 
 SPIN_S = 0.1
@@ -64,7 +63,7 @@ def holds(condition: Callable[[], Any], seconds: float, poll_s: float) -> bool:
 
 def spin(node: Node, stopping: threading.Event) -> None:
     """Spin a node until `stopping` is set or its context has been shut down."""
-    executor = StandingExecutor(node.context)
+    executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
     with contextlib.suppress(ExternalShutdownException):
         while node.context.ok() and not stopping.is_set():

@@ -228,12 +228,12 @@ class CommandInlet:
         stamped = runner.get_flag(node, "enable_stamped_cmd_vel")
         self._kind = name_of(stamped)
         kind = TwistStamped if stamped else Twist
-        hear = partial(self._on_bytes, stamped)
-        heard = node.create_subscription(
-            kind, f"{namespace}{CMD_VEL}", hear, quality, raw=True
+        self._hear = partial(self._on_bytes, stamped)
+        self._commands = node.create_subscription(
+            kind, f"{namespace}{CMD_VEL}", self._hear, quality, raw=True
         )
-        self._topic = heard.topic_name
-        self.heard = [heard]
+        self._topic = self._commands.topic_name
+        self.heard = [self._commands]
         self._types = TypeWatch(node, f"{namespace}{CMD_VEL}")
         kind = conversions.message_type("ackermann_msgs/msg/AckermannDriveStamped")
         if robot.steers and kind is not None:  # its package is optional
@@ -246,6 +246,11 @@ class CommandInlet:
         """End the subscriptions."""
         for subscription in self.heard:
             self._node.destroy_subscription(subscription)
+
+    def take_waiting(self) -> None:
+        """Take the commands that have arrived but are not handled yet."""
+        for content in qos.take_waiting(self._commands):
+            self._hear(content)
 
     def _on_bytes(self, stamped: bool, content: bytes) -> None:
         stamp_ns = 0
@@ -608,6 +613,10 @@ class DeviceNode(qos.QosWatch):
             self._timer.reset()
 
     def _reset(self) -> tuple[bool, str]:
+        # The executor may serve a request before a command that was sent earlier. In lock-step that
+        # command would move the world of the new episode.
+        for inlet in self._inlets:
+            inlet.take_waiting()
         try:
             self._require_world()
             self.begin()

@@ -189,7 +189,7 @@ def test_a_command_that_no_other_one_follows_is_followed_by_a_zero(driving):
 def test_the_death_of_the_thread_that_listens_leaves_a_zero_behind(
     driving, monkeypatch
 ):
-    spin_once = link.StandingExecutor.spin_once
+    spin_once = link.SingleThreadedExecutor.spin_once
 
     def dies(*given, **options):
         if threading.current_thread().name == "dds_backend":
@@ -199,7 +199,7 @@ def test_the_death_of_the_thread_that_listens_leaves_a_zero_behind(
     monkeypatch.setattr(threading, "excepthook", lambda *_: None)
     env, peer, heard = driving("realtime")
     env.step(AHEAD)
-    monkeypatch.setattr(link.StandingExecutor, "spin_once", dies)
+    monkeypatch.setattr(link.SingleThreadedExecutor, "spin_once", dies)
     peer.until(lambda: heard[-1] == Twist(), "a zero command")
     peer.until(
         lambda: not env.unwrapped._backend._link._context.ok(), "the thread's end"
