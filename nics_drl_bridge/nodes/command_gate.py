@@ -13,7 +13,6 @@ import numpy as np
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import LaserScan
@@ -230,8 +229,8 @@ def take_priority(priority: int) -> str:
 class CommandGate(qos.QosWatch):
     """The node between `cmd_vel_raw` and `cmd_vel`; it has its own process and starts disarmed."""
 
-    def __init__(self, context: Context) -> None:
-        super().__init__("command_gate", context=context)
+    def __init__(self, **options: Any) -> None:
+        super().__init__("command_gate", **options)
         model = runner.declare_model(self)
         logger = self.get_logger()
         self._lidar = model.lidar
@@ -251,7 +250,7 @@ class CommandGate(qos.QosWatch):
         runner.declare_row(self, parameters.FOREIGN)
         self._frame = str(runner.declare_row(self, parameters.ROBOT_FRAME))
         fault = parameters.frame_fault(
-            self._parameters.values(), parameters.ROBOT_FRAME.name
+            self.get_parameters_by_prefix("").values(), parameters.ROBOT_FRAME.name
         )
         if fault:
             raise ConfigError(fault)

@@ -5,7 +5,6 @@ from contextlib import ExitStack
 from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.context import Context
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
@@ -26,12 +25,12 @@ class ManagedNode(QosWatch, LifecycleNode):
     It declares the parameters in `rows`, in addition to those of managed nodes and of sensors.
     """
 
-    def __init__(self, name: str, context: Context, rows: Sequence[Row]) -> None:
-        super().__init__(name, context=context)
+    def __init__(self, name: str, rows: Sequence[Row], **options: Any) -> None:
+        super().__init__(name, **options)
         self.fixed: set[str] = set()
         self.undo = ExitStack()
         values = [declare_row(self, row) for row in (*managed(), *sensors(), *rows)]
-        fault = frame_fault(self._parameters.values())
+        fault = frame_fault(self.get_parameters_by_prefix("").values())
         if fault:
             raise ConfigError(fault)
         self._autostart = bool(values[0])
@@ -80,7 +79,7 @@ class ManagedNode(QosWatch, LifecycleNode):
 
     def _check_fixed(self, parameters: list[Parameter]) -> SetParametersResult:
         late = sorted(self.fixed & {parameter.name for parameter in parameters})
-        reason = frame_fault((*self._parameters.values(), *parameters))
+        reason = frame_fault((*self.get_parameters_by_prefix("").values(), *parameters))
         if late and self.state != UNCONFIGURED:
             lead = f"`ros2 lifecycle set {self.get_fully_qualified_name()} deactivate`"
             fix = f"return it to unconfigured by {lead}, then `cleanup`."

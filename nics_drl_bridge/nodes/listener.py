@@ -12,7 +12,6 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 
 from nics_drl_bridge.errors import BackendError
-from nics_drl_bridge.nodes.transport import OF_THIS_PROCESS
 
 SPIN_S = 0.1
 UNKNOWN = "UnknownROSArgsError"  # of rclpy, which exports it nowhere
@@ -22,13 +21,7 @@ GREATEST_DOMAIN_ID = 232  # above it, DDS has no ports
 def open_context(
     args: Sequence[str] | None = None, domain_id: int | None = None
 ) -> Context:
-    """Return a new context, on this machine unless the environment sets a range. BackendError."""
-
-    def make() -> Context:
-        context = Context()
-        context.init(None if args is None else list(args), domain_id=domain_id)
-        return context
-
+    """Return a new context. Raises BackendError."""
     if domain_id is None:
         asked = os.environ.get("ROS_DOMAIN_ID", "0")
     else:
@@ -39,7 +32,9 @@ def open_context(
             f"ROS 2 does not start: domain {asked} is above {GREATEST_DOMAIN_ID}."
         )
     try:
-        return OF_THIS_PROCESS.open(make)
+        context = Context()
+        context.init(None if args is None else list(args), domain_id=domain_id)
+        return context
     except RuntimeError as error:
         if type(error).__name__ == UNKNOWN:
             fix = "as in `--ros-args -p NAME:=VALUE -r FROM:=TO --params-file FILE`"

@@ -3,9 +3,9 @@
 import math
 from collections.abc import Mapping, Sequence
 from functools import partial
+from typing import Any
 
 from nav_msgs.msg import Odometry
-from rclpy.context import Context
 
 from nics_drl_bridge.errors import LONGEST, shorten
 from nics_drl_bridge.gate import inputs
@@ -25,8 +25,8 @@ SILENCE_S = 5.0  # diagnostics warn of a topic that has been silent for this lon
 class MiddlewareNode(ManagedNode):
     """Listens to a robot's topics; publishes `odometry/filtered` and `/diagnostics`."""
 
-    def __init__(self, context: Context) -> None:
-        super().__init__("middleware_node", context, middleware())
+    def __init__(self, **options: Any) -> None:
+        super().__init__("middleware_node", middleware(), **options)
         self._rejected: dict[Rejection, int] = {}  # counts at the last look
         runner.serve(self, "~/reset", self._reset)
         runner.diagnose(self, "topics", self._look)

@@ -4,10 +4,10 @@ import time
 import traceback
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped, TwistStamped
-from rclpy.context import Context
 
 from nics_drl_bridge.errors import BridgeError, ConfigError, shorten
 from nics_drl_bridge.gate import inputs
@@ -39,8 +39,8 @@ LONGEST_REASON = 300  # maximum length of a policy's error text [characters]
 class PolicyNode(ManagedNode):
     """Answers each scan with a `cmd_vel_raw` of the same stamp, until the goal is reached."""
 
-    def __init__(self, context: Context) -> None:
-        super().__init__("policy_node", context, policy())
+    def __init__(self, **options: Any) -> None:
+        super().__init__("policy_node", policy(), **options)
         self._nav2 = ControllerParameters(self)
         self.ignores = (
             self._nav2.ignores

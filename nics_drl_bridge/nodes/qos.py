@@ -97,6 +97,8 @@ MOMENT_S = 0.5
 UNKNOWN = "_UNKNOWN_"
 MOST_WAITING = 10_000  # most messages taken at once, in case a publisher never pauses
 
+# parameters of every node, which rclpy itself declares
+RCLPY_PARAMETERS = {"use_sim_time", "start_type_description_service"}
 # prefix of the parameters that override a topic's quality of service
 OVERRIDES = "qos_overrides."
 # Topics (names before remapping) whose quality of service decides whether a robot stops.
@@ -111,8 +113,8 @@ FLAG = "avoid_ros_namespace_conventions"
 
 
 def given_values(node: Node) -> dict[str, Parameter]:
-    """Return the node's own dictionary of initial values, which rclpy does not expose publicly."""
-    values: dict[str, Parameter] = getattr(node, "_parameter_overrides", {})
+    """Return the initial values that the user has given to a node's parameters, by their names."""
+    values: dict[str, Parameter] = getattr(node, "given", {})
     return values
 
 
@@ -166,7 +168,18 @@ class QosWatch(Node):
 
     As in any ROS 2 node, parameters `qos_overrides.TOPIC.publisher.POLICY` (or `subscription`)
     override the quality of service of a topic, except for `FIXED_TOPICS`.
+
+    The keyword arguments are those of rclpy's Node.
     """
+
+    def __init__(self, name: str, **options: Any) -> None:
+        # Declared for a moment, because rclpy does not tell otherwise which values were given.
+        super().__init__(
+            name, automatically_declare_parameters_from_overrides=True, **options
+        )
+        self.given = self.get_parameters_by_prefix("")
+        for given in self.given.keys() - RCLPY_PARAMETERS:
+            self.undeclare_parameter(given)
 
     def create_publisher(
         self, kind: Any, topic: str, qos: Any, **options: Any

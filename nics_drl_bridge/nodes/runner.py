@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rcl_interfaces.srv import GetParameters
@@ -38,6 +39,7 @@ UNCONFIGURED = "unconfigured"
 INACTIVE = "inactive"
 ACTIVE = "active"
 DELIVERY_S = 0.5
+INPUT_ERRORS = (BridgeError, ParameterException, OSError)
 # time until the graph shows all nodes [s]
 SETTLE_S = 0.3
 POLL_S = 0.02
@@ -48,6 +50,11 @@ RANGES = {
     int: (IntegerRange, "integer_range"),
     float: (FloatingPointRange, "floating_point_range"),
 }
+# type of a default, and of a given value that becomes one or more floats
+WHOLE_NUMBERS = (
+    (float, Parameter.Type.INTEGER),
+    (list, Parameter.Type.INTEGER_ARRAY),
+)
 SHARED = "model"  # a file may also set it for nodes without a model
 
 
@@ -58,57 +65,61 @@ def last_word(publisher: Publisher, message: Any) -> None:
 
 
 def run_node(
-    make: Callable[[Context], Node],
-    args: Sequence[str] | None = None,
-    sole_name: str = "",
+    make: Callable[..., Node], args: Sequence[str] | None = None, sole_name: str = ""
 ) -> Any:
-    """Run a node until a signal (`ENDING`), then stop and destroy it cleanly; return it."""
+    """Run a node as the main function of its process until a signal (`ENDING`); return it.
+
+    A known error prints one sentence, and ends with exit code 2.
+    """
     stopping = threading.Event()
-    started = threading.Event()
-
-    def end(*_: Any) -> None:
-        stopping.set()
-        if not started.is_set():
-            started.set()
-            raise SystemExit(0)
-
     for number in ending_signals():
-        signal.signal(number, end)
-    context = None
-    node = None
-    alone = contextlib.ExitStack()
+        signal.signal(number, lambda *_: stopping.set())
+    words = sys.argv if args is None else args
     try:
         with at_once():
-            words = sys.argv if args is None else args
             context = open_context([*words, *ros_arguments(words)])
+        return live(make, context, stopping, sole_name)
+    except INPUT_ERRORS as error:
+        sys.stderr.write(f"{explain(error)}\n")
+        raise SystemExit(EXIT_BAD_INPUT) from None
+
+
+def live(
+    make: Callable[..., Node],
+    context: Context,
+    stopping: threading.Event,
+    sole_name: str = "",
+) -> Any:
+    """Make a node by `make(context=...)`, spin it until the end, and destroy it; return it.
+
+    The end is an event, or the end of the context, which belongs to the node.
+    """
+    with contextlib.ExitStack() as undo:
+        undo.callback(context.try_shutdown)
+        with at_once():
             if sole_name:
-                alone.enter_context(sole(context, sole_name))
-            node = make(context)
+                undo.enter_context(sole(context, sole_name))
+            node = make(context=context)
+            undo.callback(_end, node)
             if hasattr(node, "start"):
                 node.start()
         gc.collect()  # now, because later it may take 0.1 s while the robot moves
-        started.set()
         for sentence in unknown(node):  # rclpy ignores them silently
             node.get_logger().warning(sentence)
         if getattr(node, "state", ACTIVE) == ACTIVE:
             node.get_logger().info("running")
         spin(node, stopping)
-    except (BridgeError, ParameterException, OSError) as error:
-        sys.stderr.write(f"{_sentence(error)}\n")
-        raise SystemExit(EXIT_BAD_INPUT) from None
-    finally:
-        started.set()
-        if node is not None:
-            if node.context.ok() and hasattr(node, "stop"):
-                node.stop()
-            node.destroy_node()
-        if context is not None:
-            context.try_shutdown()
-        alone.close()
     return node
 
 
-def _sentence(error: Exception) -> str:
+def _end(node: Any) -> None:
+    if node.context.ok() and hasattr(node, "stop"):
+        node.stop()
+    node.destroy_node()
+
+
+def explain(error: Exception) -> str:
+    """Return one line for one of `INPUT_ERRORS`."""
     if isinstance(error, OSError):
         place = f"{error.filename}: " if error.filename else ""
         return f"{place}{error.strerror or error}; choose another place."
@@ -220,29 +231,19 @@ def declare_row(node: Node, row: Row) -> Any:
         low, high = row.span
         kind, field = RANGES[type(row.default)]
         setattr(descriptor, field, [kind(from_value=low, to_value=high)])
-    _accept_integers(node, row)
-    return node.declare_parameter(row.name, row.default, descriptor).value
-
-
-def _accept_integers(node: Node, row: Row) -> None:
-    """Make the given integers of a floating-point parameter floats; rclpy refuses `rate:=2`."""
-    values = qos.given_values(node)
-    many = isinstance(row.default, list)
-    types = Parameter.Type
-    if row.name not in values:
-        return
-    given_type = values[row.name].type_
-    value = values[row.name].value
-    if many and isinstance(row.default[0], float) and given_type == types.INTEGER_ARRAY:
-        floats = list(map(float, value))
-        values[row.name] = Parameter(row.name, types.DOUBLE_ARRAY, floats)
-    if isinstance(row.default, float) and given_type == types.INTEGER:
-        values[row.name] = Parameter(row.name, types.DOUBLE, float(value))
+    # rclpy refuses whole numbers for a floating-point parameter, as in `rate:=2`.
+    given = qos.given_values(node).get(row.name)
+    value = row.default
+    if given is not None and (type(row.default), given.type_) in WHOLE_NUMBERS:
+        value = np.asarray(given.value, np.float64).tolist()
+    is_whole = value is not row.default
+    return node.declare_parameter(row.name, value, descriptor, is_whole).value
 
 
 def unknown(node: Node) -> list[str]:
     """Return a sentence for each value whose parameter the node does not have."""
-    names = [name for name in node._parameters if not name.startswith(qos.OVERRIDES)]
+    declared = node.get_parameters_by_prefix("")
+    names = [name for name in declared if not name.startswith(qos.OVERRIDES)]
     ignores = getattr(node, "ignores", lambda _: False)
     sentences = [
         f"there is no parameter {name!r}, its value is ignored; {suggest(name, names)}"

@@ -12,7 +12,6 @@ from typing import Any, cast
 import numpy as np
 from geometry_msgs.msg import TransformStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry
-from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
@@ -307,8 +306,8 @@ class DeviceNode(qos.QosWatch):
     again.
     """
 
-    def __init__(self, name: str, context: Context, make: MakeSimulator) -> None:
-        super().__init__(name, context=context)
+    def __init__(self, name: str, make: MakeSimulator, **options: Any) -> None:
+        super().__init__(name, **options)
         model = runner.declare_model(self)
         device_parameters.declare_device(self, model.lidar.frame)
         self._time = device_parameters.timing(self, model)
@@ -690,9 +689,5 @@ def fast_simulator(
     return FastSimulator(model, world, robots=robots, **options)
 
 
-def simulator_node(context: Context) -> DeviceNode:
-    """Make the node `simulator_node`; see `DeviceNode`."""
-    return DeviceNode("simulator_node", context, fast_simulator)
-
-
-main = partial(runner.run_node, simulator_node, sole_name="simulator_node")
+SimulatorNode = partial(DeviceNode, "simulator_node", fast_simulator)
+main = partial(runner.run_node, SimulatorNode, sole_name="simulator_node")

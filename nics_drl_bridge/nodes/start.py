@@ -1,6 +1,7 @@
 """Entry points of the nodes; without ROS 2 they print one sentence, not a traceback."""
 
 import faulthandler
+import os
 import signal
 import sys
 import time
@@ -13,7 +14,7 @@ from nics_drl_bridge.exit_codes import EXIT_BAD_INPUT
 
 def start(node: str, args: list[str] | None = None) -> None:
     """Run a node by its name and end the process; bad input gives one sentence and exit code 2."""
-    from nics_drl_bridge.nodes import ending, output, usage
+    from nics_drl_bridge.nodes import ending, output, transport, usage
 
     for number in ending.ending_signals():  # importing the node takes seconds
         signal.signal(number, signal.SIG_DFL)
@@ -32,6 +33,7 @@ def start(node: str, args: list[str] | None = None) -> None:
     sys.stderr.flush()
     code: Any = 0
     try:
+        transport.set_transport(os.environ)
         ending.own_process()
         main = _main_of(node)
         main(args)

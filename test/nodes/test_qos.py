@@ -113,9 +113,7 @@ def test_an_override_of_one_topic_leaves_the_others_as_they_are(overridden):
     node.create_publisher(Bool, "scan", qos.SENSOR_RELIABLE)
     other = node.create_publisher(Bool, "odom", qos.SENSOR_RELIABLE)
     assert other.qos_profile.depth == qos.SENSOR_RELIABLE.depth == 10
-    assert not [
-        name for name in node._parameters if name.startswith("qos_overrides./odom")
-    ]
+    assert not node.get_parameters_by_prefix("qos_overrides./odom")
 
 
 @pytest.mark.parametrize("topic", qos.FIXED_TOPICS)

@@ -219,7 +219,7 @@ def test_a_start_that_it_is_started_with_alone_holds(launch, meet, domain_id):
 
 def test_commands_are_as_old_as_before_when_time_is_put_back(make_node, model_folder):
     given = (f"model:={model_folder}", "world:=empty", "command_timeout:=0.5")
-    node = make_node(*given, kind=simulator_node.simulator_node)
+    node = make_node(*given, kind=simulator_node.SimulatorNode)
     node.pause(True)
     for _ in range(100):
         node.step()
@@ -375,14 +375,14 @@ def test_its_joints_tell_the_state_at_the_stamps_of_its_odometry(
 )
 def test_a_wrong_parameter_is_refused_at_the_start(make_node, parameter, error, reason):
     with pytest.raises(error, match=reason):
-        make_node(parameter, kind=simulator_node.simulator_node)
+        make_node(parameter, kind=simulator_node.SimulatorNode)
 
 
 @pytest.fixture
 def fleet(make_node, model_folder):
     """A node with two robots in lock-step, and its entities as the services know them."""
     given = (f"model:={model_folder}", "world:=empty", "mode:=lockstep")
-    node = make_node(*given, "robots:=[ant, bee]", kind=simulator_node.simulator_node)
+    node = make_node(*given, "robots:=[ant, bee]", kind=simulator_node.SimulatorNode)
     entities = Entities(node.device, node.world, node.robot_names, node.make_simulator)
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
