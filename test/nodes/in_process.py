@@ -135,7 +135,8 @@ def make_logged(node: str, lines: list[str], **options: Any) -> Any:
 class Keeper(RcutilsLogger):
     """A logger that also keeps its lines.
 
-    rclpy throttles by the caller of `log`, which is always this class; so it throttles itself.
+    rclpy throttles, and checks the severity, by the caller of `log`, which is always this class. So
+    this class throttles itself, and leaves each line to a new logger.
     """
 
     def __init__(
@@ -158,4 +159,4 @@ class Keeper(RcutilsLogger):
             return False
         self._said[place] = time.monotonic()
         self._lines.append(str(message))
-        return super().log(message, severity, **options)
+        return RcutilsLogger(self.name).log(message, severity, **options)

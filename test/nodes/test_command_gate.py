@@ -213,7 +213,7 @@ from nics_drl_bridge.nodes.command_gate import CommandGate
 from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.gate.shield_kernels import is_free
 CommandGate._listen = lambda _: print(len(is_free.signatures))
-node = CommandGate(open_context([], domain_id={domain_id}))
+node = CommandGate(context=open_context([], domain_id={domain_id}))
 node.destroy_node()
 node.context.try_shutdown()
 """
