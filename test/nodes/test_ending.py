@@ -33,8 +33,9 @@ def make(context):
 runner.run_node(make)
 ending.leave(0)
 """
-ENDS = [signal.SIGHUP, signal.SIGQUIT, signal.SIGALRM, signal.SIGRTMAX]
+ENDS = [signal.SIGHUP, signal.SIGRTMAX]
 FURTHER_ENDS = [
+    signal.SIGQUIT,
     signal.SIGINT,
     signal.SIGTERM,
     signal.SIGUSR1,

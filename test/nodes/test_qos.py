@@ -2,7 +2,6 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
-from rcl_interfaces.srv import GetParameters
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Bool
@@ -145,26 +144,3 @@ def test_an_override_that_can_not_be_is_one_sentence(overridden, override, sente
         node.create_publisher(Bool, "scan", qos.SENSOR_RELIABLE)
     assert "qos_overrides./scan.publisher." in str(caught.value)
     assert sentence in str(caught.value)
-
-
-def test_nodes_honour_what_a_file_overrides_and_refuse_it_for_the_emergency_stop(
-    launch, meet, domain_id
-):
-    chosen = {"qos_overrides": {"/odometry/filtered": {"publisher": {"depth": 7}}}}
-    launch("middleware_node", domain_id, **chosen)
-    fixed = {
-        "qos_overrides": {"/e_stop": {"subscription": {"reliability": "best_effort"}}}
-    }
-    gate = launch("command_gate", domain_id, **fixed)
-    assert gate.wait() == 2
-    assert (
-        "'qos_overrides./e_stop.subscription.reliability': can't be" in gate.read_text()
-    )
-    peer = meet(domain_id)
-    request = GetParameters.Request(
-        names=["qos_overrides./odometry/filtered.publisher.depth"]
-    )
-    (depth,) = peer.call(
-        GetParameters, "middleware_node/get_parameters", request
-    ).values
-    assert depth.integer_value == 7
