@@ -38,8 +38,13 @@ from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.nodes import qos, wire
 from nics_drl_bridge.nodes.conversions import sensor_from_ros, sensor_type
-from nics_drl_bridge.nodes.link import EpisodeServices, Link
-from nics_drl_bridge.nodes.lockstep_inbox import Inbox, Message, read_message
+from nics_drl_bridge.nodes.link import (
+    EpisodeServices,
+    Inbox,
+    Link,
+    Message,
+    read_message,
+)
 from nics_drl_bridge.nodes.parameters import (
     LOCKSTEP,
     REALTIME,

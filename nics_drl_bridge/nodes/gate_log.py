@@ -23,8 +23,8 @@ from nics_drl_bridge.nodes.black_box_writer import (
     STATE,
     WRITE,
 )
-from nics_drl_bridge.nodes.child_python import module_command
-from nics_drl_bridge.nodes.output import widen_pipe
+from nics_drl_bridge.nodes.node_process import module_command
+from nics_drl_bridge.nodes.own_process import widen_pipe
 from nics_drl_bridge.nodes.runner import Condition
 
 BURST_S = (

@@ -18,7 +18,7 @@ import weakref
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from geometry_msgs.msg import Twist, TwistStamped
@@ -35,12 +35,12 @@ from nics_drl_bridge.config import parse_namespace
 from nics_drl_bridge.env.guard import uninterrupted
 from nics_drl_bridge.errors import BackendError, ModelError
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import Start
+from nics_drl_bridge.interface import S_PER_NS, Start
 from nics_drl_bridge.middleware.measurement import CMD_VEL
-from nics_drl_bridge.nodes import qos
+from nics_drl_bridge.nodes import qos, wire
 from nics_drl_bridge.nodes.command_types import deaf_subscribers, heard_stamped
-from nics_drl_bridge.nodes.ending import ENDING
 from nics_drl_bridge.nodes.listener import holds, open_context
+from nics_drl_bridge.nodes.own_process import ENDING
 from nics_drl_bridge.nodes.parameters import stamped_by_default
 from nics_drl_bridge.nodes.runner import last_word
 from nics_drl_bridge.nodes.wire import stamped_twist_to_bytes, twist_to_bytes
@@ -447,3 +447,67 @@ class EpisodeServices:
                 runs = f"the simulator runs the {key} {answer.get(key)!r}, this env {mine!r}"
                 raise ModelError(f"{runs}; start both with the same {key}.")
         return int(answer["stamp_ns"])
+
+
+T = TypeVar("T")
+
+
+class Message(NamedTuple):
+    """A serialised message; the defaults stand for a topic without any."""
+
+    stamp_ns: int = -1
+    arrival_ns: int = 0  # on the monotonic clock
+    content: bytes = b""
+
+    @property
+    def age_s(self) -> float:
+        """Time since its arrival [s]; inf if there is none."""
+        if not self.content:
+            return math.inf
+        return (time.monotonic_ns() - self.arrival_ns) * S_PER_NS
+
+
+class Inbox:
+    """The newest message of each topic.
+
+    Args:
+        topics: names of the topics.
+        slack_ns: messages may be older than an awaited stamp by this much.
+    """
+
+    def __init__(self, topics: tuple[str, ...], slack_ns: int) -> None:
+        self._slack_ns = slack_ns
+        self.messages = dict.fromkeys(topics, Message())
+
+    def clear(self) -> None:
+        """Forget all messages."""
+        self.messages = dict.fromkeys(self.messages, Message())
+
+    def put(self, topic: str, content: bytes) -> None:
+        """Store a message. Raises BackendError if it is damaged."""
+        stamp_ns = read_message(topic, wire.stamp_of, content)
+        self.messages[topic] = Message(stamp_ns, time.monotonic_ns(), content)
+
+    def has(self, topic: str, stamp_ns: int) -> bool:
+        """True if the message of a stamp is there."""
+        return self.messages[topic].stamp_ns + self._slack_ns >= stamp_ns
+
+    def find_late(self, stamp_ns: int) -> str | None:
+        """Return the first topic whose message of a stamp is not there; None if all are."""
+        for topic in self.messages:
+            if not self.has(topic, stamp_ns):
+                return topic
+        return None
+
+    def find_newest_ns(self) -> int:
+        """Return the newest stamp of any topic [ns]; -1 if there is no message."""
+        return max(message.stamp_ns for message in self.messages.values())
+
+
+def read_message(topic: str, read: Callable[[bytes], T], content: bytes) -> T:
+    """Deserialise a message by `read`. Raises BackendError if it is damaged."""
+    try:
+        return read(content)
+    except wire.UNREADABLE as error:
+        reason = f"a message can't be read ({error}); look at who publishes it."
+        raise BackendError(f"topic {topic!r}: {reason}") from None

@@ -21,11 +21,10 @@ from nics_drl_bridge.nodes import conversions, qos, runner
 from nics_drl_bridge.nodes.follow_path import PathActions, Wish
 from nics_drl_bridge.nodes.goal_answer import GoalAnswer
 from nics_drl_bridge.nodes.goal_frames import GoalFrames
-from nics_drl_bridge.nodes.lifecycle import ManagedNode
 from nics_drl_bridge.nodes.nav2_parameters import ControllerParameters
 from nics_drl_bridge.nodes.parameters import policy
 from nics_drl_bridge.nodes.robot_topics import RobotTopics
-from nics_drl_bridge.nodes.runner import ACTIVE, UNCONFIGURED
+from nics_drl_bridge.nodes.runner import ACTIVE, UNCONFIGURED, ManagedNode
 from nics_drl_bridge.policy.pacing import ActionPace, Answer, Deadline
 from nics_drl_bridge.policy.policies import open_policy
 from nics_drl_bridge.policy.stateful import begin, resume

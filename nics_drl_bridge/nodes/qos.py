@@ -4,8 +4,9 @@ Reliable publishers match all subscribers, so this package publishes reliably, a
 best effort wherever a lost message does no harm. Late joiners get no old data, which would mislead.
 """
 
+import contextlib
 import copy
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
@@ -18,7 +19,7 @@ from rclpy.qos import QoSPolicyKind, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 
-from nics_drl_bridge.errors import ConfigError, suggest
+from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.gate import inputs
 from nics_drl_bridge.middleware.measurement import CMD_VEL
 from nics_drl_bridge.recording.messages import Offer
@@ -103,13 +104,6 @@ RCLPY_PARAMETERS = {"use_sim_time", "start_type_description_service"}
 OVERRIDES = "qos_overrides."
 # Topics (names before remapping) whose quality of service decides whether a robot stops.
 FIXED_TOPICS = (CMD_VEL, inputs.RAW, inputs.E_STOP, "ackermann_cmd")
-CHOICES: dict[str, Any] = {
-    "history": rclpy_qos.HistoryPolicy,
-    "reliability": rclpy_qos.ReliabilityPolicy,
-    "durability": rclpy_qos.DurabilityPolicy,
-    "liveliness": rclpy_qos.LivelinessPolicy,
-}
-FLAG = "avoid_ros_namespace_conventions"
 
 
 def given_values(node: Node) -> dict[str, Parameter]:
@@ -122,45 +116,28 @@ def overridden_policies(node: Node, topic: str, end: str) -> list[QoSPolicyKind]
     """Return the policies that a user's parameters set for the `end` of a topic, if any.
 
     `end` is `publisher` or `subscription`. Raises ConfigError for a topic whose quality of service
-    is fixed, and for a policy or value that does not exist.
+    is fixed.
     """
     prefix = f"{OVERRIDES}{node.resolve_topic_name(topic)}.{end}."
-    values = given_values(node)
-    policies = []
-    for name in sorted(values):
-        if not name.startswith(prefix):
-            continue
-        if topic.rsplit("/", 1)[-1] in FIXED_TOPICS:
-            reason = "can't be overridden, because the robot's stop depends on it"
-            raise ConfigError(f"parameter {name!r}: {reason}; leave it out.")
-        policy = name.removeprefix(prefix)
-        _check_override(name, policy, values[name].value)
-        policies.append(QoSPolicyKind[policy.upper()])
-    return policies
+    given = given_values(node)
+    names = sorted(name for name in given if name.startswith(prefix))
+    if names and topic.rsplit("/", 1)[-1] in FIXED_TOPICS:
+        reason = "can't be overridden, because the robot's stop depends on it"
+        raise ConfigError(f"parameter {names[0]!r}: {reason}; leave it out.")
+    return [kind for kind in QoSPolicyKind if f"{prefix}{kind.name.lower()}" in given]
 
 
-def _check_override(name: str, policy: str, value: Any) -> None:
-    known = [kind.name.lower() for kind in QoSPolicyKind if kind.name != "INVALID"]
-    if policy not in known:
-        raise ConfigError(
-            f"parameter {name!r}: there is no policy {policy!r}; "
-            f"{suggest(policy, known)}"
-        )
-    if policy in CHOICES:
-        values = [
-            choice.name.lower()
-            for choice in CHOICES[policy]
-            if choice.name != "UNKNOWN"
-        ]
-        if str(value).lower() not in values:
-            raise ConfigError(
-                f"parameter {name!r}: is {value!r}; {suggest(str(value), values)}"
-            )
-        return
-    is_flag = isinstance(value, bool)
-    if (policy == FLAG) is not is_flag or not isinstance(value, int) or value < 0:
-        needed = "true or false" if policy == FLAG else "a whole number of 0 or more"
-        raise ConfigError(f"parameter {name!r}: must be {needed}, not {value!r}.")
+@contextlib.contextmanager
+def explained(topic: str, policies: Sequence[QoSPolicyKind]) -> Iterator[None]:
+    """Within this context, an override that rclpy refuses raises ConfigError."""
+    try:
+        yield
+    except RuntimeError as error:
+        if not policies:
+            raise
+        names = ", ".join(kind.name.lower() for kind in policies)
+        fix = f"correct {OVERRIDES}*.{names}, or leave it out"
+        raise ConfigError(f"topic {topic!r}: {error}; {fix}.") from None
 
 
 class QosWatch(Node):
@@ -187,7 +164,8 @@ class QosWatch(Node):
         """Create a publisher; see rclpy."""
         profile = copied(qos)
         chosen = self.publisher_options(topic, profile)
-        return super().create_publisher(kind, topic, profile, **chosen | options)
+        with explained(topic, overridden_policies(self, topic, "publisher")):
+            return super().create_publisher(kind, topic, profile, **chosen | options)
 
     def publisher_options(self, topic: str, profile: QoSProfile) -> dict[str, Any]:
         """Return the options for a publisher that rclpy makes without `create_publisher`.
@@ -214,9 +192,10 @@ class QosWatch(Node):
         policies = overridden_policies(self, topic, "subscription")
         if policies:
             chosen["qos_overriding_options"] = QoSOverridingOptions(policies)
-        return super().create_subscription(
-            kind, topic, callback, profile, **chosen | options
-        )
+        with explained(topic, policies):
+            return super().create_subscription(
+                kind, topic, callback, profile, **chosen | options
+            )
 
     def create_lossless_subscription(
         self,

@@ -4,7 +4,7 @@ import sys
 import pytest
 
 from nics_drl_bridge.nodes.parameters import NODES
-from nics_drl_bridge.nodes.usage import help_of, wrong_with
+from nics_drl_bridge.nodes.start import help_of, wrong_with
 
 # As where no ROS 2 is installed: what is imported in vain is missed.
 WITHOUT = """

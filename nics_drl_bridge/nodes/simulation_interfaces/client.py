@@ -14,8 +14,7 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Array, Start
 from nics_drl_bridge.lidar.exact_kernels import RADIUS
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.link import POLL_S, Link
-from nics_drl_bridge.nodes.lockstep_inbox import Inbox
+from nics_drl_bridge.nodes.link import POLL_S, Inbox, Link
 from nics_drl_bridge.nodes.parameters import NEWEST
 from nics_drl_bridge.sim.entities import OBSTACLE
 from nics_drl_bridge.sim.scenes import sample_scene
