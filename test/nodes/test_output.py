@@ -128,7 +128,8 @@ def test_a_log_file_that_hangs_delays_nothing(tmp_path):
 
 def test_a_forwarder_that_is_frozen_or_killed_delays_nothing():
     code = (
-        "import os, signal\nfrom nics_drl_bridge.nodes import own_process\nown_process.forward_output()\n"
+        "import os, signal\nfrom nics_drl_bridge.nodes import own_process\n"
+        "own_process.forward_output()\n"
         "os.kill(own_process._forwarder.pid, signal.{})\n"
         "for _ in range(100_000): print('line', 'x' * 80, flush=True)\n"
         "own_process._forwarder.kill()\nos._exit(3)"
