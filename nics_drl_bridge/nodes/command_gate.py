@@ -161,7 +161,7 @@ def take_priority(priority: int) -> str:
     return ""
 
 
-class CommandGate(qos.QosWatch):
+class CommandGate(qos.BridgeNode):
     """The node between `cmd_vel_raw` and `cmd_vel`; it has its own process and starts disarmed."""
 
     def __init__(self, **options: Any) -> None:

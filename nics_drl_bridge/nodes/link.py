@@ -88,7 +88,7 @@ class Link:
                 Parameter(name, value=value)
                 for name, value in (parameters or {}).items()
             ]
-            self.node = qos.QosWatch(
+            self.node = qos.BridgeNode(
                 "bridge_env",
                 namespace=namespace,
                 context=self._context,

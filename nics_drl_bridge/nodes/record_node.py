@@ -181,7 +181,7 @@ class DriveResult:
     line: str  # one sentence about it
 
 
-class RecordNode(qos.QosWatch):
+class RecordNode(qos.BridgeNode):
     """Sends `cmd_vel` at 20 Hz, and zeros at the end or on a fault; records what it hears."""
 
     def __init__(self, **options: Any) -> None:

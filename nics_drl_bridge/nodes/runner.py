@@ -40,7 +40,7 @@ from nics_drl_bridge.nodes import qos
 from nics_drl_bridge.nodes.listener import holds, open_context, spin
 from nics_drl_bridge.nodes.own_process import at_once, ending_signals, ros_arguments
 from nics_drl_bridge.nodes.parameters import MODEL, Row, frame_fault, managed, sensors
-from nics_drl_bridge.nodes.qos import QosWatch, copied
+from nics_drl_bridge.nodes.qos import BridgeNode, copied, overriding
 
 UNCONFIGURED = "unconfigured"
 INACTIVE = "inactive"
@@ -321,7 +321,7 @@ SUCCESS = TransitionCallbackReturn.SUCCESS
 FAILURE = TransitionCallbackReturn.FAILURE
 
 
-class ManagedNode(QosWatch, LifecycleNode):
+class ManagedNode(BridgeNode, LifecycleNode):
     """A lifecycle node; `configure` creates its resources and puts their clean-up on `undo`.
 
     It declares the parameters in `rows`, in addition to those of managed nodes and of sensors.
@@ -344,9 +344,10 @@ class ManagedNode(QosWatch, LifecycleNode):
 
     def create_lifecycle_publisher(self, kind: Any, topic: str, qos: Any) -> Publisher:
         """Create a publisher, until clean-up, that is silent unless the node is active."""
-        profile = copied(qos)
-        options = self.publisher_options(topic, profile)
-        made = super().create_lifecycle_publisher(kind, topic, profile, **options)
+        with overriding(self, topic, "publisher") as options:
+            made = super().create_lifecycle_publisher(
+                kind, topic, copied(qos), **options
+            )
         self.undo.callback(self.destroy_lifecycle_publisher, made)
         return made
 

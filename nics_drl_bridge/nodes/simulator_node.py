@@ -297,7 +297,7 @@ class CommandInlet:
         self._types.look(self._kind)
 
 
-class DeviceNode(qos.QosWatch):
+class DeviceNode(qos.BridgeNode):
     """Takes `cmd_vel`; publishes `scan`, `odom`, `joint_states`, `ground_truth`, `/clock`, `/tf`.
 
     The parameter `robots` makes a fleet, with each robot in a namespace below the node's. Simulated

@@ -75,7 +75,7 @@ def module_domain_id(domains: ExitStack) -> int:
 def make_node(domain_id: int) -> Iterator[Callable[..., Any]]:
     """Makes nodes that do not spin, `make_node("rate:=2.0", words=("-r", "__ns:=/car"))`."""
     from nics_drl_bridge.nodes.listener import open_context
-    from nics_drl_bridge.nodes.qos import QosWatch
+    from nics_drl_bridge.nodes.qos import BridgeNode
 
     with ExitStack() as made:
 
@@ -84,7 +84,7 @@ def make_node(domain_id: int) -> Iterator[Callable[..., Any]]:
             context = open_context(["node", "--ros-args", *given, *words], domain_id)
             made.callback(context.try_shutdown)
             node = (
-                QosWatch("node", context=context)
+                BridgeNode("node", context=context)
                 if kind is None
                 else kind(context=context)
             )

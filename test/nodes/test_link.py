@@ -27,13 +27,13 @@ def opened(monkeypatch):
         contexts.append(OPEN(**options))
         return contexts[-1]
 
-    class Node(link.qos.QosWatch):
+    class Node(link.qos.BridgeNode):
         def __init__(self, *args, **options):
             super().__init__(*args, **options)
             nodes.append(self)
 
     monkeypatch.setattr(link, "open_context", open_context)
-    monkeypatch.setattr(link.qos, "QosWatch", Node)
+    monkeypatch.setattr(link.qos, "BridgeNode", Node)
     return contexts, nodes
 
 

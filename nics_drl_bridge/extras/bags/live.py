@@ -24,7 +24,7 @@ from nics_drl_bridge.config import parse_namespace
 from nics_drl_bridge.errors import BackendError, RecordingError, suggest
 from nics_drl_bridge.nodes.conversions import message_texts, message_type, stamp_to_ros
 from nics_drl_bridge.nodes.listener import holds, open_context
-from nics_drl_bridge.nodes.qos import QosWatch, offer_of, profile_of
+from nics_drl_bridge.nodes.qos import BridgeNode, offer_of, profile_of
 from nics_drl_bridge.nodes.runner import DELIVERY_S, run_node, steadily
 from nics_drl_bridge.recording.bag_file import BagFile, open_bag
 from nics_drl_bridge.recording.messages import Offer
@@ -83,7 +83,7 @@ class BagOrder:
         }
 
 
-class BagRecorder(QosWatch):
+class BagRecorder(BridgeNode):
     """Writes wanted topics to a bag; `say` gets each topic that starts or can't be recorded."""
 
     def __init__(
