@@ -11,11 +11,14 @@ from pathlib import Path
 
 import pytest
 
+from nics_drl_bridge.nodes.transport import set_transport
+
 ROOT = Path(__file__).resolve().parents[1]
 
 # One thread for linear algebra, here and in children, set before numpy is loaded: the workers fill
 # the cores, and threads of BLAS that wait for each other multiply the time of small problems.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+set_transport(os.environ)
 
 # Rings of tests that `make test` leaves out; CONTRIBUTING.md describes them. A whole file is moved
 # to a ring by its row here, a single test by the ring's name as a mark.

@@ -81,7 +81,7 @@ def record(
     if not preview:
         # This comes first because ROS 2 from wheels restarts Python.
         with extensions.require_modules("nics record"):
-            from nics_drl_bridge.nodes.output import forwarded_errors
+            from nics_drl_bridge.nodes.own_process import forwarded_errors
             from nics_drl_bridge.nodes.record_node import record as drive
     lines = draw_preview(plan, out)
     facts: dict[str, Any] = {"out": str(out), "robot": robot}

@@ -13,11 +13,13 @@ from nics_drl_bridge.commands.interrupts import (
     was_interrupted,
 )
 from nics_drl_bridge.exit_codes import EXIT_BAD_INPUT, EXIT_INTERRUPTED
+from nics_drl_bridge.nodes.transport import set_transport
 
 
 def main() -> None:
     """Runs a command; everything it needs is imported only now."""
     take_signals()
+    set_transport(os.environ)
     try:
         _run()
     except SystemExit as end:

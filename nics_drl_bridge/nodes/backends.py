@@ -7,11 +7,9 @@ step:
    period to t.
 2. The simulator takes the command, simulates one control period, and publishes odometry and scan
    with the stamp t.
-3. The executor's thread puts each message into the `Inbox`.
-4. `receive` waits until all messages of t are in the inbox. The odometry of t updates the estimator
-   as soon as it is there, in the executor's thread while `receive` waits; so only one thread at a
-   time uses the estimator.
-5. `receive` hands the scan to the middleware, and returns the middleware's view of the robot at t.
+3. `receive` runs the callbacks of the link, which put each message into the `Inbox`, until all
+   messages of t are there. The odometry of t updates the estimator while the scan is in transit.
+4. `receive` hands the scan to the middleware, and returns the middleware's view of the robot at t.
 
 A simulator of this package moves once each of its robots has a command, and sends a message again
 that was lost on the way. One with the standard services is moved by a service instead.
@@ -40,8 +38,13 @@ from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.nodes import qos, wire
 from nics_drl_bridge.nodes.conversions import sensor_from_ros, sensor_type
-from nics_drl_bridge.nodes.link import EpisodeServices, Link
-from nics_drl_bridge.nodes.lockstep_inbox import Inbox, Message, read_message
+from nics_drl_bridge.nodes.link import (
+    EpisodeServices,
+    Inbox,
+    Link,
+    Message,
+    read_message,
+)
 from nics_drl_bridge.nodes.parameters import (
     LOCKSTEP,
     REALTIME,
@@ -194,9 +197,7 @@ class DdsBackend:
         self._now_ns = 0  # simulated time at the end of the last step
         self._can_send = False  # True while the data of the last step are known
 
-        # Callbacks hold no reference to the backend, so that it can be garbage-collected.
-        update_estimator = partial(_update_estimator, self._middleware)
-        self._inbox = Inbox(self._topics, update_estimator, self._slack_ns)
+        self._inbox = Inbox(self._topics, self._slack_ns)
         self._link = Link(namespace, domain_id, stamped=stamped, patience_s=timeout_s)
         try:
             self._subscribe()
@@ -209,7 +210,6 @@ class DdsBackend:
                 self._episodes = EpisodeServices(
                     self._link, simulator, model, world, randomisation
                 )
-            self._link.begin()
             self._link.wait_for_peers(
                 self._topics, self._episodes.clients, timeout_s, self._advise_start()
             )
@@ -222,9 +222,13 @@ class DdsBackend:
         kinds = dict.fromkeys(self._topics, Odometry)
         kinds[SCAN] = LaserScan
         kinds |= {name: sensor_type(sensor) for name, sensor in self._sensors.items()}
+        self._subscriptions = {}
         for topic, kind in kinds.items():
+            # Callbacks hold no reference to the backend, so that it can be garbage-collected.
             put = partial(_put, self._inbox, topic)
-            self._link.node.create_subscription(kind, topic, put, qos.SENSOR, raw=True)
+            self._subscriptions[topic] = self._link.node.create_subscription(
+                kind, topic, put, qos.SENSOR, raw=True
+            )
 
     def _advise_start(self) -> str:
         """Return how to start the simulator, as the end of an error."""
@@ -254,7 +258,6 @@ class DdsBackend:
         self._link.check_open()
         self._link.check_alone()
         self._can_send = False
-        self._inbox.forget_failure()
 
     def receive_first(self, stamp_ns: int, pose: Array) -> RobotView:
         """Wait for the first data of an episode, the second half of a reset.
@@ -266,8 +269,8 @@ class DdsBackend:
         self._now_ns = stamp_ns
         self._middleware.reset(stamp_ns, pose)
         view, _ = self.receive()
-        odometry = self._inbox.get_content(ODOM)
-        _, self._link.frame = read_message(ODOM, wire.frames_of, odometry)
+        odometry = self._inbox.messages[ODOM]
+        _, self._link.frame = read_message(ODOM, wire.frames_of, odometry.content)
         return view
 
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
@@ -283,6 +286,7 @@ class DdsBackend:
             reason = "its data did not arrive, or no episode has begun; call reset()."
             raise BackendError(f"the last step did not end: {reason}")
         # If the simulator ran ahead, its data would be taken for the answer to this command.
+        self._take_waiting()
         self._check_stamps()
         twist = self._robot.to_cmd_vel(command)
         self._can_send = False
@@ -297,9 +301,10 @@ class DdsBackend:
     def receive(self) -> tuple[RobotView, dict[str, Any]]:
         """Wait for the data at the end of the period, the second half of a step.
 
-        Returns the view and `info`. The estimator has the odometry already, see `Inbox`.
+        Returns the view and `info`.
         """
-        messages = self._wait_for_data()
+        self._wait_for_data()
+        messages = self._inbox.messages
         self._check_stamps()
         self._follow_rounding(messages[ODOM].stamp_ns)
         self._take_scan(messages[SCAN])
@@ -317,24 +322,41 @@ class DdsBackend:
         self._can_send = True
         return view, info
 
-    def _wait_for_data(self) -> dict[str, Message]:
-        """Wait for the data of the step; have the simulator repeat what was lost on the way."""
-        deadline = time.monotonic() + self.timeout_s
+    def _wait_for_data(self) -> None:
+        """Wait for the data of the step; have the simulator repeat what was lost on the way.
+
+        The odometry updates the estimator as soon as it is there.
+        """
+        began_s = time.monotonic()
+        repeat_s = began_s + REPEAT_S
+        is_estimated = False
         while True:
-            remaining_s = max(0.0, deadline - time.monotonic())
-            try:
-                return self._inbox.wait(self._now_ns, min(REPEAT_S, remaining_s))
-            except StaleDataError as error:
-                if remaining_s <= REPEAT_S:
-                    raise StaleDataError(
-                        error.topic, error.age_s, self.timeout_s
-                    ) from None
+            if not is_estimated and self._inbox.has(ODOM, self._now_ns):
+                self._take_odometry(self._inbox.messages[ODOM])
+                is_estimated = True
+            late_topic = self._inbox.find_late(self._now_ns)
+            if late_topic is None:
+                return
+            now_s = time.monotonic()
+            if now_s > began_s + self.timeout_s:
+                age_s = self._inbox.messages[late_topic].age_s
+                raise StaleDataError(late_topic, age_s, self.timeout_s)
+            if now_s > repeat_s:
                 self._episodes.repeat()
+                repeat_s = now_s + REPEAT_S
+            self._link.run_callback()
+            self._take_waiting()
+
+    def _take_waiting(self) -> None:
+        """Put all messages that have arrived into the inbox; quicker than a callback for each."""
+        for topic, subscription in self._subscriptions.items():
+            for content in qos.take_waiting(subscription):
+                self._inbox.put(topic, content)
 
     def _check_stamps(self) -> None:
         """Raise BackendError unless the newest data are those of the last step."""
         for topic in self._topics:
-            ahead_ns = self._inbox.get_stamp_ns(topic) - self._now_ns
+            ahead_ns = self._inbox.messages[topic].stamp_ns - self._now_ns
             if -self._slack_ns <= ahead_ns <= self._rounding_ns:
                 continue
             self._link.check_alone()
@@ -349,6 +371,10 @@ class DdsBackend:
         """Take the stamp of the odometry for the end of the step if it is off by rounding only."""
         if abs(odometry_ns - self._now_ns) <= self._rounding_ns:
             self._now_ns = odometry_ns
+
+    def _take_odometry(self, message: Message) -> None:
+        pose, twist = read_message(ODOM, wire.odometry_of, message.content)
+        self._middleware.odometry(message.stamp_ns, message.arrival_ns, pose, twist)
 
     def _take_scan(self, message: Message) -> None:
         device_ranges = read_message(SCAN, wire.ranges_of, message.content)
@@ -375,15 +401,8 @@ class DdsBackend:
         self._link.close()
 
 
-def _put(inbox: Inbox, topic: str, content: bytes) -> object:
-    return inbox.put(topic, content)
-
-
-def _update_estimator(
-    middleware: Middleware, stamp_ns: int, arrival_ns: int, content: bytes
-) -> None:
-    pose, twist = read_message(ODOM, wire.odometry_of, content)
-    middleware.odometry(stamp_ns, arrival_ns, pose, twist)
+def _put(inbox: Inbox, topic: str, content: bytes) -> None:
+    inbox.put(topic, content)
 
 
 class FleetBackend:

@@ -15,11 +15,10 @@ import os
 import signal
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from queue import SimpleQueue
 
 from nics_drl_bridge.files import write_parts
 from nics_drl_bridge.gate.seal import append_checksum
@@ -30,11 +29,10 @@ WRITE = b"W"
 KEPT_S = 30.0  # minimum time span of the lines that are kept [s]
 MOST_LINES = 18_000  # fewer than a replay takes
 MOST_BYTES = 48 * 2**20
-MOST_AT_WORK = 3  # files that may wait for the disk
-PATIENCE_S = 20.0  # longest time for a file once the gate has ended [s]
 FILES_KEPT = 20
 NICENESS = 5
 CHUNK_BYTES = 2**20
+GIVEN_UP = threading.Event()  # set by SIGTERM
 
 
 @dataclass
@@ -87,63 +85,6 @@ class Ring:
         return kept
 
 
-class Disk:
-    """Writes files one after the other, in a thread of its own that may wait for the disk."""
-
-    def __init__(
-        self,
-        answer: Callable[[str, str], None],
-        write: Callable[..., None] = write_parts,
-    ) -> None:
-        self._answer = answer
-        self._write = write
-        self._orders: SimpleQueue[tuple[str, Sequence[str], list[bytes]] | None] = (
-            SimpleQueue()
-        )
-        # permits for files that are not written yet
-        self._room = threading.Semaphore(MOST_AT_WORK)
-        self._given_up = threading.Event()
-        self._thread = threading.Thread(target=self._work, daemon=True)
-        self._thread.start()
-
-    def write(self, path: str, own: Sequence[str], lines: list[bytes]) -> None:
-        """Queue a file for writing; `own` are the names of this gate's files, oldest first."""
-        if not self._room.acquire(blocking=False):
-            self._answer(path, "the files before it are still being written")
-            return
-        self._orders.put((path, own, lines))
-
-    def give_up(self) -> None:
-        """Stop writing the current file, and leave nothing of it behind."""
-        self._given_up.set()
-
-    def finish(self, seconds: float) -> bool:
-        """Wait until all is written, or give up after some time; False if the disk hangs."""
-        self._orders.put(None)
-        self._thread.join(seconds)
-        if self._thread.is_alive():
-            self.give_up()
-            self._thread.join(1.0)
-        return not self._thread.is_alive()
-
-    def _work(self) -> None:
-        for path, own, lines in iter(self._orders.get, None):
-            failed = ""
-            try:
-                self._write(path, self._parts(lines))
-                prune(Path(path).parent, own)
-            except OSError as error:
-                failed = str(error)
-            self._room.release()
-            self._answer(path, failed)
-
-    def _parts(self, lines: list[bytes]) -> Iterator[bytes]:
-        for line in append_checksum(lines):
-            if self._given_up.is_set():
-                raise TimeoutError("it took too long")
-            yield line
-
-
 def prune(folder: Path, own: Sequence[str]) -> None:
     """Remove the oldest files beyond `FILES_KEPT`; those in `own` count as the newest."""
     place = {name: i for i, name in enumerate(own, 1)}
@@ -163,13 +104,34 @@ def read_messages(descriptor: int) -> Iterator[tuple[bytes, bytes]]:
             yield line[:1], line[1:] + b"\n"
 
 
+def write_file(path: str, own: Sequence[str], lines: list[bytes]) -> str:
+    """Write a file and prune its folder; return why that failed, or "".
+
+    `own` are the names of this gate's files, oldest first.
+    """
+    try:
+        write_parts(path, give_parts(lines))
+        prune(Path(path).parent, own)
+    except OSError as error:
+        return str(error)
+    return ""
+
+
+def give_parts(lines: list[bytes]) -> Iterator[bytes]:
+    """Yield the parts of a file. Raises TimeoutError once the gate waits no longer."""
+    for part in append_checksum(lines):
+        if GIVEN_UP.is_set():
+            raise TimeoutError("it took too long")
+        yield part
+
+
 def answer(path: str, failed: str) -> None:
     """Tell the gate that a file is written, or why not."""
     with contextlib.suppress(OSError):  # the gate has ended
         os.write(1, json.dumps({"path": path, "failed": failed}).encode() + b"\n")
 
 
-def serve(messages: Iterator[tuple[bytes, bytes]], disk: Disk) -> None:
+def serve(messages: Iterator[tuple[bytes, bytes]]) -> None:
     """Keep what the gate sends, and write it whenever the gate asks for it."""
     ring = Ring()
     for kind, content in messages:
@@ -180,7 +142,8 @@ def serve(messages: Iterator[tuple[bytes, bytes]], disk: Disk) -> None:
             ring.add(content)
         else:
             order = json.loads(content)
-            disk.write(order["path"], order["own"], ring.lines())
+            path = order["path"]
+            answer(path, write_file(path, order["own"], ring.lines()))
 
 
 def main() -> None:
@@ -189,12 +152,8 @@ def main() -> None:
     with contextlib.suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         os.nice(NICENESS)
-    disk = Disk(answer)
-    signal.signal(signal.SIGTERM, lambda *_: disk.give_up())
-    serve(read_messages(0), disk)
-    os._exit(
-        0 if disk.finish(PATIENCE_S) else 1
-    )  # ends the process even while the disk hangs
+    signal.signal(signal.SIGTERM, lambda *_: GIVEN_UP.set())
+    serve(read_messages(0))
 
 
 if __name__ == "__main__":

@@ -13,7 +13,6 @@ import numpy as np
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import LaserScan
@@ -39,26 +38,21 @@ from nics_drl_bridge.gate.stopping import (
 )
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Array
-from nics_drl_bridge.lidar.sensor import Sensor
-from nics_drl_bridge.lidar.spec import LidarSpec, from_device
 from nics_drl_bridge.middleware.measurement import CMD_VEL, ODOM, SCAN
 from nics_drl_bridge.nodes import (
     command_types,
     device_parameters,
+    gate_inputs,
     parameters,
     qos,
     runner,
     wire,
 )
-from nics_drl_bridge.nodes.conversions import PLANAR, sensor_from_ros, sensor_type
-from nics_drl_bridge.nodes.e_stop_queue import EStopQueue
+from nics_drl_bridge.nodes.conversions import sensor_type
+from nics_drl_bridge.nodes.gate_inputs import TWIST, TWIST_STAMPED, EStopQueue, Sources
 from nics_drl_bridge.nodes.gate_log import GateLog
-from nics_drl_bridge.nodes.sources import Sources
-from nics_drl_bridge.recording.messages import is_rotation
 
 SIM_TIME = "use_sim_time"
-TWIST = "Twist"
-TWIST_STAMPED = "TwistStamped"
 FOREIGN_SETTINGS = {
     command_types.TWIST: f"{parameters.FOREIGN.name}:={TWIST}",
     command_types.TWIST_STAMPED: f"{parameters.FOREIGN.name}:={TWIST_STAMPED}",
@@ -67,7 +61,6 @@ FOREIGN_SETTINGS = {
 STALE_S = 0.05
 # default age limit of a command's scan for a slow lidar, in scan periods
 SCAN_PERIODS = 1.75
-ROTATION = slice(3, 7)  # the quaternion among the numbers of an odometry
 REFUSED = (
     "parameter 'priority': the system does not allow a real-time priority of {priority} ({error}); "
     "allow it by `ulimit -r {priority}`, `LimitRTPRIO={priority}` in its systemd unit or the "
@@ -147,65 +140,6 @@ def _declare_shield(
     return config
 
 
-def scan(lidar: LidarSpec, content: bytes) -> inputs.Scan:
-    """Read a serialised LaserScan. Raises `wire.UNREADABLE`, like the other readers."""
-    ranges = from_device(wire.ranges_of(content), lidar)
-    return inputs.Scan(wire.stamp_of(content), ranges, wire.angles_of(content))
-
-
-def reading(sensor: Sensor, content: bytes) -> inputs.SensorReading:
-    """Read a serialised message of a further sensor."""
-    points = sensor.points(sensor_from_ros(sensor, content))
-    return inputs.SensorReading(wire.stamp_of(content), sensor.name, points)
-
-
-def odometry(content: bytes) -> inputs.Odometry:
-    """Read a serialised Odometry; without a rotation its pose is NaN."""
-    pose, twist = wire.odometry_of(content)
-    if not is_rotation(*wire.numbers_of(content)[ROTATION].tolist()):
-        pose = np.full(3, np.nan)
-    return inputs.Odometry(wire.stamp_of(content), pose, twist)
-
-
-def estimate(content: bytes) -> inputs.Estimate:
-    """Read a serialised Odometry of an estimator."""
-    pose, twist = wire.odometry_of(content)
-    covariance = wire.numbers_of(content)[wire.POSE_COVARIANCE : wire.TWIST].reshape(
-        6, 6
-    )
-    return inputs.Estimate(twist, pose, covariance[PLANAR].astype(np.float64))
-
-
-def command(content: bytes) -> inputs.Command:
-    """Read a serialised TwistStamped."""
-    return inputs.Command(
-        wire.stamp_of(content), np.array(wire.stamped_twist_of(content))
-    )
-
-
-def foreign_command(
-    kind: str, oldest_ns: int, newest: inputs.Scan | None, content: bytes
-) -> inputs.Command:
-    """Read a command of another controller; it counts as computed from the newest scan.
-
-    Its stamp, if any, must not be older than `oldest_ns`. Raises `wire.UNREADABLE`.
-    """
-    if newest is None:
-        raise ValueError("no scan has arrived yet from which it could be computed")
-    if kind == TWIST:
-        return inputs.Command(newest.stamp_ns, np.array(wire.twist_of(content)))
-    if 0 < wire.stamp_of(content) < oldest_ns:
-        raise ValueError(
-            "its stamp is older than command_age; is use_sim_time the same at both?"
-        )
-    return replace(command(content), stamp_ns=newest.stamp_ns)
-
-
-def e_stop(content: bytes) -> inputs.EStop:
-    """Read a serialised Bool."""
-    return inputs.EStop(wire.truth_of(content))
-
-
 def take_priority(priority: int) -> str:
     """Give all present threads SCHED_FIFO, unless 0; return reason and fix if refused, or ""."""
     if priority == 0:
@@ -227,11 +161,11 @@ def take_priority(priority: int) -> str:
     return ""
 
 
-class CommandGate(qos.QosWatch):
+class CommandGate(qos.BridgeNode):
     """The node between `cmd_vel_raw` and `cmd_vel`; it has its own process and starts disarmed."""
 
-    def __init__(self, context: Context) -> None:
-        super().__init__("command_gate", context=context)
+    def __init__(self, **options: Any) -> None:
+        super().__init__("command_gate", **options)
         model = runner.declare_model(self)
         logger = self.get_logger()
         self._lidar = model.lidar
@@ -251,7 +185,7 @@ class CommandGate(qos.QosWatch):
         runner.declare_row(self, parameters.FOREIGN)
         self._frame = str(runner.declare_row(self, parameters.ROBOT_FRAME))
         fault = parameters.frame_fault(
-            self._parameters.values(), parameters.ROBOT_FRAME.name
+            self.get_parameters_by_prefix("").values(), parameters.ROBOT_FRAME.name
         )
         if fault:
             raise ConfigError(fault)
@@ -271,13 +205,20 @@ class CommandGate(qos.QosWatch):
         raw = device_parameters.choice(self, parameters.FOREIGN.name, kinds)
         self._raw_kind = command_types.name_of(stamped=raw != TWIST)
         self._raw_types = command_types.TypeWatch(self, inputs.RAW, FOREIGN_SETTINGS)
-        reader = command if raw == "none" else partial(self._foreign, raw)
+        reader = (
+            gate_inputs.read_command if raw == "none" else partial(self._foreign, raw)
+        )
         readers: tuple[tuple[Any, str, Callable[[bytes], inputs.Input], Any], ...] = (
-            (LaserScan, SCAN, partial(scan, self._lidar), qos.SENSOR),
+            (LaserScan, SCAN, partial(gate_inputs.read_scan, self._lidar), qos.SENSOR),
             (Odometry, ODOM, self._read_odometry, qos.SENSOR),
-            (Odometry, inputs.ESTIMATE, estimate, qos.SENSOR),
+            (Odometry, inputs.ESTIMATE, gate_inputs.read_estimate, qos.SENSOR),
             *(
-                (sensor_type(sensor), sensor.name, partial(reading, sensor), qos.SENSOR)
+                (
+                    sensor_type(sensor),
+                    sensor.name,
+                    partial(gate_inputs.read_sensor, sensor),
+                    qos.SENSOR,
+                )
                 for sensor in self._sensors
             ),
         )
@@ -328,7 +269,7 @@ class CommandGate(qos.QosWatch):
         messages = []
         for part in contents:
             try:
-                messages.append(e_stop(part))
+                messages.append(gate_inputs.read_e_stop(part))
             except wire.UNREADABLE as error:
                 self._log.refuse(inputs.E_STOP, f"{inputs.E_STOP}: {error}")
                 self._decide(
@@ -350,7 +291,7 @@ class CommandGate(qos.QosWatch):
         self._decide(inputs.Tick())
 
     def _read_odometry(self, content: bytes) -> inputs.Odometry:
-        event = odometry(content)
+        event = gate_inputs.read_odometry(content)
         if not self._frame:  # no parameter names it
             self._frame = wire.frames_of(content)[1]
         return event
@@ -358,7 +299,9 @@ class CommandGate(qos.QosWatch):
     def _foreign(self, kind: str, content: bytes) -> inputs.Command:
         age_ns = round(self._config.command_age_s * NS_PER_S)
         oldest_ns = int(self.get_clock().now().nanoseconds) - age_ns
-        return foreign_command(kind, oldest_ns, self._state.scan, content)
+        return gate_inputs.read_foreign_command(
+            kind, oldest_ns, self._state.scan, content
+        )
 
     def _arm(self) -> tuple[bool, str]:
         return self._answer(inputs.Arm(self.count_publishers(self._out.topic_name)))

@@ -79,7 +79,7 @@ def declare_device(node: Node, laser_frame: str) -> None:
         if row.name == GIVEN:
             row = row._replace(default=START in given_values(node))
         declare_row(node, row)
-    fault = frame_fault(node._parameters.values())
+    fault = frame_fault(node.get_parameters_by_prefix("").values())
     if fault:
         raise ConfigError(fault)
 

@@ -19,12 +19,11 @@ from nics_drl_bridge.nodes import black_box_writer
 from nics_drl_bridge.nodes.black_box_writer import (
     ENTRY,
     FILES_KEPT,
-    PATIENCE_S,
     STATE,
     WRITE,
 )
-from nics_drl_bridge.nodes.child_python import module_command
-from nics_drl_bridge.nodes.output import widen_pipe
+from nics_drl_bridge.nodes.node_process import module_command
+from nics_drl_bridge.nodes.own_process import widen_pipe
 from nics_drl_bridge.nodes.runner import Condition
 
 BURST_S = (
@@ -37,7 +36,7 @@ CLOSING_S = 0.7  # longest wait at the end for files that are being written [s]
 GRACE_S = 0.5  # time for the writer to clean up files that it gives up [s]
 POLL_S = 0.005
 # time without an answer after which a file counts as not written [s]
-OVERDUE_S = PATIENCE_S + 5.0
+OVERDUE_S = 25.0
 RESTART_S = 5.0  # shortest time between two starts of the writer [s]
 STATE_S = 10.0  # time between two states of the gate in the black box [s]
 MOST_ENTRIES = 5_000  # between two states

@@ -1,4 +1,8 @@
-"""Link to a robot: the rclpy entities of this process, which never leave the robot moving."""
+"""Link to a robot: the rclpy entities of this process, which never leave the robot moving.
+
+In lock-step the caller's thread runs the callbacks while it waits. In real time a thread of the
+link does so from `begin` on, because topics and the command's timeout go on between two steps.
+"""
 
 from __future__ import annotations
 
@@ -14,14 +18,14 @@ import weakref
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from geometry_msgs.msg import Twist, TwistStamped
 from numpy.typing import NDArray
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.context import Context
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
@@ -31,13 +35,12 @@ from nics_drl_bridge.config import parse_namespace
 from nics_drl_bridge.env.guard import uninterrupted
 from nics_drl_bridge.errors import BackendError, ModelError
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import Start
+from nics_drl_bridge.interface import S_PER_NS, Start
 from nics_drl_bridge.middleware.measurement import CMD_VEL
-from nics_drl_bridge.nodes import qos
+from nics_drl_bridge.nodes import qos, wire
 from nics_drl_bridge.nodes.command_types import deaf_subscribers, heard_stamped
-from nics_drl_bridge.nodes.ending import ENDING
-from nics_drl_bridge.nodes.executor import StandingExecutor
 from nics_drl_bridge.nodes.listener import holds, open_context
+from nics_drl_bridge.nodes.own_process import ENDING
 from nics_drl_bridge.nodes.parameters import stamped_by_default
 from nics_drl_bridge.nodes.runner import last_word
 from nics_drl_bridge.nodes.wire import stamped_twist_to_bytes, twist_to_bytes
@@ -45,7 +48,9 @@ from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.world_set import AnyWorld
 
 SPIN_S = 0.2
-POLL_S = 0.002
+# Longest wait of the caller's thread for a callback, between two looks at its condition [s]. Always
+# the same, because rclpy drops callbacks that are ready when the timeout changes.
+POLL_S = 0.01
 NO_RANDOMISATION = "none"
 # a request to repeat data counts as lost if unanswered for this long [s]
 LOST_S = 1.0
@@ -59,7 +64,7 @@ def _exit_at_signals() -> None:
 
 
 class Link:
-    """A node in its own context and thread; its end or silence leaves a zero command behind."""
+    """A node in its own context; its end or silence leaves a zero command behind."""
 
     def __init__(
         self,
@@ -83,7 +88,7 @@ class Link:
                 Parameter(name, value=value)
                 for name, value in (parameters or {}).items()
             ]
-            self.node = qos.QosWatch(
+            self.node = qos.BridgeNode(
                 "bridge_env",
                 namespace=namespace,
                 context=self._context,
@@ -92,6 +97,9 @@ class Link:
             )
             self._resources.node = self.node
             self._began_s = time.monotonic()
+            self._executor = SingleThreadedExecutor(context=self._context)
+            self._executor.add_node(self.node)
+            self._resources.executor = self._executor
             if stamped is None:
                 stamped = self.hears_stamped(command_topic, patience_s)
             # frame of the robot, in which commands are given; unknown until it is set
@@ -109,24 +117,41 @@ class Link:
             self.close()
             raise
 
+    def wait_until(self, condition: Callable[[], Any], seconds: float) -> bool:
+        """Wait until a condition holds, while callbacks run; False if it does not in time."""
+        if self._resources.thread is not None:
+            return holds(condition, seconds, POLL_S)
+        deadline = time.monotonic() + seconds
+        while not condition():
+            if time.monotonic() > deadline:
+                return False
+            self.run_callback()
+        return True
+
+    def run_callback(self) -> None:
+        """Wait for a moment for a callback, and run it; only without the link's own thread."""
+        try:
+            self._executor.spin_once(timeout_sec=POLL_S)
+        except ExternalShutdownException:
+            self.check_open()
+
     def hears_stamped(self, topic: str, patience_s: float) -> bool:
         """Wait for a subscriber of commands; True if it expects stamped ones, or by default."""
         name = self.node.resolve_topic_name(topic)
-        holds(lambda: self.node.count_subscribers(name) > 0, patience_s, POLL_S)
+        self.wait_until(lambda: self.node.count_subscribers(name) > 0, patience_s)
         heard = heard_stamped(self.node, topic)
         return stamped_by_default() if heard is None else heard
 
     def begin(self) -> None:
-        """Start the executor's thread; call it once all subscriptions exist."""
-        gc.collect()  # now, because later it may take 0.1 s while the robot moves
+        """Let a thread run the callbacks; call it once all subscriptions exist."""
         thread = threading.Thread(
             target=_spin,
-            args=(self._context, self.node, self._timeout),
+            args=(self._executor, self._timeout),
             daemon=True,
             name="dds_backend",
         )
-        thread.start()
         self._resources.thread = thread
+        thread.start()
 
     def send(self, twist: NDArray[np.float64], stamp_ns: int = 0) -> None:
         """Publish linear.x, linear.y, angular.z (3,); for NaN or inf, a zero and BackendError."""
@@ -157,12 +182,12 @@ class Link:
             raise BackendError("this backend is closed; make another one.")
 
     def call(self, client: Any, request: Any, timeout_s: float) -> Any:
-        """Call a service; the executor's thread completes the future. Raises BackendError."""
+        """Call a service, and return its answer. Raises BackendError."""
         deadline = time.monotonic() + timeout_s
         # A server that hung for long was dropped and must be discovered again.
-        holds(client.service_is_ready, timeout_s, POLL_S)
+        self.wait_until(client.service_is_ready, timeout_s)
         future = client.call_async(request)
-        if not holds(future.done, deadline - time.monotonic(), POLL_S):
+        if not self.wait_until(future.done, deadline - time.monotonic()):
             client.remove_pending_request(future)
             reason = f"no answer within {timeout_s:g} s; look at the simulator's log."
             raise BackendError(f"service {client.srv_name}: {reason}")
@@ -205,7 +230,9 @@ class Link:
             needed[f"service {service}"] = client.service_is_ready
         deadline = self._began_s + patience_s
         left_s = deadline - time.monotonic()
-        if not holds(lambda: all(there() for there in needed.values()), left_s, POLL_S):
+        if not self.wait_until(
+            lambda: all(there() for there in needed.values()), left_s
+        ):
             missing = ", no ".join(
                 name for name, there in needed.items() if not there()
             )
@@ -217,8 +244,11 @@ class Link:
                 f"after {patience_s:g} s there is still no {missing}; {advice}"
             )
         # A publisher that was killed stays in the graph for a while.
-        holds(lambda: not self.others_command(), deadline - time.monotonic(), POLL_S)
+        left_s = deadline - time.monotonic()
+        self.wait_until(lambda: not self.others_command(), left_s)
         self.check_alone()
+        self._resources.has_peers = True
+        gc.collect()  # now, because later it may take 0.1 s while the robot moves
 
     def close(self) -> None:
         """Publish a zero command and end the node."""
@@ -272,41 +302,38 @@ class Resources:
     context: Context
     node: Node | None = None
     timeout: CommandTimeout | None = None
-    thread: threading.Thread | None = None  # destroys the node, once it runs
+    executor: SingleThreadedExecutor | None = None
+    thread: threading.Thread | None = None  # of the executor, in real time
+    has_peers: bool = False  # before that, nothing was commanded
 
 
-def _spin(context: Context, node: Node, timeout: CommandTimeout) -> None:
-    executor = StandingExecutor(context)
-    executor.add_node(node)
+def _spin(executor: SingleThreadedExecutor, timeout: CommandTimeout) -> None:
     try:
-        while context.ok():
+        while executor.context.ok():
             executor.spin_once(timeout_sec=SPIN_S)
             timeout.look()
     except ExternalShutdownException:
         pass
     finally:
-        if context.ok():  # after an error, since nothing would notice old data
+        if executor.context.ok():  # after an error, since nothing would notice old data
             timeout.end()
-            context.try_shutdown()
-        executor.shutdown(timeout_sec=1.0)
-        node.destroy_node()
+            executor.context.try_shutdown()
 
 
 def _shut_down(opened: Resources) -> None:
     # Otherwise Python may exit while a thread is inside the middleware's library.
     with uninterrupted():
-        if opened.thread is None:  # it never began, so nothing was commanded
-            if opened.node is not None:
-                opened.node.destroy_node()
-            opened.context.try_shutdown()
-            return
         if opened.context.ok():
-            if opened.timeout is not None:
+            if opened.timeout is not None and opened.has_peers:
                 opened.timeout.end()
             opened.context.try_shutdown()
         # Garbage collection may run this in any thread, including the link's own.
-        if opened.thread is not threading.current_thread():
+        if opened.thread not in (None, threading.current_thread()):
             opened.thread.join(timeout=2.0)
+        if opened.executor is not None:
+            opened.executor.shutdown(timeout_sec=1.0)
+        if opened.node is not None:
+            opened.node.destroy_node()
 
 
 class CommandTimeout:
@@ -420,3 +447,67 @@ class EpisodeServices:
                 runs = f"the simulator runs the {key} {answer.get(key)!r}, this env {mine!r}"
                 raise ModelError(f"{runs}; start both with the same {key}.")
         return int(answer["stamp_ns"])
+
+
+T = TypeVar("T")
+
+
+class Message(NamedTuple):
+    """A serialised message; the defaults stand for a topic without any."""
+
+    stamp_ns: int = -1
+    arrival_ns: int = 0  # on the monotonic clock
+    content: bytes = b""
+
+    @property
+    def age_s(self) -> float:
+        """Time since its arrival [s]; inf if there is none."""
+        if not self.content:
+            return math.inf
+        return (time.monotonic_ns() - self.arrival_ns) * S_PER_NS
+
+
+class Inbox:
+    """The newest message of each topic.
+
+    Args:
+        topics: names of the topics.
+        slack_ns: messages may be older than an awaited stamp by this much.
+    """
+
+    def __init__(self, topics: tuple[str, ...], slack_ns: int) -> None:
+        self._slack_ns = slack_ns
+        self.messages = dict.fromkeys(topics, Message())
+
+    def clear(self) -> None:
+        """Forget all messages."""
+        self.messages = dict.fromkeys(self.messages, Message())
+
+    def put(self, topic: str, content: bytes) -> None:
+        """Store a message. Raises BackendError if it is damaged."""
+        stamp_ns = read_message(topic, wire.stamp_of, content)
+        self.messages[topic] = Message(stamp_ns, time.monotonic_ns(), content)
+
+    def has(self, topic: str, stamp_ns: int) -> bool:
+        """True if the message of a stamp is there."""
+        return self.messages[topic].stamp_ns + self._slack_ns >= stamp_ns
+
+    def find_late(self, stamp_ns: int) -> str | None:
+        """Return the first topic whose message of a stamp is not there; None if all are."""
+        for topic in self.messages:
+            if not self.has(topic, stamp_ns):
+                return topic
+        return None
+
+    def find_newest_ns(self) -> int:
+        """Return the newest stamp of any topic [ns]; -1 if there is no message."""
+        return max(message.stamp_ns for message in self.messages.values())
+
+
+def read_message(topic: str, read: Callable[[bytes], T], content: bytes) -> T:
+    """Deserialise a message by `read`. Raises BackendError if it is damaged."""
+    try:
+        return read(content)
+    except wire.UNREADABLE as error:
+        reason = f"a message can't be read ({error}); look at who publishes it."
+        raise BackendError(f"topic {topic!r}: {reason}") from None

@@ -8,12 +8,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from rclpy.context import Context
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 
 from nics_drl_bridge.errors import BackendError
-from nics_drl_bridge.nodes.executor import StandingExecutor
-from nics_drl_bridge.nodes.transport import OF_THIS_PROCESS
 
 SPIN_S = 0.1
 UNKNOWN = "UnknownROSArgsError"  # of rclpy, which exports it nowhere
@@ -23,13 +21,7 @@ GREATEST_DOMAIN_ID = 232  # above it, DDS has no ports
 def open_context(
     args: Sequence[str] | None = None, domain_id: int | None = None
 ) -> Context:
-    """Return a new context, on this machine unless the environment sets a range. BackendError."""
-
-    def make() -> Context:
-        context = Context()
-        context.init(None if args is None else list(args), domain_id=domain_id)
-        return context
-
+    """Return a new context. Raises BackendError."""
     if domain_id is None:
         asked = os.environ.get("ROS_DOMAIN_ID", "0")
     else:
@@ -40,7 +32,9 @@ def open_context(
             f"ROS 2 does not start: domain {asked} is above {GREATEST_DOMAIN_ID}."
         )
     try:
-        return OF_THIS_PROCESS.open(make)
+        context = Context()
+        context.init(None if args is None else list(args), domain_id=domain_id)
+        return context
     except RuntimeError as error:
         if type(error).__name__ == UNKNOWN:
             fix = "as in `--ros-args -p NAME:=VALUE -r FROM:=TO --params-file FILE`"
@@ -64,7 +58,7 @@ def holds(condition: Callable[[], Any], seconds: float, poll_s: float) -> bool:
 
 def spin(node: Node, stopping: threading.Event) -> None:
     """Spin a node until `stopping` is set or its context has been shut down."""
-    executor = StandingExecutor(node.context)
+    executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
     with contextlib.suppress(ExternalShutdownException):
         while node.context.ok() and not stopping.is_set():

@@ -3,9 +3,9 @@
 import math
 from collections.abc import Mapping, Sequence
 from functools import partial
+from typing import Any
 
 from nav_msgs.msg import Odometry
-from rclpy.context import Context
 
 from nics_drl_bridge.errors import LONGEST, shorten
 from nics_drl_bridge.gate import inputs
@@ -13,11 +13,10 @@ from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.middleware.measurement import Health, Rejection
 from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes import conversions, qos, runner
-from nics_drl_bridge.nodes.lifecycle import ManagedNode
 from nics_drl_bridge.nodes.map_to_odom import MapToOdom, odom_in_map
 from nics_drl_bridge.nodes.parameters import BASE_FRAME, MAP_FRAME, middleware
 from nics_drl_bridge.nodes.robot_topics import RobotTopics
-from nics_drl_bridge.nodes.runner import ACTIVE, UNCONFIGURED
+from nics_drl_bridge.nodes.runner import ACTIVE, UNCONFIGURED, ManagedNode
 
 SILENCE_S = 5.0  # diagnostics warn of a topic that has been silent for this long [s]
 
@@ -25,8 +24,8 @@ SILENCE_S = 5.0  # diagnostics warn of a topic that has been silent for this lon
 class MiddlewareNode(ManagedNode):
     """Listens to a robot's topics; publishes `odometry/filtered` and `/diagnostics`."""
 
-    def __init__(self, context: Context) -> None:
-        super().__init__("middleware_node", context, middleware())
+    def __init__(self, **options: Any) -> None:
+        super().__init__("middleware_node", middleware(), **options)
         self._rejected: dict[Rejection, int] = {}  # counts at the last look
         runner.serve(self, "~/reset", self._reset)
         runner.diagnose(self, "topics", self._look)

@@ -11,8 +11,19 @@ from typing import TypeVar
 
 from nics_drl_bridge.config import PACKAGE, dump_yaml
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.nodes.child_python import module_command
 from nics_drl_bridge.nodes.starting import NodeStart, prefix_of
+
+
+def module_command(module: str) -> list[str]:
+    """Return the command that runs a module; its arguments may follow.
+
+    `python -m` looks for modules in the working folder first. That folder may hold arbitrary data,
+    such as a model with a file `json.py`. PYTHONSAFEPATH prevents this only since Python 3.11.
+    """
+    path = f"import sys; sys.path[:] = {sys.path!r}"
+    run = f"from runpy import run_module; run_module({module!r}, run_name='__main__')"
+    return [sys.executable, "-c", f"{path}; {run}"]
+
 
 PR_SET_PDEATHSIG = 1
 PATIENCE_S = 5.0  # time limit for a process to end [s]

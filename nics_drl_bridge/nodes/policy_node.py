@@ -4,10 +4,10 @@ import time
 import traceback
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped, TwistStamped
-from rclpy.context import Context
 
 from nics_drl_bridge.errors import BridgeError, ConfigError, shorten
 from nics_drl_bridge.gate import inputs
@@ -21,11 +21,10 @@ from nics_drl_bridge.nodes import conversions, qos, runner
 from nics_drl_bridge.nodes.follow_path import PathActions, Wish
 from nics_drl_bridge.nodes.goal_answer import GoalAnswer
 from nics_drl_bridge.nodes.goal_frames import GoalFrames
-from nics_drl_bridge.nodes.lifecycle import ManagedNode
 from nics_drl_bridge.nodes.nav2_parameters import ControllerParameters
 from nics_drl_bridge.nodes.parameters import policy
 from nics_drl_bridge.nodes.robot_topics import RobotTopics
-from nics_drl_bridge.nodes.runner import ACTIVE, UNCONFIGURED
+from nics_drl_bridge.nodes.runner import ACTIVE, UNCONFIGURED, ManagedNode
 from nics_drl_bridge.policy.file.stateful import begin, resume
 from nics_drl_bridge.policy.pacing import ActionPace, Answer, Deadline
 from nics_drl_bridge.policy.policies import open_policy
@@ -39,8 +38,8 @@ LONGEST_REASON = 300  # maximum length of a policy's error text [characters]
 class PolicyNode(ManagedNode):
     """Answers each scan with a `cmd_vel_raw` of the same stamp, until the goal is reached."""
 
-    def __init__(self, context: Context) -> None:
-        super().__init__("policy_node", context, policy())
+    def __init__(self, **options: Any) -> None:
+        super().__init__("policy_node", policy(), **options)
         self._nav2 = ControllerParameters(self)
         self.ignores = (
             self._nav2.ignores

@@ -4,13 +4,13 @@ Reliable publishers match all subscribers, so this package publishes reliably, a
 best effort wherever a lost message does no harm. Late joiners get no old data, which would mislead.
 """
 
+import contextlib
 import copy
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from typing import Any
 
 from rclpy import qos as rclpy_qos
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
@@ -18,20 +18,18 @@ from rclpy.qos import QoSPolicyKind, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 
-from nics_drl_bridge.errors import ConfigError, suggest
+from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.gate import inputs
 from nics_drl_bridge.middleware.measurement import CMD_VEL
 from nics_drl_bridge.recording.messages import Offer
 
 try:
     from rclpy.event_handler import (
-        PublisherEventCallbacks,
         SubscriptionEventCallbacks,
         UnsupportedEventTypeError,
     )
 except ModuleNotFoundError:  # Humble
     from rclpy.qos_event import (
-        PublisherEventCallbacks,
         SubscriptionEventCallbacks,
         UnsupportedEventTypeError,
     )
@@ -93,117 +91,80 @@ LATCHED = profile_of(Offer(1, transient_local=True))
 # as the diagnostic aggregator expects `/diagnostics`
 DIAGNOSTICS = profile_of(Offer(10))
 
-MOMENT_S = 0.5
 UNKNOWN = "_UNKNOWN_"
 MOST_WAITING = 10_000  # most messages taken at once, in case a publisher never pauses
 
+# parameters of every node, which rclpy itself declares
+RCLPY_PARAMETERS = {"use_sim_time", "start_type_description_service"}
 # prefix of the parameters that override a topic's quality of service
 OVERRIDES = "qos_overrides."
 # Topics (names before remapping) whose quality of service decides whether a robot stops.
 FIXED_TOPICS = (CMD_VEL, inputs.RAW, inputs.E_STOP, "ackermann_cmd")
-CHOICES: dict[str, Any] = {
-    "history": rclpy_qos.HistoryPolicy,
-    "reliability": rclpy_qos.ReliabilityPolicy,
-    "durability": rclpy_qos.DurabilityPolicy,
-    "liveliness": rclpy_qos.LivelinessPolicy,
-}
-FLAG = "avoid_ros_namespace_conventions"
 
 
 def given_values(node: Node) -> dict[str, Parameter]:
-    """Return the node's own dictionary of initial values, which rclpy does not expose publicly."""
-    values: dict[str, Parameter] = getattr(node, "_parameter_overrides", {})
+    """Return the initial values that the user has given to a node's parameters, by their names."""
+    values: dict[str, Parameter] = getattr(node, "given", {})
     return values
 
 
-def overridden_policies(node: Node, topic: str, end: str) -> list[QoSPolicyKind]:
-    """Return the policies that a user's parameters set for the `end` of a topic, if any.
+@contextlib.contextmanager
+def overriding(node: Node, topic: str, end: str) -> Iterator[dict[str, Any]]:
+    """Yield the options with which rclpy makes a `publisher` or `subscription` of a topic.
 
-    `end` is `publisher` or `subscription`. Raises ConfigError for a topic whose quality of service
-    is fixed, and for a policy or value that does not exist.
+    Raises ConfigError for a topic whose quality of service is fixed, and within the context for a
+    value that rclpy refuses.
     """
     prefix = f"{OVERRIDES}{node.resolve_topic_name(topic)}.{end}."
-    values = given_values(node)
-    policies = []
-    for name in sorted(values):
-        if not name.startswith(prefix):
-            continue
-        if topic.rsplit("/", 1)[-1] in FIXED_TOPICS:
-            reason = "can't be overridden, because the robot's stop depends on it"
-            raise ConfigError(f"parameter {name!r}: {reason}; leave it out.")
-        policy = name.removeprefix(prefix)
-        _check_override(name, policy, values[name].value)
-        policies.append(QoSPolicyKind[policy.upper()])
-    return policies
-
-
-def _check_override(name: str, policy: str, value: Any) -> None:
-    known = [kind.name.lower() for kind in QoSPolicyKind if kind.name != "INVALID"]
-    if policy not in known:
-        raise ConfigError(
-            f"parameter {name!r}: there is no policy {policy!r}; "
-            f"{suggest(policy, known)}"
-        )
-    if policy in CHOICES:
-        values = [
-            choice.name.lower()
-            for choice in CHOICES[policy]
-            if choice.name != "UNKNOWN"
-        ]
-        if str(value).lower() not in values:
-            raise ConfigError(
-                f"parameter {name!r}: is {value!r}; {suggest(str(value), values)}"
-            )
+    given = given_values(node)
+    names = sorted(name for name in given if name.startswith(prefix))
+    if names and topic.rsplit("/", 1)[-1] in FIXED_TOPICS:
+        reason = "can't be overridden, because the robot's stop depends on it"
+        raise ConfigError(f"parameter {names[0]!r}: {reason}; leave it out.")
+    if not names:
+        yield {}
         return
-    is_flag = isinstance(value, bool)
-    if (policy == FLAG) is not is_flag or not isinstance(value, int) or value < 0:
-        needed = "true or false" if policy == FLAG else "a whole number of 0 or more"
-        raise ConfigError(f"parameter {name!r}: must be {needed}, not {value!r}.")
+    kinds = [kind for kind in QoSPolicyKind if f"{prefix}{kind.name.lower()}" in given]
+    try:
+        yield {"qos_overriding_options": QoSOverridingOptions(kinds)}
+    except RuntimeError as error:
+        fix = "correct it, or leave it out"
+        raise ConfigError(f"parameter {names[0]!r}: {error}; {fix}.") from None
 
 
-class QosWatch(Node):
-    """A node whose publishers and subscriptions report peers that they can't talk to.
+class BridgeNode(Node):
+    """A node whose topics' quality of service can be overridden, except for `FIXED_TOPICS`.
 
-    As in any ROS 2 node, parameters `qos_overrides.TOPIC.publisher.POLICY` (or `subscription`)
-    override the quality of service of a topic, except for `FIXED_TOPICS`.
+    The parameters are `qos_overrides.TOPIC.publisher.POLICY` (or `subscription`), as in any ROS 2
+    node. The keyword arguments are those of rclpy's Node.
     """
+
+    def __init__(self, name: str, **options: Any) -> None:
+        # Declared for a moment, because rclpy does not tell otherwise which values were given.
+        super().__init__(
+            name, automatically_declare_parameters_from_overrides=True, **options
+        )
+        self.given = self.get_parameters_by_prefix("")
+        for given in self.given.keys() - RCLPY_PARAMETERS:
+            self.undeclare_parameter(given)
 
     def create_publisher(
         self, kind: Any, topic: str, qos: Any, **options: Any
     ) -> Publisher:
         """Create a publisher; see rclpy."""
-        profile = copied(qos)
-        chosen = self.publisher_options(topic, profile)
-        return super().create_publisher(kind, topic, profile, **chosen | options)
-
-    def publisher_options(self, topic: str, profile: QoSProfile) -> dict[str, Any]:
-        """Return the options for a publisher that rclpy makes without `create_publisher`.
-
-        `profile` is changed where a user has overridden it. Raises ConfigError.
-        """
-        warn = partial(self._warn, topic=topic, qos=profile, publishing=True)
-        options: dict[str, Any] = {
-            "event_callbacks": PublisherEventCallbacks(incompatible_qos=warn)
-        }
-        policies = overridden_policies(self, topic, "publisher")
-        if policies:
-            options["qos_overriding_options"] = QoSOverridingOptions(policies)
-        return options
+        with overriding(self, topic, "publisher") as chosen:
+            return super().create_publisher(
+                kind, topic, copied(qos), **chosen, **options
+            )
 
     def create_subscription(
         self, kind: Any, topic: str, callback: Any, qos: Any, **options: Any
     ) -> Subscription:
         """Create a subscription; see rclpy."""
-        profile = copied(qos)
-        chosen: dict[str, Any] = {
-            "event_callbacks": self._subscription_events(topic, profile)
-        }
-        policies = overridden_policies(self, topic, "subscription")
-        if policies:
-            chosen["qos_overriding_options"] = QoSOverridingOptions(policies)
-        return super().create_subscription(
-            kind, topic, callback, profile, **chosen | options
-        )
+        with overriding(self, topic, "subscription") as chosen:
+            return super().create_subscription(
+                kind, topic, callback, copied(qos), **chosen, **options
+            )
 
     def create_lossless_subscription(
         self,
@@ -214,58 +175,17 @@ class QosWatch(Node):
         lost: Callable[[int], None],
     ) -> Subscription:
         """Create a raw subscription that reports how many messages the middleware has lost."""
-        events = self._subscription_events(topic, qos)
-        events.message_lost = lambda event: lost(event.total_count_change)
-        options = {"event_callbacks": events, "raw": True}
+        create = partial(self.create_subscription, kind, topic, callback, qos, raw=True)
+        events = SubscriptionEventCallbacks(
+            message_lost=lambda event: lost(event.total_count_change)
+        )
         try:
-            return self.create_subscription(kind, topic, callback, qos, **options)
+            return create(event_callbacks=events)
         except UnsupportedEventTypeError:
             self.get_logger().warning(
                 f"{topic}: this middleware does not report lost messages"
             )
-            return self.create_subscription(kind, topic, callback, qos, raw=True)
-
-    def _subscription_events(self, topic: str, qos: Any) -> SubscriptionEventCallbacks:
-        warn = partial(self._warn, topic=topic, qos=qos, publishing=False)
-        return SubscriptionEventCallbacks(incompatible_qos=warn)
-
-    def _warn(self, event: Any, topic: str, qos: Any, publishing: bool) -> None:
-        """Warn after a moment, because a peer's name is known later than its quality of service."""
-        policy = rclpy_qos.qos_policy_name_from_kind(event.last_policy_kind)
-        resolved = self.resolve_topic_name(topic)
-
-        def say() -> None:
-            self.destroy_timer(timer)
-            ours = qos if isinstance(qos, QoSProfile) else QoSProfile(depth=qos)
-            name, theirs = self._misfit(resolved, ours, publishing)
-            own, other = (_value(profile, policy) for profile in (ours, theirs))
-            offered, asked = (own, other) if publishing else (other, own)
-            if publishing:
-                cure = f"ask for {own}"
-            else:
-                cure = f"offer {own}, or put a relay between"
-            self.get_logger().warning(
-                f"{resolved}: no message passes between this node and {name}: the {policy.lower()} "
-                f"that the publisher offers ({offered}) is weaker than what the subscription "
-                f"asks for ({asked}); let {name} {cure}."
-            )
-
-        timer = self.create_timer(
-            MOMENT_S, say, clock=Clock(clock_type=ClockType.STEADY_TIME)
-        )
-
-    def _misfit(
-        self, topic: str, ours: QoSProfile, publishing: bool
-    ) -> tuple[str, Any]:
-        kind = "subscriptions" if publishing else "publishers"
-        for peer in reversed(getattr(self, f"get_{kind}_info_by_topic")(topic)):
-            pair = (ours, peer.qos_profile) if publishing else (peer.qos_profile, ours)
-            if (
-                rclpy_qos.qos_check_compatible(*pair)[0]
-                == rclpy_qos.QoSCompatibility.ERROR
-            ):
-                return owner(peer) or "a peer", peer.qos_profile
-        return "a peer", None
+            return create()
 
 
 def take_waiting(subscription: Subscription) -> list[bytes]:
@@ -283,11 +203,6 @@ def take_waiting(subscription: Subscription) -> list[bytes]:
 def copied(qos: Any) -> QoSProfile:
     """Return a copy of a profile, because rclpy writes overridden policies into its argument."""
     return copy.copy(qos) if isinstance(qos, QoSProfile) else QoSProfile(depth=qos)
-
-
-def _value(profile: Any, policy: str) -> str:
-    value = getattr(profile, policy.lower(), None)
-    return str(getattr(value, "name", value) or "unknown").lower().replace("_", " ")
 
 
 def owner(end: Any) -> str | None:

@@ -3,7 +3,7 @@
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -13,7 +13,6 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from numpy.typing import ArrayLike
-from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
@@ -182,16 +181,11 @@ class DriveResult:
     line: str  # one sentence about it
 
 
-class RecordNode(qos.QosWatch):
+class RecordNode(qos.BridgeNode):
     """Sends `cmd_vel` at 20 Hz, and zeros at the end or on a fault; records what it hears."""
 
-    def __init__(
-        self, context: Context, values: Mapping[str, Any] | None = None
-    ) -> None:
-        overrides = [
-            Parameter(name, value=value) for name, value in (values or {}).items()
-        ]
-        super().__init__("record_node", context=context, parameter_overrides=overrides)
+    def __init__(self, **options: Any) -> None:
+        super().__init__("record_node", **options)
         self.outcome: DriveResult | None = None
         self._plan, self._out, roles = declare_drive(self)
         self._drive = self._plan.begin()
@@ -389,9 +383,9 @@ def record(
     values: dict[str, Any] | None = None, args: Sequence[str] | None = None
 ) -> DriveResult:
     """Drive and record until the end, an error or a signal; parameters may also come in `args`."""
-    node: RecordNode = runner.run_node(
-        partial(RecordNode, values=values), args, "record_node"
-    )
+    overrides = [Parameter(name, value=value) for name, value in (values or {}).items()]
+    make = partial(RecordNode, parameter_overrides=overrides)
+    node: RecordNode = runner.run_node(make, args, "record_node")
     return node.outcome or DriveResult(
         False, None, None, "interrupted: nothing was saved"
     )

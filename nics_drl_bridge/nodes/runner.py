@@ -1,4 +1,4 @@
-"""What every node needs: parameters, start and end, a single instance, and diagnostics."""
+"""What every node needs: parameters, start and end, a life cycle, one instance, diagnostics."""
 
 import contextlib
 import gc
@@ -9,35 +9,44 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from typing import Any, NamedTuple
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
 from rcl_interfaces.srv import GetParameters
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.timer import Timer
 from std_srvs.srv import Trigger
 
-from nics_drl_bridge.errors import BackendError, BridgeError, suggest
+from nics_drl_bridge.errors import BackendError, BridgeError, ConfigError, suggest
 from nics_drl_bridge.exit_codes import EXIT_BAD_INPUT
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.nodes import qos
-from nics_drl_bridge.nodes.ending import at_once, ending_signals
 from nics_drl_bridge.nodes.listener import holds, open_context, spin
-from nics_drl_bridge.nodes.output import ros_arguments
-from nics_drl_bridge.nodes.parameters import MODEL, Row
+from nics_drl_bridge.nodes.own_process import at_once, ending_signals, ros_arguments
+from nics_drl_bridge.nodes.parameters import MODEL, Row, frame_fault, managed, sensors
+from nics_drl_bridge.nodes.qos import BridgeNode, copied, overriding
 
 UNCONFIGURED = "unconfigured"
 INACTIVE = "inactive"
 ACTIVE = "active"
 DELIVERY_S = 0.5
+INPUT_ERRORS = (BridgeError, ParameterException, OSError)
 # time until the graph shows all nodes [s]
 SETTLE_S = 0.3
 POLL_S = 0.02
@@ -48,6 +57,11 @@ RANGES = {
     int: (IntegerRange, "integer_range"),
     float: (FloatingPointRange, "floating_point_range"),
 }
+# type of a default, and of a given value that becomes one or more floats
+WHOLE_NUMBERS = (
+    (float, Parameter.Type.INTEGER),
+    (list, Parameter.Type.INTEGER_ARRAY),
+)
 SHARED = "model"  # a file may also set it for nodes without a model
 
 
@@ -58,57 +72,61 @@ def last_word(publisher: Publisher, message: Any) -> None:
 
 
 def run_node(
-    make: Callable[[Context], Node],
-    args: Sequence[str] | None = None,
-    sole_name: str = "",
+    make: Callable[..., Node], args: Sequence[str] | None = None, sole_name: str = ""
 ) -> Any:
-    """Run a node until a signal (`ENDING`), then stop and destroy it cleanly; return it."""
+    """Run a node as the main function of its process until a signal (`ENDING`); return it.
+
+    A known error prints one sentence, and ends with exit code 2.
+    """
     stopping = threading.Event()
-    started = threading.Event()
-
-    def end(*_: Any) -> None:
-        stopping.set()
-        if not started.is_set():
-            started.set()
-            raise SystemExit(0)
-
     for number in ending_signals():
-        signal.signal(number, end)
-    context = None
-    node = None
-    alone = contextlib.ExitStack()
+        signal.signal(number, lambda *_: stopping.set())
+    words = sys.argv if args is None else args
     try:
         with at_once():
-            words = sys.argv if args is None else args
             context = open_context([*words, *ros_arguments(words)])
+        return live(make, context, stopping, sole_name)
+    except INPUT_ERRORS as error:
+        sys.stderr.write(f"{explain(error)}\n")
+        raise SystemExit(EXIT_BAD_INPUT) from None
+
+
+def live(
+    make: Callable[..., Node],
+    context: Context,
+    stopping: threading.Event,
+    sole_name: str = "",
+) -> Any:
+    """Make a node by `make(context=...)`, spin it until the end, and destroy it; return it.
+
+    The end is an event, or the end of the context, which belongs to the node.
+    """
+    with contextlib.ExitStack() as undo:
+        undo.callback(context.try_shutdown)
+        with at_once():
             if sole_name:
-                alone.enter_context(sole(context, sole_name))
-            node = make(context)
+                undo.enter_context(sole(context, sole_name))
+            node = make(context=context)
+            undo.callback(_end, node)
             if hasattr(node, "start"):
                 node.start()
         gc.collect()  # now, because later it may take 0.1 s while the robot moves
-        started.set()
         for sentence in unknown(node):  # rclpy ignores them silently
             node.get_logger().warning(sentence)
         if getattr(node, "state", ACTIVE) == ACTIVE:
             node.get_logger().info("running")
         spin(node, stopping)
-    except (BridgeError, ParameterException, OSError) as error:
-        sys.stderr.write(f"{_sentence(error)}\n")
-        raise SystemExit(EXIT_BAD_INPUT) from None
-    finally:
-        started.set()
-        if node is not None:
-            if node.context.ok() and hasattr(node, "stop"):
-                node.stop()
-            node.destroy_node()
-        if context is not None:
-            context.try_shutdown()
-        alone.close()
     return node
 
 
-def _sentence(error: Exception) -> str:
+def _end(node: Any) -> None:
+    if node.context.ok() and hasattr(node, "stop"):
+        node.stop()
+    node.destroy_node()
+
+
+def explain(error: Exception) -> str:
+    """Return one line for one of `INPUT_ERRORS`."""
     if isinstance(error, OSError):
         place = f"{error.filename}: " if error.filename else ""
         return f"{place}{error.strerror or error}; choose another place."
@@ -220,29 +238,19 @@ def declare_row(node: Node, row: Row) -> Any:
         low, high = row.span
         kind, field = RANGES[type(row.default)]
         setattr(descriptor, field, [kind(from_value=low, to_value=high)])
-    _accept_integers(node, row)
-    return node.declare_parameter(row.name, row.default, descriptor).value
-
-
-def _accept_integers(node: Node, row: Row) -> None:
-    """Make the given integers of a floating-point parameter floats; rclpy refuses `rate:=2`."""
-    values = qos.given_values(node)
-    many = isinstance(row.default, list)
-    types = Parameter.Type
-    if row.name not in values:
-        return
-    given_type = values[row.name].type_
-    value = values[row.name].value
-    if many and isinstance(row.default[0], float) and given_type == types.INTEGER_ARRAY:
-        floats = list(map(float, value))
-        values[row.name] = Parameter(row.name, types.DOUBLE_ARRAY, floats)
-    if isinstance(row.default, float) and given_type == types.INTEGER:
-        values[row.name] = Parameter(row.name, types.DOUBLE, float(value))
+    # rclpy refuses whole numbers for a floating-point parameter, as in `rate:=2`.
+    given = qos.given_values(node).get(row.name)
+    value = row.default
+    if given is not None and (type(row.default), given.type_) in WHOLE_NUMBERS:
+        value = np.asarray(given.value, np.float64).tolist()
+    is_whole = value is not row.default
+    return node.declare_parameter(row.name, value, descriptor, is_whole).value
 
 
 def unknown(node: Node) -> list[str]:
     """Return a sentence for each value whose parameter the node does not have."""
-    names = [name for name in node._parameters if not name.startswith(qos.OVERRIDES)]
+    declared = node.get_parameters_by_prefix("")
+    names = [name for name in declared if not name.startswith(qos.OVERRIDES)]
     ignores = getattr(node, "ignores", lambda _: False)
     sentences = [
         f"there is no parameter {name!r}, its value is ignored; {suggest(name, names)}"
@@ -307,3 +315,132 @@ def diagnose(node: Node, part: str, look: Callable[[], Condition]) -> None:
         topic.publish(message)
 
     steadily(node, DIAGNOSTICS_S, publish)
+
+
+SUCCESS = TransitionCallbackReturn.SUCCESS
+FAILURE = TransitionCallbackReturn.FAILURE
+
+
+class ManagedNode(BridgeNode, LifecycleNode):
+    """A lifecycle node; `configure` creates its resources and puts their clean-up on `undo`.
+
+    It declares the parameters in `rows`, in addition to those of managed nodes and of sensors.
+    """
+
+    def __init__(self, name: str, rows: Sequence[Row], **options: Any) -> None:
+        super().__init__(name, **options)
+        self.fixed: set[str] = set()
+        self.undo = ExitStack()
+        values = [declare_row(self, row) for row in (*managed(), *sensors(), *rows)]
+        fault = frame_fault(self.get_parameters_by_prefix("").values())
+        if fault:
+            raise ConfigError(fault)
+        self._autostart = bool(values[0])
+        # the last primary state
+        self.state = UNCONFIGURED
+        self._starting = False
+        self._failure: Exception | None = None
+        self.add_on_set_parameters_callback(self._check_fixed)
+
+    def create_lifecycle_publisher(self, kind: Any, topic: str, qos: Any) -> Publisher:
+        """Create a publisher, until clean-up, that is silent unless the node is active."""
+        with overriding(self, topic, "publisher") as options:
+            made = super().create_lifecycle_publisher(
+                kind, topic, copied(qos), **options
+            )
+        self.undo.callback(self.destroy_lifecycle_publisher, made)
+        return made
+
+    def configure(self) -> None:
+        """Create what the parameters request. Raises BridgeError if one can't be used."""
+
+    def activate(self) -> None:
+        """Start to act."""
+
+    def deactivate(self) -> None:
+        """Leave the robot at rest; publish nothing afterwards."""
+
+    def start(self) -> None:
+        """Configure and activate the node, if `autostart` is set. Raises BridgeError."""
+        if not self._autostart:
+            self.get_logger().info(
+                "unconfigured: waiting for `ros2 lifecycle set` (autostart is false)"
+            )
+            return
+        self._starting = True
+        for trigger in (self.trigger_configure, self.trigger_activate):
+            if trigger() != SUCCESS:
+                raise self._failure or BridgeError(
+                    f"{self.get_name()} could not be started."
+                )
+        self._starting = False
+
+    def stop(self) -> None:
+        """Leave the robot at rest, from any state."""
+        if self.state == ACTIVE:
+            self.deactivate()
+
+    def _check_fixed(self, parameters: list[Parameter]) -> SetParametersResult:
+        late = sorted(self.fixed & {parameter.name for parameter in parameters})
+        reason = frame_fault((*self.get_parameters_by_prefix("").values(), *parameters))
+        if late and self.state != UNCONFIGURED:
+            lead = f"`ros2 lifecycle set {self.get_fully_qualified_name()} deactivate`"
+            fix = f"return it to unconfigured by {lead}, then `cleanup`."
+            reason = f"parameter {late[0]!r} is read when the node is configured; {fix}"
+        return SetParametersResult(successful=not reason, reason=reason)
+
+    def on_configure(self, _: LifecycleState) -> TransitionCallbackReturn:
+        """Configure the node; a failure leaves it unconfigured."""
+        with at_once():  # opening a policy may compile; nothing was commanded yet
+            done = self._attempt(self.configure, INACTIVE)
+        if done == FAILURE:
+            self.undo.close()
+        return done
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Transition of the state machine."""
+        super().on_activate(state)  # the publishers
+        return self._attempt(self.activate, ACTIVE)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Transition of the state machine."""
+        done = self._attempt(self.deactivate, INACTIVE)
+        super().on_deactivate(state)
+        return done
+
+    def on_cleanup(self, _: LifecycleState) -> TransitionCallbackReturn:
+        """Transition of the state machine."""
+        return self._attempt(self.undo.close, UNCONFIGURED)
+
+    def on_shutdown(self, _: LifecycleState) -> TransitionCallbackReturn:
+        """Leave the robot at rest, from any state; after an error it can be configured again."""
+        self.stop()
+        return self._attempt(self.undo.close, UNCONFIGURED)
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Act as at a shutdown; the failure is kept for `start`."""
+        failure = self._failure
+        done = self.on_shutdown(state)
+        self._failure = failure
+        return done
+
+    def _attempt(
+        self, do: Callable[[], None], reached: str
+    ) -> TransitionCallbackReturn:
+        """Do the work of a transition and report a failure, which rclpy does not."""
+        self._failure = None
+        try:
+            do()
+        except Exception as error:
+            self._failure = error
+            expected = isinstance(error, BridgeError)
+            if not self._starting:
+                kind = "" if expected else f"{type(error).__name__}: "
+                self.get_logger().error(f"{kind}{error}")
+            if not expected:
+                raise
+            return FAILURE
+        self.state = reached
+        if not self._starting:
+            self.get_logger().info("running" if reached == ACTIVE else reached)
+        return SUCCESS

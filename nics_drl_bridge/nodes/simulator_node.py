@@ -12,7 +12,6 @@ from typing import Any, cast
 import numpy as np
 from geometry_msgs.msg import TransformStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry
-from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
@@ -228,12 +227,12 @@ class CommandInlet:
         stamped = runner.get_flag(node, "enable_stamped_cmd_vel")
         self._kind = name_of(stamped)
         kind = TwistStamped if stamped else Twist
-        hear = partial(self._on_bytes, stamped)
-        heard = node.create_subscription(
-            kind, f"{namespace}{CMD_VEL}", hear, quality, raw=True
+        self._hear = partial(self._on_bytes, stamped)
+        self._commands = node.create_subscription(
+            kind, f"{namespace}{CMD_VEL}", self._hear, quality, raw=True
         )
-        self._topic = heard.topic_name
-        self.heard = [heard]
+        self._topic = self._commands.topic_name
+        self.heard = [self._commands]
         self._types = TypeWatch(node, f"{namespace}{CMD_VEL}")
         kind = conversions.message_type("ackermann_msgs/msg/AckermannDriveStamped")
         if robot.steers and kind is not None:  # its package is optional
@@ -246,6 +245,11 @@ class CommandInlet:
         """End the subscriptions."""
         for subscription in self.heard:
             self._node.destroy_subscription(subscription)
+
+    def take_waiting(self) -> None:
+        """Take the commands that have arrived but are not handled yet."""
+        for content in qos.take_waiting(self._commands):
+            self._hear(content)
 
     def _on_bytes(self, stamped: bool, content: bytes) -> None:
         stamp_ns = 0
@@ -293,7 +297,7 @@ class CommandInlet:
         self._types.look(self._kind)
 
 
-class DeviceNode(qos.QosWatch):
+class DeviceNode(qos.BridgeNode):
     """Takes `cmd_vel`; publishes `scan`, `odom`, `joint_states`, `ground_truth`, `/clock`, `/tf`.
 
     The parameter `robots` makes a fleet, with each robot in a namespace below the node's. Simulated
@@ -302,8 +306,8 @@ class DeviceNode(qos.QosWatch):
     again.
     """
 
-    def __init__(self, name: str, context: Context, make: MakeSimulator) -> None:
-        super().__init__(name, context=context)
+    def __init__(self, name: str, make: MakeSimulator, **options: Any) -> None:
+        super().__init__(name, **options)
         model = runner.declare_model(self)
         device_parameters.declare_device(self, model.lidar.frame)
         self._time = device_parameters.timing(self, model)
@@ -608,6 +612,10 @@ class DeviceNode(qos.QosWatch):
             self._timer.reset()
 
     def _reset(self) -> tuple[bool, str]:
+        # The executor may serve a request before a command that was sent earlier. In lock-step that
+        # command would move the world of the new episode.
+        for inlet in self._inlets:
+            inlet.take_waiting()
         try:
             self._require_world()
             self.begin()
@@ -681,9 +689,5 @@ def fast_simulator(
     return FastSimulator(model, world, robots=robots, **options)
 
 
-def simulator_node(context: Context) -> DeviceNode:
-    """Make the node `simulator_node`; see `DeviceNode`."""
-    return DeviceNode("simulator_node", context, fast_simulator)
-
-
-main = partial(runner.run_node, simulator_node, sole_name="simulator_node")
+SimulatorNode = partial(DeviceNode, "simulator_node", fast_simulator)
+main = partial(runner.run_node, SimulatorNode, sole_name="simulator_node")

@@ -1,38 +1,109 @@
-"""Entry points of the nodes; without ROS 2 they print one sentence, not a traceback."""
+"""Entry points of the nodes, and their help; without ROS 2 they print one sentence."""
 
 import faulthandler
+import os
 import signal
 import sys
+import textwrap
 import time
 import traceback
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
 from nics_drl_bridge.exit_codes import EXIT_BAD_INPUT
+from nics_drl_bridge.nodes import own_process, transport
+from nics_drl_bridge.nodes.parameters import NODES, Row
+
+HELP = ("-h", "--help")
+ROS = "--ros-args"
+END = "--"
+WIDTH = 100
+INDENT = 4
+
+
+def help_of(node: str) -> str:
+    """Return the help of a node by the name of its executable."""
+    if node not in NODES:
+        return f"usage: {node} [{ROS} -p NAME:=VALUE -r FROM:=TO ...]\n"
+    facts = NODES[node]()
+    topics = [
+        _hanging(f"{title}: {', '.join(names)}", INDENT)
+        for title, names in (
+            ("subscribes to", facts.subscribes),
+            ("publishes", facts.publishes),
+            ("services", facts.services),
+        )
+        if names
+    ]
+    parts = [
+        f"usage: {node} [{ROS} -p NAME:=VALUE -r FROM:=TO --params-file FILE ...]",
+        facts.about,
+        "\n".join(topics),
+        "parameters, with their defaults:",
+        "\n".join(map(_line, facts.parameters)),
+        "and `use_sim_time`, like every ROS 2 node. `ros2 param describe` also shows the ranges.",
+        f"example:\n    ros2 run nics_drl_bridge {node} {ROS} {facts.example}",
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _line(row: Row) -> str:
+    return _hanging(
+        f"    {row.name} = {row.shown or _words(row.default)}: {row.about}", 2 * INDENT
+    )
+
+
+def _words(value: Any) -> str:
+    """Return a value as it is written after `:=`."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list):
+        return f"[{', '.join(map(_words, value))}]"
+    text = str(value) if value != "" else "''"
+    return f".{text}" if text == "nan" else text
+
+
+def _hanging(text: str, indent: int) -> str:
+    return textwrap.fill(text, WIDTH, subsequent_indent=" " * indent)
+
+
+def wrong_with(node: str, words: Sequence[str]) -> str:
+    """Return a sentence about the first word that is not an argument of a node, or ""."""
+    ours = True  # False for the words that ROS 2 itself checks
+    for word in words:
+        if word in (ROS, END):
+            ours = word == END
+        elif ours:
+            example = f"-p {word}" if ":=" in word else "-p NAME:=VALUE"
+            fix = f"write parameters and remappings after {ROS}, as in `{node} {ROS} {example}`"
+            return (
+                f"{node}: there is no argument {word!r}; {fix}, or see `{node} --help`."
+            )
+    return ""
 
 
 def start(node: str, args: list[str] | None = None) -> None:
     """Run a node by its name and end the process; bad input gives one sentence and exit code 2."""
-    from nics_drl_bridge.nodes import ending, output, usage
-
-    for number in ending.ending_signals():  # importing the node takes seconds
+    for number in own_process.ending_signals():  # importing the node takes seconds
         signal.signal(number, signal.SIG_DFL)
     words = sys.argv[1:] if args is None else args[1:]
-    if any(word in usage.HELP for word in words):
-        sys.stdout.write(usage.help_of(node))
-        ending.leave(0)
-    sentence = usage.wrong_with(node, words)
+    if any(word in HELP for word in words):
+        sys.stdout.write(help_of(node))
+        own_process.leave(0)
+    sentence = wrong_with(node, words)
     if sentence:
         sys.stderr.write(f"{sentence}\n")
-        ending.leave(EXIT_BAD_INPUT)
-    output.forward_output(output.log_file(node, words))
+        own_process.leave(EXIT_BAD_INPUT)
+    own_process.forward_output(own_process.log_file(node, words))
     faulthandler.enable()  # shows where Python was when a library crashes
     # In the format of the ROS 2 log, which is available only seconds later.
     sys.stderr.write(f"[INFO] [{time.time():.9f}] [{node}]: starting\n")
     sys.stderr.flush()
     code: Any = 0
     try:
-        ending.own_process()
+        transport.set_transport(os.environ)
+        own_process.begin_own_process()
         main = _main_of(node)
         main(args)
     except SystemExit as end:
@@ -42,7 +113,7 @@ def start(node: str, args: list[str] | None = None) -> None:
         code = 1
     if code is None:
         code = 0
-    ending.leave(code if isinstance(code, int) else 1)
+    own_process.leave(code if isinstance(code, int) else 1)
 
 
 def _main_of(node: str) -> Any:

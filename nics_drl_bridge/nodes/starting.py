@@ -287,14 +287,12 @@ def names_of(robots: Any) -> tuple[str, ...]:
     else:
         words = re.findall(r"[^\s,\[\]'\"]+", str(robots))
     text = str(robots)
-    if text and (not words or text.count("[") != text.count("]")):
+    count = int(words[0]) if len(words) == 1 and words[0].isdecimal() else None
+    is_whole = bool(words) and text.count("[") == text.count("]")
+    if text and (not is_whole or count == 0):
         fix = "give a count from 1, or namespaces, as in robots:='[ant, bee]'"
         raise ConfigError(f"launch argument 'robots' is {text!r}; {fix}.")
-    if len(words) == 1 and words[0].isdecimal():
-        count = int(words[0])
-        if count < 1:
-            fix = "give a count from 1, or namespaces, as in robots:='[ant, bee]'"
-            raise ConfigError(f"launch argument 'robots' is {count}; {fix}.")
+    if count is not None:
         return default_namespaces(count) if count > 1 else ()
     for word in words:
         parse_namespace(word)

@@ -51,9 +51,9 @@ GIVEN = {
 }
 START = """
 import hashlib, sys, time
-from nics_drl_bridge.nodes import ending, start
+from nics_drl_bridge.nodes import own_process, start
 if sys.argv[1] == "late":
-    ending.own_process = lambda: None
+    own_process.begin_own_process = lambda: None
 if sys.argv[2] == "native":
     from numba.core import event
 

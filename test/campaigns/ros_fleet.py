@@ -28,12 +28,12 @@ from campaign import answer, at_least, missed_bars, parser_of
 from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
 from parts.processes import core_seconds, part, use_of
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.nodes import qos, wire
-from nics_drl_bridge.nodes.executor import StandingExecutor
 from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 
@@ -70,7 +70,7 @@ class Listener:
         self._starts: dict[str, np.ndarray] = {}
         for name in list(self.counts)[:heard]:
             self._listen(name)
-        self._executor = StandingExecutor(context)
+        self._executor = SingleThreadedExecutor(context=context)
         self._executor.add_node(self._node)
 
     def _listen(self, name: str) -> None:

@@ -74,9 +74,8 @@ def module_domain_id(domains: ExitStack) -> int:
 @pytest.fixture
 def make_node(domain_id: int) -> Iterator[Callable[..., Any]]:
     """Makes nodes that do not spin, `make_node("rate:=2.0", words=("-r", "__ns:=/car"))`."""
-    from rclpy.node import Node
-
     from nics_drl_bridge.nodes.listener import open_context
+    from nics_drl_bridge.nodes.qos import BridgeNode
 
     with ExitStack() as made:
 
@@ -84,7 +83,11 @@ def make_node(domain_id: int) -> Iterator[Callable[..., Any]]:
             given = [word for each in parameters for word in ("-p", each)]
             context = open_context(["node", "--ros-args", *given, *words], domain_id)
             made.callback(context.try_shutdown)
-            node = Node("node", context=context) if kind is None else kind(context)
+            node = (
+                BridgeNode("node", context=context)
+                if kind is None
+                else kind(context=context)
+            )
             made.callback(node.destroy_node)
             return node
 

@@ -5,25 +5,27 @@ from __future__ import annotations
 import signal
 import sys
 import threading
+import time
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from rclpy.impl import rcutils_logger
+from rclpy.impl.rcutils_logger import RcutilsLogger
 
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.nodes import runner
+from nics_drl_bridge.nodes.listener import open_context
+from nics_drl_bridge.nodes.record_node import RecordNode
 
 ENDS_S = 30.0
 MODULES = {"mujoco_node": "nics_drl_bridge.extras.mujoco.node"}
-RUNNING: dict[int, NodeThread] = {}
-"""By the thread of each."""
 
 
 class NodeThread(AbstractContextManager["NodeThread", None]):
-    """Runs what the executable runs; a signal is a call of its handler."""
+    """Runs the node of an executable; a signal sets what its handler would set."""
 
     def __init__(
         self,
@@ -39,35 +41,44 @@ class NodeThread(AbstractContextManager["NodeThread", None]):
         file.write_text(
             dump_yaml({"/**": {"ros__parameters": parameters}}), encoding="utf-8"
         )
-        self.arguments = [node, "--ros-args", "--params-file", str(file)]
+        arguments = [node, "--ros-args", "--params-file", str(file)]
         if namespace:
-            self.arguments += ["-r", f"__ns:=/{namespace.strip('/')}"]
+            arguments += ["-r", f"__ns:=/{namespace.strip('/')}"]
         for old, new in (remap or {}).items():
-            self.arguments += ["-r", f"{old}:={new}"]
-        self.arguments += words
+            arguments += ["-r", f"{old}:={new}"]
         self.node = node
-        self.domain_id = domain_id
-        self.lines = []
-        self.handler = None
-        self.returncode = None
+        self.lines: list[str] = []
+        self.returncode: int | None = None
+        self.stopping = threading.Event()
         self.log = self._process = self  # what tests ask of a process and of its log
-        self._thread = threading.Thread(target=self._run, daemon=True, name=node)
+        self._thread = threading.Thread(
+            target=self._run,
+            args=([*arguments, *words], domain_id),
+            daemon=True,
+            name=node,
+        )
         self._thread.start()
 
-    def _run(self) -> None:
-        RUNNING[threading.get_ident()] = self
+    def _run(self, arguments: list[str], domain_id: int) -> None:
         try:
-            module = MODULES.get(self.node, f"nics_drl_bridge.nodes.{self.node}")
-            import_module(module).main(self.arguments)
+            made = runner.live(
+                partial(make_logged, self.node, self.lines),
+                open_context(arguments, domain_id),
+                self.stopping,
+                self.node,
+            )
+            outcome = getattr(made, "outcome", None)  # of record_node
             self.returncode = 0
-        except SystemExit as error:
-            self.returncode = int(error.code or 0)
+            if outcome is not None:
+                self.lines.append(f"record_node: {outcome.line}")
+                self.returncode = 2 if outcome.failure is not None else 0
+        except runner.INPUT_ERRORS as error:
+            self.lines.append(runner.explain(error))
+            self.returncode = 2
         except BaseException as error:
             self.lines.append(f"Traceback: {type(error).__name__}: {error}")
             self.returncode = 1
             raise
-        finally:
-            RUNNING.pop(threading.get_ident())
 
     def read_text(self, **_: Any) -> str:
         """What it has logged, and written to standard error."""
@@ -84,11 +95,7 @@ class NodeThread(AbstractContextManager["NodeThread", None]):
 
     def send_signal(self, number: int) -> None:
         assert number in (signal.SIGINT, signal.SIGTERM), "needs a process of its own"
-        try:
-            if self.handler is not None:
-                self.handler(number, None)
-        except SystemExit:  # for a node that has not started yet
-            pass
+        self.stopping.set()
 
     def check(self) -> None:
         assert self._thread.is_alive(), (
@@ -96,72 +103,60 @@ class NodeThread(AbstractContextManager["NodeThread", None]):
         )
 
     def close(self) -> int | None:
-        while self.handler is None and self._thread.is_alive():
-            self._thread.join(0.01)
-        self.send_signal(signal.SIGINT)
+        self.stopping.set()
         return self.wait()
 
     def __exit__(self, *_: object) -> None:
         self.close()
 
 
-class _Proxy:
-    """A module, some of whose attributes depend on the thread."""
-
-    def __init__(self, module: Any, **own: Any) -> None:
-        self._module = module
-        self._own = own
-
-    def __getattr__(self, name: str) -> Any:
-        return self._own[name]() if name in self._own else getattr(self._module, name)
+def node_class(node: str) -> Any:
+    """What makes the node of an executable, by rclpy's keyword arguments."""
+    if node == "record_node":
+        return RecordNode
+    module = import_module(MODULES.get(node, f"nics_drl_bridge.nodes.{node}"))
+    return module.main.args[0]
 
 
-class _Lines:
-    """Standard error of a node."""
+def make_logged(node: str, lines: list[str], **options: Any) -> Any:
+    """A node that also keeps what it logs."""
+    made = node_class(node)
+    kind, *arguments = (made.func, *made.args) if isinstance(made, partial) else (made,)
 
-    def __init__(self, node: NodeThread) -> None:
-        self.node = node
+    said: dict[tuple[str, int], float] = {}
 
-    def write(self, text: str) -> None:
-        self.node.lines += text.splitlines()
+    class Logged(kind):
+        def get_logger(self) -> Keeper:
+            return Keeper(super().get_logger().name, lines, said)
 
-
-def _stderr() -> Any:
-    node = RUNNING.get(threading.get_ident())
-    return sys.stderr if node is None else _Lines(node)
-
-
-def _set_handler() -> Any:
-    node = RUNNING.get(threading.get_ident())
-    return (
-        signal.signal
-        if node is None
-        else lambda _, handler: setattr(node, "handler", handler)
-    )
+    return Logged(*arguments, **options)
 
 
-def _log() -> Any:
-    node = RUNNING.get(threading.get_ident())
-    log = LIBRARY.rclpy_logging_rcutils_log
-    if node is None:
-        return log
+class Keeper(RcutilsLogger):
+    """A logger that also keeps its lines.
 
-    def kept(severity: Any, name: str, message: str, *place: Any) -> Any:
-        node.lines.append(message)
-        return log(severity, name, message, *place)
+    rclpy throttles, and checks the severity, by the caller of `log`, which is always this class. So
+    this class throttles itself, and leaves each line to a new logger.
+    """
 
-    return kept
+    def __init__(
+        self, name: str, lines: list[str], said: dict[tuple[str, int], float]
+    ) -> None:
+        super().__init__(name)
+        self._lines = lines
+        self._said = said
 
-
-def _open_context(args: Any = None, domain_id: int | None = None) -> Any:
-    node = RUNNING.get(threading.get_ident())
-    return OPEN_CONTEXT(args, domain_id if node is None else node.domain_id)
-
-
-LIBRARY = rcutils_logger._rclpy
-OPEN_CONTEXT = runner.open_context
-rcutils_logger._rclpy = _Proxy(LIBRARY, rclpy_logging_rcutils_log=_log)
-runner.open_context = _open_context
-runner.signal = _Proxy(signal, signal=_set_handler)
-for each in ("runner", "record_node"):
-    import_module(f"nics_drl_bridge.nodes.{each}").sys = _Proxy(sys, stderr=_stderr)
+    def log(
+        self,
+        message: str,
+        severity: Any,
+        throttle_duration_sec: float = 0.0,
+        **options: Any,
+    ) -> bool:
+        caller = sys._getframe(2)
+        place = (caller.f_code.co_filename, caller.f_lineno)
+        if time.monotonic() < self._said.get(place, -1e9) + throttle_duration_sec:
+            return False
+        self._said[place] = time.monotonic()
+        self._lines.append(str(message))
+        return RcutilsLogger(self.name).log(message, severity, **options)

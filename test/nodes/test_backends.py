@@ -1,10 +1,7 @@
 import gc
-import os
 import signal
-import threading
 from contextlib import closing
 
-import gymnasium
 import numpy as np
 import pytest
 
@@ -13,9 +10,7 @@ from nics_drl_bridge.interface import NS_PER_S
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
 from geometry_msgs.msg import Twist
-from rclpy.serialization import serialize_message
 from rclpy.task import Future
-from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.errors import BackendError, ConfigError, ModelError, StaleDataError
@@ -27,8 +22,6 @@ from nics_drl_bridge.nodes.backends import (
     dds_backend,
     stack_facts,
 )
-from nics_drl_bridge.nodes.executor import HANDED_OVER
-from nics_drl_bridge.nodes.lockstep_inbox import Inbox
 from nics_drl_bridge.sim.scenes import member_of
 from nics_drl_bridge.sim.world import load_world
 
@@ -288,64 +281,6 @@ def test_a_message_that_cant_be_read_is_told_with_its_topic(
     drive(backend)
 
 
-def stamped(second):
-    message = LaserScan()
-    message.header.stamp.sec = second
-    return serialize_message(message)
-
-
-@pytest.fixture
-def inbox():
-    return Inbox(("odom", "scan"), lambda *_: None, slack_ns=0)
-
-
-def test_the_executor_rests_only_for_a_caller_that_waits_and_now_has_all():
-    estimated = []
-    got = []
-    inbox = Inbox(
-        ("odom", "scan"), lambda stamp, *_: estimated.append(stamp), slack_ns=0
-    )
-    assert inbox.put("odom", stamped(1)) is inbox.put("scan", stamped(1)) is None
-    caller = threading.Thread(
-        target=lambda: got.append(inbox.wait(2 * NS_PER_S, TIMEOUT_S))
-    )
-    caller.start()
-    while inbox._awaited_ns < 0:
-        os.sched_yield()
-    assert inbox.put("odom", stamped(2)) is None
-    assert estimated == [2 * NS_PER_S]
-    assert inbox.put("scan", stamped(2)) is HANDED_OVER
-    caller.join(TIMEOUT_S)
-    assert got[0].keys() == {"odom", "scan"}
-
-
-def test_what_fails_while_nothing_is_awaited_is_raised_at_the_next_wait(inbox):
-    inbox.put("odom", stamped(1))
-    inbox.put("scan", stamped(1))
-    inbox.put("scan", b"torn")
-    with pytest.raises(BackendError, match="topic 'scan': a message can't be read"):
-        inbox.wait(NS_PER_S, 0.0)
-    assert inbox.wait(NS_PER_S, 0.0).keys() == {"odom", "scan"}
-    inbox.put("scan", b"torn")
-    inbox.forget_failure()
-    inbox.wait(NS_PER_S, 0.0)
-
-
-def test_after_an_interrupted_wait_nothing_is_awaited(inbox, monkeypatch):
-    class Interrupted:
-        def acquire(self, blocking=True, timeout=None):
-            if timeout is not None:
-                raise KeyboardInterrupt
-
-        def locked(self):
-            return False
-
-    monkeypatch.setattr(inbox, "_caller_waits", Interrupted())
-    with pytest.raises(KeyboardInterrupt):
-        inbox.wait(NS_PER_S, TIMEOUT_S)
-    assert inbox.put("odom", stamped(1)) is inbox.put("scan", stamped(1)) is None
-
-
 def test_facts_of_a_fleet_have_one_shape_whatever_their_values():
     for later in (3, 4):
         facts = [
@@ -420,37 +355,6 @@ def test_close_leaves_a_zero_command_behind(connect, commands_heard):
         backend.reset(START)
 
 
-def test_an_error_in_a_step_leaves_a_zero_command_and_wants_a_reset(
-    connect, model, arena, commands_heard, monkeypatch
-):
-    env = BridgeEnv(connect(), model, arena)
-    action = np.ones(2, np.float32)
-    env.reset(seed=0)
-
-    def refused():
-        with pytest.raises(gymnasium.error.InvalidAction, match="NaN"):
-            env.step(action * np.nan)
-
-    zero_follows(commands_heard, lambda: env.step(action), refused)
-    with pytest.raises(gymnasium.error.ResetNeeded):
-        env.step(action)
-    env.reset(seed=0)
-
-    def interrupted():
-        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):  # noqa: PT012
-            patch.setattr(env._backend, "_wait_for_data", fails)
-            env.step(action)
-
-    def fails(*_):
-        raise KeyboardInterrupt
-
-    zero_follows(commands_heard, lambda: env.step(action), interrupted)
-    with pytest.raises(gymnasium.error.ResetNeeded):
-        env.step(action)
-    env.reset(seed=0)
-    env.step(action)
-
-
 def test_garbage_collection_leaves_a_zero_command_behind(
     simulator, model, arena, commands_heard
 ):
@@ -483,7 +387,10 @@ def test_somebody_else_who_moves_the_simulator_is_found_out(
             backend.reset(START)
             intruder.publish(Twist())
             peer.until(
-                lambda: backend._inbox.get_stamp_ns("odom") > backend._now_ns,
+                lambda: (
+                    backend._take_waiting()
+                    or backend._inbox.messages["odom"].stamp_ns > backend._now_ns
+                ),
                 "its effect",
             )
             with pytest.raises(

@@ -97,12 +97,6 @@ def test_a_fleet_moves_when_each_of_its_robots_has_a_command(fleet):
     assert fleet.x("left") > 0.0
 
 
-def test_robots_of_a_fleet_see_each_other(fleet, model):
-    fleet.reset(FACING)
-    seen = [fleet.scans[name][-1].ranges[model.lidar.beams // 2] for name in NAMES]
-    assert seen == pytest.approx([1.0 - model.robot.footprint_radius] * 2, abs=0.05)
-
-
 def test_the_frames_of_a_fleet_begin_with_the_namespace_of_each_robot(fleet):
     for name in NAMES:
         scan = fleet.scans[name][-1]

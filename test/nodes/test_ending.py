@@ -19,7 +19,7 @@ DEADLINE_S = 60.0
 NODE = """
 import sys
 from rclpy.node import Node
-from nics_drl_bridge.nodes import ending, runner
+from nics_drl_bridge.nodes import own_process, runner
 
 class Left(Node):
     def stop(self):
@@ -31,10 +31,11 @@ def make(context):
     return node
 
 runner.run_node(make)
-ending.leave(0)
+own_process.leave(0)
 """
-ENDS = [signal.SIGHUP, signal.SIGQUIT, signal.SIGALRM, signal.SIGRTMAX]
+ENDS = [signal.SIGHUP, signal.SIGRTMAX]
 FURTHER_ENDS = [
+    signal.SIGQUIT,
     signal.SIGINT,
     signal.SIGTERM,
     signal.SIGUSR1,

@@ -18,7 +18,6 @@ from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.interface import Start
 from nics_drl_bridge.nodes import link, qos
 from nics_drl_bridge.nodes.backends import DdsBackend
-from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
 from nics_drl_bridge.sim.world import load_world
 
 pytestmark = pytest.mark.ros
@@ -189,7 +188,7 @@ def test_a_command_that_no_other_one_follows_is_followed_by_a_zero(driving):
 def test_the_death_of_the_thread_that_listens_leaves_a_zero_behind(
     driving, monkeypatch
 ):
-    spin_once = link.StandingExecutor.spin_once
+    spin_once = link.SingleThreadedExecutor.spin_once
 
     def dies(*given, **options):
         if threading.current_thread().name == "dds_backend":
@@ -199,7 +198,7 @@ def test_the_death_of_the_thread_that_listens_leaves_a_zero_behind(
     monkeypatch.setattr(threading, "excepthook", lambda *_: None)
     env, peer, heard = driving("realtime")
     env.step(AHEAD)
-    monkeypatch.setattr(link.StandingExecutor, "spin_once", dies)
+    monkeypatch.setattr(link.SingleThreadedExecutor, "spin_once", dies)
     peer.until(lambda: heard[-1] == Twist(), "a zero command")
     peer.until(
         lambda: not env.unwrapped._backend._link._context.ok(), "the thread's end"
@@ -253,13 +252,10 @@ def test_one_robot_of_a_fleet_that_cant_be_halted_keeps_none_of_the_others_movin
         deaf._link.close()
 
 
-@pytest.mark.parametrize("kind", [DdsBackend, RealtimeBackend])
-def test_a_backend_publishes_nothing_that_is_not_finite(
-    simulators, listeners, model, kind
-):
-    mode = "lockstep" if kind is DdsBackend else "realtime"
-    peer, heard = listeners[mode]
-    backend = kind(model, load_world("empty"), domain_id=simulators[mode])
+def test_a_backend_publishes_nothing_that_is_not_finite(simulators, listeners, model):
+    peer, heard = listeners["lockstep"]
+    world = load_world("empty")
+    backend = DdsBackend(model, world, domain_id=simulators["lockstep"])
     with closing(backend):
         backend.reset(Start(seed=3, pose=np.zeros(3)))
         heard.clear()

@@ -83,7 +83,12 @@ class Operator:
         self.peer.until(released, "nothing is latched")
 
 
-@pytest.fixture(params=[False, True], ids=["button_alone", "1_kHz_beside"])
+@pytest.fixture(
+    params=[
+        pytest.param(False, id="button_alone"),
+        pytest.param(True, id="1_kHz_beside", marks=pytest.mark.campaign),
+    ]
+)
 def operator(request, launch_process, meet, domain_id):
     gate = launch_process(
         "command_gate", domain_id, limits="ackermann", e_stop_silence=5.0

@@ -1,10 +1,8 @@
 import os
 import re
 import signal
-import threading
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,16 +11,14 @@ pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
 from gate.rig import Rig, config
 
-from nics_drl_bridge.files import write_parts
 from nics_drl_bridge.gate.black_box import MOST_INPUTS, Entry, replay
-from nics_drl_bridge.nodes import gate_log
+from nics_drl_bridge.nodes import black_box_writer, gate_log
 from nics_drl_bridge.nodes.black_box_writer import (
     FILES_KEPT,
-    MOST_AT_WORK,
     MOST_LINES,
-    Disk,
     Ring,
     prune,
+    write_file,
 )
 from nics_drl_bridge.nodes.gate_log import BURST_S, LINE_S, BoxWriter, GateLog
 
@@ -309,62 +305,16 @@ def test_the_writer_has_no_file_of_the_gate_open_and_ordinary_priority(log, tmp_
         assert writer.close(DEADLINE_S) == []
 
 
-@pytest.fixture
-def disk(tmp_path):
-    """A disk that hangs until `release()`, and what it answered, by the names of files."""
-    failed = {}
-    released = threading.Event()
-
-    def answer(path, reason):
-        failed[Path(path).name] = reason
-
-    def write(path, parts):
-        released.wait(LONG_S)
-        write_parts(path, parts)
-
-    made = Disk(answer, write)
-
-    def order(name):
-        made.write(str(tmp_path / name), [], [b"line\n"])
-
-    yield SimpleNamespace(
-        order=order, failed=failed, release=released.set, finish=made.finish, made=made
-    )
-    released.set()
-
-
-def test_there_are_never_more_files_at_work_than_a_few(tmp_path, disk):
-    for number in range(MOST_AT_WORK + 2):
-        disk.order(f"{number}.jsonl")
-    busy = "the files before it are still being written"
-    assert [*disk.failed.values()] == [busy] * 2
-    disk.release()
-    assert disk.finish(DEADLINE_S)
-    assert len(files(tmp_path)) == MOST_AT_WORK
-
-
-def test_a_disk_that_hangs_for_ever_is_left_behind(disk):
-    disk.order("file.jsonl")
-    assert not disk.finish(0.1)
-
-
-def test_a_file_that_is_given_up_leaves_nothing_behind(tmp_path, disk):
-    disk.release()
-    disk.made.give_up()
-    disk.order("file.jsonl")
-    assert disk.finish(DEADLINE_S)
-    assert disk.failed == {"file.jsonl": "it took too long"}
+def test_a_file_that_is_given_up_leaves_nothing_behind(tmp_path):
+    file = str(tmp_path / "file.jsonl")
+    assert write_file(file, [], [b"line\n"]) == ""
+    os.remove(file)
+    black_box_writer.GIVEN_UP.set()
+    try:
+        assert write_file(file, [], [b"line\n"]) == "it took too long"
+    finally:
+        black_box_writer.GIVEN_UP.clear()
     assert os.listdir(tmp_path) == []
-
-
-def test_an_error_is_told_by_its_sentence_and_the_next_file_is_written(tmp_path, disk):
-    disk.release()
-    (tmp_path / "file").touch()
-    disk.order("file/1.jsonl")
-    disk.order("2.jsonl")
-    assert disk.finish(DEADLINE_S)
-    assert "exists" in disk.failed["1.jsonl"]
-    assert disk.failed["2.jsonl"] == ""
 
 
 def test_what_is_kept_begins_with_a_state_and_reaches_back_far_enough():

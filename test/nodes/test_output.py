@@ -17,8 +17,8 @@ DEADLINE_S = 30.0
 LINES = [*(f"line {k}" for k in range(50)), "over"]
 TALKER = """
 import os, sys, time
-from nics_drl_bridge.nodes.ending import leave
-from nics_drl_bridge.nodes.output import forward_output
+from nics_drl_bridge.nodes.own_process import leave
+from nics_drl_bridge.nodes.own_process import forward_output
 forward_output(*sys.argv[2:])
 for number in range(int(sys.argv[1])):
     line = f"line {number} {'.' * 80}\\n".encode()
@@ -128,10 +128,11 @@ def test_a_log_file_that_hangs_delays_nothing(tmp_path):
 
 def test_a_forwarder_that_is_frozen_or_killed_delays_nothing():
     code = (
-        "import os, signal\nfrom nics_drl_bridge.nodes import output\noutput.forward_output()\n"
-        "os.kill(output._forwarder.pid, signal.{})\n"
+        "import os, signal\nfrom nics_drl_bridge.nodes import own_process\n"
+        "own_process.forward_output()\n"
+        "os.kill(own_process._forwarder.pid, signal.{})\n"
         "for _ in range(100_000): print('line', 'x' * 80, flush=True)\n"
-        "output._forwarder.kill()\nos._exit(3)"
+        "own_process._forwarder.kill()\nos._exit(3)"
     )
     for name in ("SIGSTOP", "SIGKILL"):
         talker = start(
@@ -142,7 +143,7 @@ def test_a_forwarder_that_is_frozen_or_killed_delays_nothing():
 
 ERRORS = """
 import os, sys
-from nics_drl_bridge.nodes.output import forwarded_errors
+from nics_drl_bridge.nodes.own_process import forwarded_errors
 with forwarded_errors():
     for number in range(30_000):
         print("line", number, "x" * 80, file=sys.stderr)

@@ -12,8 +12,7 @@ from rclpy.parameter import Parameter
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.nodes import parameters
 from nics_drl_bridge.nodes.parameters import NODES, frame_fault, stamped_by_default
-from nics_drl_bridge.nodes.record_node import RecordNode
-from nodes.test_parameter_files import MAKERS
+from nodes.in_process import node_class
 
 pytestmark = pytest.mark.ros
 
@@ -24,8 +23,7 @@ RCLPY_TOPICS = ("/rosout", "/parameter_events", "/transition_event")
 @pytest.fixture(params=NODES)
 def node(request, make_node, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    make = RecordNode if request.param == "record_node" else MAKERS[request.param]
-    made = make_node(kind=make)
+    made = make_node(kind=node_class(request.param))
     if hasattr(made, "start"):
         made.start()
     return request.param, made
@@ -41,7 +39,9 @@ def same(value, default):
 def test_help_tells_the_parameters_topics_and_services_of_a_node(node):
     name, made = node
     facts = NODES[name]()
-    own = {each for each in made._parameters if not each.startswith(RCLPY)}
+    own = {
+        each for each in made.get_parameters_by_prefix("") if not each.startswith(RCLPY)
+    }
     assert own == {row.name for row in facts.parameters}
     for row in facts.parameters:
         assert made.describe_parameter(row.name).description == row.about
@@ -104,12 +104,12 @@ def test_the_frame_of_the_robot_is_its_own_and_a_footprint_may_be_none():
 @pytest.mark.parametrize("name", ["middleware_node", "policy_node"])
 def test_a_node_with_such_a_frame_is_refused_at_the_start(name, make_node):
     with pytest.raises(ConfigError, match="must differ"):
-        make_node("base_frame:=map", kind=MAKERS[name])
+        make_node("base_frame:=map", kind=node_class(name))
 
 
 @pytest.mark.parametrize("frame", ["a b", "map"])
 def test_a_running_node_refuses_such_a_frame_and_keeps_its_own(frame, make_node):
-    made = make_node("autostart:=false", kind=MAKERS["middleware_node"])
+    made = make_node("autostart:=false", kind=node_class("middleware_node"))
     (answer,) = made.set_parameters([Parameter("base_frame", value=frame)])
     assert not answer.successful
     assert "'base_frame'" in answer.reason

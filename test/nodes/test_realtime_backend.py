@@ -123,6 +123,7 @@ def test_silence_of_a_topic_is_named_with_its_age_and_a_reset_goes_on(
 @pytest.mark.parametrize(("imu", "listeners"), [("gyro", 1), ("none", 0)])
 def test_the_imu_that_is_named_is_heard(connect, vehicle, imu, listeners):
     gyro = vehicle.peer.node.create_publisher(Imu, "gyro", qos.SENSOR_RELIABLE)
+    vehicle.peer.listen(TwistStamped, "cmd_vel")  # or the backend waits for a robot
     connect(domain_id=vehicle.domain_id, imu=imu)
     assert gyro.get_subscription_count() == listeners
 

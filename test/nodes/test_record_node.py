@@ -22,7 +22,6 @@ from nics_drl_bridge.recording.readers import read_recording
 from nics_drl_bridge.recording.recording import check
 from nics_drl_bridge.robot.spec import load_robot
 from nodes.peer import DEADLINE_S, odometry, pose_of
-from nodes.test_output import full_pipe
 
 pytestmark = pytest.mark.ros
 
@@ -279,20 +278,3 @@ def test_a_recorded_drive_of_a_simulator_generates_it_again(
     away = np.hypot(*(poses - poses[0])[:, :2].T) + spec.footprint_radius
     assert 0.5 < away.max() < 2.0
     assert all(each.share > 0.6 and not each.fault for each in coverage(drive, spec))
-
-
-@pytest.mark.process
-def test_the_command_line_drives_on_and_heeds_ctrl_c_though_nobody_reads_its_errors(
-    nics, meet, domain_id, tmp_path
-):
-    exit_, entrance = full_pipe()
-    robot = FakeRobot(meet(domain_id))
-    command = nics("--robot", "ackermann", "--out", "drive.npz", errors=entrance)
-    os.close(entrance)
-    robot.until(lambda: robot.driven, "it drives")
-    command.process.send_signal(signal.SIGINT)
-    robot.until(lambda: command.ended, "it ends")
-    os.close(exit_)
-    assert command.process.returncode == 130
-    robot.peer.until(lambda: robot.heard[-1] == Twist(), "zero")
-    assert "s are recorded in drive.npz\n" in command.said

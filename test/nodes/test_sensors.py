@@ -14,7 +14,7 @@ from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.generator import save_model
 from nics_drl_bridge.lidar.further_lidar import FurtherLidar
 from nics_drl_bridge.lidar.spec import LidarSpec
-from nics_drl_bridge.nodes import command_gate, conversions, qos
+from nics_drl_bridge.nodes import conversions, gate_inputs, qos
 from nics_drl_bridge.sim.world import load_world
 
 pytestmark = pytest.mark.ros
@@ -113,8 +113,8 @@ def test_the_gate_reads_where_a_sensor_shows_something(two_lidars):
     message = conversions.sensor_to_ros(sensor, reading, 7_000_000_000, "rear_laser")
     from rclpy.serialization import serialize_message
 
-    given = command_gate.reading(sensor, serialize_message(message))
+    given = gate_inputs.read_sensor(sensor, serialize_message(message))
     assert (given.stamp_ns, given.name) == (7_000_000_000, "rear_scan")
     assert given.points == pytest.approx(np.array([[-0.6, 0.0]]), abs=1e-5)
     with pytest.raises(ValueError, match="LaserScan"):
-        command_gate.reading(sensor, b"\x00\x01\x00\x00nothing")
+        gate_inputs.read_sensor(sensor, b"\x00\x01\x00\x00nothing")

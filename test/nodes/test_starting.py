@@ -175,7 +175,7 @@ def test_every_launch_file_starts_the_launch_of_its_name():
 @pytest.mark.parametrize(
     ("given", "reason"),
     [
-        ({"robots": "0"}, "'robots' is 0"),
+        ({"robots": "0"}, "'robots' is '0'"),
         ({"robots": "[ant, bee, ant]"}, "'robots' names 'ant' twice"),
         ({"robots": "[ant"}, "'robots' is '[ant'"),
         ({"robots": "[ ]"}, "'robots' is '[ ]'"),

@@ -1,111 +1,87 @@
+"""Which transports and discovery the processes of this package have."""
+
 import os
+import socket
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
-
-from nics_drl_bridge.nodes.processes import NodeProcess
 from nics_drl_bridge.nodes.transport import (
+    BY_PROFILE,
+    FIRST_PORT,
     LOCAL,
     ONLY_LOCAL,
+    PORTS_OF_A_DOMAIN,
+    PROFILE,
     PROFILES,
     RANGE,
-    SEGMENTS,
+    RMW,
     TRANSPORTS,
     UDP,
-    chosen,
-    multicast_port,
-    ports_of,
-    stay_on_this_machine,
-    stays_here,
+    domains_in_use,
+    set_transport,
 )
 
-pytestmark = pytest.mark.ros
-
-
-WARNING = "Fast DDS did not apply "
+HERE = {RANGE: BY_PROFILE, **dict.fromkeys(PROFILES, str(PROFILE))}
+HUMBLE = {"ROS_DISTRO": "humble"}
+PEER = {"ROS_STATIC_PEERS": "10.0.0.2"}
+SUBNET = {RANGE: "SUBNET"}
 
 
 @pytest.mark.parametrize(
-    ("given", "wanted"),
+    ("chosen", "expected"),
     [
-        ({"ROS_DISTRO": "jazzy"}, {RANGE: LOCAL}),
-        ({"ROS_DISTRO": "jazzy", RANGE: "SUBNET"}, {RANGE: "SUBNET"}),
-        ({"ROS_DISTRO": "humble"}, {RANGE: LOCAL, ONLY_LOCAL: "1"}),
-        ({"ROS_DISTRO": "humble", ONLY_LOCAL: "0"}, {RANGE: LOCAL, ONLY_LOCAL: "0"}),
+        ({}, HERE),
+        ({RANGE: LOCAL}, HERE),
+        ({RANGE: "localhost"}, HERE),  # rcl takes it for LOCALHOST
+        (HERE, HERE),  # inherited
+        ({**HERE, RANGE: LOCAL}, HERE),
+        ({**HERE, **SUBNET}, {**SUBNET, TRANSPORTS: UDP}),
+        (SUBNET, {**SUBNET, TRANSPORTS: UDP}),
+        ({**SUBNET, ONLY_LOCAL: "1"}, HERE),
+        (HUMBLE, {**HUMBLE, **HERE}),
+        (
+            {**HUMBLE, ONLY_LOCAL: "0"},
+            {**HUMBLE, ONLY_LOCAL: "0", RANGE: LOCAL, TRANSPORTS: UDP},
+        ),
+        # What the user has chosen stays.
+        ({TRANSPORTS: "DEFAULT"}, {TRANSPORTS: "DEFAULT", RANGE: LOCAL}),
+        ({PROFILES[1]: "mine.xml"}, {PROFILES[1]: "mine.xml", RANGE: LOCAL}),
+        (PEER, {**PEER, RANGE: LOCAL}),
+        ({RMW: "rmw_zenoh_cpp"}, {RMW: "rmw_zenoh_cpp", RANGE: LOCAL}),
     ],
 )
-def test_discovery_stays_on_this_machine_unless_the_environment_says_otherwise(
-    given, wanted
+def test_an_environment_gets_udp_on_this_machine_unless_it_chooses_otherwise(
+    chosen, expected
 ):
-    environment = dict(given)
-    stay_on_this_machine(environment)
-    assert environment == given | wanted
+    environment = dict(chosen)
+    set_transport(environment)
+    assert environment == expected
 
 
-@pytest.mark.parametrize(
-    ("environment", "here"),
-    [
-        ({RANGE: LOCAL}, True),
-        ({RANGE: "localhost"}, True),  # rcl takes it for LOCALHOST
-        ({RANGE: "SUBNET"}, False),
-        ({RANGE: "SUBNET", ONLY_LOCAL: "1"}, True),
-        ({RANGE: LOCAL, ONLY_LOCAL: "0"}, True),
-        ({RANGE: LOCAL, "ROS_DISTRO": "humble", ONLY_LOCAL: "1"}, True),
-        ({RANGE: LOCAL, "ROS_DISTRO": "humble", ONLY_LOCAL: "0"}, False),
-    ],
-)
-def test_how_far_discovery_goes_is_read_as_rcl_reads_it(environment, here):
-    assert stays_here(environment) == here
+def test_a_domain_is_in_use_while_a_port_of_it_is_bound():
+    domain_id = min(set(range(1, 101)) - domains_in_use())
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as end:
+        end.bind(("127.0.0.1", FIRST_PORT + PORTS_OF_A_DOMAIN * domain_id + 10))
+        assert domain_id in domains_in_use()
 
 
-@pytest.mark.parametrize(
-    ("environment", "expected"),
-    [
-        ({}, False),
-        ({TRANSPORTS: UDP}, False),
-        ({TRANSPORTS: "DEFAULT"}, True),
-        ({PROFILES[1]: "mine.xml"}, True),
-        ({ONLY_LOCAL: "1"}, False),
-    ],
-)
-def test_who_names_other_transports_or_profiles_has_chosen(environment, expected):
-    assert chosen(environment) == expected
-
-
-def is_apart(process: NodeProcess, domain_id: int) -> bool:
+def is_apart(process, domain_id):
     """Whether a node has neither shared memory of Fast DDS nor the multicast of its domain."""
     maps = Path(f"/proc/{process.pid}/maps").read_bytes()
-    ports = ports_of(process.pid)
+    held = {os.readlink(file) for file in Path(f"/proc/{process.pid}/fd").iterdir()}
+    rows = Path("/proc/net/udp").read_text().splitlines()[1:]
+    fields = [row.split() for row in rows]
+    ports = {
+        int(each[1].split(":")[1], 16)
+        for each in fields
+        if f"socket:[{each[9]}]" in held
+    }
     assert ports
-    shares = any(segment in maps for segment in SEGMENTS)
-    return not shares and multicast_port(domain_id) not in ports
-
-
-@pytest.mark.process
-def test_nodes_have_udp_on_this_machine_alone(launch_process, meet, domain_id):
-    process = launch_process("command_gate", domain_id)
-    meet(domain_id).be_known_to("/command_gate")
-    assert is_apart(process, domain_id)
-
-
-def run(code: str, domain_id: int, folder: Path, **environment: str) -> str:
-    """What a Python process says that has nothing of this one's environment on DDS."""
-    ours = (RANGE, ONLY_LOCAL, TRANSPORTS, *PROFILES)
-    kept = {name: value for name, value in os.environ.items() if name not in ours}
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        env=kept | {"ROS_DOMAIN_ID": str(domain_id)} | environment,
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=120.0,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stderr
+    multicast = FIRST_PORT + PORTS_OF_A_DOMAIN * domain_id
+    return b"shm/fast" not in maps and multicast not in ports
 
 
 DRIVER = """
@@ -132,91 +108,15 @@ with open("/proc/self/maps", "rb") as maps:
 """
 
 
+@pytest.mark.ros
 @pytest.mark.process
-def test_a_driver_that_has_shared_memory_is_heard_and_hears(
-    launch_process, domain_id, tmp_path
+def test_a_node_has_udp_on_this_machine_and_a_driver_with_shared_memory_is_heard(
+    launch_process, domain_id
 ):
     process = launch_process("simulator_node", domain_id, mode="lockstep")
-    run(DRIVER, domain_id, tmp_path, **{RANGE: LOCAL})
+    ours = (RANGE, ONLY_LOCAL, TRANSPORTS, *PROFILES)
+    kept = {name: value for name, value in os.environ.items() if name not in ours}
+    own = {"ROS_DOMAIN_ID": str(domain_id), RANGE: LOCAL}
+    driver = [sys.executable, "-c", DRIVER]
+    subprocess.run(driver, env=kept | own, check=True, timeout=120.0)
     assert is_apart(process, domain_id)
-
-
-IN_ORDER = f"""
-import os
-from pathlib import Path
-from rclpy.context import Context
-from rclpy.node import Node
-from nics_drl_bridge.errors import BackendError
-from nics_drl_bridge.nodes.listener import open_context
-from nics_drl_bridge.nodes.transport import multicast_port, ports_of
-
-def ours(where=None):
-    if where is not None:
-        os.environ["{RANGE}"] = where
-    return Node("ours", context=open_context())
-
-def plain():
-    context = Context()
-    context.init(None)
-    return Node("of_somebody_else", context=context)
-
-def shared():
-    return b"shm/fast" in Path("/proc/self/maps").read_bytes()
-
-def multicast():
-    return multicast_port(int(os.environ["ROS_DOMAIN_ID"])) in ports_of()
-"""
-
-
-@pytest.mark.process
-def test_the_environment_is_left_as_it_was_found(domain_id, tmp_path):
-    code = "before = dict(os.environ)\nends = [ours(), ours()]\n"
-    code += f"assert os.environ == before | {{'{RANGE}': '{LOCAL}'}}\n"
-    code += "assert not shared() and not multicast()"
-    assert WARNING not in run(IN_ORDER + code, domain_id, tmp_path)
-
-
-@pytest.mark.process
-def test_after_a_node_of_somebody_else_discovery_stays_here_with_a_warning(
-    domain_id, tmp_path
-):
-    code = "other = plain()\nends = [ours(), ours()]\nassert not multicast()"
-    said = run(IN_ORDER + code, domain_id, tmp_path, **{RANGE: LOCAL})
-    assert said.count(WARNING) == 1
-
-
-@pytest.mark.process
-def test_discovery_does_not_silently_stay_here_where_a_subnet_is_asked_for(
-    domain_id, tmp_path
-):
-    code = "first = ours()\n"
-    code += "try:\n    ours('SUBNET')\nexcept BackendError as error:\n"
-    code += (
-        "    assert 'SUBNET, but an earlier node in this process keeps' in str(error)\n"
-    )
-    code += "else:\n    raise AssertionError('a subnet that nobody sees')"
-    run(IN_ORDER + code, domain_id, tmp_path)
-
-
-@pytest.mark.process
-def test_the_older_word_for_this_machine_is_heeded(domain_id, tmp_path):
-    code = "first = ours()\nassert not multicast() and not shared()"
-    run(IN_ORDER + code, domain_id, tmp_path, **{ONLY_LOCAL: "1"})
-
-
-@pytest.mark.process
-def test_the_probe_offers_nothing_that_rights_would_have_to_allow(domain_id, tmp_path):
-    code = (
-        "import nics_drl_bridge.nodes.transport as transport\n"
-        "seen = []\n"
-        "class Watched(transport.Node):\n"
-        "    def destroy_node(self):\n"
-        "        seen.append([self.get_name()] + [name for ends in (self.publishers,\n"
-        "            self.subscriptions) for name in sorted(each.topic_name for each in ends)]\n"
-        "            + [each.srv_name for each in self.services])\n"
-        "        super().destroy_node()\n"
-        "transport.Node = Watched\n"
-        "ours()\n"
-        "assert seen == [['transport_probe', '/parameter_events']], seen\n"
-    )
-    run(IN_ORDER + code, domain_id, tmp_path)

@@ -45,7 +45,7 @@ def record(
     kind = _choose_storage(storage)
     with extensions.require_modules("nics bag record"):
         from nics_drl_bridge.extras.bags.live import BagOrder, record_bag
-        from nics_drl_bridge.nodes.output import forwarded_errors
+        from nics_drl_bridge.nodes.own_process import forwarded_errors
     names = tuple(topics or ())
     say = partial(typer.echo, err=True)
     order = BagOrder(

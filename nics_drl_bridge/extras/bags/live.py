@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from rcl_interfaces.srv import GetParameters
-from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -25,7 +24,7 @@ from nics_drl_bridge.config import parse_namespace
 from nics_drl_bridge.errors import BackendError, RecordingError, suggest
 from nics_drl_bridge.nodes.conversions import message_texts, message_type, stamp_to_ros
 from nics_drl_bridge.nodes.listener import holds, open_context
-from nics_drl_bridge.nodes.qos import QosWatch, offer_of, profile_of
+from nics_drl_bridge.nodes.qos import BridgeNode, offer_of, profile_of
 from nics_drl_bridge.nodes.runner import DELIVERY_S, run_node, steadily
 from nics_drl_bridge.recording.bag_file import BagFile, open_bag
 from nics_drl_bridge.recording.messages import Offer
@@ -84,22 +83,22 @@ class BagOrder:
         }
 
 
-class BagRecorder(QosWatch):
+class BagRecorder(BridgeNode):
     """Writes wanted topics to a bag; `say` gets each topic that starts or can't be recorded."""
 
     def __init__(
         self,
-        context: Context,
         order: BagOrder,
         sink: BagSink,
         say: Callable[[str], None],
+        **options: Any,
     ) -> None:
         overrides = [Parameter("use_sim_time", value=order.use_sim_time)]
         super().__init__(
             "bag_recorder",
-            context=context,
             parameter_overrides=overrides,
             start_parameter_services=False,
+            **options,
         )
         self._order = order
         self._sink = sink
@@ -182,9 +181,7 @@ def record_bag(order: BagOrder, say: Callable[[str], None]) -> dict[str, int]:
     Raises BackendError if nothing was received, and RecordingError.
     """
     with open_bag_sink(order.out, order.storage, keep=True) as sink:
-        node = run_node(
-            lambda context: BagRecorder(context, order, sink, say), ["nics"]
-        )
+        node = run_node(partial(BagRecorder, order, sink, say), ["nics"])
         if sink.fault is not None:
             raise sink.fault
         if not sum(sink.counts.values()):

@@ -3,7 +3,6 @@
 from dataclasses import replace
 from functools import partial
 
-from rclpy.context import Context
 from rclpy.node import Node
 
 from nics_drl_bridge import defaults
@@ -33,9 +32,5 @@ def mujoco_simulator(
     return MujocoSimulator(model, world, robots, renderer, physics, randomisation(node))
 
 
-def mujoco_node(context: Context) -> DeviceNode:
-    """Makes the node `mujoco_node`; see `DeviceNode`."""
-    return DeviceNode("mujoco_node", context, mujoco_simulator)
-
-
-main = partial(run_node, mujoco_node, sole_name="mujoco_node")
+MujocoNode = partial(DeviceNode, "mujoco_node", mujoco_simulator)
+main = partial(run_node, MujocoNode, sole_name="mujoco_node")

@@ -1,7 +1,6 @@
 """The client: episodes and steps of any simulator that serves simulation_interfaces."""
 
 import re
-import time
 from importlib import import_module
 from typing import Any
 
@@ -15,9 +14,7 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Array, Start
 from nics_drl_bridge.lidar.exact_kernels import RADIUS
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.link import POLL_S, Link
-from nics_drl_bridge.nodes.listener import holds
-from nics_drl_bridge.nodes.lockstep_inbox import Inbox
+from nics_drl_bridge.nodes.link import POLL_S, Inbox, Link
 from nics_drl_bridge.nodes.parameters import NEWEST
 from nics_drl_bridge.sim.entities import OBSTACLE
 from nics_drl_bridge.sim.scenes import sample_scene
@@ -169,10 +166,10 @@ class StandardEpisodes:
         for _ in range(2):
             self._clock.clear()
             self._call("StepSimulation", timeout_s, steps=1)
-            if not holds(lambda: self._clock, timeout_s, POLL_S):
+            if not self._link.wait_until(lambda: self._clock, timeout_s):
                 fault = f"no message on /clock within {timeout_s:g} s, so the length of a step"
                 raise BackendError(f"{fault} is unknown; give it as the option step_s.")
-            time.sleep(POLL_S)  # of several that a step publishes the last
+            self._link.wait_until(lambda: False, POLL_S)  # of several, the last counts
             stamps.append(conversions.stamp_from_ros(self._clock[-1].clock))
         self._link.node.destroy_subscription(self._listening)
         if stamps[1] <= stamps[0]:
@@ -185,7 +182,9 @@ class StandardEpisodes:
         """Begin an episode; return the stamp of its first data [ns]. Raises BackendError."""
         if not self._steps:
             self.open(timeout_s)
-        holds(lambda: all(future.done() for future in self._pending), timeout_s, POLL_S)
+        self._link.wait_until(
+            lambda: all(future.done() for future in self._pending), timeout_s
+        )
         self._pending.clear()
         self._pause(timeout_s)
         scopes = self._types.ResetSimulation.Request
@@ -204,12 +203,11 @@ class StandardEpisodes:
         if time_ns:
             return time_ns + self._period_ns
         # An answer without a stamp: by the first data, of several steps the last.
-        holds(
+        self._link.wait_until(
             lambda: self._pending[-1].done() and self._inbox.find_newest_ns() >= 0,
             timeout_s,
-            POLL_S,
         )
-        time.sleep(POLL_S)
+        self._link.wait_until(lambda: False, POLL_S)
         return max(0, self._inbox.find_newest_ns())
 
     def _put_obstacles(self, start: Start, timeout_s: float) -> None:

@@ -12,7 +12,12 @@ from std_msgs.msg import Bool
 from nics_drl_bridge.gate import inputs
 from nics_drl_bridge.gate.intake import estimate_malformed
 from nics_drl_bridge.lidar.spec import from_device, load_lidar
-from nics_drl_bridge.nodes import command_gate, conversions, wire
+from nics_drl_bridge.nodes import conversions, gate_inputs, wire
+from nics_drl_bridge.nodes.gate_inputs import (
+    LONGEST_SLEEP_S,
+    QUEUE_MESSAGES,
+    EStopQueue,
+)
 
 STAMP_NS = 1_763_000_000_123_456_789
 LIDAR = load_lidar("paper")
@@ -34,7 +39,7 @@ def test_a_scan_is_what_the_device_says_in_the_words_of_the_package():
     ranges = np.linspace(0.0, 4.0, LIDAR.beams, dtype=np.float32)
     ranges[:3] = np.nan, np.inf, -np.inf
     message = conversions.scan_to_ros(LIDAR, ranges, STAMP_NS, "laser")
-    read = command_gate.scan(LIDAR, serialize_message(message))
+    read = gate_inputs.read_scan(LIDAR, serialize_message(message))
     assert read.stamp_ns == STAMP_NS
     assert read.angles == pytest.approx(
         (message.angle_min, message.angle_increment), rel=1e-6
@@ -45,7 +50,7 @@ def test_a_scan_is_what_the_device_says_in_the_words_of_the_package():
 
 def test_an_odometry_is_pose_and_twist():
     message = odometry()
-    read = command_gate.odometry(serialize_message(message))
+    read = gate_inputs.read_odometry(serialize_message(message))
     pose, twist = conversions.odometry_from_ros(message)
     assert (read.stamp_ns, read.pose.tobytes(), read.twist.tobytes()) == (
         STAMP_NS,
@@ -62,15 +67,15 @@ def test_an_odometry_without_a_rotation_has_no_pose(quaternion):
     message.pose.pose.orientation = Quaternion(
         **dict(zip("xyzw", quaternion, strict=True))
     )
-    assert np.isnan(command_gate.odometry(serialize_message(message)).pose).all()
+    assert np.isnan(gate_inputs.read_odometry(serialize_message(message)).pose).all()
 
 
 def test_an_estimate_is_a_twist_and_how_uncertain_its_pose_is():
     message = odometry()
-    read = command_gate.estimate(serialize_message(message))
+    read = gate_inputs.read_estimate(serialize_message(message))
     assert (
         read.pose.tolist()
-        == command_gate.odometry(serialize_message(message)).pose.tolist()
+        == gate_inputs.read_odometry(serialize_message(message)).pose.tolist()
     )
     assert np.diag(read.covariance).tolist() == [0.0, 7.0, 35.0]
     assert read.twist.tolist() == [0.3, -0.1, 0.2]
@@ -79,20 +84,20 @@ def test_an_estimate_is_a_twist_and_how_uncertain_its_pose_is():
 def test_a_command_and_a_word_of_the_e_stop():
     message = TwistStamped(twist=conversions.twist_to_ros([0.5, 0.0, np.nan]))
     message.header.stamp = conversions.stamp_to_ros(STAMP_NS)
-    read = command_gate.command(serialize_message(message))
+    read = gate_inputs.read_command(serialize_message(message))
     assert read.stamp_ns == STAMP_NS
     assert np.array_equal(read.twist, [0.5, 0.0, np.nan], equal_nan=True)
-    assert command_gate.e_stop(serialize_message(Bool(data=True))).pressed
+    assert gate_inputs.read_e_stop(serialize_message(Bool(data=True))).pressed
 
 
 @pytest.mark.parametrize(
     "read",
     [
-        lambda content: command_gate.scan(LIDAR, content),
-        command_gate.odometry,
-        command_gate.estimate,
-        command_gate.command,
-        command_gate.e_stop,
+        lambda content: gate_inputs.read_scan(LIDAR, content),
+        gate_inputs.read_odometry,
+        gate_inputs.read_estimate,
+        gate_inputs.read_command,
+        gate_inputs.read_e_stop,
     ],
 )
 def test_bytes_that_end_too_early_are_unreadable(read):
@@ -112,7 +117,7 @@ def test_bytes_that_end_too_early_are_unreadable(read):
 def test_an_estimate_one_of_whose_variances_is_no_number_is_refused(place, variance):
     message = odometry()
     message.pose.covariance[place] = variance
-    read = command_gate.estimate(serialize_message(message))
+    read = gate_inputs.read_estimate(serialize_message(message))
     assert estimate_malformed(None, read)
 
 
@@ -126,7 +131,7 @@ def test_another_controllers_command_counts_as_of_the_newest_scan():
     stamped.header.stamp = conversions.stamp_to_ros(STAMP_NS)
     for kind, message in (("Twist", twist), ("TwistStamped", stamped)):
         content = serialize_message(message)
-        read = command_gate.foreign_command(
+        read = gate_inputs.read_foreign_command(
             kind, STAMP_NS - 1, scanned(STAMP_NS + 7), content
         )
         assert (read.stamp_ns, read.twist.tolist()) == (STAMP_NS + 7, [0.5, 0.0, 0.2])
@@ -137,11 +142,55 @@ def test_another_controllers_command_is_refused_if_it_is_old_or_before_any_scan(
     stamped.header.stamp = conversions.stamp_to_ros(STAMP_NS)
     content = serialize_message(stamped)
     with pytest.raises(ValueError, match="its stamp is older than command_age"):
-        command_gate.foreign_command(
+        gate_inputs.read_foreign_command(
             "TwistStamped", STAMP_NS + 1, scanned(STAMP_NS), content
         )
     with pytest.raises(ValueError, match="no scan has arrived yet"):
-        command_gate.foreign_command("TwistStamped", 0, None, content)
+        gate_inputs.read_foreign_command("TwistStamped", 0, None, content)
     unstamped = serialize_message(TwistStamped())
-    kept = command_gate.foreign_command("TwistStamped", 1, scanned(STAMP_NS), unstamped)
+    kept = gate_inputs.read_foreign_command(
+        "TwistStamped", 1, scanned(STAMP_NS), unstamped
+    )
     assert kept.stamp_ns == STAMP_NS
+
+
+def heard_at(rate, seconds=2.0):
+    """A queue that has heard messages at a rate, up to a last tick at the time 0."""
+    queue = EStopQueue()
+    for k in range(round(rate * seconds), -1, -1):
+        queue.hear(-k / rate, 1)
+        assert queue.tick(-k / rate) == ""
+    return queue
+
+
+@pytest.mark.parametrize("rate", [5.0, 100.0, 1000.0])
+def test_a_sleep_in_which_all_messages_fit_is_no_press(rate):
+    fits = min(QUEUE_MESSAGES / rate, LONGEST_SLEEP_S)
+    assert heard_at(rate).tick(0.9 * fits) == ""
+
+
+@pytest.mark.parametrize("rate", [5.0, 100.0, 1000.0])
+def test_a_sleep_in_which_more_may_have_come_counts_as_a_press(rate):
+    fits = min(QUEUE_MESSAGES / rate, LONGEST_SLEEP_S)
+    assert "the gate slept for" in heard_at(rate).tick(1.1 * fits)
+
+
+def test_more_messages_at_once_than_surely_fit_count_as_a_press():
+    """A second publisher at 1 kHz began in a short sleep, of whose rate nothing is known yet."""
+    queue = heard_at(100.0)
+    queue.hear(0.4, 250)
+    assert "250 messages came at once" in queue.tick(0.4)
+    queue.hear(0.42, 20)
+    assert queue.tick(0.42) == ""
+
+
+def test_without_a_button_a_sleep_loses_no_press():
+    queue = EStopQueue()
+    queue.tick(0.0)
+    assert queue.tick(100.0) == ""
+
+
+def test_the_first_tick_follows_no_sleep():
+    queue = EStopQueue()
+    queue.hear(0.0, 1)
+    assert queue.tick(100.0) == ""

@@ -1,21 +1,27 @@
-"""Output of a node's process that never blocks it.
+"""The process of a node: its output, which never blocks it, and its end, which is never slow.
 
 ROS 2, its libraries and Python write to the file descriptors 1 and 2. A terminal halted by Ctrl-S,
 or a pipe that nobody reads, would block them. So both descriptors lead into a non-blocking pipe,
 and a small process forwards its content (`output_forwarder.py`). The terminal itself must not be
 made non-blocking, because that would affect every process that uses it.
+
+Python runs signal handlers between two of its own instructions, so none runs while LLVM compiles
+for seconds. Until a node runs, it has nothing to clean up, and signals keep their default effect:
+they end the process, with the signal's exit code. At the end, Python is not finalised either: on a
+busy machine that takes as long as everything before, and unloads libraries while their threads run.
 """
 
 import contextlib
 import fcntl
 import io
 import os
+import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, NoReturn, TextIO
 
 PROGRAM = Path(__file__).with_name("output_forwarder.py")
 STDOUT = 1
@@ -192,3 +198,63 @@ def widen_pipe(entrance: int) -> None:
     # not available on every system; the default size will do
     with contextlib.suppress(AttributeError, OSError):
         fcntl.fcntl(entrance, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
+
+
+ENDING = (
+    signal.SIGHUP,  # the terminal or the ssh session is gone
+    signal.SIGINT,
+    signal.SIGQUIT,
+    signal.SIGUSR1,
+    signal.SIGUSR2,
+    signal.SIGALRM,
+    signal.SIGTERM,
+    signal.SIGVTALRM,
+    signal.SIGPROF,
+    signal.SIGXCPU,
+    signal.SIGIO,
+    signal.SIGPWR,
+    *range(signal.SIGRTMIN, signal.SIGRTMAX + 1),
+)
+"""Signals that end a process unless it handles them, except SIGKILL, signals of a fault in the
+process itself, and those that Python ignores, such as SIGPIPE."""
+_own_process = False  # True if this process is a single node
+
+
+def leave(code: int) -> NoReturn:
+    """End the process; call it when all is closed."""
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(Exception):  # whoever read it has gone
+            stream.flush()
+    finish_output(FINISH_S)
+    os._exit(code)
+
+
+def ending_signals() -> list[int]:
+    """Return the signals at which this process ends cleanly.
+
+    SIGHUP is not among them if the process is to outlive its terminal, as under `nohup`.
+    """
+    outlives = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    return [number for number in ENDING if not (outlives and number == signal.SIGHUP)]
+
+
+def begin_own_process() -> None:
+    """Let `at_once` take effect, because this process is a single node."""
+    global _own_process
+    _own_process = True
+
+
+@contextlib.contextmanager
+def at_once() -> Iterator[None]:
+    """Within this context, let ending signals end the process at once, whatever it is doing."""
+    if not _own_process:
+        yield
+        return
+    handlers = {number: signal.getsignal(number) for number in ending_signals()}
+    for number in handlers:
+        signal.signal(number, signal.SIG_DFL)
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
