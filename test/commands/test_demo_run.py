@@ -113,7 +113,7 @@ def test_the_report_begins_with_success_in_three_worlds_and_folds_the_figures(
 
 def test_it_trains_in_the_world_and_simulator_of_the_plan(tmp_path):
     plan = DemoPlan(tmp_path, world="circles", train_steps=7)
-    settings, told = derive_settings(plan, direct_model())
+    settings, told, _ = derive_settings(plan, direct_model())
     assert told == ()
     assert settings.robot == str(tmp_path / "model")
     assert settings.worlds == {"circles": 512}
