@@ -1,5 +1,6 @@
 """The server: every service of the standard, and the features that stand behind them."""
 
+import re
 from collections.abc import Callable
 from typing import Any, NoReturn
 
@@ -7,7 +8,6 @@ from rclpy.action import ActionServer, CancelResponse
 from simulation_interfaces.msg import Result, SimulatorFeatures
 
 from nics_drl_bridge.nodes import conversions
-from nics_drl_bridge.nodes.simulation_interfaces.client import PACKAGE, snake_case
 from nics_drl_bridge.nodes.simulation_interfaces.entities import EntityServices
 from nics_drl_bridge.nodes.simulation_interfaces.host import (
     Handler,
@@ -18,6 +18,7 @@ from nics_drl_bridge.nodes.simulation_interfaces.spawning import FORMATS, Spawni
 from nics_drl_bridge.nodes.simulation_interfaces.state import WITHOUT_WORLD, Simulation
 from nics_drl_bridge.nodes.simulation_interfaces.worlds import Worlds
 
+PACKAGE = "simulation_interfaces"
 FEATURES = (
     "SPAWNING",
     "DELETING",
@@ -51,6 +52,11 @@ FEATURES = (
     "SPAWNING_ENTITIES",
 )
 ABOUT = "nics_drl_bridge: a 2-D world of shapes and robots of one kind; docs/simulator_node.md"
+
+
+def snake_case(name: str) -> str:
+    """Return the name of a service as all simulators write it: `get_entities`."""
+    return re.sub("(?<!^)(?=[A-Z])", "_", name).lower()
 
 
 class Server:

@@ -7,9 +7,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
-from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.nodes import simulation_interfaces as standard
-from nics_drl_bridge.nodes.simulation_interfaces import client
 
 
 @pytest.fixture(params=["1.x", "2.0"])
@@ -40,10 +38,3 @@ def test_a_simulator_goes_on_without_the_services_and_tells_why(older):
     assert standard.open_services(node) is None
     (line,) = said
     assert "2.1 or newer, is not installed" in line
-
-
-def test_a_client_tells_which_version_it_needs(older):
-    with pytest.raises(
-        ConfigError, match=r"install simulation_interfaces 2\.1 or newer"
-    ):
-        client.module("srv")
