@@ -40,7 +40,7 @@ from nics_drl_bridge.nodes.conversions import sensor_to_ros, sensor_type
 from nics_drl_bridge.nodes.link import identity
 from nics_drl_bridge.nodes.map_to_odom import odom_in_map, transform_to_ros
 from nics_drl_bridge.nodes.message_packages import how_to_install
-from nics_drl_bridge.nodes.simulation_interfaces import open_services
+from nics_drl_bridge.nodes.parts import open_parts
 from nics_drl_bridge.nodes.world_topics import WorldTopics
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.device import LEAST_VARIANCE, DeviceWorld, Sensed, variances
@@ -328,7 +328,7 @@ class DeviceNode(qos.BridgeNode):
         self._open_topics()
         self._start_time()
         # its entities include those of the first episode
-        self.standard = open_services(self)
+        self._parts = open_parts("device", self)
         self.begin()
 
     def use_world(self, world: AnyWorld) -> None:
@@ -637,7 +637,7 @@ class DeviceNode(qos.BridgeNode):
         return response
 
     def _require_world(self) -> None:
-        if self.standard is not None and not self.standard.has_world:
+        if not all(part.has_world for part in self._parts):
             raise BackendError(
                 "no world is loaded; load one with the service load_world."
             )

@@ -320,7 +320,9 @@ def test_nav2s_own_parameter_file_is_taken_under_the_name_of_its_controller_serv
     words = ("--params-file", str(tmp_path / name), *CONTROLLER)
     node = make_node(words=words, kind=PolicyNode)
     assert unknown(node) == []
-    goal, progress = node._nav2.checks("general_goal_checker", "progress_checker")
+    goal, progress = node._leaders[0].parameters.checks(
+        "general_goal_checker", "progress_checker"
+    )
     assert goal.xy_goal_tolerance == 0.25
     assert progress.movement_time_allowance == 10.0
 
@@ -337,8 +339,8 @@ def test_the_progress_checker_of_humble_is_taken_by_its_own_name(make_node, tmp_
     words = ("--params-file", str(file), *CONTROLLER)
     node = make_node(words=words, kind=PolicyNode)
     assert unknown(node) == []
-    assert node._nav2.names["progress_checker"] == ("progress",)
-    _, progress = node._nav2.checks("general_goal_checker", "progress")
+    assert node._leaders[0].parameters.names["progress_checker"] == ("progress",)
+    _, progress = node._leaders[0].parameters.checks("general_goal_checker", "progress")
     assert progress.movement_time_allowance == 7.0
 
 
@@ -355,7 +357,8 @@ def test_checkers_go_by_their_plugins_and_unknown_headings_do_not_count(make_nod
     node = make_node(*words, kind=PolicyNode)
     assert unknown(node) == []
     found = [
-        node._nav2.checks(*names) for names in (("exact", "slow"), ("near", "turning"))
+        node._leaders[0].parameters.checks(*names)
+        for names in (("exact", "slow"), ("near", "turning"))
     ]
     assert [goal.yaw_goal_tolerance for goal, _ in found] == [0.25, math.inf]
     angles = [progress.required_movement_angle for _, progress in found]
