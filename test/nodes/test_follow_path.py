@@ -22,9 +22,9 @@ from rclpy.node import NodeNameNonExistentError
 from test_packaging import ROOT
 
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.extras.nav2.follow_path import FOLLOW, NAVIGATE, PathActions
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import conversions, policy_node, qos
-from nics_drl_bridge.nodes.follow_path import FOLLOW, NAVIGATE, PathActions
 from nics_drl_bridge.nodes.policy_node import PolicyNode
 from nics_drl_bridge.nodes.runner import unknown
 from nodes.peer import pose_of
@@ -389,7 +389,7 @@ def test_a_policy_begins_anew_with_another_goal_and_not_with_another_way_to_it(
 
 
 def test_results_of_distributions_without_codes_are_filled_as_far_as_they_go():
-    from nics_drl_bridge.nodes.follow_path import result_of
+    from nics_drl_bridge.extras.nav2.follow_path import result_of
 
     class Bare:
         class Result:

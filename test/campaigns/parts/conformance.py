@@ -19,8 +19,8 @@ from rosgraph_msgs.msg import Clock
 from simulation_interfaces import msg, srv
 from simulation_interfaces.action import SimulateSteps
 
+from nics_drl_bridge.extras.simulation_interfaces.server import snake_case
 from nics_drl_bridge.nodes.listener import open_context
-from nics_drl_bridge.nodes.simulation_interfaces.server import snake_case
 
 OK = msg.Result.RESULT_OK
 UNSUPPORTED = msg.Result.RESULT_FEATURE_UNSUPPORTED

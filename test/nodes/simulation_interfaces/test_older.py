@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
-from nics_drl_bridge.nodes import simulation_interfaces as standard
+from nics_drl_bridge.extras import simulation_interfaces as standard
 
 
 @pytest.fixture(params=["1.x", "2.0"])
@@ -23,7 +23,7 @@ def older(request, monkeypatch):
         monkeypatch.setitem(sys.modules, module.__name__, module)
     for name in ("msg", "action"):
         monkeypatch.setitem(sys.modules, f"simulation_interfaces.{name}", None)
-    server = "nics_drl_bridge.nodes.simulation_interfaces.server"
+    server = "nics_drl_bridge.extras.simulation_interfaces.server"
     for name in [each for each in sys.modules if each.startswith(server)]:
         monkeypatch.delitem(sys.modules, name)
 

@@ -8,13 +8,13 @@ from simulation_interfaces.msg import EntityInfo, Result, SimulationState
 from simulation_interfaces.srv import ResetSimulation, SetSimulationState
 
 from nics_drl_bridge.errors import BridgeError
-from nics_drl_bridge.nodes import runner
-from nics_drl_bridge.nodes.simulation_interfaces.host import (
+from nics_drl_bridge.extras.simulation_interfaces.host import (
     NO_WORLD,
     Host,
     RefusalError,
     outcome,
 )
+from nics_drl_bridge.nodes import runner
 from nics_drl_bridge.sim.entities import Entities
 
 STOPPED = SimulationState.STATE_STOPPED

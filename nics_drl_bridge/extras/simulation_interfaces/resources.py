@@ -13,7 +13,7 @@ from simulation_interfaces.srv import LoadWorld
 
 from nics_drl_bridge.config import read_text
 from nics_drl_bridge.errors import ConfigError, MissingFileError
-from nics_drl_bridge.nodes.simulation_interfaces.host import RefusalError
+from nics_drl_bridge.extras.simulation_interfaces.host import RefusalError
 from nics_drl_bridge.sim.sdf import AssetsError
 from nics_drl_bridge.sim.world_set import SPECIAL
 

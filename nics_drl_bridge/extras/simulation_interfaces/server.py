@@ -7,16 +7,16 @@ from typing import Any, NoReturn
 from rclpy.action import ActionServer, CancelResponse
 from simulation_interfaces.msg import Result, SimulatorFeatures
 
-from nics_drl_bridge.nodes import conversions
-from nics_drl_bridge.nodes.simulation_interfaces.entities import EntityServices
-from nics_drl_bridge.nodes.simulation_interfaces.host import (
+from nics_drl_bridge.extras.simulation_interfaces.entities import EntityServices
+from nics_drl_bridge.extras.simulation_interfaces.host import (
     Handler,
     RefusalError,
     served,
 )
-from nics_drl_bridge.nodes.simulation_interfaces.spawning import FORMATS, Spawning
-from nics_drl_bridge.nodes.simulation_interfaces.state import WITHOUT_WORLD, Simulation
-from nics_drl_bridge.nodes.simulation_interfaces.worlds import Worlds
+from nics_drl_bridge.extras.simulation_interfaces.spawning import FORMATS, Spawning
+from nics_drl_bridge.extras.simulation_interfaces.state import WITHOUT_WORLD, Simulation
+from nics_drl_bridge.extras.simulation_interfaces.worlds import Worlds
+from nics_drl_bridge.nodes import conversions
 
 PACKAGE = "simulation_interfaces"
 FEATURES = (

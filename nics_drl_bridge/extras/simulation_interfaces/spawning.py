@@ -18,11 +18,15 @@ from simulation_interfaces.srv import SpawnEntities
 from nics_drl_bridge import geometry
 from nics_drl_bridge.config import find_config, read_text, share_folder
 from nics_drl_bridge.errors import BridgeError, ConfigError
+from nics_drl_bridge.extras.simulation_interfaces import plane, resources
+from nics_drl_bridge.extras.simulation_interfaces.entities import EntityServices
+from nics_drl_bridge.extras.simulation_interfaces.host import (
+    Host,
+    RefusalError,
+    outcome,
+)
+from nics_drl_bridge.extras.simulation_interfaces.state import Simulation
 from nics_drl_bridge.nodes import device_parameters
-from nics_drl_bridge.nodes.simulation_interfaces import plane, resources
-from nics_drl_bridge.nodes.simulation_interfaces.entities import EntityServices
-from nics_drl_bridge.nodes.simulation_interfaces.host import Host, RefusalError, outcome
-from nics_drl_bridge.nodes.simulation_interfaces.state import Simulation
 from nics_drl_bridge.sim.entities import NAME, OutsideError, hull_of
 from nics_drl_bridge.sim.models import Model, model_of_sdf, model_of_yaml
 

@@ -9,10 +9,10 @@ from geometry_msgs.msg import Vector3
 from simulation_interfaces.msg import Bounds, Result
 
 from nics_drl_bridge import geometry
+from nics_drl_bridge.extras.simulation_interfaces.host import RefusalError
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.lidar.shapes import convex_hull
 from nics_drl_bridge.nodes import conversions
-from nics_drl_bridge.nodes.simulation_interfaces.host import RefusalError
 from nics_drl_bridge.recording.messages import is_rotation
 from nics_drl_bridge.sim.entities import Entities, overlap
 

@@ -14,10 +14,10 @@ from simulation_interfaces.msg import (
 from simulation_interfaces.srv import SetEntityState
 
 from nics_drl_bridge import geometry as planar
+from nics_drl_bridge.extras.simulation_interfaces import plane
+from nics_drl_bridge.extras.simulation_interfaces.host import Host, RefusalError
+from nics_drl_bridge.extras.simulation_interfaces.state import Simulation
 from nics_drl_bridge.nodes import conversions
-from nics_drl_bridge.nodes.simulation_interfaces import plane
-from nics_drl_bridge.nodes.simulation_interfaces.host import Host, RefusalError
-from nics_drl_bridge.nodes.simulation_interfaces.state import Simulation
 from nics_drl_bridge.sim.entities import Entity, OutsideError
 from nics_drl_bridge.sim.obstacles import Pedestrian
 

@@ -17,16 +17,16 @@ from nics_drl_bridge.errors import (
     ConfigError,
     UnknownNameError,
 )
-from nics_drl_bridge.lidar.maps import FREE
-from nics_drl_bridge.nodes.runner import get_text
-from nics_drl_bridge.nodes.simulation_interfaces import resources
-from nics_drl_bridge.nodes.simulation_interfaces.entities import tags_match
-from nics_drl_bridge.nodes.simulation_interfaces.host import RefusalError
-from nics_drl_bridge.nodes.simulation_interfaces.state import (
+from nics_drl_bridge.extras.simulation_interfaces import resources
+from nics_drl_bridge.extras.simulation_interfaces.entities import tags_match
+from nics_drl_bridge.extras.simulation_interfaces.host import RefusalError
+from nics_drl_bridge.extras.simulation_interfaces.state import (
     STOPPED,
     WITHOUT_WORLD,
     Simulation,
 )
+from nics_drl_bridge.lidar.maps import FREE
+from nics_drl_bridge.nodes.runner import get_text
 from nics_drl_bridge.sim.models import HEIGHT, file_of
 from nics_drl_bridge.sim.occupancy import occupancy
 from nics_drl_bridge.sim.sdf import read_sdf, root_of
