@@ -196,7 +196,8 @@ class PolicyNode(ManagedNode):
         for leader in self._leaders:
             if leader.active:
                 self._goal = np.full(2, np.nan)  # the previous goal is given up
-                return leader.twist()
+                twist: Array = leader.twist()
+                return twist
         if not (self._topics.located and np.isfinite(self._goal).all()):
             return np.zeros(3)
         verdict = self._task.judge(self._topics.view(), {"goal": self._goal})

@@ -22,16 +22,12 @@ PACKAGE = "simulation_interfaces"
 FEATURES = (
     "SPAWNING",
     "DELETING",
-    "ENTITY_TAGS",
     "ENTITY_BOUNDS",
-    "ENTITY_BOUNDS_BOX",
-    "ENTITY_BOUNDS_CONVEX",
     "ENTITY_CATEGORIES",
     "SPAWNING_RESOURCE_STRING",
     "ENTITY_STATE_GETTING",
     "ENTITY_STATE_SETTING",
     "ENTITY_INFO_GETTING",
-    "ENTITY_INFO_SETTING",
     "SPAWNABLES",
     "SIMULATION_RESET",
     "SIMULATION_RESET_TIME",
@@ -45,7 +41,6 @@ FEATURES = (
     "STEP_SIMULATION_ACTION",
     "WORLD_LOADING",
     "WORLD_RESOURCE_STRING",
-    "WORLD_TAGS",
     "WORLD_UNLOADING",
     "WORLD_INFO_GETTING",
     "AVAILABLE_WORLDS",
@@ -77,7 +72,6 @@ class Server:
             "GetEntities": entities.list_names,
             "GetEntitiesStates": entities.list_states,
             "GetEntityInfo": entities.get_info,
-            "SetEntityInfo": entities.set_info,
             "GetEntityState": entities.get_state,
             "SetEntityState": entities.set_state,
             "GetEntityBounds": entities.get_bounds,
@@ -89,8 +83,9 @@ class Server:
             "UnloadWorld": worlds.unload,
             "GetCurrentWorld": worlds.current,
             "GetAvailableWorlds": worlds.available,
-            "GetNamedPoses": _no_named_poses,
-            "GetNamedPoseBounds": _no_named_poses,
+            "SetEntityInfo": _refuse,
+            "GetNamedPoses": _refuse,
+            "GetNamedPoseBounds": _refuse,
         }
         for name, handler in handlers.items():
             self._offer(name, served(handler, host))
@@ -126,6 +121,6 @@ class Server:
         return response
 
 
-def _no_named_poses(*_: Any) -> NoReturn:
-    reason = "worlds have no named poses here; see get_simulator_features."
+def _refuse(*_: Any) -> NoReturn:
+    reason = "this is not supported here; see get_simulator_features."
     raise RefusalError(Result.RESULT_FEATURE_UNSUPPORTED, reason)

@@ -2,12 +2,10 @@
 
 import re
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from simulation_interfaces.msg import (
-    EntityInfo,
     Resource,
     Result,
     Spawnable,
@@ -16,8 +14,8 @@ from simulation_interfaces.msg import (
 from simulation_interfaces.srv import SpawnEntities
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.config import find_config, read_text, share_folder
-from nics_drl_bridge.errors import BridgeError, ConfigError
+from nics_drl_bridge.config import find_config, list_shipped, read_text
+from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.extras.simulation_interfaces import plane, resources
 from nics_drl_bridge.extras.simulation_interfaces.entities import EntityServices
 from nics_drl_bridge.extras.simulation_interfaces.host import (
@@ -72,17 +70,9 @@ class Spawning:
                     raise
             else:
                 entities.spawn(name, model.parts, pose)
-                self._describe(name, model)
         except OutsideError as error:
             raise RefusalError(code, str(error)) from None
         response.entity_name = name
-
-    def _describe(self, name: str, model: Model) -> None:
-        info = self._entities.info(self._entities.find(name))
-        tags = list(dict.fromkeys((*info.tags, *model.tags)))
-        entity_info = EntityInfo(category=info.category, tags=tags)
-        entity_info.description = model.description or info.description
-        self._simulation.infos[name] = entity_info
 
     def _model(self, request: Any) -> Model | None:
         """The entity of a request; None for a robot. Raises RefusalError."""
@@ -172,43 +162,23 @@ class Spawning:
     def list_spawnables(self, request: Any, response: Any) -> None:
         """Answer GetSpawnables."""
         robot = self._host.model.robot
-        unknown = list[str]()
         hull = hull_of(self._simulation.entities.simulator.footprint)
         response.spawnables.append(
             _spawnable(robot.name, f"another robot {robot.name}", [hull])
         )
-        shipped = share_folder() / "config" / FOLDER
-        spawnables = [(file.stem, file) for file in sorted(shipped.iterdir())]
-        for source in request.sources:
-            files = resources.files_of(source)
-            if files is None:
-                unknown.append(source)
-            spawnables += [(str(file), file) for file in files or ()]
-        for uri, file in spawnables:
-            if file.suffix.lower() in resources.SUFFIXES:
-                self._list(file, uri, response)
-        if unknown:
+        for name in list_shipped(FOLDER):
+            model = model_of_yaml(read_text(find_config(name, FOLDER)), name)
+            hulls = [
+                geometry.rotate(hull_of(shape), at[2]) + at[:2]
+                for shape, at in model.parts
+            ]
+            response.spawnables.append(_spawnable(name, model.description, hulls))
+        if request.sources:
             response.result.result = Result.RESULT_OK
-            fault = f"sources that are not known: {', '.join(map(repr, unknown))}"
+            sources = ", ".join(map(repr, request.sources))
             response.result.error_message = (
-                f"{fault}; give folders or files of this machine."
+                f"not searched: {sources}; spawn a file by its path."
             )
-
-    def _list(self, file: Path, uri: str, response: Any) -> None:
-        try:
-            text = read_text(file, resources.MOST_BYTES)
-            if resources.SUFFIXES[file.suffix.lower()] == resources.SDF:
-                model = model_of_sdf(text, 0.0, str(file))
-            else:
-                model = model_of_yaml(text, str(file))
-        except (BridgeError, OSError):
-            return  # a world, or something else that is no entity
-        hulls = [
-            geometry.rotate(hull_of(shape), at[2]) + at[:2] for shape, at in model.parts
-        ]
-        response.spawnables.append(
-            _spawnable(uri, model.description or model.name, hulls)
-        )
 
 
 def _spawnable(uri: str, about: str, hulls: list[Any]) -> Spawnable:

@@ -4,7 +4,7 @@ from collections.abc import Generator
 from typing import Any
 
 from simulation_interfaces.action import SimulateSteps
-from simulation_interfaces.msg import EntityInfo, Result, SimulationState
+from simulation_interfaces.msg import Result, SimulationState
 from simulation_interfaces.srv import ResetSimulation, SetSimulationState
 
 from nics_drl_bridge.errors import BridgeError
@@ -42,7 +42,6 @@ class Simulation:
     def __init__(self, host: Host) -> None:
         self._host = host
         self._stepping = False
-        self.infos: dict[str, EntityInfo] = {}  # by name, where a client set it
         # or paused, or without a world, while the host is paused
         self._halted = STOPPED
         self._turn: Any = host.create_guard_condition(lambda: None)
@@ -217,7 +216,6 @@ class Simulation:
         # A robot that was spawned may have the name of one that was deleted.
         changed = any(entity.robot >= 0 for entity in self.entities.spawned.values())
         changed |= self.entities.robot_names != list(self._host.robot_names)
-        self.infos.clear()
         self.entities.restore()
         if changed:
             self._host.reopen_robots()
@@ -231,6 +229,5 @@ class Simulation:
         for name in names:
             entity = self.entities.find(name)
             self.entities.delete(entity)
-            self.infos.pop(name, None)
             if entity.robot >= 0:
                 self._host.remove_robots([entity.robot])

@@ -1,7 +1,6 @@
 """Worlds: the one that is loaded, those that may be, loading and unloading."""
 
 import math
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +10,9 @@ from simulation_interfaces.msg import Resource, Result, WorldResource
 from simulation_interfaces.srv import GetCurrentWorld, LoadWorld, UnloadWorld
 
 from nics_drl_bridge import defaults
-from nics_drl_bridge.config import parse_yaml, share_folder, validate
-from nics_drl_bridge.errors import (
-    BridgeError,
-    ConfigError,
-    UnknownNameError,
-)
+from nics_drl_bridge.config import list_shipped, parse_yaml, validate
+from nics_drl_bridge.errors import UnknownNameError
 from nics_drl_bridge.extras.simulation_interfaces import resources
-from nics_drl_bridge.extras.simulation_interfaces.entities import tags_match
 from nics_drl_bridge.extras.simulation_interfaces.host import RefusalError
 from nics_drl_bridge.extras.simulation_interfaces.state import (
     STOPPED,
@@ -29,7 +23,7 @@ from nics_drl_bridge.lidar.maps import FREE
 from nics_drl_bridge.nodes.runner import get_text
 from nics_drl_bridge.sim.models import HEIGHT, file_of
 from nics_drl_bridge.sim.occupancy import occupancy
-from nics_drl_bridge.sim.sdf import read_sdf, root_of
+from nics_drl_bridge.sim.sdf import read_sdf
 from nics_drl_bridge.sim.sections import Standing
 from nics_drl_bridge.sim.world import Region, World, check_places
 from nics_drl_bridge.sim.world_set import BARN, AnyWorld, load_worlds
@@ -41,44 +35,6 @@ EMPTY = (
 )  # places in the field of a world without walls around it [m]
 CELL = 0.05  # [m]
 MOST_OPEN = 0.5  # fraction of what is free in a field that may be open to all around
-# Tags of SDF that are read, or that do not affect what stands in a plane.
-READ = {
-    "sdf",
-    "world",
-    "model",
-    "include",
-    "uri",
-    "name",
-    "pose",
-    "placement_frame",
-    "frame",
-    "link",
-    "joint",
-    "parent",
-    "child",
-    "collision",
-    "geometry",
-    "box",
-    "size",
-    "cylinder",
-    "radius",
-    "length",
-    "sphere",
-    "capsule",
-    "plane",
-    "normal",
-    "polyline",
-    "point",
-    "height",
-    "static",
-    "state",
-    "visual",
-    "inertial",
-    "mass",
-    "inertia",
-    "mesh",
-    "scale",
-}
 
 
 class Worlds:
@@ -137,15 +93,10 @@ class Worlds:
             return world
 
     def _standing(self, file: Path, name: str, request: Any) -> World:
+        if request.fail_on_unsupported_element:
+            fault = "fail_on_unsupported_element is not supported here; leave it out."
+            raise RefusalError(Result.RESULT_FEATURE_UNSUPPORTED, fault)
         skip = bool(request.ignore_missing_or_unsupported_assets)
-        strange = sorted(
-            {element.tag for element in root_of(file).iter() if ":" not in element.tag}
-            - READ
-        )
-        if request.fail_on_unsupported_element and strange:
-            fault = f"{name}: holds <{strange[0]}>, which is not simulated"
-            fix = "remove it, or do not ask for fail_on_unsupported_element"
-            raise RefusalError(CODES.UNSUPPORTED_ELEMENTS, f"{fault}; {fix}.")
         standing = read_sdf(file, HEIGHT, skip_unknown=True, may_be_empty=True)
         if standing.left_out and not skip:
             if standing.missing:
@@ -160,40 +111,26 @@ class Worlds:
 
     def available(self, request: Any, response: Any) -> None:
         """Answer GetAvailableWorlds."""
-        tags_match(request.filter, ())
-        folder = share_folder() / "config"
-        failed = list[str]()
-        skipped = list[str]()
-        names = [file.stem for file in sorted((folder / "worlds").glob("*.yaml"))]
-        worlds = [(name, load_worlds(name)) for name in names]
-        for source in request.additional_sources:
-            if source and request.offline_only and resources.local(source) is None:
-                continue
-            try:
-                worlds += _in_source(source, skipped)
-            except (BridgeError, OSError) as error:
-                failed.append(f"{source!r}: {error}")
-        if failed and not request.continue_on_error:
-            raise RefusalError(
-                Result.RESULT_NOT_FOUND, f"a source can't be read, {failed[0]}"
-            )
-        sets = [
-            BARN,
-            *(file.stem for file in sorted((folder / "world_sets").glob("*.yaml"))),
-        ]
-        answers = [describe_world(world, Resource(uri=uri)) for uri, world in worlds]
-        for name in sets:  # whose many worlds would take long to read
+        if request.filter.tags:
+            fault = "worlds have no tags here; leave the filter out."
+            raise RefusalError(Result.RESULT_FEATURE_UNSUPPORTED, fault)
+        for name in list_shipped("worlds"):
+            shipped = describe_world(load_worlds(name), Resource(uri=name))
+            response.worlds.append(shipped)
+        # The many worlds of a set would take long to read.
+        for name in (BARN, *list_shipped("world_sets")):
             about = f"the worlds of {name}; every episode draws one of them"
-            answers.append(WorldResource(name=name, description=about, tags=["set"]))
-            answers[-1].world_resource = Resource(uri=name)
-        response.worlds = [
-            answer for answer in answers if tags_match(request.filter, answer.tags)
-        ]
-        if failed or skipped:
-            response.result.result = Result.RESULT_OK
-            response.result.error_message = (
-                f"left out: {'; '.join([*failed, *skipped])}"
+            resource = Resource(uri=name)
+            response.worlds.append(
+                WorldResource(name=name, description=about, world_resource=resource)
             )
+        if request.additional_sources:
+            sources = ", ".join(map(repr, request.additional_sources))
+            fault = f"not searched: {sources}; load a file by its path."
+            if not request.continue_on_error:
+                raise RefusalError(Result.RESULT_NOT_FOUND, fault)
+            response.result.result = Result.RESULT_OK
+            response.result.error_message = fault
 
 
 def _load(path: Path, named: bool) -> AnyWorld:
@@ -206,50 +143,15 @@ def _load(path: Path, named: bool) -> AnyWorld:
         raise
 
 
-def _in_source(source: str, skipped: list[str]) -> list[tuple[str, AnyWorld]]:
-    """Worlds of a file, or of those in a folder that can be read. Raises BridgeError, OSError."""
-    path = resources.local(source)
-    worlds = list[tuple[str, AnyWorld]]()
-    if path is None:
-        raise ConfigError("is not on this machine; give a folder or file.")
-    for file in sorted(path.iterdir()) if path.is_dir() else [path]:
-        form = resources.SUFFIXES.get(file.suffix.lower())
-        try:
-            if form == resources.SDF and (
-                root_of(file).find("world") is not None or file == path
-            ):
-                standing = read_sdf(file, HEIGHT, skip_unknown=True, may_be_empty=True)
-                worlds.append((str(file), world_of(standing, file.stem)))
-            elif form == resources.YAML or file == path:
-                worlds.append((str(file), load_worlds(file)))
-        except (BridgeError, OSError) as error:
-            if file == path:
-                raise
-            skipped.append(str(error))
-    return worlds
-
-
 def describe_world(world: AnyWorld, resource: Resource) -> WorldResource:
-    """Return the description of a world, with tags for what it contains."""
-    members = world.members
-    groups = list(chain.from_iterable(member.obstacles for member in members))
-    about = {
-        "set": len(members) > 1,
-        "map": any(member.map is not None for member in members),
-        "walled": any(member.size is not None or member.walls for member in members),
-        "obstacles": bool(groups),
-        "random": any(group.count is not None for group in groups),
-        "moving": any(group.motion is not None for group in groups),
-    }
+    """Return the description of a world."""
     x1, y1, x2, y2 = world.extent
     size = f"{x2 - x1:.3g} m x {y2 - y1:.3g} m"
-    if len(members) > 1:
-        description = f"{len(members)} worlds in {size}"
-    else:
-        description = f"a field of {size}"
-    tags = [tag for tag, holds in about.items() if holds]
+    description = f"a field of {size}"
+    if len(world.members) > 1:
+        description = f"{len(world.members)} worlds in {size}"
     return WorldResource(
-        name=world.name, world_resource=resource, description=description, tags=tags
+        name=world.name, world_resource=resource, description=description
     )
 
 
