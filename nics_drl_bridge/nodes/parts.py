@@ -3,9 +3,8 @@
 An entry `device.NAME` is called with a simulator's node, and `policy.NAME` with a policy node. It
 declares its parameters then, and returns an object, or None if it has nothing to offer there.
 
-- A part of a simulator has `has_world`: False while no world is loaded.
-- A part of a policy node is a leader: it may drive the robot to goals of its own. Its methods are
-  those of `extras.nav2.follow_path.PathActions`.
+A part of a policy node is a leader, which may drive the robot to goals of its own. Its methods are
+those of `extras.nav2.follow_path.PathActions`.
 """
 
 from typing import Any, NamedTuple

@@ -21,7 +21,7 @@ from sensor_msgs.msg import JointState, LaserScan
 from std_srvs.srv import SetBool
 
 from nics_drl_bridge import defaults
-from nics_drl_bridge.errors import BackendError, BridgeError
+from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.lidar.scanner import RENDERERS, Renderer
@@ -617,7 +617,6 @@ class DeviceNode(qos.BridgeNode):
         for inlet in self._inlets:
             inlet.take_waiting()
         try:
-            self._require_world()
             self.begin()
         except BridgeError as error:
             return False, str(error)
@@ -626,21 +625,10 @@ class DeviceNode(qos.BridgeNode):
     def _on_pause(
         self, request: SetBool.Request, response: SetBool.Response
     ) -> SetBool.Response:
-        try:
-            self._require_world()
-            self.pause(bool(request.data))
-            response.success = True
-            response.message = "paused" if self.paused else "running"
-        except BridgeError as error:
-            response.success = False
-            response.message = str(error)
+        self.pause(bool(request.data))
+        response.success = True
+        response.message = "paused" if self.paused else "running"
         return response
-
-    def _require_world(self) -> None:
-        if not all(part.has_world for part in self._parts):
-            raise BackendError(
-                "no world is loaded; load one with the service load_world."
-            )
 
     def _repeat(self) -> tuple[bool, str]:
         if not self._time.lockstep:

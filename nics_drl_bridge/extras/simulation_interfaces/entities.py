@@ -45,7 +45,6 @@ class EntityServices:
         return _info(kind, f"an obstacle: {', '.join(shapes)}")
 
     def _matching(self, filters: Any) -> list[Entity]:
-        self._simulation.require_world()
         if filters.tags.tags or filters.bounds.type != Bounds.TYPE_EMPTY:
             fault = (
                 "entities are filtered by name and category; leave out tags and bounds."
@@ -88,7 +87,6 @@ class EntityServices:
 
     def find(self, name: str) -> Entity:
         """Return the entity of a name. Raises RefusalError, UnknownEntityError."""
-        self._simulation.require_world()
         return self._simulation.entities.find(name)
 
     def get_info(self, request: Any, response: Any) -> None:

@@ -14,7 +14,7 @@ from nics_drl_bridge.extras.simulation_interfaces.host import (
     served,
 )
 from nics_drl_bridge.extras.simulation_interfaces.spawning import FORMATS, Spawning
-from nics_drl_bridge.extras.simulation_interfaces.state import WITHOUT_WORLD, Simulation
+from nics_drl_bridge.extras.simulation_interfaces.state import Simulation
 from nics_drl_bridge.extras.simulation_interfaces.worlds import Worlds
 from nics_drl_bridge.nodes import conversions
 
@@ -41,10 +41,8 @@ FEATURES = (
     "STEP_SIMULATION_ACTION",
     "WORLD_LOADING",
     "WORLD_RESOURCE_STRING",
-    "WORLD_UNLOADING",
     "WORLD_INFO_GETTING",
     "AVAILABLE_WORLDS",
-    "SPAWNING_ENTITIES",
 )
 ABOUT = "nics_drl_bridge: a 2-D world of shapes and robots of one kind; docs/simulator_node.md"
 
@@ -77,10 +75,10 @@ class Server:
             "GetEntityBounds": entities.get_bounds,
             "DeleteEntity": entities.delete,
             "SpawnEntity": spawning.spawn,
-            "SpawnEntities": spawning.spawn_all,
+            "SpawnEntities": _refuse,
             "GetSpawnables": spawning.list_spawnables,
             "LoadWorld": worlds.load,
-            "UnloadWorld": worlds.unload,
+            "UnloadWorld": _refuse,
             "GetCurrentWorld": worlds.current,
             "GetAvailableWorlds": worlds.available,
             "SetEntityInfo": _refuse,
@@ -99,11 +97,6 @@ class Server:
                 simulation.simulate,
                 cancel_callback=lambda _: CancelResponse.ACCEPT,
             )
-
-    @property
-    def has_world(self) -> bool:
-        """True unless the world was unloaded."""
-        return bool(self._simulation.state != WITHOUT_WORLD)
 
     def _offer(self, name: str, reply: Callable[[Any, Any], Any]) -> None:
         kind = conversions.message_type(f"{PACKAGE}/srv/{name}")

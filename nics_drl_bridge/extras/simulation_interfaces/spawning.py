@@ -1,7 +1,6 @@
 """Spawning: shapes of YAML and SDF, and robots of the simulator's kind."""
 
 import re
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,6 @@ from simulation_interfaces.msg import (
     Spawnable,
     SpawnResult,
 )
-from simulation_interfaces.srv import SpawnEntities
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.config import find_config, list_shipped, read_text
@@ -21,7 +19,6 @@ from nics_drl_bridge.extras.simulation_interfaces.entities import EntityServices
 from nics_drl_bridge.extras.simulation_interfaces.host import (
     Host,
     RefusalError,
-    outcome,
 )
 from nics_drl_bridge.extras.simulation_interfaces.state import Simulation
 from nics_drl_bridge.nodes import device_parameters
@@ -37,7 +34,7 @@ FOLDER = "entities"  # of the shipped ones, in config/
 
 
 class Spawning:
-    """Answers SpawnEntity, SpawnEntities and GetSpawnables."""
+    """Answers SpawnEntity and GetSpawnables."""
 
     def __init__(
         self, host: Host, simulation: Simulation, entities: EntityServices
@@ -47,8 +44,7 @@ class Spawning:
         self._entities = entities
 
     def spawn(self, request: Any, response: Any) -> None:
-        """Answer SpawnEntity, and one part of SpawnEntities. Raises RefusalError, BridgeError."""
-        self._simulation.require_world()
+        """Answer SpawnEntity. Raises RefusalError, BridgeError."""
         model = self._model(request)
         wanted = request.name or ("" if model is None else model.name)
         name = self._name(wanted, request.allow_renaming)
@@ -141,23 +137,6 @@ class Spawning:
             fault = f"the namespace {space!r} is that of another robot"
             raise RefusalError(code, f"{fault}; give one as entity_namespace.")
         return space
-
-    def spawn_all(self, request: Any, response: Any) -> None:
-        """Answer SpawnEntities."""
-        failed = []
-        for k, spawn_request in enumerate(request.spawn_requests):
-            answer = SpawnResult()
-            spawn = partial(self.spawn, spawn_request, answer)
-            answer.result.result, answer.result.error_message = outcome(
-                spawn, self._host
-            )
-            response.results.append(answer)
-            if answer.result.result != Result.RESULT_OK:
-                failed.append(f"request {k}: {answer.result.error_message}")
-        if failed:
-            code = SpawnEntities.Response.ENTITIES_SPAWN_FAILED
-            more = f"{len(failed)} of {len(request.spawn_requests)} failed"
-            raise RefusalError(code, f"{more}; {failed[0]}")
 
     def list_spawnables(self, request: Any, response: Any) -> None:
         """Answer GetSpawnables."""

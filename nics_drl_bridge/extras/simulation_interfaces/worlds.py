@@ -1,4 +1,4 @@
-"""Worlds: the one that is loaded, those that may be, loading and unloading."""
+"""Worlds: the one that is loaded, those that may be, and loading."""
 
 import math
 from pathlib import Path
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 from simulation_interfaces.msg import Resource, Result, WorldResource
-from simulation_interfaces.srv import GetCurrentWorld, LoadWorld, UnloadWorld
+from simulation_interfaces.srv import LoadWorld
 
 from nics_drl_bridge import defaults
 from nics_drl_bridge.config import list_shipped, parse_yaml, validate
@@ -16,7 +16,6 @@ from nics_drl_bridge.extras.simulation_interfaces import resources
 from nics_drl_bridge.extras.simulation_interfaces.host import RefusalError
 from nics_drl_bridge.extras.simulation_interfaces.state import (
     STOPPED,
-    WITHOUT_WORLD,
     Simulation,
 )
 from nics_drl_bridge.lidar.maps import FREE
@@ -38,7 +37,7 @@ MOST_OPEN = 0.5  # fraction of what is free in a field that may be open to all a
 
 
 class Worlds:
-    """Answers LoadWorld, UnloadWorld, GetCurrentWorld and GetAvailableWorlds."""
+    """Answers LoadWorld, GetCurrentWorld and GetAvailableWorlds."""
 
     def __init__(self, host: Any, simulation: Simulation) -> None:
         self._host = host
@@ -47,29 +46,15 @@ class Worlds:
 
     def current(self, _: Any, response: Any) -> None:
         """Answer GetCurrentWorld."""
-        if self._simulation.state == WITHOUT_WORLD:
-            reason = "no world is loaded; load one by load_world."
-            raise RefusalError(GetCurrentWorld.Response.NO_WORLD_LOADED, reason)
         response.world = describe_world(self._host.world, self._resource)
 
-    def unload(self, _: Any, __: Any) -> None:
-        """Answer UnloadWorld."""
-        if self._simulation.state == WITHOUT_WORLD:
-            reason = "no world is loaded, so that none can be unloaded."
-            raise RefusalError(UnloadWorld.Response.NO_WORLD_LOADED, reason)
-        self._unload()
-
-    def _unload(self) -> None:
-        self._simulation.restore()
-        self._simulation.halt(WITHOUT_WORLD)
-
     def load(self, request: Any, response: Any) -> None:
-        """Answer LoadWorld: the present world is unloaded, even if the other can't be read."""
+        """Answer LoadWorld; the present world stays if the other can't be read."""
         resource = resources.find(request.world_resource, CODES)
-        self._unload()
         world = self._read(resource, request)
         host = self._host
         simulation = self._simulation
+        simulation.restore()
         host.use_world(world)
         simulation.renew()
         host.begin(rewind=True)

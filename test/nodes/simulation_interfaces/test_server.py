@@ -78,7 +78,7 @@ def client(connected):
 def test_every_feature_does_what_the_standard_says_and_every_other_is_refused(client):
     from parts.conformance import announced, failures
 
-    assert len(announced(client)) == 25
+    assert len(announced(client)) == 23
     assert failures(client, "empty") == []
 
 
@@ -373,6 +373,7 @@ def test_a_wrong_argument_is_answered_by_a_code_and_one_sentence(
     result = client(name, **fields).result
     assert (result.result, sentence in result.error_message) == (code, True), result
     assert "\n" not in result.error_message
+    assert client("GetCurrentWorld").world.name == "empty"  # it stays
 
 
 def test_a_simulator_that_was_asked_to_quit_answers_and_ends(
