@@ -165,6 +165,10 @@ setup(
         ],
         f"{PACKAGE}.commands": [f"bag = {PACKAGE}.extras.bags.command:bag"],
         f"{PACKAGE}.engines": [f"ray = {PACKAGE}.extras.ray.engine:learner"],
+        f"{PACKAGE}.node_parts": [
+            f"device.simulation_interfaces = {PACKAGE}.extras.simulation_interfaces:open_services",
+            f"policy.nav2 = {PACKAGE}.extras.nav2.follow_path:PathActions",
+        ],
         f"{PACKAGE}.nodes": [f"mujoco_node = {PACKAGE}.extras.mujoco.node:main"],
         f"{PACKAGE}.sensors": [f"lidar = {PACKAGE}.lidar.further_lidar:FurtherLidar"],
         f"{PACKAGE}.viewers": [f"human = {PACKAGE}.watch.human:HumanView"],

@@ -296,7 +296,7 @@ RUNS: dict[str, Run] = {
     "shield": make_run(
         CAMPAIGNS + "shield", "--in-process --episodes 300", "--episodes 3000"
     ),
-    "standards": make_run(CAMPAIGNS + "standards", "--chunks 10", ""),
+    "standards": make_run(CAMPAIGNS + "standards"),
     "table1_kinematics": make_run("paper table1_kinematics"),
     "table3_density": make_run("paper table3_density"),
     "map_lidar": make_run("speed map_lidar"),

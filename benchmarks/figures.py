@@ -207,11 +207,11 @@ FIGURES = told(
     ),
     (
         "standards",
-        "simulation_interfaces (conformance of what is announced; a step of a client of it alone "
-        "against one over our services), a Nav2 stand-in, LEAPP's own runner",
-        "{sim_features} features, {sim_conformance_failed} failed; {client_overhead x100|.0f} % "
-        "longer; {follow_path_success|.0%} of the planned paths driven; actions differ by "
-        "{leapp_max_abs_difference|.1g} (`docs/ros.md`)",
+        "simulation_interfaces (conformance of what is announced), a Nav2 stand-in, LEAPP's own "
+        "runner",
+        "{sim_features} features, {sim_conformance_failed} failed; {follow_path_success|.0%} of "
+        "the planned paths driven; actions differ by {leapp_max_abs_difference|.1g} "
+        "(`docs/ros.md`)",
     ),
     (
         "ros_lockstep",

@@ -32,7 +32,6 @@ from measuring.perturbations import PERTURBATIONS
 from measuring.standing import Standing
 from numpy.typing import NDArray
 
-from nics_drl_bridge.commands.conditions import Conditions
 from nics_drl_bridge.commands.episodes import (
     DDS,
     FAST,
@@ -40,6 +39,7 @@ from nics_drl_bridge.commands.episodes import (
     MUJOCO,
     NAVIGATION,
     PLACES,
+    Conditions,
     drive_in,
 )
 from nics_drl_bridge.config import dump_yaml

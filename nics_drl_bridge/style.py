@@ -93,19 +93,19 @@ def make_panels(
     )
 
 
-def count_legend_columns(labels: Sequence[str], width: float) -> int:
+def _count_legend_columns(labels: Sequence[str], width: float) -> int:
     """Returns the number of columns of a legend that fits into a width [inch]."""
     letters = LETTERS_PER_IN * width
     widths = [len(label) + 5 for label in labels]
     return len(labels) if sum(widths) <= letters else max(1, int(letters / max(widths)))
 
 
-def count_legend_rows(labels: Sequence[str], width: float) -> int:
+def _count_legend_rows(labels: Sequence[str], width: float) -> int:
     """Returns the number of rows of a legend that fits into a width [inch]."""
-    return -(-len(labels) // count_legend_columns(labels, width)) if labels else 0
+    return -(-len(labels) // _count_legend_columns(labels, width)) if labels else 0
 
 
-def compute_width(panel: Panel, columns: int = 1) -> float:
+def _compute_width(panel: Panel, columns: int = 1) -> float:
     """Returns the width [inch] of a figure whose panels have a fixed size."""
     return columns * (panel.left + panel.width + RIGHT_IN)
 
@@ -115,7 +115,6 @@ def render_png(
     figure: Figure,
     legend: Axes | None = None,
     panel: Panel | None = None,
-    least_rows: int = 0,
 ) -> bytes:
     """Renders a figure as a PNG, with empty axes hidden and the legend of one of the axes on top.
 
@@ -126,13 +125,11 @@ def render_png(
         legend: axes whose legend is shown.
         panel: size of each of the axes in a grid [inch], without the text around them; determines
             the size of the figure. By default the axes fill the figure.
-        least_rows: minimum number of legend rows to reserve above such panels, so that figures
-            placed side by side get the same height.
     """
     if panel is not None:
         _, columns = _count_grid(figure)
         figure.set_layout_engine(None)
-        figure.set_figwidth(compute_width(panel, columns))
+        figure.set_figwidth(_compute_width(panel, columns))
     for axes in figure.axes:
         if not axes.has_data():
             axes.set_axis_off()
@@ -145,6 +142,7 @@ def render_png(
             letters = int(LETTERS_PER_IN * fraction * figure.get_figwidth())
             title = (fill(line, letters) for line in axes.get_title().splitlines())
             axes.set_title("\n".join(title))
+    rows = 0
     if legend is not None:
         handles, labels = legend.get_legend_handles_labels()
         width = figure.get_figwidth()
@@ -152,11 +150,11 @@ def render_png(
         place: LegendPlace = "outside upper center" if fills else "upper center"
         if labels:
             figure.legend(
-                handles, labels, loc=place, ncols=count_legend_columns(labels, width)
+                handles, labels, loc=place, ncols=_count_legend_columns(labels, width)
             )
-        least_rows = max(least_rows, count_legend_rows(labels, width))
+        rows = _count_legend_rows(labels, width)
     if panel is not None:
-        _place_panels(figure, panel, least_rows)
+        _place_panels(figure, panel, rows)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
     return buffer.getvalue()
@@ -176,7 +174,7 @@ def _place_panels(figure: Figure, panel: Panel, rows_of_legend: int) -> None:
     lines = [len(axes.get_title().splitlines()) for axes in figure.axes]
     above = ABOVE_IN + LINE_IN * max(TITLE_LINES, *lines)
     legend = LINE_IN * (rows_of_legend + 0.5)
-    width = compute_width(panel, columns)
+    width = _compute_width(panel, columns)
     height = legend + rows * (above + panel.height + BELOW_IN)
     figure.set_size_inches(width, height)
     figure.subplots_adjust(

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from nics_drl_bridge.commands.conditions import NO_CONDITIONS, Conditions
+from nics_drl_bridge.commands.episodes import NO_CONDITIONS, Conditions
 
 BENCHMARKS = Path(__file__).resolve().parents[1]
 AT_ONCE = 2

@@ -133,6 +133,24 @@ TopicOption = Annotated[
         "times. Roles: cmd_vel, pose, odom, joint_states, imu; none as a topic leaves a role out.",
     ),
 ]
+RolesOption = Annotated[
+    list[str] | None,
+    Option(
+        metavar="ROLE=TOPIC",
+        help="For a bag: topic of a role, as odom=/wheel_odom. Roles: scan, odom, cmd_vel, "
+        "pose, imu.",
+    ),
+]
+NamespaceOption = Annotated[
+    str, Option(help="Namespace of the robot's topics, for example robot1.")
+]
+ImuOption = Annotated[
+    str,
+    Option(
+        metavar="TOPIC",
+        help="Topic of the gyro; auto: imu or imu/data, if there is one; none.",
+    ),
+]
 HARDWARE_OPTIONS = (
     "start",
     "namespace",

@@ -58,7 +58,6 @@ from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 from nics_drl_bridge.sim.randomisation import load_randomisation
 from nics_drl_bridge.sim.scenes import sample_scene
 from nics_drl_bridge.sim.world import load_world
-from nics_drl_bridge.sim.world_set import AnyWorld
 
 RECORDING_SEED = 1
 TRAINING_SEED = 0
@@ -470,16 +469,18 @@ def _make_policy_lines(
     plan: DemoPlan, learned: Learned, episodes: DemoEpisodes
 ) -> list[str]:
     summary = episodes.summary
-    drawn = list[tuple[bytes, str]]()
+    blocks = [html.make_paragraph(learned.how)]
     if learned.curve:
         caption = "Success and collisions during exploration; every episode is new."
-        drawn.append((pictures.draw_training_curve(learned.curve), caption))
-    caption = f"Success unperturbed, and with each perturbation of {PERTURBED!r} alone (95 %)."
-    shares = {what: summary.success for what, summary in episodes.summaries.items()}
-    drawn.append((pictures.draw_robustness(shares), caption))
-    blocks = [html.make_paragraph(learned.how), html.make_gallery(drawn)]
+        curve = pictures.draw_training_curve(learned.curve)
+        blocks.append(html.make_picture(curve, caption))
     rows = list[tuple[str, ...]]()
-    for name, fraction in summary.shares.items():
+    perturbed = {
+        f"success with {what.replace('_', ' ')}": summary.success
+        for what, summary in episodes.summaries.items()
+        if what != AS_IT_IS
+    }
+    for name, fraction in {**summary.shares, **perturbed}.items():
         rows.append((name, *(f"{100 * value:.1f} %" for value in astuple(fraction))))
     for name, amount in (("path [m]", summary.length), ("time [s]", summary.time)):
         texts = (
@@ -488,22 +489,14 @@ def _make_policy_lines(
         rows.append((name, *texts))
     text = (
         f"{summary.episodes} unseen episodes in the world {plan.world!r}, in parallel in the fast "
-        "simulator, without exploration; path and time are means of the successful ones."
+        "simulator, without exploration; path and time are means of the successful ones. Below, "
+        f"each perturbation of {PERTURBED!r} alone."
     )
     return [
         *blocks,
         html.make_paragraph(text),
         html.make_table(("", "value", "95 % from", "to"), rows),
     ]
-
-
-def _draw_paths(
-    shown: Sequence[Mapping[str, Episode]], world: AnyWorld, radius: float
-) -> str:
-    """Draws the paths of each seed, with panels of the same size."""
-    return html.make_gallery(
-        [(png, "") for png in pictures.draw_trajectory_gallery(shown, world, radius)]
-    )
 
 
 def _format_episodes(
@@ -518,8 +511,9 @@ def _format_episodes(
     radius = model.robot.footprint_radius
     if live is None:
         text = f"{successes(here)} of {len(here)} episodes reached the goal in process."
-        alone = [{labels[0]: episode} for episode in here[:DEMO_PANELS]]
-        return [html.make_paragraph(text), _draw_paths(alone, world, radius)]
+        alone = {labels[0]: here[:DEMO_PANELS]}
+        png = pictures.draw_trajectories(alone, world, radius)
+        return [html.make_paragraph(text), html.make_picture(png, "")]
     rows = [
         (
             f"{a.seed}",
@@ -533,12 +527,11 @@ def _format_episodes(
         )
         for a, b in zip(here, there, strict=True)
     ]
-    shown = []
-    for a, b in list(zip(here, there, strict=True))[:DEMO_PANELS]:
-        runs = {labels[0]: a, labels[1]: b}
-        if a.seed == live.seed:
-            runs["deployed"] = live
-        shown.append(runs)
+    shown = {
+        labels[0]: here[:DEMO_PANELS],
+        labels[1]: there[:DEMO_PANELS],
+        "deployed": [live if a.seed == live.seed else None for a in here][:DEMO_PANELS],
+    }
     text = (
         f"{successes(here)} of {len(here)} episodes reached the goal in process, "
         f"{successes(there)} of {len(there)} over DDS in lock-step. Then simulator_node in real "
@@ -552,6 +545,6 @@ def _format_episodes(
     )
     return [
         html.make_paragraph(text),
-        _draw_paths(shown, world, radius),
+        html.make_picture(pictures.draw_trajectories(shown, world, radius), ""),
         html.make_details("Episode by episode", [html.make_paragraph(about), table]),
     ]

@@ -28,17 +28,11 @@ def doctor(
     policy: Annotated[
         str | None, Option(help="Check against a policy file instead.")
     ] = None,
-    namespace: Annotated[str, Option(help="Namespace of the robot's topics.")] = "",
+    namespace: console.NamespaceOption = "",
     duration: Annotated[
         float, Option(min=1.0, help="How long to listen to a robot [s].")
     ] = defaults.LISTEN_S,
-    imu: Annotated[
-        str,
-        Option(
-            metavar="TOPIC",
-            help="Topic of the gyro; auto: the one that is there; none.",
-        ),
-    ] = defaults.IMU_TOPIC,
+    imu: console.ImuOption = defaults.IMU_TOPIC,
     install: Annotated[
         bool, Option("--install", help="Check this machine instead: what works here.")
     ] = False,

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from importlib import import_module
 from math import isnan
@@ -13,7 +13,6 @@ from typing import Any
 import gymnasium
 
 from nics_drl_bridge import defaults, extensions
-from nics_drl_bridge.commands.conditions import NO_CONDITIONS, Conditions
 from nics_drl_bridge.commands.vehicle_goals import NEAR_M, GoalOrder
 from nics_drl_bridge.config import list_shipped
 from nics_drl_bridge.env.registry import NAVIGATION, register_envs
@@ -21,7 +20,7 @@ from nics_drl_bridge.env.sim_backend import make_backend
 from nics_drl_bridge.errors import BackendError, ConfigError, suggest
 from nics_drl_bridge.files import format_json, write_bytes, write_text
 from nics_drl_bridge.gate.gated_backend import GatedBackend
-from nics_drl_bridge.generator import SimulatorModel, open_model
+from nics_drl_bridge.generator import SimulatorModel, open_model, save_model
 from nics_drl_bridge.interface import Backend
 from nics_drl_bridge.nodes.parameters import NO_POSE
 from nics_drl_bridge.policy import evaluation
@@ -36,6 +35,7 @@ from nics_drl_bridge.report.pictures import draw_trajectories
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.seeds import check_seeds
+from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
 from nics_drl_bridge.sim.scenes import sample_scene
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
@@ -74,6 +74,42 @@ HEADS = (
 )
 Say = Callable[[str], None]
 Tell = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """Conditions of an evaluation; by default the model's lidar, no randomisation and no gate."""
+
+    lidar: str | None = None  # shipped lidar or YAML file; None: the model's
+    # shipped randomisation or YAML file, drawn for each episode
+    randomisation: str | None = None
+    # limits of a gate between policy and robot: shipped, or a YAML file
+    gate: str | None = None
+    # time limit of an episode [steps]; None: from policies, robot and world
+    steps: int | None = None
+    # overrides of the policy's task options
+    task: Mapping[str, Any] = field(default_factory=dict)
+    # path/to/file.py:ClassName of the policy's task, if it is not shipped
+    kind: str | None = None
+
+    @property
+    def ranges(self) -> Randomisation | None:
+        """Ranges that each episode draws from. Raises ConfigError."""
+        if self.randomisation is None:
+            return None
+        return load_randomisation(self.randomisation)
+
+    def model(self, name: str, folder: Path) -> tuple[SimulatorModel, str]:
+        """Opens a model; returns it and its name. Saves it below a folder if the lidar differs."""
+        model = open_model(name, self.lidar)
+        if self.lidar is None:
+            return model, name
+        place = folder / "model"
+        save_model(model, place)
+        return open_model(place), str(place)
+
+
+NO_CONDITIONS = Conditions()
 
 
 def drive_in(
@@ -137,12 +173,12 @@ def open_env(
     **options: Any,
 ) -> tuple[gymnasium.Env[Any, Any], Policy]:
     """Makes the env of a policy's task on a named backend; opens the policy."""
-    field = load_worlds(world) if isinstance(world, str) else world
+    opened_world = load_worlds(world) if isinstance(world, str) else world
     backend_options = {name: v for name, v in options.items() if v is not None}
-    driven = make_backend(backend, model, field, **backend_options)
+    driven = make_backend(backend, model, opened_world, **backend_options)
     if conditions.gate is not None:
         driven = GatedBackend(driven, model, conditions.gate)
-    return make_env(driven, policy, model, field, conditions)
+    return make_env(driven, policy, model, opened_world, conditions)
 
 
 def make_env(

@@ -55,12 +55,7 @@ def evaluate(
     shadow: Annotated[
         Path | None, Option(help="Compare policies with the drive in a bag.")
     ] = None,
-    topic: Annotated[
-        list[str] | None,
-        Option(
-            metavar="ROLE=TOPIC", help="For --shadow: for example scan=/front/scan."
-        ),
-    ] = None,
+    topic: console.RolesOption = None,
     ahead: Annotated[
         float,
         Option(
@@ -101,20 +96,11 @@ def evaluate(
             help="For --hardware: a goal that is farther away is confirmed.",
         ),
     ] = defaults.CONFIRMED_BEYOND_M,
-    namespace: Annotated[
-        str, Option(help="For --hardware: namespace of its topics.")
-    ] = "",
+    namespace: console.NamespaceOption = "",
     pose_type: Annotated[
         str, Option(help="For --hardware: type of `pose`, in map.")
     ] = defaults.POSE_TYPE,
-    imu: Annotated[
-        str,
-        Option(
-            metavar="TOPIC",
-            help="For --hardware: topic of the gyro that turns "
-            "odometry; auto: imu or imu/data, if the model was made with one; none.",
-        ),
-    ] = defaults.IMU_TOPIC,
+    imu: console.ImuOption = defaults.IMU_TOPIC,
     yes: Annotated[
         bool, Option("--yes", help="For --hardware: ask no questions.")
     ] = False,
@@ -142,11 +128,10 @@ def evaluate(
         return
     with console.show_progress():
         from nics_drl_bridge.commands import episodes as driving
-        from nics_drl_bridge.commands.conditions import Conditions
 
     count = episodes or (1 if hardware else defaults.EVALUATION_EPISODES)
     tell = partial(typer.echo, err=True)
-    conditions = Conditions(lidar, randomisation, gate, kind=task)
+    conditions = driving.Conditions(lidar, randomisation, gate, kind=task)
     order = driving.EvaluationOrder(
         policies,
         out,

@@ -42,7 +42,7 @@ EXAMPLES = {
     "up": (
         "nics up simulation world:=corridor",
         "nics up fleet robots:='[ant, bee]'",
-        "nics up vehicle params_file:=car.yaml",
+        "nics up vehicle model:=my_car params_file:=car.yaml",
     ),
     "install": ("nics install tf2_msgs", "nics install tf2_msgs --prefix messages"),
     "arm": ("nics arm", "nics arm --reset --namespace ant"),

@@ -36,7 +36,7 @@ def record(
     ] = defaults.DRIVE_S,
     speed: Annotated[float, Option(help="Share of the greatest speeds to use.")] = 1.0,
     seed: Annotated[int, Option(help="Seed of the pattern.")] = 0,
-    namespace: Annotated[str, Option(help="Namespace of the robot's topics.")] = "",
+    namespace: console.NamespaceOption = "",
     remap: Annotated[
         list[str] | None, Option(help="Rename a topic: odom:=/wheels.")
     ] = None,
@@ -46,13 +46,7 @@ def record(
     stamped: Annotated[
         bool | None, Option(help="Send cmd_vel as TwistStamped.")
     ] = None,
-    imu: Annotated[
-        str,
-        Option(
-            metavar="TOPIC",
-            help="Topic of an IMU to record; auto: imu or imu/data, if there is one; none.",
-        ),
-    ] = defaults.IMU_TOPIC,
+    imu: console.ImuOption = defaults.IMU_TOPIC,
     use_sim_time: Annotated[
         bool, Option("--use-sim-time", help="Take time from /clock.")
     ] = False,

@@ -17,14 +17,11 @@ WaitOption = Annotated[
     float,
     Option(min=0.0, help="Maximum time to wait for the node and for its consent [s]."),
 ]
-NamespaceOption = Annotated[
-    str, Option(help="Namespace of the robot, for example robot1.")
-]
 _tell = partial(typer.echo, err=True)
 
 
 def arm(
-    namespace: NamespaceOption = "",
+    namespace: console.NamespaceOption = "",
     reset: Annotated[
         bool,
         Option(
@@ -97,7 +94,7 @@ def goal(
             help="Frame of the goal: map (default), odom, base_link, ...",
         ),
     ] = "",
-    namespace: NamespaceOption = "",
+    namespace: console.NamespaceOption = "",
     wait: WaitOption = CONSENT_S,
     as_json: console.JsonOption = False,
 ) -> None:

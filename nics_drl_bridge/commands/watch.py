@@ -14,7 +14,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 if TYPE_CHECKING:
-    from nics_drl_bridge.commands.conditions import Conditions
+    from nics_drl_bridge.commands.episodes import Conditions
 
 
 def watch(
@@ -42,16 +42,9 @@ def watch(
     gate: console.GateOption = None,
     task: console.TaskOption = None,
     ros: Annotated[bool, Option("--ros", help="Show live topics instead.")] = False,
-    namespace: Annotated[str, Option(help="For --ros: namespace of its topics.")] = "",
+    namespace: console.NamespaceOption = "",
     bag: Annotated[Path | None, Option(help="Show a recorded drive instead.")] = None,
-    topic: Annotated[
-        list[str] | None,
-        Option(
-            metavar="ROLE=TOPIC",
-            help="For --bag: as "
-            "odom=/wheel_odom. Roles: scan, odom, cmd_vel, pose, imu.",
-        ),
-    ] = None,
+    topic: console.RolesOption = None,
     record: Annotated[
         Path | None,
         Option(metavar="FILE", help="Write .mp4 or .gif instead of a page."),
@@ -76,7 +69,7 @@ def watch(
     elif ros:
         source = _watch_ros(model, world, namespace)
     else:
-        from nics_drl_bridge.commands.conditions import Conditions
+        from nics_drl_bridge.commands.episodes import Conditions
 
         source = _watch_episodes(
             policy or DEFAULT_ROBOT,

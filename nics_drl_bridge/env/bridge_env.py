@@ -94,8 +94,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         randomisation: quantities drawn in each episode: the name of a shipped one, a YAML file, or
             a Randomisation; the drawn values are in `info["randomisation"]` of a reset.
         render_mode: `rgb_array`, `human` (a page in the browser, see `watch`) or None.
-        simulator: name of the node behind `dds`, or `simulation_interfaces` for any simulator that
-            provides these services, such as Gazebo or Isaac, see `docs/dds_backend.md`.
+        simulator: name of the simulator's node behind `dds`.
 
     Raises:
         ConfigError, ModelError: an unknown name or a wrong file.

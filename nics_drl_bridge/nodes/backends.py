@@ -12,7 +12,7 @@ step:
 4. `receive` hands the scan to the middleware, and returns the middleware's view of the robot at t.
 
 A simulator of this package moves once each of its robots has a command, and sends a message again
-that was lost on the way. One with the standard services is moved by a service instead.
+that was lost on the way.
 `reset` begins an episode by the simulator's services, and ends like a step.
 """
 
@@ -28,7 +28,6 @@ from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge import defaults, interface
 from nics_drl_bridge.arguments import list_keywords, refuse_unknown
-from nics_drl_bridge.config import validate
 from nics_drl_bridge.env.guard import halts_on_error
 from nics_drl_bridge.errors import BackendError, ConfigError, StaleDataError, suggest
 from nics_drl_bridge.generator import SimulatorModel
@@ -48,12 +47,10 @@ from nics_drl_bridge.nodes.link import (
 from nics_drl_bridge.nodes.parameters import (
     LOCKSTEP,
     REALTIME,
-    STANDARD,
     default_namespaces,
 )
 from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
 from nics_drl_bridge.nodes.robot_topics import data_facts
-from nics_drl_bridge.nodes.simulation_interfaces import client
 from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
 from nics_drl_bridge.sim.simulator import EpisodeSampler
 from nics_drl_bridge.sim.world_set import AnyWorld
@@ -61,6 +58,11 @@ from nics_drl_bridge.sim.world_set import AnyWorld
 TRUTH = "ground_truth"
 # The simulator is asked to repeat data that do not arrive within this time [s].
 REPEAT_S = 0.05
+# How to start the simulator, as the end of an error.
+START_SIMULATOR = (
+    "start `simulator_node` with mode:=lockstep in the same ROS_DOMAIN_ID and "
+    "namespace."
+)
 # What all robots of a fleet share; any other fact is of one robot.
 SHARED_FACTS = ("stamp_ns",)
 
@@ -94,15 +96,9 @@ def dds_backend(
             "backend 'dds' always estimates the state; leave out `estimator`."
         )
     is_single_lockstep = mode == LOCKSTEP and robots == 1
-    is_standard = options.get("simulator") == STANDARD.name
     if randomisation is not None and not is_single_lockstep:
         needed = "only one robot in mode 'lockstep' can be randomised"
         raise ConfigError(f"backend 'dds': {needed}, not {robots} in mode {mode!r}.")
-    if is_standard and (randomisation is not None or not is_single_lockstep):
-        needed = "one robot in mode 'lockstep', without randomisation"
-        raise ConfigError(
-            f"simulator {STANDARD.name!r}: drives {needed}; leave out the rest."
-        )
     if mode not in (LOCKSTEP, REALTIME):
         fix = suggest(mode, (LOCKSTEP, REALTIME))
         raise ConfigError(f"backend_options: there is no mode {mode!r}; {fix}")
@@ -138,19 +134,17 @@ class DdsBackend:
         model: the robot's model, which the simulator has to run, too.
         world: the world, which the simulator has to run, too.
         namespace: of the robot's topics.
-        simulator: name of the simulator's node; `simulation_interfaces` for any simulator that
-            serves these.
+        simulator: name of the simulator's node.
         timeout_s: longest wait for a peer, an answer or data [s].
         truth: True to add the true pose to `info`.
         domain_id: of ROS 2; by default that of the environment.
         randomisation: from which the simulator draws, too.
         stamped: True for a TwistStamped on `cmd_vel`; by default what the simulator subscribes to.
-        standard: `StandardOptions` of the simulator `simulation_interfaces`.
 
     Raises:
         BackendError: if there is no simulator, if it refuses, if it is not in lock-step, or if
             another node moved it.
-        ConfigError: if an option is wrong, or is for another kind of simulator.
+        ConfigError: if an option is wrong.
         ModelError: if the simulator runs another model or world.
         StaleDataError: if data do not arrive.
     """
@@ -166,7 +160,6 @@ class DdsBackend:
         domain_id: int | None = None,
         randomisation: Randomisation | None = None,
         stamped: bool | None = None,
-        standard: Mapping[str, Any] | None = None,
     ) -> None:
         self.timeout_s = timeout_s
         self._robot = model.robot
@@ -181,37 +174,19 @@ class DdsBackend:
             sampler = EpisodeSampler(model, world, randomisation=randomisation)
             self._facts["scenes"] = lambda seeds: sampler.draw(seeds)[0]
 
-        self._is_standard = simulator == STANDARD.name
-        if standard and not self._is_standard:
-            needed = f"options of the simulator {STANDARD.name!r}, not of {simulator!r}"
-            raise ConfigError(f"standard {dict(standard)!r}: {needed}; leave it out.")
-        options = validate(dict(standard or {}), client.StandardOptions, "standard")
         self._period_ns = round(model.control_period * NS_PER_S)
-        # Stamps may differ from the end of a step by this much: a simulator of the standard may
-        # round the length of its steps.
-        self._rounding_ns = 0
-        if self._is_standard:
-            self._rounding_ns = round(client.TOLERANCE * self._period_ns)
-        # Data may be older than the end of a step by this much.
-        self._slack_ns = max(round(options.slack_s * NS_PER_S), self._rounding_ns)
         self._now_ns = 0  # simulated time at the end of the last step
         self._can_send = False  # True while the data of the last step are known
 
-        self._inbox = Inbox(self._topics, self._slack_ns)
+        self._inbox = Inbox(self._topics)
         self._link = Link(namespace, domain_id, stamped=stamped, patience_s=timeout_s)
         try:
             self._subscribe()
-            self._episodes: client.StandardEpisodes | EpisodeServices
-            if self._is_standard:
-                self._episodes = client.StandardEpisodes(
-                    self._link, model, world, options, self._inbox
-                )
-            else:
-                self._episodes = EpisodeServices(
-                    self._link, simulator, model, world, randomisation
-                )
+            self._episodes = EpisodeServices(
+                self._link, simulator, model, world, randomisation
+            )
             self._link.wait_for_peers(
-                self._topics, self._episodes.clients, timeout_s, self._advise_start()
+                self._topics, self._episodes.clients, timeout_s, START_SIMULATOR
             )
             self._episodes.open(timeout_s)
         except BaseException:
@@ -229,18 +204,6 @@ class DdsBackend:
             self._subscriptions[topic] = self._link.node.create_subscription(
                 kind, topic, put, qos.SENSOR, raw=True
             )
-
-    def _advise_start(self) -> str:
-        """Return how to start the simulator, as the end of an error."""
-        if self._is_standard:
-            return (
-                f"start a simulator that serves {STANDARD.name}, in the same ROS_DOMAIN_ID and "
-                "namespace; `services` in `standard` is what its services' names begin with."
-            )
-        return (
-            "start `simulator_node` with mode:=lockstep in the same ROS_DOMAIN_ID and "
-            "namespace."
-        )
 
     @halts_on_error
     def reset(self, start: Start) -> RobotView:
@@ -291,7 +254,6 @@ class DdsBackend:
         twist = self._robot.to_cmd_vel(command)
         self._can_send = False
         self._link.send(twist)
-        self._episodes.advance()
         # Checked while the simulator is busy: this is free.
         self._link.check_alone()
         self._middleware.command(self._now_ns, self._robot.from_cmd_vel(twist))
@@ -306,7 +268,6 @@ class DdsBackend:
         self._wait_for_data()
         messages = self._inbox.messages
         self._check_stamps()
-        self._follow_rounding(messages[ODOM].stamp_ns)
         self._take_scan(messages[SCAN])
         for name in self._sensors:
             self._take_reading(name, messages[name])
@@ -357,20 +318,14 @@ class DdsBackend:
         """Raise BackendError unless the newest data are those of the last step."""
         for topic in self._topics:
             ahead_ns = self._inbox.messages[topic].stamp_ns - self._now_ns
-            if -self._slack_ns <= ahead_ns <= self._rounding_ns:
+            if not ahead_ns:
                 continue
             self._link.check_alone()
-            if self._is_standard:
-                fix = "step it from here alone; `slack_s` in `standard` allows older data."
-            else:
-                fix = "start the simulator with mode:=lockstep, and move it from here alone."
+            fix = (
+                "start the simulator with mode:=lockstep, and move it from here alone."
+            )
             off = f"stamped {ahead_ns / NS_PER_S:+.3f} s off the step"
             raise BackendError(f"topic {topic!r}: {off}; {fix}")
-
-    def _follow_rounding(self, odometry_ns: int) -> None:
-        """Take the stamp of the odometry for the end of the step if it is off by rounding only."""
-        if abs(odometry_ns - self._now_ns) <= self._rounding_ns:
-            self._now_ns = odometry_ns
 
     def _take_odometry(self, message: Message) -> None:
         pose, twist = read_message(ODOM, wire.odometry_of, message.content)
@@ -379,14 +334,12 @@ class DdsBackend:
     def _take_scan(self, message: Message) -> None:
         device_ranges = read_message(SCAN, wire.ranges_of, message.content)
         ranges = from_device(device_ranges, self._lidar)
-        stamp_ns = min(message.stamp_ns, self._now_ns)
-        self._middleware.scan(stamp_ns, message.arrival_ns, ranges)
+        self._middleware.scan(self._now_ns, message.arrival_ns, ranges)
 
     def _take_reading(self, name: str, message: Message) -> None:
         read = partial(sensor_from_ros, self._sensors[name])
         reading = read_message(name, read, message.content)
-        stamp_ns = min(message.stamp_ns, self._now_ns)
-        self._middleware.sense(name, stamp_ns, message.arrival_ns, reading)
+        self._middleware.sense(name, self._now_ns, message.arrival_ns, reading)
 
     def facts(self) -> BackendFacts:
         """Return the newest true pose, if `truth`, and with a randomisation how to draw scenes."""

@@ -64,22 +64,6 @@ def heading_of(x: float, y: float, z: float, w: float) -> float:
     return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
-def turned_to(stood: geometry.Quaternion, heading: float) -> geometry.Quaternion:
-    """Return an orientation turned about the vertical to a heading [rad]; its tilt stays."""
-    x = stood.x
-    y = stood.y
-    z = stood.z
-    w = stood.w
-    if not (x or y):
-        return heading_to_ros(heading)
-    half = (heading - heading_of(x, y, z, w)) / 2.0
-    s = math.sin(half)
-    c = math.cos(half)
-    return geometry.Quaternion(
-        x=c * x - s * y, y=c * y + s * x, z=c * z + s * w, w=c * w - s * z
-    )
-
-
 def twist_to_ros(twist: ArrayLike) -> geometry.Twist:
     """Return linear.x, linear.y, angular.z (3,) as a Twist."""
     message = geometry.Twist()

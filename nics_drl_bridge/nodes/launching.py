@@ -9,7 +9,7 @@ from typing import Any
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration, TextSubstitution
 from launch_ros.actions import Node
-from launch_ros.parameter_descriptions import ParameterValue
+from launch_ros.parameter_descriptions import ParameterFile, ParameterValue
 
 from launch import LaunchDescription
 from nics_drl_bridge.nodes.starting import (
@@ -74,7 +74,9 @@ def declaration_of(argument: Argument) -> DeclareLaunchArgument:
 
 def action_of(node: NodeStart) -> Node:
     """Return the `launch` action that starts a node."""
-    files = [node.params_file] if node.params_file else []
+    files = []
+    if node.params_file:
+        files = [ParameterFile(node.params_file, allow_substs=True)]
     parameters = {name: parameter_of(value) for name, value in node.parameters.items()}
     log_arguments = []
     if node.log_level:

@@ -401,9 +401,6 @@ class EpisodeServices:
     def open(self, timeout_s: float) -> None:
         """Do nothing: the simulator's model and world are checked when an episode begins."""
 
-    def advance(self) -> None:
-        """Do nothing: a command itself moves the world."""
-
     @property
     def there(self) -> bool:
         """True if a simulator offers the services."""
@@ -468,20 +465,10 @@ class Message(NamedTuple):
 
 
 class Inbox:
-    """The newest message of each topic.
+    """The newest message of each topic."""
 
-    Args:
-        topics: names of the topics.
-        slack_ns: messages may be older than an awaited stamp by this much.
-    """
-
-    def __init__(self, topics: tuple[str, ...], slack_ns: int) -> None:
-        self._slack_ns = slack_ns
+    def __init__(self, topics: tuple[str, ...]) -> None:
         self.messages = dict.fromkeys(topics, Message())
-
-    def clear(self) -> None:
-        """Forget all messages."""
-        self.messages = dict.fromkeys(self.messages, Message())
 
     def put(self, topic: str, content: bytes) -> None:
         """Store a message. Raises BackendError if it is damaged."""
@@ -490,7 +477,7 @@ class Inbox:
 
     def has(self, topic: str, stamp_ns: int) -> bool:
         """True if the message of a stamp is there."""
-        return self.messages[topic].stamp_ns + self._slack_ns >= stamp_ns
+        return self.messages[topic].stamp_ns >= stamp_ns
 
     def find_late(self, stamp_ns: int) -> str | None:
         """Return the first topic whose message of a stamp is not there; None if all are."""
@@ -498,10 +485,6 @@ class Inbox:
             if not self.has(topic, stamp_ns):
                 return topic
         return None
-
-    def find_newest_ns(self) -> int:
-        """Return the newest stamp of any topic [ns]; -1 if there is no message."""
-        return max(message.stamp_ns for message in self.messages.values())
 
 
 def read_message(topic: str, read: Callable[[bytes], T], content: bytes) -> T:

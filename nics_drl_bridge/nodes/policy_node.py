@@ -18,11 +18,10 @@ from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.middleware.uncertainty import compute_uncertainty_gain
 from nics_drl_bridge.nodes import conversions, qos, runner
-from nics_drl_bridge.nodes.follow_path import PathActions, Wish
 from nics_drl_bridge.nodes.goal_answer import GoalAnswer
 from nics_drl_bridge.nodes.goal_frames import GoalFrames
-from nics_drl_bridge.nodes.nav2_parameters import ControllerParameters
 from nics_drl_bridge.nodes.parameters import policy
+from nics_drl_bridge.nodes.parts import Wish, open_parts
 from nics_drl_bridge.nodes.robot_topics import RobotTopics
 from nics_drl_bridge.nodes.runner import ACTIVE, UNCONFIGURED, ManagedNode
 from nics_drl_bridge.policy.file.stateful import begin, resume
@@ -40,13 +39,14 @@ class PolicyNode(ManagedNode):
 
     def __init__(self, **options: Any) -> None:
         super().__init__("policy_node", policy(), **options)
-        self._nav2 = ControllerParameters(self)
-        self.ignores = (
-            self._nav2.ignores
-        )  # parameters from a file for Nav2's controller server
+        self._leaders = open_parts("policy", self)
         self._acted_ns = 0
         self._answer: GoalAnswer | None = None  # to the newest goal
         runner.diagnose(self, "policy", self._look)
+
+    def ignores(self, name: str) -> bool:
+        """Return True for a parameter in a file that means nothing to a policy."""
+        return any(leader.ignores(name) for leader in self._leaders)
 
     def configure(self) -> None:
         """Open model and policy, and subscribe."""
@@ -87,16 +87,15 @@ class PolicyNode(ManagedNode):
         self._topics.hear_initial_pose()
         self._frames = GoalFrames(self, self._topics)
         self.undo.callback(self._frames.close)
-        self._actions = PathActions(
-            self,
-            self._topics,
-            self._frames,
-            model,
-            self._nav2,
-            self._toward,
-            lambda: begin(self._policy),
-        )
-        self.undo.callback(self._actions.close)
+        for leader in self._leaders:
+            leader.open(
+                self._topics,
+                self._frames,
+                model,
+                self._toward,
+                lambda: begin(self._policy),
+            )
+            self.undo.callback(leader.close)
         timer = runner.steadily(self, POLLS * model.control_period, self._act)
         self.undo.callback(self.destroy_timer, timer)
 
@@ -106,7 +105,8 @@ class PolicyNode(ManagedNode):
 
     def deactivate(self) -> None:
         """Leave a zero command behind."""
-        self._actions.stop("the node is deactivated")
+        for leader in self._leaders:
+            leader.stop("the node is deactivated")
         runner.last_word(self._raw, self._message(np.zeros(3), self._acted_ns))
 
     def _open_policy(self, model: SimulatorModel) -> None:
@@ -126,7 +126,7 @@ class PolicyNode(ManagedNode):
 
     def _on_goal(self, message: PoseStamped) -> None:
         stamp_ns = conversions.stamp_from_ros(message.header.stamp)
-        if self._actions.active or self._actions.led:
+        if any(leader.active or leader.led for leader in self._leaders):
             reason = "a goal_pose is ignored while an action leads the robot"
             self.get_logger().info(reason, throttle_duration_sec=5.0)
             self._answer = GoalAnswer(stamp_ns, False, reason)
@@ -148,7 +148,7 @@ class PolicyNode(ManagedNode):
     def _act(self, _: int = 0) -> None:
         if self.state != ACTIVE:
             return
-        if self._actions.tick():
+        if any(leader.tick() for leader in self._leaders):
             self._raw.publish(self._message(np.zeros(3), self._acted_ns))
         newest = self._topics.middleware.cache.newest
         begin_s = time.monotonic()
@@ -193,9 +193,11 @@ class PolicyNode(ManagedNode):
         )
 
     def _twist(self) -> Array:
-        if self._actions.active:
-            self._goal = np.full(2, np.nan)  # the previous goal is given up
-            return self._actions.twist()
+        for leader in self._leaders:
+            if leader.active:
+                self._goal = np.full(2, np.nan)  # the previous goal is given up
+                twist: Array = leader.twist()
+                return twist
         if not (self._topics.located and np.isfinite(self._goal).all()):
             return np.zeros(3)
         verdict = self._task.judge(self._topics.view(), {"goal": self._goal})

@@ -21,7 +21,7 @@ from sensor_msgs.msg import JointState, LaserScan
 from std_srvs.srv import SetBool
 
 from nics_drl_bridge import defaults
-from nics_drl_bridge.errors import BackendError, BridgeError
+from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.lidar.scanner import RENDERERS, Renderer
@@ -40,7 +40,7 @@ from nics_drl_bridge.nodes.conversions import sensor_to_ros, sensor_type
 from nics_drl_bridge.nodes.link import identity
 from nics_drl_bridge.nodes.map_to_odom import odom_in_map, transform_to_ros
 from nics_drl_bridge.nodes.message_packages import how_to_install
-from nics_drl_bridge.nodes.simulation_interfaces import open_services
+from nics_drl_bridge.nodes.parts import open_parts
 from nics_drl_bridge.nodes.world_topics import WorldTopics
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.device import LEAST_VARIANCE, DeviceWorld, Sensed, variances
@@ -328,7 +328,7 @@ class DeviceNode(qos.BridgeNode):
         self._open_topics()
         self._start_time()
         # its entities include those of the first episode
-        self.standard = open_services(self)
+        self._parts = open_parts("device", self)
         self.begin()
 
     def use_world(self, world: AnyWorld) -> None:
@@ -617,7 +617,6 @@ class DeviceNode(qos.BridgeNode):
         for inlet in self._inlets:
             inlet.take_waiting()
         try:
-            self._require_world()
             self.begin()
         except BridgeError as error:
             return False, str(error)
@@ -626,21 +625,10 @@ class DeviceNode(qos.BridgeNode):
     def _on_pause(
         self, request: SetBool.Request, response: SetBool.Response
     ) -> SetBool.Response:
-        try:
-            self._require_world()
-            self.pause(bool(request.data))
-            response.success = True
-            response.message = "paused" if self.paused else "running"
-        except BridgeError as error:
-            response.success = False
-            response.message = str(error)
+        self.pause(bool(request.data))
+        response.success = True
+        response.message = "paused" if self.paused else "running"
         return response
-
-    def _require_world(self) -> None:
-        if self.standard is not None and not self.standard.has_world:
-            raise BackendError(
-                "no world is loaded; load one with the service load_world."
-            )
 
     def _repeat(self) -> tuple[bool, str]:
         if not self._time.lockstep:

@@ -19,7 +19,6 @@ from nics_drl_bridge.config import (
     find_config,
     list_shipped,
     parse_namespace,
-    parse_yaml,
     read_text,
     share_folder,
 )
@@ -98,26 +97,25 @@ class Robot(NamedTuple):
 
 
 class Setup:
-    """The settings from the arguments and the parameter file together."""
+    """The settings from the arguments; what they leave open is up to the nodes and their file."""
 
     def __init__(self, values: Values) -> None:
         flags = {name: flag_of(name, values.get(name, "")) for name in FLAGS}
         self.values = {**values, **flags}
-        file = self["params_file"]
-        self._file = parse_yaml(read_text(file), file) if file else {}
-        check_sections(file, self._file)
+        for name in ("params_file", "urdf"):
+            if self[name] and not Path(self[name]).is_file():
+                raise ConfigError(f"{name} {self[name]}: no such file; check the path.")
         if self["world"]:
             check_world(self["world"])
         if self["policy"]:
             check_policy(self["policy"])
-        self.model = self["model"] or str(self._of_file("model", "") or MODEL.default)
+        self.model = self["model"] or str(MODEL.default)
         shipped = share_folder() / "urdf" / f"{self.model}.urdf"
         self._opened: Any = None if shipped.is_file() else opened(self.model)
         self.urdf = self["urdf"] or (str(shipped) if self._opened is None else "")
         self.simulator = f"{self['simulator']}_node"
         space = self["namespace"].strip("/")
-        robots = self["robots"] or self._of_file("robots", self.simulator)
-        self.fleet = names_of(robots) if robots and "robots" in values else ()
+        self.fleet = names_of(self["robots"])
         self.robots = [Robot(space, "", space)]
         if self.fleet:
             self.robots = [
@@ -136,15 +134,6 @@ class Setup:
         """Return an argument that is true or false, or None if it was left empty."""
         return self[name] == "true" if self[name] else None
 
-    def _of_file(self, name: str, node: str) -> Any:
-        """Return a value from the parameter file, for a node in any namespace."""
-        value = None
-        for key in ("/**", f"/**/{node}", node, f"/{node}"):
-            section = self._file.get(key) or {}
-            parameters = section.get("ros__parameters") or {}
-            value = parameters.get(name, value)
-        return value
-
     def limits(self) -> str:
         """Return the gate's limits; by default the shipped limits of the given model, if any."""
         if self["limits"] or not self["model"]:
@@ -152,15 +141,23 @@ class Setup:
         robot = self.model if self._opened is None else self._opened.robot.name
         return robot if robot in list_shipped("limits") else ""
 
-    def frame(self, node: str, robot: Robot) -> str | None:
-        """Return a frame of a robot in a fleet; None for a single robot, whose file names it."""
-        base = self._of_file(BASE_FRAME.name, node) or BASE_FRAME.default
-        return f"{robot.frames}{base}" if robot.frames else None
+    def frame(self, robot: Robot) -> str | None:
+        """Return the base frame of a robot; None if a single robot's was left empty."""
+        base = self[BASE_FRAME.name]
+        if not robot.frames:
+            return base or None
+        return f"{robot.frames}{base or BASE_FRAME.default}"
 
     def description(self) -> str:
-        """Return the URDF of the robot, with the frames from the parameter file."""
-        base = str(self._of_file(BASE_FRAME.name, self.simulator) or BASE_FRAME.default)
-        laser = str(self._of_file("laser_frame", self.simulator) or "")
+        """Return the URDF of the robot. Raises ConfigError if no argument names the robot."""
+        own_file = self["params_file"] not in ("", shipped_parameters())
+        if own_file and not (self["model"] or self["urdf"]):
+            fix = "say model:=ROBOT or urdf:=FILE, or use_robot_state_pub:=false"
+            raise ConfigError(
+                f"{STATE_PUBLISHER} has to know which robot it is; {fix}."
+            )
+        base = self[BASE_FRAME.name] or str(BASE_FRAME.default)
+        laser = self["laser_frame"]
         shipped = base == BASE_FRAME.default and laser in ("", SHIPPED_LASER)
         if self["urdf"] or (self.urdf and shipped):
             return read_text(self.urdf)
@@ -252,19 +249,6 @@ def flag_of(name: str, word: str) -> str:
     return FLAG_WORDS[word.lower()]
 
 
-def check_sections(file: str, sections: Mapping[Any, Any]) -> None:
-    """Raise ConfigError unless a file holds parameters of nodes; ROS 2 says it less clearly."""
-    for name, section in sections.items():
-        if section is None:
-            continue
-        if not isinstance(section, dict):
-            form = "`NODE: {ros__parameters: {NAME: VALUE}}`"
-            fix = f"parameter files hold {form}, as config/nodes/bridge.yaml does"
-            raise ConfigError(f"{file}: key {name!r} is no section of a node; {fix}.")
-        if name != "ros__parameters":
-            check_sections(file, section)
-
-
 def check_world(name: str) -> None:
     """Raise ConfigError unless a world is shipped or a file of the user's that can be read."""
     if name not in list_shipped("worlds"):  # reading one takes a second
@@ -280,18 +264,14 @@ def check_policy(name: str) -> None:
         raise ConfigError(f"policy {name!r}: no such file; check the path.")
 
 
-def names_of(robots: Any) -> tuple[str, ...]:
+def names_of(robots: str) -> tuple[str, ...]:
     """Return the namespaces of a fleet from a count or a list; none for one robot."""
-    if isinstance(robots, list):
-        words = [str(name) for name in robots]
-    else:
-        words = re.findall(r"[^\s,\[\]'\"]+", str(robots))
-    text = str(robots)
+    words = re.findall(r"[^\s,\[\]'\"]+", robots)
     count = int(words[0]) if len(words) == 1 and words[0].isdecimal() else None
-    is_whole = bool(words) and text.count("[") == text.count("]")
-    if text and (not is_whole or count == 0):
+    is_whole = bool(words) and robots.count("[") == robots.count("]")
+    if robots and (not is_whole or count == 0):
         fix = "give a count from 1, or namespaces, as in robots:='[ant, bee]'"
-        raise ConfigError(f"launch argument 'robots' is {text!r}; {fix}.")
+        raise ConfigError(f"launch argument 'robots' is {robots!r}; {fix}.")
     if count is not None:
         return default_namespaces(count) if count > 1 else ()
     for word in words:
@@ -321,11 +301,7 @@ def numbers_of(start: str) -> list[float] | None:
 
 def simulator(setup: Setup) -> Iterator[NodeStart]:
     """Yield the simulator of all robots."""
-    robots: Any = None
-    if setup.fleet:
-        robots = list(setup.fleet)
-    elif setup["robots"]:
-        robots = 1
+    robots: Any = list(setup.fleet) or 1
     space = setup["namespace"].strip("/")
     parameters = {
         "model": setup.text("model"),
@@ -333,6 +309,8 @@ def simulator(setup: Setup) -> Iterator[NodeStart]:
         "robots": robots,
         "episode_start": numbers_of(setup["start"]),
         STAMPED: setup.flag("stamped"),
+        BASE_FRAME.name: setup.text(BASE_FRAME.name),
+        "laser_frame": setup.text("laser_frame"),
     }
     yield setup.node(PACKAGE, setup.simulator, Robot(space, "", space), parameters)
 
@@ -358,15 +336,15 @@ def bridge(setup: Setup) -> Iterator[NodeStart]:
     }
     for robot in setup.robots:
         for node, parameters in nodes.items():
-            frame = {BASE_FRAME.name: setup.frame(node, robot)}
+            frame = {BASE_FRAME.name: setup.frame(robot)}
             yield setup.node(PACKAGE, node, robot, {**shared, **parameters, **frame})
 
 
 def description(setup: Setup) -> Iterator[NodeStart]:
     """Yield robot_state_publisher of each robot, and RViz, if requested."""
     timed = {"use_sim_time": setup.flag("use_sim_time")}
-    drawn = setup.description()
     if setup.flag("use_robot_state_pub"):
+        drawn = setup.description()
         for robot in setup.robots:
             parameters = {
                 **timed,
@@ -389,25 +367,30 @@ def common(use_sim_time: str) -> list[Argument]:
             "model", "", "Shipped robot, or folder of a model; empty: from params_file"
         ),
         Argument("namespace", "", "Namespace of the robot, or of the fleet"),
+        Argument(BASE_FRAME.name, "", "Frame of the robot; empty: from params_file"),
         Argument("use_sim_time", use_sim_time, "Use /clock"),
         Argument("log_level", "info", "Log level of all nodes"),
     ]
 
 
+def shipped_parameters() -> str:
+    """Return the path of the parameter file that is used by default."""
+    return str(find_config("bridge", "nodes"))
+
+
 def of_nodes() -> list[Argument]:
     """Return the arguments of every launch that starts nodes of this package."""
-    file = str(find_config("bridge", "nodes"))
     stamped = (
         "Use TwistStamped for cmd_vel; "
         "empty: params_file, else TwistStamped on Kilted and newer"
     )
     return [
-        Argument("params_file", file, "Parameters of all nodes"),
+        Argument("params_file", shipped_parameters(), "Parameters of all nodes"),
         Argument("stamped", "", stamped),
     ]
 
 
-def of_simulator(robots: str = "") -> list[Argument]:
+def of_simulator(robots: str = "1") -> list[Argument]:
     """Return the arguments of a simulator."""
     kinds = ("simulator", "mujoco")
     start = "Start x, y, heading [m, m, rad] of each robot; empty: drawn at random"
@@ -418,6 +401,7 @@ def of_simulator(robots: str = "") -> list[Argument]:
             "robots", robots, "Number of robots, or their namespaces, as in '[a, b]'"
         ),
         Argument("start", "", start),
+        Argument("laser_frame", "", "Frame of the lidar; empty: from params_file"),
     ]
 
 
@@ -473,12 +457,12 @@ def prefix_of(package: str) -> Path | None:
     return None
 
 
-def whole_simulation(robots: str = "") -> Launch:
+def whole_simulation(robots: str = "1") -> Launch:
     """Return a simulator and, on its topics, everything that runs on a vehicle."""
     arguments = [*common("true"), *of_nodes(), *of_simulator(robots), *of_bridge()]
     return Launch(
         "Several robots in one simulator, each with gate, middleware and policy."
-        if robots
+        if robots != "1"
         else "A simulator and, on its topics, everything that runs on a vehicle.",
         [simulator, bridge, description],
         [*arguments, e_stop_required("false"), *of_description()],

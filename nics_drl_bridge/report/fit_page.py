@@ -21,7 +21,6 @@ from nics_drl_bridge.identify.report import (
 from nics_drl_bridge.report import fit_pictures, html
 from nics_drl_bridge.robot.spec import RobotSpec
 
-PATHS_SHOWN = 3
 Blocks = Sequence[str]
 Tile = tuple[str, str, bool]
 
@@ -69,22 +68,21 @@ def make_path_blocks(identified: Identified) -> Blocks:
     """Compares predicted with measured paths, and the model's errors with the yardsticks'."""
     if identified.held_out is None or not identified.judgement:
         return [html.make_paragraph("The drive is too short to hold data out.")]
-    paths = fit_pictures.draw_unseen_paths(identified.trial, PATHS_SHOWN)
+    paths = fit_pictures.draw_held_out_paths(identified.trial)
     caption = "Mean prediction errors on unseen data: those of a good model lie below the others."
     if any(at.band_m for at in identified.judgement):
         caption += " Bars: distances within which 95 % of its predictions should end."
     rows = html.make_table(HEADS, tabulate_judgement(identified.judgement))
     return [
-        html.make_gallery([(png, "") for png in paths]),
+        html.make_picture(paths, "Measured and predicted paths on unseen data."),
         html.make_picture(fit_pictures.draw_yardsticks(identified), caption),
         html.make_details("The same in numbers", [html.make_paragraph(COMPARED), rows]),
     ]
 
 
 def model_blocks(spec: RobotSpec, identified: Identified, report: str) -> Blocks:
-    """Returns the equations and, folded, all figures and pictures of fit and calibration."""
-    fit = fit_pictures.fit_pictures(spec, identified, paths=False)
-    drawn = {**fit, **fit_pictures.draw_calibration(spec, identified)}
+    """Returns the equations and, folded, all figures and pictures of the fit."""
+    drawn = fit_pictures.fit_pictures(spec, identified, paths=False)
     pictures = [
         html.make_picture(png, fit_pictures.CAPTIONS[name])
         for name, png in drawn.items()
@@ -93,7 +91,7 @@ def model_blocks(spec: RobotSpec, identified: Identified, report: str) -> Blocks
     return [
         html.make_code(equations),
         html.make_details("All figures of the fit", [html.make_code(report)]),
-        html.make_details("Pictures of the fit and of the calibration", pictures),
+        html.make_details("Pictures of the fit", pictures),
     ]
 
 

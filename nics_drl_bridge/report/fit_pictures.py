@@ -1,6 +1,5 @@
-"""Pictures of a fit (its data, predictions and terms) and of its calibration, as PNG."""
+"""Pictures of a fit: its data, predictions, terms and input curves, as PNG."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,22 +9,14 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator, NullLocator
 from numpy.typing import NDArray
 
-from nics_drl_bridge import geometry
 from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify.drive import pose_residual
 from nics_drl_bridge.identify.identify import Identified
-from nics_drl_bridge.identify.noise import drift_growth, odometry_residual
 from nics_drl_bridge.identify.open_loop import HORIZON_S, Windows, predict, windows
-from nics_drl_bridge.identify.report import CalibratedValue, collect_estimates
-from nics_drl_bridge.identify.signals import (
-    DIFFERENCE,
-    average_held,
-)
+from nics_drl_bridge.identify.signals import average_held
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.curve import delays as delays_of
-from nics_drl_bridge.robot.noise import Level
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.style import (
     DARK,
@@ -36,7 +27,6 @@ from nics_drl_bridge.style import (
     MODEL_LINE,
     OTHER,
     POINTS,
-    Panel,
     make_panels,
     render_png,
 )
@@ -44,34 +34,27 @@ from nics_drl_bridge.style import (
 SHOWN_S = 8.0
 PATHS = 6
 PATH_POINTS = 40
-UNSEEN_PANEL = Panel(3.4, 3.4)  # for one unseen path on a page
 SETTLED_S = 1.0
 LEAST_ERROR = 1e-12
 LEAST_RATE = 1e-6
 MOST_POINTS = 3000
-BINS = 60
 CURVE_POINTS = 400  # number of points at which an input curve is drawn
-REACH = 5.0  # histograms end at this many standard deviations
 CAPTIONS = {
     "accuracy": "Error against the number of terms; circles mark how many are kept.",
     "residuals": "Rates on unseen data, those of the model, and the residuals.",
     "alignment": "Commands as stamped and as they take effect, and the response of the robot.",
-    "mounting": "Velocities before and after correction: base_link of a robot that can't move "
-    "sideways has no lateral velocity.",
     "inputs": "How motors change commands, over the range of the drive, and the rates that the "
     "terms ask for.",
-    "noise": "Sensor noise, and the growth of prediction errors, next to the drift that simulator "
-    "and estimator use.",
 }
 
 
 def write_pictures(
     spec: RobotSpec, identified: Identified, folder: str | Path
 ) -> tuple[Path, ...]:
-    """Writes the pictures of a fit and of its calibration as PNG files, and returns their paths."""
+    """Writes the pictures of a fit as PNG files, and returns their paths."""
     # The spec may be of a textbook robot with another state.
     spec = identified.drive.spec
-    drawn = {**fit_pictures(spec, identified), **draw_calibration(spec, identified)}
+    drawn = fit_pictures(spec, identified)
     files = {Path(folder) / f"{name}.png": picture for name, picture in drawn.items()}
     for file, picture in files.items():
         write_bytes(file, picture)
@@ -96,6 +79,9 @@ def fit_pictures(
         pictures["residuals"] = draw_residuals(identified.trial, identified.unseen)
     if (np.ptp(identified.recording.command.values, axis=0) > 0.0).any():
         pictures["alignment"] = draw_alignment(spec, identified)
+    inputs = draw_inputs(spec, identified)
+    if inputs is not None:
+        pictures["inputs"] = inputs
     return pictures
 
 
@@ -131,16 +117,6 @@ def draw_held_out_paths(identified: Identified) -> bytes:
     for axes, path in zip(grid, paths, strict=False):
         _draw_unseen_path(axes, path)
     return render_png(figure, grid[0])
-
-
-def draw_unseen_paths(identified: Identified, most: int) -> list[bytes]:
-    """Draws up to `most` panels of `draw_held_out_paths`, each as its own PNG."""
-    drawn = []
-    for path in _collect_unseen_paths(identified)[:most]:
-        figure, (axes,) = make_panels(1, 1)
-        _draw_unseen_path(axes, path)
-        drawn.append(render_png(figure, axes, UNSEEN_PANEL))
-    return drawn
 
 
 def _collect_unseen_paths(identified: Identified) -> list[tuple[Array, Array, float]]:
@@ -289,52 +265,6 @@ def _predict_rates(identified: Identified, chosen: Windows) -> Array:
     return np.stack([chosen.start, *poses], axis=1)
 
 
-def draw_calibration(spec: RobotSpec, identified: Identified) -> dict[str, bytes]:
-    """Returns the pictures of a calibration that the recording allows, as PNG by name."""
-    drawn = {
-        "mounting": draw_mounting(identified, collect_estimates(identified)),
-        "inputs": draw_inputs(spec, identified),
-        "noise": draw_noise(identified),
-    }
-    return {name: picture for name, picture in drawn.items() if picture is not None}
-
-
-def draw_mounting(
-    identified: Identified, values: dict[str, CalibratedValue]
-) -> bytes | None:
-    """Draws velocities of the tracked body and of `base_link`; None without a rotation."""
-    rotation = values["rotation_rad"]
-    lever_x = values["lever_arm_x_m"]
-    lever_y = values["lever_arm_y_m"]
-    if rotation.value is None:
-        return None
-    tracked = identified.drive.twists.twist
-    tracked = tracked[:: max(1, len(tracked) // MOST_POINTS)]
-    calibration = identified.calibration
-    turned = geometry.rotate(tracked[:, :2], -calibration.rotation_rad)
-    x, y = calibration.lever_arm_m
-    base = turned + tracked[:, 2:] * np.array([y, -x])
-    count = 1 if lever_x.value is None else 2
-    figure, grid = make_panels(1, count, (5.2 * count, 4.4))
-    _draw_points(grid[0], (tracked[:, 0], tracked[:, 1]), (base[:, 0], base[:, 1]))
-    grid[0].set_aspect("equal", adjustable="datalim")
-    grid[0].set(
-        xlabel="velocity along x of its own frame [m/s]",
-        ylabel="velocity along y [m/s]",
-    )
-    _finish(grid[0], rotation.text)
-    for axes in grid[1:]:
-        _draw_points(axes, (tracked[:, 2], turned[:, 1]), (tracked[:, 2], base[:, 1]))
-        axes.set(xlabel="yaw rate [rad/s]", ylabel="lateral velocity [m/s]")
-        _finish(axes, f"{lever_x.text}\n{lever_y.text}")
-    return render_png(figure)
-
-
-def _draw_points(axes: Axes, tracked: Sequence[Array], base: Sequence[Array]) -> None:
-    axes.plot(*tracked, color=OTHER, label="tracked body", **POINTS)
-    axes.plot(*base, color=MODEL, label="base_link", **POINTS)
-
-
 def draw_inputs(spec: RobotSpec, identified: Identified) -> bytes | None:
     """Draws the input curves, and how limits, drag and friction change the rates of states."""
     model = identified.model
@@ -398,70 +328,3 @@ def _draw_restraint(axes: Axes, identified: Identified, dof: str) -> None:
 def _finish(axes: Axes, title: str) -> None:
     axes.set_title(title.replace("+-", "±"))
     axes.legend()
-
-
-def draw_noise(identified: Identified) -> bytes | None:
-    """Draws histograms of the residuals and the growth of the drift; None without noise."""
-    levels = identified.noise
-    drive = identified.drive
-    calibration = identified.calibration
-    model = identified.model
-    found = []
-    if drive.bursts is None:
-        pose = pose_residual(drive.recording.pose)
-        if len(pose) > DIFFERENCE:
-            found += [("pose position", levels.pose_position, pose[:, :2].ravel())]
-            found += [("pose heading", levels.pose_heading, pose[:, 2])]
-    odometry = odometry_residual(drive, calibration, model, identified.samples)
-    if odometry is not None:
-        found += [("odometry, linear", levels.odom_linear, odometry[:, 0])]
-        found += [("odometry, angular", levels.odom_angular, odometry[:, 2])]
-    histograms = [row for row in found if row[1].measured and row[1].std > 0.0]
-    growth = drift_growth(drive, calibration, model)
-    if not levels.position_drift.measured or (growth and growth[1].max() <= 1e-9):
-        growth = None
-    count = len(histograms) + 2 * (growth is not None)
-    if not count:
-        return None
-    columns = 2 if count == 4 else min(count, 3)
-    rows = -(-count // columns)
-    figure, grid = make_panels(rows, columns, (4.3 * columns, 3.4 * rows))
-    for axes, (name, level, rest) in zip(grid, histograms, strict=False):
-        edges = np.linspace(-REACH * level.std, REACH * level.std, BINS + 1)
-        axes.hist(
-            rest - np.median(rest),
-            list(edges),
-            density=True,
-            color=MEASURED,
-            alpha=0.55,
-        )
-        normal = np.exp(-0.5 * (edges / level.std) ** 2) / (
-            level.std * np.sqrt(2.0 * np.pi)
-        )
-        axes.plot(edges, normal, "--", color=MODEL)
-        axes.xaxis.set_major_locator(MaxNLocator(5))
-        axes.set(xlabel=f"residual [{level.unit}]", ylabel="density")
-        axes.set_title(f"noise of the {name}\n{_format_value(level)}")
-    if growth is not None:
-        horizon, position, heading = growth
-        after = grid[len(histograms) :]
-        _draw_growth(
-            after[0], horizon, "position", levels.position_drift, position, "m"
-        )
-        _draw_growth(after[1], horizon, "heading", levels.heading_drift, heading, "rad")
-    return render_png(figure)
-
-
-def _draw_growth(
-    axes: Axes, horizon: Array, name: str, level: Level, error: Array, unit: str
-) -> None:
-    axes.plot(horizon, error, "o-", label="error of the prediction", **MEASURED_LINE)
-    drift = level.std * np.sqrt(horizon)
-    axes.plot(horizon, drift, "--", label="the drift alone", **MODEL_LINE)
-    axes.set(xlabel="horizon [s]", ylabel=f"root mean square [{unit}]")
-    _finish(axes, f"drift of the {name}\n{_format_value(level)}")
-
-
-def _format_value(level: Level) -> str:
-    spread = "" if level.uncertainty is None else f" ± {level.uncertainty:.1g}"
-    return f"{level.std:.3g}{spread} {level.unit}"

@@ -16,10 +16,8 @@ body { font: 16px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 68rem
   padding: 0 1rem; color: var(--ink); background: var(--paper); overflow-wrap: break-word }
 h1 { margin: 0; line-height: 1.2 } h2 { margin: 2.4rem 0 .8rem; line-height: 1.25 }
 .lead, figcaption, .tile span { color: var(--soft) }
-.tiles, .gallery { display: grid; gap: 1rem;
+.tiles { display: grid; gap: 1rem;
   grid-template-columns: repeat(auto-fit, minmax(min(100%, 14rem), 1fr)) }
-.gallery { grid-template-columns: repeat(auto-fill, minmax(min(100%, 19rem), 1fr)) }
-.gallery.wide { grid-template-columns: 1fr }
 .tile { background: var(--card); border-left: .3rem solid var(--good); border-radius: .4rem;
   padding: .8rem 1rem; break-inside: avoid }
 .tile b { display: block; font-size: 1.9rem; line-height: 1.2; color: var(--good) }
@@ -31,11 +29,10 @@ th:first-child, td:first-child { text-align: left; padding-left: 0 }
 pre { background: var(--card); padding: 1rem; overflow-x: auto; font-size: 13px }
 details { border: 1px solid var(--line); border-radius: .4rem; padding: 0 1rem; margin: 1rem 0 }
 summary { cursor: pointer; font-weight: 600; padding: .7rem 0 }
-figure { margin: 1rem 0; break-inside: avoid } .gallery figure { margin: 0 }
+figure { margin: 1rem 0; break-inside: avoid }
 img { max-width: 100%; height: auto }
 @media (max-width: 40rem) { figure.wide img { max-width: none; width: 44rem } }
 @media print { body { margin: 0; max-width: none }
-  .gallery { grid-template-columns: repeat(3, 1fr) } .gallery.wide { grid-template-columns: 1fr }
   pre { white-space: pre-wrap; font-size: 8pt } th, td { padding: .2rem .5rem }
   details::details-content { content-visibility: visible; height: auto; display: block }
   figure.wide img { max-width: 100%; width: auto } h2 { break-after: avoid } }
@@ -97,14 +94,6 @@ def make_picture(png: bytes, caption: str) -> str:
 def _read_width(png: bytes) -> int:
     """Returns the width of a PNG [pixels]."""
     return int.from_bytes(png[16:20], "big")
-
-
-def make_gallery(pictures: Sequence[tuple[bytes, str]]) -> str:
-    """Returns pictures with captions side by side, or in one column on a phone or if wide."""
-    wide = any(_read_width(png) > WIDE for png, _ in pictures)
-    kind = "gallery wide" if wide else "gallery"
-    figures = "".join(make_picture(png, caption) for png, caption in pictures)
-    return f'<div class="{kind}">{figures}</div>'
 
 
 def make_details(summary: str, blocks: Sequence[str]) -> str:

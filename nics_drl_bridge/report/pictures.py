@@ -1,9 +1,7 @@
 """Pictures of trajectories, drives, trainings, policies and worlds, as PNG."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import astuple
 from itertools import chain, zip_longest
-from textwrap import fill
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +12,7 @@ from matplotlib.patches import Circle, Rectangle
 from nics_drl_bridge.env.rendering import draw_robot, draw_world
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.exact_kernels import RADIUS, X, Y
-from nics_drl_bridge.policy.evaluation import ConfidenceInterval, Episode
+from nics_drl_bridge.policy.evaluation import Episode
 from nics_drl_bridge.policy.shadow import Shadow
 from nics_drl_bridge.recording.excite import Pattern
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -33,8 +31,6 @@ from nics_drl_bridge.style import (
     OTHER,
     Panel,
     apply_style,
-    compute_width,
-    count_legend_rows,
     make_panels,
     render_png,
 )
@@ -54,7 +50,6 @@ LEAST_HEIGHT = 1.2
 GREATEST_HEIGHT = 9.0
 WORLD_MARGIN = 0.03  # around a world, as a fraction of its longer side
 CURVE_PANEL = Panel(4.0, 3.0, left=1.1)  # for the curves on the page of a demo
-NAME_LETTERS = 11  # maximum line length in names of perturbations
 
 
 class View(NamedTuple):
@@ -97,10 +92,14 @@ def _make_view_of_episodes(world: AnyWorld, episodes: Iterable[Episode]) -> View
 
 
 def draw_trajectories(
-    runs: Mapping[str, Sequence[Episode]], world: AnyWorld, footprint: float
+    runs: Mapping[str, Sequence[Episode | None]], world: AnyWorld, footprint: float
 ) -> bytes:
-    """Draws a panel per seed with the path of each run (the paper's Fig. 7)."""
-    view = _make_view_of_episodes(world, chain.from_iterable(runs.values()))
+    """Draws a panel per seed with the path of each run (the paper's Fig. 7).
+
+    The runs have the same seeds in the same order; None stands for one that was not driven.
+    """
+    every_episode = filter(None, chain.from_iterable(runs.values()))
+    view = _make_view_of_episodes(world, every_episode)
     by_seed: list[dict[str, Episode]] = []
     for episodes in zip_longest(*runs.values()):
         driven = zip(runs, episodes, strict=True)
@@ -112,22 +111,6 @@ def draw_trajectories(
     for axes, episodes_of_seed in zip(grid, by_seed, strict=False):
         _draw_panel(axes, episodes_of_seed, world, footprint, view)
     return render_png(figure, grid[0], view.panel)
-
-
-def draw_trajectory_gallery(
-    shown: Sequence[Mapping[str, Episode]], world: AnyWorld, footprint: float
-) -> list[bytes]:
-    """Draws a picture per seed with the path of each run; all panels have the same size."""
-    every_episode = chain.from_iterable(episodes.values() for episodes in shown)
-    view = _make_view_of_episodes(world, every_episode)
-    runs = dict.fromkeys(chain.from_iterable(shown))
-    rows = count_legend_rows(["goal", "start", *runs], compute_width(view.panel))
-    drawn = []
-    for episodes in shown:
-        figure, (axes,) = make_panels(1, 1)
-        _draw_panel(axes, episodes, world, footprint, view)
-        drawn.append(render_png(figure, axes, view.panel, rows))
-    return drawn
 
 
 def _draw_panel(
@@ -208,18 +191,6 @@ def draw_training_curve(points: Sequence[Point]) -> bytes:
     axes.set_ylim(0.0, 100.0)
     axes.set_xlim(left=0.0)
     axes.legend()
-    return render_png(figure, panel=CURVE_PANEL)
-
-
-def draw_robustness(shares: Mapping[str, ConfidenceInterval]) -> bytes:
-    """Draws success [%] with its confidence interval for each perturbation."""
-    figure, (axes,) = make_panels(1, 1)
-    value, low, high = 100.0 * np.array([astuple(share) for share in shares.values()]).T
-    names = [fill(name.replace("_", " "), NAME_LETTERS) for name in shares]
-    ends = value - low, high - value
-    axes.errorbar(value, names, xerr=ends, fmt="o", color=MODEL, capsize=3.0)
-    axes.invert_yaxis()
-    axes.set(xlabel="success [%]", xlim=(min(90.0, low.min() - 2.0), 100.5))
     return render_png(figure, panel=CURVE_PANEL)
 
 

@@ -18,7 +18,6 @@ from nics_drl_bridge.watch.frame import Frame, Stage
 
 Pixels = NDArray[np.uint8]  # (H, W, 3)
 COLOURS = 128  # maximum number of colours of a GIF, which limits its size
-ALIKE = 12  # difference up to which two colours become one
 SAMPLES = 12  # number of frames that colours are taken from
 
 
@@ -52,8 +51,9 @@ def join_side_by_side(row: list[Pixels]) -> Pixels:
 def write_gif(path: Path, shown: Iterable[Pixels], fps: float) -> None:
     """Writes a GIF that repeats for ever."""
     pictures = list(shown)
-    # All frames share one palette, or colours would flicker.
-    palette = choose_palette(pictures[:: -(-len(pictures) // SAMPLES)])
+    # All frames share one palette, or colours would flicker; it keeps those of small objects.
+    samples = np.concatenate(pictures[:: -(-len(pictures) // SAMPLES)])
+    palette = Image.fromarray(samples).quantize(COLOURS, Image.Quantize.MAXCOVERAGE)
     first, *rest = [
         Image.fromarray(pixels).quantize(palette=palette, dither=Image.Dither.NONE)
         for pixels in pictures
@@ -64,26 +64,6 @@ def write_gif(path: Path, shown: Iterable[Pixels], fps: float) -> None:
         buffer, "GIF", save_all=True, append_images=rest, duration=duration, loop=0
     )
     write_bytes(path, buffer.getvalue())
-
-
-def choose_palette(samples: list[Pixels]) -> Image.Image:
-    """Returns a palette of the most frequent distinct colours.
-
-    Averaged colours would lose those of small objects.
-    """
-    pixels = np.concatenate([sample.reshape(-1, 3) for sample in samples])
-    colours, counts = np.unique(
-        pixels.astype(np.int64) @ np.array([1 << 16, 1 << 8, 1]), return_counts=True
-    )
-    frequent = colours[np.argsort(-counts)]
-    rows = np.stack([frequent >> 16, frequent >> 8 & 255, frequent & 255], axis=1)
-    chosen = rows[:0]
-    while len(rows) and len(chosen) < COLOURS:
-        chosen = np.concatenate([chosen, rows[:1]])
-        rows = rows[np.abs(rows - rows[0]).max(axis=1) > ALIKE]
-    palette = Image.new("P", (1, 1))
-    palette.putpalette(chosen.ravel().tolist())
-    return palette
 
 
 def write_mp4(path: Path, shown: Iterable[Pixels], fps: float) -> None:

@@ -345,11 +345,6 @@ CAMPAIGNS: dict[str, Campaign] = {
                 "conformance: nothing is done, and all is answered as done",
                 "SPAWNING is announced, but does not do",
             ),
-            "slow": Control(
-                "speed: each step over the standard rests",
-                "client_overhead",
-                "--parts overhead --chunks 2 --size 20",
-            ),
         },
         MESSAGES,
         timeout_s=900.0,

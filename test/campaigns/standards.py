@@ -1,16 +1,13 @@
 """Do our nodes speak the standards of others: simulation_interfaces, Nav2, LEAPP?
 
 - simulation_interfaces: a client calls every feature that `simulator_node` announces, and sees that
-  it does what the standard says, and that each other one is answered as unsupported. The env over
-  these services alone is stepped beside the one over our own, in turns, each with a simulator in a
-  process of its own.
+  it does what the standard says, and that each other one is answered as unsupported.
 - LEAPP: a policy that comes with the package is exported as a bundle, which LEAPP runs; both are
   given the same observations.
 - Nav2: what `nav2_standards` measures, by its bars; its control is its own.
 
-Bars: no check fails, a step over the standard takes a tenth longer at most, and both policies give
-the same actions. The controls announce a feature that is not there, do nothing of what is asked
-for, let each step rest, or round what LEAPP is given.
+Bars: no check fails, and both policies give the same actions. The controls announce a feature that
+is not there, do nothing of what is asked for, or round what LEAPP is given.
 """
 
 from __future__ import annotations
@@ -18,31 +15,24 @@ from __future__ import annotations
 import importlib.util
 import os
 import tempfile
-import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import nav2_standards
 import numpy as np
 from campaign import answer, at_most, missed_bars, parser_of
 
-from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 
 BARS = {
     "sim_conformance_failed": at_most(0),
-    "client_overhead": at_most(0.1),
     "leapp_max_abs_difference": at_most(1e-6),
 }
 ROBOT = "ackermann"
 WORLD = "circles"
 CLAIMED = "NAMED_POSES"
-REST_S = 0.002
-PATIENCE_S = 300.0
-WARM = 50
 OBSERVATIONS = 64
 POLICY = "differential"
 
@@ -81,69 +71,6 @@ def conformance(domain_id: int, folder: Path, control: str | None) -> dict[str, 
         "sim_features": len(told),
         "sim_conformance_failed": len(failed),
         "failed": failed,
-    }
-
-
-def stepper(env: gymnasium.Env, rest_s: float) -> Callable[[int], list[float]]:
-    """A function that makes so many steps by random actions, and returns the seconds of each."""
-    random = np.random.default_rng(0)
-
-    def steps(count: int) -> list[float]:
-        times = []
-        for _ in range(count):
-            action = random.uniform(-1.0, 1.0, env.action_space.shape).astype(
-                np.float32
-            )
-            begin = time.perf_counter()
-            _, _, ended, cut, _ = env.step(action)
-            if rest_s:
-                time.sleep(rest_s)
-            times.append(time.perf_counter() - begin)
-            if ended or cut:
-                env.reset()
-        return times
-
-    return steps
-
-
-def overhead(
-    domain_id: int, folder: Path, control: str | None, chunks: int, size: int
-) -> dict[str, float]:
-    """By what share a step over the standard takes longer than one over our own services."""
-    register_envs()
-    with ExitStack() as stack:
-        sides = {}
-        for name in ("simulator_node", "simulation_interfaces"):
-            space = f"{name}_{os.getpid()}"
-            stack.enter_context(simulator(domain_id, folder / name, space, "lockstep"))
-            options = {
-                "domain_id": domain_id,
-                "namespace": space,
-                "timeout_s": PATIENCE_S,
-            }
-            env = gymnasium.make(
-                NAVIGATION,
-                backend="dds",
-                model=ROBOT,
-                world=WORLD,
-                simulator=name,
-                backend_options={**options, "stamped": False},
-            )
-            stack.callback(env.close)
-            env.reset(seed=0)
-            rests = control == "slow" and name == "simulation_interfaces"
-            sides[name] = stepper(env, REST_S if rests else 0.0)
-            sides[name](WARM)
-        times: dict[str, list[float]] = {name: [] for name in sides}
-        for _ in range(chunks):
-            for name, steps in sides.items():
-                times[name] += steps(size)
-    # What else the machine does lengthens the longest steps of either side; the median stays.
-    own, standard = (float(np.median(times[name])) for name in times)
-    return {
-        "client_overhead": round(standard / own - 1.0, 4),
-        "own_step_ms": round(own * 1e3, 4),
-        "standard_step_ms": round(standard * 1e3, 4),
     }
 
 
@@ -198,8 +125,8 @@ def missed_of(result: dict[str, Any]) -> list[str]:
 
 
 NOT_BUILT = "simulation_interfaces: source what `nox -s messages` builds"
-SIMULATION = ("sim_features", "sim_conformance_failed", "client_overhead")
-PARTS = ("conformance", "overhead", "leapp", "nav2")
+SIMULATION = ("sim_features", "sim_conformance_failed")
+PARTS = ("conformance", "leapp", "nav2")
 
 
 def measure(given: Any) -> dict[str, Any]:
@@ -209,14 +136,10 @@ def measure(given: Any) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         built = importlib.util.find_spec("simulation_interfaces") is not None
-        if {"conformance", "overhead"} & set(given.parts) and not built:
+        if "conformance" in given.parts and not built:
             result |= dict.fromkeys(SIMULATION, np.nan) | {"failed": [NOT_BUILT]}
         if "conformance" in given.parts and built:
             result |= conformance(domain_id, folder, given.control)
-        if "overhead" in given.parts and built:
-            result |= overhead(
-                domain_id, folder, given.control, given.chunks, given.size
-            )
         if "leapp" in given.parts:
             result |= leapp(folder, given.control)
         if "nav2" in given.parts:
@@ -231,8 +154,6 @@ def main() -> None:
     parser.add_argument(
         "--parameters", type=Path, help="another parameter file of Nav2"
     )
-    parser.add_argument("--chunks", type=int, default=30)
-    parser.add_argument("--size", type=int, default=100, help="steps in a chunk")
     given = parser.parse_args()
     result = measure(given)
     answer(result, missed_of(result), given.json)

@@ -6,7 +6,7 @@ import pytest
 
 pytest.importorskip("gymnasium")
 
-from nics_drl_bridge.commands.conditions import NO_CONDITIONS, Conditions
+from nics_drl_bridge.commands.episodes import NO_CONDITIONS, Conditions
 from nics_drl_bridge.generator import builtin_model, load_model
 
 

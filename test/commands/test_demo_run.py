@@ -105,7 +105,7 @@ def test_the_report_begins_with_success_in_three_worlds_and_folds_the_figures(
     ):
         assert words in verdict
     assert verdict.count("⚠") == (0 if arrived else 2)
-    assert "".join(sections["Paths in the world"]).count("<img") == 2
+    assert "".join(sections["Paths in the world"]).count("<img") == 1
     everything = "".join("".join(blocks) for blocks in sections.values())
     assert "Cross-validated" in everything
     assert "Cross-validated" not in re.sub("(?s)<details>.*?</details>", "", everything)

@@ -14,10 +14,11 @@ pytest.importorskip("gymnasium")
 
 from nics_drl_bridge import extensions
 from nics_drl_bridge.commands import episodes
-from nics_drl_bridge.commands.conditions import NO_CONDITIONS, Conditions
 from nics_drl_bridge.commands.episodes import (
     FAST,
+    NO_CONDITIONS,
     PLACES,
+    Conditions,
     EvaluationOrder,
     limit_time,
     model_name,

@@ -13,10 +13,11 @@ from unittest import mock
 
 import numpy as np
 import pytest
+import typer
 from command_line import nics
 from numba.core.caching import CacheImpl
 
-from nics_drl_bridge.commands import interrupts, start
+from nics_drl_bridge.commands import console, evaluate, interrupts, start, watch
 from nics_drl_bridge.commands.first_checks import check_settings
 from nics_drl_bridge.config import share_folder
 from nics_drl_bridge.errors import ConfigError
@@ -36,7 +37,6 @@ FILES = {
     "table.csv": "t,x\n0.0,1.0\n0.1,1.1\n0.2,1.2\n",
     "begun.yaml": "robot: differential\n",
     "misspelt.yaml": ROBOT.replace("wheel_radius", "wheel_radus"),
-    "no_command.yaml": ROBOT.partition("command:")[0],
     "turned.yaml": ROBOT.replace("min: -2.0, max: 2.0", "min: 2.0, max: -2.0"),
     "with_unit.yaml": ROBOT.replace(
         "footprint_radius: 0.15", "footprint_radius: 0.15 m"
@@ -46,7 +46,6 @@ FILES = {
     "kind.yaml": "name: mine\nkind: diferential\nfootprint_radius: 0.2\n",
     "far.yaml": ROBOT.replace("min: 0.0, max: 1.0", "min: 0.0, max: 0.01"),
     "settings.yaml": "tsak: navigation\n",
-    "hurried.yaml": "robot: differential\nworlds: {corridor: 4}\nmax_episode_steps: 30\n",
     "stop.jsonl": "no black box\n",
     "paced.yaml": "robot: differential\nworlds: {room: 4}\ntask_options: {top_speed: 0.5 m/s}\n",
     "shapeless.yaml": "name: mine\nkind: differential\nfootprint: wide\n",
@@ -64,125 +63,81 @@ MISTAKES = {
     # Names of commands, and of options.
     "genrate": "No such command 'genrate'",
     "generate drive.npz": "Missing option '--out'",
-    "generate drive.npz --output m": "No such option: --output",
     "bake " + "x" * 5000: "No such command",
     "evaluate": "Missing argument 'POLICY...'",
     "list robot": "'robot' is not one of 'robots', 'worlds'",
-    "train --steps 0": "'--(steps|episodes)'",
     "train --steps many": "'--steps': ",
     "drive --robot differential --out m --duration 1": "'--duration': ",
     # What is shipped, by its name.
     "drive --robot akermann --out m": "unknown robot 'akermann'; did you mean 'ackermann'?",
-    "drive --robot differential --out m --lidar hokuyo": "unknown lidar 'hokuyo'; did you mean",
-    "generate drive.npz --out m --robot diferential": "did you mean 'differential'?",
-    "generate drive.npz --out m --world arenna": "unknown world 'arenna'; did you mean 'arena'?",
     "train --robot diferential": "unknown robot 'diferential'; did you mean 'differential'?",
-    "train --robot differential --world corridr": "did you mean 'corridor'?",
-    "train --settings navigation_diferential": "did you mean 'navigation_differential'?",
     "train --task navigate": "unknown task 'navigate'; did you mean 'navigation'?",
     "train --algorithm dqn": "input should be 'ppo' or 'sac', not 'dqn'",
-    "train --engine sb4": "unknown engine 'sb4'; did you mean 'sb3'?",
     "train navigation": "a task is given as --task navigation",
     "train --task nowhere.py:Mine": "'nowhere.py': no such file",
     "train --task mine.py": "defines no subclass",
     "train --model ./nowhere": "./nowhere: no such folder",
     "train --robot taken": "taken: holds no model.yaml",
     "train --settings nowhere.yaml": "--settings nowhere.yaml: no such file",
-    "train --seeds -1": "seed -1: must be a whole number",
     "train --seeds 1 1": "none twice",
     f"train --seeds {2**64}": "seed 18446744073709551616: must be",
     f"evaluate straight --in fast --seed {2**63}": "seed|'--seed'",
     "train --out mine.py": "--out mine.py: is a file, not a folder",
-    "train --out /proc/run": "/proc",
     "train --watch --engine ray": "worlds of other processes are not shown",
-    "record --out d.npz --robot diferential": "did you mean 'differential'",
     "record --out d.txt": "unknown kind of recording '.txt'",
-    "record --out /proc/d.npz": "/proc",
     "record --out drive.npz": "is there already",
-    "record --out d.npz --topics nowhere.yaml": "nowhere.yaml",
     "record --out d.npz --preview --remap odom=x": "--remap 'odom=x': must be NAME:=OTHER",
-    "record --out d.npz --preview --seed -1": "seed -1",
     "demo --recording empty --out d": "empty",
-    "demo --robot ackerman --out d": "did you mean 'ackermann'",
-    "demo --world areena --out d": "did you mean 'arena'",
     "watch --ros --bag drive": "--bag does not go with --ros; leave out --bag, or --ros",
     "watch straight --bag drive": "a policy does not go with --bag",
-    "watch straight --namespace ant": "--namespace: belongs to --ros",
-    "watch straight --episodes 3": "--episodes: belongs to --record",
     "watch --record a.avi": "--record 'a.avi': ",
     "watch --bag nowhere --world arena --world room": "a robot is in one",
-    "watch strait": "did you mean 'straight'",
     "evaluate diferential": "unknown policy 'diferential'; did you mean 'differential'?",
     "evaluate differential --in fasst": "there is no such simulator; did you mean 'fast'?",
-    "evaluate differential --in fast --world circels": "did you mean 'circles'?",
     "evaluate differential --in fast --gate mechanum": "did you mean 'mecanum'?",
-    "evaluate differential --in fast --lidar rplidar": "unknown lidar 'rplidar'; did you mean",
-    "evaluate differential --in fast --randomisation milt": "did you mean 'mild'?",
     "policy info diferential": "neither a file nor a shipped policy; did you mean 'differential'?",
     "world draw cluter": "unknown world 'cluter'; did you mean 'clutter'?",
-    "urdf nobody": "unknown robot 'nobody'",
     "watch --bag bag --topic odom": "--topic 'odom': must be ROLE=TOPIC, as odom=/my_odom",
-    "demo --policy nothing.onnx --out d": "nothing.onnx: field 'file': does not exist",
     "demo --policy text.onnx --out d": "text.onnx: field 'file': is not an ONNX model",
-    "demo --policy nothing.yaml --out d": "nothing.yaml: no such file",
     "demo --policy strait": "unknown policy 'strait'; did you mean 'straight'?",
     # Keys, values and units of files.
     "drive --robot misspelt.yaml --out m": "parameter 'wheel_radius'; is 'wheel_radus' it?",
-    "drive --robot no_command.yaml --out m": "misses|missing|must",
     "drive --robot turned.yaml --out m": "turned.yaml: .*min",
     "drive --robot with_unit.yaml --out m": "key 'footprint_radius': .*'0.15 m'",
     "drive --robot twice.yaml --out m": "the key 'footprint_radius' stands twice; keep one",
     "drive --robot listed.yaml --out m": "the top level must be `key: value` lines",
     "drive --robot kind.yaml --out m": "there is no 'diferential'; did you mean 'differential'?",
-    "drive --robot nowhere.yaml --out m": "nowhere.yaml: no such file",
     "train --settings settings.yaml": "unknown key 'tsak'; did you mean 'task'",
-    "train --settings hurried.yaml": "no goal can be reached in time: world 'corridor'",
     "train --settings paced.yaml": "task option top_speed='0.5 m/s': must be a finite number",
     "drive --robot shapeless.yaml --out m": "key 'footprint': must be a list, as .*'wide'",
     "import table.csv --map units.yaml --out d.npz": "is no known unit .*not \\['m', 'm', 'rad'\\]",
     "import table.csv --map number.yaml --out d.npz": "pose.unit.*must be one of m, dm, .*not 1",
     "generate drive.npz --out m --order five": "order is 'five'; it must be 1, 2, 3 or 4",
     "generate drive.npz --out m --alpha 2": "alpha",
-    "generate drive.npz --out m --topic odom": "must be ROLE=TOPIC",
     "evaluate differential --shadow bag --goal 1;2": "--goal '1;2': must be X,Y in metres",
-    "evaluate differential --episodes 0": "'--(steps|episodes)'",
     "world draw clutter --footprint -1": "--footprint -1: must be above 0 m",
-    "record --out d.npz --preview --bound -1": "bound",
     "record --out d.npz --preview --speed 3": "speed",
     # Files that are not there, or are something else.
     "generate nothing.npz --out m": "nothing.npz: no such file",
     "generate torn.npz --out m": "torn.npz",
-    "generate empty --out m": "cmd.csv.*vrpn.csv",
-    "generate drive.npz --out m --robot mecanum": "mecanum|drive.npz",
     "generate drive.npz --out m --topic odom=/odom": "is no bag",
-    "import table.csv --map nowhere.yaml --out a.npz": "nowhere.yaml: no such",
     "generate table.csv --map good.yaml --topic pose=/p --out m": "name the topics in the map",
-    "generate text.txt --out m": "text.txt",
     "generate empty.csv --out m": "empty.csv",
     "generate table.csv --out m": "table.csv: .*map",
-    "inspect nothing.csv": "nothing.csv: no such file",
     "inspect table.csv --map begun.yaml": "is there already; give another name",
     "import table.csv --map begun.yaml --out d.csv": "must end in .npz",
-    "evaluate nothing.onnx": "nothing.onnx",
-    "evaluate text.onnx": "text.onnx",
     "explain nothing.jsonl": "no such file",
     "explain stop.jsonl": "stop.jsonl: is no JSON, line by line",
     "generate drive.npz drive.npz --out m": "drive.npz: is given twice; give each recording once",
     "generate drive.npz --robot robot/model.yaml --out robot": "robot/model.yaml: is not what this",
     "policy export differential --leapp robot/model": "robot/model/model.yaml: is not what this",
-    "doctor nothing": "nothing",
     "doctor drive.npz": "drive.npz: is no bag; nics doctor checks bags and live robots",
-    "doctor taken": "taken: is no bag; nics doctor checks bags and live robots",
     "evaluate differential --shadow table.csv": "table.csv: is no bag; a bag is the folder",
-    "bag info nothing": "nothing",
     "policy import text.txt --robot differential --out p.bin": "a policy file ends with '.onnx'",
     "world draw clutter --out clutter.jpg": "must end in .png",
     "drive --robot differential --out m --recording d.csv": "must end in .npz",
     # Places that are taken, or can't be written to.
-    "drive --robot differential --out text.txt": "text.txt",
-    "drive --robot differential --out taken": "taken",
     "generate drive.npz --out taken": "taken",
-    "world draw clutter --out /proc/clutter.png": "/proc",
     # Options that do not go together.
     "--sensor-kind mine.py list robots": "sensor 'mine.py': give path/to/file.py:ClassName",
     "train --robot differential --out run": "run: contains a run with other settings",
@@ -194,22 +149,10 @@ MISTAKES = {
     "evaluate differential --hardware --goal 2": "--goal",
     "evaluate differential ackermann": "evaluate them one by one",
     "doctor --model differential --policy differential": "give one of them",
-    "record --out d.npz --preview --namespace 1st": "namespace '1st': must be words of letters",
     "doctor --namespace a/-b": "namespace 'a/-b': must be words of letters, digits and _",
-    "bag record b --namespace a.b": "namespace 'a.b': must be words of letters, digits and _",
-    "record --out d.npz --preview --remap odom": "must be NAME:=OTHER",
     "evaluate differential --goal 2,1 --in fast": "--goal: belongs to --hardware or --shadow; add",
-    "evaluate differential --arm": "--arm: belongs to --hardware; add that, or leave it out",
-    "evaluate differential --yes": "--yes: belongs to --hardware",
-    "evaluate differential --start present": "--start: belongs to --hardware",
-    "evaluate differential --namespace ant": "--namespace: belongs to --hardware",
-    "evaluate differential --pose-type odometry": "--pose-type: belongs to --hardware",
-    "evaluate differential --topic odom=/wheels": "--topic: belongs to --shadow",
-    "evaluate differential --ahead 2": "--ahead: belongs to --shadow",
     # Numbers that are none.
     "drive --robot differential --out m --duration nan": "--duration.*(finite|should)",
-    "doctor --duration inf": "--duration inf: must be a finite number",
-    "bag record bag --duration nan": "--duration.*(must be a finite number|Input should be)",
     "bag replay bag --rate nan": "--rate.*(must be a finite number|Input should be)",
     "world import house.world --start 0 nan 0": "--start nan: must be a finite number",
     # What a policy sees, and where results go.
@@ -217,8 +160,6 @@ MISTAKES = {
     "sees: .* in base_link, the scan layout needs .*; use another lidar, or a policy trained for",
     "evaluate straight --in fast --out text.txt": "text.txt is a file, not a folder",
     "evaluate straight --backend sim": "--backend 'sim'",
-    "evaluate straight --shadow bag --lidar rplidar_a2": "leave out --lidar",
-    "evaluate straight --backend dds --hardware --in dds": "--in",
     "evaluate straight random --backend dds --hardware": "one policy at a time",
 }
 HEAVY = {"torch", "stable_baselines3", "rclpy", "matplotlib", "onnxruntime"}
@@ -279,6 +220,29 @@ def test_a_mistake_is_one_sentence(words, folder):
         "runs",
         "__pycache__",
     }
+
+
+@pytest.mark.parametrize(
+    ("command", "option", "partners", "rule"),
+    [
+        (command, option, partners, rule)
+        for rule in ("NEEDED", "APART")
+        for command, options in getattr(console, rule).items()
+        if command != "replay"
+        for option, partners in options.items()
+    ],
+)
+def test_an_option_without_its_partner_or_with_a_foe_is_refused(
+    command, option, partners, rule, capsys
+):
+    function = {"evaluate": evaluate.evaluate, "watch": watch.watch}[command]
+    given = [option] if rule == "NEEDED" else [option, partners[0]]
+    with pytest.raises(typer.Exit):
+        console.check_options(function)(**dict.fromkeys(given, "x"))
+    sentence = capsys.readouterr().err
+    words = "belongs to" if rule == "NEEDED" else "does not go with"
+    assert words in sentence
+    assert console._format_option(partners[0]) in sentence
 
 
 @pytest.mark.parametrize("given", MODULES, ids=" without ".join)

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
 import sys
 
 import numpy as np
@@ -20,52 +19,39 @@ CAR = load_robot("ackermann")
 PNG = b"\x89PNG\r\n\x1a\n"
 
 
-def nics(*words, cwd, **environment):
-    command = [
-        sys.executable,
-        "-m",
-        "nics_drl_bridge.commands.cli",
-        "record",
-        *split_words(*words),
-    ]
-    return subprocess.run(
-        command,
-        cwd=cwd,
-        env=os.environ | environment,
-        capture_output=True,
-        text=True,
-        timeout=100,
-        input="n\n",
-    )
+def invoke(*words):
+    return CliRunner().invoke(cli.app, ["record", *split_words(*words)], input="n\n")
 
 
 @pytest.mark.slow
-def test_a_preview_tells_and_draws_the_drive_and_does_no_more(tmp_path):
-    # A module path without ROS 2: a preview needs none.
-    (tmp_path / "rclpy.py").write_text("raise ModuleNotFoundError('no', name='rclpy')")
-    done = nics("--preview --out new/drive.npz", cwd=tmp_path, PYTHONPATH=str(tmp_path))
-    assert done.returncode == 0, done.stderr
+def test_a_preview_tells_and_draws_the_drive_and_needs_no_ros(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rclpy", None)
+    monkeypatch.chdir(tmp_path)
+    done = invoke("--preview --out new/drive.npz")
+    assert done.exit_code == 0, done.output
     told = done.stdout.splitlines()
     assert told[0].startswith("preview of 60 s: a path of ")
     assert told[-1] == "its path is drawn in new/drive_preview.png"
     assert (tmp_path / "new" / "drive_preview.png").read_bytes().startswith(PNG)
     assert os.listdir(tmp_path / "new") == ["drive_preview.png"]
-    words = "--preview --out new/drive.npz --json"
-    facts = json.loads(nics(words, cwd=tmp_path, PYTHONPATH=str(tmp_path)).stdout)
+    facts = json.loads(invoke("--preview --out new/drive.npz --json").stdout)
     assert facts == {"out": "new/drive.npz", "robot": DEFAULT_ROBOT, "told": told}
 
 
 @pytest.mark.ros
-def test_it_asks_before_the_robot_moves(tmp_path):
+@pytest.mark.parametrize("as_json", [False, True])
+def test_it_asks_before_the_robot_moves(tmp_path, monkeypatch, as_json):
     pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
-    done = nics("--out drive.npz", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.count("preview of ") == 1
-    assert done.stdout.endswith(
-        "Drive the robot now? [y/N]: nothing was driven or recorded.\n"
-    )
-    facts = json.loads(nics("--out drive.npz --json", cwd=tmp_path).stdout)
-    assert facts == {"out": "drive.npz", "robot": DEFAULT_ROBOT, "recorded": False}
+    monkeypatch.chdir(tmp_path)
+    done = invoke("--out drive.npz", "--json" if as_json else "")
+    assert done.exit_code == 0, done.output
+    assert "Drive the robot now? [y/N]: n" in done.output
+    if as_json:
+        facts = json.loads(done.stdout.splitlines()[-1])
+        assert facts == {"out": "drive.npz", "robot": DEFAULT_ROBOT, "recorded": False}
+    else:
+        assert done.stdout.endswith("nothing was driven or recorded.\n")
+    assert "drive.npz" not in os.listdir(tmp_path)
 
 
 def test_the_summary_tells_each_command_and_the_next_step():
@@ -91,10 +77,9 @@ def test_options_become_arguments_of_the_node():
 @pytest.mark.parametrize("complete", [True, False])
 def test_an_outcome_becomes_lines_or_an_error(monkeypatch, tmp_path, complete):
     record_node = pytest.importorskip("nics_drl_bridge.nodes.record_node")
-    order = ["record", "--yes", "--out", str(tmp_path / "drive.npz")]
     for failure, code in ((None, 0 if complete else 130), (BackendError("odom"), 2)):
         outcome = record_node.DriveResult(complete, failure, None, "over")
         monkeypatch.setattr(record_node, "record", lambda *_, outcome=outcome: outcome)
-        done = CliRunner().invoke(cli.app, order)
+        done = invoke("--yes --out", tmp_path / "drive.npz")
         assert done.exit_code == code
         assert done.output.endswith("over\n")

@@ -293,20 +293,6 @@ def test_facts_of_a_fleet_have_one_shape_whatever_their_values():
         assert found["covariance"].shape == (2, 3, 3)
 
 
-def test_an_older_scan_keeps_its_own_stamp(connect, monkeypatch):
-    backend = connect()
-    drive(backend)
-    period_ns = backend._period_ns
-    backend._slack_ns = backend._inbox._slack_ns = period_ns
-    put = backend._inbox.put
-    monkeypatch.setattr(
-        backend._inbox, "put", lambda kind, m: None if kind == "scan" else put(kind, m)
-    )
-    view, info = backend.step(np.array([0.5, 0.0]))
-    assert view.scan_age_s == pytest.approx(period_ns / NS_PER_S)
-    assert info["scan_stamp_ns"] == info["stamp_ns"] - period_ns
-
-
 def test_after_a_failed_step_a_command_asks_for_a_reset(connect, monkeypatch):
     backend = connect()
     with pytest.raises(BackendError, match=r"no episode has begun; call reset\(\)"):
@@ -441,7 +427,6 @@ def test_a_simulator_that_hangs_serves_again_when_it_wakes_and_its_death_is_noti
         ({"randomisation": "mild", "mode": "realtime"}, "only one robot in mode"),
         ({"domian_id": 3}, "did you mean 'domain_id'"),
         ({"namespace": "ant 1"}, "namespace 'ant 1'"),
-        ({"standard": {"slack_s": 0.1}}, "not of 'simulator_node'"),
         ({"robots": 2, "mode": "realtime"}, "a team of 2 robots"),
         ({"robots": 2, "namespaces": ["a"]}, "a team of 2 robots"),
         ({"robots": 2, "namespaces": ["b", "b"]}, "each of them once"),

@@ -22,9 +22,9 @@ from rclpy.node import NodeNameNonExistentError
 from test_packaging import ROOT
 
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.extras.nav2.follow_path import FOLLOW, NAVIGATE, PathActions
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import conversions, policy_node, qos
-from nics_drl_bridge.nodes.follow_path import FOLLOW, NAVIGATE, PathActions
 from nics_drl_bridge.nodes.policy_node import PolicyNode
 from nics_drl_bridge.nodes.runner import unknown
 from nodes.peer import pose_of
@@ -320,7 +320,9 @@ def test_nav2s_own_parameter_file_is_taken_under_the_name_of_its_controller_serv
     words = ("--params-file", str(tmp_path / name), *CONTROLLER)
     node = make_node(words=words, kind=PolicyNode)
     assert unknown(node) == []
-    goal, progress = node._nav2.checks("general_goal_checker", "progress_checker")
+    goal, progress = node._leaders[0].parameters.checks(
+        "general_goal_checker", "progress_checker"
+    )
     assert goal.xy_goal_tolerance == 0.25
     assert progress.movement_time_allowance == 10.0
 
@@ -337,8 +339,8 @@ def test_the_progress_checker_of_humble_is_taken_by_its_own_name(make_node, tmp_
     words = ("--params-file", str(file), *CONTROLLER)
     node = make_node(words=words, kind=PolicyNode)
     assert unknown(node) == []
-    assert node._nav2.names["progress_checker"] == ("progress",)
-    _, progress = node._nav2.checks("general_goal_checker", "progress")
+    assert node._leaders[0].parameters.names["progress_checker"] == ("progress",)
+    _, progress = node._leaders[0].parameters.checks("general_goal_checker", "progress")
     assert progress.movement_time_allowance == 7.0
 
 
@@ -355,7 +357,8 @@ def test_checkers_go_by_their_plugins_and_unknown_headings_do_not_count(make_nod
     node = make_node(*words, kind=PolicyNode)
     assert unknown(node) == []
     found = [
-        node._nav2.checks(*names) for names in (("exact", "slow"), ("near", "turning"))
+        node._leaders[0].parameters.checks(*names)
+        for names in (("exact", "slow"), ("near", "turning"))
     ]
     assert [goal.yaw_goal_tolerance for goal, _ in found] == [0.25, math.inf]
     angles = [progress.required_movement_angle for _, progress in found]
@@ -386,7 +389,7 @@ def test_a_policy_begins_anew_with_another_goal_and_not_with_another_way_to_it(
 
 
 def test_results_of_distributions_without_codes_are_filled_as_far_as_they_go():
-    from nics_drl_bridge.nodes.follow_path import result_of
+    from nics_drl_bridge.extras.nav2.follow_path import result_of
 
     class Bare:
         class Result:

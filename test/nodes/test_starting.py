@@ -24,10 +24,9 @@ def setup_of(**given):
     [
         ("1", ()),
         ("", ()),
-        (2, ("robot1", "robot2")),
+        ("2", ("robot1", "robot2")),
         ("ant bee", ("ant", "bee")),
         ("['ant']", ("ant",)),
-        (["ant", "bee"], ("ant", "bee")),
     ],
 )
 def test_robots_are_a_count_or_names(robots, names):
@@ -40,18 +39,6 @@ def test_a_flag_that_is_neither_true_nor_false_is_refused_before_any_node_starts
         setup_of(**{name: "maybe"})
     for word, value in (("True", "true"), ("0", "false"), ("", "")):
         assert setup_of(**{name: word})[name] == value
-
-
-def test_one_robot_of_an_argument_goes_before_the_fleet_of_a_file(tmp_path):
-    file = tmp_path / "fleet.yaml"
-    file.write_text("simulator_node:\n  ros__parameters:\n    robots: [ant, bee]\n")
-
-    def robots(given):
-        (node,) = starting.simulator(setup_of(robots=given, params_file=str(file)))
-        return node.parameters.get("robots")
-
-    assert robots("1") == 1
-    assert robots("") == ["ant", "bee"]
 
 
 def test_the_policies_of_a_fleet_hear_the_map_of_all():
@@ -89,24 +76,27 @@ def test_a_generated_model_has_the_limits_and_the_looks_of_its_robot(tmp_path):
     assert '<robot name="mecanum"' in setup.description()
 
 
-def test_the_model_of_the_file_of_parameters_is_drawn_where_none_is_given(tmp_path):
+def test_a_robot_of_an_own_file_of_parameters_is_named_where_it_is_described(tmp_path):
     file = tmp_path / "own.yaml"
     file.write_text("/**:\n  ros__parameters:\n    model: jackal\n")
-    assert '<robot name="jackal"' in setup_of(params_file=str(file)).description()
+    with pytest.raises(ConfigError, match="say model:=ROBOT or urdf:=FILE"):
+        setup_of(params_file=str(file)).description()
+    drawn = setup_of(params_file=str(file), model="jackal").description()
+    assert '<robot name="jackal"' in drawn
     assert '<robot name="differential"' in setup_of().description()
-    assert '<robot name="mecanum"' in setup_of(model="mecanum").description()
+    nodes = LAUNCHES["vehicle"]().nodes(
+        {"params_file": str(file), "use_robot_state_pub": "false"}
+    )
+    assert {node.params_file for node in nodes} == {str(file)}
 
 
 @pytest.mark.parametrize("model", ["mecanum", "own"])
-def test_the_robot_is_drawn_with_the_frames_of_the_file_of_parameters(tmp_path, model):
+def test_the_robot_is_drawn_with_the_frames_that_are_given(tmp_path, model):
     if model == "own":
         model = str(tmp_path / "model")
         save_model(builtin_model("mecanum"), tmp_path / "model")
-    file = tmp_path / "own.yaml"
-    file.write_text(
-        "/**:\n  ros__parameters: {base_frame: chassis, laser_frame: front_laser}\n"
-    )
-    drawn = setup_of(model=model, params_file=str(file)).description()
+    frames = {"base_frame": "chassis", "laser_frame": "front_laser"}
+    drawn = setup_of(model=model, **frames).description()
     assert '<link name="chassis">' in drawn
     assert '<link name="front_laser">' in drawn
     assert '"base_link"' not in drawn
@@ -125,7 +115,7 @@ def test_a_simulation_arms_without_an_e_stop_and_a_vehicle_does_not():
     bridge = ["command_gate", "middleware_node", "policy_node"]
     assert list(started("simulation")) == ["simulator_node", *bridge]
     assert list(started("vehicle")) == bridge
-    assert started("simulation")["simulator_node"] == {}
+    assert started("simulation")["simulator_node"] == {"robots": 1}
     with pytest.raises(ConfigError, match="'e_stop_required'"):
         started("vehicle", e_stop_required="false")
     assert started("simulation")["command_gate"]["e_stop_required"] is False
@@ -151,6 +141,12 @@ def test_every_parameter_has_the_type_that_its_node_declares(monkeypatch):
     assert nodes["simulator_node"]["enable_stamped_cmd_vel"] is False
     assert nodes["ant/policy_node"]["policy"] == "1e3"
     assert nodes["ant/policy_node"]["autostart"] is True
+    assert nodes["ant/policy_node"]["base_frame"] == "ant/base_link"
+    single = started("simulation", base_frame="chassis", laser_frame="front")
+    assert single["simulator_node"]["laser_frame"] == "front"
+    assert {name: one["base_frame"] for name, one in single.items()} == dict.fromkeys(
+        single, "chassis"
+    )
 
 
 def test_rviz_starts_by_either_name_and_shows_the_first_robot():
@@ -195,11 +191,3 @@ def test_every_launch_file_starts_the_launch_of_its_name():
 def test_an_argument_that_can_not_be_used_is_refused(given, reason):
     with pytest.raises(ConfigError, match=re.escape(reason)):
         started("simulation", **given)
-
-
-@pytest.mark.parametrize("text", ["simulator_node: 3\n", "ant:\n  node: [1]\n"])
-def test_a_file_that_holds_no_parameters_is_refused(text, tmp_path):
-    file = tmp_path / "robot.yaml"
-    file.write_text(text, encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"robot.yaml: key '\w+' is no section"):
-        started("simulation", params_file=str(file))

@@ -55,7 +55,7 @@ def test_a_page_of_a_fit_begins_with_its_verdict_and_folds_all_figures(found, tm
     shown = re.sub("(?s)<details>.*?</details>", "", html)
     assert "Cross-validated error" in html
     assert "Cross-validated error" not in shown
-    assert shown.count("<img") == 4  # three paths, and the yardsticks
+    assert shown.count("<img") == 2  # the paths, and the yardsticks
 
 
 @slow

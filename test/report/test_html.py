@@ -10,7 +10,6 @@ from nics_drl_bridge.report.html import (
     make_bullets,
     make_code,
     make_details,
-    make_gallery,
     make_page,
     make_paragraph,
     make_picture,
@@ -105,4 +104,3 @@ def test_a_doubtful_figure_is_told_by_a_sign_and_not_by_its_colour_alone(good, s
 def test_a_phone_scrolls_a_picture_that_it_can_not_show_in_whole(width, wide):
     png = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + width.to_bytes(4, "big") + bytes(9)
     assert ('<figure class="wide">' in make_picture(png, "c")) is wide
-    assert make_gallery([(png, "one"), (png, "two")]).count("<img") == 2

@@ -41,8 +41,9 @@ def test_a_gif_has_each_frame_and_moves(made, tmp_path):
             shown.append(np.asarray(image.convert("RGB"), int))
     assert shown[0].shape == (500, 500, 3)
     assert np.abs(shown[0] - shown[3]).max() > 50
-    for colour in (ROBOTS[0], GOAL):  # exactly
-        assert (shown[0] == ImageColor.getrgb(colour)).all(axis=-1).sum() > 20
+    for colour in (ROBOTS[0], GOAL):
+        off = np.abs(shown[0] - ImageColor.getrgb(colour)).max(axis=-1)
+        assert (off <= 6).sum() > 20
 
 
 def test_an_mp4_has_each_frame(made, tmp_path):

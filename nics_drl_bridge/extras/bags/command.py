@@ -31,7 +31,7 @@ def record(
         list[str] | None, Option(help="A topic to record; repeatable.")
     ] = None,
     everything: Annotated[bool, Option("--all", help="Record every topic.")] = False,
-    namespace: Annotated[str, Option(help="Namespace of the robot's topics.")] = "",
+    namespace: console.NamespaceOption = "",
     duration: Annotated[
         float | None, Option(min=0.0, help="Stop after this time [s]; else at Ctrl-C.")
     ] = None,
@@ -113,20 +113,11 @@ def replay(
     ] = False,
     model: Annotated[
         str,
-        Option(
-            "--model",
-            "--robot",
-            autocompletion=console.ROBOTS,
-            help="For --estimate: folder of a model, or a shipped robot.",
+        console.make_robot_option(
+            "For --estimate: folder of a model, or a shipped robot."
         ),
     ] = DEFAULT_ROBOT,
-    topic: Annotated[
-        list[str] | None,
-        Option(
-            metavar="ROLE=TOPIC",
-            help="For --estimate: as odom=/wheel_odom. Roles: scan, odom, cmd_vel, pose, imu.",
-        ),
-    ] = None,
+    topic: console.RolesOption = None,
     out: Annotated[
         Path | None, Option(help="For --estimate: .npz or .csv to write.")
     ] = None,
@@ -168,11 +159,8 @@ def export(
     ],
     model: Annotated[
         str | None,
-        Option(
-            "--model",
-            "--robot",
-            help="A model's folder, or a shipped robot: for its lidar's mount.",
-            autocompletion=console.ROBOTS,
+        console.make_robot_option(
+            "A model's folder, or a shipped robot: for its lidar's mount."
         ),
     ] = None,
     as_json: console.JsonOption = False,

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from typing import Any
 
 from action_msgs.msg import GoalStatus
-from geometry_msgs.msg import Vector3
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -19,8 +18,8 @@ from rosgraph_msgs.msg import Clock
 from simulation_interfaces import msg, srv
 from simulation_interfaces.action import SimulateSteps
 
+from nics_drl_bridge.extras.simulation_interfaces.server import snake_case
 from nics_drl_bridge.nodes.listener import open_context
-from nics_drl_bridge.nodes.simulation_interfaces.client import snake_case
 
 OK = msg.Result.RESULT_OK
 UNSUPPORTED = msg.Result.RESULT_FEATURE_UNSUPPORTED
@@ -151,21 +150,6 @@ def spawn_request(name: str, x: float = 0.0, /, **fields: Any) -> Any:
     return request
 
 
-def box(
-    x1: float, y1: float, x2: float, y2: float, kind: int = msg.Bounds.TYPE_BOX
-) -> Any:
-    """Returns bounds by two corners."""
-    return msg.Bounds(
-        type=kind, points=[Vector3(x=x2, y=y2, z=1.0), Vector3(x=x1, y=y1, z=-1.0)]
-    )
-
-
-def sphere(x: float, y: float, radius: float) -> Any:
-    """Returns a sphere around a point of the plane."""
-    points = [Vector3(x=x, y=y), Vector3(x=radius)]
-    return msg.Bounds(type=msg.Bounds.TYPE_SPHERE, points=points)
-
-
 def _spawns_and_deletes(c: Client) -> bool:
     spawned = c.spawn("disc", 1.0)
     there = "disc" in c.names() and spawned.entity_name == "disc"
@@ -186,16 +170,6 @@ def _names_collide(c: Client) -> bool:
     )
     renamed = other.result.result == OK and other.entity_name not in ("", "twin")
     return first.result.result == OK and bool(refused) and renamed
-
-
-def _spawns_several(c: Client) -> bool:
-    good = spawn_request("one", 1.0)
-    bad = spawn_request("", 1.0)
-    both = c("SpawnEntities", spawn_requests=[good, bad])
-    codes = [each.result.result for each in both.results]
-    failed = srv.SpawnEntities.Response.ENTITIES_SPAWN_FAILED
-    wanted = [OK, msg.SpawnResult.NAME_INVALID]
-    return both.result.result == failed and codes == wanted and "one" in c.names()
 
 
 def _text_is_spawned(c: Client) -> bool:
@@ -259,30 +233,11 @@ def _info_is_got(c: Client) -> bool:
     return info.info.category == category("ROBOT") and info.result.result == OK
 
 
-def _info_is_set(c: Client) -> bool:
-    c.spawn("disc", 1.0)
-    info = msg.EntityInfo(
-        category=category("HUMAN"), description="a person", tags=["walks"]
-    )
-    done = c.code("SetEntityInfo", entity="disc", info=info) == OK
-    return done and c("GetEntityInfo", entity="disc").info == info
-
-
 def _categories(c: Client) -> bool:
     c.spawn("disc", 1.0)
     robots = c.names(categories=[category("ROBOT")])
     still = c.names(categories=[category("STATIC_OBJECT")])
     return bool(robots) and "disc" in still and not set(robots) & set(still)
-
-
-def _tags(c: Client) -> bool:
-    c.spawn("disc", 1.0), c.spawn("other", 1.5)
-    c("SetEntityInfo", entity="disc", info=msg.EntityInfo(tags=["a", "b"]))
-    c("SetEntityInfo", entity="other", info=msg.EntityInfo(tags=["b"]))
-    kinds = msg.TagsFilter
-    either = c.names(tags=kinds(tags=["a", "b"], filter_mode=kinds.FILTER_MODE_ANY))
-    both = c.names(tags=kinds(tags=["a", "b"], filter_mode=kinds.FILTER_MODE_ALL))
-    return sorted(either) == ["disc", "other"] and both == ["disc"]
 
 
 def _bounds(c: Client) -> bool:
@@ -292,32 +247,9 @@ def _bounds(c: Client) -> bool:
     right = bounds.type == msg.Bounds.TYPE_BOX and abs(high.x - 0.15) < near > abs(
         low.x + 0.15
     )
-    inside = sphere(1.0, 0.0, 0.05)
-    outside = sphere(-1.9, -1.9, 0.01)
-    return (
-        right
-        and "disc" in c.names(bounds=inside)
-        and "disc" not in c.names(bounds=outside)
-    )
-
-
-def _bounds_box(c: Client) -> bool:
-    c.spawn("disc", 1.0)
-    there = "disc" in c.names(bounds=box(1.1, -0.1, 1.3, 0.1))
-    return there and "disc" not in c.names(bounds=box(1.3, -0.1, 1.5, 0.1))
-
-
-def _bounds_convex(c: Client) -> bool:
-    c.spawn("disc", 1.0)
-
-    def corner(x: float) -> Any:
-        corners = [(x, -0.1), (x + 0.2, -0.1), (x + 0.1, 0.1)]
-        points = [Vector3(x=a, y=b) for a, b in corners]
-        return msg.Bounds(type=msg.Bounds.TYPE_CONVEX_HULL, points=points)
-
-    return "disc" in c.names(bounds=corner(0.9)) and "disc" not in c.names(
-        bounds=corner(1.3)
-    )
+    where = msg.Bounds(type=msg.Bounds.TYPE_SPHERE)
+    filters = msg.EntityFilters(bounds=where)
+    return right and c.code("GetEntities", filters=filters) == UNSUPPORTED
 
 
 def _spawnables(c: Client) -> bool:
@@ -418,23 +350,9 @@ def _loads_text(c: Client) -> bool:
     return right and wrong == srv.LoadWorld.Response.RESOURCE_PARSE_ERROR
 
 
-def _unloads(c: Client) -> bool:
-    unloaded = c.code("UnloadWorld") == OK
-    state = int(c("GetSimulationState").state.state)
-    again = c.code("UnloadWorld")
-    spawned = c.spawn("disc").result.result
-    wanted = [
-        srv.UnloadWorld.Response.NO_WORLD_LOADED,
-        msg.Result.RESULT_INCORRECT_STATE,
-    ]
-    return unloaded and state == STATES.STATE_NO_WORLD and [again, spawned] == wanted
-
-
 def _tells_world(c: Client) -> bool:
     found = c("GetCurrentWorld")
-    c("UnloadWorld")
-    none = c.code("GetCurrentWorld") == srv.GetCurrentWorld.Response.NO_WORLD_LOADED
-    return found.result.result == OK and bool(found.world.name) and none
+    return found.result.result == OK and bool(found.world.name)
 
 
 def _lists_worlds(c: Client) -> bool:
@@ -447,28 +365,16 @@ def _lists_worlds(c: Client) -> bool:
     return right and failed.result.result != OK and on.result.result == OK
 
 
-def _filters_worlds(c: Client) -> bool:
-    every = c("GetAvailableWorlds").worlds
-    tag = every[0].tags[0]
-    found = c("GetAvailableWorlds", filter=msg.TagsFilter(tags=[tag])).worlds
-    wanted = [one.name for one in every if tag in one.tags]
-    return [one.name for one in found] == wanted and len(found) > 0
-
-
 SCOPES = srv.ResetSimulation.Request
 CHECKS: dict[str, Callable[[Client], bool]] = {
     "SPAWNING": _names_collide,
     "DELETING": _spawns_and_deletes,
-    "ENTITY_TAGS": _tags,
     "ENTITY_BOUNDS": _bounds,
-    "ENTITY_BOUNDS_BOX": _bounds_box,
-    "ENTITY_BOUNDS_CONVEX": _bounds_convex,
     "ENTITY_CATEGORIES": _categories,
     "SPAWNING_RESOURCE_STRING": _text_is_spawned,
     "ENTITY_STATE_GETTING": _state_is_got,
     "ENTITY_STATE_SETTING": _state_is_set,
     "ENTITY_INFO_GETTING": _info_is_got,
-    "ENTITY_INFO_SETTING": _info_is_set,
     "SPAWNABLES": _spawnables,
     "SIMULATION_RESET": _resets(SCOPES.SCOPE_ALL),
     "SIMULATION_RESET_TIME": _resets(SCOPES.SCOPE_TIME),
@@ -482,11 +388,8 @@ CHECKS: dict[str, Callable[[Client], bool]] = {
     "STEP_SIMULATION_ACTION": _acts,
     "WORLD_LOADING": _loads,
     "WORLD_RESOURCE_STRING": _loads_text,
-    "WORLD_TAGS": _filters_worlds,
-    "WORLD_UNLOADING": _unloads,
     "WORLD_INFO_GETTING": _tells_world,
     "AVAILABLE_WORLDS": _lists_worlds,
-    "SPAWNING_ENTITIES": _spawns_several,
 }
 # Features of which the service itself is answered as unsupported where they are not announced.
 SERVICES = {

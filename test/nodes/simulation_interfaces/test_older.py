@@ -7,9 +7,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
-from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.nodes import simulation_interfaces as standard
-from nics_drl_bridge.nodes.simulation_interfaces import client
+from nics_drl_bridge.extras import simulation_interfaces as standard
 
 
 @pytest.fixture(params=["1.x", "2.0"])
@@ -25,7 +23,7 @@ def older(request, monkeypatch):
         monkeypatch.setitem(sys.modules, module.__name__, module)
     for name in ("msg", "action"):
         monkeypatch.setitem(sys.modules, f"simulation_interfaces.{name}", None)
-    server = "nics_drl_bridge.nodes.simulation_interfaces.server"
+    server = "nics_drl_bridge.extras.simulation_interfaces.server"
     for name in [each for each in sys.modules if each.startswith(server)]:
         monkeypatch.delitem(sys.modules, name)
 
@@ -40,10 +38,3 @@ def test_a_simulator_goes_on_without_the_services_and_tells_why(older):
     assert standard.open_services(node) is None
     (line,) = said
     assert "2.1 or newer, is not installed" in line
-
-
-def test_a_client_tells_which_version_it_needs(older):
-    with pytest.raises(
-        ConfigError, match=r"install simulation_interfaces 2\.1 or newer"
-    ):
-        client.module("srv")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import unquote, urlsplit
@@ -13,7 +13,7 @@ from simulation_interfaces.srv import LoadWorld
 
 from nics_drl_bridge.config import read_text
 from nics_drl_bridge.errors import ConfigError, MissingFileError
-from nics_drl_bridge.nodes.simulation_interfaces.host import RefusalError
+from nics_drl_bridge.extras.simulation_interfaces.host import RefusalError
 from nics_drl_bridge.sim.sdf import AssetsError
 from nics_drl_bridge.sim.world_set import SPECIAL
 
@@ -59,17 +59,6 @@ def local(uri: str) -> Path | None:
     if parts.scheme == "file" and parts.netloc in ("", "localhost"):
         uri = unquote(parts.path)
     return Path(uri) if uri and "://" not in uri else None
-
-
-def files_of(source: str) -> list[Path] | None:
-    """Return the files of a folder, or a file with a known suffix; None for any other source."""
-    path = local(source)
-    with suppress(OSError):
-        if path and (
-            path.is_dir() or (path.suffix.lower() in SUFFIXES and path.is_file())
-        ):
-            return sorted(path.iterdir()) if path.is_dir() else [path]
-    return None
 
 
 def find(resource: Any, codes: Codes) -> Content:

@@ -12,9 +12,6 @@ from nics_drl_bridge.sim.entities import UnknownEntityError
 if TYPE_CHECKING:
     from nics_drl_bridge.nodes.simulator_node import DeviceNode
 
-NO_WORLD = "no world is loaded; load one by load_world first."
-
-
 # the device node that offers the services
 Host: TypeAlias = "DeviceNode"
 

@@ -1,28 +1,27 @@
 """Spawning: shapes of YAML and SDF, and robots of the simulator's kind."""
 
 import re
-from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from simulation_interfaces.msg import (
-    EntityInfo,
     Resource,
     Result,
     Spawnable,
     SpawnResult,
 )
-from simulation_interfaces.srv import SpawnEntities
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.config import find_config, read_text, share_folder
-from nics_drl_bridge.errors import BridgeError, ConfigError
+from nics_drl_bridge.config import find_config, list_shipped, read_text
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.extras.simulation_interfaces import plane, resources
+from nics_drl_bridge.extras.simulation_interfaces.entities import EntityServices
+from nics_drl_bridge.extras.simulation_interfaces.host import (
+    Host,
+    RefusalError,
+)
+from nics_drl_bridge.extras.simulation_interfaces.state import Simulation
 from nics_drl_bridge.nodes import device_parameters
-from nics_drl_bridge.nodes.simulation_interfaces import plane, resources
-from nics_drl_bridge.nodes.simulation_interfaces.entities import EntityServices
-from nics_drl_bridge.nodes.simulation_interfaces.host import Host, RefusalError, outcome
-from nics_drl_bridge.nodes.simulation_interfaces.state import Simulation
 from nics_drl_bridge.sim.entities import NAME, OutsideError, hull_of
 from nics_drl_bridge.sim.models import Model, model_of_sdf, model_of_yaml
 
@@ -35,7 +34,7 @@ FOLDER = "entities"  # of the shipped ones, in config/
 
 
 class Spawning:
-    """Answers SpawnEntity, SpawnEntities and GetSpawnables."""
+    """Answers SpawnEntity and GetSpawnables."""
 
     def __init__(
         self, host: Host, simulation: Simulation, entities: EntityServices
@@ -45,8 +44,7 @@ class Spawning:
         self._entities = entities
 
     def spawn(self, request: Any, response: Any) -> None:
-        """Answer SpawnEntity, and one part of SpawnEntities. Raises RefusalError, BridgeError."""
-        self._simulation.require_world()
+        """Answer SpawnEntity. Raises RefusalError, BridgeError."""
         model = self._model(request)
         wanted = request.name or ("" if model is None else model.name)
         name = self._name(wanted, request.allow_renaming)
@@ -68,17 +66,9 @@ class Spawning:
                     raise
             else:
                 entities.spawn(name, model.parts, pose)
-                self._describe(name, model)
         except OutsideError as error:
             raise RefusalError(code, str(error)) from None
         response.entity_name = name
-
-    def _describe(self, name: str, model: Model) -> None:
-        info = self._entities.info(self._entities.find(name))
-        tags = list(dict.fromkeys((*info.tags, *model.tags)))
-        entity_info = EntityInfo(category=info.category, tags=tags)
-        entity_info.description = model.description or info.description
-        self._simulation.infos[name] = entity_info
 
     def _model(self, request: Any) -> Model | None:
         """The entity of a request; None for a robot. Raises RefusalError."""
@@ -148,63 +138,26 @@ class Spawning:
             raise RefusalError(code, f"{fault}; give one as entity_namespace.")
         return space
 
-    def spawn_all(self, request: Any, response: Any) -> None:
-        """Answer SpawnEntities."""
-        failed = []
-        for k, spawn_request in enumerate(request.spawn_requests):
-            answer = SpawnResult()
-            spawn = partial(self.spawn, spawn_request, answer)
-            answer.result.result, answer.result.error_message = outcome(
-                spawn, self._host
-            )
-            response.results.append(answer)
-            if answer.result.result != Result.RESULT_OK:
-                failed.append(f"request {k}: {answer.result.error_message}")
-        if failed:
-            code = SpawnEntities.Response.ENTITIES_SPAWN_FAILED
-            more = f"{len(failed)} of {len(request.spawn_requests)} failed"
-            raise RefusalError(code, f"{more}; {failed[0]}")
-
     def list_spawnables(self, request: Any, response: Any) -> None:
         """Answer GetSpawnables."""
         robot = self._host.model.robot
-        unknown = list[str]()
         hull = hull_of(self._simulation.entities.simulator.footprint)
         response.spawnables.append(
             _spawnable(robot.name, f"another robot {robot.name}", [hull])
         )
-        shipped = share_folder() / "config" / FOLDER
-        spawnables = [(file.stem, file) for file in sorted(shipped.iterdir())]
-        for source in request.sources:
-            files = resources.files_of(source)
-            if files is None:
-                unknown.append(source)
-            spawnables += [(str(file), file) for file in files or ()]
-        for uri, file in spawnables:
-            if file.suffix.lower() in resources.SUFFIXES:
-                self._list(file, uri, response)
-        if unknown:
+        for name in list_shipped(FOLDER):
+            model = model_of_yaml(read_text(find_config(name, FOLDER)), name)
+            hulls = [
+                geometry.rotate(hull_of(shape), at[2]) + at[:2]
+                for shape, at in model.parts
+            ]
+            response.spawnables.append(_spawnable(name, model.description, hulls))
+        if request.sources:
             response.result.result = Result.RESULT_OK
-            fault = f"sources that are not known: {', '.join(map(repr, unknown))}"
+            sources = ", ".join(map(repr, request.sources))
             response.result.error_message = (
-                f"{fault}; give folders or files of this machine."
+                f"not searched: {sources}; spawn a file by its path."
             )
-
-    def _list(self, file: Path, uri: str, response: Any) -> None:
-        try:
-            text = read_text(file, resources.MOST_BYTES)
-            if resources.SUFFIXES[file.suffix.lower()] == resources.SDF:
-                model = model_of_sdf(text, 0.0, str(file))
-            else:
-                model = model_of_yaml(text, str(file))
-        except (BridgeError, OSError):
-            return  # a world, or something else that is no entity
-        hulls = [
-            geometry.rotate(hull_of(shape), at[2]) + at[:2] for shape, at in model.parts
-        ]
-        response.spawnables.append(
-            _spawnable(uri, model.description or model.name, hulls)
-        )
 
 
 def _spawnable(uri: str, about: str, hulls: list[Any]) -> Spawnable:

@@ -4,24 +4,22 @@ from collections.abc import Generator
 from typing import Any
 
 from simulation_interfaces.action import SimulateSteps
-from simulation_interfaces.msg import EntityInfo, Result, SimulationState
+from simulation_interfaces.msg import Result, SimulationState
 from simulation_interfaces.srv import ResetSimulation, SetSimulationState
 
 from nics_drl_bridge.errors import BridgeError
-from nics_drl_bridge.nodes import runner
-from nics_drl_bridge.nodes.simulation_interfaces.host import (
-    NO_WORLD,
+from nics_drl_bridge.extras.simulation_interfaces.host import (
     Host,
     RefusalError,
     outcome,
 )
+from nics_drl_bridge.nodes import runner
 from nics_drl_bridge.sim.entities import Entities
 
 STOPPED = SimulationState.STATE_STOPPED
 PLAYING = SimulationState.STATE_PLAYING
 PAUSED = SimulationState.STATE_PAUSED
 QUITTING = SimulationState.STATE_QUITTING
-WITHOUT_WORLD = SimulationState.STATE_NO_WORLD
 NAMES = {STOPPED: "stopped", PLAYING: "playing", PAUSED: "paused", QUITTING: "quitting"}
 MOST_STEPS = 100_000  # of one call of a service, which answers nothing else meanwhile
 GOODBYE_S = 0.2  # until the answer to who ended the simulation has left
@@ -42,9 +40,7 @@ class Simulation:
     def __init__(self, host: Host) -> None:
         self._host = host
         self._stepping = False
-        self.infos: dict[str, EntityInfo] = {}  # by name, where a client set it
-        # or paused, or without a world, while the host is paused
-        self._halted = STOPPED
+        self._halted = STOPPED  # or paused, or quitting, while the host is paused
         self._turn: Any = host.create_guard_condition(lambda: None)
         self.renew()
 
@@ -69,11 +65,6 @@ class Simulation:
         self._halted = state
         self._stepping = False
 
-    def require_world(self) -> None:
-        """Raise RefusalError if no world is loaded."""
-        if self.state in (WITHOUT_WORLD, QUITTING):
-            raise RefusalError(Result.RESULT_INCORRECT_STATE, NO_WORLD)
-
     def get_state(self, _: Any, response: Any) -> None:
         """Answer GetSimulationState."""
         response.state.state = self.state
@@ -84,22 +75,16 @@ class Simulation:
         wanted = request.state.state
         state = self.state
         if wanted == state:
-            already = (
-                f"the simulation is {NAMES.get(state, 'without a world')} already."
-            )
+            already = f"the simulation is {NAMES[state]} already."
             raise RefusalError(codes.ALREADY_IN_TARGET_STATE, already)
         if wanted not in NAMES:
             states = ", ".join(f"{value} ({name})" for value, name in NAMES.items())
-            fault = f"state {wanted} can't be set; choose one of {states}"
-            raise RefusalError(
-                codes.INCORRECT_TRANSITION, f"{fault}, or load or unload a world."
-            )
+            fault = f"state {wanted} can't be set; choose one of {states}."
+            raise RefusalError(codes.INCORRECT_TRANSITION, fault)
         if wanted == QUITTING:
             self.halt(QUITTING)
             runner.steadily(self._host, GOODBYE_S, self._host.context.try_shutdown)
             return
-        if state in (WITHOUT_WORLD, QUITTING):
-            raise RefusalError(codes.INCORRECT_TRANSITION, NO_WORLD)
         if wanted == STOPPED:
             try:
                 self._reset_all()
@@ -190,7 +175,6 @@ class Simulation:
 
     def reset(self, request: Any, _: Any) -> None:
         """Answer ResetSimulation."""
-        self.require_world()
         scope = request.scope or SCOPES.SCOPE_ALL
         if not scope & EVERY_SCOPE or (
             scope & ~EVERY_SCOPE and scope != SCOPES.SCOPE_ALL
@@ -217,7 +201,6 @@ class Simulation:
         # A robot that was spawned may have the name of one that was deleted.
         changed = any(entity.robot >= 0 for entity in self.entities.spawned.values())
         changed |= self.entities.robot_names != list(self._host.robot_names)
-        self.infos.clear()
         self.entities.restore()
         if changed:
             self._host.reopen_robots()
@@ -231,6 +214,5 @@ class Simulation:
         for name in names:
             entity = self.entities.find(name)
             self.entities.delete(entity)
-            self.infos.pop(name, None)
             if entity.robot >= 0:
                 self._host.remove_robots([entity.robot])

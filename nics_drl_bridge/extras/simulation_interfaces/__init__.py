@@ -6,7 +6,7 @@ from nics_drl_bridge.nodes import conversions, runner
 from nics_drl_bridge.nodes.parameters import NEWEST, STANDARD
 
 if TYPE_CHECKING:
-    from nics_drl_bridge.nodes.simulation_interfaces.server import Server
+    from nics_drl_bridge.extras.simulation_interfaces.server import Server
 
 
 def open_services(node: Any) -> "Server | None":
@@ -17,6 +17,6 @@ def open_services(node: Any) -> "Server | None":
         missing = "the package simulation_interfaces, 2.1 or newer, is not installed"
         node.get_logger().info(f"{missing}, so that its services are not offered")
         return None
-    from nics_drl_bridge.nodes.simulation_interfaces.server import Server
+    from nics_drl_bridge.extras.simulation_interfaces.server import Server
 
     return Server(node)

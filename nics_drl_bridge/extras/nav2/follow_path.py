@@ -15,13 +15,14 @@ from rclpy.node import Node, NodeNameNonExistentError
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.extras.nav2.nav2_parameters import ControllerParameters, chosen
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import S_PER_NS, Array
 from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 from nics_drl_bridge.nodes import conversions, qos, runner
 from nics_drl_bridge.nodes.goal_frames import GoalFrames
-from nics_drl_bridge.nodes.nav2_parameters import ControllerParameters, chosen
+from nics_drl_bridge.nodes.parts import Wish
 from nics_drl_bridge.nodes.robot_topics import RobotTopics
 from nics_drl_bridge.policy.follow import (
     GoalChecker,
@@ -56,13 +57,6 @@ class Refusal(Exception):  # noqa: N818  (an outcome, by the standard's code)
     def __init__(self, code: str, sentence: str) -> None:
         super().__init__(sentence)
         self.code = code
-
-
-class Wish(NamedTuple):
-    """Motion that a policy requests on the way to a goal."""
-
-    twist: Array  # (3,) for `cmd_vel`
-    touched: bool
 
 
 class HeldActionServer(ActionServer):
@@ -131,34 +125,40 @@ class Run:
 class PathActions:
     """Serves both actions while a node is active; a new goal replaces the present one.
 
-    `drive` asks the policy to drive to a goal (2,) in the map of the estimate, and `reset_policy`
-    empties its memory. Without nav2_msgs nothing is served. If another node, such as Nav2's
+    Without nav2_msgs nothing is served. If another node, such as Nav2's
     bt_navigator, serves `navigate_to_pose`, this one does not.
     """
 
-    def __init__(
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self.parameters = ControllerParameters(node)
+        self.ignores = self.parameters.ignores
+        self._run: Run | None = None
+        self._undo: list[Callable[[], Any]] = []
+        self._servers: dict[str, HeldActionServer] = {}
+
+    def open(
         self,
-        node: Node,
         topics: RobotTopics,
         frames: GoalFrames,
         model: SimulatorModel,
-        parameters: ControllerParameters,
         drive: Callable[[Array], Wish],
         reset_policy: Callable[[], None],
     ) -> None:
-        self._node = node
+        """Serve the actions until `close`.
+
+        `drive` asks the policy to drive to a goal (2,) in the map of the estimate, and
+        `reset_policy` empties its memory.
+        """
+        node = self._node
         self._topics = topics
         self._frames = frames
         self._robot = model.robot
-        self._parameters = parameters
         self._drive = drive
         self._reset_policy = reset_policy
-        self._run: Run | None = None
         self._map: tuple[str, GridMap] | None = None  # and its frame
         self._limit = math.inf  # of the speed [m/s]
         self._period_s = model.control_period
-        self._undo: list[Callable[[], Any]] = []
-        self._servers: dict[str, HeldActionServer] = {}
         self._kinds = {
             name: conversions.message_type(kind) for name, kind in KINDS.items()
         }
@@ -272,7 +272,7 @@ class PathActions:
     def _follow(self, goal: Goal) -> Run:
         asked = goal.handle.request
         names = []
-        for kind, names_of_kind in self._parameters.names.items():
+        for kind, names_of_kind in self.parameters.names.items():
             name, wrong = chosen(
                 kind.replace("_", " "), getattr(asked, f"{kind}_id", ""), names_of_kind
             )
@@ -299,8 +299,7 @@ class PathActions:
         except ConfigError as error:
             raise Refusal(goal.code, f"{NAVIGATE}: {error}") from None
         checks = [
-            self._parameters.names[f"{kind}_checker"][0]
-            for kind in ("goal", "progress")
+            self.parameters.names[f"{kind}_checker"][0] for kind in ("goal", "progress")
         ]
         return self._begin(goal, frame, way, checks)
 
@@ -336,7 +335,7 @@ class PathActions:
         path = self._planned(goal, poses)
         self._robot_in(goal.name, frame)
         self._require_on_map(goal, frame, poses)
-        arrival, progress = self._parameters.checks(*checks)
+        arrival, progress = self.parameters.checks(*checks)
         checkers = (
             GoalChecker(arrival, not self._robot.steers),
             ProgressChecker(progress),

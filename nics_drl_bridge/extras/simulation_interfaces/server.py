@@ -1,36 +1,33 @@
 """The server: every service of the standard, and the features that stand behind them."""
 
+import re
 from collections.abc import Callable
 from typing import Any, NoReturn
 
 from rclpy.action import ActionServer, CancelResponse
 from simulation_interfaces.msg import Result, SimulatorFeatures
 
-from nics_drl_bridge.nodes import conversions
-from nics_drl_bridge.nodes.simulation_interfaces.client import PACKAGE, snake_case
-from nics_drl_bridge.nodes.simulation_interfaces.entities import EntityServices
-from nics_drl_bridge.nodes.simulation_interfaces.host import (
+from nics_drl_bridge.extras.simulation_interfaces.entities import EntityServices
+from nics_drl_bridge.extras.simulation_interfaces.host import (
     Handler,
     RefusalError,
     served,
 )
-from nics_drl_bridge.nodes.simulation_interfaces.spawning import FORMATS, Spawning
-from nics_drl_bridge.nodes.simulation_interfaces.state import WITHOUT_WORLD, Simulation
-from nics_drl_bridge.nodes.simulation_interfaces.worlds import Worlds
+from nics_drl_bridge.extras.simulation_interfaces.spawning import FORMATS, Spawning
+from nics_drl_bridge.extras.simulation_interfaces.state import Simulation
+from nics_drl_bridge.extras.simulation_interfaces.worlds import Worlds
+from nics_drl_bridge.nodes import conversions
 
+PACKAGE = "simulation_interfaces"
 FEATURES = (
     "SPAWNING",
     "DELETING",
-    "ENTITY_TAGS",
     "ENTITY_BOUNDS",
-    "ENTITY_BOUNDS_BOX",
-    "ENTITY_BOUNDS_CONVEX",
     "ENTITY_CATEGORIES",
     "SPAWNING_RESOURCE_STRING",
     "ENTITY_STATE_GETTING",
     "ENTITY_STATE_SETTING",
     "ENTITY_INFO_GETTING",
-    "ENTITY_INFO_SETTING",
     "SPAWNABLES",
     "SIMULATION_RESET",
     "SIMULATION_RESET_TIME",
@@ -44,13 +41,15 @@ FEATURES = (
     "STEP_SIMULATION_ACTION",
     "WORLD_LOADING",
     "WORLD_RESOURCE_STRING",
-    "WORLD_TAGS",
-    "WORLD_UNLOADING",
     "WORLD_INFO_GETTING",
     "AVAILABLE_WORLDS",
-    "SPAWNING_ENTITIES",
 )
 ABOUT = "nics_drl_bridge: a 2-D world of shapes and robots of one kind; docs/simulator_node.md"
+
+
+def snake_case(name: str) -> str:
+    """Return the name of a service as all simulators write it: `get_entities`."""
+    return re.sub("(?<!^)(?=[A-Z])", "_", name).lower()
 
 
 class Server:
@@ -71,20 +70,20 @@ class Server:
             "GetEntities": entities.list_names,
             "GetEntitiesStates": entities.list_states,
             "GetEntityInfo": entities.get_info,
-            "SetEntityInfo": entities.set_info,
             "GetEntityState": entities.get_state,
             "SetEntityState": entities.set_state,
             "GetEntityBounds": entities.get_bounds,
             "DeleteEntity": entities.delete,
             "SpawnEntity": spawning.spawn,
-            "SpawnEntities": spawning.spawn_all,
+            "SpawnEntities": _refuse,
             "GetSpawnables": spawning.list_spawnables,
             "LoadWorld": worlds.load,
-            "UnloadWorld": worlds.unload,
+            "UnloadWorld": _refuse,
             "GetCurrentWorld": worlds.current,
             "GetAvailableWorlds": worlds.available,
-            "GetNamedPoses": _no_named_poses,
-            "GetNamedPoseBounds": _no_named_poses,
+            "SetEntityInfo": _refuse,
+            "GetNamedPoses": _refuse,
+            "GetNamedPoseBounds": _refuse,
         }
         for name, handler in handlers.items():
             self._offer(name, served(handler, host))
@@ -98,11 +97,6 @@ class Server:
                 simulation.simulate,
                 cancel_callback=lambda _: CancelResponse.ACCEPT,
             )
-
-    @property
-    def has_world(self) -> bool:
-        """True unless the world was unloaded."""
-        return bool(self._simulation.state != WITHOUT_WORLD)
 
     def _offer(self, name: str, reply: Callable[[Any, Any], Any]) -> None:
         kind = conversions.message_type(f"{PACKAGE}/srv/{name}")
@@ -120,6 +114,6 @@ class Server:
         return response
 
 
-def _no_named_poses(*_: Any) -> NoReturn:
-    reason = "worlds have no named poses here; see get_simulator_features."
+def _refuse(*_: Any) -> NoReturn:
+    reason = "this is not supported here; see get_simulator_features."
     raise RefusalError(Result.RESULT_FEATURE_UNSUPPORTED, reason)

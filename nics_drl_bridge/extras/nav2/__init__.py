@@ -1,0 +1,1 @@
+"""Nav2's actions, served by a policy."""
