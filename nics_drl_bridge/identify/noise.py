@@ -23,7 +23,6 @@ from nics_drl_bridge.robot.taylor import TaylorModel
 
 HORIZON_S = 1.0
 SPACING_S = 0.25
-GROWTH_S = (0.25, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0)
 STATE_HORIZON_S = 0.1
 MIN_WINDOWS = 20
 # a larger error of a prediction over a second is divergence, not drift
@@ -157,22 +156,6 @@ def _measure_pose_drift(
         "position_drift": level(shift / HORIZON_S, "m/sqrt(s)"),
         "heading_drift": level(turn / HORIZON_S, "rad/sqrt(s)"),
     }
-
-
-def drift_growth(
-    drive: Drive, calibration: Calibration, model: TaylorModel
-) -> tuple[Array, Array, Array] | None:
-    """Returns horizons [s], errors per axis [m] and of heading [rad]; None if it is too short."""
-    rows = []
-    for horizon in GROWTH_S:
-        predicted = _predict_errors(drive, calibration, model, horizon)
-        if predicted is None:
-            break
-        square = np.mean(predicted[1] ** 2, axis=0)
-        rows.append(
-            (horizon, np.sqrt(0.5 * (square[0] + square[1])), np.sqrt(square[2]))
-        )
-    return tuple(np.array(rows).T) if rows else None
 
 
 def _measure_state_drift(

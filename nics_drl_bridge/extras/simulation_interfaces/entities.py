@@ -1,6 +1,5 @@
 """Entities: their names, their states, what they are, and their bounds."""
 
-import re
 from typing import Any
 
 from geometry_msgs.msg import Accel, Twist
@@ -14,6 +13,7 @@ from simulation_interfaces.msg import (
 from simulation_interfaces.srv import SetEntityState
 
 from nics_drl_bridge.extras.simulation_interfaces import plane
+from nics_drl_bridge.extras.simulation_interfaces.filters import compile_filter
 from nics_drl_bridge.extras.simulation_interfaces.host import Host, RefusalError
 from nics_drl_bridge.extras.simulation_interfaces.state import Simulation
 from nics_drl_bridge.nodes import conversions
@@ -51,10 +51,9 @@ class EntityServices:
             )
             raise RefusalError(Result.RESULT_FEATURE_UNSUPPORTED, fault)
         try:
-            pattern = re.compile(filters.filter)
-        except re.error as error:
-            fault = f"the filter {filters.filter!r} is no regular expression ({error}); mend it."
-            raise RefusalError(FAILED, fault) from None
+            pattern = compile_filter(filters.filter)
+        except ValueError as error:
+            raise RefusalError(FAILED, str(error)) from None
         categories = {category.category for category in filters.categories}
         return [
             entity
