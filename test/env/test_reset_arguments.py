@@ -5,8 +5,8 @@ import pytest
 from robots import direct_model, field
 
 from nics_drl_bridge.env.bridge_env import BridgeEnv
-from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.pettingzoo_env import BridgeParallelEnv
+from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 

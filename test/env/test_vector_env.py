@@ -13,8 +13,8 @@ from robots import direct_model, field
 
 from nics_drl_bridge.env import vector_env
 from nics_drl_bridge.env.bridge_env import BridgeEnv
-from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.registry import ENVIRONMENTS, NAVIGATION
+from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.env.teaching import Teaching
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 
