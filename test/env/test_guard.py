@@ -210,7 +210,7 @@ WHENS = st.one_of(st.integers(0, 12), st.integers(0, 80))
 
 
 @pytest.mark.slow
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=200, deadline=None)
 @given(
     st.sampled_from(sorted(ENVS)),
     st.sampled_from([Robot, RobotWithoutHalt]),
