@@ -28,8 +28,8 @@ from measuring.scenes import BATCH, CIRCLE, errors
 from numpy.typing import NDArray
 
 from nics_drl_bridge import style
-from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.registry import NAVIGATION, register_envs
+from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.generator import SimulatorModel

@@ -43,7 +43,7 @@ from pathlib import Path
 
 Path({canary!r}).touch()
 
-from nics_drl_bridge.env.navigation import Navigation
+from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.lidar.further_lidar import FurtherLidar
 
 

@@ -15,7 +15,7 @@ from measuring.rates import interleaved, shortest
 from nics_drl_bridge.lidar import map_kernels
 from nics_drl_bridge.lidar.beam_kernels import INF, LidarPose, finish
 from nics_drl_bridge.lidar.maps import GridMap
-from nics_drl_bridge.lidar.scan_kernels import scan_lanes
+from nics_drl_bridge.lidar.scan_kernels import scan_scratch
 
 SIZE = 20.0
 RESOLUTION = 0.05
@@ -90,23 +90,23 @@ def run(
     range_max: float,
     arrays: Any,
     walk: bool,
-    lanes: Any,
+    scratch: Any,
 ) -> None:
     """Scans from poses `at`, walking or jumping."""
     for n in range(at.shape[0]):
-        lanes.scan[:] = INF
+        scratch.scan[:] = INF
         x, y, c, s = at[n]
         map_kernels.scan_map(
-            lanes.scan,
+            scratch.scan,
             beams,
             LidarPose(x, y, c, s, 0.0),
             range_max,
             arrays,
             walk,
-            lanes.singles,
-            lanes.integers,
+            scratch.singles,
+            scratch.integers,
         )
-        finish(out[n], lanes.scan, 0.0, range_max)
+        finish(out[n], scratch.scan, 0.0, range_max)
 
 
 def scan_map(
@@ -114,7 +114,7 @@ def scan_map(
 ) -> tuple[NDArray[np.float32], float]:
     """Returns scans, and scans per second of the best of some runs."""
     out = np.empty((len(at), beams.directions.shape[1]), np.float32)
-    lanes = scan_lanes(beams.directions.shape[1])
-    call = partial(run, out, beams, at, range_max, arrays, walk, lanes)
+    scratch = scan_scratch(beams.directions.shape[1])
+    call = partial(run, out, beams, at, range_max, arrays, walk, scratch)
     seconds = shortest(interleaved({"scan": call}, REPEATS))["scan"]
     return np.minimum(out, range_max), len(at) / seconds

@@ -32,7 +32,7 @@ from bench import at_least, at_most, missed_bars
 
 from measuring.environments import NotInstalledError, clean, python_with
 from nics_drl_bridge.defaults import EPISODE_STEPS
-from nics_drl_bridge.env.navigation import Navigation
+from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.sim.scenes import Scene, sample_scene
 from nics_drl_bridge.sim.world import World

@@ -14,7 +14,7 @@ import numpy as np
 from nics_drl_bridge import defaults, extensions
 from nics_drl_bridge.commands.episodes import DDS, FAST, LABELS, START_S, Say, drive_in
 from nics_drl_bridge.config import dump_yaml
-from nics_drl_bridge.env.navigation import Navigation
+from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import BackendError, PolicyError
 from nics_drl_bridge.files import write_bytes, write_text

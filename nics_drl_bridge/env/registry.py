@@ -16,9 +16,9 @@ from nics_drl_bridge.lidar.sectors import layout_of
 from nics_drl_bridge.lidar.sensor import Sensor
 
 TASKS = {  # name -> module and class
-    "navigation": "nics_drl_bridge.env.navigation:Navigation",
-    "cooperative_reaching": "nics_drl_bridge.env.teams:CooperativeReaching",
-    "pursuit_evasion": "nics_drl_bridge.env.teams:PursuitEvasion",
+    "navigation": "nics_drl_bridge.env.tasks.navigation:Navigation",
+    "cooperative_reaching": "nics_drl_bridge.env.tasks.teams:CooperativeReaching",
+    "pursuit_evasion": "nics_drl_bridge.env.tasks.teams:PursuitEvasion",
 }
 
 

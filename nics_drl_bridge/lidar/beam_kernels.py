@@ -128,9 +128,9 @@ def beams_within(span: Span, turned_by: float, beam_count: int) -> tuple[int, in
     A span that reaches into the next turn covers the beams there too, where it is to be `turned_by`
     a full turn.
     """
-    first = np.int64(max(np.ceil(span.right - turned_by - ROUNDING), 0.0))
+    right = np.ceil(span.right - turned_by - ROUNDING)
     left = np.floor(span.left - turned_by + ROUNDING)
-    return first, np.int64(min(left, beam_count - 1.0)) + 1
+    return int(max(right, 0.0)), int(min(left, beam_count - 1.0)) + 1
 
 
 @kernel(inline=True)

@@ -49,7 +49,7 @@ class FurtherLidar(Sensor):
         faults = self.lidar.fault_parameters
 
         def render(out: Readings, worlds: Integers) -> None:
-            lanes = scan_kernels.scan_lanes(self.size)
+            scratch = scan_kernels.scan_scratch(self.size)
             scan_kernels.scan_worlds(
                 out,
                 state.pose,
@@ -59,7 +59,7 @@ class FurtherLidar(Sensor):
                 around.first,
                 around.fixtures,
                 lidar,
-                lanes,
+                scratch,
             )
             seeds = state.seeds ^ salt
             fault_kernels.distort_worlds(

@@ -137,12 +137,12 @@ def _compare(bodies: Array, exact: LidarArrays, baked: LidarArrays) -> _Errors:
     robots = np.tile([-mount[0], -mount[1], 0.0], (PLACES, 1, 1))
     scans = np.empty((2, PLACES, 1, directions.shape[1]), np.float32)
     worlds = np.arange(PLACES)
-    lanes = scan_kernels.scan_lanes(directions.shape[1])
+    scratch = scan_kernels.scan_scratch(directions.shape[1])
     nearby = np.arange(bodies.shape[1], dtype=np.int32)
     empty = stack_fixtures([np.zeros((0, 4))], [None], np.zeros(PLACES, np.int64))
     for ranges, sensor in zip(scans, (exact, baked), strict=True):
         scan_kernels.scan_worlds(
-            ranges, robots, worlds, bodies, nearby, -1, empty, sensor, lanes
+            ranges, robots, worlds, bodies, nearby, -1, empty, sensor, scratch
         )
     exact_ranges, baked_ranges = scans[:, :, 0].astype(np.float64)
     both = np.isfinite(exact_ranges) & np.isfinite(baked_ranges)

@@ -143,7 +143,7 @@ def look_up_body(
         part.far, part.far_next = find_points(far, np.int64(point), hits, table)
         part.next_weight = np.float32(exact_point - point)
         part.far_weight = cell.far_weight
-        count += hits > 0
+        count += int(hits > 0)
         turned_by = span.full_turn
         if span.left < turned_by:
             break

@@ -51,7 +51,7 @@ class LidarArrays(NamedTuple):
     exact: bool  # True if maps are scanned exactly, from cell to cell
 
 
-class ScanLanes(NamedTuple):
+class ScanScratch(NamedTuple):
     """Scratch memory of the scans of one thread."""
 
     scan: ShortIntegers  # the scan while it is made, see `beam_kernels`
@@ -60,9 +60,9 @@ class ScanLanes(NamedTuple):
     integers: ShortIntegers
 
 
-def scan_lanes(beam_count: int) -> ScanLanes:
+def scan_scratch(beam_count: int) -> ScanScratch:
     """Allocate the memory that one thread needs to scan."""
-    return ScanLanes(
+    return ScanScratch(
         np.zeros(beam_count + max(FEWEST, map_kernels.LANES), np.int32),
         np.zeros(MOST_FOUND, LOOK_UP),
         np.zeros(map_kernels.SINGLES * map_kernels.LANES, np.float32),
@@ -80,7 +80,7 @@ def scan_worlds(
     first_robot: int,
     fixtures: Fixtures,
     lidar: LidarArrays,
-    lanes: ScanLanes,
+    scratch: ScanScratch,
 ) -> None:
     """Scan from all robots of some worlds.
 
@@ -94,7 +94,7 @@ def scan_worlds(
             robots have no bodies.
         fixtures: walls and maps of the worlds.
         lidar: the lidar of every robot.
-        lanes: scratch memory.
+        scratch: scratch memory.
     """
     for n in chosen:
         for m in range(robot_poses.shape[1]):
@@ -111,7 +111,7 @@ def scan_worlds(
                 own_body,
                 fixtures,
                 lidar,
-                lanes,
+                scratch,
             )
 
 
@@ -125,7 +125,7 @@ def scan_robot(
     own_body: int,
     fixtures: Fixtures,
     lidar: LidarArrays,
-    lanes: ScanLanes,
+    scratch: ScanScratch,
 ) -> None:
     """Scan from one robot of the world n.
 
@@ -138,12 +138,12 @@ def scan_robot(
         own_body: index of the robot's own body, which it does not see; -1 for none.
         fixtures: walls and maps.
         lidar: the lidar.
-        lanes: scratch memory.
+        scratch: scratch memory.
     """
-    scan = lanes.scan
+    scan = scratch.scan
     for i in range(scan.shape[0]):
         scan[i] = INF
-    fuse_bodies(pose, bodies, nearby, own_body, lidar, lanes)
+    fuse_bodies(pose, bodies, nearby, own_body, lidar, scratch)
     scan_walls(scan, lidar.beams, pose, walls_of(n, fixtures), lidar.range_max)
     if fixtures.squares.size > 0:
         map_kernels.scan_map(
@@ -153,8 +153,8 @@ def scan_robot(
             lidar.range_max,
             grid_of(n, fixtures),
             lidar.exact,
-            lanes.singles,
-            lanes.integers,
+            scratch.singles,
+            scratch.integers,
         )
     finish(ranges, scan, lidar.range_min, lidar.range_max)
 
@@ -166,7 +166,7 @@ def fuse_bodies(
     nearby: ShortIntegers,
     own_body: int,
     lidar: LidarArrays,
-    lanes: ScanLanes,
+    scratch: ScanScratch,
 ) -> None:
     """Fuse the visible bodies (K, 7) of one world into a scan, see `scan_robot`."""
     count = 0
@@ -177,13 +177,13 @@ def fuse_bodies(
         if not is_visible or k == own_body:
             continue
         if not is_looked_up:
-            scan_body(lanes.scan, lidar.beams, pose, body, lidar.outlines)
+            scan_body(scratch.scan, lidar.beams, pose, body, lidar.outlines)
             continue
         if count > MOST_FOUND - 2:
-            fuse_look_ups(lanes.scan, rows, lanes.found[:count])
+            fuse_look_ups(scratch.scan, rows, scratch.found[:count])
             count = 0
-        count = look_up_body(body, pose, lidar.beams, lidar.table, lanes.found, count)
-    fuse_look_ups(lanes.scan, rows, lanes.found[:count])
+        count = look_up_body(body, pose, lidar.beams, lidar.table, scratch.found, count)
+    fuse_look_ups(scratch.scan, rows, scratch.found[:count])
 
 
 @kernel(contracts=True, inline=True)

@@ -154,7 +154,7 @@ class Scanner:
             out[:] = self.scan(poses, bodies, walls)
             return out
         worlds = np.arange(len(poses))
-        lanes = scan_kernels.scan_lanes(self.spec.beams)
+        scratch = scan_kernels.scan_scratch(self.spec.beams)
         member = np.zeros(len(poses), np.int64)
         first = np.array([0, len(walls)])
         around = self._without_walls._replace(member=member, walls=walls, first=first)
@@ -167,7 +167,7 @@ class Scanner:
             -1,
             around,
             self.arguments,
-            lanes,
+            scratch,
         )
         return out
 

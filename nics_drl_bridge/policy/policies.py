@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.config import read_text
-from nics_drl_bridge.env.navigation import Navigation
+from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.errors import ConfigError, PolicyError, suggest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.geometry import Array

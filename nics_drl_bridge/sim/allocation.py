@@ -291,6 +291,6 @@ def _allocate_scratch(
             slice_ranges=np.zeros(model.lidar.beams, np.float32),
             twist=np.zeros(3),
             everybody=np.arange(bodies + 1, dtype=np.int32),
-            lanes=scan_kernels.scan_lanes(model.lidar.beams),
+            scratch=scan_kernels.scan_scratch(model.lidar.beams),
         ),
     )

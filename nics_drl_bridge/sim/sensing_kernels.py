@@ -223,7 +223,7 @@ def scan_together(
                 data.velocity.shape[1] + m,
                 world_set.fixtures,
                 lidar,
-                scratch.scans.lanes,
+                scratch.scans.scratch,
             )
 
 
@@ -296,7 +296,7 @@ def _scan_from_past(
             -1,
             world_set.fixtures,
             lidar,
-            scans.lanes,
+            scans.scratch,
         )
         if groups > 1:
             for i in range(group * beams // groups, (group + 1) * beams // groups):

@@ -19,7 +19,7 @@ from nics_drl_bridge.lidar.arrays import Integers as Integers
 from nics_drl_bridge.lidar.arrays import ShortIntegers, Singles
 from nics_drl_bridge.lidar.exact_kernels import OutlineArrays
 from nics_drl_bridge.lidar.map_kernels import Fixtures
-from nics_drl_bridge.lidar.scan_kernels import LidarArrays, ScanLanes
+from nics_drl_bridge.lidar.scan_kernels import LidarArrays, ScanScratch
 from nics_drl_bridge.robot.kernels import Terms
 from nics_drl_bridge.sim.cell_kernels import BodyCells
 
@@ -190,7 +190,7 @@ class Scans(NamedTuple):
     slice_poses: Array  # (G, 3) poses during a sweep
     slice_ranges: Singles  # (B,) scan from one of these poses
     everybody: ShortIntegers  # (K + M + 1,) indices of `bodies`
-    lanes: ScanLanes  # of the look-up of bodies
+    scratch: ScanScratch
 
 
 class Scratch(NamedTuple):

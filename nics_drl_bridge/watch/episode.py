@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.config import list_shipped
 from nics_drl_bridge.env.bridge_env import BridgeEnv
-from nics_drl_bridge.env.navigation import Navigation
+from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import wrap_angle
 from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, SHAPE, X, Y

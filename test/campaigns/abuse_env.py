@@ -26,7 +26,7 @@ from nav_msgs.msg import Odometry
 from parts.spun_node import SpunNode
 
 from nics_drl_bridge.env.bridge_env import BridgeEnv
-from nics_drl_bridge.env.navigation import Navigation
+from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.nodes import qos
 from nics_drl_bridge.nodes.link import Link

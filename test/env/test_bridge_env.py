@@ -11,9 +11,9 @@ from robots import FOOTPRINT, circles, direct_model, field, lidar
 from nics_drl_bridge import extensions
 from nics_drl_bridge.defaults import EPISODE_STEPS
 from nics_drl_bridge.env.bridge_env import BridgeEnv
-from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.env.sim_backend import SimBackend
+from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.lidar.bake import bake

@@ -15,10 +15,10 @@ from robots import direct_model, field
 
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.guard import halts_on_error
-from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.pettingzoo_env import BridgeParallelEnv
 from nics_drl_bridge.env.task import Task
-from nics_drl_bridge.env.teams import CooperativeReaching
+from nics_drl_bridge.env.tasks.navigation import Navigation
+from nics_drl_bridge.env.tasks.teams import CooperativeReaching
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.policy.evaluation import drive
@@ -210,7 +210,7 @@ WHENS = st.one_of(st.integers(0, 12), st.integers(0, 80))
 
 
 @pytest.mark.slow
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=200, deadline=None)
 @given(
     st.sampled_from(sorted(ENVS)),
     st.sampled_from([Robot, RobotWithoutHalt]),

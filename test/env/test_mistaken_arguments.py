@@ -9,9 +9,9 @@ import pytest
 
 import nics_drl_bridge
 from nics_drl_bridge.env.bridge_env import BridgeEnv
-from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.pettingzoo_env import BridgeParallelEnv
 from nics_drl_bridge.env.registry import NAVIGATION
+from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.errors import BridgeError
 
 NAN = float("nan")
@@ -168,7 +168,8 @@ def test_a_closed_env_refuses_what_is_called_after_close(
         ("x = 1", "", "defines no subclass of nics_drl_bridge.env.task.Task"),
         ("x = 1", ":Patrol", "defines no subclass of nics_drl_bridge.env.task.Task"),
         (
-            "from nics_drl_bridge.env.navigation import Navigation\nclass Mine(Navigation): pass",
+            "from nics_drl_bridge.env.tasks.navigation import Navigation\n"
+            "class Mine(Navigation): pass",
             "",
             "name its class, for example .*:Mine",
         ),

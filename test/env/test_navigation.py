@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from robots import DIRECT, FOOTPRINT, lidar
 
-from nics_drl_bridge.env.navigation import Navigation
+from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.robot.spec import load_robot
 

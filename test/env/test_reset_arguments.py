@@ -5,8 +5,8 @@ import pytest
 from robots import direct_model, field
 
 from nics_drl_bridge.env.bridge_env import BridgeEnv
-from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.pettingzoo_env import BridgeParallelEnv
+from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 
@@ -120,6 +120,7 @@ def test_a_task_whose_command_no_robot_can_be_told_is_named(command):
     env = BridgeEnv(model=direct_model(), world=field(), task=Senseless)
     env.reset(seed=0)
     with pytest.raises(
-        ConfigError, match=r"^the task's command .*must be finite and of shape \(1, 3"
+        ConfigError,
+        match=r"^the task's command .*must be finite and of shape \(1, 1, 3",
     ):
         env.step(np.ones(3, np.float32))

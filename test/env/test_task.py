@@ -13,7 +13,6 @@ from gymnasium.vector import SyncVectorEnv
 from robots import DIRECT, direct_model, field, lidar
 from shapely.geometry import LineString, Polygon
 
-from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.registry import ENVIRONMENTS, TASK, make_task
 from nics_drl_bridge.env.task import (
     DRIVES,
@@ -23,6 +22,7 @@ from nics_drl_bridge.env.task import (
     distance,
     still,
 )
+from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import open_model

@@ -6,7 +6,7 @@ from robots import DIRECT, FOOTPRINT, direct_model, field, lidar
 
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.task import Episodes
-from nics_drl_bridge.env.teams import CooperativeReaching, PursuitEvasion
+from nics_drl_bridge.env.tasks.teams import CooperativeReaching, PursuitEvasion
 from nics_drl_bridge.interface import RobotView
 
 B = 72

@@ -13,8 +13,8 @@ from robots import direct_model, field
 
 from nics_drl_bridge.env import vector_env
 from nics_drl_bridge.env.bridge_env import BridgeEnv
-from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.registry import ENVIRONMENTS, NAVIGATION
+from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.env.teaching import Teaching
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 
@@ -119,7 +119,7 @@ def test_it_steps_as_gymnasiums_own_vector_env_of_single_envs(task, mode):
 
 @pytest.mark.parametrize(
     ("steps", "counts"),
-    [(100, (1, 17)), pytest.param(2000, (1, 4, 16, 64), marks=pytest.mark.campaign)],
+    [(100, (1, 17)), pytest.param(800, (1, 4, 64), marks=pytest.mark.campaign)],
 )
 @pytest.mark.parametrize("task", TASKS, ids=IDS)
 def test_a_world_does_not_depend_on_how_many_others_there_are(task, steps, counts):
@@ -143,7 +143,7 @@ def digest(arrays):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("task", TASKS, ids=IDS)
+@pytest.mark.parametrize("task", TASKS[1:4], ids=IDS[1:4])
 def test_threads_change_no_bit(task, mode):
     envs = [
         vector(5, threads=threads, autoreset_mode=mode, **task) for threads in THREADS
@@ -198,8 +198,9 @@ def test_start_and_goal_can_be_given_to_all_worlds():
 
 
 @pytest.mark.parametrize("name", ENVIRONMENTS)
-@pytest.mark.parametrize("actions", ["continuous", "discrete"])
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize(
+    ("actions", "mode"), [("continuous", MODES[0]), ("discrete", MODES[1])]
+)
 def test_gymnasiums_checks_of_an_env_find_nothing_to_warn_of_in_a_vector(
     name, actions, mode
 ):

@@ -9,7 +9,7 @@ from nics_drl_bridge.geometry import rotate
 from nics_drl_bridge.lidar import map_kernels
 from nics_drl_bridge.lidar.beam_kernels import LidarPose, beams_of
 from nics_drl_bridge.lidar.maps import NO_MAP, GridMap
-from nics_drl_bridge.lidar.scan_kernels import scan_lanes
+from nics_drl_bridge.lidar.scan_kernels import scan_scratch
 
 BEAMS = 37
 KERNELS = ("exact", "baked")
@@ -23,8 +23,8 @@ def directions(beams=BEAMS):
 def scan(kernel, grid, pose, range_max=100.0, rays=None, before=np.inf):
     """A scan (B,) from x, y, heading."""
     rays = directions() if rays is None else np.asarray(rays, dtype=np.float64)
-    lanes = scan_lanes(len(rays))
-    out = lanes.scan.view(np.float32)
+    scratch = scan_scratch(len(rays))
+    out = scratch.scan.view(np.float32)
     out[:] = before
     c = np.cos(pose[2])
     s = np.sin(pose[2])
@@ -32,14 +32,14 @@ def scan(kernel, grid, pose, range_max=100.0, rays=None, before=np.inf):
     beams = beams_of(np.ascontiguousarray(rays.T), -np.pi, 2.0 * np.pi / len(rays))
     lidar = LidarPose(*map(float, pose[:2]), c, s, float(pose[2]))
     map_kernels.scan_map(
-        lanes.scan,
+        scratch.scan,
         beams,
         lidar,
         range_max,
         arrays,
         kernel == "exact",
-        lanes.singles,
-        lanes.integers,
+        scratch.singles,
+        scratch.integers,
     )
     return out[: len(rays)]
 

@@ -12,8 +12,8 @@ pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
 from geometry_msgs.msg import Twist
 
-from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.registry import COOPERATIVE_REACHING, NAVIGATION
+from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.interface import Start
 from nics_drl_bridge.nodes import link, qos

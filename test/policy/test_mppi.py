@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from robots import lidar
 
-from nics_drl_bridge.env.navigation import Navigation
+from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.interface import RobotView

@@ -255,7 +255,8 @@ def test_where_ray_is_missing_one_sentence_says_what_to_install(tmp_path):
 
 @pytest.mark.process
 def test_an_interrupted_training_tells_the_command_that_resumes_it(tmp_path):
-    own = "from nics_drl_bridge.env.navigation import Navigation\nclass Mine(Navigation): pass\n"
+    imported = "from nics_drl_bridge.env.tasks.navigation import Navigation\n"
+    own = f"{imported}class Mine(Navigation): pass\n"
     (tmp_path / "own.py").write_text(own)
     settings = "worlds: {empty: 64}\nsteps: 20000000\ncheckpoint_every: 2000\n"
     (tmp_path / "short.yaml").write_text(settings)

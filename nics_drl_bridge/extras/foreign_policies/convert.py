@@ -9,7 +9,7 @@ import numpy as np
 import onnx
 
 from nics_drl_bridge.config import parse_yaml, read_text, validate
-from nics_drl_bridge.env.navigation import Navigation
+from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.errors import ConfigError, PolicyError
 from nics_drl_bridge.extras.foreign_policies import leapp_import
 from nics_drl_bridge.extras.foreign_policies.adapter import Adapter, part_size

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.env.navigation import Navigation
+from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.geometry import Array, compute_depths
 from nics_drl_bridge.policy.planners import local_map_kernels as kernels
 from nics_drl_bridge.robot.spec import RobotSpec

@@ -9,8 +9,8 @@ from itertools import pairwise, product
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.task import still
+from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.generator import BUILTIN_SEED, CONTROL_PERIOD_S, SimulatorModel
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.identify import identify

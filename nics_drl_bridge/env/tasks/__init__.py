@@ -1,0 +1,1 @@
+"""The tasks that are shipped, one robot or a team each."""
