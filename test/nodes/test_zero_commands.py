@@ -118,7 +118,7 @@ def said(process, text, told=""):
         ("step", "stepped", [signal.SIGINT] * 5, -signal.SIGINT),
         ("step", "stepped", [signal.SIGTERM], 128 + signal.SIGTERM),
         many("step", "stepped", [signal.SIGHUP], 128 + signal.SIGHUP),
-        ("exit", "stepped", [], 0),
+        many("exit", "stepped", [], 0),
         many("reset", "off its start", [signal.SIGINT] * 5, -signal.SIGINT),
         many("error_in_step", "stepped", [], 1),
         many("error_in_reset", "off its start", [], 1),
