@@ -191,7 +191,7 @@ def test_the_last_command_of_a_process_is_zero_in_lock_step_too(
 ):
     simulator = launch("simulator_node", domain_id, mode="lockstep", world="empty")
     peer = meet(domain_id)
-    peer.until(lambda: simulator.handler is not None, "its start")
+    peer.until(lambda: "running" in simulator.read_text(), "its start")
     heard = peer.listen(Twist, "cmd_vel", qos.EVERY_COMMAND)
     process = drive(what, LOCK_STEP)
     moving = lambda: any(command.linear.x > 0.0 for command in heard)  # noqa: E731
