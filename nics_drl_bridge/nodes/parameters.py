@@ -38,10 +38,14 @@ class Row(NamedTuple):
 
 def stamped_by_default() -> bool:
     """True if this ROS 2 distribution uses TwistStamped for commands: Kilted and newer."""
-    named = os.environ.get("ROS_DISTRO", "")
-    if named:
-        return named not in PLAIN_TWISTS
-    return not any(map(_is_wheel, PLAIN_TWISTS))
+    return not is_before_kilted(os.environ.get("ROS_DISTRO", ""))
+
+
+def is_before_kilted(distribution: str) -> bool:
+    """True if a distribution, or the one of the wheels if it is empty, is older than Kilted."""
+    if distribution:
+        return distribution in PLAIN_TWISTS
+    return any(map(_is_wheel, PLAIN_TWISTS))
 
 
 def _is_wheel(name: str) -> bool:

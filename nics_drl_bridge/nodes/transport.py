@@ -13,6 +13,8 @@ import sys
 from collections.abc import Mapping, MutableMapping
 from pathlib import Path
 
+from nics_drl_bridge.nodes.parameters import is_before_kilted
+
 RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 LOCAL = "LOCALHOST"
 ONLY_LOCAL = "ROS_LOCALHOST_ONLY"
@@ -41,13 +43,14 @@ def set_transport(environment: MutableMapping[str, str]) -> None:
 
     Call it in a process of this package before its first node, and for its children.
     """
-    if environment.get(PROFILES[0]) == str(PROFILE):  # inherited
+    distribution = environment.get("ROS_DISTRO", "")
+    profile = PROFILES[is_before_kilted(distribution)]
+    if environment.get(profile) == str(PROFILE):  # inherited
         if environment.get(RANGE) == BY_PROFILE:
             return
-        for name in PROFILES:
-            environment.pop(name, None)
+        del environment[profile]
     environment.setdefault(RANGE, LOCAL)
-    if environment.get("ROS_DISTRO") == OLDEST_DISTRIBUTION:
+    if distribution == OLDEST_DISTRIBUTION:
         environment.setdefault(ONLY_LOCAL, "1")
     is_fast_dds = environment.get(RMW, FAST_DDS).startswith("rmw_fast")
     if sys.platform != "linux" or not is_fast_dds or has_chosen(environment):
@@ -57,7 +60,7 @@ def set_transport(environment: MutableMapping[str, str]) -> None:
     elif not any(map(environment.get, PEERS)):
         environment.pop(ONLY_LOCAL, None)  # it would override the others
         environment[RANGE] = BY_PROFILE
-        environment.update(dict.fromkeys(PROFILES, str(PROFILE)))
+        environment[profile] = str(PROFILE)
 
 
 def stays_here(environment: Mapping[str, str]) -> bool:

@@ -70,8 +70,8 @@ def test_an_env_follows_the_type_that_a_simulator_hears_and_its_frame(
     ) as backend:
         assert backend._link.stamped
         backend.reset(Start(seed=1, pose=np.zeros(3)))
-        backend.step(np.array([0.5, 0.0]))
-        peer.until(lambda: heard, "a command")
+        ahead = np.array([0.5, 0.0])
+        peer.until(lambda: backend.step(ahead) and heard, "a command")
         assert heard[-1].header.frame_id == "car_1/base_footprint"
 
 
@@ -118,7 +118,6 @@ def test_a_drive_whose_chosen_type_nobody_hears_names_who_hears_the_other(
     peer.until(
         lambda: f"set stamped:={str(other).lower()}" in node.read_text(),
         "the reason",
-        30.0,
     )
     assert "expects geometry_msgs/msg/" in node.read_text()
 

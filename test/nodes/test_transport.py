@@ -24,8 +24,10 @@ from nics_drl_bridge.nodes.transport import (
     set_transport,
 )
 
-HERE = {RANGE: BY_PROFILE, **dict.fromkeys(PROFILES, str(PROFILE))}
+KILTED = {"ROS_DISTRO": "kilted"}
+HERE = {**KILTED, RANGE: BY_PROFILE, PROFILES[0]: str(PROFILE)}
 HUMBLE = {"ROS_DISTRO": "humble"}
+HERE_HUMBLE = {**HUMBLE, RANGE: BY_PROFILE, PROFILES[1]: str(PROFILE)}
 PEER = {"ROS_STATIC_PEERS": "10.0.0.2"}
 SUBNET = {RANGE: "SUBNET"}
 
@@ -38,10 +40,10 @@ SUBNET = {RANGE: "SUBNET"}
         ({RANGE: "localhost"}, HERE),  # rcl takes it for LOCALHOST
         (HERE, HERE),  # inherited
         ({**HERE, RANGE: LOCAL}, HERE),
-        ({**HERE, **SUBNET}, {**SUBNET, TRANSPORTS: UDP}),
+        ({**HERE, **SUBNET}, {**KILTED, **SUBNET, TRANSPORTS: UDP}),
         (SUBNET, {**SUBNET, TRANSPORTS: UDP}),
         ({**SUBNET, ONLY_LOCAL: "1"}, HERE),
-        (HUMBLE, {**HUMBLE, **HERE}),
+        (HUMBLE, HERE_HUMBLE),
         (
             {**HUMBLE, ONLY_LOCAL: "0"},
             {**HUMBLE, ONLY_LOCAL: "0", RANGE: LOCAL, TRANSPORTS: UDP},
@@ -56,9 +58,9 @@ SUBNET = {RANGE: "SUBNET"}
 def test_an_environment_gets_udp_on_this_machine_unless_it_chooses_otherwise(
     chosen, expected
 ):
-    environment = dict(chosen)
+    environment = KILTED | chosen
     set_transport(environment)
-    assert environment == expected
+    assert environment == KILTED | expected
 
 
 def test_a_domain_is_in_use_while_a_port_of_it_is_bound():

@@ -118,7 +118,7 @@ def said(process, text, told=""):
         ("step", "stepped", [signal.SIGINT] * 5, -signal.SIGINT),
         ("step", "stepped", [signal.SIGTERM], 128 + signal.SIGTERM),
         many("step", "stepped", [signal.SIGHUP], 128 + signal.SIGHUP),
-        ("exit", "stepped", [], 0),
+        many("exit", "stepped", [], 0),
         many("reset", "off its start", [signal.SIGINT] * 5, -signal.SIGINT),
         many("error_in_step", "stepped", [], 1),
         many("error_in_reset", "off its start", [], 1),
@@ -191,7 +191,7 @@ def test_the_last_command_of_a_process_is_zero_in_lock_step_too(
 ):
     simulator = launch("simulator_node", domain_id, mode="lockstep", world="empty")
     peer = meet(domain_id)
-    peer.until(lambda: simulator.handler is not None, "its start")
+    peer.until(lambda: "running" in simulator.read_text(), "its start")
     heard = peer.listen(Twist, "cmd_vel", qos.EVERY_COMMAND)
     process = drive(what, LOCK_STEP)
     moving = lambda: any(command.linear.x > 0.0 for command in heard)  # noqa: E731
