@@ -48,7 +48,8 @@ TRUE_RADIUS = 0.4  # within which the true pose counts as at the goal [m]
 GOAL_DISTANCE = (2.0, 5.0)
 GOAL_CLEARANCE = 0.9  # of a goal from pillars and walls [m]
 GOAL_PATIENCE_S = 60.0
-ANSWER_S = 3.0  # within which the policy takes up a goal, and the gate answers
+ANSWER_S = 3.0  # within which the policy takes up a goal
+GATE_S = 10.0  # within which the gate answers
 REST_S = 1.0  # at rest for so long, the robot has ended a drive
 HELD_PATIENCE_S = 10.0  # within which a held body is stopped, or never
 DRIVES_BEFORE_HOLD_S = (0.2, 5.0)  # between the first moving command and a hold
@@ -244,7 +245,7 @@ class Operator(SpunNode):
     def ask_gate(self, service: str) -> tuple[bool, str]:
         """Calls a service of the gate; returns whether it agreed and what it said."""
         try:
-            answer = self.call_service(Trigger, f"command_gate/{service}", ANSWER_S)
+            answer = self.call_service(Trigger, f"command_gate/{service}", GATE_S)
         except TimeoutError as error:
             return False, str(error)
         return bool(answer.success), str(answer.message)
