@@ -111,8 +111,8 @@ def followed(
             opened.enter_context(NodeProcess(name, folder, given, domain_id))
         tree = StandIn(domain_id, FollowPath, "Nobody" if bare else "FollowPath")
         opened.callback(tree.close)
-        tree.until(tree.client.server_is_ready, "the action follow_path", kick=True)
-        tree.until(
+        tree.wait_for(tree.client.server_is_ready, "the action follow_path", kick=True)
+        tree.wait_for(
             lambda: tree.poses.get_subscription_count() >= 2, "both ends of initialpose"
         )
         for seed in range(episodes):
@@ -131,7 +131,7 @@ def followed(
             shown = occupancy(
                 worlds, standing(sampler, 0, scene.bodies)
             ).cells.tobytes()
-            tree.until(
+            tree.wait_for(
                 lambda shown=shown: tree.shows(shown), "map and truth", kick=True
             )
             tree.place(scene.starts[0])

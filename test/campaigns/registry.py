@@ -16,7 +16,9 @@ FOLDER = Path(__file__).resolve().parent
 ROOT = FOLDER.parents[1]
 sys.path += [str(ROOT / "benchmarks"), str(ROOT / "test")]
 
-from bench import Control  # noqa: E402
+import bench  # noqa: E402
+
+Control = bench.Control
 
 
 @dataclass(frozen=True)
@@ -114,7 +116,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         timeout_s=1900.0,
     ),
     "gate_envelope": Campaign(
-        "--steps 6000",
+        "--steps 3000",
         {
             "no_limits": Control(
                 "the gate's limits: they are a hundred times as wide",
@@ -148,7 +150,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         attempts=REAL_TIME,
     ),
     "gate_held": Campaign(
-        "--hours 0.1 --holds 20 --case 0",
+        "--hours 0.03 --holds 18 --case 0",
         {
             "rule_off": Control(
                 "the rule: `stop_when_held` is false",

@@ -28,13 +28,11 @@ from campaign import answer, at_least, missed_bars, parser_of
 from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
 from parts.processes import core_seconds, part, use_of
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
+from parts.spun_node import SpunNode
 from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.nodes import qos, wire
-from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 
 SCAN_HZ = 10.0
@@ -54,7 +52,7 @@ SIDE_PER_ROBOT_M = 3.0
 SETTLE_S = 2.0
 
 
-class Listener:
+class Listener(SpunNode):
     """Counts what arrives of each robot.
 
     Args:
@@ -63,15 +61,12 @@ class Listener:
     """
 
     def __init__(self, robots: int, heard: int) -> None:
-        context = open_context()
-        self._node = Node("listener", context=context, start_parameter_services=False)
+        super().__init__("listener")
         self.counts = {f"robot{k + 1}": {"scan": 0, "odom": 0} for k in range(robots)}
         self.driven = dict.fromkeys(self.counts, 0.0)
         self._starts: dict[str, np.ndarray] = {}
         for name in list(self.counts)[:heard]:
             self._listen(name)
-        self._executor = SingleThreadedExecutor(context=context)
-        self._executor.add_node(self._node)
 
     def _listen(self, name: str) -> None:
         counts = self.counts[name]
@@ -87,29 +82,26 @@ class Listener:
                 self.driven[name] = max(self.driven[name], gone)
 
         for kind, topic, take in ((LaserScan, "scan", scan), (Odometry, "odom", odom)):
-            self._node.create_subscription(
+            self.node.create_subscription(
                 kind, f"{name}/{topic}", take, qos.SENSOR, raw=True
             )
 
-    def spin(self, seconds: float, until_all: bool = False) -> None:
-        """Listens for a time, or until every robot was heard."""
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            self._executor.spin_once(timeout_sec=0.1)
-            if until_all and all(all(each.values()) for each in self.counts.values()):
-                return
+    @property
+    def heard_all(self) -> bool:
+        """Whether every topic of every robot was heard."""
+        return all(all(each.values()) for each in self.counts.values())
 
 
 def listen(robots: int, heard: int, seconds: float, patience_s: float) -> None:
     """Says when it begins to count, and then by robot: rates [1/s] and how far it drove [m]."""
     listener = Listener(robots, heard)
-    listener.spin(patience_s, until_all=True)
-    listener.spin(SETTLE_S)
+    listener.until(lambda: listener.heard_all, patience_s)
+    listener.until(lambda: False, SETTLE_S)
     known = {name: dict(counts) for name, counts in listener.counts.items()}
     began = time.monotonic()
     sys.stdout.write("counting\n")
     sys.stdout.flush()
-    listener.spin(seconds)
+    listener.until(lambda: False, seconds)
     spent = time.monotonic() - began
     told = {
         name: {
@@ -123,9 +115,9 @@ def listen(robots: int, heard: int, seconds: float, patience_s: float) -> None:
 
 def command(robots: int) -> None:
     """Commands every robot, until its parent is gone."""
-    node = Node("commander", context=open_context(), start_parameter_services=False)
+    commander = SpunNode("commander")
     topics = [
-        node.create_publisher(Twist, f"robot{k + 1}/cmd_vel", qos.COMMAND)
+        commander.node.create_publisher(Twist, f"robot{k + 1}/cmd_vel", qos.COMMAND)
         for k in range(robots)
     ]
     message = wire.twist_to_bytes(np.array(COMMAND))

@@ -57,6 +57,7 @@ def test_every_rule_of_the_gate_has_a_name_by_which_it_is_taken_out(module):
 
 
 @pytest.mark.ros
+@pytest.mark.campaign
 def test_a_robot_that_does_not_move_is_no_round(ros_module, monkeypatch):
     abuse_env = ros_module("abuse_env")
     monkeypatch.setattr(abuse_env, "AHEAD", 0.0 * abuse_env.AHEAD)

@@ -21,6 +21,7 @@ import numpy as np
 from campaign import answer, at_least, at_most, missed_bars, parser_of
 from parts.loaders import WRITTEN, Loader
 
+from nics_drl_bridge import files
 from nics_drl_bridge.errors import BridgeError
 
 LONGEST_S = 0.05  # within which a writer is killed after it began to write
@@ -78,9 +79,8 @@ def _remove(path: Path) -> None:
 
 
 def _write_for_ever(loader: Loader, path: Path) -> None:
-    """In a process of its own; ends with it. A write begins with its temporary file or folder."""
-    tempfile.mkstemp = _note_begin(tempfile.mkstemp)
-    tempfile.mkdtemp = _note_begin(tempfile.mkdtemp)
+    """In a process of its own; ends with it. A write begins with its hidden file or folder."""
+    files.make_hidden_name = _note_begin(files.make_hidden_name)
     version = 0
     try:
         while True:

@@ -19,19 +19,19 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rclpy
 import yaml
 from campaign import answer, parser_of
 from geometry_msgs.msg import PoseStamped, TwistStamped
 from numpy.typing import NDArray
-from rclpy.node import Node
+from parts.spun_node import SpunNode
+from skid_rover import PILLARS
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
@@ -49,6 +49,7 @@ GOAL_DISTANCE = (2.0, 5.0)
 GOAL_CLEARANCE = 0.9  # of a goal from pillars and walls [m]
 GOAL_PATIENCE_S = 60.0
 ANSWER_S = 3.0  # within which the policy takes up a goal
+GATE_S = 10.0  # within which the gate answers
 REST_S = 1.0  # at rest for so long, the robot has ended a drive
 HELD_PATIENCE_S = 10.0  # within which a held body is stopped, or never
 DRIVES_BEFORE_HOLD_S = (0.2, 5.0)  # between the first moving command and a hold
@@ -56,67 +57,33 @@ ARMED_S = 300.0  # between two armings
 HERE = Path(__file__).resolve().parent
 
 OPEN_PLACE = {"size": [30.0, 30.0], "pillars": []}
-FIELD = {
-    "size": [12.0, 12.0],
-    "pillars": [
-        [2.5, 1.5, 0.3],
-        [-2.0, 2.8, 0.2],
-        [3.6, -2.2, 0.35],
-        [-3.4, -2.6, 0.3],
-        [0.6, 4.0, 0.25],
-        [-4.2, 1.0, 0.2],
-        [0.4, -3.6, 0.35],
-        [4.2, 3.9, 0.2],
-        [-1.4, -1.3, 0.2],
-        [2.0, -4.6, 0.2],
-    ],
-}
-WORLD = {
-    "name": "field",
-    "size": [12.0, 12.0],
-    "obstacles": [
-        {
-            "shapes": [
-                {"kind": "circle", "radius": 0.2},
-                {"kind": "circle", "radius": 0.35},
-            ],
-            "count": 10,
-            "gap": 1.2,
-        }
-    ],
-    "clearance": 0.9,
-    "goal_distance": list(GOAL_DISTANCE),
-}
-ROBOT = {
-    "name": "rover",
-    "kind": "skid_steer",
-    "footprint": [[0.45, 0.34], [-0.45, 0.34], [-0.45, -0.34], [0.45, -0.34]],
-    "lidar": "rplidar_a2",
-    "parameters": {"track": 0.57, "wheel_radius": 0.165},
-    "command": [
-        {
-            "name": "forward_command",
-            "unit": "m/s",
-            "min": -0.8,
-            "max": 0.8,
-            "cmd_vel": "linear.x",
-        },
-        {
-            "name": "turn_command",
-            "unit": "rad/s",
-            "min": -1.2,
-            "max": 1.2,
-            "cmd_vel": "angular.z",
-        },
-    ],
-}
-LIMITS = {
-    "robot": "rover",
-    "commands": {
-        "forward_command": {"min": -0.4, "max": 0.8, "rate": 2.0, "jerk": 40.0},
-        "turn_command": {"min": -1.2, "max": 1.2, "rate": 6.0, "jerk": 120.0},
-    },
-}
+FIELD = {"size": [12.0, 12.0], "pillars": [list(pillar) for pillar in PILLARS]}
+WORLD = f"""
+name: field
+size: [12.0, 12.0]
+obstacles:
+  - shapes: [{{kind: circle, radius: 0.2}}, {{kind: circle, radius: 0.35}}]
+    count: 10
+    gap: 1.2
+clearance: 0.9
+goal_distance: {list(GOAL_DISTANCE)}
+"""
+ROBOT = """
+name: rover
+kind: skid_steer
+footprint: [[0.45, 0.34], [-0.45, 0.34], [-0.45, -0.34], [0.45, -0.34]]
+lidar: rplidar_a2
+parameters: {track: 0.57, wheel_radius: 0.165}
+command:
+  - {name: forward_command, unit: m/s, min: -0.8, max: 0.8, cmd_vel: linear.x}
+  - {name: turn_command, unit: rad/s, min: -1.2, max: 1.2, cmd_vel: angular.z}
+"""
+LIMITS = """
+robot: rover
+commands:
+  forward_command: {min: -0.4, max: 0.8, rate: 2.0, jerk: 40.0}
+  turn_command: {min: -1.2, max: 1.2, rate: 6.0, jerk: 120.0}
+"""
 
 
 def arguments() -> argparse.Namespace:
@@ -151,15 +118,20 @@ class Workshop:
         }
         self._environment = os.environ | chosen
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "robot.yaml").write_text(yaml.safe_dump(ROBOT))
-        (folder / "limits.yaml").write_text(yaml.safe_dump(LIMITS))
-        (folder / "field.yaml").write_text(yaml.safe_dump(WORLD))
-        (folder / "training.yaml").write_text(yaml.safe_dump(training_settings()))
-        (folder / "open_place.json").write_text(json.dumps(OPEN_PLACE))
-        (folder / "field.json").write_text(json.dumps(FIELD))
+        files = {
+            "robot.yaml": ROBOT,
+            "limits.yaml": LIMITS,
+            "field.yaml": WORLD,
+            "training.yaml": yaml.safe_dump(training_settings()),
+            "open_place.json": json.dumps(OPEN_PLACE),
+            "field.json": json.dumps(FIELD),
+        }
+        for name, text in files.items():
+            (folder / name).write_text(text)
 
-    def nics(self, *words: str) -> str:
+    def nics(self, line: str) -> str:
         """Runs a `nics` command in the folder; returns what it printed."""
+        words = line.split()
         command = [str(Path(sys.executable).with_name("nics")), *words]
         done = subprocess.run(
             command,
@@ -170,9 +142,7 @@ class Workshop:
         )
         (self.folder / f"{words[0]}.log").write_text(done.stdout + done.stderr)
         if done.returncode != 0:
-            raise SystemExit(
-                f"nics {' '.join(words)} ended with {done.returncode}: {done.stderr}"
-            )
+            raise SystemExit(f"nics {line} ended with {done.returncode}: {done.stderr}")
         return done.stdout
 
     @contextmanager
@@ -198,39 +168,21 @@ class Workshop:
             return
         with self.driver("open_place.json"):
             self.nics(
-                "record",
-                "--robot",
-                "robot.yaml",
-                "--out",
-                "drive",
-                "--bound",
-                "5",
-                "--duration",
-                "90",
-                "--yes",
+                "record --robot robot.yaml --out drive --bound 5 --duration 90 --yes"
             )
 
     def generate(self) -> str:
         """Generates the simulator; returns the report."""
         if not (self.folder / "rover" / "model.yaml").exists():
-            self.nics("generate", "drive", "--robot", "robot.yaml", "--out", "rover")
+            self.nics("generate drive --robot robot.yaml --out rover")
         return (self.folder / "rover" / "report.txt").read_text()
 
     def train(self) -> Path:
         """Trains the policy; returns its file."""
         if not (self.folder / "policies").exists():
             self.nics(
-                "train",
-                "--robot",
-                "rover",
-                "--world",
-                "field.yaml",
-                "--settings",
-                "training.yaml",
-                "--seeds",
-                str(self._seed),
-                "--out",
-                "policies",
+                "train --robot rover --world field.yaml --settings training.yaml "
+                f"--seeds {self._seed} --out policies"
             )
         return self.folder / "policies" / f"seed_{self._seed}" / "policy.onnx"
 
@@ -249,11 +201,11 @@ def is_moving(message: TwistStamped) -> bool:
     return bool(twist.linear.x or twist.linear.y or twist.angular.z)
 
 
-class Operator(Node):
+class Operator(SpunNode):
     """A person with a button and a map: gives goals, arms the gate, and judges by the true pose."""
 
-    def __init__(self, place: dict[str, Any], seed: int) -> None:
-        super().__init__("operator")
+    def __init__(self, place: dict[str, Any], seed: int, domain_id: int) -> None:
+        super().__init__("operator", domain_id)
         self._pillars = np.array(place["pillars"])
         self._size = np.array(place["size"])
         self._rng = np.random.default_rng(seed)
@@ -261,18 +213,14 @@ class Operator(Node):
         self.touched = False
         self.commanded: list[tuple[float, bool]] = []  # time [s], whether it moves
         self._policy_moves = False  # since the last goal
-        self.create_subscription(PoseStamped, "true_pose", self._on_pose, 10)
-        self.create_subscription(Bool, "touched", self._on_touch, 10)
-        self.create_subscription(TwistStamped, "cmd_vel", self._on_command, 10)
-        self.create_subscription(TwistStamped, "cmd_vel_raw", self._on_wish, 10)
-        self._goal = self.create_publisher(PoseStamped, "goal_pose", 1)
-        self._button = self.create_publisher(Bool, "e_stop", 10)
-        self._hold = self.create_publisher(Bool, "hold", 10)
-        self.create_timer(0.05, lambda: self._button.publish(Bool(data=False)))
-        self._gate = {
-            name: self.create_client(Trigger, f"command_gate/{name}")
-            for name in ("arm", "reset", "e_stop")
-        }
+        self.node.create_subscription(PoseStamped, "true_pose", self._on_pose, 10)
+        self.node.create_subscription(Bool, "touched", self._on_touch, 10)
+        self.node.create_subscription(TwistStamped, "cmd_vel", self._on_command, 10)
+        self.node.create_subscription(TwistStamped, "cmd_vel_raw", self._on_wish, 10)
+        self._goal = self.node.create_publisher(PoseStamped, "goal_pose", 1)
+        self._button = self.node.create_publisher(Bool, "e_stop", 10)
+        self._hold = self.node.create_publisher(Bool, "hold", 10)
+        self.node.create_timer(0.05, lambda: self._button.publish(Bool(data=False)))
 
     def _on_pose(self, message: PoseStamped) -> None:
         turned = message.pose.orientation
@@ -294,24 +242,13 @@ class Operator(Node):
         """Returns whether a node listens to goals."""
         return self._goal.get_subscription_count() > 0
 
-    def wait_until(self, condition: Callable[[], bool], patience_s: float) -> bool:
-        """Listens until a condition holds; False after so long."""
-        deadline = time.monotonic() + patience_s
-        while time.monotonic() < deadline:
-            rclpy.spin_once(self, timeout_sec=0.05)
-            if condition():
-                return True
-        return False
-
     def ask_gate(self, service: str) -> tuple[bool, str]:
         """Calls a service of the gate; returns whether it agreed and what it said."""
-        client = self._gate[service]
-        if not self.wait_until(client.service_is_ready, 60.0):
-            return False, f"command_gate/{service} is not there"
-        future = client.call_async(Trigger.Request())
-        if not self.wait_until(future.done, 10.0):
-            return False, f"command_gate/{service} does not answer"
-        return bool(future.result().success), str(future.result().message)
+        try:
+            answer = self.call_service(Trigger, f"command_gate/{service}", GATE_S)
+        except TimeoutError as error:
+            return False, str(error)
+        return bool(answer.success), str(answer.message)
 
     def arm(self, patience_s: float) -> str:
         """Arms the gate, asking again until it agrees; returns its last refusal, or nothing."""
@@ -322,7 +259,7 @@ class Operator(Node):
             if agreed:
                 return ""
             self.ask_gate("reset")
-            self.wait_until(lambda: False, 0.5)
+            self.until(lambda: False, 0.5)
         return message
 
     def draw_goal(self) -> Array:
@@ -359,11 +296,11 @@ class Operator(Node):
         """Lets the robot drive; returns how far from the goal it rests [m], NaN if it does not."""
         begin_s = time.monotonic()
         self.send_goal(goal)
-        while not self.wait_until(lambda: self._policy_moves, ANSWER_S):
+        while not self.until(lambda: self._policy_moves, ANSWER_S):
             if time.monotonic() - begin_s > GOAL_PATIENCE_S:
                 return math.nan
             self.send_goal(goal)  # it may have come before the policy knew where it is
-        ended = self.wait_until(lambda: self.is_at_rest(begin_s), GOAL_PATIENCE_S)
+        ended = self.until(lambda: self.is_at_rest(begin_s), GOAL_PATIENCE_S)
         self.commanded.clear()
         if not ended or self.pose is None:
             return math.nan
@@ -445,14 +382,14 @@ def stop_held_body(operator: Operator, drives_for_s: float) -> float:
             return math.nan
         operator.commanded.clear()
         operator.send_goal(operator.draw_goal())
-        if not operator.wait_until(operator.is_driving, 20.0):
+        if not operator.until(operator.is_driving, 20.0):
             return math.nan
-        operator.wait_until(lambda: False, drives_for_s)
+        operator.until(lambda: False, drives_for_s)
         if operator.is_driving():
             break
     operator.hold(True)
     held_s = time.monotonic()
-    stops = operator.wait_until(lambda: operator.is_at_rest(0.0), HELD_PATIENCE_S)
+    stops = operator.until(lambda: operator.is_at_rest(0.0), HELD_PATIENCE_S)
     moved = [at for at, moves in operator.commanded if moves]
     operator.hold(False)
     return moved[-1] - held_s if stops else math.inf
@@ -497,24 +434,18 @@ def measure(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     workshop.record()
     report = workshop.generate()
     policy = workshop.train()
-    os.environ |= {
-        "ROS_DOMAIN_ID": str(domain_id),
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-    }
-    rclpy.init()
-    operator = Operator(FIELD, options.seed)
+    operator = Operator(FIELD, options.seed, domain_id)
     with (
         workshop.driver("field.json"),
         run_bridge(workshop, policy, domain_id, options.control),
     ):
-        if not operator.wait_until(lambda: operator.pose is not None, 30.0):
+        if not operator.until(lambda: operator.pose is not None, 30.0):
             raise SystemExit("the robot's driver is silent; see driver.log.")
-        if not operator.wait_until(operator.is_policy_there, 120.0):
+        if not operator.until(operator.is_policy_there, 120.0):
             raise SystemExit("the policy does not listen; see nodes/policy_node.log.")
         drives = drive_to_goals(operator, options.goals, options.minutes)
         held_s = hold_again_and_again(operator, options.holds, options.seed)
-    operator.destroy_node()
-    rclpy.try_shutdown()
+    operator.close()
     return {
         "report": report.splitlines()[:8],
         "success": drives.success,

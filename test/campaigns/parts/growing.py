@@ -164,13 +164,6 @@ def _chain(length: int, make: Callable[[str, str], Any]) -> list[Any]:
     return [make(a, b) for a, b in itertools.pairwise(names)]
 
 
-def _double(axis: int) -> Callable[[int], tuple[list[Any], dict[str, Any]]]:
-    def make(size: int) -> tuple[list[Any], dict[str, Any]]:
-        return _chain(16 + size, lambda a, b: _node("Concat", [a, a], b, axis=axis)), {}
-
-    return make
-
-
 def _node(kind: str, inputs: list[str], output: str, **settings: Any) -> Any:
     return onnx.helper.make_node(kind, inputs, [output], **settings)
 
@@ -184,8 +177,10 @@ def _fill(kind: str, **settings: Any) -> Callable[[int], Any]:
 
 
 GRAPHS: dict[str, Callable[[int], tuple[list[Any], dict[str, Any]]]] = {
-    "columns": _double(1),
-    "rows": _double(0),
+    "doubled": lambda size: (
+        _chain(16 + size, lambda a, b: _node("Concat", [a, a], b, axis=size % 2)),
+        {},
+    ),
     "operators": lambda size: (
         _chain(1000 + 3000 * size, lambda a, b: _node("Tanh", [a], b)),
         {},
@@ -201,13 +196,6 @@ GRAPHS: dict[str, Callable[[int], tuple[list[Any], dict[str, Any]]]] = {
             "turned": np.zeros((1, 8000 * size), np.float32),
         },
     ),
-    "a square": lambda size: (
-        [
-            _node("Transpose", ["observation"], "x_t", perm=[1, 0]),
-            _node("MatMul", ["observation", "x_t"], "x_0"),
-        ],
-        {},
-    ),
     "a mismatch": lambda size: (
         [_node("MatMul", ["observation", "x_wrong"], "x_0")],
         {"wrong": np.zeros((1000 + size, 4), np.float32)},
@@ -215,7 +203,6 @@ GRAPHS: dict[str, Callable[[int], tuple[list[Any], dict[str, Any]]]] = {
     "ConstantOfShape": _fill("ConstantOfShape"),
     "RandomNormal": _fill("RandomNormal", shape=[10**5, 10**5]),
     "Loop": _fill("Loop"),
-    "Expand": _fill("Expand"),
 }
 
 

@@ -11,13 +11,11 @@ import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistStamped
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from numpy.typing import NDArray
+from parts.spun_node import SpunNode
 from rclpy.action import ActionClient
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.policy.route import route
 
 Array = NDArray[np.float64]
@@ -27,16 +25,14 @@ STUCK_S = 2.0
 REPLAN = 40  # feedbacks after which the path is replanned
 
 
-class StandIn:
+class StandIn(SpunNode):
     """Speaks to a simulator in lock-step and to a policy; relays the commands of the latter."""
 
     def __init__(
         self, domain_id: int, kind: Any, controller: str = "FollowPath"
     ) -> None:
-        self.context = open_context(domain_id=domain_id)
-        self.node = node = Node("behaviour_tree", context=self.context)
-        self._executor = SingleThreadedExecutor(context=self.context)
-        self._executor.add_node(node)
+        super().__init__("behaviour_tree", domain_id)
+        node = self.node
         self.kind = kind
         self.client = ActionClient(node, kind, "follow_path")
         self.maps = list[Any]()
@@ -58,30 +54,20 @@ class StandIn:
         self._moved_s = time.monotonic()
         self._commands.publish(message.twist)
 
-    def close(self) -> None:
-        """Ends the node."""
-        self._executor.shutdown(timeout_sec=1.0)
-        self.node.destroy_node()
-        self.context.try_shutdown()
-
-    def until(self, done: Callable[[], Any], what: str, kick: bool = False) -> None:
+    def wait_for(self, done: Callable[[], Any], what: str, kick: bool = False) -> None:
         """Spins until something is the case. Raises TimeoutError."""
-        begin = time.monotonic()
-        while not done():
-            if time.monotonic() - begin > DEADLINE_S:
-                raise TimeoutError(f"not within {DEADLINE_S:g} s: {what}")
-            self._executor.spin_once(timeout_sec=0.02)
+
+        def holds() -> Any:
             if kick and time.monotonic() - self._moved_s > STUCK_S:
                 self._relay(TwistStamped())  # a message was lost
+            return done()
+
+        if not self.until(holds, DEADLINE_S):
+            raise TimeoutError(f"not within {DEADLINE_S:g} s: {what}")
 
     def call(self, kind: Any, service: str, request: Any = None) -> Any:
-        """The answer of a service."""
-        client = self.node.create_client(kind, service)
-        self.until(client.service_is_ready, service)
-        future = client.call_async(kind.Request() if request is None else request)
-        self.until(future.done, service)
-        self.node.destroy_client(client)
-        return future.result()
+        """Returns the answer of a service."""
+        return self.call_service(kind, service, DEADLINE_S, request)
 
     @property
     def pose(self) -> Array:
@@ -114,7 +100,7 @@ class StandIn:
         future = self.client.send_goal_async(
             goal, feedback_callback=self.feedback.append
         )
-        self.until(future.done, "an answer to a goal", kick=True)
+        self.wait_for(future.done, "an answer to a goal", kick=True)
         return future.result()
 
     def drive(self, goal: Array, radius: float) -> Any:
@@ -122,7 +108,7 @@ class StandIn:
         handle = self.send(self.plan(goal, radius), controller_id=self._controller)
         while True:
             result, known = handle.get_result_async(), len(self.feedback)
-            self.until(
+            self.wait_for(
                 lambda result=result, known=known: (
                     result.done() or len(self.feedback) >= known + REPLAN
                 ),
