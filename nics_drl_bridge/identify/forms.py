@@ -31,6 +31,7 @@ WORTH = 0.03  # minimum fraction of the residual variance that a curve must expl
 # fraction from which it is beyond doubt; higher for the turn rate, where understeer looks alike
 CLEAR = 0.25
 STRIDE_S = 0.04
+ENOUGH_ROWS = 1000  # to rank delays
 NOTHING = 1e-6  # [m/s, rad/s]
 # order of the model in the search for a delay
 DELAY_ORDER = 2
@@ -430,7 +431,8 @@ def _measure_unexplained(spec: RobotSpec, samples: Samples, command: Array) -> f
     states = len(spec.state)
     free = [3 + i for i, v in enumerate(spec.state) if v.twist] or [0, 2]
     x = np.concatenate([samples.x[:, :states], command], axis=1)
-    stride = max(1, round(STRIDE_S / samples.dt))
-    kept = np.arange(len(x)) % stride == 0  # rows in between hardly differ
+    # rows in between hardly differ
+    stride = max(1, min(round(STRIDE_S / samples.dt), len(x) // ENOUGH_ROWS))
+    kept = np.arange(len(x)) % stride == 0
     fit = fit_motion_terms(replace(samples, x=x).rows(kept), spec, DELAY_ORDER)
     return float((1.0 - fit.r2[free]).sum())
