@@ -5,9 +5,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from nics_drl_bridge.config import Schema
+from nics_drl_bridge.env.guide import Guide
 from nics_drl_bridge.env.task import Outcome
 from nics_drl_bridge.generator import footprint_shape
-from nics_drl_bridge.sim.guide import Guide
 from nics_drl_bridge.sim.scenes import Scenes
 from nics_drl_bridge.sim.simulator import FastSimulator
 

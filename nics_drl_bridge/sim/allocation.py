@@ -20,7 +20,6 @@ from nics_drl_bridge.robot.kernels import SERIES, allocate_scratch, make_terms
 from nics_drl_bridge.sim import state as records
 from nics_drl_bridge.sim.cell_kernels import BodyCells, body_cells
 from nics_drl_bridge.sim.contact_kernels import SEVERAL
-from nics_drl_bridge.sim.impact_kernels import EVENT, FLIGHT
 from nics_drl_bridge.sim.obstacles import Motion, plan_arrays
 from nics_drl_bridge.sim.separation_kernels import FIRST, MARK, PLAN
 from nics_drl_bridge.sim.world import World
@@ -250,7 +249,6 @@ def _allocate_scratch(
     bodies = obstacles + robots
     blocks = -(-worlds * robots // LANES)
     lanes = robots * min(worlds, -(-worlds // blocks))
-    corners = max(int(np.diff(scanner.table.outlines.corner).max(initial=4)), 4)
     x, dq = allocate_scratch(kinematics)
     commands = len(kinematics.variables) - kinematics.state_size
     return records.Scratch(
@@ -261,15 +259,13 @@ def _allocate_scratch(
             change=np.zeros((commands, lanes), np.int64),
             coefficient=np.zeros((np.count_nonzero(kinematics.coefficients), lanes)),
         ),
-        single=records.Single(
-            x=x,
-            dq=dq,
-            trial=np.zeros(BODY),
-            spare=np.zeros((corners, 2)),
-            origin=np.zeros((obstacles, 3)),
-            period_start=np.zeros((obstacles, 3)),
-            flights=np.zeros((bodies, FLIGHT)),
-            events=np.zeros((robots, EVENT)),
+        single=records.Single(x, dq),
+        tight=records.Tight(
+            motions=np.zeros(robots, records.MOTION),
+            listed=records.allocate_touches(),
+            start=np.zeros((obstacles, 3)),
+            stops=np.zeros(obstacles),
+            fastest=np.zeros(1),
         ),
         nearby=records.Nearby(
             near=np.zeros((robots, 1 + SEVERAL), np.int64),

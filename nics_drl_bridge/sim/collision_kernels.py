@@ -1,10 +1,11 @@
-"""Compiled collision: the signed clearance between bodies, straight walls and a static map.
+"""Compiled collision: the clearance between bodies, straight walls and a static map, and touches.
 
-It is the distance between two outlines that are apart, at most `limit` [m]. Where they overlap it
-is negative: the depth at which the deepest point of one lies within the other, over their corners
-and the midpoints of the pieces of edges within. Shared arguments: a body (7,) has the columns of
-`state`, a wall (4,) two ends; the distances of a map are 0 in solid cells; `spare` (F, 2), at least
-4, is scratch for the corners of the first body.
+A `Solid` is a placed outline. The clearance of two solids is the distance between their outlines,
+at most `limit` [m]. Of solids that overlap it is negative: the distance of the first one's origin
+from the other, less the radius of the circle around the first one. Nearest points that are nearer
+than `skin` [m] are listed as touches. Shared arguments: a body (7,) has the columns of `state`, a
+wall (4,) two ends; the distances of a map are 0 in solid cells; `listed` is scratch memory for
+touches, and the number of those that it already holds comes as `count` and is returned.
 """
 
 import math
@@ -22,12 +23,11 @@ from nics_drl_bridge.lidar.exact_kernels import (
     X,
     Y,
 )
-from nics_drl_bridge.sim.state import Array, MapField
+from nics_drl_bridge.sim.state import Array, MapField, Touches
 
-# Outlines this near touch; their depth then decides about an overlap [m]
-TOUCHING = 1e-12
-ON_EDGE = 1e-9  # tolerance beyond an edge's ends for intersections, as a fraction of its length
+OVERLAP = 1e-12  # minimum overlap [m]
 FLOAT32 = 1e-6  # Relative rounding error of the distances of a map
+CORNERS_OF_WALL = 2
 
 
 class Outline(NamedTuple):
@@ -36,6 +36,27 @@ class Outline(NamedTuple):
     corners: Array
     begin: int
     end: int
+
+
+class Solid(NamedTuple):
+    """A placed outline."""
+
+    outline: Outline  # in its own frame
+    x: float  # origin of that frame [m]
+    y: float
+    cos: float  # of its heading
+    sin: float
+    radius: float  # of a circle, else 0 [m]
+    reach: float  # radius of the circle around the origin that encloses it [m]
+
+
+class Edge(NamedTuple):
+    """A straight line between two points [m]; both are the centre, of a circle."""
+
+    ax: float
+    ay: float
+    bx: float
+    by: float
 
 
 @kernel
@@ -50,6 +71,14 @@ def is_round(body: Array, outlines: OutlineArrays) -> bool:
     """True for a circle."""
     shape = int(body[SHAPE])
     return outlines.first[shape] == outlines.first[shape + 1]
+
+
+@kernel
+def solid_of(body: Array, outlines: OutlineArrays) -> Solid:
+    """Return a body as a solid."""
+    radius = body[RADIUS] if is_round(body, outlines) else 0.0
+    outline = outline_of(body, outlines)
+    return Solid(outline, body[X], body[Y], body[COS], body[SIN], radius, body[RADIUS])
 
 
 @kernel
@@ -78,50 +107,6 @@ def segment_distance2(
 
 
 @kernel
-def _side(ax: float, ay: float, bx: float, by: float, x: float, y: float) -> float:
-    return (bx - ax) * (y - ay) - (by - ay) * (x - ax)
-
-
-@kernel
-def cross(
-    ax: float,
-    ay: float,
-    bx: float,
-    by: float,
-    px: float,
-    py: float,
-    qx: float,
-    qy: float,
-) -> bool:
-    """True if the segments from a to b and from p to q cross."""
-    return (_side(ax, ay, bx, by, px, py) > 0.0) != (
-        _side(ax, ay, bx, by, qx, qy) > 0.0
-    ) and (_side(px, py, qx, qy, ax, ay) > 0.0) != (_side(px, py, qx, qy, bx, by) > 0.0)
-
-
-@kernel
-def _edges_distance2(
-    ax: float,
-    ay: float,
-    bx: float,
-    by: float,
-    px: float,
-    py: float,
-    qx: float,
-    qy: float,
-) -> float:
-    """Square of the distance between two segments [m^2]; -1 if they cross."""
-    if cross(ax, ay, bx, by, px, py, qx, qy):
-        return -1.0
-    return min(
-        segment_distance2(ax, ay, px, py, qx, qy),
-        segment_distance2(bx, by, px, py, qx, qy),
-        segment_distance2(px, py, ax, ay, bx, by),
-        segment_distance2(qx, qy, ax, ay, bx, by),
-    )
-
-
-@kernel
 def outline_point(x: float, y: float, outline: Outline) -> float:
     """Signed distance from (x, y) to an outline; negative inside."""
     corners = outline.corners
@@ -131,7 +116,7 @@ def outline_point(x: float, y: float, outline: Outline) -> float:
     inside = False
     ax = corners[end - 1, 0]
     ay = corners[end - 1, 1]
-    if end - begin == 2:
+    if end - begin == CORNERS_OF_WALL:
         bx = corners[begin, 0]
         by = corners[begin, 1]
         return math.sqrt(segment_distance2(x, y, bx, by, ax, ay))
@@ -147,165 +132,177 @@ def outline_point(x: float, y: float, outline: Outline) -> float:
 
 
 @kernel
-def _next_cut(
-    ax: float, ay: float, ex: float, ey: float, after: float, q: Outline
-) -> float:
-    """Next cut of the edge from (ax, ay) along (ex, ey) by outline q, as a fraction of the edge."""
-    least = 1.0
-    cx = q.corners[q.end - 1, 0]
-    cy = q.corners[q.end - 1, 1]
-    for w in range(q.begin, q.end):
-        dx = q.corners[w, 0]
-        dy = q.corners[w, 1]
-        fx = dx - cx
-        fy = dy - cy
-        cross = ex * fy - ey * fx
-        if cross != 0.0:
-            at = ((cx - ax) * fy - (cy - ay) * fx) / cross
-            if after + ON_EDGE < at < least:
-                along = ((cx - ax) * ey - (cy - ay) * ex) / cross
-                if -ON_EDGE <= along <= 1.0 + ON_EDGE:
-                    least = at
-        cx = dx
-        cy = dy
-    return least
+def _count_edges(outline: Outline) -> int:
+    """Number of edges; a circle counts as one edge without length."""
+    corners = outline.end - outline.begin
+    return corners if corners > CORNERS_OF_WALL else 1
 
 
 @kernel
-def _deepest(p: Outline, q: Outline) -> float:
-    depth = 0.0
-    if q.end - q.begin == 2:
-        return depth
-    ax = p.corners[p.end - 1, 0]
-    ay = p.corners[p.end - 1, 1]
-    for v in range(p.begin, p.end):
-        bx = p.corners[v, 0]
-        by = p.corners[v, 1]
-        ex = bx - ax
-        ey = by - ay
-        depth = max(depth, -outline_point(bx, by, q))
-        at = 0.0
-        while at < 1.0:
-            cut = _next_cut(ax, ay, ex, ey, at, q)
-            middle = 0.5 * (at + cut)
-            depth = max(depth, -outline_point(ax + middle * ex, ay + middle * ey, q))
-            at = cut
-        ax = bx
-        ay = by
-    return depth
+def _get_edge(v: int, outline: Outline) -> Edge:
+    corners = outline.corners
+    if outline.begin == outline.end:
+        return Edge(0.0, 0.0, 0.0, 0.0)
+    i = outline.begin + v
+    j = i + 1 if i + 1 < outline.end else outline.begin
+    return Edge(corners[i, 0], corners[i, 1], corners[j, 0], corners[j, 1])
 
 
 @kernel
-def _outline_gap(
-    p: Outline, x: float, y: float, reach: float, q: Outline, limit: float
-) -> float:
-    """Signed clearance of two outlines in one frame; a circle (x, y, reach) encloses p."""
-    least = limit * limit
-    crossing = False
-    touching = False
-    ax = q.corners[q.end - 1, 0]
-    ay = q.corners[q.end - 1, 1]
-    for v in range(q.begin, q.end):
-        bx = q.corners[v, 0]
-        by = q.corners[v, 1]
-        near = reach + math.sqrt(least)
-        if segment_distance2(x, y, ax, ay, bx, by) <= near * near:
-            cx = p.corners[p.end - 1, 0]
-            cy = p.corners[p.end - 1, 1]
-            for w in range(p.begin, p.end):
-                dx = p.corners[w, 0]
-                dy = p.corners[w, 1]
-                distance2 = _edges_distance2(ax, ay, bx, by, cx, cy, dx, dy)
-                crossing = crossing or distance2 < 0.0
-                touching = touching or distance2 <= TOUCHING * TOUCHING
-                least = min(least, max(distance2, 0.0))
-                cx = dx
-                cy = dy
-        ax = bx
-        ay = by
-    overlapping = crossing or touching
-    if not overlapping and q.end - q.begin > 2:
-        overlapping = (
-            outline_point(p.corners[p.begin, 0], p.corners[p.begin, 1], q) < 0.0
-        )
-    if not overlapping and p.end - p.begin > 2:
-        overlapping = (
-            outline_point(q.corners[q.begin, 0], q.corners[q.begin, 1], p) < 0.0
-        )
-    if not overlapping:
-        return math.sqrt(least)
-    depth = max(_deepest(p, q), _deepest(q, p))
-    if depth > 0.0:
-        return -depth
-    if crossing and (q.end - q.begin > 2 or p.end - p.begin > 2):
-        return -TOUCHING
-    return 0.0
+def _place_edge(edge: Edge, x: float, y: float, c: float, s: float) -> Edge:
+    return Edge(
+        x + c * edge.ax - s * edge.ay,
+        y + s * edge.ax + c * edge.ay,
+        x + c * edge.bx - s * edge.by,
+        y + s * edge.bx + c * edge.by,
+    )
+
+
+@kernel
+def _side(edge: Edge, x: float, y: float) -> float:
+    """Positive left of the line through an edge, negative right of it."""
+    across = (edge.bx - edge.ax) * (y - edge.ay)
+    return across - (edge.by - edge.ay) * (x - edge.ax)
+
+
+@kernel
+def _cross(p: Edge, q: Edge) -> bool:
+    """True if two edges cross."""
+    p_crosses = (_side(q, p.ax, p.ay) > 0.0) != (_side(q, p.bx, p.by) > 0.0)
+    return p_crosses and (_side(p, q.ax, q.ay) > 0.0) != (_side(p, q.bx, q.by) > 0.0)
+
+
+@kernel
+def _find_nearest(p: Edge, q: Edge) -> tuple[float, float, float, float]:
+    """Return the vector from the nearest point of q to that of p, and the nearest point of p."""
+    nx, ny = from_segment(p.ax, p.ay, q.ax, q.ay, q.bx, q.by)
+    x = p.ax
+    y = p.ay
+    if p.ax == p.bx and p.ay == p.by:
+        return nx, ny, x, y
+    if _cross(p, q):
+        return 0.0, 0.0, x, y
+    ox, oy = from_segment(p.bx, p.by, q.ax, q.ay, q.bx, q.by)
+    if ox * ox + oy * oy < nx * nx + ny * ny:
+        nx = ox
+        ny = oy
+        x = p.bx
+        y = p.by
+    for cx, cy in ((q.ax, q.ay), (q.bx, q.by)):
+        ox, oy = from_segment(cx, cy, p.ax, p.ay, p.bx, p.by)
+        if ox * ox + oy * oy < nx * nx + ny * ny:
+            nx = -ox
+            ny = -oy
+            x = cx - ox
+            y = cy - oy
+    return nx, ny, x, y
+
+
+@kernel
+def _measure_origin(x: float, y: float, solid: Solid) -> float:
+    """Signed distance of a point in the frame of a solid from it [m]."""
+    if solid.radius > 0.0:
+        return math.sqrt(x * x + y * y) - solid.radius
+    return outline_point(x, y, solid.outline)
+
+
+@kernel
+def find_gap(
+    one: Solid, other: Solid, limit: float, skin: float, listed: Touches, count: int
+) -> tuple[float, int]:
+    """Clearance of a solid from another one, up to `limit` >= 0, see the module."""
+    dx = one.x - other.x
+    dy = one.y - other.y
+    far = one.reach + other.reach + max(limit, skin)
+    if dx * dx + dy * dy > far * far:
+        return limit, count
+    x = other.cos * dx + other.sin * dy
+    y = other.cos * dy - other.sin * dx
+    c = one.cos * other.cos + one.sin * other.sin
+    s = one.sin * other.cos - one.cos * other.sin
+    least = max(limit, OVERLAP)
+    may_contain = _count_edges(other.outline) > 1
+    earlier = count
+    for v in range(_count_edges(other.outline)):
+        q = _get_edge(v, other.outline)
+        far = one.reach + other.radius + max(least, skin)
+        if segment_distance2(x, y, q.ax, q.ay, q.bx, q.by) > far * far:
+            continue
+        may_contain = True
+        for w in range(_count_edges(one.outline)):
+            p = _place_edge(_get_edge(w, one.outline), x, y, c, s)
+            nx, ny, px, py = _find_nearest(p, q)
+            away = math.sqrt(nx * nx + ny * ny)
+            gap = away - one.radius - other.radius
+            least = min(least, gap)
+            if OVERLAP < gap < skin and count < listed.touches.shape[0]:
+                touch = listed.touches[count]
+                touch.nx = (other.cos * nx - other.sin * ny) / away
+                touch.ny = (other.sin * nx + other.cos * ny) / away
+                touch.x = other.x + other.cos * px - other.sin * py
+                touch.y = other.y + other.sin * px + other.cos * py
+                touch.gap = gap
+                count += 1
+    overlaps = least < OVERLAP or (may_contain and _contain(one, other, x, y, c, s))
+    if not overlaps:
+        return min(least, limit), count
+    return min(_measure_origin(x, y, other) - one.reach, -OVERLAP), earlier
+
+
+@kernel
+def _contain(one: Solid, other: Solid, x: float, y: float, c: float, s: float) -> bool:
+    """True if one of two solids whose outlines do not meet is inside the other.
+
+    The first one is at (x, y) in the other's frame, turned by an angle with cosine c and sine s.
+    """
+    if other.radius > 0.0 or _count_edges(other.outline) > 1:
+        p = _place_edge(_get_edge(0, one.outline), x, y, c, s)
+        if _measure_origin(p.ax, p.ay, other) < 0.0:
+            return True
+    if one.radius > 0.0 or _count_edges(one.outline) > 1:
+        q = _get_edge(0, other.outline)
+        qx = c * (q.ax - x) + s * (q.ay - y)
+        qy = c * (q.ay - y) - s * (q.ax - x)
+        return _measure_origin(qx, qy, one) < 0.0
+    return False
 
 
 @kernel
 def body_gap(
-    body: Array, obstacle: Array, outlines: OutlineArrays, limit: float, spare: Array
+    one: Array, other: Array, outlines: OutlineArrays, limit: float, listed: Touches
 ) -> float:
-    """Signed clearance of two bodies; see the module."""
-    dx = body[X] - obstacle[X]
-    dy = body[Y] - obstacle[Y]
-    far = body[RADIUS] + obstacle[RADIUS] + max(limit, 0.0)
-    if dx * dx + dy * dy > far * far:
-        return limit
-    mine = outline_of(body, outlines)
-    outline = outline_of(obstacle, outlines)
-    c = obstacle[COS]
-    s = obstacle[SIN]
-    x = c * dx + s * dy
-    y = c * dy - s * dx
-    if mine.begin == mine.end:
-        if outline.begin == outline.end:
-            gap = math.sqrt(dx * dx + dy * dy) - obstacle[RADIUS]
-        else:
-            gap = outline_point(x, y, outline)
-        return min(gap - body[RADIUS], limit)
-    if outline.begin == outline.end:
-        x = -(body[COS] * dx + body[SIN] * dy)
-        y = -(body[COS] * dy - body[SIN] * dx)
-        return min(outline_point(x, y, mine) - obstacle[RADIUS], limit)
-    cos = body[COS] * c + body[SIN] * s
-    sin = body[SIN] * c - body[COS] * s
-    for v in range(mine.end - mine.begin):
-        px = mine.corners[mine.begin + v, 0]
-        py = mine.corners[mine.begin + v, 1]
-        spare[v, 0] = x + cos * px - sin * py
-        spare[v, 1] = y + sin * px + cos * py
-    placed = Outline(spare, 0, mine.end - mine.begin)
-    return min(
-        _outline_gap(placed, x, y, body[RADIUS], outline, max(limit, 0.0)), limit
-    )
+    """Clearance of two bodies, see the module."""
+    solid = solid_of(other, outlines)
+    gap, _ = find_gap(solid_of(one, outlines), solid, limit, 0.0, listed, 0)
+    return gap
 
 
 @kernel
 def wall_gap(
-    body: Array, wall: Array, outlines: OutlineArrays, limit: float, spare: Array
-) -> float:
-    """Signed clearance of a body and a straight wall."""
-    distance2 = segment_distance2(body[X], body[Y], wall[0], wall[1], wall[2], wall[3])
-    far = body[RADIUS] + max(limit, 0.0)
-    if distance2 > far * far:
-        return limit
-    outline = outline_of(body, outlines)
-    if outline.begin == outline.end:
-        return min(math.sqrt(distance2) - body[RADIUS], limit)
-    for v in range(2):
-        dx = wall[2 * v] - body[X]
-        dy = wall[2 * v + 1] - body[Y]
-        spare[v, 0], spare[v, 1] = (
-            body[COS] * dx + body[SIN] * dy,
-            body[COS] * dy - body[SIN] * dx,
-        )
-    x = 0.5 * (spare[0, 0] + spare[1, 0])
-    y = 0.5 * (spare[0, 1] + spare[1, 1])
-    reach = math.hypot(spare[0, 0] - x, spare[0, 1] - y)
-    return min(
-        _outline_gap(Outline(spare, 0, 2), x, y, reach, outline, max(limit, 0.0)), limit
-    )
+    one: Solid,
+    walls: Array,
+    limit: float,
+    skin: float,
+    listed: Touches,
+    count: int,
+) -> tuple[float, int]:
+    """Clearance of a solid from straight walls (W, 4), see the module."""
+    corners = walls.reshape((-1, 2))
+    least = limit
+    for w in range(walls.shape[0]):
+        far = one.reach + max(least, skin)
+        if (
+            segment_distance2(
+                one.x, one.y, walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3]
+            )
+            > far * far
+        ):
+            continue
+        outline = Outline(corners, 2 * w, 2 * w + 2)
+        wall = Solid(outline, 0.0, 0.0, 1.0, 0.0, 0.0, np.inf)
+        gap, count = find_gap(one, wall, max(least, 0.0), skin, listed, count)
+        least = min(least, gap)
+    return least, count
 
 
 @kernel
@@ -394,42 +391,39 @@ def map_bound(body: Array, grid: MapField) -> float:
 
 @kernel
 def map_gap(
-    body: Array, grid: MapField, outlines: OutlineArrays, limit: float, spare: Array
-) -> float:
-    """Signed clearance of a body and the solid cells of a map."""
+    one: Solid,
+    grid: MapField,
+    limit: float,
+    skin: float,
+    listed: Touches,
+    count: int,
+) -> tuple[float, int]:
+    """Clearance of a solid from the solid cells of a map, see the module."""
     if grid.distances.size == 0:
-        return limit
+        return limit, count
     size = grid.cell
-    radius = body[RADIUS]
-    outline = outline_of(body, outlines)
-    x, y = in_grid(body[X], body[Y], grid)
+    x, y = in_grid(one.x, one.y, grid)
     low, high = _bounds(x, y, grid)
-    if low - radius > limit:
-        return limit
-    c = body[COS] * grid.cos + body[SIN] * grid.sin
-    s = body[SIN] * grid.cos - body[COS] * grid.sin
-    far = radius + max(min(limit, high), 0.0) + size
+    if low - one.reach > max(limit, skin):
+        return limit, count
+    square = listed.square
+    for v in range(4):
+        square[v, 0] = ((v + 1) // 2) % 2 * size
+        square[v, 1] = v // 2 * size
+    outline = Outline(square, 0, 4)
     least = limit
+    far = one.reach + max(min(limit, high), skin) + size
     low_i, end_i, low_j, end_j = cells_near(x, y, far, grid)
     for i in range(low_i, end_i):
         for j in range(low_j, end_j):
             dx = max(j * size - x, x - (j + 1) * size, 0.0)
             dy = max(i * size - y, y - (i + 1) * size, 0.0)
-            near = radius + max(least, 0.0)
-            if grid.distances[i, j] > 0.0 or dx * dx + dy * dy > near * near:
+            far = one.reach + max(least, skin)
+            if grid.distances[i, j] > 0.0 or dx * dx + dy * dy > far * far:
                 continue
-            if outline.begin == outline.end:
-                least = min(least, math.sqrt(dx * dx + dy * dy) - radius)
-                continue
-            for v in range(4):
-                across = (j + ((v + 1) // 2) % 2) * size - x
-                up = (i + v // 2) * size - y
-                spare[v, 0] = c * across + s * up
-                spare[v, 1] = c * up - s * across
-            mx = 0.5 * (spare[0, 0] + spare[2, 0])
-            my = 0.5 * (spare[0, 1] + spare[2, 1])
-            square = Outline(spare, 0, 4)
-            reach = 0.75 * size
-            gap = _outline_gap(square, mx, my, reach, outline, max(least, 0.0))
+            cx = grid.x + grid.cos * j * size - grid.sin * i * size
+            cy = grid.y + grid.sin * j * size + grid.cos * i * size
+            cell = Solid(outline, cx, cy, grid.cos, grid.sin, 0.0, 1.5 * size)
+            gap, count = find_gap(one, cell, max(least, 0.0), skin, listed, count)
             least = min(least, gap)
-    return least
+    return least, count

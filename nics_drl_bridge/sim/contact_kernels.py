@@ -1,19 +1,32 @@
-"""Compiled contacts: which robots may touch something within a period, and what they touch.
+"""Compiled contacts: which robots may touch something in a period, and how these robots move.
 
 A robot whose circle cannot meet anything within the period moves freely. For the other robots,
 `near` lists the bodies to test in each substep. If bodies are sorted into cells, a robot tests only
 those around it. In a crowd all bodies are sorted in each period; otherwise standing obstacles are
 sorted once per episode.
+
+All robots that may meet something are advanced together, by their clearance over the greatest
+speed at which it may shrink, but by `FLOOR` at least. Within the `SKIN` around a robot, its motion
+is bent so that no near point approaches: it slides, turns and leaves. A step that ends in an
+overlap all the same is not made: the robot keeps only its turn, and if that does not help, it
+stands still for the rest of the substep. An obstacle that runs into a robot stops for the rest of
+the period.
+
+Shared arguments: m is a robot; `begin` is a time in the period, `time` and `end` in the interval
+that is advanced [s].
 """
 
 import math
+from typing import NamedTuple
+
+import numpy as np
 
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SIN, X, Y
-from nics_drl_bridge.robot.kernels import wrap
+from nics_drl_bridge.robot.kernels import move, wrap
 from nics_drl_bridge.sim import collision_kernels as collision
 from nics_drl_bridge.sim.cell_kernels import BodyCells, around
-from nics_drl_bridge.sim.state import Array, Nearby, State, Surroundings
+from nics_drl_bridge.sim.state import Array, Nearby, Record, State, Surroundings, Tight
 
 # Bit flags of what a robot may meet
 FREE = 0
@@ -22,6 +35,351 @@ WALLS = 2
 MAP = 4
 # Maximum number of bodies listed near a robot; if there are more, all are tested
 SEVERAL = 32
+FLOOR = 4e-4  # A step brings two bodies nearer by so much at least [m]
+SKIN = 2.0 * FLOOR  # Bodies nearer than this are in contact if they approach [m]
+# Speed at which a body in contact is moved towards a clearance of FLOOR, as a fraction of its own
+SPRING = 0.1
+APPROACH = 1e-6  # An approach slower than this fraction of the speed is due to rounding
+SWEEPS = 20  # Maximum number of passes over the touches of a robot to bend its motion
+# Bounds of the speed of any point of a robot whose motion is bent, as fractions of its own speed
+ROUND_HEADROOM = 1.2
+CORNERED_HEADROOM = 1.7
+
+
+class World(NamedTuple):
+    """One world whose robots may meet something in the period."""
+
+    bodies: Array  # (K + M, 7) obstacles, then robots, as they stand
+    velocity: Array  # (K, 3) of the obstacles
+    first: int  # index of the first robot
+    scene: Surroundings
+    nearby: Nearby
+    tight: Tight
+    touched: Array  # (M,) 1 for robots in contact
+    series: Array  # see `robot.kernels`
+    period: float  # [s]
+
+
+@kernel
+def find_contacts(
+    m: int, limit: float, skin: float, world: World
+) -> tuple[float, int, int]:
+    """Return the clearance of a robot up to `limit` [m], the nearest body or -1, and the touches.
+
+    What it touches within `skin` [m] is in `world.tight.listed`.
+    """
+    scene = world.scene
+    near = world.nearby.near
+    meets = world.nearby.meets[m]
+    listed = world.tight.listed
+    me = world.first + m
+    body = collision.solid_of(world.bodies[me], scene.outlines)
+    least = limit
+    whom = -1
+    count = 0
+    if meets & BODIES:
+        is_listed = near[m, 0] <= SEVERAL
+        for i in range(near[m, 0] if is_listed else world.bodies.shape[0]):
+            k = near[m, 1 + i] if is_listed else i
+            if k == me or world.bodies[k, RADIUS] <= 0.0:
+                continue
+            other = collision.solid_of(world.bodies[k], scene.outlines)
+            counted = count
+            gap, count = collision.find_gap(
+                body, other, max(least, 0.0), skin, listed, count
+            )
+            for t in range(counted, count):
+                listed.touches[t].other = k
+            if gap < least:
+                least = gap
+                whom = k
+    counted = count
+    if meets & WALLS:
+        gap, count = collision.wall_gap(body, scene.walls, limit, skin, listed, count)
+        if gap < least:
+            least = gap
+            whom = -1
+    if meets & MAP:
+        gap, count = collision.map_gap(body, scene.grid, limit, skin, listed, count)
+        if gap < least:
+            least = gap
+            whom = -1
+    for t in range(counted, count):
+        listed.touches[t].other = -1
+    return least, whom, count
+
+
+@kernel
+def start_motion(m: int, vx: float, vy: float, turn: float, world: World) -> None:
+    """Let a robot move with a twist from where it stands, at the beginning of an interval."""
+    motion = world.tight.motions[m]
+    body = world.bodies[world.first + m]
+    motion.wish_x = vx
+    motion.wish_y = vy
+    motion.wish_turn = turn
+    motion.bound = _bound_speed(body, vx, vy, turn, world)
+    motion.touches = False
+    motion.halts = 0
+    _turn_off(motion, body, 0.0, vx, vy, turn)
+
+
+@kernel
+def _bound_speed(body: Array, vx: float, vy: float, turn: float, world: World) -> float:
+    """Bound of the speed of any point of a robot, even if its motion is bent [m/s]."""
+    if collision.is_round(body, world.scene.outlines):
+        return ROUND_HEADROOM * math.sqrt(vx * vx + vy * vy)
+    rim = turn * body[RADIUS]
+    return CORNERED_HEADROOM * math.sqrt(vx * vx + vy * vy + rim * rim)
+
+
+@kernel
+def _turn_off(
+    motion: Record, body: Array, time: float, vx: float, vy: float, turn: float
+) -> None:
+    """Let a robot go on with another twist from where it stands."""
+    motion.x = body[X]
+    motion.y = body[Y]
+    motion.heading = body[HEADING]
+    motion.cos = body[COS]
+    motion.sin = body[SIN]
+    motion.vx = vx
+    motion.vy = vy
+    motion.turn = turn
+    motion.since = time
+
+
+@kernel
+def _place_robot(motion: Record, body: Array, time: float, series: Array) -> None:
+    lasted = time - motion.since
+    turned = motion.turn * lasted
+    body[X], body[Y], body[COS], body[SIN] = move(
+        motion.x,
+        motion.y,
+        motion.cos,
+        motion.sin,
+        motion.vx,
+        motion.vy,
+        turned,
+        lasted,
+        series,
+    )
+    body[HEADING] = motion.heading + turned
+
+
+@kernel
+def place_obstacles(time: float, world: World) -> None:
+    """Place the obstacles where they are at a time in the period."""
+    for k in range(world.first):
+        lasted = min(time, world.tight.stops[k])
+        _place_obstacle(
+            world.bodies[k], world.tight.start[k], world.velocity[k], lasted
+        )
+
+
+@kernel
+def _place_obstacle(body: Array, start: Array, velocity: Array, time: float) -> None:
+    body[X] = start[0] + velocity[0] * time
+    body[Y] = start[1] + velocity[1] * time
+    if velocity[2] != 0.0:
+        heading = wrap(start[2] + velocity[2] * time)
+        body[HEADING] = heading
+        body[COS] = math.cos(heading)
+        body[SIN] = math.sin(heading)
+
+
+@kernel
+def _find_rate(k: int, begin: float, touch: Record, world: World) -> float:
+    """Speed at which the touched point of body k approaches the robot that touches it [m/s]."""
+    if k < 0:
+        return 0.0
+    body = world.bodies[k]
+    if k < world.first:
+        if begin >= world.tight.stops[k]:
+            return 0.0
+        vx = world.velocity[k, 0]
+        vy = world.velocity[k, 1]
+        turn = world.velocity[k, 2]
+    else:
+        motion = world.tight.motions[k - world.first]
+        vx = body[COS] * motion.vx - body[SIN] * motion.vy
+        vy = body[SIN] * motion.vx + body[COS] * motion.vy
+        turn = motion.turn
+    arm = (touch.x - body[X]) * touch.ny - (touch.y - body[Y]) * touch.nx
+    return touch.nx * vx + touch.ny * vy + turn * arm  # type: ignore[no-any-return]
+
+
+@kernel
+def _judge(m: int, begin: float, time: float, rest: float, world: World) -> None:
+    """Choose how a robot moves on from a time, and until when it cannot meet anything."""
+    tight = world.tight
+    motion = tight.motions[m]
+    speed = motion.bound + tight.fastest[0]
+    limit = max(speed * max(rest, world.period - begin - time), SKIN)
+    gap, whom, count = find_contacts(m, limit, SKIN, world)
+    if gap < -collision.OVERLAP:
+        _mark(m, whom, world)
+    motion.gap = gap
+    motion.room = gap - speed * rest
+    motion.touches = gap < FLOOR
+    for t in range(count):
+        touch = tight.listed.touches[t]
+        k = touch.other
+        rate = _find_rate(k, begin + time, touch, world)
+        if 0 <= k < world.first and rate > 0.0:
+            tight.stops[k] = begin + time
+            _mark(m, k, world)
+        touch.rate = min(rate, 0.0)
+    if motion.halts == 0:
+        _bend(m, time, count, world)
+    body = world.bodies[world.first + m]
+    speed = _bound_speed(body, motion.vx, motion.vy, motion.turn, world)
+    motion.clock = time + max(gap, FLOOR) / (speed + tight.fastest[0])
+    if count > 0:
+        motion.clock = min(motion.clock, time + FLOOR / (SPRING * motion.bound))
+
+
+@kernel
+def _bend(m: int, time: float, count: int, world: World) -> None:
+    """Bend the motion of a robot so that it does not approach what it touches.
+
+    Each pass removes the approach at one touch after the other, by the impulse that would stop a
+    ring there: it slides without friction, and a touched corner turns it.
+    """
+    motion = world.tight.motions[m]
+    body = world.bodies[world.first + m]
+    c = body[COS]
+    s = body[SIN]
+    vx = c * motion.wish_x - s * motion.wish_y
+    vy = s * motion.wish_x + c * motion.wish_y
+    turn = motion.wish_turn
+    inertia = body[RADIUS] * body[RADIUS]
+    is_bent = False
+    for sweep in range(SWEEPS):
+        is_done = True
+        for t in range(count):
+            touch = world.tight.listed.touches[t]
+            arm = (touch.x - body[X]) * touch.ny - (touch.y - body[Y]) * touch.nx
+            rate = touch.nx * vx + touch.ny * vy + arm * turn - touch.rate
+            if sweep == 0 and rate < -APPROACH * motion.bound:
+                _mark(m, touch.other, world)
+            lacks = SPRING * motion.bound * (1.0 - touch.gap / FLOOR) - rate
+            if lacks > APPROACH * motion.bound:
+                push = lacks / (1.0 + arm * arm / inertia)
+                vx += push * touch.nx
+                vy += push * touch.ny
+                turn += push * arm / inertia
+                is_done = False
+                is_bent = True
+        if is_done:
+            break
+    if is_bent:
+        _turn_off(motion, body, time, c * vx + s * vy, c * vy - s * vx, turn)
+    elif (
+        motion.vx != motion.wish_x
+        or motion.vy != motion.wish_y
+        or motion.turn != motion.wish_turn
+    ):
+        _turn_off(motion, body, time, motion.wish_x, motion.wish_y, motion.wish_turn)
+
+
+@kernel
+def _mark(m: int, k: int, world: World) -> None:
+    """Mark robot m, and body k if that is a robot, as having touched something."""
+    world.touched[m] = 1
+    if k >= world.first:
+        world.touched[k - world.first] = 1
+
+
+@kernel
+def _halt(m: int, begin: float, time: float, end: float, world: World) -> bool:
+    """Let a robot that overlaps something at the end of a step only turn, or stand still.
+
+    Returns:
+        True if it did either.
+    """
+    motion = world.tight.motions[m]
+    gap, whom, _ = find_contacts(m, 0.0, 0.0, world)
+    if gap >= min(motion.gap, 0.0):
+        return False
+    if motion.halts > 1:
+        if 0 <= whom < world.first and world.tight.stops[whom] > begin + time:
+            world.tight.stops[whom] = begin + time
+            place_obstacles(begin + end, world)
+            return True
+        return False
+    _mark(m, whom, world)
+    body = world.bodies[world.first + m]
+    turn = motion.turn if motion.halts == 0 else 0.0
+    _place_robot(motion, body, time, world.series)
+    _turn_off(motion, body, time, 0.0, 0.0, turn)
+    _place_robot(motion, body, end, world.series)
+    motion.halts += 1
+    return True
+
+
+@kernel
+def _find_fastest(obstacles_move: bool, world: World) -> float:
+    """Greatest speed of any body but an only robot [m/s]."""
+    meets = world.nearby.meets
+    fastest = 0.0
+    for k in range(world.first if obstacles_move else 0):
+        vx = world.velocity[k, 0]
+        vy = world.velocity[k, 1]
+        rim = abs(world.velocity[k, 2]) * world.bodies[k, RADIUS]
+        fastest = max(fastest, math.sqrt(vx * vx + vy * vy) + rim)
+    for m in range(meets.shape[0] if meets.shape[0] > 1 else 0):
+        if meets[m] != FREE:
+            fastest = max(fastest, world.tight.motions[m].bound)
+    return fastest
+
+
+@kernel
+def advance(begin: float, duration: float, obstacles_move: bool, world: World) -> None:
+    """Move the robots that may meet something, and the obstacles, by a duration [s]."""
+    meets = world.nearby.meets
+    motions = world.tight.motions
+    fastest = _find_fastest(obstacles_move, world)
+    world.tight.fastest[0] = fastest
+    # Robots that are judged at nearly the same time are judged together: there are fewer steps.
+    early = np.inf
+    for m in range(meets.shape[0]):
+        if meets[m] != FREE:
+            speed = motions[m].bound + fastest
+            is_far = motions[m].room > speed * duration
+            motions[m].clock = np.inf if is_far else 0.0
+            motions[m].room -= speed * duration
+            early = min(early, 0.5 * FLOOR / speed)
+    time = 0.0
+    while time < duration:
+        end = duration
+        for m in range(meets.shape[0]):
+            if meets[m] != FREE:
+                if motions[m].clock <= time + early:
+                    _judge(m, begin, time, duration - time, world)
+                end = min(end, motions[m].clock)
+        _step(begin, time, end, obstacles_move, world)
+        time = end
+
+
+@kernel
+def _step(
+    begin: float, time: float, end: float, obstacles_move: bool, world: World
+) -> None:
+    """Move all from a time to another; halt robots that would overlap something."""
+    meets = world.nearby.meets
+    motions = world.tight.motions
+    if obstacles_move:
+        place_obstacles(begin + end, world)
+    for m in range(meets.shape[0]):
+        if meets[m] != FREE:
+            body = world.bodies[world.first + m]
+            _place_robot(motions[m], body, end, world.series)
+    is_halted = True
+    while is_halted:
+        is_halted = False
+        for m in range(meets.shape[0]):
+            if meets[m] != FREE and motions[m].touches:
+                is_halted |= _halt(m, begin, time, end, world)
 
 
 @kernel
@@ -69,15 +427,20 @@ def find_near(
     own_reach = reach[me]
     count = 0
     standing = bodies.shape[1] - near.shape[0] if scene.standing else 0
-    for i in range(around(n, x, y, own_reach, cells)):
-        k = cells.found[i]
+    for f in range(around(n, x, y, own_reach, cells)):
+        k = cells.found[f]
         other_reach = bodies[n, k, RADIUS] if k < standing else reach[k]
         dx = bodies[n, k, X] - x
         dy = bodies[n, k, Y] - y
         far = own_reach + other_reach
         if dx * dx + dy * dy <= far * far and k != me and other_reach > 0.0:
+            # in order of the bodies, with cells or without: the bits of a contact depend on it
+            i = min(count, SEVERAL)
+            while count < SEVERAL and i > 0 and near[m, i] > k:
+                near[m, 1 + i] = near[m, i]
+                i -= 1
             if count < SEVERAL:
-                near[m, 1 + count] = k
+                near[m, 1 + i] = k
             count += 1
     near[m, 0] = count
     meets = BODIES if count > 0 else FREE
@@ -97,57 +460,12 @@ def find_near(
 
 
 @kernel
-def contact(
-    body: Array,
-    m: int,
-    world: Array,
-    scene: Surroundings,
-    nearby: Nearby,
-    spare: Array,
-    limit: float,
-) -> tuple[float, int]:
-    """Clearance [m], up to `limit`, of robot m placed as `body` (7,), and nearest body or -1."""
-    outlines = scene.outlines
-    near = nearby.near
-    least = limit
-    whom = -1
-    if nearby.meets[m] & BODIES:
-        me = world.shape[0] - near.shape[0] + m
-        listed = near[m, 0] <= SEVERAL
-        for i in range(near[m, 0] if listed else world.shape[0]):
-            k = near[m, 1 + i] if listed else i
-            if k == me or world[k, RADIUS] <= 0.0:
-                continue
-            gap = collision.body_gap(body, world[k], outlines, limit, spare)
-            if gap < least:
-                least = gap
-                whom = k
-    if nearby.meets[m] & WALLS:
-        for w in range(scene.walls.shape[0]):
-            gap = collision.wall_gap(body, scene.walls[w], outlines, limit, spare)
-            if gap < least:
-                least = gap
-                whom = -1
-    if nearby.meets[m] & MAP:
-        gap = collision.map_gap(body, scene.grid, outlines, limit, spare)
-        if gap < least:
-            least = gap
-            whom = -1
-    return least, whom
-
-
-@kernel
 def move_obstacles(
     bodies: Array, start: Array, velocity: Array, n: int, time: float
 ) -> None:
     """Move the obstacles of world n to `time` [s] after their poses `start` (K, 3)."""
     for k in range(velocity.shape[1]):
-        bodies[n, k, X] = start[k, 0] + velocity[n, k, 0] * time
-        bodies[n, k, Y] = start[k, 1] + velocity[n, k, 1] * time
-        if velocity[n, k, 2] != 0.0:
-            heading = wrap(start[k, 2] + velocity[n, k, 2] * time)
-            bodies[n, k, HEADING] = heading
-            bodies[n, k, COS], bodies[n, k, SIN] = math.cos(heading), math.sin(heading)
+        _place_obstacle(bodies[n, k], start[k], velocity[n, k], time)
 
 
 @kernel

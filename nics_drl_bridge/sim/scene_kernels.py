@@ -27,7 +27,7 @@ from nics_drl_bridge.random_kernels import uniform_of
 from nics_drl_bridge.sim import cell_kernels
 from nics_drl_bridge.sim import collision_kernels as collision
 from nics_drl_bridge.sim.cell_kernels import BodyCells
-from nics_drl_bridge.sim.state import MapField
+from nics_drl_bridge.sim.state import MapField, Touches
 
 TRIES = 2000
 RESTARTS = 50
@@ -90,7 +90,7 @@ class SceneScratch(NamedTuple):
     gaps: Array  # (K,) free space around each obstacle [m]
     trial: Array  # (7,) an obstacle
     disc: Array  # (7,) a robot
-    spare: Array  # see `collision_kernels`
+    listed: Touches
     cells: BodyCells  # of the obstacles that are placed
 
 
@@ -153,8 +153,8 @@ def _within(x: float, y: float, space: FreeSpace) -> tuple[bool, float, float]:
     )
 
 
-@kernel
-def _clear_of_walls(body: Array, room: float, plan: ScenePlan, spare: Array) -> bool:
+@kernel(inline=True)
+def _clear_of_walls(body: Array, room: float, plan: ScenePlan, listed: Touches) -> bool:
     space = plan.space
     outlines = plan.outlines
     inside, low, high = _within(body[X], body[Y], space)
@@ -169,15 +169,24 @@ def _clear_of_walls(body: Array, room: float, plan: ScenePlan, spare: Array) -> 
         y = body[Y] + body[SIN] * first[0] + body[COS] * first[1]
         if not _within(x, y, space)[0]:
             return False
-    for w in range(space.walls.shape[0]):
-        if collision.wall_gap(body, space.walls[w], outlines, room, spare) < room:
-            return False
-    return collision.map_gap(body, space.grid, outlines, room, spare) >= room
+    return _measure_walls(body, room, plan, listed) >= room
 
 
 @kernel
+def _measure_walls(
+    body: Array, limit: float, plan: ScenePlan, listed: Touches
+) -> float:
+    """Clearance of a body from walls and map, up to a limit [m]."""
+    solid = collision.solid_of(body, plan.outlines)
+    gap, _ = collision.wall_gap(solid, plan.space.walls, limit, 0.0, listed, 0)
+    if gap == limit:
+        gap, _ = collision.map_gap(solid, plan.space.grid, limit, 0.0, listed, 0)
+    return gap
+
+
+@kernel(inline=True)
 def _clear_of(
-    body: Array, obstacle: Array, room: float, outlines: OutlineArrays, spare: Array
+    body: Array, obstacle: Array, room: float, outlines: OutlineArrays, listed: Touches
 ) -> bool:
     dx = body[X] - obstacle[X]
     dy = body[Y] - obstacle[Y]
@@ -186,10 +195,10 @@ def _clear_of(
         return True
     if collision.is_round(body, outlines) and collision.is_round(obstacle, outlines):
         return False
-    return collision.body_gap(body, obstacle, outlines, room, spare) >= room
+    return collision.body_gap(body, obstacle, outlines, room, listed) >= room
 
 
-@kernel
+@kernel(inline=True)
 def _is_clear(
     x: float,
     y: float,
@@ -210,7 +219,7 @@ def _is_clear(
         counts = moving or plan.groups[plan.group[k], MOVING] == 0.0
         counts = counts and bodies[k, RADIUS] > 0.0
         if counts and not _clear_of(
-            disc, bodies[k], room, plan.outlines, scratch.spare
+            disc, bodies[k], room, plan.outlines, scratch.listed
         ):
             return False
     return True
@@ -222,7 +231,7 @@ def _is_free(
 ) -> bool:
     return _is_clear(
         x, y, plan.clearance, True, plan, bodies, scratch
-    ) and _clear_of_walls(scratch.disc, plan.clearance, plan, scratch.spare)
+    ) and _clear_of_walls(scratch.disc, plan.clearance, plan, scratch.listed)
 
 
 @kernel
@@ -402,7 +411,7 @@ def _place_obstacles(
                 counter += 1
             _put(trial, x, y, heading, shape, plan)
             placed = _is_apart(k, widest, plan, bodies, scratch) and _clear_of_walls(
-                trial, MARGIN, plan, scratch.spare
+                trial, MARGIN, plan, scratch.listed
             )
             if placed:
                 _put(bodies[k], x, y, heading, shape, plan)
@@ -427,7 +436,7 @@ def _is_apart(
         obstacle = bodies[near[i]]
         gap = max(gaps[k], gaps[near[i]])
         if obstacle[RADIUS] > 0.0 and not _clear_of(
-            trial, obstacle, gap, plan.outlines, scratch.spare
+            trial, obstacle, gap, plan.outlines, scratch.listed
         ):
             return False
     return True
@@ -560,7 +569,7 @@ def draw_scenes(
     # the scratch memory may be sized for another world with more obstacles
     cells = cell_kernels.limit_found(scratch.cells, count)
     scratch = SceneScratch(
-        s.seen, s.stack, s.latest, s.active, s.gaps, s.trial, s.disc, s.spare, cells
+        s.seen, s.stack, s.latest, s.active, s.gaps, s.trial, s.disc, s.listed, cells
     )
     cell_kernels.cover(0, plan.square[0], plan.square[1], plan.square[2], cells)
     _put(s.disc, 0.0, 0.0, 0.0, plan.radii.shape[0] - 1, plan)

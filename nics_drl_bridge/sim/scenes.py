@@ -29,7 +29,7 @@ from nics_drl_bridge.sim.cell_kernels import FEWEST, body_cells
 from nics_drl_bridge.sim.obstacles import Motion
 from nics_drl_bridge.sim.packing_kernels import pack
 from nics_drl_bridge.sim.scene_kernels import FreeSpace, ScenePlan, SceneScratch
-from nics_drl_bridge.sim.state import NO_FIELD, MapField
+from nics_drl_bridge.sim.state import NO_FIELD, MapField, allocate_touches
 from nics_drl_bridge.sim.world import Goals, Starts, World, check_places
 from nics_drl_bridge.sim.world_set import AnyWorld
 
@@ -110,9 +110,8 @@ class MemberSampler:
             world.obstacles[g].motion for g in slots
         )
         self.plan = _plan(world, footprint_radius, slots, catalogue)
-        # Maximum number of cells, obstacles and corners; threads draw with a scratch memory each.
-        corners = max(int(np.diff(self.plan.outlines.first).max()), 4)
-        self.room = self.plan.space.area.size, len(self.plan.group), corners
+        # Maximum number of cells and obstacles; threads draw with a scratch memory each.
+        self.room = self.plan.space.area.size, len(self.plan.group)
         self.scratches: list[SceneScratch] = []
 
     @cached_property
@@ -357,7 +356,7 @@ def _places(places: Starts | Goals | None) -> Array:
     return rows
 
 
-def _scratch(cells: int, count: int, corners: int) -> SceneScratch:
+def _scratch(cells: int, count: int) -> SceneScratch:
     return SceneScratch(
         np.zeros(cells, np.int64),
         np.zeros((2, cells), np.int64),
@@ -366,7 +365,7 @@ def _scratch(cells: int, count: int, corners: int) -> SceneScratch:
         np.zeros(count),
         np.zeros(BODY),
         np.zeros(BODY),
-        np.zeros((corners, 2)),
+        allocate_touches(),
         body_cells(1 if count >= FEWEST else 0, count),
     )
 

@@ -9,7 +9,7 @@ Further dimensions: S state, C commands, T kinematic terms, H periods of command
 of the past, W walls, B beams, L lanes, G groups of beams, n some of the worlds.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +50,9 @@ LANE_SIN = 3
 LANE_HEADING = 4  # unwrapped
 LANE_PATH = 5  # upper bound on the length of the path in the period [m]
 LANE_ROWS = 6
+
+# Maximum number of touches of a robot that bend its motion; beyond, it may get stuck
+MOST_TOUCHES = 512
 
 
 class State(NamedTuple):
@@ -155,18 +158,80 @@ class Lanes(NamedTuple):
     change: Integers  # (C, L) substep of the period at which each command changes
 
 
-class Single(NamedTuple):
-    """Scratch memory of one world whose robots move carefully, see `careful_kernels`."""
+MOTION = np.dtype(
+    [
+        # where the robot was when its present twist began: pose, time in the interval [s]
+        ("x", np.float64),
+        ("y", np.float64),
+        ("heading", np.float64),
+        ("cos", np.float64),
+        ("sin", np.float64),
+        ("since", np.float64),
+        # twist in the robot's frame [m/s, m/s, rad/s]; what it would be without contacts
+        ("vx", np.float64),
+        ("vy", np.float64),
+        ("turn", np.float64),
+        ("wish_x", np.float64),
+        ("wish_y", np.float64),
+        ("wish_turn", np.float64),
+        ("bound", np.float64),  # of the speed of any of its points [m/s]
+        ("clock", np.float64),  # time until when it cannot meet anything [s]
+        ("room", np.float64),  # what it may approach anything before it is judged [m]
+        ("gap", np.float64),  # its latest clearance, negative where it overlaps [m]
+        ("touches", np.bool_),  # True if it may meet something before its clock
+        (
+            "halts",
+            np.int64,
+        ),  # 1 once it may only turn in this interval, 2 once it stands
+    ],
+    align=True,
+)
+"""Motion of a robot that may meet something, see `contact_kernels`."""
+Records = NDArray[Any]  # of a structure
+Record = Any  # one of them, whose fields mypy does not know
 
-    x: Array  # (S + C + 1,) of one robot, see `robot.kernels.allocate_scratch`
-    dq: Array  # (3 + S,) rates of one robot
-    trial: Array  # (7,) a body
-    spare: Array  # (V, 2) corners
-    # (K, 3) poses from which the obstacles move by their velocity; a stop shifts them
-    origin: Array
-    period_start: Array  # (K, 3) poses of the obstacles at the start of the period
-    flights: Array  # (K + M, FLIGHT) see `impact_kernels`
-    events: Array  # (M, EVENT) see `impact_kernels`
+TOUCH = np.dtype(
+    [
+        ("x", np.float64),  # nearest point of the robot [m]
+        ("y", np.float64),
+        ("nx", np.float64),  # unit vector to it from what it touches
+        ("ny", np.float64),
+        ("gap", np.float64),  # [m]
+        ("rate", np.float64),  # speed of what it touches along the unit vector [m/s]
+        ("other", np.int64),  # body that it touches; -1 for a wall or the map
+    ],
+    align=True,
+)
+"""A point of a robot that nearly touches something."""
+
+
+class Touches(NamedTuple):
+    """Scratch memory of the touches of one robot."""
+
+    touches: Records  # (T,) of `TOUCH`
+    square: Array  # (4, 2) corners of a cell of a map [m]
+
+
+def allocate_touches() -> Touches:
+    """Allocate memory for the touches of a robot."""
+    return Touches(np.zeros(MOST_TOUCHES, TOUCH), np.zeros((4, 2)))
+
+
+class Tight(NamedTuple):
+    """Scratch memory of one world whose robots may meet something, see `contact_kernels`."""
+
+    motions: Records  # (M,) of `MOTION`
+    listed: Touches
+    start: Array  # (K, 3) poses of the obstacles at the start of the period
+    stops: Array  # (K,) time in the period at which each obstacle stops [s]
+    fastest: Array  # (1,) speed of the fastest other body [m/s]
+
+
+class Single(NamedTuple):
+    """Scratch memory of one robot, see `robot.kernels.allocate_scratch`."""
+
+    x: Array  # (S + C + 1,)
+    dq: Array  # (3 + S,) rates
 
 
 class Nearby(NamedTuple):
@@ -198,6 +263,7 @@ class Scratch(NamedTuple):
 
     lanes: Lanes
     single: Single
+    tight: Tight
     nearby: Nearby
     cells: BodyCells  # the cells of all worlds, with a list of found bodies per thread
     scans: Scans

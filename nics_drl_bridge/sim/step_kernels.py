@@ -27,37 +27,18 @@ import numpy as np
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.map_kernels import cells_of, walls_of
 from nics_drl_bridge.lidar.scan_kernels import LidarArrays
-from nics_drl_bridge.robot.kernels import (
-    apply_curve,
-    find_delayed_command,
-    replace_coefficients,
-    run,
-    wrap,
-)
+from nics_drl_bridge.robot.kernels import apply_curve
 from nics_drl_bridge.sim import cell_kernels as cells
 from nics_drl_bridge.sim import contact_kernels as contacts
 from nics_drl_bridge.sim import obstacle_kernels as obstacles
 from nics_drl_bridge.sim import sensing_kernels as sensing
-from nics_drl_bridge.sim.careful_kernels import (
-    compute_rates,
-    drift_carefully,
-    move_carefully,
-)
+from nics_drl_bridge.sim.motion_kernels import compute_rates, move_freely, move_world
 from nics_drl_bridge.sim.state import (
-    DRIFT_X,
-    DRIFT_Y,
-    LANE_COS,
-    LANE_HEADING,
-    LANE_PATH,
-    LANE_SIN,
-    LANE_X,
-    LANE_Y,
     POSE,
     TRUE_TWIST,
     Array,
     Dynamics,
     Integers,
-    Lanes,
     MapField,
     Movers,
     Scratch,
@@ -203,7 +184,7 @@ def _step_unpacked(
             data.steps[n] += 1
             first_lane = (n - block_begin) * robots
             scene = get_surroundings(n, world_set)
-            _move_world(n, first_lane, data, scene, motion, scratch)
+            move_world(n, first_lane, data, scene, motion, scratch)
             _measure_world(n, first_lane, data, scene, motion, scratch)
             waiting_count = sensing.scan_or_wait(
                 n, waiting_count, data, world_set, lidar, motion, scratch
@@ -274,158 +255,6 @@ def _begin_period_of_world(
             speeds[m, 1] = s * vx + c * vy
         scene = get_surroundings(n, world_set)
         obstacles.steer(n, data, scene, motion.dt * motion.substeps, speeds)
-
-
-@kernel
-def move_freely(
-    first_world: int, end_world: int, data: State, motion: Dynamics, lanes: Lanes
-) -> None:
-    """Move the robots of worlds [first_world, end_world) for one period, as if nothing stood there.
-
-    The result is in the lanes: robot m of world n is in lane (n - first_world) M + m. The period is
-    integrated from one change of a command to the next.
-    """
-    _fill_lanes(first_world, end_world, data, motion, lanes)
-    terms = replace_coefficients(motion.terms, lanes.coefficient)
-    lane_count = (end_world - first_world) * data.pose.shape[1]
-    substep = 0
-    while substep < motion.substeps:
-        next_change = _apply_commands(
-            substep, first_world, lane_count, data, motion, lanes
-        )
-        run(
-            lanes.pose,
-            lanes.x,
-            lanes.dq,
-            terms,
-            motion.series,
-            motion.dt,
-            next_change - substep,
-        )
-        substep = next_change
-
-
-@kernel(inline=True)
-def _fill_lanes(
-    first_world: int, end_world: int, data: State, motion: Dynamics, lanes: Lanes
-) -> None:
-    """Copy poses, states and coefficients of robots to the lanes; note when commands change."""
-    robots = data.pose.shape[1]
-    pose = lanes.pose
-    for n in range(first_world, end_world):
-        for m in range(robots):
-            lane = (n - first_world) * robots + m
-            heading = data.pose[n, m, 2]
-            pose[LANE_X, lane] = data.pose[n, m, 0]
-            pose[LANE_Y, lane] = data.pose[n, m, 1]
-            pose[LANE_COS, lane] = math.cos(heading)
-            pose[LANE_SIN, lane] = math.sin(heading)
-            pose[LANE_HEADING, lane] = heading
-            pose[LANE_PATH, lane] = 0.0
-            for s in range(data.state.shape[2]):
-                lanes.x[s, lane] = data.state[n, m, s]
-            for t in range(lanes.coefficient.shape[0]):
-                lanes.coefficient[t, lane] = data.coefficient[n, m, t]
-            # Each command changes once in a period, at this substep.
-            for c in range(lanes.change.shape[0]):
-                delay = data.delay[n, m] + motion.terms.late[c]
-                lanes.change[c, lane] = delay % motion.substeps
-
-
-@kernel(inline=True)
-def _apply_commands(
-    substep: int,
-    first_world: int,
-    lane_count: int,
-    data: State,
-    motion: Dynamics,
-    lanes: Lanes,
-) -> int:
-    """Put the commands that take effect at a substep into the lanes; return the next such substep.
-
-    If no command changes any more, that is the end of the period.
-    """
-    robots = data.pose.shape[1]
-    size = data.state.shape[2]
-    substeps = motion.substeps
-    change = lanes.change
-    next_change = substeps
-    for c in range(change.shape[0]):
-        for lane in range(lane_count):
-            if change[c, lane] > substep:
-                next_change = min(next_change, change[c, lane])
-            if change[c, lane] == substep or substep == 0:
-                n = first_world + lane // robots
-                m = lane % robots
-                delay = data.delay[n, m] + motion.terms.late[c]
-                row = find_delayed_command(
-                    substep, delay, substeps, data.history.shape[2]
-                )
-                lanes.x[size + c, lane] = data.history[n, m, row, c]
-    return next_change
-
-
-@kernel
-def _move_world(
-    n: int,
-    first_lane: int,
-    data: State,
-    scene: Surroundings,
-    motion: Dynamics,
-    scratch: Scratch,
-) -> None:
-    """Move robots and obstacles of world n, after `move_freely`.
-
-    A robot that can meet nothing in this period takes its free motion from the lanes. If any robot
-    may meet something, these robots and the obstacles are moved carefully, from contact to contact.
-    """
-    lanes = scratch.lanes
-    nearby = scratch.nearby
-    single = scratch.single
-    robots = data.pose.shape[1]
-    period = motion.dt * motion.substeps
-    for m in range(robots):
-        # Each component is uniform, so at most sqrt(3) of its standard deviations.
-        sum_of_deviations = data.noise[n, m, DRIFT_X] + data.noise[n, m, DRIFT_Y]
-        longest_drift = math.sqrt(3.0 * period) * sum_of_deviations
-        nearby.path[m] = lanes.pose[LANE_PATH, first_lane + m] + longest_drift
-    longest_path, obstacles_move = contacts.compute_reaches(
-        n, data, scene, nearby, period
-    )
-    if scene.crowded:
-        cells.sort(n, data.bodies[n], data.bodies.shape[1], scratch.cells)
-        scratch.cells.frame[n, cells.MOVED] = longest_path
-    any_meets = False
-    for m in range(robots):
-        nearby.meets[m] = contacts.find_near(
-            n, m, data.bodies, scene, nearby, scratch.cells
-        )
-        any_meets = any_meets or nearby.meets[m] != contacts.FREE
-    for m in range(robots):
-        if nearby.meets[m] == contacts.FREE:
-            _take_free_motion(n, m, first_lane + m, data, lanes)
-    if obstacles_move:
-        for k in range(data.velocity.shape[1]):
-            for i in range(3):
-                single.origin[k, i] = data.bodies[n, k, i]
-                single.period_start[k, i] = data.bodies[n, k, i]
-    if any_meets:
-        move_carefully(n, obstacles_move, data, scene, motion, nearby, single)
-    elif obstacles_move:
-        contacts.move_obstacles(data.bodies, single.origin, data.velocity, n, period)
-    for m in range(robots):
-        data.pose[n, m, 2] = wrap(data.pose[n, m, 2])
-    drift_carefully(n, data, scene, motion, nearby, single)
-
-
-@kernel(inline=True)
-def _take_free_motion(n: int, m: int, lane: int, data: State, lanes: Lanes) -> None:
-    """Copy pose and state of a robot from its lane."""
-    data.pose[n, m, 0] = lanes.pose[LANE_X, lane]
-    data.pose[n, m, 1] = lanes.pose[LANE_Y, lane]
-    data.pose[n, m, 2] = lanes.pose[LANE_HEADING, lane]
-    for s in range(data.state.shape[2]):
-        data.state[n, m, s] = lanes.x[s, lane]
 
 
 @kernel(inline=True)

@@ -115,6 +115,18 @@ CAMPAIGNS: dict[str, Campaign] = {
         ("rclpy", "stable_baselines3"),
         timeout_s=1900.0,
     ),
+    "fast_robots": Campaign(
+        "--steps 5",
+        {
+            "fat": Control(
+                "the touch: the robots are measured 2 mm larger", "overlap_mm"
+            ),
+            "no_walls": Control(
+                "the walls between the rooms, for the simulator", "passed_a_wall"
+            ),
+        },
+        quick=True,
+    ),
     "gate_envelope": Campaign(
         "--steps 3000",
         {

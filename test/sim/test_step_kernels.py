@@ -20,7 +20,7 @@ from nics_drl_bridge.sim.world import World
 ORIGIN = np.zeros((1, 1, 3))
 SUBSTEPS = 10
 PERIOD = 0.1
-OVERLAP = 1e-6
+OVERLAP = 1e-3  # a robot stops this near to what it touches [m]
 """So deep may a robot be in what it touches [m]."""
 
 

@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge.env.guide_kernels import sweep
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.sim.guide_kernels import sweep
 
 Grid = NDArray[np.float32]
 # distance to the goal at which a robot has arrived

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from robots import circles, direct_model, field
 
+from nics_drl_bridge.env.guide import Guide
 from nics_drl_bridge.generator import footprint_shape
-from nics_drl_bridge.sim.guide import Guide
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import World
 from nics_drl_bridge.sim.world_set import WorldSet

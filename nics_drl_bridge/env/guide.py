@@ -6,11 +6,11 @@ Only a simulator knows them; they serve as a reward in training.
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge.env import guide_kernels as kernels
+from nics_drl_bridge.env.guide_kernels import GuideGrid
 from nics_drl_bridge.geometry import compute_depths
 from nics_drl_bridge.lidar.arrays import Array
 from nics_drl_bridge.lidar.shapes import Circle, Polygon
-from nics_drl_bridge.sim import guide_kernels as kernels
-from nics_drl_bridge.sim.guide_kernels import GuideGrid
 from nics_drl_bridge.sim.scenes import Scenes, SceneSampler
 from nics_drl_bridge.sim.state import State
 
