@@ -94,8 +94,6 @@ DIAGNOSTICS = profile_of(Offer(10))
 UNKNOWN = "_UNKNOWN_"
 MOST_WAITING = 10_000  # most messages taken at once, in case a publisher never pauses
 
-# parameters of every node, which rclpy itself declares
-RCLPY_PARAMETERS = {"use_sim_time", "start_type_description_service"}
 # prefix of the parameters that override a topic's quality of service
 OVERRIDES = "qos_overrides."
 # Topics (names before remapping) whose quality of service decides whether a robot stops.
@@ -140,13 +138,25 @@ class BridgeNode(Node):
     """
 
     def __init__(self, name: str, **options: Any) -> None:
-        # Declared for a moment, because rclpy does not tell otherwise which values were given.
+        self.given: dict[str, Parameter] = {}  # the values that the user has given
+        self._is_begun = False
         super().__init__(
             name, automatically_declare_parameters_from_overrides=True, **options
         )
-        self.given = self.get_parameters_by_prefix("")
-        for given in self.given.keys() - RCLPY_PARAMETERS:
-            self.undeclare_parameter(given)
+
+    def declare_parameters(
+        self, namespace: str, parameters: Any, ignore_override: bool = False
+    ) -> Any:
+        """Declare parameters; see rclpy, which calls this first with all values that are given.
+
+        Those are noted, and declared when their meaning is known: an empty list has no type yet.
+        """
+        if ignore_override and not self._is_begun:
+            self._is_begun = True
+            for name, value, _ in parameters:
+                self.given[name] = Parameter(name, value=value)
+            return []
+        return super().declare_parameters(namespace, parameters, ignore_override)
 
     def create_publisher(
         self, kind: Any, topic: str, qos: Any, **options: Any

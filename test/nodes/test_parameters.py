@@ -12,6 +12,7 @@ from rclpy.parameter import Parameter
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.nodes import parameters
 from nics_drl_bridge.nodes.parameters import NODES, frame_fault, stamped_by_default
+from nics_drl_bridge.nodes.qos import given_values
 from nodes.in_process import node_class
 
 pytestmark = pytest.mark.ros
@@ -139,3 +140,13 @@ def test_without_a_sourced_distribution_its_wheels_tell_which_it_is(monkeypatch)
     assert not stamped_by_default()
     monkeypatch.setattr(parameters, "_is_wheel", lambda name: False)
     assert stamped_by_default()
+
+
+def test_values_that_are_given_are_known_before_they_are_declared(make_node):
+    node = make_node("plugins:=[]", "rate:=2")
+    given = {name: value.value for name, value in given_values(node).items()}
+    assert given["plugins"] is None  # an empty list has no type yet
+    assert given["rate"] == 2
+    assert not node.has_parameter("rate")
+    assert node.declare_parameter("rate", 1).value == 2
+    assert node.declare_parameter("plugins", ["a"]).value is None
