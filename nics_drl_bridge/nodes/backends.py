@@ -28,7 +28,7 @@ from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge import defaults, interface
 from nics_drl_bridge.arguments import list_keywords, refuse_unknown
-from nics_drl_bridge.env.guard import halts_on_error
+from nics_drl_bridge.env.guard import halts_on_error, uninterrupted
 from nics_drl_bridge.errors import BackendError, ConfigError, StaleDataError, suggest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Array, BackendFacts, RobotView, Start
@@ -310,9 +310,12 @@ class DdsBackend:
 
     def _take_waiting(self) -> None:
         """Put all messages that have arrived into the inbox; quicker than a callback for each."""
-        for topic, subscription in self._subscriptions.items():
-            for content in qos.take_waiting(subscription):
-                self._inbox.put(topic, content)
+        with (
+            uninterrupted()
+        ):  # Ctrl-C amid a call of the library would leave it undefined
+            for topic, subscription in self._subscriptions.items():
+                for content in qos.take_waiting(subscription):
+                    self._inbox.put(topic, content)
 
     def _check_stamps(self) -> None:
         """Raise BackendError unless the newest data are those of the last step."""

@@ -201,6 +201,10 @@ class CommandGate(qos.BridgeNode):
             logger.warning(refused)
 
     def _listen(self) -> None:
+        # first, because an executor takes waiting messages in the order of subscriptions
+        self._button = self.create_lossless_subscription(
+            Bool, inputs.E_STOP, self._take_e_stop, qos.E_STOP, lost=self._miss_e_stop
+        )
         kinds = ("none", TWIST, TWIST_STAMPED)
         raw = device_parameters.choice(self, parameters.FOREIGN.name, kinds)
         self._raw_kind = command_types.name_of(stamped=raw != TWIST)
@@ -231,9 +235,6 @@ class CommandGate(qos.BridgeNode):
             kind, inputs.RAW, command_taker, qos.EVERY_POLICY, raw=True
         )
         self._sources = Sources(self, commands.topic_name)
-        self._button = self.create_lossless_subscription(
-            Bool, inputs.E_STOP, self._take_e_stop, qos.E_STOP, lost=self._miss_e_stop
-        )
         runner.serve(self, "~/arm", self._arm)
         runner.serve(self, "~/reset", lambda: self._answer(inputs.Reset()))
         runner.serve(self, "~/e_stop", self._press)

@@ -129,9 +129,14 @@ class Link:
         return True
 
     def run_callback(self) -> None:
-        """Wait for a moment for a callback, and run it; only without the link's own thread."""
+        """Wait for a moment for a callback, and run it; only without the link's own thread.
+
+        Ctrl-C waits for its end, or it could leave the executor amid its bookkeeping, after which
+        no callback would ever run again.
+        """
         try:
-            self._executor.spin_once(timeout_sec=POLL_S)
+            with uninterrupted():
+                self._executor.spin_once(timeout_sec=POLL_S)
         except ExternalShutdownException:
             self.check_open()
 
@@ -312,8 +317,9 @@ def _spin(executor: SingleThreadedExecutor, timeout: CommandTimeout) -> None:
         while executor.context.ok():
             executor.spin_once(timeout_sec=SPIN_S)
             timeout.look()
-    except ExternalShutdownException:
-        pass
+    except Exception:  # another thread may have shut the context down meanwhile
+        if executor.context.ok():
+            raise
     finally:
         if executor.context.ok():  # after an error, since nothing would notice old data
             timeout.end()
@@ -328,8 +334,10 @@ def _shut_down(opened: Resources) -> None:
                 opened.timeout.end()
             opened.context.try_shutdown()
         # Garbage collection may run this in any thread, including the link's own.
-        if opened.thread not in (None, threading.current_thread()):
-            opened.thread.join(timeout=2.0)
+        thread = opened.thread
+        is_own = thread is threading.current_thread()
+        if thread is not None and thread.is_alive() and not is_own:
+            thread.join(timeout=2.0)
         if opened.executor is not None:
             opened.executor.shutdown(timeout_sec=1.0)
         if opened.node is not None:

@@ -1,6 +1,5 @@
 """A node that listens in a thread of its own, as commands need it; imports no simulator."""
 
-import contextlib
 import os
 import threading
 import time
@@ -8,7 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from rclpy.context import Context
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 from nics_drl_bridge.errors import BackendError
@@ -60,10 +59,14 @@ def spin(node: Node, stopping: threading.Event) -> None:
     """Spin a node until `stopping` is set or its context has been shut down."""
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
-    with contextlib.suppress(ExternalShutdownException):
+    try:
         while node.context.ok() and not stopping.is_set():
             executor.spin_once(timeout_sec=SPIN_S)
-    executor.shutdown(timeout_sec=1.0)
+    except Exception:  # another thread may have shut the context down meanwhile
+        if node.context.ok():
+            raise
+    finally:
+        executor.shutdown(timeout_sec=1.0)
 
 
 class Listener(Node):

@@ -15,6 +15,7 @@ from nics_drl_bridge import extensions
 from nics_drl_bridge.interface import Array
 
 GROUP = "node_parts"
+REINSTALL = "install nics_drl_bridge again."
 
 
 class Wish(NamedTuple):
@@ -26,8 +27,9 @@ class Wish(NamedTuple):
 
 def open_parts(kind: str, node: Node) -> list[Any]:
     """Return the parts of a kind of node, `device` or `policy`. Raises BridgeError."""
-    names = [
-        name for name in extensions.find_extensions(GROUP) if name.startswith(kind)
-    ]
+    names = extensions.find_extensions(GROUP)
+    names = [name for name in names if name.startswith(f"{kind}.")]
+    if not names:  # of an environment that was made before this package had parts
+        node.get_logger().warning(f"no parts of a {kind} are installed; {REINSTALL}")
     parts = [extensions.load(GROUP, name)(node) for name in names]
     return [part for part in parts if part is not None]

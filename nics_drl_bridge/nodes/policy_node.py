@@ -88,6 +88,7 @@ class PolicyNode(ManagedNode):
         self._frames = GoalFrames(self, self._topics)
         self.undo.callback(self._frames.close)
         for leader in self._leaders:
+            self.undo.callback(leader.close)
             leader.open(
                 self._topics,
                 self._frames,
@@ -95,7 +96,6 @@ class PolicyNode(ManagedNode):
                 self._toward,
                 lambda: begin(self._policy),
             )
-            self.undo.callback(leader.close)
         timer = runner.steadily(self, POLLS * model.control_period, self._act)
         self.undo.callback(self.destroy_timer, timer)
 
@@ -105,9 +105,11 @@ class PolicyNode(ManagedNode):
 
     def deactivate(self) -> None:
         """Leave a zero command behind."""
-        for leader in self._leaders:
-            leader.stop("the node is deactivated")
-        runner.last_word(self._raw, self._message(np.zeros(3), self._acted_ns))
+        try:
+            for leader in self._leaders:
+                leader.stop("the node is deactivated")
+        finally:
+            runner.last_word(self._raw, self._message(np.zeros(3), self._acted_ns))
 
     def _open_policy(self, model: SimulatorModel) -> None:
         name = runner.get_text(self, "policy")
@@ -148,7 +150,8 @@ class PolicyNode(ManagedNode):
     def _act(self, _: int = 0) -> None:
         if self.state != ACTIVE:
             return
-        if any(leader.tick() for leader in self._leaders):
+        ticks = [leader.tick() for leader in self._leaders]
+        if any(ticks):
             self._raw.publish(self._message(np.zeros(3), self._acted_ns))
         newest = self._topics.middleware.cache.newest
         begin_s = time.monotonic()

@@ -57,11 +57,6 @@ RANGES = {
     int: (IntegerRange, "integer_range"),
     float: (FloatingPointRange, "floating_point_range"),
 }
-# type of a default, and of a given value that becomes one or more floats
-WHOLE_NUMBERS = (
-    (float, Parameter.Type.INTEGER),
-    (list, Parameter.Type.INTEGER_ARRAY),
-)
 SHARED = "model"  # a file may also set it for nodes without a model
 
 
@@ -241,10 +236,18 @@ def declare_row(node: Node, row: Row) -> Any:
     # rclpy refuses whole numbers for a floating-point parameter, as in `rate:=2`.
     given = qos.given_values(node).get(row.name)
     value = row.default
-    if given is not None and (type(row.default), given.type_) in WHOLE_NUMBERS:
+    if given is not None and _are_whole_numbers(row.default, given):
         value = np.asarray(given.value, np.float64).tolist()
     is_whole = value is not row.default
     return node.declare_parameter(row.name, value, descriptor, is_whole).value
+
+
+def _are_whole_numbers(default: Any, given: Parameter) -> bool:
+    """True if whole numbers are given for one or more floats."""
+    if isinstance(default, list):
+        is_list_of_floats = all(isinstance(value, float) for value in default)
+        return is_list_of_floats and given.type_ == Parameter.Type.INTEGER_ARRAY
+    return isinstance(default, float) and given.type_ == Parameter.Type.INTEGER
 
 
 def unknown(node: Node) -> list[str]:

@@ -68,10 +68,25 @@ def list_fields(message: Any, path: str = "") -> Iterator[str]:
 
 
 def make_field_reader(path: str) -> Callable[[Any], Any]:
-    """Returns a function that reads a field of messages; NaN where a message lacks it."""
+    """Returns a function that reads a field of messages; NaN where a message lacks it.
+
+    What stands in brackets at the end is the name of an element, where the message names them, even
+    if it is a number or has dots.
+    """
     parts = PART.findall(path)
+    head, _, rest = path.partition("[")
+    *outer, last = PART.findall(head) or [""]
+    label = rest[:-1] if rest.endswith("]") else None
 
     def read(message: Any) -> Any:
+        named = message
+        for part in outer:
+            named = getattr(named, part, None)
+        labels = getattr(named, NAMES, None)
+        if isinstance(labels, list) and label in labels and last != NAMES:
+            values = getattr(named, last)
+            k = labels.index(label)
+            return values[k] if k < len(values) else np.nan
         within = message
         for part in parts:
             if isinstance(message, (list, tuple, np.ndarray)):

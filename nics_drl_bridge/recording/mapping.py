@@ -352,10 +352,15 @@ class Mapping(Schema):
         if not isinstance(data, dict):
             return data
         command = data.get("command", True)
+        topic = data.get("command_topic")
+        if topic and command not in (None, {}, "", True):
+            raise ValueError("give `command` or `command_topic`, not both")
         if isinstance(command, str) and command:
             return {**data, "command": {}, "command_topic": command}
-        if command in (None, {}, "") and "command_topic" not in data:
+        if command in (None, {}, "") and not topic:
             raise ValueError(NO_COMMAND_NAMED)
+        if topic:
+            return {**data, "command": {}}
         return data
 
     @model_validator(mode="after")

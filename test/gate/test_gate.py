@@ -7,8 +7,10 @@ from gate.rig import TICK_S, Rig, config, driving
 from nics_drl_bridge.gate.inputs import (
     Command,
     EStop,
+    Odometry,
     Press,
     Reset,
+    Scan,
     Tick,
 )
 from nics_drl_bridge.gate.stops import FROZEN_INPUTS
@@ -44,6 +46,15 @@ def test_an_e_stop_that_was_heard_and_falls_silent_counts_as_pressed(required):
     assert "e_stop_silent" in rig.arm().answer
 
 
+def test_without_an_e_stop_required_one_that_was_never_heard_means_nothing():
+    rig = Rig(config(e_stop_required=False))
+    rig.run(2.0, without="e_stop")
+    assert rig.arm().granted
+    rig.speed = 0.5
+    rig.run(1.0, without="e_stop")
+    assert rig.moves
+
+
 def test_before_the_first_command_nothing_moves():
     rig = Rig()
     rig.run(1.5, without="command")
@@ -73,14 +84,12 @@ def test_a_command_that_overtakes_its_scan_does_not_stop_the_robot():
     rig.run(0.06, without="scan command")
     rig.stamp += 1
     rig.wish = np.array([0.3, 0.0, 0.0])
-    arrival_s = rig.now
     rig.command()
     rig.now += TICK_S
     assert rig.tick().cause is None
     assert rig.state.command.twist[0] == 0.5
     rig.scan()
     assert rig.state.command.twist[0] == 0.3
-    assert rig.state.command_s == arrival_s
     assert rig.tick().cause is None
 
 
@@ -97,6 +106,18 @@ def test_a_command_that_waits_for_its_scan_does_not_undo_a_later_malformed_one()
     rig.now += TICK_S
     assert rig.tick().cause is None
     assert rig.state.command.twist[0] == 0.2
+
+
+def test_the_age_of_a_command_counts_from_its_arrival_although_its_scan_came_later():
+    rig = driving()
+    rig.run(0.06, without="scan command")
+    rig.stamp += 1
+    arrival_s = rig.now
+    rig.command()
+    rig.now += 2.0 * TICK_S
+    rig.scan()
+    assert rig.state.pending is None
+    assert rig.state.command_s == arrival_s
 
 
 @pytest.mark.parametrize(
@@ -331,3 +352,37 @@ def test_a_car_that_takes_turn_rates_is_limited_by_its_steering_angle():
     assert rig.decision.twist[2] == pytest.approx(
         0.5 * np.tan(rig.config.limits.high[1]) / 0.2
     )
+
+
+def test_whatever_comes_in_what_goes_out_is_finite_within_limits_and_zero_when_stopped():
+    rng = np.random.default_rng(0)
+    odd = np.array([np.nan, np.inf, -np.inf, 1e308, 5e-324, 0.0, -1.0, 0.3])
+    for _ in range(4):
+        rig = driving()
+        low = rig.config.limits.low
+        high = rig.config.limits.high
+        for _ in range(150):
+            rig.run(TICK_S, without=str(rng.choice(["", "scan", "odom", "command"])))
+            stamp = int(rng.choice([rig.stamp, 0, -1, rig.stamp + 10**12]))
+            twist = np.where(
+                rng.random(3) < 0.2, rng.choice(odd, 3), rng.normal(size=3)
+            )
+            event = [
+                Command(stamp, twist),
+                Scan(
+                    stamp,
+                    rng.choice(odd[odd < 1e30], 720).astype(np.float32),
+                    (-np.pi, np.pi / 360),
+                ),
+                Odometry(stamp, twist, twist),
+                Tick(),
+            ][rng.integers(4)]
+            now = float(rng.choice([rig.now, np.nan, 0.0], p=[0.9, 0.05, 0.05]))
+            decision = rig.give(event, now)
+            value = decision.twist[list(rig.config.fields)]
+            assert np.isfinite(decision.twist).all()
+            assert (value >= low).all()
+            assert (value <= high).all()
+            assert decision.twist[1] == 0.0
+            if decision.cause is not None:
+                assert not decision.twist.any()

@@ -5,14 +5,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from gate.rig import TICK_S, Rig, config, driving
 from nics_drl_bridge.config import find_config, list_shipped
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.gate import gate
 from nics_drl_bridge.gate.limits import (
+    Limits,
     follow,
     is_implausible,
+    is_within,
     load_limits,
     saturate,
 )
@@ -21,6 +25,8 @@ from nics_drl_bridge.robot.spec import load_robot
 
 ROBOTS = list_shipped("limits")
 LIMITS = {robot: load_limits(robot, load_robot(robot)) for robot in ROBOTS}
+TOLERANCE = 1e-6
+WISH = st.floats(-3.0, 3.0)
 
 
 @pytest.mark.parametrize("robot", ["differential", "mecanum"])
@@ -45,6 +51,34 @@ def test_a_command_within_the_limits_stays_as_it_is(robot):
     command = limits.low + 0.6 * (limits.high - limits.low)
     assert saturate(command, limits).tolist() == command.tolist()
     assert not is_implausible(command, limits)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    robot=st.sampled_from(ROBOTS),
+    steps=st.lists(
+        st.tuples(WISH, WISH, WISH, st.floats(1e-3, 0.2)), min_size=5, max_size=60
+    ),
+)
+def test_no_wish_at_any_interval_exceeds_speed_rate_or_jerk(robot, steps):
+    limits = LIMITS[robot]
+    size = len(limits.low)
+    value = np.zeros(size)
+    slope = np.zeros(size)
+    last_change = np.zeros(size)
+    for *wish, dt in steps:
+        before = value
+        value, slope = follow(
+            value, slope, saturate(np.array(wish[:size]), limits), dt, limits
+        )
+        change = (value - before) / dt
+        assert (value <= limits.high).all()
+        assert (value >= limits.low).all()
+        assert (np.abs(change) <= limits.rate * (1 + TOLERANCE)).all()
+        assert (
+            np.abs(change - last_change) <= limits.jerk * dt * (1 + TOLERANCE) + 1e-9
+        ).all()
+        last_change = change
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
@@ -73,12 +107,15 @@ def test_a_motion_too_soon_after_the_last_is_not_published():
     [
         (("robot: ackermann", "robot: car"), "key 'robot'"),
         (("speed_command:", "sped_command:"), "'commands.sped_command'"),
+        (("  steering_command:", "  # "), "'commands.steering_command'"),
         (("rate: 2.0, ", ""), "'commands.speed_command.rate'"),
         (("max: 1.0", "max: .inf"), "'commands.speed_command.max'"),
+        (("rate: 2.0", "rate: 0.0"), "'commands.speed_command.rate'"),
         (("min: -0.5, max: 1.0", "min: 0.0, max: 0.0"), "min must be less than max"),
         (("min: -0.5, max: 1.0", "min: 0.2, max: 1.0"), "speed_command.min'"),
         (("jerk: 40.0}", "jerk: 40.0, snap: 1.0}"), "speed_command.snap'"),
         (("max: 1.0", "max: 10.0"), "speed_command.max': 10 m/s"),
+        (("min: -0.5", "min: -0.6"), "speed_command.min': -0.6 m/s"),
         (("max: 0.5", "max: 0.51"), "give at most 0.5"),
         (("rate: 2.0", "rate: 76.0"), "give at most 75"),
         (("jerk: 40.0", "jerk: 3751.0"), "give at most 3750"),
@@ -86,6 +123,7 @@ def test_a_motion_too_soon_after_the_last_is_not_published():
         (("jerk: 80.0", "jerk: 9e-5"), "steering_command.jerk': 9e-05"),
         (("min: -0.5, max: 1.0", "min: -0.001, max: 0.0099"), "could never move"),
         (("rate: 2.0, jerk: 40.0", "rate: 75.0, jerk: 3750.0"), ""),
+        (("rate: 2.0, jerk: 40.0", "rate: 0.001, jerk: 2e-4"), ""),
         (("min: -0.5, max: 1.0", "min: -0.001, max: 0.01"), ""),
     ],
 )
@@ -100,6 +138,40 @@ def test_a_file_of_limits_is_refused_for_the_key_that_is_wrong(tmp_path, change,
     with pytest.raises(ConfigError, match=re.escape(words)) as told:
         load_limits(str(path), load_robot("ackermann"))
     assert str(path) in str(told.value)
+
+
+ABSURD = st.floats(1e-308, 1e308)
+TWIST = st.floats(-1.8e308, 1.8e308)
+
+
+@st.composite
+def absurd_limits(draw):
+    """Limits of two commands that no file would be let through with."""
+    pairs = [[draw(ABSURD) for _ in range(2)] for _ in range(4)]
+    low, high, rate, jerk = (np.array(pair) for pair in pairs)
+    kinds = np.array([True, False]), np.array([False, draw(st.booleans())])
+    return Limits(-low, high, rate, jerk, *kinds)
+
+
+@settings(max_examples=120, deadline=None)
+@given(
+    limits=absurd_limits(),
+    steps=st.lists(
+        st.tuples(TWIST, TWIST, ABSURD | st.floats(1e-3, 0.2)), min_size=1, max_size=8
+    ),
+)
+def test_whatever_the_limits_the_wish_and_the_interval_what_follows_is_a_number_within(
+    limits, steps
+):
+    value = np.zeros(2)
+    slope = np.zeros(2)
+    with np.errstate(all="ignore"):
+        for *wish, dt in steps:
+            value, slope = follow(
+                value, slope, saturate(np.array(wish), limits), dt, limits
+            )
+            assert is_within(value, limits)
+            assert np.isfinite(slope).all()
 
 
 @pytest.mark.parametrize("value", [np.nan, 1.1, -0.6, np.inf])

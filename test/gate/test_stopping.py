@@ -7,6 +7,7 @@ import pytest
 from robots import field
 
 from gate.rig import Rig, config
+from nics_drl_bridge.config import find_config
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.gate.limits import load_limits
 from nics_drl_bridge.gate.stopping import (
@@ -108,7 +109,7 @@ def test_the_way_that_is_kept_free_is_what_the_simulator_needs(at_the_rim, least
         model = limited(model, at_the_rim / model.robot.parameters["wheel_radius"])
     limits = load_limits("jackal", model.robot)
     shield, _ = shield_config(model, limits)
-    for speed in (1.0, 0.2, -0.4):
+    for speed in (1.0, 0.5, 0.2, -0.4):
         needed = stopping_distance(model, limits, speed)
         assert kept_free(shield, abs(speed)) >= needed - 0.01
         assert kept_free(shield, abs(speed)) <= 1.3 * needed + 0.05
@@ -134,7 +135,9 @@ def test_a_model_that_shows_no_lag_has_an_assumed_one():
 
 
 @pytest.mark.slow
-def test_a_robot_that_does_not_stop_by_its_model_needs_to_be_told_how_it_stops():
+def test_a_robot_that_does_not_stop_by_its_model_needs_to_be_told_how_it_stops(
+    tmp_path,
+):
     model = builtin_model("jackal")
     rolling = limited(model, 1e-4)
     limits = load_limits("jackal", model.robot)
@@ -144,6 +147,11 @@ def test_a_robot_that_does_not_stop_by_its_model_needs_to_be_told_how_it_stops()
         shield_config(rolling, limits)
     told = {"latency": 0.5, "deceleration": 0.05}
     assert shield_config(rolling, limits, overrides=told)[0].deceleration == 0.05
+    text = find_config("jackal", "limits").read_text()
+    (tmp_path / "my.yaml").write_text(
+        f"{text}shield: {{latency: 0.5, deceleration: 0.05}}\n"
+    )
+    assert shield_config(rolling, limits, tmp_path / "my.yaml")[0].latency_s == 0.5
 
 
 @pytest.mark.parametrize(

@@ -378,3 +378,22 @@ def test_every_stop_is_in_the_black_box_and_replays(robot, black_box):
     again = replay(files[-1])
     assert again.differing == ()
     assert again.entries[-1].decision.cause.rule == "scan_silent"
+
+
+def test_as_shipped_it_stops_before_an_obstacle_and_counts_it(
+    launch, meet, domain_id, model, tmp_path
+):
+    given = {"limits": "ackermann", "black_box": str(tmp_path), **PATIENT}
+    gate = launch("command_gate", domain_id, **given)
+    robot = Robot(meet(domain_id), model.lidar)
+    robot.drives(0.2, 0.0, 0.0)
+    cut = int(robot.diagnosed().get("cut by the shield", 0))
+    robot.distance = 0.19
+    robot.peer.until(
+        lambda: int(robot.diagnosed().get("cut by the shield", 0)) > cut,
+        "the shield cuts",
+    )
+    robot.says("commands pass")
+    robot.stops()
+    said = gate.log.read_text(encoding="utf-8")
+    assert "the shield is on: latency 0.2, deceleration 2, margin 0.05" in said

@@ -86,7 +86,7 @@ class Operator:
 @pytest.fixture(
     params=[
         pytest.param(False, id="button_alone"),
-        pytest.param(True, id="1_kHz_beside", marks=pytest.mark.campaign),
+        pytest.param(True, id="1_kHz_beside"),
     ]
 )
 def operator(request, launch_process, meet, domain_id):

@@ -1,7 +1,11 @@
 """A link leaves nothing open, wherever the constructor of its backend fails."""
 
+import os
+import signal
+import threading
 from functools import partial
 
+import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
@@ -80,3 +84,21 @@ def test_a_constructor_that_fails_leaves_nothing_open(
     for node in nodes:
         with pytest.raises(Exception, match="destruction was requested"), node.handle:
             pass
+
+
+def test_ctrl_c_at_any_moment_leaves_the_callbacks_running(domain_id):
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    robot = Link(domain_id=domain_id)
+    calls = []
+    try:
+        robot.node.create_timer(0.001, lambda: calls.append(1))
+        for delay_s in np.linspace(0.001, 0.03, 40):
+            interrupt = partial(os.kill, os.getpid(), signal.SIGINT)
+            threading.Timer(delay_s, interrupt).start()
+            with pytest.raises(KeyboardInterrupt):
+                robot.wait_until(lambda: False, 30.0)
+        count = len(calls)
+        assert robot.wait_until(lambda: len(calls) > count + 10, 30.0)
+    finally:
+        robot.close()
+        signal.signal(signal.SIGINT, before)

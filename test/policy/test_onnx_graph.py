@@ -90,10 +90,45 @@ def dividing(proto):
     )
 
 
+def dividing_by_rows(proto):
+    """A divisor that is 0 for one number of observations, other than that which is rehearsed."""
+    return add(
+        proto,
+        make_node("Shape", ["observation"], ["shape"]),
+        make_node("Gather", ["shape", "first"], ["rows"]),
+        make_node("Sub", ["rows", "two"], ["fewer"]),
+        make_node("Div", ["least", "fewer"], ["none"]),
+        first=np.array(0),
+        two=np.array(2),
+        least=np.array(-(2**63)),
+    )
+
+
+def growing_with_fewer_rows(proto):
+    """A product whose size grows as the number of observations falls."""
+    return add(
+        proto,
+        make_node("Shape", ["observation"], ["shape"]),
+        make_node("Gather", ["shape", "first"], ["rows"]),
+        make_node("Sub", ["most", "rows"], ["missing"]),
+        make_node("Slice", ["weights", "zero", "missing"], ["part"]),
+        make_node("Unsqueeze", ["part", "zero"], ["row"]),
+        make_node("Unsqueeze", ["part", "one"], ["column"]),
+        make_node("Mul", ["row", "column"], ["large"]),
+        first=np.array(0),
+        most=np.array([256]),
+        zero=np.array([0]),
+        one=np.array([1]),
+        weights=np.zeros(256, np.float32),
+    )
+
+
 REFUSED = {
-    "division of constants": (divided, "graph", "takes more than"),
+    "division of constants": (divided, "graph.node", "may crash the process"),
     "division of whole numbers": (dividing, "graph.node", "may crash the process"),
+    "division by rows": (dividing_by_rows, "graph.node", "may crash the process"),
     "sizes by value": (by_value, "graph.node", "can't be known"),
+    "sizes by rows": (growing_with_fewer_rows, "graph.node", "can't be known"),
     "shapes that do not fit": (mismatched, "graph", "Incompatible dimensions"),
     "sparse weights": (sparse, "graph.node", "sparse"),
 }

@@ -268,11 +268,19 @@ def joints(*messages, spec=CART, **roles):
         BOTH,
         ("wheel_left_joint", "wheel_right_joint"),
         ("base/Left_Wheel", "base/Right_Wheel"),
+        ("bot.left_wheel", "bot.right_wheel"),
     ],
 )
 def test_wheels_are_known_by_the_words_of_their_names(names):
     found = joints((names, (0.0, 0.0), (1.0, 2.0)), (names, (0.1, 0.2), (3.0, 4.0)))
     assert found["state"] == found["wheels"] == [[1.0, 2.0], [3.0, 4.0]]
+
+
+@pytest.mark.parametrize("names", [("1", "0"), ("11", "12")])
+def test_a_joint_whose_name_is_a_number_is_found_by_its_name(names):
+    state = dict(zip(BOTH, names, strict=True))
+    found = joints((names, (0.0, 0.0), (1.0, 2.0)), state=state)
+    assert found["state"] == [[1.0, 2.0]]
 
 
 def test_wheels_in_another_order_are_put_in_the_robots():

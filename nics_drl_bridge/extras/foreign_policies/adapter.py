@@ -32,6 +32,8 @@ DTYPES = {
     "tensor(float16)": np.float16,
     "tensor(int64)": np.int64,
     "tensor(int32)": np.int32,
+    "tensor(int8)": np.int8,
+    "tensor(uint8)": np.uint8,
     "tensor(bool)": np.bool_,
 }
 AFTER_SCAN = 6  # elements of an observation after the scan: goal and velocity
@@ -85,8 +87,7 @@ class Adapter:
         self._session = session
         self._source = source
         self._empty_inputs = {
-            end.name: np.zeros(end.shape, DTYPES[end.type])
-            for end in session.get_inputs()
+            end.name: self._make_empty_input(end) for end in session.get_inputs()
         }
         self._names = [end.name for end in session.get_outputs()]
         self._check_names()
@@ -149,6 +150,14 @@ class Adapter:
                 elif part.of.startswith("last."):
                     kept.append("twist")
         return list(dict.fromkeys(["begun", *kept])) if kept else []
+
+    def _make_empty_input(self, end: Any) -> NDArray[Any]:
+        """Returns zeros for an input of the session. Raises PolicyError for other types."""
+        is_fixed = all(isinstance(size, int) for size in end.shape)
+        if end.type not in DTYPES or not is_fixed:
+            reason = f"is {end.type} of shape {end.shape}, which can't be filled."
+            raise self._fault(f"inputs.{end.name}", reason)
+        return np.zeros(end.shape, DTYPES[end.type])
 
     def _run_network(self, feeds: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
         outputs = run_network(self._session, self._source, dict(feeds))
@@ -386,11 +395,14 @@ class Adapter:
         return float(clamp(value, command.clip))
 
     def _choose(self, choices: Choices, output: NDArray[Any]) -> Array:
+        nothing = np.full(len(self._commands), np.nan)  # never sent to a robot
+        if np.isnan(output.astype(float)).any():
+            return nothing
         if np.issubdtype(output.dtype, np.integer) and output.size == 1:
             index = int(output[0])
         else:
             index = int(output.argmax())
         if not 0 <= index < len(choices.commands):
-            return np.full(len(self._commands), np.nan)  # never sent to a robot
+            return nothing
         chosen = choices.commands[index]
         return np.array([chosen.get(name, 0.0) for name in self._commands])

@@ -276,6 +276,12 @@ def inputs_of(model: Any) -> list[Any]:
     return [value for value in model.graph.input if value.name not in weights]
 
 
+def has_open_rows(model: Any) -> bool:
+    """True if an input takes any number of observations."""
+    shapes = [value.type.tensor_type.shape.dim for value in inputs_of(model)]
+    return any(shape and not shape[0].dim_value for shape in shapes)
+
+
 def fix_rows(model: Any, rows: int) -> Any:
     """Returns a model for `rows` observations at once, without the shapes that it states itself."""
     bare = onnx.ModelProto()

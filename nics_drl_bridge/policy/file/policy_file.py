@@ -243,6 +243,13 @@ def _check_ends(contract: Contract, session: Any, source: str) -> None:
 def _check_golden(policy: PolicyFile, source: str) -> None:
     golden = policy.contract.golden
     state = policy.contract.state
+    commands = len(policy.contract.robot.command)
+    actions = 1 if policy.contract.actions == "discrete" else commands
+    for name, width in (("actions", actions), ("commands", commands)):
+        columns = golden.rows(name).shape[1]
+        if columns != width:
+            reason = f"have {columns} columns, but {width} are needed."
+            raise PolicyError(source, f"golden.{name}", reason)
     start = None if state is None else np.full(state.size, state.start, np.float32)
     action, command = run_in_turn(policy.run, golden.rows("observations"), start)
     computed = {"actions": action.reshape(len(command), -1), "commands": command}
