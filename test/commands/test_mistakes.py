@@ -98,7 +98,7 @@ MISTAKES = {
     "policy info diferential": "neither a file nor a shipped policy; did you mean 'differential'?",
     "world draw cluter": "unknown world 'cluter'; did you mean 'clutter'?",
     "watch --bag bag --topic odom": "--topic 'odom': must be ROLE=TOPIC, as odom=/my_odom",
-    "demo --policy text.onnx --out d": "text.onnx: field 'file': is not an ONNX model",
+    "demo --policy text.onnx --out d": "text.onnx: field 'file': does not end with the checksum",
     "demo --policy strait": "unknown policy 'strait'; did you mean 'straight'?",
     # Keys, values and units of files.
     "drive --robot misspelt.yaml --out m": "parameter 'wheel_radius'; is 'wheel_radus' it?",
