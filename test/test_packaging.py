@@ -57,9 +57,11 @@ print({PACKAGE}.__version__, {PACKAGE}.__file__, share_folder(), sep="\\n")
 
 LOAD_ENTRY_POINTS = f"""
 from importlib.metadata import distribution
+from types import ModuleType
 for point in distribution("{PACKAGE}").entry_points:
     try:
-        assert callable(point.load()), point
+        loaded = point.load()
+        assert callable(loaded) or isinstance(loaded, ModuleType), point
     except ModuleNotFoundError as error:  # a library of an extra that is not installed
         assert not error.name.startswith("{PACKAGE}"), error
         assert ".nodes." in point.value or ".extras." in point.value, error
