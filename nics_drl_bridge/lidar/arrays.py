@@ -3,7 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.geometry import Array as Array
+from nics_drl_bridge.geometry import Array
+
+__all__ = ["Array", "Integers", "Mask", "ShortIntegers", "Singles"]
 
 Singles = NDArray[np.float32]
 Integers = NDArray[np.int64]
