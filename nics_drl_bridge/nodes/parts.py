@@ -27,8 +27,8 @@ class Wish(NamedTuple):
 
 def open_parts(kind: str, node: Node) -> list[Any]:
     """Return the parts of a kind of node, `device` or `policy`. Raises BridgeError."""
-    names = extensions.find_extensions(GROUP)
-    names = [name for name in names if name.startswith(f"{kind}.")]
+    installed = extensions.find_extensions(GROUP)
+    names = [name for name in installed if name.startswith(f"{kind}.")]
     if not names:  # of an environment that was made before this package had parts
         node.get_logger().warning(f"no parts of a {kind} are installed; {REINSTALL}")
     parts = [extensions.load(GROUP, name)(node) for name in names]
