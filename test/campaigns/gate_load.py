@@ -45,7 +45,7 @@ ODOM_HZ = 50
 MAD_S = 0.5
 """Commands are NaN for so long, then good for so long."""
 BARS = {
-    "ratio": at_most(2.5, "the gate's share of a core to the bare node's"),
+    "ratio": at_most(1.1, "the gate's share of a core to the bare node's"),
     "longest_gap_s": at_most(0.2, "time without a command [s]"),
     "longest_gap_in_burst_s": at_most(0.2, "time without a command in the burst [s]"),
     "sent": at_least(0.9, "invalid: share of the messages that were sent"),

@@ -162,7 +162,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         attempts=REAL_TIME,
     ),
     "gate_held": Campaign(
-        "--hours 0.03 --holds 18 --case 0",
+        "--hours 0.1 --holds 20 --case 0",
         {
             "rule_off": Control(
                 "the rule: `stop_when_held` is false",

@@ -104,7 +104,7 @@ class DeadReckoning:
     """A robot in a round of its own whose estimator hears odometry alone, and its gate."""
 
     def __init__(self):
-        self.gate = Rig(config("differential", estimate_position=0.15))
+        self.gate = Rig(config("differential", estimate_position=0.2))
         self.estimator = Estimator(builtin_model("differential"))
         self.steps = 0
         self.pose = np.zeros(3)
@@ -147,7 +147,7 @@ class DeadReckoning:
 
 @pytest.mark.parametrize(
     "hours",
-    [1.0 / 6.0, pytest.param(2.0, marks=pytest.mark.campaign)],
+    [0.25, pytest.param(2.0, marks=pytest.mark.campaign)],
     ids=["short", "two_hours"],
 )
 @pytest.mark.slow
@@ -161,5 +161,6 @@ def test_without_a_localiser_it_can_be_armed_again_every_five_minutes_and_drives
             assert robot.gate.decision.cause is None, robot.gate.decision.cause
             passing += robot.gate.moves
     assert passing > 0.99 * hours * 3600.0 / PERIOD_S
-    # By what was counted before, it could not be armed.
-    assert robot.std.max() > 2 * robot.gate.config.estimate_position
+    assert (
+        robot.std.max() > 2 * 0.2
+    )  # by what was counted before, it could not be armed

@@ -48,11 +48,11 @@ def test_stamps_that_run_ahead_of_time_latch_a_stop(step_s, simulated):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "pace", [1.0 + 9e-4, pytest.param(1.0 - 9e-4, marks=pytest.mark.campaign)]
+    "pace", [1.0 + 5e-4, pytest.param(1.0 - 5e-4, marks=pytest.mark.campaign)]
 )
 def test_clocks_that_drift_as_real_ones_do_are_followed(pace):
     rig = driven(pace)
-    for _ in range(12):  # by more than what an armed gate takes for the future
+    for _ in range(22):  # by more than what an armed gate takes for the future
         rig.run(10.0)
         assert rig.decision.cause is None
     assert rig.state.scans.late[-1] < 1e-3
