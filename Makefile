@@ -62,7 +62,7 @@ DESCRIBED_BY := setup.py setup.cfg package.xml pyproject.toml constraints.txt Ma
 
 OTHER_PYTHON := name another interpreter, as in: make setup PYTHON=python3.12
 
-.PHONY: help setup demo test test-quick test-docs test-package test-campaign test-all ros-status lint format types pytest benchmark tables docs reference notebooks pictures clean distclean
+.PHONY: help setup demo test test-quick test-docs test-package test-campaign test-all ros-status lint format types pytest benchmark wheel tables docs reference notebooks pictures clean distclean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 15
@@ -179,6 +179,16 @@ benchmark: setup ## run every benchmark, in half an hour, write benchmarks/resul
 	@if [ -e $(MESSAGES) ]; then source $(MESSAGES); fi; \
 		$(BIN)/python benchmarks/bench.py run \
 		$(if $(BENCHMARKS),--only $(BENCHMARKS)) $(if $(LONG),--long) $(if $(OUT),--out "$(OUT)")
+
+# The machine code is made beside a copy of the sources, so that the checkout stays as it is.
+WHEEL ?= build/wheel
+DIST ?= dist
+wheel: setup ## a wheel in dist/ that carries machine code, so that nothing is compiled at first use
+	rm -rf $(WHEEL) && mkdir -p $(WHEEL)/source
+	$(BIN)/python -m build --sdist --no-isolation --outdir $(WHEEL) .
+	tar -xzf $(WHEEL)/*.tar.gz --strip-components 1 -C $(WHEEL)/source
+	cd $(WHEEL)/source && PYTHONPATH=$$PWD $(abspath $(BIN))/nics warmup --for-wheel
+	$(BIN)/python -m build --wheel --no-isolation --outdir $(DIST) $(WHEEL)/source
 
 tables: setup ## make the tables of README and docs from benchmarks/results.json
 	@$(BIN)/python benchmarks/bench.py tables

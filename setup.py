@@ -140,7 +140,10 @@ setup(
     license=text_of("license"),
     python_requires=">=3.10,<3.15",
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
-    package_data={PACKAGE: ["py.typed", "nodes/*.xml", "watch/*.html"]},
+    package_data={
+        # `make wheel` writes the machine code.
+        PACKAGE: ["py.typed", "nodes/*.xml", "watch/*.html", "machine_code/*"]
+    },
     data_files=data_files(),
     zip_safe=False,
     install_requires=REQUIRES,

@@ -3,6 +3,9 @@
 numba itself checks only the file that defines a function. Here, cached code is valid until that
 module changes, or any module that it imports, directly or not, from this package or from the
 folder of a user's own kernel.
+
+A wheel may carry machine code for `TARGET`, which most x86 machines run; it is loaded where the
+cache has none. On other machines, and after an edit, the kernels are compiled as usual.
 """
 
 import gc
@@ -34,6 +37,10 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.status import REPEATED_S, STATUS
 
 PACKAGE = Path(__file__).parent
+TARGET = "x86-64-v3"
+# what it has beyond the first x86-64, by LLVM's names
+TARGET_FEATURES = ("avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe")
+CARRIED = PACKAGE / "machine_code"  # of the wheel; no folder in a checkout
 PATIENCE_S = 2.0  # longer compiling is announced on standard error
 SECONDS_EACH = 0.5  # typical time to compile a kernel with its helpers [s]
 TRUSTED_AFTER = 5  # kernels after which the measured pace weighs as much
@@ -211,6 +218,11 @@ class _Kernel(CPUDispatcher):  # type: ignore[misc]
 
 
 class _Index(IndexDataCacheFile):  # type: ignore[misc]
+    def __init__(self, folder: str, name: str, stamp: str) -> None:
+        super().__init__(folder, name, stamp)
+        # The version is compared before types are unpickled: their classes may have been renamed.
+        self._version += stamp
+
     def _load_index(self) -> dict[Any, Any]:
         try:
             return dict(super()._load_index())
@@ -234,8 +246,37 @@ class _Index(IndexDataCacheFile):  # type: ignore[misc]
         return data if (version, owner) == (self._version, key) else None
 
 
+class _Target:
+    """Stands for numba's code generator in the key of machine code for `TARGET`."""
+
+    @staticmethod
+    def magic_tuple() -> tuple[str, str, str]:
+        return llvm.get_process_triple(), TARGET, ""
+
+
+@cache
+def runs_target() -> bool:
+    """True if this machine runs machine code for `TARGET`."""
+    try:
+        features = llvm.get_host_cpu_features()
+    except RuntimeError:  # LLVM does not know this machine
+        return False
+    return all(features.get(name, False) for name in TARGET_FEATURES)
+
+
+def compile_for_wheel() -> None:
+    """Makes this process write the code of the kernels that it imports into `CARRIED`.
+
+    numba compiles for `TARGET` if NUMBA_CPU_NAME and NUMBA_CPU_FEATURES said so at its import.
+    """
+    CARRIED.mkdir(exist_ok=True)
+    _Cache.writes_carried = True
+
+
 class _Cache(FunctionCache):  # type: ignore[misc]
     """Machine code on disk, stamped with a digest of all the sources it was compiled from."""
+
+    writes_carried = False
 
     def __init__(self, function: Callable[..., Any], kind: str = "") -> None:
         try:
@@ -247,12 +288,26 @@ class _Cache(FunctionCache):  # type: ignore[misc]
         name = re.sub(r"-\d+(\.py\d+\w*)$", rf"{kind}\1", self._impl.filename_base)
         stamp = compute_digest(Path(function.__code__.co_filename))
         self._cache_file = _Index(self._cache_path, name, stamp)
-        # The version is compared before types are unpickled: their classes may have been renamed.
-        self._cache_file._version += stamp
+        self._carried: _Index | None = None
+        file = Path(function.__code__.co_filename)
+        if not kind and CARRIED.is_dir() and file.is_relative_to(PACKAGE):
+            folder = ".".join(file.relative_to(PACKAGE).parent.parts)
+            self._carried = _Index(str(CARRIED), f"{folder}.{name}", stamp)
+            if self.writes_carried:
+                self._cache_file = self._carried
 
     @property
     def is_warm(self) -> bool:
-        return bool(self._cache_file._load_index())
+        return any(
+            index._load_index() for index in (self._cache_file, self._carried) if index
+        )
+
+    def _load_overload(self, signature: Any, target_context: Any) -> Any:
+        overload = super()._load_overload(signature, target_context)
+        if overload is not None or self._carried is None or not runs_target():
+            return overload
+        data = self._carried.load(self._index_key(signature, _Target))
+        return None if data is None else self._impl.rebuild(target_context, data)
 
 
 class _InnerCache(_Cache):

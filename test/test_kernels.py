@@ -64,16 +64,26 @@ def package(tmp_path):
     return folder
 
 
-def ask(package: Path) -> tuple[list[float], list[int]]:
+FOR_WHEEL = """
+from nics_drl_bridge.kernels import compile_for_wheel
+compile_for_wheel()
+"""
+TARGET = {"NUMBA_CPU_NAME": kernels.TARGET, "NUMBA_CPU_FEATURES": ""}
+
+
+def ask(
+    package: Path, code: str = ASK, target: dict[str, str] | None = None
+) -> tuple[list[float], list[int]]:
     """What the kernels give in a fresh process, and how many were compiled there."""
     # Not kept as bytecode, which an edit within the same second would leave as it was.
+    env = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
     done = subprocess.run(
-        [sys.executable, "-B", "-c", ASK],
+        [sys.executable, "-B", "-c", code],
         cwd=package.parent,
         capture_output=True,
         text=True,
         check=False,
-        env={k: v for k, v in os.environ.items() if k != "PYTHONPATH"},
+        env=env | (target or {}),
     )
     assert done.returncode == 0, done.stderr
     values, compiled = done.stdout.splitlines()
@@ -110,6 +120,20 @@ def test_an_edit_of_what_a_kernel_is_made_of_compiles_it_anew_and_no_other(
     values, compiled = ask(package)
     assert (values[0], compiled) == (expected, [1, 0])
     assert ask(package)[1] == [0, 0]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not kernels.runs_target(), reason=f"not {kernels.TARGET}")
+def test_machine_code_that_a_wheel_carries_is_loaded_until_its_source_changes(package):
+    ask(package, FOR_WHEEL + ASK, TARGET)
+    shutil.rmtree(package / "__pycache__")
+    package = (
+        package.parent.rename(package.parent.with_name("elsewhere")) / package.name
+    )
+    assert ask(package) == ([20.0, -1.0, float("inf")], [0, 0])
+    constants = package / "constants.py"
+    constants.write_text(constants.read_text().replace("1.0", "3.0"))
+    assert ask(package) == ([40.0, -1.0, float("inf")], [1, 0])
 
 
 @pytest.mark.slow

@@ -90,6 +90,48 @@ def test_a_release_runs_the_demo_outside_of_the_repository(dist, kind, tmp_path)
     assert (tmp_path / "demo" / "report.html").is_file()
 
 
+FIRST_STEPS = """
+import time
+begin = time.process_time()
+import hashlib
+from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+from nics_drl_bridge.kernels import COMPILING
+
+env = BridgeVectorEnv(512)
+env.action_space.seed(0)
+env.reset(seed=0)
+env.step(env.action_space.sample())
+spent = time.process_time() - begin
+digest = hashlib.sha256()
+for _ in range(200):
+    observation, reward, *_ = env.step(env.action_space.sample())
+    digest.update(observation.tobytes() + reward.tobytes())
+print(spent, COMPILING.count, digest.hexdigest())
+"""
+
+
+@pytest.mark.process
+@pytest.mark.timeout(3600)
+def test_a_wheel_with_machine_code_compiles_nothing_and_gives_the_same_bits(tmp_path):
+    from nics_drl_bridge.kernels import TARGET, runs_target
+
+    if not runs_target():
+        pytest.skip(f"this machine does not run {TARGET}")
+    made = (f"WHEEL={tmp_path / 'made'}", f"DIST={tmp_path}")
+    run("make", "--old-file", "setup", "wheel", *made, cwd=ROOT)
+    uv = Path(sys.executable).with_name("uv")
+    python = tmp_path / "venv" / "bin" / "python"
+    run(uv, "venv", "--python", sys.executable, tmp_path / "venv", cwd=tmp_path)
+    install = (uv, "pip", "install", "--compile-bytecode", "--python", python)
+    pins = ("--constraints", ROOT / "constraints.txt")
+    run(*install, *pins, next(tmp_path.glob("*.whl")), cwd=tmp_path)
+    spent_s, compiled, digest = run(python, "-c", FIRST_STEPS, cwd=tmp_path).split()
+    assert int(compiled) == 0
+    assert float(spent_s) < 5.0  # of CPU, a twentieth of what compiling takes
+    from_source = run(sys.executable, "-c", FIRST_STEPS, cwd=tmp_path).split()
+    assert digest == from_source[-1]
+
+
 def test_the_container_file_copies_what_there_is_and_runs_what_is_installed():
     parser = pytest.importorskip(
         "dockerfile_parse", reason="needs dockerfile-parse of `test`"

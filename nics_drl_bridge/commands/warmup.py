@@ -1,10 +1,11 @@
 """`nics warmup`: compiles the kernels in advance, on two cores."""
 
+import os
 import signal
 import time
 from collections.abc import Callable
 from multiprocessing import get_context
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 
@@ -12,17 +13,25 @@ from nics_drl_bridge.commands.console import JsonOption, show_progress
 from nics_drl_bridge.files import format_json
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
+WheelOption = Annotated[
+    bool,
+    typer.Option(
+        "--for-wheel",
+        help="Compile for x86-64-v3 into the package's folder, as `make wheel` does.",
+    ),
+]
 
-def warmup(as_json: JsonOption = False) -> None:
+
+def warmup(for_wheel: WheelOption = False, as_json: JsonOption = False) -> None:
     """Compiles all kernels in advance, once per machine, on two cores."""
     begin = time.monotonic()
+    if for_wheel:  # numba reads these at its import
+        os.environ |= {"NUMBA_CPU_NAME": "x86-64-v3", "NUMBA_CPU_FEATURES": ""}
     typer.echo("compiling the kernels: a minute or two, once on this machine", err=True)
     # Spawned, not forked: a fork could inherit a lock that is never released.
     with (
         show_progress("compiling"),
-        get_context("spawn").Pool(
-            2, signal.signal, (signal.SIGINT, signal.SIG_IGN)
-        ) as pool,
+        get_context("spawn").Pool(2, _begin, (for_wheel,)) as pool,
     ):
         *first, model = pool.apply(_compile_by, (_model,))
         jobs = [
@@ -38,6 +47,15 @@ def warmup(as_json: JsonOption = False) -> None:
         typer.echo(
             f"compiled {count} kernels in {took:.0f} s ({cpu_s:.0f} s of CPU)", err=True
         )
+
+
+def _begin(for_wheel: bool) -> None:
+    """Leaves Ctrl-C to the parent; for a wheel, code goes into the package's folder."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if for_wheel:
+        from nics_drl_bridge.kernels import compile_for_wheel
+
+        compile_for_wheel()
 
 
 def _compile_by(part: Callable[..., Any], *given: Any) -> tuple[int, float, Any]:
