@@ -47,6 +47,10 @@ class Thresholds:
     # the same windows: this drive can't rank two models that are closer than that. A wider margin
     # would accept models that are probably worse than a textbook with fewer parameters.
     standard_errors: float = 1.0
+    # A model that is farther off than its fitted textbook by this ratio has terms that do not pay,
+    # even where the drive is too short to prove it.
+    simpler: float = 1.02
+    simpler_from: float = 0.0005  # by this fraction of the path at least
     # Two simulators that differ by less train the same policy.
     alike: float = 0.005  # fraction of the path
     # Motion while the pose was missing was neither learnt nor tested.
@@ -109,6 +113,19 @@ def compare(
 def loses_to_textbook(judgement: tuple[HorizonErrors, ...]) -> bool:
     """True if a model's predictions are worse than its fitted textbook's, beyond the noise."""
     return any(next(shortfall_of_textbook(at), "") for at in usual(judgement))
+
+
+def is_beaten_by_textbook(judgement: tuple[HorizonErrors, ...]) -> bool:
+    """True if the fitted textbook, which is simpler, predicts better than a model."""
+    for at in usual(judgement):
+        if at.textbook is not None:
+            textbook_m = at.textbook.position_m
+            limit_m = max(
+                THRESHOLDS.simpler * textbook_m,
+                textbook_m + THRESHOLDS.simpler_from * at.path_m,
+            )
+            return not at.model.position_m <= limit_m
+    return False
 
 
 def shortfall(judgement: tuple[HorizonErrors, ...]) -> Iterator[str]:

@@ -14,6 +14,7 @@ from nics_drl_bridge.identify.acceptance import (
     combined,
     compare,
     comparison_noise,
+    is_beaten_by_textbook,
     loses_to_textbook,
     rate,
     rate_unseen,
@@ -126,6 +127,15 @@ def test_a_tie_is_neither_better_nor_worse():
     assert compare(errors(0.2), errors(0.1), 0.05, 2.0) is Outcome.WORSE
     assert compare(errors(0.1), errors(0.2), 0.05, 2.0) is Outcome.BETTER
     assert compare(errors(float("inf")), errors(0.2), 0.05, 2.0) is Outcome.WORSE
+
+
+@pytest.mark.parametrize(
+    ("error_m", "beaten"),
+    [(0.09, False), (0.1015, False), (0.103, True), (float("inf"), True)],
+)
+def test_the_fitted_textbook_beats_a_model_that_is_farther_off(error_m, beaten):
+    assert is_beaten_by_textbook(after_5_s(error_m, path=2.0, textbook=0.1)) == beaten
+    assert not is_beaten_by_textbook(after_5_s(error_m, path=2.0))
 
 
 def test_a_tie_with_the_textbook_is_no_shortfall():

@@ -197,7 +197,7 @@ def test_a_good_drive_passes_the_strict_checks(name):
 
 def test_where_predictions_run_away_the_model_is_linear(monkeypatch):
     """Each half second of commands comes late by another time, as over a bad link."""
-    monkeypatch.setattr(acceptance, "loses_to_textbook", lambda judgement: False)
+    monkeypatch.setattr(acceptance, "is_beaten_by_textbook", lambda judgement: False)
     spec = load_robot("differential")
     rng = np.random.default_rng(9)
     whole = record(spec, rng, 40.0, dt=0.02)

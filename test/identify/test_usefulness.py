@@ -78,7 +78,7 @@ def test_standing_still_is_off_by_the_way_from_start_to_end(car):
 @pytest.fixture
 def no_textbook(monkeypatch):
     """Leaves a model as it is, however much better its textbook is."""
-    monkeypatch.setattr(acceptance, "loses_to_textbook", lambda judgement: False)
+    monkeypatch.setattr(acceptance, "is_beaten_by_textbook", lambda judgement: False)
 
 
 @pytest.mark.slow
