@@ -4,9 +4,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
-
-import numpy as np
+from typing import Any, cast
 
 from nics_drl_bridge.arguments import check_path
 from nics_drl_bridge.config import check_no_device, find_config
@@ -33,8 +31,6 @@ FOLDER = "xtark_folder"  # shipped mapping of a folder that is read without a ma
 # Files that such a folder must have, and may have
 FILES = ("cmd.csv", "vrpn.csv")
 WHEELS = ("L_wheel.csv", "R_wheel.csv")
-# Maximum size of each of these; with --map, tables may be larger
-MAX_FILE_BYTES = 64 * 2**20
 AnyMapping = Mapping | TopicRoles | str | Path | None
 
 
@@ -145,11 +141,34 @@ def _read(
         named = mapping.robot if isinstance(mapping, Mapping) else None
         return drive, robot or named or drive.robot
     if isinstance(mapping, Mapping):
-        return _read_by_mapping(path, robot, mapping)
+        definition = robot if isinstance(robot, str) else mapping.robot
+        known: Robot = robot or definition
+        if mapping.command_topic is not None and known is not None:
+            known = _build(known)
+        drive = _read_by_mapping(path, known, mapping)
+        if definition is not None:
+            drive = replace(drive, robot=read_definition(definition))
+        return drive, known
     if has_bag:
-        return _read_by_roles(path, robot, mapping or TopicRoles())
+        if robot is None:
+            raise RecordingError(
+                f"{path}: is a bag; say of which robot, with a RobotSpec."
+            )
+        spec = _build(robot)
+        return _read_by_mapping(path, spec, mapping or TopicRoles()), spec
     if _holds(path, FILES):
-        return _read_folder(path, robot)
+        file = find_config(FOLDER, "recordings")
+        mapping = load_mapping(file)
+        known = robot or mapping.robot
+        if not _holds(path, WHEELS):
+            mapping = mapping.model_copy(update={"wheels": None})
+        try:  # its robot may be any with as many commands
+            drive = replace(_read_by_mapping(path, None, mapping), variables=())
+        except RecordingError as error:
+            raise RecordingError(
+                f"{error} The mapping is {file}; choose another with --map."
+            ) from None
+        return drive, known
     if path.suffix == ".npz":
         return load_recording(path), robot  # which names its fault
     if not path.exists():
@@ -161,58 +180,21 @@ def _read(
     )
 
 
+def _build(robot: RobotSpec | str | dict[str, Any]) -> RobotSpec:
+    return robot if isinstance(robot, RobotSpec) else build_robot(robot)
+
+
 def _read_by_mapping(
-    path: Path, robot: RobotSpec | str | None, mapping: Mapping
-) -> tuple[Recording, Robot]:
-    definition = mapping.robot
-    if isinstance(robot, str):
-        definition = robot
-    known: Robot = robot or definition
-    if mapping.command_topic is not None and known is not None:
-        known = known if isinstance(known, RobotSpec) else build_robot(known)
-    spec = known if isinstance(known, RobotSpec) else None
-    with open_source(path, mapping) as source:
-        drive = read_mapped(source, mapping, spec)
-    if definition is not None:
-        drive = replace(drive, robot=read_definition(definition))
-    return drive, known
-
-
-def _read_by_roles(
-    path: Path, robot: RobotSpec | str | None, roles: TopicRoles
-) -> tuple[Recording, Robot]:
-    """Reads a bag by the mapping that the roles of its topics stand for."""
-    if robot is None:
-        raise RecordingError(f"{path}: is a bag; say of which robot, with a RobotSpec.")
-    spec = robot if isinstance(robot, RobotSpec) else build_robot(robot)
-    with open_bag(path) as file:
-        bag = Bag(file)
-        mapping = write_mapping(roles, bag, spec)
-        bag.use(mapping)
-        return read_mapped(bag, mapping, spec), spec
-
-
-def _read_folder(path: Path, robot: RobotSpec | str | None) -> tuple[Recording, Robot]:
-    """Reads a folder by its shipped mapping; wheels may be missing, and its robot may be any."""
-    file = find_config(FOLDER, "recordings")
-    mapping = load_mapping(file)
-    wheels = _holds(path, WHEELS)
-    if not wheels:
-        mapping = mapping.model_copy(update={"wheels": None})
-    for name in FILES + WHEELS * wheels:
-        if (path / name).stat().st_size > MAX_FILE_BYTES:
-            raise RecordingError(
-                f"{path / name}: is larger than {MAX_FILE_BYTES // 2**20} MB, which "
-                f"few drives are; cut it, or give --map {file}."
-            )
-    try:
-        with open_source(path) as source:
-            drive = replace(read_mapped(source, mapping), variables=())
-    except RecordingError as error:
-        raise RecordingError(
-            f"{error} The mapping is {file}; choose another with --map."
-        ) from None
-    return drive, robot or mapping.robot
+    path: Path, robot: Robot, mapping: Mapping | TopicRoles
+) -> Recording:
+    """Reads a drive by a mapping, or a bag by the one that its topics' roles stand for."""
+    spec = robot if isinstance(robot, RobotSpec) else None
+    with open_source(path) as source:
+        if isinstance(source, Bag):
+            if isinstance(mapping, TopicRoles) and spec is not None:
+                mapping = write_mapping(mapping, source, spec)
+            source.use(cast(Mapping, mapping))
+        return read_mapped(source, cast(Mapping, mapping), spec)
 
 
 def _holds(path: Path, files: tuple[str, ...]) -> bool:
@@ -272,12 +254,10 @@ def _build_with_ranges(robot: Robot, recording: Recording) -> RobotSpec:
     """Returns a robot; command ranges that its definition omits are as recorded."""
     if isinstance(robot, RobotSpec):
         return robot
-    low, high = (f(recording.command.values, axis=0).tolist() for f in (np.min, np.max))
-    names = recording.variables[-len(low) :]
-    return build_robot(
-        robot or DEFAULT_ROBOT,
-        dict(zip(names, zip(low, high, strict=True), strict=False)),
-    )
+    commands = recording.command.values.T
+    ranges = [(float(row.min()), float(row.max())) for row in commands]
+    names = recording.variables[-len(ranges) :]
+    return build_robot(robot or DEFAULT_ROBOT, dict(zip(names, ranges, strict=False)))
 
 
 def reorder_variables(recording: Recording, spec: RobotSpec) -> Recording:
@@ -308,7 +288,7 @@ def reorder_variables(recording: Recording, spec: RobotSpec) -> Recording:
 
 
 @contextmanager
-def open_source(path: Path, mapping: Mapping | None = None) -> Iterator[Source]:
+def open_source(path: Path) -> Iterator[Source]:
     """Opens a recording in any format. Raises RecordingError if there is nothing to read."""
     if not check_no_device(path).exists():
         raise RecordingError(f"{path}: no such file or folder; check the path.")
@@ -316,7 +296,4 @@ def open_source(path: Path, mapping: Mapping | None = None) -> Iterator[Source]:
         yield Files(path)
         return
     with open_bag(path) as file:
-        bag = Bag(file)
-        if mapping is not None:
-            bag.use(mapping)
-        yield bag
+        yield Bag(file)

@@ -226,6 +226,6 @@ def test_more_rows_or_bytes_than_any_drive_has_are_refused(tmp_path):
     with (tmp_path / "cmd.csv").open("wb") as file:
         file.truncate(2**33)
     with pytest.raises(
-        RecordingError, match=r"larger than 64 MB.* cut it, or give --map"
+        RecordingError, match=r"larger than 256 MB; cut it"
     ):
         read_recording(tmp_path)
