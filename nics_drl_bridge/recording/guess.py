@@ -8,7 +8,6 @@ import numpy as np
 from nics_drl_bridge.geometry import Array, east_and_north
 from nics_drl_bridge.recording.guesses import (
     GLOBE,
-    TICKS,
     Candidate,
     CommandGuess,
     PoseGuess,
@@ -44,18 +43,6 @@ NEEDS_TURN = "; add `ticks_per_turn:`, the counts of a turn of the wheel"
 NO_VALUES = {"header", "stamp", "seq", "covariance", "index", "id", "row"}
 
 
-class _Guesses(NamedTuple):
-    """The guesses from which a mapping is drafted."""
-
-    tables: Sequence[TableSurvey]
-    pose: PoseGuess | None
-    guess: CommandGuess
-    switches: tuple[Switch, ...]
-    gyro: Field | None
-    episode: Field | None
-    common_time: str | None  # the stamps of most tables, for the whole mapping
-
-
 class MappingDraft(NamedTuple):
     """A draft of a mapping."""
 
@@ -75,40 +62,41 @@ def propose_mapping(tables: Sequence[TableSurvey]) -> MappingDraft:
     """Drafts a mapping in YAML; guesses are marked, and uncertain parts are left blank."""
     pose = guess_pose(tables)
     guess = guess_command(tables, pose)
-    times = [table.time for table in tables if table.time is not None]
-    common_time = max(times, key=times.count, default=None)
-    pose_lines = [NO_POSE, "pose:", "  x: ", "  y: "]
-    poses = None
-    if pose is not None:
-        units = _name_units(pose)
-        pose_lines = _write_pose(pose, units, common_time)
-        poses = _compute_poses(pose, units)
-    switches: tuple[Switch, ...] = ()
-    if guess.listed:
-        switches = guess_switches(tables)
+    switches = guess_switches(tables) if guess.listed else ()
+    commanded = [command.column for command in guess.listed.values()]
     gyro = guess_yaw_rate(tables)
-    if gyro and any(gyro is command.column for command in guess.listed.values()):
+    if gyro in commanded:
         gyro = None
     episode = guess_episode(tables)
-    guesses = _Guesses(tables, pose, guess, switches, gyro, episode, common_time)
-    doubts = [*_find_doubts(guess, poses, str(common_time))]
-    if not guess.listed:
-        doubts.append(NO_COMMAND)
+    # The stamps of most tables are those of the whole mapping.
+    times = [table.time for table in tables if table.time is not None]
+    time = max(times, key=times.count, default=None)
+
     lines = [_write_robot(guess)]
-    if common_time is not None:
-        lines.append(f"time: {common_time}  {GUESSED}")
+    if time is not None:
+        lines.append(f"time: {time}  {GUESSED}")
     elif any(table.t is None and table.rows for table in tables):
         lines.append(
             f"time: {{rate: 50}}  {GUESSED}: no stamps were found; rows a second"
         )
     if episode is not None:
         lines.append(f"episode: {episode.reference}  {GUESSED}")
-    lines += pose_lines
-    lines += _write_clock(pose, guess.listed)
-    lines += _write_commands(guesses)
+    doubts: list[str] = []
+    if pose is None:
+        lines += [NO_POSE, "pose:", "  x: ", "  y: "]
+    else:
+        units = _name_units(pose)
+        lines += _write_pose(pose, units, time)
+        lines += _write_clock(pose, guess.listed)
+        doubts += _find_doubts(guess, _compute_poses(pose, units), str(time))
+    if not guess.listed:
+        doubts.append(NO_COMMAND)
+    lines += _write_commands(guess, switches, time)
     if gyro is not None:
-        lines.append(f"{write_imu_line(gyro, common_time)}  {GUESSED}")
-    return MappingDraft(doubts, lines, [*_list_unused(guesses)])
+        lines.append(f"{write_imu_line(gyro, time)}  {GUESSED}")
+    used = [command.column for command in guess.candidates.values()]
+    used += [*commanded, *(switch.column for switch in switches), gyro, episode]
+    return MappingDraft(doubts, lines, [*_list_unused(tables, used, pose)])
 
 
 def _find_doubts(
@@ -143,50 +131,43 @@ def _write_robot(guess: CommandGuess) -> str:
     )
 
 
-def _write_commands(guesses: _Guesses) -> Iterator[str]:
+def _write_commands(
+    guess: CommandGuess, switches: Sequence[Switch], time: str | None
+) -> Iterator[str]:
     """Yields the commands, or a blank with the candidates as comments."""
-    guess = guesses.guess
-    when = ""
-    if guesses.switches:
-        flags = [switch.condition for switch in guesses.switches]
-        when = f"when: {{{', '.join(flags)}}}"
-    if guess.commands:
-        if guess.of_wheels:
-            found = "none is certain" if guess.candidates else "no command was recorded"
-            yield f"command:  # {found}: what the wheels did stands in for it"
-        else:
-            yield "command:"
-        for name, candidate in guess.commands.items():
-            value = _write_command(name, candidate, when, guesses.common_time)
-            yield f"  {name}: {value}  {GUESSED}{_write_remark(candidate)}"
-        for name, candidate in guess.candidates.items():
-            yield f"#  or {name}: {_write_command(name, candidate, when, guesses.common_time)}"
-    elif guess.candidates:
-        yield "command:  # none is certain: uncomment what was sent to the robot"
-        for name, candidate in guess.candidates.items():
-            yield f"#  {name}: {_write_command(name, candidate, when, guesses.common_time)}"
-    else:
-        yield f"command:  # {NO_COMMAND}"
+    when = ", ".join(switch.condition for switch in switches)
 
+    def write(name: str, candidate: Candidate) -> str:
+        keys = [*_write_unit_keys(name, candidate.column)]
+        # A switch cuts off the motor; the steering stays as it is.
+        if when and "steer" not in name:
+            keys.append(f"when: {{{when}}}")
+        return f"{name}: {write_value(candidate.column, keys, time)}"
 
-def _write_command(name: str, candidate: Candidate, when: str, time: str | None) -> str:
-    keys = [*_write_unit_keys(name, candidate.column)]
-    # A switch cuts off the motor; the steering stays as it is.
-    if when and "steer" not in name:
-        keys.append(when)
-    return write_value(candidate.column, keys, time)
-
-
-def _write_remark(candidate: Candidate) -> str:
-    if candidate.is_still:
-        return STILL
-    is_counter = not TICKS.isdisjoint(split_words(candidate.column.name))
-    return NEEDS_TURN * (is_counter and candidate.meaning != "steering")
+    head = "command:"
+    if not guess.listed:
+        head += f"  # {NO_COMMAND}"
+    elif guess.of_wheels:
+        found = "none is certain" if guess.candidates else "no command was recorded"
+        head += f"  # {found}: what the wheels did stands in for it"
+    elif not guess.commands:
+        head += "  # none is certain: uncomment what was sent to the robot"
+    yield head
+    for name, candidate in guess.commands.items():
+        remark = ""
+        if candidate.is_still:
+            remark = STILL
+        elif candidate.meaning != "steering" and candidate.column.counts:
+            remark = NEEDS_TURN
+        yield f"  {write(name, candidate)}  {GUESSED}{remark}"
+    either = "or " if guess.commands else ""
+    for name, candidate in guess.candidates.items():
+        yield f"#  {either}{write(name, candidate)}"
 
 
 def _write_unit_keys(name: str, column: Field) -> Iterator[str]:
     unit = column.unit
-    if not TICKS.isdisjoint(split_words(column.name)):
+    if column.counts:
         yield "unit: ticks"
         if "steer" in name:
             yield "differentiate: false"
@@ -198,19 +179,12 @@ def _write_unit_keys(name: str, column: Field) -> Iterator[str]:
         yield "unit: deg"
 
 
-def _write_clock(
-    pose: PoseGuess | None, commands: Mapping[str, Candidate]
-) -> Iterator[str]:
+def _write_clock(pose: PoseGuess, commands: Mapping[str, Candidate]) -> Iterator[str]:
     """Yields the line that gives the pose a clock of its own, if its stamps show one."""
-    if pose is None or pose.table.t is None or not pose.table.stamps:
-        return
     t = pose.table.t
-    stamps = [
-        (table.unit, np.sort(table.t))
-        for table in (candidate.column.table for candidate in commands.values())
-        if table.t is not None
-    ]
-    if not stamps:
+    tables = [candidate.column.table for candidate in commands.values()]
+    stamps = [(other.unit, np.sort(other.t)) for other in tables if other.t is not None]
+    if t is None or not pose.table.stamp_columns or not stamps:
         return
     line = f"  clock: tracker  {GUESSED}"
     if all(other[-1] < min(t) or other[0] > max(t) for _, other in stamps):
@@ -221,19 +195,21 @@ def _write_clock(
         yield f"{line}: one counts from its first row, and in another unit"
 
 
-def _list_unused(guesses: _Guesses) -> Iterator[str]:
+def _list_unused(
+    tables: Sequence[TableSurvey], used: Sequence[Field | None], pose: PoseGuess | None
+) -> Iterator[str]:
     """Yields a text for each table with the columns of values that the draft does not use."""
-    guess = guesses.guess
-    candidates = [*guess.commands.values(), *guess.candidates.values()]
-    used = [candidate.column for candidate in candidates]
-    used += [switch.column for switch in guesses.switches]
-    for table in guesses.tables:
+    for table in tables:
         unused = []
         for column in table.columns:
             is_value = NO_VALUES.isdisjoint(split_words(column.name))
-            is_named = column in (*used, guesses.gyro, guesses.episode)
-            if is_value and not is_named and not is_used(column, guesses.pose):
-                unused.append(f"{column.name}{_explain_unused(column)}")
+            if not is_value or column in used or is_used(column, pose):
+                continue
+            remark = ""
+            if not column.moves:
+                is_constant = column.low == column.high
+                remark = " (constant)" if is_constant else " (no numbers)"
+            unused.append(f"{column.name}{remark}")
         place = "" if table.is_single else f"{table.name}: "
         listed = ", ".join(unused[:MOST_LISTED])
         if len(unused) > MOST_LISTED:
@@ -242,20 +218,12 @@ def _list_unused(guesses: _Guesses) -> Iterator[str]:
             yield f"not used: {place}{listed}"
 
 
-def _explain_unused(column: Field) -> str:
-    if column.moves:
-        return ""
-    if column.low == column.high:
-        return " (constant)"
-    return " (no numbers)"
-
-
 def _write_pose(
     pose: PoseGuess, units: Mapping[str, str], common_time: str | None
 ) -> list[str]:
     table = pose.table
     is_known = pose.x.name in (form[0].format("x") for form in POSES[:4])
-    if table.stamps is None and is_known:
+    if not table.stamp_columns and is_known:
         return [f"pose: {table.name}  {GUESSED}"]  # a message whose fields are known
     lines = [f"pose:  {GUESSED}"]
     if not table.is_single:
@@ -275,32 +243,26 @@ def _write_pose(
 
 def _name_units(pose: PoseGuess) -> dict[str, str]:
     """Returns the units that the names of a pose's columns show, unless they are m and rad."""
-    units = {
-        "unit": pose.x.unit,
-        "heading_unit": None if pose.heading is None else pose.heading.unit,
-    }
+    units = {"unit": pose.x.unit}
     if not {*GLOBE}.isdisjoint(split_words(pose.x.name)):
         units["unit"] = "deg"
-    named = {}
-    for key, unit in units.items():
-        if unit is None:
-            continue
-        si, factor = UNITS[unit]
-        if factor != 1.0 and si in ("m", "rad"):
-            named[key] = unit
-    return named
+    if pose.heading is not None:
+        units["heading_unit"] = pose.heading.unit
+    return {
+        key: unit
+        for key, unit in units.items()
+        if unit and UNITS[unit].factor != 1.0 and UNITS[unit].si in ("m", "rad")
+    }
 
 
 def _compute_poses(
     pose: PoseGuess, units: Mapping[str, str]
 ) -> tuple[Array, Array] | None:
     """Returns stamps (T,) and poses (T, 3) of a guess in SI; None if its rows have no stamps."""
-    table = pose.table
-    if table.t is None:
-        return None
+    t = pose.table.t
     columns = [column.numbers for column in pose.columns]
     # The columns may be of several streams.
-    if any(len(column) != len(table.t) for column in columns):
+    if t is None or any(len(column) != len(t) for column in columns):
         return None
     x, y, *orientation = columns
     heading = orientation[0]
@@ -310,11 +272,9 @@ def _compute_poses(
     is_finite = np.isfinite(values).all(axis=1)
     if is_finite.sum() < 3:
         return None
-    if "heading_unit" in units:
-        values[:, 2] *= UNITS[units["heading_unit"]].factor
-    if "unit" in units:
-        si, factor = UNITS[units["unit"]]
-        values[:, :2] *= factor
-        if si == "rad":
-            values[:, :2] = np.stack(east_and_north(*values[:, :2].T), axis=1)
-    return table.t[is_finite], values[is_finite]
+    values[:, 2] *= UNITS[units.get("heading_unit", "rad")].factor
+    si, factor = UNITS[units.get("unit", "m")]
+    values[:, :2] *= factor
+    if si == "rad":
+        values[:, :2] = np.stack(east_and_north(*values[:, :2].T), axis=1)
+    return t[is_finite], values[is_finite]

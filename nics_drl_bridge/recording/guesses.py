@@ -17,7 +17,7 @@ from nics_drl_bridge.recording import topic_roles
 from nics_drl_bridge.recording.imu_axis import AXES, UpAxis, find_table_axis
 from nics_drl_bridge.recording.mapping import NO_COMMANDS, UNITS
 from nics_drl_bridge.recording.names import split_words, word_set
-from nics_drl_bridge.recording.survey import Field, TableSurvey, split_unit
+from nics_drl_bridge.recording.survey import TICKS, Field, TableSurvey, split_unit
 from nics_drl_bridge.recording.table import Column, is_text
 from nics_drl_bridge.robot.spec import find_kind, list_kinds
 from nics_drl_bridge.robot.template import list_names
@@ -128,7 +128,6 @@ NEVER = word_set("""
     force load status axes buttons level line
 """)
 NOT_COMMANDED = NEVER | NO_COMMANDS | MEASURING
-TICKS = word_set("tick ticks encoder enc encoders count counts")
 WHEEL_WORDS = TICKS | word_set("wheel wheels rpm")
 # Words that show what a column holds
 EXPLAINED = NOT_COMMANDED | WHEEL_WORDS | word_set("x y z")

@@ -120,10 +120,15 @@ def _read_drive(
 
 
 def _read_values(
-    reader: MappedReader, name: str, values: Names[str, Value], held: bool
+    reader: MappedReader,
+    name: str,
+    values: Names[str, Value],
+    held: bool,
+    source: Measured | None = None,
 ) -> Stream:
+    """Reads values into a stream with a column for each."""
     parts = [
-        reader.read_series(f"{name}.{key}", value, None, held)
+        reader.read_series(f"{name}.{key}", value, source, held)
         for key, value in values.items()
     ]
     return combine_series(name, parts, held)
@@ -152,25 +157,24 @@ def _guess_pose_source(source: Source, mapping: Mapping) -> MeasuredBy:
     """Returns what measured the pose, guessed from names of topic or file, columns and frames."""
     pose = mapping.pose
     values = (pose.x, pose.y, pose.heading)
-    references = [value.from_ for value in values if value is not None]
-    tables = [pose.in_, *(str(name).partition(":")[0] for name in references)]
-    kind = ""
-    for table in tables:
-        for name in (table, f"/{table}"):
-            if table and name in source.names:
-                kind = kind or source.get_table(name).kind
-    names = [pose.in_, pose.clock, *pose.frames, *references]
-    return guess_source_by_names(
-        (str(name) for name in names if name is not None), kind
-    )
+    references = [str(value.from_) for value in values if value is not None]
+    tables = [pose.in_, *(name.partition(":")[0] for name in references)]
+    known = [
+        source.get_table(name).kind
+        for table in tables
+        for name in (table, f"/{table}")
+        if table and name in source.names
+    ]
+    names = (pose.in_, pose.clock, *pose.frames, *references)
+    kind = next(filter(None, known), "")
+    return guess_source_by_names(filter(None, names), kind)
 
 
 def _read_turn_rate(reader: MappedReader, imu: ImuSource, heading: Value) -> Stream:
     """Reads a second heading as the turn rate that integrates to it, without accelerations."""
     heading = heading.model_copy(update={"unit": heading.unit or "rad"})
     _check_kind("imu.heading", heading, ("rad",))
-    series = reader.read_series("imu.heading", heading, imu, held=False)
-    stream = combine_series("imu", [series], held=False)
+    stream = _read_values(reader, "imu", {"heading": heading}, False, imu)
     stream = stream.rows(np.append(True, np.diff(stream.t) > 0.0))
     values = np.zeros((len(stream.t), 3))
     if len(stream.t) > 1:
@@ -211,20 +215,19 @@ def _check_units(reader: MappedReader, pose: Stream, spec: RobotSpec | None) -> 
     )
 
 
-def _read_measured(reader: MappedReader, name: str, stream: Measured) -> Stream:
+def _read_measured(reader: MappedReader, name: str, source: Measured) -> Stream:
     """Reads a stream of measurements; values that are not mapped are zero."""
-    parts: dict[int, Series] = {}
-    for column, (key, kinds) in enumerate(schema.SI[name].items()):
-        value: Value | None = getattr(stream, key)
-        if value is None:
-            continue
-        if value.unit is not None:
-            _check_kind(f"{name}.{key}", value, kinds)
-        parts[column] = reader.read_series(f"{name}.{key}", value, stream, held=False)
-    measured = combine_series(name, list(parts.values()), held=False)
-    values = np.zeros((len(measured.t), len(schema.SI[name])))
-    values[:, list(parts)] = measured.values
-    return replace(measured, values=values)
+    values: dict[str, Value] = {}
+    for key, kinds in schema.SI[name].items():
+        value: Value | None = getattr(source, key)
+        if value is not None:
+            values[key] = value
+            if value.unit is not None:
+                _check_kind(f"{name}.{key}", value, kinds)
+    measured = _read_values(reader, name, values, False, source)
+    rows = np.zeros((len(measured.t), len(schema.SI[name])))
+    rows[:, [list(schema.SI[name]).index(key) for key in values]] = measured.values
+    return replace(measured, values=rows)
 
 
 COMMANDS = (
@@ -311,12 +314,11 @@ def _read_heading(
     """Returns the headings of quaternions, without quaternions of length 0."""
     if isinstance(references, str):
         references = [f"{references}.{axis}" for axis in "xyzw"]
-    values = [Value.model_validate({"from": reference}) for reference in references]
-    parts = [
-        reader.read_series("pose.quaternion", value, pose, held=False)
-        for value in values
-    ]
-    stream = combine_series("pose.quaternion", parts, held=False)
+    values = {
+        axis: Value.model_validate({"from": reference})
+        for axis, reference in zip("xyzw", references, strict=True)
+    }
+    stream = _read_values(reader, "pose.quaternion", values, False, pose)
     place = f"{reader.source.place}: pose"
     length = np.linalg.norm(stream.values, axis=1)
     is_lost = length < NO_LENGTH

@@ -27,6 +27,7 @@ MOST_COLUMNS = 200  # maximum number of columns of a table that are surveyed
 SHORTEST_STEP_S = 1e-4
 LEAST_SCORE = 0.25  # minimum score of a column of stamps
 MAX_BACKWARD_FRACTION = 0.05  # maximum fraction of backward steps of a column of stamps
+TICKS = word_set("tick ticks encoder enc encoders count counts")
 TIMES = word_set("""
     time times stamp timestamp t s sec secs seconds elapsed ms us ns millis
     micros nanos date datetime
@@ -136,6 +137,11 @@ class Field:
         return split_unit(self.name)[1]
 
     @property
+    def counts(self) -> bool:
+        """True if its name is that of ticks."""
+        return not TICKS.isdisjoint(split_words(self.name))
+
+    @property
     def values(self) -> Column:
         """Values (T,)."""
         return self.table.data[self.name]
@@ -159,7 +165,8 @@ class TableSurvey:
     name: str
     rows: int
     columns: list[Field] = field(default_factory=list)
-    stamps: str | None = None  # column of the stamps; None if they come with the rows
+    # column of the stamps, or of seconds and nanoseconds; empty if they come with the rows
+    stamp_columns: Sequence[str] = ()
     unit: str | None = None  # unit of the stamps, unless seconds
     findings: list[str] = field(default_factory=list)
     t: Array | None = None  # (T,) [s]
@@ -170,38 +177,33 @@ class TableSurvey:
     @property
     def facts(self) -> dict[str, Any]:
         """The survey as plain data."""
-        facts = {name: getattr(self, name) for name in ("name", "rows", "stamps")}
-        facts |= {"unit": self.unit, "findings": self.findings, "kind": self.kind}
         columns = [(c.name, c.low, c.high) for c in self.columns]
-        return {**facts, "columns": columns, "regularity": self.regularity}
+        stamps = ", ".join(self.stamp_columns)
+        return {
+            "name": self.name,
+            "rows": self.rows,
+            "stamps": f"[{stamps}]" if len(self.stamp_columns) > 1 else stamps or None,
+            "unit": self.unit,
+            "findings": self.findings,
+            "kind": self.kind,
+            "columns": columns,
+            "regularity": self.regularity,
+        }
 
     @property
     def time(self) -> str | None:
         """The stamps for a mapping, such as `t`, `[s, ns]` or `{from: t, unit: ms}`."""
-        columns = [write_reference(column) for column in self.stamp_columns]
-        if not columns:
+        if not self.stamp_columns:
             return None
-        text = columns[0]
-        if len(columns) > 1:
-            text = f"[{', '.join(columns)}]"
-        if self.unit:
-            return f"{{from: {text}, unit: {self.unit}}}"
-        return text
+        text = ", ".join(map(write_reference, self.stamp_columns))
+        if len(self.stamp_columns) > 1:
+            text = f"[{text}]"
+        return f"{{from: {text}, unit: {self.unit}}}" if self.unit else text
 
     @property
     def numbers(self) -> list[Field]:
         """The columns that hold numbers."""
         return [column for column in self.columns if column.is_number]
-
-    @property
-    def stamp_columns(self) -> list[str]:
-        """The columns of the stamps."""
-        if self.stamps is None:
-            return []
-        split = re.fullmatch(r"\[(.+), (.+)\]", self.stamps)
-        if split:
-            return [split[1], split[2]]
-        return [self.stamps]
 
     @property
     def regularity(self) -> list[str]:
@@ -261,10 +263,12 @@ def _inspect_table(name: str, table: Table) -> TableSurvey:
     if stream is not None:
         survey.t = stream.t
         return survey
-    survey.stamps, raw = _guess_stamps(survey.data)
-    if survey.stamps is not None and raw is not None:
+    survey.stamp_columns, raw = _guess_stamps(survey.data)
+    if survey.stamp_columns:
         raw = raw[np.isfinite(raw)]
-        survey.unit = guess_time_unit(raw) or _guess_unit_by_name(survey.stamps, raw)
+        survey.unit = guess_time_unit(raw)
+        if survey.unit is None and len(survey.stamp_columns) == 1:
+            survey.unit = _guess_unit_by_name(survey.stamp_columns[0], raw)
         survey.t = raw * UNITS[survey.unit or "s"].factor
     return survey
 
@@ -272,13 +276,11 @@ def _inspect_table(name: str, table: Table) -> TableSurvey:
 def _guess_unit_by_name(name: str, raw: Array) -> str | None:
     """Returns the unit below a second that the name of stamps states, as in `time_ms`."""
     words, unit = split_unit(name)
-    if unit is None:
-        unit = (words or [""])[-1]
+    unit = unit or (words or [""])[-1]
     if unit not in UNITS_OF_STEP:
         return None
-    if compute_usual_step(raw) * UNITS[unit].factor < SHORTEST_STEP_S:
-        return None
-    return unit
+    is_too_short = compute_usual_step(raw) * UNITS[unit].factor < SHORTEST_STEP_S
+    return None if is_too_short else unit
 
 
 def _find_range(column: Column) -> tuple[float, float]:
@@ -298,22 +300,22 @@ def _select_numbers(data: dict[str, Column]) -> dict[str, Array]:
     }
 
 
-def _guess_stamps(data: dict[str, Column]) -> tuple[str | None, Array | None]:
-    """Guesses the column of stamps by its name and by how steadily it rises."""
+def _guess_stamps(data: dict[str, Column]) -> tuple[Sequence[str], Array]:
+    """Guesses the columns of stamps by their names and by how steadily they rise."""
     values = _select_numbers(data)
     for seconds, fraction in stamping.SPLIT:
         if {seconds, fraction} <= values.keys():
             stamps = stamping.join_stamps(data[seconds], data[fraction])
-            return f"[{seconds}, {fraction}]", stamps
+            return (seconds, fraction), stamps
     for name, column in data.items():
         dates = None if name in values else parse_dates(column)
         if dates is not None:
             values[name] = dates
     scores = {name: _score_stamps(name, column) for name, column in values.items()}
-    best = max(scores, key=lambda name: scores[name], default=None)
-    if best is None or scores[best] < LEAST_SCORE:
-        return None, None
-    return best, values[best]
+    best = max(scores, key=lambda name: scores[name], default="")
+    if scores.get(best, 0.0) < LEAST_SCORE:
+        return (), np.zeros(0)
+    return (best,), values[best]
 
 
 def _score_stamps(name: str, values: Array) -> float:

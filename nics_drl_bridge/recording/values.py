@@ -119,10 +119,10 @@ class MappedReader:
             return StampedRows(rows / time.rate, rows, "", count)
         key = table.place, repr(time)
         if key not in self._stamped_rows:
+            read = self._read_stamps
             if time is None or time.from_ in (schema.HEADER, schema.ARRIVAL):
-                self._stamped_rows[key] = self._take_stamps(table, time)
-            else:
-                self._stamped_rows[key] = self._read_stamps(table, time)
+                read = self._take_stamps
+            self._stamped_rows[key] = read(table, time)
         stamped = self._stamped_rows[key]
         if stamped.total != count:
             raise RecordingError(
@@ -143,15 +143,18 @@ class MappedReader:
         default_clock = stamping.RECEIVE
         if getattr(self.mapping.time, "from_", None) == schema.HEADER:
             default_clock = stamping.HEADER
-        clock = stream.clock
-        if clock == default_clock:
-            clock = ""
+        clock = "" if stream.clock == default_clock else stream.clock
         rows = stream.values[:, 0].astype(np.intp)
         return StampedRows(stream.t, rows, clock, len(table.column(0)))
 
     def _read_stamps(self, table: Table, time: schema.Time) -> StampedRows:
         """Reads stamps from columns of a table, and repairs what loggers did to them."""
-        raw = self._read_raw_stamps(table, time)
+        names = [self._locate_beside(table, column)[1] for column in time.columns]
+        column = table.column(names[0])
+        dates = parse_dates(column) if is_text(column) and len(names) == 1 else None
+        raw = read_numbers(table, names[0]) if dates is None else dates
+        if len(names) == 2:
+            raw = stamping.join_stamps(raw, read_numbers(table, names[1]))
         rows = np.flatnonzero(np.isfinite(raw))
         t = raw[rows]
         _check_whole_seconds(table, time, t)
@@ -163,28 +166,17 @@ class MappedReader:
         self.add_notes(note)
         unit = guess_time_unit(t)
         if time.unit is None and unit is not None:
-            column = time.columns[0]
+            column_name = time.columns[0]
             raise RecordingError(
-                f"{table.place}: the stamps {column!r} are {np.median(np.diff(t)):.4g} "
-                f"apart, which can't be seconds; write `time: {{from: {column}, unit: "
-                f"{unit}}}` into the mapping (`unit: s` if they are)."
+                f"{table.place}: the stamps {column_name!r} are "
+                f"{np.median(np.diff(t)):.4g} apart, which can't be seconds; write "
+                f"`time: {{from: {column_name}, unit: {unit}}}` into the mapping "
+                "(`unit: s` if they are)."
             )
         t = t * schema.UNITS[time.unit or "s"].factor
         t, order, note = stamping.repair_order(t, name)
         self.add_notes(note)
         return StampedRows(t, rows[order], "", len(raw))
-
-    def _read_raw_stamps(self, table: Table, time: schema.Time) -> Array:
-        names = [self._locate_beside(table, column)[1] for column in time.columns]
-        if len(names) == 2:
-            seconds = read_numbers(table, names[0])
-            nanoseconds = read_numbers(table, names[1])
-            return stamping.join_stamps(seconds, nanoseconds)
-        column = table.column(names[0])
-        dates = parse_dates(column) if is_text(column) else None
-        if dates is not None:
-            return dates
-        return read_numbers(table, names[0])
 
     def _locate_beside(
         self, table: Table, reference: Reference
@@ -234,29 +226,17 @@ class MappedReader:
                 "and were left out."
             )
         series = Series(stamped.t[is_finite], raw[is_finite], clock)
-        may_be_speed = get_unit(value).si in ("", "rad/s", "m/s", "ticks/s")
-        behaviour = ""
-        if may_be_speed and value.wrap is None and not value.counts:
-            behaviour = stamping.describe_counter(series.values)
-        if behaviour:
-            raise RecordingError(
-                f"{table.place}: {column_name!r} is a counter that {behaviour}, no "
-                f"speed: write `{{from: {column_name}, unit: ticks, ticks_per_turn: "
-                f"...}}` for {name}."
-            )
-        series = self._convert_to_si(name, value, series, held)
-        if value.when:
-            return self._apply_flags(value, series, table, time)
-        return series
-
-    def _convert_to_si(
-        self, name: str, value: Value, series: Series, held: bool
-    ) -> Series:
-        factor = get_unit(value).factor * value.scale
-        if value.maximum is not None:
-            factor *= value.maximum
+        unit = get_unit(value)
         if value.wrap is not None or value.counts:
             series = self._unwrap(name, value, series)
+        elif unit.si in ("", "rad/s", "m/s", "ticks/s"):
+            behaviour = stamping.describe_counter(series.values)
+            if behaviour:
+                raise RecordingError(
+                    f"{table.place}: {column_name!r} is a counter that {behaviour}, no "
+                    f"speed: write `{{from: {column_name}, unit: ticks, "
+                    f"ticks_per_turn: ...}}` for {name}."
+                )
         if value.counts:
             if stamping.is_oscillating(series.values):
                 raise RecordingError(
@@ -265,7 +245,13 @@ class MappedReader:
                     f"{value.unit or 'ticks'}/s` for {name}."
                 )
             series = _derive_rate(series, held)
-        return series._replace(values=series.values * factor + value.offset)
+        factor = unit.factor * value.scale
+        if value.maximum is not None:
+            factor *= value.maximum
+        series = series._replace(values=series.values * factor + value.offset)
+        if value.when:
+            return self._apply_flags(value, series, table, time)
+        return series
 
     def _unwrap(self, name: str, value: Value, series: Series) -> Series:
         """Continues a counter across its overflows; an absolute angle starts near zero."""
@@ -425,16 +411,14 @@ def combine_series(name: str, parts: Sequence[Series], held: bool) -> Stream:
         stop = min(part.t[-1] for part in parts)
         if held:
             t = np.unique(np.concatenate([part.t for part in parts]))
-            t = t[t >= start]
-        else:
-            t = t[(t >= start) & (t <= stop)]
+            stop = np.inf
+        t = t[(t >= start) & (t <= stop)]
         if not len(t):
             raise RecordingError(
                 f"{name}: its values are of times that do not overlap."
             )
+        columns = [np.interp(t, part.t, part.values) for part in parts]
         if held:
             rows = [np.searchsorted(part.t, t, side="right") - 1 for part in parts]
             columns = [part.values[row] for part, row in zip(parts, rows, strict=True)]
-        else:
-            columns = [np.interp(t, part.t, part.values) for part in parts]
     return Stream(t, np.stack(columns, axis=1), clocks[0])
