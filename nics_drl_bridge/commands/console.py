@@ -16,7 +16,7 @@ from typer import Option
 
 from nics_drl_bridge import defaults, extensions
 from nics_drl_bridge.commands.interrupts import was_interrupted
-from nics_drl_bridge.errors import BridgeError, ConfigError, suggest
+from nics_drl_bridge.errors import BridgeError, ConfigError
 from nics_drl_bridge.exit_codes import EXIT_BAD_INPUT, EXIT_INTERRUPTED
 from nics_drl_bridge.files import format_json
 from nics_drl_bridge.robot import DEFAULT_ROBOT
@@ -232,19 +232,10 @@ def _format_option(name: str) -> str:
 def parse_roles(options: Sequence[str]) -> dict[str, str]:
     """Parses the options ROLE=TOPIC of a bag; returns role -> topic. Raises ConfigError."""
     from nics_drl_bridge.middleware.playback import TYPES
+    from nics_drl_bridge.recording.topic_roles import parse_topics
 
-    roles = {}
-    for option in options:
-        role, _, name = option.partition("=")
-        if role not in TYPES:
-            raise ConfigError(
-                f"--topic {option!r}: must be ROLE=TOPIC; {suggest(role, TYPES)}"
-            )
-        if not name:
-            fix = f"must be ROLE=TOPIC, as {role}=/my_{role}"
-            raise ConfigError(f"--topic {option!r}: {fix}.")
-        roles[role] = name if name.startswith("/") else f"/{name}"
-    return roles
+    topics = parse_topics(options, TYPES)
+    return {role: f"/{topic.removeprefix('/')}" for role, topic in topics.items()}
 
 
 @contextmanager

@@ -2,7 +2,7 @@
 
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 from typer import Argument, Option
@@ -69,7 +69,7 @@ def evaluate(
         bool, Option("--hardware", help="Drive the vehicle, through command_gate.")
     ] = False,
     start: Annotated[
-        str,
+        Literal["wait", "present"],
         Option(
             help="For --hardware: wait until it stands at the start, or start where it is."
         ),
@@ -82,7 +82,7 @@ def evaluate(
         ),
     ] = None,
     goal_frame: Annotated[
-        str | None,
+        Literal["robot", "map"] | None,
         Option(
             metavar="robot|map",
             help="For --hardware: the goal is ahead and left of where the robot "
@@ -92,6 +92,7 @@ def evaluate(
     confirm_beyond: Annotated[
         float,
         Option(
+            min=0.0,
             metavar="METRES",
             help="For --hardware: a goal that is farther away is confirmed.",
         ),

@@ -1,8 +1,7 @@
 """`nics list`: shipped robots, worlds, lidars and policies, by the names that commands take."""
 
 from collections.abc import Callable
-from enum import Enum
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from typer import Argument
 
@@ -12,13 +11,7 @@ from nics_drl_bridge.config import list_shipped
 Row = dict[str, Any]
 
 
-class Listed(str, Enum):
-    """Kinds of shipped things."""
-
-    ROBOTS = "robots"
-    WORLDS = "worlds"
-    LIDARS = "lidars"
-    POLICIES = "policies"
+Listed = Literal["robots", "worlds", "lidars", "policies"]
 
 
 def list_(
@@ -27,7 +20,7 @@ def list_(
     """Lists the shipped robots, worlds, lidars or policies."""
     rows = ROWS[what]()
     cells = [tuple(map(str, row.values())) for row in rows]
-    print_line(as_json, format_table(tuple(rows[0]), cells), **{what.value: rows})
+    print_line(as_json, format_table(tuple(rows[0]), cells), **{what: rows})
 
 
 def robots() -> list[Row]:
@@ -121,9 +114,9 @@ def policies() -> list[Row]:
     ]
 
 
-ROWS: dict[Listed, Callable[[], list[Row]]] = {
-    Listed.ROBOTS: robots,
-    Listed.WORLDS: worlds,
-    Listed.LIDARS: lidars,
-    Listed.POLICIES: policies,
+ROWS: dict[str, Callable[[], list[Row]]] = {
+    "robots": robots,
+    "worlds": worlds,
+    "lidars": lidars,
+    "policies": policies,
 }

@@ -45,11 +45,7 @@ ROS_TOOLS = (
     "fastrtps-cmake-module",
 )
 COMPILERS = ("c++", "g++", "clang++")
-# program -> the wheel or Debian package that has it
-PROGRAMS = {
-    "cmake": "cmake",
-    "make": "make",
-}
+PROGRAMS = ("cmake", "make")
 FOLDERS = ("msg", "srv", "action")
 NAME_ELEMENT = re.compile(r"<name>\s*([^<]*?)\s*</name>")
 PACKAGE_NAME = re.compile(r"[a-z][a-z0-9_]*")
@@ -168,7 +164,7 @@ class Interfaces:
 def check_programs() -> None:
     """Raises ConfigError if cmake, make or a C++ compiler is missing."""
     missing = [name for name in PROGRAMS if shutil.which(name) is None]
-    packages = [PROGRAMS[name] for name in missing]
+    packages = [*missing]
     if not any(shutil.which(name) for name in COMPILERS):
         missing.append("a C++ compiler")
         packages.append("g++")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nics_drl_bridge import defaults, geometry
-from nics_drl_bridge.errors import ConfigError, suggest
+from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.sim.scenes import Scene
 from nics_drl_bridge.sim.world import World
@@ -16,9 +16,7 @@ from nics_drl_bridge.sim.world_set import AnyWorld
 # frames of goals
 ROBOT = "robot"
 MAP = "map"
-GOAL_FRAMES = (ROBOT, MAP)
 # where episodes start, see `RealtimeOptions.start`
-WAIT = "wait"
 PRESENT = "present"
 # increase of a confirmed distance below which nobody is asked again [m]
 NEAR_M = 0.5
@@ -38,22 +36,9 @@ class GoalOrder:
     point: Point | None = None  # x, y [m]; None: each episode's goal in the world
     # None: `robot` if episodes start at the present place, else `map`
     frame: str | None = None
-    start: str = defaults.VEHICLE_START  # WAIT or PRESENT
+    start: str = defaults.VEHICLE_START  # `wait` or PRESENT
     localised: bool = False  # True: a pose sensor locates the robot in `map`
     confirm_beyond_m: float = defaults.CONFIRMED_BEYOND_M
-
-    def __post_init__(self) -> None:
-        if self.frame not in (None, *GOAL_FRAMES):
-            raise ConfigError(
-                f"--goal-frame {self.frame!r}: {suggest(str(self.frame), GOAL_FRAMES)}"
-            )
-        if self.start not in (WAIT, PRESENT):
-            raise ConfigError(
-                f"--start {self.start!r}: {suggest(self.start, (WAIT, PRESENT))}"
-            )
-        if not self.confirm_beyond_m >= 0.0:
-            option = f"--confirm-beyond {self.confirm_beyond_m:g}"
-            raise ConfigError(f"{option}: must be a distance of 0 m or more.")
 
     @property
     def relative(self) -> bool:

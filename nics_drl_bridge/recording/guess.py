@@ -94,8 +94,9 @@ def propose_mapping(tables: Sequence[TableSurvey]) -> MappingDraft:
     lines += _write_commands(guess, switches, time)
     if gyro is not None:
         lines.append(f"{write_imu_line(gyro, time)}  {GUESSED}")
-    used = [command.column for command in guess.candidates.values()]
-    used += [*commanded, *(switch.column for switch in switches), gyro, episode]
+    used: list[Field | None] = [*commanded, gyro, episode]
+    used += [command.column for command in guess.candidates.values()]
+    used += [switch.column for switch in switches]
     return MappingDraft(doubts, lines, [*_list_unused(tables, used, pose)])
 
 

@@ -102,25 +102,28 @@ def load_topic_roles(
     roles = TopicRoles()
     if file:
         roles = load_yaml(file, TopicRoles)
-    topics: dict[str, str] = {}
-    for option in options:
-        role, equals, topic = (part.strip() for part in option.partition("="))
-        if not equals or not topic:
-            raise ConfigError(
-                f"--topic {option!r}: must be ROLE=TOPIC, as in cmd_vel=/cmd_vel."
-            )
-        if role not in ROLES:
-            raise ConfigError(
-                f"--topic {option!r}: unknown role {role!r}; {suggest(role, ROLES)}"
-            )
-        if role in topics:
-            raise ConfigError(
-                f"--topic {option!r}: {role} was given before; give it once."
-            )
-        topics[role] = topic
+    topics = parse_topics(options, ROLES)
     return validate(
         {**roles.model_dump(exclude_none=True), **topics}, TopicRoles, "topics"
     )
+
+
+def parse_topics(options: Iterable[str], roles: Iterable[str]) -> dict[str, str]:
+    """Parses options `ROLE=TOPIC`; returns role -> topic. Raises ConfigError."""
+    topics: dict[str, str] = {}
+    for option in options:
+        role, _, topic = (part.strip() for part in option.partition("="))
+        fault = ""
+        if role not in roles:
+            fault = f"unknown role {role!r}; {suggest(role, roles)}"
+        elif not topic:
+            fault = f"must be ROLE=TOPIC, as {role}=/my_{role}."
+        elif role in topics:
+            fault = f"{role} was given before; give it once."
+        if fault:
+            raise ConfigError(f"--topic {option!r}: {fault}")
+        topics[role] = topic
+    return topics
 
 
 def assign(

@@ -119,10 +119,10 @@ class MappedReader:
             return StampedRows(rows / time.rate, rows, "", count)
         key = table.place, repr(time)
         if key not in self._stamped_rows:
-            read = self._read_stamps
             if time is None or time.from_ in (schema.HEADER, schema.ARRIVAL):
-                read = self._take_stamps
-            self._stamped_rows[key] = read(table, time)
+                self._stamped_rows[key] = self._take_stamps(table, time)
+            else:
+                self._stamped_rows[key] = self._read_stamps(table, time)
         stamped = self._stamped_rows[key]
         if stamped.total != count:
             raise RecordingError(

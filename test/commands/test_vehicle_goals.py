@@ -127,16 +127,3 @@ class Terminal:
 
     def readline(self, *_):
         return self.answer
-
-
-@pytest.mark.parametrize(
-    ("given", "sentence"),
-    [
-        ({"frame": "odom"}, r"--goal-frame 'odom': (did you mean|valid are)"),
-        ({"start": "presnt"}, "--start 'presnt': did you mean 'present'"),
-        ({"confirm_beyond_m": -1.0}, "--confirm-beyond -1: must be"),
-    ],
-)
-def test_a_wrong_option_is_one_sentence(given, sentence):
-    with pytest.raises(ConfigError, match=sentence):
-        GoalOrder(**given)

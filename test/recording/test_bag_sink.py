@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import shutil
 import sqlite3
 import subprocess
 import sys
@@ -49,21 +48,6 @@ def test_of_a_killed_recorder_all_that_was_flushed_is_there(tmp_path, storage):
     assert not list(tmp_path.glob(".drive.*"))
 
 
-@pytest.fixture
-def small_disk(tmp_path):
-    """A file system of 400 kB."""
-    place = tmp_path / "small"
-    place.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", "size=400k", "tmpfs", str(place)]
-    if (
-        shutil.which("mount") is None
-        or subprocess.run(mount, capture_output=True).returncode
-    ):
-        pytest.skip("no file system can be mounted here")
-    yield place
-    subprocess.run(["umount", "-l", str(place)], check=True)
-
-
 def record(place, storage, count, keep=True, then=None, flush_every=10):
     """Messages of a second, as the recorder writes them; `then` is raised after the last one."""
     message = bags.STORE.serialize_cdr(bags.twist(1.0, 0.0, 0.0), bags.kinds.TWIST)
@@ -75,18 +59,6 @@ def record(place, storage, count, keep=True, then=None, flush_every=10):
                 sink.flush()
         if then is not None:
             raise then
-
-
-@pytest.mark.parametrize("storage", STORAGES)
-def test_a_full_disk_keeps_what_was_recorded(small_disk, storage):
-    with pytest.raises(
-        RecordingError, match="what was written until then lies in"
-    ) as refused:
-        record(small_disk / "drive", storage, 100_000)
-    assert "full" in str(refused.value) or "No space left" in str(refused.value)
-    (left,) = small_disk.glob(".drive.*/drive")
-    assert str(left) in str(refused.value)
-    assert bags.unfinished_messages(left) > 500
 
 
 @pytest.mark.parametrize(

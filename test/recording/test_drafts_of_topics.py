@@ -187,16 +187,3 @@ def test_a_draft_of_a_bag_is_right_or_blank(bag):
     draft = parse_yaml(text, "draft")
     assert draft["pose"] == place, text
     assert list((draft["command"] or {}).values()) == commands, text
-
-
-def test_topics_that_no_word_explains_are_candidates():
-    motor = topic("/commands/motor/speed", FLOAT, {"data": "v"})
-    servo = topic("/commands/servo/position", FLOAT, {"data": "w"})
-    consigne = topic("/consigne", "my_msgs/msg/Consigne", {"vitesse": "v"})
-    for tables, expected in (
-        ([odometry(), motor, servo], "#  command_1: /commands/servo/position:data"),
-        ([odometry(), consigne], "#  command_0: /consigne:vitesse"),
-    ):
-        text = propose_mapping(tables).text
-        assert "no command was recorded" not in text
-        assert expected in text

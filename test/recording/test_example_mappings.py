@@ -82,16 +82,6 @@ def test_the_wheel_speeds_of_a_real_car_are_no_counters(shared_recordings, drive
         read_recording(shared_recordings / "xtark_ackermann" / drive, mapping=counting)
 
 
-def test_the_throttle_is_zero_while_the_switch_is_off(shared_recordings):
-    raw = np.genfromtxt(
-        shared_recordings / SOURCES["jetracer_csv"][0], delimiter=",", skip_header=1
-    )
-    _, drive = imported(shared_recordings, "jetracer_csv")
-    safe = raw[:, 7] == 1.0
-    assert np.array_equal(drive.command.values[:, 0], np.where(safe, raw[:, 8], 0.0))
-    assert 0.1 < safe.mean() < 1.0
-
-
 @pytest.mark.parametrize("k", [0, 1])
 def test_ticks_are_wheels_that_turn_the_robot_as_its_calibration_says(
     shared_recordings, k

@@ -96,14 +96,6 @@ def test_every_command_is_moved_by_the_rules_that_a_fit_judges_a_drive_by(
     assert (changes.sum(axis=1) == len(robot.command)).any()
 
 
-@pytest.mark.slow
-def test_a_seed_tells_a_drive():
-    one, other = (preview(ROBOTS[0], 20.0, seed=seed).command for seed in (0, 1))
-    same = DrivePlan(ROBOTS[0], 2.0, 20.0).preview().command
-    assert np.array_equal(one, same)
-    assert not np.array_equal(one, other)
-
-
 def drive_another(robot, really, gain, seed):
     """Greatest distance of a robot that moves otherwise than expected, and is watched."""
     drive = DrivePlan(robot, bound=2.0, duration=60.0, seed=seed).begin()

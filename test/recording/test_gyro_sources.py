@@ -6,11 +6,9 @@ import bags
 import numpy as np
 import pytest
 
-from nics_drl_bridge.recording.guess import propose_mapping
 from nics_drl_bridge.recording.pose_source import guess_source_by_names
-from nics_drl_bridge.recording.readers import open_source, read_recording
+from nics_drl_bridge.recording.readers import read_recording
 from nics_drl_bridge.recording.recording import load_recording, save_recording
-from nics_drl_bridge.recording.survey import inspect_tables
 from nics_drl_bridge.recording.topic_roles import ODOMETRY, POSE, TRANSFORMS, TopicRoles
 from nics_drl_bridge.robot.spec import load_robot
 
@@ -91,14 +89,3 @@ def test_a_mapping_says_itself_what_measured_the_pose(tmp_path):
         encoding="utf-8",
     )
     assert read_recording(table(tmp_path), mapping=mapping).measured_by == "tracker"
-
-
-def test_a_draft_of_a_bag_with_an_imu_names_its_yaw_rate(tmp_path):
-    rows = [
-        (t, bags.imu(t, 0.0, 0.0, 0.25 + 0.1 * np.sin(t))) for t in bags.times(0.02)
-    ]
-    bag = bags.write(tmp_path / "bag", bags.drive() | {"/imu/data": rows})
-    with open_source(bag) as source:
-        draft = propose_mapping(inspect_tables(source)).text
-    assert "yaw_rate: /imu/data:angular_velocity.z" in draft
-    assert "not used: /imu/data: angular_velocity.z" not in draft

@@ -335,18 +335,6 @@ def test_an_imported_drive_keeps_deviations_and_repairs(tmp_path, columns):
     assert same(back, read(file, "{robot: ackermann, command: {x: 3}}"))
 
 
-@pytest.mark.parametrize(
-    "pwm",
-    [np.where(np.arange(400) % 100 < 50, -127, 127), np.zeros(400), 5 * np.arange(400)],
-)
-def test_commands_in_whole_numbers_are_no_counters(tmp_path, pwm):
-    columns = drive(400) | {"v": pwm + np.arange(400) % 2}
-    found = read(write(tmp_path / "log.csv", columns))
-    assert np.array_equal(
-        np.unique(found.command.values[:, 0]), np.unique(columns["v"])
-    )
-
-
 def test_poses_far_from_the_origin_of_a_fast_car_are_read(tmp_path, columns):
     moved = {"x": 60.0 * columns["x"] + 4e5, "y": 60.0 * columns["y"] + 5e6}
     path = write(tmp_path / "log.csv", columns | moved)

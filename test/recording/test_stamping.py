@@ -150,13 +150,6 @@ def test_a_stamp_from_another_age_is_refused(at, by):
     refused({"command": COMMAND, "pose": topic("/pose", headers)})
 
 
-def test_repeated_messages_stay_in_order():
-    twice = np.repeat(T, 2)
-    pose = topic("/pose", twice, twice + TRANSPORT)
-    made = stamp_streams({"command": COMMAND, "pose": pose}, "auto", "drive")
-    assert np.allclose(made["pose"].t, twice)
-
-
 def test_receipt_out_of_order_is_sorted():
     order = np.random.default_rng(0).permutation(len(T))
     data = topic("/cmd_vel", None, T[order])

@@ -18,21 +18,6 @@ def steady(spec, command):
     return textbook(spec).target(np.array(command))
 
 
-@pytest.mark.slow
-def test_a_car_on_a_constant_steer_drives_a_circle_of_the_textbook_radius():
-    car = load_robot("ackermann")
-    book = textbook(car)
-    command = np.array([0.8, 0.3])
-    radius = car.parameters["wheelbase"] / np.tan(0.3)
-    for time in (0.5, 1.7, 4.0):
-        pose, _ = integrate(book, np.zeros(3), steady(car, command), command, time)
-        angle = 0.8 * time / radius
-        assert pose[:2] == pytest.approx(
-            [radius * np.sin(angle), radius * (1.0 - np.cos(angle))], abs=1e-9
-        )
-        assert geometry.wrap_angle(pose[2] - angle) == pytest.approx(0.0, abs=1e-9)
-
-
 @pytest.mark.parametrize("name", ["differential", "mecanum"])
 @pytest.mark.parametrize("share", [(1.0, 0.0), (0.0, 1.0), (0.3, -0.8)])
 def test_wheels_turn_so_that_the_body_moves_as_commanded(name, share):
@@ -109,15 +94,6 @@ def test_a_recorded_drive_holds_commands_within_limits_and_starts_at_rest():
     assert not drive.pose.values[0].any()
     heading = drive.pose.values[:, 2]
     assert ((heading >= -np.pi) & (heading < np.pi)).all()
-
-
-def test_the_same_generator_state_gives_the_same_drive():
-    spec = load_robot("ackermann")
-    one = record(spec, np.random.default_rng(3), duration=3.0)
-    same = record(spec, np.random.default_rng(3), duration=3.0)
-    other = record(spec, np.random.default_rng(4), duration=3.0)
-    assert np.array_equal(one.pose.values, same.pose.values)
-    assert not np.array_equal(one.pose.values, other.pose.values)
 
 
 @pytest.mark.parametrize("name", ROBOTS)

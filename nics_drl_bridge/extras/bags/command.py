@@ -3,7 +3,7 @@
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 from typer import Argument, Option
@@ -17,10 +17,10 @@ bag = typer.Typer(
     help="Records, describes, replays, exports bags.", no_args_is_help=True
 )
 
-STORAGES = ("mcap", "sqlite3")
 BagArgument = Annotated[Path, Argument(help="Folder or file of a rosbag2.")]
 StorageOption = Annotated[
-    str, Option(help="mcap (checksums) or sqlite3.", metavar="mcap|sqlite3")
+    Literal["mcap", "sqlite3"],
+    Option(help="mcap (checksums) or sqlite3.", metavar="mcap|sqlite3"),
 ]
 
 
@@ -42,14 +42,19 @@ def record(
     as_json: console.JsonOption = False,
 ) -> None:
     """Records a robot's topics without driving it."""
-    kind = _choose_storage(storage)
     with extensions.require_modules("nics bag record"):
         from nics_drl_bridge.extras.bags.live import BagOrder, record_bag
         from nics_drl_bridge.nodes.own_process import forwarded_errors
     names = tuple(topics or ())
     say = partial(typer.echo, err=True)
     order = BagOrder(
-        out, names, everything, parse_namespace(namespace), duration, kind, use_sim_time
+        out,
+        names,
+        everything,
+        parse_namespace(namespace),
+        duration,
+        storage,
+        use_sim_time,
     )
     with forwarded_errors():
         counts = dict(sorted(record_bag(order, say).items()))
@@ -174,14 +179,6 @@ def export(
     console.print_line(
         as_json, f"bag written to {mcap}{also}", mcap=str(mcap), added=added
     )
-
-
-def _choose_storage(name: str) -> Any:
-    from nics_drl_bridge.errors import ConfigError, suggest
-
-    if name not in STORAGES:
-        raise ConfigError(f"--storage {name!r}: {suggest(name, STORAGES)}")
-    return name
 
 
 def _format_row(topic: Any) -> tuple[str, ...]:
