@@ -15,7 +15,6 @@ from nics_drl_bridge.recording import mapping as mapped
 from nics_drl_bridge.recording import topic_roles as roles
 from nics_drl_bridge.recording.bag_file import BagFile, Message, read_times
 from nics_drl_bridge.recording.messages import get_frames
-from nics_drl_bridge.recording.pose_source import guess_source_by_names
 from nics_drl_bridge.recording.recording import Stream
 from nics_drl_bridge.recording.stamping import (
     ROBOT_STREAMS,
@@ -190,7 +189,7 @@ class Bag(Source):
             topic
             for topic in self._used
             if types[topic] == roles.ODOMETRY
-            and guess_source_by_names((topic,), types[topic]) == "odometry"
+            and roles.guess_source_by_names((topic,), types[topic]) == "odometry"
         ]
         return measure_latency(self.file, odometry[0] if len(odometry) == 1 else None)
 

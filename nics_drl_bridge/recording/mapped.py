@@ -6,14 +6,14 @@ from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.geometry import Array, east_and_north, wrap_angle
 from nics_drl_bridge.recording import mapping as schema
 from nics_drl_bridge.recording import recording as recordings
 from nics_drl_bridge.recording import stamping
-from nics_drl_bridge.recording.episodes import split_by_time, split_table
-from nics_drl_bridge.recording.joining import join
+from nics_drl_bridge.recording.joining import join, split_at
 from nics_drl_bridge.recording.mapping import (
     ImuSource,
     Mapping,
@@ -25,7 +25,6 @@ from nics_drl_bridge.recording.mapping import (
     is_place_on_earth,
     may_be_place_on_earth,
 )
-from nics_drl_bridge.recording.pose_source import guess_source_by_names
 from nics_drl_bridge.recording.recording import (
     MeasuredBy,
     Recording,
@@ -33,7 +32,8 @@ from nics_drl_bridge.recording.recording import (
     check_streams,
     find_implausible_pose,
 )
-from nics_drl_bridge.recording.table import Source, read_numbers
+from nics_drl_bridge.recording.table import Source, Table, read_numbers
+from nics_drl_bridge.recording.topic_roles import guess_source_by_names
 from nics_drl_bridge.recording.values import (
     MappedReader,
     Series,
@@ -47,6 +47,7 @@ MOST_TILT_DEG = 40.0  # maximum median tilt of a robot that drives on wheels
 # Maximum fraction of zero quaternions, where the tracker lost the body
 MOST_UNTRACKED = 0.05
 NO_LENGTH = 1e-9
+MIN_EPISODE_ROWS = 3  # shorter episodes are left out
 MIN_POSE_S = 1.0
 MOST_RATIO = 100.0  # maximum ratio of the durations of two streams of a drive
 
@@ -61,18 +62,101 @@ def read_mapped(
     if mapping.episode is None:
         return _read_drive(source, mapping, spec)[0]
     plain = mapping.model_copy(update={"episode": None})
-    episodes = split_table(source, mapping)
+    episodes = _split_table(source, mapping, mapping.episode)
     if not episodes:
         recording, origin_s = _read_drive(source, plain, spec)
-        return split_by_time(source, mapping, recording, origin_s)
+        return _split_by_time(source, mapping, recording, origin_s)
     drives = []
-    for episode in episodes:
+    for label, episode in episodes:
         try:
             drive, _ = _read_drive(episode, plain, spec)
             drives.append(replace(drive, source=episode.place))
         except RecordingError as error:
-            raise RecordingError(f"episode {episode.episode}: {error}") from None
+            raise RecordingError(f"episode {label}: {error}") from None
     return replace(join(drives), source=source.place)
+
+
+class _Episode(Source):
+    """The rows of one episode in a table that holds everything that a mapping reads."""
+
+    def __init__(
+        self, place: str, name: str, table: Table, rows: NDArray[np.intp]
+    ) -> None:
+        super().__init__(place, [name])
+        self._table = replace(
+            table,
+            place=place,
+            column=lambda which: table.column(which)[rows],
+            row=lambda k: table.row(int(rows[k])),
+        )
+
+    def read(self, name: str) -> Table:
+        """Returns the table with the rows of the episode."""
+        return self._table
+
+
+def _split_table(
+    source: Source, mapping: Mapping, episode: Reference
+) -> list[tuple[str, Source]]:
+    """Returns label and rows of each episode of a table.
+
+    Empty for several tables, or rows that come with stamps. Raises ConfigError if no episode is
+    long enough.
+    """
+    reader = MappedReader(source, mapping)
+    table, reference = reader.locate(episode)
+    pose = mapping.pose
+    values = (*mapping.command.values(), *mapping.state.values())
+    used = [reader.locate(value.from_)[0] for value in values]
+    used.append(reader.locate(pose.x.from_ if pose.x else 0, pose.in_)[0])
+    # Stamps that come with the rows continue from one episode to the next.
+    if any(other is not table for other in used) or table.stamps("") is not None:
+        return []
+    name = next(name for name in source.names if source.get_table(name) is table)
+    column = table.column(reference)
+    labels, first, group = np.unique(column, return_index=True, return_inverse=True)
+    episodes: list[tuple[str, Source]] = []
+    for k in np.argsort(first):
+        rows = np.flatnonzero(group == k)
+        if len(rows) >= MIN_EPISODE_ROWS:
+            label = _format_label(labels[k])
+            place = f"{source.place} (episode {label})"
+            episodes.append((label, _Episode(place, name, table, rows)))
+    if not episodes:
+        raise ConfigError(
+            f"{table.place}: no value of the column {reference!r} lasts for "
+            f"{MIN_EPISODE_ROWS} rows; name the column that numbers the episodes."
+        )
+    return episodes
+
+
+def _split_by_time(
+    source: Source, mapping: Mapping, recording: Recording, since: float
+) -> Recording:
+    """Splits a recording where its episode column changes.
+
+    `since` [s] was subtracted from its stamps. Raises ConfigError if pose and commands have
+    different clocks.
+    """
+    if recording.pose.clock != recording.command.clock:
+        raise ConfigError(
+            f"{source.place}: episode: pose and commands have clocks of their own; "
+            "give each episode as a recording of its own."
+        )
+    reader = MappedReader(source, mapping)
+    table, which = reader.locate(mapping.episode or 0)
+    column = table.column(which)
+    stamped = reader.stamp_rows(table, column, None)
+    values = column[stamped.rows]
+    changes = np.flatnonzero(values[1:] != values[:-1]) + 1
+    starts = [-np.inf, *(float(t) - since for t in stamped.t[changes])]
+    labels = [_format_label(values[k]) for k in (0, *changes)]
+    names = [f"{source.place} (episode {label})" for label in labels]
+    return split_at(recording, starts, names)
+
+
+def _format_label(value: Any) -> str:
+    return str(value) if isinstance(value, str) else f"{float(value):g}"
 
 
 def _read_drive(

@@ -11,6 +11,7 @@ from pydantic import Field
 
 from nics_drl_bridge.config import Schema, load_yaml, validate
 from nics_drl_bridge.errors import ConfigError, RecordingError, suggest
+from nics_drl_bridge.recording.recording import MeasuredBy
 
 Stamps = Literal["auto", "header", "receive"]
 NONE = "none"
@@ -46,6 +47,28 @@ USUAL = {
     "imu": (r"/imu(/data)?$", r"/imu[^/]*$", r"imu", r""),  # no other role has its type
 }
 """Patterns of usual names, the most reliable first; the first that matches a topic decides."""
+
+
+TRACKED = re.compile(
+    r"vrpn|mocap|motion_?capture|optitrack|vicon|qualisys|phasespace|motive|ground_?truth|truth"
+    r"|(^|[^a-z])gt([^a-z]|$)|slam|amcl|locali[sz]|(^|[^a-z])(pf|map|gps|rtk|gnss|utm|uwb)([^a-z]|$)"
+    r"|aruco|april_?tag|tracker|tracked|(^|/)pf|particle_?filter",
+    re.IGNORECASE,
+)
+ODOMETER = re.compile(r"odom|wheel|encoder|dead_?reckon", re.IGNORECASE)
+
+
+def guess_source_by_names(names: Iterable[str], kind: str) -> MeasuredBy:
+    """Guesses what measured poses by all names that belong to them; empty if it is unclear."""
+    names = [*names]
+    if any(TRACKED.search(name) for name in names):
+        return "tracker"
+    if kind == ODOMETRY or any(ODOMETER.search(name) for name in names):
+        return "odometry"
+    # Odometry does not use these types, unless its name says so.
+    if kind in (POSE, POSE_COVARIANCE, TRANSFORM):
+        return "tracker"
+    return ""
 
 
 class JointSource(Schema):

@@ -6,10 +6,15 @@ import bags
 import numpy as np
 import pytest
 
-from nics_drl_bridge.recording.pose_source import guess_source_by_names
 from nics_drl_bridge.recording.readers import read_recording
 from nics_drl_bridge.recording.recording import load_recording, save_recording
-from nics_drl_bridge.recording.topic_roles import ODOMETRY, POSE, TRANSFORMS, TopicRoles
+from nics_drl_bridge.recording.topic_roles import (
+    ODOMETRY,
+    POSE,
+    TRANSFORMS,
+    TopicRoles,
+    guess_source_by_names,
+)
 from nics_drl_bridge.robot.spec import load_robot
 
 HEADER = "t,cmd_v,cmd_w,odom_x,odom_y,odom_yaw,second\n"
