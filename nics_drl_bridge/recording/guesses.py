@@ -10,7 +10,6 @@ from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording import topic_roles
@@ -19,6 +18,7 @@ from nics_drl_bridge.recording.mapping import NO_COMMANDS, UNITS
 from nics_drl_bridge.recording.names import split_words, word_set
 from nics_drl_bridge.recording.survey import TICKS, Field, TableSurvey, split_unit
 from nics_drl_bridge.recording.table import Column, is_text
+from nics_drl_bridge.recording.values import match_values
 from nics_drl_bridge.robot.spec import find_kind, list_kinds
 from nics_drl_bridge.robot.template import list_names
 
@@ -305,7 +305,7 @@ class Switch(NamedTuple):
     """A column that must have a certain value for the commands to count."""
 
     column: Field
-    on: str  # the value, as written in a mapping
+    on: float | str  # the value
 
     @property
     def condition(self) -> str:
@@ -313,7 +313,10 @@ class Switch(NamedTuple):
         text = self.column.reference
         if ":" in text and not text.startswith('"'):
             text = f'"{text}"'
-        return f"{text}: {self.on}"
+        on = self.on
+        if not isinstance(on, str):
+            on = np.format_float_positional(on, trim="-")
+        return f"{text}: {on}"
 
 
 def guess_switches(tables: Sequence[TableSurvey]) -> tuple[Switch, ...]:
@@ -328,19 +331,13 @@ def guess_switches(tables: Sequence[TableSurvey]) -> tuple[Switch, ...]:
                 continue
             switches.append(Switch(column, on))
             if len(values) == table.rows:
-                is_on &= _equals(values, on)
+                is_on &= match_values(values, on)
         if table.rows and not is_on.any():
             return ()
     return tuple(switches)
 
 
-def _equals(values: Column, on: str) -> NDArray[np.bool_]:
-    if is_text(values):
-        return np.array([str(value) == on for value in values])
-    return np.asarray(values.astype(np.float64) == float(on))
-
-
-def _find_on_value(words: set[str], values: Column) -> str | None:
+def _find_on_value(words: set[str], values: Column) -> float | str | None:
     """Returns the value at which the commands count, from the names of column and values."""
     if is_text(values):
         texts = {str(value) for value in np.unique(values)}
@@ -355,10 +352,10 @@ def _find_on_value(words: set[str], values: Column) -> str | None:
     if len(numbers) != 2 or numbers[0] != 0.0:
         return None
     if words & DISABLING or {"e", "stop"} <= words:
-        return "0"
+        return 0.0
     is_powered = words & POWER and words & POWERED and numbers[1] == 1.0
     if words & ENABLING or {"dead", "man"} <= words or is_powered:
-        return np.format_float_positional(numbers[1], trim="-")
+        return float(numbers[1])
     return None
 
 

@@ -152,7 +152,7 @@ def _place_parts(
         **joined,
         source=", ".join(dict.fromkeys(drive.source for drive in recordings)),
         repairs=(
-            *_describe_join(sources, bool(held_out)),
+            _describe_join(sources, bool(held_out)),
             *_collect_repairs(recordings, shared),
         ),
         robot=next(
@@ -230,19 +230,16 @@ def _append_streams(name: str, parts: Sequence[Stream]) -> Stream:
     return Stream(t, values, parts[0].clock, sigma)
 
 
-def _describe_join(sources: Sequence[str], is_split: bool) -> tuple[str, ...]:
+def _describe_join(sources: Sequence[str], is_split: bool) -> str:
+    names = f"{sources[0]} to {sources[-1]}"
     if len(sources) <= 10:
         names = ", ".join(sources)
-    else:
-        names = f"{sources[0]} to {sources[-1]}"
     split = "all of them were fitted because they are too short to hold a part out"
     if is_split:
         split = "the last third of each was held out of the first fit"
     return (
-        (
-            f"{len(sources)} drives were joined ({names}): {split}; no prediction crosses "
-            "over."
-        ),
+        f"{len(sources)} drives were joined ({names}): {split}; no prediction crosses "
+        "over."
     )
 
 
