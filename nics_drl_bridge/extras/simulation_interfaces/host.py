@@ -1,19 +1,31 @@
 """How the services are answered by the node that offers them, and how they refuse."""
 
-import errno
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
+from urllib.parse import unquote, urlsplit
 
-from simulation_interfaces.msg import Result
+from simulation_interfaces.msg import Result, SpawnResult
+from simulation_interfaces.srv import LoadWorld
 
-from nics_drl_bridge.errors import BridgeError
+from nics_drl_bridge.errors import (
+    BridgeError,
+    ConfigError,
+    MissingFileError,
+    UnknownNameError,
+)
 from nics_drl_bridge.sim.entities import UnknownEntityError
+from nics_drl_bridge.sim.sdf import AssetsError
 
 if TYPE_CHECKING:
     from nics_drl_bridge.nodes.simulator_node import DeviceNode
 
 # the device node that offers the services
 Host: TypeAlias = "DeviceNode"
+Handler = Callable[[Any, Any], None]
+# A service's message whose constants are its codes for resources that it can't use.
+Codes = type[SpawnResult] | type[LoadWorld.Response]
 
 
 class RefusalError(BridgeError):
@@ -24,48 +36,64 @@ class RefusalError(BridgeError):
         self.code = code
 
 
-Handler = Callable[[Any, Any], None]
-ABSENT = (
-    errno.ENOENT,
-    errno.ENOTDIR,
-    errno.EISDIR,
-    errno.EACCES,
-    errno.ENAMETOOLONG,
-    errno.ELOOP,
-)
-
-
-def outcome(act: Callable[[], object], host: Host) -> tuple[int, str]:
-    """Do something; return the standard's code of how it went, and a sentence if it failed."""
-    try:
-        act()
-    except RefusalError as error:
-        return error.code, str(error)
-    except UnknownEntityError as error:
-        return Result.RESULT_NOT_FOUND, str(error)
-    except BridgeError as error:
-        return Result.RESULT_OPERATION_FAILED, str(error)
-    except Exception as error:  # noqa: BLE001  (the other robots and clients go on)
-        if isinstance(error, OSError) and error.errno in ABSENT:
-            return Result.RESULT_NOT_FOUND, str(
-                BridgeError(f"{error}; check the path.")
-            )
-        fault = f"the simulator failed: {type(error).__name__}: {error}"
-        host.get_logger().error(fault)
-        return Result.RESULT_OPERATION_FAILED, " ".join(fault.split())
-    return Result.RESULT_OK, ""
-
-
 def served(handler: Handler, host: Host) -> Callable[[Any, Any], Any]:
-    """Return a service's callback, which answers by a handler's result or refusal."""
+    """Return a service's callback, which answers whether a handler succeeds or why it does not."""
 
     def reply(request: Any, response: Any) -> Any:
-        code, sentence = outcome(lambda: handler(request, response), host)
-        # A handler that succeeds in part has set the result itself.
-        if code != Result.RESULT_OK or not response.result.result:
-            response.result.result = code
-        if sentence:
-            response.result.error_message = sentence
+        code = Result.RESULT_OPERATION_FAILED
+        sentence = ""
+        try:
+            handler(request, response)
+            code = Result.RESULT_OK
+        except RefusalError as error:
+            code = error.code
+            sentence = str(error)
+        except UnknownEntityError as error:
+            code = Result.RESULT_NOT_FOUND
+            sentence = str(error)
+        except OSError as error:
+            code = Result.RESULT_NOT_FOUND
+            sentence = str(BridgeError(f"{error}; check the path."))
+        except BridgeError as error:
+            sentence = str(error)
+        except Exception as error:  # noqa: BLE001  (the other robots and clients go on)
+            fault = f"the simulator failed: {type(error).__name__}: {error}"
+            host.get_logger().error(fault)
+            sentence = " ".join(fault.split())
+        response.result.result = code
+        response.result.error_message = sentence
         return response
 
     return reply
+
+
+def local_path(uri: str, codes: Codes, formats: tuple[str, ...]) -> Path:
+    """Return the path that a URI or a plain path means, or a name. Raises RefusalError."""
+    fault = "is not on this machine; give file:// or a path"
+    place = uri
+    try:
+        parts = urlsplit(uri)
+    except ValueError:  # of a host that is none
+        parts = None
+    if parts and parts.scheme == "file" and parts.netloc in ("", "localhost"):
+        place = unquote(parts.path)
+    path = Path(place)
+    if parts and "://" not in place:
+        if path.suffix in ("", *formats) or path.is_dir():
+            return path
+        fault = f"is none of {', '.join(formats)}; convert it"
+    raise RefusalError(codes.UNSUPPORTED_FORMAT, f"uri {uri!r}: {fault}.")
+
+
+@contextmanager
+def refused(codes: Codes) -> Iterator[None]:
+    """Within this context, a resource that can't be used raises RefusalError with its code."""
+    try:
+        yield
+    except AssetsError as error:
+        code = codes.MISSING_ASSETS if error.missing else codes.UNSUPPORTED_ASSETS
+        raise RefusalError(code, str(error)) from None
+    except (MissingFileError, UnknownNameError) as error:
+        raise RefusalError(Result.RESULT_NOT_FOUND, str(error)) from None
+    except ConfigError as error:
+        raise RefusalError(codes.RESOURCE_PARSE_ERROR, str(error)) from None

@@ -4,31 +4,26 @@ import re
 from collections.abc import Callable
 from typing import Any, NoReturn
 
-from rclpy.action import ActionServer, CancelResponse
 from simulation_interfaces.msg import Result, SimulatorFeatures
 
-from nics_drl_bridge.extras.simulation_interfaces.entities import EntityServices
+from nics_drl_bridge.extras.simulation_interfaces.entities import (
+    FORMATS,
+    EntityServices,
+)
 from nics_drl_bridge.extras.simulation_interfaces.host import (
     Handler,
     RefusalError,
     served,
 )
-from nics_drl_bridge.extras.simulation_interfaces.spawning import FORMATS, Spawning
 from nics_drl_bridge.extras.simulation_interfaces.state import Simulation
-from nics_drl_bridge.extras.simulation_interfaces.worlds import Worlds
 from nics_drl_bridge.nodes import conversions
 
-PACKAGE = "simulation_interfaces"
 FEATURES = (
     "SPAWNING",
     "DELETING",
-    "ENTITY_BOUNDS",
-    "ENTITY_CATEGORIES",
     "SPAWNING_RESOURCE_STRING",
     "ENTITY_STATE_GETTING",
     "ENTITY_STATE_SETTING",
-    "ENTITY_INFO_GETTING",
-    "SPAWNABLES",
     "SIMULATION_RESET",
     "SIMULATION_RESET_TIME",
     "SIMULATION_RESET_STATE",
@@ -38,11 +33,19 @@ FEATURES = (
     "SIMULATION_STATE_PAUSE",
     "STEP_SIMULATION_SINGLE",
     "STEP_SIMULATION_MULTIPLE",
-    "STEP_SIMULATION_ACTION",
     "WORLD_LOADING",
-    "WORLD_RESOURCE_STRING",
     "WORLD_INFO_GETTING",
-    "AVAILABLE_WORLDS",
+)
+UNSUPPORTED = (
+    "GetAvailableWorlds",
+    "GetEntityBounds",
+    "GetEntityInfo",
+    "GetNamedPoseBounds",
+    "GetNamedPoses",
+    "GetSpawnables",
+    "SetEntityInfo",
+    "SpawnEntities",
+    "UnloadWorld",
 )
 ABOUT = "nics_drl_bridge: a 2-D world of shapes and robots of one kind; docs/simulator_node.md"
 
@@ -57,49 +60,29 @@ class Server:
 
     def __init__(self, host: Any) -> None:
         self._host = host
-        self._simulation = Simulation(host)
-        simulation = self._simulation
+        simulation = Simulation(host)
         entities = EntityServices(host, simulation)
-        spawning = Spawning(host, simulation, entities)
-        worlds = Worlds(host, simulation)
         handlers: dict[str, Handler] = {
+            **dict.fromkeys(UNSUPPORTED, _refuse),
             "GetSimulationState": simulation.get_state,
             "SetSimulationState": simulation.set_state,
             "ResetSimulation": simulation.reset,
             "StepSimulation": simulation.step,
+            "LoadWorld": simulation.load_world,
+            "GetCurrentWorld": simulation.get_world,
             "GetEntities": entities.list_names,
             "GetEntitiesStates": entities.list_states,
-            "GetEntityInfo": entities.get_info,
             "GetEntityState": entities.get_state,
             "SetEntityState": entities.set_state,
-            "GetEntityBounds": entities.get_bounds,
             "DeleteEntity": entities.delete,
-            "SpawnEntity": spawning.spawn,
-            "SpawnEntities": _refuse,
-            "GetSpawnables": spawning.list_spawnables,
-            "LoadWorld": worlds.load,
-            "UnloadWorld": _refuse,
-            "GetCurrentWorld": worlds.current,
-            "GetAvailableWorlds": worlds.available,
-            "SetEntityInfo": _refuse,
-            "GetNamedPoses": _refuse,
-            "GetNamedPoseBounds": _refuse,
+            "SpawnEntity": entities.spawn,
         }
         for name, handler in handlers.items():
             self._offer(name, served(handler, host))
         self._offer("GetSimulatorFeatures", self._tell)
-        kind = conversions.message_type(f"{PACKAGE}/action/SimulateSteps")
-        if kind:
-            self._action = ActionServer(
-                host,
-                kind,
-                "simulate_steps",
-                simulation.simulate,
-                cancel_callback=lambda _: CancelResponse.ACCEPT,
-            )
 
     def _offer(self, name: str, reply: Callable[[Any, Any], Any]) -> None:
-        kind = conversions.message_type(f"{PACKAGE}/srv/{name}")
+        kind = conversions.message_type(f"simulation_interfaces/srv/{name}")
         if kind is not None:  # in an older version of the standard there are fewer
             self._host.create_service(kind, snake_case(name), reply)
 

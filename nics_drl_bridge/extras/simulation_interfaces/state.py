@@ -1,20 +1,20 @@
-"""State of the simulation: playing, paused, stopped; steps, and resets."""
+"""The simulation: playing, paused, stopped; its steps, resets, and worlds."""
 
-from collections.abc import Generator
 from typing import Any
 
-from simulation_interfaces.action import SimulateSteps
-from simulation_interfaces.msg import Result, SimulationState
-from simulation_interfaces.srv import ResetSimulation, SetSimulationState
+from simulation_interfaces.msg import Resource, Result, SimulationState, WorldResource
+from simulation_interfaces.srv import LoadWorld, ResetSimulation, SetSimulationState
 
 from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.extras.simulation_interfaces.host import (
     Host,
     RefusalError,
-    outcome,
+    local_path,
+    refused,
 )
 from nics_drl_bridge.nodes import runner
 from nics_drl_bridge.sim.entities import Entities
+from nics_drl_bridge.sim.world_set import SPECIAL, load_worlds
 
 STOPPED = SimulationState.STATE_STOPPED
 PLAYING = SimulationState.STATE_PLAYING
@@ -25,13 +25,7 @@ MOST_STEPS = 100_000  # of one call of a service, which answers nothing else mea
 GOODBYE_S = 0.2  # until the answer to who ended the simulation has left
 SCOPES = ResetSimulation.Request
 EVERY_SCOPE = SCOPES.SCOPE_TIME | SCOPES.SCOPE_STATE | SCOPES.SCOPE_SPAWNED
-
-
-class Turn:
-    """Lets the executor handle all else before a coroutine goes on."""
-
-    def __await__(self) -> Generator[None, None, None]:
-        yield
+CODES = LoadWorld.Response
 
 
 class Simulation:
@@ -39,12 +33,11 @@ class Simulation:
 
     def __init__(self, host: Host) -> None:
         self._host = host
-        self._stepping = False
         self._halted = STOPPED  # or paused, or quitting, while the host is paused
-        self._turn: Any = host.create_guard_condition(lambda: None)
-        self.renew()
+        self._resource = Resource(uri=runner.get_text(host, "world"))
+        self._list_entities()
 
-    def renew(self) -> None:
+    def _list_entities(self) -> None:
         """List the entities of a world that the host begins to simulate."""
         host = self._host
         self.entities = Entities(
@@ -59,11 +52,10 @@ class Simulation:
             return int(PLAYING)
         return int(self._halted)
 
-    def halt(self, state: int) -> None:
+    def _halt(self, state: int) -> None:
         """Hold the simulation in a state other than playing."""
         self._host.pause(True)
         self._halted = state
-        self._stepping = False
 
     def get_state(self, _: Any, response: Any) -> None:
         """Answer GetSimulationState."""
@@ -82,96 +74,30 @@ class Simulation:
             fault = f"state {wanted} can't be set; choose one of {states}."
             raise RefusalError(codes.INCORRECT_TRANSITION, fault)
         if wanted == QUITTING:
-            self.halt(QUITTING)
             runner.steadily(self._host, GOODBYE_S, self._host.context.try_shutdown)
-            return
         if wanted == STOPPED:
             try:
                 self._reset_all()
             except BridgeError as error:
-                self.halt(PAUSED)
+                self._halt(PAUSED)
                 fault = f"it did not stop: {error}"
                 raise RefusalError(codes.STATE_TRANSITION_ERROR, fault) from None
-        self._stepping = False
         if wanted == PLAYING:
             self._host.pause(False)
         else:
-            self.halt(wanted)
-
-    def require_paused(self, steps: int) -> None:
-        """Raise RefusalError unless so many steps can be made now."""
-        problem = ""
-        if self.state != PAUSED:
-            problem = "the simulation is not paused; set its state to paused first."
-        elif self._stepping:
-            problem = "steps of simulate_steps are being made; wait for their end, or cancel them."
-        elif steps < 1:
-            problem = "steps is 0; ask for 1 or more."
-        if problem:
-            raise RefusalError(Result.RESULT_OPERATION_FAILED, problem)
+            self._halt(wanted)
 
     def step(self, request: Any, _: Any) -> None:
         """Answer StepSimulation."""
-        self.require_paused(request.steps)
-        if request.steps > MOST_STEPS:
-            fault = (
-                f"steps is {request.steps}, and {MOST_STEPS} are the most of one call"
-            )
-            raise RefusalError(
-                Result.RESULT_OPERATION_FAILED, f"{fault}; use simulate_steps."
-            )
+        problem = ""
+        if self.state != PAUSED:
+            problem = "the simulation is not paused; set its state to paused first."
+        elif not 1 <= request.steps <= MOST_STEPS:
+            problem = f"steps is {request.steps}; ask for 1 to {MOST_STEPS}."
+        if problem:
+            raise RefusalError(Result.RESULT_OPERATION_FAILED, problem)
         for _ in range(request.steps):
             self._host.step()
-
-    async def simulate(self, goal: Any) -> Any:
-        """Execute SimulateSteps: one step at a turn, so that all else is answered meanwhile."""
-        steps = goal.request.steps
-        result = SimulateSteps.Result()
-        result.result.result = Result.RESULT_OPERATION_FAILED
-        try:
-            self.require_paused(steps)
-        except RefusalError as error:
-            result.result.error_message = str(error)
-            goal.abort()
-            return result
-        self._stepping = True
-        done = 0
-        why = ""
-        try:
-            while done < steps and not why:
-                _, why = outcome(self._host.step, self._host)
-                if why:
-                    break
-                done += 1
-                goal.publish_feedback(
-                    SimulateSteps.Feedback(
-                        completed_steps=done, remaining_steps=steps - done
-                    )
-                )
-                self._turn.trigger()
-                await Turn()
-                why = self._interrupted(goal, done, steps)
-        finally:
-            self._stepping = False
-        result.result.error_message = why
-        if done == steps:
-            result.result.result = Result.RESULT_OK
-            result.result.error_message = ""
-            goal.succeed()
-        elif goal.is_cancel_requested:
-            goal.canceled()
-        else:
-            goal.abort()
-        return result
-
-    def _interrupted(self, goal: Any, done: int, steps: int) -> str:
-        if goal.is_cancel_requested:
-            return f"cancelled after {done} of {steps} steps."
-        if self.state != PAUSED or not self._stepping:
-            return (
-                f"the simulation was changed after {done} of {steps} steps; ask again."
-            )
-        return ""
 
     def reset(self, request: Any, _: Any) -> None:
         """Answer ResetSimulation."""
@@ -182,7 +108,6 @@ class Simulation:
             bits = "1 (time), 2 (state) and 4 (spawned)"
             fault = f"scope {scope} has bits that mean nothing; add up {bits}, or give 0 for all."
             raise RefusalError(Result.RESULT_FEATURE_UNSUPPORTED, fault)
-        self._stepping = False
         if scope & EVERY_SCOPE == EVERY_SCOPE:
             self._reset_all()
             return
@@ -190,13 +115,18 @@ class Simulation:
             if set(self.entities.robot_names) <= self.entities.spawned.keys():
                 fault = "a simulator needs a robot, and all were spawned; reset all, by scope 0."
                 raise RefusalError(Result.RESULT_OPERATION_FAILED, fault)
-            self.remove(*self.entities.spawned)
+            for name in tuple(self.entities.spawned):
+                self.remove(name)
         if scope & SCOPES.SCOPE_STATE:
             self._host.begin(rewind=bool(scope & SCOPES.SCOPE_TIME))
         elif scope & SCOPES.SCOPE_TIME:
             self._host.rewind()
 
-    def restore(self) -> None:
+    def _reset_all(self) -> None:
+        self._restore()
+        self._host.begin(rewind=True)
+
+    def _restore(self) -> None:
         """Remove what was spawned, and bring back what was deleted."""
         # A robot that was spawned may have the name of one that was deleted.
         changed = any(entity.robot >= 0 for entity in self.entities.spawned.values())
@@ -205,14 +135,42 @@ class Simulation:
         if changed:
             self._host.reopen_robots()
 
-    def _reset_all(self) -> None:
-        self.restore()
-        self._host.begin(rewind=True)
+    def remove(self, name: str) -> None:
+        """Remove an entity, and the topics of a robot. Raises UnknownEntityError."""
+        entity = self.entities.find(name)
+        self.entities.delete(entity)
+        if entity.robot >= 0:
+            self._host.remove_robots([entity.robot])
 
-    def remove(self, *names: str) -> None:
-        """Remove entities, and the topics of robots among them."""
-        for name in names:
-            entity = self.entities.find(name)
-            self.entities.delete(entity)
-            if entity.robot >= 0:
-                self._host.remove_robots([entity.robot])
+    def load_world(self, request: Any, response: Any) -> None:
+        """Answer LoadWorld; the present world stays if the other can't be read."""
+        resource = request.world_resource
+        if resource.resource_string and not resource.uri:
+            fault = "a world is loaded by its name or file; give a uri."
+            raise RefusalError(Result.RESULT_FEATURE_UNSUPPORTED, fault)
+        if not resource.uri:
+            raise RefusalError(CODES.NO_RESOURCE, "the uri is empty; give one.")
+        with refused(CODES):
+            name = resource.uri
+            if not any(sign in name for sign in SPECIAL):
+                name = str(local_path(name, CODES, (".yaml", ".yml")))
+            world = load_worlds(name)
+        self._restore()
+        self._host.use_world(world)
+        self._list_entities()
+        self._host.begin(rewind=True)
+        self._halt(STOPPED)
+        self._resource = resource
+        self.get_world(request, response)
+
+    def get_world(self, _: Any, response: Any) -> None:
+        """Answer GetCurrentWorld."""
+        world = self._host.world
+        x1, y1, x2, y2 = world.extent
+        count = len(world.members)
+        what = "a field of" if count == 1 else f"{count} worlds in"
+        response.world = WorldResource(
+            name=world.name,
+            world_resource=self._resource,
+            description=f"{what} {x2 - x1:.3g} m x {y2 - y1:.3g} m",
+        )

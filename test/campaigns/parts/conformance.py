@@ -10,13 +10,10 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from action_msgs.msg import GoalStatus
-from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 from simulation_interfaces import msg, srv
-from simulation_interfaces.action import SimulateSteps
 
 from nics_drl_bridge.extras.simulation_interfaces.server import snake_case
 from nics_drl_bridge.nodes.listener import open_context
@@ -27,7 +24,6 @@ FAILED = msg.Result.RESULT_OPERATION_FAILED
 NOT_FOUND = msg.Result.RESULT_NOT_FOUND
 STATES = msg.SimulationState
 SHAPE = "kind: circle\nradius: 0.15\n"
-WORLD = "name: text\nsize: [5.0, 4.0]\ngoal_distance: [1.0, 3.0]\n"
 PATIENCE_S = 300.0
 IDLE_S = 10.0
 
@@ -49,9 +45,6 @@ class Client:
         self._executor.add_node(self.node)
         self._clients: dict[str, Any] = {}
         self._prefix = f"{prefix}/" if prefix else ""
-        self._action = ActionClient(
-            self.node, SimulateSteps, f"{self._prefix}simulate_steps"
-        )
         self.clock: list[Any] = []
         self.node.create_subscription(Clock, "/clock", self.clock.append, 10)
 
@@ -91,23 +84,9 @@ class Client:
         """Sets the simulation's state; returns the result."""
         return self.code("SetSimulationState", state=STATES(state=state))
 
-    def simulate(self, steps: int, cancel_at: int = 0) -> tuple[int, int, list[int]]:
-        """Runs the action; returns goal status, result, and the completed steps of the feedback."""
-        self.until(self._action.server_is_ready, "the action server")
-        seen: list[int] = []
-        feedback = lambda one: seen.append(one.feedback.completed_steps)  # noqa: E731
-        sent = self._action.send_goal_async(SimulateSteps.Goal(steps=steps), feedback)
-        goal = self.wait(sent, "the goal is accepted")
-        if cancel_at:
-            self.until(lambda: len(seen) >= cancel_at, "feedback")
-            self.wait(goal.cancel_goal_async(), "the goal is cancelled")
-        end = self.wait(goal.get_result_async(), "the action ends")
-        return end.status, end.result.result.result, seen
-
     def time_ns(self) -> int:
         """Returns the stamp of a robot's state: the simulated time."""
-        robots = msg.EntityFilters(categories=[category("ROBOT")])
-        stamp = self("GetEntitiesStates", filters=robots).states[0].header.stamp
+        stamp = self("GetEntitiesStates").states[0].header.stamp
         return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
     def names(self, **filters: Any) -> list[str]:
@@ -133,11 +112,6 @@ class Client:
         self._executor.shutdown(timeout_sec=1.0)
         self.node.destroy_node()
         self.context.try_shutdown()
-
-
-def category(name: str) -> Any:
-    """Returns a category by its name."""
-    return msg.EntityCategory(category=getattr(msg.EntityCategory, f"CATEGORY_{name}"))
 
 
 def spawn_request(name: str, x: float = 0.0, /, **fields: Any) -> Any:
@@ -210,7 +184,7 @@ def _state_is_got(c: Client) -> bool:
 
 
 def _state_is_set(c: Client) -> bool:
-    robot = c.names(categories=[category("ROBOT")])[0]
+    robot = c.names()[0]
     state = msg.EntityState()
     state.pose.position.x, state.pose.position.y = 0.5, -0.5
     set_ = c.code("SetEntityState", entity=robot, state=state, set_pose=True)
@@ -227,42 +201,9 @@ def _state_is_set(c: Client) -> bool:
     return right and abs(found.x - 0.5) + abs(found.y + 0.5) < 1e-6
 
 
-def _info_is_got(c: Client) -> bool:
-    robot = c.names(categories=[category("ROBOT")])[0]
-    info = c("GetEntityInfo", entity=robot)
-    return info.info.category == category("ROBOT") and info.result.result == OK
-
-
-def _categories(c: Client) -> bool:
-    c.spawn("disc", 1.0)
-    robots = c.names(categories=[category("ROBOT")])
-    still = c.names(categories=[category("STATIC_OBJECT")])
-    return bool(robots) and "disc" in still and not set(robots) & set(still)
-
-
-def _bounds(c: Client) -> bool:
-    c.spawn("disc", 1.0)
-    bounds = c("GetEntityBounds", entity="disc").bounds
-    (high, low), near = bounds.points, 0.01
-    right = bounds.type == msg.Bounds.TYPE_BOX and abs(high.x - 0.15) < near > abs(
-        low.x + 0.15
-    )
-    where = msg.Bounds(type=msg.Bounds.TYPE_SPHERE)
-    filters = msg.EntityFilters(bounds=where)
-    return right and c.code("GetEntities", filters=filters) == UNSUPPORTED
-
-
-def _spawnables(c: Client) -> bool:
-    listed = c("GetSpawnables", sources=["/nowhere"])
-    told = listed.result.result == OK and "/nowhere" in listed.result.error_message
-    first = next(one for one in listed.spawnables if "robot" not in one.description)
-    spawned = c.spawn("listed", 1.0, entity_resource=first.entity_resource)
-    return told and spawned.result.result == OK
-
-
 def _resets(scope: int) -> Callable[[Client], bool]:
     def check(c: Client) -> bool:
-        robot = c.names(categories=[category("ROBOT")])[0]
+        robot = c.names()[0]
         began = c("GetEntityState", entity=robot).state.pose.position.x
         first = c.time_ns()
         c.spawn("disc", 1.0), c("StepSimulation", steps=5)
@@ -320,17 +261,6 @@ def _steps(steps: int) -> Callable[[Client], bool]:
     return check
 
 
-def _acts(c: Client) -> bool:
-    status, result, seen = c.simulate(20)
-    right = status == GoalStatus.STATUS_SUCCEEDED and result == OK and seen[-1:] == [20]
-    status, _, seen = c.simulate(1_000_000, cancel_at=3)
-    right = right and status == GoalStatus.STATUS_CANCELED and seen == sorted(seen)
-    right = right and _state_of_simulation(c)
-    c.set_state(STATES.STATE_PLAYING)
-    status, result, _ = c.simulate(3)
-    return right and result == FAILED and status == GoalStatus.STATUS_ABORTED
-
-
 def _loads(c: Client) -> bool:
     codes = srv.LoadWorld.Response
     loaded = c("LoadWorld", world_resource=msg.Resource(uri="empty"))
@@ -341,41 +271,18 @@ def _loads(c: Client) -> bool:
     return right and [empty, other] == [codes.NO_RESOURCE, codes.UNSUPPORTED_FORMAT]
 
 
-def _loads_text(c: Client) -> bool:
-    loaded = c("LoadWorld", world_resource=msg.Resource(resource_string=WORLD))
-    wrong = c.code(
-        "LoadWorld", world_resource=msg.Resource(resource_string="name: [\n")
-    )
-    right = loaded.result.result == OK and loaded.world.name == "text"
-    return right and wrong == srv.LoadWorld.Response.RESOURCE_PARSE_ERROR
-
-
 def _tells_world(c: Client) -> bool:
     found = c("GetCurrentWorld")
     return found.result.result == OK and bool(found.world.name)
-
-
-def _lists_worlds(c: Client) -> bool:
-    listed = c("GetAvailableWorlds")
-    right = listed.result.result == OK and len(listed.worlds) > 1
-    failed = c("GetAvailableWorlds", additional_sources=["/nowhere"])
-    on = c(
-        "GetAvailableWorlds", additional_sources=["/nowhere"], continue_on_error=True
-    )
-    return right and failed.result.result != OK and on.result.result == OK
 
 
 SCOPES = srv.ResetSimulation.Request
 CHECKS: dict[str, Callable[[Client], bool]] = {
     "SPAWNING": _names_collide,
     "DELETING": _spawns_and_deletes,
-    "ENTITY_BOUNDS": _bounds,
-    "ENTITY_CATEGORIES": _categories,
     "SPAWNING_RESOURCE_STRING": _text_is_spawned,
     "ENTITY_STATE_GETTING": _state_is_got,
     "ENTITY_STATE_SETTING": _state_is_set,
-    "ENTITY_INFO_GETTING": _info_is_got,
-    "SPAWNABLES": _spawnables,
     "SIMULATION_RESET": _resets(SCOPES.SCOPE_ALL),
     "SIMULATION_RESET_TIME": _resets(SCOPES.SCOPE_TIME),
     "SIMULATION_RESET_STATE": _resets(SCOPES.SCOPE_STATE),
@@ -385,11 +292,8 @@ CHECKS: dict[str, Callable[[Client], bool]] = {
     "SIMULATION_STATE_PAUSE": _pauses,
     "STEP_SIMULATION_SINGLE": _steps(1),
     "STEP_SIMULATION_MULTIPLE": _steps(7),
-    "STEP_SIMULATION_ACTION": _acts,
     "WORLD_LOADING": _loads,
-    "WORLD_RESOURCE_STRING": _loads_text,
     "WORLD_INFO_GETTING": _tells_world,
-    "AVAILABLE_WORLDS": _lists_worlds,
 }
 # Features of which the service itself is answered as unsupported where they are not announced.
 SERVICES = {
