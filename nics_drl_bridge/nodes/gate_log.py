@@ -1,13 +1,12 @@
 """Reports of `command_gate`: log lines, counters and the black box. Never waits for a disk."""
 
-import contextlib
-import json
 import os
+import signal
 import subprocess
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Sequence
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
 
 from rclpy.impl.rcutils_logger import RcutilsLogger
@@ -16,14 +15,9 @@ from nics_drl_bridge.gate.black_box import Entry, format_entry, format_head
 from nics_drl_bridge.gate.inputs import get_topic
 from nics_drl_bridge.gate.state import Cause, GateConfig, GateState
 from nics_drl_bridge.nodes import black_box_writer
-from nics_drl_bridge.nodes.black_box_writer import (
-    ENTRY,
-    FILES_KEPT,
-    STATE,
-    WRITE,
-)
+from nics_drl_bridge.nodes.black_box_writer import FILES_KEPT
+from nics_drl_bridge.nodes.listener import holds
 from nics_drl_bridge.nodes.node_process import module_command
-from nics_drl_bridge.nodes.own_process import widen_pipe
 from nics_drl_bridge.nodes.runner import Condition
 
 BURST_S = (
@@ -33,15 +27,12 @@ LINE_S = 2.0  # time between two log lines of a kind; those in between are count
 # limit of that time, which doubles with each line while a kind persists [s]
 LONGEST_LINE_S = 64.0
 CLOSING_S = 0.7  # longest wait at the end for files that are being written [s]
-GRACE_S = 0.5  # time for the writer to clean up files that it gives up [s]
 POLL_S = 0.005
-# time without an answer after which a file counts as not written [s]
-OVERDUE_S = 25.0
-RESTART_S = 5.0  # shortest time between two starts of the writer [s]
+KEPT_S = 30.0  # minimum time span of the lines that are kept [s]
 STATE_S = 10.0  # time between two states of the gate in the black box [s]
 MOST_ENTRIES = 5_000  # between two states
-MOST_BACKLOG = 4 * 2**20  # bytes that wait for the writer; a minute of driving
-MOST_TOLD = 65_536  # largest read of answers [bytes]
+MOST_LINES = 18_000  # fewer than a replay takes
+MOST_BYTES = 48 * 2**20
 
 
 class GateLog:
@@ -51,9 +42,7 @@ class GateLog:
         self, config: GateConfig, folder: Path, robot: str, logger: RcutilsLogger
     ) -> None:
         self.counters: Counter[str] = Counter()
-        self._config = config
         self._logger = logger
-        self._folder = folder
         self._hardware = robot
         self._cause: Cause | None = None
         self._now = float("-inf")
@@ -66,15 +55,11 @@ class GateLog:
         self._said: dict[str, tuple[float, float]] = {}
         self._kept: Counter[str] = Counter()  # events of a kind since its last line
         self._owed = False
-        self._writer = BoxWriter()
-        # time of the last state sent to the writer [s]
-        self._state_s = float("-inf")
-        self._entries = 0  # sent to the writer since that state
-        self._names: list[str] = []
+        self._box = BlackBox(config, folder)
 
     def note(self, entry: Entry) -> None:
         """Account for a decision."""
-        self._record(entry)
+        self._box.add(entry)
         decision = entry.decision
         cause = entry.decision.cause
         self._now = entry.now
@@ -98,20 +83,6 @@ class GateLog:
                 self._logger.warning(f"stopped by {cause.line}{more}")
         if self._burst and not rule and entry.now - self._since >= BURST_S:
             self._burst.clear()
-
-    def _record(self, entry: Entry) -> None:
-        """Send an entry to the writer, preceded now and then by the state from which it follows."""
-        passed = entry.now - self._state_s
-        if (
-            self._writer.needs_state
-            or passed >= STATE_S
-            or self._entries >= MOST_ENTRIES
-        ):
-            self._writer.state(entry.now, format_head(self._config, entry.before))
-            self._state_s = entry.now
-            self._entries = 0
-        self._writer.entry(format_entry(entry))
-        self._entries += 1
 
     def refuse(self, topic: str, fault: str) -> None:
         """Count an input that is refused by its topic, and log what is wrong with it."""
@@ -156,23 +127,17 @@ class GateLog:
             self.counters["stops of a burst, not in the black box"] += 1
         elif was_passing:
             self._burst.add(rule)
-            self._write(rule)
+            when = time.strftime("%Y%m%d_%H%M%S")
+            self._box.write(f"{when}_{self.counters.total():06d}_{rule}.jsonl")
 
-    def _write(self, rule: str) -> None:
-        name = (
-            f"{time.strftime('%Y%m%d_%H%M%S')}_{self.counters.total():06d}_{rule}.jsonl"
-        )
-        self._names = [*self._names[1 - FILES_KEPT :], name]
-        self._writer.write(self._folder / name, self._names)
-
-    def _failed(self, reason: str) -> None:
-        self.counters["not written"] += 1
-        self._logger.error(f"the black box could not be written: {reason}")
+    def _tell_failures(self, reasons: Sequence[str]) -> None:
+        for reason in reasons:
+            self.counters["not written"] += 1
+            self._logger.error(f"the black box could not be written: {reason}")
 
     def finding(self, state: GateState) -> Condition:
         """Return the finding for `/diagnostics`."""
-        for failure in self._writer.failures():
-            self._failed(failure)
+        self._tell_failures(self._box.failures())
         facts: dict[str, object] = {
             "armed": state.armed,
             "latched": state.latched is not None,
@@ -182,153 +147,105 @@ class GateLog:
         return Condition(message, self._cause is not None, facts, self._hardware)
 
     def close(self) -> None:
-        """Wait briefly for files that are being written; leave none incomplete."""
-        for failure in self._writer.close(CLOSING_S):
-            self._failed(failure)
+        """Wait briefly for files that are being written."""
+        self._tell_failures(self._box.close(CLOSING_S))
 
 
-class BoxWriter:
-    """Handle of the black box's writer, which is a separate process (`black_box_writer.py`).
+@dataclass
+class Segment:
+    """Lines of the black box: a state of the gate, and the entries that follow it."""
 
-    The writer is restarted if it has ended or does not read. Only `close` waits for it.
+    begin_s: float  # time of the state
+    lines: list[bytes]
+    size: int  # of the lines [bytes]
+
+
+class BlackBox:
+    """Keeps the latest inputs of a gate, and starts a process for each file to write.
+
+    So a stop never waits for the disk, and a file is completed even if the gate is killed.
     """
 
-    def __init__(self) -> None:
-        self.needs_state = True  # before the next entry
-        self._backlog = bytearray()  # not yet taken by the pipe
-        # path of each file without an answer yet -> time of the order [s]
-        self._orders: dict[str, float] = {}
-        self._answers = b""  # an incomplete line
+    def __init__(self, config: GateConfig, folder: Path) -> None:
+        self._config = config
+        self._folder = folder
+        self._segments: deque[Segment] = deque()
+        self._names: list[str] = []  # of the newest files
+        self._writers: list[subprocess.Popen[bytes]] = []
         self._failed: list[str] = []
-        self._entrance = self._exit = -1  # our ends of its pipes
-        self._start()
 
-    def __del__(self) -> None:
-        self._close_pipes()  # this ends the writer
+    def add(self, entry: Entry) -> None:
+        """Keep an entry, preceded now and then by the state from which it follows."""
+        segments = self._segments
+        if (
+            not segments
+            or entry.now - segments[-1].begin_s >= STATE_S
+            or len(segments[-1].lines) > MOST_ENTRIES
+        ):
+            head = format_head(self._config, entry.before)
+            segments.append(Segment(entry.now, [head], len(head)))
+        line = format_entry(entry)
+        segments[-1].lines.append(line)
+        segments[-1].size += len(line)
+        while len(segments) > 1 and (
+            segments[1].begin_s <= entry.now - KEPT_S or self._is_full()
+        ):
+            segments.popleft()
 
-    def state(self, now: float, line: bytes) -> None:
-        """Send the gate's state at a time [s]; the next entries follow from it."""
-        self.needs_state = False
-        self._send(STATE, f"{now} ".encode() + line)
+    def _is_full(self) -> bool:
+        lines = sum(len(segment.lines) for segment in self._segments)
+        size = sum(segment.size for segment in self._segments)
+        return lines > MOST_LINES or size > MOST_BYTES
 
-    def entry(self, line: bytes) -> None:
-        """Send an entry."""
-        self._send(ENTRY, line)
+    def lines(self) -> list[bytes]:
+        """Return the lines for a file: the oldest state, and all entries since."""
+        kept: list[bytes] = []
+        for segment in self._segments:
+            kept += segment.lines[1:] if kept else segment.lines
+        return kept
 
-    def write(self, path: Path, own: Sequence[str]) -> None:
-        """Order a file of what was sent last; `own` are the names of this gate's files."""
-        self._orders[str(path)] = time.monotonic()
-        order = {"path": str(path), "own": list(own)}
-        self._send(WRITE, json.dumps(order).encode() + b"\n")
+    def write(self, name: str) -> None:
+        """Start to write a file of what is kept."""
+        self._names = [*self._names[1 - FILES_KEPT :], name]
+        program = module_command(black_box_writer.__name__)
+        try:
+            with os.fdopen(os.memfd_create("black_box"), "w+b") as memory:
+                memory.writelines(self.lines())
+                memory.seek(0)
+                writer = subprocess.Popen(
+                    [*program, str(self._folder), *self._names],
+                    stdin=memory,
+                    stdout=subprocess.DEVNULL,
+                    stderr=subprocess.PIPE,
+                    start_new_session=True,  # not ended by Ctrl-C or the gate's end
+                )
+        except OSError as error:
+            self._failed.append(f"its writer can't be started ({error.strerror})")
+        else:
+            self._writers.append(writer)
 
     def failures(self) -> list[str]:
-        """Return the failures since the last call; start a new writer if there is none."""
-        self._flush()
-        self._hear()
-        now = time.monotonic()
-        for path, begun_s in tuple(self._orders.items()):
-            if now - begun_s > OVERDUE_S:
-                self._lose(path, "the disk does not answer")
-        if self._process.poll() is not None and now - self._started_s > RESTART_S:
-            self._restart(f"its writer ended with {self._process.returncode}")
+        """Return the failures since the last call."""
         failed = self._failed
         self._failed = []
+        for writer in tuple(self._writers):
+            code = writer.poll()
+            if code is None:
+                continue
+            self._writers.remove(writer)
+            _, reason = writer.communicate()
+            if code == -signal.SIGALRM:
+                failed.append("the disk does not answer")
+            elif code:
+                words = reason.decode(errors="replace").strip()
+                failed.append(words or f"its writer ended with {code}")
         return failed
 
     def close(self, seconds: float) -> list[str]:
-        """Wait for files that are being written, then let the writer give up; see `failures`."""
-        self._finish(seconds)
-        if self._process.poll() is None:
-            self._process.terminate()
-            self._finish(GRACE_S)
-        reason = f"its writer ended with {self._process.poll()}"
-        # the disk blocks the writer, which ends once it is released
-        if self._process.poll() is None:
-            self._process.kill()
-            reason = "the disk does not answer"
-        self._hear()
-        for path in tuple(self._orders):
-            self._lose(path, reason)
-        self._close_pipes()
-        failed = self._failed
-        self._failed = []
-        return failed
-
-    def _send(self, kind: bytes, line: bytes) -> None:
-        self._backlog += kind + line
-        self._flush()
-        if len(self._backlog) > MOST_BACKLOG:
-            self._process.kill()
-            self._restart("its writer did not read")
-
-    def _flush(self) -> None:
-        with contextlib.suppress(OSError):  # the pipe is full, or the writer has ended
-            while self._backlog:
-                sent = os.write(self._entrance, self._backlog)
-                del self._backlog[:sent]
-
-    def _hear(self) -> None:
-        with contextlib.suppress(OSError):  # there is nothing more
-            for part in iter(partial(os.read, self._exit, MOST_TOLD), b""):
-                self._answers += part
-        *lines, self._answers = self._answers.split(b"\n")
-        for line in lines:
-            answer = json.loads(line)
-            if answer["failed"]:
-                self._lose(answer["path"], answer["failed"])
-            self._orders.pop(answer["path"], None)
-
-    def _lose(self, path: str, reason: str) -> None:
-        if self._orders.pop(path, None) is not None:
-            self._failed.append(reason)
-
-    def _restart(self, reason: str) -> None:
-        self._hear()
-        lost = tuple(self._orders)
-        for path in lost:
-            self._lose(path, reason)
-        if not lost:
-            self._failed.append(reason)
-        try:
-            self._start()
-        except OSError as error:
-            self._failed.append(f"its writer can't be started ({error.strerror})")
-
-    def _start(self) -> None:
-        """Start the writer; executed, not forked, because DDS has threads in this process."""
-        self._close_pipes()
-        self._backlog = bytearray()
-        self._answers = b""
-        self.needs_state = True
-        self._started_s = time.monotonic()
-        source, self._entrance = os.pipe()
-        self._exit, target = os.pipe()
-        widen_pipe(self._entrance)
-        os.set_blocking(self._exit, False)
-        try:
-            self._process = subprocess.Popen(
-                module_command(black_box_writer.__name__),
-                stdin=source,
-                stdout=target,
-                stderr=subprocess.DEVNULL,
-                start_new_session=True,  # Ctrl-C would reach the writer; the gate ends it
-            )
-        finally:
-            os.close(source)
-            os.close(target)
-
-    def _close_pipes(self) -> None:
-        for descriptor in (self._entrance, self._exit):
-            if descriptor >= 0:
-                os.close(descriptor)
-        self._entrance = -1
-        self._exit = -1
-
-    def _finish(self, seconds: float) -> None:
-        deadline = time.monotonic() + seconds
-        while self._process.poll() is None and time.monotonic() < deadline:
-            self._flush()
-            if not self._backlog and self._entrance >= 0:
-                os.close(self._entrance)  # the writer ends once it has read everything
-                self._entrance = -1
-            time.sleep(POLL_S)
+        """Wait for files that are being written; see `failures`. After that they go on alone."""
+        holds(
+            lambda: all(writer.poll() is not None for writer in self._writers),
+            seconds,
+            POLL_S,
+        )
+        return self.failures()

@@ -75,12 +75,12 @@ def bare_node() -> None:
     rclpy.spin(node)
 
 
-class FrozenWriter(gate_log.BoxWriter):
-    """A writer of the black box that does nothing, as if its disk hung."""
+class FrozenBox(gate_log.BlackBox):
+    """A black box whose writers do nothing, as if their disk hung."""
 
-    def _start(self) -> None:
-        super()._start()
-        self._process.send_signal(signal.SIGSTOP)
+    def write(self, name: str) -> None:
+        super().write(name)
+        self._writers[-1].send_signal(signal.SIGSTOP)
 
 
 def ill_gate(control: str, arguments: list[str]) -> None:
@@ -90,7 +90,7 @@ def ill_gate(control: str, arguments: list[str]) -> None:
         for name in ("scan", "odometry", "estimate", "command", "e_stop"):
             setattr(command_gate, name, _often(getattr(command_gate, name)))
     else:
-        gate_log.BoxWriter = FrozenWriter
+        gate_log.BlackBox = FrozenBox
         gate_log.CLOSING_S = HUNG_S
     start(GATE, [GATE, *arguments])
 

@@ -2,7 +2,6 @@ import os
 import re
 import signal
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,15 +11,16 @@ pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 from gate.rig import Rig, config
 
 from nics_drl_bridge.gate.black_box import MOST_INPUTS, Entry, replay
-from nics_drl_bridge.nodes import black_box_writer, gate_log
-from nics_drl_bridge.nodes.black_box_writer import (
-    FILES_KEPT,
-    MOST_LINES,
-    Ring,
-    prune,
-    write_file,
+from nics_drl_bridge.nodes import gate_log
+from nics_drl_bridge.nodes.black_box_writer import FILES_KEPT, prune
+from nics_drl_bridge.nodes.gate_log import (
+    BURST_S,
+    KEPT_S,
+    LINE_S,
+    STATE_S,
+    BlackBox,
+    GateLog,
 )
-from nics_drl_bridge.nodes.gate_log import BURST_S, LINE_S, BoxWriter, GateLog
 
 DEADLINE_S = 20.0
 LONG_S = 60.0
@@ -91,7 +91,6 @@ def written(log, folder, count):
         assert time.monotonic() < deadline, (
             f"{len(files(folder))} of {count} files came"
         )
-        log._writer._flush()  # as the gate does at its next tick
         time.sleep(0.01)
     return files(folder)
 
@@ -205,20 +204,30 @@ def test_what_is_the_case_is_said_in_the_end_though_it_was_kept_back_at_first(
     assert logger.info_lines == ["commands pass (1 more since the last such line)"]
 
 
-@pytest.mark.slow
-def test_a_writer_that_is_frozen_delays_neither_a_decision_nor_the_end(log, logger):
-    os.kill(log._writer._process.pid, signal.SIGSTOP)
+def freeze_writers(log):
+    for writer in log._box._writers:
+        os.kill(writer.pid, signal.SIGSTOP)
+
+
+def test_writers_that_hang_delay_neither_a_decision_nor_the_end_and_are_told_of(
+    tmp_path, log, logger
+):
     rig = Recorded(log).drive()
     began = time.monotonic()
     for _ in range(3):
         rig.stop_by_nonsense()
+        freeze_writers(log)
         rig.go_on(BURST_S + 1.0)
     log.close()
     assert time.monotonic() - began < LONG_S / 3
-    assert log.counters["not written"] == 3
-    assert (
-        "the black box could not be written: the disk does not answer" in logger.errors
-    )
+    for writer in log._box._writers:
+        os.kill(writer.pid, signal.SIGALRM)  # as its own timeout does
+        os.kill(writer.pid, signal.SIGCONT)
+    until(lambda: log.finding(rig.state).facts.get("not written") == 3)
+    assert set(logger.errors) == {
+        "the black box could not be written: the disk does not answer"
+    }
+    assert files(tmp_path) == []
 
 
 def test_a_file_that_can_not_be_written_is_told_of_in_the_log_and_the_diagnostics(
@@ -248,44 +257,6 @@ def test_the_writer_imports_nothing_from_the_working_folder(
     assert not canary.exists()
 
 
-def test_a_writer_that_was_killed_is_told_of_and_the_next_stop_is_written(
-    tmp_path, log, logger, monkeypatch
-):
-    monkeypatch.setattr(gate_log, "RESTART_S", 0.0)
-    rig = Recorded(log).drive()
-    killed = log._writer._process
-    killed.kill()
-    until(lambda: log.finding(rig.state) and logger.errors)
-    assert logger.errors == [
-        "the black box could not be written: its writer ended with -9"
-    ]
-    rig.run(1.0)
-    rig.stop_by_nonsense()
-    (file,) = written(log, tmp_path, 1)
-    assert replay(file).differing == ()
-    assert killed.poll() == -signal.SIGKILL
-
-
-def test_a_writer_that_does_not_read_is_replaced(tmp_path, log, logger, monkeypatch):
-    monkeypatch.setattr(gate_log, "MOST_BACKLOG", 10_000)
-    os.kill(log._writer._process.pid, signal.SIGSTOP)
-    rig = Recorded(log).drive()
-    while not log._writer.failures():
-        rig.run(1.0)
-    rig.stop_by_nonsense()
-    (file,) = written(log, tmp_path, 1)
-    assert replay(file).differing == ()
-
-
-def test_a_file_that_was_asked_for_is_written_though_the_gate_is_killed(tmp_path, log):
-    rig = Recorded(log).drive()
-    rig.stop_by_nonsense()
-    log._writer._close_pipes()  # as the system does
-    (file,) = written(log, tmp_path, 1)
-    assert replay(file).differing == ()
-    assert log._writer._process.wait(DEADLINE_S) == 0
-
-
 def test_the_oldest_files_go_first_whatever_the_clock_says(tmp_path):
     for i in range(FILES_KEPT + 2):
         (tmp_path / f"2026{i:02d}_rule.jsonl").touch()
@@ -295,45 +266,21 @@ def test_the_oldest_files_go_first_whatever_the_clock_says(tmp_path):
     assert sorted(os.listdir(tmp_path)) == ["1970_rule.jsonl", *newest]
 
 
-def test_the_writer_has_no_file_of_the_gate_open_and_ordinary_priority(log, tmp_path):
-    with (tmp_path / "socket").open("w"):
-        writer = BoxWriter()
-        pid = writer._process.pid
-        held = [os.readlink(path) for path in Path(f"/proc/{pid}/fd").iterdir()]
-        assert not any("socket" in name for name in held)
-        assert os.sched_getscheduler(pid) == os.SCHED_OTHER
-        assert writer.close(DEADLINE_S) == []
-
-
-def test_a_file_that_is_given_up_leaves_nothing_behind(tmp_path):
-    file = str(tmp_path / "file.jsonl")
-    assert write_file(file, [], [b"line\n"]) == ""
-    os.remove(file)
-    black_box_writer.GIVEN_UP.set()
-    try:
-        assert write_file(file, [], [b"line\n"]) == "it took too long"
-    finally:
-        black_box_writer.GIVEN_UP.clear()
-    assert os.listdir(tmp_path) == []
-
-
-def test_what_is_kept_begins_with_a_state_and_reaches_back_far_enough():
-    ring = Ring(kept_s=30.0)
-    for second in range(100):
-        if second % 10 == 0:
-            ring.begin(float(second), b"state %d" % second)
-        ring.add(b"entry %d" % second)
-        kept = ring.lines()
-        begin = int(kept[0].removeprefix(b"state "))
-        assert kept[1:] == [b"entry %d" % k for k in range(begin, second + 1)]
-        assert min(second, 30) <= second - begin <= 40
-
-
-def test_what_is_kept_can_always_be_replayed_though_much_comes():
-    ring = Ring(most_lines=100)
-    for second in range(20):
-        ring.begin(float(second), b"state")
-        for _ in range(30):
-            ring.add(b"entry")
-    assert 70 <= len(ring.lines()) <= 100
-    assert MOST_LINES < MOST_INPUTS
+@pytest.mark.parametrize("most_lines", [10_000, 40])
+def test_what_is_kept_begins_with_a_state_and_can_always_be_replayed(
+    tmp_path, monkeypatch, most_lines
+):
+    monkeypatch.setattr(gate_log, "MOST_LINES", most_lines)
+    monkeypatch.setattr(gate_log, "format_head", lambda _, state: b"S%d" % state)
+    monkeypatch.setattr(gate_log, "format_entry", lambda entry: b"%d" % entry.now)
+    box = BlackBox(None, tmp_path)
+    for now in range(100):
+        box.add(Entry(now, None, now, None))
+        head, *entries = box.lines()
+        begin = int(head.removeprefix(b"S"))
+        assert entries == [b"%d" % k for k in range(begin, now + 1)]
+        if most_lines > 100:
+            assert min(now, KEPT_S) <= now - begin <= KEPT_S + STATE_S
+        else:
+            assert 20 <= len(entries) <= most_lines or now < 20
+    assert gate_log.MOST_LINES < MOST_INPUTS
