@@ -16,82 +16,69 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
 
-KEPT_BYTES = 2**20  # most bytes of lines that wait for an output
-CHUNK_BYTES = 65_536
+KEPT_LINES = 5_000  # most lines that wait for an output
+LINE_BYTES = 8_192  # longer lines are cut
 COLOURS = re.compile(rb"\x1b\[[0-9;]*m")
 PATIENCE_S = 5.0  # time for writing the rest after the node's end [s]
 
 
 class Output:
-    """The lines that wait for one output, and the thread that writes them."""
+    """The newest lines that wait for one output, and the thread that writes them."""
 
     def __init__(self, open_output: Callable[[], int]) -> None:
-        self._open_output = (
-            open_output  # called in the thread, because the disk may hang here too
-        )
-        self._descriptor = -1
-        self._lines: deque[bytes] = deque()
-        self._bytes = 0  # of these lines
-        self._dropped = 0  # lines since the last one written
+        # called in the thread, because the disk may hang here too
+        self._open_output = open_output
+        self._lines: deque[tuple[int, bytes]] = deque(maxlen=KEPT_LINES)  # numbered
+        self._count = 0
         self._ended = False
-        self._changed = threading.Condition()
-        self._thread = threading.Thread(target=self._write_lines, daemon=True)
-        self._thread.start()
+        self._lock = threading.Lock()
+        self._changed = threading.Event()
+        self.thread = threading.Thread(target=self._write_lines, daemon=True)
+        self.thread.start()
 
     def put(self, line: bytes) -> None:
-        """Add a line, and drop the oldest ones if too much waits."""
-        with self._changed:
-            self._lines.append(line)
-            self._bytes += len(line)
-            while self._bytes > KEPT_BYTES and len(self._lines) > 1:
-                self._bytes -= len(self._lines.popleft())
-                self._dropped += 1
-            self._changed.notify()
+        """Add a line, which pushes out the oldest one if too many wait."""
+        with self._lock:
+            self._lines.append((self._count, line))
+            self._count += 1
+        self._changed.set()
 
     def end(self) -> None:
         """Mark the end: no line follows."""
-        with self._changed:
-            self._ended = True
-            self._changed.notify()
-
-    def join(self, seconds: float) -> None:
-        """Wait until all lines are written, or for some time."""
-        self._thread.join(seconds)
+        self._ended = True
+        self._changed.set()
 
     def _write_lines(self) -> None:
         try:
-            self._descriptor = self._open_output()
+            descriptor = self._open_output()
         except OSError:  # the folder of logs can't be written to
-            self._descriptor = os.open(os.devnull, os.O_WRONLY)
-        while True:
-            with self._changed:
-                while not self._lines and not self._ended:
-                    self._changed.wait()
-                if not self._lines:
-                    return
-                line = self._lines.popleft()
-                self._bytes -= len(line)
-                dropped = self._dropped
-                self._dropped = 0
+            descriptor = os.open(os.devnull, os.O_WRONLY)
+        written = 0
+        while self._lines or not self._ended:
+            if not self._lines:
+                self._changed.wait()
+                self._changed.clear()
+                continue
+            number, line = self._lines.popleft()
+            dropped = number - written
+            written = number + 1
+            if dropped:
+                noun = "line was" if dropped == 1 else "lines were"
+                why = "dropped here: nobody read this output"
+                line = f"({dropped} {noun} {why})\n".encode() + line
             try:
-                if dropped:
-                    self._write(told_of(dropped))
-                self._write(line)
+                write_all(descriptor, line)
             except OSError:  # the reader has gone
-                self._descriptor = os.open(os.devnull, os.O_WRONLY)
-
-    def _write(self, data: bytes) -> None:
-        while data:
-            try:
-                data = data[os.write(self._descriptor, data) :]
-            except BlockingIOError:  # somebody has made this output non-blocking
-                select.select([], [self._descriptor], [])
+                descriptor = os.open(os.devnull, os.O_WRONLY)
 
 
-def told_of(dropped: int) -> bytes:
-    """Return the line that says how many lines were dropped."""
-    lines = "line was" if dropped == 1 else "lines were"
-    return f"({dropped} {lines} dropped here: nobody read this output)\n".encode()
+def write_all(descriptor: int, data: bytes) -> None:
+    """Write data to a file descriptor, even if it is non-blocking. Raises OSError."""
+    while data:
+        try:
+            data = data[os.write(descriptor, data) :]
+        except BlockingIOError:  # somebody has made this output non-blocking
+            select.select([], [descriptor], [])
 
 
 def open_log(path: str) -> int:
@@ -100,26 +87,13 @@ def open_log(path: str) -> int:
     return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
 
 
-def copy_lines(source: int, outputs: Sequence[Output]) -> None:
-    """Copy lines from a file descriptor to outputs until its end."""
-    rest = b""
-    for chunk in iter(partial(os.read, source, CHUNK_BYTES), b""):
-        *lines, rest = (rest + chunk).split(b"\n")
-        for line in lines:
-            put_line(line + b"\n", outputs)
-        if len(rest) > CHUNK_BYTES:
-            put_line(rest, outputs)
-            rest = b""
-    if rest:
-        put_line(rest, outputs)
-
-
-def put_line(line: bytes, outputs: Sequence[Output]) -> None:
-    """Add a line to outputs; only the first may show colours."""
-    shown, *others = outputs
-    shown.put(line)
-    for output in others:
-        output.put(COLOURS.sub(b"", line))
+def copy_lines(source: int, shown: Output, logs: Sequence[Output]) -> None:
+    """Copy lines from a file descriptor until its end; only what is shown may have colours."""
+    with open(source, "rb") as file:
+        for line in iter(partial(file.readline, LINE_BYTES), b""):
+            shown.put(line)
+            for log in logs:
+                log.put(COLOURS.sub(b"", line))
 
 
 def main(log: str, pairs: Sequence[str]) -> None:
@@ -130,7 +104,7 @@ def main(log: str, pairs: Sequence[str]) -> None:
     for pair in pairs:
         source, descriptor = map(int, pair.split(":"))
         output = Output(partial(int, descriptor))
-        reader = threading.Thread(target=copy_lines, args=(source, [output, *logs]))
+        reader = threading.Thread(target=copy_lines, args=(source, output, logs))
         reader.start()
         outputs.append(output)
         readers.append(reader)
@@ -140,7 +114,7 @@ def main(log: str, pairs: Sequence[str]) -> None:
     for output in outputs:
         output.end()
     for output in outputs:
-        output.join(max(0.0, deadline - time.monotonic()))
+        output.thread.join(max(0.0, deadline - time.monotonic()))
     os._exit(0)  # also while a thread waits for its output
 
 

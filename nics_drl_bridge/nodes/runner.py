@@ -7,7 +7,6 @@ import signal
 import socket
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from typing import Any, NamedTuple
@@ -20,12 +19,10 @@ from rcl_interfaces.msg import (
     ParameterDescriptor,
     SetParametersResult,
 )
-from rcl_interfaces.srv import GetParameters
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.exceptions import ParameterException
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -37,7 +34,7 @@ from nics_drl_bridge.errors import BackendError, BridgeError, ConfigError, sugge
 from nics_drl_bridge.exit_codes import EXIT_BAD_INPUT
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.nodes import qos
-from nics_drl_bridge.nodes.listener import holds, open_context, spin
+from nics_drl_bridge.nodes.listener import open_context, spin
 from nics_drl_bridge.nodes.own_process import at_once, ending_signals, ros_arguments
 from nics_drl_bridge.nodes.parameters import MODEL, Row, frame_fault, managed, sensors
 from nics_drl_bridge.nodes.qos import BridgeNode, copied, overriding
@@ -47,11 +44,6 @@ INACTIVE = "inactive"
 ACTIVE = "active"
 DELIVERY_S = 0.5
 INPUT_ERRORS = (BridgeError, ParameterException, OSError)
-# time until the graph shows all nodes [s]
-SETTLE_S = 0.3
-POLL_S = 0.02
-# a node silent for this long counts as dead, though the graph shows it for 20 s more [s]
-LIVENESS_S = 1.5
 DIAGNOSTICS_S = 1.0
 RANGES = {
     int: (IntegerRange, "integer_range"),
@@ -130,55 +122,26 @@ def explain(error: Exception) -> str:
 
 @contextlib.contextmanager
 def sole(context: Context, name: str) -> Iterator[None]:
-    """Ensure a single instance while a node runs. Raises BackendError if another is running."""
+    """Ensure a single instance on this machine while a node runs. Raises BackendError."""
     # The probe resolves its name exactly like the node.
     probe = Node(
         name, context=context, start_parameter_services=False, enable_rosout=False
     )
+    whole = probe.get_fully_qualified_name()
+    probe.destroy_node()
+    domain = context.get_domain_id()
+    key = hashlib.sha256(f"{domain} {whole}".encode()).hexdigest()
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as claim:
         try:
-            whole = probe.get_fully_qualified_name()
-            domain = context.get_domain_id()
-            key = hashlib.sha256(f"{domain} {whole}".encode()).hexdigest().encode()
-            taken = False
-            try:
-                if sys.platform == "linux":
-                    claim.bind(b"\0nics_drl_bridge " + key)
-            except OSError:
-                taken = True
-            if taken or (_seen(probe, whole) and _lives(probe, whole)):
-                fix = "end it, or give this one a namespace: `--ros-args -r __ns:=/robot_2`."
-                raise BackendError(
-                    f"a node {whole!r} already runs in ROS domain {domain}; {fix}"
-                )
-        finally:
-            probe.destroy_node()
+            claim.bind(f"\0nics_drl_bridge {key}")
+        except OSError:
+            fix = (
+                "end it, or give this one a namespace: `--ros-args -r __ns:=/robot_2`."
+            )
+            raise BackendError(
+                f"a node {whole!r} already runs in ROS domain {domain}; {fix}"
+            ) from None
         yield
-
-
-def _seen(probe: Node, whole: str) -> bool:
-
-    def shows() -> bool:
-        nodes = probe.get_node_names_and_namespaces()
-        return [f"{space.rstrip('/')}/{name}" for name, space in nodes].count(whole) > 1
-
-    return holds(shows, SETTLE_S, POLL_S)
-
-
-def _lives(probe: Node, whole: str) -> bool:
-    client = probe.create_client(GetParameters, f"{whole}/get_parameters")
-    executor = SingleThreadedExecutor(context=probe.context)
-    executor.add_node(probe)
-    deadline = time.monotonic() + LIVENESS_S
-    try:
-        holds(client.service_is_ready, LIVENESS_S, POLL_S)
-        answer = client.call_async(GetParameters.Request())
-        executor.spin_until_future_complete(
-            answer, max(0.1, deadline - time.monotonic())
-        )
-        return bool(answer.done())
-    finally:
-        executor.shutdown(timeout_sec=1.0)
 
 
 def steadily(node: Node, period_s: float, call: Callable[[], Any]) -> Timer:

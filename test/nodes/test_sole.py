@@ -1,18 +1,13 @@
 """Two stacks in one domain: apart by their namespaces, or the second does not start."""
 
 import signal
-import threading
 
 import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
 from diagnostic_msgs.msg import DiagnosticArray
-from rcl_interfaces.srv import GetParameters
-from rclpy.node import Node
 
-from nics_drl_bridge.errors import BackendError
-from nics_drl_bridge.nodes.runner import sole
 from nics_drl_bridge.nodes.simulator_node import WATCH_S
 from nodes.peer import DEADLINE_S
 
@@ -63,32 +58,6 @@ def test_a_node_that_was_just_killed_does_not_keep_the_next_from_starting(
         lambda: gates() == 2, "the next gate beside the dead one, which is still listed"
     )
     again.check()
-
-
-def test_a_node_of_another_package_with_the_same_name_is_asked_and_found(
-    domain_id, meet
-):
-    peer, other = meet(domain_id), meet(domain_id)
-    name = peer.node.get_name()
-    asked = other.node.create_client(GetParameters, f"{name}/get_parameters")
-    alive = Node(name, context=peer.context)  # with the services of parameters
-    peer._executor.add_node(alive)
-    done = threading.Event()
-    spinning = threading.Thread(
-        target=lambda: peer.until(done.is_set, "the end"), daemon=True, name="alive"
-    )
-    spinning.start()
-    try:
-        other.until(lambda: asked.service_is_ready(), "it in the graph")
-        with (
-            pytest.raises(BackendError, match="already runs"),
-            sole(other.context, name),
-        ):
-            pass
-    finally:
-        done.set()
-        spinning.join()
-        alive.destroy_node()
 
 
 def test_two_simulators_that_tell_the_time_in_one_domain_name_each_other(
