@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
@@ -149,9 +148,9 @@ def take_priority(priority: int) -> str:
             with contextlib.suppress(
                 ProcessLookupError
             ):  # the thread has ended meanwhile
-                os.sched_setscheduler(
-                    int(thread), os.SCHED_FIFO, os.sched_param(priority)
-                )
+                # the writers of black boxes run at ordinary priority
+                policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+                os.sched_setscheduler(int(thread), policy, os.sched_param(priority))
     except (
         OSError,
         AttributeError,
@@ -189,7 +188,7 @@ class CommandGate(qos.BridgeNode):
         )
         if fault:
             raise ConfigError(fault)
-        kind = TwistStamped if self._stamped else Twist
+        kind = command_types.KINDS[command_types.name_of(self._stamped)]
         self._out = self.create_publisher(kind, CMD_VEL, qos.COMMAND)
         self._queue = EStopQueue()
         self._listen()
@@ -207,8 +206,8 @@ class CommandGate(qos.BridgeNode):
         )
         kinds = ("none", TWIST, TWIST_STAMPED)
         raw = device_parameters.choice(self, parameters.FOREIGN.name, kinds)
-        self._raw_kind = command_types.name_of(stamped=raw != TWIST)
-        self._raw_types = command_types.TypeWatch(self, inputs.RAW, FOREIGN_SETTINGS)
+        raw_kind = command_types.name_of(stamped=raw != TWIST)
+        command_types.TypeWatch(self, inputs.RAW, raw_kind, FOREIGN_SETTINGS)
         reader = (
             gate_inputs.read_command if raw == "none" else partial(self._foreign, raw)
         )
@@ -229,10 +228,12 @@ class CommandGate(qos.BridgeNode):
         for kind, topic, read, profile in readers:
             taker = partial(self._take, topic, read)
             self.create_subscription(kind, topic, taker, profile, raw=True)
-        kind = Twist if raw == TWIST else TwistStamped
-        command_taker = partial(self._take_command, reader)
         commands = self.create_subscription(
-            kind, inputs.RAW, command_taker, qos.EVERY_POLICY, raw=True
+            command_types.KINDS[raw_kind],
+            inputs.RAW,
+            partial(self._take_command, reader),
+            qos.EVERY_POLICY,
+            raw=True,
         )
         self._sources = Sources(self, commands.topic_name)
         runner.serve(self, "~/arm", self._arm)
@@ -349,7 +350,6 @@ class CommandGate(qos.BridgeNode):
     def _look(self) -> runner.Condition:
         self._sources.count_publishers()
         condition = self._log.finding(self._state)
-        self._raw_types.look(self._raw_kind)
         others = self.count_publishers(self._out.topic_name) - 1
         if others < 1:
             return condition

@@ -27,7 +27,7 @@ from nics_drl_bridge.middleware import measurement
 from nics_drl_bridge.middleware.ekf import ANYWHERE, START_STD
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.command_types import CommandListener
+from nics_drl_bridge.nodes.command_types import KINDS, TypeWatch, name_of
 from nics_drl_bridge.nodes.conversions import INITIAL_POSE, initial_pose
 from nics_drl_bridge.nodes.parameters import (
     IMU,
@@ -90,11 +90,10 @@ class RobotTopics:
         # pose and covariance of `initialpose`
         self._placed: tuple[Array, Array] | None = None
         self._subscriptions: list[Any] = []
-        self._commands = CommandListener(
-            node,
-            measurement.CMD_VEL,
-            get_flag(node, STAMPED),
-            self._locked(self._take_command),
+        kind = name_of(get_flag(node, STAMPED))
+        self._types = TypeWatch(node, measurement.CMD_VEL, kind)
+        self._subscribe(
+            measurement.CMD_VEL, KINDS[kind], self._take_command, qos.COMMAND
         )
         heard: dict[str, tuple[Any, Callable[[Any], None]]] = {
             measurement.SCAN: (LaserScan, self._take_scan),
@@ -112,23 +111,20 @@ class RobotTopics:
         for sensor in model.sensors:
             take_reading = partial(self._take_reading, sensor)
             heard[sensor.name] = (conversions.sensor_type(sensor), take_reading)
-        for topic, (kind, take) in heard.items():
-            self._subscribe(topic, kind, take, qos.SENSOR)
+        for topic, (type_, take) in heard.items():
+            self._subscribe(topic, type_, take, qos.SENSOR)
         self.expected = tuple(heard)
         self.expected_topics = self.expected
         self._hear_imu()
 
-    def _locked(self, take: Callable[[Any], None]) -> Callable[[Any], None]:
+    def _subscribe(
+        self, topic: str, kind: Any, take: Callable[[Any], None], quality: Any
+    ) -> None:
         def locked(message: Any) -> None:
             with self.lock:
                 take(message)
 
-        return locked
-
-    def _subscribe(
-        self, topic: str, kind: Any, take: Callable[[Any], None], quality: Any
-    ) -> None:
-        made = self._node.create_subscription(kind, topic, self._locked(take), quality)
+        made = self._node.create_subscription(kind, topic, locked, quality)
         self._subscriptions.append(made)
 
     @property
@@ -155,7 +151,7 @@ class RobotTopics:
 
     def close(self) -> None:
         """End the subscriptions."""
-        self._commands.close()
+        self._types.close()
         while self._subscriptions:
             self._node.destroy_subscription(self._subscriptions.pop())
 

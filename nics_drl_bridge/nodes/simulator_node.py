@@ -10,7 +10,7 @@ from functools import partial
 from typing import Any, cast
 
 import numpy as np
-from geometry_msgs.msg import TransformStamped, Twist, TwistStamped
+from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -35,7 +35,7 @@ from nics_drl_bridge.nodes import (
     runner,
     wire,
 )
-from nics_drl_bridge.nodes.command_types import TypeWatch, name_of
+from nics_drl_bridge.nodes.command_types import KINDS, TypeWatch, name_of
 from nics_drl_bridge.nodes.conversions import sensor_to_ros, sensor_type
 from nics_drl_bridge.nodes.link import identity
 from nics_drl_bridge.nodes.map_to_odom import odom_in_map, transform_to_ros
@@ -225,24 +225,24 @@ class CommandInlet:
         self._take = take
         self._too_old = too_old
         stamped = runner.get_flag(node, "enable_stamped_cmd_vel")
-        self._kind = name_of(stamped)
-        kind = TwistStamped if stamped else Twist
         self._hear = partial(self._on_bytes, stamped)
+        kind = name_of(stamped)
         self._commands = node.create_subscription(
-            kind, f"{namespace}{CMD_VEL}", self._hear, quality, raw=True
+            KINDS[kind], f"{namespace}{CMD_VEL}", self._hear, quality, raw=True
         )
         self._topic = self._commands.topic_name
         self.heard = [self._commands]
-        self._types = TypeWatch(node, f"{namespace}{CMD_VEL}")
-        kind = conversions.message_type("ackermann_msgs/msg/AckermannDriveStamped")
-        if robot.steers and kind is not None:  # its package is optional
+        self._types = TypeWatch(node, self._topic, kind)
+        drive = conversions.message_type("ackermann_msgs/msg/AckermannDriveStamped")
+        if robot.steers and drive is not None:  # its package is optional
             topic = f"{namespace}ackermann_cmd"
             self.heard.append(
-                node.create_subscription(kind, topic, self._on_ackermann, quality)
+                node.create_subscription(drive, topic, self._on_ackermann, quality)
             )
 
     def close(self) -> None:
         """End the subscriptions."""
+        self._types.close()
         for subscription in self.heard:
             self._node.destroy_subscription(subscription)
 
@@ -291,10 +291,6 @@ class CommandInlet:
         self._node.get_logger().warning(
             f"{self._topic}: {what}", throttle_duration_sec=QUIET_S
         )
-
-    def watch(self) -> None:
-        """Warn once about each node that publishes the other type, which is never received."""
-        self._types.look(self._kind)
 
 
 class DeviceNode(qos.BridgeNode):
@@ -473,8 +469,6 @@ class DeviceNode(qos.BridgeNode):
             runner.steadily(self, 0.0, self._on_free_time)
 
     def _watch(self) -> None:
-        for inlet in self._inlets:
-            inlet.watch()
         names = set(qos.owners(self.get_publishers_info_by_topic(CLOCK)))
         for name in names - self._clocks:
             self.get_logger().warning(

@@ -1,7 +1,6 @@
 """`cmd_vel` is a TwistStamped by default since Kilted, and who speaks to a node follows it."""
 
 from contextlib import closing
-from functools import partial
 
 import numpy as np
 import pytest
@@ -18,7 +17,6 @@ from nics_drl_bridge.nodes.backends import DdsBackend
 from nics_drl_bridge.nodes.command_gate import CommandGate
 from nics_drl_bridge.nodes.link import Link
 from nics_drl_bridge.nodes.parameters import stamped_by_default
-from nics_drl_bridge.nodes.watching import RosSource
 from nics_drl_bridge.sim.world import load_world
 from nodes.peer import stamp_ns
 
@@ -82,26 +80,15 @@ def test_without_anybody_who_listens_it_is_the_distributions_type(domain_id):
     link.close()
 
 
-def test_commands_are_heard_whatever_their_type_is_and_whenever_it_changes(
-    meet, domain_id, model
+def test_an_estimator_names_who_publishes_commands_of_the_other_type(
+    launch, meet, domain_id
 ):
+    process = launch("middleware_node", domain_id, enable_stamped_cmd_vel=True)
     peer = meet(domain_id)
-    messages = {True: TwistStamped(), False: Twist()}
-    messages[True].twist.linear.x = 0.25
-    messages[False].linear.x = 0.5
-    speeds = {True: 0.25, False: 0.5}
-    with closing(RosSource(model, None, domain_id=domain_id)) as source:
-
-        def heard():
-            return source.frame().worlds[0].shot.commands[0, 0]
-
-        for kind in (True, False, True):
-            commands = peer.node.create_publisher(KINDS[kind], "cmd_vel", qos.COMMAND)
-            send = partial(commands.publish, messages[kind])
-            timer = peer.node.create_timer(0.05, send)
-            peer.until(lambda kind=kind: heard() == speeds[kind], "the command", 30.0)
-            peer.node.destroy_timer(timer)
-            peer.node.destroy_publisher(commands)
+    peer.node.create_publisher(Twist, "cmd_vel", qos.COMMAND)
+    peer.until(
+        lambda: "set enable_stamped_cmd_vel:=false" in process.read_text(), "a warning"
+    )
 
 
 def test_a_drive_whose_chosen_type_nobody_hears_names_who_hears_the_other(
