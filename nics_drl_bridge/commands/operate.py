@@ -106,7 +106,7 @@ def goal(
         answer = operator.send_goal(
             namespace, GoalRequest(x, y, yaw, frame), wait, _tell
         )
-    if not answer.taken:
+    if not answer.granted:
         typer.echo(f"nics: policy_node rejects the goal: {answer.told}", err=True)
         raise typer.Exit(EXIT_REFUSED)
     line = f"policy_node drives to {answer.told} as long as command_gate is armed"

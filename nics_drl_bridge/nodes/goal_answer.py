@@ -13,12 +13,12 @@ class GoalAnswer:
     """The answer to a goal: accepted or refused."""
 
     stamp_ns: int  # of the goal's message
-    taken: bool
+    granted: bool
     told: str  # where the goal is, or why it was refused
 
     def to_facts(self) -> dict[str, object]:
         """Return the answer as facts of a node's diagnostics."""
-        return {STAMP: self.stamp_ns, TAKEN: self.taken, TOLD: self.told}
+        return {STAMP: self.stamp_ns, TAKEN: self.granted, TOLD: self.told}
 
 
 def answer_from_values(values: Mapping[str, str]) -> GoalAnswer | None:

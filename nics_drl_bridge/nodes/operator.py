@@ -5,12 +5,12 @@ It imports no simulator and no kernels: an emergency stop must not wait for seco
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any, NamedTuple, TypeVar
 
-from builtin_interfaces.msg import Time
+from builtin_interfaces.msg import Time as TimeMessage
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from rclpy.node import Node
@@ -28,8 +28,7 @@ from nics_drl_bridge.nodes.listener import Listener, holds
 GATE = "command_gate"
 POLICY = ": policy"  # how the name of a policy node's status ends
 POLL_S = 0.02
-ASK_AGAIN_S = 1.0  # between two requests to a gate that refuses [s]
-SEND_AGAIN_S = 1.0  # between two goals to a policy node that refuses [s]
+ASK_AGAIN_S = 1.0  # between two requests that are refused [s]
 GATE_ANSWER_S = 5.0  # that a gate may take to answer [s]
 CALL_S = 10.0  # the same with the time to find its service [s]
 SETTLE_S = 1.0  # in which all gates are seen, once one of them is [s]
@@ -44,8 +43,7 @@ class GateAnswer(NamedTuple):
     told: str
 
 
-@dataclass(frozen=True)
-class GoalRequest:
+class GoalRequest(NamedTuple):
     """A goal as a person asks for it."""
 
     x: float  # [m]
@@ -53,15 +51,20 @@ class GoalRequest:
     yaw: float = 0.0  # [rad]
     frame: str = ""  # empty: the map, whatever the policy node calls it
 
-    def to_ros(self, stamp_ns: int) -> PoseStamped:
-        """Return the goal as a message."""
-        stamp = Time(sec=stamp_ns // NS_PER_S, nanosec=stamp_ns % NS_PER_S)
-        message = PoseStamped(header=Header(stamp=stamp, frame_id=self.frame))
-        message.pose.position.x = self.x
-        message.pose.position.y = self.y
-        message.pose.orientation.z = math.sin(self.yaw / 2.0)
-        message.pose.orientation.w = math.cos(self.yaw / 2.0)
-        return message
+
+Answer = TypeVar("Answer", GateAnswer, GoalAnswer)
+
+
+def insist(ask: Callable[[], Answer], deadline: float, tell: Tell, what: str) -> Answer:
+    """Ask until the answer is granted or a time comes; tell once that it is refused."""
+    answer = ask()
+    left_s = deadline - time.monotonic()
+    if not answer.granted and left_s > ASK_AGAIN_S:
+        tell(f"{what} yet ({answer.told}); asking again for {left_s:.0f} s")
+    while not answer.granted and time.monotonic() + ASK_AGAIN_S < deadline:
+        time.sleep(ASK_AGAIN_S)
+        answer = ask()
+    return answer
 
 
 class _Call:
@@ -94,6 +97,11 @@ class _Call:
         return self._future is not None and bool(self._future.done())
 
 
+def space_of(name: str) -> str:
+    """Return the namespace of a node by its full name; empty for the root."""
+    return name.rpartition("/")[0]
+
+
 class Operator(AbstractContextManager["Operator", None]):
     """A node that calls gates and sends goals; a context manager. Raises BackendError."""
 
@@ -111,19 +119,15 @@ class Operator(AbstractContextManager["Operator", None]):
     ) -> GateAnswer:
         """Arm a gate, and ask again while it refuses; a reset before that releases its stop."""
         deadline = time.monotonic() + seconds
-        gate = self._wait_for_gate(namespace, seconds)
+        gate = self._wait_for(self._gates, GATE, namespace, seconds)
+
+        def call(service: str) -> GateAnswer:
+            wait_s = min(deadline - time.monotonic(), CALL_S)
+            return _Call(self._node, gate, service).wait_for_answer(wait_s)
+
         if reset:
-            self._call(gate, "reset", deadline)
-        answer = self._call(gate, "arm", deadline)
-        left_s = deadline - time.monotonic()
-        if not answer.granted and left_s > ASK_AGAIN_S:
-            tell(
-                f"{gate} does not arm yet ({answer.told}); asking again for {left_s:.0f} s"
-            )
-        while not answer.granted and time.monotonic() + ASK_AGAIN_S < deadline:
-            time.sleep(ASK_AGAIN_S)
-            answer = self._call(gate, "arm", deadline)
-        return answer
+            call("reset")
+        return insist(partial(call, "arm"), deadline, tell, f"{gate} does not arm")
 
     def stop(self, namespace: str | None, seconds: float) -> Iterator[GateAnswer]:
         """Press the e-stop of one gate, or of all if no namespace is given; yield each answer.
@@ -131,8 +135,8 @@ class Operator(AbstractContextManager["Operator", None]):
         An answer is yielded as soon as it comes, so that nobody waits for gates that may follow.
         """
         if namespace is not None:
-            gate = self._wait_for_gate(namespace, seconds)
-            yield self._call(gate, "e_stop", time.monotonic() + CALL_S)
+            gate = self._wait_for(self._gates, GATE, namespace, seconds)
+            yield _Call(self._node, gate, "e_stop").wait_for_answer(CALL_S)
             return
         waiting: dict[str, _Call] = {}
         seen = set[str]()
@@ -148,7 +152,7 @@ class Operator(AbstractContextManager["Operator", None]):
                 yield waiting.pop(gate).wait_for_answer(0.0)
             time.sleep(POLL_S)
         if not seen:
-            raise BackendError(f"{self._nobody(GATE, seconds)}; nothing was stopped.")
+            raise BackendError(self._explain_absence(GATE, seconds, "", []))
         deadline = time.monotonic() + GATE_ANSWER_S
         for call in waiting.values():
             yield call.wait_for_answer(deadline - time.monotonic())
@@ -162,64 +166,59 @@ class Operator(AbstractContextManager["Operator", None]):
         topic = self._node.create_publisher(
             PoseStamped, f"{space}/goal_pose", qos.COMMAND
         )
-        name = self._wait_for_policy(topic, space, seconds)
-        answer = self._send(topic, goal, name, deadline)
-        if not answer.taken and time.monotonic() < deadline:
-            tell(f"{name} does not take the goal yet ({answer.told}), sending it again")
-        while not answer.taken and time.monotonic() + SEND_AGAIN_S < deadline:
-            time.sleep(SEND_AGAIN_S)
-            answer = self._send(topic, goal, name, deadline)
-        return answer
+        policies = partial(list, self._policies)
+        name = self._wait_for(policies, "policy_node", namespace, seconds)
+        left_s = deadline - time.monotonic()
+        if not holds(topic.get_subscription_count, left_s, POLL_S):
+            condition = self._policies[name][0]
+            raise BackendError(
+                f"{name} hears no goals, its state is {condition!r}; see its log."
+            )
+        send = partial(self._send, topic, goal, name, deadline)
+        return insist(send, deadline, tell, f"{name} does not take the goal")
 
     def _send(
         self, topic: Publisher, goal: GoalRequest, name: str, deadline: float
     ) -> GoalAnswer:
         stamp_ns = time.time_ns()
         wait_s = max(deadline - time.monotonic(), 0.0)
-        topic.publish(goal.to_ros(stamp_ns))
-
-        def answered() -> bool:
-            answer = answer_from_values(self._policies[name][1])
-            return answer is not None and answer.stamp_ns == stamp_ns
-
-        if holds(answered, wait_s, POLL_S):
-            answer = answer_from_values(self._policies[name][1])
-            if answer is not None:
-                return answer
-        condition = self._policies[name][0]
-        return GoalAnswer(
-            stamp_ns, False, f"no answer within {wait_s:.1f} s, {condition}"
+        message = PoseStamped(header=Header(frame_id=goal.frame))
+        message.header.stamp = TimeMessage(
+            sec=stamp_ns // NS_PER_S, nanosec=stamp_ns % NS_PER_S
         )
+        message.pose.position.x, message.pose.position.y = goal.x, goal.y
+        message.pose.orientation.z = math.sin(goal.yaw / 2.0)
+        message.pose.orientation.w = math.cos(goal.yaw / 2.0)
+        topic.publish(message)
 
-    def _wait_for_policy(self, topic: Publisher, space: str, seconds: float) -> str:
-        """Wait for the policy node of a namespace, and return its name."""
+        def find_answer() -> GoalAnswer | None:
+            answer = answer_from_values(self._policies[name][1])
+            return answer if answer and answer.stamp_ns == stamp_ns else None
 
-        def found() -> list[str]:
-            names = list(self._policies)
-            return [name for name in names if name.rpartition("/")[0] == space]
+        holds(find_answer, wait_s, POLL_S)
+        why = f"no answer within {wait_s:.1f} s, {self._policies[name][0]}"
+        return find_answer() or GoalAnswer(stamp_ns, False, why)
 
-        holds(lambda: topic.get_subscription_count() and found(), seconds, POLL_S)
-        names = found()
-        if not names:
-            spaces = {name.rpartition("/")[0] for name in list(self._policies)}
-            raise BackendError(
-                f"{self._nobody('policy_node', seconds, space, spaces)}."
-            )
-        if not topic.get_subscription_count():
-            condition = self._policies[names[0]][0]
-            raise BackendError(
-                f"{names[0]} hears no goals, its state is {condition!r}; see its log."
-            )
-        return names[0]
-
-    def _wait_for_gate(self, namespace: str, seconds: float) -> str:
-        """Wait for the gate of a namespace, and return its name."""
+    def _wait_for(
+        self,
+        names: Callable[[], Iterable[str]],
+        what: str,
+        namespace: str,
+        seconds: float,
+    ) -> str:
+        """Wait for a node of a namespace among `names`, and return its name."""
         space = parse_namespace(namespace)
-        gate = f"{space}/{GATE}"
-        if not holds(lambda: gate in self._gates(), seconds, POLL_S):
-            spaces = {gate.rpartition("/")[0] for gate in self._gates()}
-            raise BackendError(f"{self._nobody(GATE, seconds, space, spaces)}.")
-        return gate
+
+        def find() -> str | None:
+            return next((name for name in names() if space_of(name) == space), None)
+
+        holds(find, seconds, POLL_S)
+        name = find()
+        if name is None:
+            raise BackendError(
+                self._explain_absence(what, seconds, space, sorted(names()))
+            )
+        return name
 
     def _gates(self) -> set[str]:
         """Return the names of all gates that are seen."""
@@ -231,24 +230,18 @@ class Operator(AbstractContextManager["Operator", None]):
         ]
         return set(ends)
 
-    def _nobody(
-        self, what: str, seconds: float, space: str = "", spaces: set[str] | None = None
+    def _explain_absence(
+        self, what: str, seconds: float, space: str, others: Sequence[str]
     ) -> str:
-        """Return a clause that says where nobody answers, and where somebody does."""
-        where = f"in namespace {space or '/'} of ROS domain {self._node.context.get_domain_id()}"
+        """Return a sentence that says where nobody is, and which others there are."""
+        domain = self._node.context.get_domain_id()
+        where = f"in namespace {space or '/'} of ROS domain {domain}"
         fault = f"no {what} was seen {where} within {seconds:g} s"
-        if not spaces:
-            return f"{fault}; start one, as by `nics up simulation`, in the same ROS_DOMAIN_ID"
-        names = sorted(space.strip("/") for space in spaces)
-        fix = f"say --namespace {names[0]}" if names[0] else "leave --namespace out"
-        return (
-            f"{fault}; there is one in {', '.join(f'/{name}' for name in names)}: {fix}"
-        )
-
-    def _call(self, gate: str, service: str, deadline: float) -> GateAnswer:
-        """Call a service of a gate; wait for its answer until a deadline, at most `CALL_S`."""
-        wait_s = min(deadline - time.monotonic(), CALL_S)
-        return _Call(self._node, gate, service).wait_for_answer(wait_s)
+        if not others:
+            return f"{fault}; start one, as by `nics up simulation`, in the same ROS_DOMAIN_ID."
+        first = space_of(others[0]).strip("/")
+        fix = f"say --namespace {first}" if first else "leave --namespace out"
+        return f"{fault}; there is {', '.join(others)}: {fix}."
 
     def _take_diagnostics(self, message: Any) -> None:
         for status in message.status:

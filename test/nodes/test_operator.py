@@ -54,14 +54,17 @@ def test_a_node_that_can_not_be_made_leaves_no_context(monkeypatch):
 def test_the_time_left_to_arm_is_told_and_kept(clock, monkeypatch):
     operator = Operator.__new__(Operator)
 
-    def wait_for_gate(namespace, seconds):
+    class Call:
+        def __init__(self, node, gate, service):
+            self.wait_for_answer = lambda _: GateAnswer(gate, False, "x")
+
+    def wait_for(*_):
         clock.sleep(7.0)
         return "/command_gate"
 
-    monkeypatch.setattr(operator, "_wait_for_gate", wait_for_gate)
-    monkeypatch.setattr(
-        operator, "_call", lambda gate, *_: GateAnswer(gate, False, "x")
-    )
+    operator._node = None
+    monkeypatch.setattr(operator, "_wait_for", wait_for)
+    monkeypatch.setattr(module, "_Call", Call)
     told = []
     answer = operator.arm("", 10.0, False, told.append)
     assert told == ["/command_gate does not arm yet (x); asking again for 3 s"]
@@ -83,7 +86,7 @@ def test_a_gate_that_hangs_holds_up_the_arming_no_longer_than_was_given(
 
     operator = Operator.__new__(Operator)
     operator._node = None
-    monkeypatch.setattr(operator, "_wait_for_gate", lambda *_: "/command_gate")
+    monkeypatch.setattr(operator, "_wait_for", lambda *_: "/command_gate")
     monkeypatch.setattr(module, "_Call", Call)
     answer = operator.arm("", seconds, True, lambda _: None)
     assert answer == GateAnswer("/command_gate", False, "it did not answer in time")
