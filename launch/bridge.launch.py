@@ -3,7 +3,8 @@
 ros2 launch nics_drl_bridge bridge.launch.py namespace:=car
 """
 
-from nics_drl_bridge.nodes.launching import LAUNCHES, describe
+from nics_drl_bridge.nodes.launching import describe
+from nics_drl_bridge.nodes.starting import LAUNCHES
 
 
 def generate_launch_description():

@@ -6,7 +6,8 @@ Give your own parameter file, because model, limits and latency depend on the ro
 ros2 launch nics_drl_bridge vehicle.launch.py model:=my_car params_file:=car.yaml
 """
 
-from nics_drl_bridge.nodes.launching import LAUNCHES, describe
+from nics_drl_bridge.nodes.launching import describe
+from nics_drl_bridge.nodes.starting import LAUNCHES
 
 
 def generate_launch_description():

@@ -188,7 +188,6 @@ class DdsBackend:
             self._link.wait_for_peers(
                 self._topics, self._episodes.clients, timeout_s, START_SIMULATOR
             )
-            self._episodes.open(timeout_s)
         except BaseException:
             self.close()
             raise

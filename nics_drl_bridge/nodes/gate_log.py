@@ -1,5 +1,6 @@
 """Reports of `command_gate`: log lines, counters and the black box. Never waits for a disk."""
 
+import math
 import os
 import signal
 import subprocess
@@ -23,9 +24,7 @@ from nics_drl_bridge.nodes.runner import Condition
 BURST_S = (
     3.0  # commands must pass for this long before a stop counts as a new burst [s]
 )
-LINE_S = 2.0  # time between two log lines of a kind; those in between are counted [s]
-# limit of that time, which doubles with each line while a kind persists [s]
-LONGEST_LINE_S = 64.0
+LINE_S = 2.0  # time between two log lines of a kind; all are counted [s]
 CLOSING_S = 0.7  # longest wait at the end for files that are being written [s]
 POLL_S = 0.005
 KEPT_S = 30.0  # minimum time span of the lines that are kept [s]
@@ -45,16 +44,14 @@ class GateLog:
         self._logger = logger
         self._hardware = robot
         self._cause: Cause | None = None
-        self._now = float("-inf")
-        self._since = float("-inf")
+        self._now = -math.inf
+        self._since = -math.inf
         # the rule that stops the robot; "" while commands pass, None at first
         self._rule: str | None = None
         # rules whose stop was recorded in the present burst
         self._burst: set[str] = set()
-        # For each kind: time of the last line, and minimum time until the next [s].
-        self._said: dict[str, tuple[float, float]] = {}
-        self._kept: Counter[str] = Counter()  # events of a kind since its last line
-        self._owed = False
+        self._logged_s: dict[str, float] = {}  # time of the last line of a kind
+        self._is_untold = False  # the present rule is not logged yet
         self._box = BlackBox(config, folder)
 
     def note(self, entry: Entry) -> None:
@@ -69,57 +66,43 @@ class GateLog:
             self.counters["cut by the shield"] += 1
         rule = "" if cause is None else cause.rule
         if rule != self._rule:
-            self._changed(rule)
+            self._change_rule(rule)
         self._cause = cause
-        # a rule that persists is always logged
-        lasts = entry.now - self._since >= LINE_S
-        # otherwise the line follows later
-        more = self._due(rule, lasts) if self._owed else None
-        if more is not None:
-            self._owed = False
+        # what is the case is always logged in the end, maybe later
+        if self._is_untold and self._may_log("rule"):
+            self._is_untold = False
             if cause is None:
-                self._logger.info(f"commands pass{more}")
+                self._logger.info("commands pass")
             else:
-                self._logger.warning(f"stopped by {cause.line}{more}")
+                self._logger.warning(f"stopped by {cause.line}")
         if self._burst and not rule and entry.now - self._since >= BURST_S:
             self._burst.clear()
 
     def refuse(self, topic: str, fault: str) -> None:
         """Count an input that is refused by its topic, and log what is wrong with it."""
-        more = self._counted(f"refused, {topic}")
-        if more is not None:
-            self._logger.warning(f"refused: {fault}{more}")
+        self.counters[f"refused, {topic}"] += 1
+        if self._may_log(topic):
+            self._logger.warning(f"refused: {fault}")
 
     def no_number(self, twist: Sequence[float]) -> None:
         """Count and log a decision that is not finite; that must never happen."""
-        more = self._counted("not finite, sent as zero")
-        if more is not None:
-            then = f"zero is sent, and the e-stop is pressed{more}"
+        self.counters["not finite, sent as zero"] += 1
+        if self._may_log("not finite"):
+            then = "zero is sent, and the e-stop is pressed"
             self._logger.error(f"decided on {list(twist)}, which is not finite: {then}")
 
-    def _counted(self, kind: str) -> str | None:
-        self.counters[kind] += 1
-        self._kept[kind] += 1
-        return self._due(kind)
+    def _may_log(self, kind: str) -> bool:
+        """Return whether the last line of a kind is old enough; the next one counts as logged."""
+        if self._now - self._logged_s.get(kind, -math.inf) < LINE_S:
+            return False
+        self._logged_s[kind] = self._now
+        return True
 
-    def _due(self, kind: str, certainly: bool = False) -> str | None:
-        """Return a suffix for the line; None if one of its kind was logged a moment ago."""
-        said, wait_s = self._said.get(kind, (float("-inf"), LINE_S))
-        if not certainly and self._now - said < wait_s:
-            return None
-        kept = self._kept.pop(kind, 1) - 1
-        self._said[kind] = (
-            self._now,
-            min(2.0 * wait_s, LONGEST_LINE_S) if kept else LINE_S,
-        )
-        return f" ({kept} more since the last such line)" if kept else ""
-
-    def _changed(self, rule: str) -> None:
+    def _change_rule(self, rule: str) -> None:
         was_passing = self._rule == ""
         self._rule = rule
         self._since = self._now
-        self._owed = True
-        self._kept[rule] += 1
+        self._is_untold = True
         if not rule:
             return
         self.counters[f"stopped, {rule}"] += 1

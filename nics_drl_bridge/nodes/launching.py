@@ -1,7 +1,8 @@
 """Launch descriptions of the launches in `starting`, for the files in `launch/` and your own.
 
 Your own launch file can take a whole launch, as in `describe(whole_simulation())`, or combine parts
-and arguments, as in `describe(Launch("...", [bridge], [*common("false"), *of_bridge()]))`.
+and arguments of `starting`, as in `describe(Launch("...", [bridge], [*common("false"),
+*of_bridge()]))`.
 """
 
 from typing import Any
@@ -12,39 +13,7 @@ from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterFile, ParameterValue
 
 from launch import LaunchDescription
-from nics_drl_bridge.nodes.starting import (
-    LAUNCHES,
-    Argument,
-    Launch,
-    NodeStart,
-    bridge,
-    common,
-    description,
-    e_stop_required,
-    of_bridge,
-    of_description,
-    of_nodes,
-    of_simulator,
-    simulator,
-    whole_simulation,
-)
-
-__all__ = [
-    "LAUNCHES",
-    "Argument",
-    "Launch",
-    "bridge",
-    "common",
-    "describe",
-    "description",
-    "e_stop_required",
-    "of_bridge",
-    "of_description",
-    "of_nodes",
-    "of_simulator",
-    "simulator",
-    "whole_simulation",
-]
+from nics_drl_bridge.nodes.starting import Argument, Launch, NodeStart
 
 
 def describe(launch: Launch) -> Any:

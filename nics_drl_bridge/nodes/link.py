@@ -406,9 +406,6 @@ class EpisodeServices:
         self._asked_s = 0.0
         self.clients = [self._reset, self._parameters]
 
-    def open(self, timeout_s: float) -> None:
-        """Do nothing: the simulator's model and world are checked when an episode begins."""
-
     @property
     def there(self) -> bool:
         """True if a simulator offers the services."""

@@ -4,6 +4,7 @@ import math
 import os
 import re
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import fields
 from importlib.metadata import PackageNotFoundError, distribution
 from typing import Any, NamedTuple
 
@@ -243,75 +244,35 @@ def nav2() -> list[Row]:
     ]
 
 
+CHECKS = {  # what the fields of `GoalCheck` and `ProgressCheck` mean
+    "xy_goal_tolerance": "Maximum distance from the goal [m].",
+    "yaw_goal_tolerance": "Heading tolerance [rad]; ignored for robots that steer.",
+    "stateful": "A position once reached counts as reached from then on.",
+    "path_length_tolerance": "Maximum remaining path length at the goal [m].",
+    "required_movement_radius": "Distance that counts as progress [m].",
+    "required_movement_angle": "Rotation that also counts as progress [rad], for a "
+    "PoseProgressChecker.",
+    "movement_time_allowance": "Time limit for progress [s].",
+}
+
+
 def checkers(goals: Sequence[str], progress: Sequence[str]) -> list[Row]:
     """Return the parameters of the named checks; they are those of Nav2's checkers."""
     from nics_drl_bridge.policy.follow import GoalCheck, ProgressCheck
 
-    span = (0.0, 1e6)
-    plugin = Row(
-        "plugin",
-        "nav2_controller::SimpleGoalChecker",
-        "Nav2 checker to imitate.",
-        fixed=False,
-    )
-    goal_rows = [
-        Row(
-            "xy_goal_tolerance",
-            GoalCheck.xy_goal_tolerance,
-            "Maximum distance from the goal [m].",
-            span,
-            False,
-        ),
-        Row(
-            "yaw_goal_tolerance",
-            GoalCheck.yaw_goal_tolerance,
-            "Heading tolerance [rad]; ignored for robots that steer.",
-            span,
-            False,
-        ),
-        Row(
-            "stateful",
-            GoalCheck.stateful,
-            "A position once reached counts as reached from then on.",
-            fixed=False,
-        ),
-        Row(
-            "path_length_tolerance",
-            GoalCheck.path_length_tolerance,
-            "Maximum remaining path length at the goal [m].",
-            span,
-            False,
-        ),
-        plugin,
-    ]
-    progress_rows = [
-        plugin._replace(default="nav2_controller::SimpleProgressChecker"),
-        Row(
-            "required_movement_radius",
-            ProgressCheck.required_movement_radius,
-            "Distance that counts as progress [m].",
-            span,
-            False,
-        ),
-        Row(
-            "required_movement_angle",
-            0.5,
-            "Rotation that also counts as progress [rad], for a PoseProgressChecker.",
-            span,
-            False,
-        ),
-        Row(
-            "movement_time_allowance",
-            ProgressCheck.movement_time_allowance,
-            "Time limit for progress [s].",
-            span,
-            False,
-        ),
-    ]
     rows = []
-    for names, check in ((goals, goal_rows), (progress, progress_rows)):
+    for names, check in ((goals, GoalCheck), (progress, ProgressCheck)):
+        defaults_of = {field.name: field.default for field in fields(check)}
+        if check is ProgressCheck:
+            defaults_of["required_movement_angle"] = 0.5
+        plugin = f"nav2_controller::Simple{check.__name__}er"
         for name in names:
-            rows += [row._replace(name=f"{name}.{row.name}") for row in check]
+            rows.append(
+                Row(f"{name}.plugin", plugin, "Nav2 checker to imitate.", fixed=False)
+            )
+            for field, value in defaults_of.items():
+                span = None if isinstance(value, bool) else (0.0, 1e6)
+                rows.append(Row(f"{name}.{field}", value, CHECKS[field], span, False))
     return rows
 
 
@@ -560,10 +521,6 @@ def gate_rules(odom_rate: float = math.nan, scan_age: float = math.nan) -> list[
     ]
 
 
-SPLIT = {  # parameters of earlier versions, and what replaced them
-    "estimate_std": "'estimate_position' [m] and 'estimate_heading' [rad], which limit how much "
-    "the estimate's uncertainty grows within 10 s, counted from arming",
-}
 RULES_IN_SECONDS = ("scan_age", "odom_age", "command_age", "e_stop_silence")
 
 

@@ -214,41 +214,28 @@ def _are_whole_numbers(default: Any, given: Parameter) -> bool:
 
 
 def unknown(node: Node) -> list[str]:
-    """Return a sentence for each value whose parameter the node does not have."""
-    declared = node.get_parameters_by_prefix("")
-    names = [name for name in declared if not name.startswith(qos.OVERRIDES)]
-    ignores = getattr(node, "ignores", lambda _: False)
-    sentences = [
-        f"there is no parameter {name!r}, its value is ignored; {suggest(name, names)}"
-        for name in sorted(qos.given_values(node))
-        if name not in (*names, SHARED)
-        and not name.startswith(qos.OVERRIDES)
-        and not ignores(name)
-    ]
-    return sentences + unused_overrides(node)
+    """Return a sentence for each value whose parameter the node does not have.
 
-
-def unused_overrides(node: Node) -> list[str]:
-    """Return a sentence for each quality of service that is given for a topic without such an end.
-
-    A managed node that is not configured has no topics yet.
+    A managed node that is not configured has no topics yet, whose quality of service it could set.
     """
-    if getattr(node, "state", ACTIVE) == UNCONFIGURED:
-        return []
-    ends = [
-        f"{qos.OVERRIDES}{publisher.topic_name}.publisher"
-        for publisher in node.publishers
+    names = [
+        name
+        for name in node.get_parameters_by_prefix("")
+        if not name.startswith(qos.OVERRIDES)
     ]
-    ends += [
-        f"{qos.OVERRIDES}{subscription.topic_name}.subscription"
-        for subscription in node.subscriptions
-    ]
-    return [
-        f"parameter {name!r} is ignored: the node has no such publisher or subscription; "
-        f"{suggest(name.rpartition('.')[0], ends)}"
-        for name in sorted(qos.given_values(node))
-        if name.startswith(qos.OVERRIDES) and not node.has_parameter(name)
-    ]
+    ignores = getattr(node, "ignores", lambda _: False)
+    has_topics = getattr(node, "state", ACTIVE) != UNCONFIGURED
+    sentences = []
+    for name in sorted(qos.given_values(node)):
+        if name == SHARED or node.has_parameter(name) or ignores(name):
+            continue
+        if not name.startswith(qos.OVERRIDES):
+            fix = f"its value is ignored; {suggest(name, names)}"
+            sentences.append(f"there is no parameter {name!r}, {fix}")
+        elif has_topics:
+            why = "the node has no such publisher or subscription"
+            sentences.append(f"parameter {name!r} is ignored: {why}.")
+    return sentences
 
 
 class Condition(NamedTuple):

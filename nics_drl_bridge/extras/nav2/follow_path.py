@@ -5,6 +5,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -172,18 +173,14 @@ class PathActions:
         if node.get_parameter(NAVIGATE).value:
             self._serve(NAVIGATE, self._navigate)
             timer = runner.steadily(node, LOOK_S, self._look)
-            self._undo.append(lambda: node.destroy_timer(timer))
-        self._listen(OccupancyGrid, "map", self._take_map, qos.LATCHED)
+            self._undo.append(partial(node.destroy_timer, timer))
         topic = runner.get_text(node, "speed_limit_topic")
-        self._listen(
-            conversions.message_type(SPEED_LIMIT), topic, self._take_limit, qos.COMMAND
-        )
-
-    def _listen(
-        self, kind: Any, topic: str, take: Callable[[Any], None], quality: Any
-    ) -> None:
-        heard = self._node.create_subscription(kind, topic, take, quality)
-        self._undo.append(lambda: self._node.destroy_subscription(heard))
+        limit_type = conversions.message_type(SPEED_LIMIT)
+        for heard in (
+            node.create_subscription(OccupancyGrid, "map", self._take_map, qos.LATCHED),
+            node.create_subscription(limit_type, topic, self._take_limit, qos.COMMAND),
+        ):
+            self._undo.append(partial(node.destroy_subscription, heard))
 
     def _serve(self, name: str, begin: Callable[[Goal], Run]) -> None:
         kind = self._kinds[name]
@@ -294,23 +291,19 @@ class PathActions:
         end = np.array([read_pose(asked.pose)])
         frame, end = self._placed(goal, asked.pose.header.frame_id, end)
         self._planned(goal, end)
-        try:
-            way = self._way(frame, self._robot_in(NAVIGATE, frame), end[0])
-        except ConfigError as error:
-            raise Refusal(goal.code, f"{NAVIGATE}: {error}") from None
+        # on the map if there is one, else straight
+        points = np.stack([self._robot_in(NAVIGATE, frame)[:2], end[0, :2]])
+        if self._map is not None and frame in ("", self._map[0]):
+            radius = self._robot.footprint_radius
+            try:
+                points = route(self._map[1], *points, radius)
+            except ConfigError as error:
+                raise Refusal(goal.code, f"{NAVIGATE}: {error}") from None
+        way = np.column_stack([points, np.full(len(points), end[0, 2])])
         checks = [
             self.parameters.names[f"{kind}_checker"][0] for kind in ("goal", "progress")
         ]
         return self._begin(goal, frame, way, checks)
-
-    def _way(self, frame: str, robot: Array, end: Array) -> Array:
-        """Return the path (P, 3) on the map if there is one, else a straight one."""
-        points = np.stack([robot[:2], end[:2]])
-        if self._map is not None and frame in ("", self._map[0]):
-            points = route(
-                self._map[1], points[0], points[1], self._robot.footprint_radius
-            )
-        return np.column_stack([points, np.full(len(points), end[2])])
 
     def _placed(self, goal: Goal, frame: str, poses: Array) -> tuple[str, Array]:
         try:
@@ -334,7 +327,6 @@ class PathActions:
         frame, poses = self._placed(goal, frame, poses)
         path = self._planned(goal, poses)
         self._robot_in(goal.name, frame)
-        self._require_on_map(goal, frame, poses)
         arrival, progress = self.parameters.checks(*checks)
         checkers = (
             GoalChecker(arrival, not self._robot.steers),
@@ -348,23 +340,6 @@ class PathActions:
             return PlannedPath(poses)
         except ConfigError as error:
             raise Refusal(goal.code, f"{goal.name}: {error}") from None
-
-    def _require_on_map(self, goal: Goal, frame: str, poses: Array) -> None:
-        if self._map is None:
-            return
-        wanted, grid = self._map
-        here = self._frames.robot_in(frame)
-        there = self._frames.robot_in(wanted)
-        if here is None or there is None:
-            return
-        points = geometry.compose(there, geometry.between(here, poses))[:, :2]
-        cells = grid.world_to_cell(points)
-        off = ((cells < 0) | (cells >= grid.cells.shape)).any(axis=-1)
-        if off.any():
-            k = int(np.argmax(off))
-            x, y = points[k].round(2) + 0.0  # no negative zero
-            why = f"pose {k} of the path, ({x:.2f}, {y:.2f}) m, is off the map; replan it."
-            raise Refusal(goal.code, f"{goal.name}: {why}")
 
     # The robot drives to a goal.
 
@@ -490,16 +465,11 @@ class PathActions:
             self._node.get_logger().info(
                 "goal reached" if end == SUCCEED else "goal cancelled"
             )
-        goal.server.finish(goal.handle, end, result_of(goal.kind, code, sentence))
-
-
-def result_of(kind: Any, code: str, sentence: str = "") -> Any:
-    """Return an action's result; by distribution it has no fields, a code, or code and sentence."""
-    result = kind.Result()
-    if hasattr(result, "error_code"):
-        result.error_code = getattr(
-            kind.Result, code, getattr(kind.Result, "UNKNOWN", 0)
-        )
-    if hasattr(result, "error_msg"):
-        result.error_msg = sentence
-    return result
+        # by distribution, a result has no fields, a code, or code and sentence
+        kind = goal.kind.Result
+        result = kind()
+        if hasattr(result, "error_code"):
+            result.error_code = getattr(kind, code, getattr(kind, "UNKNOWN", 0))
+        if hasattr(result, "error_msg"):
+            result.error_msg = sentence
+        goal.server.finish(goal.handle, end, result)
