@@ -38,10 +38,10 @@ def arm(
     with Operator() as operator:
         answer = operator.arm(namespace, wait, reset, _tell)
     if not answer.granted:
-        typer.echo(f"nics: {answer.gate} refuses to arm: {answer.told}", err=True)
+        typer.echo(f"nics: {answer.node} refuses to arm: {answer.told}", err=True)
         raise typer.Exit(EXIT_REFUSED)
-    line = f"{answer.gate} is armed: the robot moves when its policy has a goal"
-    console.print_line(as_json, line, gate=answer.gate, armed=True)
+    line = f"{answer.node} is armed: the robot moves when its policy has a goal"
+    console.print_line(as_json, line, gate=answer.node, armed=True)
 
 
 def stop(
@@ -63,11 +63,11 @@ def stop(
         # Nothing is printed before all gates were called: a halted terminal would hold that up.
         answers = list(operator.stop(namespace, wait))
     for answer in answers:
-        stopped[answer.gate] = answer.granted
+        stopped[answer.node] = answer.granted
         if not answer.granted:
-            _tell(f"nics: {answer.gate} was NOT stopped: {answer.told}")
+            _tell(f"nics: {answer.node} was NOT stopped: {answer.told}")
         elif not as_json:
-            typer.echo(_describe_stop(answer.gate))
+            typer.echo(_describe_stop(answer.node))
     if as_json:
         console.print_line(as_json, "", stopped=stopped)
     if not all(stopped.values()):

@@ -41,13 +41,12 @@ from nics_drl_bridge.nodes.link import (
     EpisodeServices,
     Inbox,
     Link,
-    Message,
     read_message,
 )
 from nics_drl_bridge.nodes.parameters import (
     LOCKSTEP,
     REALTIME,
-    default_namespaces,
+    name_fleet,
 )
 from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
 from nics_drl_bridge.nodes.robot_topics import data_facts
@@ -104,8 +103,13 @@ def dds_backend(
         raise ConfigError(f"backend_options: there is no mode {mode!r}; {fix}")
     option_names = list_keywords(DdsBackend)
     if robots > 1:
-        namespaces = options.pop("namespaces", default_namespaces(robots))
-        _check_fleet(mode, robots, namespaces)
+        namespaces = options.pop("namespaces", name_fleet(robots))
+        if mode != LOCKSTEP or len(namespaces) != robots:
+            needed = f"in mode 'lockstep' alone, with {robots} namespaces"
+            value = f"not in {mode!r} with {list(namespaces)!r}"
+            raise ConfigError(
+                f"backend_options: a team of {robots} robots is driven {needed}, {value}."
+            )
         refuse_unknown("backend 'dds'", options, option_names - {"namespace"})
         return FleetBackend(model, world, namespaces, **options)
     if mode == REALTIME:
@@ -114,17 +118,6 @@ def dds_backend(
     if isinstance(randomisation, str):
         randomisation = load_randomisation(randomisation)
     return DdsBackend(model, world, randomisation=randomisation, **options)
-
-
-def _check_fleet(mode: str, robots: int, namespaces: Sequence[str]) -> None:
-    """Raise ConfigError unless a fleet is in lock-step and has a namespace for each robot."""
-    if mode == LOCKSTEP and len(namespaces) == robots:
-        return
-    needed = f"in mode 'lockstep' alone, with {robots} namespaces"
-    value = f"not in {mode!r} with {list(namespaces)!r}"
-    raise ConfigError(
-        f"backend_options: a team of {robots} robots is driven {needed}, {value}."
-    )
 
 
 class DdsBackend:
@@ -267,9 +260,15 @@ class DdsBackend:
         self._wait_for_data()
         messages = self._inbox.messages
         self._check_stamps()
-        self._take_scan(messages[SCAN])
-        for name in self._sensors:
-            self._take_reading(name, messages[name])
+        scan = messages[SCAN]
+        device_ranges = read_message(SCAN, wire.ranges_of, scan.content)
+        ranges = from_device(device_ranges, self._lidar)
+        self._middleware.scan(self._now_ns, scan.arrival_ns, ranges)
+        for name, sensor in self._sensors.items():
+            read = partial(sensor_from_ros, sensor)
+            reading = read_message(name, read, messages[name].content)
+            arrival_ns = messages[name].arrival_ns
+            self._middleware.sense(name, self._now_ns, arrival_ns, reading)
         info: dict[str, Any] = {"stamp_ns": self._now_ns}
         info |= data_facts(self._middleware, time.monotonic_ns())
         if self._has_truth:
@@ -292,15 +291,18 @@ class DdsBackend:
         is_estimated = False
         while True:
             if not is_estimated and self._inbox.has(ODOM, self._now_ns):
-                self._take_odometry(self._inbox.messages[ODOM])
+                odometry = self._inbox.messages[ODOM]
+                measured = read_message(ODOM, wire.odometry_of, odometry.content)
+                arrival_ns = odometry.arrival_ns
+                self._middleware.odometry(odometry.stamp_ns, arrival_ns, *measured)
                 is_estimated = True
-            late_topic = self._inbox.find_late(self._now_ns)
-            if late_topic is None:
+            late = [t for t in self._topics if not self._inbox.has(t, self._now_ns)]
+            if not late:
                 return
             now_s = time.monotonic()
             if now_s > began_s + self.timeout_s:
-                age_s = self._inbox.messages[late_topic].age_s
-                raise StaleDataError(late_topic, age_s, self.timeout_s)
+                age_s = self._inbox.messages[late[0]].age_s
+                raise StaleDataError(late[0], age_s, self.timeout_s)
             if now_s > repeat_s:
                 self._episodes.repeat()
                 repeat_s = now_s + REPEAT_S
@@ -328,20 +330,6 @@ class DdsBackend:
             )
             off = f"stamped {ahead_ns / NS_PER_S:+.3f} s off the step"
             raise BackendError(f"topic {topic!r}: {off}; {fix}")
-
-    def _take_odometry(self, message: Message) -> None:
-        pose, twist = read_message(ODOM, wire.odometry_of, message.content)
-        self._middleware.odometry(message.stamp_ns, message.arrival_ns, pose, twist)
-
-    def _take_scan(self, message: Message) -> None:
-        device_ranges = read_message(SCAN, wire.ranges_of, message.content)
-        ranges = from_device(device_ranges, self._lidar)
-        self._middleware.scan(self._now_ns, message.arrival_ns, ranges)
-
-    def _take_reading(self, name: str, message: Message) -> None:
-        read = partial(sensor_from_ros, self._sensors[name])
-        reading = read_message(name, read, message.content)
-        self._middleware.sense(name, self._now_ns, message.arrival_ns, reading)
 
     def facts(self) -> BackendFacts:
         """Return the newest true pose, if `truth`, and with a randomisation how to draw scenes."""

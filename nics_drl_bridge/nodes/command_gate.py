@@ -200,15 +200,18 @@ class CommandGate(qos.BridgeNode):
     def _listen(self) -> None:
         # first, because an executor takes waiting messages in the order of subscriptions
         self._button = self.create_lossless_subscription(
-            Bool, inputs.E_STOP, self._take_e_stop, qos.E_STOP, lost=self._miss_e_stop
+            Bool,
+            inputs.E_STOP,
+            self._take_e_stop,
+            qos.E_STOP,
+            lost=lambda count: self._decide(
+                inputs.Press(f"{count} messages were lost, and may have been a press")
+            ),
         )
         kinds = ("none", TWIST, TWIST_STAMPED)
         raw = device_parameters.choice(self, parameters.FOREIGN.name, kinds)
         raw_kind = command_types.name_of(stamped=raw != TWIST)
         command_types.TypeWatch(self, inputs.RAW, raw_kind, FOREIGN_SETTINGS)
-        reader = (
-            gate_inputs.read_command if raw == "none" else partial(self._foreign, raw)
-        )
         readers: tuple[tuple[Any, str, Callable[[bytes], inputs.Input], Any], ...] = (
             (LaserScan, SCAN, partial(gate_inputs.read_scan, self._lidar), qos.SENSOR),
             (Odometry, ODOM, self._read_odometry, qos.SENSOR),
@@ -229,12 +232,13 @@ class CommandGate(qos.BridgeNode):
         commands = self.create_subscription(
             command_types.KINDS[raw_kind],
             inputs.RAW,
-            partial(self._take_command, reader),
+            partial(self._take_command, raw),
             qos.EVERY_POLICY,
             raw=True,
         )
         self._sources = Sources(self, commands.topic_name)
-        runner.serve(self, "~/arm", self._arm)
+        count = partial(self.count_publishers, self._out.topic_name)
+        runner.serve(self, "~/arm", lambda: self._answer(inputs.Arm(count())))
         runner.serve(self, "~/reset", lambda: self._answer(inputs.Reset()))
         runner.serve(self, "~/e_stop", self._press)
 
@@ -248,19 +252,21 @@ class CommandGate(qos.BridgeNode):
         else:
             self._decide(event)
 
-    def _take_command(
-        self,
-        read: Callable[[bytes], inputs.Command],
-        content: bytes,
-        info: Mapping[str, Any],
-    ) -> None:
-        source = self._sources.name_of(info)
-        publishers = self._sources.publishers
+    def _take_command(self, raw: str, content: bytes, info: Mapping[str, Any]) -> None:
+        def read(content: bytes) -> inputs.Command:
+            if raw == "none":
+                command = gate_inputs.read_command(content)
+            else:
+                age_ns = round(self._config.command_age_s * NS_PER_S)
+                oldest_ns = int(self.get_clock().now().nanoseconds) - age_ns
+                command = gate_inputs.read_foreign_command(
+                    raw, oldest_ns, self._state.scan, content
+                )
+            source = self._sources.name_of(info)
+            publishers = self._sources.publishers
+            return replace(command, source=source, publishers=publishers)
 
-        def read_with_source(content: bytes) -> inputs.Command:
-            return replace(read(content), source=source, publishers=publishers)
-
-        self._take(inputs.RAW, read_with_source, content)
+        self._take(inputs.RAW, read, content)
 
     def _take_e_stop(self, content: bytes) -> None:
         """Decide on all waiting messages; a press comes first, so that it waits for no other."""
@@ -280,10 +286,6 @@ class CommandGate(qos.BridgeNode):
         if messages:
             self._decide(messages[-1])
 
-    def _miss_e_stop(self, count: int) -> None:
-        noun = "message was" if count == 1 else "messages were"
-        self._decide(inputs.Press(f"{count} {noun} lost, and may have been a press"))
-
     def _tick(self) -> None:
         reason = self._queue.tick(time.monotonic())
         if reason:
@@ -295,16 +297,6 @@ class CommandGate(qos.BridgeNode):
         if not self._frame:  # no parameter names it
             self._frame = wire.frames_of(content)[1]
         return event
-
-    def _foreign(self, kind: str, content: bytes) -> inputs.Command:
-        age_ns = round(self._config.command_age_s * NS_PER_S)
-        oldest_ns = int(self.get_clock().now().nanoseconds) - age_ns
-        return gate_inputs.read_foreign_command(
-            kind, oldest_ns, self._state.scan, content
-        )
-
-    def _arm(self) -> tuple[bool, str]:
-        return self._answer(inputs.Arm(self.count_publishers(self._out.topic_name)))
 
     def _press(self) -> tuple[bool, str]:
         self._decide(inputs.Press())

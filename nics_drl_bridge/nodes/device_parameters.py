@@ -1,11 +1,9 @@
 """Parameters of a device node: devices, frames, episodes, and the rates of world and topics."""
 
 import math
-import re
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
@@ -19,9 +17,9 @@ from nics_drl_bridge.nodes.parameters import (
     LOCKSTEP,
     MODES,
     ROBOTS,
-    default_namespaces,
     device,
     frame_fault,
+    name_fleet,
 )
 from nics_drl_bridge.nodes.qos import given_values
 from nics_drl_bridge.nodes.runner import declare_row, get_number, get_text
@@ -30,8 +28,6 @@ from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
 
 START = "episode_start"
 GIVEN = "episode_start_given"
-GREATEST_FLEET = 256
-NAMESPACE = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
 # fraction of a step by which it may be early, because timers are no more precise
 SLACK = 0.1
 # a backlog longer than this is dropped instead of made up for [ns]
@@ -147,33 +143,6 @@ def choice(node: Node, name: str, valid: tuple[str, ...]) -> str:
     return value
 
 
-def namespaces(node: Node) -> tuple[str, ...]:
-    """Return the robots' namespaces below the node's; empty for one robot. Raises ConfigError."""
-    value: Any = node.get_parameter("robots").value
-    if (
-        isinstance(value, int)
-        and not isinstance(value, bool)
-        and 1 <= value <= GREATEST_FLEET
-    ):
-        return ("",) if value == 1 else default_namespaces(value)
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        names = tuple(value)
-    else:
-        names = ()
-    valid = all(isinstance(name, str) and NAMESPACE.fullmatch(name) for name in names)
-    if (
-        not names
-        or not valid
-        or len(set(names)) < len(names)
-        or len(names) > GREATEST_FLEET
-    ):
-        fix = f"give a count from 1 to {GREATEST_FLEET}, or a list of different namespaces"
-        raise ConfigError(
-            f"parameter 'robots' is {value!r}; {fix}, as in [robot1, robot2]."
-        )
-    return names
-
-
 def frames(node: Node, namespace: str) -> Frames:
     """Return the frames of a robot; in a fleet all but the map begin with its namespace."""
     prefix = get_text(node, "frame_prefix") + (f"{namespace}/" if namespace else "")
@@ -190,7 +159,7 @@ def _check_episode(node: Node, parameters: list[Parameter]) -> SetParametersResu
             if not values.size or values.size % 3 or not np.isfinite(values).all():
                 reason = "episode_start must be three finite numbers per robot: x, y, heading."
             elif node.has_parameter(GIVEN):
-                needed = 3 * len(namespaces(node))
+                needed = 3 * len(name_fleet(node.get_parameter(ROBOTS.name).value))
                 if values.size != needed:
                     reason = f"episode_start has {values.size} numbers; give {needed}, 3 per robot."
         elif parameter.name == "episode_seed" and parameter.value < 0:

@@ -56,13 +56,6 @@ NO_RANDOMISATION = "none"
 LOST_S = 1.0
 
 
-def _exit_at_signals() -> None:
-    """Let signals end Python like an exception, unless the program handles them itself."""
-    for number in ENDING:
-        if signal.getsignal(number) is signal.SIG_DFL:
-            signal.signal(number, lambda number, _: sys.exit(128 + number))
-
-
 class Link:
     """A node in its own context; its end or silence leaves a zero command behind."""
 
@@ -78,7 +71,10 @@ class Link:
     ) -> None:
         namespace = parse_namespace(namespace)
         if threading.current_thread() is threading.main_thread():
-            _exit_at_signals()
+            # Signals end Python like an exception, unless the program handles them itself.
+            for number in ENDING:
+                if signal.getsignal(number) is signal.SIG_DFL:
+                    signal.signal(number, lambda number, _: sys.exit(128 + number))
         self._context = open_context(domain_id=domain_id)
         self._resources = Resources(self._context)
         # Also applies if the link never begins or its owner fails to construct.
@@ -483,13 +479,6 @@ class Inbox:
     def has(self, topic: str, stamp_ns: int) -> bool:
         """True if the message of a stamp is there."""
         return self.messages[topic].stamp_ns >= stamp_ns
-
-    def find_late(self, stamp_ns: int) -> str | None:
-        """Return the first topic whose message of a stamp is not there; None if all are."""
-        for topic in self.messages:
-            if not self.has(topic, stamp_ns):
-                return topic
-        return None
 
 
 def read_message(topic: str, read: Callable[[bytes], T], content: bytes) -> T:

@@ -4,7 +4,6 @@ import time
 from functools import partial
 from typing import Any
 
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 from nics_drl_bridge import defaults
@@ -22,8 +21,7 @@ from nics_drl_bridge.report.doctor_facts import (
 )
 
 NAME = "nics_doctor"
-SPIN_S = 0.1
-LOOK_S = 0.5
+LOOK_S = 0.2
 DISCOVERY_S = 10.0
 # matches any offer, so it hears every topic
 ANY_PUBLISHER = profile_of(Offer(100, reliable=False))
@@ -37,26 +35,20 @@ def listen(
 ) -> Facts:
     """Listen for a time [s] after the first message, awaited for at most 10 s; send nothing."""
     node = Listener(NAME, domain_id)
-    executor = SingleThreadedExecutor(context=node.context)
-    executor.add_node(node)
+    node.start()
     facts = Facts(f"the robot in {namespace or '/'}", True, names_in(namespace, imu))
     subscribed: set[str] = set()
     began = time.monotonic()
-    looked = 0.0
     end = None
     try:
         while time.monotonic() < (began + DISCOVERY_S if end is None else end):
-            if time.monotonic() - looked > LOOK_S:
-                looked = time.monotonic()
-                _look(node, facts, subscribed, imu)
-            executor.spin_once(timeout_sec=SPIN_S)
+            _look(node, facts, subscribed, imu)
+            time.sleep(LOOK_S)
             if end is None and facts.heard:
                 end = time.monotonic() + seconds
         _look(node, facts, subscribed, imu)
     finally:
-        executor.shutdown(timeout_sec=1.0)
-        node.context.try_shutdown()
-        node.destroy_node()
+        node.close()
     facts.end_ns = time.time_ns()
     return facts
 

@@ -35,10 +35,10 @@ SETTLE_S = 1.0  # in which all gates are seen, once one of them is [s]
 Tell = Callable[[str], None]
 
 
-class GateAnswer(NamedTuple):
-    """Answer of one gate."""
+class TriggerAnswer(NamedTuple):
+    """Answer of a node's service."""
 
-    gate: str  # its name
+    node: str  # its name
     granted: bool
     told: str
 
@@ -52,7 +52,7 @@ class GoalRequest(NamedTuple):
     frame: str = ""  # empty: the map, whatever the policy node calls it
 
 
-Answer = TypeVar("Answer", GateAnswer, GoalAnswer)
+Answer = TypeVar("Answer", TriggerAnswer, GoalAnswer)
 
 
 def insist(ask: Callable[[], Answer], deadline: float, tell: Tell, what: str) -> Answer:
@@ -67,7 +67,7 @@ def insist(ask: Callable[[], Answer], deadline: float, tell: Tell, what: str) ->
     return answer
 
 
-class _Call:
+class Call:
     """A request to a service of a gate, which is sent once the service is there."""
 
     def __init__(self, node: Node, gate: str, service: str) -> None:
@@ -76,17 +76,17 @@ class _Call:
         self._client = node.create_client(Trigger, f"{gate}/{service}")
         self._future: Any = None
 
-    def wait_for_answer(self, seconds: float) -> GateAnswer:
+    def wait_for_answer(self, seconds: float) -> TriggerAnswer:
         """Return the answer, or why there is none after so long; end the call."""
         try:
             holds(self.is_answered, max(seconds, 0.0), POLL_S)
             if self._future is None:
-                return GateAnswer(self._gate, False, "it has ended")
+                return TriggerAnswer(self._gate, False, "it has ended")
             if not self._future.done():
                 reason = "it did not answer in time; the request may still take effect"
-                return GateAnswer(self._gate, False, reason)
+                return TriggerAnswer(self._gate, False, reason)
             answer = self._future.result()
-            return GateAnswer(self._gate, bool(answer.success), str(answer.message))
+            return TriggerAnswer(self._gate, bool(answer.success), str(answer.message))
         finally:
             self._node.destroy_client(self._client)
 
@@ -116,29 +116,29 @@ class Operator(AbstractContextManager["Operator", None]):
 
     def arm(
         self, namespace: str, seconds: float, reset: bool, tell: Tell
-    ) -> GateAnswer:
+    ) -> TriggerAnswer:
         """Arm a gate, and ask again while it refuses; a reset before that releases its stop."""
         deadline = time.monotonic() + seconds
         gate = self._wait_for(self._gates, GATE, namespace, seconds)
 
-        def call(service: str) -> GateAnswer:
+        def call(service: str) -> TriggerAnswer:
             wait_s = min(deadline - time.monotonic(), CALL_S)
-            return _Call(self._node, gate, service).wait_for_answer(wait_s)
+            return Call(self._node, gate, service).wait_for_answer(wait_s)
 
         if reset:
             call("reset")
         return insist(partial(call, "arm"), deadline, tell, f"{gate} does not arm")
 
-    def stop(self, namespace: str | None, seconds: float) -> Iterator[GateAnswer]:
+    def stop(self, namespace: str | None, seconds: float) -> Iterator[TriggerAnswer]:
         """Press the e-stop of one gate, or of all if no namespace is given; yield each answer.
 
         An answer is yielded as soon as it comes, so that nobody waits for gates that may follow.
         """
         if namespace is not None:
             gate = self._wait_for(self._gates, GATE, namespace, seconds)
-            yield _Call(self._node, gate, "e_stop").wait_for_answer(CALL_S)
+            yield Call(self._node, gate, "e_stop").wait_for_answer(CALL_S)
             return
-        waiting: dict[str, _Call] = {}
+        waiting: dict[str, Call] = {}
         seen = set[str]()
         deadline = time.monotonic() + seconds
         while time.monotonic() < deadline:
@@ -146,7 +146,7 @@ class Operator(AbstractContextManager["Operator", None]):
                 if not seen:
                     deadline = time.monotonic() + SETTLE_S
                 seen.add(gate)
-                waiting[gate] = _Call(self._node, gate, "e_stop")
+                waiting[gate] = Call(self._node, gate, "e_stop")
             # a gate that hangs holds up no other
             for gate in [gate for gate, call in waiting.items() if call.is_answered()]:
                 yield waiting.pop(gate).wait_for_answer(0.0)

@@ -9,7 +9,7 @@ from importlib.metadata import PackageNotFoundError, distribution
 from typing import Any, NamedTuple
 
 from nics_drl_bridge import defaults
-from nics_drl_bridge.errors import shorten
+from nics_drl_bridge.errors import ConfigError, shorten
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 REALTIME = "realtime"
@@ -22,6 +22,8 @@ HIGHEST_PRIORITY = 99
 # distributions whose robots expect a Twist
 PLAIN_TWISTS = ("humble", "iron", "jazzy")
 STAMPED = "enable_stamped_cmd_vel"
+GREATEST_FLEET = 256
+NAMESPACE = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
 FRAME = re.compile(r"[^\s/]\S{0,254}")
 MAY_BE_EMPTY = ("footprint_frame",)
 
@@ -389,9 +391,20 @@ ROBOTS = Row(
 )
 
 
-def default_namespaces(robots: int) -> tuple[str, ...]:
-    """Return the default namespaces of several robots: robot1, robot2, ..."""
-    return tuple(f"robot{k + 1}" for k in range(robots))
+def name_fleet(robots: Any) -> tuple[str, ...]:
+    """Return the namespaces of robots, given as a count or as names; one alone has none.
+
+    Raises ConfigError.
+    """
+    if type(robots) is int and 1 <= robots <= GREATEST_FLEET:
+        return ("",) if robots == 1 else tuple(f"robot{k + 1}" for k in range(robots))
+    is_list = isinstance(robots, Sequence) and not isinstance(robots, str)
+    names = tuple(robots) if is_list else ()
+    valid = all(isinstance(name, str) and NAMESPACE.fullmatch(name) for name in names)
+    if not valid or not len(names) == len(set(names)) in range(1, GREATEST_FLEET + 1):
+        fix = f"give a count from 1 to {GREATEST_FLEET}, or a list of different namespaces"
+        raise ConfigError(f"'robots' is {robots!r}; {fix}, as in [robot1, robot2].")
+    return names
 
 
 FRICTION = Row(

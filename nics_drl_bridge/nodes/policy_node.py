@@ -208,15 +208,13 @@ class PolicyNode(ManagedNode):
             if verdict.touched:
                 why = "touching something, stopped"
             else:
-                why = self._told_reached()
+                now = self._topics.middleware.estimator.covariance[:3, :3]
+                gained = compute_uncertainty_gain(self._covariance, now)
+                told = gained.describe_since("it was set")
+                why = f"goal reached, as believed; {told}"
             self.get_logger().info(why, throttle_duration_sec=5.0)
             return np.zeros(3)
         return self._toward(self._goal).twist
-
-    def _told_reached(self) -> str:
-        now = self._topics.middleware.estimator.covariance[:3, :3]
-        gained = compute_uncertainty_gain(self._covariance, now)
-        return f"goal reached, as believed; {gained.describe_since('it was set')}"
 
     def _toward(self, goal: Array) -> Wish:
         view = self._topics.view()

@@ -12,19 +12,18 @@ from typing import Any
 import numpy as np
 from nav_msgs.msg import Odometry
 from numpy.typing import ArrayLike, NDArray
-from std_srvs.srv import Trigger
 
 from nics_drl_bridge.config import PACKAGE
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.listener import GREATEST_DOMAIN_ID, Listener, holds
 from nics_drl_bridge.nodes.node_process import ChildProcess, command_of
+from nics_drl_bridge.nodes.operator import Call, TriggerAnswer, insist
 from nics_drl_bridge.nodes.starting import NodeStart
 from nics_drl_bridge.nodes.transport import domains_in_use
 
 LAST_DOMAIN_ID = 101  # above it DDS ports may collide with Linux's ephemeral ports
 LOG_LINES = 5
-ASK_AGAIN_S = 0.2
 REPLY_S = 2.0  # longest wait for one answer before asking again [s]
 POLL_S = 0.005
 
@@ -122,29 +121,21 @@ class Witness(AbstractContextManager["Witness", None]):
 
     def arms(self, gate: str, timeout_s: float) -> str:
         """Ask a gate to arm until it agrees; return its last reason for refusing, or ''."""
-        answer = self._asked(f"{gate}/arm", timeout_s)
-        return "" if answer.success else str(answer.message)
+        answer = self._ask(gate, "arm", timeout_s)
+        return "" if answer.granted else answer.told
 
     def touched(self, simulator: str, timeout_s: float) -> bool:
         """True if the simulated robot touched something in this episode. Raises BackendError."""
-        answer = self._asked(f"{simulator}/touched", timeout_s)
-        if not answer.success:
-            raise BackendError(f"the episode can't be judged: {answer.message}.")
-        return bool(np.any(json.loads(answer.message)))
+        answer = self._ask(simulator, "touched", timeout_s)
+        if not answer.granted:
+            raise BackendError(f"the episode can't be judged: {answer.told}.")
+        return bool(np.any(json.loads(answer.told)))
 
-    def _asked(self, service: str, timeout_s: float) -> Trigger.Response:
-        client = self._node.create_client(Trigger, service)
-        answer = Trigger.Response(success=False, message=f"{service} does not answer")
-        deadline = time.monotonic() + timeout_s
-        while time.monotonic() < deadline and not answer.success:
-            if client.wait_for_service(timeout_sec=ASK_AGAIN_S):
-                future = client.call_async(Trigger.Request())
-                if holds(future.done, REPLY_S, POLL_S):
-                    answer = future.result()
-            if not answer.success:
-                time.sleep(ASK_AGAIN_S)
-        self._node.destroy_client(client)
-        return answer
+    def _ask(self, node: str, service: str, timeout_s: float) -> TriggerAnswer:
+        def call() -> TriggerAnswer:
+            return Call(self._node, node, service).wait_for_answer(REPLY_S)
+
+        return insist(call, time.monotonic() + timeout_s, lambda _: None, node)
 
     def __exit__(self, *_: object) -> None:
         self._node.close()

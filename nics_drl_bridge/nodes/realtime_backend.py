@@ -145,7 +145,13 @@ class RealtimeBackend:
             command_timeout_s=command_timeout_s,
         )
         try:
-            declare_sensors(self._link.node, self._find_command_type())
+            # the robot itself gets stamped commands, maybe from a gate
+            stamped = chosen.stamped
+            if stamped is None and chosen.gated:
+                stamped = self._link.hears_stamped(CMD_VEL, chosen.timeout_s)
+            elif stamped is None:
+                stamped = self._link.stamped
+            declare_sensors(self._link.node, stamped)
             self._topics = RobotTopics(self._link.node, model, now_ns=time.monotonic_ns)
             self._episodes = EpisodeServices(self._link, chosen.simulator, model, world)
             self._link.begin()
@@ -159,14 +165,6 @@ class RealtimeBackend:
             self.close()
             raise
 
-    def _find_command_type(self) -> bool:
-        """Return whether the robot itself gets stamped commands, maybe from a gate."""
-        if self._options.stamped is not None:
-            return self._options.stamped
-        if not self._options.gated:
-            return self._link.stamped
-        return self._link.hears_stamped(CMD_VEL, self._options.timeout_s)
-
     @halts_on_error
     def reset(self, start: Start) -> RobotView:
         """Begin an episode by a simulator's services, or once a vehicle is ready at the start."""
@@ -176,7 +174,18 @@ class RealtimeBackend:
             self._wait_until_ready(start)
         # A simulator's services may be found only during that wait.
         if not self._is_vehicle():
-            self._begin_in_simulator(start)
+            timeout_s = self._options.timeout_s
+            stamp_ns = self._episodes.begin(start, timeout_s)
+            with self._topics.lock:
+                self._topics.begin(stamp_ns, start.pose)
+
+            def find_unheard() -> list[str]:
+                silences_s = self._measure_silences()
+                return [topic for topic, s in silences_s.items() if math.isinf(s)]
+
+            holds(lambda: not find_unheard(), timeout_s, POLL_S)
+            for topic in find_unheard():
+                raise StaleDataError(topic, math.inf, timeout_s)
         elif self._options.lays_map:
             with self._topics.lock:
                 self._topics.place(start.pose)
@@ -261,23 +270,6 @@ class RealtimeBackend:
                 silences_s[topic] = (now_ns - arrived_ns[topic]) / NS_PER_S
         return silences_s
 
-    def _begin_in_simulator(self, start: Start) -> None:
-        """Begin an episode by the simulator's services, and wait until each topic is heard."""
-        timeout_s = self._options.timeout_s
-        stamp_ns = self._episodes.begin(start, timeout_s)
-        with self._topics.lock:
-            self._topics.begin(stamp_ns, start.pose)
-        holds(lambda: self._find_unheard_topic() is None, timeout_s, POLL_S)
-        unheard_topic = self._find_unheard_topic()
-        if unheard_topic is not None:
-            raise StaleDataError(unheard_topic, math.inf, timeout_s)
-
-    def _find_unheard_topic(self) -> str | None:
-        """Return a topic that has never been heard in this episode, or None if there is none."""
-        silences_s = self._measure_silences()
-        unheard = [topic for topic in silences_s if math.isinf(silences_s[topic])]
-        return unheard[0] if unheard else None
-
     def _is_vehicle(self) -> bool:
         if self._options.vehicle is not None:
             return self._options.vehicle
@@ -337,16 +329,12 @@ class RealtimeBackend:
             return Hindrance("it is still moving", "stop whatever else drives it")
         if start is None or self._options.start == "present":
             return None
-        return self._find_offset(view.pose, start.pose)
-
-    def _find_offset(self, pose: Array, start_pose: Array) -> Hindrance | None:
-        """Return how far a pose (3,) is off the start, or None within the tolerance."""
-        dx, dy, turn = geometry.between(pose, start_pose)
+        dx, dy, turn = geometry.between(view.pose, start.pose)
         distance = math.hypot(dx, dy)
         max_distance, max_turn = self._options.tolerance
         if distance <= max_distance and abs(turn) <= max_turn:
             return None
-        x, y, heading = start_pose
+        x, y, heading = start.pose
         reason = (
             f"it is {distance:.2f} m and {math.degrees(abs(turn)):.0f} deg off its start "
             f"({x:.2f} m, {y:.2f} m, {math.degrees(heading):.0f} deg)"

@@ -122,6 +122,9 @@ class RobotPort:
         self.frames = frames
         self._outbox = outbox
         self._publishers: list[Publisher] = []
+        self.inlet: CommandInlet  # of the robot's commands
+        self.command_ns = 0  # time of the newest command
+        self.has_command = False  # in lock-step: since the last step
         self._send = partial(outbox.send, late=time.odom_late_ns)
         self._send_scan = partial(outbox.send, late=time.scan_late_ns)
 
@@ -161,6 +164,7 @@ class RobotPort:
 
     def close(self) -> None:
         """End its topics."""
+        self.inlet.close()
         self._outbox.drop(self._publishers)
         for publisher in self._publishers:
             self._node.destroy_publisher(publisher)
@@ -307,10 +311,8 @@ class DeviceNode(qos.BridgeNode):
         model = runner.declare_model(self)
         device_parameters.declare_device(self, model.lidar.frame)
         self._time = device_parameters.timing(self, model)
-        self._names = device_parameters.namespaces(self)
+        self._names = parameters.name_fleet(self.get_parameter("robots").value)
         self._given = model
-        self._command_ns = np.zeros(0, np.int64)
-        self._heard = np.zeros(0, np.bool_)
         self.model = device_parameters.timed_model(self, model, self._time)
         self._make = make
         self.use_world(load_worlds(runner.get_text(self, "world")))
@@ -335,23 +337,10 @@ class DeviceNode(qos.BridgeNode):
         self._identity = identity(
             self._given, world, device_parameters.randomisation(self)
         )
-        self._size(range(len(self._names)))
 
     def make_simulator(self, world: AnyWorld, robots: int) -> FastSimulator:
         """Make a simulator of a world for M robots. Raises ConfigError."""
         return self._make(self, self.model, world, robots)
-
-    def _size(self, kept: Sequence[int]) -> None:
-        """Keep the commands of the robots in `kept`, and make room for new robots."""
-        count = self.device.robots
-        command_ns_before = self._command_ns
-        heard_before = self._heard
-        self._command_ns = np.zeros(count, np.int64)
-        # in lock-step: the robots that have a command
-        self._heard = np.zeros(count, np.bool_)
-        present = [k for k in kept if k < len(command_ns_before)]
-        self._command_ns[: len(present)] = command_ns_before[present]
-        self._heard[: len(present)] = heard_before[present]
 
     @property
     def robot_names(self) -> tuple[str, ...]:
@@ -373,7 +362,6 @@ class DeviceNode(qos.BridgeNode):
         self._clock_topic = self.create_publisher(Clock, CLOCK, qos.SENSOR_RELIABLE)
         self._clocks = {self.get_fully_qualified_name()}
         self._ports: list[RobotPort] = []
-        self._inlets: list[CommandInlet] = []
         self._world_topics = WorldTopics(self, lambda: self.device)
         for name in self._names:
             self._open_robot(name)
@@ -388,7 +376,7 @@ class DeviceNode(qos.BridgeNode):
         space = f"{name}/" if name else ""
         frames = device_parameters.frames(self, name.strip("/"))
         port = RobotPort(self, space, self.model, frames, self._time, self._outbox)
-        inlet = CommandInlet(
+        port.inlet = CommandInlet(
             self,
             space,
             self.model.robot,
@@ -396,16 +384,14 @@ class DeviceNode(qos.BridgeNode):
             partial(self._on_command, port),
             self._too_old,
         )
-        inlet.heard.append(
+        port.inlet.heard.append(
             self._world_topics.hear(space, lambda: self._ports.index(port))
         )
-        self._inlets.append(inlet)
         self._ports.append(port)
 
     def add_robot(self, namespace: str) -> None:
         """Open the topics of the robot that was added to the device last."""
         self._open_robot(namespace)
-        self._size(range(self.device.robots - 1))
         self._publish_mounts()
 
     def reopen_robots(self) -> None:
@@ -413,18 +399,13 @@ class DeviceNode(qos.BridgeNode):
         self.remove_robots(range(len(self._ports)))
         for name in self._names:
             self._open_robot(name)
-        self._size(())
         self._publish_mounts()
 
     def remove_robots(self, gone: Sequence[int]) -> None:
         """Close the topics of robots that have left the device."""
-        kept = [k for k in range(len(self._ports)) if k not in gone]
-        for k in gone:
-            self._ports[k].close()
-            self._inlets[k].close()
-        self._ports = [self._ports[k] for k in kept]
-        self._inlets = [self._inlets[k] for k in kept]
-        self._size(kept)
+        for port in [self._ports[k] for k in gone]:
+            port.close()
+            self._ports.remove(port)
         self._complete.trigger()  # not here: more robots may be about to leave
 
     def _open_transforms(self) -> None:
@@ -466,7 +447,7 @@ class DeviceNode(qos.BridgeNode):
             if period * NS_PER_S > CLOCK_NS:
                 runner.steadily(self, CLOCK_NS / NS_PER_S, self._on_clock)
         elif not self._time.lockstep:
-            runner.steadily(self, 0.0, self._on_free_time)
+            runner.steadily(self, 0.0, lambda: None if self.paused else self.step())
 
     def _watch(self) -> None:
         names = set(qos.owners(self.get_publishers_info_by_topic(CLOCK)))
@@ -489,30 +470,25 @@ class DeviceNode(qos.BridgeNode):
         message = "paused" if self.paused else "running"
         return runner.Condition(message, False, facts, self._hardware)
 
-    def _timeout_ns(self) -> int:
-        return int(runner.get_number(self, "command_timeout") * NS_PER_S)
-
     def _too_old(self, stamp_ns: int) -> bool:
-        return not self._time.lockstep and self.now_ns - stamp_ns > self._timeout_ns()
+        """Return whether a command of a time is over; in lock-step it never is."""
+        timeout_ns = int(runner.get_number(self, "command_timeout") * NS_PER_S)
+        return not self._time.lockstep and self.now_ns - stamp_ns > timeout_ns
 
     def _on_command(self, port: RobotPort, command: Array) -> None:
         if port not in self._ports:  # its robot has left since the command arrived
             return
         robot = self._ports.index(port)
         self.device.commands[robot] = command
-        self._command_ns[robot] = self.now_ns
+        port.command_ns = self.now_ns
         if self._time.lockstep and not self.paused:
-            self._heard[robot] = True
+            port.has_command = True
             self._advance_if_complete()
 
     def _advance_if_complete(self) -> None:
         """In lock-step, move the world once all present robots have a command."""
-        if (
-            self._time.lockstep
-            and not self.paused
-            and self._heard.size
-            and self._heard.all()
-        ):
+        complete = all(port.has_command for port in self._ports)
+        if self._time.lockstep and not self.paused and complete and self._ports:
             self.advance()
 
     def _on_time(self) -> None:
@@ -546,18 +522,13 @@ class DeviceNode(qos.BridgeNode):
         if self._clock_topic.get_subscription_count():
             self._clock_topic.publish(Clock(clock=conversions.stamp_to_ros(time_ns)))
 
-    def _on_free_time(self) -> None:
-        if not self.paused:
-            self.step()
-
     def advance(self) -> None:
         """Move the world by one step, and publish what is due."""
-        if not self._time.lockstep:  # robots without recent commands stop
-            self.device.commands[
-                self.now_ns - self._command_ns > self._timeout_ns()
-            ] = 0.0
+        for k, port in enumerate(self._ports):
+            port.has_command = False
+            if self._too_old(port.command_ns):
+                self.device.commands[k] = 0.0
         self.device.advance()
-        self._heard[:] = False
         self.now_ns += self._time.step_ns
         self._publish()
 
@@ -570,14 +541,15 @@ class DeviceNode(qos.BridgeNode):
         self.device.begin(seed, start if is_given else None)
         if rewind:
             self.now_ns = self._first_ns
-        self._heard[:] = False
+        for port in self._ports:
+            port.has_command = False
         self.now_ns += self._time.step_ns
         self._publish_after_jump()
 
     def rewind(self) -> None:
         """Set the time back to its start; nothing moves."""
-        # keep the age of the commands
-        self._command_ns += self._first_ns - self.now_ns
+        for port in self._ports:  # keep the age of the commands
+            port.command_ns += self._first_ns - self.now_ns
         self.now_ns = self._first_ns
         self._publish_after_jump()
 
@@ -608,8 +580,8 @@ class DeviceNode(qos.BridgeNode):
     def _reset(self) -> tuple[bool, str]:
         # The executor may serve a request before a command that was sent earlier. In lock-step that
         # command would move the world of the new episode.
-        for inlet in self._inlets:
-            inlet.take_waiting()
+        for port in self._ports:
+            port.inlet.take_waiting()
         try:
             self.begin()
         except BridgeError as error:

@@ -18,7 +18,6 @@ from nics_drl_bridge.config import (
     PACKAGE,
     find_config,
     list_shipped,
-    parse_namespace,
     read_text,
     share_folder,
 )
@@ -28,7 +27,7 @@ from nics_drl_bridge.nodes.parameters import (
     IMU,
     MODEL,
     STAMPED,
-    default_namespaces,
+    name_fleet,
 )
 
 STATE_PUBLISHER = "robot_state_publisher"
@@ -100,15 +99,24 @@ class Setup:
     """The settings from the arguments; what they leave open is up to the nodes and their file."""
 
     def __init__(self, values: Values) -> None:
-        flags = {name: flag_of(name, values.get(name, "")) for name in FLAGS}
-        self.values = {**values, **flags}
-        for name in ("params_file", "urdf"):
-            if self[name] and not Path(self[name]).is_file():
-                raise ConfigError(f"{name} {self[name]}: no such file; check the path.")
-        if self["world"]:
-            check_world(self["world"])
-        if self["policy"]:
-            check_policy(self["policy"])
+        self.values = dict(values)
+        # What is wrong is refused here, before any node is started.
+        for name in FLAGS:
+            word = self[name]
+            if word.lower() not in FLAG_WORDS:
+                raise ConfigError(
+                    f"launch argument {name!r} is {word!r}; give true or false."
+                )
+            self.values[name] = FLAG_WORDS[word.lower()]
+        for name in ("params_file", "urdf", "policy"):
+            file = self[name]
+            is_file = name != "policy" or file.endswith((".onnx", ".yaml", ".yml"))
+            if file and is_file and not Path(file).is_file():
+                raise ConfigError(f"{name} {file}: no such file; check the path.")
+        if self["world"] and self["world"] not in list_shipped("worlds"):
+            from nics_drl_bridge.sim.world_set import load_worlds
+
+            load_worlds(self["world"])  # it takes a second
         self.model = self["model"] or str(MODEL.default)
         shipped = share_folder() / "urdf" / f"{self.model}.urdf"
         self._opened: Any = None if shipped.is_file() else opened(self.model)
@@ -242,46 +250,16 @@ def opened(model: str) -> Any:
     return open_model(model)
 
 
-def flag_of(name: str, word: str) -> str:
-    """Return `true`, `false` or "" for an empty argument. Raises ConfigError for other words."""
-    if word.lower() not in FLAG_WORDS:  # refused here, before any node is started
-        raise ConfigError(f"launch argument {name!r} is {word!r}; give true or false.")
-    return FLAG_WORDS[word.lower()]
-
-
-def check_world(name: str) -> None:
-    """Raise ConfigError unless a world is shipped or a file of the user's that can be read."""
-    if name not in list_shipped("worlds"):  # reading one takes a second
-        from nics_drl_bridge.sim.world_set import load_worlds
-
-        load_worlds(name)
-
-
-def check_policy(name: str) -> None:
-    """Raise ConfigError if a policy is a file that does not exist."""
-    is_file = name.endswith((".onnx", ".yaml", ".yml"))
-    if is_file and not Path(name).is_file():
-        raise ConfigError(f"policy {name!r}: no such file; check the path.")
-
-
 def names_of(robots: str) -> tuple[str, ...]:
     """Return the namespaces of a fleet from a count or a list; none for one robot."""
     words = re.findall(r"[^\s,\[\]'\"]+", robots)
-    count = int(words[0]) if len(words) == 1 and words[0].isdecimal() else None
-    is_whole = bool(words) and robots.count("[") == robots.count("]")
-    if robots and (not is_whole or count == 0):
-        fix = "give a count from 1, or namespaces, as in robots:='[ant, bee]'"
-        raise ConfigError(f"launch argument 'robots' is {robots!r}; {fix}.")
-    if count is not None:
-        return default_namespaces(count) if count > 1 else ()
-    for word in words:
-        parse_namespace(word)
-    twice = {word for word in words if words.count(word) > 1}
-    if twice:
-        raise ConfigError(
-            f"launch argument 'robots' names {min(twice)!r} twice; name each once."
-        )
-    return tuple(words)
+    if not robots:
+        return ()
+    if robots.count("[") != robots.count("]"):
+        raise ConfigError(f"'robots' is {robots!r}; close the list, as in [ant, bee].")
+    is_count = len(words) == 1 and words[0].isdecimal()
+    names = name_fleet(int(words[0]) if is_count else words)
+    return names if any(names) else ()
 
 
 def numbers_of(start: str) -> list[float] | None:
@@ -470,54 +448,30 @@ def whole_simulation(robots: str = "1") -> Launch:
     )
 
 
-def fleet() -> Launch:
-    """Return several robots in one simulator, each with a bridge in its namespace."""
-    return whole_simulation(robots="2")
-
-
-def vehicle() -> Launch:
-    """Return everything that runs on a vehicle; without any `e_stop` message it stays stopped."""
-    return Launch(
+LAUNCHES: dict[str, Callable[[], Launch]] = {
+    "simulation": whole_simulation,
+    # Without any `e_stop` message, a vehicle stays stopped.
+    "vehicle": lambda: Launch(
         "Gate, middleware and policy of a vehicle; start the drivers of lidar and base separately.",
         [bridge, description],
         [*common("false"), *of_nodes(), *of_bridge(), *of_description()],
-    )
-
-
-def simulator_alone() -> Launch:
-    """Return a simulator and the description of its robots, to drive by `cmd_vel`."""
-    return Launch(
+    ),
+    "fleet": lambda: whole_simulation(robots="2"),
+    "simulator": lambda: Launch(
         "Only a simulator, to be driven through cmd_vel from elsewhere.",
         [simulator, description],
         [*common("true"), *of_nodes(), *of_simulator(), *of_description()],
         simulated=True,
-    )
-
-
-def bridge_alone() -> Launch:
-    """Return middleware, policy and gate on a robot's topics."""
-    return Launch(
+    ),
+    "bridge": lambda: Launch(
         "Gate, middleware and policy on the topics of a robot.",
         [bridge],
         [*common("false"), *of_nodes(), *of_bridge(), e_stop_required("true")],
-    )
-
-
-def description_alone() -> Launch:
-    """Return the description of a robot: robot_state_publisher with its URDF, and RViz."""
-    return Launch(
+    ),
+    "description": lambda: Launch(
         "The description of a robot: robot_state_publisher with its URDF, and RViz.",
         [description],
         [*common("false"), *of_description()],
-    )
-
-
-LAUNCHES: dict[str, Callable[[], Launch]] = {
-    "simulation": whole_simulation,
-    "vehicle": vehicle,
-    "fleet": fleet,
-    "simulator": simulator_alone,
-    "bridge": bridge_alone,
-    "description": description_alone,
+    ),
 }
 """Every launch by name, for `nics up` and the files in `launch/`."""

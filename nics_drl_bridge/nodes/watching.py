@@ -1,6 +1,7 @@
 """A live robot for the page of `nics watch`; it listens to topics and sends only goals."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -56,7 +57,7 @@ class RosSource:
         self._title = namespace or "live topics"
         self._model_name = model_name
         self._trail = Track()
-        self._goal = np.zeros((0, 2))
+        self._goal: PoseStamped | None = None
         self._gate: str | None = None
         self._truth: Array | None = None
         # frame of goals, as named by the estimate or the simulator
@@ -67,23 +68,18 @@ class RosSource:
             NAME, domain_id, parse_namespace(namespace), has_parameters=True
         )
         declare_sensors(self._node)
-        self._topics = RobotTopics(self._node, model, on_lidar=self._take_lidar)
+        self._topics = RobotTopics(
+            self._node, model, on_lidar=partial(setattr, self, "_new_lidar")
+        )
         self._goals = self._node.create_publisher(PoseStamped, "goal_pose", qos.COMMAND)
         for kind, topic, take, quality in (
-            (PoseStamped, "goal_pose", self._take_goal, qos.COMMAND),
+            (PoseStamped, "goal_pose", partial(setattr, self, "_goal"), qos.COMMAND),
             (Odometry, "ground_truth", self._take_truth, qos.SENSOR),
             (Odometry, inputs.ESTIMATE, self._take_map_frame, qos.SENSOR),
             (DiagnosticArray, "/diagnostics", self._take_diagnostics, qos.DIAGNOSTICS),
         ):
             self._node.create_subscription(kind, topic, take, quality)
         self._node.start()
-
-    def _take_lidar(self, lidar: LidarSpec) -> None:
-        self._new_lidar = lidar
-
-    def _take_goal(self, message: PoseStamped) -> None:
-        position = message.pose.position
-        self._goal = np.array([[position.x, position.y]])
 
     def _take_truth(self, message: Odometry) -> None:
         pose = conversions.odometry_from_ros(message)[0]
@@ -116,11 +112,15 @@ class RosSource:
             covariance = middleware.estimator.covariance[None, :3, :3].copy()
             heard = sorted(middleware.cache.newest)
         pose = view.pose if self._truth is None else self._truth
+        goals = []
+        if self._goal is not None:
+            position = self._goal.pose.position
+            goals = [(position.x, position.y)]
         shot = Snapshot(
             pose[None],
             view.ranges[None],
             np.zeros((0, BODY)),
-            self._goal,
+            np.reshape(goals, (-1, 2)),
             estimates=view.pose[None],
             covariance=covariance,
             commands=command[None],

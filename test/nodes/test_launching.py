@@ -7,8 +7,9 @@ pytest.importorskip("launch_ros", reason="needs launch: nox -s upstream")
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 
 from launch import LaunchContext
-from nics_drl_bridge.nodes import launching, starting
-from nics_drl_bridge.nodes.launching import LAUNCHES, describe
+from nics_drl_bridge.nodes import launching
+from nics_drl_bridge.nodes.launching import describe
+from nics_drl_bridge.nodes.starting import LAUNCHES
 
 pytestmark = pytest.mark.ros
 
@@ -69,6 +70,6 @@ def test_a_launch_file_starts_the_same_nodes_with_the_same_parameters(
 
 
 def test_a_text_that_looks_like_a_number_stays_a_text(monkeypatch):
-    monkeypatch.setattr(starting, "check_world", lambda name: None)
+    monkeypatch.setattr("nics_drl_bridge.sim.world_set.load_worlds", lambda name: None)
     (node,) = launched(LAUNCHES["simulator"](), {"world": "7"}, monkeypatch)
     assert plain(node["parameters"][-1]["world"]) == "7"

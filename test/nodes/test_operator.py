@@ -9,7 +9,7 @@ pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 from nics_drl_bridge.nodes import listener
 from nics_drl_bridge.nodes import operator as module
 from nics_drl_bridge.nodes.goal_answer import GoalAnswer
-from nics_drl_bridge.nodes.operator import GateAnswer, GoalRequest, Operator
+from nics_drl_bridge.nodes.operator import GoalRequest, Operator, TriggerAnswer
 
 pytestmark = pytest.mark.ros
 
@@ -56,7 +56,7 @@ def test_the_time_left_to_arm_is_told_and_kept(clock, monkeypatch):
 
     class Call:
         def __init__(self, node, gate, service):
-            self.wait_for_answer = lambda _: GateAnswer(gate, False, "x")
+            self.wait_for_answer = lambda _: TriggerAnswer(gate, False, "x")
 
     def wait_for(*_):
         clock.sleep(7.0)
@@ -64,7 +64,7 @@ def test_the_time_left_to_arm_is_told_and_kept(clock, monkeypatch):
 
     operator._node = None
     monkeypatch.setattr(operator, "_wait_for", wait_for)
-    monkeypatch.setattr(module, "_Call", Call)
+    monkeypatch.setattr(module, "Call", Call)
     told = []
     answer = operator.arm("", 10.0, False, told.append)
     assert told == ["/command_gate does not arm yet (x); asking again for 3 s"]
@@ -82,14 +82,14 @@ def test_a_gate_that_hangs_holds_up_the_arming_no_longer_than_was_given(
 
         def wait_for_answer(self, left_s):
             clock.sleep(left_s)
-            return GateAnswer(self.gate, False, "it did not answer in time")
+            return TriggerAnswer(self.gate, False, "it did not answer in time")
 
     operator = Operator.__new__(Operator)
     operator._node = None
     monkeypatch.setattr(operator, "_wait_for", lambda *_: "/command_gate")
-    monkeypatch.setattr(module, "_Call", Call)
+    monkeypatch.setattr(module, "Call", Call)
     answer = operator.arm("", seconds, True, lambda _: None)
-    assert answer == GateAnswer("/command_gate", False, "it did not answer in time")
+    assert answer == TriggerAnswer("/command_gate", False, "it did not answer in time")
     assert clock.now == seconds
 
 
@@ -125,7 +125,7 @@ def test_a_stopped_robot_is_told_at_once_and_one_seen_later_is_stopped_too(
 
         def wait_for_answer(self, left_s):
             clock.sleep(left_s)
-            return GateAnswer(self.gate, self.gate != hanging, "")
+            return TriggerAnswer(self.gate, self.gate != hanging, "")
 
     def find_gates():
         return {hanging} | {gate for gate, s in appearing.items() if s <= clock.now}
@@ -133,9 +133,9 @@ def test_a_stopped_robot_is_told_at_once_and_one_seen_later_is_stopped_too(
     operator = Operator.__new__(Operator)
     operator._node = None
     monkeypatch.setattr(operator, "_gates", find_gates)
-    monkeypatch.setattr(module, "_Call", Call)
+    monkeypatch.setattr(module, "Call", Call)
     told = [
-        (answer.gate, answer.granted, round(clock.now, 1))
+        (answer.node, answer.granted, round(clock.now, 1))
         for answer in operator.stop(None, 5.0)
     ]
     assert told == [

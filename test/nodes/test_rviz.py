@@ -24,7 +24,7 @@ def test_the_map_is_shown_to_who_comes_late_too():
 def test_every_topic_of_the_picture_is_led_to_those_of_the_robot_and_the_map_to_that_of_all():
     pytest.importorskip("launch_ros", reason="needs launch: nox -s upstream")
     from nics_drl_bridge.config import find_config
-    from nics_drl_bridge.nodes import launching
+    from nics_drl_bridge.nodes import starting
 
     arguments = {
         "params_file": str(find_config("bridge", "nodes")),
@@ -35,8 +35,8 @@ def test_every_topic_of_the_picture_is_led_to_those_of_the_robot_and_the_map_to_
         ({"namespace": "car"}, "/car/map"),
         ({"namespace": "hall", "robots": "[a, b]"}, "/hall/map"),
     ):
-        setup = launching.Setup(arguments | {"rviz_config": str(FILE)} | given)
+        setup = starting.Setup(arguments | {"rviz_config": str(FILE)} | given)
         setup.node = lambda *given, **_: given
-        *_, (*_, topics) = launching.description(setup)
+        *_, (*_, topics) = starting.description(setup)
         assert dict(topics)["/map"] == place
         assert dict(topics).keys() == NAMED.keys()

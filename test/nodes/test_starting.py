@@ -126,7 +126,7 @@ def test_a_simulation_arms_without_an_e_stop_and_a_vehicle_does_not():
 
 
 def test_every_parameter_has_the_type_that_its_node_declares(monkeypatch):
-    monkeypatch.setattr(starting, "check_world", lambda name: None)
+    monkeypatch.setattr("nics_drl_bridge.sim.world_set.load_worlds", lambda name: None)
     given = {
         "world": "7",
         "policy": "1e3",
@@ -171,11 +171,11 @@ def test_every_launch_file_starts_the_launch_of_its_name():
 @pytest.mark.parametrize(
     ("given", "reason"),
     [
-        ({"robots": "0"}, "'robots' is '0'"),
-        ({"robots": "[ant, bee, ant]"}, "'robots' names 'ant' twice"),
+        ({"robots": "0"}, "'robots' is 0"),
+        ({"robots": "[ant, bee, ant]"}, "different namespaces"),
         ({"robots": "[ant"}, "'robots' is '[ant'"),
-        ({"robots": "[ ]"}, "'robots' is '[ ]'"),
-        ({"robots": "[ant, 9x]"}, "namespace '9x'"),
+        ({"robots": "[ ]"}, "different namespaces"),
+        ({"robots": "[ant, 9x]"}, "different namespaces"),
         ({"start": "1 2 3 4"}, "'start' is '1 2 3 4'"),
         ({"start": "1 2 x"}, "'start' is '1 2 x'"),
         ({"world": "corridr"}, "did you mean 'corridor'"),

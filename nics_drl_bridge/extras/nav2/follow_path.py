@@ -3,7 +3,7 @@
 import contextlib
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -121,6 +121,15 @@ class Run:
     progress: ProgressChecker
     started_s: float
     valid_s: float  # last time at which a command was valid
+
+
+@contextlib.contextmanager
+def refusing(goal: Goal, code: str) -> Iterator[None]:
+    """Within this context, what is wrong with a goal raises Refusal with a code."""
+    try:
+        yield
+    except ConfigError as error:
+        raise Refusal(code, f"{goal.name}: {error}") from None
 
 
 class PathActions:
@@ -289,27 +298,20 @@ class PathActions:
             reason = f"behaviour trees such as {asked.behavior_tree!r} are not supported; {fix}."
             raise Refusal("FAILED_TO_LOAD_BEHAVIOR_TREE", f"{NAVIGATE}: {reason}")
         end = np.array([read_pose(asked.pose)])
-        frame, end = self._placed(goal, asked.pose.header.frame_id, end)
-        self._planned(goal, end)
+        with refusing(goal, "TF_ERROR"):
+            frame, end = self._frames.fixed(asked.pose.header.frame_id, end)
+        with refusing(goal, goal.code):
+            PlannedPath(end)
         # on the map if there is one, else straight
         points = np.stack([self._robot_in(NAVIGATE, frame)[:2], end[0, :2]])
         if self._map is not None and frame in ("", self._map[0]):
-            radius = self._robot.footprint_radius
-            try:
-                points = route(self._map[1], *points, radius)
-            except ConfigError as error:
-                raise Refusal(goal.code, f"{NAVIGATE}: {error}") from None
+            with refusing(goal, goal.code):
+                points = route(self._map[1], *points, self._robot.footprint_radius)
         way = np.column_stack([points, np.full(len(points), end[0, 2])])
         checks = [
             self.parameters.names[f"{kind}_checker"][0] for kind in ("goal", "progress")
         ]
         return self._begin(goal, frame, way, checks)
-
-    def _placed(self, goal: Goal, frame: str, poses: Array) -> tuple[str, Array]:
-        try:
-            return self._frames.fixed(frame, poses)
-        except ConfigError as error:
-            raise Refusal("TF_ERROR", f"{goal.name}: {error}") from None
 
     def _robot_in(self, name: str, frame: str) -> Array:
         robot = self._frames.robot_in(frame)
@@ -323,9 +325,11 @@ class PathActions:
     def _begin(
         self, goal: Goal, frame: str, poses: Array, checks: Sequence[str]
     ) -> Run:
-        self._planned(goal, poses)
-        frame, poses = self._placed(goal, frame, poses)
-        path = self._planned(goal, poses)
+        with refusing(goal, goal.code):
+            PlannedPath(poses)  # before its frame is looked at
+        with refusing(goal, "TF_ERROR"):
+            frame, poses = self._frames.fixed(frame, poses)
+        path = PlannedPath(poses)
         self._robot_in(goal.name, frame)
         arrival, progress = self.parameters.checks(*checks)
         checkers = (
@@ -334,12 +338,6 @@ class PathActions:
         )
         now_s = time.monotonic()
         return Run(goal, frame, path, *checkers, now_s, now_s)
-
-    def _planned(self, goal: Goal, poses: Array) -> PlannedPath:
-        try:
-            return PlannedPath(poses)
-        except ConfigError as error:
-            raise Refusal(goal.code, f"{goal.name}: {error}") from None
 
     # The robot drives to a goal.
 
