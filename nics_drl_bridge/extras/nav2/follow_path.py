@@ -331,6 +331,7 @@ class PathActions:
             frame, poses = self._frames.fixed(frame, poses)
         path = PlannedPath(poses)
         self._robot_in(goal.name, frame)
+        self._require_on_map(goal, frame, poses)
         arrival, progress = self.parameters.checks(*checks)
         checkers = (
             GoalChecker(arrival, not self._robot.steers),
@@ -338,6 +339,23 @@ class PathActions:
         )
         now_s = time.monotonic()
         return Run(goal, frame, path, *checkers, now_s, now_s)
+
+    def _require_on_map(self, goal: Goal, frame: str, poses: Array) -> None:
+        if self._map is None:
+            return
+        wanted, grid = self._map
+        here = self._frames.robot_in(frame)
+        there = self._frames.robot_in(wanted)
+        if here is None or there is None:
+            return
+        points = geometry.compose(there, geometry.between(here, poses))[:, :2]
+        cells = grid.world_to_cell(points)
+        off = ((cells < 0) | (cells >= grid.cells.shape)).any(axis=-1)
+        if off.any():
+            k = int(np.argmax(off))
+            x, y = points[k].round(2) + 0.0  # no negative zero
+            why = f"pose {k} of the path, ({x:.2f}, {y:.2f}) m, is off the map; replan it."
+            raise Refusal(goal.code, f"{goal.name}: {why}")
 
     # The robot drives to a goal.
 
@@ -463,11 +481,17 @@ class PathActions:
             self._node.get_logger().info(
                 "goal reached" if end == SUCCEED else "goal cancelled"
             )
-        # by distribution, a result has no fields, a code, or code and sentence
-        kind = goal.kind.Result
-        result = kind()
-        if hasattr(result, "error_code"):
-            result.error_code = getattr(kind, code, getattr(kind, "UNKNOWN", 0))
-        if hasattr(result, "error_msg"):
-            result.error_msg = sentence
+        result = result_of(goal.kind, code, sentence)
         goal.server.finish(goal.handle, end, result)
+
+
+def result_of(kind: Any, code: str, sentence: str = "") -> Any:
+    """Return an action's result; by distribution it has no fields, a code, or code and sentence."""
+    result = kind.Result()
+    if hasattr(result, "error_code"):
+        result.error_code = getattr(
+            kind.Result, code, getattr(kind.Result, "UNKNOWN", 0)
+        )
+    if hasattr(result, "error_msg"):
+        result.error_msg = sentence
+    return result
