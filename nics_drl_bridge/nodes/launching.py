@@ -20,8 +20,12 @@ def describe(launch: Launch) -> Any:
     """Return the launch description of a launch: its arguments, and the nodes that they select."""
 
     def start(context: Any) -> list[Any]:
+        configurations = context.launch_configurations
         names = [argument.name for argument in launch.arguments]
-        values = {name: context.launch_configurations[name] for name in names}
+        values = {name: configurations[name] for name in names}
+        # Below the namespace of a PushRosNamespace around the launch, if any.
+        pushed = configurations.get("ros_namespace", "").strip("/")
+        values["namespace"] = f"{pushed}/{values['namespace'].strip('/')}".strip("/")
         return [action_of(node) for node in launch.nodes(values)]
 
     declared = [declaration_of(argument) for argument in launch.arguments]
@@ -54,7 +58,7 @@ def action_of(node: NodeStart) -> Node:
         package=node.package,
         executable=node.executable,
         name=node.executable,
-        namespace=node.namespace,
+        namespace=f"/{node.namespace}",
         parameters=[*files, parameters],
         remappings=list(node.remappings),
         arguments=[*node.arguments, *log_arguments],

@@ -58,7 +58,9 @@ def test_a_launch_file_starts_the_same_nodes_with_the_same_parameters(
     assert [node["executable"] for node in found] == [
         node.executable for node in wanted
     ]
-    assert [node["namespace"] for node in found] == [node.namespace for node in wanted]
+    assert [node["namespace"] for node in found] == [
+        f"/{node.namespace}" for node in wanted
+    ]
     for one, other in zip(found, wanted, strict=True):
         *files, parameters = one["parameters"]
         paths = [file.param_file[0].text for file in files]
@@ -73,3 +75,11 @@ def test_a_text_that_looks_like_a_number_stays_a_text(monkeypatch):
     monkeypatch.setattr("nics_drl_bridge.sim.world_set.load_worlds", lambda name: None)
     (node,) = launched(LAUNCHES["simulator"](), {"world": "7"}, monkeypatch)
     assert plain(node["parameters"][-1]["world"]) == "7"
+
+
+def test_a_fleet_below_a_pushed_namespace_has_its_transforms_there(monkeypatch):
+    given = {"ros_namespace": "/site", "namespace": "hall", "robots": "[ant, bee]"}
+    nodes = launched(LAUNCHES["fleet"](), given, monkeypatch)
+    assert {node["namespace"] for node in nodes} >= {"/site/hall", "/site/hall/bee"}
+    places = {dict(node["remappings"])["/tf"] for node in nodes}
+    assert places == {"tf", "/site/hall/tf"}

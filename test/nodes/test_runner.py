@@ -99,4 +99,3 @@ def test_a_quality_of_service_for_a_topic_that_the_node_has_not_is_told(make_nod
     node.create_publisher(Bool, "/scan", 1)
     (line,) = unknown(node)
     assert "'qos_overrides./scam.publisher.depth' is ignored" in line
-    assert "did you mean 'qos_overrides./scan.publisher'?" in line

@@ -180,7 +180,7 @@ def test_every_launch_file_starts_the_launch_of_its_name():
         ({"start": "1 2 x"}, "'start' is '1 2 x'"),
         ({"world": "corridr"}, "did you mean 'corridor'"),
         ({"world": "nope.yaml"}, "nope.yaml: no such file"),
-        ({"policy": "nope.onnx"}, "'nope.onnx': no such file"),
+        ({"policy": "nope.onnx"}, "nope.onnx: no such file"),
         ({"urdf": "/nope.urdf"}, "/nope.urdf: no such file"),
         ({"wrld": "arena"}, "did you mean 'world'"),
         ({"simulator": "gazebo"}, "'simulator' is 'gazebo'"),
