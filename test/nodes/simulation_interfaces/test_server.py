@@ -327,7 +327,7 @@ def test_poses_may_be_given_in_the_frame_of_an_entity(client):
         (
             "SpawnEntity",
             spawned(resource_string=MESH),
-            105,
+            108,
             "has a mesh",
         ),
         (
