@@ -13,7 +13,7 @@ from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.middleware.measurement import Health, Rejection
 from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes import conversions, qos, runner
-from nics_drl_bridge.nodes.map_to_odom import MapToOdom, odom_in_map
+from nics_drl_bridge.nodes.frames import MapToOdom, odom_in_map
 from nics_drl_bridge.nodes.parameters import BASE_FRAME, MAP_FRAME, middleware
 from nics_drl_bridge.nodes.robot_topics import RobotTopics
 from nics_drl_bridge.nodes.runner import ACTIVE, UNCONFIGURED, ManagedNode

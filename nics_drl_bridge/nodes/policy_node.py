@@ -18,8 +18,8 @@ from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.middleware.uncertainty import compute_uncertainty_gain
 from nics_drl_bridge.nodes import conversions, qos, runner
+from nics_drl_bridge.nodes.frames import GoalFrames
 from nics_drl_bridge.nodes.goal_answer import GoalAnswer
-from nics_drl_bridge.nodes.goal_frames import GoalFrames
 from nics_drl_bridge.nodes.parameters import policy
 from nics_drl_bridge.nodes.parts import Wish, open_parts
 from nics_drl_bridge.nodes.robot_topics import RobotTopics

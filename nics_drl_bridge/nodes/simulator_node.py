@@ -37,8 +37,8 @@ from nics_drl_bridge.nodes import (
 )
 from nics_drl_bridge.nodes.command_types import KINDS, TypeWatch, name_of
 from nics_drl_bridge.nodes.conversions import sensor_to_ros, sensor_type
+from nics_drl_bridge.nodes.frames import odom_in_map, transform_to_ros
 from nics_drl_bridge.nodes.link import identity
-from nics_drl_bridge.nodes.map_to_odom import odom_in_map, transform_to_ros
 from nics_drl_bridge.nodes.message_packages import how_to_install
 from nics_drl_bridge.nodes.parts import open_parts
 from nics_drl_bridge.nodes.world_topics import WorldTopics

@@ -11,7 +11,7 @@ from geometry_msgs.msg import PoseStamped, TransformStamped
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.nodes import conversions
-from nics_drl_bridge.nodes.goal_frames import GoalFrames
+from nics_drl_bridge.nodes.frames import GoalFrames
 from nics_drl_bridge.nodes.parameters import policy
 from nics_drl_bridge.nodes.runner import declare_row
 

@@ -9,7 +9,7 @@ from std_srvs.srv import Trigger
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.map_to_odom import (
+from nics_drl_bridge.nodes.frames import (
     odom_in_map,
     transform_from_ros,
     transform_to_ros,

@@ -22,7 +22,7 @@ from nics_drl_bridge.interface import S_PER_NS, Array
 from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 from nics_drl_bridge.nodes import conversions, qos, runner
-from nics_drl_bridge.nodes.goal_frames import GoalFrames
+from nics_drl_bridge.nodes.frames import GoalFrames
 from nics_drl_bridge.nodes.parts import Wish
 from nics_drl_bridge.nodes.robot_topics import RobotTopics
 from nics_drl_bridge.policy.follow import (
