@@ -222,15 +222,20 @@ class RealtimeBackend:
         After a clock jump, wait until all topics have arrived again.
         """
         limit_s = self._options.stale_after_s
-        holds(lambda: self._find_missing_topic() is None, limit_s, POLL_S)
+
+        def find_missing() -> list[str]:
+            with self._topics.lock:
+                newest = self._topics.middleware.cache.newest
+                return [t for t in self._topics.expected if t not in newest]
+
+        holds(lambda: not find_missing(), limit_s, POLL_S)
         with self._topics.lock:
             silences_s = self._measure_silences()
-            silent_topic = max(silences_s, key=lambda topic: silences_s[topic])
-            missing_topic = self._find_missing_topic()
-            if missing_topic is not None:
-                raise StaleDataError(missing_topic, silences_s[missing_topic], limit_s)
-            if silences_s[silent_topic] > limit_s:
-                raise StaleDataError(silent_topic, silences_s[silent_topic], limit_s)
+            missing = find_missing()
+            longest = max(silences_s, key=lambda topic: silences_s[topic])
+            topic = missing[0] if missing else longest
+            if missing or silences_s[topic] > limit_s:
+                raise StaleDataError(topic, silences_s[topic], limit_s)
             info = {
                 "stamp_ns": self._topics.newest_ns,
                 "deadline_misses": self._misses,
@@ -239,13 +244,6 @@ class RealtimeBackend:
             self._scan_ns = self._topics.middleware.cache.newest[SCAN].stamp_ns
             _, self._link.frame = self._topics.frames
             return self._topics.view(), info
-
-    def _find_missing_topic(self) -> str | None:
-        """Return a topic without a datum on the present clock, or None if there is none."""
-        with self._topics.lock:
-            newest = self._topics.middleware.cache.newest
-            missing = [topic for topic in self._topics.expected if topic not in newest]
-        return missing[0] if missing else None
 
     def _measure_silences(self) -> dict[str, float]:
         """Return how long each topic has been silent [s]; inf for one that was never heard.

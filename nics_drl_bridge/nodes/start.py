@@ -11,15 +11,16 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
+import yaml
+
 from nics_drl_bridge.exit_codes import EXIT_BAD_INPUT
 from nics_drl_bridge.nodes import own_process, transport
-from nics_drl_bridge.nodes.parameters import NODES, Row
+from nics_drl_bridge.nodes.parameters import NODES
 
 HELP = ("-h", "--help")
 ROS = "--ros-args"
 END = "--"
 WIDTH = 100
-INDENT = 4
 
 
 def help_of(node: str) -> str:
@@ -27,8 +28,9 @@ def help_of(node: str) -> str:
     if node not in NODES:
         return f"usage: {node} [{ROS} -p NAME:=VALUE -r FROM:=TO ...]\n"
     facts = NODES[node]()
+    hang = partial(textwrap.fill, width=WIDTH, subsequent_indent=" " * 8)
     topics = [
-        _hanging(f"{title}: {', '.join(names)}", INDENT)
+        hang(f"{title}: {', '.join(names)}")
         for title, names in (
             ("subscribes to", facts.subscribes),
             ("publishes", facts.publishes),
@@ -41,31 +43,20 @@ def help_of(node: str) -> str:
         facts.about,
         "\n".join(topics),
         "parameters, with their defaults:",
-        "\n".join(map(_line, facts.parameters)),
+        "\n".join(
+            hang(f"    {row.name} = {row.shown or words_of(row.default)}: {row.about}")
+            for row in facts.parameters
+        ),
         "and `use_sim_time`, like every ROS 2 node. `ros2 param describe` also shows the ranges.",
         f"example:\n    ros2 run nics_drl_bridge {node} {ROS} {facts.example}",
     ]
     return "\n\n".join(parts) + "\n"
 
 
-def _line(row: Row) -> str:
-    return _hanging(
-        f"    {row.name} = {row.shown or _words(row.default)}: {row.about}", 2 * INDENT
-    )
-
-
-def _words(value: Any) -> str:
+def words_of(value: Any) -> str:
     """Return a value as it is written after `:=`."""
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, list):
-        return f"[{', '.join(map(_words, value))}]"
-    text = str(value) if value != "" else "''"
-    return f".{text}" if text == "nan" else text
-
-
-def _hanging(text: str, indent: int) -> str:
-    return textwrap.fill(text, WIDTH, subsequent_indent=" " * indent)
+    text: str = yaml.safe_dump(value, default_flow_style=True)
+    return text.removesuffix("...\n").strip()
 
 
 def wrong_with(node: str, words: Sequence[str]) -> str:
