@@ -166,8 +166,9 @@ class Operator(AbstractContextManager["Operator", None]):
         topic = self._node.create_publisher(
             PoseStamped, f"{space}/goal_pose", qos.COMMAND
         )
-        policies = partial(list, self._policies)
-        name = self._wait_for(policies, "policy_node", namespace, seconds)
+        name = self._wait_for(
+            lambda: list(self._policies), "policy_node", namespace, seconds
+        )
         left_s = deadline - time.monotonic()
         if not holds(topic.get_subscription_count, left_s, POLL_S):
             condition = self._policies[name][0]

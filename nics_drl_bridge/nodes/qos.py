@@ -182,7 +182,7 @@ class BridgeNode(Node):
         topic: str,
         callback: Any,
         qos: Any,
-        lost: Callable[[int], None],
+        lost: Callable[[int], object],
     ) -> Subscription:
         """Create a raw subscription that reports how many messages the middleware has lost."""
         create = partial(self.create_subscription, kind, topic, callback, qos, raw=True)

@@ -328,34 +328,30 @@ def test_without_a_simulator_the_error_names_all_that_is_missing(
     assert "ground_truth" not in str(caught.value)
 
 
-def test_close_leaves_a_zero_command_behind(connect, commands_heard):
-    backend = connect()
-    backend.reset(START)
-    zero_follows(
-        commands_heard, lambda: backend.step(np.array([0.5, 0.0])), backend.close
-    )
-    backend.close()  # twice does no harm
-    with pytest.raises(BackendError, match="closed"):
-        backend.step(np.zeros(2))
-    with pytest.raises(BackendError, match="closed"):
-        backend.reset(START)
-
-
-def test_garbage_collection_leaves_a_zero_command_behind(
-    simulator, model, arena, commands_heard
+@pytest.mark.parametrize("end", ["close", "garbage"])
+def test_the_end_of_an_env_leaves_a_zero_command_behind(
+    simulator, model, arena, commands_heard, end
 ):
     env = BridgeEnv("dds", model, arena, backend_options={"domain_id": simulator[0]})
     env.myself = env  # a cycle, which only the collector ends
     env.reset(seed=3)
+    backend = env._backend if end == "close" else None
 
-    def forget():
+    def act():
         nonlocal env
+        if backend is not None:
+            env.close()
+            env.close()  # twice does no harm
         del env
         gc.collect()
 
     zero_follows(
-        commands_heard, lambda: env.step(np.array([1.0, 0.0], np.float32)), forget
+        commands_heard, lambda: env.step(np.array([1.0, 0.0], np.float32)), act
     )
+    for use in (lambda: backend.step(np.zeros(2)), lambda: backend.reset(START)):
+        if backend is not None:
+            with pytest.raises(BackendError, match="closed"):
+                use()
 
 
 def test_somebody_else_who_moves_the_simulator_is_found_out(

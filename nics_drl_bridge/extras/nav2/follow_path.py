@@ -306,7 +306,8 @@ class PathActions:
         points = np.stack([self._robot_in(NAVIGATE, frame)[:2], end[0, :2]])
         if self._map is not None and frame in ("", self._map[0]):
             with refusing(goal, goal.code):
-                points = route(self._map[1], *points, self._robot.footprint_radius)
+                radius = self._robot.footprint_radius
+                points = route(self._map[1], points[0], points[1], radius)
         way = np.column_stack([points, np.full(len(points), end[0, 2])])
         checks = [
             self.parameters.names[f"{kind}_checker"][0] for kind in ("goal", "progress")
