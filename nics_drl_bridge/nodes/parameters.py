@@ -534,6 +534,10 @@ def gate_rules(odom_rate: float = math.nan, scan_age: float = math.nan) -> list[
     ]
 
 
+SPLIT = {  # parameters of earlier versions, and what replaced them
+    "estimate_std": "'estimate_position' [m] and 'estimate_heading' [rad], which limit how much "
+    "the estimate's uncertainty grows within 10 s, counted from arming",
+}
 RULES_IN_SECONDS = ("scan_age", "odom_age", "command_age", "e_stop_silence")
 
 
