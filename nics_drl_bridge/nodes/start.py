@@ -11,8 +11,6 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
-import yaml
-
 from nics_drl_bridge.exit_codes import EXIT_BAD_INPUT
 from nics_drl_bridge.nodes import own_process, transport
 from nics_drl_bridge.nodes.parameters import NODES
@@ -55,8 +53,12 @@ def help_of(node: str) -> str:
 
 def words_of(value: Any) -> str:
     """Return a value as it is written after `:=`."""
-    text: str = yaml.safe_dump(value, default_flow_style=True)
-    return text.removesuffix("...\n").strip()
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list):
+        return f"[{', '.join(map(words_of, value))}]"
+    text = str(value) if value != "" else "''"
+    return f".{text}" if text == "nan" else text
 
 
 def wrong_with(node: str, words: Sequence[str]) -> str:
