@@ -59,7 +59,7 @@ SHORT = (
 )
 KINDS = {
     "robot": Kind(
-        "Robot file", RobotSpec, "config/robots/ackermann.yaml", "kinematics", SHORT
+        "Robot file", RobotSpec, "config/robots/ackermann.yaml", "robots", SHORT
     ),
     "world": Kind("World file", World, "config/worlds/crowd.yaml", "worlds"),
     "world_set": Kind(
@@ -73,7 +73,7 @@ KINDS = {
         "examples/recordings/jetracer_csv.yaml",
         "recordings",
     ),
-    "topics": Kind("Topic roles of a bag", TopicRoles, "", "kinematics"),
+    "topics": Kind("Topic roles of a bag", TopicRoles, "", "recordings"),
     "training": Kind(
         "Settings of a training",
         TrainingSettings,

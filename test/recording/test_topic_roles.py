@@ -148,7 +148,7 @@ def test_the_options_go_before_the_file(tmp_path):
 
 
 def test_the_example_of_the_docs_is_a_mapping(tmp_path):
-    page = Path(__file__).parents[2] / "docs" / "kinematics.md"
+    page = Path(__file__).parents[2] / "docs" / "recordings.md"
     (example,) = re.findall(
         r"```yaml\n(cmd_vel.*?)```", page.read_text(encoding="utf-8"), re.DOTALL
     )
