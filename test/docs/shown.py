@@ -197,7 +197,7 @@ SUPPLIES: dict[str, Callable[[Path], object]] = {
     "theirs.yaml": foreign,
     "rear.yaml": shown("sensors.md", 0),
 }
-WRITES = ("--out", "-o", "--map", "--mcap", "--record")
+WRITES = ("--out", "-o", "--map", "--mcap", "--record", "--recording")
 
 
 def supply(line: str, folder: Path) -> None:
