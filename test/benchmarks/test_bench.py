@@ -322,14 +322,14 @@ def test_rows_are_of_runs_that_there_are_and_as_long_as_their_head():
             assert len(cells) == len(table.head), f"{name}: {cells}"
 
 
-def test_each_table_stands_in_one_place_and_again_only_where_the_papers_are():
+def test_each_table_stands_in_one_place():
     import figures
 
     first = []
     for path in figures.documents():
         found = [match[1] for match in figures.REGION.finditer(path.read_text())]
         assert len(found) == len(set(found)), path
-        first += [] if path.name == "paper.md" else found
+        first += found
     assert sorted(first) == sorted([*figures.TABLES, figures.MACHINE])
 
 
