@@ -30,6 +30,7 @@ BEFORE = {
     ("policy_file.md", 1): "observation, _ = env.reset(seed=0)\n",
     ("howto.md", 0): AGENT,
     ("tasks.md", 0): "import gymnasium\nimport nics_drl_bridge\n",
+    ("extensions.md", 0): "import gymnasium\n",  # before what imports the package
 }
 """What a reader has by then."""
 ELSEWHERE = {
