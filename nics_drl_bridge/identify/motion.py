@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import scipy  # .signal loads in a second, when used
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import RecordingError
@@ -92,7 +91,7 @@ def body_twists(
     step = float(grid[1] - grid[0])
     pose = unwrapped(poses_at(drive, calibration, grid, 0.5 * width))
     rows = 2 * max(2, round(width / step)) + 1
-    rates = scipy.signal.savgol_filter(pose, rows, 2, deriv=1, delta=step, axis=0)
+    rates = find_slopes(pose, rows, step)
     forward = geometry.rotate(rates[:, :2], -pose[:, 2])
     return np.concatenate([forward, rates[:, 2:]], axis=1)
 
@@ -101,9 +100,27 @@ def as_smooth(command: Array, step: float, width: float) -> Array:
     """Returns commands (T, C) at uniform times, smoothed like a twist derived by parabolas."""
     sums = np.cumsum(command, axis=0) * step
     rows = 2 * max(2, round(width / step)) + 1
-    return np.asarray(
-        scipy.signal.savgol_filter(sums, rows, 2, deriv=1, delta=step, axis=0)
-    )
+    return find_slopes(sums, rows, step)
+
+
+def find_slopes(values: Array, rows: int, step: float) -> Array:
+    """Returns slopes of parabolas through an odd number of rows of `values` (T, C) around each.
+
+    They are those of `scipy.signal.savgol_filter`, which takes most of a second to import.
+    """
+    half = rows // 2
+    at = step * np.arange(-half, half + 1)
+    slopes = np.empty_like(values)
+    around = np.lib.stride_tricks.sliding_window_view(values, rows, axis=0)
+    slopes[half : len(values) - half] = around @ (at / (at @ at))
+    # No parabola is centred on the ends, which take those of the first and the last rows.
+    for end, near in (
+        (slice(None, rows), slice(None, half)),
+        (slice(-rows, None), slice(-half, None)),
+    ):
+        curve = np.polynomial.polynomial.polyfit(at, values[end], 2)
+        slopes[end][near] = curve[1] + 2.0 * np.outer(at[near], curve[2])
+    return slopes
 
 
 def _infer_follower(

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import savgol_filter
 
 from identify.drives import slipping_car
 from nics_drl_bridge.identify.calibration import Calibration
@@ -15,6 +16,7 @@ from nics_drl_bridge.identify.motion import (
     WIDTHS_S,
     as_smooth,
     by_motion,
+    find_slopes,
     grid_of,
     half_width,
     known_state,
@@ -27,6 +29,13 @@ from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot.spec import build_robot, load_robot
 
 MOUNTED = Calibration(rotation_rad=-0.1, lever_arm_m=(0.08, 0.0))
+
+
+@pytest.mark.parametrize("rows", [5, 21, 49])
+def test_slopes_are_those_of_scipy_also_at_the_ends(rows):
+    values = np.random.default_rng(0).normal(size=(50, 3)).cumsum(axis=0)
+    expected = savgol_filter(values, rows, 2, deriv=1, delta=0.05, axis=0)
+    assert find_slopes(values, rows, 0.05) == pytest.approx(expected, abs=1e-11)
 
 
 @pytest.fixture(scope="module")
