@@ -38,7 +38,7 @@ def names(folder: Path) -> set[str]:
 def drive(tmp_path_factory):
     path = tmp_path_factory.mktemp("drive") / "drive.npz"
     car = load_robot("ackermann")
-    save_recording(textbook.record(car, np.random.default_rng(0), duration=30.0), path)
+    save_recording(textbook.record(car, np.random.default_rng(0), duration=20.0), path)
     return path
 
 
@@ -88,14 +88,13 @@ def test_generate_makes_a_model_of_a_recording_and_replaces_it(drive, tmp_path):
     assert load_model(tmp_path / "models" / "car").fingerprint != model.fingerprint
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("dt", [0.0100036, 0.0083, 1.0 / 60.0])
+@pytest.mark.parametrize("dt", [0.0100036, 1.0 / 60.0])
 def test_a_recording_of_any_rate_gives_a_model_whose_step_divides_the_period(
     tmp_path, dt
 ):
     spec = load_robot("differential")
     save_recording(
-        textbook.record(spec, np.random.default_rng(0), 40.0, dt), tmp_path / "d.npz"
+        textbook.record(spec, np.random.default_rng(0), 20.0, dt), tmp_path / "d.npz"
     )
     done = nics("generate d.npz --robot differential --out car", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

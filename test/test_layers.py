@@ -97,35 +97,44 @@ def layer_of(part: str) -> int | None:
     return next((level for level, parts in enumerate(LAYERS) if part in parts), None)
 
 
-def wrong_directions(package: Path) -> list[str]:
+Imports = dict[Path, set[str]]
+
+
+def read_imports(package: Path) -> Imports:
+    """What each file of a package imports; paths begin with the package's name."""
+    return {
+        path.relative_to(package.parent): imports_of(path, package)
+        for path in sorted(package.rglob("*.py"))
+    }
+
+
+def wrong_directions(imports: Imports) -> list[str]:
     """A sentence for each import that runs up or sideways."""
     wrong = []
-    for path in sorted(package.rglob("*.py")):
-        place = path.relative_to(package)
+    for path, modules in imports.items():
+        place = Path(*path.parts[1:])
         own = place.parts[0].removesuffix(".py")
         if own == "__init__":
             continue
         if layer_of(own) is None:
             wrong.append(f"{place}: {own!r} stands in no layer")
             continue
-        for module in sorted(imports_of(path, package)):
+        for module in sorted(modules):
             first, _, rest = module.partition(".")
             part = rest.partition(".")[0]
-            if first != package.name or part == own or layer_of(part) is None:
+            if first != PACKAGE or part == own or layer_of(part) is None:
                 continue
             if layer_of(part) >= layer_of(own):
                 wrong.append(f"{place}: imports {module}")
     return wrong
 
 
-def strangers(package: Path) -> list[str]:
+def strangers(imports: Imports) -> list[str]:
     """A sentence for each library that is imported away from its home."""
     wrong = []
-    for path in sorted(package.rglob("*.py")):
-        place = path.relative_to(package).as_posix()
-        for library in sorted(
-            {module.partition(".")[0] for module in imports_of(path, package)}
-        ):
+    for path, modules in imports.items():
+        place = Path(*path.parts[1:]).as_posix()
+        for library in sorted({module.partition(".")[0] for module in modules}):
             for name, homes in HOMES.items():
                 away = not any(fnmatch(place, home) for home in homes)
                 if fnmatch(library, name) and away:
@@ -138,13 +147,9 @@ def test_the_page_on_architecture_shows_the_order():
 
 
 @pytest.mark.slow
-def test_imports_run_one_way():
-    assert wrong_directions(ROOT / PACKAGE) == []
-
-
-@pytest.mark.slow
-def test_each_library_is_imported_at_its_home_only():
-    assert strangers(ROOT / PACKAGE) == []
+def test_imports_run_one_way_and_each_library_is_imported_at_its_home_only():
+    imports = read_imports(ROOT / PACKAGE)
+    assert wrong_directions(imports) + strangers(imports) == []
 
 
 @pytest.fixture
@@ -278,8 +283,9 @@ def test_an_env_in_process_imports_neither_ros_nor_pictures_nor_slow_libraries()
 def test_a_wrong_import_is_found_in_a_package_without_another_fault(
     package, find, file, line
 ):
-    assert wrong_directions(package) == strangers(package) == []
+    sound = read_imports(package)
+    assert wrong_directions(sound) == strangers(sound) == []
     (package / file).parent.mkdir(exist_ok=True)
     (package / file).write_text(line)
-    (sentence,) = find(package)
+    (sentence,) = find(read_imports(package))
     assert sentence.startswith(f"{file}: ")

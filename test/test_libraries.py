@@ -5,11 +5,13 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from importlib import import_module
 
 import pytest
 
 import nics_drl_bridge
 from nics_drl_bridge import extensions
+from nics_drl_bridge.errors import ConfigError
 
 # No distribution has these as packages of its own.
 FOREIGN = ("filterpy", "gymnasium")
@@ -69,40 +71,38 @@ def test_all_that_is_missing_or_of_a_wrong_version_is_told_at_once(monkeypatch):
     assert "pip install 'filterpy>=2.0' " in told
 
 
+NICS = """
+import sys
+from nics_drl_bridge.commands.start import main
+
+def nics(*words):
+    sys.argv = ["nics", *words]
+    try:
+        main()
+    except SystemExit as end:
+        return end.code
+"""
+
+
 @pytest.mark.process
 @pytest.mark.slow
-def test_the_core_does_without_what_no_system_brings():
+def test_the_core_does_without_what_no_system_brings(tmp_path):
     names = [name for name in nics_drl_bridge.__all__ if name not in NEED_THEM]
-    code = f"{WITHOUT}\nimport nics_drl_bridge\nfor name in {names}: getattr(nics_drl_bridge, name)"
+    car = str(tmp_path / "car.urdf")
+    code = f"""{WITHOUT}{NICS}
+import nics_drl_bridge
+for name in {names}:
+    getattr(nics_drl_bridge, name)
+for words in (["--help"], ["generate", "--help"], ["urdf", "ackermann", "--out", {car!r}]):
+    assert not nics(*words), words
+assert nics("evaluate", "straight", "--episodes", "1", "--out", {str(tmp_path)!r}) == 2
+"""
     done = python(code)
     assert done.returncode == 0, done.stderr
-
-
-@pytest.mark.process
-@pytest.mark.parametrize(
-    "words", [("--help",), ("generate", "--help"), ("urdf", "{out}")]
-)
-def test_nics_does_without_what_no_system_brings(words, tmp_path):
-    given = [word.replace("{out}", "ackermann") for word in words]
-    given += ["--out", str(tmp_path / "car.urdf")] if words[0] == "urdf" else []
-    done = python(
-        f"{WITHOUT}\nfrom nics_drl_bridge.commands.start import main\nmain()", *given
-    )
-    assert done.returncode == 0, done.stderr
-
-
-@pytest.mark.process
-def test_nics_says_in_one_sentence_what_a_command_needs(tmp_path):
-    code = f"{WITHOUT}\nfrom nics_drl_bridge.commands.start import main\nmain()"
-    done = python(
-        code, "evaluate", "straight", "--episodes", "1", "--out", str(tmp_path / "out")
-    )
-    assert done.returncode == 2
-    (sentence,) = done.stderr.splitlines()
+    sentence = done.stderr.splitlines()[-1]
     assert sentence == "nics: needs the module 'gymnasium'; install it."
 
 
-@pytest.mark.process
 @pytest.mark.parametrize(
     ("module", "what", "library", "extra"),
     [
@@ -112,12 +112,17 @@ def test_nics_says_in_one_sentence_what_a_command_needs(tmp_path):
         ("policy.train.export", "the export of a policy", "torch", "train"),
     ],
 )
-def test_a_module_whose_extra_is_missing_names_it(module, what, library, extra):
-    code = WITHOUT.replace(repr(FOREIGN), repr((library,)))
-    done = python(f"{code}\nimport nics_drl_bridge.{module}")
-    fix = f"pip install 'nics_drl_bridge[{extra}]'."
-    last = done.stderr.splitlines()[-1]
-    assert last.endswith(f"ConfigError: {what} needs the module {library!r}; {fix}")
+def test_a_module_whose_extra_is_missing_names_it(
+    monkeypatch, module, what, library, extra
+):
+    name = f"nics_drl_bridge.{module}"
+    monkeypatch.delitem(sys.modules, name, raising=False)
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(ConfigError) as refused:
+        import_module(name)
+    sentence = str(refused.value)
+    assert sentence.startswith(f"{what} needs the module '{library}")
+    assert sentence.endswith(f"pip install 'nics_drl_bridge[{extra}]'.")
 
 
 @pytest.mark.process

@@ -26,7 +26,7 @@ def disturbed() -> Found:
     car = load_robot("ackermann")
     spoilt = drive(
         car,
-        duration=60.0,
+        duration=30.0,
         latency=0.12,
         pose_clock_ahead=3.0,
         rotation=0.3,
@@ -35,7 +35,7 @@ def disturbed() -> Found:
         burst=0.1,
         measured_state=False,
     )
-    spoilt = with_wheels(spoilt, drive(car, duration=60.0, latency=0.12), swapped=True)
+    spoilt = with_wheels(spoilt, drive(car, duration=30.0, latency=0.12), swapped=True)
     return car, identify(spoilt, car)
 
 

@@ -67,7 +67,7 @@ def taken(step, steps=STEPS, bookkeeping=BOOKKEEPING):
     return min(grown), min(most)
 
 
-def compiled(step, steps=100):
+def compiled(step, steps=10):
     """How often compiled code allocates in a step."""
     _nrt_python.memsys_enable_stats()
     try:
