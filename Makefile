@@ -9,7 +9,7 @@ PYTHON ?= python3
 RECORDING ?=
 PYTEST_ARGS ?=
 # Tests of one file run one after the other; with an empty PARALLEL= all tests do.
-PARALLEL ?= -n auto --dist loadfile
+PARALLEL ?= -n auto --dist loadfile --no-loadscope-reorder
 # Tests of `make test` often wait for processes, so three workers keep two cores busy.
 WORKERS := $(shell echo $$(($$(nproc 2>/dev/null || getconf _NPROCESSORS_ONLN) * 3 / 2)))
 # The slowest tests are printed, and the time of each is written.

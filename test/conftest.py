@@ -5,6 +5,7 @@ import re
 import signal
 import subprocess
 import sys
+from collections import defaultdict
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
@@ -39,6 +40,9 @@ FILES = {
     "benchmarks/test_benchmarks.py": "campaign",
     "identify/test_drives_of_others.py": "campaign",
 }
+
+# About what a test takes on two busy cores, by its marks [s].
+USUAL_S = {"process": 3.0, "ros": 1.5, "slow": 1.5}
 
 # A run with `-m "not (a or b)"` leaves out whole files, before it imports what they need.
 LEFT_OUT = re.compile(r"not \((\w+(?: or \w+)*)\)")
@@ -86,11 +90,18 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Marks every test with the ring of its file."""
+    """Marks every test with the ring of its file, and puts long files first.
+
+    Otherwise a worker that takes a long file last keeps the others waiting.
+    """
+    seconds: defaultdict[Path, float] = defaultdict(float)
     for item in items:
         file = os.path.relpath(item.path, ROOT / "test")
         if file in FILES:
             item.add_marker(FILES[file])
+        usual = [USUAL_S.get(mark.name, 0.0) for mark in item.iter_markers()]
+        seconds[item.path] += max(usual, default=0.0)
+    items.sort(key=lambda item: -seconds[item.path])
 
 
 def pytest_report_header(config: pytest.Config) -> str:

@@ -6,12 +6,12 @@ import shutil
 import subprocess
 import sys
 import zipfile
-from email.message import Message
-from email.parser import HeaderParser
+from importlib.metadata import PackageMetadata
 from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
+from build.util import project_wheel_metadata
 from catkin_pkg.package import Package, parse_package
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
@@ -148,10 +148,9 @@ def names_in_wheel(wheel: Path) -> set[str]:
 
 
 @pytest.fixture(scope="module")
-def metadata(wheel: Path) -> Message:
-    """The wheel's core metadata."""
-    text = zipfile.ZipFile(wheel).read(f"{PACKAGE}-{VERSION}.dist-info/METADATA")
-    return HeaderParser().parsestr(text.decode())
+def metadata(checkout: Path) -> PackageMetadata:
+    """The core metadata that a wheel would have."""
+    return project_wheel_metadata(checkout, isolated=False)
 
 
 @pytest.fixture(scope="module")
@@ -191,6 +190,7 @@ def install_space(checkout: Path) -> Path:
     return workspace / "install"
 
 
+@pytest.mark.package
 def test_the_wheel_holds_every_module(checkout: Path, names_in_wheel: set[str]) -> None:
     written = files_below(checkout, PACKAGE)
     assert f"{PACKAGE}/probe/inner/leaf.py" in written
@@ -200,6 +200,7 @@ def test_the_wheel_holds_every_module(checkout: Path, names_in_wheel: set[str]) 
     } == written
 
 
+@pytest.mark.package
 def test_the_wheel_holds_every_config_launch_and_urdf_file(
     checkout: Path, names_in_wheel: set[str]
 ) -> None:
@@ -242,9 +243,11 @@ def test_colcon_puts_the_executables_where_ros2_run_looks(install_space: Path) -
     assert all(os.access(path, os.X_OK) for path in folder.iterdir())
 
 
-def test_colcon_shares_config_launch_files_urdf_and_the_ament_marker(
+def test_colcon_installs_modules_config_launch_files_urdf_and_the_ament_marker(
     checkout: Path, install_space: Path
 ) -> None:
+    (module,) = (install_space / PACKAGE).glob(f"lib/python*/site-packages/{PACKAGE}")
+    assert files_below(module.parent, PACKAGE) == files_below(checkout, PACKAGE)
     share = install_space / PACKAGE / "share"
     written = files_below(checkout, "config", "launch", "urdf")
     assert files_below(share / PACKAGE, "config", "launch", "urdf") == written
@@ -281,7 +284,7 @@ def test_package_xml_is_as_its_format_wants_it_and_every_xml_file_is_well_formed
             ElementTree.parse(file)
 
 
-def requirements(metadata: Message, extra: str = "") -> list[Requirement]:
+def requirements(metadata: PackageMetadata, extra: str = "") -> list[Requirement]:
     """What the wheel requires on this machine, with an extra or without."""
     every = [Requirement(text) for text in metadata.get_all("Requires-Dist", [])]
     return [
@@ -292,7 +295,7 @@ def requirements(metadata: Message, extra: str = "") -> list[Requirement]:
 
 
 def test_package_xml_has_the_rosdep_key_of_every_python_library(
-    metadata: Message,
+    metadata: PackageMetadata,
 ) -> None:
     libraries = {one.name for one in requirements(metadata)}
     assert "numpy" in libraries
@@ -312,7 +315,7 @@ def package_xml() -> Package:
 
 
 def test_every_requirement_is_pinned_to_a_version_that_it_allows(
-    metadata: Message,
+    metadata: PackageMetadata,
 ) -> None:
     lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
     every = [Requirement(line) for line in lines if line and not line.startswith("#")]
@@ -343,7 +346,7 @@ def test_the_linter_of_ros_2_finds_nothing_in_the_package() -> None:
 
 
 def test_a_sourced_ros_2_replaces_the_ros_wheels_and_nothing_else(
-    metadata: Message,
+    metadata: PackageMetadata,
 ) -> None:
     core, everything, without_ros, ros = (
         {one.name for one in requirements(metadata, extra)}
