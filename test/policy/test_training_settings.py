@@ -12,6 +12,8 @@ from nics_drl_bridge.policy.train.settings import (
     chosen_settings,
     load_training,
 )
+from nics_drl_bridge.sim import world_set
+from nics_drl_bridge.sim.world import load_world
 from nics_drl_bridge.sim.world_set import load_worlds
 
 PARTS = {
@@ -25,7 +27,9 @@ SHIPPED = sorted(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SHIPPED)
-def test_shipped_settings_name_worlds_and_a_task_that_there_are(name):
+def test_shipped_settings_name_worlds_and_a_task_that_there_are(name, monkeypatch):
+    # Thousands of worlds of a set are otherwise generated, which takes seconds.
+    monkeypatch.setattr(world_set, "grow", lambda *_: load_world("empty"))
     settings = load_training(name)
     model = open_model(settings.robot, settings.lidar)
     task = make_task(settings.task, model, settings.task_options)
