@@ -35,8 +35,6 @@ FILES = {
     "docs/test_shown_python.py": "docs",
     "docs/test_site.py": "docs",
     "docs/test_fresh_clone.py": "package",
-    "test_release.py": "package",
-    "test_without_ros.py": "package",
     "benchmarks/test_benchmarks.py": "campaign",
     "identify/test_drives_of_others.py": "campaign",
 }

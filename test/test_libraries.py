@@ -13,32 +13,52 @@ import nics_drl_bridge
 from nics_drl_bridge import extensions
 from nics_drl_bridge.errors import ConfigError
 
-# No distribution has these as packages of its own.
-FOREIGN = ("filterpy", "gymnasium")
-NEED_THEM = ("load_policy", "make", "make_vec")
-WITHOUT = f"""
+NEED_GYMNASIUM = ("load_policy", "make", "make_vec")
+ROS = ("rclpy", "rosidl_runtime_py", "ament_index_python", "launch", "tf2_ros")
+ROS += ("builtin_interfaces", "_msgs", "_srvs")
+WITHOUT = """
 import sys
 
-class Absent:
-    def find_spec(self, name, *_):
-        if name.partition(".")[0] in {FOREIGN}:
-            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+class Without:
+    def __init__(self, finder):
+        self.finder = finder
 
-sys.meta_path.insert(0, Absent())
+    def find_spec(self, name, path=None, target=None):
+        absent = name.partition(".")[0].endswith({names})
+        return None if absent else self.finder.find_spec(name, path, target)
+
+    def __getattr__(self, name):
+        return getattr(self.finder, name)
+
+sys.meta_path[:] = [Without(finder) for finder in sys.meta_path]
 """
+NICS = """
+from nics_drl_bridge.commands.start import main
+
+def nics(*words):
+    sys.argv = ["nics", *words]
+    try:
+        main()
+    except SystemExit as end:
+        return end.code
+"""
+SETTINGS = (
+    "{worlds: {empty: 32}, steps: 2048, hidden: [16], ppo: {rollout: 16, batch: 256}}"
+)
 
 
-def python(code, *words, path=None):
+def python(code, *words, path=None, cwd=None):
     """What a process says that runs some code; its libraries may be other ones."""
     before = [str(path)] if path else []
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([*before, *sys.path[1:]])}
     command = [sys.executable, "-c", code, *words]
     return subprocess.run(
         command,
+        cwd=cwd,
         env=environment,
         capture_output=True,
         text=True,
-        timeout=240,
+        timeout=800,
         check=False,
     )
 
@@ -71,25 +91,12 @@ def test_all_that_is_missing_or_of_a_wrong_version_is_told_at_once(monkeypatch):
     assert "pip install 'filterpy>=2.0' " in told
 
 
-NICS = """
-import sys
-from nics_drl_bridge.commands.start import main
-
-def nics(*words):
-    sys.argv = ["nics", *words]
-    try:
-        main()
-    except SystemExit as end:
-        return end.code
-"""
-
-
 @pytest.mark.process
 @pytest.mark.slow
 def test_the_core_does_without_what_no_system_brings(tmp_path):
-    names = [name for name in nics_drl_bridge.__all__ if name not in NEED_THEM]
+    names = [name for name in nics_drl_bridge.__all__ if name not in NEED_GYMNASIUM]
     car = str(tmp_path / "car.urdf")
-    code = f"""{WITHOUT}{NICS}
+    code = f"""{WITHOUT.format(names=("filterpy", "gymnasium"))}{NICS}
 import nics_drl_bridge
 for name in {names}:
     getattr(nics_drl_bridge, name)
@@ -145,3 +152,25 @@ def test_an_old_library_is_one_sentence(tmp_path, start):
     *before, sentence = done.stderr.splitlines()
     assert len(before) == (0 if command else 1)  # a node says at once that it starts
     assert "needs pydantic>=2.6 (1.10.4); pip install 'pydantic>=2.6'." in sentence
+
+
+@pytest.mark.package
+@pytest.mark.process
+@pytest.mark.timeout(900)  # a cold start compiles
+def test_without_ros_2_a_policy_is_trained_and_evaluated(tmp_path):
+    (tmp_path / "short.yaml").write_text(SETTINGS, encoding="utf-8")
+    train = "train --settings short.yaml --seeds 0 --episodes 8 --out run"
+    evaluate = "evaluate run/seed_0/policy.onnx --world empty --episodes 2 --out seen"
+    code = f"""{WITHOUT.format(names=ROS)}{NICS}
+from importlib.util import find_spec
+assert not any(map(find_spec, ("rclpy", "sensor_msgs", "std_srvs")))
+for line in ({train!r}, {evaluate!r} + " --in fast"):
+    assert not nics(*line.split()), line
+assert nics(*{evaluate!r}.split(), "--in", "dds") == 2
+"""
+    done = python(code, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "seen" / "evaluation.json").is_file()
+    sentence = done.stderr.splitlines()[-1]
+    assert sentence.startswith("nics: ")
+    assert "rclpy" in sentence

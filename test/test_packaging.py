@@ -1,20 +1,26 @@
 """The package as a user gets it: installed with pip, and built with colcon."""
 
+import io
 import os
 import re
 import shutil
 import subprocess
 import sys
 import zipfile
+from collections.abc import Sequence
 from importlib.metadata import PackageMetadata
 from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
+import yaml
 from build.util import project_wheel_metadata
 from catkin_pkg.package import Package, parse_package
+from dockerfile_parse import DockerfileParser
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+
+from nics_drl_bridge.kernels import TARGET, runs_target
 
 pytestmark = [pytest.mark.process, pytest.mark.slow]
 ROOT = Path(__file__).resolve().parents[1]
@@ -36,6 +42,13 @@ ROSDEP_KEYS = {
     "pyyaml": "python3-yaml",
 }
 WITHOUT_KEY = {"threadpoolctl"}
+OF_OTHERS = (
+    "PYTHONPATH",
+    "VIRTUAL_ENV",
+    "LD_LIBRARY_PATH",
+    "_ROS_WHEELS_BOOTSTRAP_COMPLETE",
+)
+INSTRUCTIONS = {"FROM", "WORKDIR", "COPY", "RUN", "ENTRYPOINT", "CMD"}
 VERSION = "9.8.7"  # written into the package.xml of the copy, and nowhere else
 
 # Files added to the copy, deeper than any of today's: packaging that lists folders by hand,
@@ -70,16 +83,19 @@ for point in distribution("{PACKAGE}").entry_points:
 """
 
 
-def run(*command: str | Path, cwd: Path, **env: str) -> str:
+def run(
+    *command: str | Path, cwd: Path, without: Sequence[str] = (), **env: str
+) -> str:
     """Runs a command; what it printed is returned, or shown when it fails."""
+    inherited = {key: value for key, value in os.environ.items() if key not in without}
     done = subprocess.run(
         [str(word) for word in command],
         cwd=cwd,
-        env=os.environ | env,
+        env=inherited | env,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
-        timeout=100,
+        timeout=1700,
     )
     assert done.returncode == 0, (
         f"{command} ended with {done.returncode}:\n{done.stdout}"
@@ -124,19 +140,16 @@ def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def wheel(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The wheel, built from the source archive as an index would hold it."""
-    dist = tmp_path_factory.mktemp("dist")
-    run(
-        sys.executable,
-        "-m",
-        "build",
-        "--no-isolation",
-        "--outdir",
-        dist,
-        checkout,
-        cwd=dist,
-    )
+def dist(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the source archive, and the wheel that is made of it."""
+    folder = tmp_path_factory.mktemp("dist")
+    words = ("-m", "build", "--no-isolation", "--outdir", folder, checkout)
+    run(sys.executable, *words, cwd=folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def wheel(dist: Path) -> Path:
     return next(dist.glob("*.whl"))
 
 
@@ -355,3 +368,123 @@ def test_a_sourced_ros_2_replaces_the_ros_wheels_and_nothing_else(
     assert everything - without_ros == ros - core
     for extra in set(metadata.get_all("Provides-Extra", [])) - {"distributed"}:
         assert {one.name for one in requirements(metadata, extra)} <= everything
+
+
+@pytest.mark.package
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("kind", ["*.whl", "*.tar.gz"])
+def test_a_release_runs_the_demo_outside_of_the_repository(dist, kind, tmp_path):
+    python = tmp_path / "venv" / "bin" / "python"
+    uv = Path(sys.executable).with_name("uv")
+    release = f"{next(dist.glob(kind))}[ros,deploy]"
+    constraints = ("--constraints", ROOT / "constraints.txt")
+    demo = ["demo", "--policy", "differential", "--episodes", "2", "--out", "demo"]
+    for command in (
+        (uv, "venv", "--python", sys.executable, tmp_path / "venv"),
+        (uv, "pip", "install", "--python", python, *constraints, release),
+        (python, "-c", WHERE_AM_I),
+        (python.with_name("nics"), *demo),
+    ):
+        told = run(*command, cwd=tmp_path, without=OF_OTHERS)
+        if WHERE_AM_I in command:
+            assert str(tmp_path) in told
+    assert "in process 2/2, over DDS 2/2" in told
+    assert (tmp_path / "demo" / "paths.png").is_file()
+    assert (tmp_path / "demo" / "report.html").is_file()
+
+
+FIRST_STEPS = """
+import time
+begin = time.process_time()
+import hashlib
+from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+from nics_drl_bridge.kernels import COMPILING
+
+env = BridgeVectorEnv(512)
+env.action_space.seed(0)
+env.reset(seed=0)
+env.step(env.action_space.sample())
+spent = time.process_time() - begin
+digest = hashlib.sha256()
+for _ in range(200):
+    observation, reward, *_ = env.step(env.action_space.sample())
+    digest.update(observation.tobytes() + reward.tobytes())
+print(spent, COMPILING.count, digest.hexdigest())
+"""
+
+
+@pytest.mark.package
+@pytest.mark.timeout(3600)
+@pytest.mark.skipif(not runs_target(), reason=f"this machine does not run {TARGET}")
+def test_a_wheel_with_machine_code_compiles_nothing_and_gives_the_same_bits(tmp_path):
+    made = (f"WHEEL={tmp_path / 'made'}", f"DIST={tmp_path}")
+    run("make", "--old-file", "setup", "wheel", *made, cwd=ROOT, without=OF_OTHERS)
+    uv = Path(sys.executable).with_name("uv")
+    python = tmp_path / "venv" / "bin" / "python"
+    run(
+        uv,
+        "venv",
+        "--python",
+        sys.executable,
+        tmp_path / "venv",
+        cwd=tmp_path,
+        without=OF_OTHERS,
+    )
+    install = (uv, "pip", "install", "--compile-bytecode", "--python", python)
+    pins = ("--constraints", ROOT / "constraints.txt")
+    run(*install, *pins, next(tmp_path.glob("*.whl")), cwd=tmp_path, without=OF_OTHERS)
+    spent_s, compiled, digest = run(
+        python, "-c", FIRST_STEPS, cwd=tmp_path, without=OF_OTHERS
+    ).split()
+    assert int(compiled) == 0
+    assert float(spent_s) < 5.0  # of CPU, a twentieth of what compiling takes
+    from_source = run(
+        sys.executable, "-c", FIRST_STEPS, cwd=tmp_path, without=OF_OTHERS
+    ).split()
+    assert digest == from_source[-1]
+
+
+def text_of(name: str) -> str:
+    return (ROOT / name).read_text(encoding="utf-8")
+
+
+def test_the_container_file_copies_what_there_is_and_runs_what_is_installed(metadata):
+    file = io.BytesIO((ROOT / "Containerfile").read_bytes())
+    every = DockerfileParser(fileobj=file).structure
+    lines = [
+        (one["instruction"], one["value"])
+        for one in every
+        if one["instruction"] != "COMMENT"
+    ]
+    assert lines[0][0] == "FROM"
+    assert {name for name, _ in lines} == INSTRUCTIONS
+    for name, words in lines:
+        if name == "COPY":
+            *sources, _ = words.split()
+            assert all((ROOT / source).exists() for source in sources), words
+    asked = re.search(r"'\.\[(.*?)\]'", text_of("Containerfile"))
+    assert set(asked[1].split(",")) <= set(metadata.get_all("Provides-Extra"))
+    assert dict(lines)["ENTRYPOINT"] == '["nics"]'
+
+
+def test_the_citation_has_the_version_of_the_package_and_what_its_format_needs():
+    citation = yaml.safe_load(text_of("CITATION.cff"))
+    assert {"cff-version", "message", "title", "authors"} <= set(citation)
+    assert all(one["authors"] for one in (citation, *citation["references"]))
+    (version,) = re.findall("<version>(.*)</version>", text_of("package.xml"))
+    assert citation["version"] == version
+    assert f"{citation['license']}" in text_of("LICENSE")
+
+
+@pytest.mark.parametrize("name", ["README.md", "docs/install.md", "Makefile"])
+def test_the_versions_of_python_are_those_of_setup(name):
+    wanted = r'python_requires=">=3\.(\d+),<3\.(\d+)"'
+    low, high = re.search(wanted, text_of("setup.py")).groups()
+    told = set(re.findall(r"3\.(\d+) to 3\.(\d+)", text_of(name)))
+    assert told == {(low, str(int(high) - 1))}
+
+
+def test_the_page_on_installing_has_every_extra_that_users_need(metadata):
+    extras = set(metadata.get_all("Provides-Extra")) - {"test", "dev-without-ros"}
+    page = text_of("docs/install.md")
+    assert extras == set(re.findall(r"^\| `([\w-]+)` \|", page, re.MULTILINE))

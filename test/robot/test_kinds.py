@@ -200,9 +200,9 @@ def test_a_robot_that_does_not_fit_its_kind_is_refused(kind, changes, fault):
 
 
 def successes(env, policy):
-    """In how many of three episodes the goal is reached."""
+    """In how many of two episodes the goal is reached."""
     reached = 0
-    for seed in range(3):
+    for seed in range(2):
         observation, info, ended = *env.reset(seed=seed), False
         for _ in range(200):
             observation, _, ended, _, info = env.step(policy.act(observation))
@@ -249,8 +249,8 @@ def test_a_model_moves_as_its_kind_and_drives_in_an_env_to_goals(model):
     env = BridgeEnv(model=model, world="empty")
     names = ("dynamic_window",) if robot.name == NEW else ("straight", "dynamic_window")
     for name in names if robot.name != "ackermann" else ():
-        assert successes(env, make_policy(name, env.task)) == 3
-        assert successes(env, make_policy(name, env.task, model)) == 3
+        assert successes(env, make_policy(name, env.task)) == 2
+        assert successes(env, make_policy(name, env.task, model)) == 2
 
 
 @pytest.mark.slow
@@ -261,7 +261,7 @@ def test_a_free_robot_reaches_goals_by_its_model_and_not_without(name):
     robot = build_robot({"kind": "free", "footprint_radius": 0.2}, ranges)
     model = generate(record(car, np.random.default_rng(0)), robot, lidar(), ())[0]
     env = BridgeEnv(model=model, world="empty")
-    assert successes(env, make_policy(name, env.task, model)) == 3
+    assert successes(env, make_policy(name, env.task, model)) == 2
     observation, _ = env.reset(seed=0)
     with pytest.raises(ConfigError, match="has no textbook kinematics"):
         make_policy(name, env.task).act(observation)
