@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-import scipy  # .signal loads in a second, when used
+import scipy  # its parts load slowly, when used
 
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import shooting

@@ -8,8 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy  # its parts load slowly, when used
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.geometry import Array
@@ -341,7 +341,7 @@ class _Search:
         high[:count] = ((inputs.high - inputs.start) / inputs.scale)[at]
         aside = INSIDE * (high - low)[:count]  # at a bound the search would not move
         start[:count] = np.clip(0.0, low[:count] + aside, high[:count] - aside)
-        solution = least_squares(
+        solution = scipy.optimize.least_squares(
             self.residual,
             start,
             jac=self.jacobian,

@@ -14,9 +14,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-import scipy  # .signal loads in a second, when used
+import scipy  # its parts load slowly, when used
 from numpy.typing import NDArray
-from scipy.interpolate import make_interp_spline
 
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.kernels import limp
@@ -230,7 +229,7 @@ def resample(
     pose = pose[distinct]
     weights = weights[distinct]
     if half_width == 0.0:
-        return np.asarray(make_interp_spline(t, pose, k=3)(at))
+        return np.asarray(scipy.interpolate.make_interp_spline(t, pose, k=3)(at))
     # Rows first to last - 1 are the poses of each time; `row` (n, m) pads them to one number m.
     first = np.minimum(np.searchsorted(t, at - half_width), np.searchsorted(t, at) - 2)
     first = np.clip(first, 0, max(len(t) - FEWEST_SMOOTHED, 0))

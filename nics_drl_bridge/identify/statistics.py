@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy  # its parts load slowly, when used
 from numpy.typing import NDArray
 from scipy.linalg import qr, solve_triangular
-from scipy.optimize import least_squares
 
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording.recording import Samples
@@ -51,7 +51,7 @@ def minimise(
     slope: Any = "2-point"
     if jacobian is not None:
         slope = lambda z: jacobian(start + (z - 1.0) * scale) * scale  # noqa: E731
-    solution = least_squares(
+    solution = scipy.optimize.least_squares(
         lambda z: residual(start + (z - 1.0) * scale),
         np.ones(len(start)),
         jac=slope,

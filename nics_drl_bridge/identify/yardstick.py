@@ -5,9 +5,8 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-import scipy  # .signal loads in a second, when used
+import scipy  # its parts load slowly, when used
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError, RecordingError
@@ -386,7 +385,7 @@ def fit_yardstick(
             return np.asarray(np.nan_to_num(rates)).ravel()
 
         theta = form.pack()
-        solution = least_squares(
+        solution = scipy.optimize.least_squares(
             residuals,
             theta,
             x_scale=np.maximum(np.abs(theta), 0.05),

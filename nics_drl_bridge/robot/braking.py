@@ -13,8 +13,8 @@ from itertools import combinations, product
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy  # its parts load slowly, when used
 from numpy.typing import NDArray
-from scipy.optimize import linprog
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array
@@ -523,7 +523,7 @@ def _fit_tightest(
     ahead = whole[straight] * weight
     cost = np.array([ahead.mean(), (ahead * pace[straight]).mean()])
     rows = np.stack([-whole, -whole * pace], axis=-1)
-    result = linprog(cost, rows, -distance, bounds=(0.0, None))
+    result = scipy.optimize.linprog(cost, rows, -distance, bounds=(0.0, None))
     if not result.success:
         return _Fit(
             slack=math.inf,
