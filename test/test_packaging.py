@@ -8,6 +8,7 @@ import subprocess
 import sys
 import zipfile
 from collections.abc import Sequence
+from functools import partial
 from importlib.metadata import PackageMetadata
 from pathlib import Path
 from xml.etree import ElementTree
@@ -101,6 +102,9 @@ def run(
         f"{command} ended with {done.returncode}:\n{done.stdout}"
     )
     return done.stdout
+
+
+run_apart = partial(run, without=OF_OTHERS)
 
 
 def files_below(root: Path, *tops: str) -> set[str]:
@@ -385,7 +389,7 @@ def test_a_release_runs_the_demo_outside_of_the_repository(dist, kind, tmp_path)
         (python, "-c", WHERE_AM_I),
         (python.with_name("nics"), *demo),
     ):
-        told = run(*command, cwd=tmp_path, without=OF_OTHERS)
+        told = run_apart(*command, cwd=tmp_path)
         if WHERE_AM_I in command:
             assert str(tmp_path) in told
     assert "in process 2/2, over DDS 2/2" in told
@@ -418,29 +422,26 @@ print(spent, COMPILING.count, digest.hexdigest())
 @pytest.mark.skipif(not runs_target(), reason=f"this machine does not run {TARGET}")
 def test_a_wheel_with_machine_code_compiles_nothing_and_gives_the_same_bits(tmp_path):
     made = (f"WHEEL={tmp_path / 'made'}", f"DIST={tmp_path}")
-    run("make", "--old-file", "setup", "wheel", *made, cwd=ROOT, without=OF_OTHERS)
+    run_apart("make", "--old-file", "setup", "wheel", *made, cwd=ROOT)
     uv = Path(sys.executable).with_name("uv")
     python = tmp_path / "venv" / "bin" / "python"
-    run(
+    run_apart(
         uv,
         "venv",
         "--python",
         sys.executable,
         tmp_path / "venv",
         cwd=tmp_path,
-        without=OF_OTHERS,
     )
     install = (uv, "pip", "install", "--compile-bytecode", "--python", python)
     pins = ("--constraints", ROOT / "constraints.txt")
-    run(*install, *pins, next(tmp_path.glob("*.whl")), cwd=tmp_path, without=OF_OTHERS)
-    spent_s, compiled, digest = run(
-        python, "-c", FIRST_STEPS, cwd=tmp_path, without=OF_OTHERS
+    run_apart(*install, *pins, next(tmp_path.glob("*.whl")), cwd=tmp_path)
+    spent_s, compiled, digest = run_apart(
+        python, "-c", FIRST_STEPS, cwd=tmp_path
     ).split()
     assert int(compiled) == 0
     assert float(spent_s) < 5.0  # of CPU, a twentieth of what compiling takes
-    from_source = run(
-        sys.executable, "-c", FIRST_STEPS, cwd=tmp_path, without=OF_OTHERS
-    ).split()
+    from_source = run_apart(sys.executable, "-c", FIRST_STEPS, cwd=tmp_path).split()
     assert digest == from_source[-1]
 
 
