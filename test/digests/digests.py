@@ -2,7 +2,7 @@
 
 Each digest runs a part of the package on fixed seeds and keeps a few projections of all that came
 out on fixed random signs, so that one number that changes shows. In `test`,
-`PYTHONPATH=../benchmarks python -m digests.digests NAME...` records them again, for a
+`PYTHONPATH=../benchmarks:campaigns python -m digests.digests NAME...` records them again, for a
 change that is meant to change them.
 """
 
@@ -128,11 +128,18 @@ def identified() -> Found:
     found = {}
     for name, disturbed in {
         "clean": {},
+        "late and noisy": {"latency": 0.08, "noise": (0.002, 0.004), "seed": 1},
         "turned": {
             "rotation": 0.1,
             "lever": (0.05, -0.02),
             "noise": (0.001, 0.002),
             "seed": 2,
+        },
+        "bursts": {
+            "burst": 0.1,
+            "pose_clock_ahead": 3.0,
+            "noise": (0.001, 0.002),
+            "seed": 3,
         },
         "poses only": {"measured_state": False, "latency": 0.05, "seed": 4},
     }.items():
@@ -159,6 +166,36 @@ def numbers_of(data: Any) -> list[float]:
     return [float(data)] if isinstance(data, int | float) else []
 
 
+def gate() -> Found:
+    """What the gate decides about adversaries, moment by moment, with its shipped shield."""
+    from parts import shield_in_process
+    from parts.adversaries import ADVERSARIES
+    from parts.shield_places import Job, Place
+
+    found = {}
+    for index, robot in enumerate(ROBOTS):
+        place = Place(robot, ("crowd", "clutter", "arena")[index])
+        config = shield_in_process.config_of(place, {})
+        decisions: list[float] = []
+        for seed, kind in enumerate(ADVERSARIES):
+            shield_in_process.drive(
+                place, config, [Job(kind, seed)], decisions_into(decisions)
+            )
+        found[robot] = projected(decisions)
+    return found
+
+
+def decisions_into(kept: list[float]) -> Callable[[Any, float], None]:
+    """Keeps what each decision says: the twist, the rule that stopped it, and the latch."""
+
+    def keep(decision: Any, now: float) -> None:
+        cause = decision.cause
+        rule = "" if cause is None else cause.rule
+        kept.extend([*decision.twist, float(sum(rule.encode()))])
+
+    return keep
+
+
 DIGESTS: dict[str, Callable[[], Found]] = {
     each.__name__: each
     for each in (
@@ -167,6 +204,7 @@ DIGESTS: dict[str, Callable[[], Found]] = {
         table_1,
         table_2,
         identified,
+        gate,
         motion_state_errors,
         motion_state_terms,
         barn,
@@ -186,6 +224,7 @@ def main() -> None:
     """Records digests again: those that are named, or all."""
     sys.path[:0] = [
         str(TEST),
+        str(TEST / "campaigns"),
         str(TEST.parent / "benchmarks"),
     ]
     kept = json.loads(FILE.read_text()) if FILE.exists() else {}
