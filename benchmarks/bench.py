@@ -43,6 +43,8 @@ MARK = "NICS_BENCHMARK_RUN"
 """The environment variable by which the processes of a run are found again."""
 GRACE_S = 10.0
 LAST_WORDS = 2000
+Given = argparse.Namespace
+Result = dict[str, Any]
 LIBRARIES = ("numpy", "numba", "scipy", "gymnasium", "torch", "onnxruntime", "mujoco")
 
 
@@ -90,25 +92,37 @@ class Control:
 
 @dataclass(frozen=True)
 class Benchmark:
-    """One of the benchmarks of a file.
+    """One of the benchmarks of a file, or a campaign.
 
     Attributes:
         measure: takes the arguments and returns the figures; its docstring says what is measured.
-        judge: returns a sentence for each bar that the figures miss.
+        judge: bars by the names of figures, or what returns a sentence for each bar that is missed.
         controls: by their names.
-        options: settings of further arguments, by their names.
+        options: further arguments by their names: the default value, that and a help, or settings
+            of `argparse`.
         short: arguments of a short form; None where there is none.
         unsettled: words of the bars that the short form does not settle.
         needs: modules to import.
     """
 
     measure: Callable[[argparse.Namespace], dict[str, Any]]
-    judge: Callable[[dict[str, Any]], list[str]]
+    judge: Mapping[str, Bar] | Callable[[dict[str, Any]], list[str]]
     controls: Mapping[str, Control]
-    options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    options: Mapping[str, Any] = field(default_factory=dict)
     short: str | None = ""
     unsettled: tuple[str, ...] = ()
     needs: tuple[str, ...] = ()
+
+    def run(self, words: Sequence[str], doc: str | None = None) -> NoReturn:
+        """Measures and answers by arguments; `--short` puts those of the short form before them."""
+        parser = make_parser(doc or self.measure.__doc__, self)
+        if "--short" in words and self.short is not None:
+            words = [*self.short.split(), *words]
+        given = parser.parse_args(words)
+        result = self.measure(given)
+        judge = self.judge
+        missed = judge(result) if callable(judge) else missed_bars(result, judge)
+        answer(result, missed, given.json)
 
 
 def run_benchmark(benchmarks: Mapping[str, Benchmark]) -> NoReturn:
@@ -118,14 +132,12 @@ def run_benchmark(benchmarks: Mapping[str, Benchmark]) -> NoReturn:
         words = [*benchmarks, *words]
     if not words or words[0] not in benchmarks:
         raise SystemExit(f"name a benchmark: {', '.join(benchmarks)}")
-    chosen = benchmarks[words[0]]
-    controls = {key: control.what for key, control in chosen.controls.items()}
-    parser = parser_of(chosen.measure.__doc__, controls)
-    for option, settings in chosen.options.items():
-        parser.add_argument(f"--{option}", **settings)
-    given = parser.parse_args(words[1:])
-    result = chosen.measure(given)
-    answer(result, chosen.judge(result), given.json)
+    benchmarks[words[0]].run(words[1:])
+
+
+def some_of(choices: Sequence[str]) -> dict[str, Any]:
+    """Settings of an argument that takes some words of those that there are, by default all."""
+    return {"nargs": "+", "choices": list(choices), "default": list(choices)}
 
 
 def at_most(value: float, what: str = "") -> Bar:
@@ -153,19 +165,10 @@ def missed_bars(
     ]
 
 
-def parser_of(
-    doc: str | None,
-    controls: Mapping[str, str],
-    kind: type = argparse.ArgumentParser,
-) -> Any:
-    """A parser with `--json` and `--control`, described by the first line of a module.
-
-    Args:
-        doc: of the benchmark's module.
-        controls: name -> what is taken out; `--control` alone takes the first one.
-        kind: of the parser.
-    """
-    parser = kind(
+def make_parser(doc: str | None, about: Benchmark) -> argparse.ArgumentParser:
+    """A parser that is described by the first line of a docstring."""
+    controls = {name: control.what for name, control in about.controls.items()}
+    parser = argparse.ArgumentParser(
         description=(doc or "").splitlines()[0],
         epilog="controls, which must fail: "
         + "; ".join(f"{k}: {v}" for k, v in controls.items()),
@@ -174,10 +177,20 @@ def parser_of(
     parser.add_argument(
         "--control",
         nargs="?",
-        const=next(iter(controls)),
+        const=next(iter(controls), None),
         choices=list(controls),
         help="take out what is measured: the bars must then be missed",
     )
+    if about.short is not None:
+        told = f"the short form: {about.short or 'as it is'}"
+        parser.add_argument("--short", action="store_true", help=told)
+    for name, settings in about.options.items():
+        if not isinstance(settings, Mapping):
+            value, told = settings if isinstance(settings, tuple) else (settings, None)
+            settings = {"type": type(value), "default": value, "help": told}
+            if value is False:
+                settings = {"action": "store_true", "help": told}
+        parser.add_argument(f"--{name}", **settings)
     return parser
 
 
@@ -191,22 +204,19 @@ def table_of(result: Mapping[str, Any], indent: str = "") -> str:
     )
 
 
-def answer(
-    result: Mapping[str, Any], missed: Sequence[str], as_json: bool, table: str = ""
-) -> NoReturn:
+def answer(result: Mapping[str, Any], missed: Sequence[str], as_json: bool) -> NoReturn:
     """Prints a result and the missed bars, and ends with 1 if there are any, else 0.
 
     Args:
         result: what was measured, as JSON can hold it; what is not finite becomes null.
         missed: a sentence for each bar that was missed, with the figure and the bar.
         as_json: whether to print one JSON object, with the sentences as `failures`.
-        table: the result for people, where it is another than a line for each figure.
     """
     if as_json:
         told = finite({**result, FAILURES: list(missed)})
         sys.stdout.write(json.dumps(told, allow_nan=False) + "\n")
     else:
-        sys.stdout.write(table or table_of(result))
+        sys.stdout.write(table_of(result))
         sys.stdout.write("".join(f"FAILED: {line}\n" for line in missed))
     raise SystemExit(1 if missed else 0)
 
@@ -224,6 +234,7 @@ def finite(value: Any) -> Any:
 # figures of the tables. Some campaigns give figures, too; they run in their folder.
 
 CAMPAIGNS = "../test/campaigns/"
+TIMEOUT_S = 600.0
 LONG_TIMEOUT_S = 4 * 3600.0
 
 
@@ -232,27 +243,24 @@ class Run:
     """One run of a script.
 
     Attributes:
-        script: its file, from the folder of the benchmarks.
-        benchmark: of that file; empty for a script of one.
+        what: the script, from the folder of the benchmarks, and the benchmark of it, if of many.
         arguments: within half an hour for all runs.
-        long: those of the long version.
-        timeout_s: after which a run is ended [s].
+        long: those of the long version, where they are others.
     """
 
-    script: str
-    benchmark: str = ""
-    arguments: tuple[str, ...] = ()
-    long: tuple[str, ...] = ()
-    timeout_s: float = 600.0
-    long_timeout_s: float = LONG_TIMEOUT_S
+    what: str
+    arguments: str = ""
+    long: str | None = None
 
+    @property
+    def script(self) -> str:
+        """The file."""
+        return f"{self.what.split()[0]}.py"
 
-def make_run(what: str, arguments: str = "", long: str | None = None) -> Run:
-    """A run of `SCRIPT BENCHMARK`, with arguments as one would type them."""
-    script, _, benchmark = what.partition(" ")
-    words = tuple(arguments.split())
-    longer = words if long is None else tuple(long.split())
-    return Run(f"{script}.py", benchmark, words, longer)
+    def words(self, long: bool) -> list[str]:
+        """The arguments of the script."""
+        chosen = self.long if long and self.long is not None else self.arguments
+        return [*self.what.split()[1:], *chosen.split()]
 
 
 LEARNERS = ("differential", "ackermann", "mecanum")
@@ -263,48 +271,48 @@ LIDARS = {
     "sick": "sick_tim571",
 }
 RUNS: dict[str, Run] = {
-    "barn": make_run("policies barn", "--every 5", ""),
-    "barn_five_fold": make_run("policies barn", "--five-fold --folds 1", "--five-fold"),
-    "barn_mujoco": make_run("policies barn", "--in mujoco_dds --policy jackal"),
-    "baselines": make_run("policies baselines", "--episodes 50", "--episodes 200"),
-    "env_scaling": make_run("speed env_scaling"),
-    "env_throughput": make_run("speed env_throughput", "--repeats 3", ""),
+    "barn": Run("policies barn", "--every 5", ""),
+    "barn_five_fold": Run("policies barn", "--five-fold --folds 1", "--five-fold"),
+    "barn_mujoco": Run("policies barn", "--in mujoco_dds --policy jackal"),
+    "baselines": Run("policies baselines", "--episodes 50", "--episodes 200"),
+    "env_scaling": Run("speed env_scaling"),
+    "env_throughput": Run("speed env_throughput", "--repeats 3", ""),
     **{
-        f"env_throughput_{name}": make_run(
+        f"env_throughput_{name}": Run(
             "speed env_throughput", f"--lidar {lidar} --repeats 3", f"--lidar {lidar}"
         )
         for name, lidar in LIDARS.items()
     },
-    "env_throughput_obstacles": make_run(
+    "env_throughput_obstacles": Run(
         "speed env_throughput", "--obstacles 260 --repeats 3", "--obstacles 260"
     ),
-    "estimator": make_run("fidelity estimator", "--drives 30", ""),
-    "fig4_pointcloud": make_run("paper fig4_pointcloud", "--scans 60", ""),
-    "first_hour": make_run("first_hour"),
-    "gate_envelope": make_run(
+    "estimator": Run("fidelity estimator", "--drives 30", ""),
+    "fig4_pointcloud": Run("paper fig4_pointcloud", "--scans 60", ""),
+    "first_hour": Run("first_hour"),
+    "gate_envelope": Run(
         CAMPAIGNS + "gate_envelope", "--steps 30000", "--steps 1000000"
     ),
-    "gate_faults": make_run(
+    "gate_faults": Run(
         CAMPAIGNS + "gate_faults", "--repeats 1", "--load 2 --repeats 100"
     ),
-    "generate_from_mujoco": make_run("fidelity generate_from_mujoco", "--drives 3", ""),
-    "lidar_complexity": make_run("paper lidar_complexity", "--repeats 20", ""),
-    "lidar_peers": make_run("speed lidar_peers"),
-    "paper_fig7": make_run("paper paper_fig7", "--episodes 1", ""),
-    "parity": make_run(CAMPAIGNS + "parity"),
-    "ros_lockstep": make_run("speed ros_lockstep", "--chunks 40", ""),
-    "shield": make_run(
+    "generate_from_mujoco": Run("fidelity generate_from_mujoco", "--drives 3", ""),
+    "lidar_complexity": Run("paper lidar_complexity", "--repeats 20", ""),
+    "lidar_peers": Run("speed lidar_peers"),
+    "paper_fig7": Run("paper paper_fig7", "--episodes 1", ""),
+    "parity": Run(CAMPAIGNS + "parity"),
+    "ros_lockstep": Run("speed ros_lockstep", "--chunks 40", ""),
+    "shield": Run(
         CAMPAIGNS + "shield", "--in-process --episodes 300", "--episodes 3000"
     ),
-    "standards": make_run(CAMPAIGNS + "standards"),
-    "table1_kinematics": make_run("paper table1_kinematics"),
-    "table3_density": make_run("paper table3_density"),
-    "map_lidar": make_run("speed map_lidar"),
-    "real_drives": make_run("fidelity real_drives"),
-    "table2_lidar": make_run("paper table2_lidar"),
-    "table2_hokuyo": make_run("paper table2_lidar", "--lidar hokuyo_ust_10lx"),
+    "standards": Run(CAMPAIGNS + "standards"),
+    "table1_kinematics": Run("paper table1_kinematics"),
+    "table3_density": Run("paper table3_density"),
+    "map_lidar": Run("speed map_lidar"),
+    "real_drives": Run("fidelity real_drives"),
+    "table2_lidar": Run("paper table2_lidar"),
+    "table2_hokuyo": Run("paper table2_lidar", "--lidar hokuyo_ust_10lx"),
     **{
-        f"training_{robot}{name}": make_run(
+        f"training_{robot}{name}": Run(
             "policies training",
             f"--robot {robot}{lidar} --seeds 0",
             f"--robot {robot}{lidar} --seeds 0 1 2",
@@ -313,13 +321,13 @@ RUNS: dict[str, Run] = {
         for robot in LEARNERS
     },
     **{
-        f"robustness_{robot}": make_run(
+        f"robustness_{robot}": Run(
             "policies robustness", f"--robots {robot} --episodes 1", f"--robots {robot}"
         )
         for robot in SHIPPED
     },
     **{
-        f"transfer_{robot}": make_run(
+        f"transfer_{robot}": Run(
             "policies transfer", f"--robots {robot} --episodes 3", f"--robots {robot}"
         )
         for robot in SHIPPED
@@ -327,17 +335,12 @@ RUNS: dict[str, Run] = {
 }
 
 
-NO_SCRIPTS = ("bench.py", "figures.py")
-
-
 def plan_of(folder: Path) -> dict[str, Run]:
     """Every run of the scripts in a folder, by name; a script without a row is run as it is."""
-    found = {name: run for name, run in RUNS.items() if (folder / run.script).exists()}
-    known = {*NO_SCRIPTS, *(run.script for run in RUNS.values())}
-    for path in sorted(folder.glob("*.py")):
-        if path.name not in known:
-            found[path.stem] = Run(path.name)
-    return found
+    known = {"bench.py", "figures.py", *(run.script for run in RUNS.values())}
+    others = (path for path in sorted(folder.glob("*.py")) if path.name not in known)
+    there = {name: run for name, run in RUNS.items() if (folder / run.script).exists()}
+    return there | {path.stem: Run(path.stem) for path in others}
 
 
 # A run: a benchmark in a process of its own, to its end.
@@ -539,11 +542,8 @@ def run_all(given: argparse.Namespace, plan: Mapping[str, Any]) -> int:
     states = []
     for name in chosen:
         run = plan[name]
-        arguments = run.long if given.long else run.arguments
-        timeout_s = given.timeout or (
-            run.long_timeout_s if given.long else run.timeout_s
-        )
-        words = (*filter(None, [run.benchmark]), *arguments)
+        words = run.words(given.long)
+        timeout_s = given.timeout or (LONG_TIMEOUT_S if given.long else TIMEOUT_S)
         sys.stderr.write(f"{name}: {run.script} {' '.join(words)}\n")
         entry = {
             "script": Path(run.script).name,

@@ -5,7 +5,6 @@ python benchmarks/fidelity.py real_drives | generate_from_mujoco | estimator
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
 from collections import deque
@@ -16,11 +15,28 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bench import Benchmark, Control, at_least, at_most, missed_bars, run_benchmark
-from measuring.drive_bars import DRIVES, RECORDINGS, SEGMENT_S, SEGMENTED, judge_drives
+from bench import (
+    Benchmark,
+    Control,
+    Given,
+    Result,
+    at_least,
+    at_most,
+    missed_bars,
+    run_benchmark,
+    some_of,
+)
+from measuring.drives import (
+    DRIVES,
+    RECORDINGS,
+    SEGMENT_S,
+    SEGMENTED,
+    Truth,
+    compared,
+    judge_drives,
+)
 from measuring.foreign_robots import ROBOTS, foreign_drive
 from measuring.rates import interleaved, shortest
-from measuring.truths import Truth, compared
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BridgeError
@@ -48,9 +64,6 @@ from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import World
-
-Given = argparse.Namespace
-Result = dict[str, Any]
 
 # Real drives
 
@@ -513,7 +526,6 @@ def judge_estimator(result: Result) -> list[str]:
     return missed
 
 
-NAMES = [*DRIVES, *ROBOTS]
 BENCHMARKS = {
     "real_drives": Benchmark(
         measure_real_drives,
@@ -523,8 +535,8 @@ BENCHMARKS = {
             "shuffled": Control("the time: commands are of another", "error_m"),
         },
         {
-            "recordings": {"type": Path, "default": RECORDINGS, "help": "folder"},
-            "only": {"nargs": "+", "choices": NAMES, "default": NAMES},
+            "recordings": (RECORDINGS, "folder"),
+            "only": some_of((*DRIVES, *ROBOTS)),
         },
         short=f"--only {SEGMENTED}",
     ),
@@ -537,15 +549,11 @@ BENCHMARKS = {
             "nan": Control("one coefficient", "over_path nan"),
         },
         {
-            "train": {"type": float, "default": 90.0, "help": "to learn from [s]"},
-            "unseen": {"type": float, "default": 20.0, "help": "of each other drive"},
-            "drives": {"type": int, "default": 8, "help": "unseen ones"},
-            "seed": {"type": int, "default": 0, "help": "of the drive to learn"},
-            "robots": {
-                "nargs": "+",
-                "choices": MUJOCO_ROBOTS,
-                "default": list(MUJOCO_ROBOTS),
-            },
+            "train": (90.0, "to learn from [s]"),
+            "unseen": (20.0, "of each other drive"),
+            "drives": (8, "unseen ones"),
+            "seed": (0, "of the drive to learn"),
+            "robots": some_of(MUJOCO_ROBOTS),
         },
         short="--robots differential --train 40 --unseen 10 --drives 1",
         unsettled=("MuJoCo's speed",),
@@ -561,8 +569,8 @@ BENCHMARKS = {
             "stands": Control("the motion: robots do not move", "way_m"),
         },
         {
-            "drives": {"type": int, "default": 100, "help": "of each robot"},
-            "seed": {"type": int, "default": 0},
+            "drives": (100, "of each robot"),
+            "seed": 0,
         },
         short="--drives 11",
     ),

@@ -23,6 +23,7 @@ from bench import (
     at_most,
     missed_bars,
     run_benchmark,
+    some_of,
 )
 from measuring.environments import newcomer, wait_for
 from PIL import Image, ImageChops
@@ -143,7 +144,7 @@ BENCHMARKS = {
                 "--roads robot",
             )
         },
-        {"roads": {"nargs": "+", "choices": list(ROADS), "default": list(ROADS)}},
+        {"roads": some_of(tuple(ROADS))},
         short=None,
     )
 }

@@ -7,7 +7,6 @@ python benchmarks/paper.py fig4_pointcloud | paper_fig7
 
 from __future__ import annotations
 
-import argparse
 import shutil
 import tempfile
 import time
@@ -18,8 +17,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bench import Benchmark, Control, at_least, at_most, missed_bars, run_benchmark
-from measuring import clouds, mujoco_rays
+from bench import (
+    Benchmark,
+    Control,
+    Given,
+    Result,
+    at_least,
+    at_most,
+    missed_bars,
+    run_benchmark,
+    some_of,
+)
+from measuring import fig4
 from measuring.environments import NotInstalledError
 from measuring.rates import interleaved, medians, shortest
 from measuring.scenes import (
@@ -52,8 +61,6 @@ from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.style import render_png
 
 Array = NDArray[np.float64]
-Given = argparse.Namespace
-Result = dict[str, Any]
 
 # Table I
 
@@ -76,7 +83,6 @@ EXACT = 1e-12  # below this an error is rounding, whatever the paper has
 # Times the speed of plain Python in the same run.
 FASTER_ALONE = 100.0
 FASTER_TOGETHER = 1000.0
-FLOAT32_M = 1e-4
 ROBOTS = 1024
 BATCHED_STEPS = 400
 SINGLE_STEPS = 100_000
@@ -133,36 +139,21 @@ def _average(values: Array) -> Array:
     return np.sqrt((values**2).mean(axis=0))
 
 
-def make_batch(model: TaylorModel, dtype: type, robot: Subject) -> tuple[Any, ...]:
-    """Returns arguments of `kernels.run` for robots at the origin under random inputs."""
+def time_batched(model: TaylorModel, robot: Subject) -> float:
+    """Returns robot-steps per second of many robots, at the origin under random inputs."""
     terms = kernels.make_terms(model)
     rng = np.random.default_rng(3)
-    x = np.ones((len(model.variables) + 1, ROBOTS), dtype)
+    x = np.ones((len(model.variables) + 1, ROBOTS))
     low = robot.spec.command_low[:, None]
     high = robot.spec.command_high[:, None]
     x[:-1] = rng.uniform(low, high, (len(low), ROBOTS))
-    pose = np.zeros((6, ROBOTS), dtype)
+    pose = np.zeros((6, ROBOTS))
     pose[2] = 1.0
-    each = np.repeat(terms.coefficient[:, None], ROBOTS, axis=1).astype(dtype)
+    each = np.repeat(terms.coefficient[:, None], ROBOTS, axis=1)
     terms = terms._replace(coefficient=each)
-    dq = np.zeros((len(model.dofs), ROBOTS), dtype)
-    return pose, x, dq, terms, kernels.SERIES.astype(dtype), dtype(model.dt)
-
-
-def find_float32_error(model: TaylorModel, robot: Subject) -> float:
-    """Returns the largest distance between float32 and float64 after 1,000 steps [m]."""
-    ends = []
-    for dtype in (np.float32, np.float64):
-        arguments = make_batch(model, dtype, robot)
-        kernels.run(*arguments, 1000)
-        ends.append(arguments[0][:2].astype(np.float64))
-    return float(np.hypot(*(ends[0] - ends[1])).max())
-
-
-def time_batched(model: TaylorModel, dtype: type, robot: Subject) -> float:
-    """Returns robot-steps per second of many robots on one thread."""
-    arguments = make_batch(model, dtype, robot)
-    call = partial(kernels.run, *arguments, BATCHED_STEPS)
+    dq = np.zeros((len(model.dofs), ROBOTS))
+    series = kernels.SERIES
+    call = partial(kernels.run, pose, x, dq, terms, series, model.dt, BATCHED_STEPS)
     times = interleaved({"run": call}, REPEATS)
     return ROBOTS * BATCHED_STEPS / shortest(times)["run"]
 
@@ -212,7 +203,7 @@ def measure_robot(name: str, control: str | None) -> Result:
         single = batched = time_python(robot)
     else:
         single = time_single(model, robot)
-        batched = time_batched(model, np.float64, robot)
+        batched = time_batched(model, robot)
     return {
         **dict(zip(ERRORS, step.tolist(), strict=True)),
         "rmse_twist": twist.tolist(),
@@ -220,8 +211,6 @@ def measure_robot(name: str, control: str | None) -> Result:
         "terms_total": found.regression.terms_total,
         "steps_per_s_single": single,
         "steps_per_s_batched": batched,
-        "steps_per_s_batched_float32": time_batched(model, np.float32, robot),
-        "float32_error_after_1000_steps_m": find_float32_error(model, robot),
     }
 
 
@@ -232,12 +221,9 @@ def measure_table1(given: Given) -> Result:
     random every step moves along exact arcs; the model is fitted to the first drive and tried on
     another. Errors are root mean squares per step of 1 ms, in the body frame, in float64.
     """
-    car = make_subject("ackermann")
-    fourth = fit(drive(car, 1), car.spec, order=4).model
     return {
         "robots": {name: measure_robot(name, given.control) for name in PARAMETERS},
-        "ackermann_order4_rmse_heading_rad": float(find_errors(fourth, car, 2)[0][2]),
-        "python_reference_steps_per_s": time_python(car),
+        "python_reference_steps_per_s": time_python(make_subject("ackermann")),
     }
 
 
@@ -247,7 +233,6 @@ def judge_table1(result: Result) -> list[str]:
     for name, robot in result["robots"].items():
         pairs = zip(ERRORS, PAPER_ERRORS[name], strict=True)
         bars = {key: at_most(max(paper, EXACT)) for key, paper in pairs}
-        bars["float32_error_after_1000_steps_m"] = at_most(FLOAT32_M)
         bars["steps_per_s_single"] = at_least(FASTER_ALONE * python)
         bars["steps_per_s_batched"] = at_least(FASTER_TOGETHER * python)
         missed += missed_bars(robot, bars, f"{name}: ")
@@ -483,12 +468,10 @@ def measure_complexity(given: Given) -> Result:
     }
 
 
-def judge_complexity(result: Result) -> list[str]:
-    bars = {
-        "baked_end_to_end": at_most(MOST_WORSE),
-        "exact_by_baked": at_least(FASTER_THAN_EXACT),
-    }
-    return missed_bars(result, bars)
+COMPLEXITY_BARS = {
+    "baked_end_to_end": at_most(MOST_WORSE),
+    "exact_by_baked": at_least(FASTER_THAN_EXACT),
+}
 
 
 # Figures 4 and 7
@@ -506,60 +489,51 @@ def measure_fig4(given: Given) -> Result:
     drifting odometry. yag-slam is LGPL: it gets an environment of its own, made at first use.
     """
     spec = load_lidar("paper_12m")
-    truth = clouds.make_path(given.scans)
-    baked = make_scanner(spec, clouds.OBSTACLES, "baked")
+    truth = fig4.make_path(given.scans)
+    baked = make_scanner(spec, fig4.OBSTACLES, "baked")
     exact = Scanner(spec, baked.table, "exact")
-    placed = exact.place(clouds.OBSTACLES, clouds.POSES)
+    placed = exact.place(fig4.OBSTACLES, fig4.POSES)
     bodies = np.broadcast_to(placed, (given.scans, *placed.shape))
     shift_m = 0.1 if given.control == "shifted" else 0.0
     beside = truth + np.array([shift_m, 0.0, 0.0])
     ranges = {
-        "exact": exact.scan(truth, bodies, clouds.WALLS),
-        "baked": baked.scan(beside, bodies, clouds.WALLS),
+        "exact": exact.scan(truth, bodies, fig4.WALLS),
+        "baked": baked.scan(beside, bodies, fig4.WALLS),
     }
     if given.control == "nan":
         ranges["baked"][0, 0] = np.nan
     missing = {}
     try:
-        ranges["mujoco"] = mujoco_rays.scan(
-            spec, truth, clouds.OBSTACLES, clouds.POSES, clouds.WALLS
-        )
+        ranges["mujoco"] = fig4.scan_in_mujoco(spec, truth)
     except ConfigError as error:
         missing["mujoco"] = str(error)
-    points = {
-        name: clouds.make_cloud(spec, truth, each) for name, each in ranges.items()
-    }
+    points = {name: fig4.make_cloud(spec, truth, each) for name, each in ranges.items()}
     others = [name for name in ranges if name != "exact"]
     result: Result = {
         "scans": given.scans,
         "points": {name: len(each) for name, each in points.items()},
         "cloud_rmse_m": {
-            name: clouds.find_cloud_rmse(points[name], points["exact"])
-            for name in others
+            name: fig4.find_cloud_rmse(points[name], points["exact"]) for name in others
         },
         "range_rmse_m": {
-            name: clouds.find_beam_rmse(ranges[name], ranges["exact"])
-            for name in others
+            name: fig4.find_beam_rmse(ranges[name], ranges["exact"]) for name in others
         },
         "slam": None,
     }
-    mapped = None
+    mapped = {}
+    odometry = fig4.let_drift(truth, 0)
     if not given.without_slam:
-        odometry = clouds.let_drift(truth, 0)
         try:
-            found = clouds.make_map(spec, ranges["baked"], odometry)
+            mapped = fig4.make_map(spec, ranges["baked"], odometry)
         except NotInstalledError as error:
             missing["slam"] = str(error)
-        else:
-            rebuilt = clouds.make_cloud(spec, found["poses"], ranges["baked"])
-            mapped = (found, rebuilt, odometry)
-            result["slam"] = {
-                "odometry_error_m": clouds.find_path_error(odometry, truth),
-                "path_error_m": clouds.find_path_error(found["poses"], truth),
-                "cloud_rmse_m": clouds.find_cloud_rmse(rebuilt, points["exact"]),
-            }
-    figure = clouds.draw(truth, points, result, mapped)
-    write_bytes(given.out, render_png(figure))
+    if mapped:
+        points["slam"] = fig4.make_cloud(spec, mapped["poses"], ranges["baked"])
+        result["slam"] = {
+            "odometry_error_m": fig4.find_path_error(odometry, truth),
+            "path_error_m": fig4.find_path_error(mapped["poses"], truth),
+        }
+    write_bytes(given.out, render_png(fig4.draw(truth, points, mapped, odometry)))
     return {**result, "missing": missing, "picture": str(given.out)}
 
 
@@ -588,33 +562,26 @@ DEVIATION_M = {"fast": 0.0, "dds": 1e-6, "mujoco_dds": 1.0}
 
 def measure_fig7(given: Given) -> Result:
     """Fig. 7: what are the trajectories of one policy in different worlds, for three robots?"""
-    from measuring.evaluations import Run, evaluate_all
+    from measuring.evaluations import evaluate_all
 
     given.out.mkdir(parents=True, exist_ok=True)
+    runs = {
+        robot: f"{given.policy or robot} --model {robot} --world {TRAJECTORY_WORLD} "
+        f"--episodes {given.episodes} --seed {FIRST_SEED}"
+        for robot in given.robots
+    }
     told = {}
     with tempfile.TemporaryDirectory() as folder:
-        runs = {
-            robot: Run(
-                given.policy or robot,
-                robot,
-                TRAJECTORY_WORLD,
-                given.episodes,
-                FIRST_SEED,
-                Path(folder) / robot,
-                given.control,
-            )
-            for robot in given.robots
-        }
-        for robot, places in evaluate_all(runs).items():
+        for robot, places in evaluate_all(runs, Path(folder), given.control).items():
             (drawn,) = (Path(folder) / robot).glob("trajectories_*.png")
             picture = given.out / f"fig7_{robot}.png"
             shutil.move(drawn, picture)
+            success = {place: one["success"][0] for place, one in places.items()}
+            apart = {place: one["deviation"][0] for place, one in places.items()}
             told[robot] = {
                 "picture": str(picture),
-                "success": {place: one["success"][0] for place, one in places.items()},
-                "deviation_m": {
-                    place: one["deviation"][0] for place, one in places.items()
-                },
+                "success": success,
+                "deviation_m": apart,
             }
     return {"robots": told}
 
@@ -633,7 +600,7 @@ def judge_fig7(result: Result) -> list[str]:
     return missed if result["robots"] else ["no robot was driven"]
 
 
-SCANS: dict[str, Any] = {"type": int, "default": 4096, "help": "scans of each scene"}
+SCANS = (4096, "scans of each scene")
 SMALL_TABLE = "--distances 10 --rotations 8"
 BENCHMARKS = {
     "table1_kinematics": Benchmark(
@@ -659,9 +626,9 @@ BENCHMARKS = {
             ),
         },
         {
-            "lidar": {"default": "paper", "help": "a shipped one, or a file"},
+            "lidar": ("paper", "a shipped one, or a file"),
             "scans": SCANS,
-            "repeats": {"type": int, "default": 200, "help": "timed batches"},
+            "repeats": (200, "timed batches"),
         },
         short="--scans 256 --repeats 2",
         unsettled=("baked_scans_per_s", "share_of_write_limit"),
@@ -678,7 +645,7 @@ BENCHMARKS = {
     ),
     "lidar_complexity": Benchmark(
         measure_complexity,
-        judge_complexity,
+        COMPLEXITY_BARS,
         {
             "exact": Control(
                 "the baked scanner: the exact one stands in",
@@ -687,11 +654,11 @@ BENCHMARKS = {
             )
         },
         {
-            "most": {"type": int, "default": VERTICES[-1], "help": "last vertices"},
-            "scans": {"type": int, "default": BATCH, "help": "of a batch"},
-            "repeats": {"type": int, "default": 60, "help": "timed batches"},
-            "distances": {"type": int, "default": 100, "help": "of the table's grid"},
-            "rotations": {"type": int, "default": 240, "help": "of the table's grid"},
+            "most": (VERTICES[-1], "last vertices"),
+            "scans": (BATCH, "of a batch"),
+            "repeats": (60, "timed batches"),
+            "distances": (100, "of the table's grid"),
+            "rotations": (240, "of the table's grid"),
         },
         short=f"--most 16 --scans 32 --repeats 2 {SMALL_TABLE}",
         unsettled=("baked_end_to_end", "exact_by_baked"),
@@ -704,9 +671,9 @@ BENCHMARKS = {
             "nan": Control("one range of the baked scans", "range RMSE [m], baked nan"),
         },
         {
-            "scans": {"type": int, "default": 200, "help": "scans along the path"},
-            "without-slam": {"action": "store_true", "help": "install nothing"},
-            "out": {"type": Path, "default": Path("runs/fig4_pointcloud.png")},
+            "scans": (200, "scans along the path"),
+            "without-slam": (False, "install nothing"),
+            "out": Path("runs/fig4_pointcloud.png"),
         },
         short="--scans 12 --without-slam",
         needs=("mujoco",),
@@ -719,13 +686,9 @@ BENCHMARKS = {
             "lying": Control("the truth: a robot says it is there", "goals reached"),
         },
         {
-            "episodes": {"type": int, "default": 6},
-            "robots": {
-                "nargs": "+",
-                "choices": TRAJECTORY_ROBOTS,
-                "default": list(TRAJECTORY_ROBOTS),
-            },
-            "out": {"type": Path, "default": Path("runs/paper_fig7")},
+            "episodes": 6,
+            "robots": some_of(TRAJECTORY_ROBOTS),
+            "out": Path("runs/paper_fig7"),
             "policy": {"help": "a baseline instead of each robot's shipped policy"},
         },
         short="--episodes 1 --robots differential",

@@ -6,7 +6,6 @@ python benchmarks/policies.py transfer | robustness
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import json
 import sys
@@ -25,11 +24,20 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from bench import Benchmark, Control, at_least, at_most, missed_bars, run_benchmark
+from bench import (
+    Benchmark,
+    Control,
+    Given,
+    Result,
+    at_least,
+    at_most,
+    missed_bars,
+    run_benchmark,
+    some_of,
+)
 from measuring import perturbations
-from measuring.evaluations import Run, evaluate_all
+from measuring.evaluations import Standing, evaluate_all
 from measuring.perturbations import PERTURBATIONS
-from measuring.standing import Standing
 from numpy.typing import NDArray
 
 from nics_drl_bridge.commands.episodes import (
@@ -73,8 +81,6 @@ from nics_drl_bridge.sim.world import World, load_world
 from nics_drl_bridge.sim.world_set import BARN, AnyWorld, WorldSet, load_worlds
 
 Array = NDArray[np.float64]
-Given = argparse.Namespace
-Result = dict[str, Any]
 ROBOTS = ("differential", "ackermann", "mecanum")
 STANDS = Control("the driving: the policy stands still", "success")
 
@@ -450,10 +456,10 @@ ROUNDING = 1e-9
 Found = dict[str, dict[str, dict[str, Any]]]
 
 
-def get_conditions(robot: str) -> Conditions:
+def get_conditions(robot: str) -> str:
     """Returns those of a deployment: a real lidar, mild randomisation, the robot's limits."""
-    lidar = None if load_robot(robot).lidar else TRANSFER_LIDAR
-    return Conditions(lidar, "mild", robot)
+    lidar = "" if load_robot(robot).lidar else f"--lidar {TRANSFER_LIDAR} "
+    return f"{lidar}--randomisation mild --gate {robot}"
 
 
 def get_shares(found: Found, name: str) -> dict[str, Any]:
@@ -485,25 +491,19 @@ def measure_transfer(given: Given) -> Result:
         )
         sys.stderr.write(f"{name}: {', '.join(shares)}\n")
 
+    places = " ".join(f"--in {place}" for place in given.places)
+    about = f"--episodes {given.episodes} --seed {TRANSFER_SEED} {places}"
+    runs = {
+        f"{robot}/{world}": f"{robot} --model {robot} --world {world} {about} "
+        + get_conditions(robot)
+        for robot, world in product(given.robots, given.worlds)
+    }
     found: Found = {robot: {} for robot in given.robots}
     with tempfile.TemporaryDirectory() as folder:
-        runs = {
-            f"{robot}/{world}": Run(
-                robot,
-                robot,
-                world,
-                given.episodes,
-                TRANSFER_SEED,
-                Path(folder) / robot / world,
-                given.control,
-                get_conditions(robot),
-                given.places,
-            )
-            for robot, world in product(given.robots, given.worlds)
-        }
-        for name, figures in evaluate_all(runs, tell).items():
-            robot, world = name.split("/")
-            found[robot][world] = figures
+        evaluated = evaluate_all(runs, Path(folder), given.control, tell)
+    for name, figures in evaluated.items():
+        robot, world = name.split("/")
+        found[robot][world] = figures
     keys = ("success", "collision", "believed", "length")
     result: Result = {name: get_shares(found, name) for name in keys}
     result["points_from_fast"] = {
@@ -728,9 +728,7 @@ def judge_robustness(result: Result) -> list[str]:
     return missed if any(result["success"].values()) else ["no policy was driven"]
 
 
-EPISODES: dict[str, Any] = {"type": int, "default": 500}
-SHIPPED = shipped_policies()
-OF_SHIPPED = {"nargs": "+", "choices": SHIPPED, "default": SHIPPED}
+SHIPPED = some_of(shipped_policies())
 BENCHMARKS = {
     "training": Benchmark(
         measure_training,
@@ -746,7 +744,7 @@ BENCHMARKS = {
             "robot": {"choices": sorted(LONGEST_S), "default": "differential"},
             "lidar": {"help": "instead of the robot's own, a shipped one or a file"},
             "seeds": {"type": int, "nargs": "+", "default": [0]},
-            "episodes": EPISODES,
+            "episodes": 500,
         },
         short=None,
         needs=("torch",),
@@ -757,9 +755,9 @@ BENCHMARKS = {
         {"standing": STANDS},
         {
             "world": {"nargs": "+", "default": [LEARNING_WORLD]},
-            "robot": {"nargs": "+", "choices": ROBOTS, "default": ROBOTS},
+            "robot": some_of(ROBOTS),
             "policy": {"nargs": "+", "default": list(POLICIES)},
-            "episodes": EPISODES,
+            "episodes": 500,
         },
         short="--robot differential --policy dynamic_window --episodes 20",
     ),
@@ -776,7 +774,7 @@ BENCHMARKS = {
                 "const": f"shipped_{BARN_ROBOT}",
                 "help": "learn from four fifths of the worlds, judge in the others",
             },
-            "runs": {"type": int, "default": 1, "help": "in each world"},
+            "runs": (1, "in each world"),
             "every": {"type": int, "help": "one in so many worlds"},
             "folds": {"type": int, "default": FOLDS, "choices": range(1, FOLDS + 1)},
         },
@@ -790,19 +788,10 @@ BENCHMARKS = {
             "standing": STANDS,
         },
         {
-            "episodes": {"type": int, "default": 100, "help": "in each place"},
-            "robots": OF_SHIPPED,
-            "worlds": {
-                "nargs": "+",
-                "choices": list(TRANSFER_FLOORS),
-                "default": list(TRANSFER_FLOORS),
-            },
-            "in": {
-                "nargs": "+",
-                "dest": "places",
-                "choices": PLACES,
-                "default": list(PLACES),
-            },
+            "episodes": (100, "in each place"),
+            "robots": SHIPPED,
+            "worlds": some_of(tuple(TRANSFER_FLOORS)),
+            "in": some_of(PLACES) | {"dest": "places"},
         },
         short="--episodes 1 --robots differential --worlds circles",
         unsettled=("",),
@@ -816,18 +805,10 @@ BENCHMARKS = {
             "standing": STANDS,
         },
         {
-            "episodes": {"type": int, "default": 40, "help": "in each world"},
-            "robots": OF_SHIPPED,
-            "worlds": {
-                "nargs": "+",
-                "choices": ROBUST_WORLDS,
-                "default": list(ROBUST_WORLDS),
-            },
-            "only": {
-                "nargs": "+",
-                "choices": PERTURBATIONS,
-                "default": list(PERTURBATIONS),
-            },
+            "episodes": (40, "in each world"),
+            "robots": SHIPPED,
+            "worlds": some_of(ROBUST_WORLDS),
+            "only": some_of(PERTURBATIONS),
             "multiples": {"nargs": "+", "type": float, "default": MULTIPLES},
             "picture": {"type": Path, "help": "draw the curves into this file"},
             "of": {"type": Path, "help": "draw the picture of these results only"},

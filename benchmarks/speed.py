@@ -7,7 +7,6 @@ python benchmarks/speed.py ros_lockstep
 
 from __future__ import annotations
 
-import argparse
 import math
 import os
 import time
@@ -20,7 +19,16 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from bench import Benchmark, Control, at_least, at_most, missed_bars, run_benchmark
+from bench import (
+    Benchmark,
+    Control,
+    Given,
+    Result,
+    at_least,
+    at_most,
+    missed_bars,
+    run_benchmark,
+)
 from measuring import peers
 from measuring.grids import MAPS, RESOLUTION, draw_poses, scan_map
 from measuring.rates import interleaved, medians
@@ -45,8 +53,6 @@ from nics_drl_bridge.sim.scenes import Scene, sample_scene
 from nics_drl_bridge.sim.world import World
 from nics_drl_bridge.sim.world_set import AnyWorld, WorldSet
 
-Given = argparse.Namespace
-Result = dict[str, Any]
 TIMES_SLOWER = 10  # under the control `slow`
 
 # Environments beside peers
@@ -718,12 +724,8 @@ def measure_lockstep(given: Given) -> Result:
     return measure_in_turns(given.chunks, given.size, given.control)
 
 
-def judge_lockstep(result: Result) -> list[str]:
-    return missed_bars(result, LOCKSTEP_BARS)
-
-
-REPEATED: dict[str, Any] = {"type": int, "default": 10, "help": "timed rounds"}
-WITHOUT_PEERS = {"action": "store_true", "help": "install nothing"}
+REPEATED = (10, "timed rounds")
+WITHOUT_PEERS = (False, "install nothing")
 BENCHMARKS = {
     "env_throughput": Benchmark(
         measure_throughput,
@@ -740,11 +742,11 @@ BENCHMARKS = {
             ),
         },
         {
-            "worlds": {"type": int, "default": 2048, "help": "of the vector env"},
-            "threads": {"type": int, "default": os.cpu_count() or 1},
+            "worlds": (2048, "of the vector env"),
+            "threads": os.cpu_count() or 1,
             "repeats": REPEATED,
             "lidar": {"help": "name or file of another lidar; without peers"},
-            "obstacles": {"type": int, "default": peers.CIRCLES, "help": "no peers"},
+            "obstacles": (peers.CIRCLES, "no peers"),
             "without-peers": WITHOUT_PEERS,
         },
         short="--worlds 64 --threads 1 --repeats 1 --without-peers",
@@ -768,9 +770,9 @@ BENCHMARKS = {
             ),
         },
         {
-            "repeats": {"type": int, "default": 20_000, "help": "env steps of a point"},
+            "repeats": (20_000, "env steps of a point"),
             "picture": {"type": Path, "help": "draw the curves into this file"},
-            "ends-only": {"action": "store_true", "help": "two points of each curve"},
+            "ends-only": (False, "two points of each curve"),
         },
         short="--ends-only --repeats 5",
         unsettled=(" cost",),
@@ -792,8 +794,8 @@ BENCHMARKS = {
             ),
         },
         {
-            "scans": {"type": int, "default": BATCH, "help": "of one of our batches"},
-            "scenes": {"type": int, "default": 50, "help": "for the peers"},
+            "scans": (BATCH, "of one of our batches"),
+            "scenes": (50, "for the peers"),
             "repeats": REPEATED,
             "without-peers": WITHOUT_PEERS,
         },
@@ -808,19 +810,19 @@ BENCHMARKS = {
             "slow": Control("the jumps: the walk stands in", "the walk's speed"),
             "nan": Control("one range", "RMSE [m] nan"),
         },
-        {"seed": {"type": int, "default": 0}},
+        {"seed": 0},
         unsettled=("the walk's speed",),
     ),
     "ros_lockstep": Benchmark(
         measure_lockstep,
-        judge_lockstep,
+        LOCKSTEP_BARS,
         {
             "slow": Control("speed: a step rests", "ratio 0."),
             "standing": Control("the commands: the robot does not drive", "driven_m 0"),
         },
         {
-            "chunks": {"type": int, "default": 150},
-            "size": {"type": int, "default": 100, "help": "steps in a chunk"},
+            "chunks": 150,
+            "size": (100, "steps in a chunk"),
         },
         short="--chunks 2 --size 20",
         unsettled=("ratio",),

@@ -25,8 +25,8 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 
+from measuring.evaluations import standing_action
 from measuring.peers import WORLD
-from measuring.standing import standing_action
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id

@@ -93,11 +93,10 @@ def test_every_run_has_arguments_that_its_benchmark_knows():
     from bench import RUNS
 
     for name, planned in RUNS.items():
-        if planned.benchmark:
-            options = {
-                f"--{option}" for option in BY_NAME[planned.benchmark][1].options
-            }
-            words = [*planned.arguments, *planned.long]
+        _, *named = planned.what.split()
+        if named:
+            options = {f"--{option}" for option in BY_NAME[named[0]][1].options}
+            words = f"{planned.arguments} {planned.long or ''}".split()
             assert {word for word in words if word.startswith("--")} <= options, name
 
 

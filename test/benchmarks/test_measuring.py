@@ -85,7 +85,7 @@ def test_wheels_are_found_in_a_model_that_moves_by_them():
         -np.ones(4),
         np.ones(4),
     )
-    found = import_module("measuring.truths").wheels_of(model)
+    found = import_module("measuring.drives").wheels_of(model)
     expected = {"left_m": left, "right_m": right, "base_m": base}
     assert found == pytest.approx(expected, rel=1e-3)
 
@@ -106,7 +106,7 @@ def test_wheels_are_found_in_a_model_that_moves_by_them():
     ids=str,
 )
 def test_a_drive_misses_a_bar_by_one_figure(change):
-    bars = import_module("measuring.drive_bars")
+    bars = import_module("measuring.drives")
     limits = bars.Bars(share=0.03, error_m=0.03)
     shares = {"share_of_path": 0.02, "yardstick_share": 0.03}
     good = {**shares, "error_m": 0.02, "constant_twist_share": 0.5}
@@ -116,7 +116,7 @@ def test_a_drive_misses_a_bar_by_one_figure(change):
 
 
 def test_every_mapping_that_is_shown_has_its_drive():
-    bars = import_module("measuring.drive_bars")
+    bars = import_module("measuring.drives")
     found = [*bars.EXAMPLES.glob("*.yaml"), *bars.SHIPPED.glob("*.yaml")]
     # One is a link to a shipped one.
     mappings = {drive.mapping for drive in bars.DRIVES.values()}
@@ -237,9 +237,9 @@ def test_every_world_that_comes_with_the_package_is_driven(policies):
 
 
 def test_a_robot_drives_with_its_own_lidar_or_a_real_one_behind_its_own_gate(policies):
-    assert policies.get_conditions("jackal").lidar is None
-    given = policies.get_conditions("mecanum")
-    assert (given.lidar, given.gate) == ("rplidar_a2", "mecanum")
+    own = "--randomisation mild --gate "
+    assert policies.get_conditions("jackal") == f"{own}jackal"
+    assert policies.get_conditions("mecanum") == f"--lidar rplidar_a2 {own}mecanum"
 
 
 @pytest.mark.parametrize(

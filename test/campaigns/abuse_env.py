@@ -20,7 +20,7 @@ from unittest import mock
 
 import gymnasium
 import numpy as np
-from campaign import answer, at_least, at_most, missed_bars, parser_of
+from campaign import Given, Result, at_least, at_most, run_campaign
 from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
 from parts.spun_node import SpunNode
@@ -309,10 +309,10 @@ def abuse(env: BridgeEnv, watcher: Watcher, rng: Rng) -> tuple[str, list[str]]:
     return told, [bar for bar, wrong in missed.items() if wrong]
 
 
-def measure(seed: int, rounds: int, control: str | None = None) -> dict[str, Any]:
+def measure(given: Given) -> Result:
     """Drives and throws so many times; each round takes some seconds."""
-    result: dict[str, Any] = dict.fromkeys(BARS, 0) | {"told": []}
-    rng = np.random.default_rng(seed)
+    result: Result = dict.fromkeys(BARS, 0) | {"told": []}
+    rng = np.random.default_rng(given.seed)
     domain_id = free_domain_id()
     parameters = {
         "model": ROBOT,
@@ -327,10 +327,10 @@ def measure(seed: int, rounds: int, control: str | None = None) -> dict[str, Any
         node = stack.enter_context(simulator)
         watcher = Watcher(domain_id)
         stack.callback(watcher.close)
-        if control == "no_guard":
+        if given.control == "no_guard":
             stack.enter_context(mock.patch.object(Link, "halt"))
         env = make_env(domain_id)
-        for k in range(rounds):
+        for k in range(given.rounds):
             node.check()
             if not env._backend._link._closing.alive:  # a round has closed it
                 env = make_env(domain_id)
@@ -338,21 +338,11 @@ def measure(seed: int, rounds: int, control: str | None = None) -> dict[str, Any
             result["tries"] += 1
             for bar in missed:
                 result[bar] += 1
-                result["told"].append(f"{bar}: seed {seed}, round {k}, {told}")
+                result["told"].append(f"{bar}: seed {given.seed}, round {k}, {told}")
         env._picture = None
         env.close()
     return result
 
 
-def main() -> None:
-    """Prints a table, or one JSON object; ends with 1 where a bar was missed."""
-    parser = parser_of(__doc__)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--rounds", type=int, default=100)
-    given = parser.parse_args()
-    result = measure(given.seed, given.rounds, given.control)
-    answer(result, missed_bars(result, BARS), given.json)
-
-
 if __name__ == "__main__":
-    main()
+    run_campaign(measure, BARS, {"seed": 0, "rounds": 100})

@@ -1,49 +1,440 @@
-"""What a campaign is written with: the arguments that all have, and how it answers."""
+"""The campaigns: long proofs of promises, each with a short form and controls that must fail.
+
+`python test/campaigns/NAME.py` runs a campaign, `--short` its short form. Under a control, what the
+campaign proves is taken out, so that it has to miss the bar that is named here.
+`make test-campaign` runs all short forms and all controls.
+"""
 
 from __future__ import annotations
 
-import argparse
 import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
-from registry import ROOT, bench, campaigns_of
+FOLDER = Path(__file__).resolve().parent
+ROOT = FOLDER.parents[1]
+sys.path += [str(ROOT / "benchmarks"), str(ROOT / "test")]
 
-answer = bench.answer
-at_least = bench.at_least
-at_most = bench.at_most
-missed_bars = bench.missed_bars
-__all__ = ["ROOT", "answer", "at_least", "at_most", "missed_bars", "parser_of"]
+from bench import (  # noqa: E402
+    Bar,
+    Benchmark,
+    Control,
+    Given,
+    Result,
+    at_least,
+    at_most,
+    missed_bars,
+    some_of,
+)
+
+__all__ = [
+    "CAMPAIGNS",
+    "FOLDER",
+    "ROOT",
+    "Given",
+    "Result",
+    "at_least",
+    "at_most",
+    "missed_bars",
+    "run_campaign",
+    "some_of",
+]
 
 
-class Parser(argparse.ArgumentParser):
-    """A parser that puts the short form in the place of `--short`."""
+@dataclass(frozen=True)
+class Campaign:
+    """One campaign.
 
-    def __init__(self, *given: Any, **named: Any) -> None:
-        super().__init__(*given, **named)
-        self.short: list[str] = []
+    Attributes:
+        short: arguments of the short form.
+        controls: by their names.
+        needs: modules to import; `root` for root with `ip` and `nft`, `nav2` for Nav2's sources.
+        script: where it is not the campaign's name.
+        quick: whether `make test` runs the short form, too.
+        attempts: of a short form that a busy machine may hold up.
+        timeout_s: of one attempt.
+    """
 
-    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """As usual; arguments after `--short` go before its own."""
-        words = list(sys.argv[1:] if args is None else args)
-        if "--short" in words:
-            words.remove("--short")
-            words = [*self.short, *words]
-        return super().parse_known_args(words, namespace)
+    short: str
+    controls: Mapping[str, Control] = field(default_factory=dict)
+    needs: tuple[str, ...] = ()
+    script: str = ""
+    quick: bool = False
+    attempts: int = 1
+    timeout_s: float = 600.0
 
 
-def parser_of(doc: str | None) -> Parser:
-    """The parser of the running script, with its controls and its short form."""
+REAL_TIME = 3
+ROS = ("rclpy",)
+FILES = ("torch", "rosbags")
+MESSAGES = ("rclpy", "simulation_interfaces")
+ONE_RULE = "--tests test/gate/test_arming.py --rule arming/one_publisher"
+ONE_FAULT = "--repeats 1 --fault scan_silent"
+ENV = "--steps 30000 --cases arena"
+FAULTS = (
+    "scan_silent",
+    "e_stop",
+    "policy_hung",
+    "odom_teleports",
+    "stamps_run_ahead",
+    "scan_alternates",
+    "gate_frozen",
+    "no_motion",
+)
+CAMPAIGNS: dict[str, Campaign] = {
+    "abuse_env": Campaign(
+        "--rounds 3 --seed 1",
+        {
+            "no_guard": Control(
+                "what stops the robot when an exception leaves the env",
+                "moved",
+                "--rounds 2",
+            )
+        },
+        ROS,
+    ),
+    "cold_start": Campaign(
+        "",
+        {
+            "no_cache": Control(
+                "the kernels: every process finds an empty cache of them", ""
+            ),
+            "compiled": Control(
+                "the waiting: all kernels were compiled before the time is taken",
+                "nothing was measured",
+            ),
+        },
+        ROS,
+        timeout_s=3500.0,
+    ),
+    "damaged_input": Campaign(
+        "--rounds 40 --seed 5",
+        {
+            "credulous": Control(
+                "the checks of policies and of YAML", "must be at most 0", "--rounds 60"
+            ),
+            "no_checksum": Control(
+                "the checksums of recordings, models, tables, policies and checkpoints",
+                "accepted ",
+                "--rounds 60",
+            ),
+        },
+        FILES,
+    ),
+    "deploy_environment": Campaign(
+        "",
+        {
+            "no_policy": Control(
+                "most of the policy file", "policy_node sent no command"
+            ),
+            "training_installed": Control(
+                "the clean environment: training is installed",
+                "of training there is torch",
+            ),
+        },
+        ("rclpy", "stable_baselines3"),
+        timeout_s=1900.0,
+    ),
+    "fast_robots": Campaign(
+        "--steps 5",
+        {
+            "fat": Control(
+                "the touch: the robots are measured 2 mm larger", "overlap_mm"
+            ),
+            "no_walls": Control(
+                "the walls between the rooms, for the simulator", "passed_a_wall"
+            ),
+        },
+        quick=True,
+    ),
+    "gate_envelope": Campaign(
+        "--steps 3000",
+        {
+            "no_limits": Control(
+                "the gate's limits: they are a hundred times as wide",
+                "violations ",
+            ),
+            "nan": Control("one number in a thousand decisions", "violations"),
+            "standing": Control("the commands: all are zero", "share_in_motion 0"),
+        },
+        quick=True,
+    ),
+    "gate_faults": Campaign(
+        "--repeats 2 " + " ".join(f"--fault {name}" for name in FAULTS),
+        {
+            "slow_gate": Control(
+                "the gate's ages: it lets data get ten times as old",
+                "scan_silent: time to zero [s]",
+                ONE_FAULT,
+            ),
+            "no_gate": Control(
+                "the gate: commands are relayed past it",
+                "scan_silent: time to zero [s] inf",
+                ONE_FAULT,
+            ),
+            "standing": Control(
+                "the motion: the robot is never told to move",
+                "scan_silent: injections while the robot moved 0",
+                ONE_FAULT,
+            ),
+        },
+        ROS,
+        attempts=REAL_TIME,
+    ),
+    "gate_held": Campaign(
+        "--hours 0.1 --holds 20 --case 0",
+        {
+            "rule_off": Control(
+                "the rule: `stop_when_held` is false",
+                "held bodies that were stopped in time",
+                "--hours 0.01 --holds 4 --case 7",
+            ),
+            "zero_thresholds": Control(
+                "the rule's thresholds: any scan contradicts odometry",
+                "stops by body_held",
+                "--hours 0.01 --holds 4 --case 7",
+            ),
+        },
+        quick=True,
+    ),
+    "gate_load": Campaign(
+        "--seconds 4 --burst 4",
+        {
+            "busy": Control(
+                "haste: the gate reads each message and decides ten times",
+                "the gate's share of a core",
+            ),
+            "slow_disk": Control(
+                "the disk: the gate waits for one that does not answer, at its end",
+                "replayed 0",
+            ),
+        },
+        ROS,
+        attempts=REAL_TIME,
+    ),
+    "gate_rules": Campaign(
+        ONE_RULE,
+        {
+            "no_tests": Control(
+                "the tests of the gate's rules", "rule arming/one_publisher"
+            ),
+            "untested_rule": Control(
+                "the test of a rule: one is added that no test covers",
+                "rule stop/_covers_nothing",
+            ),
+        },
+    ),
+    "nav2_standards": Campaign(
+        "--episodes 3",
+        {
+            "bare": Control(
+                "the map's obstacles, a known controller, all nodes but the simulator",
+                "map_agreement",
+                "--episodes 1",
+            )
+        },
+        ("rclpy", "nav2_msgs", "nav2"),
+        timeout_s=900.0,
+    ),
+    "node_endings": Campaign(
+        "--times 2 --loops 0 --nodes middleware_node --phases starting compiling native",
+        {
+            "late": Control(
+                "the handler that ends a node within a step of native code",
+                "middleware_node native: took ",
+                "--times 2 --loops 0 --nodes middleware_node --phases native",
+            )
+        },
+        ROS,
+        attempts=REAL_TIME,
+    ),
+    "packet_loss": Campaign(
+        "--seconds 8 --loss 20",
+        {
+            "no_gate": Control(
+                "the gate: the policy's last command is repeated to the base",
+                "unsafe_commands",
+                "--seconds 6 --loss 40",
+            ),
+            "standing": Control(
+                "the motion: nobody arms the gate", "invalid: nothing moved"
+            ),
+            "no_loss": Control("the losses", "none was lost"),
+            "slow_robot": Control("two scans of three", "scans that the robot sent"),
+        },
+        ("rclpy", "root"),
+        attempts=REAL_TIME,
+    ),
+    "parity": Campaign(
+        "--steps 25 --robot ackermann",
+        {
+            "nan": Control(
+                "a number of one observation", "difference inf: must be at most 0"
+            ),
+            "noise": Control("the last bit of one number", "difference "),
+            "late": Control(
+                "one observation, of which the one before is told again",
+                "late_observations",
+            ),
+            "standing": Control("the commands: no robot drives", "driven_m 0:"),
+        },
+        ROS,
+    ),
+    "parity_fleet": Campaign(
+        "--steps 25 --robot ackermann --robots 2 --seed 5", {}, ROS, "parity"
+    ),
+    "ros_fleet": Campaign(
+        "--robots 2 --seconds 2",
+        {
+            "standing": Control("the commands: no robot drives", ": driven_m 0"),
+            "deaf": Control(
+                "the topics of one robot, which nobody receives",
+                "robot2 of 2: scan 0:",
+                "--robots 2 --seconds 2 --patience 15",
+            ),
+        },
+        ROS,
+        attempts=REAL_TIME,
+    ),
+    "shield": Campaign(
+        "--in-process --episodes 18",
+        {
+            "no_shield": Control("the shield: it is off", "contacts of"),
+            "standing": Control(
+                "the motion: every driver stays where it is", "path driven"
+            ),
+            "no_braking_distance": Control(
+                "what the robot needs to stop: the shield is told that it needs nothing",
+                "braking distance",
+            ),
+        },
+    ),
+    "shield_over_dds": Campaign(
+        "--episodes 6 --place mecanum/crowd --place ackermann/clutter",
+        {},
+        ROS,
+        "shield",
+        attempts=REAL_TIME,
+    ),
+    "soak": Campaign(
+        "--minutes 0.2 --warm-up 0.1",
+        {
+            "standing": Control(
+                "the gate's consent: the robot in real time never moves",
+                "driven_m 0:",
+                "--minutes 0.05 --warm-up 0.0",
+            ),
+            "leak": Control(
+                "order: each episode leaves a file open",
+                "fds_growth ",
+                "--minutes 0.2 --warm-up 0.0",
+            ),
+        },
+        ROS,
+        attempts=REAL_TIME,
+    ),
+    "soak_env": Campaign(
+        "--steps 60000 --cases arena crowd team",
+        {
+            "stuck": Control(
+                "motion: the poses of one world are put back after each step",
+                "a robot that stood for",
+                ENV,
+            ),
+            "blind": Control(
+                "news: one world goes on telling its first observation",
+                "an observation that stood for",
+                ENV,
+            ),
+            "endless": Control(
+                "the env's time limit", "an episode of", f"{ENV} --limit 10"
+            ),
+            "nan": Control("one number of an observation", "not finite", ENV),
+            "leak": Control(
+                "thrift: 1 MB more is held after each round", "memory grew by", ENV
+            ),
+        },
+    ),
+    "soak_env_resets": Campaign(
+        "--resets 300",
+        {
+            "leak": Control(
+                "order: a file more is open after each reset",
+                "file descriptors more",
+                "--resets 100",
+            )
+        },
+        (),
+        "soak_env",
+        quick=True,
+    ),
+    "standards": Campaign(
+        "--parts conformance",
+        {
+            "claims": Control(
+                "conformance: a feature that is not there counts as announced",
+                "sim_conformance_failed 1",
+            ),
+            "idle": Control(
+                "conformance: nothing is done, and all is answered as done",
+                "SPAWNING is announced, but does not do",
+            ),
+        },
+        MESSAGES,
+        timeout_s=900.0,
+    ),
+    "standards_leapp": Campaign(
+        "--parts leapp",
+        {
+            "coarse": Control(
+                "digits: LEAPP is given observations in steps of a hundredth",
+                "leapp_max_abs_difference",
+            )
+        },
+        ("leapp", "rclpy", "torch"),
+        "standards",
+    ),
+    "torn_files": Campaign(
+        "--kills 8",
+        {
+            "naive_writer": Control(
+                "the temporary file: what is written is written where it is to lie",
+                "torn ",
+                "--kills 12",
+            )
+        },
+        FILES,
+    ),
+    "unknown_robot": Campaign(
+        "--goals 10",
+        {
+            "no_gyro": Control(
+                "the gyro, so that the estimator believes slipping wheels", "success"
+            ),
+            "no_gate_rule": Control(
+                "the rule that compares scans with odometry, so that a held body goes on",
+                "a held body",
+            ),
+        },
+        ("rclpy", "dartpy"),
+        timeout_s=3500.0,
+    ),
+}
+
+
+def run_campaign(
+    measure: Callable[[Given], Result],
+    judge: Mapping[str, Bar] | Callable[[Result], list[str]],
+    options: Mapping[str, Any] | None = None,
+) -> NoReturn:
+    """Runs the campaign whose script is running, as a benchmark with its controls and short form.
+
+    See `bench.Benchmark` for the arguments.
+    """
     script = Path(sys.argv[0]).stem
-    campaigns = campaigns_of(script)
-    controls = {
-        name: control.what
-        for campaign in campaigns
-        for name, control in campaign.controls.items()
-    }
-    parser = bench.parser_of(doc, controls, Parser)
-    parser.short = campaigns[0].short.split()
-    parser.add_argument(
-        "--short", action="store_true", help=f"the short form: {campaigns[0].short}"
-    )
-    return parser
+    own = [each for name, each in CAMPAIGNS.items() if (each.script or name) == script]
+    controls = {name: taken for each in own for name, taken in each.controls.items()}
+    campaign = Benchmark(measure, judge, controls, options or {}, own[0].short)
+    campaign.run(sys.argv[1:], sys.modules["__main__"].__doc__)

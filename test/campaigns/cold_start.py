@@ -12,9 +12,8 @@ import os
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
 
-from campaign import ROOT, answer, at_least, at_most, missed_bars, parser_of
+from campaign import ROOT, Given, Result, at_least, at_most, missed_bars, run_campaign
 from measuring.environments import newcomer, wait_for
 
 FORGET = """
@@ -37,8 +36,13 @@ print(time.monotonic() - begin)
 """
 
 
-def measure(folder: Path, control: str | None) -> dict[str, Any]:
+def measure(given: Given) -> Result:
     """All figures, see the head of this file."""
+    with tempfile.TemporaryDirectory() as folder:
+        return measure_in(Path(folder), given.control)
+
+
+def measure_in(folder: Path, control: str | None) -> Result:
     clone = folder / "clone"
     around = newcomer(folder, FORGET if control == "no_cache" else "")
     wait_for(["git", "clone", "--quiet", str(ROOT), str(clone)], folder, around)
@@ -70,7 +74,7 @@ def measure(folder: Path, control: str | None) -> dict[str, Any]:
     }
 
 
-def missed_of(result: dict[str, Any]) -> list[str]:
+def judge(result: Result) -> list[str]:
     """The bars that were missed."""
     missed = missed_bars(result, BARS)
     if not result["told"].startswith("demo: "):
@@ -80,13 +84,5 @@ def missed_of(result: dict[str, Any]) -> list[str]:
     return missed
 
 
-def main() -> None:
-    """Prints a table, or one JSON object."""
-    given = parser_of(__doc__).parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        result = measure(Path(folder), given.control)
-    answer(result, missed_of(result), given.json)
-
-
 if __name__ == "__main__":
-    main()
+    run_campaign(measure, judge)

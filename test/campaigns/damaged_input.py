@@ -16,8 +16,9 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-from campaign import answer, at_least, at_most, missed_bars, parser_of
-from hypothesis import HealthCheck, Phase, given, seed, settings
+from campaign import Given, Result, at_least, at_most, run_campaign
+from hypothesis import HealthCheck, Phase, seed, settings
+from hypothesis import given as drawn
 from hypothesis import strategies as st
 from parts.attempt import MOST_MEMORY, Attempt, Outcome, make
 from parts.damage import attempts
@@ -81,8 +82,9 @@ def judge(attempt: Attempt, outcome: Outcome) -> list[str]:
     return missed
 
 
-def measure(rounds: int, number: int, control: str | None) -> dict[str, Any]:
+def measure(given: Given) -> Result:
     """Hands in so many inputs and counts what came of them."""
+    COMPILING.quiet = True  # that kernels are compiled is no part of a sentence
     counts = Counter(dict.fromkeys(("tries", "good", *WRONG), 0))
     kinds: Counter[str] = Counter()
     told = []
@@ -94,15 +96,15 @@ def measure(rounds: int, number: int, control: str | None) -> dict[str, Any]:
             loader.write(home / loader.name, 0)
             wholes[loader.name] = home / loader.name, loader.read(home / loader.name)
 
-        @seed(number)
+        @seed(given.seed)
         @settings(
-            max_examples=rounds,
+            max_examples=given.rounds,
             deadline=None,
             database=None,
             phases=[Phase.generate],
             suppress_health_check=list(HealthCheck),
         )
-        @given(st.data())
+        @drawn(st.data())
         def hand_in(data: st.DataObject) -> None:
             attempt = data.draw(attempts(wholes, Path(name) / "damaged"))
             outcome = make(attempt)
@@ -113,21 +115,10 @@ def measure(rounds: int, number: int, control: str | None) -> dict[str, Any]:
                 line = f"{bar}: {attempt.kind}: {attempt.told}: {outcome.words}"
                 told.append(f"{line} ({outcome.own_s:.1f} s)")
 
-        with take_out(control):
+        with take_out(given.control):
             hand_in()
     return {**counts, "by_kind": dict(kinds), "told": told}
 
 
-def main() -> None:
-    """Prints a table, or one JSON object; ends with 1 when something got through."""
-    parser = parser_of(__doc__)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--rounds", type=int, default=2000, help="inputs to hand in")
-    asked = parser.parse_args()
-    COMPILING.quiet = True  # that kernels are compiled is no part of a sentence
-    result = measure(asked.rounds, asked.seed, asked.control)
-    answer(result, missed_bars(result, BARS), asked.json)
-
-
 if __name__ == "__main__":
-    main()
+    run_campaign(measure, BARS, {"seed": 0, "rounds": (2000, "inputs to hand in")})

@@ -15,15 +15,13 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
 
-from campaign import answer, parser_of
+from campaign import FOLDER, ROOT, Given, Result, run_campaign
 from measuring.environments import inherit_for_newcomer
 
-ROOT = Path(__file__).resolve().parents[2]
 ROBOT = "differential"
 FORBIDDEN = ("torch", "stable_baselines3", "mujoco", "tensorboard")
-STAND_IN = Path(__file__).resolve().parent / "parts" / "deployed_policy.py"
+STAND_IN = FOLDER / "parts" / "deployed_policy.py"
 INSTALL_S = 900
 DRIVE_S = 900
 
@@ -85,17 +83,13 @@ def present(python: Path) -> list[str]:
     return done.stdout.split()
 
 
-def measure(control: str | None, here: bool) -> dict[str, Any]:
-    """Makes the environment, drives in it, and removes it.
-
-    Args:
-        control: its name, or None.
-        here: takes the environment that runs this instead of a new one.
-    """
+def measure(given: Given) -> Result:
+    """Makes the environment, drives in it, and removes it; controls drive in this one."""
+    here = given.here or given.control is not None
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         model, policy = export(folder)
-        if control == "no_policy":
+        if given.control == "no_policy":
             policy.write_bytes(policy.read_bytes()[:100])
         began = time.monotonic()
         python = Path(sys.executable) if here else installed(folder / "environment")
@@ -116,7 +110,7 @@ def measure(control: str | None, here: bool) -> dict[str, Any]:
     return {**told, **json.loads(done.stdout.splitlines()[-1])}
 
 
-def missed(found: dict[str, Any]) -> list[str]:
+def judge(found: Result) -> list[str]:
     """A sentence for each bar that was missed."""
     said = []
     if not found["commands"] > 0:
@@ -126,18 +120,5 @@ def missed(found: dict[str, Any]) -> list[str]:
     return said
 
 
-def main() -> None:
-    """Prints what was found; 0 when the node drove without anything of training."""
-    parser = parser_of(__doc__)
-    parser.add_argument(
-        "--here",
-        action="store_true",
-        help="in this environment; it takes no time to install",
-    )
-    given = parser.parse_args()
-    found = measure(given.control, given.here or given.control is not None)
-    answer(found, missed(found), given.json)
-
-
 if __name__ == "__main__":
-    main()
+    run_campaign(measure, judge, {"here": (False, "in this environment")})

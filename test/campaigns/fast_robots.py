@@ -11,14 +11,10 @@ out of the simulator.
 from __future__ import annotations
 
 import dataclasses
-import sys
 
 import numpy as np
-from campaign import ROOT, answer, at_least, at_most, missed_bars, parser_of
+from campaign import Given, Result, at_least, at_most, run_campaign
 from numpy.typing import NDArray
-
-sys.path.append(str(ROOT / "test"))
-
 from robots import DIRECT, direct_model, lidar
 
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -78,20 +74,19 @@ def find_overlap(bodies: NDArray[np.float64], radius: float) -> float:
     return float(max(overlap[:, ~own].max(), to_field.max(), to_walls.max()))
 
 
-def measure(
-    robots: int, steps: int, seed: int, control: str | None
-) -> dict[str, float]:
+def measure(given: Given) -> Result:
     """Drive all robots for some periods."""
-    simulator = make_simulator(max(1, robots // ROBOTS), walls=control != "no_walls")
-    radius = RADIUS + (FATTER_M if control == "fat" else 0.0)
-    simulator.reset(np.arange(len(simulator.data.steps)) + seed)
+    walls = given.control != "no_walls"
+    simulator = make_simulator(max(1, given.robots // ROBOTS), walls)
+    radius = RADIUS + (FATTER_M if given.control == "fat" else 0.0)
+    simulator.reset(np.arange(len(simulator.data.steps)) + given.seed)
     bodies = simulator.data.bodies
     shape = simulator.data.pose.shape
     rooms = bodies[:, -ROBOTS:, :2] > 0.0
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(given.seed)
     overlap = -np.inf
     contacts = 0
-    for step in range(steps):
+    for step in range(given.steps):
         if step % HELD_PERIODS == 0:
             most = [FASTEST, FASTEST, FASTEST_TURN]
             commands = rng.uniform(-1.0, 1.0, shape) ** 3 * most
@@ -108,16 +103,5 @@ def measure(
     }
 
 
-def main() -> None:
-    """Answer as one JSON object, or as words."""
-    parser = parser_of(__doc__)
-    parser.add_argument("--robots", type=int, default=10_000)
-    parser.add_argument("--steps", type=int, default=300)
-    parser.add_argument("--seed", type=int, default=1)
-    given = parser.parse_args()
-    figures = measure(given.robots, given.steps, given.seed, given.control)
-    answer(figures, missed_bars(figures, BARS), given.json)
-
-
 if __name__ == "__main__":
-    main()
+    run_campaign(measure, BARS, {"robots": 10_000, "steps": 300, "seed": 1})

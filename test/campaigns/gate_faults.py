@@ -16,14 +16,13 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from campaign import answer, at_least, at_most, missed_bars, parser_of
+from campaign import Given, Result, at_least, at_most, missed_bars, run_campaign
 from parts.faults import FAULTS, LATE_S, Around
 from parts.faulty_robot import ROBOT, SPEED, NoMotionError, Robot
 from parts.processes import busy
@@ -44,7 +43,7 @@ AGES = {"scan_age": 3.0, "odom_age": 3.0, "command_age": 3.0, "e_stop_silence": 
 
 
 @dataclass
-class Result:
+class Times:
     """What one fault led to.
 
     Attributes:
@@ -57,32 +56,22 @@ class Result:
     times: list[float] = field(default_factory=list)
     after: list[float] = field(default_factory=list)
 
-    def summary(self, limit_s: float) -> dict[str, Any]:
-        """For the JSON object; NaN where nothing was measured."""
-        return {
-            "n": len(self.times),
-            "p50_s": round(float(np.median(self.after)), 4)
-            if self.after
-            else float("nan"),
-            "max_s": round(max(self.times), 4) if self.times else float("nan"),
-            "limit_s": limit_s,
-            "unsafe_commands": self.unsafe,
+
+def judge(result: Result) -> list[str]:
+    missed = []
+    for name, one in result.items():
+        bars = {
+            "n": at_least(one["asked"], "injections while the robot moved"),
+            "max_s": at_most(one["limit_s"], "time to zero [s]"),
+            "unsafe_commands": at_most(0),
         }
+        if one["limit_s"] == LATE_S:
+            bars["p50_s"] = at_most(MEDIAN_S, "median time to zero [s]")
+        missed += missed_bars(one, bars, f"{name}: ")
+    return missed
 
 
-def missed_by(name: str, one: dict[str, Any], wanted: int) -> list[str]:
-    """A sentence for each bar that a fault's summary misses."""
-    bars = {
-        "n": at_least(wanted, "injections while the robot moved"),
-        "max_s": at_most(one["limit_s"], "time to zero [s]"),
-        "unsafe_commands": at_most(0),
-    }
-    if one["limit_s"] == LATE_S:
-        bars["p50_s"] = at_most(MEDIAN_S, "median time to zero [s]")
-    return missed_bars(one, bars, f"{name}: ")
-
-
-def inject(around: Around, name: str, result: Result, patience_s: float) -> None:
+def inject(around: Around, name: str, result: Times, patience_s: float) -> None:
     """Drives, breaks something, and watches what the gate says."""
     fault = FAULTS[name]
     robot = around.robot
@@ -145,21 +134,31 @@ class Bench:
         self.patience_s = SHORT_PATIENCE_S if control == "standing" else PATIENCE_S
 
 
-def measure(names: Sequence[str], repeats: int, control: str = "") -> dict[str, Result]:
+def measure(given: Given) -> Result:
     """Injects each fault so often; a gate of its own for each fault."""
-    results = {name: Result() for name in names}
-    for name in names:
-        with ExitStack() as stack:
-            bench = Bench(name, control, stack)
-            idle = 0
-            while (known := len(results[name].times)) < repeats and idle < MOST_IDLE:
-                _some(bench, name, repeats, results[name])
-                sys.stderr.write(f"{name}: {len(results[name].times)} of {repeats}\n")
-                idle = idle + 1 if known == len(results[name].times) else 0
-    return results
+    result = {}
+    with busy(given.load):
+        for name in given.fault or FAULTS:
+            found = Times()
+            with ExitStack() as stack:
+                bench = Bench(name, given.control or "", stack)
+                idle = 0
+                while (known := len(found.times)) < given.repeats and idle < MOST_IDLE:
+                    _some(bench, name, given.repeats, found)
+                    sys.stderr.write(f"{name}: {len(found.times)} of {given.repeats}\n")
+                    idle = idle + 1 if known == len(found.times) else 0
+            result[name] = {
+                "n": len(found.times),
+                "asked": given.repeats,
+                "p50_s": round(float(np.median(found.after or np.nan)), 4),
+                "max_s": round(max(found.times, default=np.nan), 4),
+                "limit_s": FAULTS[name].limit_s,
+                "unsafe_commands": found.unsafe,
+            }
+    return result
 
 
-def _some(bench: Bench, name: str, repeats: int, result: Result) -> None:
+def _some(bench: Bench, name: str, repeats: int, result: Times) -> None:
     """One injection; or, if the policy outlives it, all of them with one policy."""
     if not FAULTS[name].policy:
         try:
@@ -191,28 +190,11 @@ def _some(bench: Bench, name: str, repeats: int, result: Result) -> None:
                 return
 
 
-def main() -> None:
-    """Prints a table, or one JSON object; ends with 1 when a stop came late."""
-    parser = parser_of(__doc__)
-    parser.add_argument("--repeats", type=int, default=30)
-    parser.add_argument(
-        "--fault", action="append", choices=sorted(FAULTS), help="only this one"
-    )
-    parser.add_argument(
-        "--load", type=int, default=0, help="keep so many cores busy besides"
-    )
-    given = parser.parse_args()
-    names = given.fault or list(FAULTS)
-    with busy(given.load):
-        results = measure(names, given.repeats, given.control or "")
-    summary = {name: one.summary(FAULTS[name].limit_s) for name, one in results.items()}
-    missed = [
-        line
-        for name, one in summary.items()
-        for line in missed_by(name, one, given.repeats)
-    ]
-    answer(summary, missed, given.json)
-
+OPTIONS = {
+    "repeats": 30,
+    "fault": {"action": "append", "choices": sorted(FAULTS), "help": "only this one"},
+    "load": (0, "keep so many cores busy besides"),
+}
 
 if __name__ == "__main__":
-    main()
+    run_campaign(measure, judge, OPTIONS)

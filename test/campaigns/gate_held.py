@@ -13,7 +13,7 @@ import sys
 import warnings
 
 import numpy as np
-from campaign import answer, parser_of
+from campaign import Given, Result, at_least, at_most, missed_bars, run_campaign
 from parts.held_body import RULE, Case, Tally, drive_freely, hold_bodies
 
 from nics_drl_bridge.gate import scan_motion
@@ -71,60 +71,9 @@ def zero_thresholds() -> None:
     )
 
 
-def summary(free: Tally, held: Tally) -> dict[str, object]:
-    """The figures, for the JSON object."""
-    delays = np.array(held.delays_s)
-    return {
-        "hours": round(free.driven_s / 3600.0, 3),
-        "judged_share": round(free.judged_s / max(free.driven_s, 1e-9), 3),
-        "trips": len(free.trips) + len(held.trips),
-        "tripped": free.trips[:20],
-        "held": len(delays),
-        "stopped_in_time": int((delays <= WITHIN_S + 1e-6).sum()),
-        "median_s": round(float(np.median(delays)), 3) if len(delays) else float("nan"),
-        "late": held.missed[:20],
-        "other_stops": dict(free.other_stops + held.other_stops),
-    }
-
-
-def missed(result: dict[str, object], hours: float, holds: int) -> list[str]:
-    """A sentence for each bar that was missed."""
-    found = []
-    if result["trips"]:
-        found.append(
-            f"{result['trips']} robots that drove freely were stopped by {RULE}, bar 0"
-        )
-    if result["hours"] < 0.99 * hours:
-        found.append(f"invalid: {result['hours']} h were driven, not {hours}")
-    if result["judged_share"] < LEAST_JUDGED:
-        found.append(
-            f"invalid: scans told something in {result['judged_share']} of the time"
-        )
-    if result["held"] < holds:
-        found.append(f"invalid: {result['held']} bodies were held, not {holds}")
-    share = result["stopped_in_time"] / max(result["held"], 1)
-    if not share >= LEAST_STOPPED:
-        found.append(
-            f"{share:.3f} of the held bodies were stopped in time, bar {LEAST_STOPPED}"
-        )
-    return found
-
-
-def main() -> None:
-    """Prints figures, or one JSON object; ends with 1 when a bar was missed."""
-    parser = parser_of(__doc__)
-    parser.add_argument(
-        "--hours", type=float, default=10.0, help="of free driving, all together"
-    )
-    parser.add_argument(
-        "--holds", type=int, default=390, help="bodies that are held, all together"
-    )
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--case", type=int, action="append", choices=range(len(CASES)))
-    given = parser.parse_args()
-    warnings.simplefilter(
-        "ignore"
-    )  # robots may be driven faster than their recordings were
+def measure(given: Given) -> Result:
+    """Drives freely, then holds bodies, in all cases."""
+    warnings.simplefilter("ignore")  # robots may go faster than their recordings did
 
     def change(config: GateConfig) -> GateConfig:
         return replace(config, stop_when_held=given.control != "rule_off")
@@ -144,15 +93,42 @@ def main() -> None:
         sys.stderr.write(
             f"{case.robot} in {case.world}: {len(free.trips)} trips so far, {late}\n"
         )
-    result = summary(free, held)
-    table = (
-        f"{result['hours']} h of free driving: {result['trips']} stops by {RULE}; scans told "
-        f"something in {result['judged_share']:.0%} of the time\n"
-        f"{result['held']} held bodies: {result['stopped_in_time']} stopped within {WITHIN_S:g} s, "
-        f"after {result['median_s']} s in the median\n"
-    )
-    answer(result, missed(result, given.hours, holds * len(cases)), given.json, table)
+    delays = np.array(held.delays_s or [np.inf])
+    asked = given.hours, holds * len(cases)
+    return {
+        "hours": free.driven_s / 3600.0,
+        "judged_share": free.judged_s / max(free.driven_s, 1e-9),
+        "trips": len(free.trips) + len(held.trips),
+        "tripped": free.trips[:20],
+        "held": len(held.delays_s),
+        "stopped_share": float((delays <= WITHIN_S + 1e-6).mean()),
+        "median_s": float(np.median(delays)),
+        "late": held.missed[:20],
+        "other_stops": dict(free.other_stops + held.other_stops),
+        "asked": asked,
+    }
 
+
+def judge(result: Result) -> list[str]:
+    hours, holds = result["asked"]
+    bars = {
+        "trips": at_most(0, f"stops by {RULE} of robots that drove freely"),
+        "hours": at_least(0.99 * hours, "invalid: hours that were driven"),
+        "judged_share": at_least(LEAST_JUDGED, "invalid: time in which scans told"),
+        "held": at_least(holds, "invalid: held bodies"),
+        "stopped_share": at_least(
+            LEAST_STOPPED, "share of the held bodies that were stopped in time"
+        ),
+    }
+    return missed_bars(result, bars)
+
+
+OPTIONS = {
+    "hours": (10.0, "of free driving, all together"),
+    "holds": (390, "bodies that are held, all together"),
+    "seed": 0,
+    "case": {"type": int, "action": "append", "choices": range(len(CASES))},
+}
 
 if __name__ == "__main__":
-    main()
+    run_campaign(measure, judge, OPTIONS)

@@ -13,10 +13,10 @@ SIGINT: `exit_s` is how long it still lives. The first of those stops has to be 
 
 from __future__ import annotations
 
-import argparse
 import math
 import signal
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 import rclpy
-from campaign import answer, at_least, at_most, missed_bars, parser_of
+from campaign import Given, Result, at_least, at_most, run_campaign
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from parts.faulty_robot import PATIENCE_S, ROBOT, Robot
@@ -52,6 +52,7 @@ BARS = {
     "moving": at_least(0.8, "invalid: share of the commands that came and moved"),
     "stops": at_least(3, "invalid: stops in the burst"),
     "exit_s": at_most(2.0, "from SIGINT to the gate's end [s]"),
+    "replayed": at_least(1),  # the first stop of the burst, by the black box
 }
 """After a gap between two commands of more than 0.2 s the gate itself stops."""
 BUSY = 10
@@ -83,16 +84,16 @@ class FrozenBox(gate_log.BlackBox):
         self._writers[-1].send_signal(signal.SIGSTOP)
 
 
-def ill_gate(control: str, arguments: list[str]) -> None:
-    """A control's gate: the real one, but for what is taken out."""
+def run_gate(control: str) -> None:
+    """The gate, but for what a control takes out."""
     if control == "busy":
         command_gate.decide = _often(command_gate.decide)
         for name in ("scan", "odometry", "estimate", "command", "e_stop"):
             setattr(command_gate, name, _often(getattr(command_gate, name)))
-    else:
-        gate_log.BlackBox = FrozenBox
+    elif control:
+        gate_log.BoxWriter = FrozenWriter
         gate_log.CLOSING_S = HUNG_S
-    start(GATE, [GATE, *arguments])
+    start(GATE, [GATE, *sys.argv[1:]])
 
 
 def _often(call: Callable[..., Any]) -> Callable[..., Any]:
@@ -120,18 +121,18 @@ def gate(domain_id: int, folder: Path, control: str) -> Any:
         "stop_when_held": "false",  # the robot's scans do not show how it moves
     }
     given = [f"{name}:={value}" for name, value in parameters.items()]
-    words = ["--part", control or "gate", "--ros-args"]
-    words += [word for one in given for word in ("-p", one)]
-    return part(__file__, domain_id, *words, stderr=subprocess.DEVNULL)
+    words = ["--ros-args", *(word for one in given for word in ("-p", one))]
+    call = f"run_gate({control!r})"
+    return part(__file__, domain_id, call, *words, stderr=subprocess.DEVNULL)
 
 
-def measure(seconds: float, burst_s: float, control: str) -> dict[str, Any]:
+def measure(given: Given) -> Result:
     """Drives for a time and takes what both processes used of a core; then stops and ends."""
     domain_id = free_domain_id()
     with (
         tempfile.TemporaryDirectory() as name,
-        gate(domain_id, Path(name), control) as real,
-        part(__file__, domain_id, "--part", "bare", stderr=subprocess.DEVNULL) as bare,
+        gate(domain_id, Path(name), given.control or "") as real,
+        part(__file__, domain_id, "bare_node()", stderr=subprocess.DEVNULL) as bare,
     ):
         robot = Robot(domain_id, odom_hz=ODOM_HZ)
         try:
@@ -141,8 +142,8 @@ def measure(seconds: float, burst_s: float, control: str) -> dict[str, Any]:
                 )
             robot.drive()
             robot.until(lambda: False, 1.0)
-            shares = share_of_a_core(robot, (real.pid, bare.pid), seconds)
-            return shares | ended_after_a_burst(robot, real, burst_s, Path(name))
+            shares = share_of_a_core(robot, (real.pid, bare.pid), given.seconds)
+            return shares | ended_after_a_burst(robot, real, given.burst, Path(name))
         finally:
             robot.close()
 
@@ -200,35 +201,14 @@ def ended_after_a_burst(
         "longest_gap_in_burst_s": round(float(np.diff(times).max()), 4),
         "exit_s": round(exit_s, 3),
         "files": len(list(folder.iterdir())),
-        "replayed": bool(files) and replay(files[0]).differing == (),
+        "replayed": int(bool(files) and replay(files[0]).differing == ()),
     }
 
 
-def main() -> None:
-    """Prints a table, or one JSON object; ends with 1 when a bar was missed."""
-    parser = parser_of(__doc__)
-    parser.add_argument("--seconds", type=float, default=30.0, help="of driving")
-    parser.add_argument(
-        "--burst", type=float, default=15.0, help="of stops, before the end [s]"
-    )
-    parser.add_argument("--part", help=argparse.SUPPRESS)
-    given, rest = parser.parse_known_args()
-    if given.part == "bare":
-        bare_node()
-    elif given.part == "gate":
-        start(GATE, [GATE, *rest])
-    elif given.part is not None:
-        ill_gate(given.part, rest)
-    if given.part is not None:
-        return
-    if rest:
-        parser.error(f"unrecognized arguments: {' '.join(rest)}")
-    result = measure(given.seconds, given.burst, given.control or "")
-    missed = missed_bars(result, BARS)
-    if not result["replayed"]:
-        missed.append("the first stop of the burst is not in the black box")
-    answer(result, missed, given.json)
-
+OPTIONS = {
+    "seconds": (30.0, "of driving"),
+    "burst": (15.0, "of stops, before the end [s]"),
+}
 
 if __name__ == "__main__":
-    main()
+    run_campaign(measure, BARS, OPTIONS)

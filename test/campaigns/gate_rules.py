@@ -9,9 +9,8 @@ from __future__ import annotations
 import argparse
 import subprocess
 import sys
-from pathlib import Path
 
-from campaign import answer, parser_of
+from campaign import ROOT, Given, Result, run_campaign
 
 from nics_drl_bridge.gate import arming, evidence, gate, intake
 
@@ -19,7 +18,6 @@ LEAST_RULES = 30
 """There are more; a run that found fewer has lost a table."""
 TESTS = "test/gate"
 OTHER_TEST = "test/gate/test_stopping.py"
-ROOT = Path(__file__).resolve().parents[2]
 TABLES = {
     "stop": (gate, "STOPS", lambda rule: rule.judge.__name__),
     "refusal": (intake, "REFUSALS", lambda rule: rule[1].__name__),
@@ -82,13 +80,8 @@ def _inside(name: str, control: str, tests: str) -> int:
     return int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", tests]))
 
 
-def main() -> None:
-    """Prints a table, or one JSON object; ends with 1 when a rule is not tested."""
-    parser = parser_of(__doc__)
-    parser.add_argument("--rule", action="append", help="only this one; else all")
-    parser.add_argument("--tests", default=TESTS, help="that have to fail")
-    parser.add_argument("--inside", help=argparse.SUPPRESS)
-    given = parser.parse_args()
+def measure(given: Given) -> Result:
+    """Takes out one rule after the other."""
     control = given.control or ""
     if given.inside is not None:
         raise SystemExit(_inside(given.inside, control, given.tests))
@@ -100,16 +93,24 @@ def main() -> None:
     asked = known if given.rule is None else given.rule
     if control == "untested_rule":
         asked = [name for name in known if name.endswith(_covers_nothing.__name__)]
-    untested = []
-    for name in asked:
-        found = tests_fail_without(name, control, given.tests)
-        untested += [] if found else [name]
-    missed = [f"no test misses the rule {name}, bar: one does" for name in untested]
-    if len(known) < LEAST_RULES or not asked:
-        missed.append(f"{len(known)} rules are known, {len(asked)} were looked at")
-    result = {"rules": len(known), "looked_at": len(asked), "untested": untested}
-    answer(result, missed, given.json)
+    untested = [
+        name for name in asked if not tests_fail_without(name, control, given.tests)
+    ]
+    return {"rules": len(known), "looked_at": len(asked), "untested": untested}
 
+
+def judge(result: Result) -> list[str]:
+    missed = [f"no test misses the rule {name}" for name in result["untested"]]
+    if result["rules"] < LEAST_RULES or not result["looked_at"]:
+        missed.append(f"{result['rules']} rules, {result['looked_at']} looked at")
+    return missed
+
+
+OPTIONS = {
+    "rule": {"action": "append", "help": "only this one; else all"},
+    "tests": (TESTS, "that have to fail"),
+    "inside": {"help": argparse.SUPPRESS},
+}
 
 if __name__ == "__main__":
-    main()
+    run_campaign(measure, judge, OPTIONS)

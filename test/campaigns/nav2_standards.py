@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from campaign import answer, parser_of
+from campaign import Given, Result, at_least, at_most, run_campaign
 
 from nics_drl_bridge.lidar.scanner import make_scanner
 from nics_drl_bridge.lidar.spec import load_lidar
@@ -31,7 +31,11 @@ from nics_drl_bridge.sim.occupancy import occupancy, standing
 from nics_drl_bridge.sim.scenes import SceneSampler
 from nics_drl_bridge.sim.world_set import load_worlds
 
-BARS = {"map_agreement": 0.995, "follow_path_success": 0.95, "nav2_names_missing": 0}
+BARS = {
+    "map_agreement": at_least(0.995),
+    "follow_path_success": at_least(0.95),
+    "nav2_names_missing": at_most(0),
+}
 WORLDS = ("arena", "circles", "clutter", "corridor", "doorway", "room", "barn")
 ROBOT = "differential"
 WORLD = "room"
@@ -209,7 +213,7 @@ def parameters_in(folder: Path, given: Path | None) -> Path | None:
 def figures(
     bare: bool = False, episodes: int = 20, parameters: Path | None = None
 ) -> dict[str, Any]:
-    """The three figures by the names of `BARS`; NaN for those whose messages are not installed."""
+    """The figures of `BARS`; NaN for what needs messages that `nox -s messages` builds."""
     shares = {name: map_agreement(name, bare=bare) for name in WORLDS}
     least, same = (min(each) for each in zip(*shares.values(), strict=True))
     result: dict[str, Any] = {"map_agreement": least, "map_same_beam": same}
@@ -229,31 +233,16 @@ def figures(
     return result
 
 
-def missed_of(result: dict[str, Any]) -> list[str]:
-    """A sentence for each bar that was missed, or could not be measured."""
-    found = []
-    for name, bar in BARS.items():
-        value = result[name]
-        least = name != "nav2_names_missing"
-        if math.isnan(value):
-            found.append(f"{name}: not measured; source what `nox -s messages` builds")
-        elif value < bar if least else value > bar:
-            found.append(
-                f"{name}: {value:g}, bar at {'least' if least else 'most'} {bar:g}"
-            )
-    return found
+def measure(given: Given) -> Result:
+    """All figures."""
+    return figures(given.control is not None, given.episodes, given.parameters)
 
 
-def main() -> None:
-    """Prints the figures; ends with 1 where a bar was missed."""
-    parser = parser_of(__doc__)
-    parser.add_argument("--episodes", type=int, default=20, help="paths to follow")
-    parser.add_argument("--parameters", type=Path, help="a parameter file of Nav2")
-    given = parser.parse_args()
-    result = figures(given.control is not None, given.episodes, given.parameters)
-    missed = missed_of(result)
-    answer(result, missed, given.json)
+OPTIONS = {
+    "episodes": (20, "paths to follow"),
+    "parameters": {"type": Path, "help": "a parameter file of Nav2"},
+}
 
 
 if __name__ == "__main__":
-    main()
+    run_campaign(measure, BARS, OPTIONS)

@@ -10,7 +10,6 @@ elsewhere Python's own handlers are as fast.
 
 from __future__ import annotations
 
-import argparse
 import os
 import signal
 import statistics
@@ -23,7 +22,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from campaign import answer, parser_of
+from campaign import Given, Result, run_campaign, some_of
 from parts.processes import busy
 
 from nics_drl_bridge.nodes.parameters import NODES
@@ -144,7 +143,7 @@ def summary(endings: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def measure(given: argparse.Namespace) -> dict[str, Any]:
+def measure(given: Given) -> Result:
     """All endings, by node and phase."""
     os.environ["ROS_DOMAIN_ID"] = str(free_domain_id())
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
@@ -164,7 +163,7 @@ def measure(given: argparse.Namespace) -> dict[str, Any]:
                     for k, each in enumerate(own)
                 ]
             )
-            sys.stderr.write(row_of(name, found[name]))
+            sys.stderr.write(f"{name}: {found[name]['longest_s']:.3f} s at most\n")
     return {
         "times": given.times,
         "loops": given.loops,
@@ -173,8 +172,7 @@ def measure(given: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-def missed_of(result: dict[str, Any]) -> list[str]:
-    """The bars that were missed."""
+def judge(result: Result) -> list[str]:
     missed = []
     for name, each in result["endings"].items():
         quiet = name.endswith("starting") and not result["loops"]
@@ -195,35 +193,12 @@ def missed_of(result: dict[str, Any]) -> list[str]:
     return missed
 
 
-def row_of(name: str, each: dict[str, Any]) -> str:
-    """A line of the table."""
-    figures = "".join(
-        f"{each[key]:>12.3f}" for key in ("reached_s", "median_s", "longest_s")
-    )
-    figures += f"{len(each['failed']):>5}"
-    return f"{name:<28}{figures}\n"
-
-
-def options(words: Sequence[str] | None = None) -> argparse.Namespace:
-    """The arguments."""
-    parser = parser_of(__doc__)
-    parser.add_argument(
-        "--times", type=int, default=10, help="of each node in each phase"
-    )
-    parser.add_argument("--loops", type=int, default=2, help="busy ones")
-    parser.add_argument("--nodes", nargs="+", default=list(NODES), choices=list(NODES))
-    parser.add_argument(
-        "--phases", nargs="+", default=list(PHASES), choices=list(PHASES)
-    )
-    return parser.parse_args(words)
-
-
-def main() -> None:
-    """Prints a table, or one JSON object."""
-    given = options()
-    result = measure(given)
-    answer(result, missed_of(result), given.json)
-
+OPTIONS = {
+    "times": (10, "of each node in each phase"),
+    "loops": (2, "busy ones"),
+    "nodes": some_of(tuple(NODES)),
+    "phases": some_of(tuple(PHASES)),
+}
 
 if __name__ == "__main__":
-    main()
+    run_campaign(measure, judge, OPTIONS)

@@ -11,7 +11,6 @@ has measured nothing, and fails.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import subprocess
@@ -24,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from campaign import answer, at_least, at_most, missed_bars, parser_of
+from campaign import FOLDER, Given, Result, at_least, at_most, missed_bars, run_campaign
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from parts.faulty_robot import PERIOD_S, ROBOT, SPEED, Robot
@@ -146,7 +145,7 @@ def run_robot(seconds: float, folder: Path, control: str) -> None:
         robot.close()
 
 
-def judge(heard: list[Any], used: list[Any], since: float) -> dict[str, Any]:
+def count_unsafe(heard: list[Any], used: list[Any], since: float) -> dict[str, Any]:
     """How old the data behind each moving command were, and how many were too old or wrong."""
     low = np.array([0.0, 0.0, -0.5])
     high = np.array([1.0, 0.0, 0.5])
@@ -175,7 +174,9 @@ def judge(heard: list[Any], used: list[Any], since: float) -> dict[str, Any]:
     }
 
 
-def measure(percent: int, seconds: float, cable: Link, control: str) -> dict[str, Any]:
+def measure_loss(
+    percent: int, seconds: float, cable: Link, control: str
+) -> dict[str, Any]:
     """Drives over a network that loses so many packets of a hundred."""
     environment = os.environ | NETWORK | {"ROS_DOMAIN_ID": str(1 + percent)}
     cable.lose(0)
@@ -183,13 +184,10 @@ def measure(percent: int, seconds: float, cable: Link, control: str) -> dict[str
         folder = Path(name)
         parts = []
         for end, part in enumerate(("robot", "stack")):
-            words = [sys.executable, __file__, "--part", part, "--folder", name]
-            words += [
-                "--seconds",
-                str(seconds),
-                *(["--control", control] if control else []),
-            ]
-            parts.append(subprocess.Popen(cable.command(end, words), env=environment))
+            call = f"run_{part}({seconds}, packet_loss.Path({name!r}), {control!r})"
+            code = f"import packet_loss; packet_loss.{call}"
+            words = cable.command(end, [sys.executable, "-c", code])
+            parts.append(subprocess.Popen(words, env=environment, cwd=FOLDER))
         try:
             deadline = time.monotonic() + PATIENCE_S
             while not (folder / "driving").exists() and time.monotonic() < deadline:
@@ -205,7 +203,7 @@ def measure(percent: int, seconds: float, cable: Link, control: str) -> dict[str
         heard = json.loads((folder / "heard.json").read_text())
         used = json.loads((folder / "used.json").read_text())
     arrived = sum(stamp >= since for _, stamp in used)
-    judged = judge(heard["heard"], used, since)
+    judged = count_unsafe(heard["heard"], used, since)
     asked = round(seconds / PERIOD_S)
     return {
         "scans_asked": asked,
@@ -215,7 +213,7 @@ def measure(percent: int, seconds: float, cable: Link, control: str) -> dict[str
     }
 
 
-def missed_of(name: str, one: dict[str, Any]) -> list[str]:
+def judge_loss(name: str, one: dict[str, Any]) -> list[str]:
     """A sentence for each bar that a loss missed."""
     low, high = (share * one["scans_asked"] for share in SENT_SHARES)
     sent = "invalid: scans that the robot sent"
@@ -235,37 +233,33 @@ def missed_of(name: str, one: dict[str, Any]) -> list[str]:
     return missed_bars(figures, bars, f"{name}: ")
 
 
-def main() -> None:
-    """Prints a table, or one JSON object; ends with 1 when a bar was missed."""
-    parser = parser_of(__doc__)
-    parser.add_argument(
-        "--seconds", type=float, default=60.0, help="of driving at each loss"
-    )
-    parser.add_argument(
-        "--loss", type=int, action="append", help="of a hundred packets"
-    )
-    parser.add_argument("--part", choices=("robot", "stack"), help=argparse.SUPPRESS)
-    parser.add_argument("--folder", type=Path, help=argparse.SUPPRESS)
-    given = parser.parse_args()
-    if given.part is not None:
-        part = run_robot if given.part == "robot" else run_stack
-        part(given.seconds, given.folder, given.control or "")
-        return
+def measure(given: Given) -> Result:
+    """Drives at each loss."""
+    runs = {}
     try:
         with link() as cable:
-            runs = {
-                f"loss_{percent}": measure(
+            for percent in given.loss or LOSSES:
+                runs[f"loss_{percent}"] = measure_loss(
                     percent, given.seconds, cable, given.control or ""
                 )
-                for percent in given.loss or LOSSES
-            }
     except NoNamespacesError as error:
         sys.stderr.write(f"{error}\n")
         raise SystemExit(2) from None
-    missed = [line for name, one in runs.items() for line in missed_of(name, one)]
-    unsafe = sum(one["unsafe_commands"] for one in runs.values())
-    answer(runs | {"unsafe_commands": unsafe}, missed, given.json)
+    return {
+        "runs": runs,
+        "unsafe": sum(each["unsafe_commands"] for each in runs.values()),
+    }
 
+
+def judge(result: Result) -> list[str]:
+    runs = result["runs"].items()
+    return [line for name, one in runs for line in judge_loss(name, one)]
+
+
+OPTIONS = {
+    "seconds": (60.0, "of driving at each loss"),
+    "loss": {"type": int, "action": "append", "help": "of a hundred packets"},
+}
 
 if __name__ == "__main__":
-    main()
+    run_campaign(measure, judge, OPTIONS)

@@ -19,8 +19,8 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from campaign import answer, at_least, at_most, missed_bars, parser_of
-from measuring.standing import standing_action
+from campaign import Given, Result, at_least, at_most, run_campaign
+from measuring.evaluations import standing_action
 
 from nics_drl_bridge.env.registry import COOPERATIVE_REACHING, NAVIGATION, register_envs
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
@@ -185,14 +185,14 @@ def compare(
     }
 
 
-def measure_all(
-    world: str, steps: int, seed: int, control: str | None
-) -> dict[str, Any]:
-    """Each robot alone, then the fleet; with the worst of all on top."""
-    runs = {
-        robot: measure(robot, world, steps, seed, control=control) for robot in ROBOTS
-    }
-    fleet = measure(ROBOTS[0], world, steps, seed, FLEET, control)
+def measure_all(given: Given) -> Result:
+    """Each robot alone, then the fleet, with the worst of all on top; or one of these."""
+    about = given.world, given.steps, given.seed
+    if given.robot is not None or given.robots is not None:
+        robot = given.robot or ROBOTS[0]
+        return measure(robot, *about, given.robots or 1, given.control)
+    runs = {robot: measure(robot, *about, control=given.control) for robot in ROBOTS}
+    fleet = measure(ROBOTS[0], *about, FLEET, given.control)
     runs[f"{FLEET} robots in namespaces"] = fleet
     return {
         "steps": sum(int(run["steps"]) for run in runs.values()),
@@ -203,25 +203,13 @@ def measure_all(
     }
 
 
-def main() -> None:
-    """Prints a table, or one JSON object, and ends with 1 where a bar was missed."""
-    parser = parser_of(__doc__)
-    parser.add_argument("--steps", type=int, default=500)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--robot", help="one kind of robot alone, as ackermann")
-    parser.add_argument("--robots", type=int, help="so many of them, in namespaces")
-    parser.add_argument("--world", default="arena")
-    given = parser.parse_args()
-    if given.robot is None and given.robots is None:
-        result = measure_all(given.world, given.steps, given.seed, given.control)
-    else:
-        robot = given.robot or ROBOTS[0]
-        alone = given.robots or 1
-        result = measure(
-            robot, given.world, given.steps, given.seed, alone, given.control
-        )
-    answer(result, missed_bars(result, BARS), given.json)
-
+OPTIONS = {
+    "steps": 500,
+    "seed": 0,
+    "robot": {"help": "one kind of robot alone, as ackermann"},
+    "robots": {"type": int, "help": "so many of them, in namespaces"},
+    "world": "arena",
+}
 
 if __name__ == "__main__":
-    main()
+    run_campaign(measure_all, BARS, OPTIONS)

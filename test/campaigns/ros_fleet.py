@@ -12,7 +12,6 @@ miss one robot.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import subprocess
@@ -24,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from campaign import answer, at_least, missed_bars, parser_of
+from campaign import Given, Result, at_least, missed_bars, run_campaign
 from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
 from parts.processes import core_seconds, part, use_of
@@ -169,7 +168,9 @@ def world_file(folder: Path, robots: int) -> Path:
     return file
 
 
-def measure(robots: int, seconds: float, patience_s: float, control: str | None) -> Run:
+def measure_fleet(
+    robots: int, seconds: float, patience_s: float, control: str | None
+) -> Run:
     """Runs a fleet of `robots`, drives it, and listens to it for `seconds`."""
     domain_id = free_domain_id()
     with tempfile.TemporaryDirectory() as name:
@@ -181,32 +182,16 @@ def measure(robots: int, seconds: float, patience_s: float, control: str | None)
             "odom_rate": ODOM_HZ,
             "enable_stamped_cmd_vel": False,
         }
-        fleet = str(robots)
-        driven = str(0 if control == "standing" else robots)
-        heard = str(robots - 1 if control == "deaf" else robots)
-        options = (
-            "--seconds",
-            str(seconds),
-            "--patience",
-            str(patience_s),
-            "--heard",
-            heard,
-        )
+        driven = 0 if control == "standing" else robots
+        heard = robots - 1 if control == "deaf" else robots
+        listening = f"listen({robots}, {heard}, {seconds}, {patience_s})"
         with (
             NodeProcess(
                 "simulator_node", Path(name), parameters, domain_id
             ) as simulator,
-            part(__file__, domain_id, "--part", "command", "--robots", driven),
+            part(__file__, domain_id, f"command({driven})"),
             part(
-                __file__,
-                domain_id,
-                "--part",
-                "listen",
-                "--robots",
-                fleet,
-                *options,
-                stdout=subprocess.PIPE,
-                text=True,
+                __file__, domain_id, listening, stdout=subprocess.PIPE, text=True
             ) as listener,
         ):
             if (
@@ -234,9 +219,9 @@ def measure(robots: int, seconds: float, patience_s: float, control: str | None)
 
 def largest(seconds: float, patience_s: float) -> Run:
     """The largest fleet that is held; the smallest that was tried, where none is."""
-    best = measure(SIZES[0], seconds, patience_s, None)
+    best = measure_fleet(SIZES[0], seconds, patience_s, None)
     for robots in SIZES[1:] if best.held else ():
-        run = measure(robots, seconds, patience_s, None)
+        run = measure_fleet(robots, seconds, patience_s, None)
         if not run.held:
             break
         best = run
@@ -246,49 +231,37 @@ def largest(seconds: float, patience_s: float) -> Run:
 def smaller(failed: Run, seconds: float, patience_s: float) -> Run:
     """The largest fleet below one that was not held."""
     for robots in range(failed.robots - 4, 0, -4):
-        run = measure(robots, seconds, patience_s, None)
+        run = measure_fleet(robots, seconds, patience_s, None)
         if run.held:
             return run
     return failed
 
 
-def missed_of(run: Run) -> list[str]:
-    """A sentence for each bar that was missed, with the robot that misses it most."""
+def measure(given: Given) -> Result:
+    """The largest fleet that is held, or one of some size."""
+    if given.robots or given.control:
+        robots = given.robots or SIZES[0]
+        run = measure_fleet(robots, given.seconds, given.patience, given.control)
+    else:
+        run = largest(given.seconds, given.patience)
+    return asdict(run)
+
+
+def judge(result: Result) -> list[str]:
+    each = result["each"]
     missed = []
     for key, bar in BARS.items():
-        worst = min(run.each, key=lambda name, key=key: run.each[name][key])
-        where = f"{worst} of {run.robots}: "
-        missed += missed_bars(run.each[worst], {key: bar}, where)
+        worst = min(each, key=lambda name, key=key: each[name][key])
+        where = f"{worst} of {result['robots']}: "
+        missed += missed_bars(each[worst], {key: bar}, where)
     return missed
 
 
-def main() -> None:
-    """Prints a table, or one JSON object, and ends with 1 where a bar was missed."""
-    parser = parser_of(__doc__)
-    parser.add_argument(
-        "--seconds", type=float, default=10.0, help="to listen to each fleet"
-    )
-    parser.add_argument("--robots", type=int, help="this size alone")
-    parser.add_argument(
-        "--patience", type=float, default=90.0, help="for the first messages [s]"
-    )
-    parser.add_argument("--part", choices=("command", "listen"), help=argparse.SUPPRESS)
-    parser.add_argument("--heard", type=int, help=argparse.SUPPRESS)
-    given = parser.parse_args()
-    if given.part == "command":
-        command(given.robots)
-    elif given.part == "listen":
-        listen(given.robots, given.heard, given.seconds, given.patience)
-    else:
-        robots = SIZES[0] if given.control and given.robots is None else given.robots
-        run = (
-            largest(given.seconds, given.patience)
-            if robots is None
-            else measure(robots, given.seconds, given.patience, given.control)
-        )
-        result = asdict(run)
-        answer(result, missed_of(run), given.json)
-
+OPTIONS = {
+    "seconds": (10.0, "to listen to each fleet"),
+    "robots": {"type": int, "help": "this size alone"},
+    "patience": (90.0, "for the first messages [s]"),
+}
 
 if __name__ == "__main__":
-    main()
+    run_campaign(measure, judge, OPTIONS)

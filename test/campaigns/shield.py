@@ -15,7 +15,6 @@ itself, the running episodes are driven again, and when that was often, the run 
 from __future__ import annotations
 
 import math
-import os
 import sys
 import tempfile
 from collections import Counter
@@ -25,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from campaign import answer, at_least, at_most, missed_bars, parser_of
+from campaign import Given, Result, at_least, at_most, missed_bars, run_campaign
 from parts import shield_in_process
 from parts.adversaries import ADVERSARIES
 from parts.braking import braking_used
@@ -181,8 +180,8 @@ def _mean(values: Sequence[float]) -> float | None:
     return round(float(np.mean(values)), 2) if values else None
 
 
-def missed(result: Mapping[str, Any], asked: int) -> list[str]:
-    """A sentence for each bar that was missed."""
+def judge(result: Result) -> list[str]:
+    asked = result["asked"]
     least_contacts = max(1.0, LEAST_CONTACTS_WITHOUT * result["tried_without"])
     least_goals = max(1.0, LEAST_GOALS * result["goals_reached_without"])
     bars = {
@@ -202,41 +201,37 @@ def missed(result: Mapping[str, Any], asked: int) -> list[str]:
     return missed_bars(result, bars)
 
 
-def main() -> None:
-    """Prints figures, or one JSON object; ends with 1 when a bar was missed."""
-    parser = parser_of(__doc__)
-    parser.add_argument(
-        "--episodes", type=int, default=300, help=f"of {ADVERSARY_S:g} s each"
-    )
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument(
-        "--in-process", action="store_true", help="without DDS, with drawn delays"
-    )
-    names = [f"{robot}/{world}" for robot in ROBOTS for world in WORLDS]
-    more = [f"{OUTLINED}/{world}" for world in WORLDS]
-    about = f"only there; repeatable; those of the {OUTLINED} go in process alone"
-    parser.add_argument("--place", action="append", choices=names + more, help=about)
-    parser.add_argument(
-        "--at-once", type=int, default=Plan.at_once, help="robots side by side over DDS"
-    )
-    given = parser.parse_args()
-    if not given.in_process and set(more) & set(given.place or ()):
-        parser.error(f"the {OUTLINED} drives in process alone; add --in-process")
+def measure(given: Given) -> Result:
+    """Drives all episodes, some of them without the shield as well."""
+    named = given.place or [f"{robot}/{world}" for robot in ROBOTS for world in WORLDS]
+    if not given.in_process and any(name.startswith(OUTLINED) for name in named):
+        raise SystemExit(f"the {OUTLINED} drives in process alone; add --in-process")
     plan = Plan(
         given.episodes, given.seed, given.in_process, given.control or "", given.at_once
     )
-    places = [Place(*name.split("/")) for name in given.place or names]
+    places = [Place(*name.split("/")) for name in named]
     with_it, without = plan.jobs(len(places))
     shielded, first = drive(plan, places, with_it, plan.shield)
     bare, second = drive(plan, places, without, None)
-    result = summary(shielded, bare, (first, second))
-    result["driven"] = "in process" if plan.in_process else "over DDS"
-    result["braking"] = round(
-        max(braking_used(place.robot, plan.shield) for place in places), 3
-    )
-    result["load"] = round(os.getloadavg()[0], 1)
-    answer(result, missed(result, plan.episodes), given.json)
+    return {
+        **summary(shielded, bare, (first, second)),
+        "asked": plan.episodes,
+        "driven": "in process" if plan.in_process else "over DDS",
+        "braking": max(braking_used(place.robot, plan.shield) for place in places),
+    }
 
+
+OPTIONS = {
+    "episodes": (300, f"of {ADVERSARY_S:g} s each"),
+    "seed": 0,
+    "in-process": (False, "without DDS, with drawn delays"),
+    "place": {
+        "action": "append",
+        "choices": [f"{r}/{world}" for r in (*ROBOTS, OUTLINED) for world in WORLDS],
+        "help": f"only there; those of the {OUTLINED} go in process alone",
+    },
+    "at-once": (Plan.at_once, "robots side by side over DDS"),
+}
 
 if __name__ == "__main__":
-    main()
+    run_campaign(measure, judge, OPTIONS)

@@ -22,7 +22,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from campaign import answer, at_least, at_most, missed_bars, parser_of
+from campaign import Given, Result, at_least, at_most, missed_bars, run_campaign
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
@@ -262,8 +262,9 @@ def growth(
     }
 
 
-def measure(minutes: float, warm_up: float, control: str | None) -> dict[str, Any]:
+def measure(given: Given) -> Result:
     """Runs everything and tells what grew."""
+    control = given.control
     with ExitStack() as stack:
         soak = begin(stack, control)
         deadline = time.monotonic() + PATIENCE_S
@@ -271,10 +272,10 @@ def measure(minutes: float, warm_up: float, control: str | None) -> dict[str, An
             run(soak, 1.0)
             if time.monotonic() > deadline:
                 break
-        run(soak, 60.0 * warm_up)
+        run(soak, 60.0 * given.warm_up)
         before = dict(soak.drive.stops)
         known = counts(soak)
-        samples = run(soak, 60.0 * minutes)
+        samples = run(soak, 60.0 * given.minutes)
         stops = {
             rule: count - before.get(rule, 0)
             for rule, count in soak.drive.stops.items()
@@ -293,7 +294,7 @@ def measure(minutes: float, warm_up: float, control: str | None) -> dict[str, An
                 name: round(v, 2) for name, v in memory.items()
             },
             **{name: round(now - known[name], 3) for name, now in counts(soak).items()},
-            "minutes": minutes,
+            "minutes": given.minutes,
         }
 
 
@@ -308,8 +309,7 @@ def counts(soak: Soak) -> dict[str, float]:
     }
 
 
-def missed_of(result: dict[str, Any]) -> list[str]:
-    """A sentence for each bar that was missed."""
+def judge(result: Result) -> list[str]:
     minutes = result["minutes"]
     goals = int(GOALS_REACHED * minutes)  # of whole minutes
     rates = {
@@ -319,17 +319,7 @@ def missed_of(result: dict[str, Any]) -> list[str]:
     return missed_bars(result, BARS | rates)
 
 
-def main() -> None:
-    """Prints a table, or one JSON object, and ends with 1 where a bar was missed."""
-    parser = parser_of(__doc__)
-    parser.add_argument("--minutes", type=float, default=10.0)
-    parser.add_argument(
-        "--warm-up", type=float, default=1.0, help="minutes before it counts"
-    )
-    given = parser.parse_args()
-    result = measure(given.minutes, given.warm_up, given.control)
-    answer(result, missed_of(result), given.json)
-
+OPTIONS = {"minutes": 10.0, "warm-up": (1.0, "minutes before it counts")}
 
 if __name__ == "__main__":
-    main()
+    run_campaign(measure, judge, OPTIONS)

@@ -15,7 +15,15 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from campaign import answer, at_least, at_most, missed_bars, parser_of
+from campaign import (
+    Given,
+    Result,
+    at_least,
+    at_most,
+    missed_bars,
+    run_campaign,
+    some_of,
+)
 from numpy.typing import NDArray
 from parts.processes import use_of
 
@@ -131,8 +139,10 @@ class Case:
         return {key: value for key, value in vars(self).items() if key[0] != "_"}
 
 
-def run(given: Any) -> dict[str, Any]:
+def measure(given: Given) -> Result:
     """Runs the cases in turn, the first round to warm up and for the memory to settle."""
+    if given.resets:
+        return run_resets(given.resets, given.seed, given.control)
     limit = 10**9 if given.control == "endless" else given.limit
     cases = {
         name: Case(CASES[name], given.seed + 1000 * k, limit)
@@ -154,12 +164,15 @@ def run(given: Any) -> dict[str, Any]:
         "seconds": time.perf_counter() - begin,
         "rss_growth_mb": memory[-1] - memory[1],
         "cases": {name: case.describe() for name, case in cases.items()},
+        "limit": given.limit,
     }
 
 
-def missed_of(result: dict[str, Any], limit: int) -> list[str]:
-    """Returns the bars that a soak missed."""
-    bars = CASE_BARS | {"longest": at_most(limit + 1, "an episode of so many steps")}
+def judge(result: Result) -> list[str]:
+    if "resets" in result:
+        return missed_bars(result, RESET_BARS)
+    longest = at_most(result["limit"] + 1, "an episode of so many steps")
+    bars = CASE_BARS | {"longest": longest}
     missed = missed_bars(result, MEMORY)
     for name, case in result["cases"].items():
         missed += missed_bars(case, bars, f"{name}: ")
@@ -200,27 +213,13 @@ def run_resets(resets: int, seed: int, control: str | None) -> dict[str, Any]:
     }
 
 
-def main() -> None:
-    """Prints a table, or one JSON object."""
-    parser = parser_of(__doc__)
-    parser.add_argument(
-        "--steps", type=int, default=20_000_000, help="env steps in all"
-    )
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES))
-    parser.add_argument(
-        "--limit", type=int, default=LIMIT, help="steps of the longest episode"
-    )
-    parser.add_argument(
-        "--resets", type=int, default=0, help="resets of a single env instead"
-    )
-    given = parser.parse_args()
-    if given.resets:
-        told = run_resets(given.resets, given.seed, given.control)
-        answer(told, missed_bars(told, RESET_BARS), given.json)
-    result = run(given)
-    answer(result, missed_of(result, given.limit), given.json)
-
+OPTIONS = {
+    "steps": (20_000_000, "env steps in all"),
+    "seed": 0,
+    "cases": some_of(tuple(CASES)),
+    "limit": (LIMIT, "steps of the longest episode"),
+    "resets": (0, "resets of a single env instead"),
+}
 
 if __name__ == "__main__":
-    main()
+    run_campaign(measure, judge, OPTIONS)

@@ -22,7 +22,7 @@ from typing import Any
 
 import nav2_standards
 import numpy as np
-from campaign import answer, at_most, missed_bars, parser_of
+from campaign import Given, Result, at_most, missed_bars, run_campaign, some_of
 
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 
@@ -115,12 +115,11 @@ def leapp(folder: Path, control: str | None) -> dict[str, float]:
     return {"leapp_max_abs_difference": gap}
 
 
-def missed_of(result: dict[str, Any]) -> list[str]:
-    """A sentence for each bar that was missed."""
+def judge(result: Result) -> list[str]:
     measured = {name: bar for name, bar in BARS.items() if name in result}
     missed = missed_bars(result, measured)
     if "map_agreement" in result:
-        missed += nav2_standards.missed_of(result)
+        missed += missed_bars(result, nav2_standards.BARS)
     return [*missed, *result.get("failed", [])]
 
 
@@ -129,7 +128,7 @@ SIMULATION = ("sim_features", "sim_conformance_failed")
 PARTS = ("conformance", "leapp", "nav2")
 
 
-def measure(given: Any) -> dict[str, Any]:
+def measure(given: Given) -> Result:
     """All figures of the parts that were asked for."""
     domain_id = free_domain_id()
     result = dict[str, Any]()
@@ -147,17 +146,10 @@ def measure(given: Any) -> dict[str, Any]:
     return result
 
 
-def main() -> None:
-    """Prints a table, or one JSON object; ends with 1 where a bar was missed."""
-    parser = parser_of(__doc__)
-    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
-    parser.add_argument(
-        "--parameters", type=Path, help="another parameter file of Nav2"
-    )
-    given = parser.parse_args()
-    result = measure(given)
-    answer(result, missed_of(result), given.json)
-
+OPTIONS = {
+    "parts": some_of(PARTS),
+    "parameters": {"type": Path, "help": "another parameter file of Nav2"},
+}
 
 if __name__ == "__main__":
-    main()
+    run_campaign(measure, judge, OPTIONS)

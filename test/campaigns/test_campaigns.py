@@ -11,7 +11,7 @@ from importlib.util import find_spec
 
 import pytest
 
-from .registry import CAMPAIGNS, FOLDER, Campaign
+from .campaign import CAMPAIGNS, FOLDER, Campaign
 
 ROOT = FOLDER.parents[1]
 NAV2 = ROOT.parent / "shared" / "upstream" / "nav2_interfaces.tar.gz"
@@ -88,7 +88,7 @@ def test_a_control_misses_its_bar(name, control):
     assert any(taken.bar in line for line in missed), missed
 
 
-def test_every_script_is_in_the_registry_and_knows_its_short_form():
+def test_every_script_is_in_the_registry():
     scripts = {
         path.stem
         for path in FOLDER.glob("*.py")

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from .registry import FOLDER
+from .campaign import FOLDER
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 pytest.importorskip("dartpy", reason="needs DART: dartpy is not installed")

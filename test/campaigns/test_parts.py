@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 import sys
+from argparse import Namespace
 from importlib import import_module
 
 import numpy as np
 import pytest
 
-from .registry import FOLDER
+from .campaign import FOLDER
 
 
 @pytest.fixture
@@ -41,10 +42,17 @@ NAN = float("nan")
     ],
 )
 def test_a_fault_that_is_late_unsafe_or_not_measured_misses_one_bar(ros_module, change):
-    missed_by = ros_module("gate_faults").missed_by
-    good = {"n": 2, "p50_s": 0.2, "max_s": 0.3, "limit_s": 0.4, "unsafe_commands": 0}
-    assert missed_by("x", good, 2) == []
-    assert len(missed_by("x", good | change, 2)) == 1
+    judge = ros_module("gate_faults").judge
+    good = {
+        "n": 2,
+        "asked": 2,
+        "p50_s": 0.2,
+        "max_s": 0.3,
+        "limit_s": 0.4,
+        "unsafe_commands": 0,
+    }
+    assert judge({"x": good}) == []
+    assert len(judge({"x": good | change})) == 1
 
 
 def test_every_rule_of_the_gate_has_a_name_by_which_it_is_taken_out(module):
@@ -64,7 +72,7 @@ def test_a_robot_that_does_not_move_is_no_round(ros_module, monkeypatch):
     monkeypatch.setattr(abuse_env, "MOVES_S", 0.3)
     monkeypatch.setattr(abuse_env, "MOVING", 1e6)
     with pytest.raises(RuntimeError, match="does not move"):
-        abuse_env.measure(1, 1)
+        abuse_env.measure(Namespace(seed=1, rounds=1, control=None))
 
 
 @pytest.mark.parametrize(

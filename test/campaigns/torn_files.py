@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from campaign import answer, at_least, at_most, missed_bars, parser_of
+from campaign import Given, Result, at_least, at_most, missed_bars, run_campaign
 from parts.loaders import WRITTEN, Loader
 
 from nics_drl_bridge import files
@@ -121,30 +121,24 @@ def write_naively(loader: Loader) -> Loader:
     return replace(loader, write=write)
 
 
-def measure(kills: int, seed: int, control: str | None) -> dict[str, Any]:
+def measure(given: Given) -> Result:
     """Counts over all that the package writes, and by its kind."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(given.seed)
     found = {}
     for loader in WRITTEN:
-        writer = write_naively(loader) if control == "naive_writer" else loader
+        writer = write_naively(loader) if given.control == "naive_writer" else loader
         with tempfile.TemporaryDirectory() as folder:
-            found[loader.name] = count_torn(writer, kills, rng, Path(folder))
+            found[loader.name] = count_torn(writer, given.kills, rng, Path(folder))
     keys = ("torn", "kills", "kills_during_a_write")
     total = {key: sum(one[key] for one in found.values()) for key in keys}
     return {**total, "by_kind": found}
 
 
-def main() -> None:
-    """Prints a table, or one JSON object; ends with 1 when a file was torn."""
-    parser = parser_of(__doc__)
-    parser.add_argument("--kills", type=int, default=300, help="of each kind of file")
-    parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args()
-    result = measure(given.kills, given.seed, given.control)
+def judge(result: Result) -> list[str]:
     during = at_least(max(1.0, LEAST_DURING * result["kills"]))
     bars = {"torn": at_most(0), "kills": at_least(1), "kills_during_a_write": during}
-    answer(result, missed_bars(result, bars), given.json)
+    return missed_bars(result, bars)
 
 
 if __name__ == "__main__":
-    main()
+    run_campaign(measure, judge, {"kills": (300, "of each kind of file"), "seed": 0})

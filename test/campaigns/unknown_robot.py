@@ -10,7 +10,6 @@ another moment of a drive, and the gate has to stop it.
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import os
@@ -27,7 +26,7 @@ from typing import Any
 
 import numpy as np
 import yaml
-from campaign import answer, parser_of
+from campaign import FOLDER, Given, Result, run_campaign
 from geometry_msgs.msg import PoseStamped, TwistStamped
 from numpy.typing import NDArray
 from parts.spun_node import SpunNode
@@ -54,7 +53,6 @@ REST_S = 1.0  # at rest for so long, the robot has ended a drive
 HELD_PATIENCE_S = 10.0  # within which a held body is stopped, or never
 DRIVES_BEFORE_HOLD_S = (0.2, 5.0)  # between the first moving command and a hold
 ARMED_S = 300.0  # between two armings
-HERE = Path(__file__).resolve().parent
 
 OPEN_PLACE = {"size": [30.0, 30.0], "pillars": []}
 FIELD = {"size": [12.0, 12.0], "pillars": [list(pillar) for pillar in PILLARS]}
@@ -84,25 +82,6 @@ commands:
   forward_command: {min: -0.4, max: 0.8, rate: 2.0, jerk: 40.0}
   turn_command: {min: -1.2, max: 1.2, rate: 6.0, jerk: 120.0}
 """
-
-
-def arguments() -> argparse.Namespace:
-    """Returns the options of the command line."""
-    parser = parser_of(__doc__)
-    parser.add_argument("--goals", type=int, default=40)
-    parser.add_argument(
-        "--seed", type=int, default=0, help="of goals, noise and the training"
-    )
-    parser.add_argument(
-        "--minutes", type=float, default=0.0, help="drive on, re-arming every 5"
-    )
-    parser.add_argument(
-        "--holds", type=int, default=20, help="how often its body is held"
-    )
-    parser.add_argument(
-        "--folder", type=Path, help="keep all files there, and use what is there"
-    )
-    return parser.parse_args()
 
 
 class Workshop:
@@ -154,7 +133,7 @@ class Workshop:
             command.append("--no-imu")
         with (self.folder / "driver.log").open("wb") as log:
             process = subprocess.Popen(
-                command, cwd=HERE, env=self._environment, stdout=log, stderr=log
+                command, cwd=FOLDER, env=self._environment, stdout=log, stderr=log
             )
         try:
             yield
@@ -427,8 +406,14 @@ def run_bridge(
     return stack
 
 
-def measure(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
-    """Records, generates, trains and drives; returns the figures."""
+def measure(given: Given) -> Result:
+    """Records, generates, trains and drives."""
+    with tempfile.TemporaryDirectory() as temporary:
+        return measure_in((given.folder or Path(temporary)).resolve(), given)
+
+
+def measure_in(folder: Path, options: Given) -> Result:
+    """Does so in a folder."""
     domain_id = free_domain_id()
     workshop = Workshop(folder, domain_id, options.control != "no_gyro", options.seed)
     workshop.record()
@@ -457,8 +442,7 @@ def measure(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     }
 
 
-def missed_of(result: dict[str, Any]) -> list[str]:
-    """Returns a sentence for each bar that was missed."""
+def judge(result: Result) -> list[str]:
     missed = []
     if not result["success"] >= SUCCESS_BAR:
         missed.append(
@@ -476,34 +460,13 @@ def missed_of(result: dict[str, Any]) -> list[str]:
     return missed
 
 
-def table_of(result: dict[str, Any]) -> str:
-    """Returns the figures for people."""
-    ended = [away for away in result["away_m"] if math.isfinite(away)]
-    delays = result["held_stopped_after_s"]
-    rows = [
-        *result["report"],
-        f"goals              {len(result['away_m'])}",
-        f"success            {result['success']:.3f}",
-        f"true distance [m]  mean {np.mean(ended):.3f}, greatest {np.max(ended):.3f}"
-        if ended
-        else "no drive has ended",
-        f"touched            {result['touched']}",
-        f"armed              {result['armings']} times, refused: {result['refusals']}",
-        f"held bodies        {len(delays)}, stopped after {np.median(delays):.2f} s in the median, "
-        f"{np.max(delays):.2f} s at most"
-        if delays
-        else "no body was held",
-    ]
-    return "\n".join(rows) + "\n"
-
-
-def main() -> None:
-    """Prints the figures; ends with 1 where a bar was missed."""
-    options = arguments()
-    with tempfile.TemporaryDirectory() as temporary:
-        result = measure(options, (options.folder or Path(temporary)).resolve())
-    answer(result, missed_of(result), options.json, table_of(result))
-
+OPTIONS = {
+    "goals": 40,
+    "seed": (0, "of goals, noise and the training"),
+    "minutes": (0.0, "drive on, re-arming every 5"),
+    "holds": (20, "how often its body is held"),
+    "folder": {"type": Path, "help": "keep all files there, and use what is there"},
+}
 
 if __name__ == "__main__":
-    main()
+    run_campaign(measure, judge, OPTIONS)

@@ -66,22 +66,27 @@ def busy(loops: int) -> Iterator[None]:
 
 @contextmanager
 def part(
-    script: str, domain_id: int, *words: str, **given: Any
+    script: str, domain_id: int, call: str, *words: str, **given: Any
 ) -> Iterator[subprocess.Popen[Any]]:
-    """A script in a process of its own, in a ROS domain, until the end of the block.
+    """A call of a campaign in a process of its own, in a ROS domain, until the end of the block.
 
     Args:
-        script: its file.
+        script: the campaign's file.
         domain_id: of ROS.
-        words: its arguments.
+        call: of one of its functions.
+        words: arguments of the process.
         given: further arguments of `Popen`.
     """
     environment = os.environ | {
         "ROS_DOMAIN_ID": str(domain_id),
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
     }
-    command = [sys.executable, script, *words]
-    with subprocess.Popen(command, env=environment, **given) as process:
+    file = Path(script)
+    code = f"import {file.stem} as campaign; campaign.{call}"
+    command = [sys.executable, "-c", code, *words]
+    with subprocess.Popen(
+        command, env=environment, cwd=file.parent, **given
+    ) as process:
         try:
             yield process
         finally:

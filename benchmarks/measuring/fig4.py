@@ -1,19 +1,18 @@
-"""The path of the paper's Fig. 4 among its obstacles: point clouds, a map by SLAM, the picture."""
+"""The paper's Fig. 4: a path among obstacles, point clouds, MuJoCo's rays, a map by SLAM."""
 
 from __future__ import annotations
 
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from measuring.environments import python_with, run
 from nics_drl_bridge import geometry
+from nics_drl_bridge.extras.mujoco.machines import load_mujoco
 from nics_drl_bridge.lidar.shapes import Circle, Polygon, Rectangle, Shape
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.style import DARK, MEASURED, MODEL, OTHER, make_panels
@@ -47,6 +46,8 @@ OBSTACLES: tuple[Shape, ...] = (
 POSES = np.array(
     [(-1.1, 0.3, 0.0), (1.0, -0.2, 0.3), (3.1, 2.2, 0.5), (-3.0, -2.1, -0.7)]
 )
+HALF_HEIGHT = 0.25  # of what stands on MuJoCo's floor [m]
+THIN = 0.01  # half of MuJoCo's walls [m]
 LAPS = 1.15
 DRIFT = np.array([1.02, 1.0, 1.04])
 ODOMETRY_NOISE = np.array([0.004, 0.002, 0.004])
@@ -112,6 +113,55 @@ def find_path_error(poses: Array, truth: Array) -> float:
     return float(np.sqrt(((poses[:, :2] - truth[:, :2]) ** 2).sum(axis=1).mean()))
 
 
+def describe_side(ends: Array) -> str:
+    """A thin box of MuJoCo behind a straight side x1, y1, x2, y2, which is seen from its left."""
+    along = ends[2:] - ends[:2]
+    length = float(np.hypot(*along))
+    right = np.array([along[1], -along[0]]) / length
+    x, y = (ends[:2] + ends[2:]) / 2.0 + THIN * right
+    at = f'pos="{x} {y} {HALF_HEIGHT}" euler="0 0 {np.arctan2(along[1], along[0])}"'
+    return f'<geom type="box" size="{length / 2} {THIN} {HALF_HEIGHT}" {at}/>'
+
+
+def list_sides(shape: Shape, pose: Array) -> list[str]:
+    """An obstacle in MuJoCo: a cylinder, or its sides, which are all that level rays see."""
+    if isinstance(shape, Circle):
+        x, y, _ = pose
+        size = f'size="{shape.radius} {HALF_HEIGHT}" pos="{x} {y} {HALF_HEIGHT}"'
+        return [f'<geom type="cylinder" {size}/>']
+    corners = geometry.rotate(shape.outline, pose[2]) + pose[:2]
+    sides = np.concatenate([np.roll(corners, -1, axis=0), corners], axis=1)
+    return [describe_side(side) for side in sides]
+
+
+def scan_in_mujoco(spec: LidarSpec, path: Array) -> NDArray[np.float32]:
+    """(N, B) ranges of MuJoCo's rays from each pose (N, 3) of a path; `inf` where nothing is hit.
+
+    Raises:
+        ConfigError: MuJoCo is not installed.
+    """
+    mujoco = load_mujoco()
+    geoms = [describe_side(side) for side in WALLS]
+    for shape, pose in zip(OBSTACLES, POSES, strict=True):
+        geoms += list_sides(shape, pose)
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><compiler angle="radian"/><worldbody>'
+        f"{''.join(geoms)}</worldbody></mujoco>"
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    ranges = np.full((len(path), spec.beams), np.inf, np.float32)
+    hit = np.zeros(1, np.int32)
+    for n, (x, y, heading) in enumerate(geometry.compose(path, np.array(spec.mount))):
+        start = np.array([x, y, HALF_HEIGHT])
+        for b, angle in enumerate(heading + spec.angles):
+            ray = np.array([np.cos(angle), np.sin(angle), 0.0])
+            distance = mujoco.mj_ray(model, data, start, ray, None, 1, -1, hit)
+            if 0.0 <= distance <= spec.range_max:
+                ranges[n, b] = distance
+    return ranges
+
+
 def make_outline(shape: Shape, pose: Array) -> Array:
     """(V, 2) a closed line around an obstacle [m]."""
     t = np.linspace(0.0, 2.0 * np.pi, 60)
@@ -121,87 +171,39 @@ def make_outline(shape: Shape, pose: Array) -> Array:
     return geometry.rotate(np.concatenate([corners, corners[:1]]), pose[2]) + pose[:2]
 
 
-def prepare_panel(axes: Axes, title: str, truth: Array) -> None:
-    """What all four have in common."""
-    axes.set_title(title)
-    axes.set_aspect("equal")
-    axes.set_xlim(-4.3, 4.3)
-    axes.set_ylim(-3.3, 3.3)
-    axes.plot(*truth[:, :2].T, color=MODEL, lw=1.2, label="path")
-    axes.plot(*truth[0, :2], "o", color=MODEL, ms=4)
-
-
-def draw_cloud(axes: Axes, points: Array) -> None:
-    """A point cloud."""
-    axes.plot(
-        *points.T, ".", ms=1.2, mew=0.0, color=MEASURED, alpha=0.6, rasterized=True
-    )
-
-
-def draw_map(
-    axes: Axes, found: dict[str, Array], points: Array, odometry: Array
-) -> None:
-    """The map as yag-slam drew it, the cloud from its path, and the path of the odometry."""
-    image = found["image"]
-    cell = float(found["resolution"])
-    left, low = found["origin"] - 0.5 * cell  # the origin is the middle of a cell
-    height, width = (side * cell for side in image.shape[:2])
-    axes.imshow(
-        image,
-        cmap="gray",
-        alpha=0.4,
-        origin="lower",
-        extent=(left, left + width, low, low + height),
-        zorder=0,
-    )
-    draw_cloud(axes, points)
-    axes.plot(*odometry[:, :2].T, "--", color=OTHER, lw=1.2, label="odometry")
-    axes.plot(*found["poses"][:, :2].T, color=MEASURED, lw=1.2, label="path by SLAM")
-
-
 def draw(
-    truth: Array, clouds: dict[str, Array], result: dict[str, Any], mapped: Any
+    truth: Array, clouds: dict[str, Array], mapped: dict[str, Array], odometry: Array
 ) -> Figure:
-    """Draws the clouds and the map in four panels."""
-    titles = make_titles(result)
+    """Draws each cloud in a panel of its own, and in that of the `slam` what SLAM made of it.
+
+    Args:
+        truth: (N, 3) the path.
+        clouds: by name.
+        mapped: what yag-slam returned; empty for nothing.
+        odometry: (N, 3) the path as yag-slam was told it.
+    """
     figure, grid = make_panels(2, 2, (11.0, 8.6), sharex=True, sharey=True)
-    for axes, name in zip(grid, ("exact", "baked", "mujoco"), strict=False):
-        prepare_panel(axes, titles[name], truth)
-        if name in clouds:
-            draw_cloud(axes, clouds[name])
-    prepare_panel(grid[3], titles["slam"], truth)
-    if mapped is not None:
-        draw_map(grid[3], *mapped)
-    for axes in grid:
+    for axes, (name, points) in zip(grid, clouds.items(), strict=False):
+        axes.set_title(name)
+        axes.set_aspect("equal")
+        axes.plot(*truth[:, :2].T, color=MODEL, lw=1.2, label="path")
+        axes.plot(
+            *points.T, ".", ms=1.2, mew=0.0, color=MEASURED, alpha=0.6, rasterized=True
+        )
         for shape, pose in zip(OBSTACLES, POSES, strict=True):
-            axes.plot(
-                *make_outline(shape, pose).T, color=DARK, lw=0.5, alpha=0.5, zorder=1
-            )
-    grid[3].legend(loc="lower right", bbox_to_anchor=(0.95, 0.08))
-    for axes in grid[2:]:
-        axes.set_xlabel("x [m]")
-    for axes in grid[::2]:
-        axes.set_ylabel("y [m]")
+            axes.plot(*make_outline(shape, pose).T, color=DARK, lw=0.5, alpha=0.5)
+    if mapped:
+        cell = float(mapped["resolution"])
+        left, low = mapped["origin"] - 0.5 * cell  # the origin is the middle of a cell
+        height, width = (side * cell for side in mapped["image"].shape[:2])
+        extent = (left, left + width, low, low + height)
+        image = mapped["image"]
+        axes.imshow(
+            image, cmap="gray", alpha=0.4, origin="lower", extent=extent, zorder=0
+        )
+        axes.plot(*odometry[:, :2].T, "--", color=OTHER, lw=1.2, label="odometry")
+        axes.plot(
+            *mapped["poses"][:, :2].T, color=MEASURED, lw=1.2, label="path by SLAM"
+        )
+        axes.legend(loc="lower right")
     return figure
-
-
-def make_titles(result: dict[str, Any]) -> dict[str, str]:
-    """What stands above each panel."""
-    titles = {
-        "exact": f"a) scan mode: {result['points']['exact']:,} points of {result['scans']} scans"
-    }
-    for letter, name, word in (("b", "baked", "baked"), ("c", "mujoco", "MuJoCo")):
-        titles[name] = f"{letter}) {word}: not available"
-        if name in result["cloud_rmse_m"]:
-            apart = max(1e3 * result["cloud_rmse_m"][name], 0.01)
-            less = "less than " if apart == 0.01 else ""
-            titles[name] = f"{letter}) {word}: {less}{apart:.2f} mm RMSE from a)"
-    titles["slam"] = "d) map by yag-slam: not available"
-    if result["slam"] is not None:
-        before, after = (
-            1e3 * result["slam"][key] for key in ("odometry_error_m", "path_error_m")
-        )
-        titles["slam"] = (
-            f"d) yag-slam from b): path off by {after:.0f} mm, odometry {before:.0f} mm"
-        )
-    return titles
