@@ -301,9 +301,7 @@ RUNS: dict[str, Run] = {
     "paper_fig7": Run("paper paper_fig7", "--episodes 1", ""),
     "parity": Run(CAMPAIGNS + "parity"),
     "ros_lockstep": Run("speed ros_lockstep", "--chunks 40", ""),
-    "shield": Run(
-        CAMPAIGNS + "shield", "--in-process --episodes 300", "--episodes 3000"
-    ),
+    "shield": Run(CAMPAIGNS + "shield", "--episodes 300", "--episodes 3000"),
     "standards": Run(CAMPAIGNS + "standards"),
     "table1_kinematics": Run("paper table1_kinematics"),
     "table3_density": Run("paper table3_density"),

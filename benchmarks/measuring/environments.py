@@ -51,18 +51,10 @@ def inherit_for_newcomer() -> dict[str, str]:
     return kept | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 
 
-def newcomer(folder: Path, site: str = "") -> dict[str, str]:
-    """The environment variables of a newcomer, with temporary files in a folder.
-
-    Args:
-        folder: of the newcomer.
-        site: Python that each of the newcomer's processes begins with.
-    """
+def newcomer(folder: Path) -> dict[str, str]:
+    """The environment variables of a newcomer, with temporary files in a folder."""
     kept = inherit_for_newcomer() | {"TMPDIR": str(folder)}
     kept.pop("MAKEFLAGS", None)
-    if site:
-        (folder / "sitecustomize.py").write_text(site)
-        kept["PYTHONPATH"] = str(folder)
     return kept
 
 

@@ -129,51 +129,18 @@ def _pick(rng: Rng, choices: Any) -> Any:
     return choices[rng.integers(len(choices))]
 
 
-ACTIONS: tuple[Any, ...] = (
-    np.ones(3, np.float32),
-    np.ones(8, np.float32),
-    np.float32(1.0),
-    None,
-    "ahead",
-    [[AHEAD]],
-    [AHEAD, 1.0],
-    {"speed": 1.0},
-    AHEAD * 1j * np.nan,
-    object(),
-    np.ones((0, 2)),
-    np.array(["a", "b"]),
-)
-SEEDS: tuple[Any, ...] = (
-    *(-1, -(2**70), 2**63, 2**4999, 1.5),
-    *(float("nan"), "three", [1], np.ones(3)),
-)
-OPTIONS: tuple[Any, ...] = (
-    {"start": "there"},
-    {"start": (1.0,)},
-    {"goal": np.nan},
-    {"goal": np.ones(5)},
-    {"goal": object()},
-    {"strat": (0.0, 0.0, 0.0)},
-    {3: 4},
-    [1],
-    "start",
-    7,
-    {"start": None},
-    {"start": (np.inf, 0.0, 0.0)},
-)
+ACTIONS: tuple[Any, ...] = (np.ones(3, np.float32), None, [AHEAD, 1.0], object())
+SEEDS: tuple[Any, ...] = (-1, 2**4999, 1.5, "three")
+OPTIONS: tuple[Any, ...] = ({"start": (1.0,)}, {"goal": np.nan}, {3: 4}, [1])
 COMMANDS: tuple[Callable[[Any], Any], ...] = (
     lambda right: right * np.nan,
-    lambda right: right / 0.0,
     lambda right: right[..., :1],
     lambda right: None,
-    lambda right: "ahead",
     lambda right: right * -np.inf,
 )
 CALLS: tuple[Callable[[Any], Any], ...] = (
     lambda env: env.step(),
     lambda env: env.reset(3),
-    lambda env: env.reset(sed=1),
-    lambda env: env.render("human"),
     lambda env: env.close(1),
 )
 

@@ -95,20 +95,6 @@ CAMPAIGNS: dict[str, Campaign] = {
         },
         ROS,
     ),
-    "cold_start": Campaign(
-        "",
-        {
-            "no_cache": Control(
-                "the kernels: every process finds an empty cache of them", ""
-            ),
-            "compiled": Control(
-                "the waiting: all kernels were compiled before the time is taken",
-                "nothing was measured",
-            ),
-        },
-        ROS,
-        timeout_s=3500.0,
-    ),
     "damaged_input": Campaign(
         "--rounds 40 --seed 5",
         {
@@ -138,7 +124,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         timeout_s=1900.0,
     ),
     "fast_robots": Campaign(
-        "--steps 5",
+        "--steps 5 --robots 2000",
         {
             "fat": Control(
                 "the touch: the robots are measured 2 mm larger", "overlap_mm"
@@ -184,7 +170,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         attempts=REAL_TIME,
     ),
     "gate_held": Campaign(
-        "--hours 0.1 --holds 20 --case 0",
+        "--hours 0.02 --holds 8 --case 7",
         {
             "rule_off": Control(
                 "the rule: `stop_when_held` is false",
@@ -299,7 +285,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         attempts=REAL_TIME,
     ),
     "shield": Campaign(
-        "--in-process --episodes 18",
+        "--episodes 18",
         {
             "no_shield": Control("the shield: it is off", "contacts of"),
             "standing": Control(
@@ -310,13 +296,6 @@ CAMPAIGNS: dict[str, Campaign] = {
                 "braking distance",
             ),
         },
-    ),
-    "shield_over_dds": Campaign(
-        "--episodes 6 --place mecanum/crowd --place ackermann/clutter",
-        {},
-        ROS,
-        "shield",
-        attempts=REAL_TIME,
     ),
     "soak": Campaign(
         "--minutes 0.2 --warm-up 0.1",
@@ -336,7 +315,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         attempts=REAL_TIME,
     ),
     "soak_env": Campaign(
-        "--steps 60000 --cases arena crowd team",
+        "--steps 40000 --cases arena team",
         {
             "stuck": Control(
                 "motion: the poses of one world are put back after each step",
@@ -353,21 +332,11 @@ CAMPAIGNS: dict[str, Campaign] = {
             ),
             "nan": Control("one number of an observation", "not finite", ENV),
             "leak": Control(
-                "thrift: 1 MB more is held after each round", "memory grew by", ENV
+                "thrift: 1 MB and a file more are held after each round",
+                "file descriptors more",
+                ENV,
             ),
         },
-    ),
-    "soak_env_resets": Campaign(
-        "--resets 300",
-        {
-            "leak": Control(
-                "order: a file more is open after each reset",
-                "file descriptors more",
-                "--resets 100",
-            )
-        },
-        (),
-        "soak_env",
         quick=True,
     ),
     "standards": Campaign(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import itertools
-import json
 import os
 import zipfile
 from collections.abc import Callable, Mapping
@@ -15,9 +14,8 @@ import numpy as np
 import onnx
 
 from nics_drl_bridge.config import dump_yaml
-from nics_drl_bridge.files import hash_bytes, seal, write_sums
+from nics_drl_bridge.files import seal, write_sums
 from nics_drl_bridge.lidar.table import ARRAYS
-from nics_drl_bridge.policy.file import onnx_graph
 
 Bomb = Callable[[Path, int], None]
 """Puts a bomb of some size, from 1 to 8, in the place of a whole input."""
@@ -39,8 +37,6 @@ HEADERS: dict[str, Callable[[int], bytes]] = {
     "rows": lambda size: _npy("'<f8'", f"({10 ** (6 + 2 * size)},)"),
     "columns": lambda size: _npy("'<f4'", f"({2**32}, {2**32 + size})"),
     "pickled code": lambda size: _npy("'|O'", "(3,)", CODE),
-    "brackets": lambda size: _npy("'<f8'", "(" * (3000 * size)),
-    "letters": lambda size: _npy(f"'<U{2**27 * size}'", "()"),
     "zeros": lambda size: _npy("'<f8'", f"({120_000_000 + size},)", bytes(960_000_000)),
 }
 
@@ -80,52 +76,25 @@ TABLES = {
 # Lines of CSV, JSON and pickles.
 
 
-def _replace_row(make: Callable[[int], str]) -> Bomb:
-    def write(path: Path, size: int) -> None:
-        file = path / ("cmd.csv", "vrpn.csv")[size % 2]
-        rows = file.read_text(encoding="utf-8").split("\n")
-        rows[len(rows) * size // 9] = make(size)
-        file.write_text("\n".join(rows), encoding="utf-8")
-
-    return write
+def _write_digits(path: Path, size: int) -> None:
+    file = path / ("cmd.csv", "vrpn.csv")[size % 2]
+    file.write_text("1" * (7_000_000 * size), encoding="utf-8")
 
 
-CSVS = {
-    "digits": _replace_row(lambda size: "1" * (7_000_000 * size)),
-    "columns": _replace_row(lambda size: "0.5," * (1_000_000 * size)),
-    "an open quote": _replace_row(lambda size: '"' + "a\n" * (100_000 * size)),
-    "a large number": _replace_row(lambda size: f"{'9' * 5000},0,0"),
-    "control characters": _replace_row(lambda size: "\x00,\x1b[2J,x"),
-}
+CSVS = {"digits": _write_digits}
 
 
 def grow_boxes(open_box: Open, save_box: Save) -> Mapping[str, Bomb]:
     """Returns bombs of black boxes, by name."""
 
-    def replace_scan(kind: str) -> Bomb:
-        def write(path: Path, size: int) -> None:
-            lines = open_box(path)
-            shape = [10 ** (4 + 2 * size)]
-            array = {"kind": "array", "type": kind, "shape": shape, "data": ""}
-            lines[1]["given"] = {"kind": "Scan", "ranges": array}
-            save_box(path, lines)
+    def replace_scan(path: Path, size: int) -> None:
+        lines = open_box(path)
+        shape = [10 ** (4 + 2 * size)]
+        array = {"kind": "array", "type": "<f8", "shape": shape, "data": ""}
+        lines[1]["given"] = {"kind": "Scan", "ranges": array}
+        save_box(path, lines)
 
-        return write
-
-    def nest(path: Path, size: int) -> None:
-        first, second, *rest = path.read_text().splitlines(keepends=True)[:-1]
-        record = json.dumps(json.loads(second) | {"given": 0})
-        depth = 2000 * size
-        second = record.replace('"given": 0', f'"given": {"[" * depth}{"]" * depth}')
-        text = "".join([first, f"{second}\n", *rest])
-        sums = json.dumps({"sha256": hash_bytes(text.encode())})
-        path.write_text(f"{text}{sums}\n")
-
-    return {
-        "numbers": replace_scan("<f8"),
-        "letters": replace_scan("<U100000000"),
-        "brackets": nest,
-    }
+    return {"numbers": replace_scan}
 
 
 def grow_checkpoints() -> Mapping[str, Bomb]:
@@ -141,18 +110,9 @@ def grow_checkpoints() -> Mapping[str, Bomb]:
 
         return write
 
-    def inflate(path: Path, size: int) -> None:
-        buffer = io.BytesIO()
-        with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
-            archive.writestr("archive/data.pkl", bytes(900_000_000))
-            archive.writestr("archive/version", b"3\n")
-        path.write_bytes(seal(buffer.getvalue()))
-
     return {
-        "text": save(lambda torch: {"format": "x" * 10**6, "about": "[" * 10**6}),
         "code": save(lambda torch: {"format": Path("x"), "about": print}),
         "numbers": save(lambda torch: torch.zeros(1).expand(2**40)),
-        "zeros": inflate,
     }
 
 
@@ -189,20 +149,7 @@ GRAPHS: dict[str, Callable[[int], tuple[list[Any], dict[str, Any]]]] = {
         _chain(3, lambda a, b: _node("Gather", [a, "x_index"], b, axis=1)),
         {"index": np.zeros(400_000 * size, np.int64)},
     ),
-    "a wide product": lambda size: (
-        [_node("Mul", ["x_thin", "x_turned"], "x_0")],
-        {
-            "thin": np.zeros((8000 * size, 1), np.float32),
-            "turned": np.zeros((1, 8000 * size), np.float32),
-        },
-    ),
-    "a mismatch": lambda size: (
-        [_node("MatMul", ["observation", "x_wrong"], "x_0")],
-        {"wrong": np.zeros((1000 + size, 4), np.float32)},
-    ),
     "ConstantOfShape": _fill("ConstantOfShape"),
-    "RandomNormal": _fill("RandomNormal", shape=[10**5, 10**5]),
-    "Loop": _fill("Loop"),
 }
 
 
@@ -229,15 +176,6 @@ def grow_policies(open_contract: Open, save_contract: Save) -> Mapping[str, Bomb
     def replace_bytes(make: Callable[[int], bytes]) -> Bomb:
         return lambda path, size: path.write_bytes(make(size)) and None
 
-    def tell(make: Callable[[int], str]) -> Bomb:
-        def write(path: Path, size: int) -> None:
-            proto = onnx.load(path)
-            del proto.metadata_props[:]
-            onnx.helper.set_model_props(proto, {onnx_graph.KEY: make(size)})
-            path.write_bytes(onnx_graph.sealed(proto.SerializeToString()))
-
-        return write
-
     def nest(size: int) -> bytes:
         nested = b""
         for _ in range(300 * size):
@@ -249,13 +187,7 @@ def grow_policies(open_contract: Open, save_contract: Save) -> Mapping[str, Bomb
         "empty operators": replace_bytes(
             lambda size: _field(7, _field(1, b"") * (800_000 * size))
         ),
-        "weights": replace_bytes(
-            lambda size: _field(7, _field(5, _field(4, bytes(4_000_000 * size))))
-        ),
         "nested graphs": replace_bytes(nest),
-        "a contract of brackets": tell(lambda size: "[" * (500_000 * size)),
-        "a nested contract": tell(lambda size: '{"a":' * (300_000 * size)),
-        "a long contract": tell(lambda size: f'"{"z" * (4_000_000 * size)}"'),
     }
 
 
@@ -297,18 +229,10 @@ WORLDS = {
     "a range of copies": _world(lambda n: {"obstacles": _group(count=[0, 10**12])}),
     "groups": _world(lambda n: {"obstacles": _group(count=9000) * (5 * n)}),
     "a huge field": _world(lambda n: {"size": [_large(n), _large(n)]}),
-    "a long field": _world(lambda n: {"size": [_large(n), 1e-3]}),
-    "a tiny field": _world(lambda n: {"size": [10.0 ** (-40 * n)] * 2}),
-    "a huge shape": _world(lambda n: {"obstacles": _shape("circle", radius=_large(n))}),
     "a tiny shape": _world(
         lambda n: {"obstacles": _shape("rectangle", size=[10.0 ** (-40 * n)] * 2)}
     ),
     "walls": _world(lambda n: {"walls": [[0, 0, 1, k] for k in range(30_000)]}),
-    "a long wall": _world(lambda n: {"walls": [[0.0, 0.0, _large(n), _large(n)]]}),
-    "a gap": _world(lambda n: {"obstacles": _group(gap=_large(n))}),
-    "a far goal": _world(lambda n: {"goal_distance": [1.0, -_large(n)]}),
-    "a clearance": _world(lambda n: {"clearance": _large(n)}),
-    "places beyond": _world(lambda n: {"starts": {"regions": [[_large(n)] * 4]}}),
 }
 
 
@@ -326,19 +250,9 @@ def _picture(make: Callable[[Path, int], object]) -> Bomb:
 MAPS = {
     "a pipe": _picture(lambda image, size: os.mkfifo(image)),
     "an endless device": _picture(lambda image, size: image.symlink_to("/dev/zero")),
-    "a loop": _picture(lambda image, size: image.symlink_to(image)),
-    "a folder": _picture(lambda image, size: image.mkdir()),
     "pixels": _picture(
         lambda image, size: image.write_bytes(
             b"P5\n%d %d\n255\n" % (9000 * size, 2**31) + bytes(1000)
-        )
-    ),
-    "pixels of a PNG": _picture(
-        lambda image, size: image.write_bytes(
-            b"\x89PNG\r\n\x1a\n\0\0\0\x0dIHDR"
-            + (9000 * size).to_bytes(4, "big") * 2
-            + b"\x08\0\0\0\0"
-            + bytes(50)
         )
     ),
 }
