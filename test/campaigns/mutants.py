@@ -31,11 +31,11 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
-from itertools import pairwise, zip_longest
+from dataclasses import asdict, dataclass
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -56,6 +56,8 @@ KILLED = "killed"
 SURVIVED = "survived"
 TIMED_OUT = "timed out"  # counts as killed
 CONTROLS = {"unchanged": SURVIVED, "raises": KILLED}  # what each has to end with
+# What each writes at the end of the room's `__init__.py`.
+CONTROL_TEXTS = {"unchanged": "", "raises": "\nraise RuntimeError('control')\n"}
 
 OTHER_RINGS = "not (docs or package or campaign)"
 # Time-out of a run: some times the room's time without a mutant, and time to compile kernels [s].
@@ -64,25 +66,27 @@ TIMEOUT_EXTRA_S = 600.0
 CLEAN_TIMEOUT_S = 3 * 3600.0
 NO_TESTS = 5  # pytest's exit code when no test was collected
 
+# Operators and what replaces them, by kind.
 COMPARED = {
-    "<": ">",
-    ">": "<",
-    "<=": ">=",
-    ">=": "<=",
-    "==": "!=",
-    "!=": "==",
-    "is": "is not",
-    "is not": "is",
-    "in": "not in",
-    "not in": "in",
+    "Lt": "Gt",
+    "Gt": "Lt",
+    "LtE": "GtE",
+    "GtE": "LtE",
+    "Eq": "NotEq",
+    "NotEq": "Eq",
+    "Is": "IsNot",
+    "IsNot": "Is",
+    "In": "NotIn",
+    "NotIn": "In",
 }
-SHIFTED = {"<": "<=", "<=": "<", ">": ">=", ">=": ">"}
-CALCULATED = {"+": "-", "-": "+", "*": "/", "/": "*", "//": "*", "%": "*", "**": "*"}
-NEGATED = {"and": "or", "or": "and"}
-# Comments are matched first, so that an operator in a comment is not taken for one.
-OPERATOR = re.compile(
-    r"#[^\n]*|is\s+not\b|not\s+in\b|\bis\b|\bin\b|\band\b|\bor\b|[<>=!]=|\*\*|//|[-+*/%@&|^<>]"
-)
+SHIFTED = {"Lt": "LtE", "LtE": "Lt", "Gt": "GtE", "GtE": "Gt"}
+CALCULATED = {
+    "Add": "Sub",
+    "Sub": "Add",
+    "Mult": "Div",
+    "Div": "Mult",
+    **dict.fromkeys(("FloorDiv", "Mod", "Pow"), "Mult"),
+}
 # Conditions on the machine or on the way a module is run; here they have one outcome.
 MACHINE = {"TYPE_CHECKING", "__name__", "platform", "version_info"}
 UNCHECKED_CALLS = {"prefetch"}  # changes the speed alone
@@ -105,42 +109,36 @@ ISOLATE = (
 
 @dataclass(frozen=True)
 class Mutant:
-    """One place of the source and the text that replaces it."""
+    """One place of the source that is changed."""
 
     room: str
     file: str  # from the root of the tree
     function: str  # qualified name; "" at the level of the module
     kind: str
     occurrence: int  # number of the place in its function among those of its kind
-    start: int  # first byte that is replaced
-    end: int  # byte behind the last one that is replaced
-    text: str  # has as many line breaks as what it replaces
+    line: int = 0
 
     @property
     def key(self) -> str:
         return f"{self.file}:{self.function}:{self.kind}:{self.occurrence}"
 
-    def write(self, source: bytes) -> bytes:
-        """Returns the source with this place replaced."""
-        return source[: self.start] + self.text.encode() + source[self.end :]
+    def write(self, source: str) -> str:
+        """Returns the source with this place changed, formatted anew and without comments."""
+        if self.kind in CONTROLS:
+            return source + CONTROL_TEXTS[self.kind]
+        sites = _Sites()
+        tree = ast.parse(source)
+        sites.visit(tree)
+        sites.changes[self.function, self.kind][self.occurrence][1]()
+        return ast.unparse(tree) + "\n"
 
-    def describe(self, source: bytes) -> dict[str, Any]:
+    def describe(self, source: str) -> dict[str, Any]:
         """Returns what identifies the mutant for a reader."""
-        before = source.decode().split("\n")
-        after = self.write(source).decode().split("\n")
-        pairs = list(zip_longest(before, after, fillvalue=""))
-        changed = [number for number, (old, new) in enumerate(pairs) if old != new]
-        line = changed[0] if changed else 0
-        return {
-            "room": self.room,
-            "file": self.file,
-            "function": self.function,
-            "kind": self.kind,
-            "occurrence": self.occurrence,
-            "line": line + 1,
-            "before": pairs[line][0].strip(),
-            "after": pairs[line][1].strip(),
-        }
+        before = ast.unparse(ast.parse(source)).split("\n")
+        after = self.write(source).split("\n")
+        pairs = zip_longest(before, after, fillvalue="")
+        old, new = next((pair for pair in pairs if pair[0] != pair[1]), ("", ""))
+        return asdict(self) | {"before": old.strip(), "after": new.strip()}
 
 
 class Run(NamedTuple):
@@ -160,55 +158,35 @@ class Clean(NamedTuple):
 
 
 class _Sites(ast.NodeVisitor):
-    """Finds the places of one file that can be mutated."""
+    """Finds the places of one file that can be changed, by function and kind."""
 
-    def __init__(self, room: str, file: str, source: bytes) -> None:
-        self.mutants: list[Mutant] = []
-        self._room = room
-        self._file = file
-        self._source = source
-        self._lines = [0]
-        for line in source.splitlines(keepends=True):
-            self._lines.append(self._lines[-1] + len(line))
+    def __init__(self) -> None:
+        self.changes: dict[tuple[str, str], list[tuple[int, Callable[[], None]]]]
+        self.changes = defaultdict(list)
         self._names: list[str] = []
-        self._counts: Counter[tuple[str, str]] = Counter()
 
-    def _span(self, node: ast.expr | ast.stmt) -> tuple[int, int]:
-        assert node.end_lineno is not None
-        assert node.end_col_offset is not None
-        start = self._lines[node.lineno - 1] + node.col_offset
-        return start, self._lines[node.end_lineno - 1] + node.end_col_offset
+    def _add(self, kind: str, node: ast.AST, **fields: Any) -> None:
+        """Adds a change of some fields of a node."""
 
-    def _add(self, kind: str, span: tuple[int, int], text: str) -> None:
-        """Adds a mutant; lines that the text lacks are kept as line breaks."""
-        function = ".".join(self._names)
-        breaks = self._source[slice(*span)].count(b"\n") - text.count("\n")
-        if breaks and kind == "condition":
-            text = f"({text}" + "\n" * breaks + ")"
-        else:
-            text += "\n" * breaks
-        place = (function, kind)
-        mutant = Mutant(
-            self._room, self._file, function, kind, self._counts[place], *span, text
-        )
-        self._counts[place] += 1
-        self.mutants.append(mutant)
+        def change() -> None:
+            vars(node).update(fields)
 
-    def _add_operators(
-        self, left: ast.expr, right: ast.expr, **changes: dict[str, str]
-    ) -> None:
-        """Adds what replaces the operator between two operands: kind and changes."""
-        start = self._span(left)[1]
-        between = self._source[start : self._span(right)[0]].decode()
-        for match in OPERATOR.finditer(between):
-            operator = " ".join(match[0].split())
-            if not operator.startswith("#"):
-                span = start + len(between[: match.start()].encode())
-                end = span + len(match[0].encode())
-                for kind, change in changes.items():
-                    if operator in change:
-                        self._add(kind, (span, end), change[operator])
-                return
+        self._note(kind, node, change)
+
+    def _replace(self, kind: str, node: ast.AST, other: ast.AST) -> None:
+        """Adds a change of a node into another one."""
+
+        def change() -> None:
+            content = dict(vars(other))
+            node.__class__ = other.__class__
+            vars(node).clear()
+            vars(node).update(content)
+
+        self._note(kind, node, change)
+
+    def _note(self, kind: str, node: Any, change: Callable[[], None]) -> None:
+        place = (".".join(self._names), kind)
+        self.changes[place].append((node.lineno, change))
 
     def _visit_all(self, nodes: Sequence[ast.AST | None]) -> None:
         for node in nodes:
@@ -252,44 +230,55 @@ class _Sites(ast.NodeVisitor):
             self.generic_visit(node)
 
     def visit_Compare(self, node: ast.Compare) -> None:
-        for left, right in pairwise([node.left, *node.comparators]):
-            self._add_operators(left, right, comparison=COMPARED, boundary=SHIFTED)
+        for number, operator in enumerate(node.ops):
+            for kind, others in (("comparison", COMPARED), ("boundary", SHIFTED)):
+                if other := _find_other(operator, others):
+                    changed = [*node.ops[:number], other, *node.ops[number + 1 :]]
+                    self._add(kind, node, ops=changed)
         self.generic_visit(node)
 
     def visit_BoolOp(self, node: ast.BoolOp) -> None:
-        for left, right in pairwise(node.values):
-            self._add_operators(left, right, boolean=NEGATED)
+        values = node.values
+        for end in range(1, len(values)):
+            if isinstance(node.op, ast.And):
+                sides = [_join(ast.And(), x) for x in (values[:end], values[end:])]
+                self._add("boolean", node, op=ast.Or(), values=sides)
+            else:
+                pair = _join(ast.And(), values[end - 1 : end + 1])
+                others = [*values[: end - 1], pair, *values[end + 1 :]]
+                self._replace("boolean", node, _join(ast.Or(), others))
         self.generic_visit(node)
 
     def visit_BinOp(self, node: ast.BinOp) -> None:
         if not any(_is_text(x) for x in (node.left, node.right)):
-            self._add_operators(node.left, node.right, arithmetic=CALCULATED)
+            self._add_arithmetic(node)
         self.generic_visit(node)
 
     def visit_AugAssign(self, node: ast.AugAssign) -> None:
         if not _is_text(node.value):
-            self._add_operators(node.target, node.value, arithmetic=CALCULATED)
+            self._add_arithmetic(node)
         self.generic_visit(node)
 
+    def _add_arithmetic(self, node: ast.BinOp | ast.AugAssign) -> None:
+        if other := _find_other(node.op, CALCULATED):
+            self._add("arithmetic", node, op=other)
+
     def visit_UnaryOp(self, node: ast.UnaryOp) -> None:
-        start = self._span(node)[0]
-        if isinstance(node.op, ast.Not):
-            self._add("boolean", (start, start + len("not")), "")
-        elif isinstance(node.op, ast.Invert):
-            self._add("boolean", (start, start + 1), "")
+        if isinstance(node.op, ast.Not | ast.Invert):
+            self._replace("boolean", node, node.operand)
         elif isinstance(node.op, ast.USub) and not isinstance(
             node.operand, ast.Constant
         ):
-            self._add("arithmetic", (start, start + 1), "")
+            self._replace("arithmetic", node, node.operand)
         self.generic_visit(node)
 
     def visit_Constant(self, node: ast.Constant) -> None:
         value = node.value
         if isinstance(value, bool):
-            self._add("boolean", self._span(node), str(not value))
+            self._add("boolean", node, value=not value)
         elif isinstance(value, int | float):
             larger = value + 1 if value + 1 != value else value * 2
-            self._add("constant", self._span(node), repr(larger))
+            self._add("constant", node, value=larger)
 
     def visit_If(self, node: ast.If) -> None:
         names = {x.id for x in ast.walk(node.test) if isinstance(x, ast.Name)}
@@ -297,34 +286,34 @@ class _Sites(ast.NodeVisitor):
         if names & MACHINE:
             self._visit_all(node.orelse)
             return
-        self._add_condition(node.test, "True", "False")
+        self._add_condition(node.test, True, False)
         self.generic_visit(node)
 
     def visit_IfExp(self, node: ast.IfExp) -> None:
-        self._add_condition(node.test, "True", "False")
+        self._add_condition(node.test, True, False)
         self.generic_visit(node)
 
     def visit_While(self, node: ast.While) -> None:
-        self._add_condition(node.test, "False")  # True would only time out
+        self._add_condition(node.test, False)  # True would only time out
         self.generic_visit(node)
 
     def visit_comprehension(self, node: ast.comprehension) -> None:
         for condition in node.ifs:
-            self._add_condition(condition, "True", "False")
+            self._add_condition(condition, True, False)
         self.generic_visit(node)
 
-    def _add_condition(self, condition: ast.expr, *outcomes: str) -> None:
+    def _add_condition(self, condition: ast.expr, *outcomes: bool) -> None:
         if isinstance(condition, ast.Constant):
             return
         for outcome in outcomes:
-            self._add("condition", self._span(condition), outcome)
+            self._replace("condition", condition, ast.Constant(outcome))
 
     def visit_Return(self, node: ast.Return) -> None:
         # What is false already is the same to most callers as None.
         if node.value is not None and not (
             isinstance(node.value, ast.Constant) and not node.value.value
         ):
-            self._add("return", self._span(node), "return None")
+            self._add("return", node, value=ast.Constant(None))
         self.generic_visit(node)
 
     def visit_Expr(self, node: ast.Expr) -> None:
@@ -334,8 +323,18 @@ class _Sites(ast.NodeVisitor):
             name = called.id if isinstance(called, ast.Name) else name
             if name in UNCHECKED_CALLS:
                 return
-            self._add("call", self._span(node), "pass")
+            self._replace("call", node, ast.Pass())
         self.generic_visit(node)
+
+
+def _find_other(operator: ast.AST, others: dict[str, str]) -> Any:
+    """Returns the operator that replaces another one, or None."""
+    name = others.get(type(operator).__name__)
+    return name and getattr(ast, name)()
+
+
+def _join(operator: ast.boolop, values: list[ast.expr]) -> ast.expr:
+    return values[0] if len(values) == 1 else ast.BoolOp(operator, values)
 
 
 def _is_text(node: ast.expr) -> bool:
@@ -348,10 +347,14 @@ def find_mutants(tree: Path, room: str) -> list[Mutant]:
     """Returns all mutants of a room."""
     mutants: list[Mutant] = []
     for path in sorted((tree / PACKAGE / room).rglob("*.py")):
-        source = path.read_bytes()
-        sites = _Sites(room, path.relative_to(tree).as_posix(), source)
-        sites.visit(ast.parse(source))
-        mutants += sites.mutants
+        file = path.relative_to(tree).as_posix()
+        sites = _Sites()
+        sites.visit(ast.parse(path.read_bytes()))
+        for (function, kind), changes in sites.changes.items():
+            mutants += [
+                Mutant(room, file, function, kind, number, line)
+                for number, (line, _) in enumerate(changes)
+            ]
     return mutants
 
 
@@ -379,25 +382,6 @@ def draw(tree: Path, seed: int, rooms: Sequence[str], count: int) -> list[Mutant
     return drawn
 
 
-def make_control(tree: Path, control: str, room: str) -> Mutant:
-    """Returns the control of a room: its `__init__.py` as it is, or raising an error."""
-    file = f"{PACKAGE}/{room}/__init__.py"
-    size = len((tree / file).read_bytes())
-    text = "" if control == "unchanged" else "\nraise RuntimeError('control')\n"
-    return Mutant(room, file, "", control, 0, size, size, text)
-
-
-def imported_words(file: Path) -> set[str]:
-    """Returns the words of all imports of a file."""
-    words = set[str]()
-    for node in ast.walk(ast.parse(file.read_bytes())):
-        if isinstance(node, ast.ImportFrom):
-            words |= set((node.module or "").split("."))
-        if isinstance(node, ast.ImportFrom | ast.Import):
-            words |= {word for x in node.names for word in x.name.split(".")}
-    return words
-
-
 def order_tests(tree: Path, mutant_file: str, room: str) -> list[str]:
     """Returns the test files of a room: the module's own, those that import it, the others."""
     module = Path(mutant_file).stem
@@ -406,23 +390,20 @@ def order_tests(tree: Path, mutant_file: str, room: str) -> list[str]:
     def distance(file: Path) -> tuple[int, Path]:
         if file.name == f"test_{module}.py":
             return 0, file
-        return (1 if module in imported_words(file) else 2), file
+        imports = rf"^(from|import)\b[^\n]*(\([^)]*)?\b{module}\b"
+        found = re.search(imports, file.read_text(encoding="utf-8"), re.MULTILINE)
+        return (1 if found else 2), file
 
     files = sorted(folder.rglob("test_*.py"), key=distance)
     return [file.relative_to(tree).as_posix() for file in files]
 
 
 def copy_tree(source: Path, target: Path) -> None:
-    """Copies what git knows or would add, and the compiled kernels."""
-    words = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
-    listed = subprocess.run(words, cwd=source, capture_output=True, check=True)
-    files = [source / os.fsdecode(name) for name in listed.stdout.split(b"\0") if name]
-    files += (source / PACKAGE).rglob("*.nb[ic]")
-    for file in files:
-        if file.is_file():  # not deleted
-            place = target / file.relative_to(source)
-            place.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(file, place)
+    """Copies the sources and the compiled kernels."""
+    left_out = (".git", ".venv", ".nox", "runs", "build", "*.pyc", ".*_cache")
+    shutil.copytree(
+        source, target, symlinks=True, ignore=shutil.ignore_patterns(*left_out)
+    )
 
 
 def copy_snapshot(snapshot: Path, target: Path) -> None:
@@ -546,8 +527,8 @@ class Laboratory:
         tree = self.folder / "tree"
         copy_snapshot(self.snapshot, tree)
         file = tree / mutant.file
-        source = file.read_bytes()
-        file.write_bytes(mutant.write(source))
+        source = file.read_text(encoding="utf-8")
+        file.write_text(mutant.write(source), encoding="utf-8")
         timeout_s = TIMEOUT_FACTOR * clean.seconds + TIMEOUT_EXTRA_S
         left_out = list(clean.failed)
         unsteady: list[str] = []
@@ -647,12 +628,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # The end of this process ends the tests and removes the copies.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     if asked.control:
-        mutants = [make_control(ROOT, asked.control, room) for room in asked.rooms]
+        mutants = [
+            Mutant(room, f"{PACKAGE}/{room}/__init__.py", "", asked.control, 0)
+            for room in asked.rooms
+        ]
     else:
         mutants = draw(ROOT, asked.seed, asked.rooms, asked.count)
     if asked.list:
         for mutant in mutants:
-            print(json.dumps(mutant.describe((ROOT / mutant.file).read_bytes())))
+            print(
+                json.dumps(
+                    mutant.describe((ROOT / mutant.file).read_text(encoding="utf-8"))
+                )
+            )
         return 0
     with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
         laboratory = Laboratory(Path(folder), ROOT)
@@ -661,7 +649,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
             "seed": asked.seed,
             "control": asked.control,
             "digest": compute_digest(laboratory.snapshot),
-            "commit": read_commit(ROOT),
             "isolated": laboratory.isolated,
         }
         records = read_records(asked.out, run, asked.resume)
@@ -713,13 +700,6 @@ def test_room(
         write({"record": "mutant", **record})
         place = f"{record['file']}:{record['line']} {record['kind']}"
         print(f"{record['outcome']:<10} {record['seconds']:>6} s  {place}", flush=True)
-
-
-def read_commit(root: Path) -> str:
-    """Returns the commit of a tree, which its digest may differ from."""
-    words = ["git", "rev-parse", "HEAD"]
-    asked = subprocess.run(words, cwd=root, capture_output=True, text=True, check=True)
-    return asked.stdout.strip()
 
 
 if __name__ == "__main__":

@@ -40,7 +40,7 @@ def tree(tmp_path) -> Path:
 
 def lines_of(tree: Path) -> set[tuple[str, str, str]]:
     """Kind, old line and new line of all mutants."""
-    source = (tree / mutants.PACKAGE / "gate" / "limits.py").read_bytes()
+    source = (tree / mutants.PACKAGE / "gate" / "limits.py").read_text()
     found = [x.describe(source) for x in mutants.find_mutants(tree, "gate")]
     return {(x["kind"], x["before"], x["after"]) for x in found}
 
@@ -54,12 +54,10 @@ def mutated(tree: Path, line: str) -> set[tuple[str, str]]:
 
 def test_code_is_mutated_but_no_annotation_message_or_decorator(tree):
     loop = "return [min(value, LARGEST) * 2 for value in zip(values, low, strict=True)]"
-    head = (
-        "def limit(values: Annotated[float, 6], low: int = 1) -> Annotated[float, 8]:"
-    )
+    head = "def limit(values: Annotated[float, 6], low: int=1) -> Annotated[float, 8]:"
     assert lines_of(tree) == {
         ("constant", "LARGEST = 2.5", "LARGEST = 3.5"),
-        ("constant", head, head.replace("= 1", "= 2")),
+        ("constant", head, head.replace("=1", "=2")),
         ("condition", "if low < 0:", "if True:"),
         ("condition", "if low < 0:", "if False:"),
         ("comparison", "if low < 0:", "if low > 0:"),
@@ -82,9 +80,17 @@ def test_code_is_mutated_but_no_annotation_message_or_decorator(tree):
         ("x = 'a' + b", set()),
         ("x = a is not b", {("comparison", "x = a is b")}),
         ("x = a not in b", {("comparison", "x = a in b")}),
-        ("x = (a) == (b)", {("comparison", "x = (a) != (b)")}),
-        ("x = ä and b", {("boolean", "x = ä or b")}),
-        ("x = not(a)", {("boolean", "x = (a)")}),
+        ("x = (a) == (b)", {("comparison", "x = a != b")}),
+        ("x = a and b", {("boolean", "x = a or b")}),
+        (
+            "x = a and b and c",
+            {("boolean", "x = a or (b and c)"), ("boolean", "x = a and b or c")},
+        ),
+        (
+            "x = a or b or c",
+            {("boolean", "x = a and b or c"), ("boolean", "x = a or (b and c)")},
+        ),
+        ("x = not(a)", {("boolean", "x = a")}),
         ("x = ~a", {("boolean", "x = a")}),
         ("f(x=True)", {("call", "pass"), ("boolean", "f(x=False)")}),
         ("x = 1e300", {("constant", "x = 2e+300")}),
@@ -92,24 +98,23 @@ def test_code_is_mutated_but_no_annotation_message_or_decorator(tree):
             "x = a if b else c",
             {("condition", f"x = a if {o} else c") for o in (True, False)},
         ),
-        ("while a: pass", {("condition", "while False: pass")}),
-        ("def f(): return False", {("boolean", "def f(): return True")}),
+        ("while a: pass", {("condition", "while False:")}),
+        ("def f(): return False", {("boolean", "return True")}),
     ],
 )
 def test_each_place_has_the_mutants_of_its_kind(tree, line, expected):
     assert mutated(tree, line) == expected
 
 
-def test_a_mutant_compiles_differs_in_one_place_and_keeps_the_line_numbers():
-    drawn = mutants.draw(ROOT, 1, ("gate",), 48)
+def test_a_mutant_compiles_and_differs_in_one_place():
+    drawn = mutants.draw(ROOT, 1, ("gate",), 24)
     assert {mutant.kind for mutant in drawn} == set(KINDS)
     for mutant in drawn:
-        source = (ROOT / mutant.file).read_bytes()
-        broken = mutant.write(source)
-        assert broken.count(b"\n") == source.count(b"\n"), mutant
-        assert ast.dump(ast.parse(broken)) != ast.dump(ast.parse(source)), mutant
-        assert broken.startswith(source[: mutant.start])
-        assert broken.endswith(source[mutant.end :])
+        source = (ROOT / mutant.file).read_text()
+        before = ast.unparse(ast.parse(source)).split("\n")
+        after = ast.unparse(ast.parse(mutant.write(source))).split("\n")
+        changed = [one != other for one, other in zip(before, after, strict=True)]
+        assert sum(changed) == 1, mutant
 
 
 def test_a_seed_draws_the_same_mutants_after_a_change_of_other_places(tree):
@@ -123,8 +128,7 @@ def test_a_seed_draws_the_same_mutants_after_a_change_of_other_places(tree):
 
 def test_a_larger_draw_contains_the_smaller_one_and_rooms_have_equal_parts():
     few = mutants.draw(ROOT, 54, ("gate", "env"), 9)
-    many = mutants.draw(ROOT, 54, ("gate", "env"), 30)
-    assert set(few) < set(many)
+    assert set(few) < set(mutants.draw(ROOT, 54, ("gate", "env"), 30))
     assert [mutant.room for mutant in few] == ["gate"] * 5 + ["env"] * 4
 
 
@@ -175,7 +179,7 @@ def test_an_interrupted_run_is_continued_unless_seed_or_code_have_changed(tmp_pa
 def test_the_summary_counts_a_time_out_as_found_and_shows_survivors(tree):
     drawn = mutants.draw(tree, 7, ("gate",), 3)
     records = [
-        mutant.describe(SOURCE.encode()) | {"outcome": outcome}
+        mutant.describe(SOURCE) | {"outcome": outcome}
         for mutant, outcome in zip(drawn, (KILLED, TIMED_OUT, SURVIVED), strict=True)
     ]
     gate, _, place, *_ = mutants.summarise(records, ["gate"]).split("\n")
