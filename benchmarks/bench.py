@@ -7,8 +7,8 @@ A file holds the benchmarks of one question, each with a name, as `python benchm
 table2_lidar --help`. A benchmark prints one JSON object, whose `failures` are sentences about
 missed bars, and ends with 1 if there are any. A run ends with its bars met, with some missed, or
 broken: crashed, hung, or without that object. `results.json` keeps the figures that the tables
-show, with machine, commit and load; it is rewritten after each run. `figures.py` has the tables,
-`RUNS` the runs.
+show, with machine, commit and load; it is rewritten after each run. `tables.md` lists the
+runs, `figures.py` makes the tables.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NoReturn
@@ -233,7 +234,6 @@ def finite(value: Any) -> Any:
 # The runs. `make benchmark` takes half an hour on two cores; LONG=1 takes hours and gives the
 # figures of the tables. Some campaigns give figures, too; they run in their folder.
 
-CAMPAIGNS = "../test/campaigns/"
 TIMEOUT_S = 600.0
 LONG_TIMEOUT_S = 4 * 3600.0
 
@@ -263,81 +263,34 @@ class Run:
         return [*self.what.split()[1:], *chosen.split()]
 
 
-LEARNERS = ("differential", "ackermann", "mecanum")
-SHIPPED = (*LEARNERS, "jackal")
-LIDARS = {
-    "lidar": "hokuyo_ust_10lx",
-    "rplidar": "rplidar_a2",
-    "sick": "sick_tim571",
-}
-RUNS: dict[str, Run] = {
-    "barn": Run("policies barn", "--every 5", ""),
-    "barn_five_fold": Run("policies barn", "--five-fold --folds 1", "--five-fold"),
-    "barn_mujoco": Run("policies barn", "--in mujoco_dds --policy jackal"),
-    "baselines": Run("policies baselines", "--episodes 50", "--episodes 200"),
-    "env_scaling": Run("speed env_scaling"),
-    "env_throughput": Run("speed env_throughput", "--repeats 3", ""),
-    **{
-        f"env_throughput_{name}": Run(
-            "speed env_throughput", f"--lidar {lidar} --repeats 3", f"--lidar {lidar}"
-        )
-        for name, lidar in LIDARS.items()
-    },
-    "env_throughput_obstacles": Run(
-        "speed env_throughput", "--obstacles 260 --repeats 3", "--obstacles 260"
-    ),
-    "estimator": Run("fidelity estimator", "--drives 30", ""),
-    "fig4_pointcloud": Run("paper fig4_pointcloud", "--scans 60", ""),
-    "first_hour": Run("first_hour"),
-    "gate_envelope": Run(
-        CAMPAIGNS + "gate_envelope", "--steps 30000", "--steps 1000000"
-    ),
-    "gate_faults": Run(
-        CAMPAIGNS + "gate_faults", "--repeats 1", "--load 2 --repeats 100"
-    ),
-    "generate_from_mujoco": Run("fidelity generate_from_mujoco", "--drives 3", ""),
-    "lidar_complexity": Run("paper lidar_complexity", "--repeats 20", ""),
-    "lidar_peers": Run("speed lidar_peers"),
-    "paper_fig7": Run("paper paper_fig7", "--episodes 1", ""),
-    "parity": Run(CAMPAIGNS + "parity"),
-    "ros_lockstep": Run("speed ros_lockstep", "--chunks 40", ""),
-    "shield": Run(CAMPAIGNS + "shield", "--episodes 300", "--episodes 3000"),
-    "standards": Run(CAMPAIGNS + "standards"),
-    "table1_kinematics": Run("paper table1_kinematics"),
-    "table3_density": Run("paper table3_density"),
-    "map_lidar": Run("speed map_lidar"),
-    "real_drives": Run("fidelity real_drives"),
-    "table2_lidar": Run("paper table2_lidar"),
-    "table2_hokuyo": Run("paper table2_lidar", "--lidar hokuyo_ust_10lx"),
-    **{
-        f"training_{robot}{name}": Run(
-            "policies training",
-            f"--robot {robot}{lidar} --seeds 0",
-            f"--robot {robot}{lidar} --seeds 0 1 2",
-        )
-        for name, lidar in (("", ""), ("_rplidar", " --lidar rplidar_a2"))
-        for robot in LEARNERS
-    },
-    **{
-        f"robustness_{robot}": Run(
-            "policies robustness", f"--robots {robot} --episodes 1", f"--robots {robot}"
-        )
-        for robot in SHIPPED
-    },
-    **{
-        f"transfer_{robot}": Run(
-            "policies transfer", f"--robots {robot} --episodes 3", f"--robots {robot}"
-        )
-        for robot in SHIPPED
-    },
-}
+@cache
+def read_sections() -> dict[str, list[list[str]]]:
+    """The rows of cells of each table of `tables.md`, by name, the head first."""
+    text = (SCRIPTS / "tables.md").read_text(encoding="utf-8")
+    return {
+        section.partition("\n")[0]: [
+            [cell.strip() for cell in line[1:-1].split("|")]
+            for line in section.splitlines()
+            if line.startswith("|") and not line.startswith("|---")
+        ]
+        for section in text.split("\n## ")[1:]
+    }
+
+
+def read_runs() -> dict[str, Run]:
+    """All runs, by name."""
+    return {
+        name: Run(what, arguments, {"": None, "-": ""}.get(long, long))
+        for name, what, arguments, long in read_sections()["runs"][1:]
+    }
 
 
 def plan_of(folder: Path) -> dict[str, Run]:
     """Every run of the scripts in a folder, by name; a script without a row is run as it is."""
-    known = {"bench.py", "figures.py", *(run.script for run in RUNS.values())}
+    runs = read_runs()
+    known = {"bench.py", "figures.py", *(run.script for run in runs.values())}
     others = (path for path in sorted(folder.glob("*.py")) if path.name not in known)
-    there = {name: run for name, run in RUNS.items() if (folder / run.script).exists()}
+    there = {name: run for name, run in runs.items() if (folder / run.script).exists()}
     return there | {path.stem: Run(path.stem) for path in others}
 
 

@@ -31,8 +31,6 @@ from measuring.drives import (
     RECORDINGS,
     SEGMENT_S,
     SEGMENTED,
-    Truth,
-    compared,
     judge_drives,
 )
 from measuring.foreign_robots import ROBOTS, foreign_drive
@@ -68,22 +66,11 @@ from nics_drl_bridge.sim.world import World
 # Real drives
 
 SEED = 11  # of the drives of the own robots
-OTHER_TIME = 0.37  # part of the drive by which the commands of the control are moved
 
 
-def _take_out(control: str | None, recording: Recording) -> Recording:
-    """Returns the recording with what a control takes out of it."""
-    if control != "shuffled":
-        return recording
-    command = recording.command
-    values = np.roll(command.values, round(OTHER_TIME * len(command.t)), axis=0)
-    return replace(recording, command=replace(command, values=values))
-
-
-def judge_model(found: Identified, recording: Recording, control: str | None) -> Result:
+def judge_model(found: Identified, control: str | None) -> Result:
     """Returns the errors of a model, and of its yardsticks, on what it has not seen."""
-    # The trial: what is written was fitted to the last third, too. The yardsticks know the commands
-    # that were given, whatever a control made of them.
+    # The trial: what is written was fitted to the last third, too.
     found = found.trial
     drive = found.drive
     calibration = found.calibration
@@ -92,8 +79,7 @@ def judge_model(found: Identified, recording: Recording, control: str | None) ->
     ends = predict(found.model, calibration, drive, chosen)
     if control == "standing":
         ends = chosen.start
-    given = drive.part(replace(drive.recording, command=recording.command))
-    yardstick = fit_yardstick(given, until, calibration.clock_offset_s)
+    yardstick = fit_yardstick(drive, until, calibration.clock_offset_s)
     error, share, heading = average_errors(ends, chosen)
     coverages = {at.horizon_s: at.coverage for at in found.judgement}
     coverage = coverages.get(HORIZON_S)
@@ -101,7 +87,7 @@ def judge_model(found: Identified, recording: Recording, control: str | None) ->
         "error_m": error,
         "share_of_path": share,
         "heading_error_rad": heading,
-        "yardstick_share": average_errors(yardstick.predict(given, chosen), chosen)[1],
+        "yardstick_share": average_errors(yardstick.predict(drive, chosen), chosen)[1],
         "constant_twist_share": average_errors(kept_twist(drive, chosen), chosen)[1],
         "coverage_95": float("nan") if coverage is None else coverage,
         "path_m": float(chosen.path.mean()),
@@ -117,9 +103,7 @@ def average_errors(ends: Array, chosen: Windows) -> tuple[float, float, float]:
     return error, error / float(chosen.path.mean()), heading
 
 
-def measure_drive(
-    source: Path, mapping: Path, truth: Truth, control: str | None
-) -> Result:
+def measure_drive(source: Path, mapping: Path, control: str | None) -> Result:
     """Returns a drive's figures, or the sentence that refuses it."""
     begin = time.perf_counter()
     lines = mapping.read_text("utf-8").splitlines()
@@ -128,14 +112,13 @@ def measure_drive(
     }
     try:
         spec, recording = open_drive(source, None, mapping)
-        found = identify(_take_out(control, recording), spec, alpha="auto")
-        told |= judge_model(found, recording, control)
+        found = identify(recording, spec, alpha="auto")
+        told |= judge_model(found, control)
     except BridgeError as error:
         return told | {"refused": str(error)}
     except Exception as error:  # noqa: BLE001 - one drive's crash is a bar missed, not the end
         return told | {"crashed": f"{type(error).__name__}: {error}"}
     return told | {
-        "truths": compared(found, truth),
         "equations": found.model.equations(),
         "notes": list(found.notes),
         "seconds": time.perf_counter() - begin,
@@ -145,7 +128,6 @@ def measure_drive(
 def leave_out(source: Path, mapping: Path, control: str | None) -> Result:
     """Returns mean errors on segments of a drive, each predicted by a model of all others."""
     spec, recording = open_drive(source, None, mapping)
-    recording = _take_out(control, recording)
     drive = Drive(recording, spec)
     since = recording.pose.t - recording.pose.t[0]
     errors = []
@@ -180,8 +162,7 @@ def measure_real_drives(given: Given) -> Result:
     Each drive goes in by its mapping alone. A model is made of the first two thirds, and predicts
     the poses of the last third 5 s ahead by the commands, from every tenth of a second. Beside it,
     on the same windows: a robot that keeps its twist, and its textbook fitted to the same two
-    thirds. Of robots in simulators of their own, all else that is found is compared with what is
-    true.
+    thirds.
     """
     control = given.control
     result: Result = {"drives": {}, "left_out": {}, "own_robots": {}}
@@ -192,7 +173,7 @@ def measure_real_drives(given: Given) -> Result:
     for name in real:
         drive = DRIVES[name]
         source = given.recordings / drive.source
-        found = measure_drive(source, drive.mapping, drive.truth, control)
+        found = measure_drive(source, drive.mapping, control)
         result["drives"][name] = found
         if name == SEGMENTED:
             result["left_out"][name] = leave_out(source, drive.mapping, control)
@@ -200,7 +181,7 @@ def measure_real_drives(given: Given) -> Result:
         for name in (each for each in given.only if each in ROBOTS):
             source = Path(folder) / name
             mapping = foreign_drive(ROBOTS[name], SEED).write(source)
-            found = measure_drive(source, mapping, ROBOTS[name].truth, control)
+            found = measure_drive(source, mapping, control)
             result["own_robots"][name] = found
     return result
 
@@ -311,7 +292,7 @@ def measure_mujoco(given: Given) -> Result:
             hold = HOLDS_S[n % len(HOLDS_S)]
             drives.append(record(robot, rng, given.unseen, hold=hold))
         found = identify(recording, spec, alpha="auto")
-        factor = {"standing": 1e-9, "nan": np.nan}.get(given.control or "", 1.0)
+        factor = 1e-9 if given.control == "standing" else 1.0
         model = replace(found.model, coefficients=factor * found.model.coefficients)
         found = replace(found, model=model)
 
@@ -396,11 +377,6 @@ class _NoFilter(Middleware):
         return seen if newest is None else replace(seen, pose=newest.value[0])
 
 
-class _NoNumber(Middleware):
-    def view(self, now_ns: int) -> RobotView:
-        return replace(super().view(now_ns), pose=np.full(3, np.nan))
-
-
 def _expect_little(model: SimulatorModel) -> Middleware:
     """Returns a filter that expects a quarter of the noise."""
     levels = {
@@ -414,7 +390,6 @@ def _expect_little(model: SimulatorModel) -> Middleware:
 MAKES: dict[str | None, Callable[[SimulatorModel], Middleware]] = {
     "no_filter": _NoFilter,
     "overconfident": _expect_little,
-    "nan": _NoNumber,
 }
 
 
@@ -433,7 +408,7 @@ def make_noisy(robot: str) -> SimulatorModel:
 
 
 def estimate_drive(
-    simulator: FastSimulator, middleware: Middleware, seed: int, moving: bool
+    simulator: FastSimulator, middleware: Middleware, seed: int
 ) -> Estimated:
     """Drives at random; measurements are under way for the latency, and some get lost."""
     robot = simulator.model.robot
@@ -447,7 +422,7 @@ def estimate_drive(
     estimated = []
     for k in range(DRIVE_S * 10):
         if k % 5 == 0:
-            command = rng.uniform(robot.command_low, robot.command_high) * moving
+            command = rng.uniform(robot.command_low, robot.command_high)
         middleware.command(k * PERIOD, command)
         simulator.step(command[None, None])
         now = (k + 1) * PERIOD
@@ -498,16 +473,13 @@ def measure_estimator(given: Given) -> Result:
     stamp; the estimate, harder, with where the robot is when it is asked, 100 ms later. NEES is
     that of the pose at the newest measurement, once at the end of each drive.
     """
-    moving = given.control != "stands"
     make = MAKES.get(given.control, Middleware)
     seeds = range(given.seed, given.seed + given.drives)
     found = {}
     for robot in ESTIMATED:
         model = make_noisy(robot)
         simulator = FastSimulator(model, WIDE)
-        found[robot] = [
-            estimate_drive(simulator, make(model), seed, moving) for seed in seeds
-        ]
+        found[robot] = [estimate_drive(simulator, make(model), seed) for seed in seeds]
     return {
         **summarise_drives([each for drives in found.values() for each in drives]),
         "robots": {robot: summarise_drives(drives) for robot, drives in found.items()},
@@ -532,7 +504,6 @@ BENCHMARKS = {
         judge_drives,
         {
             "standing": Control("the model: it says the robot stands", "error_m"),
-            "shuffled": Control("the time: commands are of another", "error_m"),
         },
         {
             "recordings": (RECORDINGS, "folder"),
@@ -546,7 +517,6 @@ BENCHMARKS = {
         {
             "standing": Control("the model: it says the robot stands", "over_path"),
             "slow": Control("the model's speed: it is MuJoCo's", "MuJoCo's speed"),
-            "nan": Control("one coefficient", "over_path nan"),
         },
         {
             "train": (90.0, "to learn from [s]"),
@@ -565,8 +535,6 @@ BENCHMARKS = {
         {
             "no_filter": Control("the filter: raw odometry stands in", "is off"),
             "overconfident": Control("three quarters of the noise expected", "NEES"),
-            "nan": Control("the estimate: it is no number", "by nan"),
-            "stands": Control("the motion: robots do not move", "way_m"),
         },
         {
             "drives": (100, "of each robot"),

@@ -17,14 +17,13 @@ from statistics import harmonic_mean, mean
 from textwrap import shorten
 from typing import Any
 
-from bench import MET, RESULTS, ROOT, SCRIPTS, read_results
+from bench import MET, RESULTS, ROOT, read_results, read_sections
 
 PLACEHOLDER = re.compile(
     r"\{(?:(?P<how>max|min|sum|mean|harmonic_mean) )?(?P<path>[^{}: ]+)(?: of (?P<run>\w+))?"
     r"(?: x(?P<factor>[0-9.e+-]+))?(?::(?P<format>[^{}]*))?\}"
 )
 """A figure in a cell: a path into the result of a run, by default that of the row."""
-SECTION = re.compile(r"^## (\w+)(, without notes)?\n(.*?)(?=^## |\Z)", re.DOTALL | re.M)
 REGION = re.compile(r"<!-- results:([a-z0-9_]+) -->\n(.*?)<!-- /results -->", re.DOTALL)
 HOW = {"max": max, "min": min, "sum": sum, "mean": mean, "harmonic_mean": harmonic_mean}
 NOT_MEASURED = "not measured"
@@ -54,15 +53,13 @@ class Table:
 @cache
 def read_tables() -> Mapping[str, Table]:
     """The tables of `tables.md`, by name."""
-    text = (SCRIPTS / "tables.md").read_text(encoding="utf-8")
     tables = {}
-    for name, without_notes, content in SECTION.findall(text):
-        head, _, *rows = [
-            tuple(cell.strip() for cell in line[1:-1].split("|"))
-            for line in content.splitlines()
-            if line.startswith("|")
-        ]
-        tables[name] = Table(head[1:], tuple(rows), not without_notes)
+    for title, (head, *rows) in read_sections().items():
+        name, _, without_notes = title.partition(", ")
+        tables[name] = Table(
+            tuple(head[1:]), tuple(map(tuple, rows)), not without_notes
+        )
+    del tables["runs"]
     return tables
 
 

@@ -16,7 +16,6 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import product
 from multiprocessing import get_context
 from pathlib import Path
@@ -577,12 +576,11 @@ class Job:
     world: str
     episodes: int
     perturbations: tuple[str, ...]
-    multiples: tuple[float, ...]
     control: str | None
 
 
-def count_reached(job: Job, perturbation: str | None, times: float) -> tuple[int, int]:
-    """Counts episodes that succeed under a perturbation, or none, truly and to the robot."""
+def count_reached(job: Job, perturbation: str | None, times: float) -> int:
+    """Counts episodes that truly succeed under a perturbation, or none."""
     model = perturbations.open_real_model(job.robot)
     world = load_world(job.world)
     driver: Policy
@@ -608,16 +606,14 @@ def count_reached(job: Job, perturbation: str | None, times: float) -> tuple[int
     env = gymnasium.make(NAVIGATION, backend=gated, model=model, world=world, task=task)
     with closing(env):
         driven = drive_all(env, driver, range(ROBUST_SEED, ROBUST_SEED + job.episodes))
-    return successes(driven), sum(one.believed_success for one in driven)
+    return successes(driven)
 
 
-def count_curves(job: Job) -> tuple[Job, dict[str, NDArray[np.int64]]]:
-    """Counts under each perturbation (1 + multiples, 2), the first without any."""
+def count_curves(job: Job) -> dict[str, NDArray[np.int64]]:
+    """Counts under each perturbation (1 + multiples,), the first without any."""
     nothing = count_reached(job, None, 0.0)
-    return job, {
-        each: np.array(
-            [nothing, *(count_reached(job, each, times) for times in job.multiples)]
-        )
+    return {
+        each: np.array([nothing, *(count_reached(job, each, k) for k in MULTIPLES)])
         for each in job.perturbations
     }
 
@@ -629,52 +625,39 @@ def measure_robustness(given: Given) -> Result:
     with one of them at parts and multiples of its declared range: with the greatest value that the
     randomisation of its training draws. The footprint is no part of that, and time constants need
     not be; they are declared in measuring/perturbations.py. Lidar, gate, shield and estimator are
-    those of a deployment, and know nothing of the perturbation; success is by the truth, and told
-    beside what the robots believed. `--of RESULTS` only draws the picture of earlier runs.
+    those of a deployment, and know nothing of the perturbation; success is by the truth. `--of
+    RESULTS` only draws the picture of earlier runs.
     """
     if given.of:
         runs = json.loads(given.of.read_text(encoding="utf-8"))["runs"]
         perturbations.draw(collect_curves(runs), given.picture, MULTIPLES)
         raise SystemExit(0)
-    multiples = tuple(sorted({DECLARED, *given.multiples}))
-    make = partial(
-        Job,
-        episodes=given.episodes,
-        perturbations=tuple(given.only),
-        multiples=multiples,
-        control=given.control,
-    )
-    jobs = [make(*each) for each in product(given.robots, given.worlds)]
+    jobs = [
+        Job(robot, world, given.episodes, tuple(given.only), given.control)
+        for robot, world in product(given.robots, given.worlds)
+    ]
     counts: dict[str, dict[str, Any]] = {
         robot: dict.fromkeys(given.only, 0) for robot in given.robots
     }
     with ProcessPoolExecutor(AT_ONCE, mp_context=get_context("spawn")) as pool:
-        for job, found in pool.map(count_curves, jobs):
-            told = {each: some.tolist() for each, some in found.items()}
-            sys.stderr.write(f"{job.robot} in {job.world}: {told} of {job.episodes}\n")
+        for job, found in zip(jobs, pool.map(count_curves, jobs), strict=True):
+            sys.stderr.write(f"{job.robot} in {job.world}: {found}\n")
             for each, some in found.items():
                 counts[job.robot][each] = counts[job.robot][each] + some
     episodes = given.episodes * len(given.worlds)
-    success, believed = (
-        {
-            robot: {
-                each: (some[:, k] / episodes).tolist() for each, some in own.items()
-            }
-            for robot, own in counts.items()
-        }
-        for k in range(2)
-    )
+    success = {
+        robot: {each: (some / episodes).tolist() for each, some in own.items()}
+        for robot, own in counts.items()
+    }
     if given.picture:
-        perturbations.draw(success, given.picture, multiples)
-    lost = find_losses(success, multiples)
+        perturbations.draw(success, given.picture, MULTIPLES)
+    lost = find_losses(success)
     return {
         "declared": {
             robot: perturbations.describe(perturbations.load_declared(robot))
             for robot in success
         },
-        "multiples": [0.0, *multiples],
         "success": success,
-        "believed": believed,
         "lost_points": lost,
         "worst": find_worst(lost),
         "episodes": episodes,
@@ -691,11 +674,9 @@ def collect_curves(runs: Mapping[str, Any]) -> dict[str, dict[str, list[float]]]
     }
 
 
-def find_losses(
-    success: Curves, multiples: Sequence[float]
-) -> dict[str, dict[str, float]]:
+def find_losses(success: Curves) -> dict[str, dict[str, float]]:
     """Returns points of success lost at the declared range: robot -> perturbation -> value."""
-    at = 1 + multiples.index(DECLARED)
+    at = 1 + MULTIPLES.index(DECLARED)
     return {
         robot: {
             each: round(100.0 * (some[0] - some[at]), 3) for each, some in own.items()
@@ -809,7 +790,6 @@ BENCHMARKS = {
             "robots": SHIPPED,
             "worlds": some_of(ROBUST_WORLDS),
             "only": some_of(PERTURBATIONS),
-            "multiples": {"nargs": "+", "type": float, "default": MULTIPLES},
             "picture": {"type": Path, "help": "draw the curves into this file"},
             "of": {"type": Path, "help": "draw the picture of these results only"},
         },

@@ -10,10 +10,10 @@ from __future__ import annotations
 import math
 import os
 import time
-import tracemalloc
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +57,6 @@ TIMES_SLOWER = 10  # under the control `slow`
 
 # Environments beside peers
 
-FEW_BEAMS = 8
 # How many times a peer's rate with one scan per control period ours is on one thread, at least.
 AT_EQUAL_WORK = {"ir_sim": 900.0, "irsim_x": 70.0}
 SHARES = {
@@ -94,10 +93,8 @@ class Case:
 
     @property
     def model(self) -> SimulatorModel:
-        """The robot, whose lidar may be next to blind."""
+        """The robot with the lidar."""
         lidar = peers.MODEL.lidar if self.lidar is None else load_lidar(self.lidar)
-        if self.control == "blind":
-            lidar = lidar.model_copy(update={"beams": FEW_BEAMS})
         if self.clean:
             lidar = lidar.model_copy(update={"noise_std": 0.0, "faults": LidarFaults()})
         if lidar == peers.MODEL.lidar:
@@ -330,7 +327,6 @@ def judge_equal_work(result: Result, least: Mapping[str, float]) -> list[str]:
 
 MOST_TIMES = {"worlds": 0.5, "robots": 4.0, "obstacles": 12.0, "beams": 12.0}
 MOST_TIMES["members"] = 1.15
-MOST_MEMORY = 1.5  # of the last set, with all its copies, to that of the first one
 WORLDS = 256
 OBSTACLES = 10
 SIDE = 8.0
@@ -345,9 +341,6 @@ SWEEPS: dict[str, tuple[int, ...]] = {
 AREA_PER_ROBOT = 12.0  # [m^2]
 AREA_PER_OBSTACLE = 4.0  # [m^2]
 FEWEST = 40  # steps of which the median is taken, at least, unless fewer are asked for
-ALONE = (
-    1024  # steps of a call, at most, where each world is stepped by a call of its own
-)
 ROBOT_STEPS = 256  # robots of all worlds together while their number in each grows
 
 
@@ -433,74 +426,40 @@ def make_point(name: str, value: int) -> BridgeVectorEnv:
     return make_env(beams=value)
 
 
-def make_apart(count: int) -> list[BridgeVectorEnv]:
-    """Returns a vector env for each world of a set, in which together as many copies are."""
-    copies = max(1, WORLDS // count)
-    return [make_env(copies, world=world) for world in make_members(count)]
-
-
-def make_stepper(
-    env: BridgeVectorEnv, times: int, in_pairs: bool
-) -> Callable[[], None]:
+def make_stepper(env: BridgeVectorEnv, in_pairs: bool) -> Callable[[], None]:
     """Returns a call that steps an environment, by the same random actions again and again.
 
     Args:
         env: which.
-        times: steps of a call.
         in_pairs: whether each robot of a world looks at each other in each substep, one by one.
     """
     env.reset(seed=0)
     env.action_space.seed(0)
-    actions = [env.action_space.sample() for _ in range(16)]
-    count = [0]
+    actions = cycle([env.action_space.sample() for _ in range(16)])
     looks = env.model.timing[1] if in_pairs and env.robots > 1 else 0
 
     def step() -> None:
-        for _ in range(times):
-            env.step(actions[count[0] % len(actions)])
-            count[0] += 1
-            for _ in range(looks):
-                for world in env.simulator.data.pose[:, :, :2].tolist():
-                    min(math.dist(one, other) for one in world for other in world)
+        env.step(next(actions))
+        for _ in range(looks):
+            for world in env.simulator.data.pose[:, :, :2].tolist():
+                min(math.dist(one, other) for one in world for other in world)
 
     return step
 
 
 def measure_curve(
-    name: str, values: Sequence[int], repeats: int, control: str | None
+    name: str, values: Sequence[int], repeats: int, in_pairs: bool
 ) -> list[float]:
     """Returns the cost of an env step at each point of a curve [us]."""
     costs = []
     for value in values:
-        alone = control == "slow" and name == "worlds"
-        times = min(value, ALONE) if alone else 1
-        if (name, control) == ("members", "apart"):
-            envs = make_apart(value)
-        else:
-            envs = [make_point(name, 1 if alone else value)]
-        stepped = sum(env.num_envs for env in envs) * times
-        often = max(min(repeats, FEWEST), repeats // stepped)
-        steps = [make_stepper(env, times, control == "quadratic") for env in envs]
-        calls = {value: lambda steps=steps: [step() for step in steps]}
+        env = make_point(name, value)
+        often = max(min(repeats, FEWEST), repeats // env.num_envs)
+        calls = {value: make_stepper(env, in_pairs)}
         seconds = medians(interleaved(calls, often, clock=time.process_time))
-        costs.append(1e6 * seconds[value] / stepped)
-        for env in envs:
-            env.close()
+        costs.append(1e6 * seconds[value] / env.num_envs)
+        env.close()
     return costs
-
-
-def measure_memory(control: str | None) -> float:
-    """Returns how many times the memory of a set of one the set of most takes, with its copies."""
-    taken = []
-    for value in (SWEEPS["members"][0], SWEEPS["members"][-1]):
-        tracemalloc.start()
-        apart = control == "apart"
-        envs = make_apart(value) if apart else [make_point("members", value)]
-        for env in envs:
-            env.reset(seed=0)
-        taken.append(tracemalloc.get_traced_memory()[0])
-        tracemalloc.stop()
-    return taken[1] / taken[0]
 
 
 def measure_scaling(given: Given) -> Result:
@@ -517,11 +476,10 @@ def measure_scaling(given: Given) -> Result:
     for name, sizes in SWEEPS.items():
         result[name] = [sizes[0], sizes[-1]] if given.ends_only else list(sizes)
         result[f"{name}_us"] = measure_curve(
-            name, result[name], given.repeats, given.control
+            name, result[name], given.repeats, given.control == "quadratic"
         )
     per_robot = np.array(result["robots_us"]) / np.array(result["robots"])
     result["robots_us_per_robot"] = per_robot.tolist()
-    result["members_memory"] = measure_memory(given.control)
     costs = {name: _costs_of(result, name) for name in SWEEPS}
     result["end_to_end"] = {name: each[-1] / each[0] for name, each in costs.items()}
     if given.picture:
@@ -538,9 +496,7 @@ def judge_scaling(result: Result) -> list[str]:
         name: at_most(most, f"{name}: {result[name][-1]} cost, times {result[name][0]}")
         for name, most in MOST_TIMES.items()
     }
-    taken = at_most(MOST_MEMORY, f"members: {result['members'][-1]} take, times")
-    missed = missed_bars(result["end_to_end"], bars)
-    return missed + missed_bars(result, {"members_memory": taken})
+    return missed_bars(result["end_to_end"], bars)
 
 
 def draw_curves(result: Result, file: Path) -> None:
@@ -584,12 +540,11 @@ class Scans:
         self.scene = (placed, peers.WORLD.all_walls())
         self.out = np.empty((len(drawn), SPREAD.beams), np.float32)
 
-    def render(self, renderer: Renderer, times: int = 1, turned: float = 0.0) -> Any:
-        """Renders the batch some times, every lidar turned [rad]; returns ranges (N, B) [m]."""
+    def render(self, renderer: Renderer, turned: float = 0.0) -> Any:
+        """Renders the batch, every lidar turned [rad]; returns ranges (N, B) [m]."""
         scanner = Scanner(SPREAD, self.table, renderer)
         starts = self.starts + np.array([0.0, 0.0, turned])
-        for _ in range(times):
-            scanner.scan(starts, *self.scene, out=self.out)
+        scanner.scan(starts, *self.scene, out=self.out)
         return self.out.copy()
 
 
@@ -604,14 +559,12 @@ def measure_lidar_peers(given: Given) -> Result:
     rivals = () if given.without_peers else tuple(peers.PEERS)
     table = bake(SPREAD, (CIRCLE,))
     batch = Scans(table, peers.make_scenes(given.scans))
-    times = TIMES_SLOWER if given.control == "slow" else 1
     calls: dict[str, Callable[[], object]] = {
-        name: partial(batch.render, name, times) for name in RENDERERS
+        name: partial(batch.render, name) for name in RENDERERS
     }
     calls["write"] = partial(batch.out.fill, 1.0)
     drawn = peers.make_scenes(given.scenes)
-    alone = "scan_by_the_lidar" if given.control == "other_way" else "scan"
-    found = peers.measure(calls, rivals, drawn, given.repeats, alone)
+    found = peers.measure(calls, rivals, drawn, given.repeats)
     rate = {name: given.scans / seconds for name, seconds in found.seconds.items()}
     theirs = {name: 1.0 / one["scan_s"] for name, one in found.peers.items()}
     few = Scans(table, drawn)
@@ -673,8 +626,6 @@ def measure_maps(given: Given) -> Result:
             beside[:, 0] += RESOLUTION if given.control == "shifted" else 0.0
             walk = given.control == "slow"
             baked, baked_speed = scan_map(beams, beside, *about, walk)
-            if given.control == "nan":
-                baked[0, 0] = np.nan
             error = baked.astype(np.float64) - exact
             rows.append(
                 {
@@ -736,10 +687,6 @@ BENCHMARKS = {
                 "the motion: the robots stand still",
                 "our env 'one': moved_m_per_period",
             ),
-            "blind": Control(
-                "the scan: the lidar has 8 beams",
-                "our env 'one': beams_changed_per_period",
-            ),
         },
         {
             "worlds": (2048, "of the vector env"),
@@ -760,14 +707,6 @@ BENCHMARKS = {
                 "the search for what is near: each robot looks at each other, in Python",
                 "robots: 64 cost",
             ),
-            "slow": Control(
-                "the batch: worlds are stepped one after the other",
-                "worlds: 16384 cost",
-            ),
-            "apart": Control(
-                "the set: each of its worlds is a vector env of its own",
-                "members: 250 take",
-            ),
         },
         {
             "repeats": (20_000, "env steps of a point"),
@@ -783,14 +722,6 @@ BENCHMARKS = {
         {
             "shifted": Control(
                 "the same scan: the exact one is turned by one beam", "RMSE [m]: baked"
-            ),
-            "slow": Control(
-                "the speed: each scan that counts is ten", "share of the rate"
-            ),
-            "other_way": Control(
-                "one way of measuring: a scan alone is asked of their lidar",
-                "agreement",
-                "--scans 32 --scenes 4 --repeats 2",
             ),
         },
         {
@@ -808,7 +739,6 @@ BENCHMARKS = {
         {
             "shifted": Control("a cell: the map that is jumped through", "RMSE"),
             "slow": Control("the jumps: the walk stands in", "the walk's speed"),
-            "nan": Control("one range", "RMSE [m] nan"),
         },
         {"seed": 0},
         unsettled=("the walk's speed",),

@@ -1,8 +1,8 @@
-"""Drives of robots in simulators of their own, with all that is true of them.
+"""Drives of robots in simulators of their own.
 
 Their equations of motion share nothing with the package's kinematics: forces between wheels and
-ground, servos of second order, motors with a torque curve. Of what a physics engine simulates, as
-the DART robot of `test/campaigns/unknown_robot.py`, latencies, dead zones and lags are not known.
+ground, servos of second order, motors with a torque curve. No physics engine has such motors,
+servos and encoders; a robot of DART drives in `test/campaigns/unknown_robot.py`.
 
 What a recorder sees: commands at 20 Hz that act after a latency, poses of a motion capture whose
 tracked body sits somewhere on the robot, or encoders that overflow. Everything follows from a seed.
@@ -12,14 +12,13 @@ from __future__ import annotations
 
 import csv
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 
-from measuring.drives import Truth
 from nics_drl_bridge import geometry
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
@@ -204,44 +203,7 @@ class ForeignRobot:
     ] = ()  # greatest rates of the commands, by the robot's own driver
     mounting: tuple[float, float, float] = (0.0, 0.0, 0.0)  # pose of the tracked body
     pose_s: float = 0.01  # between poses
-    # the tracked point's x is defined, as no other point moves alike
-    arm_known: bool = True
-    dead_zone: float | None = None  # greatest throttle at which it stands
-    wheels: dict[str, float] = field(default_factory=dict)  # radii and base [m]
     ticks_per_turn: int = 0  # of encoders that are recorded in place of commands
-
-    @property
-    def truth(self) -> Truth:
-        """All that a model may be compared with."""
-        x, y, heading = self.mounting
-        mounting = {"rotation_rad": -heading, "lever_arm_y_m": y}
-        return Truth(
-            None if self.ticks_per_turn or self.slew else self.latency_s,
-            mounting | ({"lever_arm_x_m": x} if self.arm_known else {}),
-            self.dead_zone,
-            {name: (size, size) for name, size in self.wheels.items()},
-        )
-
-
-def throttle_car() -> ForeignRobot:
-    """A car of 1:10 by throttle: dead zone, motor curve, drag, understeer, slip."""
-    dead = 0.1
-    pull = 8.0
-    rolling = 0.25
-    values = (dead, pull, 7.0, rolling, 0.12, 0.26, 0.4, 0.06, 0.035, 0.015, 0.03)
-    return ForeignRobot(
-        THROTTLE_CAR,
-        values,
-        {"throttle": (-0.2, 0.5), "steering": (-1.0, 1.0)},
-        {
-            "kind": "ackermann_throttle",
-            "footprint_radius": 0.25,
-            "parameters": {"wheelbase": 0.26},
-        },
-        latency_s=0.04,
-        mounting=(0.08, 0.0, 0.1),
-        dead_zone=dead + (1.0 - dead) * rolling / pull,
-    )
 
 
 ROBOTS: dict[str, ForeignRobot] = {
@@ -251,9 +213,19 @@ ROBOTS: dict[str, ForeignRobot] = {
         {"forward_command": (-1.0, 1.0), "turn_command": (-1.5, 1.5)},
         {"kind": "skid_steer", "footprint_radius": 0.4, "parameters": {"track": 0.48}},
         mounting=(0.15, 0.0, 0.3),
-        arm_known=False,
     ),
-    "throttle_car": throttle_car(),
+    "throttle_car": ForeignRobot(
+        THROTTLE_CAR,
+        (0.1, 8.0, 7.0, 0.25, 0.12, 0.26, 0.4, 0.06, 0.035, 0.015, 0.03),
+        {"throttle": (-0.2, 0.5), "steering": (-1.0, 1.0)},
+        {
+            "kind": "ackermann_throttle",
+            "footprint_radius": 0.25,
+            "parameters": {"wheelbase": 0.26},
+        },
+        latency_s=0.04,
+        mounting=(0.08, 0.0, 0.1),
+    ),
     "tricycle": ForeignRobot(
         TRICYCLE,
         (0.9, 0.15, 180.0, 22.0),
@@ -287,7 +259,6 @@ ROBOTS: dict[str, ForeignRobot] = {
         mounting=(-0.1, 0.0, 0.0),
         pose_s=0.02,
         ticks_per_turn=2048,
-        wheels={"left_m": 0.0975, "right_m": 0.0985, "base_m": 0.34},
     ),
 }
 ROBOTS["slewed_tricycle"] = replace(ROBOTS["tricycle"], slew=(0.6, 1.0), delays_s=())

@@ -96,10 +96,6 @@ class Simulator:
         """The scan of a step, alone."""
         getattr(self.owner, self.name)()
 
-    def scan_by_the_lidar(self) -> None:
-        """A scan as one would ask the lidar itself for it, which is not the scan of a step."""
-        self.env.robot.lidar.step(self.env.robot.state)
-
     def step(self, action: np.ndarray) -> None:
         """What they offer to users: a motion and a scan."""
         self.env.step(action)
@@ -223,7 +219,6 @@ class Readings:
         about = given["about"]
         self.simulator = Simulator(self.scenes[0], about)
         self.at = 0
-        self.alone = getattr(self.simulator, given["alone"])
         self.rng = np.random.default_rng(1)
         self.tasks = {
             name: Task(
@@ -237,7 +232,7 @@ class Readings:
         found = []
         for scene in self.scenes:
             self.simulator.begin(scene)
-            self.alone()
+            self.simulator.scan()
             found.append(
                 [float(value) for value in self.simulator.env.robot.lidar.range_data]
             )
@@ -259,7 +254,7 @@ class Readings:
                     [[self.rng.uniform(0.0, 1.0)], [self.rng.uniform(-2.0, 2.0)]]
                 )
                 calls = {
-                    "scan": (self.alone,),
+                    "scan": (self.simulator.scan,),
                     "step": (self.simulator.step, action),
                     "step_without_scan": (self.simulator.step_without_scan, action),
                 }

@@ -147,13 +147,8 @@ def make_scenes(count: int) -> list[Scene]:
     return [sample_scene(WORLD, footprint, seed) for seed in range(count)]
 
 
-def describe_task(drawn: Sequence[Scene], alone: str) -> dict[str, Any]:
-    """What a peer is told.
-
-    Args:
-        drawn: the scenes.
-        alone: the method of its `Simulator` that is timed as the scan alone.
-    """
+def describe_task(drawn: Sequence[Scene]) -> dict[str, Any]:
+    """What a peer is told of the scenes."""
     lidar = MODEL.lidar
     return {
         "about": {
@@ -177,7 +172,6 @@ def describe_task(drawn: Sequence[Scene], alone: str) -> dict[str, Any]:
             }
             for one in drawn
         ],
-        "alone": alone,
     }
 
 
@@ -245,7 +239,6 @@ def measure(
     names: Sequence[str],
     drawn: Sequence[Scene],
     rounds: int,
-    alone: str = "scan",
 ) -> Measured:
     """Times our calls and the peers' readings, all in turn; the first round does not count."""
     found = Measured({}, {}, {}, {}, {}, {})
@@ -254,7 +247,7 @@ def measure(
     try:
         for name in names:
             try:
-                peers[name] = start_peer(name, describe_task(drawn, alone))
+                peers[name] = start_peer(name, describe_task(drawn))
                 found.ranges[name] = peers[name].ranges
             except NotInstalledError as error:
                 found.missing[name] = str(error)
