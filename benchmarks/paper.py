@@ -1,14 +1,12 @@
-"""The tables and figures of the paper: kinematics, lidar, point clouds, trajectories.
+"""The tables and figures of the paper: kinematics, lidar, point clouds.
 
 python benchmarks/paper.py table1_kinematics
 python benchmarks/paper.py table2_lidar | table3_density | lidar_complexity
-python benchmarks/paper.py fig4_pointcloud | paper_fig7
+python benchmarks/paper.py fig4_pointcloud
 """
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -26,7 +24,6 @@ from bench import (
     at_most,
     missed_bars,
     run_benchmark,
-    some_of,
 )
 from measuring import fig4
 from measuring.environments import NotInstalledError
@@ -123,20 +120,14 @@ def drive(robot: Subject, seed: int) -> Samples:
     return Samples(t=t, q=np.zeros((STEPS, 3)), x=x, dq=geometry.log(moved) / DT, dt=DT)
 
 
-def find_errors(model: TaylorModel, robot: Subject, seed: int) -> tuple[Array, Array]:
-    """Returns the RMSE (3,) per step in the body frame, and of the body twist times the step."""
+def find_errors(model: TaylorModel, robot: Subject, seed: int) -> Array:
+    """Returns the RMSE (3,) per step in the body frame."""
     x = drive(robot, seed).x
     truth = robot.twist(x) * DT
     guess = model.rates(x) * DT
     apart = geometry.exp(guess)[:, :2] - geometry.exp(truth)[:, :2]
     turned = guess[:, 2:] - truth[:, 2:]
-    apart = np.concatenate([apart, turned], axis=1)
-    return _average(apart), _average(guess - truth)
-
-
-def _average(values: Array) -> Array:
-    """Returns the root mean square over the first axis."""
-    return np.sqrt((values**2).mean(axis=0))
+    return np.sqrt((np.concatenate([apart, turned], axis=1) ** 2).mean(axis=0))
 
 
 def time_batched(model: TaylorModel, robot: Subject) -> float:
@@ -192,19 +183,13 @@ def measure_robot(name: str, control: str | None) -> Result:
         digits = [float(f"{each:.2g}") for each in model.coefficients.ravel()]
         rounded = np.reshape(digits, model.coefficients.shape)
         model = replace(model, coefficients=rounded)
-    step, twist = find_errors(model, robot, 2)
-    if control == "slow":
-        single = batched = time_python(robot)
-    else:
-        single = time_single(model, robot)
-        batched = time_batched(model, robot)
+    step = find_errors(model, robot, 2)
     return {
         **dict(zip(ERRORS, step.tolist(), strict=True)),
-        "rmse_twist": twist.tolist(),
         "terms_kept": model.terms_kept,
         "terms_total": found.regression.terms_total,
-        "steps_per_s_single": single,
-        "steps_per_s_batched": batched,
+        "steps_per_s_single": time_single(model, robot),
+        "steps_per_s_batched": time_batched(model, robot),
     }
 
 
@@ -307,11 +292,9 @@ def measure_table2(given: Given) -> Result:
     """
     spec = load_lidar(given.lidar)
     bake(spec, SCENES["mixture"], COARSE)  # compiled before it is timed
-    result: Result = {"lidar": spec.name, "scenes": {}, "table_bytes": {}, "bake_s": {}}
+    result: Result = {"lidar": spec.name, "scenes": {}, "table_bytes": {}}
     for name, shapes in SCENES.items():
-        begin = time.perf_counter()
         table = bake(spec, shapes, COARSE if given.control == "coarse" else DENSITY)
-        result["bake_s"][name] = time.perf_counter() - begin
         result["table_bytes"][name] = table.memory
         drawn = batches(shapes, given.scans, spec)
         compared = compare_scans(spec, table, drawn, given.control)
@@ -464,7 +447,7 @@ COMPLEXITY_BARS = {
 }
 
 
-# Figures 4 and 7
+# Figure 4
 
 CLOUD_M = {"baked": 0.01, "mujoco": 1e-4}
 RANGE_M = {"baked": 0.05, "mujoco": 1e-4}
@@ -540,54 +523,6 @@ def judge_fig4(result: Result) -> list[str]:
     return missed
 
 
-TRAJECTORY_ROBOTS = ("differential", "ackermann", "mecanum")
-TRAJECTORY_WORLD = "circles"
-FIRST_SEED = 2_000_000
-LEAST_REACHED = 0.8  # fraction of the goals that are truly reached in each world
-# Mean of how far a path may be from that in process [m], by place.
-DEVIATION_M = {"fast": 0.0, "dds": 1e-6, "mujoco_dds": 1.0}
-
-
-def measure_fig7(given: Given) -> Result:
-    """Fig. 7: what are the trajectories of one policy in different worlds, for three robots?"""
-    from measuring.evaluations import evaluate_all
-
-    given.out.mkdir(parents=True, exist_ok=True)
-    runs = {
-        robot: f"{given.policy or robot} --model {robot} --world {TRAJECTORY_WORLD} "
-        f"--episodes {given.episodes} --seed {FIRST_SEED}"
-        for robot in given.robots
-    }
-    told = {}
-    with tempfile.TemporaryDirectory() as folder:
-        for robot, places in evaluate_all(runs, Path(folder), given.control).items():
-            (drawn,) = (Path(folder) / robot).glob("trajectories_*.png")
-            picture = given.out / f"fig7_{robot}.png"
-            shutil.move(drawn, picture)
-            success = {place: one["success"][0] for place, one in places.items()}
-            apart = {place: one["deviation"][0] for place, one in places.items()}
-            told[robot] = {
-                "picture": str(picture),
-                "success": success,
-                "deviation_m": apart,
-            }
-    return {"robots": told}
-
-
-def judge_fig7(result: Result) -> list[str]:
-    missed = []
-    for robot, told in result["robots"].items():
-        reached = dict.fromkeys(DEVIATION_M, at_least(LEAST_REACHED))
-        bars = {place: at_most(bar) for place, bar in DEVIATION_M.items()}
-        apart = {
-            place: np.nan if each is None else each
-            for place, each in told["deviation_m"].items()
-        }
-        missed += missed_bars(told["success"], reached, f"{robot}, goals reached, ")
-        missed += missed_bars(apart, bars, f"{robot}, paths apart [m], ")
-    return missed if result["robots"] else ["no robot was driven"]
-
-
 SCANS = (4096, "scans of each scene")
 SMALL_TABLE = "--distances 10 --rotations 8"
 BENCHMARKS = {
@@ -596,9 +531,6 @@ BENCHMARKS = {
         judge_table1,
         {
             "rounded": Control("all but two digits of the coefficients", "rmse_x_m"),
-            "slow": Control(
-                "the compiled model: plain Python stands in", "steps_per_s"
-            ),
         },
         unsettled=("steps_per_s",),
     ),
@@ -658,22 +590,6 @@ BENCHMARKS = {
         },
         short="--scans 12 --without-slam",
         needs=("mujoco",),
-    ),
-    "paper_fig7": Benchmark(
-        measure_fig7,
-        judge_fig7,
-        {
-            "standing": Control("the motion: the policy stands still", "goals reached"),
-            "lying": Control("the truth: a robot says it is there", "goals reached"),
-        },
-        {
-            "episodes": 6,
-            "robots": some_of(TRAJECTORY_ROBOTS),
-            "out": Path("runs/paper_fig7"),
-            "policy": {"help": "a baseline instead of each robot's shipped policy"},
-        },
-        short="--episodes 1 --robots differential",
-        needs=("rclpy", "mujoco"),
     ),
 }
 

@@ -480,7 +480,7 @@ def measure_transfer(given: Given) -> Result:
     The conditions are those of a deployment: a real lidar, mild randomisation, the gate and its
     shield. What counts is where the robot truly ended and whether it truly touched something; what
     the robot itself took for a success is told beside it. Two worlds are driven at a time, each in
-    processes of its own.
+    processes of its own. `--out` keeps the pictures of the trajectories, as the paper's Fig. 7.
     """
 
     def tell(name: str, figures: dict[str, Any]) -> None:
@@ -499,7 +499,8 @@ def measure_transfer(given: Given) -> Result:
     }
     found: Found = {robot: {} for robot in given.robots}
     with tempfile.TemporaryDirectory() as folder:
-        evaluated = evaluate_all(runs, Path(folder), given.control, tell)
+        out = given.out or Path(folder)
+        evaluated = evaluate_all(runs, out, given.control, tell)
     for name, figures in evaluated.items():
         robot, world = name.split("/")
         found[robot][world] = figures
@@ -773,6 +774,7 @@ BENCHMARKS = {
             "robots": SHIPPED,
             "worlds": some_of(tuple(TRANSFER_FLOORS)),
             "in": some_of(PLACES) | {"dest": "places"},
+            "out": {"type": Path, "help": "keep all files there, as trajectories"},
         },
         short="--episodes 1 --robots differential --worlds circles",
         unsettled=("",),

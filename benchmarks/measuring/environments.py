@@ -111,21 +111,3 @@ def python_with(name: str, requirements: tuple[str, ...]) -> Path:
         raise NotInstalledError(f"{name} can't be installed: {last[0]}") from None
     ready.write_text(wanted)
     return python
-
-
-def run(python: Path, script: Path, *arguments: str, timeout: float = 600.0) -> str:
-    """Standard output of a script in such an environment. Raises NotInstalledError if it fails."""
-    try:
-        done = subprocess.run(
-            [str(python), str(script), *arguments],
-            env=clean(),
-            check=True,
-            capture_output=True,
-            text=True,
-            timeout=timeout,
-        )
-    except (OSError, subprocess.SubprocessError) as error:
-        said = getattr(error, "stderr", None) or str(error)
-        last = str(said).strip().splitlines()[-1:] or ["no message"]
-        raise NotInstalledError(f"{script.name} failed: {last[0]}") from None
-    return done.stdout

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.commands import episodes
 from nics_drl_bridge.env.bridge_env import BridgeEnv
-from nics_drl_bridge.env.task import Task, discrete_commands, still
+from nics_drl_bridge.env.task import Task, still
 from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.middleware.middleware import Middleware
 
@@ -80,15 +80,9 @@ class Standing:
     """
 
     def __init__(self, task: Task) -> None:
-        robot = task.robot
-        rest = still(task.robot)
-        if isinstance(task.action_space, gymnasium.spaces.Discrete):
-            off = np.abs(discrete_commands(robot) - rest).sum(axis=1)
-            self._action = np.asarray(off.argmin())
-        else:
-            low, high = task.command_limits
-            share = (rest - low) / (high - low)
-            self._action = (2.0 * share - 1.0).astype(np.float32)
+        low, high = task.command_limits
+        share = (still(task.robot) - low) / (high - low)
+        self._action = (2.0 * share - 1.0).astype(np.float32)
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[Any]:
         """The same action for every observation (..., O)."""

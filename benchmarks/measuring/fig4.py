@@ -10,12 +10,12 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from measuring.environments import python_with, run
+from measuring.environments import clean, python_with, wait_for
 from nics_drl_bridge import geometry
 from nics_drl_bridge.extras.mujoco.machines import load_mujoco
 from nics_drl_bridge.lidar.shapes import Circle, Polygon, Rectangle, Shape
 from nics_drl_bridge.lidar.spec import LidarSpec
-from nics_drl_bridge.style import DARK, MEASURED, MODEL, OTHER, make_panels
+from nics_drl_bridge.style import MEASURED, MODEL, OTHER, make_panels
 
 Array = NDArray[np.float64]
 HERE = Path(__file__).resolve().parent
@@ -97,7 +97,8 @@ def make_map(
         np.savez(
             asked, ranges=ranges, odometry=odometry, angles=spec.angles, limits=limits
         )
-        run(python, HERE / "yag_slam_map.py", str(asked), str(answered))
+        script = str(HERE / "yag_slam_map.py")
+        wait_for([str(python), script, str(asked), str(answered)], HERE, clean())
         with np.load(answered) as found:
             return dict(found)
 
@@ -162,15 +163,6 @@ def scan_in_mujoco(spec: LidarSpec, path: Array) -> NDArray[np.float32]:
     return ranges
 
 
-def make_outline(shape: Shape, pose: Array) -> Array:
-    """(V, 2) a closed line around an obstacle [m]."""
-    t = np.linspace(0.0, 2.0 * np.pi, 60)
-    corners = shape.outline
-    if isinstance(shape, Circle):
-        corners = shape.radius * np.stack([np.cos(t), np.sin(t)], axis=1)
-    return geometry.rotate(np.concatenate([corners, corners[:1]]), pose[2]) + pose[:2]
-
-
 def draw(
     truth: Array, clouds: dict[str, Array], mapped: dict[str, Array], odometry: Array
 ) -> Figure:
@@ -190,8 +182,6 @@ def draw(
         axes.plot(
             *points.T, ".", ms=1.2, mew=0.0, color=MEASURED, alpha=0.6, rasterized=True
         )
-        for shape, pose in zip(OBSTACLES, POSES, strict=True):
-            axes.plot(*make_outline(shape, pose).T, color=DARK, lw=0.5, alpha=0.5)
     if mapped:
         cell = float(mapped["resolution"])
         left, low = mapped["origin"] - 0.5 * cell  # the origin is the middle of a cell
