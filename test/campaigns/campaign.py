@@ -142,7 +142,6 @@ CAMPAIGNS: dict[str, Campaign] = {
                 "the gate's limits: they are a hundred times as wide",
                 "violations ",
             ),
-            "nan": Control("one number in a thousand decisions", "violations"),
             "standing": Control("the commands: all are zero", "share_in_motion 0"),
         },
         quick=True,
@@ -256,9 +255,6 @@ CAMPAIGNS: dict[str, Campaign] = {
     "parity": Campaign(
         "--steps 25 --robot ackermann",
         {
-            "nan": Control(
-                "a number of one observation", "difference inf: must be at most 0"
-            ),
             "noise": Control("the last bit of one number", "difference "),
             "late": Control(
                 "one observation, of which the one before is told again",
@@ -330,7 +326,6 @@ CAMPAIGNS: dict[str, Campaign] = {
             "endless": Control(
                 "the env's time limit", "an episode of", f"{ENV} --limit 10"
             ),
-            "nan": Control("one number of an observation", "not finite", ENV),
             "leak": Control(
                 "thrift: 1 MB and a file more are held after each round",
                 "file descriptors more",

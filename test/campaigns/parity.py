@@ -55,8 +55,6 @@ class Spoilt(gymnasium.Wrapper):
         self._steps += 1
         seen = observation.copy()
         if self._steps == SPOILT_STEP:
-            if self._control == "nan":
-                seen[-1] = np.nan
             if self._control == "noise":
                 seen[-1] = np.nextafter(seen[-1], np.float32(np.inf))
             if self._control == "late" and self._last is not None:

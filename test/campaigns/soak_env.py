@@ -99,8 +99,6 @@ class Case:
                 data.pose[0] = before[0]
             elif control == "blind":
                 seen[0] = self._seen[0]
-            elif control == "nan":
-                seen[0, 0] = np.nan
             self.nans += count_not_finite(seen, reward, data.pose, data.odom)
             self._count(
                 seen, (data.pose != before).any(axis=-1), terminated | truncated

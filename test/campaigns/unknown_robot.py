@@ -52,7 +52,6 @@ GATE_S = 10.0  # within which the gate answers
 REST_S = 1.0  # at rest for so long, the robot has ended a drive
 HELD_PATIENCE_S = 10.0  # within which a held body is stopped, or never
 DRIVES_BEFORE_HOLD_S = (0.2, 5.0)  # between the first moving command and a hold
-ARMED_S = 300.0  # between two armings
 
 OPEN_PLACE = {"size": [30.0, 30.0], "pillars": []}
 FIELD = {"size": [12.0, 12.0], "pillars": [list(pillar) for pillar in PILLARS]}
@@ -325,28 +324,23 @@ class Drives:
         )
 
 
-def drive_to_goals(operator: Operator, goals: int, minutes: float) -> Drives:
-    """Drives to so many goals, and for so many minutes, re-arming the gate every five of them."""
+def drive_to_goals(operator: Operator, goals: int) -> Drives:
+    """Drives to so many goals; the gate is armed again where it has stopped the robot."""
     drives = Drives()
-    began_s = time.monotonic()
-    armed_s = -math.inf
-    while len(drives.away) < goals or time.monotonic() - began_s < 60.0 * minutes:
-        if time.monotonic() - armed_s > ARMED_S:
-            if drives.armings:
-                operator.ask_gate("e_stop")
+    armed = False
+    while len(drives.away) < goals:
+        if not armed:
             refusal = operator.arm(60.0)
             if refusal:
                 drives.refusals.append(refusal)
                 break
             drives.armings += 1
-            armed_s = time.monotonic()
-        goal = operator.draw_goal()
-        away = operator.drive_to(goal)
+        away = operator.drive_to(operator.draw_goal())
         drives.away.append(away)
         print(f"goal {len(drives.away)}: {away:.2f} m away", file=sys.stderr)
-        if math.isnan(away):
+        armed = not math.isnan(away)
+        if not armed:
             operator.ask_gate("reset")
-            armed_s = -math.inf
     drives.touched = operator.touched
     return drives
 
@@ -428,7 +422,7 @@ def measure_in(folder: Path, options: Given) -> Result:
             raise SystemExit("the robot's driver is silent; see driver.log.")
         if not operator.until(operator.is_policy_there, 120.0):
             raise SystemExit("the policy does not listen; see nodes/policy_node.log.")
-        drives = drive_to_goals(operator, options.goals, options.minutes)
+        drives = drive_to_goals(operator, options.goals)
         held_s = hold_again_and_again(operator, options.holds, options.seed)
     operator.close()
     return {
@@ -463,7 +457,6 @@ def judge(result: Result) -> list[str]:
 OPTIONS = {
     "goals": 40,
     "seed": (0, "of goals, noise and the training"),
-    "minutes": (0.0, "drive on, re-arming every 5"),
     "holds": (20, "how often its body is held"),
     "folder": {"type": Path, "help": "keep all files there, and use what is there"},
 }

@@ -366,12 +366,9 @@ def _read_world(path: str) -> object:
 
 CONFIGS: dict[str, Callable[[str], object]] = {
     "robots/ackermann": load_robot,
-    "robots/differential": load_robot,
     "lidars/rplidar_a2": _read_lidar,
-    "lidars/paper": _read_lidar,
     "worlds/arena": _read_world,
     "worlds/crowd": _read_world,
-    "worlds/clutter": _read_world,
     "limits/differential": lambda path: load_limits(path, load_robot("differential")),
     "randomisation/strong": load_randomisation,
     "training/navigation_differential": load_training,
