@@ -99,7 +99,9 @@ CAMPAIGNS: dict[str, Campaign] = {
         "--rounds 40 --seed 5",
         {
             "credulous": Control(
-                "the checks of policies and of YAML", "must be at most 0", "--rounds 60"
+                "the checks of policies and of YAML",
+                "must be at most 0",
+                "--rounds 120 --seed 1",
             ),
             "no_checksum": Control(
                 "the checksums of recordings, models, tables, policies and checkpoints",
