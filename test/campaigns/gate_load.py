@@ -91,7 +91,7 @@ def run_gate(control: str) -> None:
         for name in ("scan", "odometry", "estimate", "command", "e_stop"):
             setattr(command_gate, name, _often(getattr(command_gate, name)))
     elif control:
-        gate_log.BoxWriter = FrozenWriter
+        gate_log.BlackBox = FrozenBox
         gate_log.CLOSING_S = HUNG_S
     start(GATE, [GATE, *sys.argv[1:]])
 
