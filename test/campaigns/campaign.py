@@ -295,6 +295,13 @@ CAMPAIGNS: dict[str, Campaign] = {
             ),
         },
     ),
+    "shield_over_dds": Campaign(
+        "--over-dds --episodes 6 --place mecanum/crowd ackermann/clutter",
+        {},
+        ROS,
+        "shield",
+        attempts=REAL_TIME,
+    ),
     "soak": Campaign(
         "--minutes 0.2 --warm-up 0.1",
         {

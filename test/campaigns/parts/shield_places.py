@@ -1,7 +1,7 @@
 """A robot in a world of its own, for the shield's benchmark: what happens to it, and what it costs.
 
 The world moves in short steps; its base looks for a command once per control period, as a slow one
-does.
+does, and stops when commands fall silent.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ GOAL_S = 25.0
 MOVING, MOVING_STEPS = 0.02, 10
 """A robot whose true place moved more slowly than that, over so many steps before a touch, stood
 and was walked into [m/s]. At rest the car's own noise shakes it by up to 0.012 m/s."""
+SILENCE_S = 0.5
 GOAL = "goal"
 
 
@@ -71,6 +72,7 @@ class Outcome:
         path: that it drove [m].
         seconds: that it took [s].
         speed: at the touch, if any [m/s].
+        silence: the longest time for which its gate said nothing, over DDS [s].
         where: robot, world and seed.
     """
 
@@ -82,6 +84,7 @@ class Outcome:
     path: float = 0.0
     seconds: float = 0.0
     speed: float = 0.0
+    silence: float = 0.0
     where: tuple[str, str, int] = field(default=("", "", 0))
 
 
