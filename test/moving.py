@@ -9,8 +9,8 @@ import numpy as np
 from nics_drl_bridge.lidar.exact_kernels import OutlineArrays
 from nics_drl_bridge.lidar.shapes import place
 from nics_drl_bridge.sim import obstacle_kernels as kernels
+from nics_drl_bridge.sim.obstacle_kernels import MARK
 from nics_drl_bridge.sim.obstacles import plan_arrays
-from nics_drl_bridge.sim.separation_kernels import MARK
 from nics_drl_bridge.sim.state import NO_FIELD, Movers, State, Surroundings
 
 PERIOD = 0.1

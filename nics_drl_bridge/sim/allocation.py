@@ -18,10 +18,10 @@ from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.shapes import BODY
 from nics_drl_bridge.robot.kernels import SERIES, allocate_scratch, make_terms
 from nics_drl_bridge.sim import state as records
-from nics_drl_bridge.sim.cell_kernels import BodyCells, body_cells
+from nics_drl_bridge.sim.collision_kernels import body_cells
 from nics_drl_bridge.sim.contact_kernels import SEVERAL
+from nics_drl_bridge.sim.obstacle_kernels import FIRST, MARK, PLAN
 from nics_drl_bridge.sim.obstacles import Motion, plan_arrays
-from nics_drl_bridge.sim.separation_kernels import FIRST, MARK, PLAN
 from nics_drl_bridge.sim.world import World
 
 SLICES = 16  # Number of groups of beams in which a skewed scan is rendered
@@ -199,7 +199,9 @@ def map_field(grid: GridMap | None) -> records.MapField:
     )
 
 
-def allocate_cells(sizes: Sizes, world_set: records.WorldSetArrays) -> BodyCells:
+def allocate_cells(
+    sizes: Sizes, world_set: records.WorldSetArrays
+) -> records.BodyCells:
     """Allocate the cells of all worlds, none if testing all bodies takes less time."""
     worlds = sizes.worlds if world_set.crowded or world_set.standing else 0
     return body_cells(worlds, sizes.robots + sizes.obstacles, world_set.standing)
@@ -227,7 +229,7 @@ def allocate_part(
     model: SimulatorModel,
     scanner: Scanner,
     sizes: Sizes,
-    cells: BodyCells,
+    cells: records.BodyCells,
     part: slice,
 ) -> records.Part:
     """Return the kernels' arguments for one part of the worlds, with its own scratch memory."""
@@ -240,7 +242,11 @@ def allocate_part(
 
 
 def _allocate_scratch(
-    model: SimulatorModel, scanner: Scanner, sizes: Sizes, cells: BodyCells, worlds: int
+    model: SimulatorModel,
+    scanner: Scanner,
+    sizes: Sizes,
+    cells: records.BodyCells,
+    worlds: int,
 ) -> records.Scratch:
     """Allocate the memory of a thread that steps so many worlds."""
     kinematics = model.kinematics

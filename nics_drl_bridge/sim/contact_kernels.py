@@ -25,8 +25,16 @@ from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SIN, X, Y
 from nics_drl_bridge.robot.kernels import move, wrap
 from nics_drl_bridge.sim import collision_kernels as collision
-from nics_drl_bridge.sim.cell_kernels import BodyCells, around
-from nics_drl_bridge.sim.state import Array, Nearby, Record, State, Surroundings, Tight
+from nics_drl_bridge.sim.collision_kernels import find_around
+from nics_drl_bridge.sim.state import (
+    Array,
+    BodyCells,
+    Nearby,
+    Record,
+    State,
+    Surroundings,
+    Tight,
+)
 
 # Bit flags of what a robot may meet
 FREE = 0
@@ -427,7 +435,7 @@ def find_near(
     own_reach = reach[me]
     count = 0
     standing = bodies.shape[1] - near.shape[0] if scene.standing else 0
-    for f in range(around(n, x, y, own_reach, cells)):
+    for f in range(find_around(n, x, y, own_reach, cells)):
         k = cells.found[f]
         other_reach = bodies[n, k, RADIUS] if k < standing else reach[k]
         dx = bodies[n, k, X] - x

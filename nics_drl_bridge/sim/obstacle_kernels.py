@@ -1,24 +1,75 @@
 """Compiled motion of obstacles, each a circle: one call at reset, and one per world and period.
 
-Columns of `marks`, plans: `separation_kernels`. Draws depend on seed, step and k alone. Pedestrians
+Draws depend on seed, step and k alone. Pedestrians
 move by the social force model of Helbing and Molnar (1995), Phys. Rev. E 51, 4282, whose equation
 numbers are used: a drive towards the goal (2), repulsion by others along ellipses that anticipate
 their next step (3, 4) and by walls (5), less by what is out of sight (8), and a fluctuation.
 Distances are between surfaces. The anticipated step is that of the relative motion (Johansson,
 Helbing, Shukla 2007): by the other's alone, a walker pushes against a robot in its way.
+
+`restrain` then limits each step to free space. Each wall, body and side of the field limits an
+obstacle to a half plane: along the unit vector to the nearest point it may move by `room`. Of two
+that both move, each may use half of the gap, so that neither needs to know the other's step
+(buffered Voronoi cells; Zhou, Wang, Bandyopadhyay, Schwager 2017). A displacement within all half
+planes is free of contacts throughout the period.
 """
 
 import math
+from typing import NamedTuple
+
+import numpy as np
 
 from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.arrays import Array
 from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, X, Y
 from nics_drl_bridge.robot.kernels import wrap
-from nics_drl_bridge.sim import separation_kernels as at
-from nics_drl_bridge.sim.collision_kernels import on_wall
-from nics_drl_bridge.sim.separation_kernels import Traffic
-from nics_drl_bridge.sim.state import State, Surroundings
+from nics_drl_bridge.sim.collision_kernels import in_grid, on_wall
+from nics_drl_bridge.sim.state import MapField, State, Surroundings
+
+# A row of a plan (K, P): the motion of an obstacle.
+(
+    KIND,
+    SPEED_LOW,
+    SPEED_HIGH,
+    FIRST,
+    COUNT,
+    LOOP,
+    PAUSE,
+    RELAXATION,
+    REPULSION,
+    RANGE,
+    WALL_REPULSION,
+    WALL_RANGE,
+    FORESIGHT,
+    VIEW,
+    BEHIND,
+    FLUCTUATION,
+    PLAN,
+) = range(17)
+STILL, PATROL, PEDESTRIAN = range(3)  # values of the column KIND
+# Memory of an obstacle, a row of marks (N, K, F).
+SPEED, VX, VY, GOAL_X, GOAL_Y, UNTIL, INDEX, WAY, REST, MARK = range(10)
+SLACK = 1e-6  # Margin that is never used [m]: rounding must not make two bodies touch
+ROBOT_GAP = 0.1  # gap that an obstacle keeps to a robot, like people [m]; less looks like contact
+# Number of times a displacement is bent before the remaining excess is shortened
+PASSES = 3
+FINEST = 0.25  # Minimum step along a path through a static map, in cells
+HALVINGS = 8  # Number of bisections of its last step to find the end of the free path
+
+
+class Traffic(NamedTuple):
+    """Everything that the moving obstacles of one world keep clear of in a period."""
+
+    bodies: Array  # (K + M, 7) obstacles, then robots
+    first: int  # index of the first robot
+    speeds: Array  # (M, 2) velocity of the robots in `map` [m/s]
+    plans: Array  # (K, P) motions of the obstacles
+    walls: Array  # (W, 4)
+    field: Array  # (4,) minimum x, y and maximum x, y of the field [m]
+    grid: MapField
+    period: float  # [s]
+
 
 DRAWS = 64  # Maximum number of draws per obstacle and period
 MOST = 10_000  # Obstacles of a world at most: draws do not depend on how many there are
@@ -50,14 +101,14 @@ def reset_marks(n: int, data: State, plans: Array) -> None:
         mark = data.marks[n, k]
         row = plans[k]
         mark[:] = 0.0
-        if row[at.KIND] == at.STILL:
+        if row[KIND] == STILL:
             continue
-        low = row[at.SPEED_LOW]
-        high = row[at.SPEED_HIGH]
-        mark[at.SPEED] = low + (high - low) * _share(seed, k * DRAWS)
-        mark[at.GOAL_X], mark[at.GOAL_Y] = bodies[n, k, X], bodies[n, k, Y]
-        mark[at.UNTIL] = -1.0
-        mark[at.WAY] = 1.0
+        low = row[SPEED_LOW]
+        high = row[SPEED_HIGH]
+        mark[SPEED] = low + (high - low) * _share(seed, k * DRAWS)
+        mark[GOAL_X], mark[GOAL_Y] = bodies[n, k, X], bodies[n, k, Y]
+        mark[UNTIL] = -1.0
+        mark[WAY] = 1.0
 
 
 @kernel
@@ -75,35 +126,35 @@ def steer(
     count = velocity.shape[0]
     plans = movers.plans
     bodies = data.bodies[n]
-    traffic = at.Traffic(
+    traffic = Traffic(
         bodies, count, speeds, plans, scene.walls, movers.bounds, scene.grid, period
     )
     draws = (step + 1) * MOST
     # walkers first: they react to the velocities of the last period
     for k in range(count):
         velocity[k, :] = 0.0
-        if plans[k, at.KIND] == at.PEDESTRIAN and bodies[k, RADIUS] > 0.0:
+        if plans[k, KIND] == PEDESTRIAN and bodies[k, RADIUS] > 0.0:
             velocity[k, 0], velocity[k, 1] = _walk(
                 data.marks[n], k, traffic, seed, (draws + k) * DRAWS, step
             )
     for k in range(count):
-        kind = plans[k, at.KIND]
+        kind = plans[k, KIND]
         mark = data.marks[n, k]
         body = bodies[k]
-        if kind == at.STILL or body[RADIUS] <= 0.0:
+        if kind == STILL or body[RADIUS] <= 0.0:
             continue
         dx = velocity[k, 0] * period
         dy = velocity[k, 1] * period
-        if kind == at.PATROL:
+        if kind == PATROL:
             dx, dy = _follow(mark, body, plans[k], movers.waypoints, period, False)
         wished_x = dx
         wished_y = dy
-        dx, dy = at.restrain(dx, dy, k, traffic, kind != at.PATROL)
-        if kind == at.PATROL and dx == wished_x and dy == wished_y:
+        dx, dy = restrain(dx, dy, k, traffic, kind != PATROL)
+        if kind == PATROL and dx == wished_x and dy == wished_y:
             _follow(mark, body, plans[k], movers.waypoints, period, True)
-        mark[at.VX] = dx / period
-        mark[at.VY] = dy / period
-        velocity[k, 0], velocity[k, 1] = mark[at.VX], mark[at.VY]
+        mark[VX] = dx / period
+        mark[VY] = dy / period
+        velocity[k, 0], velocity[k, 1] = mark[VX], mark[VY]
         if dx != 0.0 or dy != 0.0:  # it faces the direction of motion
             turn = wrap(math.atan2(dy, dx) - body[HEADING]) / period
             velocity[k, 2] = min(max(turn, -TURN), TURN)
@@ -114,9 +165,9 @@ def _follow(
     mark: Array, body: Array, row: Array, waypoints: Array, period: float, keep: bool
 ) -> tuple[float, float]:
     """Displacement of a patrol along its path in a period; `keep` stores its progress."""
-    index = int(mark[at.INDEX])
-    way = mark[at.WAY]
-    rest = mark[at.REST]
+    index = int(mark[INDEX])
+    way = mark[WAY]
+    rest = mark[REST]
     x = body[X]
     y = body[Y]
     left = period
@@ -126,26 +177,26 @@ def _follow(
         left = left - pause
         if left <= 0.0:
             break
-        goal = waypoints[int(row[at.FIRST]) + index]
+        goal = waypoints[int(row[FIRST]) + index]
         away = math.hypot(goal[0] - x, goal[1] - y)
-        reach = mark[at.SPEED] * left
+        reach = mark[SPEED] * left
         if away > reach:
             x = x + (goal[0] - x) * reach / away
             y = y + (goal[1] - y) * reach / away
             break
         x = goal[0]
         y = goal[1]
-        left = left - away / mark[at.SPEED]
-        rest = row[at.PAUSE]
-        if row[at.LOOP] != 0.0:
-            index = (index + 1) % int(row[at.COUNT])
+        left = left - away / mark[SPEED]
+        rest = row[PAUSE]
+        if row[LOOP] != 0.0:
+            index = (index + 1) % int(row[COUNT])
         else:
-            way = way if 0 <= index + way < int(row[at.COUNT]) else -way
+            way = way if 0 <= index + way < int(row[COUNT]) else -way
             index += int(way)
     if keep:
-        mark[at.INDEX] = index
-        mark[at.WAY] = way
-        mark[at.REST] = rest
+        mark[INDEX] = index
+        mark[WAY] = way
+        mark[REST] = rest
     return x - body[X], y - body[Y]
 
 
@@ -195,19 +246,15 @@ def _from_bodies(
         rx = bodies[k, X] - bodies[j, X]
         ry = bodies[k, Y] - bodies[j, Y]
         if j < first:
-            vx = marks[j, at.VX]
-            vy = marks[j, at.VY]
+            vx = marks[j, VX]
+            vy = marks[j, VY]
         else:
             vx = traffic.speeds[j - first, 0]
             vy = traffic.speeds[j - first, 1]
-        vx = vx - marks[k, at.VX]
-        vy = vy - marks[k, at.VY]
+        vx = vx - marks[k, VX]
+        vy = vy - marks[k, VY]
         near = bodies[k, RADIUS] + bodies[j, RADIUS]
-        far = (
-            near
-            + FAR * row[at.RANGE]
-            + math.sqrt(vx * vx + vy * vy) * row[at.FORESIGHT]
-        )
+        far = near + FAR * row[RANGE] + math.sqrt(vx * vx + vy * vy) * row[FORESIGHT]
         away2 = rx * rx + ry * ry
         if away2 > far * far or away2 == 0.0:
             continue
@@ -218,13 +265,13 @@ def _from_bodies(
             ry * share,
             vx,
             vy,
-            row[at.FORESIGHT],
-            row[at.REPULSION],
-            row[at.RANGE],
+            row[FORESIGHT],
+            row[REPULSION],
+            row[RANGE],
         )
         # Less (8) from outside the angle of sight of a walker that looks along e.
-        seen = -(ex * fx + ey * fy) >= row[at.VIEW] * math.sqrt(fx * fx + fy * fy)
-        weight = 1.0 if seen else row[at.BEHIND]
+        seen = -(ex * fx + ey * fy) >= row[VIEW] * math.sqrt(fx * fx + fy * fy)
+        weight = 1.0 if seen else row[BEHIND]
         ax = ax + weight * fx
         ay = ay + weight * fy
     return ax, ay
@@ -240,7 +287,7 @@ def _from_walls(k: int, traffic: Traffic) -> tuple[float, float]:
     x = body[X]
     y = body[Y]
     radius = body[RADIUS]
-    reach = row[at.WALL_RANGE]
+    reach = row[WALL_RANGE]
     far = radius + FAR * reach
     for w in range(walls.shape[0]):
         px, py = on_wall(x, y, walls[w])
@@ -250,18 +297,14 @@ def _from_walls(k: int, traffic: Traffic) -> tuple[float, float]:
         if 0.0 < away2 < far * far:
             away = math.sqrt(away2)
             size = (
-                row[at.WALL_REPULSION]
-                / reach
-                * math.exp(-max(away - radius, 0.0) / reach)
+                row[WALL_REPULSION] / reach * math.exp(-max(away - radius, 0.0) / reach)
             )
             ax = ax + size * ox / away
             ay = ay + size * oy / away
-    away = at.map_distance(x, y, traffic.grid)
+    away = map_distance(x, y, traffic.grid)
     if away < far:
-        nx, ny = at.map_direction(x, y, traffic.grid)
-        size = (
-            row[at.WALL_REPULSION] / reach * math.exp(-max(away - radius, 0.0) / reach)
-        )
+        nx, ny = map_direction(x, y, traffic.grid)
+        size = row[WALL_REPULSION] / reach * math.exp(-max(away - radius, 0.0) / reach)
         ax = ax - size * nx
         ay = ay - size * ny
     return ax, ay
@@ -283,14 +326,14 @@ def _new_goal(
     for i in range(CANDIDATES):
         gx = middle_x + (2.0 * _share(seed, counter + 2 * i) - 1.0) * wide
         gy = middle_y + (2.0 * _share(seed, counter + 2 * i + 1) - 1.0) * deep
-        mark[at.GOAL_X] = gx
-        mark[at.GOAL_Y] = gy
+        mark[GOAL_X] = gx
+        mark[GOAL_Y] = gy
         if math.hypot(gx - x, gy - y) >= LEAST_WALK:
-            free = at.clearance(gx, gy, k, traffic)
+            free = clearance(gx, gy, k, traffic)
             if free >= radius + ROOM:
                 break
-    way = math.hypot(mark[at.GOAL_X] - x, mark[at.GOAL_Y] - y)
-    mark[at.UNTIL] = step + (2.0 * way / mark[at.SPEED] + PATIENCE) / traffic.period
+    way = math.hypot(mark[GOAL_X] - x, mark[GOAL_Y] - y)
+    mark[UNTIL] = step + (2.0 * way / mark[SPEED] + PATIENCE) / traffic.period
 
 
 @kernel
@@ -304,32 +347,229 @@ def _walk(
     period = traffic.period
     x = body[X]
     y = body[Y]
-    away = math.hypot(mark[at.GOAL_X] - x, mark[at.GOAL_Y] - y)
-    if step >= mark[at.UNTIL] or away < ARRIVED:
+    away = math.hypot(mark[GOAL_X] - x, mark[GOAL_Y] - y)
+    if step >= mark[UNTIL] or away < ARRIVED:
         _new_goal(mark, k, traffic, seed, counter + 4, step)
-        away = math.hypot(mark[at.GOAL_X] - x, mark[at.GOAL_Y] - y)
+        away = math.hypot(mark[GOAL_X] - x, mark[GOAL_Y] - y)
     ex = 0.0
     ey = 0.0
     if away > 0.0:
-        ex = (mark[at.GOAL_X] - x) / away
-        ey = (mark[at.GOAL_Y] - y) / away
+        ex = (mark[GOAL_X] - x) / away
+        ey = (mark[GOAL_Y] - y) / away
     ax, ay = _from_bodies(k, ex, ey, marks, traffic)
     bx, by = _from_walls(k, traffic)
-    ax += bx + (mark[at.SPEED] * ex - mark[at.VX]) / row[at.RELAXATION]
-    ay += by + (mark[at.SPEED] * ey - mark[at.VY]) / row[at.RELAXATION]
-    if row[at.FLUCTUATION] > 0.0:
-        ax += row[at.FLUCTUATION] * random.normal(
-            seed, random.MOTION_STREAM, counter // 2
-        )
-        ay += row[at.FLUCTUATION] * random.normal(
+    ax += bx + (mark[SPEED] * ex - mark[VX]) / row[RELAXATION]
+    ay += by + (mark[SPEED] * ey - mark[VY]) / row[RELAXATION]
+    if row[FLUCTUATION] > 0.0:
+        ax += row[FLUCTUATION] * random.normal(seed, random.MOTION_STREAM, counter // 2)
+        ay += row[FLUCTUATION] * random.normal(
             seed, random.MOTION_STREAM, counter // 2 + 1
         )
     size = math.hypot(ax, ay)
     share = period * min(1.0, STRONGEST / size) if size > 0.0 else 0.0
-    vx = mark[at.VX] + share * ax
-    vy = mark[at.VY] + share * ay
+    vx = mark[VX] + share * ax
+    vy = mark[VY] + share * ay
     fast = math.hypot(vx, vy)
-    if fast > row[at.SPEED_HIGH]:
-        vx = vx * row[at.SPEED_HIGH] / fast
-        vy = vy * row[at.SPEED_HIGH] / fast
+    if fast > row[SPEED_HIGH]:
+        vx = vx * row[SPEED_HIGH] / fast
+        vy = vy * row[SPEED_HIGH] / fast
     return vx, vy
+
+
+@kernel
+def map_distance(x: float, y: float, grid: MapField) -> float:
+    """Distance from a point to the static map [m], bilinear between the centres of cells."""
+    distances = grid.distances
+    rows, columns = distances.shape
+    if rows < 2 or columns < 2:
+        return np.inf
+    u, v = in_grid(x, y, grid)
+    u = u / grid.cell - 0.5
+    v = v / grid.cell - 0.5
+    u = min(max(u, 0.0), columns - 1.0)
+    v = min(max(v, 0.0), rows - 1.0)
+    j = min(int(u), columns - 2)
+    i = min(int(v), rows - 2)
+    if distances[i, j] == np.inf:
+        return np.inf
+    u = u - j
+    v = v - i
+    low = distances[i, j] * (1.0 - u) + distances[i, j + 1] * u
+    high = distances[i + 1, j] * (1.0 - u) + distances[i + 1, j + 1] * u
+    return low * (1.0 - v) + high * v
+
+
+@kernel
+def map_direction(x: float, y: float, grid: MapField) -> tuple[float, float]:
+    """Unit vector to the nearest point of the static map; zero where there is none."""
+    step = 0.5 * grid.cell
+    gx = map_distance(x - step, y, grid) - map_distance(x + step, y, grid)
+    gy = map_distance(x, y - step, grid) - map_distance(x, y + step, grid)
+    length = math.hypot(gx, gy)
+    if not 0.0 < length < np.inf:
+        return 0.0, 0.0
+    return gx / length, gy / length
+
+
+@kernel
+def clearance(x: float, y: float, k: int, traffic: Traffic) -> float:
+    """Distance from a point to the nearest object except body k [m]."""
+    bodies = traffic.bodies
+    walls = traffic.walls
+    field = traffic.field
+    least = min(min(x - field[0], field[2] - x), min(y - field[1], field[3] - y))
+    for w in range(walls.shape[0]):
+        px, py = on_wall(x, y, walls[w])
+        ox = px - x
+        oy = py - y
+        away2 = ox * ox + oy * oy
+        if least > 0.0 and 0.0 < away2 < least * least:
+            least = math.sqrt(away2)
+    for j in range(bodies.shape[0]):
+        if j != k and bodies[j, RADIUS] > 0.0:
+            ox = bodies[j, X] - x
+            oy = bodies[j, Y] - y
+            reach = least + bodies[j, RADIUS]
+            away2 = ox * ox + oy * oy
+            if reach > 0.0 and 0.0 < away2 < reach * reach:
+                least = math.sqrt(away2) - bodies[j, RADIUS]
+    return min(least, map_distance(x, y, traffic.grid))
+
+
+@kernel
+def _hold(
+    dx: float, dy: float, nx: float, ny: float, room: float, bend: bool
+) -> tuple[float, float]:
+    """Limit a displacement to `room` along n: bend it, or shorten the whole."""
+    ahead = dx * nx + dy * ny
+    room = max(room - SLACK, 0.0)
+    if ahead <= room:
+        return dx, dy
+    if bend:
+        return dx - (ahead - room) * nx, dy - (ahead - room) * ny
+    return dx * (room / ahead), dy * (room / ahead)
+
+
+@kernel
+def _hold_bodies(
+    dx: float, dy: float, k: int, traffic: Traffic, bend: bool
+) -> tuple[float, float]:
+    bodies = traffic.bodies
+    first = traffic.first
+    speeds = traffic.speeds
+    period = traffic.period
+    x = bodies[k, X]
+    y = bodies[k, Y]
+    radius = bodies[k, RADIUS]
+    length = math.sqrt(dx * dx + dy * dy)
+    for j in range(bodies.shape[0]):
+        if j == k or bodies[j, RADIUS] <= 0.0:
+            continue
+        ox = bodies[j, X] - x
+        oy = bodies[j, Y] - y
+        near = radius + bodies[j, RADIUS]
+        step = 0.0
+        if j >= first:
+            vx = speeds[j - first, 0]
+            vy = speeds[j - first, 1]
+            step = math.sqrt(vx * vx + vy * vy) * period
+            near += ROBOT_GAP
+        reach = near + 2.0 * (length + SLACK) + step
+        away2 = ox * ox + oy * oy
+        if away2 >= reach * reach or away2 == 0.0:
+            continue
+        away = math.sqrt(away2)
+        nx = ox / away
+        ny = oy / away
+        room = away - near
+        if j >= first:
+            towards = speeds[j - first, 0] * nx + speeds[j - first, 1] * ny
+            room += min(towards, 0.0) * period
+        elif traffic.plans[j, KIND] != STILL:
+            room *= 0.5
+        dx, dy = _hold(dx, dy, nx, ny, room, bend)
+    return dx, dy
+
+
+@kernel
+def _hold_walls(
+    dx: float, dy: float, body: Array, traffic: Traffic, bend: bool
+) -> tuple[float, float]:
+    x = body[X]
+    y = body[Y]
+    radius = body[RADIUS]
+    walls = traffic.walls
+    field = traffic.field
+    reach = radius + math.sqrt(dx * dx + dy * dy) + 2.0 * SLACK
+    for side, bound in ((-1.0, 0), (1.0, 2)):
+        dx, dy = _hold(dx, dy, side, 0.0, side * field[bound] - radius - side * x, bend)
+        dx, dy = _hold(
+            dx, dy, 0.0, side, side * field[bound + 1] - radius - side * y, bend
+        )
+    for w in range(walls.shape[0]):
+        px, py = on_wall(x, y, walls[w])
+        ox = px - x
+        oy = py - y
+        away2 = ox * ox + oy * oy
+        if 0.0 < away2 < reach * reach:
+            away = math.sqrt(away2)
+            dx, dy = _hold(dx, dy, ox / away, oy / away, away - radius, bend)
+    return dx, dy
+
+
+@kernel
+def _hold_map(
+    dx: float, dy: float, body: Array, grid: MapField, bend: bool
+) -> tuple[float, float]:
+    x = body[X]
+    y = body[Y]
+    radius = body[RADIUS]
+    length = math.sqrt(dx * dx + dy * dy)
+    clearance = map_distance(x, y, grid) - radius
+    if clearance - SLACK > length or length == 0.0:
+        return dx, dy
+    nx, ny = map_direction(x, y, grid)
+    if bend:
+        return _hold(dx, dy, nx, ny, clearance, True)
+    if clearance <= SLACK and dx * nx + dy * ny <= 0.0 and nx * nx + ny * ny > 0.0:
+        # In contact with the map, it may only move where the clearance does not decrease.
+        if map_distance(x + dx, y + dy, grid) - radius >= clearance:
+            return (dx, dy)
+        return (0.0, 0.0)
+    free = 0.0
+    way = 0.0
+    room = clearance
+    finest = FINEST * grid.cell / length
+    while way < 1.0:
+        way = min(way + max(room / length, finest), 1.0)
+        room = map_distance(x + dx * way, y + dy * way, grid) - radius
+        if room < SLACK:
+            break
+        free = way
+    for _ in range(HALVINGS if free < way else 0):
+        middle = 0.5 * (free + way)
+        if map_distance(x + dx * middle, y + dy * middle, grid) - radius < SLACK:
+            way = middle
+        else:
+            free = middle
+    return dx * free, dy * free
+
+
+@kernel
+def restrain(
+    dx: float, dy: float, k: int, traffic: Traffic, bends: bool
+) -> tuple[float, float]:
+    """Return the part of a displacement [m] that obstacle k can make; with `bends` it slides."""
+    body = traffic.bodies[k]
+    for _ in range(PASSES if bends else 0):
+        wished_x = dx
+        wished_y = dy
+        dx, dy = _hold_bodies(dx, dy, k, traffic, True)
+        dx, dy = _hold_walls(dx, dy, body, traffic, True)
+        dx, dy = _hold_map(dx, dy, body, traffic.grid, True)
+        if dx == wished_x and dy == wished_y:
+            break
+    # Shortening preserves limits already met, so all are met afterwards.
+    dx, dy = _hold_bodies(dx, dy, k, traffic, False)
+    dx, dy = _hold_walls(dx, dy, body, traffic, False)
+    return _hold_map(dx, dy, body, traffic.grid, False)

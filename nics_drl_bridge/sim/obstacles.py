@@ -11,7 +11,7 @@ from pydantic import AfterValidator, Field, model_validator
 from nics_drl_bridge.config import Schema
 from nics_drl_bridge.lidar.arrays import Array
 from nics_drl_bridge.lidar.shapes import Coordinate
-from nics_drl_bridge.sim import separation_kernels as at
+from nics_drl_bridge.sim import obstacle_kernels as at
 
 __all__ = ["Motion", "Patrol", "Pedestrian", "plan_arrays"]
 # Maximum speed of an obstacle [m/s]; beyond, a control period is too coarse

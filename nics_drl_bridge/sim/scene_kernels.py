@@ -24,10 +24,15 @@ from nics_drl_bridge.lidar.exact_kernels import (
     Y,
 )
 from nics_drl_bridge.random_kernels import uniform_of
-from nics_drl_bridge.sim import cell_kernels
 from nics_drl_bridge.sim import collision_kernels as collision
-from nics_drl_bridge.sim.cell_kernels import BodyCells
-from nics_drl_bridge.sim.state import MapField, Touches
+from nics_drl_bridge.sim.collision_kernels import (
+    add_to_cells,
+    clear_cells,
+    cover_square,
+    find_added_around,
+    limit_found,
+)
+from nics_drl_bridge.sim.state import BodyCells, MapField, Touches
 
 TRIES = 2000
 RESTARTS = 50
@@ -212,9 +217,7 @@ def _is_clear(
     disc[X] = x
     disc[Y] = y
     near = scratch.cells.found
-    for i in range(
-        cell_kernels.around_added(0, x, y, disc[RADIUS] + room, scratch.cells)
-    ):
+    for i in range(find_added_around(0, x, y, disc[RADIUS] + room, scratch.cells)):
         k = near[i]
         counts = moving or plan.groups[plan.group[k], MOVING] == 0.0
         counts = counts and bodies[k, RADIUS] > 0.0
@@ -386,7 +389,7 @@ def _place_obstacles(
     trial = scratch.trial
     cells = scratch.cells
     widest = MARGIN
-    cell_kernels.clear(0, cells)
+    clear_cells(0, cells)
     for k in range(bodies.shape[0]):
         group = plan.groups[plan.group[k]]
         shape = int(bodies[k, SHAPE])
@@ -396,7 +399,7 @@ def _place_obstacles(
         if group[FIXED] > 0.0:
             pose = plan.poses[k]
             _put(bodies[k], pose[0], pose[1], pose[2], shape, plan)
-            cell_kernels.add(0, k, bodies[k], cells)
+            add_to_cells(0, k, bodies[k], cells)
     for k in range(bodies.shape[0]):
         if plan.groups[plan.group[k], FIXED] > 0.0 or not scratch.active[k]:
             continue
@@ -415,7 +418,7 @@ def _place_obstacles(
             )
             if placed:
                 _put(bodies[k], x, y, heading, shape, plan)
-                cell_kernels.add(0, k, bodies[k], cells)
+                add_to_cells(0, k, bodies[k], cells)
                 break
         if not placed:
             return counter, False
@@ -430,9 +433,7 @@ def _is_apart(
     gaps = scratch.gaps
     near = scratch.cells.found
     reach = trial[RADIUS] + widest
-    for i in range(
-        cell_kernels.around_added(0, trial[X], trial[Y], reach, scratch.cells)
-    ):
+    for i in range(find_added_around(0, trial[X], trial[Y], reach, scratch.cells)):
         obstacle = bodies[near[i]]
         gap = max(gaps[k], gaps[near[i]])
         if obstacle[RADIUS] > 0.0 and not _clear_of(
@@ -567,11 +568,11 @@ def draw_scenes(
     count = plan.group.shape[0]
     s = scratch
     # the scratch memory may be sized for another world with more obstacles
-    cells = cell_kernels.limit_found(scratch.cells, count)
+    cells = limit_found(scratch.cells, count)
     scratch = SceneScratch(
         s.seen, s.stack, s.latest, s.active, s.gaps, s.trial, s.disc, s.listed, cells
     )
-    cell_kernels.cover(0, plan.square[0], plan.square[1], plan.square[2], cells)
+    cover_square(0, plan.square[0], plan.square[1], plan.square[2], cells)
     _put(s.disc, 0.0, 0.0, 0.0, plan.radii.shape[0] - 1, plan)
     s.disc[RADIUS] = plan.footprint
     for n in range(seeds.shape[0]):

@@ -25,7 +25,7 @@ from nics_drl_bridge.lidar.shapes import (
 )
 from nics_drl_bridge.seeds import check_seeds
 from nics_drl_bridge.sim import scene_kernels as kernels
-from nics_drl_bridge.sim.cell_kernels import FEWEST, body_cells
+from nics_drl_bridge.sim.collision_kernels import FEWEST, body_cells
 from nics_drl_bridge.sim.obstacles import Motion
 from nics_drl_bridge.sim.packing_kernels import pack
 from nics_drl_bridge.sim.scene_kernels import FreeSpace, ScenePlan, SceneScratch

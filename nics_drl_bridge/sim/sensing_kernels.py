@@ -21,7 +21,7 @@ from nics_drl_bridge.lidar.beam_kernels import locate_lidar
 from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SIN, X, Y
 from nics_drl_bridge.lidar.scan_kernels import LidarArrays, scan_robot
 from nics_drl_bridge.robot.kernels import move, wrap
-from nics_drl_bridge.sim.cell_kernels import around
+from nics_drl_bridge.sim.collision_kernels import find_around
 from nics_drl_bridge.sim.state import (
     BODY_COLUMNS,
     ODOM,
@@ -213,7 +213,7 @@ def scan_together(
     for n in scratch.scans.waiting[:waiting_count]:
         for m in range(data.pose.shape[1]):
             pose = locate_lidar(data.pose[n, m], lidar.mount)
-            count = around(n, pose.x, pose.y, lidar.range_max, cells)
+            count = find_around(n, pose.x, pose.y, lidar.range_max, cells)
             scan_robot(
                 data.ranges[n, m],
                 n,
@@ -329,7 +329,7 @@ def _gather_bodies(
     # The cells of a crowd hold the present positions.
     in_cells = world_set.standing or (world_set.crowded and lag == 0)
     if in_cells:
-        candidates = around(n, pose[0], pose[1], reach, cells)
+        candidates = find_around(n, pose[0], pose[1], reach, cells)
     count = 0
     ago = min(lag * motion.dt, FURTHEST_BACK)
     for i in range(candidates):

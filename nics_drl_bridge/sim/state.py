@@ -21,7 +21,6 @@ from nics_drl_bridge.lidar.exact_kernels import OutlineArrays
 from nics_drl_bridge.lidar.map_kernels import Fixtures
 from nics_drl_bridge.lidar.scan_kernels import LidarArrays, ScanScratch
 from nics_drl_bridge.robot.kernels import Terms
-from nics_drl_bridge.sim.cell_kernels import BodyCells
 
 # Columns of `State.noise`: standard deviations of the odometry's linear velocity [m/s] and turn
 # rate [rad/s]; then of the drift of x, y [m/sqrt(s)], heading [rad/sqrt(s)], each state variable.
@@ -82,7 +81,7 @@ class State(NamedTuple):
     # (N, K, 3) velocity of the obstacles in `map` in this period [m/s, m/s, rad/s]
     velocity: Array
     past: Array  # (N, M, R, PAST_COLUMNS) ring buffer: the end of period i is in row i % R
-    marks: Array  # (N, K, MARK) memory of moving obstacles, columns as in `separation_kernels`
+    marks: Array  # (N, K, MARK) memory of moving obstacles, columns as in `obstacle_kernels`
 
 
 class MapField(NamedTuple):
@@ -103,7 +102,7 @@ class Movers(NamedTuple):
     """Motion of the obstacles of one world."""
 
     moves: bool  # True if an obstacle of any member moves
-    plans: Array  # (K, PLAN) motions, columns as in `separation_kernels`
+    plans: Array  # (K, PLAN) motions, columns as in `obstacle_kernels`
     waypoints: Array  # (Q, 2) of all patrols [m]
     bounds: Array  # (4,) minimum x, y and maximum x, y that obstacles stay in [m]
 
@@ -215,6 +214,20 @@ class Touches(NamedTuple):
 def allocate_touches() -> Touches:
     """Allocate memory for the touches of a robot."""
     return Touches(np.zeros(MOST_TOUCHES, TOUCH), np.zeros((4, 2)))
+
+
+class BodyCells(NamedTuple):
+    """The bodies of N worlds in G x G cells each; without rows, all bodies are always found."""
+
+    # (N, G^2 + 2) place in `then` of each cell's first body, those in no cell being the last; of
+    # chains the first body itself, or -1
+    first: ShortIntegers
+    # (N, K) the bodies in the order of cells; of a chain the next, or -1. One row if the bodies
+    # themselves are put into that order
+    then: ShortIntegers
+    ordered: bool  # True if they are
+    frame: Array  # (N, FRAME)
+    found: ShortIntegers  # (K,) scratch for one thread: the bodies around a point
 
 
 class Tight(NamedTuple):

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nics_drl_bridge.sim import cell_kernels as kernels
+from nics_drl_bridge.sim import collision_kernels as kernels
 
 RADIUS = 5
 
@@ -29,10 +29,10 @@ def test_every_body_that_comes_within_reach_is_found_once(count):
     for n in rng.integers(0, 3, 40):
         bodies = bodies_at_random(rng, count)
         standing = int(rng.integers(count + 1))
-        kernels.sort(n, bodies, standing, cells)
+        kernels.sort_into_cells(n, bodies, standing, cells)
         spot = rng.uniform(-12.0, 12.0, 2)
         reach = rng.uniform(0.0, 3.0)
-        several = kernels.around(n, *spot, reach, cells)
+        several = kernels.find_around(n, *spot, reach, cells)
         got = cells.found[:several].tolist()
         assert len(set(got)) == len(got)
         assert within(bodies, spot, reach) <= set(got)
@@ -46,15 +46,20 @@ def test_bodies_are_found_as_they_are_added():
     cells = kernels.body_cells(1, 30)
     bodies = bodies_at_random(np.random.default_rng(1), 30)
     bodies[:, RADIUS] = np.where(np.arange(30) % 7, 0.1, 5.0)
-    kernels.cover(0, -10.0, -10.0, 20.0, cells)
+    kernels.cover_square(0, -10.0, -10.0, 20.0, cells)
     for k in range(30):
         assert (
-            k not in cells.found[: kernels.around_added(0, *bodies[k, :2], 0.0, cells)]
+            k
+            not in cells.found[
+                : kernels.find_added_around(0, *bodies[k, :2], 0.0, cells)
+            ]
         )
-        kernels.add(0, k, bodies[k], cells)
-        assert k in cells.found[: kernels.around_added(0, *bodies[k, :2], 0.0, cells)]
-    kernels.clear(0, cells)
-    assert kernels.around_added(0, 0.0, 0.0, 100.0, cells) == 0
+        kernels.add_to_cells(0, k, bodies[k], cells)
+        assert (
+            k in cells.found[: kernels.find_added_around(0, *bodies[k, :2], 0.0, cells)]
+        )
+    kernels.clear_cells(0, cells)
+    assert kernels.find_added_around(0, 0.0, 0.0, 100.0, cells) == 0
 
 
 def test_bodies_that_are_put_in_order_are_the_same_and_found_among_those_that_move():
@@ -68,7 +73,7 @@ def test_bodies_that_are_put_in_order_are_the_same_and_found_among_those_that_mo
         assert np.array_equal(bodies[70:], before[70:])
         assert sorted(map(tuple, bodies)) == sorted(map(tuple, before))
         for spot in rng.uniform(-12.0, 12.0, (10, 2)):
-            got = cells.found[: kernels.around(n, *spot, 1.0, cells)].tolist()
+            got = cells.found[: kernels.find_around(n, *spot, 1.0, cells)].tolist()
             assert len(set(got)) == len(got)
             assert within(bodies, spot, 1.0) | set(range(70, 80)) <= set(got)
             few += len(got) < 40
@@ -77,8 +82,8 @@ def test_bodies_that_are_put_in_order_are_the_same_and_found_among_those_that_mo
 
 def test_without_cells_all_bodies_are_found():
     cells = kernels.body_cells(0, 5)
-    kernels.clear(0, cells)
-    kernels.add(0, 2, np.ones(7), cells)
-    for around in (kernels.around, kernels.around_added):
+    kernels.clear_cells(0, cells)
+    kernels.add_to_cells(0, 2, np.ones(7), cells)
+    for around in (kernels.find_around, kernels.find_added_around):
         assert around(0, 50.0, 50.0, 0.1, cells) == 5
     assert cells.found.tolist() == [0, 1, 2, 3, 4]

@@ -10,8 +10,8 @@ from robots import FOOTPRINT, RADIUS, circles, direct_model, field
 from nics_drl_bridge.config import Schema, validate
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.lidar.maps import GridMap
+from nics_drl_bridge.sim import obstacle_kernels as at
 from nics_drl_bridge.sim import obstacle_kernels as kernels
-from nics_drl_bridge.sim import separation_kernels as at
 from nics_drl_bridge.sim.allocation import map_field
 from nics_drl_bridge.sim.obstacle_kernels import FAR, repulsion
 from nics_drl_bridge.sim.obstacles import (

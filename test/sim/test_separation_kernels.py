@@ -7,9 +7,9 @@ from shapely import LineString, MultiLineString, Point
 
 from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.shapes import place
-from nics_drl_bridge.sim import separation_kernels as at
+from nics_drl_bridge.sim import obstacle_kernels as at
 from nics_drl_bridge.sim.allocation import map_field
-from nics_drl_bridge.sim.separation_kernels import (
+from nics_drl_bridge.sim.obstacle_kernels import (
     PLAN,
     Traffic,
     clearance,
