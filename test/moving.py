@@ -9,9 +9,8 @@ import numpy as np
 from nics_drl_bridge.lidar.exact_kernels import OutlineArrays
 from nics_drl_bridge.lidar.shapes import place
 from nics_drl_bridge.sim import obstacle_kernels as kernels
-from nics_drl_bridge.sim.obstacle_kernels import MARK
-from nics_drl_bridge.sim.obstacles import plan_arrays
-from nics_drl_bridge.sim.state import NO_FIELD, Movers, State, Surroundings
+from nics_drl_bridge.sim.state import MARK, NO_FIELD, Movers, State, Surroundings
+from nics_drl_bridge.sim.world import plan_arrays
 
 PERIOD = 0.1
 
@@ -24,7 +23,7 @@ class Watched:
         places: (T + 1, K + M, 2) where the bodies were [m].
         headings: (T + 1, K) of the obstacles.
         velocities: (T, K, 3).
-        marks: (T, K, F).
+        marks: (T, K) of `state.MARK`.
     """
 
     places: np.ndarray
@@ -129,7 +128,7 @@ def watch(
     count = len(motions)
     poses = np.concatenate([places, np.zeros((len(places), 1))], axis=1)[None]
     bodies = place(poses, np.asarray(radii)[None], np.zeros((1, len(places))))
-    marks = np.zeros((1, count, MARK))
+    marks = np.zeros((1, count), MARK)
     velocity = np.zeros((1, count, 3))
     walls = sides(half) if walls is None else np.concatenate([sides(half), walls])
     state = state_of(bodies, marks, velocity, [seed])

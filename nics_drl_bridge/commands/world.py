@@ -16,7 +16,7 @@ from nics_drl_bridge.files import format_json, write_text
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 if TYPE_CHECKING:
-    from nics_drl_bridge.sim.sections import Standing
+    from nics_drl_bridge.sim.sdf import Standing
 
 world = typer.Typer(
     help="Imports worlds made by other tools, draws worlds, writes maps.",

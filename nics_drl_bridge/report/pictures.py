@@ -16,9 +16,8 @@ from nics_drl_bridge.policy.evaluation import Episode
 from nics_drl_bridge.policy.shadow import Shadow
 from nics_drl_bridge.recording.excite import Pattern
 from nics_drl_bridge.robot.spec import RobotSpec
-from nics_drl_bridge.sim.obstacles import Motion, Patrol
 from nics_drl_bridge.sim.scenes import Scene, SceneSampler, member_of
-from nics_drl_bridge.sim.world import World
+from nics_drl_bridge.sim.world import Motion, Patrol, World
 from nics_drl_bridge.sim.world_set import AnyWorld
 from nics_drl_bridge.style import (
     DARK,

@@ -20,9 +20,7 @@ from nics_drl_bridge.robot.kernels import SERIES, allocate_scratch, make_terms
 from nics_drl_bridge.sim import state as records
 from nics_drl_bridge.sim.collision_kernels import body_cells
 from nics_drl_bridge.sim.contact_kernels import SEVERAL
-from nics_drl_bridge.sim.obstacle_kernels import FIRST, MARK, PLAN
-from nics_drl_bridge.sim.obstacles import Motion, plan_arrays
-from nics_drl_bridge.sim.world import World
+from nics_drl_bridge.sim.world import Motion, World, plan_arrays
 
 SLICES = 16  # Number of groups of beams in which a skewed scan is rendered
 LANES = 256  # Number of robots moved side by side: their arrays stay in the L1 cache
@@ -126,7 +124,7 @@ def allocate_state(model: SimulatorModel, sizes: Sizes) -> records.State:
         noise=np.tile(noise, (*shape, 1)),
         velocity=np.zeros((sizes.worlds, sizes.obstacles, 3)),
         past=np.zeros(past),
-        marks=np.zeros((sizes.worlds, sizes.obstacles, MARK)),
+        marks=np.zeros((sizes.worlds, sizes.obstacles), records.MARK),
     )
 
 
@@ -209,18 +207,15 @@ def allocate_cells(
 
 def _stack_plans(
     motions: Sequence[Sequence[Motion | None]],
-) -> tuple[Array, Array]:
-    """Return the plans (P, K, PLAN) and waypoints (Q, 2) of the motions (P, K) of all members."""
-    plans = np.zeros((len(motions), max(map(len, motions)), PLAN))
-    waypoints = []
-    first = 0
+) -> tuple[records.Records, Array]:
+    """Return the plans (P, K) and waypoints (Q, 2) of the motions (P, K) of all members."""
+    plans = np.zeros((len(motions), max(map(len, motions))), records.PLAN)
+    waypoints = np.zeros((0, 2))
     for plan, motions_of_member in zip(plans, motions, strict=True):
-        rows, waypoints_of_member = plan_arrays(motions_of_member)
-        plan[: len(rows)] = rows
-        plan[:, FIRST] += first
-        first += len(waypoints_of_member)
-        waypoints.append(waypoints_of_member)
-    return plans, np.concatenate(waypoints)
+        plan[: len(motions_of_member)], more = plan_arrays(motions_of_member)
+        plan["first"] += len(waypoints)
+        waypoints = np.concatenate([waypoints, more])
+    return plans, waypoints
 
 
 def allocate_part(

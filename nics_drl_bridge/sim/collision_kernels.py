@@ -7,8 +7,8 @@ than `skin` [m] are listed as touches. Shared arguments: a body (7,) has the col
 wall (4,) two ends; the distances of a map are 0 in solid cells; `listed` is scratch memory for
 touches, and the number of those that it already holds comes as `count` and is returned.
 
-Bodies may be sorted into square cells, so that those around a point are found without testing all. A
-body lies in the cell of its centre. One that moves or is larger than a cell is in no cell and is
+Bodies may be sorted into square cells, so that those around a point are found without testing all.
+A body lies in the cell of its centre. One that moves or is larger than a cell is in no cell and is
 always found. The outermost cells reach to infinity. Bodies are either sorted all at once, so that
 neighbouring cells are contiguous, or added one by one to a chain per cell.
 """

@@ -13,10 +13,10 @@ from nics_drl_bridge.lidar.exact_kernels import RADIUS, SHAPE
 from nics_drl_bridge.lidar.shapes import Shape, convex_hull, place
 from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.sim.device import DeviceWorld
-from nics_drl_bridge.sim.obstacles import FASTEST, Motion
 from nics_drl_bridge.sim.scenes import Scenes
-from nics_drl_bridge.sim.sections import Placed
+from nics_drl_bridge.sim.sdf import Placed
 from nics_drl_bridge.sim.simulator import FastSimulator
+from nics_drl_bridge.sim.world import FASTEST, Motion
 from nics_drl_bridge.sim.world_set import AnyWorld
 
 OBSTACLE = "obstacle_"  # prefix of the name of a world's obstacle, before its number

@@ -12,8 +12,7 @@ from pydantic import Field, model_validator
 from nics_drl_bridge.config import Schema, parse_yaml, validate
 from nics_drl_bridge.errors import BridgeError, ConfigError
 from nics_drl_bridge.lidar.shapes import Shape
-from nics_drl_bridge.sim.sdf import AssetsError, SdfError, read_sdf, root_of
-from nics_drl_bridge.sim.sections import Placed
+from nics_drl_bridge.sim.sdf import AssetsError, Placed, SdfError, read_sdf, root_of
 from nics_drl_bridge.sim.world import Pose
 
 HEIGHT = 0.2  # height at which SDF bodies count, as in `nics world import` [m]

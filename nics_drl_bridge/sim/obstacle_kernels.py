@@ -25,31 +25,17 @@ from nics_drl_bridge.lidar.arrays import Array
 from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, X, Y
 from nics_drl_bridge.robot.kernels import wrap
 from nics_drl_bridge.sim.collision_kernels import in_grid, on_wall
-from nics_drl_bridge.sim.state import MapField, State, Surroundings
+from nics_drl_bridge.sim.state import (
+    PATROL,
+    PEDESTRIAN,
+    STILL,
+    MapField,
+    Record,
+    Records,
+    State,
+    Surroundings,
+)
 
-# A row of a plan (K, P): the motion of an obstacle.
-(
-    KIND,
-    SPEED_LOW,
-    SPEED_HIGH,
-    FIRST,
-    COUNT,
-    LOOP,
-    PAUSE,
-    RELAXATION,
-    REPULSION,
-    RANGE,
-    WALL_REPULSION,
-    WALL_RANGE,
-    FORESIGHT,
-    VIEW,
-    BEHIND,
-    FLUCTUATION,
-    PLAN,
-) = range(17)
-STILL, PATROL, PEDESTRIAN = range(3)  # values of the column KIND
-# Memory of an obstacle, a row of marks (N, K, F).
-SPEED, VX, VY, GOAL_X, GOAL_Y, UNTIL, INDEX, WAY, REST, MARK = range(10)
 SLACK = 1e-6  # Margin that is never used [m]: rounding must not make two bodies touch
 ROBOT_GAP = 0.1  # gap that an obstacle keeps to a robot, like people [m]; less looks like contact
 # Number of times a displacement is bent before the remaining excess is shortened
@@ -64,7 +50,7 @@ class Traffic(NamedTuple):
     bodies: Array  # (K + M, 7) obstacles, then robots
     first: int  # index of the first robot
     speeds: Array  # (M, 2) velocity of the robots in `map` [m/s]
-    plans: Array  # (K, P) motions of the obstacles
+    plans: Records  # (K,) motions of the obstacles
     walls: Array  # (W, 4)
     field: Array  # (4,) minimum x, y and maximum x, y of the field [m]
     grid: MapField
@@ -93,22 +79,25 @@ def _share(seed: int, counter: int) -> float:
 
 
 @kernel
-def reset_marks(n: int, data: State, plans: Array) -> None:
+def reset_marks(n: int, data: State, plans: Records) -> None:
     """Reset the memory of the obstacles of world n for an episode; draw their speeds."""
     seed = data.seeds[n]
     bodies = data.bodies
     for k in range(plans.shape[0]):
         mark = data.marks[n, k]
         row = plans[k]
-        mark[:] = 0.0
-        if row[KIND] == STILL:
+        mark.vx = 0.0
+        mark.vy = 0.0
+        mark.index = 0
+        mark.rest = 0.0
+        if row.kind == STILL:
             continue
-        low = row[SPEED_LOW]
-        high = row[SPEED_HIGH]
-        mark[SPEED] = low + (high - low) * _share(seed, k * DRAWS)
-        mark[GOAL_X], mark[GOAL_Y] = bodies[n, k, X], bodies[n, k, Y]
-        mark[UNTIL] = -1.0
-        mark[WAY] = 1.0
+        low = row.slowest
+        high = row.fastest
+        mark.speed = low + (high - low) * _share(seed, k * DRAWS)
+        mark.goal_x, mark.goal_y = bodies[n, k, X], bodies[n, k, Y]
+        mark.until = -1.0
+        mark.way = 1
 
 
 @kernel
@@ -133,12 +122,12 @@ def steer(
     # walkers first: they react to the velocities of the last period
     for k in range(count):
         velocity[k, :] = 0.0
-        if plans[k, KIND] == PEDESTRIAN and bodies[k, RADIUS] > 0.0:
+        if plans[k].kind == PEDESTRIAN and bodies[k, RADIUS] > 0.0:
             velocity[k, 0], velocity[k, 1] = _walk(
                 data.marks[n], k, traffic, seed, (draws + k) * DRAWS, step
             )
     for k in range(count):
-        kind = plans[k, KIND]
+        kind = plans[k].kind
         mark = data.marks[n, k]
         body = bodies[k]
         if kind == STILL or body[RADIUS] <= 0.0:
@@ -152,9 +141,9 @@ def steer(
         dx, dy = restrain(dx, dy, k, traffic, kind != PATROL)
         if kind == PATROL and dx == wished_x and dy == wished_y:
             _follow(mark, body, plans[k], movers.waypoints, period, True)
-        mark[VX] = dx / period
-        mark[VY] = dy / period
-        velocity[k, 0], velocity[k, 1] = mark[VX], mark[VY]
+        mark.vx = dx / period
+        mark.vy = dy / period
+        velocity[k, 0], velocity[k, 1] = mark.vx, mark.vy
         if dx != 0.0 or dy != 0.0:  # it faces the direction of motion
             turn = wrap(math.atan2(dy, dx) - body[HEADING]) / period
             velocity[k, 2] = min(max(turn, -TURN), TURN)
@@ -162,12 +151,12 @@ def steer(
 
 @kernel
 def _follow(
-    mark: Array, body: Array, row: Array, waypoints: Array, period: float, keep: bool
+    mark: Record, body: Array, row: Record, waypoints: Array, period: float, keep: bool
 ) -> tuple[float, float]:
     """Displacement of a patrol along its path in a period; `keep` stores its progress."""
-    index = int(mark[INDEX])
-    way = mark[WAY]
-    rest = mark[REST]
+    index = mark.index
+    way = mark.way
+    rest = mark.rest
     x = body[X]
     y = body[Y]
     left = period
@@ -177,26 +166,26 @@ def _follow(
         left = left - pause
         if left <= 0.0:
             break
-        goal = waypoints[int(row[FIRST]) + index]
+        goal = waypoints[row.first + index]
         away = math.hypot(goal[0] - x, goal[1] - y)
-        reach = mark[SPEED] * left
+        reach = mark.speed * left
         if away > reach:
             x = x + (goal[0] - x) * reach / away
             y = y + (goal[1] - y) * reach / away
             break
         x = goal[0]
         y = goal[1]
-        left = left - away / mark[SPEED]
-        rest = row[PAUSE]
-        if row[LOOP] != 0.0:
-            index = (index + 1) % int(row[COUNT])
+        left = left - away / mark.speed
+        rest = row.pause
+        if row.loop:
+            index = (index + 1) % row.count
         else:
-            way = way if 0 <= index + way < int(row[COUNT]) else -way
-            index += int(way)
+            way = way if 0 <= index + way < row.count else -way
+            index += way
     if keep:
-        mark[INDEX] = index
-        mark[WAY] = way
-        mark[REST] = rest
+        mark.index = index
+        mark.way = way
+        mark.rest = rest
     return x - body[X], y - body[Y]
 
 
@@ -233,7 +222,7 @@ def repulsion(
 
 @kernel
 def _from_bodies(
-    k: int, ex: float, ey: float, marks: Array, traffic: Traffic
+    k: int, ex: float, ey: float, marks: Records, traffic: Traffic
 ) -> tuple[float, float]:
     bodies = traffic.bodies
     first = traffic.first
@@ -246,15 +235,15 @@ def _from_bodies(
         rx = bodies[k, X] - bodies[j, X]
         ry = bodies[k, Y] - bodies[j, Y]
         if j < first:
-            vx = marks[j, VX]
-            vy = marks[j, VY]
+            vx = marks[j].vx
+            vy = marks[j].vy
         else:
             vx = traffic.speeds[j - first, 0]
             vy = traffic.speeds[j - first, 1]
-        vx = vx - marks[k, VX]
-        vy = vy - marks[k, VY]
+        vx = vx - marks[k].vx
+        vy = vy - marks[k].vy
         near = bodies[k, RADIUS] + bodies[j, RADIUS]
-        far = near + FAR * row[RANGE] + math.sqrt(vx * vx + vy * vy) * row[FORESIGHT]
+        far = near + FAR * row.range + math.sqrt(vx * vx + vy * vy) * row.foresight
         away2 = rx * rx + ry * ry
         if away2 > far * far or away2 == 0.0:
             continue
@@ -265,13 +254,13 @@ def _from_bodies(
             ry * share,
             vx,
             vy,
-            row[FORESIGHT],
-            row[REPULSION],
-            row[RANGE],
+            row.foresight,
+            row.repulsion,
+            row.range,
         )
         # Less (8) from outside the angle of sight of a walker that looks along e.
-        seen = -(ex * fx + ey * fy) >= row[VIEW] * math.sqrt(fx * fx + fy * fy)
-        weight = 1.0 if seen else row[BEHIND]
+        seen = -(ex * fx + ey * fy) >= row.cos_view * math.sqrt(fx * fx + fy * fy)
+        weight = 1.0 if seen else row.behind
         ax = ax + weight * fx
         ay = ay + weight * fy
     return ax, ay
@@ -287,7 +276,7 @@ def _from_walls(k: int, traffic: Traffic) -> tuple[float, float]:
     x = body[X]
     y = body[Y]
     radius = body[RADIUS]
-    reach = row[WALL_RANGE]
+    reach = row.wall_range
     far = radius + FAR * reach
     for w in range(walls.shape[0]):
         px, py = on_wall(x, y, walls[w])
@@ -297,14 +286,14 @@ def _from_walls(k: int, traffic: Traffic) -> tuple[float, float]:
         if 0.0 < away2 < far * far:
             away = math.sqrt(away2)
             size = (
-                row[WALL_REPULSION] / reach * math.exp(-max(away - radius, 0.0) / reach)
+                row.wall_repulsion / reach * math.exp(-max(away - radius, 0.0) / reach)
             )
             ax = ax + size * ox / away
             ay = ay + size * oy / away
     away = map_distance(x, y, traffic.grid)
     if away < far:
         nx, ny = map_direction(x, y, traffic.grid)
-        size = row[WALL_REPULSION] / reach * math.exp(-max(away - radius, 0.0) / reach)
+        size = row.wall_repulsion / reach * math.exp(-max(away - radius, 0.0) / reach)
         ax = ax - size * nx
         ay = ay - size * ny
     return ax, ay
@@ -312,7 +301,7 @@ def _from_walls(k: int, traffic: Traffic) -> tuple[float, float]:
 
 @kernel
 def _new_goal(
-    mark: Array, k: int, traffic: Traffic, seed: int, counter: int, step: int
+    mark: Record, k: int, traffic: Traffic, seed: int, counter: int, step: int
 ) -> None:
     body = traffic.bodies[k]
     field = traffic.field
@@ -326,19 +315,19 @@ def _new_goal(
     for i in range(CANDIDATES):
         gx = middle_x + (2.0 * _share(seed, counter + 2 * i) - 1.0) * wide
         gy = middle_y + (2.0 * _share(seed, counter + 2 * i + 1) - 1.0) * deep
-        mark[GOAL_X] = gx
-        mark[GOAL_Y] = gy
+        mark.goal_x = gx
+        mark.goal_y = gy
         if math.hypot(gx - x, gy - y) >= LEAST_WALK:
             free = clearance(gx, gy, k, traffic)
             if free >= radius + ROOM:
                 break
-    way = math.hypot(mark[GOAL_X] - x, mark[GOAL_Y] - y)
-    mark[UNTIL] = step + (2.0 * way / mark[SPEED] + PATIENCE) / traffic.period
+    way = math.hypot(mark.goal_x - x, mark.goal_y - y)
+    mark.until = step + (2.0 * way / mark.speed + PATIENCE) / traffic.period
 
 
 @kernel
 def _walk(
-    marks: Array, k: int, traffic: Traffic, seed: int, counter: int, step: int
+    marks: Records, k: int, traffic: Traffic, seed: int, counter: int, step: int
 ) -> tuple[float, float]:
     """Return the next velocity of walker k in `map` [m/s], after fewer than `DRAWS` draws."""
     mark = marks[k]
@@ -347,32 +336,32 @@ def _walk(
     period = traffic.period
     x = body[X]
     y = body[Y]
-    away = math.hypot(mark[GOAL_X] - x, mark[GOAL_Y] - y)
-    if step >= mark[UNTIL] or away < ARRIVED:
+    away = math.hypot(mark.goal_x - x, mark.goal_y - y)
+    if step >= mark.until or away < ARRIVED:
         _new_goal(mark, k, traffic, seed, counter + 4, step)
-        away = math.hypot(mark[GOAL_X] - x, mark[GOAL_Y] - y)
+        away = math.hypot(mark.goal_x - x, mark.goal_y - y)
     ex = 0.0
     ey = 0.0
     if away > 0.0:
-        ex = (mark[GOAL_X] - x) / away
-        ey = (mark[GOAL_Y] - y) / away
+        ex = (mark.goal_x - x) / away
+        ey = (mark.goal_y - y) / away
     ax, ay = _from_bodies(k, ex, ey, marks, traffic)
     bx, by = _from_walls(k, traffic)
-    ax += bx + (mark[SPEED] * ex - mark[VX]) / row[RELAXATION]
-    ay += by + (mark[SPEED] * ey - mark[VY]) / row[RELAXATION]
-    if row[FLUCTUATION] > 0.0:
-        ax += row[FLUCTUATION] * random.normal(seed, random.MOTION_STREAM, counter // 2)
-        ay += row[FLUCTUATION] * random.normal(
+    ax += bx + (mark.speed * ex - mark.vx) / row.relaxation
+    ay += by + (mark.speed * ey - mark.vy) / row.relaxation
+    if row.fluctuation > 0.0:
+        ax += row.fluctuation * random.normal(seed, random.MOTION_STREAM, counter // 2)
+        ay += row.fluctuation * random.normal(
             seed, random.MOTION_STREAM, counter // 2 + 1
         )
     size = math.hypot(ax, ay)
     share = period * min(1.0, STRONGEST / size) if size > 0.0 else 0.0
-    vx = mark[VX] + share * ax
-    vy = mark[VY] + share * ay
+    vx = mark.vx + share * ax
+    vy = mark.vy + share * ay
     fast = math.hypot(vx, vy)
-    if fast > row[SPEED_HIGH]:
-        vx = vx * row[SPEED_HIGH] / fast
-        vy = vy * row[SPEED_HIGH] / fast
+    if fast > row.fastest:
+        vx = vx * row.fastest / fast
+        vy = vy * row.fastest / fast
     return vx, vy
 
 
@@ -485,7 +474,7 @@ def _hold_bodies(
         if j >= first:
             towards = speeds[j - first, 0] * nx + speeds[j - first, 1] * ny
             room += min(towards, 0.0) * period
-        elif traffic.plans[j, KIND] != STILL:
+        elif traffic.plans[j].kind != STILL:
             room *= 0.5
         dx, dy = _hold(dx, dy, nx, ny, room, bend)
     return dx, dy

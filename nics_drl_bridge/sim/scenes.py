@@ -26,11 +26,10 @@ from nics_drl_bridge.lidar.shapes import (
 from nics_drl_bridge.seeds import check_seeds
 from nics_drl_bridge.sim import scene_kernels as kernels
 from nics_drl_bridge.sim.collision_kernels import FEWEST, body_cells
-from nics_drl_bridge.sim.obstacles import Motion
 from nics_drl_bridge.sim.packing_kernels import pack
 from nics_drl_bridge.sim.scene_kernels import FreeSpace, ScenePlan, SceneScratch
 from nics_drl_bridge.sim.state import NO_FIELD, MapField, allocate_touches
-from nics_drl_bridge.sim.world import Goals, Starts, World, check_places
+from nics_drl_bridge.sim.world import Goals, Motion, Starts, World, check_places
 from nics_drl_bridge.sim.world_set import AnyWorld
 
 CELL = 0.1  # Side of cells without a map [m]; larger in large fields, smaller in small ones

@@ -10,6 +10,7 @@ import os
 from collections.abc import Iterator
 from fnmatch import fnmatch
 from functools import cache
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree.ElementTree import Element, TreeBuilder
@@ -19,14 +20,169 @@ import numpy as np
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
+from nics_drl_bridge import geometry
 from nics_drl_bridge.arguments import check_path
 from nics_drl_bridge.config import check_no_device
 from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.lidar.arrays import Array
-from nics_drl_bridge.lidar.shapes import FARTHEST, LARGEST, MOST_CORNERS, SMALLEST
-from nics_drl_bridge.sim import sections
-from nics_drl_bridge.sim.sections import Placed, ShapelessError, Solid, Standing
-from nics_drl_bridge.sim.world import MOST_OBSTACLES
+from nics_drl_bridge.lidar.shapes import (
+    FARTHEST,
+    LARGEST,
+    MOST_CORNERS,
+    SMALLEST,
+    Circle,
+    Polygon,
+    Rectangle,
+    Shape,
+    convex_hull,
+)
+from nics_drl_bridge.sim.world import MOST_OBSTACLES, Obstacles, Region
+
+TILT = 1e-3  # up to this angle [rad] a body counts as upright: a millimetre in a metre
+DIGITS = 6  # shapes and poses are rounded to a micrometre
+AROUND = 1.0  # margin of the bounds around starts and goals [m]
+
+
+class ShapelessError(ValueError):
+    """A body whose section is not a shape of a world; the text names the body."""
+
+    def __init__(self, body: str, missing: bool = False) -> None:
+        super().__init__(body)
+        self.missing = missing  # its file is missing
+
+
+_Cut = tuple[Shape, float, float, float] | None  # with its pose, before rounding
+
+
+class Box(NamedTuple):
+    """A box centred at its own origin."""
+
+    size: tuple[float, ...]  # along x, y, z [m]
+
+    def cut(self, pose: Array, up: float) -> _Cut:
+        """See `section`; `up` is the height of the plane above the origin [m]."""
+        vertical = _find_vertical_axis(pose)
+        if vertical is None:
+            return self._cut_leaning(pose, up)
+        if not abs(up) < self.size[vertical] / 2.0:
+            return None
+        along, across = (axis for axis in range(3) if axis != vertical)
+        return _make_rectangle(pose, along, self.size[along], self.size[across])
+
+    def _cut_leaning(self, pose: Array, up: float) -> _Cut:
+        """The convex polygon through the points where the plane cuts the edges."""
+        signs = np.array(list(product((-0.5, 0.5), repeat=3)))
+        corners = signs * self.size @ pose[:3, :3].T  # around the box's middle
+        cuts = []
+        for a, b in combinations(range(8), 2):
+            if np.count_nonzero(signs[a] != signs[b]) > 1:
+                continue  # no edge
+            below = corners[a, 2] - up
+            above = corners[b, 2] - up
+            if below * above < 0.0:
+                share = below / (below - above)
+                cuts.append(corners[a] + share * (corners[b] - corners[a]))
+        hull = convex_hull(np.array(cuts)[:, :2]) if cuts else np.zeros((0, 2))
+        if len(hull) < 3 or np.ptp(hull, axis=0).min() < SMALLEST:
+            return None
+        return _make_polygon(hull), pose[0, 3], pose[1, 3], 0.0
+
+
+class Cylinder(NamedTuple):
+    """A cylinder along its own z, centred at its origin."""
+
+    radius: float  # [m]
+    length: float  # [m]
+
+    def cut(self, pose: Array, up: float) -> _Cut:
+        """See `section`; `up` is the height of the plane above the origin [m]."""
+        if _find_vertical_axis(pose) == 2:
+            is_cut = abs(up) < self.length / 2.0
+            return _make_disc(pose, self.radius**2) if is_cut else None
+        if abs(pose[2, 2]) >= math.sin(TILT):
+            raise ShapelessError("a cylinder that leans")
+        width2 = self.radius**2 - up**2
+        if width2 <= 0.0:
+            return None
+        return _make_rectangle(pose, 2, self.length, 2.0 * math.sqrt(width2))
+
+
+class Capsule(NamedTuple):
+    """A cylinder with a hemisphere at either end."""
+
+    radius: float  # [m]
+    length: float  # of the cylinder alone [m]
+
+    def cut(self, pose: Array, up: float) -> _Cut:
+        """See `section`; `up` is the height of the plane above the origin [m]."""
+        if _find_vertical_axis(pose) != 2:
+            raise ShapelessError("a capsule that leans or lies")
+        beyond = max(abs(up) - self.length / 2.0, 0.0)
+        return _make_disc(pose, self.radius**2 - beyond**2)
+
+
+class Sphere(NamedTuple):
+    """A sphere around its own origin."""
+
+    radius: float  # [m]
+
+    def cut(self, pose: Array, up: float) -> _Cut:
+        """See `section`; `up` is the height of the plane above the origin [m]."""
+        return _make_disc(pose, self.radius**2 - up**2)
+
+
+class Prism(NamedTuple):
+    """An outline extruded upwards from its own z = 0."""
+
+    points: tuple[tuple[float, ...], ...]  # x, y of the corners [m]
+    height: float  # [m]
+
+    def cut(self, pose: Array, up: float) -> _Cut:
+        """See `section`; `up` is the height of the plane above the origin [m]."""
+        if _find_vertical_axis(pose) != 2:
+            raise ShapelessError("a polyline that leans or lies")
+        upwards = float(np.sign(pose[2, 2]))
+        if not 0.0 < up * upwards < self.height:
+            return None
+        polygon = _make_polygon(np.array(self.points) * (1.0, upwards))
+        return polygon, pose[0, 3], pose[1, 3], _find_heading(pose, 0)
+
+
+Solid = Box | Cylinder | Capsule | Sphere | Prism
+Placed = tuple[Shape, tuple[float, float, float]]  # a shape and its pose in the plane
+
+
+class Standing(NamedTuple):
+    """Shapes that stand in a field at the height of a plane."""
+
+    placed: tuple[Placed, ...]
+    left_out: tuple[str, ...]  # a clause for each model that a world can't hold
+    missing: bool = False  # the file of one of these models is missing
+
+    @property
+    def obstacles(self) -> tuple[Obstacles, ...]:
+        """Group of obstacles of one shape each, for a `World`."""
+        groups: dict[Shape, list[tuple[float, float, float]]] = {}
+        for shape, pose in self.placed:
+            groups.setdefault(shape, []).append(pose)
+        return tuple(
+            Obstacles(shapes=(shape,), at=tuple(at)) for shape, at in groups.items()
+        )
+
+    def bounds(self, *places: tuple[float, ...]) -> Region:
+        """Return the smallest field with all shapes, and 1 m around places x, y, ... [m]."""
+        around = AROUND * np.array([(-1.0, -1.0), (1.0, 1.0)])
+        corners = [around + place[:2] for place in places]
+        for shape, pose in self.placed:
+            outline = geometry.rotate(shape.outline, pose[2])
+            corners.append(
+                (outline if len(outline) else shape.radius / AROUND * around) + pose[:2]
+            )
+        points = np.concatenate(corners)
+        x1, y1 = (np.floor(points.min(axis=0) * 1e3) / 1e3).tolist()
+        x2, y2 = (np.ceil(points.max(axis=0) * 1e3) / 1e3).tolist()
+        return x1, y1, x2, y2
+
 
 MOST_BYTES = 2**24  # limit of a file; the largest saved worlds have some megabytes
 MOST_MODELS = 20_000  # including included models
@@ -73,95 +229,6 @@ class Where(NamedTuple):
     def error(self, rest: str) -> SdfError:
         """Return an error that names the place."""
         return SdfError(self.file, self.element + rest)
-
-
-def read_sdf(
-    path: str | Path,
-    height: float,
-    without: tuple[str, ...] = (),
-    skip_unknown: bool = False,
-    may_be_empty: bool = False,
-) -> Standing:
-    """Read what stands in a Gazebo world at a height [m] above z = 0.
-
-    Args:
-        path: path of a `.world` or `.sdf` file.
-        height: height at which bodies count, that of the lidar [m].
-        without: names of models to leave out, in which `*` stands for anything.
-        skip_unknown: True to leave out what can't be a shape: meshes, and bodies that lean.
-        may_be_empty: True for a world in which nothing stands.
-
-    Raises:
-        ConfigError: the file is damaged or not SDF, has an unknown shape, or nothing stands there.
-    """
-    check_path("path", path)
-    path = Path(path)
-    placed = list[Placed]()
-    unknown = dict[str, list[str]]()
-    missing = set[str]()  # the models of these whose file is missing
-    seen = 0
-    try:
-        for body in _bodies(_Scope(_world(path), path, "", _Order(without)), np.eye(4)):
-            seen += 1
-            try:
-                obstacle = _section_of(body, height)
-            except ShapelessError as error:
-                unknown.setdefault(body.model, []).append(str(error))
-                if error.missing:
-                    missing.add(body.model)
-                continue
-            if obstacle is not None:
-                placed.append(obstacle)
-            if len(placed) > MOST_OBSTACLES:
-                reason = f"holds more than {MOST_OBSTACLES} bodies at a height of {height:g} m"
-                fix = "leave some out by --without MODEL, or split the world"
-                raise SdfError(path, f": {reason}; {fix}.")
-    except RecursionError:
-        reason = ": is nested too deeply; flatten its models."
-        raise SdfError(path, reason) from None
-    left_out = tuple(
-        f"model {name!r} has {', '.join(what)}" for name, what in unknown.items()
-    )
-    if left_out and not skip_unknown:
-        more = f" (as {len(left_out) - 1} more models)" if len(left_out) > 1 else ""
-        fix = "leave it out by --skip-unknown or --without MODEL, or put a box in its place"
-        raise AssetsError(
-            path,
-            f": {left_out[0]}{more}, which a world can't hold; {fix}.",
-            next(iter(unknown)) in missing,
-        )
-    shapes = seen - sum(map(len, unknown.values()))
-    if left_out and not shapes and not may_be_empty:
-        reason = f"contains nothing that a world can hold ({left_out[0]})"
-        raise AssetsError(
-            path,
-            f": {reason}; put a box in its place.",
-            next(iter(unknown)) in missing,
-        )
-    if not placed and not may_be_empty:
-        reason = f"none of its {shapes} collision geometries stands at a height of {height:g} m"
-        raise SdfError(path, f": {reason}; choose another --height.")
-    return Standing(tuple(placed), left_out, bool(missing))
-
-
-def _section_of(body: "_Body", height: float) -> Placed | None:
-    """The shape of a body at a height [m]; None for the ground and for bodies above or below.
-
-    Raises ShapelessError, and ConfigError for a shape that no world takes.
-    """
-    solid = body.solid()
-    if solid is None:
-        return None
-    try:
-        return sections.section(solid, body.pose, height)
-    except ValidationError as error:
-        problem = error.errors(include_url=False)[0]["msg"].removeprefix(
-            "Value error, "
-        )
-        reason = (
-            f"its shape at a height of {height:g} m can't stand in a world ({problem})"
-        )
-        raise body.where.error(f": {reason}; change it.") from None
 
 
 class _Order:
@@ -326,15 +393,15 @@ class _Body(NamedTuple):
             normal = self.pose[:3, :3] @ _floats(
                 shape.findtext("normal", "0 0 1"), 3, self.where
             )
-            if abs(normal[2]) < math.cos(sections.TILT) * np.linalg.norm(normal):
+            if abs(normal[2]) < math.cos(TILT) * np.linalg.norm(normal):
                 raise ShapelessError("a plane that is not level")
             return None
         if shape.tag == "box":
-            return sections.Box(self._lengths(shape, "size", 3))
+            return Box(self._lengths(shape, "size", 3))
         if shape.tag == "sphere":
-            return sections.Sphere(*self._lengths(shape, "radius"))
+            return Sphere(*self._lengths(shape, "radius"))
         if shape.tag in ("cylinder", "capsule"):
-            kind = sections.Cylinder if shape.tag == "cylinder" else sections.Capsule
+            kind = Cylinder if shape.tag == "cylinder" else Capsule
             return kind(
                 *self._lengths(shape, "radius"), *self._lengths(shape, "length")
             )
@@ -355,7 +422,7 @@ class _Body(NamedTuple):
         if len(points) > MOST_CORNERS:
             most = f"has {len(points)} points, a shape at most {MOST_CORNERS}"
             raise self.where.error(f": <polyline> {most}; coarsen it.")
-        return sections.Prism(tuple(points), *self._lengths(polyline, "height"))
+        return Prism(tuple(points), *self._lengths(polyline, "height"))
 
     def _lengths(self, shape: Element, key: str, count: int = 1) -> tuple[float, ...]:
         where = self.where.at(f": <{key}> of its <{shape.tag}>")
@@ -367,6 +434,95 @@ class _Body(NamedTuple):
             reason = f" must be above 0 and at most {LARGEST:g} m, not {text!r}."
             raise where.error(reason)
         return lengths
+
+
+def read_sdf(
+    path: str | Path,
+    height: float,
+    without: tuple[str, ...] = (),
+    skip_unknown: bool = False,
+    may_be_empty: bool = False,
+) -> Standing:
+    """Read what stands in a Gazebo world at a height [m] above z = 0.
+
+    Args:
+        path: path of a `.world` or `.sdf` file.
+        height: height at which bodies count, that of the lidar [m].
+        without: names of models to leave out, in which `*` stands for anything.
+        skip_unknown: True to leave out what can't be a shape: meshes, and bodies that lean.
+        may_be_empty: True for a world in which nothing stands.
+
+    Raises:
+        ConfigError: the file is damaged or not SDF, has an unknown shape, or nothing stands there.
+    """
+    check_path("path", path)
+    path = Path(path)
+    placed = list[Placed]()
+    unknown = dict[str, list[str]]()
+    missing = set[str]()  # the models of these whose file is missing
+    seen = 0
+    try:
+        for body in _bodies(_Scope(_world(path), path, "", _Order(without)), np.eye(4)):
+            seen += 1
+            try:
+                obstacle = _section_of(body, height)
+            except ShapelessError as error:
+                unknown.setdefault(body.model, []).append(str(error))
+                if error.missing:
+                    missing.add(body.model)
+                continue
+            if obstacle is not None:
+                placed.append(obstacle)
+            if len(placed) > MOST_OBSTACLES:
+                reason = f"holds more than {MOST_OBSTACLES} bodies at a height of {height:g} m"
+                fix = "leave some out by --without MODEL, or split the world"
+                raise SdfError(path, f": {reason}; {fix}.")
+    except RecursionError:
+        reason = ": is nested too deeply; flatten its models."
+        raise SdfError(path, reason) from None
+    left_out = tuple(
+        f"model {name!r} has {', '.join(what)}" for name, what in unknown.items()
+    )
+    if left_out and not skip_unknown:
+        more = f" (as {len(left_out) - 1} more models)" if len(left_out) > 1 else ""
+        fix = "leave it out by --skip-unknown or --without MODEL, or put a box in its place"
+        raise AssetsError(
+            path,
+            f": {left_out[0]}{more}, which a world can't hold; {fix}.",
+            next(iter(unknown)) in missing,
+        )
+    shapes = seen - sum(map(len, unknown.values()))
+    if left_out and not shapes and not may_be_empty:
+        reason = f"contains nothing that a world can hold ({left_out[0]})"
+        raise AssetsError(
+            path,
+            f": {reason}; put a box in its place.",
+            next(iter(unknown)) in missing,
+        )
+    if not placed and not may_be_empty:
+        reason = f"none of its {shapes} collision geometries stands at a height of {height:g} m"
+        raise SdfError(path, f": {reason}; choose another --height.")
+    return Standing(tuple(placed), left_out, bool(missing))
+
+
+def _section_of(body: "_Body", height: float) -> Placed | None:
+    """The shape of a body at a height [m]; None for the ground and for bodies above or below.
+
+    Raises ShapelessError, and ConfigError for a shape that no world takes.
+    """
+    solid = body.solid()
+    if solid is None:
+        return None
+    try:
+        return section(solid, body.pose, height)
+    except ValidationError as error:
+        problem = error.errors(include_url=False)[0]["msg"].removeprefix(
+            "Value error, "
+        )
+        reason = (
+            f"its shape at a height of {height:g} m can't stand in a world ({problem})"
+        )
+        raise body.where.error(f": {reason}; change it.") from None
 
 
 def _bodies(scope: _Scope, pose: Array) -> Iterator[_Body]:
@@ -515,3 +671,50 @@ def _tree(path: Path) -> Element:
             path, f", {at}: is not valid XML: {problem}; correct it."
         ) from None
     return builder.close()
+
+
+def section(solid: Solid, pose: Array, height: float) -> Placed | None:
+    """Cut a body at a height above the ground.
+
+    Args:
+        solid: the body.
+        pose: (4, 4) of the body in the world [m].
+        height: of the plane [m].
+
+    Returns:
+        The shape, and its pose x, y [m], heading [rad]; None if the body is all above or below.
+
+    Raises:
+        ShapelessError: it leans, and its section is neither circle, rectangle nor polygon.
+    """
+    cut = solid.cut(pose, height - float(pose[2, 3]))
+    if cut is None or not cut[0].radius > SMALLEST:
+        return None
+    shape, *place = cut
+    x, y, heading = (round(value, DIGITS) + 0.0 for value in place)
+    return shape, (x, y, heading)
+
+
+def _find_vertical_axis(pose: Array) -> int | None:
+    """The body's own axis that is vertical, 0 to 2; None if none is."""
+    upright = np.abs(pose[2, :3]) > math.cos(TILT)
+    return int(np.argmax(upright)) if upright.any() else None
+
+
+def _find_heading(pose: Array, axis: int) -> float:
+    return math.atan2(pose[1, axis], pose[0, axis])
+
+
+def _make_disc(pose: Array, radius2: float) -> _Cut:
+    """A circle of a radius squared around the body's origin, if it is positive."""
+    radius = round(math.sqrt(max(radius2, 0.0)), DIGITS)
+    return (Circle(radius=radius), pose[0, 3], pose[1, 3], 0.0) if radius else None
+
+
+def _make_rectangle(pose: Array, along: int, length: float, width: float) -> _Cut:
+    x, y = (max(round(side, DIGITS), SMALLEST) for side in (length, width))
+    return Rectangle(size=(x, y)), pose[0, 3], pose[1, 3], _find_heading(pose, along)
+
+
+def _make_polygon(points: Array) -> Polygon:
+    return Polygon(points=np.round(points, DIGITS).tolist())

@@ -54,6 +54,57 @@ LANE_ROWS = 6
 MOST_TOUCHES = 512
 
 
+Records = NDArray[Any]  # of a structure
+Record = Any  # one of them, whose fields mypy does not know
+
+# How an obstacle moves
+STILL = 0
+PATROL = 1
+PEDESTRIAN = 2
+
+PLAN = np.dtype(
+    [
+        ("kind", np.int64),
+        # of the desired speed, which is drawn per episode [m/s]
+        ("slowest", np.float64),
+        ("fastest", np.float64),
+        # of a patrol: its waypoints, and how it goes through them
+        ("first", np.int64),
+        ("count", np.int64),
+        ("loop", np.bool_),
+        ("pause", np.float64),
+        # of a pedestrian, see `world.Pedestrian`
+        ("relaxation", np.float64),
+        ("repulsion", np.float64),
+        ("range", np.float64),
+        ("wall_repulsion", np.float64),
+        ("wall_range", np.float64),
+        ("foresight", np.float64),
+        ("cos_view", np.float64),  # of half the angle of sight
+        ("behind", np.float64),
+        ("fluctuation", np.float64),
+    ],
+    align=True,
+)
+"""Motion of an obstacle."""
+
+MARK = np.dtype(
+    [
+        ("speed", np.float64),  # desired in this episode [m/s]
+        ("vx", np.float64),  # velocity in the last period [m/s]
+        ("vy", np.float64),
+        ("goal_x", np.float64),  # of a pedestrian [m]
+        ("goal_y", np.float64),
+        ("until", np.float64),  # step at which it gives this goal up
+        ("index", np.int64),  # of the next waypoint of a patrol
+        ("way", np.int64),  # 1 forwards through its waypoints, -1 backwards
+        ("rest", np.float64),  # waiting time that is left [s]
+    ],
+    align=True,
+)
+"""Memory of a moving obstacle."""
+
+
 class State(NamedTuple):
     """All that changes in a simulation; `FastSimulator.data`.
 
@@ -81,7 +132,7 @@ class State(NamedTuple):
     # (N, K, 3) velocity of the obstacles in `map` in this period [m/s, m/s, rad/s]
     velocity: Array
     past: Array  # (N, M, R, PAST_COLUMNS) ring buffer: the end of period i is in row i % R
-    marks: Array  # (N, K, MARK) memory of moving obstacles, columns as in `obstacle_kernels`
+    marks: Records  # (N, K) of `MARK`
 
 
 class MapField(NamedTuple):
@@ -102,7 +153,7 @@ class Movers(NamedTuple):
     """Motion of the obstacles of one world."""
 
     moves: bool  # True if an obstacle of any member moves
-    plans: Array  # (K, PLAN) motions, columns as in `obstacle_kernels`
+    plans: Records  # (K,) of `PLAN`
     waypoints: Array  # (Q, 2) of all patrols [m]
     bounds: Array  # (4,) minimum x, y and maximum x, y that obstacles stay in [m]
 
@@ -131,7 +182,7 @@ class WorldSetArrays(NamedTuple):
     crowded: bool  # `crowded`, `standing`: as in `Surroundings`
     standing: bool
     moves: bool  # True if an obstacle of any member moves
-    plans: Array  # (P, K, PLAN)
+    plans: Records  # (P, K) of `PLAN`
     waypoints: Array  # (Q, 2) of all patrols of all members [m]
     bounds: Array  # (P, 4) as in `Movers`
 
@@ -186,8 +237,6 @@ MOTION = np.dtype(
     align=True,
 )
 """Motion of a robot that may meet something, see `contact_kernels`."""
-Records = NDArray[Any]  # of a structure
-Record = Any  # one of them, whose fields mypy does not know
 
 TOUCH = np.dtype(
     [

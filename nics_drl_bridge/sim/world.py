@@ -1,13 +1,19 @@
-"""World files: the field of the episodes and its obstacles."""
+"""World files: the field of the episodes, its obstacles, and how these move."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, PrivateAttr, field_validator, model_validator
+from pydantic import (
+    Field,
+    PrivateAttr,
+    field_validator,
+    model_validator,
+)
 
 from nics_drl_bridge.config import Heading, Schema, find_config, load_yaml
 from nics_drl_bridge.errors import ConfigError
@@ -16,7 +22,7 @@ from nics_drl_bridge.lidar.arrays import Array
 from nics_drl_bridge.lidar.maps import GridMap, load_map
 from nics_drl_bridge.lidar.shapes import LARGEST, MOST_SHAPES, Coordinate, Shape
 from nics_drl_bridge.sim.collision_kernels import wall_distance
-from nics_drl_bridge.sim.obstacles import Motion, Patrol
+from nics_drl_bridge.sim.state import PATROL, PEDESTRIAN, PLAN, Records
 
 MOST_OBSTACLES = 10_000
 MOST_ACROSS_M = 1000.0  # diagonal; observations represent goal distances up to 1000 m
@@ -28,6 +34,71 @@ Side = Annotated[float, Field(ge=SMALLEST_FIELD, le=LARGEST)]
 Pose = tuple[Coordinate, Coordinate, Heading]
 Point = tuple[Coordinate, Coordinate]
 Region = tuple[Coordinate, Coordinate, Coordinate, Coordinate]
+# Maximum speed of an obstacle [m/s]; beyond, a control period is too coarse
+FASTEST = 10.0
+# Upper bound on the parameters of the social force model, each in its unit
+STRONGEST = 1e3
+Strength = Annotated[float, Field(ge=0.0, le=STRONGEST)]
+Range = Annotated[float, Field(ge=1e-3, le=STRONGEST)]
+
+
+class Patrol(Schema):
+    """Moves from waypoint to waypoint, and waits while something is in the way."""
+
+    kind: Literal["patrol"] = "patrol"  # which kind of motion this is
+    # x, y in `map` [m]
+    waypoints: tuple[Point, ...] = Field(min_length=2, max_length=1000)
+    speed: float = Field(gt=0.0, le=FASTEST)  # [m/s]
+    # continue from the last waypoint to the first; otherwise back and forth
+    loop: bool = True
+    # waiting time at each waypoint [s]
+    pause: float = Field(default=0.0, ge=0.0, le=1e6)
+
+    @model_validator(mode="after")
+    def _apart(self) -> "Patrol":
+        corners = [*self.waypoints, *self.waypoints[: int(self.loop)]]
+        if any(corner == next_corner for corner, next_corner in pairwise(corners)):
+            raise ValueError("consecutive waypoints must differ")
+        return self
+
+
+class Pedestrian(Schema):
+    """Walks to random goals, by the social force model of Helbing and Molnar (1995).
+
+    Symbols and defaults are those of "Social force model for pedestrian dynamics", Phys. Rev. E 51,
+    4282, but the ellipses of the repulsion follow the relative velocity (Johansson, Helbing, Shukla
+    2007), and distances are between the surfaces of the discs (Helbing, Farkas, Vicsek 2000). The
+    speeds are the paper's 1.34 m/s, plus or minus one standard deviation of 0.26 m/s.
+    """
+
+    kind: Literal["pedestrian"] = "pedestrian"  # which kind of motion this is
+    # range of the desired speed, drawn per episode; its upper end is a limit [m/s]
+    speed: tuple[float, float] = (1.08, 1.6)
+    # tau, relaxation time to the desired velocity [s]
+    relaxation: float = Field(default=0.5, ge=0.1, le=10.0)
+    repulsion: Strength = 2.1  # V0 [m^2/s^2] of walkers, obstacles and robots
+    range: Range = 0.3  # sigma [m]
+    wall_repulsion: Strength = 10.0  # U0 [m^2/s^2]
+    wall_range: Range = 0.2  # R [m]
+    # delta t, the time by which the others' motion is extrapolated [s]
+    foresight: Strength = 1.0
+    # 2 phi, angle of sight [rad]
+    view: float = Field(default=math.radians(200.0), ge=0.0, le=2.0 * math.pi)
+    # c, weight of forces from outside the angle of sight
+    behind: float = Field(default=0.5, ge=0.0, le=1.0)
+    fluctuation: Strength = 0.1  # standard deviation of a random acceleration [m/s^2]
+
+    @field_validator("speed")
+    @classmethod
+    def _fast(cls, speed: tuple[float, float]) -> tuple[float, float]:
+        if not 0.0 < speed[0] <= speed[1] <= FASTEST:
+            raise ValueError(
+                f"speed must be [minimum, maximum], above 0 and at most {FASTEST:g} m/s"
+            )
+        return speed
+
+
+Motion = Annotated[Patrol | Pedestrian, Field(discriminator="kind")]
 
 
 class Obstacles(Schema):
@@ -40,7 +111,7 @@ class Obstacles(Schema):
     gap: Distance = 0.0  # free space between one of them and any other obstacle [m]
     # fixed poses, x, y [m], heading [rad], instead of `count` at random
     at: tuple[Pose, ...] = ()
-    # motion, see `sim.obstacles`; by default the obstacles stand still
+    # motion; by default the obstacles stand still
     motion: Motion | None = None
 
     @field_validator("count", mode="before")
@@ -217,6 +288,30 @@ class World(Schema):
             y = self.size[1] / 2.0
             sides = [(-x, -y, x, -y), (x, -y, x, y), (x, y, -x, y), (-x, y, -x, -y)]
         return np.array([*sides, *self.walls], dtype=np.float64).reshape(-1, 4)
+
+
+def plan_arrays(
+    motions: Sequence[Patrol | Pedestrian | None],
+) -> tuple[Records, Array]:
+    """Return the plans (K,) of obstacles with these motions, and patrols' waypoints (Q, 2)."""
+    plans = np.zeros(len(motions), PLAN)
+    waypoints: list[Point] = []
+    for plan, motion in zip(plans, motions, strict=True):
+        if motion is None:
+            continue
+        values = motion.model_dump(exclude={"kind", "speed", "waypoints", "view"})
+        plan["slowest"], plan["fastest"] = np.broadcast_to(motion.speed, 2)
+        if isinstance(motion, Patrol):
+            plan["kind"] = PATROL
+            plan["first"] = len(waypoints)
+            plan["count"] = len(motion.waypoints)
+            waypoints += motion.waypoints
+        else:
+            plan["kind"] = PEDESTRIAN
+            plan["cos_view"] = math.cos(motion.view / 2.0)
+        for name, value in values.items():
+            plan[name] = value
+    return plans, np.reshape(waypoints, (-1, 2))
 
 
 def load_world(name: str | Path, also: Iterable[str] = ()) -> World:

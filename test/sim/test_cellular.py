@@ -5,8 +5,7 @@ import pytest
 import shapely
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.sim.cellular import Cellular, grow
-from nics_drl_bridge.sim.world_set import load_worlds
+from nics_drl_bridge.sim.world_set import Cellular, grow, load_worlds
 
 GIVEN = Cellular(worlds=12, fill=(0.15, 0.32))
 

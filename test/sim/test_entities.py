@@ -14,8 +14,8 @@ from nics_drl_bridge.sim.entities import (
     UnknownEntityError,
     overlap,
 )
-from nics_drl_bridge.sim.obstacles import FASTEST
 from nics_drl_bridge.sim.simulator import FastSimulator
+from nics_drl_bridge.sim.world import FASTEST
 from nics_drl_bridge.sim.world_set import load_worlds
 
 DISC = Circle(radius=0.2)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from shapely import affinity
 
 from nics_drl_bridge.lidar.shapes import Circle, Polygon, Rectangle
-from nics_drl_bridge.sim.sections import (
+from nics_drl_bridge.sim.sdf import (
     Box,
     Capsule,
     Cylinder,

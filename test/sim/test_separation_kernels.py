@@ -10,13 +10,12 @@ from nics_drl_bridge.lidar.shapes import place
 from nics_drl_bridge.sim import obstacle_kernels as at
 from nics_drl_bridge.sim.allocation import map_field
 from nics_drl_bridge.sim.obstacle_kernels import (
-    PLAN,
     Traffic,
     clearance,
     map_distance,
     restrain,
 )
-from nics_drl_bridge.sim.state import NO_FIELD
+from nics_drl_bridge.sim.state import NO_FIELD, PLAN
 
 HALF = np.array([1.5, 1.0])
 WALLS = np.concatenate([sides(HALF), [(-1.5, 0.2, -0.4, 0.3), (0.5, -1.0, 0.5, -0.2)]])
@@ -35,8 +34,8 @@ def crowd(seed, count=5, robots=2):
 
 def traffic(bodies, kinds, speeds=NOBODY, walls=WALLS, half=HALF, grid=NO_FIELD):
     """Obstacles that move by some kinds of motion, then robots with some speeds (M, 2)."""
-    plans = np.zeros((len(kinds), PLAN))
-    plans[:, at.KIND] = kinds
+    plans = np.zeros(len(kinds), PLAN)
+    plans["kind"] = kinds
     field = np.concatenate([-half, half])
     return Traffic(bodies, len(kinds), speeds, plans, walls, field, grid, PERIOD)
 

@@ -11,8 +11,7 @@ from nics_drl_bridge.interface import Array
 from nics_drl_bridge.lidar.exact_kernels import RADIUS, SHAPE
 from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.shapes import Circle, Rectangle, Segment, Shape, convex_hull
-from nics_drl_bridge.sim.obstacles import Motion
-from nics_drl_bridge.sim.world import World
+from nics_drl_bridge.sim.world import Motion, World
 
 HEIGHT = 0.5  # height of walls and obstacles [m]
 WALL_THICKNESS = 0.002  # thickness of walls [m]; for the lidar they have none
