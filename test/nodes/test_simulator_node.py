@@ -21,8 +21,8 @@ from sensor_msgs.msg import JointState, LaserScan
 from std_srvs.srv import SetBool, Trigger
 
 from nics_drl_bridge.errors import BridgeError
+from nics_drl_bridge.extras.simulation_interfaces.roster import Entities
 from nics_drl_bridge.nodes import conversions, simulator_node
-from nics_drl_bridge.sim.entities import Entities
 from nics_drl_bridge.sim.world import load_world
 from nodes.peer import pose_of, stamp_ns
 

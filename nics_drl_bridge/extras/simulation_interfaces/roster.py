@@ -24,8 +24,6 @@ NAME = re.compile(r"(?=.{1,120}\Z)[A-Za-z0-9_][A-Za-z0-9_./-]*")
 REACH = 10.0  # limit of a twist set on a robot, as a multiple of its maximum command
 CORNERS = 32  # number of corners of the outline that represents a circle
 
-# Makes the simulator of a world for a number of robots.
-
 
 class UnknownEntityError(BridgeError):
     """No entity has that name."""
@@ -339,20 +337,3 @@ def hull_of(shape: Shape) -> Array:
         return convex_hull(shape.outline)
     angles = np.arange(CORNERS) * (2.0 * np.pi / CORNERS)
     return np.column_stack([np.cos(angles), np.sin(angles)]) * shape.radius
-
-
-def overlap(first: Array, second: Array) -> bool:
-    """True if two convex polygons (V, 2) have a point in common: no edge of either divides them."""
-    for corners in (first, second):
-        edges = np.roll(corners, -1, axis=0) - corners
-        axes = np.column_stack([-edges[:, 1], edges[:, 0]])
-        if len(corners) == 2:  # a segment: also along itself
-            axes = np.concatenate([axes[:1], edges[:1]])
-        mine = first @ axes.T
-        theirs = second @ axes.T
-        apart = (mine.max(axis=0) < theirs.min(axis=0)) | (
-            theirs.max(axis=0) < mine.min(axis=0)
-        )
-        if apart.any():
-            return False
-    return True

@@ -4,8 +4,12 @@ import pytest
 
 from nics_drl_bridge.config import find_config, read_text, share_folder
 from nics_drl_bridge.errors import BridgeError, ConfigError
+from nics_drl_bridge.extras.simulation_interfaces.models import (
+    MOST_PARTS,
+    model_of_sdf,
+    model_of_yaml,
+)
 from nics_drl_bridge.lidar.shapes import Circle, Rectangle
-from nics_drl_bridge.sim.models import MOST_PARTS, model_of_sdf, model_of_yaml
 from nics_drl_bridge.sim.sdf import AssetsError
 
 CRATE = (

@@ -4,16 +4,15 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.generator import builtin_model
-from nics_drl_bridge.lidar.shapes import Circle, Rectangle
-from nics_drl_bridge.sim.device import DeviceWorld
-from nics_drl_bridge.sim.entities import (
+from nics_drl_bridge.extras.simulation_interfaces.roster import (
     Entities,
     OutsideError,
     StillError,
     UnknownEntityError,
-    overlap,
 )
+from nics_drl_bridge.generator import builtin_model
+from nics_drl_bridge.lidar.shapes import Circle, Rectangle
+from nics_drl_bridge.sim.device import DeviceWorld
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import FASTEST
 from nics_drl_bridge.sim.world_set import load_worlds
@@ -187,14 +186,6 @@ def test_a_robot_takes_no_twist_beyond_its_reach(staged, value):
         entities.move(car, START, np.array([value, value, value]))
     assert entities.pose(car) == pytest.approx(at)
     assert entities.twist(car) == pytest.approx(twist)
-
-
-def test_polygons_overlap_if_no_edge_divides_them():
-    square = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
-    assert overlap(square, square + 0.9)
-    assert not overlap(square, square + 1.1)
-    assert overlap(square, np.array([(-1.0, 0.5), (2.0, 0.5)]))
-    assert not overlap(square, np.array([(1.1, -1.0), (1.1, 2.0)]))
 
 
 def test_an_obstacle_moves_no_faster_than_obstacles_can(staged):
