@@ -26,8 +26,7 @@ from nics_drl_bridge.robot.kernels import SERIES, make_terms, simulate_rollouts
 from nics_drl_bridge.robot.noise import Noise
 from nics_drl_bridge.robot.spec import build_robot
 from nics_drl_bridge.robot.taylor import NamedTaylorModel, TaylorModel
-from nics_drl_bridge.sim.command_range import CommandRange
-from nics_drl_bridge.sim.simulator import FastSimulator
+from nics_drl_bridge.sim.simulator import CommandRange, FastSimulator
 
 CAR = build_robot(
     {

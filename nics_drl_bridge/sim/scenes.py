@@ -12,6 +12,7 @@ from pydantic import ValidationError
 from scipy import ndimage
 
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.kernels import pack
 from nics_drl_bridge.lidar.arrays import Array, Integers, ShortIntegers
 from nics_drl_bridge.lidar.maps import OCCUPIED, GridMap
 from nics_drl_bridge.lidar.shapes import (
@@ -26,7 +27,6 @@ from nics_drl_bridge.lidar.shapes import (
 from nics_drl_bridge.seeds import check_seeds
 from nics_drl_bridge.sim import scene_kernels as kernels
 from nics_drl_bridge.sim.collision_kernels import FEWEST, body_cells
-from nics_drl_bridge.sim.packing_kernels import pack
 from nics_drl_bridge.sim.scene_kernels import FreeSpace, ScenePlan, SceneScratch
 from nics_drl_bridge.sim.state import NO_FIELD, MapField, allocate_touches
 from nics_drl_bridge.sim.world import Goals, Motion, Starts, World, check_places

@@ -5,7 +5,10 @@ by one control period, see `step_kernels`. Everything that changes is in `FastSi
 `state.State`. The worlds are split into parts, one per thread.
 """
 
-from collections.abc import Callable
+import itertools
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -14,18 +17,25 @@ from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge import defaults
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.files import hash_bytes
 from nics_drl_bridge.generator import SimulatorModel, footprint_shape
+from nics_drl_bridge.kernels import pack
+from nics_drl_bridge.lidar import scan_kernels
 from nics_drl_bridge.lidar.arrays import Array, Integers
 from nics_drl_bridge.lidar.bake import with_shapes
-from nics_drl_bridge.lidar.exact_kernels import SHAPE
+from nics_drl_bridge.lidar.exact_kernels import SHAPE, OutlineArrays
+from nics_drl_bridge.lidar.maps import GridMap, joined, stack_fixtures
 from nics_drl_bridge.lidar.scanner import Renderer, Scanner
 from nics_drl_bridge.lidar.sensor import Render, SensedWorlds, unread
-from nics_drl_bridge.lidar.shapes import place
+from nics_drl_bridge.lidar.shapes import BODY, place
+from nics_drl_bridge.robot import taylor
+from nics_drl_bridge.robot.kernels import SERIES, allocate_scratch, make_terms
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
-from nics_drl_bridge.sim import allocation, step_kernels
-from nics_drl_bridge.sim.command_range import CommandRange, warn_caller
-from nics_drl_bridge.sim.packing_kernels import pack
+from nics_drl_bridge.sim import state as records
+from nics_drl_bridge.sim import step_kernels
+from nics_drl_bridge.sim.collision_kernels import body_cells
+from nics_drl_bridge.sim.contact_kernels import SEVERAL
 from nics_drl_bridge.sim.randomisation import (
     Draws,
     Randomisation,
@@ -34,8 +44,116 @@ from nics_drl_bridge.sim.randomisation import (
 )
 from nics_drl_bridge.sim.scenes import Scenes, SceneSampler
 from nics_drl_bridge.sim.state import POSE, TRUE_TWIST, WorldSetArrays
+from nics_drl_bridge.sim.world import Motion, World, plan_arrays
 from nics_drl_bridge.sim.world_set import AnyWorld
 from nics_drl_bridge.threads import run_parts
+
+SLICES = 16  # Number of groups of beams in which a skewed scan is rendered
+LANES = 256  # Number of robots moved side by side: their arrays stay in the L1 cache
+# Minimum number of pairs of a robot and a body for sorting bodies into cells
+CROWD = 4096
+# Minimum number of robots: for fewer, testing all bodies takes less time
+FEWEST_OF_A_CROWD = 8
+STANDING = 32  # Minimum number of obstacles for sorting them into cells once, if all of them stand
+# Limits of a simulation: robots in one world, each of which is tested against every other, and
+# numbers in the arrays of all worlds, some GB.
+MOST_ROBOTS = 1_000
+MOST_NUMBERS = 2**30
+# Numbers of a robot or an obstacle whose count depends on neither beams, history nor past [1]
+NUMBERS_PER_BODY = 64
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Dimensions of a simulation."""
+
+    worlds: int  # N
+    robots: int  # M in each
+    obstacles: int  # K in each
+    longest_delay: int  # maximum common latency of commands [substeps]
+    longest_age: int  # maximum age of an observation [substeps]
+
+    @property
+    def crowded(self) -> bool:
+        """True if sorting the bodies of a world into cells pays off."""
+        pairs = self.robots * (self.robots + self.obstacles)
+        return self.robots >= FEWEST_OF_A_CROWD and pairs >= CROWD
+
+    def count_past_rows(self, model: SimulatorModel) -> int:
+        """Return R: a row for the newest period, and one for each that an observation may lag."""
+        return count_periods(self.longest_age, model) + 1
+
+    def count_history_rows(self, model: SimulatorModel) -> int:
+        """Return H: a row for the newest command, and one for each period it may be delayed."""
+        own_delays = make_terms(model.kinematics).late
+        longest = self.longest_delay + int(own_delays.max(initial=0))
+        return count_periods(longest, model) + 1
+
+
+TOLERANCE = 0.05  # tolerated excess over the recorded range, as a fraction of a command's limits
+
+
+class OutsideValidityWarning(UserWarning):
+    """Commands lie outside the range that the model's recording covered."""
+
+
+def warn_caller(message: str) -> None:
+    """Issue an OutsideValidityWarning at the line that steps the simulator."""
+    warnings.warn(message, OutsideValidityWarning, stacklevel=5)
+
+
+class CommandRange:
+    """The range of commands to which a model was fitted; reports each command that leaves it once.
+
+    A command whose effect was assumed, not fitted, may have any value.
+    """
+
+    def __init__(
+        self,
+        model: TaylorModel,
+        robot: RobotSpec,
+        tell: Callable[[str], None] = warn_caller,
+    ) -> None:
+        self._tell = tell
+        self._names = robot.variable_names[model.state_size :]
+        fitted = np.stack([model.low, model.high])[:, model.state_size :]
+        # The model's range is of commands in effect; the checked ones are those sent.
+        for curve in model.inputs:
+            c = self._names.index(curve.command)
+            fitted[:, c] = curve.invert(fitted[:, c])
+        self._fitted: Array = fitted
+        margin = TOLERANCE * (robot.command_high - robot.command_low)
+        self._low: Array = fitted[0] - margin
+        self._high: Array = fitted[1] + margin
+        for _, term in model.assumed:
+            powers = taylor.parse_term(term, model.variables)
+            assumed = powers[model.state_size :] > 0
+            self._low[assumed] = -np.inf
+            self._high[assumed] = np.inf
+        # A dict, because `pop` is atomic: parts of the worlds are checked by several threads.
+        self._unreported = dict.fromkeys(self._names, True)
+
+    def check(self, commands: Array) -> None:
+        """Report which of the commands (..., C) leave the range, each of the C commands once."""
+        if not self._unreported:
+            return
+        flat = commands.reshape(-1, commands.shape[-1])
+        lowest = flat.min(axis=0)
+        highest = flat.max(axis=0)
+        outside = (lowest < self._low) | (highest > self._high)
+        if not outside.any():
+            return
+        for c in np.flatnonzero(outside).tolist():
+            name = self._names[c]
+            if not self._unreported.pop(name, False):
+                continue
+            value = lowest[c] if lowest[c] < self._low[c] else highest[c]
+            low, high = self._fitted[:, c]
+            self._tell(
+                f"{name} is {value:.4g}, but the model was fitted to {low:.4g} to {high:.4g} only: "
+                "its motion there is extrapolated; record a drive that covers it."
+            )
+
 
 Indices = Integers
 Result = TypeVar("Result")
@@ -127,7 +245,7 @@ class FastSimulator:
                 f"{threads}; a longest_delay of at least the model's {model.timing.delay} substeps "
                 f"and a longest_age of at least 0, not {delay} and {longest_age}."
             )
-        allocation.check_robots(robots, world.source)
+        check_robots(robots, world.source)
         if randomisation is not None and not isinstance(randomisation, Randomisation):
             randomisation = load_randomisation(randomisation)
         check_speed(model.kinematics, model.robot, world)
@@ -139,21 +257,19 @@ class FastSimulator:
             delay = max(delay, self.episodes.draws.longest_delay)
             longest_age = max(longest_age, self.episodes.draws.longest_age)
         self.sampler = self.episodes.scenes
-        self._sizes = allocation.Sizes(
-            worlds, robots, self.sampler.count, delay, longest_age
-        )
-        allocation.check_memory(model, self._sizes, world.source)
+        self._sizes = Sizes(worlds, robots, self.sampler.count, delay, longest_age)
+        check_memory(model, self._sizes, world.source)
         self.footprint = footprint_shape(model.robot)
         shapes = (*self.sampler.shapes, self.footprint)
         table = with_shapes(model.lidar, model.table, shapes)
         # Index in the lidar's table of each shape of the sampler, and of the footprint.
         self._in_table = np.array([table.outlines.index_of(shape) for shape in shapes])
         self._scanner = Scanner(model.lidar, table, renderer)
-        self.data = allocation.allocate_state(model, self._sizes)
+        self.data = allocate_state(model, self._sizes)
         self.goals: Array = np.zeros((worlds, robots, 2))
         self.drawn: dict[str, NDArray[Any]] = {}
         self.readings = unread(model.sensors, worlds, robots)
-        self.parts = allocation.split(worlds, threads)
+        self.parts = split(worlds, threads)
         self._command_range = CommandRange(model.kinematics, model.robot, tell)
 
     def reset(
@@ -197,7 +313,7 @@ class FastSimulator:
             if len(of_part):
                 step_kernels.begin_episodes(self.packed[part.start], of_part)
                 self.sense(of_part)
-        if self.sampler.count < allocation.STANDING:
+        if self.sampler.count < STANDING:
             return scenes
         return Scenes(
             self.obstacles_of(chosen), scenes.starts, scenes.goals, scenes.member
@@ -311,11 +427,11 @@ class FastSimulator:
     @cached_property
     def packed(self) -> dict[int, Any]:
         """The kernels' argument for each part, by the part's first world."""
-        cells = allocation.allocate_cells(self._sizes, self._world_set)
+        cells = allocate_cells(self._sizes, self._world_set)
         packed = {}
         for part in self.parts:
             packed[part.start] = pack(
-                allocation.allocate_part(
+                allocate_part(
                     self.data,
                     self._world_set,
                     self.model,
@@ -330,7 +446,7 @@ class FastSimulator:
 
     @cached_property
     def _world_set(self) -> WorldSetArrays:
-        return allocation.stack_members(
+        return stack_members(
             self.world.members,
             self.sampler.motions,
             self._scanner.table.outlines.arguments,
@@ -469,3 +585,228 @@ def check_speed(model: TaylorModel, robot: RobotSpec, world: AnyWorld) -> None:
             f"across {shortest_side:.3g} m of world; lower the limits of its commands, or generate "
             "its model with a shorter step."
         )
+
+
+def count_periods(substeps: int, model: SimulatorModel) -> int:
+    """Return the number of control periods that so many substeps begin."""
+    return -(-substeps // model.timing.substeps)
+
+
+def check_robots(robots: int, source: str) -> None:
+    """Raise ConfigError for more robots than a world may have."""
+    if robots > MOST_ROBOTS:
+        raise ConfigError(
+            f"{source} with {robots:.10g} robots: a world may have {MOST_ROBOTS} robots."
+        )
+
+
+def check_memory(model: SimulatorModel, sizes: Sizes, source: str) -> None:
+    """Raise ConfigError, before anything is allocated, for more worlds than fit in memory."""
+    per_robot = (
+        model.lidar.beams
+        + NUMBERS_PER_BODY
+        + sizes.count_past_rows(model) * records.PAST_COLUMNS
+        + sizes.count_history_rows(model) * len(model.robot.command)
+    )
+    per_world = sizes.robots * per_robot + sizes.obstacles * NUMBERS_PER_BODY
+    if sizes.worlds * per_world <= MOST_NUMBERS:
+        return
+    raise ConfigError(
+        f"{sizes.worlds:.10g} copies of {source} with {sizes.robots} robots, {sizes.obstacles} "
+        f"obstacles, delays of {sizes.longest_delay} and ages of {sizes.longest_age} substeps: "
+        f"{MOST_NUMBERS // per_world} copies of it are the most that fit in memory."
+    )
+
+
+def allocate_state(model: SimulatorModel, sizes: Sizes) -> records.State:
+    """Allocate the arrays of worlds before their first reset, with the model's parameters."""
+    shape = (sizes.worlds, sizes.robots)
+    bodies = sizes.obstacles + sizes.robots
+    noise = [*model.noise.odometry, *model.noise.simulated_drift(model.robot)]
+    terms = make_terms(model.kinematics)
+    history = (*shape, sizes.count_history_rows(model), len(model.robot.command))
+    past = (*shape, sizes.count_past_rows(model), records.PAST_COLUMNS)
+    return records.State(
+        pose=np.zeros((*shape, 3)),
+        state=np.zeros((*shape, len(model.robot.state))),
+        history=np.zeros(history),
+        bodies=np.zeros((sizes.worlds, bodies, BODY)),
+        odom=np.zeros((*shape, 3)),
+        twist=np.zeros((*shape, 3)),
+        ranges=np.full((*shape, model.lidar.beams), np.inf, np.float32),
+        collided=np.zeros(shape, np.uint8),
+        steps=np.zeros(sizes.worlds, np.int64),
+        seeds=np.zeros(sizes.worlds, np.int64),
+        member=np.zeros(sizes.worlds, np.int64),
+        faults=np.tile(model.lidar.fault_parameters, (*shape, 1)),
+        coefficient=np.tile(terms.coefficient, (*shape, 1)),
+        delay=np.full(shape, model.timing.delay, np.int64),
+        age=np.zeros(shape, np.int64),
+        noise=np.tile(noise, (*shape, 1)),
+        velocity=np.zeros((sizes.worlds, sizes.obstacles, 3)),
+        past=np.zeros(past),
+        marks=np.zeros((sizes.worlds, sizes.obstacles), records.MARK),
+    )
+
+
+def split(worlds: int, threads: int) -> tuple[slice, ...]:
+    """Split N worlds into contiguous parts of nearly equal size, one per thread."""
+    edges = np.arange(min(threads, worlds) + 1) * worlds // min(threads, worlds)
+    return tuple(slice(int(a), int(b)) for a, b in itertools.pairwise(edges))
+
+
+def stack_members(
+    worlds: Sequence[World],
+    motions: Sequence[Sequence[Motion | None]],
+    outlines: OutlineArrays,
+    sizes: Sizes,
+    member: Integers,
+) -> WorldSetArrays:
+    """Stack the surroundings of the members of a world set.
+
+    Args:
+        worlds: the P members.
+        motions: (P, K) of their obstacles.
+        outlines: of all shapes.
+        sizes: of the simulation.
+        member: (N,) the member that each world is a copy of; it changes as episodes begin.
+    """
+    grids = _share_equal_maps([world.grid for world in worlds])
+    distances, map_places = joined([map_field(grid).distances for grid in grids])
+    moves = any(motion is not None for group in motions for motion in group)
+    standing = not (sizes.crowded or moves) and sizes.obstacles >= STANDING
+    plans, waypoints = _stack_plans(motions if moves else [() for _ in worlds])
+    bounds = np.array([world.extent for world in worlds])
+    return WorldSetArrays(
+        stack_fixtures([world.all_walls() for world in worlds], grids, member),
+        distances,
+        map_places,
+        outlines,
+        sizes.crowded,
+        standing,
+        moves,
+        plans,
+        waypoints,
+        bounds,
+    )
+
+
+def _share_equal_maps(grids: Sequence[GridMap | None]) -> list[GridMap | None]:
+    """Return one object for all maps of equal content, which is then baked and stored once."""
+    distinct: dict[Any, GridMap] = {}
+    shared: list[GridMap | None] = []
+    for grid in grids:
+        if grid is None:
+            shared.append(None)
+            continue
+        content = (
+            grid.cells.shape,
+            grid.resolution,
+            grid.origin,
+            hash_bytes(grid.cells.tobytes()),
+        )
+        shared.append(distinct.setdefault(content, grid))
+    return shared
+
+
+def map_field(grid: GridMap | None) -> records.MapField:
+    """Return a static map for the kernels."""
+    if grid is None:
+        return records.NO_FIELD
+    return records.MapField(
+        np.ascontiguousarray(grid.distance_field), *grid.arrays.frame.tolist()
+    )
+
+
+def allocate_cells(sizes: Sizes, world_set: WorldSetArrays) -> records.BodyCells:
+    """Allocate the cells of all worlds, none if testing all bodies takes less time."""
+    worlds = sizes.worlds if world_set.crowded or world_set.standing else 0
+    return body_cells(worlds, sizes.robots + sizes.obstacles, world_set.standing)
+
+
+def _stack_plans(
+    motions: Sequence[Sequence[Motion | None]],
+) -> tuple[records.Records, Array]:
+    """Return the plans (P, K) and waypoints (Q, 2) of the motions (P, K) of all members."""
+    plans = np.zeros((len(motions), max(map(len, motions))), records.PLAN)
+    waypoints = np.zeros((0, 2))
+    for plan, motions_of_member in zip(plans, motions, strict=True):
+        plan[: len(motions_of_member)], more = plan_arrays(motions_of_member)
+        plan["first"] += len(waypoints)
+        waypoints = np.concatenate([waypoints, more])
+    return plans, waypoints
+
+
+def allocate_part(
+    data: records.State,
+    world_set: WorldSetArrays,
+    model: SimulatorModel,
+    scanner: Scanner,
+    sizes: Sizes,
+    cells: records.BodyCells,
+    part: slice,
+) -> records.Part:
+    """Return the kernels' arguments for one part of the worlds, with its own scratch memory."""
+    timing = model.timing
+    motion = records.Dynamics(
+        make_terms(model.kinematics), SERIES, float(timing.dt), int(timing.substeps)
+    )
+    scratch = _allocate_scratch(model, scanner, sizes, cells, part.stop - part.start)
+    return records.Part(data, world_set, scanner.arguments, motion, scratch)
+
+
+def _allocate_scratch(
+    model: SimulatorModel,
+    scanner: Scanner,
+    sizes: Sizes,
+    cells: records.BodyCells,
+    worlds: int,
+) -> records.Scratch:
+    """Allocate the memory of a thread that steps so many worlds."""
+    kinematics = model.kinematics
+    robots = sizes.robots
+    obstacles = sizes.obstacles
+    bodies = obstacles + robots
+    blocks = -(-worlds * robots // LANES)
+    lanes = robots * min(worlds, -(-worlds // blocks))
+    x, dq = allocate_scratch(kinematics)
+    commands = len(kinematics.variables) - kinematics.state_size
+    return records.Scratch(
+        lanes=records.Lanes(
+            pose=np.zeros((records.LANE_ROWS, lanes)),
+            x=np.ones((len(kinematics.variables) + 1, lanes)),
+            dq=np.zeros((len(kinematics.dofs), lanes)),
+            change=np.zeros((commands, lanes), np.int64),
+            coefficient=np.zeros((np.count_nonzero(kinematics.coefficients), lanes)),
+        ),
+        single=records.Single(x, dq),
+        tight=records.Tight(
+            motions=np.zeros(robots, records.MOTION),
+            listed=records.allocate_touches(),
+            start=np.zeros((obstacles, 3)),
+            stops=np.zeros(obstacles),
+            fastest=np.zeros(1),
+        ),
+        nearby=records.Nearby(
+            near=np.zeros((robots, 1 + SEVERAL), np.int64),
+            meets=np.zeros(robots, np.int64),
+            path=np.zeros(robots),
+            reach=np.zeros(bodies),
+            speeds=np.zeros((robots, 2)),
+        ),
+        cells=cells._replace(
+            then=cells.then.copy() if cells.ordered else cells.then,
+            found=cells.found.copy(),
+        ),
+        scans=records.Scans(
+            start_poses=np.zeros((lanes, 3)),
+            waiting=np.zeros(worlds, np.int64),
+            bodies=np.zeros((bodies + 1, BODY)),
+            pose=np.zeros(3),
+            slice_poses=np.zeros((SLICES, 3)),
+            slice_ranges=np.zeros(model.lidar.beams, np.float32),
+            twist=np.zeros(3),
+            everybody=np.arange(bodies + 1, dtype=np.int32),
+            scratch=scan_kernels.scan_scratch(model.lidar.beams),
+        ),
+    )

@@ -16,7 +16,7 @@
 A world is bit-identical in any batch, part or thread: nothing is summed over worlds, and random
 numbers depend on the world's own seed and counter alone.
 
-Shared arguments: `packed` is a `state.Part`, packed by `packing_kernels.pack`; n is a world, m a
+Shared arguments: `packed` is a `state.Part`, packed by `kernels.pack`; n is a world, m a
 robot in it; the robot's lane is `first_lane` + m.
 """
 

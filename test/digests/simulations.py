@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.generator import SimulatorModel, builtin_model
 from nics_drl_bridge.lidar.spec import LidarSpec
-from nics_drl_bridge.sim.allocation import Sizes
 from nics_drl_bridge.sim.barn import barn_world
-from nics_drl_bridge.sim.simulator import FastSimulator
+from nics_drl_bridge.sim.simulator import FastSimulator, Sizes
 from nics_drl_bridge.sim.world import World
 
 from .projection import Found, joined

@@ -18,7 +18,7 @@ from nics_drl_bridge.lidar.shapes import (
     place,
 )
 from nics_drl_bridge.sim import collision_kernels as kernels
-from nics_drl_bridge.sim.allocation import map_field
+from nics_drl_bridge.sim.simulator import map_field
 from nics_drl_bridge.sim.state import NO_FIELD, allocate_touches
 
 L = Polygon(points=((0, 0), (1, 0), (1, 0.3), (0.3, 0.3), (0.3, 1), (0, 1)))

@@ -8,7 +8,7 @@ import pytest
 
 from nics_drl_bridge.robot.spec import load_robot
 from nics_drl_bridge.robot.taylor import TaylorModel
-from nics_drl_bridge.sim.command_range import CommandRange, OutsideValidityWarning
+from nics_drl_bridge.sim.simulator import CommandRange, OutsideValidityWarning
 
 
 @pytest.fixture

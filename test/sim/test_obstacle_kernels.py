@@ -12,9 +12,8 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.sim import obstacle_kernels as at
 from nics_drl_bridge.sim import obstacle_kernels as kernels
-from nics_drl_bridge.sim.allocation import map_field
 from nics_drl_bridge.sim.obstacle_kernels import FAR, repulsion
-from nics_drl_bridge.sim.simulator import FastSimulator
+from nics_drl_bridge.sim.simulator import FastSimulator, map_field
 from nics_drl_bridge.sim.world import (
     Motion,
     Patrol,

@@ -8,13 +8,13 @@ from shapely import LineString, MultiLineString, Point
 from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.shapes import place
 from nics_drl_bridge.sim import obstacle_kernels as at
-from nics_drl_bridge.sim.allocation import map_field
 from nics_drl_bridge.sim.obstacle_kernels import (
     Traffic,
     clearance,
     map_distance,
     restrain,
 )
+from nics_drl_bridge.sim.simulator import map_field
 from nics_drl_bridge.sim.state import NO_FIELD, PLAN
 
 HALF = np.array([1.5, 1.0])

@@ -12,10 +12,13 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.shapes import Circle
-from nics_drl_bridge.sim.allocation import SLICES
-from nics_drl_bridge.sim.command_range import OutsideValidityWarning
 from nics_drl_bridge.sim.randomisation import Randomisation
-from nics_drl_bridge.sim.simulator import CHECK_INTERVAL, FastSimulator
+from nics_drl_bridge.sim.simulator import (
+    CHECK_INTERVAL,
+    SLICES,
+    FastSimulator,
+    OutsideValidityWarning,
+)
 from nics_drl_bridge.sim.state import State
 from nics_drl_bridge.sim.world import load_world
 

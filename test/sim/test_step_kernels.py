@@ -12,7 +12,7 @@ from robots import FOOTPRINT, RADIUS, direct_model, field, lidar
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.robot.spec import RobotSpec
-from nics_drl_bridge.sim import allocation as sizes
+from nics_drl_bridge.sim import simulator as sizes
 from nics_drl_bridge.sim.collision_kernels import body_cells
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import World
