@@ -5,7 +5,7 @@ at most `limit` [m]. Of solids that overlap it is negative: the distance of the 
 from the other, less the radius of the circle around the first one. Nearest points that are nearer
 than `skin` [m] are listed as touches. Shared arguments: a body (7,) has the columns of `state`, a
 wall (4,) two ends; the distances of a map are 0 in solid cells; `listed` is scratch memory for
-touches, and the number of those that it already holds comes as `count` and is returned.
+touches, which adds to those that it holds.
 
 Bodies may be sorted into square cells, so that those around a point are found without testing all.
 A body lies in the cell of its centre. One that moves or is larger than a cell is in no cell and is
@@ -52,6 +52,7 @@ class Outline(NamedTuple):
 class Solid(NamedTuple):
     """A placed outline."""
 
+    body: int  # number of the body; -1 for a wall or a cell of the map
     outline: Outline  # in its own frame
     x: float  # origin of that frame [m]
     y: float
@@ -85,11 +86,13 @@ def is_round(body: Array, outlines: OutlineArrays) -> bool:
 
 
 @kernel
-def solid_of(body: Array, outlines: OutlineArrays) -> Solid:
-    """Return a body as a solid."""
-    radius = body[RADIUS] if is_round(body, outlines) else 0.0
+def solid_of(k: int, body: Array, outlines: OutlineArrays) -> Solid:
+    """Return a body, whose number is k, as a solid."""
     outline = outline_of(body, outlines)
-    return Solid(outline, body[X], body[Y], body[COS], body[SIN], radius, body[RADIUS])
+    radius = body[RADIUS] if is_round(body, outlines) else 0.0
+    return Solid(
+        k, outline, body[X], body[Y], body[COS], body[SIN], radius, body[RADIUS]
+    )
 
 
 @kernel
@@ -177,13 +180,6 @@ def _side(edge: Edge, x: float, y: float) -> float:
 
 
 @kernel
-def _cross(p: Edge, q: Edge) -> bool:
-    """True if two edges cross."""
-    p_crosses = (_side(q, p.ax, p.ay) > 0.0) != (_side(q, p.bx, p.by) > 0.0)
-    return p_crosses and (_side(p, q.ax, q.ay) > 0.0) != (_side(p, q.bx, q.by) > 0.0)
-
-
-@kernel
 def _find_nearest(p: Edge, q: Edge) -> tuple[float, float, float, float]:
     """Return the vector from the nearest point of q to that of p, and the nearest point of p."""
     nx, ny = from_segment(p.ax, p.ay, q.ax, q.ay, q.bx, q.by)
@@ -191,7 +187,9 @@ def _find_nearest(p: Edge, q: Edge) -> tuple[float, float, float, float]:
     y = p.ay
     if p.ax == p.bx and p.ay == p.by:
         return nx, ny, x, y
-    if _cross(p, q):
+    p_crosses = (_side(q, p.ax, p.ay) > 0.0) != (_side(q, p.bx, p.by) > 0.0)
+    q_crosses = (_side(p, q.ax, q.ay) > 0.0) != (_side(p, q.bx, q.by) > 0.0)
+    if p_crosses and q_crosses:
         return 0.0, 0.0, x, y
     ox, oy = from_segment(p.bx, p.by, q.ax, q.ay, q.bx, q.by)
     if ox * ox + oy * oy < nx * nx + ny * ny:
@@ -219,21 +217,22 @@ def _measure_origin(x: float, y: float, solid: Solid) -> float:
 
 @kernel
 def find_gap(
-    one: Solid, other: Solid, limit: float, skin: float, listed: Touches, count: int
-) -> tuple[float, int]:
-    """Clearance of a solid from another one, up to `limit` >= 0, see the module."""
+    one: Solid, other: Solid, limit: float, skin: float, listed: Touches
+) -> float:
+    """Clearance of a solid from another one, up to `limit`, see the module."""
+    limit = max(limit, 0.0)
     dx = one.x - other.x
     dy = one.y - other.y
     far = one.reach + other.reach + max(limit, skin)
     if dx * dx + dy * dy > far * far:
-        return limit, count
+        return limit
     x = other.cos * dx + other.sin * dy
     y = other.cos * dy - other.sin * dx
     c = one.cos * other.cos + one.sin * other.sin
     s = one.sin * other.cos - one.cos * other.sin
     least = max(limit, OVERLAP)
     may_contain = _count_edges(other.outline) > 1
-    earlier = count
+    earlier = listed.number[0]
     for v in range(_count_edges(other.outline)):
         q = _get_edge(v, other.outline)
         far = one.reach + other.radius + max(least, skin)
@@ -246,18 +245,21 @@ def find_gap(
             away = math.sqrt(nx * nx + ny * ny)
             gap = away - one.radius - other.radius
             least = min(least, gap)
+            count = listed.number[0]
             if OVERLAP < gap < skin and count < listed.touches.shape[0]:
                 touch = listed.touches[count]
+                touch.other = other.body
                 touch.nx = (other.cos * nx - other.sin * ny) / away
                 touch.ny = (other.sin * nx + other.cos * ny) / away
                 touch.x = other.x + other.cos * px - other.sin * py
                 touch.y = other.y + other.sin * px + other.cos * py
                 touch.gap = gap
-                count += 1
+                listed.number[0] = count + 1
     overlaps = least < OVERLAP or (may_contain and _contain(one, other, x, y, c, s))
     if not overlaps:
-        return min(least, limit), count
-    return min(_measure_origin(x, y, other) - one.reach, -OVERLAP), earlier
+        return min(least, limit)
+    listed.number[0] = earlier
+    return min(_measure_origin(x, y, other) - one.reach, -OVERLAP)
 
 
 @kernel
@@ -279,58 +281,38 @@ def _contain(one: Solid, other: Solid, x: float, y: float, c: float, s: float) -
 
 
 @kernel
-def body_gap(
-    one: Array, other: Array, outlines: OutlineArrays, limit: float, listed: Touches
-) -> float:
-    """Clearance of two bodies, see the module."""
-    solid = solid_of(other, outlines)
-    gap, _ = find_gap(solid_of(one, outlines), solid, limit, 0.0, listed, 0)
-    return gap
-
-
-@kernel
 def wall_gap(
-    one: Solid,
-    walls: Array,
-    limit: float,
-    skin: float,
-    listed: Touches,
-    count: int,
-) -> tuple[float, int]:
+    one: Solid, walls: Array, limit: float, skin: float, listed: Touches
+) -> float:
     """Clearance of a solid from straight walls (W, 4), see the module."""
     corners = walls.reshape((-1, 2))
     least = limit
     for w in range(walls.shape[0]):
         far = one.reach + max(least, skin)
-        if (
-            segment_distance2(
-                one.x, one.y, walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3]
-            )
-            > far * far
-        ):
-            continue
-        outline = Outline(corners, 2 * w, 2 * w + 2)
-        wall = Solid(outline, 0.0, 0.0, 1.0, 0.0, 0.0, np.inf)
-        gap, count = find_gap(one, wall, max(least, 0.0), skin, listed, count)
-        least = min(least, gap)
-    return least, count
+        if wall_distance2(one.x, one.y, walls[w]) <= far * far:
+            outline = Outline(corners, 2 * w, 2 * w + 2)
+            wall = Solid(-1, outline, 0.0, 0.0, 1.0, 0.0, 0.0, np.inf)
+            least = min(least, find_gap(one, wall, least, skin, listed))
+    return least
 
 
 @kernel
-def _along(x: float, y: float, wall: Array) -> float:
-    ex = wall[2] - wall[0]
-    ey = wall[3] - wall[1]
-    length2 = ex * ex + ey * ey
-    if length2 > 0.0:
-        return min(max(((x - wall[0]) * ex + (y - wall[1]) * ey) / length2, 0.0), 1.0)
-    return 0.0
+def wall_distance2(x: float, y: float, wall: Array) -> float:
+    """Square of the distance from a point to a straight wall (4,) [m^2]."""
+    return segment_distance2(x, y, wall[0], wall[1], wall[2], wall[3])
 
 
 @kernel
 def on_wall(x: float, y: float, wall: Array) -> tuple[float, float]:
     """Return the point of a straight wall nearest to a point."""
-    share = _along(x, y, wall)
-    return wall[0] + share * (wall[2] - wall[0]), wall[1] + share * (wall[3] - wall[1])
+    ex = wall[2] - wall[0]
+    ey = wall[3] - wall[1]
+    length2 = ex * ex + ey * ey
+    share = 0.0
+    if length2 > 0.0:
+        share = ((x - wall[0]) * ex + (y - wall[1]) * ey) / length2
+        share = min(max(share, 0.0), 1.0)
+    return wall[0] + share * ex, wall[1] + share * ey
 
 
 @kernel
@@ -338,12 +320,9 @@ def wall_distance(x: float, y: float, walls: Array) -> float:
     """Distance from a point to the nearest straight wall (W, 4) [m]; inf if there is none."""
     least = np.inf
     for w in range(walls.shape[0]):
-        ax = walls[w, 0]
-        ay = walls[w, 1]
-        share = _along(x, y, walls[w])
-        ex = walls[w, 2] - ax
-        ey = walls[w, 3] - ay
-        least = min(least, np.hypot(x - ax - share * ex, y - ay - share * ey))
+        wall = walls[w]
+        dx, dy = from_segment(x, y, wall[0], wall[1], wall[2], wall[3])
+        least = min(least, np.hypot(dx, dy))
     return least
 
 
@@ -353,24 +332,6 @@ def in_grid(x: float, y: float, grid: MapField) -> tuple[float, float]:
     dx = x - grid.x
     dy = y - grid.y
     return grid.cos * dx + grid.sin * dy, grid.cos * dy - grid.sin * dx
-
-
-@kernel
-def cells_near(
-    x: float, y: float, far: float, grid: MapField
-) -> tuple[int, int, int, int]:
-    """Return first and last + 1 row and column of the cells up to `far` [m] from a point."""
-    rows, columns = grid.distances.shape
-    low_i = math.floor((y - far) / grid.cell)
-    high_i = math.floor((y + far) / grid.cell)
-    low_j = math.floor((x - far) / grid.cell)
-    high_j = math.floor((x + far) / grid.cell)
-    return (
-        max(low_i, 0),
-        min(high_i, rows - 1) + 1,
-        max(low_j, 0),
-        min(high_j, columns - 1) + 1,
-    )
 
 
 @kernel
@@ -386,9 +347,8 @@ def _bounds(x: float, y: float, grid: MapField) -> tuple[float, float]:
     within = math.hypot(px - (j + 0.5) * size, py - (i + 0.5) * size)
     outside = math.hypot(x - px, y - py)
     middle = grid.distances[i, j]
-    return middle * (1.0 - FLOAT32) - within, middle * (
-        1.0 + FLOAT32
-    ) + within + outside
+    low = middle * (1.0 - FLOAT32) - within
+    return low, middle * (1.0 + FLOAT32) + within + outside
 
 
 @kernel
@@ -402,21 +362,16 @@ def map_bound(body: Array, grid: MapField) -> float:
 
 @kernel
 def map_gap(
-    one: Solid,
-    grid: MapField,
-    limit: float,
-    skin: float,
-    listed: Touches,
-    count: int,
-) -> tuple[float, int]:
+    one: Solid, grid: MapField, limit: float, skin: float, listed: Touches
+) -> float:
     """Clearance of a solid from the solid cells of a map, see the module."""
     if grid.distances.size == 0:
-        return limit, count
+        return limit
     size = grid.cell
     x, y = in_grid(one.x, one.y, grid)
     low, high = _bounds(x, y, grid)
     if low - one.reach > max(limit, skin):
-        return limit, count
+        return limit
     square = listed.square
     for v in range(4):
         square[v, 0] = ((v + 1) // 2) % 2 * size
@@ -424,9 +379,11 @@ def map_gap(
     outline = Outline(square, 0, 4)
     least = limit
     far = one.reach + max(min(limit, high), skin) + size
-    low_i, end_i, low_j, end_j = cells_near(x, y, far, grid)
-    for i in range(low_i, end_i):
-        for j in range(low_j, end_j):
+    rows, columns = grid.distances.shape
+    end_i = min(math.floor((y + far) / size) + 1, rows)
+    end_j = min(math.floor((x + far) / size) + 1, columns)
+    for i in range(max(math.floor((y - far) / size), 0), end_i):
+        for j in range(max(math.floor((x - far) / size), 0), end_j):
             dx = max(j * size - x, x - (j + 1) * size, 0.0)
             dy = max(i * size - y, y - (i + 1) * size, 0.0)
             far = one.reach + max(least, skin)
@@ -434,10 +391,9 @@ def map_gap(
                 continue
             cx = grid.x + grid.cos * j * size - grid.sin * i * size
             cy = grid.y + grid.sin * j * size + grid.cos * i * size
-            cell = Solid(outline, cx, cy, grid.cos, grid.sin, 0.0, 1.5 * size)
-            gap, count = find_gap(one, cell, max(least, 0.0), skin, listed, count)
-            least = min(least, gap)
-    return least, count
+            cell = Solid(-1, outline, cx, cy, grid.cos, grid.sin, 0.0, 1.5 * size)
+            least = min(least, find_gap(one, cell, least, skin, listed))
+    return least
 
 
 def body_cells(worlds: int, bodies: int, ordered: bool = False) -> BodyCells:

@@ -31,7 +31,6 @@ from nics_drl_bridge.sim.state import (
     BodyCells,
     Nearby,
     Record,
-    State,
     Surroundings,
     Tight,
 )
@@ -69,10 +68,8 @@ class World(NamedTuple):
 
 
 @kernel
-def find_contacts(
-    m: int, limit: float, skin: float, world: World
-) -> tuple[float, int, int]:
-    """Return the clearance of a robot up to `limit` [m], the nearest body or -1, and the touches.
+def find_contacts(m: int, limit: float, skin: float, world: World) -> tuple[float, int]:
+    """Return the clearance of a robot up to `limit` [m], and the nearest body or -1.
 
     What it touches within `skin` [m] is in `world.tight.listed`.
     """
@@ -81,40 +78,27 @@ def find_contacts(
     meets = world.nearby.meets[m]
     listed = world.tight.listed
     me = world.first + m
-    body = collision.solid_of(world.bodies[me], scene.outlines)
+    body = collision.solid_of(me, world.bodies[me], scene.outlines)
     least = limit
     whom = -1
-    count = 0
+    listed.number[0] = 0
     if meets & BODIES:
         is_listed = near[m, 0] <= SEVERAL
         for i in range(near[m, 0] if is_listed else world.bodies.shape[0]):
             k = near[m, 1 + i] if is_listed else i
             if k == me or world.bodies[k, RADIUS] <= 0.0:
                 continue
-            other = collision.solid_of(world.bodies[k], scene.outlines)
-            counted = count
-            gap, count = collision.find_gap(
-                body, other, max(least, 0.0), skin, listed, count
-            )
-            for t in range(counted, count):
-                listed.touches[t].other = k
+            other = collision.solid_of(k, world.bodies[k], scene.outlines)
+            gap = collision.find_gap(body, other, least, skin, listed)
             if gap < least:
                 least = gap
                 whom = k
-    counted = count
+    to_bodies = least
     if meets & WALLS:
-        gap, count = collision.wall_gap(body, scene.walls, limit, skin, listed, count)
-        if gap < least:
-            least = gap
-            whom = -1
+        least = collision.wall_gap(body, scene.walls, least, skin, listed)
     if meets & MAP:
-        gap, count = collision.map_gap(body, scene.grid, limit, skin, listed, count)
-        if gap < least:
-            least = gap
-            whom = -1
-    for t in range(counted, count):
-        listed.touches[t].other = -1
-    return least, whom, count
+        least = collision.map_gap(body, scene.grid, least, skin, listed)
+    return least, whom if least == to_bodies else -1
 
 
 @kernel
@@ -157,7 +141,7 @@ def _turn_off(
 
 
 @kernel
-def _place_robot(motion: Record, body: Array, time: float, series: Array) -> None:
+def _place_robot(motion: Record, body: Array, time: float, world: World) -> None:
     lasted = time - motion.since
     turned = motion.turn * lasted
     body[X], body[Y], body[COS], body[SIN] = move(
@@ -169,7 +153,7 @@ def _place_robot(motion: Record, body: Array, time: float, series: Array) -> Non
         motion.vy,
         turned,
         lasted,
-        series,
+        world.series,
     )
     body[HEADING] = motion.heading + turned
 
@@ -223,14 +207,14 @@ def _judge(m: int, begin: float, time: float, rest: float, world: World) -> None
     motion = tight.motions[m]
     speed = motion.bound + tight.fastest[0]
     limit = max(speed * max(rest, world.period - begin - time), SKIN)
-    gap, whom, count = find_contacts(m, limit, SKIN, world)
+    gap, whom = find_contacts(m, limit, SKIN, world)
+    count = tight.listed.number[0]
     if gap < -collision.OVERLAP:
         _mark(m, whom, world)
     motion.gap = gap
     motion.room = gap - speed * rest
     motion.touches = gap < FLOOR
-    for t in range(count):
-        touch = tight.listed.touches[t]
+    for touch in tight.listed.touches[:count]:
         k = touch.other
         rate = _find_rate(k, begin + time, touch, world)
         if 0 <= k < world.first and rate > 0.0:
@@ -238,7 +222,7 @@ def _judge(m: int, begin: float, time: float, rest: float, world: World) -> None
             _mark(m, k, world)
         touch.rate = min(rate, 0.0)
     if motion.halts == 0:
-        _bend(m, time, count, world)
+        _bend(m, time, world)
     body = world.bodies[world.first + m]
     speed = _bound_speed(body, motion.vx, motion.vy, motion.turn, world)
     motion.clock = time + max(gap, FLOOR) / (speed + tight.fastest[0])
@@ -247,7 +231,7 @@ def _judge(m: int, begin: float, time: float, rest: float, world: World) -> None
 
 
 @kernel
-def _bend(m: int, time: float, count: int, world: World) -> None:
+def _bend(m: int, time: float, world: World) -> None:
     """Bend the motion of a robot so that it does not approach what it touches.
 
     Each pass removes the approach at one touch after the other, by the impulse that would stop a
@@ -262,10 +246,10 @@ def _bend(m: int, time: float, count: int, world: World) -> None:
     turn = motion.wish_turn
     inertia = body[RADIUS] * body[RADIUS]
     is_bent = False
+    listed = world.tight.listed
     for sweep in range(SWEEPS):
         is_done = True
-        for t in range(count):
-            touch = world.tight.listed.touches[t]
+        for touch in listed.touches[: listed.number[0]]:
             arm = (touch.x - body[X]) * touch.ny - (touch.y - body[Y]) * touch.nx
             rate = touch.nx * vx + touch.ny * vy + arm * turn - touch.rate
             if sweep == 0 and rate < -APPROACH * motion.bound:
@@ -306,7 +290,7 @@ def _halt(m: int, begin: float, time: float, end: float, world: World) -> bool:
         True if it did either.
     """
     motion = world.tight.motions[m]
-    gap, whom, _ = find_contacts(m, 0.0, 0.0, world)
+    gap, whom = find_contacts(m, 0.0, 0.0, world)
     if gap >= min(motion.gap, 0.0):
         return False
     if motion.halts > 1:
@@ -318,9 +302,9 @@ def _halt(m: int, begin: float, time: float, end: float, world: World) -> bool:
     _mark(m, whom, world)
     body = world.bodies[world.first + m]
     turn = motion.turn if motion.halts == 0 else 0.0
-    _place_robot(motion, body, time, world.series)
+    _place_robot(motion, body, time, world)
     _turn_off(motion, body, time, 0.0, 0.0, turn)
-    _place_robot(motion, body, end, world.series)
+    _place_robot(motion, body, end, world)
     motion.halts += 1
     return True
 
@@ -346,11 +330,12 @@ def advance(begin: float, duration: float, obstacles_move: bool, world: World) -
     """Move the robots that may meet something, and the obstacles, by a duration [s]."""
     meets = world.nearby.meets
     motions = world.tight.motions
+    robots = meets.shape[0]
     fastest = _find_fastest(obstacles_move, world)
     world.tight.fastest[0] = fastest
     # Robots that are judged at nearly the same time are judged together: there are fewer steps.
     early = np.inf
-    for m in range(meets.shape[0]):
+    for m in range(robots):
         if meets[m] != FREE:
             speed = motions[m].bound + fastest
             is_far = motions[m].room > speed * duration
@@ -360,65 +345,23 @@ def advance(begin: float, duration: float, obstacles_move: bool, world: World) -
     time = 0.0
     while time < duration:
         end = duration
-        for m in range(meets.shape[0]):
+        for m in range(robots):
             if meets[m] != FREE:
                 if motions[m].clock <= time + early:
                     _judge(m, begin, time, duration - time, world)
                 end = min(end, motions[m].clock)
-        _step(begin, time, end, obstacles_move, world)
+        if obstacles_move:
+            place_obstacles(begin + end, world)
+        for m in range(robots):
+            if meets[m] != FREE:
+                _place_robot(motions[m], world.bodies[world.first + m], end, world)
+        is_halted = True
+        while is_halted:  # robots that would overlap something
+            is_halted = False
+            for m in range(robots):
+                if meets[m] != FREE and motions[m].touches:
+                    is_halted |= _halt(m, begin, time, end, world)
         time = end
-
-
-@kernel
-def _step(
-    begin: float, time: float, end: float, obstacles_move: bool, world: World
-) -> None:
-    """Move all from a time to another; halt robots that would overlap something."""
-    meets = world.nearby.meets
-    motions = world.tight.motions
-    if obstacles_move:
-        place_obstacles(begin + end, world)
-    for m in range(meets.shape[0]):
-        if meets[m] != FREE:
-            body = world.bodies[world.first + m]
-            _place_robot(motions[m], body, end, world.series)
-    is_halted = True
-    while is_halted:
-        is_halted = False
-        for m in range(meets.shape[0]):
-            if meets[m] != FREE and motions[m].touches:
-                is_halted |= _halt(m, begin, time, end, world)
-
-
-@kernel
-def compute_reaches(
-    n: int, data: State, scene: Surroundings, nearby: Nearby, period: float
-) -> tuple[float, bool]:
-    """Write to `nearby.reach` how far each body may reach in a period [s].
-
-    Returns:
-        Longest path of a body [m], and True if an obstacle moves.
-    """
-    reach = nearby.reach
-    path = nearby.path
-    bodies = data.bodies
-    velocity = data.velocity
-    longest = 0.0
-    moving = False
-    obstacles = velocity.shape[1]
-    for k in range(0 if scene.standing else obstacles):
-        reach[k] = bodies[n, k, RADIUS]
-        vx = velocity[n, k, 0]
-        vy = velocity[n, k, 1]
-        if (vx != 0.0 or vy != 0.0 or velocity[n, k, 2] != 0.0) and reach[k] > 0.0:
-            moved = math.sqrt(vx * vx + vy * vy) * period
-            reach[k] += moved
-            longest = max(longest, moved)
-            moving = True
-    for m in range(path.shape[0]):
-        reach[obstacles + m] = bodies[n, obstacles + m, RADIUS] + path[m]
-        longest = max(longest, path[m])
-    return longest, moving
 
 
 @kernel
@@ -453,10 +396,7 @@ def find_near(
     near[m, 0] = count
     meets = BODIES if count > 0 else FREE
     for w in range(walls.shape[0]):
-        d2 = collision.segment_distance2(
-            x, y, walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3]
-        )
-        if d2 <= own_reach * own_reach:
+        if collision.wall_distance2(x, y, walls[w]) <= own_reach * own_reach:
             meets |= WALLS
             break
     if (
@@ -477,7 +417,10 @@ def move_obstacles(
 
 
 @kernel
-def put_body(bodies: Array, n: int, k: int, pose: Array) -> None:
-    """Place body k of world n at a pose (3,)."""
-    bodies[n, k, X], bodies[n, k, Y], bodies[n, k, HEADING] = pose[0], pose[1], pose[2]
-    bodies[n, k, COS], bodies[n, k, SIN] = math.cos(pose[2]), math.sin(pose[2])
+def put_body(body: Array, pose: Array) -> None:
+    """Place a body at a pose (3,)."""
+    body[X] = pose[0]
+    body[Y] = pose[1]
+    body[HEADING] = pose[2]
+    body[COS] = math.cos(pose[2])
+    body[SIN] = math.sin(pose[2])

@@ -174,19 +174,9 @@ def _clear_of_walls(body: Array, room: float, plan: ScenePlan, listed: Touches) 
         y = body[Y] + body[SIN] * first[0] + body[COS] * first[1]
         if not _within(x, y, space)[0]:
             return False
-    return _measure_walls(body, room, plan, listed) >= room
-
-
-@kernel
-def _measure_walls(
-    body: Array, limit: float, plan: ScenePlan, listed: Touches
-) -> float:
-    """Clearance of a body from walls and map, up to a limit [m]."""
-    solid = collision.solid_of(body, plan.outlines)
-    gap, _ = collision.wall_gap(solid, plan.space.walls, limit, 0.0, listed, 0)
-    if gap == limit:
-        gap, _ = collision.map_gap(solid, plan.space.grid, limit, 0.0, listed, 0)
-    return gap
+    solid = collision.solid_of(0, body, outlines)
+    gap = collision.wall_gap(solid, space.walls, room, 0.0, listed)
+    return collision.map_gap(solid, space.grid, gap, 0.0, listed) >= room
 
 
 @kernel(inline=True)
@@ -200,7 +190,9 @@ def _clear_of(
         return True
     if collision.is_round(body, outlines) and collision.is_round(obstacle, outlines):
         return False
-    return collision.body_gap(body, obstacle, outlines, room, listed) >= room
+    one = collision.solid_of(0, body, outlines)
+    other = collision.solid_of(0, obstacle, outlines)
+    return collision.find_gap(one, other, room, 0.0, listed) >= room
 
 
 @kernel(inline=True)

@@ -19,7 +19,7 @@ from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import fault_kernels
 from nics_drl_bridge.lidar.beam_kernels import locate_lidar
 from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SIN, X, Y
-from nics_drl_bridge.lidar.scan_kernels import LidarArrays, scan_robot
+from nics_drl_bridge.lidar.scan_kernels import scan_robot
 from nics_drl_bridge.robot.kernels import move, wrap
 from nics_drl_bridge.sim.collision_kernels import find_around
 from nics_drl_bridge.sim.state import (
@@ -32,9 +32,8 @@ from nics_drl_bridge.sim.state import (
     TRUE_TWIST,
     Array,
     Dynamics,
-    Scratch,
+    Part,
     State,
-    WorldSetArrays,
 )
 
 # Obstacles of a late scan are moved back by their velocity for so long at most [s]: a pedestrian
@@ -43,24 +42,13 @@ FURTHEST_BACK = 1.0
 
 
 @kernel
-def record_start(n: int, m: int, data: State) -> None:
-    """Record robot m of world n, which stands still, as the start of an episode."""
-    start = data.past[n, m, 0]
-    for i in range(3):
-        start[POSE + i] = data.pose[n, m, i]
-        start[TRUE_TWIST + i] = 0.0
-        start[ODOM + i] = data.odom[n, m, i]
-        start[ODOM_TWIST + i] = data.twist[n, m, i]
-
-
-@kernel
 def measure_odometry(
     n: int,
     m: int,
-    data: State,
     start: Array,
     end: Array,
     twist: Array,
+    data: State,
     motion: Dynamics,
 ) -> None:
     """Measure the odometry of robot m of world n, at the end of a period.
@@ -70,10 +58,10 @@ def measure_odometry(
     Args:
         n: the world.
         m: the robot.
-        data: the state, whose `past`, `odom` and `twist` are written.
         start: (3,) pose by the wheels at the start of the period.
         end: (3,) pose by the wheels at the end of the period.
         twist: (3,) or more; body twist by the wheels at the end of the period.
+        data: the state, whose `past`, `odom` and `twist` are written.
         motion: length of the period.
     """
     steps = data.steps[n]
@@ -126,10 +114,8 @@ def measure_odometry(
         return
     past = data.past[n, m]
     lag = limit_lag(data.age[n, m], steps, rows, substeps)
-    odom[0], odom[1], odom[2] = interpolate_past(past, ODOM, lag, steps, substeps)
-    odom_twist[0], odom_twist[1], odom_twist[2] = interpolate_past(
-        past, ODOM_TWIST, lag, steps, substeps
-    )
+    interpolate_past(past, ODOM, lag, steps, substeps, odom)
+    interpolate_past(past, ODOM_TWIST, lag, steps, substeps, odom_twist)
 
 
 @kernel
@@ -151,66 +137,52 @@ def limit_lag(age: int, steps: int, rows: int, substeps: int) -> int:
 
 @kernel
 def interpolate_past(
-    past: Array, column: int, lag: int, steps: int, substeps: int
-) -> tuple[float, float, float]:
-    """Return what a robot recorded `lag` substeps before the end of period `steps`.
+    past: Array, column: int, lag: int, steps: int, substeps: int, out: Array
+) -> None:
+    """Write what a robot recorded `lag` substeps before the end of period `steps` to `out` (3,).
 
     `past` (R, PAST_COLUMNS) is its ring buffer; `column` is the first of the three columns that are
-    returned: `POSE`, `TRUE_TWIST`, `ODOM` or `ODOM_TWIST`.
+    written: `POSE`, `TRUE_TWIST`, `ODOM` or `ODOM_TWIST`.
     """
-    rows = past.shape[0]
     newer = steps - lag // substeps
     fraction = (lag % substeps) / substeps
-    new = newer % rows
-    x = past[new, column]
-    y = past[new, column + 1]
-    z = past[new, column + 2]
-    if fraction > 0.0:
-        old = (newer - 1) % rows
-        x += fraction * (past[old, column] - x)
-        y += fraction * (past[old, column + 1] - y)
-        change = past[old, column + 2] - z
-        if column in (POSE, ODOM):
-            z = wrap(z + fraction * wrap(change))
-        else:
-            z += fraction * change
-    return x, y, z
+    new = past[newer % past.shape[0]]
+    old = past[(newer - 1) % past.shape[0]]
+    is_pose = column in (POSE, ODOM)
+    for i in range(3):
+        out[i] = new[column + i]
+        if fraction > 0.0:
+            change = old[column + i] - out[i]
+            if i == 2 and is_pose:
+                out[i] = wrap(out[i] + fraction * wrap(change))
+            else:
+                out[i] += fraction * change
 
 
 @kernel(inline=True)
-def scan_or_wait(
-    n: int,
-    waiting_count: int,
-    data: State,
-    world_set: WorldSetArrays,
-    lidar: LidarArrays,
-    motion: Dynamics,
-    scratch: Scratch,
-) -> int:
+def scan_or_wait(n: int, waiting_count: int, part: Part) -> int:
     """Scan world n, unless `scan_together` can; return how many worlds now wait for that."""
+    data = part.data
     any_late = False
     for m in range(data.age.shape[1]):
         is_skewed = data.faults[n, m, fault_kernels.SKEW] != 0.0
         any_late = any_late or data.age[n, m] > 0 or is_skewed
     if any_late:
         for m in range(data.pose.shape[1]):
-            _scan_from_past(n, m, data, world_set, lidar, motion, scratch)
+            _scan_from_past(n, m, part)
         return waiting_count
-    scratch.scans.waiting[waiting_count] = n
+    part.scratch.scans.waiting[waiting_count] = n
     return waiting_count + 1
 
 
 @kernel
-def scan_together(
-    waiting_count: int,
-    data: State,
-    world_set: WorldSetArrays,
-    lidar: LidarArrays,
-    scratch: Scratch,
-) -> None:
+def scan_together(waiting_count: int, part: Part) -> None:
     """Scan the worlds that wait, as they stand."""
-    cells = scratch.cells
-    for n in scratch.scans.waiting[:waiting_count]:
+    data = part.data
+    lidar = part.lidar
+    scans = part.scratch.scans
+    cells = part.scratch.cells
+    for n in scans.waiting[:waiting_count]:
         for m in range(data.pose.shape[1]):
             pose = locate_lidar(data.pose[n, m], lidar.mount)
             count = find_around(n, pose.x, pose.y, lidar.range_max, cells)
@@ -221,18 +193,17 @@ def scan_together(
                 data.bodies[n],
                 cells.found[:count],
                 data.velocity.shape[1] + m,
-                world_set.fixtures,
+                part.world_set.fixtures,
                 lidar,
-                scratch.scans.scratch,
+                scans.scratch,
             )
 
 
 @kernel
-def distort_scans(
-    first_world: int, end_world: int, data: State, lidar: LidarArrays
-) -> None:
+def distort_scans(first_world: int, end_world: int, part: Part) -> None:
     """Apply the faults of each robot's lidar to the scans of worlds [first_world, end_world)."""
-    limits = lidar.range_min, lidar.range_max
+    data = part.data
+    limits = part.lidar.range_min, part.lidar.range_max
     robots = data.ranges.shape[1]
     for n in range(first_world, end_world):
         for m in range(robots):
@@ -243,41 +214,32 @@ def distort_scans(
 
 
 @kernel
-def _scan_from_past(
-    n: int,
-    m: int,
-    data: State,
-    world_set: WorldSetArrays,
-    lidar: LidarArrays,
-    motion: Dynamics,
-    scratch: Scratch,
-) -> None:
+def _scan_from_past(n: int, m: int, part: Part) -> None:
     """Scan from where robot m of world n was when its reported scan was taken.
 
     With skew, each group of beams is scanned from its own pose during the sweep.
     """
-    scans = scratch.scans
+    data = part.data
+    lidar = part.lidar
+    scans = part.scratch.scans
     steps = data.steps[n]
-    substeps = motion.substeps
+    substeps = part.motion.substeps
     skew = data.faults[n, m, fault_kernels.SKEW]
     pose = scans.pose
     twist = scans.twist
     past = data.past[n, m]
     lag = limit_lag(data.age[n, m], steps, past.shape[0], substeps)
-    pose[0], pose[1], pose[2] = interpolate_past(past, POSE, lag, steps, substeps)
-    twist[0], twist[1], twist[2] = interpolate_past(
-        past, TRUE_TWIST, lag, steps, substeps
-    )
+    interpolate_past(past, POSE, lag, steps, substeps, pose)
+    interpolate_past(past, TRUE_TWIST, lag, steps, substeps, twist)
     reach = lidar.range_max + math.hypot(lidar.mount[0], lidar.mount[1])
     if skew != 0.0:
         reach += math.hypot(twist[0], twist[1]) * lidar.sweep_time
-    count = _gather_bodies(n, m, lag, reach, data, world_set, motion, scratch)
-    nearby = scans.everybody[:count]
+    nearby = scans.everybody[: _gather_bodies(n, m, lag, reach, part)]
     ranges = data.ranges[n, m]
     beams = ranges.shape[0]
     groups = 1 if skew == 0.0 else scans.slice_poses.shape[0]
     if groups > 1:
-        moving = (steps * substeps - lag) * motion.dt
+        moving = (steps * substeps - lag) * part.motion.dt
         fault_kernels.slice_poses(
             scans.slice_poses, pose, twist, lidar.sweep_time, skew, moving
         )
@@ -294,7 +256,7 @@ def _scan_from_past(
             scans.bodies,
             nearby,
             -1,
-            world_set.fixtures,
+            part.world_set.fixtures,
             lidar,
             scans.scratch,
         )
@@ -304,54 +266,45 @@ def _scan_from_past(
 
 
 @kernel
-def _gather_bodies(
-    n: int,
-    m: int,
-    lag: int,
-    reach: float,
-    data: State,
-    world_set: WorldSetArrays,
-    motion: Dynamics,
-    scratch: Scratch,
-) -> int:
+def _gather_bodies(n: int, m: int, lag: int, reach: float, part: Part) -> int:
     """Copy the bodies around `scans.pose`, as they were `lag` substeps ago; return their number.
 
     Robots are interpolated in the past. Of obstacles no past is kept: they are moved back by their
     present velocity. That is exact within the period, and beyond it while they keep their velocity;
     the extrapolation ends at `FURTHEST_BACK`.
     """
-    scans = scratch.scans
-    cells = scratch.cells
-    velocity = data.velocity
+    data = part.data
+    world_set = part.world_set
+    motion = part.motion
+    scans = part.scratch.scans
+    found = part.scratch.cells.found
     pose = scans.pose
-    obstacle_count = velocity.shape[1]
+    first_robot = data.velocity.shape[1]
     candidates = data.bodies.shape[1]
     # The cells of a crowd hold the present positions.
     in_cells = world_set.standing or (world_set.crowded and lag == 0)
     if in_cells:
-        candidates = find_around(n, pose[0], pose[1], reach, cells)
+        candidates = find_around(n, pose[0], pose[1], reach, part.scratch.cells)
     count = 0
     ago = min(lag * motion.dt, FURTHEST_BACK)
     for i in range(candidates):
-        k = cells.found[i] if in_cells else i
+        k = found[i] if in_cells else i
         radius = data.bodies[n, k, RADIUS]
-        if k == obstacle_count + m or radius <= 0.0:
+        if k == first_robot + m or radius <= 0.0:
             continue
         body = scans.bodies[count]
         for j in range(BODY_COLUMNS):
             body[j] = data.bodies[n, k, j]
         has_turned = False
-        if lag > 0 and k >= obstacle_count:
-            past = data.past[n, k - obstacle_count]
-            body[X], body[Y], body[HEADING] = interpolate_past(
-                past, POSE, lag, data.steps[n], motion.substeps
-            )
+        if lag > 0 and k >= first_robot:
+            past = data.past[n, k - first_robot]
+            interpolate_past(past, POSE, lag, data.steps[n], motion.substeps, body)
             has_turned = True
         elif lag > 0:
-            body[X] -= velocity[n, k, 0] * ago
-            body[Y] -= velocity[n, k, 1] * ago
-            body[HEADING] -= velocity[n, k, 2] * ago
-            has_turned = velocity[n, k, 2] != 0.0
+            velocity = data.velocity[n, k]
+            for j in range(3):
+                body[j] -= velocity[j] * ago
+            has_turned = velocity[2] != 0.0
         if has_turned:
             body[COS] = math.cos(body[HEADING])
             body[SIN] = math.sin(body[HEADING])

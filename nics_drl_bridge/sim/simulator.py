@@ -790,7 +790,6 @@ def _allocate_scratch(
         nearby=records.Nearby(
             near=np.zeros((robots, 1 + SEVERAL), np.int64),
             meets=np.zeros(robots, np.int64),
-            path=np.zeros(robots),
             reach=np.zeros(bodies),
             speeds=np.zeros((robots, 2)),
         ),

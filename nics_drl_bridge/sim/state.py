@@ -257,12 +257,14 @@ class Touches(NamedTuple):
     """Scratch memory of the touches of one robot."""
 
     touches: Records  # (T,) of `TOUCH`
+    number: Integers  # (1,) of those that are listed
     square: Array  # (4, 2) corners of a cell of a map [m]
 
 
 def allocate_touches() -> Touches:
     """Allocate memory for the touches of a robot."""
-    return Touches(np.zeros(MOST_TOUCHES, TOUCH), np.zeros((4, 2)))
+    touches = np.zeros(MOST_TOUCHES, TOUCH)
+    return Touches(touches, np.zeros(1, np.int64), np.zeros((4, 2)))
 
 
 class BodyCells(NamedTuple):
@@ -301,7 +303,6 @@ class Nearby(NamedTuple):
 
     near: Integers  # (M, 1 + SEVERAL) number and indices of the bodies near each robot
     meets: Integers  # (M,) bit flags of `contact_kernels`
-    path: Array  # (M,) upper bound on the length of each robot's path [m]
     reach: Array  # (K + M,) how far each body may reach from its present centre [m]
     speeds: Array  # (M, 2) velocity of the robots in `map` [m/s]
 

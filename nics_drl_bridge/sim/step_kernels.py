@@ -2,11 +2,11 @@
 
 `step_worlds` queues the commands, then takes the worlds in blocks, one lane for each robot:
 
-1. `_begin_period_of_block` saves the robots' poses, and chooses the velocities of the obstacles.
+1. `_begin_period_of_world` saves the robots' poses, and chooses the velocities of the obstacles.
 2. `move_freely` moves all robots of the block side by side, as if nothing stood in their way.
-3. `move_world` takes that motion for robots that can meet nothing, and moves the obstacles. A robot
-   that may meet something is moved carefully instead, from where it stood, see `contact_kernels`.
-   All robots then drift.
+3. `_move_world` takes that motion for robots that can meet nothing, and moves the obstacles. A
+   robot that may meet something is moved carefully instead, from where it stood, see
+   `contact_kernels`. All robots then drift.
 4. `_measure_world` measures the odometry.
 5. Each robot scans, and its lidar's faults are applied, see `sensing_kernels`.
 
@@ -27,9 +27,8 @@ import numpy as np
 
 from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.lidar.exact_kernels import RADIUS
+from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, X, Y
 from nics_drl_bridge.lidar.map_kernels import cells_of, walls_of
-from nics_drl_bridge.lidar.scan_kernels import LidarArrays
 from nics_drl_bridge.robot import kernels as robot
 from nics_drl_bridge.robot.kernels import apply_curve
 from nics_drl_bridge.sim import contact_kernels as contacts
@@ -52,6 +51,8 @@ from nics_drl_bridge.sim.state import (
     LANE_SIN,
     LANE_X,
     LANE_Y,
+    ODOM,
+    ODOM_TWIST,
     POSE,
     TRUE_TWIST,
     Array,
@@ -60,7 +61,7 @@ from nics_drl_bridge.sim.state import (
     Lanes,
     MapField,
     Movers,
-    Scratch,
+    Part,
     Single,
     State,
     Surroundings,
@@ -75,35 +76,23 @@ SCANNED_TOGETHER = 48
 @kernel(allocates=True)
 def step_worlds(packed: Any, commands: Array, first_world: int) -> None:
     """Step n worlds of a part, from `first_world` on, under commands (n, M, C) for one period."""
-    part = packed.content
-    _step_unpacked(
-        part.data,
-        part.world_set,
-        part.lidar,
-        part.motion,
-        part.scratch,
-        commands,
-        first_world,
-    )
+    _step_part(packed.content, commands, first_world)
 
 
 @kernel(allocates=True)
 def begin_episodes(packed: Any, chosen: Integers) -> None:
     """Begin episodes in the worlds `chosen` (n,), where everything is in place and stands still."""
     part = packed.content
-    data = part.data
-    waiting = part.scratch.scans.waiting
     for i in range(chosen.shape[0]):
-        waiting[i] = chosen[i]
-        scene = get_surroundings(chosen[i], part.world_set)
+        n = chosen[i]
+        part.scratch.scans.waiting[i] = n
+        scene = get_surroundings(n, part.world_set)
         if part.world_set.moves:
-            obstacles.reset_marks(chosen[i], data, scene.movers.plans)
-        _sort_bodies(chosen[i], data, scene, part.scratch)
-    sensing.scan_together(
-        chosen.shape[0], data, part.world_set, part.lidar, part.scratch
-    )
+            obstacles.reset_marks(n, part.data, scene.movers.plans)
+        _sort_bodies(n, scene, part)
+    sensing.scan_together(chosen.shape[0], part)
     for n in chosen:
-        sensing.distort_scans(n, n + 1, data, part.lidar)
+        sensing.distort_scans(n, n + 1, part)
 
 
 @kernel(allocates=True)
@@ -111,17 +100,15 @@ def sort_worlds(packed: Any, first_world: int, end_world: int) -> None:
     """Sort the bodies of worlds [first_world, end_world) of a part into cells, as they stand."""
     part = packed.content
     for n in range(first_world, end_world):
-        scene = get_surroundings(n, part.world_set)
-        _sort_bodies(n, part.data, scene, part.scratch)
+        _sort_bodies(n, get_surroundings(n, part.world_set), part)
 
 
 @kernel(allocates=True)
 def begin_period(packed: Any) -> None:
     """Begin a period of worlds whose robots another engine moves."""
     part = packed.content
-    speeds = part.scratch.nearby.speeds
     for n in range(part.data.pose.shape[0]):
-        _begin_period_of_world(n, part.data, part.world_set, part.motion, speeds)
+        _begin_period_of_world(n, 0, part)
 
 
 @kernel(allocates=True)
@@ -143,76 +130,60 @@ def end_period(
     """
     part = packed.content
     data = part.data
-    world_set = part.world_set
-    motion = part.motion
-    scratch = part.scratch
-    first_robot = data.velocity.shape[1]
     waiting_count = 0
     for n in range(data.pose.shape[0]):
         data.steps[n] += 1
-        past = data.past[n, :, data.steps[n] % data.past.shape[2]]
         for m in range(data.pose.shape[1]):
-            contacts.put_body(data.bodies, n, first_robot + m, data.pose[n, m])
+            start = wheel_start[n, m]
+            end = wheel_end[n, m]
+            contacts.put_body(
+                data.bodies[n, data.velocity.shape[1] + m], data.pose[n, m]
+            )
             sensing.measure_odometry(
-                n,
-                m,
-                data,
-                wheel_start[n, m],
-                wheel_end[n, m],
-                wheel_twist[n, m],
-                motion,
+                n, m, start, end, wheel_twist[n, m], data, part.motion
             )
             # The lidar is where the robot truly is, not where the wheels say.
+            row = data.past[n, m, data.steps[n] % data.past.shape[2]]
             for i in range(3):
-                past[m, POSE + i] = data.pose[n, m, i]
-                past[m, TRUE_TWIST + i] = true_twist[n, m, i]
-        _sort_bodies(n, data, get_surroundings(n, world_set), scratch)
-        waiting_count = sensing.scan_or_wait(
-            n, waiting_count, data, world_set, part.lidar, motion, scratch
-        )
-    sensing.scan_together(waiting_count, data, world_set, part.lidar, scratch)
-    sensing.distort_scans(0, data.pose.shape[0], data, part.lidar)
+                row[POSE + i] = data.pose[n, m, i]
+                row[TRUE_TWIST + i] = true_twist[n, m, i]
+        _sort_bodies(n, get_surroundings(n, part.world_set), part)
+        waiting_count = sensing.scan_or_wait(n, waiting_count, part)
+    sensing.scan_together(waiting_count, part)
+    sensing.distort_scans(0, data.pose.shape[0], part)
 
 
 @kernel
-def _step_unpacked(
-    data: State,
-    world_set: WorldSetArrays,
-    lidar: LidarArrays,
-    motion: Dynamics,
-    scratch: Scratch,
-    commands: Array,
-    first_world: int,
-) -> None:
+def _step_part(part: Part, commands: Array, first_world: int) -> None:
     """Step some worlds, see `step_worlds`.
 
     Scans of several worlds are made together, because one lidar's scan is too short to keep the
     processor busy. This is not done in `step_worlds` itself: there numba would count references to
     the part's arrays, which takes longer than the step.
     """
+    data = part.data
     robots = data.pose.shape[1]
     end_world = first_world + commands.shape[0]
-    _queue_commands(data.history, commands, first_world, motion.terms.curves)
-    worlds_per_block = scratch.lanes.pose.shape[1] // robots
+    _queue_commands(data.history, commands, first_world, part.motion.terms.curves)
+    worlds_per_block = part.scratch.lanes.pose.shape[1] // robots
     for block_begin in range(first_world, end_world, worlds_per_block):
         block_end = min(block_begin + worlds_per_block, end_world)
-        _begin_period_of_block(block_begin, block_end, data, world_set, motion, scratch)
-        move_freely(block_begin, block_end, data, motion, scratch.lanes)
+        for n in range(block_begin, block_end):
+            _begin_period_of_world(n, (n - block_begin) * robots, part)
+        move_freely(block_begin, block_end, data, part.motion, part.scratch.lanes)
         waiting_count = np.int64(0)
         first_to_distort = block_begin
         for n in range(block_begin, block_end):
             data.steps[n] += 1
             first_lane = (n - block_begin) * robots
-            scene = get_surroundings(n, world_set)
-            move_world(n, first_lane, data, scene, motion, scratch)
-            _measure_world(n, first_lane, data, scene, motion, scratch)
-            waiting_count = sensing.scan_or_wait(
-                n, waiting_count, data, world_set, lidar, motion, scratch
-            )
+            scene = get_surroundings(n, part.world_set)
+            _move_world(n, first_lane, scene, part)
+            _measure_world(n, first_lane, scene, part)
+            waiting_count = sensing.scan_or_wait(n, waiting_count, part)
             is_last = n + 1 == block_end
             if is_last or (n + 1 - first_to_distort) * robots >= SCANNED_TOGETHER:
-                sensing.scan_together(waiting_count, data, world_set, lidar, scratch)
-                sensing.distort_scans(first_to_distort, n + 1, data, lidar)
+                sensing.scan_together(waiting_count, part)
+                sensing.distort_scans(first_to_distort, n + 1, part)
                 waiting_count = np.int64(0)
                 first_to_distort = n + 1
 
@@ -233,68 +204,50 @@ def _queue_commands(
 
 
 @kernel(inline=True)
-def _begin_period_of_block(
-    first_world: int,
-    end_world: int,
-    data: State,
-    world_set: WorldSetArrays,
-    motion: Dynamics,
-    scratch: Scratch,
-) -> None:
-    """Keep the robots' poses in worlds [first_world, end_world), and steer the obstacles."""
-    robots = data.pose.shape[1]
-    start_poses = scratch.scans.start_poses
-    for n in range(first_world, end_world):
-        for m in range(robots):
-            lane = (n - first_world) * robots + m
-            for i in range(3):
-                start_poses[lane, i] = data.pose[n, m, i]
-        _begin_period_of_world(n, data, world_set, motion, scratch.nearby.speeds)
+def _begin_period_of_world(n: int, first_lane: int, part: Part) -> None:
+    """Keep the robots' poses; choose the velocities of the obstacles.
 
-
-@kernel(inline=True)
-def _begin_period_of_world(
-    n: int, data: State, world_set: WorldSetArrays, motion: Dynamics, speeds: Array
-) -> None:
-    """Record the start of an episode that begins; choose the velocities of the obstacles.
-
-    `speeds` (M, 2) is scratch memory for the velocities of the robots in `map`.
+    Where an episode begins, also record its start, at which the robots stand still.
     """
-    robots = data.pose.shape[1]
-    if data.steps[n] == 0:
-        for m in range(robots):
-            sensing.record_start(n, m, data)
-    if world_set.moves:
-        row = data.steps[n] % data.past.shape[2]
-        for m in range(robots):
-            vx = data.past[n, m, row, TRUE_TWIST]
-            vy = data.past[n, m, row, TRUE_TWIST + 1]
-            c = math.cos(data.pose[n, m, 2])
-            s = math.sin(data.pose[n, m, 2])
-            speeds[m, 0] = c * vx - s * vy
-            speeds[m, 1] = s * vx + c * vy
-        scene = get_surroundings(n, world_set)
-        obstacles.steer(n, data, scene, motion.dt * motion.substeps, speeds)
-
-
-@kernel(inline=True)
-def _measure_world(
-    n: int,
-    first_lane: int,
-    data: State,
-    scene: Surroundings,
-    motion: Dynamics,
-    scratch: Scratch,
-) -> None:
-    """Put the robots' bodies at their present poses, and measure their odometry."""
-    frame = scratch.cells.frame
-    first_robot = data.velocity.shape[1]
+    data = part.data
+    speeds = part.scratch.nearby.speeds
+    rows = data.past.shape[2]
     for m in range(data.pose.shape[1]):
         pose = data.pose[n, m]
-        start = scratch.scans.start_poses[first_lane + m]
-        contacts.put_body(data.bodies, n, first_robot + m, pose)
-        compute_rates(n, m, motion.substeps - 1, data, motion, scratch.single)
-        sensing.measure_odometry(n, m, data, start, pose, scratch.single.dq, motion)
+        for i in range(3):
+            part.scratch.scans.start_poses[first_lane + m, i] = pose[i]
+        row = data.past[n, m, data.steps[n] % rows]
+        if data.steps[n] == 0:
+            for i in range(3):
+                row[POSE + i] = pose[i]
+                row[TRUE_TWIST + i] = 0.0
+                row[ODOM + i] = data.odom[n, m, i]
+                row[ODOM_TWIST + i] = data.twist[n, m, i]
+        if part.world_set.moves:
+            vx = row[TRUE_TWIST]
+            vy = row[TRUE_TWIST + 1]
+            c = math.cos(pose[2])
+            s = math.sin(pose[2])
+            speeds[m, 0] = c * vx - s * vy
+            speeds[m, 1] = s * vx + c * vy
+    if part.world_set.moves:
+        scene = get_surroundings(n, part.world_set)
+        obstacles.steer(n, data, scene, part.motion.dt * part.motion.substeps, speeds)
+
+
+@kernel(inline=True)
+def _measure_world(n: int, first_lane: int, scene: Surroundings, part: Part) -> None:
+    """Put the robots' bodies at their present poses, and measure their odometry."""
+    data = part.data
+    motion = part.motion
+    single = part.scratch.single
+    frame = part.scratch.cells.frame
+    for m in range(data.pose.shape[1]):
+        pose = data.pose[n, m]
+        start = part.scratch.scans.start_poses[first_lane + m]
+        contacts.put_body(data.bodies[n, data.velocity.shape[1] + m], pose)
+        compute_rates(n, m, motion.substeps - 1, data, motion, single)
+        sensing.measure_odometry(n, m, start, pose, single.dq, data, motion)
         # The cells must know how far any body may be from where it was sorted.
         if scene.crowded:
             dx = pose[0] - start[0]
@@ -304,14 +257,15 @@ def _measure_world(
 
 
 @kernel
-def _sort_bodies(n: int, data: State, scene: Surroundings, scratch: Scratch) -> None:
+def _sort_bodies(n: int, scene: Surroundings, part: Part) -> None:
     """Sort the bodies of world n into its cells, or its standing obstacles by cells."""
+    bodies = part.data.bodies[n]
+    cells = part.scratch.cells
     if scene.crowded:
-        sort_into_cells(n, data.bodies[n], data.bodies.shape[1], scratch.cells)
+        sort_into_cells(n, bodies, bodies.shape[0], cells)
     elif scene.standing:
-        obstacle_count = data.velocity.shape[1]
-        spare = scratch.scans.bodies
-        put_in_order(n, data.bodies[n], obstacle_count, spare, scratch.cells)
+        spare = part.scratch.scans.bodies
+        put_in_order(n, bodies, part.data.velocity.shape[1], spare, cells)
 
 
 @kernel(view=True)
@@ -337,99 +291,110 @@ def get_surroundings(n: int, world_set: WorldSetArrays) -> Surroundings:
     )
 
 
-@kernel
-def move_world(
-    n: int,
-    first_lane: int,
-    data: State,
-    scene: Surroundings,
-    motion: Dynamics,
-    scratch: Scratch,
-) -> None:
-    """Move robots and obstacles of world n, after `move_freely`."""
-    meets = scratch.nearby.meets
-    start = scratch.tight.start
-    period = motion.dt * motion.substeps
-    obstacles_move = _find_what_is_near(n, first_lane, data, scene, motion, scratch)
+@kernel(inline=True)
+def _move_world(n: int, first_lane: int, scene: Surroundings, part: Part) -> None:
+    """Move robots and obstacles of world n, after `move_freely`; let the robots drift."""
+    data = part.data
+    motion = part.motion
+    lanes = part.scratch.lanes
+    start = part.scratch.tight.start
+    obstacles_move = _find_what_is_near(n, first_lane, scene, part)
     if obstacles_move:
         for k in range(data.velocity.shape[1]):
             for i in range(3):
                 start[k, i] = data.bodies[n, k, i]
     any_meets = False
     for m in range(data.pose.shape[1]):
-        if meets[m] == FREE:
-            _take_free_motion(n, m, first_lane + m, data, scratch.lanes)
-            _drift_freely(n, m, data, motion)
-        else:
+        if part.scratch.nearby.meets[m] != FREE:
             any_meets = True
+            continue
+        lane = first_lane + m
+        pose = data.pose[n, m]
+        pose[0] = lanes.pose[LANE_X, lane]
+        pose[1] = lanes.pose[LANE_Y, lane]
+        pose[2] = robot.wrap(lanes.pose[LANE_HEADING, lane])
+        for i in range(data.state.shape[2]):
+            data.state[n, m, i] = lanes.x[i, lane]
+        ahead, left, turn = draw_drift(n, m, data, motion)
+        if ahead != 0.0 or left != 0.0 or turn != 0.0:
+            c = math.cos(pose[2])
+            s = math.sin(pose[2])
+            pose[0], pose[1], _, _ = robot.move(
+                pose[0], pose[1], c, s, ahead, left, turn, 1.0, motion.series
+            )
+            pose[2] = robot.wrap(pose[2] + turn)
     if any_meets:
-        _move_carefully(n, obstacles_move, data, scene, motion, scratch)
+        _move_carefully(n, obstacles_move, scene, part)
     elif obstacles_move:
+        period = motion.dt * motion.substeps
         contacts.move_obstacles(data.bodies, start, data.velocity, n, period)
 
 
 @kernel(inline=True)
 def _find_what_is_near(
-    n: int,
-    first_lane: int,
-    data: State,
-    scene: Surroundings,
-    motion: Dynamics,
-    scratch: Scratch,
+    n: int, first_lane: int, scene: Surroundings, part: Part
 ) -> bool:
     """Find what each robot may meet in the period; return True if an obstacle moves."""
-    lanes = scratch.lanes
-    nearby = scratch.nearby
-    robots = data.pose.shape[1]
-    period = motion.dt * motion.substeps
-    for m in range(robots):
+    data = part.data
+    lane_poses = part.scratch.lanes.pose
+    nearby = part.scratch.nearby
+    cells = part.scratch.cells
+    first = data.velocity.shape[1]
+    period = part.motion.dt * part.motion.substeps
+    longest = 0.0  # path of any body
+    obstacles_move = False
+    for k in range(0 if scene.standing else first):
+        nearby.reach[k] = data.bodies[n, k, RADIUS]
+        vx = data.velocity[n, k, 0]
+        vy = data.velocity[n, k, 1]
+        moves = vx != 0.0 or vy != 0.0 or data.velocity[n, k, 2] != 0.0
+        if moves and nearby.reach[k] > 0.0:
+            moved = math.sqrt(vx * vx + vy * vy) * period
+            nearby.reach[k] += moved
+            longest = max(longest, moved)
+            obstacles_move = True
+    for m in range(data.pose.shape[1]):
         # Each component is uniform, so at most sqrt(3) of its standard deviations.
         sum_of_deviations = data.noise[n, m, DRIFT_X] + data.noise[n, m, DRIFT_Y]
-        longest_drift = math.sqrt(3.0 * period) * sum_of_deviations
-        path = lanes.pose[LANE_PATH, first_lane + m]
-        body = data.bodies[n, data.velocity.shape[1] + m]
+        path = lane_poses[LANE_PATH, first_lane + m]
+        body = data.bodies[n, first + m]
         if not is_round(body, scene.outlines):
             # Where a corner touches something, a turn moves the robot away.
-            turned = lanes.pose[LANE_HEADING, first_lane + m] - data.pose[n, m, 2]
+            turned = lane_poses[LANE_HEADING, first_lane + m] - data.pose[n, m, 2]
             path += abs(turned) * body[RADIUS]
-        nearby.path[m] = path + longest_drift
-    longest_path, obstacles_move = contacts.compute_reaches(
-        n, data, scene, nearby, period
-    )
+        path += math.sqrt(3.0 * period) * sum_of_deviations
+        nearby.reach[first + m] = body[RADIUS] + path
+        longest = max(longest, path)
     if scene.crowded:
-        sort_into_cells(n, data.bodies[n], data.bodies.shape[1], scratch.cells)
-        scratch.cells.frame[n, MOVED] = longest_path
-    for m in range(robots):
-        nearby.meets[m] = contacts.find_near(
-            n, m, data.bodies, scene, nearby, scratch.cells
-        )
-    return obstacles_move  # type: ignore[no-any-return]
+        sort_into_cells(n, data.bodies[n], data.bodies.shape[1], cells)
+        cells.frame[n, MOVED] = longest
+    for m in range(data.pose.shape[1]):
+        nearby.meets[m] = contacts.find_near(n, m, data.bodies, scene, nearby, cells)
+    return obstacles_move
 
 
 @kernel
 def _move_carefully(
-    n: int,
-    obstacles_move: bool,
-    data: State,
-    scene: Surroundings,
-    motion: Dynamics,
-    scratch: Scratch,
+    n: int, obstacles_move: bool, scene: Surroundings, part: Part
 ) -> None:
     """Move the obstacles of one world, and the robots that may meet something; let these drift.
 
     Without contact, such a robot moves exactly as in `move_freely`.
     """
-    meets = scratch.nearby.meets
-    stops = scratch.tight.stops
-    dq = scratch.single.dq
+    data = part.data
+    motion = part.motion
+    single = part.scratch.single
+    tight = part.scratch.tight
+    meets = part.scratch.nearby.meets
+    stops = tight.stops
     period = motion.dt * motion.substeps
     world = World(
         data.bodies[n],
         data.velocity[n],
         data.velocity.shape[1],
         scene,
-        scratch.nearby,
-        scratch.tight,
+        part.scratch.nearby,
+        tight,
         data.collided[n],
         motion.series,
         period,
@@ -437,12 +402,13 @@ def _move_carefully(
     stops[:] = period
     for m in range(meets.shape[0]):
         if meets[m] != FREE:
-            contacts.put_body(data.bodies, n, world.first + m, data.pose[n, m])
-            scratch.tight.motions[m].room = 0.0
+            contacts.put_body(world.bodies[world.first + m], data.pose[n, m])
+            tight.motions[m].room = 0.0
     for j in range(motion.substeps):
         for m in range(meets.shape[0]):
             if meets[m] != FREE:
-                compute_rates(n, m, j, data, motion, scratch.single)
+                compute_rates(n, m, j, data, motion, single)
+                dq = single.dq
                 contacts.start_motion(m, dq[0], dq[1], dq[2], world)
                 for s in range(data.state.shape[2]):
                     now = data.state[n, m, s]
@@ -451,21 +417,6 @@ def _move_carefully(
                         now, dq[3 + s], motion.dt, bounds
                     )
         contacts.advance(j * motion.dt, motion.dt, obstacles_move, world)
-    _drift_carefully(n, data, motion, world)
-    for m in range(meets.shape[0]):
-        if meets[m] != FREE:
-            for i in range(3):
-                data.pose[n, m, i] = world.bodies[world.first + m, i]
-            data.pose[n, m, 2] = robot.wrap(data.pose[n, m, 2])
-    for k in range(world.first if obstacles_move else 0):
-        if stops[k] < period:
-            for i in range(3):
-                data.velocity[n, k, i] *= stops[k] / period
-
-
-@kernel
-def _drift_carefully(n: int, data: State, motion: Dynamics, world: World) -> None:
-    meets = world.nearby.meets
     drifts = False
     for m in range(meets.shape[0]):
         if meets[m] != FREE:
@@ -474,21 +425,16 @@ def _drift_carefully(n: int, data: State, motion: Dynamics, world: World) -> Non
             drifts = drifts or ahead != 0.0 or left != 0.0 or turn != 0.0
     if drifts:
         contacts.advance(motion.substeps * motion.dt, 1.0, False, world)
-
-
-@kernel
-def _drift_freely(n: int, m: int, data: State, motion: Dynamics) -> None:
-    """Let a robot drift that can meet nothing; wrap its heading."""
-    pose = data.pose[n, m]
-    pose[2] = robot.wrap(pose[2])
-    ahead, left, turn = draw_drift(n, m, data, motion)
-    if ahead != 0.0 or left != 0.0 or turn != 0.0:
-        c = math.cos(pose[2])
-        s = math.sin(pose[2])
-        pose[0], pose[1], _, _ = robot.move(
-            pose[0], pose[1], c, s, ahead, left, turn, 1.0, motion.series
-        )
-        pose[2] = robot.wrap(pose[2] + turn)
+    for m in range(meets.shape[0]):
+        if meets[m] != FREE:
+            body = world.bodies[world.first + m]
+            data.pose[n, m, 0] = body[X]
+            data.pose[n, m, 1] = body[Y]
+            data.pose[n, m, 2] = robot.wrap(body[HEADING])
+    for k in range(world.first if obstacles_move else 0):
+        if stops[k] < period:
+            for i in range(3):
+                data.velocity[n, k, i] *= stops[k] / period
 
 
 @kernel
@@ -637,13 +583,3 @@ def _apply_commands(
                 )
                 lanes.x[size + c, lane] = data.history[n, m, row, c]
     return next_change
-
-
-@kernel(inline=True)
-def _take_free_motion(n: int, m: int, lane: int, data: State, lanes: Lanes) -> None:
-    """Copy pose and state of a robot from its lane."""
-    data.pose[n, m, 0] = lanes.pose[LANE_X, lane]
-    data.pose[n, m, 1] = lanes.pose[LANE_Y, lane]
-    data.pose[n, m, 2] = lanes.pose[LANE_HEADING, lane]
-    for s in range(data.state.shape[2]):
-        data.state[n, m, s] = lanes.x[s, lane]

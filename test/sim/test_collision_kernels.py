@@ -57,11 +57,12 @@ def body(index, pose):
 
 
 def solid(index, pose):
-    return kernels.solid_of(body(index, pose), ARRAYS)
+    return kernels.solid_of(0, body(index, pose), ARRAYS)
 
 
 def gap(one, other, limit=np.inf):
-    return kernels.body_gap(one, other, ARRAYS, limit, LISTED)
+    pair = (kernels.solid_of(0, body, ARRAYS) for body in (one, other))
+    return kernels.find_gap(*pair, limit, 0.0, LISTED)
 
 
 @pytest.mark.slow
@@ -102,9 +103,7 @@ def test_the_clearance_to_a_straight_wall_is_that_of_shapely(index):
         wall = rng.uniform(-1.0, 1.0, 4)
         line = geometry.LineString([wall[:2], wall[2:]])
         expected = solid_of(SHAPES[index], pose).distance(line) - radius(SHAPES[index])
-        found, _ = kernels.wall_gap(
-            solid(index, pose), wall[None], np.inf, 0.0, LISTED, 0
-        )
+        found = kernels.wall_gap(solid(index, pose), wall[None], np.inf, 0.0, LISTED)
         if expected > 0.0:
             assert found == pytest.approx(expected, abs=1e-9)
         else:
@@ -127,8 +126,7 @@ def test_the_clearance_to_a_map_is_that_of_shapely(index):
         expected -= radius(SHAPES[index])
         there = solid(index, pose)
         found, at_once = (
-            kernels.map_gap(there, known, limit, 0.0, LISTED, 0)[0]
-            for limit in (np.inf, 0.0)
+            kernels.map_gap(there, known, limit, 0.0, LISTED) for limit in (np.inf, 0.0)
         )
         assert kernels.map_bound(body(index, pose), known) <= max(expected, 0.0) + 1e-6
         if expected > 0.0:
@@ -144,7 +142,7 @@ def test_where_there_is_no_map_nothing_is_near():
     there = body(0, [0.0, 0.0, 0.0])
     assert kernels.map_bound(there, NO_FIELD) == np.inf
     solid_there = solid(0, [0.0, 0.0, 0.0])
-    assert kernels.map_gap(solid_there, NO_FIELD, 1.0, 0.0, LISTED, 0) == (1.0, 0)
+    assert kernels.map_gap(solid_there, NO_FIELD, 1.0, 0.0, LISTED) == 1.0
 
 
 @pytest.mark.parametrize("index", range(len(SHAPES) - 1))
@@ -155,9 +153,9 @@ def test_touches_are_nearest_points_and_lead_away_from_what_is_touched(index):
     for _ in range(60):
         pose = rng.uniform(-0.6, 0.6, 3) * [1.0, 1.0, 4.0]
         wall = np.array([-1.0, -0.5, 1.0, -0.5])
-        least, count = kernels.wall_gap(
-            solid(index, pose), wall[None], 1.0, skin, LISTED, 0
-        )
+        LISTED.number[0] = 0
+        least = kernels.wall_gap(solid(index, pose), wall[None], 1.0, skin, LISTED)
+        count = LISTED.number[0]
         listed = LISTED.touches[:count]
         assert (listed["gap"] >= least).all()
         assert (listed["ny"] * (listed["y"] + 0.5) >= 0.0).all()
