@@ -113,18 +113,8 @@ def _frame_of(world: World, cell: float) -> _Frame:
 
 def _enclose(made: GridMap, half: Array) -> None:
     """Occupy everything outside a field, given half its size (2,) [m]."""
-    is_turned = made.origin[2] != 0.0
-    if is_turned:
-        centres = made.cell_to_world(_cell_indices(made.cells))
-        made.cells[(np.abs(centres) > half).any(axis=-1)] = OCCUPIED
-        return
-    # x depends on the column alone, and y on the row alone
-    rows = np.arange(made.cells.shape[0])
-    columns = np.arange(made.cells.shape[1])
-    x = made.cell_to_world(np.stack([0 * columns, columns], axis=-1))[:, 0]
-    y = made.cell_to_world(np.stack([rows, 0 * rows], axis=-1))[:, 1]
-    made.cells[np.abs(y) > half[1]] = OCCUPIED
-    made.cells[:, np.abs(x) > half[0]] = OCCUPIED
+    centres = made.cell_to_world(_cell_indices(made.cells))
+    made.cells[(np.abs(centres) > half).any(axis=-1)] = OCCUPIED
 
 
 def _cell_indices(cells: NDArray[Any]) -> NDArray[np.int_]:

@@ -2,12 +2,13 @@
 
 Every number is drawn from its own counter, so a seed's scene is the same in any batch. Obstacles
 are placed one by one where they overlap nothing, in cells known to be free, then starts and goals
-in pairs; if that fails, with fresh numbers. Shared arguments: `source` and `counter` are those of
-the next draw, `plan` is the ScenePlan, `scratch` the SceneScratch, `disc` a body without corners.
+in pairs; if that fails, with fresh numbers.
 """
 
 import math
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.kernels import kernel
@@ -32,7 +33,7 @@ from nics_drl_bridge.sim.collision_kernels import (
     find_added_around,
     limit_found,
 )
-from nics_drl_bridge.sim.state import BodyCells, MapField, Touches
+from nics_drl_bridge.sim.state import BodyCells, MapField, Records, Touches
 
 TRIES = 2000
 RESTARTS = 50
@@ -42,10 +43,37 @@ MARGIN = 1e-9  # Minimum distance of obstacles from walls and from each other [m
 DRAWN = 0
 NO_OBSTACLES = 1
 NO_ROBOTS = 2
-# columns of a group
-LEAST, GREATEST, GAP, FIRST_SHAPE, SHAPES, FIXED, MOVING, GROUP = range(8)
-X1, Y1, X2, Y2, LEAST_HEADING, GREATEST_HEADING, SHARE, PLACE = range(8)
-"""Columns of a place: a region [m], headings [rad], cumulative fraction of the places up to it."""
+
+GROUP = np.dtype(
+    [
+        ("least", np.int64),  # number of obstacles
+        ("greatest", np.int64),
+        ("gap", np.float64),  # [m]
+        ("first_shape", np.int64),  # in `ScenePlan.choices`
+        ("shapes", np.int64),
+        ("is_fixed", np.bool_),
+        ("moves", np.bool_),
+    ],
+    align=True,
+)
+"""A group of obstacles."""
+
+PLACE = np.dtype(
+    [
+        ("x1", np.float64),  # region [m]
+        ("y1", np.float64),
+        ("x2", np.float64),
+        ("y2", np.float64),
+        ("least_heading", np.float64),  # [rad]
+        ("greatest_heading", np.float64),
+        ("share", np.float64),  # cumulative fraction of the places up to it
+    ],
+    align=True,
+)
+"""A place of starts or goals."""
+
+DRAWS = np.dtype([("source", np.uint64), ("counter", np.int64)], align=True)
+"""The next draw of a scene, see `random_kernels.uniform_of`."""
 
 
 class FreeSpace(NamedTuple):
@@ -70,13 +98,13 @@ class ScenePlan(NamedTuple):
     space: FreeSpace
     outlines: exact_kernels.OutlineArrays  # of all shapes, the last of which is a disc
     radii: Array  # (H,) of the circles around them [m]
-    groups: Array  # (G, GROUP)
+    groups: Records  # (G,) of `GROUP`
     group: Integers  # (K,) of each obstacle
     choices: Integers  # shapes that each group may take, one group after the other
     variants: Integers  # (S, H) index of each shape in each size
     poses: Array  # (K, 3) of the obstacles at fixed poses
-    starts: Array  # (P, PLACE); no rows for anywhere
-    goals: Array  # (P, PLACE)
+    starts: Records  # (P,) of `PLACE`; none for anywhere
+    goals: Records  # (P,) of `PLACE`
     footprint: float  # radius of a robot [m]
     clearance: float  # [m]
     least: float  # distance of a goal from its start [m]
@@ -88,6 +116,7 @@ class ScenePlan(NamedTuple):
 class SceneScratch(NamedTuple):
     """Scratch memory of one call; threads may draw at the same time."""
 
+    draws: Records  # (1,) of `DRAWS`
     seen: Integers  # (rows * columns,) number of the search that last visited each cell
     stack: Integers  # (2, rows * columns) cells to visit, from either end
     latest: Integers  # (1,) number of the latest search
@@ -211,7 +240,7 @@ def _is_clear(
     near = scratch.cells.found
     for i in range(find_added_around(0, x, y, disc[RADIUS] + room, scratch.cells)):
         k = near[i]
-        counts = moving or plan.groups[plan.group[k], MOVING] == 0.0
+        counts = moving or not plan.groups[plan.group[k]].moves
         counts = counts and bodies[k, RADIUS] > 0.0
         if counts and not _clear_of(
             disc, bodies[k], room, plan.outlines, scratch.listed
@@ -302,19 +331,25 @@ def _is_joined(
 
 
 @kernel
-def _point(
-    source: int, counter: int, chosen: ShortIntegers, cells: MapField
+def _draw(scratch: SceneScratch) -> float:
+    """Draw the next number of the scene, uniform from 0 to below 1."""
+    draws = scratch.draws[0]
+    draws.counter += 1
+    return uniform_of(draws.source, draws.counter - 1)
+
+
+@kernel
+def _draw_point(
+    chosen: ShortIntegers, cells: MapField, scratch: SceneScratch
 ) -> tuple[float, float]:
-    """Draw a point in one of the chosen cells, given by row-major indices; take 3 counters."""
-    cell = int(uniform_of(source, counter) * chosen.shape[0])
+    """Draw a point in one of the chosen cells, given by row-major indices."""
+    cell = int(_draw(scratch) * chosen.shape[0])
     # if all cells are allowed, the look-up would only miss the cache
     if chosen.shape[0] < cells.distances.size:
         cell = chosen[cell]
-    i = cell // cells.distances.shape[1]
-    j = cell % cells.distances.shape[1]
-    return place_in(
-        i + uniform_of(source, counter + 1), j + uniform_of(source, counter + 2), cells
-    )
+    row = cell // cells.distances.shape[1] + _draw(scratch)
+    column = cell % cells.distances.shape[1] + _draw(scratch)
+    return place_in(row, column, cells)
 
 
 @kernel
@@ -324,57 +359,44 @@ def _put(
     body[X] = x
     body[Y] = y
     body[HEADING] = heading
-    body[COS], body[SIN] = math.cos(heading), math.sin(heading)
+    body[COS] = math.cos(heading)
+    body[SIN] = math.sin(heading)
     body[RADIUS] = plan.radii[shape]
     body[SHAPE] = shape
 
 
 @kernel
-def _choose(
-    source: int,
-    wanted: int,
-    size: int,
-    plan: ScenePlan,
-    bodies: Array,
-    active: Mask,
-) -> int:
-    groups = plan.groups
-    counter = 0
+def _choose_obstacles(
+    wanted: int, size: int, plan: ScenePlan, bodies: Array, scratch: SceneScratch
+) -> None:
+    """Draw which obstacles the scene has, and the shape of each."""
     total = 0
     before = 0
     k = 0
-    for g in range(groups.shape[0]):
-        if groups[g, FIXED] == 0.0:
-            total += int(groups[g, GREATEST])
-    for g in range(groups.shape[0]):
-        least = int(groups[g, LEAST])
-        greatest = int(groups[g, GREATEST])
-        count = least + int(uniform_of(source, counter) * (greatest - least + 1))
-        counter += 1
-        if groups[g, FIXED] == 0.0:
+    for group in plan.groups:
+        if not group.is_fixed:
+            total += group.greatest
+    for group in plan.groups:
+        span = group.greatest - group.least + 1
+        count = group.least + int(_draw(scratch) * span)
+        if not group.is_fixed:
             if wanted >= 0:  # each group gets its share
                 most = min(wanted, total)
-                after = before + greatest
-                count = (most * after + total // 2) // total - (
-                    most * before + total // 2
-                ) // total
-            before += greatest
-        first = int(groups[g, FIRST_SHAPE])
-        shapes = int(groups[g, SHAPES])
-        for number in range(greatest):
-            taken = plan.choices[first + int(uniform_of(source, counter) * shapes)]
-            counter += 1
-            active[k] = number < count
+                up_to = most * before + total // 2
+                count = (up_to + most * group.greatest) // total - up_to // total
+            before += group.greatest
+        for number in range(group.greatest):
+            choice = group.first_shape + int(_draw(scratch) * group.shapes)
+            scratch.active[k] = number < count
             bodies[k, :] = 0.0
-            bodies[k, COS], bodies[k, SHAPE] = 1.0, plan.variants[size, taken]
+            bodies[k, COS] = 1.0
+            bodies[k, SHAPE] = plan.variants[size, plan.choices[choice]]
             k += 1
-    return counter
 
 
 @kernel
-def _place_obstacles(
-    source: int, counter: int, plan: ScenePlan, bodies: Array, scratch: SceneScratch
-) -> tuple[int, bool]:
+def _place_obstacles(plan: ScenePlan, bodies: Array, scratch: SceneScratch) -> bool:
+    """Place the obstacles of the scene; return True if there was space for all of them."""
     space = plan.space
     outlines = plan.outlines
     gaps = scratch.gaps
@@ -384,26 +406,24 @@ def _place_obstacles(
     clear_cells(0, cells)
     for k in range(bodies.shape[0]):
         group = plan.groups[plan.group[k]]
-        shape = int(bodies[k, SHAPE])
-        gaps[k] = max(group[GAP], MARGIN)
+        gaps[k] = max(group.gap, MARGIN)
         widest = max(widest, gaps[k])
         bodies[k, RADIUS] = 0.0
-        if group[FIXED] > 0.0:
+        if group.is_fixed:
             pose = plan.poses[k]
+            shape = int(bodies[k, SHAPE])
             _put(bodies[k], pose[0], pose[1], pose[2], shape, plan)
             add_to_cells(0, k, bodies[k], cells)
     for k in range(bodies.shape[0]):
-        if plan.groups[plan.group[k], FIXED] > 0.0 or not scratch.active[k]:
+        if plan.groups[plan.group[k]].is_fixed or not scratch.active[k]:
             continue
         shape = int(bodies[k, SHAPE])
         heading = 0.0
         placed = False
         for _ in range(TRIES):
-            x, y = _point(source, counter, space.for_anything, space.cells)
-            counter += 3
+            x, y = _draw_point(space.for_anything, space.cells, scratch)
             if outlines.first[shape] < outlines.first[shape + 1]:
-                heading = (2.0 * uniform_of(source, counter) - 1.0) * math.pi
-                counter += 1
+                heading = (2.0 * _draw(scratch) - 1.0) * math.pi
             _put(trial, x, y, heading, shape, plan)
             placed = _is_apart(k, widest, plan, bodies, scratch) and _clear_of_walls(
                 trial, MARGIN, plan, scratch.listed
@@ -413,8 +433,8 @@ def _place_obstacles(
                 add_to_cells(0, k, bodies[k], cells)
                 break
         if not placed:
-            return counter, False
-    return counter, True
+            return False
+    return True
 
 
 @kernel
@@ -436,23 +456,39 @@ def _is_apart(
 
 
 @kernel
-def _spot(
-    source: int, counter: int, places: Array, space: FreeSpace
+def _draw_place(
+    places: Records, space: FreeSpace, scratch: SceneScratch
 ) -> tuple[float, float, float]:
-    """Draw x, y, heading of a start or goal in one of the places; take 4 counters."""
-    turn = uniform_of(source, counter + 3)
+    """Draw x, y, heading of a start or goal in one of the places."""
     if places.shape[0] == 0:
-        x, y = _point(source, counter, space.for_robots, space.cells)
-        return x, y, (2.0 * turn - 1.0) * math.pi
-    share = uniform_of(source, counter)
+        x, y = _draw_point(space.for_robots, space.cells, scratch)
+        return x, y, (2.0 * _draw(scratch) - 1.0) * math.pi
+    share = _draw(scratch)
     p = 0
-    while p < places.shape[0] - 1 and share >= places[p, SHARE]:
+    while p < places.shape[0] - 1 and share >= places[p].share:
         p += 1
     place = places[p]
-    x = place[X1] + uniform_of(source, counter + 1) * (place[X2] - place[X1])
-    y = place[Y1] + uniform_of(source, counter + 2) * (place[Y2] - place[Y1])
-    spread = place[GREATEST_HEADING] - place[LEAST_HEADING]
-    return x, y, place[LEAST_HEADING] + turn * spread
+    x = place.x1 + _draw(scratch) * (place.x2 - place.x1)
+    y = place.y1 + _draw(scratch) * (place.y2 - place.y1)
+    spread = place.greatest_heading - place.least_heading
+    return x, y, place.least_heading + _draw(scratch) * spread
+
+
+@kernel
+def _draw_goal(
+    x: float, y: float, plan: ScenePlan, scratch: SceneScratch
+) -> tuple[float, float]:
+    """Draw a goal, for some worlds uniformly in the ring around the start."""
+    if not plan.around:
+        gx, gy, _ = _draw_place(plan.goals, plan.space, scratch)
+        return gx, gy
+    least = plan.least
+    greatest = plan.greatest
+    turn = 2.0 * math.pi * _draw(scratch)
+    share = _draw(scratch)
+    scratch.draws[0].counter += 2  # as many as a place takes
+    far = math.sqrt(least * least + share * (greatest * greatest - least * least))
+    return x + far * math.cos(turn), y + far * math.sin(turn)
 
 
 @kernel
@@ -466,52 +502,29 @@ def _apart(x: float, y: float, others: Array, m: int, least: float) -> bool:
 
 
 @kernel
-def _goal_of(
-    source: int, counter: int, x: float, y: float, plan: ScenePlan
-) -> tuple[float, float]:
-    """Draw a goal, for some worlds uniformly in the ring around the start; take 4 counters."""
-    if not plan.around:
-        gx, gy, _ = _spot(source, counter, plan.goals, plan.space)
-        return gx, gy
-    least = plan.least
-    greatest = plan.greatest
-    turn = 2.0 * math.pi * uniform_of(source, counter)
-    share = uniform_of(source, counter + 1)
-    far = math.sqrt(least * least + share * (greatest * greatest - least * least))
-    return x + far * math.cos(turn), y + far * math.sin(turn)
-
-
-@kernel
 def _place_robots(
-    source: int,
-    counter: int,
     plan: ScenePlan,
     bodies: Array,
     starts: Array,
     goals: Array,
     scratch: SceneScratch,
-) -> tuple[int, bool]:
+) -> bool:
+    """Draw a start and a goal for each robot; return True if there are some for all of them."""
     between = 2.0 * plan.footprint + plan.clearance
     for m in range(starts.shape[0]):
         placed = False
         detours = 0
         for _ in range(TRIES):
-            x, y, heading = _spot(source, counter, plan.starts, plan.space)
-            counter += 4
-            if area_of(x, y, plan.space) == 0 or not _is_free(
-                x, y, plan, bodies, scratch
-            ):
+            x, y, heading = _draw_place(plan.starts, plan.space, scratch)
+            area = area_of(x, y, plan.space)
+            if area == 0 or not _is_free(x, y, plan, bodies, scratch):
                 continue
-            gx, gy = _goal_of(source, counter, x, y, plan)
-            counter += 4
+            gx, gy = _draw_goal(x, y, plan, scratch)
             distance2 = (gx - x) * (gx - x) + (gy - y) * (gy - y)
             fits = plan.least * plan.least <= distance2 <= plan.greatest * plan.greatest
-            fits = fits and area_of(gx, gy, plan.space) == area_of(x, y, plan.space)
-            fits = (
-                fits
-                and _apart(x, y, starts, m, between)
-                and _apart(gx, gy, goals, m, between)
-            )
+            fits = fits and area_of(gx, gy, plan.space) == area
+            fits = fits and _apart(x, y, starts, m, between)
+            fits = fits and _apart(gx, gy, goals, m, between)
             if not (fits and _is_free(gx, gy, plan, bodies, scratch)):
                 continue
             if not _is_joined(x, y, gx, gy, plan, bodies, scratch):
@@ -527,8 +540,8 @@ def _place_robots(
             placed = True
             break
         if not placed:
-            return counter, False
-    return counter, True
+            return False
+    return True
 
 
 @kernel
@@ -560,37 +573,34 @@ def draw_scenes(
     count = plan.group.shape[0]
     s = scratch
     # the scratch memory may be sized for another world with more obstacles
-    cells = limit_found(scratch.cells, count)
+    cells = limit_found(s.cells, count)
     scratch = SceneScratch(
-        s.seen, s.stack, s.latest, s.active, s.gaps, s.trial, s.disc, s.listed, cells
+        s.draws,
+        s.seen,
+        s.stack,
+        s.latest,
+        s.active,
+        s.gaps,
+        s.trial,
+        s.disc,
+        s.listed,
+        cells,
     )
     cover_square(0, plan.square[0], plan.square[1], plan.square[2], cells)
     _put(s.disc, 0.0, 0.0, 0.0, plan.radii.shape[0] - 1, plan)
     s.disc[RADIUS] = plan.footprint
     for n in range(seeds.shape[0]):
         state = NO_OBSTACLES
-        source = random.source(seeds[n], random.SCENE_STREAM)
-        counter = _choose(
-            source, wanted[n], sizes[n], plan, bodies[n, :count], scratch.active
-        )
+        obstacles = bodies[n, :count]
+        scratch.draws[0].source = random.source(seeds[n], random.SCENE_STREAM)
+        scratch.draws[0].counter = 0
+        _choose_obstacles(wanted[n], sizes[n], plan, obstacles, scratch)
         for _ in range(RESTARTS):
-            counter, placed = _place_obstacles(
-                source, counter, plan, bodies[n, :count], scratch
-            )
-            if placed:
+            if _place_obstacles(plan, obstacles, scratch):
                 state = NO_ROBOTS
-                counter, placed = _place_robots(
-                    source,
-                    counter,
-                    plan,
-                    bodies[n, :count],
-                    starts[n],
-                    goals[n],
-                    scratch,
-                )
-            if placed:
-                state = DRAWN
-                break
+                if _place_robots(plan, obstacles, starts[n], goals[n], scratch):
+                    state = DRAWN
+                    break
         if state != DRAWN:
             return n, state
     return seeds.shape[0], DRAWN

@@ -28,7 +28,7 @@ from nics_drl_bridge.seeds import check_seeds
 from nics_drl_bridge.sim import scene_kernels as kernels
 from nics_drl_bridge.sim.collision_kernels import FEWEST, body_cells
 from nics_drl_bridge.sim.scene_kernels import FreeSpace, ScenePlan, SceneScratch
-from nics_drl_bridge.sim.state import NO_FIELD, MapField, allocate_touches
+from nics_drl_bridge.sim.state import NO_FIELD, MapField, Records, allocate_touches
 from nics_drl_bridge.sim.world import Goals, Motion, Starts, World, check_places
 from nics_drl_bridge.sim.world_set import AnyWorld
 
@@ -299,19 +299,17 @@ def _plan(
         catalogue.spaces[alike] = _free_space(world, footprint, drawn)
     space = catalogue.spaces[alike]
     outlines = catalogue.outlines
-    groups = np.zeros((len(world.obstacles), kernels.GROUP))
+    groups = np.zeros(len(world.obstacles), kernels.GROUP)
     choices: list[int] = []
     poses = np.zeros((len(slots), 3))
     for g, group in enumerate(world.obstacles):
-        fixed = float(bool(group.at))
-        moving = float(group.motion is not None)
         groups[g] = (
             *group.counts,
             group.gap,
             len(choices),
             len(group.shapes),
-            fixed,
-            moving,
+            bool(group.at),
+            group.motion is not None,
         )
         choices += [catalogue.place[shape] for shape in group.shapes]
         if group.at:
@@ -339,24 +337,23 @@ def _plan(
     )
 
 
-def _places(places: Starts | Goals | None) -> Array:
+def _places(places: Starts | Goals | None) -> Records:
     if places is None:
-        return np.zeros((0, kernels.PLACE))
-    rows = np.zeros((len(places.at) + len(places.regions), kernels.PLACE))
-    for row, at in zip(rows, places.at, strict=False):
-        row[:2] = at[:2]
-        row[2:4] = at[:2]
-        row[4:6] = at[2] if len(at) > 2 else 0.0
-    for row, (x1, y1, x2, y2) in zip(rows, places.regions, strict=False):
-        row[:6] = min(x1, x2), min(y1, y2), max(x1, x2), max(y1, y2), -math.pi, math.pi
-    sizes = (rows[:, 2] - rows[:, 0]) * (rows[:, 3] - rows[:, 1])
+        return np.zeros(0, kernels.PLACE)
+    rows = [(*at[:2], *at[:2], *(at[2:] or (0.0,)) * 2, 0.0) for at in places.at]
+    for x1, y1, x2, y2 in places.regions:
+        low = min(x1, x2), min(y1, y2)
+        rows.append((*low, max(x1, x2), max(y1, y2), -math.pi, math.pi, 0.0))
+    array = np.array(rows, kernels.PLACE)
+    sizes = (array["x2"] - array["x1"]) * (array["y2"] - array["y1"])
     shares = sizes if sizes.all() else np.ones(len(rows))
-    rows[:, kernels.SHARE] = np.cumsum(shares) / shares.sum()
-    return rows
+    array["share"] = np.cumsum(shares) / shares.sum()
+    return array
 
 
 def _scratch(cells: int, count: int) -> SceneScratch:
     return SceneScratch(
+        np.zeros(1, kernels.DRAWS),
         np.zeros(cells, np.int64),
         np.zeros((2, cells), np.int64),
         np.zeros(1, np.int64),

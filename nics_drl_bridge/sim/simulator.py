@@ -245,7 +245,10 @@ class FastSimulator:
                 f"{threads}; a longest_delay of at least the model's {model.timing.delay} substeps "
                 f"and a longest_age of at least 0, not {delay} and {longest_age}."
             )
-        check_robots(robots, world.source)
+        if robots > MOST_ROBOTS:
+            raise ConfigError(
+                f"{world.source} with {robots:.10g} robots: a world may have {MOST_ROBOTS}."
+            )
         if randomisation is not None and not isinstance(randomisation, Randomisation):
             randomisation = load_randomisation(randomisation)
         check_speed(model.kinematics, model.robot, world)
@@ -269,7 +272,8 @@ class FastSimulator:
         self.goals: Array = np.zeros((worlds, robots, 2))
         self.drawn: dict[str, NDArray[Any]] = {}
         self.readings = unread(model.sensors, worlds, robots)
-        self.parts = split(worlds, threads)
+        edges = np.arange(min(threads, worlds) + 1) * worlds // min(threads, worlds)
+        self.parts = tuple(slice(*ends) for ends in itertools.pairwise(edges.tolist()))
         self._command_range = CommandRange(model.kinematics, model.robot, tell)
 
     def reset(
@@ -370,7 +374,7 @@ class FastSimulator:
         obstacles = self.data.bodies[0, : self.sampler.count]
         obstacles[:] = bodies
         obstacles[:, SHAPE] = self._in_table[bodies[:, SHAPE].astype(np.int64)]
-        self._sort_first_world()
+        step_kernels.sort_worlds(self.packed[0], 0, 1)
 
     def put_robot(self, robot: int, pose: Array, state: Array) -> None:
         """Put a robot of the first world at a pose (3,) with a state (S,); odometry stays.
@@ -384,7 +388,7 @@ class FastSimulator:
         past[:, TRUE_TWIST : TRUE_TWIST + 3] = 0.0
         body = place(pose, self.footprint.radius, self._in_table[-1])
         self.data.bodies[0, self.sampler.count + robot] = body
-        self._sort_first_world()
+        step_kernels.sort_worlds(self.packed[0], 0, 1)
 
     def sort_bodies(self) -> None:
         """Sort the bodies of all worlds into cells again, after `data` was written from outside."""
@@ -427,18 +431,28 @@ class FastSimulator:
     @cached_property
     def packed(self) -> dict[int, Any]:
         """The kernels' argument for each part, by the part's first world."""
-        cells = allocate_cells(self._sizes, self._world_set)
+        world_set = self._world_set
+        sizes = self._sizes
+        timing = self.model.timing
+        motion = records.Dynamics(
+            make_terms(self.model.kinematics),
+            SERIES,
+            float(timing.dt),
+            int(timing.substeps),
+        )
+        # Without cells, all bodies are tested, which takes less time if they are few.
+        sorted_worlds = sizes.worlds if world_set.crowded or world_set.standing else 0
+        cells = body_cells(
+            sorted_worlds, sizes.robots + sizes.obstacles, world_set.standing
+        )
         packed = {}
         for part in self.parts:
+            scratch = _allocate_scratch(
+                self.model, sizes, cells, part.stop - part.start
+            )
             packed[part.start] = pack(
-                allocate_part(
-                    self.data,
-                    self._world_set,
-                    self.model,
-                    self._scanner,
-                    self._sizes,
-                    cells,
-                    part,
+                records.Part(
+                    self.data, world_set, self._scanner.arguments, motion, scratch
                 )
             )
             step_kernels.sort_worlds(packed[part.start], part.start, part.stop)
@@ -505,19 +519,13 @@ class FastSimulator:
     def _apply_draws(self, chosen: Indices, draws: Draws) -> None:
         """Give the worlds the numbers that a randomisation drew."""
         data = self.data
-        data.coefficient[chosen] = draws.coefficient
-        data.noise[chosen] = draws.noise
-        data.delay[chosen] = draws.delay
-        data.age[chosen] = draws.age
-        data.faults[chosen] = draws.faults
+        for name in ("coefficient", "noise", "delay", "age", "faults"):
+            getattr(data, name)[chosen] = getattr(draws, name)
         for name, values in draws.named().items():
             if name not in self.drawn:
                 shape = (len(data.steps), *values.shape[1:])
                 self.drawn[name] = np.zeros(shape, values.dtype)
             self.drawn[name][chosen] = values
-
-    def _sort_first_world(self) -> None:
-        step_kernels.sort_worlds(self.packed[0], 0, 1)
 
     def _check_commands(self, part: slice, commands: ArrayLike) -> Array:
         """Return commands (n, M, C) as an array; report those outside the range of the fit."""
@@ -592,14 +600,6 @@ def count_periods(substeps: int, model: SimulatorModel) -> int:
     return -(-substeps // model.timing.substeps)
 
 
-def check_robots(robots: int, source: str) -> None:
-    """Raise ConfigError for more robots than a world may have."""
-    if robots > MOST_ROBOTS:
-        raise ConfigError(
-            f"{source} with {robots:.10g} robots: a world may have {MOST_ROBOTS} robots."
-        )
-
-
 def check_memory(model: SimulatorModel, sizes: Sizes, source: str) -> None:
     """Raise ConfigError, before anything is allocated, for more worlds than fit in memory."""
     per_robot = (
@@ -649,12 +649,6 @@ def allocate_state(model: SimulatorModel, sizes: Sizes) -> records.State:
     )
 
 
-def split(worlds: int, threads: int) -> tuple[slice, ...]:
-    """Split N worlds into contiguous parts of nearly equal size, one per thread."""
-    edges = np.arange(min(threads, worlds) + 1) * worlds // min(threads, worlds)
-    return tuple(slice(int(a), int(b)) for a, b in itertools.pairwise(edges))
-
-
 def stack_members(
     worlds: Sequence[World],
     motions: Sequence[Sequence[Motion | None]],
@@ -693,13 +687,10 @@ def stack_members(
 
 def _share_equal_maps(grids: Sequence[GridMap | None]) -> list[GridMap | None]:
     """Return one object for all maps of equal content, which is then baked and stored once."""
-    distinct: dict[Any, GridMap] = {}
-    shared: list[GridMap | None] = []
+    distinct: dict[Any, GridMap | None] = {}
+    shared = []
     for grid in grids:
-        if grid is None:
-            shared.append(None)
-            continue
-        content = (
+        content = grid and (
             grid.cells.shape,
             grid.resolution,
             grid.origin,
@@ -718,12 +709,6 @@ def map_field(grid: GridMap | None) -> records.MapField:
     )
 
 
-def allocate_cells(sizes: Sizes, world_set: WorldSetArrays) -> records.BodyCells:
-    """Allocate the cells of all worlds, none if testing all bodies takes less time."""
-    worlds = sizes.worlds if world_set.crowded or world_set.standing else 0
-    return body_cells(worlds, sizes.robots + sizes.obstacles, world_set.standing)
-
-
 def _stack_plans(
     motions: Sequence[Sequence[Motion | None]],
 ) -> tuple[records.Records, Array]:
@@ -737,30 +722,8 @@ def _stack_plans(
     return plans, waypoints
 
 
-def allocate_part(
-    data: records.State,
-    world_set: WorldSetArrays,
-    model: SimulatorModel,
-    scanner: Scanner,
-    sizes: Sizes,
-    cells: records.BodyCells,
-    part: slice,
-) -> records.Part:
-    """Return the kernels' arguments for one part of the worlds, with its own scratch memory."""
-    timing = model.timing
-    motion = records.Dynamics(
-        make_terms(model.kinematics), SERIES, float(timing.dt), int(timing.substeps)
-    )
-    scratch = _allocate_scratch(model, scanner, sizes, cells, part.stop - part.start)
-    return records.Part(data, world_set, scanner.arguments, motion, scratch)
-
-
 def _allocate_scratch(
-    model: SimulatorModel,
-    scanner: Scanner,
-    sizes: Sizes,
-    cells: records.BodyCells,
-    worlds: int,
+    model: SimulatorModel, sizes: Sizes, cells: records.BodyCells, worlds: int
 ) -> records.Scratch:
     """Allocate the memory of a thread that steps so many worlds."""
     kinematics = model.kinematics
