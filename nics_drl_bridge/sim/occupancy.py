@@ -4,9 +4,9 @@
 
 1. `_frame_of`: choose the cells. They are aligned with the world's own map if it has one, cover the
    field, its walls and the map, and leave a border of one cell around them.
-2. `_enclose`: occupy every cell whose centre lies outside a walled field.
-3. `_copy_map`: copy the world's own map. Each of its cells becomes a square of smaller cells.
-4. `_mark_line`: occupy the cells along each wall, found by points much closer than a cell.
+2. Occupy every cell whose centre lies outside a walled field.
+3. Copy the world's own map.
+4. Occupy the cells along each wall, found by points much closer than a cell.
 5. `_fill`: occupy the cells whose centre lies in an obstacle. A part thinner than a cell may
    contain no centre; there, the cells along its outline are occupied, and of a disc its middle.
 
@@ -64,12 +64,19 @@ def occupancy(
     origin = compose(frame.pose, [*(frame.first * frame.cell), 0.0])
     cells = np.full(frame.size, FREE, np.int8)
     made = GridMap(cells, frame.cell, tuple(origin.tolist()))
-    if world.size is not None:
-        _enclose(made, np.array(world.size) / 2.0)
-    if world.grid is not None:
-        _copy_map(made, world.grid, frame.first)
+    if world.size is not None:  # closed around the field
+        centres = made.cell_to_world(_cell_indices(cells))
+        cells[(np.abs(centres) > np.array(world.size) / 2.0).any(axis=-1)] = OCCUPIED
+    if world.grid is not None:  # each cell of the map becomes a square of smaller cells
+        parts = round(world.grid.resolution / made.resolution)
+        copied = world.grid.cells.repeat(parts, axis=0).repeat(parts, axis=1)
+        column, row = -frame.first
+        into = cells[row : row + copied.shape[0], column : column + copied.shape[1]]
+        into[:] = np.where(into == OCCUPIED, into, copied)
     for wall in np.array(world.walls, np.float64).reshape(-1, 2, 2):
-        _mark_line(made, wall)
+        index = made.world_to_cell(_along(wall, made.resolution))
+        index = index[_is_within(index, cells)]
+        cells[index[:, 0], index[:, 1]] = OCCUPIED
     for shape, pose in obstacles:
         _fill(made, shape, np.asarray(pose, np.float64))
     return made
@@ -111,31 +118,9 @@ def _frame_of(world: World, cell: float) -> _Frame:
     return _Frame(pose, first, (int(rows), int(columns)), cell)
 
 
-def _enclose(made: GridMap, half: Array) -> None:
-    """Occupy everything outside a field, given half its size (2,) [m]."""
-    centres = made.cell_to_world(_cell_indices(made.cells))
-    made.cells[(np.abs(centres) > half).any(axis=-1)] = OCCUPIED
-
-
 def _cell_indices(cells: NDArray[Any]) -> NDArray[np.int_]:
     """Row and column (rows, columns, 2) of every cell of a grid (rows, columns)."""
     return np.moveaxis(np.indices(cells.shape), 0, -1)
-
-
-def _copy_map(made: GridMap, grid: GridMap, first: NDArray[np.int_]) -> None:
-    """Copy a world's own map (see `_Frame.first`), except where cells are occupied already."""
-    parts = round(grid.resolution / made.resolution)
-    cells = grid.cells.repeat(parts, axis=0).repeat(parts, axis=1)
-    column, row = -first
-    into = made.cells[row : row + cells.shape[0], column : column + cells.shape[1]]
-    into[:] = np.where(into == OCCUPIED, into, cells)
-
-
-def _mark_line(made: GridMap, ends: Array) -> None:
-    """Occupy the cells that a straight line between two ends (2, 2) runs through [m]."""
-    index = made.world_to_cell(_along(ends, made.resolution))
-    index = index[_is_within(index, made.cells)]
-    made.cells[index[:, 0], index[:, 1]] = OCCUPIED
 
 
 def _is_within(index: NDArray[np.int_], cells: NDArray[Any]) -> Mask:

@@ -483,22 +483,15 @@ def read_sdf(
     left_out = tuple(
         f"model {name!r} has {', '.join(what)}" for name, what in unknown.items()
     )
-    if left_out and not skip_unknown:
-        more = f" (as {len(left_out) - 1} more models)" if len(left_out) > 1 else ""
-        fix = "leave it out by --skip-unknown or --without MODEL, or put a box in its place"
-        raise AssetsError(
-            path,
-            f": {left_out[0]}{more}, which a world can't hold; {fix}.",
-            next(iter(unknown)) in missing,
-        )
     shapes = seen - sum(map(len, unknown.values()))
-    if left_out and not shapes and not may_be_empty:
-        reason = f"contains nothing that a world can hold ({left_out[0]})"
-        raise AssetsError(
-            path,
-            f": {reason}; put a box in its place.",
-            next(iter(unknown)) in missing,
-        )
+    if left_out and not (skip_unknown and (shapes or may_be_empty)):
+        fix = "put a box in its place"
+        if not skip_unknown:
+            fix = f"leave it out by --skip-unknown or --without MODEL, or {fix}"
+        more = f" (as {len(left_out) - 1} more models)" if len(left_out) > 1 else ""
+        reason = f"{left_out[0]}{more}, which a world can't hold"
+        is_missing = next(iter(unknown)) in missing
+        raise AssetsError(path, f": {reason}; {fix}.", is_missing)
     if not placed and not may_be_empty:
         reason = f"none of its {shapes} collision geometries stands at a height of {height:g} m"
         raise SdfError(path, f": {reason}; choose another --height.")
@@ -600,18 +593,17 @@ def _found(uri: str, file: Path) -> Path | None:
         path = folder / name
         if name and path.is_file():
             return path
-        if name and path.is_dir():
-            return _model_in(path)
+        if not (name and path.is_dir()):
+            continue
+        # the SDF of the newest version
+        config = path / "model.config"
+        listed = list(_tree(config).iterfind("sdf")) if config.is_file() else []
+        versions = [_version(sdf.get("version", "")) for sdf in listed]
+        newest = "model.sdf"
+        if listed:
+            newest = (listed[versions.index(max(versions))].text or "").strip()
+        return path / newest if (path / newest).is_file() else None
     return None
-
-
-def _model_in(folder: Path) -> Path | None:
-    """The SDF of the newest version in a model's folder."""
-    config = folder / "model.config"
-    listed = list(_tree(config).iterfind("sdf")) if config.is_file() else []
-    newest = max(listed, key=lambda sdf: _version(sdf.get("version", "")), default=None)
-    file = folder / ("model.sdf" if newest is None else (newest.text or "").strip())
-    return file if file.is_file() else None
 
 
 def _version(text: str) -> tuple[int, ...]:
