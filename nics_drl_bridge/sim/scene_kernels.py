@@ -118,7 +118,7 @@ class SceneScratch(NamedTuple):
 
     draws: Records  # (1,) of `DRAWS`
     seen: Integers  # (rows * columns,) number of the search that last visited each cell
-    stack: Integers  # (2, rows * columns) cells to visit, from either end
+    stack: Integers  # (rows * columns,) cells to visit
     latest: Integers  # (1,) number of the latest search
     active: Mask  # (K,) obstacles of the scene
     gaps: Array  # (K,) free space around each obstacle [m]
@@ -270,41 +270,32 @@ def _is_joined(
 ) -> bool:
     """True if a robot can move between two points of an area, from cell to cell.
 
-    Searches from both ends, each towards the other first: where there is no path, one end is often
-    enclosed and its search ends soon. The cells of both points count as free.
+    Of the cells beside the present one, the nearest to the goal is visited first. The cells of both
+    points count as free.
     """
     cells = plan.space.cells
     label = plan.space.area
     room = plan.space.room - plan.footprint
     seen = scratch.seen
     stack = scratch.stack
-    latest = scratch.latest
     rows, columns = label.shape
     i, j, _ = cell_of(x, y, cells)
     gi, gj, _ = cell_of(gx, gy, cells)
     area = label[i, j]
-    start = i * columns + j
-    goal = gi * columns + gj
-    if start == goal:
-        return True
-    latest[0] += 2
-    blocked = -latest[0]  # a mark of either side's search
-    stack[0, 0] = start
-    stack[1, 0] = goal
-    seen[start], seen[goal] = latest[0], latest[0] + 1
-    # of the stack of this side, and of that of the other one
+    scratch.latest[0] += 1
+    latest = scratch.latest[0]
+    seen[i * columns + j] = latest
+    stack[0] = i * columns + j
     height = 1
-    other_height = 1
-    side = 0
     while height > 0:
         height -= 1
-        cell = stack[side, height]
-        i = cell // columns
-        j = cell % columns
-        ti, tj = (gi, gj) if side == 0 else (start // columns, start % columns)
-        up = 1 if ti >= i else -1
-        right = 1 if tj >= j else -1
-        steep = abs(ti - i) >= abs(tj - j)
+        i = stack[height] // columns
+        j = stack[height] % columns
+        if i == gi and j == gj:
+            return True
+        up = 1 if gi >= i else -1
+        right = 1 if gj >= j else -1
+        steep = abs(gi - i) >= abs(gj - j)
         for way in range(4):  # the last one is popped first
             toward = 1 if way > 1 else -1
             along = (way == 0 or way == 3) == steep
@@ -312,21 +303,15 @@ def _is_joined(
             column = j + (0 if along else toward * right)
             if not (0 <= row < rows and 0 <= column < columns):
                 continue
-            new = row * columns + column
-            if seen[new] == latest[0] + 1 - side:
-                return True
-            if (
-                label[row, column] != area
-                or seen[new] == latest[0] + side
-                or seen[new] == blocked
-            ):
+            cell = row * columns + column
+            if label[row, column] != area or seen[cell] == latest:
                 continue
+            seen[cell] = latest
             cx, cy = place_in(row + 0.5, column + 0.5, cells)
-            free = _is_clear(cx, cy, room, False, plan, bodies, scratch)
-            seen[new] = latest[0] + side if free else blocked
-            stack[side, height] = new
-            height += int(free)
-        height, other_height, side = other_height, height, 1 - side
+            is_goal = row == gi and column == gj
+            if is_goal or _is_clear(cx, cy, room, False, plan, bodies, scratch):
+                stack[height] = cell
+                height += 1
     return False
 
 

@@ -355,7 +355,7 @@ def _scratch(cells: int, count: int) -> SceneScratch:
     return SceneScratch(
         np.zeros(1, kernels.DRAWS),
         np.zeros(cells, np.int64),
-        np.zeros((2, cells), np.int64),
+        np.zeros(cells, np.int64),
         np.zeros(1, np.int64),
         np.zeros(count, np.bool_),
         np.zeros(count),
