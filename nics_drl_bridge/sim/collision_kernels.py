@@ -9,8 +9,7 @@ touches, which adds to those that it holds.
 
 Bodies may be sorted into square cells, so that those around a point are found without testing all.
 A body lies in the cell of its centre. One that moves or is larger than a cell is in no cell and is
-always found. The outermost cells reach to infinity. Bodies are either sorted all at once, so that
-neighbouring cells are contiguous, or added one by one to a chain per cell.
+always found. The outermost cells reach to infinity.
 """
 
 import math
@@ -34,7 +33,6 @@ LEFT, BOTTOM, PER_METRE, SIDE, LARGEST, MOVED, FRAME = range(7)
 """Columns of `BodyCells.frame`: x, y of the first cell [m], cells per metre, cells in a row,
 maximum radius of the bodies in cells [m], maximum distance moved since by any of them [m]."""
 PER_BODY = 1.0  # Cells
-FEWEST = 20  # with fewer bodies, testing all takes less time than cells
 
 OVERLAP = 1e-12  # minimum overlap [m]
 FLOAT32 = 1e-6  # Relative rounding error of the distances of a map
@@ -97,7 +95,12 @@ def solid_of(k: int, body: Array, outlines: OutlineArrays) -> Solid:
 
 @kernel
 def from_segment(
-    x: float, y: float, ax: float, ay: float, bx: float, by: float
+    x: float,
+    y: float,
+    ax: float,
+    ay: float,
+    bx: float,
+    by: float,
 ) -> tuple[float, float]:
     """Return the vector to (x, y) from the nearest point of the segment (ax, ay) to (bx, by)."""
     ex = bx - ax
@@ -113,7 +116,12 @@ def from_segment(
 
 @kernel
 def segment_distance2(
-    x: float, y: float, ax: float, ay: float, bx: float, by: float
+    x: float,
+    y: float,
+    ax: float,
+    ay: float,
+    bx: float,
+    by: float,
 ) -> float:
     """Square of the distance from (x, y) to the segment from (ax, ay) to (bx, by) [m^2]."""
     dx, dy = from_segment(x, y, ax, ay, bx, by)
@@ -217,7 +225,11 @@ def _measure_origin(x: float, y: float, solid: Solid) -> float:
 
 @kernel
 def find_gap(
-    one: Solid, other: Solid, limit: float, skin: float, listed: Touches
+    one: Solid,
+    other: Solid,
+    limit: float,
+    skin: float,
+    listed: Touches,
 ) -> float:
     """Clearance of a solid from another one, up to `limit`, see the module."""
     limit = max(limit, 0.0)
@@ -282,7 +294,11 @@ def _contain(one: Solid, other: Solid, x: float, y: float, c: float, s: float) -
 
 @kernel
 def wall_gap(
-    one: Solid, walls: Array, limit: float, skin: float, listed: Touches
+    one: Solid,
+    walls: Array,
+    limit: float,
+    skin: float,
+    listed: Touches,
 ) -> float:
     """Clearance of a solid from straight walls (W, 4), see the module."""
     corners = walls.reshape((-1, 2))
@@ -362,7 +378,11 @@ def map_bound(body: Array, grid: MapField) -> float:
 
 @kernel
 def map_gap(
-    one: Solid, grid: MapField, limit: float, skin: float, listed: Touches
+    one: Solid,
+    grid: MapField,
+    limit: float,
+    skin: float,
+    listed: Touches,
 ) -> float:
     """Clearance of a solid from the solid cells of a map, see the module."""
     if grid.distances.size == 0:
@@ -413,39 +433,9 @@ def body_cells(worlds: int, bodies: int, ordered: bool = False) -> BodyCells:
     return cells
 
 
-@kernel(view=True)
-def limit_found(cells: BodyCells, count: int) -> BodyCells:
-    """Return cells whose list of all bodies ends after some of them."""
-    c = cells
-    return BodyCells(c.first, c.then, c.ordered, c.frame, c.found[:count])
-
-
 @kernel(inline=True)
 def _place(way: float, cells_per_metre: float, side: float) -> int:
     return int(min(max(way * cells_per_metre, 0.0), side - 1.0))
-
-
-@kernel
-def cover_square(
-    n: int, low_x: float, low_y: float, extent: float, cells: BodyCells
-) -> None:
-    """Place the empty cells of a world on a square with the corner (low_x, low_y)."""
-    if cells.first.shape[0] > 0:
-        frame = cells.frame[n]
-        frame[LEFT] = low_x
-        frame[BOTTOM] = low_y
-        frame[PER_METRE] = 1.0
-        if 0.0 < extent < np.inf:
-            frame[PER_METRE] = frame[SIDE] / extent
-        clear_cells(n, cells)
-
-
-@kernel
-def clear_cells(n: int, cells: BodyCells) -> None:
-    """Empty the cells of a world."""
-    if cells.first.shape[0] > 0:
-        cells.first[n, :] = -1
-        cells.frame[n, LARGEST] = cells.frame[n, MOVED] = 0.0
 
 
 @kernel(inline=True)
@@ -456,15 +446,6 @@ def _cell(body: Array, stands: bool, frame: Array) -> int:
     frame[LARGEST] = max(frame[LARGEST], body[RADIUS])
     row = _place(body[Y] - frame[BOTTOM], frame[PER_METRE], side)
     return row * side + _place(body[X] - frame[LEFT], frame[PER_METRE], side)
-
-
-@kernel
-def add_to_cells(n: int, k: int, body: Array, cells: BodyCells) -> None:
-    """Add a body (7,) to the chain of its cell."""
-    if cells.first.shape[0] > 0:
-        cell = _cell(body, True, cells.frame[n])
-        cells.then[n, k] = cells.first[n, cell]
-        cells.first[n, cell] = k
 
 
 @kernel
@@ -480,10 +461,17 @@ def sort_into_cells(n: int, bodies: Array, standing: int, cells: BodyCells) -> N
             high_x = max(high_x, bodies[k, X])
             low_y = min(low_y, bodies[k, Y])
             high_y = max(high_y, bodies[k, Y])
-    cover_square(n, low_x, low_y, max(high_x - low_x, high_y - low_y, 1e-6), cells)
+    extent = max(high_x - low_x, high_y - low_y, 1e-6)
+    frame = cells.frame[n]
+    frame[LEFT] = low_x
+    frame[BOTTOM] = low_y
+    frame[PER_METRE] = 1.0
+    if extent < np.inf:
+        frame[PER_METRE] = frame[SIDE] / extent
+    frame[LARGEST] = 0.0
+    frame[MOVED] = 0.0
     first = cells.first[n]
     cell_of = cells.found
-    frame = cells.frame[n]
     then = cells.then[0 if cells.ordered else n]
     first[:] = 0
     for k in range(bodies.shape[0]):
@@ -512,7 +500,11 @@ def _copy(body: Array, to: Array) -> None:
 
 @kernel
 def put_in_order(
-    n: int, bodies: Array, standing: int, spare: Array, cells: BodyCells
+    n: int,
+    bodies: Array,
+    standing: int,
+    spare: Array,
+    cells: BodyCells,
 ) -> None:
     """Sort the first `standing` bodies (K, 7) themselves, absent ones last; no others may move.
 
@@ -534,64 +526,30 @@ def put_in_order(
     first[end] = bodies.shape[0]  # the absent, and those that move, are always found
 
 
-@kernel(inline=True)
-def _window(
-    n: int, x: float, y: float, reach: float, cells: BodyCells
-) -> tuple[int, int, int, int]:
-    """Return minimum and maximum row, then column, of the cells around a place."""
-    frame = cells.frame[n]
-    per_metre = cells.frame[n, PER_METRE]
-    side = cells.frame[n, SIDE]
-    far = reach + frame[LARGEST] + frame[MOVED]
-    x = x - frame[LEFT]
-    y = y - frame[BOTTOM]
-    low = _place(y - far, per_metre, side)
-    high = _place(y + far, per_metre, side)
-    return low, high, _place(x - far, per_metre, side), _place(x + far, per_metre, side)
-
-
 @kernel
 def find_around(n: int, x: float, y: float, reach: float, cells: BodyCells) -> int:
     """Write the sorted bodies that may be within `reach` [m] to `cells.found`; return how many."""
     first = cells.first
-    then = cells.then
-    nearby = cells.found
-    count = 0
+    found = cells.found
     if first.shape[0] == 0:
-        return nearby.shape[0]  # which lists all bodies
-    low, high, left, right = _window(n, x, y, reach, cells)
-    side = int(cells.frame[n, SIDE])
-    for row in range(low, high + 1):
-        for i in range(first[n, row * side + left], first[n, row * side + right + 1]):
-            nearby[count] = i if cells.ordered else then[n, i]
-            count = count + 1
-    for i in range(first[n, side * side], first[n, side * side + 1]):
-        nearby[count] = i if cells.ordered else then[n, i]
-        count = count + 1
-    return count
-
-
-@kernel
-def find_added_around(
-    n: int, x: float, y: float, reach: float, cells: BodyCells
-) -> int:
-    """Do the same as `find_around` for bodies that were added one by one."""
-    first = cells.first
-    then = cells.then
-    nearby = cells.found
+        return found.shape[0]  # which lists all bodies
+    frame = cells.frame[n]
+    per_metre = frame[PER_METRE]
+    side = int(frame[SIDE])
+    far = reach + frame[LARGEST] + frame[MOVED]
+    x = x - frame[LEFT]
+    y = y - frame[BOTTOM]
+    left = _place(x - far, per_metre, side)
+    right = _place(x + far, per_metre, side)
+    high = _place(y + far, per_metre, side)
     count = 0
-    if first.shape[0] == 0:
-        return nearby.shape[0]
-    low, high, left, right = _window(n, x, y, reach, cells)
-    side = int(cells.frame[n, SIDE])
-    for row in range(low, high + 2):
+    for row in range(_place(y - far, per_metre, side), high + 2):
         begin = row * side + left
         end = row * side + right
-        if row > high:  # the chain of bodies in no cell
+        if row > high:  # those in no cell
             begin = side * side
-            end = side * side
-        for cell in range(begin, end + 1):
-            k = first[n, cell]
-            while k >= 0:
-                nearby[count], k, count = k, then[n, k], count + 1
+            end = begin
+        for i in range(first[n, begin], first[n, end + 1]):
+            found[count] = i if cells.ordered else cells.then[n, i]
+            count += 1
     return count

@@ -126,7 +126,12 @@ def _bound_speed(body: Array, vx: float, vy: float, turn: float, world: World) -
 
 @kernel
 def _turn_off(
-    motion: Record, body: Array, time: float, vx: float, vy: float, turn: float
+    motion: Record,
+    body: Array,
+    time: float,
+    vx: float,
+    vy: float,
+    turn: float,
 ) -> None:
     """Let a robot go on with another twist from where it stands."""
     motion.x = body[X]
@@ -366,7 +371,12 @@ def advance(begin: float, duration: float, obstacles_move: bool, world: World) -
 
 @kernel
 def find_near(
-    n: int, m: int, bodies: Array, scene: Surroundings, nearby: Nearby, cells: BodyCells
+    n: int,
+    m: int,
+    bodies: Array,
+    scene: Surroundings,
+    nearby: Nearby,
+    cells: BodyCells,
 ) -> int:
     """Return flags of what robot m of world n may meet; write row m of `nearby.near`."""
     near = nearby.near
@@ -409,7 +419,11 @@ def find_near(
 
 @kernel
 def move_obstacles(
-    bodies: Array, start: Array, velocity: Array, n: int, time: float
+    bodies: Array,
+    start: Array,
+    velocity: Array,
+    n: int,
+    time: float,
 ) -> None:
     """Move the obstacles of world n to `time` [s] after their poses `start` (K, 3)."""
     for k in range(velocity.shape[1]):

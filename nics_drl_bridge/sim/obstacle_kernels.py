@@ -102,7 +102,11 @@ def reset_marks(n: int, data: State, plans: Records) -> None:
 
 @kernel
 def steer(
-    n: int, data: State, scene: Surroundings, period: float, speeds: Array
+    n: int,
+    data: State,
+    scene: Surroundings,
+    period: float,
+    speeds: Array,
 ) -> None:
     """Set the obstacles' velocities for a period [s]; `speeds` (M, 2) are the robots' [m/s].
 
@@ -151,7 +155,12 @@ def steer(
 
 @kernel
 def _follow(
-    mark: Record, body: Array, row: Record, waypoints: Array, period: float, keep: bool
+    mark: Record,
+    body: Array,
+    row: Record,
+    waypoints: Array,
+    period: float,
+    keep: bool,
 ) -> tuple[float, float]:
     """Displacement of a patrol along its path in a period; `keep` stores its progress."""
     index = mark.index
@@ -222,7 +231,11 @@ def repulsion(
 
 @kernel
 def _from_bodies(
-    k: int, ex: float, ey: float, marks: Records, traffic: Traffic
+    k: int,
+    ex: float,
+    ey: float,
+    marks: Records,
+    traffic: Traffic,
 ) -> tuple[float, float]:
     bodies = traffic.bodies
     first = traffic.first
@@ -301,7 +314,12 @@ def _from_walls(k: int, traffic: Traffic) -> tuple[float, float]:
 
 @kernel
 def _new_goal(
-    mark: Record, k: int, traffic: Traffic, seed: int, counter: int, step: int
+    mark: Record,
+    k: int,
+    traffic: Traffic,
+    seed: int,
+    counter: int,
+    step: int,
 ) -> None:
     body = traffic.bodies[k]
     field = traffic.field
@@ -327,7 +345,12 @@ def _new_goal(
 
 @kernel
 def _walk(
-    marks: Records, k: int, traffic: Traffic, seed: int, counter: int, step: int
+    marks: Records,
+    k: int,
+    traffic: Traffic,
+    seed: int,
+    counter: int,
+    step: int,
 ) -> tuple[float, float]:
     """Return the next velocity of walker k in `map` [m/s], after fewer than `DRAWS` draws."""
     mark = marks[k]
@@ -427,7 +450,12 @@ def clearance(x: float, y: float, k: int, traffic: Traffic) -> float:
 
 @kernel
 def _hold(
-    dx: float, dy: float, nx: float, ny: float, room: float, bend: bool
+    dx: float,
+    dy: float,
+    nx: float,
+    ny: float,
+    room: float,
+    bend: bool,
 ) -> tuple[float, float]:
     """Limit a displacement to `room` along n: bend it, or shorten the whole."""
     ahead = dx * nx + dy * ny
@@ -441,7 +469,11 @@ def _hold(
 
 @kernel
 def _hold_bodies(
-    dx: float, dy: float, k: int, traffic: Traffic, bend: bool
+    dx: float,
+    dy: float,
+    k: int,
+    traffic: Traffic,
+    bend: bool,
 ) -> tuple[float, float]:
     bodies = traffic.bodies
     first = traffic.first
@@ -482,7 +514,11 @@ def _hold_bodies(
 
 @kernel
 def _hold_walls(
-    dx: float, dy: float, body: Array, traffic: Traffic, bend: bool
+    dx: float,
+    dy: float,
+    body: Array,
+    traffic: Traffic,
+    bend: bool,
 ) -> tuple[float, float]:
     x = body[X]
     y = body[Y]
@@ -508,7 +544,11 @@ def _hold_walls(
 
 @kernel
 def _hold_map(
-    dx: float, dy: float, body: Array, grid: MapField, bend: bool
+    dx: float,
+    dy: float,
+    body: Array,
+    grid: MapField,
+    bend: bool,
 ) -> tuple[float, float]:
     x = body[X]
     y = body[Y]
@@ -546,7 +586,11 @@ def _hold_map(
 
 @kernel
 def restrain(
-    dx: float, dy: float, k: int, traffic: Traffic, bends: bool
+    dx: float,
+    dy: float,
+    k: int,
+    traffic: Traffic,
+    bends: bool,
 ) -> tuple[float, float]:
     """Return the part of a displacement [m] that obstacle k can make; with `bends` it slides."""
     body = traffic.bodies[k]

@@ -322,7 +322,11 @@ class Sampler:
 
 
 def _between(
-    bounds: Bounds, seeds: Integers, robots: int, group: int, column: int = 0
+    bounds: Bounds,
+    seeds: Integers,
+    robots: int,
+    group: int,
+    column: int = 0,
 ) -> Array:
     """Draw (n, M, Q) numbers between bounds (Q,), for the columns of a group from one on."""
     drawn = np.empty((len(seeds), robots, len(bounds[0])))

@@ -26,13 +26,7 @@ from nics_drl_bridge.lidar.exact_kernels import (
 )
 from nics_drl_bridge.random_kernels import uniform_of
 from nics_drl_bridge.sim import collision_kernels as collision
-from nics_drl_bridge.sim.collision_kernels import (
-    add_to_cells,
-    clear_cells,
-    cover_square,
-    find_added_around,
-    limit_found,
-)
+from nics_drl_bridge.sim.collision_kernels import find_around, sort_into_cells
 from nics_drl_bridge.sim.state import BodyCells, MapField, Records, Touches
 
 TRIES = 2000
@@ -110,7 +104,6 @@ class ScenePlan(NamedTuple):
     least: float  # distance of a goal from its start [m]
     greatest: float
     around: bool  # True to draw goals around their starts
-    square: Array  # (3,) minimum x, minimum y, side of a square over the field [m]
 
 
 class SceneScratch(NamedTuple):
@@ -125,7 +118,7 @@ class SceneScratch(NamedTuple):
     trial: Array  # (7,) an obstacle
     disc: Array  # (7,) a robot
     listed: Touches
-    cells: BodyCells  # of the obstacles that are placed
+    cells: BodyCells  # of the obstacles, once all are placed
 
 
 @kernel
@@ -210,7 +203,11 @@ def _clear_of_walls(body: Array, room: float, plan: ScenePlan, listed: Touches) 
 
 @kernel(inline=True)
 def _clear_of(
-    body: Array, obstacle: Array, room: float, outlines: OutlineArrays, listed: Touches
+    body: Array,
+    obstacle: Array,
+    room: float,
+    outlines: OutlineArrays,
+    listed: Touches,
 ) -> bool:
     dx = body[X] - obstacle[X]
     dy = body[Y] - obstacle[Y]
@@ -237,11 +234,10 @@ def _is_clear(
     disc = scratch.disc
     disc[X] = x
     disc[Y] = y
-    near = scratch.cells.found
-    for i in range(find_added_around(0, x, y, disc[RADIUS] + room, scratch.cells)):
-        k = near[i]
+    cells = scratch.cells
+    for i in range(find_around(0, x, y, disc[RADIUS] + room, cells)):
+        k = cells.found[i]
         counts = moving or not plan.groups[plan.group[k]].moves
-        counts = counts and bodies[k, RADIUS] > 0.0
         if counts and not _clear_of(
             disc, bodies[k], room, plan.outlines, scratch.listed
         ):
@@ -251,7 +247,11 @@ def _is_clear(
 
 @kernel
 def _is_free(
-    x: float, y: float, plan: ScenePlan, bodies: Array, scratch: SceneScratch
+    x: float,
+    y: float,
+    plan: ScenePlan,
+    bodies: Array,
+    scratch: SceneScratch,
 ) -> bool:
     return _is_clear(
         x, y, plan.clearance, True, plan, bodies, scratch
@@ -339,7 +339,12 @@ def _draw_point(
 
 @kernel
 def _put(
-    body: Array, x: float, y: float, heading: float, shape: int, plan: ScenePlan
+    body: Array,
+    x: float,
+    y: float,
+    heading: float,
+    shape: int,
+    plan: ScenePlan,
 ) -> None:
     body[X] = x
     body[Y] = y
@@ -352,7 +357,11 @@ def _put(
 
 @kernel
 def _choose_obstacles(
-    wanted: int, size: int, plan: ScenePlan, bodies: Array, scratch: SceneScratch
+    wanted: int,
+    size: int,
+    plan: ScenePlan,
+    bodies: Array,
+    scratch: SceneScratch,
 ) -> None:
     """Draw which obstacles the scene has, and the shape of each."""
     total = 0
@@ -386,19 +395,14 @@ def _place_obstacles(plan: ScenePlan, bodies: Array, scratch: SceneScratch) -> b
     outlines = plan.outlines
     gaps = scratch.gaps
     trial = scratch.trial
-    cells = scratch.cells
-    widest = MARGIN
-    clear_cells(0, cells)
     for k in range(bodies.shape[0]):
         group = plan.groups[plan.group[k]]
         gaps[k] = max(group.gap, MARGIN)
-        widest = max(widest, gaps[k])
         bodies[k, RADIUS] = 0.0
         if group.is_fixed:
             pose = plan.poses[k]
             shape = int(bodies[k, SHAPE])
             _put(bodies[k], pose[0], pose[1], pose[2], shape, plan)
-            add_to_cells(0, k, bodies[k], cells)
     for k in range(bodies.shape[0]):
         if plan.groups[plan.group[k]].is_fixed or not scratch.active[k]:
             continue
@@ -410,12 +414,11 @@ def _place_obstacles(plan: ScenePlan, bodies: Array, scratch: SceneScratch) -> b
             if outlines.first[shape] < outlines.first[shape + 1]:
                 heading = (2.0 * _draw(scratch) - 1.0) * math.pi
             _put(trial, x, y, heading, shape, plan)
-            placed = _is_apart(k, widest, plan, bodies, scratch) and _clear_of_walls(
+            placed = _is_apart(k, plan, bodies, scratch) and _clear_of_walls(
                 trial, MARGIN, plan, scratch.listed
             )
             if placed:
                 _put(bodies[k], x, y, heading, shape, plan)
-                add_to_cells(0, k, bodies[k], cells)
                 break
         if not placed:
             return False
@@ -423,18 +426,14 @@ def _place_obstacles(plan: ScenePlan, bodies: Array, scratch: SceneScratch) -> b
 
 
 @kernel
-def _is_apart(
-    k: int, widest: float, plan: ScenePlan, bodies: Array, scratch: SceneScratch
-) -> bool:
+def _is_apart(k: int, plan: ScenePlan, bodies: Array, scratch: SceneScratch) -> bool:
+    """True if the trial of obstacle k keeps its gap from those that are placed."""
     trial = scratch.trial
     gaps = scratch.gaps
-    near = scratch.cells.found
-    reach = trial[RADIUS] + widest
-    for i in range(find_added_around(0, trial[X], trial[Y], reach, scratch.cells)):
-        obstacle = bodies[near[i]]
-        gap = max(gaps[k], gaps[near[i]])
-        if obstacle[RADIUS] > 0.0 and not _clear_of(
-            trial, obstacle, gap, plan.outlines, scratch.listed
+    for j in range(bodies.shape[0]):
+        gap = max(gaps[k], gaps[j])
+        if bodies[j, RADIUS] > 0.0 and not _clear_of(
+            trial, bodies[j], gap, plan.outlines, scratch.listed
         ):
             return False
     return True
@@ -556,24 +555,9 @@ def draw_scenes(
     """
     plan: ScenePlan = packed.content
     count = plan.group.shape[0]
-    s = scratch
-    # the scratch memory may be sized for another world with more obstacles
-    cells = limit_found(s.cells, count)
-    scratch = SceneScratch(
-        s.draws,
-        s.seen,
-        s.stack,
-        s.latest,
-        s.active,
-        s.gaps,
-        s.trial,
-        s.disc,
-        s.listed,
-        cells,
-    )
-    cover_square(0, plan.square[0], plan.square[1], plan.square[2], cells)
-    _put(s.disc, 0.0, 0.0, 0.0, plan.radii.shape[0] - 1, plan)
-    s.disc[RADIUS] = plan.footprint
+    disc = scratch.disc
+    _put(disc, 0.0, 0.0, 0.0, plan.radii.shape[0] - 1, plan)
+    disc[RADIUS] = plan.footprint
     for n in range(seeds.shape[0]):
         state = NO_OBSTACLES
         obstacles = bodies[n, :count]
@@ -582,6 +566,7 @@ def draw_scenes(
         _choose_obstacles(wanted[n], sizes[n], plan, obstacles, scratch)
         for _ in range(RESTARTS):
             if _place_obstacles(plan, obstacles, scratch):
+                sort_into_cells(0, obstacles, count, scratch.cells)
                 state = NO_ROBOTS
                 if _place_robots(plan, obstacles, starts[n], goals[n], scratch):
                     state = DRAWN

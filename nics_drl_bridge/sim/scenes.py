@@ -26,7 +26,7 @@ from nics_drl_bridge.lidar.shapes import (
 )
 from nics_drl_bridge.seeds import check_seeds
 from nics_drl_bridge.sim import scene_kernels as kernels
-from nics_drl_bridge.sim.collision_kernels import FEWEST, body_cells
+from nics_drl_bridge.sim.collision_kernels import body_cells
 from nics_drl_bridge.sim.scene_kernels import FreeSpace, ScenePlan, SceneScratch
 from nics_drl_bridge.sim.state import NO_FIELD, MapField, Records, allocate_touches
 from nics_drl_bridge.sim.world import Goals, Motion, Starts, World, check_places
@@ -333,7 +333,6 @@ def _plan(
         least,
         greatest,
         around,
-        _square_over(space.cells),
     )
 
 
@@ -362,18 +361,8 @@ def _scratch(cells: int, count: int) -> SceneScratch:
         np.zeros(BODY),
         np.zeros(BODY),
         allocate_touches(),
-        body_cells(1 if count >= FEWEST else 0, count),
+        body_cells(1, count),
     )
-
-
-def _square_over(field: MapField) -> Array:
-    """Minimum x, minimum y and side (3,) of a square that covers a field [m]."""
-    rows, columns = field.distances.shape
-    place = kernels.place_in.py_func  # type: ignore[attr-defined]
-    x, y = place(
-        np.array([0, 0, rows, rows]), np.array([0, columns, 0, columns]), field
-    )
-    return np.array([x.min(), y.min(), max(np.ptp(x), np.ptp(y))])
 
 
 def _free_space(world: World, footprint: float, drawn: bool) -> FreeSpace:

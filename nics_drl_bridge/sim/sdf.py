@@ -310,7 +310,11 @@ class _Scope:
                 self.strange.append((name, ShapelessError(body, missing=True)))
 
     def _add_model(
-        self, element: Element, file: Path, name: str, include: Element | None = None
+        self,
+        element: Element,
+        file: Path,
+        name: str,
+        include: Element | None = None,
     ) -> None:
         whole = f"{self.name}::{name}" if self.name else name
         if self._order.takes(whole):

@@ -137,7 +137,12 @@ def limit_lag(age: int, steps: int, rows: int, substeps: int) -> int:
 
 @kernel
 def interpolate_past(
-    past: Array, column: int, lag: int, steps: int, substeps: int, out: Array
+    past: Array,
+    column: int,
+    lag: int,
+    steps: int,
+    substeps: int,
+    out: Array,
 ) -> None:
     """Write what a robot recorded `lag` substeps before the end of period `steps` to `out` (3,).
 

@@ -497,7 +497,11 @@ class FastSimulator:
         )
 
     def _place_scenes(
-        self, chosen: Indices, seeds: Indices, scenes: Scenes, starts: Array
+        self,
+        chosen: Indices,
+        seeds: Indices,
+        scenes: Scenes,
+        starts: Array,
     ) -> None:
         """Put the robots at `starts` (n, M, 3) and the obstacles of the scenes, all at rest."""
         data = self.data

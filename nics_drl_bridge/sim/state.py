@@ -270,11 +270,9 @@ def allocate_touches() -> Touches:
 class BodyCells(NamedTuple):
     """The bodies of N worlds in G x G cells each; without rows, all bodies are always found."""
 
-    # (N, G^2 + 2) place in `then` of each cell's first body, those in no cell being the last; of
-    # chains the first body itself, or -1
+    # (N, G^2 + 2) place in `then` of each cell's first body, those in no cell being the last
     first: ShortIntegers
-    # (N, K) the bodies in the order of cells; of a chain the next, or -1. One row if the bodies
-    # themselves are put into that order
+    # (N, K) the bodies in the order of cells. One row if the bodies themselves are put into it
     then: ShortIntegers
     ordered: bool  # True if they are
     frame: Array  # (N, FRAME)

@@ -439,7 +439,12 @@ def _move_carefully(
 
 @kernel
 def compute_rates(
-    n: int, m: int, j: int, data: State, motion: Dynamics, single: Single
+    n: int,
+    m: int,
+    j: int,
+    data: State,
+    motion: Dynamics,
+    single: Single,
 ) -> None:
     """Write to `single.dq` the rates of robot m in substep j, by the command then in effect."""
     size = data.state.shape[2]
@@ -498,7 +503,11 @@ def draw_drift(
 
 @kernel
 def move_freely(
-    first_world: int, end_world: int, data: State, motion: Dynamics, lanes: Lanes
+    first_world: int,
+    end_world: int,
+    data: State,
+    motion: Dynamics,
+    lanes: Lanes,
 ) -> None:
     """Move the robots of worlds [first_world, end_world) for one period, as if nothing stood there.
 
@@ -527,7 +536,11 @@ def move_freely(
 
 @kernel(inline=True)
 def _fill_lanes(
-    first_world: int, end_world: int, data: State, motion: Dynamics, lanes: Lanes
+    first_world: int,
+    end_world: int,
+    data: State,
+    motion: Dynamics,
+    lanes: Lanes,
 ) -> None:
     """Copy poses, states and coefficients of robots to the lanes; note when commands change."""
     robots = data.pose.shape[1]

@@ -344,7 +344,11 @@ def check_places(world: World) -> None:
 
 
 def check_place(
-    what: str, world: World, x: float, y: float, radius: float = 0.0
+    what: str,
+    world: World,
+    x: float,
+    y: float,
+    radius: float = 0.0,
 ) -> None:
     """Raise ConfigError for a place off a world's field, or in a wall within a radius [m]."""
     solid = 0.0 if world.grid is None else world.grid.resolution  # room in a full cell

@@ -42,26 +42,6 @@ def test_every_body_that_comes_within_reach_is_found_once(count):
     assert some or count < 60
 
 
-def test_bodies_are_found_as_they_are_added():
-    cells = kernels.body_cells(1, 30)
-    bodies = bodies_at_random(np.random.default_rng(1), 30)
-    bodies[:, RADIUS] = np.where(np.arange(30) % 7, 0.1, 5.0)
-    kernels.cover_square(0, -10.0, -10.0, 20.0, cells)
-    for k in range(30):
-        assert (
-            k
-            not in cells.found[
-                : kernels.find_added_around(0, *bodies[k, :2], 0.0, cells)
-            ]
-        )
-        kernels.add_to_cells(0, k, bodies[k], cells)
-        assert (
-            k in cells.found[: kernels.find_added_around(0, *bodies[k, :2], 0.0, cells)]
-        )
-    kernels.clear_cells(0, cells)
-    assert kernels.find_added_around(0, 0.0, 0.0, 100.0, cells) == 0
-
-
 def test_bodies_that_are_put_in_order_are_the_same_and_found_among_those_that_move():
     rng = np.random.default_rng(2)
     cells = kernels.body_cells(2, 80, ordered=True)
@@ -82,8 +62,5 @@ def test_bodies_that_are_put_in_order_are_the_same_and_found_among_those_that_mo
 
 def test_without_cells_all_bodies_are_found():
     cells = kernels.body_cells(0, 5)
-    kernels.clear_cells(0, cells)
-    kernels.add_to_cells(0, 2, np.ones(7), cells)
-    for around in (kernels.find_around, kernels.find_added_around):
-        assert around(0, 50.0, 50.0, 0.1, cells) == 5
+    assert kernels.find_around(0, 50.0, 50.0, 0.1, cells) == 5
     assert cells.found.tolist() == [0, 1, 2, 3, 4]
