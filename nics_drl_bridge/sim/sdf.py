@@ -593,20 +593,22 @@ def _found(uri: str, file: Path) -> Path | None:
     for key in PATHS:
         listed = os.environ.get(key, "").split(os.pathsep)
         folders += [Path(entry) for entry in listed if entry]
-    for folder in folders:
-        path = folder / name
+    for parent in folders:
+        path = parent / name
         if name and path.is_file():
             return path
         if not (name and path.is_dir()):
             continue
         # the SDF of the newest version
         config = path / "model.config"
-        listed = list(_tree(config).iterfind("sdf")) if config.is_file() else []
-        versions = [_version(sdf.get("version", "")) for sdf in listed]
-        newest = "model.sdf"
-        if listed:
-            newest = (listed[versions.index(max(versions))].text or "").strip()
-        return path / newest if (path / newest).is_file() else None
+        versions: list[Element] = []
+        if config.is_file():
+            versions += _tree(config).iterfind("sdf")
+        newest = max(
+            versions, key=lambda sdf: _version(sdf.get("version", "")), default=None
+        )
+        found = path / ("model.sdf" if newest is None else (newest.text or "").strip())
+        return found if found.is_file() else None
     return None
 
 
