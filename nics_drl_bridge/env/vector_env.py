@@ -169,7 +169,9 @@ class BridgeVectorEnv(
             "bodies": self._bodies,
         }
         data = {
-            f"data.{name}": rows for name, rows in self.simulator.data._asdict().items()
+            # Tensors have no structures, so that checkpoints hold the numbers of these.
+            f"data.{name}": rows.view(np.int64) if rows.dtype.names else rows
+            for name, rows in self.simulator.data._asdict().items()
         }
         known = self._teacher.changing if self._teacher else {}
         return {**own, **data, **known, "goals": self.simulator.goals}
