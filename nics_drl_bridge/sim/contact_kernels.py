@@ -406,7 +406,10 @@ def find_near(
     near[m, 0] = count
     meets = BODIES if count > 0 else FREE
     for w in range(walls.shape[0]):
-        if collision.wall_distance2(x, y, walls[w]) <= own_reach * own_reach:
+        d2 = collision.segment_distance2(
+            x, y, walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3]
+        )
+        if d2 <= own_reach * own_reach:
             meets |= WALLS
             break
     if (

@@ -211,12 +211,12 @@ def _begin_period_of_world(n: int, first_lane: int, part: Part) -> None:
     """
     data = part.data
     speeds = part.scratch.nearby.speeds
-    rows = data.past.shape[2]
+    newest = data.steps[n] % data.past.shape[2]
     for m in range(data.pose.shape[1]):
         pose = data.pose[n, m]
         for i in range(3):
             part.scratch.scans.start_poses[first_lane + m, i] = pose[i]
-        row = data.past[n, m, data.steps[n] % rows]
+        row = data.past[n, m, newest]
         if data.steps[n] == 0:
             for i in range(3):
                 row[POSE + i] = pose[i]
