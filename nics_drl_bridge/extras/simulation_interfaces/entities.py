@@ -18,12 +18,21 @@ from nics_drl_bridge.extras.simulation_interfaces.host import (
     local_path,
     refused,
 )
+from nics_drl_bridge.extras.simulation_interfaces.models import (
+    TEXT,
+    Model,
+    model_of_sdf,
+    model_of_yaml,
+)
+from nics_drl_bridge.extras.simulation_interfaces.roster import (
+    NAME,
+    Entity,
+    OutsideError,
+)
 from nics_drl_bridge.extras.simulation_interfaces.state import Simulation
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.nodes import conversions, device_parameters
 from nics_drl_bridge.recording.messages import is_rotation
-from nics_drl_bridge.sim.entities import NAME, Entity, OutsideError
-from nics_drl_bridge.sim.models import TEXT, Model, model_of_sdf, model_of_yaml
 
 FAILED = Result.RESULT_OPERATION_FAILED
 INVALID_POSE = SetEntityState.Response.INVALID_POSE

@@ -15,7 +15,7 @@ from nics_drl_bridge.errors import (
     MissingFileError,
     UnknownNameError,
 )
-from nics_drl_bridge.sim.entities import UnknownEntityError
+from nics_drl_bridge.extras.simulation_interfaces.roster import UnknownEntityError
 from nics_drl_bridge.sim.sdf import AssetsError
 
 if TYPE_CHECKING:

@@ -12,8 +12,8 @@ from nics_drl_bridge.extras.simulation_interfaces.host import (
     local_path,
     refused,
 )
+from nics_drl_bridge.extras.simulation_interfaces.roster import Entities
 from nics_drl_bridge.nodes import runner
-from nics_drl_bridge.sim.entities import Entities
 from nics_drl_bridge.sim.world_set import SPECIAL, load_worlds
 
 STOPPED = SimulationState.STATE_STOPPED
