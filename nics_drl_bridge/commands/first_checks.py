@@ -64,9 +64,9 @@ def check_task(name: str) -> None:
         raise ConfigError(
             f"task {str(file)!r}: no such file; give path/to/file.py:ClassName."
         )
-    from nics_drl_bridge.env.registry import class_for
+    from nics_drl_bridge.env.registry import find_task_class
 
-    class_for(name, {})
+    find_task_class(name, {})
 
 
 def check_training(

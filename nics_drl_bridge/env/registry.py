@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable
 from inspect import Parameter, signature
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -13,7 +12,6 @@ from nics_drl_bridge.env.task import Task
 from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.sectors import layout_of
-from nics_drl_bridge.lidar.sensor import Sensor
 
 TASKS = {  # name -> module and class
     "navigation": "nics_drl_bridge.env.tasks.navigation:Navigation",
@@ -33,12 +31,11 @@ def make_task(
     Options are arguments of the class: `scan` as in `sectors.layout_of`, `sensors` as names.
     """
     if isinstance(task, Task):
-        made = _checked(task, model, options)
-        made.check_observation_space()
-        return made
+        _check_same(task, model, options)
+        return task
     check_options("task_options", options)
     options = dict(options or {})
-    task_class = class_for(task, options)
+    task_class = find_task_class(task, options)
     if "scan" in options:
         options["scan"] = layout_of(options["scan"], model.lidar)
     if "sensors" in options:
@@ -46,7 +43,15 @@ def make_task(
         if isinstance(names, str) or not isinstance(names, Iterable):
             fix = "must be a list of names of the model's sensors"
             raise ConfigError(f"task option sensors={format_value(names)}: {fix}.")
-        options["sensors"] = tuple(_sensor(name, model) for name in names)
+        known = {sensor.name: sensor for sensor in model.sensors}
+        names = [getattr(name, "name", str(name)) for name in names]
+        for name in names:
+            if name not in known:
+                hint = suggest(name, known)
+                raise ConfigError(
+                    f"task option sensors: the model has no sensor {name!r}; {hint}"
+                )
+        options["sensors"] = tuple(known[name] for name in names)
     try:
         # The error of a missing option names it here, without the constructor.
         signature(task_class).bind(model.robot, model.lidar, **options)
@@ -59,20 +64,25 @@ def make_task(
     return made
 
 
-def _sensor(name: Any, model: SimulatorModel) -> Sensor:
-    sensors = {sensor.name: sensor for sensor in model.sensors}
-    sensor_name = name.name if isinstance(name, Sensor) else str(name)
-    if sensor_name not in sensors:
-        hint = suggest(sensor_name, sensors)
+def _check_same(task: Task, model: SimulatorModel, options: Any) -> None:
+    """Raises ConfigError unless a task was made for a model's robot, without `options`."""
+    name = type(task).__name__
+    if options:
         raise ConfigError(
-            f"task option sensors: the model has no sensor {sensor_name!r}; {hint}"
+            f"task {name} already exists; set {sorted(options)} when making it."
         )
-    return sensors[sensor_name]
+    if task.robot != model.robot or task.lidar != model.lidar:
+        raise ConfigError(
+            f"task {name} is for the robot {task.robot.name!r} with {task.lidar.beams} beams, the "
+            f"model is {model.robot.name!r} with {model.lidar.beams}; make it with model.robot and "
+            "model.lidar."
+        )
+    task.check_observation_space()
 
 
-def class_for(task: str | type[Task], options: dict[str, Any]) -> type[Task]:
+def find_task_class(task: Any, options: dict[str, Any]) -> type[Task]:
     """Returns a task's class. Raises ConfigError if it does not exist or lacks an option."""
-    task_class = task if isinstance(task, type) else _class_of(task)
+    task_class = task if isinstance(task, type) else _import_task_class(task)
     if not issubclass(task_class, Task):
         raise ConfigError(
             f"task {task_class.__name__}: is not a subclass of env.task.Task; derive it."
@@ -90,68 +100,36 @@ def class_for(task: str | type[Task], options: dict[str, Any]) -> type[Task]:
     return task_class
 
 
-def _checked(task: Task, model: SimulatorModel, options: dict[str, Any] | None) -> Task:
-    name = type(task).__name__
-    if options:
-        raise ConfigError(
-            f"task {name} already exists; set {sorted(options)} when making it."
-        )
-    if task.robot != model.robot or task.lidar != model.lidar:
-        raise ConfigError(
-            f"task {name} is for the robot {task.robot.name!r} with {task.lidar.beams} beams, the "
-            f"model is {model.robot.name!r} with {model.lidar.beams}; make it with model.robot and "
-            "model.lidar."
-        )
-    return task
-
-
-def _class_of(name: Any) -> type[Task]:
+def _import_task_class(name: Any) -> type:
+    """Imports a class by the name of a shipped task, or by `path/to/file.py:ClassName`."""
     if not isinstance(name, str):
         fix = "a name, path/to/file.py:ClassName, a subclass of Task, or a Task"
         raise ConfigError(f"task={format_value(name)}: must be {fix}.")
-    path, colon, attribute = name.rpartition(":")
-    if not colon and name.endswith(".py"):
-        raise ConfigError(f"task {name!r}: {_missing_class(Path(name))}")
-    if not colon:
-        if name not in TASKS:
-            hint = suggest(name, TASKS)
-            raise ConfigError(
-                f"unknown task {name!r}; {hint} (or give path/to/file.py:ClassName)."
-            )
-        return _class_of(TASKS[name])
+    path, _, attribute = TASKS.get(name, name).rpartition(":")
+    if not path and name.endswith(".py"):
+        path = name
+        attribute = ""
+    if not path:
+        hint = f"{suggest(name, TASKS)} (or give path/to/file.py:ClassName)."
+        raise ConfigError(f"unknown task {name!r}; {hint}")
     module = extensions.load_module(path, "task")
     task_class = getattr(module, attribute, None)
-    if not (isinstance(task_class, type) and issubclass(task_class, Task)):
-        tasks = _tasks_in(module)
-        if not tasks:
-            raise ConfigError(f"task {name!r}: {path} {NO_TASK}")
+    if isinstance(task_class, type):
+        return task_class
+    own = [
+        name
+        for name, value in vars(module).items()
+        if isinstance(value, type)
+        and issubclass(value, Task)
+        and value.__module__ == module.__name__
+    ]
+    if not own:
         raise ConfigError(
-            f"task {name!r}: {path} has no such Task; {suggest(attribute, tasks)}"
+            f"task {name!r}: {path} defines no subclass of {Task.__module__}.Task; see "
+            "docs/tasks.md."
         )
-    return task_class
-
-
-NO_TASK = "defines no subclass of nics_drl_bridge.env.task.Task; see docs/tasks.md."
-
-
-def _tasks_in(module: Any) -> list[str]:
-    """Returns the names of the tasks that a module itself defines."""
-    names = []
-    for value in vars(module).values():
-        is_task = isinstance(value, type) and issubclass(value, Task)
-        if is_task and value.__module__ == module.__name__:
-            names.append(value.__name__)
-    return names
-
-
-def _missing_class(file: Path) -> str:
-    """Returns advice on what to write instead of a file without a class name."""
-    if not file.is_file():
-        return "the file does not exist; give path/to/file.py:ClassName."
-    tasks = _tasks_in(extensions.load_module(str(file), "task"))
-    if not tasks:
-        return NO_TASK
-    return f"name its class, for example {file}:{tasks[0]}."
+    hint = suggest(attribute, own) if attribute else f"name its class, {path}:{own[0]}."
+    raise ConfigError(f"task {name!r}: {path} has no such Task; {hint}")
 
 
 NAVIGATION = "NicsBridge/Navigation-v0"

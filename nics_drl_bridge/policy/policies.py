@@ -1,7 +1,5 @@
 """Policies by name: baselines that any trained policy must beat, planners, and policy files."""
 
-import itertools
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge import geometry
 from nics_drl_bridge.config import read_text
 from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.errors import ConfigError, PolicyError, suggest
@@ -18,93 +15,24 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.policy.file.contract import MAPPINGS, SUFFIX, shipped
 from nics_drl_bridge.policy.file.stateful import Policy, Stateful
-from nics_drl_bridge.policy.planners import dynamic_window_kernels as kernels
-from nics_drl_bridge.policy.planners.local_map import (
-    MOST_M,
-    outline_of,
-    rays_of,
-    scratch_of,
-    split_observation,
-)
-from nics_drl_bridge.policy.planners.local_map_kernels import (
-    Clearance,
-    FootprintDiscs,
-    MapScratch,
-    ScanRays,
-)
+from nics_drl_bridge.policy.planners.dynamic_window import DynamicWindow
 from nics_drl_bridge.policy.planners.mppi import Mppi
-from nics_drl_bridge.robot.braking import Braking, find_braking
-from nics_drl_bridge.robot.kinds import (
-    compute_steady_twist,
-    find_command,
-    has_textbook,
-    reach,
+from nics_drl_bridge.policy.planners.twists import (
+    find_steady_twists,
+    list_commands,
+    scale_to_actions,
 )
-from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.robot.kinds import find_command, has_textbook, reach
 
 if TYPE_CHECKING:
     from nics_drl_bridge.policy.file.policy_file import PolicyFile
 
 
-# The margin is wider than in `Mppi`, because the dynamic window chooses from few twists.
-CLEARANCE = Clearance(margin=0.1, soft=0.4)
 FULL_TURN_RAD = 0.8  # bearing of the goal above which a robot turns at full rate
-SETTLED_S = 5.0  # time to the steady twist of a held command
 # minimum of a twist component that counts as controllable [m/s, rad/s]
 LEAST_REACH = 1e-3
 # fraction of the speed if the goal is behind a robot that can't turn in place
 CREEP = 0.3
-
-
-def _grid(robot: RobotSpec) -> Array:
-    """Returns a grid of commands (K, C) over the full range of each, including rest."""
-    counts = {1: (15,), 2: (7, 15), 3: (7, 7, 5)}.get(len(robot.command))
-    axes = [
-        np.unique(
-            np.append(
-                np.linspace(command.min, command.max, count),
-                np.clip(0, command.min, command.max),
-            )
-        )
-        for command, count in zip(
-            robot.command, counts or [3] * len(robot.command), strict=True
-        )
-    ]
-    return np.array(list(itertools.product(*axes)))
-
-
-def _settled(task: Navigation, commands: Array, model: SimulatorModel | None) -> Array:
-    """Returns the steady body twists (K, 3) of held commands (K, C).
-
-    Uses the model if the robot does not take `cmd_vel`, whose kind is only approximate, or if its
-    motors distort commands, which no kind describes.
-    """
-    if model is None or (task.robot.takes_cmd_vel and model.kinematics.is_plain):
-        return compute_steady_twist(task.robot, commands)
-    kinematics = model.kinematics
-    start = np.zeros((len(commands), 3))
-    state = np.zeros((len(commands), kinematics.state_size))
-    moved = start
-    low = kinematics.low[: state.shape[1]]
-    high = kinematics.high[: state.shape[1]]
-    for _ in range(round(SETTLED_S / kinematics.dt)):
-        moved, state = kinematics.step(start, state, commands)
-        state = np.clip(state, low, high)
-    return geometry.log(moved) / kinematics.dt
-
-
-def _find_slowest_lag(robot: RobotSpec) -> float:
-    """Returns the slowest lag that a robot's kind states [s]; 0 without any."""
-    lags = [value for name, value in robot.parameters.items() if name.endswith("_lag")]
-    return max(lags, default=0.0)
-
-
-def actions_of(task: Navigation, commands: Array) -> NDArray[np.float32]:
-    """Returns the continuous actions (..., C) for commands (..., C), clamped to [-1, 1]."""
-    low, high = task.command_limits
-    return np.clip(2.0 * (commands - low) / (high - low) - 1.0, -1.0, 1.0).astype(
-        np.float32
-    )
 
 
 @dataclass(frozen=True)
@@ -129,7 +57,7 @@ class StraightToGoal:
             wanted = robot.from_fields(shares) * robot.command_high
         else:
             wanted = self._command(shares)
-        return actions_of(self.task, wanted)
+        return scale_to_actions(self.task, wanted)
 
     def _command(self, shares: Array) -> Array:
         """Returns commands (..., C) for fractions (..., 3) of the maximum twist."""
@@ -142,8 +70,8 @@ class StraightToGoal:
 
     @cached_property
     def _known(self) -> tuple[Array, Array]:
-        commands = _grid(self.task.robot)
-        return commands, _settled(self.task, commands, self.model)
+        commands = list_commands(self.task.robot)
+        return commands, find_steady_twists(self.task, commands, self.model)
 
     @cached_property
     def _reach(self) -> Array:
@@ -175,113 +103,8 @@ class RandomActions:
         return np.random.default_rng(self.seed)
 
 
-@dataclass(frozen=True)
-class DynamicWindow:
-    """The dynamic-window approach (Fox, Burgard, Thrun 1997).
-
-    Path lengths to the goal lead around visible obstacles (Brock, Khatib 1999). Raises ConfigError
-    if the robot's twists are unknown, see `compute_steady_twist`.
-    """
-
-    task: Navigation
-    clearance: Clearance = CLEARANCE
-    period: float = 0.1  # time between commands [s]
-    steps: int = 10  # steps of the look-ahead, each 1.5 periods long
-    # see `TwistWeights`
-    weights: tuple[float, float, float, float] = (
-        1.0,
-        0.6,
-        0.3,
-        1.5,
-    )
-    model: SimulatorModel | None = None  # provides twists without `cmd_vel`
-
-    def __post_init__(self) -> None:
-        _ = self._search
-
-    def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Chooses the action; see `Policy`."""
-        parts = split_observation(self.task, observation)
-        chosen = np.empty(len(parts[0]), np.int64)
-        kernels.choose_all(chosen, *parts, *self._search, self._sense)
-        return self._scaled[chosen[0] if observation.ndim == 1 else chosen]
-
-    @cached_property
-    def _search(self) -> tuple[Array, kernels.LookAhead, kernels.TwistWeights]:
-        twists = _settled(self.task, self._commands, self.model)
-        lag = _find_slowest_lag(self.task.robot)
-        share = 1.0 - math.exp(-self.period / lag) if lag > 0.0 else 1.0
-        if self.model is None:
-            braking = Braking(lag, math.inf)
-        else:
-            limits = self.task.command_limits
-            braking = find_braking(self.task.robot, self.model.kinematics, *limits)
-        steps = [
-            np.diff(np.unique(speeds.round(6))).max(initial=0.0) for speeds in twists.T
-        ]
-        # The window includes at least one step of the grid.
-        reach = np.maximum(share * np.ptp(twists, axis=0), steps) + 1e-6
-        if self.model is None:
-            late = 0.0
-        else:
-            late = max(0.0, self.model.calibration.command_latency_s)
-        # A twist is held for a period and judged a period later; then the robot reacts. The
-        # reaction time is known only to within a step of the robot's model, so it is rounded.
-        held = 2.0 * self.period + late
-        reaction = held + round(braking.reaction_s, 2)
-        turn_reaction = 0.0
-        turn_slowness = 0.0
-        if braking.turn is not None:
-            turn_reaction = held + round(braking.turn.reaction_s, 2)
-            turn_slowness = 1.0 / braking.turn.deceleration
-        step = 1.5 * self.period
-        slowest = float(braking.mean_time_s(twists).max()) - braking.reaction_s
-        needed = math.ceil((reaction + slowest) / step)
-        far = math.inf
-        count = self.steps
-        # Look ahead for as long as the robot needs to stop, but only over ground that it sees.
-        if needed > count:
-            count = needed
-            fastest = float(np.hypot(twists[:, 0], twists[:, 1]).max())
-            far = min(fastest * step * count, self.task.sight.range_max, MOST_M)
-        ahead = kernels.LookAhead(
-            reach,
-            step,
-            count,
-            reaction,
-            1.0 / braking.deceleration,
-            braking.lever_m,
-            turn_reaction,
-            turn_slowness,
-            far,
-        )
-        return twists, ahead, kernels.TwistWeights(*self.weights)
-
-    @cached_property
-    def _sense(self) -> tuple[ScanRays, FootprintDiscs, Clearance, MapScratch]:
-        outline, (twists, ahead, _) = outline_of(self.task.robot), self._search
-        far = (
-            float(np.hypot(twists[:, 0], twists[:, 1]).max())
-            * ahead.period
-            * ahead.steps
-        )
-        half = min(far, self.task.sight.range_max) + outline.outer
-        scratch = scratch_of(self.task.scan_parts, outline, self.clearance, half)
-        return rays_of(self.task), outline, self.clearance, scratch
-
-    @cached_property
-    def _commands(self) -> Array:
-        return _grid(self.task.robot)
-
-    @cached_property
-    def _scaled(self) -> NDArray[np.float32]:
-        return actions_of(self.task, self._commands)
-
-
 POLICIES: dict[str, Callable[[Navigation, SimulatorModel | None], Policy]] = {
-    "dynamic_window": lambda task, model: DynamicWindow(
-        task, period=0.1 if model is None else model.control_period, model=model
-    ),
+    "dynamic_window": DynamicWindow,
     "mppi": Mppi,
     "random": lambda task, _: RandomActions(task),
     "straight": StraightToGoal,

@@ -16,7 +16,8 @@ from nics_drl_bridge.geometry import wrap_angle
 from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, SHAPE, X, Y
 from nics_drl_bridge.lidar.shapes import Circle, Rectangle, Shape
 from nics_drl_bridge.policy.file.stateful import Policy, begin
-from nics_drl_bridge.policy.policies import POLICIES, actions_of, shipped_policies
+from nics_drl_bridge.policy.planners.twists import scale_to_actions
+from nics_drl_bridge.policy.policies import POLICIES, shipped_policies
 from nics_drl_bridge.seeds import check_seeds
 from nics_drl_bridge.sim.scenes import scaled
 from nics_drl_bridge.sim.world import Obstacles, World, check_place
@@ -112,7 +113,7 @@ class Lane:
             return int(
                 np.abs(self.task.discrete_commands - command).sum(axis=-1).argmin()
             )
-        return actions_of(self.task, command)
+        return scale_to_actions(self.task, command)
 
     def restart(self, seed: float) -> bool:
         """Starts the episode of a seed in the original world; returns True if the env is new.

@@ -173,7 +173,7 @@ def test_a_closed_env_refuses_what_is_called_after_close(
             "",
             "name its class, for example .*:Mine",
         ),
-        (None, "", "the file does not exist; give path/to/file.py:ClassName"),
+        (None, "", "no such file; give path/to/file.py:ClassName"),
     ],
 )
 def test_a_file_without_a_task_is_told(

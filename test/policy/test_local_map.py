@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import math
 import tracemalloc
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from shapely.geometry import Point, Polygon
 from shapely.prepared import prep
 
+from nics_drl_bridge.env.task import Sight
 from nics_drl_bridge.geometry import compute_depths
-from nics_drl_bridge.policy.planners.local_map import CELL_M, outline_of, scratch_of
-from nics_drl_bridge.policy.planners.local_map_kernels import (
+from nics_drl_bridge.policy.planners.local_map import (
+    CELL_M,
     Clearance,
-    ScanRays,
-    astray,
-    look,
-    room_at,
-    touching,
-    way_at,
+    fill_outline,
+    find_contact_limit,
+    find_room,
+    find_way,
+    make_map_maker,
+    map_scan,
+    score_heading,
 )
 from nics_drl_bridge.robot.spec import build_robot, load_robot
 
@@ -28,20 +31,18 @@ GOAL = np.array([3.0, 0.0])
 ROBOTS = ("differential", "tricycle")
 
 
-def seen(points, robot="jackal", goal=GOAL):
+def map_rays(shares, directions, origin, robot="jackal", goal=GOAL):
+    """The map of a scan with these rays, as fractions of 10 m."""
+    sight = Sight(np.arctan2(*np.transpose(directions)[::-1]), np.array(origin), 10.0)
+    task = SimpleNamespace(sight=sight, scan_parts=len(shares))
+    outline = fill_outline(load_robot(robot))
+    return map_scan(shares, goal, make_map_maker(task, outline, CLOSE, 3.0))
+
+
+def seen(points, robot="jackal"):
     """What a robot knows whose scan ends at points (P, 2)."""
     at = np.asarray(points, np.float64).reshape(-1, 2)
-    away = np.linalg.norm(at, axis=1)
-    outline = outline_of(load_robot(robot))
-    rays = ScanRays(at / away[:, None], np.zeros(2), 10.0)
-    return look(
-        away / 10.0,
-        goal,
-        rays,
-        outline,
-        CLOSE,
-        scratch_of(len(at), outline, CLOSE, 3.0),
-    )
+    return map_rays(np.linalg.norm(at, axis=1) / 10.0, at, (0.0, 0.0), robot)
 
 
 def footprint(robot):
@@ -80,7 +81,7 @@ def test_room_is_the_distance_from_the_outline_up_to_a_cell(robot):
         hit = np.array([[x + c * ahead - s * left, y + s * ahead + c * left]])
         if np.linalg.norm(hit) < 1e-3:
             continue
-        room = room_at(x, y, c, s, seen(hit, robot))
+        room = find_room(x, y, c, s, seen(hit, robot))
         exact = shape.exterior.distance(Point(ahead, left))
         if shape.contains(Point(ahead, left)):
             assert room < CELL_M
@@ -104,7 +105,7 @@ def test_the_discs_of_a_large_footprint_take_little_memory_and_leave_little_out(
     length, width
 ):
     tracemalloc.start()
-    outline = outline_of(box(length, width))
+    outline = fill_outline(box(length, width))
     _, most = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert most < 30e6
@@ -121,21 +122,21 @@ def test_the_discs_of_a_large_footprint_take_little_memory_and_leave_little_out(
 
 def test_a_robot_that_is_too_near_already_may_only_move_away():
     around = seen([[0.254 + 0.02, 0.0]])
-    assert touching(around) == pytest.approx(
-        room_at(0.0, 0.0, 1.0, 0.0, around), abs=2e-3
+    assert find_contact_limit(around) == pytest.approx(
+        find_room(0.0, 0.0, 1.0, 0.0, around), abs=2e-3
     )
-    assert room_at(0.1, 0.0, 1.0, 0.0, around) < touching(around)
-    assert room_at(-0.1, 0.0, 1.0, 0.0, around) > touching(around)
-    assert touching(seen([[2.0, 0.0]])) == CLOSE.margin
+    assert find_room(0.1, 0.0, 1.0, 0.0, around) < find_contact_limit(around)
+    assert find_room(-0.1, 0.0, 1.0, 0.0, around) > find_contact_limit(around)
+    assert find_contact_limit(seen([[2.0, 0.0]])) == CLOSE.margin
 
 
 def test_the_way_in_the_open_is_straight_and_leads_around_a_wall():
     free = seen([[0.0, 9.0]])
     blocked = seen(wall(1.5, -1.2, 1.2))
-    assert way_at(0.0, 0.0, free) == pytest.approx(3.0, rel=0.05)
+    assert find_way(0.0, 0.0, free) == pytest.approx(3.0, rel=0.05)
     around = 2.0 * math.hypot(1.5, 1.2 + 0.215)
-    assert around < way_at(0.0, 0.0, blocked) < 2.0 * around
-    assert way_at(2.5, 0.0, blocked) < 1.0
+    assert around < find_way(0.0, 0.0, blocked) < 2.0 * around
+    assert find_way(2.5, 0.0, blocked) < 1.0
 
 
 def test_a_gap_too_narrow_for_the_robot_costs_more_than_the_way_around():
@@ -143,23 +144,20 @@ def test_a_gap_too_narrow_for_the_robot_costs_more_than_the_way_around():
         seen(np.concatenate([wall(1.5, -1.0, -half), wall(1.5, half, 1.0)]))
         for half in (0.2, 0.5)
     )
-    assert way_at(0.0, 0.0, wide) < way_at(0.0, 0.0, narrow) - 0.5
+    assert find_way(0.0, 0.0, wide) < find_way(0.0, 0.0, narrow) - 0.5
 
 
 def test_a_heading_along_the_way_is_not_astray_and_the_other_way_is():
     around = seen([[0.0, 9.0]])
-    way = way_at(0.0, 0.0, around)
+    way = find_way(0.0, 0.0, around)
     along, aside, against = (
-        astray(0.0, 0.0, math.cos(a), math.sin(a), way, around)
+        score_heading(0.0, 0.0, math.cos(a), math.sin(a), way, around)
         for a in (0.0, math.pi / 2, math.pi)
     )
     assert along < 0.1 < aside < 0.9 < against
 
 
 def test_unknown_shares_and_those_without_a_return_are_no_obstacles():
-    outline = outline_of(load_robot("jackal"))
-    rays = ScanRays(np.array([[1.0, 0.0]] * 3), np.array([0.12, 0.0]), 10.0)
     for share, free in ((0.0, True), (1.0, True), (0.015, False)):
-        scratch = scratch_of(3, outline, CLOSE, 3.0)
-        around = look(np.full(3, share), GOAL, rays, outline, CLOSE, scratch)
-        assert (touching(around) == CLOSE.margin) == free
+        around = map_rays(np.full(3, share), [[1.0, 0.0]] * 3, (0.12, 0.0))
+        assert (find_contact_limit(around) == CLOSE.margin) == free

@@ -12,8 +12,7 @@ from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.interface import RobotView
-from nics_drl_bridge.policy.planners.mppi import Mppi
-from nics_drl_bridge.policy.planners.mppi_kernels import draw, follow
+from nics_drl_bridge.policy.planners.mppi import Mppi, draw, fit_command
 from nics_drl_bridge.robot.spec import load_robot
 
 ROBOTS = ("ackermann", "differential", "mecanum", "tricycle")
@@ -72,8 +71,8 @@ def test_the_command_behind_a_twist_is_that_which_led_to_it(robot):
     twist = np.array(
         [moved * np.cos(direction).item(), moved * np.sin(direction).item(), turned]
     )
-    _, lanes = policy._memory()
-    follow(twist, policy._plant, lanes)
+    _, lanes = policy._make_memory()
+    fit_command(twist, policy._plant, lanes)
     assert lanes.held == pytest.approx(command, abs=0.08)
 
 

@@ -132,7 +132,7 @@ def test_a_car_turns_by_its_own_wheelbase(changes):
     twist = [speed, 0.0, speed * np.tan(angle) / 2.5]
     assert compute_steady_twist(long, long.command_high) == pytest.approx(twist)
     planner = DynamicWindow(Navigation(long, lidar()))
-    assert np.abs(planner._search[0]).max(axis=0) == pytest.approx(np.abs(twist))
+    assert np.abs(planner.twists).max(axis=0) == pytest.approx(np.abs(twist))
 
 
 def test_the_planner_asks_a_model_whose_motors_bend_commands_where_they_lead():
@@ -144,13 +144,13 @@ def test_the_planner_asks_a_model_whose_motors_bend_commands_where_they_lead():
     )
     task = task_of("ackermann")
     plain, asking = (make_policy("dynamic_window", task, m) for m in (model, bent))
-    assert np.abs(asking._search[0][:, 0]).max() == pytest.approx(0.7, abs=0.02)
-    speeds = asking._commands[:, 0]
+    assert np.abs(asking.twists[:, 0]).max() == pytest.approx(0.7, abs=0.02)
+    speeds = asking.commands[:, 0]
     crawling = speeds[speeds > 0.0].min()
     assert crawling < 0.3
-    still = asking._search[0][asking._commands[:, 0] == crawling]
+    still = asking.twists[asking.commands[:, 0] == crawling]
     assert np.abs(still).max() < 1e-3
-    slowness = asking._search[1].slowness - plain._search[1].slowness
+    slowness = asking.ahead.slowness - plain.ahead.slowness
     assert 0.7 * slowness == pytest.approx(
         1.4, abs=0.35
     )  # from 0.7 m/s by 0.5 m/s^2, not by 2

@@ -29,71 +29,14 @@ COMMAND = "command"
 STATE_IN = "state_in"
 STATE_OUT = "state_out"
 OPERATORS = frozenset(
-    [
-        "Abs",
-        "Add",
-        "ArgMax",
-        "Atan",
-        "AveragePool",
-        "BatchNormalization",
-        "Cast",
-        "Clip",
-        "Concat",
-        "Constant",
-        "Conv",
-        "Cos",
-        "Div",
-        "Elu",
-        "Erf",
-        "Exp",
-        "Flatten",
-        "GRU",
-        "Gather",
-        "Gelu",
-        "Gemm",
-        "GlobalAveragePool",
-        "HardSigmoid",
-        "HardSwish",
-        "Identity",
-        "LSTM",
-        "LayerNormalization",
-        "LeakyRelu",
-        "Log",
-        "LogSoftmax",
-        "MatMul",
-        "Max",
-        "MaxPool",
-        "Min",
-        "Mish",
-        "Mul",
-        "Neg",
-        "PRelu",
-        "Pow",
-        "RNN",
-        "Reciprocal",
-        "ReduceMax",
-        "ReduceMean",
-        "ReduceMin",
-        "ReduceSum",
-        "Relu",
-        "Reshape",
-        "Selu",
-        "Shape",
-        "Sigmoid",
-        "Sign",
-        "Sin",
-        "Slice",
-        "Softmax",
-        "Softplus",
-        "Softsign",
-        "Split",
-        "Sqrt",
-        "Squeeze",
-        "Sub",
-        "Tanh",
-        "Transpose",
-        "Unsqueeze",
-    ]
+    """
+    Abs Add ArgMax Atan AveragePool BatchNormalization Cast Clip Concat Constant Conv
+    Cos Div Elu Erf Exp Flatten GRU Gather Gelu Gemm GlobalAveragePool HardSigmoid
+    HardSwish Identity LSTM LayerNormalization LeakyRelu Log LogSoftmax MatMul Max
+    MaxPool Min Mish Mul Neg PRelu Pow RNN Reciprocal ReduceMax ReduceMean ReduceMin
+    ReduceSum Relu Reshape Selu Shape Sigmoid Sign Sin Slice Softmax Softplus Softsign
+    Split Sqrt Squeeze Sub Tanh Transpose Unsqueeze
+    """.split()
 )
 """Operators of networks: no loops, branches, random numbers or data-dependent sizes."""
 FLOATS = frozenset({TensorProto.FLOAT, TensorProto.DOUBLE, TensorProto.FLOAT16})

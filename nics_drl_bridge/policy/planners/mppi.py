@@ -1,10 +1,16 @@
-"""Model-predictive path integral control (Williams and others 2017), as a policy."""
+"""Model-predictive path integral control (Williams and others 2017), as a policy.
+
+Simulates K rollouts at a time in the robot's model, over H periods and the stop after them.
+Commands are actions in [-1, 1] at knots, interpolated linearly. Shapes: N robots, S states, C
+commands, Q knots.
+"""
 
 import math
 import os
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise, product
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,32 +20,103 @@ from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.generator import BUILTIN_SEED, CONTROL_PERIOD_S, SimulatorModel
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.identify import identify
-from nics_drl_bridge.policy.planners import mppi_kernels as kernels
+from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.policy.planners import local_map as maps
 from nics_drl_bridge.policy.planners.local_map import (
+    ARRIVED_M,
     MOST_M,
-    outline_of,
-    rays_of,
-    scratch_of,
-    split_observation,
-)
-from nics_drl_bridge.policy.planners.local_map_kernels import (
     Clearance,
     FootprintDiscs,
-    MapScratch,
-    ScanRays,
+    MapMaker,
+    Situation,
+    find_room,
+    find_way,
 )
+from nics_drl_bridge.random_kernels import PLANNER_STREAM, normal, uniform
 from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.robot.braking import Braking, find_braking
-from nics_drl_bridge.robot.kernels import SERIES, make_terms, replace_coefficients
+from nics_drl_bridge.robot.kernels import (
+    SERIES,
+    Terms,
+    advance,
+    apply_curve,
+    make_terms,
+    rates,
+    replace_coefficients,
+    run,
+)
 from nics_drl_bridge.robot.kinds import compute_steady_twist
 from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.threads import run_parts
 
+HORIZON_S = 2.0  # time of a rollout
+KNOTS = 4  # actions along a rollout
+SPREADS = (0.4, 0.2)  # standard deviation of the noise in the rounds after the first
+TEMPERATURE = 0.05  # of the weights of rollouts, as a path length [m]
+CLEARANCE = Clearance(margin=0.08, soft=0.4)
 SETTLED_S = 3.0  # time to the steady state of a held command
 FINEST = 0.25  # maximum rollout step as a fraction of a lag
 FEWEST = 8  # minimum number of robots per thread
-CLEARANCE = Clearance(margin=0.08, soft=0.4)
-WORTH = kernels.Worth(near=4.0, early=0.3, change=0.02, astray=0.2)
+# Weights of the terms in the cost of a rollout: of driving all of it at the margin [m], of the mean
+# path length to the goal, where that at the end has the rest of 1, of the squared change of actions
+# between knots [m], and of a final heading that leads away from the goal [m]
+NEAR = 4.0
+EARLY = 0.3
+CHANGE = 0.02
+ASTRAY = 0.2
+HIT = 1e3  # cost of an immediate contact; later ones cost less
+# multiple of the range from which proposals are drawn before clamping, so many lie at its ends
+BEYOND = 1.3
+# passes over the commands when fitting them to a twist
+PASSES = 12
+EASE = 1e-6
+
+
+class Plant(NamedTuple):
+    """The model of a robot, for K rollouts at a time."""
+
+    terms: Terms  # with coefficients (T, K), one column per rollout
+    single: Terms  # with coefficients (T,), for one robot
+    series: Array
+    dt: float  # [s]
+    substeps: int  # integration steps per period
+    latency: float  # delay before a command takes effect [s]
+    settled: Array  # (S, C) steady state per unit of a held command
+    low: Array  # (C,) minimum of each command
+    high: Array
+
+
+class Sampling(NamedTuple):
+    """The rollouts of a plan, each of which ends with a stop."""
+
+    offers: Array  # (K, Q, C) proposed actions of the first round
+    # (K, Q, C) standard normal noise, added to the best actions in later rounds
+    noise: Array
+    between: Array  # (H, Q) weights of the knots in the action of each period
+    # (C,) True for commands that are held while the robot stops
+    holds: NDArray[np.bool_]
+    rest: Array  # (C,) value of the other commands
+    # maximum number of periods for the stop; 0 if the robot can stop within half a rollout
+    stop: int
+    far: float  # distance along an axis beyond which the map is unknown [m]
+
+
+class RollOuts(NamedTuple):
+    """Scratch memory of one robot's plan; a lane is one of the K rollouts."""
+
+    pose: Array  # (6, K) see `robot.kernels.run`
+    x: Array  # (S + C + 1, K)
+    dq: Array  # (3 + S, K)
+    actions: Array  # (K, Q, C)
+    nominal: Array  # (Q, C)
+    held: Array  # (C,) held command that explains the present twist
+    x_single: Array  # (S + C + 1,) of one robot
+    rate: Array  # (3 + S,)
+    start: Array  # (3,)
+    cost: Array  # (K,)
+    way: Array  # (K,)
+    # (K,) period of the contact or arrival; negative: neither
+    ended: NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -53,77 +130,52 @@ class Mppi:
     task: Navigation
     model: SimulatorModel | None = None
     samples: int = 256  # rollouts per round
-    horizon: float = 2.0  # [s]
-    knots: int = 4  # actions along a rollout, interpolated linearly
-    # standard deviation of the noise in the rounds after the first
-    spreads: tuple[float, ...] = (
-        0.4,
-        0.2,
-    )
-    # temperature of the rollout weights, as a path length [m]
-    temperature: float = 0.05
-    clearance: Clearance = CLEARANCE
-    worth: kernels.Worth = WORTH
     seed: int = 0
 
     def __post_init__(self) -> None:
-        _ = self._halt
+        _ = self._sampling
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Plans the actions; see `Policy`."""
-        parts = split_observation(self.task, observation)
-        out = np.empty((len(parts[0]), len(self.task.robot.command)))
-        self._plan(out, *parts)
-        actions = out.astype(np.float32)
-        return actions[0] if observation.ndim == 1 else actions
+        """Plans the actions on all cores, each with its own memory; see `Policy`."""
+        parts = maps.split_observation(self.task, observation)
+        actions = np.empty((len(parts[0]), len(self.task.robot.command)))
+        count = max(1, min(os.cpu_count() or 1, len(actions) // FEWEST))
+        cuts = np.linspace(0, len(actions), count + 1).astype(int).tolist()
 
-    def _plan(self, *arrays: Array) -> None:
-        """Plans for the rows of arrays (N, ...) on all cores, each core with its own memory."""
-        count = max(1, min(os.cpu_count() or 1, len(arrays[0]) // FEWEST))
-        cuts = np.linspace(0, len(arrays[0]), count + 1).astype(int).tolist()
+        def plan_part(rows: slice) -> None:
+            maker, lanes = self._free.pop() if self._free else self._make_memory()
+            arrays = [array[rows] for array in (actions, *parts)]
+            plan_all(*arrays, maker, self._plant, self._sampling, lanes)
+            self._free.append((maker, lanes))
 
-        def part(rows: slice) -> None:
-            scratch, lanes = self._free.pop() if self._free else self._memory()
-            kernels.plan_all(
-                *(array[rows] for array in arrays),
-                (*self._sense, scratch),
-                self._plant,
-                self._sampling,
-                self.worth,
-                lanes,
-            )
-            self._free.append((scratch, lanes))
-
-        run_parts(part, [slice(*ends) for ends in pairwise(cuts)])
+        run_parts(plan_part, [slice(*ends) for ends in pairwise(cuts)])
+        planned = actions.astype(np.float32)
+        return planned[0] if observation.ndim == 1 else planned
 
     @cached_property
-    def _free(self) -> list[tuple[MapScratch, kernels.RollOuts]]:
+    def _free(self) -> list[tuple[MapMaker, RollOuts]]:
         return []  # memory that no thread is using
 
-    def _memory(self) -> tuple[MapScratch, kernels.RollOuts]:
-        robot, (_, outline, clearance) = self.task.robot, self._sense
-        low, high = self.task.command_limits
-        if self.task.robot.takes_cmd_vel:
-            ends = np.stack([low, high])
-        else:
-            ends = np.zeros((1, len(low)))
-        half = (
-            math.hypot(*np.abs(compute_steady_twist(robot, ends))[:, :2].max(axis=0))
-            * self.horizon
-        )
-        if self._halt.most > 0:
+    @cached_property
+    def _outline(self) -> FootprintDiscs:
+        return maps.fill_outline(self.task.robot)
+
+    def _make_memory(self) -> tuple[MapMaker, RollOuts]:
+        half = self._fastest * HORIZON_S
+        if self._sampling.stop > 0:
             half = self._reach
-        half = min(half or np.inf, self.task.sight.range_max) + outline.outer
-        scratch = scratch_of(self.task.scan_parts, outline, clearance, half)
-        (states, count), many = self._plant.settled.shape, self.samples
+        half = min(half, self.task.sight.range_max) + self._outline.outer
+        maker = maps.make_map_maker(self.task, self._outline, CLEARANCE, half)
+        states, count = self._plant.settled.shape
+        many = self.samples
         x = np.ones(states + count + 1)
         rate = np.zeros(3 + states)
-        return scratch, kernels.RollOuts(
+        return maker, RollOuts(
             np.zeros((6, many)),
             np.repeat(x[:, None], many, 1),
             np.repeat(rate[:, None], many, 1),
-            np.zeros((many, self.knots, count)),
-            np.zeros((self.knots, count)),
+            np.zeros((many, KNOTS, count)),
+            np.zeros((KNOTS, count)),
             np.zeros(count),
             x,
             rate,
@@ -134,17 +186,12 @@ class Mppi:
         )
 
     @cached_property
-    def _sense(self) -> tuple[ScanRays, FootprintDiscs, Clearance]:
-        return rays_of(self.task), outline_of(self.task.robot), self.clearance
-
-    @cached_property
     def _kinematics(self) -> TaylorModel:
         if self.model is not None:
             return self.model.kinematics
         robot = self.task.robot
-        return identify(
-            textbook.record(robot, np.random.default_rng(BUILTIN_SEED)), robot
-        ).model
+        drive = textbook.record(robot, np.random.default_rng(BUILTIN_SEED))
+        return identify(drive, robot).model
 
     @property
     def _period(self) -> float:
@@ -161,25 +208,15 @@ class Mppi:
         x = np.concatenate([state, self._kinematics.apply_curves(ends)], axis=-1)
         return self._kinematics.rates(x)[:, :3]
 
-    @cached_property
-    def _halt(self) -> kernels.Halt:
-        """The stop at the end of a rollout; empty if the robot can stop within half a rollout."""
-        robot = self.task.robot
-        angles = np.array([variable.unit == "rad" for variable in robot.command])
-        times = self._braking.time_s(self._top_twists)
-        longest = float(np.max(times, initial=0.0))
-        if longest <= 0.5 * self.horizon:
-            return kernels.Halt(angles, still(robot), 0, math.inf)
-        far = min(self._reach, self.task.sight.range_max, MOST_M)
-        return kernels.Halt(
-            angles, still(robot), math.ceil(longest / self._period), far
-        )
+    @property
+    def _fastest(self) -> float:
+        """Maximum speed [m/s]."""
+        return math.hypot(*np.abs(self._top_twists)[:, :2].max(axis=0))
 
     @property
     def _reach(self) -> float:
         """Distance covered by a rollout at full speed and the following stop [m]."""
-        fastest = np.hypot(*np.abs(self._top_twists)[:, :2].max(axis=0))
-        return float(fastest * self.horizon + self._braking.distance(fastest))
+        return self._fastest * HORIZON_S + self._braking.distance(self._fastest)
 
     @cached_property
     def _braking(self) -> Braking:
@@ -187,55 +224,287 @@ class Mppi:
         return find_braking(self.task.robot, self._kinematics, *limits)
 
     @cached_property
-    def _plant(self) -> kernels.Plant:
+    def _plant(self) -> Plant:
         model = self._kinematics
-        robot = self.task.robot
         period = self._period
         terms = make_terms(model)
         latency = float(model.delays.max(initial=0.0))
         if self.model is not None:
             latency += max(0.0, self.model.calibration.command_latency_s)
-        decays = (
-            (terms.dof >= 3)
-            & (terms.degree == 1)
-            & (terms.factors[:, 0] == terms.dof - 3)
-        )
+        # The shortest lag, of a state that decays by itself, decides on the step.
+        decays = (terms.dof >= 3) & (terms.degree == 1)
+        decays &= terms.factors[:, 0] == terms.dof - 3
         fastest = np.abs(terms.coefficient[decays]).max(initial=0.0)
-        substeps = min(
-            max(1, math.ceil(period * fastest / FINEST)), round(period / model.dt)
-        )
-        rows = np.repeat(terms.coefficient[:, None], self.samples, axis=1)
-        return kernels.Plant(
-            replace_coefficients(terms, rows),
+        finest = round(period / model.dt)
+        substeps = min(max(1, math.ceil(period * fastest / FINEST)), finest)
+        # steady states of half of each command alone
+        commands = np.diag(0.5 * self.task.robot.command_high)
+        pose = np.zeros((len(commands), 3))
+        state = np.zeros((len(commands), model.state_size))
+        for _ in range(round(SETTLED_S / model.dt)):
+            pose, state = model.step(pose, state, commands)
+        return Plant(
+            replace_coefficients(
+                terms, np.repeat(terms.coefficient[:, None], self.samples, axis=1)
+            ),
             terms,
             SERIES,
             period / substeps,
             substeps,
             latency,
-            _settled(model, robot.command_high),
+            np.ascontiguousarray((state / commands.diagonal()[:, None]).T),
             *self.task.command_limits,
         )
 
     @cached_property
-    def _sampling(self) -> kernels.Sampling:
-        offers, noise = np.empty(
-            (2, self.samples, self.knots, len(self.task.robot.command))
-        )
+    def _sampling(self) -> Sampling:
+        robot = self.task.robot
+        offers, noise = np.empty((2, self.samples, KNOTS, len(robot.command)))
         low, high = self.task.command_limits
-        rest = 2.0 * (still(self.task.robot) - low) / (high - low) - 1.0
-        kernels.draw(offers, noise, rest, self.seed)
-        places = np.linspace(0.0, self.knots - 1.0, round(self.horizon / self._period))
-        between = np.maximum(0.0, 1.0 - np.abs(places[:, None] - np.arange(self.knots)))
-        return kernels.Sampling(
-            offers, noise, np.array(self.spreads), between, self.temperature, self._halt
+        draw(offers, noise, 2.0 * (still(robot) - low) / (high - low) - 1.0, self.seed)
+        places = np.linspace(0.0, KNOTS - 1.0, round(HORIZON_S / self._period))
+        between = np.maximum(0.0, 1.0 - np.abs(places[:, None] - np.arange(KNOTS)))
+        holds = np.array([command.unit == "rad" for command in robot.command])
+        stop = 0
+        far = math.inf
+        longest = float(np.max(self._braking.time_s(self._top_twists), initial=0.0))
+        if longest > 0.5 * HORIZON_S:
+            stop = math.ceil(longest / self._period)
+            far = min(self._reach, self.task.sight.range_max, MOST_M)
+        return Sampling(offers, noise, between, holds, still(robot), stop, far)
+
+
+@kernel(allocates=True)
+def draw(offers: Array, noise: Array, rest: Array, seed: int) -> None:
+    """Draws `Sampling.offers`, the first of them rest (C,), and `Sampling.noise`, by seed."""
+    for k in range(offers.shape[0]):
+        for q in range(offers.shape[1]):
+            for c in range(offers.shape[2]):
+                i = (k * offers.shape[1] + q) * offers.shape[2] + c
+                drawn = BEYOND * (2.0 * uniform(seed, PLANNER_STREAM, 3 * i) - 1.0)
+                # Half of the proposals hold one action.
+                held = k < offers.shape[0] // 2 and q > 0
+                offers[k, q, c] = (
+                    offers[k, 0, c] if held else min(max(drawn, -1.0), 1.0)
+                )
+                if k == 0:
+                    offers[k, q, c] = rest[c]
+                noise[k, q, c] = normal(seed, PLANNER_STREAM, 3 * i + 1)
+
+
+@kernel(allocates=True)
+def plan_all(
+    out: Array,
+    scans: Array,
+    goals: Array,
+    twists: Array,
+    maker: MapMaker,
+    plant: Plant,
+    sampling: Sampling,
+    lanes: RollOuts,
+) -> None:
+    """Writes the first actions (N, C) of the plans of N robots.
+
+    Scans are (N, P), goals (N, 2), twists (N, 3). Instead of warm-starting from the previous plan,
+    the first round proposes actions from the whole range. The planner therefore has no memory: its
+    actions depend only on the observation.
+    """
+    for n in range(out.shape[0]):
+        around = maps.map_scan(scans[n], goals[n], maker)
+        # pose and state when the first command takes effect
+        fit_command(twists[n], plant, lanes)
+        lanes.start[:] = 0.0
+        if plant.latency > 0.0:
+            advance(lanes.start, twists[n], plant.latency, plant.series)
+        lanes.actions[:] = sampling.offers
+        best = _roll_out(around, plant, sampling, lanes)
+        lanes.nominal[:] = lanes.actions[best]
+        for spread in SPREADS:
+            for k in range(lanes.actions.shape[0]):
+                for q in range(lanes.nominal.shape[0]):
+                    for c in range(lanes.nominal.shape[1]):
+                        action = lanes.nominal[q, c]
+                        if k > 0:
+                            action += spread * sampling.noise[k, q, c]
+                        lanes.actions[k, q, c] = min(max(action, -1.0), 1.0)
+            best = _roll_out(around, plant, sampling, lanes)
+            _average(best, lanes)
+        out[n] = lanes.nominal[0]
+
+
+@kernel
+def _average(best: int, lanes: RollOuts) -> None:
+    """Replaces the nominal actions by the cost-weighted mean of the sampled ones."""
+    lanes.nominal[:] = 0.0
+    total = 0.0
+    for k in range(lanes.cost.shape[0]):
+        weight = math.exp((lanes.cost[best] - lanes.cost[k]) / TEMPERATURE)
+        total += weight
+        for q in range(lanes.nominal.shape[0]):
+            for c in range(lanes.nominal.shape[1]):
+                lanes.nominal[q, c] += weight * lanes.actions[k, q, c]
+    for q in range(lanes.nominal.shape[0]):
+        for c in range(lanes.nominal.shape[1]):
+            lanes.nominal[q, c] /= total
+
+
+@kernel
+def fit_command(twist: Array, plant: Plant, lanes: RollOuts) -> None:
+    """Writes the held command whose steady twist is nearest to a twist (3,), and its state.
+
+    Coordinate descent on the squared difference.
+    """
+    held = lanes.held
+    x = lanes.x_single
+    dq = lanes.rate
+    terms = plant.single
+    count = plant.settled.shape[1]
+    for c in range(count):
+        held[c] = min(max(0.0, plant.low[c]), plant.high[c])
+    for _ in range(PASSES):
+        for c in range(count):
+            _settle(held, plant, lanes)
+            rates(dq, x, terms)
+            r0 = twist[0] - dq[0]
+            r1 = twist[1] - dq[1]
+            r2 = twist[2] - dq[2]
+            b0 = dq[0]
+            b1 = dq[1]
+            b2 = dq[2]
+            step = 1e-3 * (plant.high[c] - plant.low[c])
+            held[c] += step
+            _settle(held, plant, lanes)
+            rates(dq, x, terms)
+            held[c] -= step
+            g0 = (dq[0] - b0) / step
+            g1 = (dq[1] - b1) / step
+            g2 = (dq[2] - b2) / step
+            size = g0 * g0 + g1 * g1 + g2 * g2 + EASE
+            value = held[c] + (g0 * r0 + g1 * r1 + g2 * r2) / size
+            held[c] = min(max(value, plant.low[c]), plant.high[c])
+    _settle(held, plant, lanes)
+
+
+@kernel
+def _settle(command: Array, plant: Plant, lanes: RollOuts) -> None:
+    """Writes the steady state of a command (C,) and its effect into `one`."""
+    states, count = plant.settled.shape
+    x = lanes.x_single
+    for s in range(states):
+        x[s] = 0.0
+        for c in range(count):
+            x[s] += plant.settled[s, c] * command[c]
+    for c in range(count):
+        x[states + c] = apply_curve(command[c], plant.single.curves[c])
+    x[states + count] = 1.0
+
+
+@kernel
+def _roll_out(
+    around: Situation, plant: Plant, sampling: Sampling, lanes: RollOuts
+) -> int:
+    """Rolls out the actions of all lanes; writes their costs and returns the cheapest lane."""
+    _begin(plant, lanes)
+    states = plant.settled.shape[0]
+    periods = sampling.between.shape[0]
+    limit = maps.find_contact_limit(around)
+    for t in range(periods + sampling.stop):
+        for c in range(plant.low.shape[0]):
+            row = lanes.x[states + c]
+            curve = plant.single.curves[c]
+            if t < periods:
+                middle = 0.5 * (plant.low[c] + plant.high[c])
+                half = 0.5 * (plant.high[c] - plant.low[c])
+                for k in range(row.shape[0]):
+                    action = 0.0
+                    for q in range(lanes.nominal.shape[0]):
+                        action += sampling.between[t, q] * lanes.actions[k, q, c]
+                    row[k] = apply_curve(middle + half * action, curve)
+            elif not sampling.holds[c]:
+                row[:] = apply_curve(sampling.rest[c], curve)
+        run(
+            lanes.pose,
+            lanes.x,
+            lanes.dq,
+            plant.terms,
+            plant.series,
+            plant.dt,
+            plant.substeps,
         )
+        for k in range(lanes.cost.shape[0]):
+            if lanes.ended[k] < 0:
+                _add_cost(k, t, limit, around, sampling, lanes)
+    best = 0
+    for k in range(lanes.cost.shape[0]):
+        lanes.cost[k] += (1.0 - EARLY) * lanes.way[k]
+        if lanes.cost[k] < lanes.cost[best]:
+            best = k
+    return best
 
 
-def _settled(model: TaylorModel, high: Array) -> Array:
-    """Returns the steady state (S, C) per unit of each command."""
-    commands = np.diag(0.5 * high)
-    pose = np.zeros((len(high), 3))
-    state = np.zeros((len(high), model.state_size))
-    for _ in range(round(SETTLED_S / model.dt)):
-        pose, state = model.step(pose, state, commands)
-    return np.ascontiguousarray((state / (0.5 * high)[:, None]).T)
+@kernel
+def _begin(plant: Plant, lanes: RollOuts) -> None:
+    """Puts all lanes at the start; begins their costs with the changes of action between knots."""
+    states, count = plant.settled.shape
+    x = lanes.start[0]
+    y = lanes.start[1]
+    heading = lanes.start[2]
+    for k in range(lanes.cost.shape[0]):
+        lanes.pose[0, k] = x
+        lanes.pose[1, k] = y
+        lanes.pose[2, k], lanes.pose[3, k] = math.cos(heading), math.sin(heading)
+        lanes.pose[4, k] = heading
+        lanes.pose[5, k] = 0.0
+        for s in range(states):
+            lanes.x[s, k] = lanes.x_single[s]
+        change = 0.0
+        for c in range(count):
+            before = (
+                2.0 * (lanes.held[c] - plant.low[c]) / (plant.high[c] - plant.low[c])
+                - 1.0
+            )
+            for q in range(lanes.nominal.shape[0]):
+                change += (lanes.actions[k, q, c] - before) ** 2
+                before = lanes.actions[k, q, c]
+        lanes.cost[k] = CHANGE * change
+        lanes.way[k] = 0.0
+        lanes.ended[k] = -1
+
+
+@kernel
+def _add_cost(
+    k: int,
+    t: int,
+    limit: float,
+    around: Situation,
+    sampling: Sampling,
+    lanes: RollOuts,
+) -> None:
+    """Adds the cost of period t in lane k: of the way and of contacts, or of those in a stop."""
+    periods = sampling.between.shape[0]
+    x = lanes.pose[0, k]
+    y = lanes.pose[1, k]
+    c = lanes.pose[2, k]
+    s = lanes.pose[3, k]
+    room = find_room(x, y, c, s, around)
+    if t >= periods:
+        if room < limit or max(abs(x), abs(y)) > sampling.far:
+            lanes.cost[k] += HIT * (1.0 - (t - periods) / sampling.stop)
+            lanes.ended[k] = t
+        return
+    way = find_way(x, y, around)
+    lanes.way[k] = way
+    lanes.cost[k] += EARLY * way / periods
+    if room < limit:
+        lanes.cost[k] += HIT * (2.0 - t / periods)
+        lanes.ended[k] = t
+        return
+    keep = around.clearance
+    near = max(keep.margin + keep.soft - room, 0.0) / keep.soft
+    lanes.cost[k] += NEAR * near * near / periods
+    if math.hypot(around.goal[0] - x, around.goal[1] - y) < ARRIVED_M:
+        lanes.ended[k] = t
+        lanes.way[k] = 0.0
+    elif t == periods - 1:
+        astray = maps.score_heading(x, y, c, s, way, around)
+        lanes.cost[k] += ASTRAY * astray * min(way, 1.0)

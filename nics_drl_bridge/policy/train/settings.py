@@ -18,7 +18,7 @@ from nics_drl_bridge.config import (
     load_yaml,
     validate,
 )
-from nics_drl_bridge.env.registry import class_for
+from nics_drl_bridge.env.registry import find_task_class
 from nics_drl_bridge.env.teaching import Teaching
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, open_model
@@ -330,7 +330,7 @@ def fit_settings(settings: TrainingSettings, opened: Opened, inherited: bool) ->
     options = dict(settings.task_options)
     notes = list[str]()
     lidar = opened.model.lidar
-    class_for(settings.task, options)
+    find_task_class(settings.task, options)
     worlds = opened.worlds.values()
     pace = pace_of(opened.model, worlds, options.get("top_speed"))
     changed: dict[str, Any] = {}
