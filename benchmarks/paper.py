@@ -47,7 +47,7 @@ from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.identify.fit import fit
 from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.scanner import Scanner, make_scanner
-from nics_drl_bridge.lidar.shapes import Polygon, Shape, convex_hull
+from nics_drl_bridge.lidar.shapes import Polygon, Shape, find_convex_hull
 from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
 from nics_drl_bridge.lidar.table import Density, LidarTable
 from nics_drl_bridge.recording.recording import Samples
@@ -394,7 +394,7 @@ def make_polygon(vertices: int, seed: int, notch: float) -> Polygon:
     angles = 2.0 * np.pi / vertices * turns
     depth = 1.0 - notch * rng.random(vertices)
     points = depth[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    hull = convex_hull(points)
+    hull = find_convex_hull(points)
     points *= PERIMETER / np.hypot(*(hull - np.roll(hull, 1, axis=0)).T).sum()
     return Polygon(points=tuple((float(x), float(y)) for x, y in points))
 

@@ -66,7 +66,7 @@ from nics_drl_bridge.policy.evaluation import (
     summarise,
 )
 from nics_drl_bridge.policy.file.stateful import Policy
-from nics_drl_bridge.policy.policies import POLICIES, open_policy, shipped_policies
+from nics_drl_bridge.policy.policies import POLICIES, list_shipped_policies, open_policy
 from nics_drl_bridge.policy.train.settings import (
     TrainingSettings,
     load_training,
@@ -103,7 +103,7 @@ def shorten(settings: TrainingSettings) -> TrainingSettings:
 
 def learn(settings: TrainingSettings, seed: int, episodes: int) -> Result:
     """Trains with one seed and drives unseen episodes; returns the figures."""
-    from nics_drl_bridge.policy.train.algorithms import act_of
+    from nics_drl_bridge.policy.train.algorithms import make_act
     from nics_drl_bridge.policy.train.run import train
 
     model, worlds = open_training(settings)
@@ -118,7 +118,7 @@ def learn(settings: TrainingSettings, seed: int, episodes: int) -> Result:
         settings.task_options,
         settings.max_episode_steps,
     )
-    act = act_of(trained.algorithm)
+    act = make_act(trained.algorithm)
     outcomes = drive_worlds(env, act, range(FIRST_SEED, FIRST_SEED + episodes))
     wall_s = time.perf_counter() - begin
     told = summarise(outcomes, model.control_period)
@@ -189,7 +189,7 @@ def measure_baselines(given: Given) -> Result:
     """
     figures = {}
     for world, robot in product(given.world, given.robot):
-        own = [robot] if robot in shipped_policies() else []
+        own = [robot] if robot in list_shipped_policies() else []
         for name in [*own, *given.policy]:
             summary = drive_episodes(robot, name, world, given.episodes, given.control)
             figures[f"{world}/{robot}/{name}"] = dataclasses.asdict(summary)

@@ -43,7 +43,7 @@ from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar import map_kernels
 from nics_drl_bridge.lidar.bake import bake
-from nics_drl_bridge.lidar.beam_kernels import beams_of
+from nics_drl_bridge.lidar.beam_kernels import make_beams
 from nics_drl_bridge.lidar.faults import LidarFaults
 from nics_drl_bridge.lidar.maps import OCCUPIED, GridMap
 from nics_drl_bridge.lidar.scanner import Renderer, Scanner
@@ -611,7 +611,7 @@ def measure_maps(given: Given) -> Result:
     rows = []
     for name, make in MAPS.items():
         grid = GridMap((make(given.seed) * OCCUPIED).astype(np.int8), RESOLUTION)
-        map_kernels.free_squares(grid.blocked)  # compiles
+        map_kernels.find_free_squares(grid.blocked)  # compiles
         begin = time.perf_counter()
         squares, _ = grid.arrays
         bake_s = time.perf_counter() - begin
@@ -619,7 +619,7 @@ def measure_maps(given: Given) -> Result:
         for lidar in MAP_LIDARS:
             spec = load_lidar(lidar)
             directions = np.ascontiguousarray(spec.directions.T)
-            beams = beams_of(directions, spec.angle_min, spec.angle_increment)
+            beams = make_beams(directions, spec.angle_min, spec.angle_increment)
             about = (spec.range_max, grid.arrays)
             exact, exact_speed = scan_map(beams, poses, *about, True)
             beside = poses.copy()

@@ -25,11 +25,11 @@ from nics_drl_bridge.files import SUMS, write_sums
 from nics_drl_bridge.gate.limits import load_limits
 from nics_drl_bridge.generator import load_model, open_model, save_model
 from nics_drl_bridge.lidar.sensor import add_sensor_kind, load_sensor, sensor_of_data
-from nics_drl_bridge.policy.file.contract import _task_hash
+from nics_drl_bridge.policy.file.contract import _hash_task
 from nics_drl_bridge.policy.file.policy_file import load_policy
 from nics_drl_bridge.policy.policies import open_policy
 from nics_drl_bridge.policy.train.checkpoint import read_checkpoint
-from nics_drl_bridge.policy.train.run import settings_of
+from nics_drl_bridge.policy.train.run import read_run_settings
 from nics_drl_bridge.policy.train.settings import load_training
 from nics_drl_bridge.recording.mapping import load_mapping
 from nics_drl_bridge.recording.messages import collect_types
@@ -117,7 +117,7 @@ def policy_with_a_sensor(trap, place):
 def policy_with_a_task(trap, place):
     def change(data):
         data["task"]["name"] = place
-        data["task"]["sha256"] = _task_hash(data["task"], data["observation"])
+        data["task"]["sha256"] = _hash_task(data["task"], data["observation"])
 
     return policy_with(trap, change)
 
@@ -196,7 +196,7 @@ WAYS = {
         load_training(write(t.folder, "settings.yaml", f"task: '{p('Trap')}'\n"))
     ),
     "the task of a run": lambda t, p: open_named_task(
-        settings_of(run_of_a_task(t, p("Trap")))
+        read_run_settings(run_of_a_task(t, p("Trap")))
     ),
     "a resumed run": lambda t, p: resume_a_run(t, p("Trap")),
     "a backend": lambda t, p: make_backend(
@@ -379,7 +379,7 @@ def test_settings_of_a_task_of_ones_own_are_read_where_the_caller_names_it(trap)
         load_training(file)
     settings = load_training(file, task=place)
     assert (settings.task, settings.steps) == (place, 77)
-    assert settings_of(run_of_a_task(trap, place), place).task == place
+    assert read_run_settings(run_of_a_task(trap, place), place).task == place
 
 
 def test_a_run_of_a_task_of_ones_own_is_resumed_where_the_caller_names_it(trap):

@@ -33,15 +33,15 @@ from nics_drl_bridge.policy.evaluation import (
 from nics_drl_bridge.policy.policies import (
     check_policy_file,
     is_policy_file,
+    list_shipped_policies,
     open_policy,
-    shipped_policies,
 )
 from nics_drl_bridge.policy.train.settings import (
     Fitted,
     Opened,
+    find_pace,
     fit_settings,
     load_training,
-    pace_of,
 )
 from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.recording.readers import open_drive, read_recording
@@ -214,7 +214,7 @@ def learn(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
         return _train_policy(plan, model, say)
     policy = BASELINE
     if (
-        model.robot.name in shipped_policies()
+        model.robot.name in list_shipped_policies()
         and find_spec("onnxruntime")
         and find_spec("onnx")
     ):
@@ -281,7 +281,7 @@ def _evaluate(
 ) -> dict[str, Summary]:
     say(f"evaluating {name} in {MANY} unseen episodes, all at once, then perturbed")
     policy, task = open_policy(name, model)
-    limit = pace_of(model, [load_world(plan.world)]).steps
+    limit = find_pace(model, [load_world(plan.world)]).steps
     summaries = {}
     for condition, drawn in {
         AS_IT_IS: None,

@@ -28,7 +28,7 @@ from nics_drl_bridge.policy.evaluation import Episode, Tally, drive, drive_all
 from nics_drl_bridge.policy.file.contract import Contract
 from nics_drl_bridge.policy.file.stateful import Policy
 from nics_drl_bridge.policy.policies import is_policy_file, open_policy
-from nics_drl_bridge.policy.train.settings import pace_of
+from nics_drl_bridge.policy.train.settings import find_pace
 from nics_drl_bridge.report.doctor import examine
 from nics_drl_bridge.report.doctor_facts import derive_expected
 from nics_drl_bridge.report.pictures import draw_trajectories
@@ -192,7 +192,7 @@ def make_env(
     register_envs()
     opened, task = open_policy(policy, model, conditions.kind)
     task = replace(task, **conditions.task)
-    limit = conditions.steps or pace_of(model, [world]).steps
+    limit = conditions.steps or find_pace(model, [world]).steps
     options: dict[str, Any] = {
         "max_episode_steps": limit,
         "backend": backend,
@@ -321,7 +321,7 @@ def limit_time(
     say: Say,
 ) -> Conditions:
     """Sets the time limit: the policies', or one for robot and world; says if it is short."""
-    pace = pace_of(model, [world])
+    pace = find_pace(model, [world])
     limits = [
         contract.max_episode_steps
         for contract in contracts.values()

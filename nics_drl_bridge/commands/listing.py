@@ -106,9 +106,11 @@ def lidars() -> list[Row]:
 
 def policies() -> list[Row]:
     """Returns the shipped policy files and the baselines."""
-    from nics_drl_bridge.policy.policies import POLICIES, shipped_policies
+    from nics_drl_bridge.policy.policies import POLICIES, list_shipped_policies
 
-    trained = [{"name": name, "kind": "policy file"} for name in shipped_policies()]
+    trained = [
+        {"name": name, "kind": "policy file"} for name in list_shipped_policies()
+    ]
     return trained + [
         {"name": name, "kind": "baseline, any robot"} for name in sorted(POLICIES)
     ]

@@ -118,7 +118,7 @@ def train(
     task_of_user = task if ":" in task else None
     opened = None
     if resume and out is not None:
-        chosen = train_run.settings_of(out, task_of_user)
+        chosen = train_run.read_run_settings(out, task_of_user)
     else:
         chosen, opened = _load_settings(task, settings, named)
     folder = out or Path("runs") / chosen.title
@@ -197,9 +197,9 @@ def _load_settings(
     task: str, settings: str | None, named: dict[str, Any]
 ) -> tuple[Any, Any]:
     """Returns the settings of a training, and what they name; prints what was adapted."""
-    from nics_drl_bridge.policy.train.settings import settings_for
+    from nics_drl_bridge.policy.train.settings import choose_fitting_settings
 
-    chosen = settings_for(task, settings, named)
+    chosen = choose_fitting_settings(task, settings, named)
     for line in chosen.notes:
         typer.echo(line, err=True)
     return chosen.settings, chosen.opened

@@ -10,17 +10,17 @@ from numpy.typing import NDArray
 from nics_drl_bridge import defaults, extensions
 from nics_drl_bridge.arguments import check_arguments, check_options, format_value
 from nics_drl_bridge.env import guard
-from nics_drl_bridge.env.guard import give, halts_on_error, refused_after_close
+from nics_drl_bridge.env.guard import give, refuse_after_close, stop_on_error
 from nics_drl_bridge.env.registry import make_task
-from nics_drl_bridge.env.sim_backend import completed, make_backend
-from nics_drl_bridge.env.snapshot import Snapshot, gate_of, goals_of
+from nics_drl_bridge.env.sim_backend import complete_backend, make_backend
+from nics_drl_bridge.env.snapshot import Snapshot, find_gate, find_goals
 from nics_drl_bridge.env.task import (
     Episodes,
     Memory,
     Observation,
     Task,
+    make_team_space,
     still,
-    team_space,
     total,
 )
 from nics_drl_bridge.errors import ConfigError, suggest
@@ -127,8 +127,10 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         self.world = world if isinstance(world, AnyWorld) else load_worlds(world)
         self.task = make_task(task, self.model, task_options)
         self.robots = self.task.robots
-        self.observation_space = team_space(self.task.observation_space, self.robots)
-        self.action_space = team_space(self.task.action_space, self.robots)
+        self.observation_space = make_team_space(
+            self.task.observation_space, self.robots
+        )
+        self.action_space = make_team_space(self.task.action_space, self.robots)
         self.memory: Memory = {}
         self.scene: Scene | None = None
         self.ended: NDArray[np.bool_] = np.zeros(self.robots, np.bool_)
@@ -155,10 +157,10 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
             given = {name: value for name, value in own.items() if value is not None}
             options = {**(backend_options or {}), **given}
             backend = make_backend(backend, self.model, self.world, **options)
-        self._backend: Backend = completed(backend, self._row(self._rest))
+        self._backend: Backend = complete_backend(backend, self._get_row(self._rest))
 
-    @refused_after_close
-    @halts_on_error
+    @refuse_after_close
+    @stop_on_error
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
@@ -184,42 +186,45 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
             guard.check_places("start", starts[None], [self.scene], self.world, radius)
         episodes = Episodes(np.array([episode]), starts[None], self.scene.goals[None])
         if not self._rehearsed:
-            self._rehearse(episodes)
+            self._try_task(episodes)
         memory = guard.begin_task(
             self.task, episodes, options, [self.scene], self.world, "start"
         )
-        self._view = self._lifted(
-            self._backend.reset(Start(episode, self._row(starts)))
+        self._view = self._lift(
+            self._backend.reset(Start(episode, self._get_row(starts)))
         )
         self.memory = memory
         self._command = self._rest
         self._facts = {}
         self._steps = 0
         self.ended = np.zeros(self.robots, np.bool_)
-        facts: dict[str, Any] = {"episode_seed": episode, "start": self._row(starts)}
+        facts: dict[str, Any] = {
+            "episode_seed": episode,
+            "start": self._get_row(starts),
+        }
         facts["bodies"] = self.scene.bodies.copy()
         drawn = self._backend.facts().get("randomisation")
         if drawn:
             facts["randomisation"] = drawn
         seen = self.task.observation(self._view, self.memory)
-        observation = self.task.valid("observation", seen, self._shape)[0]
+        observation = self.task.check_result("observation", seen, self._shape)[0]
         if self.render_mode == "human":
             self.render()
-        return observation.reshape(-1), self._info(self._view, facts)
+        return observation.reshape(-1), self._make_info(self._view, facts)
 
-    def _rehearse(self, episodes: Episodes) -> None:
+    def _try_task(self, episodes: Episodes) -> None:
         """Runs the task once before the robot moves: it is too slow to compile while driving."""
         free = np.full((1, self.robots, self.model.lidar.beams), np.inf, np.float32)
         sensed = unread(self.model.sensors, 1, self.robots)
         starts = episodes.starts
         view = RobotView(starts.copy(), 0.0 * starts, free, 0.0, 0.0, 0.0, sensed)
-        memory = self.task.begun(episodes)
+        memory = self.task.start_episodes(episodes)
         with suppress(ConfigError):  # the task may refuse the made-up view
             self.task.take_step(np.empty(self._shape, np.float32), view, view, memory)
         self._rehearsed = True
 
-    @refused_after_close
-    @halts_on_error
+    @refuse_after_close
+    @stop_on_error
     def step(
         self, action: NDArray[Any]
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -234,8 +239,8 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
             self.render()
         return observation.reshape(-1), reward, bool(self.ended.all()), False, info
 
-    @refused_after_close
-    @halts_on_error
+    @refuse_after_close
+    @stop_on_error
     def advance(
         self, action: NDArray[Any]
     ) -> tuple[NDArray[np.float32], dict[str, Array], dict[str, Any]]:
@@ -247,14 +252,14 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         if before is None:
             raise gymnasium.error.ResetNeeded("call reset() before step().")
         given = guard.check_action(action, self.action_space, "action")
-        command = self._row(
+        command = self._get_row(
             self.task.drive(given.reshape(self._each), self.ended[None])[0]
         )
         seen, facts = self._backend.step(command)
         self._command = command
         self._facts = facts
         self._steps = self._steps + 1
-        view = self._lifted(seen)
+        view = self._lift(seen)
         out = np.empty(self._shape, np.float32)
         outcome = self.task.take_step(out, before, view, self.memory)
         if self.robots > 1:
@@ -263,16 +268,16 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         self.ended = outcome.ended[0]
         self._view = view
         for name, values in outcome.info.items():
-            row = self._row(values[0])
+            row = self._get_row(values[0])
             facts[name] = row.item() if row.ndim == 0 else row.copy()
-        return out[0], terms, self._info(view, facts)
+        return out[0], terms, self._make_info(view, facts)
 
     def halt(self) -> None:
         """Stops the robot until the next reset; any exception does this, too."""
         self._view = None
         self._backend.halt()
 
-    def _lifted(self, view: RobotView) -> RobotView:
+    def _lift(self, view: RobotView) -> RobotView:
         lead = (1, self.robots, -1)
         sensed = {name: reading.reshape(lead) for name, reading in view.sensed.items()}
         return RobotView(
@@ -286,19 +291,19 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
             view.sensed_age_s,
         )
 
-    def _row(self, rows: NDArray[Any]) -> NDArray[Any]:
+    def _get_row(self, rows: NDArray[Any]) -> NDArray[Any]:
         return rows[0] if self.robots == 1 else rows
 
-    def _info(self, view: RobotView, facts: dict[str, Any]) -> dict[str, Any]:
+    def _make_info(self, view: RobotView, facts: dict[str, Any]) -> dict[str, Any]:
         shown = {
-            name: self._row(self.memory[name][0]).copy() for name in self.task.shown
+            name: self._get_row(self.memory[name][0]).copy() for name in self.task.shown
         }
         ages = {"scan_age_s": view.scan_age_s, "odom_age_s": view.odom_age_s}
         ages |= {"sensed_age_s": view.sensed_age_s} if view.sensed else {}
-        return {**shown, "pose": self._row(view.pose[0]).copy(), **ages, **facts}
+        return {**shown, "pose": self._get_row(view.pose[0]).copy(), **ages, **facts}
 
-    @refused_after_close
-    @halts_on_error
+    @refuse_after_close
+    @stop_on_error
     def render(self) -> Any:
         """Draws the current world from above; see Gymnasium."""
         if self.render_mode is None:
@@ -329,7 +334,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
             poses=np.reshape(facts.get("true_pose", view.pose), (self.robots, 3)),
             ranges=view.ranges[0],
             bodies=facts.get("bodies", self.scene.bodies),
-            goals=goals_of(self.memory).copy(),
+            goals=find_goals(self.memory).copy(),
             member=int(np.asarray(self.scene.member)),
             step=self._steps,
             estimates=view.pose[0],
@@ -337,10 +342,10 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
             if covariance is None
             else np.reshape(covariance, (-1, 3, 3)),
             commands=np.reshape(self._command, (self.robots, -1)),
-            gate=gate_of(known),
+            gate=find_gate(known),
         )
 
-    @halts_on_error
+    @stop_on_error
     def close(self) -> None:
         """Stops the robot with a zero command and closes the page."""
         picture = self._picture

@@ -26,44 +26,44 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
-def halts_on_error(
+def stop_on_error(
     method: Callable[Concatenate[Any, P], T],
 ) -> Callable[Concatenate[Any, P], T]:
     """Makes a method `halt` its robot if it raises any exception, including KeyboardInterrupt."""
 
     @wraps(method)
-    def guarded(self: Any, /, *args: P.args, **kwargs: P.kwargs) -> T:
+    def call_guarded(self: Any, /, *args: P.args, **kwargs: P.kwargs) -> T:
         try:
             return method(self, *args, **kwargs)
         except BaseException:
-            with uninterrupted():
+            with delay_interrupts():
                 self.halt()
             raise
 
-    return guarded
+    return call_guarded
 
 
 class ClosedEnvError(ConfigError, gymnasium.error.ClosedEnvironmentError):
     """A method was called after `close`."""
 
 
-def refused_after_close(
+def refuse_after_close(
     method: Callable[Concatenate[Any, P], T],
 ) -> Callable[Concatenate[Any, P], T]:
     """Makes a method of an env raise ClosedEnvError once `_closed` is True."""
 
     @wraps(method)
-    def guarded(self: Any, /, *args: P.args, **kwargs: P.kwargs) -> T:
+    def call_guarded(self: Any, /, *args: P.args, **kwargs: P.kwargs) -> T:
         if self._closed:
             call = f"{method.__name__}() after close()"
             raise ClosedEnvError(f"{call}: the env is closed; make a new one.")
         return method(self, *args, **kwargs)
 
-    return guarded
+    return call_guarded
 
 
 @contextlib.contextmanager
-def uninterrupted() -> Iterator[None]:
+def delay_interrupts() -> Iterator[None]:
     """Defers Ctrl-C to the end of the block, so that it can't interrupt the stopping of a robot."""
     if threading.current_thread() is not threading.main_thread():
         yield  # Ctrl-C never interrupts other threads
@@ -88,7 +88,7 @@ def check_reset(seed: Any, options: Any, worlds: int = 1) -> None:
         raise ConfigError(f"reset options of type {type(options).__name__}: {needed}")
 
 
-def override(
+def apply_options(
     memory: dict[str, NDArray[Any]], options: Mapping[str, Any] | None, *of_env: str
 ) -> None:
     """Writes values of `reset(options=...)` into all rows of the memory arrays they name.
@@ -118,8 +118,8 @@ def begin_task(
 
     Options in `of_env` belong to the env.
     """
-    memory: dict[str, NDArray[Any]] = task.begun(episodes)
-    override(memory, options, *of_env)
+    memory: dict[str, NDArray[Any]] = task.start_episodes(episodes)
+    apply_options(memory, options, *of_env)
     if options and "goal" in options:
         check_places("goal", memory["goal"], scenes, world)
     return memory
@@ -161,7 +161,7 @@ def check_places(
         shapes = world.shapes
         pairs = product(at[:, :2].tolist(), scene.bodies)
         free = free or not any(
-            _on(x, y, radius, body, shapes) for (x, y), body in pairs
+            _is_on(x, y, radius, body, shapes) for (x, y), body in pairs
         )
     if not free and len(places):
         fix = "move it, or use another seed"
@@ -170,7 +170,7 @@ def check_places(
         )
 
 
-def _on(
+def _is_on(
     x: float, y: float, radius: float, body: NDArray[Any], shapes: Sequence[Shape]
 ) -> bool:
     """Returns True if a disc overlaps a body."""
@@ -206,7 +206,7 @@ def check_action(action: Any, space: gymnasium.Space[Any], name: str) -> NDArray
         if array.dtype.char not in "fd":
             # The kernels are compiled only for float32 and float64.
             array = array.astype(np.float64)
-        if not kernels.finite(array.reshape(1, -1)):
+        if not kernels.is_finite(array.reshape(1, -1)):
             raise gymnasium.error.InvalidAction(
                 f"{name} {array!r}: contains NaN or inf."
             )
@@ -218,7 +218,7 @@ def check_action(action: Any, space: gymnasium.Space[Any], name: str) -> NDArray
 def check_command(command: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
     """Returns a task's command as an array. Raises ConfigError unless finite, of this shape."""
     made = np.asarray(command, np.float64)
-    if made.shape != shape or not kernels.finite(made.reshape(1, -1)):
+    if made.shape != shape or not kernels.is_finite(made.reshape(1, -1)):
         needed = f"must be finite and of shape {shape}; check its `command`."
         raise ConfigError(f"the task's command {made!r:.80}: {needed}")
     return made

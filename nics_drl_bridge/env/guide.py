@@ -40,7 +40,7 @@ class Guide:
         walls = np.full((len(members), *sizes.max(axis=0)), np.inf, np.float32)
         stands = np.zeros((len(members), sampler.count), np.bool_)
         for p, scene_sampler in enumerate(sampler.samplers):
-            kernels.walls_of(
+            kernels.sample_walls(
                 walls[p, : sizes[p, 0], : sizes[p, 1]],
                 extents[p],
                 cells[p],
@@ -69,16 +69,18 @@ class Guide:
     def begin(self, worlds: NDArray[np.intp], scenes: Scenes) -> None:
         """Compute the path lengths in the scenes of episodes that begin in some worlds (n,)."""
         member = np.asarray(scenes.member, np.int64)
-        kernels.guide(
+        kernels.find_ways(
             self.fields, worlds, member, scenes.bodies, scenes.goals, self._grid
         )
 
-    def lengths(self, rows: slice | NDArray[np.intp], data: State) -> Array:
+    def measure_lengths(self, rows: slice | NDArray[np.intp], data: State) -> Array:
         """Path lengths (n, M) [m] from the present places of the robots of some worlds.
 
         Near obstacles, a metre counts as more than one; see `guide_kernels`.
         """
         poses = data.pose[rows]
         out = np.empty(poses.shape[:2])
-        kernels.lengths(out, poses, data.member[rows], self.fields[rows], self._grid)
+        kernels.measure_lengths(
+            out, poses, data.member[rows], self.fields[rows], self._grid
+        )
         return out

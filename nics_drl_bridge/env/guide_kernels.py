@@ -40,7 +40,7 @@ class GuideGrid(NamedTuple):
 
 
 @kernel(allocates=True)
-def walls_of(out: Singles, extent: Array, cell: float, cells: MapField) -> None:
+def sample_walls(out: Singles, extent: Array, cell: float, cells: MapField) -> None:
     """Write the distances of `cells` to walls and map for coarser cells (rows, columns).
 
     The field is `extent` (4,), beyond which nothing is free.
@@ -58,7 +58,7 @@ def walls_of(out: Singles, extent: Array, cell: float, cells: MapField) -> None:
 
 
 @kernel(allocates=True)
-def guide(
+def find_ways(
     out: Singles,
     worlds: Integers,
     member: Integers,
@@ -83,10 +83,10 @@ def guide(
         cell = grid.frames[p, 2]
         for k in range(bodies.shape[1]):
             if grid.stands[p, k] and bodies[n, k, RADIUS] > 0.0:
-                _approach(space, bodies[n, k], x, y, cell, grid)
+                _lower_space(space, bodies[n, k], x, y, cell, grid)
         for i in range(wide[0]):
             for j in range(wide[1]):
-                space[i, j] = np.float32(cell * _cost(space[i, j], grid))
+                space[i, j] = np.float32(cell * _find_cost(space[i, j], grid))
         for m in range(goals.shape[1]):
             field = out[worlds[n], m, : wide[0], : wide[1]]
             u = (goals[n, m, 0] - x) / cell - 0.5
@@ -95,7 +95,7 @@ def guide(
 
 
 @kernel
-def _approach(
+def _lower_space(
     space: Singles,
     body: Array,
     x: float,
@@ -112,12 +112,14 @@ def _approach(
     outline = collision.outline_of(body, grid.outlines)
     for i in range(first, last + 1):
         for j in range(left, right + 1):
-            gap = _gap(x + (j + 0.5) * cell, y + (i + 0.5) * cell, body, outline)
+            gap = _measure_gap(
+                x + (j + 0.5) * cell, y + (i + 0.5) * cell, body, outline
+            )
             space[i, j] = min(space[i, j], np.float32(gap))
 
 
 @kernel
-def _gap(x: float, y: float, body: Array, outline: Outline) -> float:
+def _measure_gap(x: float, y: float, body: Array, outline: Outline) -> float:
     """Distance of a point from a body with an outline [m]."""
     dx = x - body[X]
     dy = y - body[Y]
@@ -128,7 +130,7 @@ def _gap(x: float, y: float, body: Array, outline: Outline) -> float:
 
 
 @kernel
-def _cost(space: float, grid: GuideGrid) -> float:
+def _find_cost(space: float, grid: GuideGrid) -> float:
     """Cost of a metre at a place, given the free space around it [m]."""
     beside = space - grid.outer
     if beside >= COMFORT:
@@ -155,13 +157,13 @@ def _spread(field: Singles, cost: Singles, u: float, v: float) -> None:
     for _ in range(ROUNDS):
         change = np.float32(0.0)
         for way in range(4):
-            change = max(change, sweep(field, cost, way >= 2, way % 2 == 1))
+            change = max(change, update_ways(field, cost, way >= 2, way % 2 == 1))
         if change <= SETTLED:
             return
 
 
 @kernel
-def sweep(ways: Singles, prices: Singles, down: bool, left: bool) -> np.float32:
+def update_ways(ways: Singles, prices: Singles, down: bool, left: bool) -> np.float32:
     """Update the path lengths row by row from one corner; return the maximum change [m].
 
     Both (rows, columns) are float32; the price of a cell is the cost of crossing it.
@@ -193,7 +195,7 @@ def sweep(ways: Singles, prices: Singles, down: bool, left: bool) -> np.float32:
 
 
 @kernel(allocates=True)
-def lengths(
+def measure_lengths(
     out: Array,
     poses: Array,
     member: Integers,

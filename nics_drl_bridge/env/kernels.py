@@ -38,7 +38,7 @@ class ScanScale(NamedTuple):
 
 
 @kernel(allocates=True)
-def episode_seeds(
+def compute_episode_seeds(
     seeds: NDArray[np.int64], numbers: NDArray[np.int64], out: NDArray[np.int64]
 ) -> None:
     """Computes seeds (n,) of episodes from their numbers (n,) and their envs' seeds (n,)."""
@@ -47,7 +47,9 @@ def episode_seeds(
 
 
 @kernel(allocates=True)
-def commands(out: Array, actions: NDArray[np.float32], low: Array, high: Array) -> None:
+def scale_actions(
+    out: Array, actions: NDArray[np.float32], low: Array, high: Array
+) -> None:
     """Scales actions (R, C), clamped to [-1, 1], to commands (R, C) between their limits (C,)."""
     for i in range(out.shape[0]):
         for c in range(out.shape[1]):
@@ -56,7 +58,7 @@ def commands(out: Array, actions: NDArray[np.float32], low: Array, high: Array) 
 
 
 @kernel(allocates=True)
-def finite(values: Array | NDArray[np.float32]) -> bool:
+def is_finite(values: Array | NDArray[np.float32]) -> bool:
     """Returns True if all values (R, C) are finite."""
     for i in range(values.shape[0]):
         for c in range(values.shape[1]):
@@ -73,17 +75,17 @@ def look(
     if scale.sectors > 0:
         resample(shares, ranges, scale.plan)
         for s in range(shares.shape[0]):
-            shares[s] = _share(shares[s], scale)
-        return contact(ranges, scale)
+            shares[s] = _scale_range(shares[s], scale)
+        return has_contact(ranges, scale)
     hits = np.int32(0)
     for b in range(ranges.shape[0]):
         hits = np.int32(hits | np.int32(ranges[b] < scale.leaves[b]))
-        shares[b] = _share(ranges[b], scale)
-    return hits != 0 and contact(ranges, scale)
+        shares[b] = _scale_range(ranges[b], scale)
+    return hits != 0 and has_contact(ranges, scale)
 
 
 @kernel(inline=True)
-def _share(value: np.float32, scale: ScanScale) -> np.float32:
+def _scale_range(value: np.float32, scale: ScanScale) -> np.float32:
     # NaN (unknown) compares False, so it becomes 0, as does -inf (too close).
     share = value * scale.per_metre
     share = share if share > np.float32(0.0) else np.float32(0.0)
@@ -92,7 +94,7 @@ def _share(value: np.float32, scale: ScanScale) -> np.float32:
 
 
 @kernel(allocates=True)
-def contact(ranges: NDArray[np.float32], scale: ScanScale) -> bool:
+def has_contact(ranges: NDArray[np.float32], scale: ScanScale) -> bool:
     """Returns True if a beam of a scan (B,) and its neighbours' mean end within the footprint.
 
     A single beam is too noisy: of hundreds, one is nearly always off by three standard deviations.
@@ -105,13 +107,15 @@ def contact(ranges: NDArray[np.float32], scale: ScanScale) -> bool:
             i = np.uintp(begin + k)
             hits = np.int32(hits | np.int32(ranges[i] < scale.leaves[i]))
         for b in range(begin, begin + beams if hits != 0 else begin):
-            if ranges[b] < scale.leaves[b] and _gap(b, ranges, scale) < np.float32(0.0):
+            if ranges[b] < scale.leaves[b] and _sum_gaps(b, ranges, scale) < np.float32(
+                0.0
+            ):
                 return True
     return False
 
 
 @kernel(inline=True)
-def _gap(b: int, ranges: NDArray[np.float32], scale: ScanScale) -> np.float32:
+def _sum_gaps(b: int, ranges: NDArray[np.float32], scale: ScanScale) -> np.float32:
     gap = np.float32(0.0)
     for k in range(
         max(b - scale.beside, 0), min(b + scale.beside + 1, ranges.shape[0])
@@ -135,7 +139,7 @@ def looks(
 
 
 @kernel(allocates=True)
-def bearing(dx: float, dy: float, heading: float) -> tuple[float, float, float]:
+def find_bearing(dx: float, dy: float, heading: float) -> tuple[float, float, float]:
     """Returns the distance [m] to a point at (dx, dy), and cosine and sine of its bearing."""
     distance = math.sqrt(dx * dx + dy * dy)
     if distance == 0.0:
@@ -169,7 +173,7 @@ def navigate(
         flags[i, 1] = look(out[i, :parts], ranges[i], scale)
         dx = goals[i, 0] - pose[i, 0]
         dy = goals[i, 1] - pose[i, 1]
-        distance, c, s = bearing(dx, dy, pose[i, 2])
+        distance, c, s = find_bearing(dx, dy, pose[i, 2])
         dx = goals[i, 0] - before[i, 0]
         dy = goals[i, 1] - before[i, 1]
         approach[i] = math.sqrt(dx * dx + dy * dy) - distance
@@ -183,8 +187,10 @@ def navigate(
 
 
 @kernel(allocates=True)
-def bearings(out: Array, ways: Array, headings: Array) -> None:
-    """Writes `bearing` (R, 3) of points at displacements `ways` (R, 2) from headings (R,)."""
+def find_bearings(out: Array, ways: Array, headings: Array) -> None:
+    """Writes `find_bearing` (R, 3) of points at displacements `ways` (R, 2) from headings (R,)."""
     for r in range(out.shape[0]):
-        distance, out[r, 1], out[r, 2] = bearing(ways[r, 0], ways[r, 1], headings[r])
+        distance, out[r, 1], out[r, 2] = find_bearing(
+            ways[r, 0], ways[r, 1], headings[r]
+        )
         out[r, 0] = min(distance, LIMIT)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from nics_drl_bridge import defaults, extensions
 from nics_drl_bridge.arguments import check_arguments, check_count
 from nics_drl_bridge.env.bridge_env import RENDER_FPS, BridgeEnv
-from nics_drl_bridge.env.guard import halts_on_error
+from nics_drl_bridge.env.guard import stop_on_error
 from nics_drl_bridge.env.task import Task
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
@@ -92,7 +92,7 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         """Returns the action space of an agent, always the same object."""
         return self.action_spaces[agent]
 
-    @halts_on_error
+    @stop_on_error
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, dict[str, Any]]]:
@@ -110,7 +110,7 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         )
         return seen, {name: self._of(info, m) for m, name in enumerate(self.agents)}
 
-    @halts_on_error
+    @stop_on_error
     def step(
         self, actions: dict[str, NDArray[Any]]
     ) -> tuple[
@@ -172,12 +172,12 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
             return value[m]
         return value
 
-    @halts_on_error
+    @stop_on_error
     def render(self) -> Any:
         """Draws the current world from above."""
         return self.env.render()
 
-    @halts_on_error
+    @stop_on_error
     def close(self) -> None:
         """Closes the window."""
         self.env.close()

@@ -13,7 +13,7 @@ from matplotlib.patches import Polygon as Outline
 from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.env.snapshot import Snapshot, hits_of
+from nics_drl_bridge.env.snapshot import Snapshot, locate_hits
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, SHAPE
@@ -64,14 +64,14 @@ class WorldPicture:
                 *np.transpose(trail), color=ROBOTS[m % len(ROBOTS)], linewidth=1.5
             )
         for m, (pose, scan) in enumerate(zip(shot.poses, shot.ranges, strict=True)):
-            self._robot(axes, pose, scan, ROBOTS[m % len(ROBOTS)])
+            self._draw_robot(axes, pose, scan, ROBOTS[m % len(ROBOTS)])
         self._canvas.draw()
         return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
-    def _robot(
+    def _draw_robot(
         self, axes: Axes, pose: Array, ranges: NDArray[np.float32], colour: str
     ) -> None:
-        hits = hits_of(self._model.lidar, pose, ranges)
+        hits = locate_hits(self._model.lidar, pose, ranges)
         robot = self._model.robot
         axes.plot(hits[:, 0], hits[:, 1], ".", color=SCAN, markersize=2.0)
         draw_robot(
@@ -125,10 +125,10 @@ def draw_world(
         axes.plot([x1, x2], [y1, y2], color=WALL, linewidth=2)
     for body in bodies:
         if body[RADIUS] > 0.0:
-            axes.add_patch(_patch(world, body))
+            axes.add_patch(_make_patch(world, body))
 
 
-def _patch(world: AnyWorld, body: NDArray[np.float64]) -> Patch:
+def _make_patch(world: AnyWorld, body: NDArray[np.float64]) -> Patch:
     shape = world.shapes[int(body[SHAPE]) % len(world.shapes)]
     if not len(shape.outline):
         return Disc((body[0], body[1]), body[RADIUS], color=STANDING)

@@ -25,7 +25,7 @@ from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world_set import AnyWorld
 
 
-def _sent(pose: Array) -> Array:
+def _decode_pose(pose: Array) -> Array:
     """Returns a pose (3,) as decoded from a message: the quaternion rounds the heading."""
     z = math.sin(float(pose[2]) / 2.0)
     w = math.cos(float(pose[2]) / 2.0)
@@ -83,7 +83,7 @@ class SimBackend:
             middleware.command(self._now_ns, one)
         self.simulator.step(commands[None])
         self._now_ns += self._period_ns
-        facts = {"stamp_ns": self._now_ns, **self._truth()}
+        facts = {"stamp_ns": self._now_ns, **self._get_truth()}
         view = self._measure()
         if self._middlewares:  # covariance at the time of this view
             covariances = []
@@ -97,18 +97,18 @@ class SimBackend:
         """Returns the truth, the obstacles and the drawn values; see `interface.Backend`."""
         simulator = self.simulator
         known: BackendFacts = {
-            **self._truth(),
+            **self._get_truth(),
             "bodies": simulator.obstacles[0],
             "scenes": simulator.scenes,
         }
         drawn = simulator.drawn
         if drawn:
             known["randomisation"] = {
-                name: self._of_episode(values) for name, values in drawn.items()
+                name: self._get_draw(values) for name, values in drawn.items()
             }
         return known
 
-    def _truth(self) -> BackendFacts:
+    def _get_truth(self) -> BackendFacts:
         data = self.simulator.data
         row = self._row
         collided = data.collided[row]
@@ -119,7 +119,7 @@ class SimBackend:
             else collided.astype(np.bool_),
         }
 
-    def _of_episode(self, draws: NDArray[Any]) -> Any:
+    def _get_draw(self, draws: NDArray[Any]) -> Any:
         drawn = draws[0] if draws.ndim == 1 else draws[self._row]
         return drawn.copy() if drawn.ndim else drawn.item()
 
@@ -139,7 +139,7 @@ class SimBackend:
         views = []
         for m, middleware in enumerate(self._middlewares):
             middleware.odometry(
-                now, now, _sent(data.odom[0, m]), data.twist[0, m].copy()
+                now, now, _decode_pose(data.odom[0, m]), data.twist[0, m].copy()
             )
             middleware.scan(now, now, data.ranges[0, m].copy())
             for name, readings in self.simulator.readings.items():
@@ -196,7 +196,7 @@ class CompletedBackend:
         self._moved = False
 
 
-def completed(backend: Any, still: Array) -> Backend:
+def complete_backend(backend: Any, still: Array) -> Backend:
     """Returns a backend with all methods. Raises ConfigError if the object is not a backend."""
     if isinstance(backend, Backend):
         return backend

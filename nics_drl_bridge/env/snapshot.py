@@ -29,19 +29,19 @@ class Snapshot:
     gate: str | None = None
 
 
-def goals_of(memory: Mapping[str, NDArray[Any]]) -> Array:
+def find_goals(memory: Mapping[str, NDArray[Any]]) -> Array:
     """Returns the goals (G, 2) in a task's memory, possibly none."""
     return np.reshape(memory.get("goal", np.zeros((0, 2))), (-1, 2))
 
 
-def gate_of(info: Mapping[str, Any]) -> str | None:
+def find_gate(info: Mapping[str, Any]) -> str | None:
     """Returns `Snapshot.gate` from the `info` of a step; None without a gate."""
     if "stopped_by" not in info:
         return None
     return str(info["stopped_by"]) or ("shield" if info["shielded"] else "")
 
 
-def hits_of(lidar: LidarSpec, pose: Array, ranges: NDArray[np.float32]) -> Array:
+def locate_hits(lidar: LidarSpec, pose: Array, ranges: NDArray[np.float32]) -> Array:
     """Returns the points (n, 2) in `map` [m] that a scan (B,) hits from a robot's pose (3,)."""
     mount = geometry.compose(pose, lidar.mount)
     there = np.isfinite(ranges)

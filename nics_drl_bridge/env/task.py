@@ -186,7 +186,7 @@ class Task(ABC):
         out = np.empty(actions.shape)
         rows = actions.reshape(-1, actions.shape[-1])
         low, high = self.command_limits
-        kernels.commands(out.reshape(rows.shape), rows, low, high)
+        kernels.scale_actions(out.reshape(rows.shape), rows, low, high)
         # Don't teach what a vehicle can't do: a car driven by turn rates can't steer at rest.
         return (
             self.robot.pass_through_cmd_vel(out) if self.robot.takes_turn_rate else out
@@ -237,7 +237,7 @@ class Task(ABC):
         kept = dict(memory)
         self.update(before, after, memory)
         if memory.keys() != kept.keys():
-            raise self._wrong(
+            raise self._make_error(
                 f"memory {sorted(memory)}", f"must keep {sorted(kept)} from `reset`"
             )
         # Copy rebound arrays into the env's rows. Read all first, because they may alias.
@@ -250,58 +250,60 @@ class Task(ABC):
                 new.dtype, rows.dtype, "same_kind"
             ):
                 like = f"must stay {rows.dtype} of shape {rows.shape} in `update`"
-                raise self._wrong(
+                raise self._make_error(
                     f"memory {name!r}", f"{like}, not {new.dtype} of shape {new.shape}"
                 )
             rows[...] = new
-        out[...] = self.valid("observation", self.observation(after, memory), out.shape)
+        out[...] = self.check_result(
+            "observation", self.observation(after, memory), out.shape
+        )
         terms = self.reward(before, after, memory)
         each = out.shape[:-1]
         info = self.info(after, memory)
         for what, part in (("reward", terms), ("info", info)):
             if not isinstance(part, dict):
-                raise self._wrong(what, "must be a dictionary of arrays")
+                raise self._make_error(what, "must be a dictionary of arrays")
         for name, term in terms.items():
-            self.valid(f"reward term {name!r}", term, each)
+            self.check_result(f"reward term {name!r}", term, each)
         for name, fact in info.items():
-            self._leads(f"info {name!r}", fact, each)
-        ended = self.valid("end", self.end(after, memory), each)
+            self._check_lead(f"info {name!r}", fact, each)
+        ended = self.check_result("end", self.end(after, memory), each)
         if np.asarray(ended).dtype != np.bool_:
             kind = np.asarray(ended).dtype
-            raise self._wrong(
+            raise self._make_error(
                 "end", f"must be True or False for each robot, not {kind}"
             )
         return Outcome(terms, ended, info)
 
-    def begun(self, episodes: Episodes) -> Memory:
+    def start_episodes(self, episodes: Episodes) -> Memory:
         """Returns the memory of `reset`. Raises ConfigError if it does not fit or lacks `shown`."""
         memory = self.reset(episodes)
         if not isinstance(memory, dict) or not memory.keys() >= set(self.shown):
-            raise self._wrong(
+            raise self._make_error(
                 "reset", f"must return a dictionary of arrays with {[*self.shown]}"
             )
         lead = episodes.starts.shape[:2]
         for name, rows in memory.items():
-            self._leads(f"memory {name!r}", rows, lead[:1])
+            self._check_lead(f"memory {name!r}", rows, lead[:1])
         for name in self.shown:
-            self._leads(f"memory {name!r}, which is shown,", memory[name], lead)
+            self._check_lead(f"memory {name!r}, which is shown,", memory[name], lead)
         return memory
 
-    def _leads(self, what: str, given: Any, lead: tuple[int, ...]) -> None:
+    def _check_lead(self, what: str, given: Any, lead: tuple[int, ...]) -> None:
         if not isinstance(given, np.ndarray) or given.shape[: len(lead)] != lead:
             fault = f"must be an array whose shape begins with {lead}"
-            raise self._wrong(
+            raise self._make_error(
                 what, f"{fault}, not {type(given).__name__} of shape {np.shape(given)}"
             )
 
-    def _wrong(self, what: str, fault: str) -> ConfigError:
+    def _make_error(self, what: str, fault: str) -> ConfigError:
         return ConfigError(f"task {type(self).__name__}: its {what} {fault}.")
 
-    def valid(self, what: str, given: Any, shape: tuple[int, ...]) -> Any:
+    def check_result(self, what: str, given: Any, shape: tuple[int, ...]) -> Any:
         """Returns a user's result. Raises ConfigError unless it is finite and of this shape."""
-        if np.shape(given) != shape or not _finite(given):
+        if np.shape(given) != shape or not _is_finite(given):
             fault = f"must be finite, of shape {shape}, not {given!r:.80} of {np.shape(given)}"
-            raise self._wrong(what, fault)
+            raise self._make_error(what, fault)
         return given
 
     def check_observation_space(self) -> None:
@@ -309,7 +311,7 @@ class Task(ABC):
         space: Any = self.observation_space
         if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1:
             fix = "must be a property that returns a Box of one dimension; see `box`"
-            raise self._wrong("observation_space", fix)
+            raise self._make_error("observation_space", fix)
 
     @cached_property
     def command_limits(self) -> tuple[Array, Array]:
@@ -392,14 +394,14 @@ class Task(ABC):
     @cached_property
     def scale(self) -> ScanScale:
         """Conversion of a scan, for the kernels."""
-        leaves = contact_ranges(self.robot, self.lidar, self.contact_margin)
+        leaves = find_contact_ranges(self.robot, self.lidar, self.contact_margin)
         sectors = 0 if self.scan is None else self.scan.sectors
         per_metre = np.float32(1.0 / self.sight.range_max)
         beside = int(CONTACT_ANGLE / 2.0 / abs(self.lidar.angle_increment))
         return ScanScale(per_metre, leaves, beside, sectors, self.plan)
 
 
-def _finite(given: Any) -> bool:
+def _is_finite(given: Any) -> bool:
     """Returns True if all entries are finite numbers."""
     values = np.asarray(given)
     return values.dtype.kind in "fiub" and bool(np.isfinite(values).all())
@@ -426,7 +428,7 @@ def still(robot: RobotSpec) -> Array:
     return nearest_zero
 
 
-def team_space(space: gymnasium.Space[Any], robots: int) -> gymnasium.Space[Any]:
+def make_team_space(space: gymnasium.Space[Any], robots: int) -> gymnasium.Space[Any]:
     """Returns M robots' joint space: Box (M L,) of a Box (L,), MultiDiscrete of a Discrete."""
     if robots == 1:
         return space
@@ -445,7 +447,7 @@ def bearing(pose: ArrayLike, points: ArrayLike) -> Array:
     out = np.empty((*ways.shape[:-1], 3))
     headings = np.empty(ways.shape[:-1])
     headings[...] = poses[..., 2]
-    kernels.bearings(out.reshape(-1, 3), ways.reshape(-1, 2), headings.reshape(-1))
+    kernels.find_bearings(out.reshape(-1, 3), ways.reshape(-1, 2), headings.reshape(-1))
     return out
 
 
@@ -470,7 +472,7 @@ def total(values: Array) -> Array:
     return np.asarray(summed)
 
 
-def contact_ranges(
+def find_contact_ranges(
     robot: RobotSpec, lidar: LidarSpec, margin: float
 ) -> NDArray[np.float32]:
     """Returns ranges (B,) at which beams leave the footprint plus a margin [m]; -inf if never."""

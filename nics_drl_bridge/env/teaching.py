@@ -52,7 +52,7 @@ class Teacher:
         """Starts episodes in worlds (n,), whose scenes contain the robots."""
         if self._guide is not None:
             self._guide.begin(worlds, scenes)
-            self._left[worlds] = self._guide.lengths(worlds, self._data)
+            self._left[worlds] = self._guide.measure_lengths(worlds, self._data)
 
     def judge(self, part: slice, outcome: Outcome) -> Outcome:
         """Adds teaching rewards to the outcome of a part of the worlds."""
@@ -60,7 +60,7 @@ class Teacher:
         ended = outcome.ended
         info = outcome.info
         if self._guide is not None:
-            left = self._guide.lengths(part, self._data)
+            left = self._guide.measure_lengths(part, self._data)
             terms = terms | {"path": self._given.path * (self._left[part] - left)}
             self._left[part] = left
         if self._given.contact is not None:
@@ -70,7 +70,7 @@ class Teacher:
             ended = ended | unseen
         return Outcome(terms, ended, info)
 
-    def again(
+    def find_repeats(
         self, over: NDArray[np.bool_], success: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
         """Returns True for worlds (N,) that repeat the episode that just ended."""

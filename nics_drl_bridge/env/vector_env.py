@@ -15,15 +15,15 @@ from nics_drl_bridge import defaults
 from nics_drl_bridge.arguments import check_arguments, check_count, format_value
 from nics_drl_bridge.env import guard
 from nics_drl_bridge.env.bridge_env import RENDER_FPS, check_render_mode
-from nics_drl_bridge.env.kernels import episode_seeds
+from nics_drl_bridge.env.kernels import compute_episode_seeds
 from nics_drl_bridge.env.registry import make_task
-from nics_drl_bridge.env.snapshot import Snapshot, goals_of
+from nics_drl_bridge.env.snapshot import Snapshot, find_goals
 from nics_drl_bridge.env.task import (
     Episodes,
     Memory,
     Outcome,
     Task,
-    team_space,
+    make_team_space,
     total,
 )
 from nics_drl_bridge.env.teaching import Teacher, Teaching
@@ -123,10 +123,10 @@ class BridgeVectorEnv(
         self.world = world if isinstance(world, AnyWorld) else load_worlds(world)
         self.task = make_task(task, self.model, task_options)
         self.robots = self.task.robots
-        self.single_observation_space = team_space(
+        self.single_observation_space = make_team_space(
             self.task.observation_space, self.robots
         )
-        self.single_action_space = team_space(self.task.action_space, self.robots)
+        self.single_action_space = make_team_space(self.task.action_space, self.robots)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.simulator = FastSimulator(
@@ -176,7 +176,7 @@ class BridgeVectorEnv(
         known = self._teacher.changing if self._teacher else {}
         return {**own, **data, **known, "goals": self.simulator.goals}
 
-    @guard.refused_after_close
+    @guard.refuse_after_close
     def reset(
         self,
         *,
@@ -186,21 +186,23 @@ class BridgeVectorEnv(
         """Starts an episode in every world; world i takes its seeds from `seed + i`."""
         guard.check_reset(seed, options, self.num_envs)
         super().reset(seed=seed if isinstance(seed, int) else None)
-        chosen = chosen_worlds(options, self.num_envs)
+        chosen = choose_worlds(options, self.num_envs)
         if not (self.ready or chosen.all()):
             raise gymnasium.error.ResetNeeded(
                 "reset all worlds before you reset some of them."
             )
-        seeds, fresh = named_seeds(seed, chosen, self._episode < 0, self.np_random)
+        seeds, fresh = choose_seeds(seed, chosen, self._episode < 0, self.np_random)
         self.ready = False
         self._first[fresh] = seeds[fresh]
         self._episode[fresh] = -1
         if not chosen.all():  # the other worlds keep their observation
-            self._out[...] = self.task.observation(self._view(slice(None)), self.memory)
+            self._out[...] = self.task.observation(
+                self._make_view(slice(None)), self.memory
+            )
         self._begin(np.flatnonzero(chosen), self._out, options)
-        infos = masked(self._known() | self._beginnings(), chosen, True)
+        infos = add_masks(self._get_known() | self._get_beginnings(), chosen, True)
         self.ready = True
-        return flat(self._out.copy() if self.copy else self._out), infos
+        return flatten(self._out.copy() if self.copy else self._out), infos
 
     def _begin(
         self,
@@ -212,7 +214,7 @@ class BridgeVectorEnv(
             return
         self._episode[worlds] += 1
         seeds = np.empty(len(worlds), np.int64)
-        episode_seeds(self._first[worlds], self._episode[worlds], seeds)
+        compute_episode_seeds(self._first[worlds], self._episode[worlds], seeds)
         starts = None
         if options and "start" in options:
             starts = np.empty((len(worlds), self.robots, 3))
@@ -241,12 +243,12 @@ class BridgeVectorEnv(
             self.memory[name][worlds] = rows
         self.ended[worlds] = False
         self._over[worlds] = False
-        seen = self.task.observation(self._view(worlds), fresh)
-        out[worlds] = self.task.valid(
+        seen = self.task.observation(self._make_view(worlds), fresh)
+        out[worlds] = self.task.check_result(
             "observation", seen, (len(worlds), *out.shape[1:])
         )
 
-    def _view(self, rows: Rows) -> RobotView:
+    def _make_view(self, rows: Rows) -> RobotView:
         data = self.simulator.data
         readings = self.simulator.readings
         seen = data.odom[rows], data.twist[rows], data.ranges[rows]
@@ -254,7 +256,7 @@ class BridgeVectorEnv(
             *seen, 0.0, 0.0, 0.0, {name: readings[name][rows] for name in readings}
         )
 
-    @guard.refused_after_close
+    @guard.refuse_after_close
     def step(
         self, actions: NDArray[Any]
     ) -> tuple[Observation, Array, Flags, Flags, dict[str, Any]]:
@@ -268,7 +270,9 @@ class BridgeVectorEnv(
         out = np.empty_like(self._out) if self.copy else self._out
         begun = self._over.copy()  # these worlds are reset and ignore their action
         run = self.simulator.run_parts
-        outcome = joined(run(lambda part: self._advance(part, given[part], out, begun)))
+        outcome = join_outcomes(
+            run(lambda part: self._advance(part, given[part], out, begun))
+        )
         terminated = self.ended.all(axis=1) & ~begun
         truncated = (self.simulator.data.steps >= self._limit) & ~begun
         reward = np.where(begun, 0.0, total(self._reward))
@@ -276,11 +280,16 @@ class BridgeVectorEnv(
         infos: dict[str, Any] = {}
         facts = {
             "stamp_ns": self.simulator.data.steps * self._period_ns,
-            "true_pose": self._row(self.simulator.data.pose).copy(),
-            "true_collision": self._row(self.simulator.data.collided).astype(np.bool_),
-            **{name: self._row(values).copy() for name, values in outcome.info.items()},
+            "true_pose": self._get_row(self.simulator.data.pose).copy(),
+            "true_collision": self._get_row(self.simulator.data.collided).astype(
+                np.bool_
+            ),
+            **{
+                name: self._get_row(values).copy()
+                for name, values in outcome.info.items()
+            },
             "reward_terms": {
-                name: self._row(t).copy() for name, t in outcome.terms.items()
+                name: self._get_row(t).copy() for name, t in outcome.terms.items()
             },
         }
         if self._mode is AutoresetMode.SAME_STEP:
@@ -289,7 +298,7 @@ class BridgeVectorEnv(
             self._over = over
             self._tell(infos, facts, begun)
         self.ready = True
-        return flat(out), reward, terminated, truncated, infos
+        return flatten(out), reward, terminated, truncated, infos
 
     def _advance(
         self, part: slice, actions: NDArray[Any], out: Observation, begun: Flags
@@ -308,7 +317,7 @@ class BridgeVectorEnv(
         )
         self.simulator.step_part(part, command)
         memory = {name: rows[part] for name, rows in self.memory.items()}
-        outcome = self.task.take_step(out[part], before, self._view(part), memory)
+        outcome = self.task.take_step(out[part], before, self._make_view(part), memory)
         if self._teacher is not None:
             outcome = self._teacher.judge(part, outcome)
         if self.robots > 1:
@@ -330,54 +339,56 @@ class BridgeVectorEnv(
             shown = np.full(self.num_envs, None, dtype=object)
             # Only for ended worlds, because each needs its own object.
             for n in np.flatnonzero(over):
-                shown[n] = flat(out)[n].copy()
-            infos |= masked({"final_obs": shown}, over)
-            infos |= masked({"final_info": self._known() | facts}, over, True)
+                shown[n] = flatten(out)[n].copy()
+            infos |= add_masks({"final_obs": shown}, over)
+            infos |= add_masks({"final_info": self._get_known() | facts}, over, True)
             if self._teacher is not None:
                 success = np.reshape(facts.get("is_success", over), (self.num_envs, -1))
                 self._episode[
-                    self._teacher.again(over, np.asarray(success.all(axis=1)))
+                    self._teacher.find_repeats(over, np.asarray(success.all(axis=1)))
                 ] -= 1
             run = self.simulator.run_parts
             run(lambda part: self._begin(part.start + np.flatnonzero(over[part]), out))
         self._tell(infos, facts, over)
 
     def _tell(self, infos: dict[str, Any], facts: dict[str, Any], begun: Flags) -> None:
-        infos |= masked(self._known(), np.ones_like(begun))
+        infos |= add_masks(self._get_known(), np.ones_like(begun))
         some = bool(begun.any())
         if some:
-            infos |= masked(self._beginnings(), begun, True)
+            infos |= add_masks(self._get_beginnings(), begun, True)
         if not begun.all():
-            infos |= masked(facts, ~begun, some)
+            infos |= add_masks(facts, ~begun, some)
 
     # Facts as arrays (N, ...) for worlds with one robot, or (N, M, ...) for teams.
 
-    def _known(self) -> dict[str, Any]:
-        shown = {name: self._row(self.memory[name]).copy() for name in self.task.shown}
-        pose = self._row(self.simulator.data.odom).copy()
+    def _get_known(self) -> dict[str, Any]:
+        shown = {
+            name: self._get_row(self.memory[name]).copy() for name in self.task.shown
+        }
+        pose = self._get_row(self.simulator.data.odom).copy()
         ages = np.zeros((2, self.num_envs))
         return {**shown, "pose": pose, "scan_age_s": ages[0], "odom_age_s": ages[1]}
 
-    def _beginnings(self) -> dict[str, Any]:
+    def _get_beginnings(self) -> dict[str, Any]:
         drawn = {
-            name: self._row(values) if values.ndim > 1 else values
+            name: self._get_row(values) if values.ndim > 1 else values
             for name, values in self.simulator.drawn.items()
         }
         return {
             "episode_seed": self.simulator.data.seeds,
-            "start": self._row(self._starts),
+            "start": self._get_row(self._starts),
             "bodies": self._bodies,
             **({"randomisation": drawn} if drawn else {}),
         }
 
-    def _row(self, rows: NDArray[Any]) -> NDArray[Any]:
+    def _get_row(self, rows: NDArray[Any]) -> NDArray[Any]:
         return rows[:, 0] if self.robots == 1 else rows
 
     def close_extras(self, **_: Any) -> None:
         """Marks the env as closed; there is nothing to free."""
         self._closed = True
 
-    @guard.refused_after_close
+    @guard.refuse_after_close
     def render(self) -> tuple[Any, ...] | None:
         """Draws every world; see Gymnasium."""
         if self.render_mode is None:
@@ -397,7 +408,7 @@ class BridgeVectorEnv(
         """Returns the current state of world n for a picture; `step` does not change its arrays."""
         data = self.simulator.data
         bodies = self.simulator.obstacles_of(np.array([n]))[0]
-        goals = goals_of(
+        goals = find_goals(
             {name: rows[n] for name, rows in self.memory.items() if name == "goal"}
         )
         seen = data.pose[n].copy(), data.ranges[n].copy(), bodies, goals.copy()
@@ -406,12 +417,12 @@ class BridgeVectorEnv(
         )
 
 
-def flat(observations: Observation) -> Observation:
+def flatten(observations: Observation) -> Observation:
     """Concatenates observations of each world's robots to (N, M O), without a copy."""
     return observations.reshape(len(observations), -1)
 
 
-def joined(parts: Sequence[Outcome]) -> Outcome:
+def join_outcomes(parts: Sequence[Outcome]) -> Outcome:
     """Joins the outcomes of consecutive parts of the worlds."""
     if len(parts) == 1:
         return parts[0]
@@ -424,7 +435,7 @@ def joined(parts: Sequence[Outcome]) -> Outcome:
     return Outcome(terms, np.concatenate([part.ended for part in parts]), info)
 
 
-def chosen_worlds(options: dict[str, Any] | None, count: int) -> Flags:
+def choose_worlds(options: dict[str, Any] | None, count: int) -> Flags:
     """Returns the mask (N,) of worlds to reset. Raises ConfigError for a wrong `reset_mask`."""
     if not options or "reset_mask" not in options:
         return np.ones(count, np.bool_)
@@ -435,7 +446,7 @@ def chosen_worlds(options: dict[str, Any] | None, count: int) -> Flags:
     return chosen.copy()
 
 
-def named_seeds(
+def choose_seeds(
     seed: int | Sequence[int | None] | None,
     chosen: Flags,
     unnamed: Flags,
@@ -476,7 +487,7 @@ def zeros(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
     return np.frombuffer(fresh, dtype).reshape(shape)
 
 
-def masked(facts: Facts, mask: Flags, alone: bool = False) -> dict[str, Any]:
+def add_masks(facts: Facts, mask: Flags, alone: bool = False) -> dict[str, Any]:
     """Pairs facts (N, ...) with masks `_name` (N,), like Gymnasium; zero elsewhere if `alone`."""
     paired: dict[str, Any] = {}
     gone = ~mask
@@ -485,7 +496,7 @@ def masked(facts: Facts, mask: Flags, alone: bool = False) -> dict[str, Any]:
         paired[name] = values
         paired[f"_{name}"] = mask.copy()
         if isinstance(values, Mapping):
-            paired[name] = masked(values, mask, alone)
+            paired[name] = add_masks(values, mask, alone)
         elif alone and most:
             paired[name] = values.copy()
             paired[name][gone] = np.zeros((), values.dtype)

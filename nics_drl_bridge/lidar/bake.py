@@ -14,7 +14,7 @@ from nics_drl_bridge.lidar import bake_kernels
 from nics_drl_bridge.lidar.arrays import Array, Integers
 from nics_drl_bridge.lidar.shapes import Circle, Outlines, Shape, describe
 from nics_drl_bridge.lidar.spec import LidarSpec
-from nics_drl_bridge.lidar.table import MOST_WIDE, Density, LidarTable, padding
+from nics_drl_bridge.lidar.table import MOST_WIDE, Density, LidarTable, count_padding
 
 TOUCHING = 1e-6  # excess of the nearest grid distance over the radius, as a fraction of the radius
 # upper limit of twice the steps between grid rotations [rad]
@@ -48,7 +48,7 @@ def bake(
     shapes = tuple(dict.fromkeys(shapes))
     density = density or Density.for_beams(spec.angle_increment)
     outlines = Outlines.of(shapes)
-    grids = [grid_of(spec, outlines, h, density) for h in range(len(shapes))]
+    grids = [make_grid(spec, outlines, h, density) for h in range(len(shapes))]
     cells = np.concatenate(
         [np.zeros((0, 6), np.int64), *(g.cell.reshape(-1, 6) for g in grids)]
     )
@@ -69,13 +69,13 @@ def bake(
         np.array(about, dtype=np.float64).reshape(-1, 3),
         (np.cumsum(sizes) - sizes).astype(np.int32),
         cells.astype(np.int16),
-        np.zeros(int(sizes.sum()) + padding(spec.angle_increment), np.float32),
+        np.zeros(int(sizes.sum()) + count_padding(spec.angle_increment), np.float32),
     )
     _fill(table, grids)
     return table
 
 
-def with_shapes(
+def add_shapes(
     spec: LidarSpec, table: LidarTable, shapes: Sequence[Shape]
 ) -> LidarTable:
     """Return the table if it contains all of these shapes, or else one of equal density."""
@@ -86,7 +86,7 @@ def with_shapes(
     return bake(spec, (*table.shapes, *shapes), table.density)
 
 
-def grid_of(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> Grid:
+def make_grid(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> Grid:
     """Compute the cells of a shape and the widths of their rows."""
     shape = outlines.shapes[h]
     radius = outlines.radii[h]
@@ -119,7 +119,7 @@ def grid_of(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> Gr
             wound = _wound(
                 hull, hints[..., side], edges[..., side] - turns[:, None] + side * np.pi
             )
-            two, climb = _candidates(wound, parts, len(hull))
+            two, climb = _choose_corners(wound, parts, len(hull))
             miss = _miss(hull, two, edges[..., side], turns, distances, parts)
             far_off = miss > MISS * spec.angle_increment
             # close to contact, the rim of a cell does not bound its interior
@@ -135,7 +135,7 @@ def grid_of(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> Gr
     return Grid(distances, np.arange(count) * unit, edges[parts // 2 :: parts], cell)
 
 
-def _within(values: NDArray[Any], parts: int, outer: np.ufunc) -> NDArray[Any]:
+def _reduce_cells(values: NDArray[Any], parts: int, outer: np.ufunc) -> NDArray[Any]:
     """Outermost value in each cell (T, D) up to the next cell: two distances are blended."""
     count = len(values) // parts
     turned = outer.reduce(
@@ -148,7 +148,7 @@ def _within(values: NDArray[Any], parts: int, outer: np.ufunc) -> NDArray[Any]:
 
 def _reach_of(edge: Array, parts: int, outer: np.ufunc) -> Array:
     """Outermost edge (T, D) of all cells that use the row of a cell."""
-    result = _within(edge, parts, outer)
+    result = _reduce_cells(edge, parts, outer)
     result[:, 1:] = outer(result[:, 1:], result[:, :-1])
     return result
 
@@ -162,14 +162,16 @@ def _wound(hull: Array, hints: Integers, along: Array) -> Integers:
     return np.asarray(hints + len(hull) * rounds)
 
 
-def _candidates(wound: Integers, parts: int, corners: int) -> tuple[Integers, Integers]:
+def _choose_corners(
+    wound: Integers, parts: int, corners: int
+) -> tuple[Integers, Integers]:
     """Two corners (T, D, 2) that can be an edge within each cell, or a start for climbing.
 
     Along a line and around a circle outside, the corner changes monotonically: those at the rim of
     a cell enclose all others. If more than two, those at one and three quarters represent all.
     """
-    low = _within(wound, parts, np.minimum)
-    high = _within(wound, parts, np.maximum)
+    low = _reduce_cells(wound, parts, np.minimum)
+    high = _reduce_cells(wound, parts, np.maximum)
     quarter = (high - low) // 4
     first = wound[parts // 2 :: parts]
     away = np.clip(np.maximum(high - first, first - low), 1, corners - 1)

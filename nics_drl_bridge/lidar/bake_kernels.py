@@ -7,8 +7,12 @@ import numpy as np
 
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.arrays import Array, Integers, ShortIntegers, Singles
-from nics_drl_bridge.lidar.beam_kernels import INF, Beams, beams_of
-from nics_drl_bridge.lidar.exact_kernels import scan_circle, scan_polygon, turned
+from nics_drl_bridge.lidar.beam_kernels import INF, Beams, make_beams
+from nics_drl_bridge.lidar.exact_kernels import (
+    place_corner,
+    scan_circle,
+    scan_polygon,
+)
 
 EDGE = 1e-6  # ranges at an edge are taken this far inside it, as a fraction of the whole width
 
@@ -36,13 +40,13 @@ def find_edges(
                 edges[t, d, 0] = -half
                 edges[t, d, 1] = half
                 continue
-            rx, ry = turned(distances[d], 0.0, c, s, hull[0])
+            rx, ry = place_corner(distances[d], 0.0, c, s, hull[0])
             lx = rx
             ly = ry
             right = 0
             left = 0
             for v in range(1, hull.shape[0]):
-                x, y = turned(distances[d], 0.0, c, s, hull[v])
+                x, y = place_corner(distances[d], 0.0, c, s, hull[v])
                 if rx * y - ry * x < 0.0:
                     rx = x
                     ry = y
@@ -81,11 +85,11 @@ def find_range(angle: float, shape: ShapeAhead) -> np.float32:
     """Find the range to a shape in one direction [rad]."""
     direction = np.array([[math.cos(angle)], [math.sin(angle)]])
     scan = np.full(1, INF, np.int32)
-    scan_ahead(scan, beams_of(direction, angle, 1.0), shape)
+    scan_ahead(scan, make_beams(direction, angle, 1.0), shape)
     nearest = scan.view(np.float32)[0]
     if not np.isfinite(nearest):  # a wall seen edge-on
         for v in range(shape.corners.shape[0]):
-            x, y = turned(shape.distance, 0.0, shape.c, shape.s, shape.corners[v])
+            x, y = place_corner(shape.distance, 0.0, shape.c, shape.s, shape.corners[v])
             nearest = min(nearest, np.float32(math.hypot(x, y)))
     return nearest
 
@@ -105,7 +109,7 @@ def fill_row(
         angles = (start + np.arange(first, last + 1)) * step
         directions = np.stack((np.cos(angles), np.sin(angles)))
         scan = fine.view(np.int32)[first : last + 1]
-        scan_ahead(scan, beams_of(directions, angles[0], step), shape)
+        scan_ahead(scan, make_beams(directions, angles[0], step), shape)
     while first <= last and not np.isfinite(fine[first]):
         first += 1
     while last > first and not np.isfinite(fine[last]):

@@ -56,7 +56,7 @@ class LidarPose(NamedTuple):
 
 
 @kernel(allocates=True)
-def beams_of(directions: Array, first: float, step: float) -> Beams:
+def make_beams(directions: Array, first: float, step: float) -> Beams:
     """Return the beams of directions (2, B) that are a `step` apart, from `first` on [rad]."""
     count = directions.shape[1]
     # Half of the angle without beams, less half a step so that rounding does not matter.

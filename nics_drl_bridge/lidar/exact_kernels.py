@@ -104,17 +104,17 @@ def scan_polygon(
     corners: Array,
 ) -> None:
     """Fuse the exact ranges to the outline `corners` (V, 2), turned by (c, s), at (x, y)."""
-    corner_x, corner_y = turned(x, y, c, s, corners[corners.shape[0] - 1])
+    corner_x, corner_y = place_corner(x, y, c, s, corners[corners.shape[0] - 1])
     start = corner_x, corner_y, arctan2(corner_y, corner_x)
     for v in range(corners.shape[0]):
-        corner_x, corner_y = turned(x, y, c, s, corners[v])
+        corner_x, corner_y = place_corner(x, y, c, s, corners[v])
         end = corner_x, corner_y, arctan2(corner_y, corner_x)
         scan_edge(scan, beams, start, end)
         start = end
 
 
 @kernel(inline=True)
-def turned(
+def place_corner(
     x: float, y: float, c: float, s: float, corner: Array
 ) -> tuple[float, float]:
     """Position of a corner (2,) of a shape turned by (c, s) and placed at (x, y)."""
@@ -127,8 +127,8 @@ def scan_walls(
 ) -> None:
     """Fuse walls (W, 4) of the world; those out of range are skipped."""
     for w in range(walls.shape[0]):
-        start_x, start_y = _see(walls[w, 0], walls[w, 1], lidar)
-        end_x, end_y = _see(walls[w, 2], walls[w, 3], lidar)
+        start_x, start_y = _transform_point(walls[w, 0], walls[w, 1], lidar)
+        end_x, end_y = _transform_point(walls[w, 2], walls[w, 3], lidar)
         ex = end_x - start_x
         ey = end_y - start_y
         # The nearest point, as a fraction of the length.
@@ -144,7 +144,7 @@ def scan_walls(
 
 
 @kernel(inline=True)
-def _see(x: float, y: float, lidar: LidarPose) -> tuple[float, float]:
+def _transform_point(x: float, y: float, lidar: LidarPose) -> tuple[float, float]:
     """Return a point of the world in the frame of the lidar."""
     dx = x - lidar.x
     dy = y - lidar.y
@@ -160,7 +160,7 @@ def scan_body(
     outlines: OutlineArrays,
 ) -> None:
     """Fuse one body (7,) of the world."""
-    x, y = _see(body[X], body[Y], lidar)
+    x, y = _transform_point(body[X], body[Y], lidar)
     shape = int(body[SHAPE])
     begin = outlines.first[shape]
     end = outlines.first[shape + 1]

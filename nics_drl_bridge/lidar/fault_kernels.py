@@ -57,22 +57,24 @@ def distort(
 
     A return stays within the limits, range_min and range_max [m]; `counter` is that of the scan.
     """
-    device = _device(limits, faults)
+    device = _prepare_device(limits, faults)
     noisy = device.std > 0.0 or device.grows > 0.0
     coarse = device.step > 0.0 and device.first <= device.last
     if faults[TOO_CLOSE] == AS_GHOST:
-        _ghosts(ranges, device, random.key(seed, random.GHOST_STREAM, counter))
+        _add_ghosts(ranges, device, random.key(seed, random.GHOST_STREAM, counter))
     if faults[TOO_CLOSE] == AS_RANGE_MIN or not (
         noisy or coarse or device.close == -np.inf
     ):
         _close(ranges, device.close)
     if noisy and coarse:
-        _noise(ranges, device, random.key(seed, random.RANGE_STREAM, counter), True)
+        _add_noise(ranges, device, random.key(seed, random.RANGE_STREAM, counter), True)
     elif noisy:
-        _noise(ranges, device, random.key(seed, random.RANGE_STREAM, counter), False)
+        _add_noise(
+            ranges, device, random.key(seed, random.RANGE_STREAM, counter), False
+        )
     elif coarse:
         for i in range(ranges.shape[0]):
-            ranges[i] = _report(ranges[i], _coarse(ranges[i], device), device)
+            ranges[i] = _report(ranges[i], _quantize(ranges[i], device), device)
     if faults[DROPOUT] > 0.0 or faults[DROPOUT_FAR] > 0.0:
         by = random.key(seed, random.DROPOUT_STREAM, counter)
         _drop(
@@ -81,7 +83,7 @@ def distort(
 
 
 @kernel(inline=True)
-def _device(limits: tuple[float, float], faults: Array) -> Distortion:
+def _prepare_device(limits: tuple[float, float], faults: Array) -> Distortion:
     single = np.float32
     step = faults[QUANTISATION]
     close = np.inf
@@ -97,8 +99,8 @@ def _device(limits: tuple[float, float], faults: Array) -> Distortion:
     most = single(limits[1])
     first = single(math.ceil((limits[0] - ROUNDING) * per_step))
     last = single(math.floor((limits[1] + ROUNDING) * per_step))
-    first += single(_multiple(first, single(step), rest) < least)
-    last -= single(_multiple(last, single(step), rest) > most)
+    first += single(_multiply_step(first, single(step), rest) < least)
+    last -= single(_multiply_step(last, single(step), rest) > most)
     return Distortion(
         least,
         most,
@@ -114,7 +116,7 @@ def _device(limits: tuple[float, float], faults: Array) -> Distortion:
 
 
 @kernel(allocates=True)
-def _ghosts(ranges: Singles, device: Distortion, by: int) -> None:
+def _add_ghosts(ranges: Singles, device: Distortion, by: int) -> None:
     whole = ranges.view(np.int32)
     for i in range(ranges.shape[0]):
         ghost = device.least + random.share_of(random.bits(by, i)) * (
@@ -133,15 +135,17 @@ def _close(ranges: Singles, close: np.float32) -> None:
 
 
 @kernel(allocates=True, inline=True)
-def _noise(ranges: Singles, device: Distortion, by: int, coarse: bool) -> None:
+def _add_noise(ranges: Singles, device: Distortion, by: int, coarse: bool) -> None:
     runs = ranges.shape[0] // random.RUN
     for k in range(runs):
-        _noise_run(ranges, random.RUN, device, by, k, coarse)
-    _noise_run(ranges, ranges.shape[0] - runs * random.RUN, device, by, runs, coarse)
+        _add_noise_run(ranges, random.RUN, device, by, k, coarse)
+    _add_noise_run(
+        ranges, ranges.shape[0] - runs * random.RUN, device, by, runs, coarse
+    )
 
 
 @kernel(contracts=True, inline=True)
-def _noise_run(
+def _add_noise_run(
     ranges: Singles,
     count: int,
     device: Distortion,
@@ -155,7 +159,7 @@ def _noise_run(
         i = begin + np.uintp(j)
         value = ranges[i]
         noisy = value + (device.std + device.grows * value) * random.normal_of(run, j)
-        noisy = _coarse(noisy, device) if coarse else _limited(noisy, device)
+        noisy = _quantize(noisy, device) if coarse else _limit(noisy, device)
         ranges[i] = _report(value, noisy, device)
 
 
@@ -169,21 +173,21 @@ def _report(value: np.float32, measured: np.float32, device: Distortion) -> np.f
 
 
 @kernel(contracts=True, inline=True)
-def _coarse(value: np.float32, device: Distortion) -> np.float32:
+def _quantize(value: np.float32, device: Distortion) -> np.float32:
     """Return the nearest multiple of the step within the limits."""
     count = np.floor(value * device.per_step + np.float32(0.5))
     count = device.first if count < device.first else count
     count = device.last if count > device.last else count
-    return _multiple(count, device.step, device.rest)
+    return _multiply_step(count, device.step, device.rest)
 
 
 @kernel(contracts=True, inline=True)
-def _multiple(count: np.float32, step: np.float32, rest: np.float32) -> np.float32:
+def _multiply_step(count: np.float32, step: np.float32, rest: np.float32) -> np.float32:
     return count * step + count * rest  # rounded once
 
 
 @kernel(inline=True)
-def _limited(value: np.float32, device: Distortion) -> np.float32:
+def _limit(value: np.float32, device: Distortion) -> np.float32:
     value = device.least if value < device.least else value
     return device.most if value > device.most else value
 

@@ -48,7 +48,7 @@ class LidarFaults(Schema):
     dropout_far: float = Field(default=0.0, ge=0.0, le=1.0)
 
     @model_validator(mode="after")
-    def _probable(self) -> "LidarFaults":
+    def _check_probability(self) -> "LidarFaults":
         if self.dropout + self.dropout_far > 1.0:
             raise ValueError("dropout and dropout_far must add up to at most 1")
         return self

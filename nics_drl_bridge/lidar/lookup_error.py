@@ -1,7 +1,7 @@
 """Distances at which a shape may be looked up, measured for the renderer `auto`.
 
 The space around the lidar is divided into rings by the shape's distance, and the returns into bands
-by their range. For each ring, `lookup_distances`
+by their range. For each ring, `find_lookup_distances`
 
 1. places the shape at random in the ring (`_place_around`), and again so that the lidar is nearly
    in line with one of its edges (`_turn_edge_on`), where rare beams have large errors;
@@ -48,7 +48,7 @@ SLANT = np.radians(1.5)
 NARROWEST = 0.1
 
 
-def lookup_distances(
+def find_lookup_distances(
     exact: LidarArrays, baked: LidarArrays, shape: int, radius: float, greatest: float
 ) -> tuple[float, float]:
     """Find the distances between which looking up a shape has an RMSE of at most `greatest` [m].

@@ -86,7 +86,7 @@ def cells_of(cells: NDArray[np.uint32], place: Integers) -> NDArray[np.uint32]:
 
 
 @kernel(allocates=True)
-def free_squares(blocked: Mask) -> NDArray[np.uint32]:
+def find_free_squares(blocked: Mask) -> NDArray[np.uint32]:
     """Bake the squares (rows + 2, columns + 2) of a map (rows, columns), see `GridArrays`."""
     rows, columns = blocked.shape
     side = np.zeros((rows + 2, columns + 2), np.int32)
@@ -110,14 +110,14 @@ def free_squares(blocked: Mask) -> NDArray[np.uint32]:
 
 
 @kernel
-def _line(at: float, step: float, cell: int) -> float:
+def _find_line(at: float, step: float, cell: int) -> float:
     if step == 0.0:
         return np.inf
     return (cell + (1 if step > 0.0 else 0) - at) / step
 
 
 @kernel
-def _entry(at: float, step: float, size: int) -> tuple[float, float]:
+def _find_entry(at: float, step: float, size: int) -> tuple[float, float]:
     """Distances along a beam at which it enters and leaves [0, size] on one axis [cells]."""
     if step == 0.0:
         if 0.0 <= at < size:
@@ -145,8 +145,8 @@ def walk(
     if 0 <= x < columns and 0 <= y < rows:
         solid = squares[y + 1, x + 1] == 0
     else:
-        x_in, x_out = _entry(u, du, columns)
-        y_in, y_out = _entry(v, dv, rows)
+        x_in, x_out = _find_entry(u, du, columns)
+        y_in, y_out = _find_entry(v, dv, rows)
         t = max(x_in, y_in)
         if t < 0.0 or t > min(x_out, y_out) or t > limit:
             return np.inf
@@ -154,17 +154,17 @@ def walk(
         y = min(max(math.floor(v + dv * t), 0), rows - 1)
         if squares[y + 1, x + 1] == 0:
             return t
-    x_line = _line(u, du, x)
-    y_line = _line(v, dv, y)
+    x_line = _find_line(u, du, x)
+    y_line = _find_line(v, dv, y)
     while True:
         if x_line < y_line:
             t = x_line
             x = x + (1 if du > 0.0 else -1)
-            x_line = _line(u, du, x)
+            x_line = _find_line(u, du, x)
         else:
             t = y_line
             y = y + (1 if dv > 0.0 else -1)
-            y_line = _line(v, dv, y)
+            y_line = _find_line(v, dv, y)
         if t > limit:
             return np.inf
         if not (0 <= x < columns and 0 <= y < rows):

@@ -65,7 +65,9 @@ class GridMap:
         """The map for the kernels; baked on first use."""
         x, y, heading = self.origin
         frame = np.array([x, y, np.cos(heading), np.sin(heading), self.resolution])
-        return map_kernels.GridArrays(map_kernels.free_squares(self.blocked), frame)
+        return map_kernels.GridArrays(
+            map_kernels.find_free_squares(self.blocked), frame
+        )
 
     def world_to_cell(self, points: ArrayLike) -> Integers:
         """Return row and column (..., 2) of points (..., 2) x, y [m]; may be outside the map."""
@@ -145,7 +147,7 @@ class MapFile(Schema):
     mode: Literal["trinary", "scale", "raw"] = "trinary"
 
     @model_validator(mode="after")
-    def _consistent(self) -> "MapFile":
+    def _check_consistent(self) -> "MapFile":
         if not self.free_thresh < self.occupied_thresh:
             raise ValueError("free_thresh must be less than occupied_thresh")
         return self
@@ -163,7 +165,7 @@ def load_map(
     path = find_config(name, "maps")
     file = load_yaml(path, MapFile)
     grey, opaque = read_image(path.parent / file.image, str(path))
-    cells = np.ascontiguousarray(cells_of(grey, opaque, file)[::-1])
+    cells = np.ascontiguousarray(convert_pixels(grey, opaque, file)[::-1])
     return GridMap(cells, file.resolution, file.origin, unknown_stops, occupied_from)
 
 
@@ -200,17 +202,17 @@ def map_files(grid: GridMap, path: Path) -> None:
     write_text(path, dump_yaml(about))
 
 
-def cells_of(
+def convert_pixels(
     grey: NDArray[np.uint8], opaque: Mask | None, file: MapFile
 ) -> NDArray[np.int8]:
     """Cells (rows, columns) of an image from brightness and opacity, in the image's row order."""
-    cells: NDArray[np.int8] = _cells_by_brightness(file)[grey]
+    cells: NDArray[np.int8] = _convert_brightness(file)[grey]
     if opaque is not None and file.mode != "raw":
         cells[~opaque] = UNKNOWN
     return cells
 
 
-def _cells_by_brightness(file: MapFile) -> NDArray[np.int8]:
+def _convert_brightness(file: MapFile) -> NDArray[np.int8]:
     """(256,) the cell for each brightness of a pixel."""
     grey = np.arange(256)
     if file.mode == "raw":
@@ -260,7 +262,7 @@ def read_image(path: Path, source: str) -> tuple[NDArray[np.uint8], Mask | None]
             with Image.open(path, formats=tuple(FORMATS)) as image:
                 if image.width * image.height > MAX_CELLS:
                     raise Image.DecompressionBombError
-                return _pixels(image)
+                return _read_pixels(image)
     except Image.DecompressionBombError:
         reason = f"has too many pixels, a map may have {MAX_CELLS}; cut or coarsen it."
         raise ConfigError(f"{path}: {reason}") from None
@@ -277,7 +279,7 @@ def read_image(path: Path, source: str) -> tuple[NDArray[np.uint8], Mask | None]
         raise ConfigError(f"{path}: {reason}") from None
 
 
-def _pixels(image: Image.Image) -> tuple[NDArray[np.uint8], Mask | None]:
+def _read_pixels(image: Image.Image) -> tuple[NDArray[np.uint8], Mask | None]:
     """Brightness and opacity, computed in blocks of rows: intermediate numbers are far larger."""
     shape = (image.height, image.width)
     grey = np.empty(shape, np.uint8)

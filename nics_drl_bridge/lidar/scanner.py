@@ -13,9 +13,9 @@ from nics_drl_bridge.errors import ConfigError, ModelError, suggest
 from nics_drl_bridge.lidar import scan_kernels
 from nics_drl_bridge.lidar.arrays import Array, Singles
 from nics_drl_bridge.lidar.bake import bake
-from nics_drl_bridge.lidar.beam_kernels import beams_of
+from nics_drl_bridge.lidar.beam_kernels import make_beams
 from nics_drl_bridge.lidar.exact_kernels import SHAPE
-from nics_drl_bridge.lidar.lookup_error import lookup_distances
+from nics_drl_bridge.lidar.lookup_error import find_lookup_distances
 from nics_drl_bridge.lidar.map_kernels import Fixtures
 from nics_drl_bridge.lidar.maps import GridMap, stack_fixtures
 from nics_drl_bridge.lidar.scan_kernels import LidarArrays
@@ -29,7 +29,7 @@ DEFAULT_RENDERER: Renderer = "auto"
 NO_WALLS = np.zeros((0, 4))
 # `auto` looks up at distances where the ranges' RMSE is at most this [m]
 GREATEST_ERROR = 0.01
-# cache of `lookup_distances`
+# cache of `find_lookup_distances`
 _MEASURED: dict[tuple[Any, ...], tuple[float, float]] = {}
 # `auto` scans beams farther apart exactly: rows of few points err [rad]
 WIDEST_BEAMS = 0.2
@@ -82,7 +82,7 @@ class Scanner:
         table = self.table
         return LidarArrays(
             np.array(spec.mount),
-            beams_of(
+            make_beams(
                 np.ascontiguousarray(spec.directions.T),
                 spec.angle_min,
                 spec.angle_increment,
@@ -90,7 +90,7 @@ class Scanner:
             spec.range_min,
             spec.range_max,
             spec.sweep_time,
-            self._looked_up(),
+            self._find_lookup_limits(),
             table.outlines.arguments,
             table.arrays,
             self.renderer == "exact",
@@ -100,7 +100,7 @@ class Scanner:
     def _without_walls(self) -> Fixtures:
         return stack_fixtures([NO_WALLS], [self.grid], np.zeros(1, np.int64))
 
-    def _looked_up(self) -> Array:
+    def _find_lookup_limits(self) -> Array:
         spec = self.spec
         table = self.table
         radii = self.table.outlines.radii
@@ -114,7 +114,7 @@ class Scanner:
                 if key not in _MEASURED:  # once per process
                     exact = replace(self, renderer="exact", grid=None)
                     baked = replace(self, renderer="baked", grid=None)
-                    _MEASURED[key] = lookup_distances(
+                    _MEASURED[key] = find_lookup_distances(
                         exact.arguments,
                         baked.arguments,
                         h,
@@ -142,7 +142,7 @@ class Scanner:
         world; the ranges are written to `out` if it is given. Raises ConfigError for an array of a
         wrong shape, ModelError for a body of a shape that is not in the table.
         """
-        poses, bodies, walls = self._scene(poses, bodies, walls)
+        poses, bodies, walls = self._check_scene(poses, bodies, walls)
         shape = (len(poses), self.spec.beams)
         if out is None:
             out = np.empty(shape, np.float32)
@@ -171,7 +171,7 @@ class Scanner:
         )
         return out
 
-    def _scene(
+    def _check_scene(
         self, poses: ArrayLike, bodies: ArrayLike, walls: ArrayLike
     ) -> tuple[Array, ...]:
         poses = np.atleast_2d(np.asarray(poses, dtype=np.float64))

@@ -38,13 +38,13 @@ def resample(out: Singles, ranges: Singles, plan: SectorPlan) -> None:
     A sector without a beam takes the nearer return of the two adjacent beams.
     """
     if plan.shift[0] != 0.0 or plan.shift[1] != 0.0:
-        _by_place(out, ranges, plan)
+        _fill_by_place(out, ranges, plan)
     else:
-        _by_beam(out, ranges, plan.first, plan.hits)
+        _fill_by_beam(out, ranges, plan.first, plan.hits)
 
 
 @kernel(allocates=True)
-def _by_beam(
+def _fill_by_beam(
     out: Singles,
     ranges: Singles,
     first: ShortIntegers,
@@ -68,7 +68,7 @@ def _by_beam(
 
 
 @kernel(allocates=True)
-def _by_place(out: Singles, ranges: Singles, plan: SectorPlan) -> None:
+def _fill_by_place(out: Singles, ranges: Singles, plan: SectorPlan) -> None:
     """Fill each sector from its returns, or the nearer of the neighbouring beams around it."""
     sectors = out.shape[0]
     beams = ranges.shape[0]
@@ -78,11 +78,11 @@ def _by_place(out: Singles, ranges: Singles, plan: SectorPlan) -> None:
     for s in range(sectors):
         out[s] = np.nan
     for b in range(beams):
-        where[b], value[b] = _seen(ranges[b], plan.directions[b], plan)
+        where[b], value[b] = _locate_return(ranges[b], plan.directions[b], plan)
         s = where[b]
         if 0 <= s < sectors:
             has_return[s] = True
-            out[s] = _nearer(out[s], value[b])
+            out[s] = _choose_nearer(out[s], value[b])
     around = round(TURN / plan.width)
     for b in range(beams if plan.closed else beams - 1):
         after = b + 1
@@ -100,11 +100,13 @@ def _by_place(out: Singles, ranges: Singles, plan: SectorPlan) -> None:
         for _ in range(gap - 1):
             s = (s + step) % around
             if s < sectors and not has_return[s]:
-                out[s] = _nearer(out[s], near)
+                out[s] = _choose_nearer(out[s], near)
 
 
 @kernel(allocates=True)
-def _seen(r: np.float32, direction: Array, plan: SectorPlan) -> tuple[int, np.float32]:
+def _locate_return(
+    r: np.float32, direction: Array, plan: SectorPlan
+) -> tuple[int, np.float32]:
     """Sector of a return seen from the viewpoint, -1 if unknown, and its distance."""
     if r != r:
         return -1, np.float32(np.nan)
@@ -121,5 +123,5 @@ def _seen(r: np.float32, direction: Array, plan: SectorPlan) -> tuple[int, np.fl
 
 
 @kernel(allocates=True)
-def _nearer(first: np.float32, second: np.float32) -> np.float32:
+def _choose_nearer(first: np.float32, second: np.float32) -> np.float32:
     return first if first <= second else second

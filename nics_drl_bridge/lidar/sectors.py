@@ -44,7 +44,7 @@ class ScanLayout(Schema):
     viewpoint: tuple[Place, Place] = (0.0, 0.0)  # x, y in `base_link` [m]
 
     @model_validator(mode="after")
-    def _consistent(self) -> "ScanLayout":
+    def _check_consistent(self) -> "ScanLayout":
         check_angles(self.angle_min, self.angle_max)
         return self
 
@@ -98,7 +98,7 @@ def layout_of(setting: Any, lidar: LidarSpec) -> ScanLayout | None:
     return validate(dict(setting), ScanLayout, "task option scan")
 
 
-def sectors_over(lidar: LidarSpec) -> int:
+def count_sectors(lidar: LidarSpec) -> int:
     """Number of sectors over a lidar's view, with the width of those in `LAYOUTS`."""
     return max(4, round((lidar.angle_max - lidar.angle_min) / LAYOUTS["around"].width))
 
@@ -132,7 +132,7 @@ def plan_of(lidar: LidarSpec, layout: ScanLayout) -> SectorPlan:
     _check(lidar, layout, angles)
     first, count = np.zeros((2, layout.sectors), np.int32)
     for s, middle in enumerate(layout.angles):
-        first[s], count[s] = _beams_of(
+        first[s], count[s] = _find_beams(
             wrap_angle(angles - middle), 0.5 * layout.width + BORDER_RAD
         )
     left_open = 2.0 * np.pi - (lidar.angles[-1] - lidar.angles[0])
@@ -150,7 +150,7 @@ def plan_of(lidar: LidarSpec, layout: ScanLayout) -> SectorPlan:
     )
 
 
-def _beams_of(away: Array, half: float) -> tuple[int, int]:
+def _find_beams(away: Array, half: float) -> tuple[int, int]:
     """First beam and number of beams `away` (B,) by at most `half` [rad], or the adjacent ones."""
     inside = np.abs(away) <= half
     if not inside.any():
@@ -200,7 +200,7 @@ def _check(lidar: LidarSpec, layout: ScanLayout, angles: Array) -> None:
 def _narrower(lidar: LidarSpec, layout: ScanLayout) -> str:
     if layout.model_dump() == LAYOUTS["around"].model_dump() and covers(lidar, "front"):
         return "say `scan: front`, its 270 deg"
-    return f"use a lidar that sees farther or wider, or train with `scan: {sectors_over(lidar)}`"
+    return f"use a lidar that sees farther or wider, or train with `scan: {count_sectors(lidar)}`"
 
 
 @dataclass(frozen=True)
@@ -217,7 +217,7 @@ class Reader:
         return values
 
 
-def reader_of(
+def make_reader(
     header: ScanHeader, beams: int, like: LidarSpec, upside_down: bool = False
 ) -> Reader:
     """Return the reader for scans of B beams with the header of a LaserScan.
@@ -257,11 +257,11 @@ def reader_of(
     return Reader(validate(fields, LidarSpec, "LaserScan"), backwards)
 
 
-def reader_beside(
+def match_reader(
     header: ScanHeader, beams: int, like: LidarSpec, upside_down: bool = False
 ) -> Reader:
-    """Like `reader_of`, but returns exactly the expected lidar if the header agrees with it."""
-    reader = reader_of(header, beams, like, upside_down)
+    """Like `make_reader`, but returns exactly the expected lidar if the header agrees with it."""
+    reader = make_reader(header, beams, like, upside_down)
     limits = np.array([reader.lidar.range_min, reader.lidar.range_max])
     near = np.allclose(limits, [like.range_min, like.range_max], rtol=1e-4, atol=1e-4)
     same = near and reader.lidar.beams == like.beams

@@ -166,7 +166,7 @@ def check_sensors(sensors: tuple[Sensor, ...], frames: tuple[str, ...]) -> None:
         used.append(sensor.frame)
 
 
-def _validated(entries: Any) -> Sensor:
+def _validate(entries: Any) -> Sensor:
     try:
         return sensor_of_data(entries)
     except ConfigError as error:
@@ -177,4 +177,4 @@ _dumped = PlainSerializer(
     lambda sensor: sensor.model_dump(mode="json"), return_type=dict
 )
 # a field of a schema
-AnySensor = Annotated[Sensor, PlainValidator(_validated), _dumped]
+AnySensor = Annotated[Sensor, PlainValidator(_validate), _dumped]

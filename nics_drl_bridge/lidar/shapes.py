@@ -8,9 +8,10 @@ The kernels know shapes by their index in `Outlines`, which lists the corners of
 array. `place` turns shapes at poses into bodies (..., 7): x, y, heading, cosine and sine of the
 heading, radius, and the index of the shape.
 
-Baking needs two more properties of a shape. `convex_hull` determines its silhouette: the leftmost
-and the rightmost corner, as seen from outside, are corners of the hull. `rotational_order` counts
-the rotations that map the shape onto itself, so that a table needs only one of their sectors.
+Baking needs two more properties of a shape. `find_convex_hull` determines its silhouette: the
+leftmost and the rightmost corner, as seen from outside, are corners of the hull.
+`find_rotational_order` counts the rotations that map the shape onto itself, so that a table needs
+only one of their sectors.
 """
 
 from collections.abc import Sequence
@@ -73,7 +74,7 @@ class Rectangle(Outlined):
 
     @field_validator("size", mode="before")
     @classmethod
-    def _extended(cls, size: Any) -> Any:
+    def _check_extent(cls, size: Any) -> Any:
         if isinstance(size, list | tuple) and any(part == 0.0 for part in size):
             raise ValueError(
                 "size must be greater than 0; a wall without thickness is a segment"
@@ -99,7 +100,7 @@ class Polygon(Outlined):
 
     @field_validator("points")
     @classmethod
-    def _distinct(
+    def _check_distinct(
         cls, points: tuple[tuple[float, float], ...]
     ) -> tuple[tuple[float, float], ...]:
         if len(set(points)) < 3:
@@ -127,7 +128,7 @@ class Segment(Outlined):
     ends: tuple[tuple[Place, Place], tuple[Place, Place]]
 
     @model_validator(mode="after")
-    def _extended(self) -> "Segment":
+    def _check_extent(self) -> "Segment":
         if self.ends[0] == self.ends[1]:
             raise ValueError("ends must be two different points")
         if np.ptp(self.ends, axis=0).max() < SMALLEST:
@@ -166,19 +167,19 @@ def place(poses: ArrayLike, radii: ArrayLike, shapes: ArrayLike) -> Array:
     return bodies
 
 
-def convex_hull(points: Array) -> Array:
+def find_convex_hull(points: Array) -> Array:
     """Corners (P, 2) of the convex hull, counter-clockwise; Andrew's monotone chain (1979)."""
     ordered = sorted({(float(x), float(y)) for x, y in points})
     if len(ordered) < 3:
         return np.array(ordered)
     reach = _reach(points)
     smallest_area = 1e-12 * reach * reach
-    lower = _half_hull(ordered, smallest_area)
-    upper = _half_hull(ordered[::-1], smallest_area)
+    lower = _find_half_hull(ordered, smallest_area)
+    upper = _find_half_hull(ordered[::-1], smallest_area)
     return np.array(lower + upper)
 
 
-def _half_hull(
+def _find_half_hull(
     ordered: Sequence[tuple[float, float]], smallest_area: float
 ) -> list[tuple[float, float]]:
     """Lower hull of points from left to right, or upper one from right to left, without its end.
@@ -197,7 +198,7 @@ def _half_hull(
     return chain[:-1]
 
 
-def rotational_order(outline: Array, hull: Array) -> int:
+def find_rotational_order(outline: Array, hull: Array) -> int:
     """Order of the rotational symmetry of a shape: 4 for a square, 1 for most shapes."""
     if len(outline) < 3:
         return 1
@@ -244,10 +245,10 @@ class Outlines:
         orders = []
         for shape in shapes:
             outline = shape.outline
-            hull = convex_hull(outline) if len(outline) else np.zeros((1, 2))
+            hull = find_convex_hull(outline) if len(outline) else np.zeros((1, 2))
             outlines.append(outline)
             hulls.append(hull)
-            orders.append(rotational_order(outline, hull))
+            orders.append(find_rotational_order(outline, hull))
         twice = [np.concatenate([hull, hull]) for hull in hulls]
         nothing = np.zeros((0, 2))
         radii = np.array([shape.radius for shape in shapes], dtype=np.float64)

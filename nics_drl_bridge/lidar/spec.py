@@ -47,7 +47,7 @@ def check_angles(angle_min: float, angle_max: float) -> None:
         raise ValueError("angle_min and angle_max must lie within -2 pi and 2 pi")
 
 
-def without_sensor_model(data: Any) -> Any:
+def drop_sensor_model(data: Any) -> Any:
     """Take an empty `sensor_model` of an earlier version out of a file's content."""
     if not isinstance(data, dict) or "sensor_model" not in data:
         return data
@@ -82,11 +82,11 @@ class LidarSpec(Schema):
 
     @model_validator(mode="before")
     @classmethod
-    def _without_sensor_model(cls, data: Any) -> Any:
-        return without_sensor_model(data)
+    def _drop_sensor_model(cls, data: Any) -> Any:
+        return drop_sensor_model(data)
 
     @model_validator(mode="after")
-    def _consistent(self) -> "LidarSpec":
+    def _check_consistent(self) -> "LidarSpec":
         if not self.range_min < self.range_max:
             raise ValueError("range_min must be less than range_max")
         check_angles(self.angle_min, self.angle_max)
@@ -167,7 +167,7 @@ def to_device(ranges: ArrayLike, spec: LidarSpec) -> Ranges:
     """Convert ranges (..., B) to the device's convention; only `inf` is replaced."""
     out = np.array(ranges, dtype=np.float32)
     if spec.no_return != "inf":
-        out[out == np.inf] = _no_return(spec)
+        out[out == np.inf] = _get_no_return(spec)
     return out
 
 
@@ -178,7 +178,7 @@ def from_device(values: ArrayLike, spec: LidarSpec) -> Ranges:
     """
     out = np.array(values, dtype=np.float32)
     if spec.no_return != "inf":
-        no_return = _no_return(spec)
+        no_return = _get_no_return(spec)
         if np.isnan(no_return):
             out[np.isnan(out)] = np.inf
         else:
@@ -188,7 +188,7 @@ def from_device(values: ArrayLike, spec: LidarSpec) -> Ranges:
     return out
 
 
-def _no_return(spec: LidarSpec) -> np.float32:
+def _get_no_return(spec: LidarSpec) -> np.float32:
     return np.float32(
         {"zero": 0.0, "nan": np.nan, "range_max": spec.range_max}[spec.no_return]
     )

@@ -26,7 +26,7 @@ from nics_drl_bridge.files import (
 from nics_drl_bridge.lidar.arrays import Array, Integers, ShortIntegers, Singles
 from nics_drl_bridge.lidar.lookup_kernels import FEWEST, TABLE_SHAPE, TableArrays
 from nics_drl_bridge.lidar.shapes import Circle, Outlines, Shape
-from nics_drl_bridge.lidar.spec import LidarSpec, without_sensor_model
+from nics_drl_bridge.lidar.spec import LidarSpec, drop_sensor_model
 
 FORMAT = "nics_drl_bridge/lidar_table/4"
 ABOUT_FILE = "about.json"
@@ -63,11 +63,11 @@ class TableAbout(Schema):
 
     @model_validator(mode="before")
     @classmethod
-    def _without_sensor_model(cls, data: Any) -> Any:
-        return without_sensor_model(data)
+    def _drop_sensor_model(cls, data: Any) -> Any:
+        return drop_sensor_model(data)
 
 
-def padding(beam_angle: float) -> int:
+def count_padding(beam_angle: float) -> int:
     """Maximum number of values that a look-up reads from a row: half a turn, a block."""
     return math.ceil(math.pi / beam_angle) + 1 + 16
 
@@ -149,7 +149,7 @@ class LidarTable:
         # Extent of the row, corners on the right and on the left: see `TableArrays.cells`.
         pairs = (cell[:, [0, 3, 5]] << 16) | (cell[:, [1, 2, 4]] & MOST_WIDE)
         cells = np.column_stack([self.start, pairs])
-        missing = max(FEWEST - padding(self.beam_angle), 0)
+        missing = max(FEWEST - count_padding(self.beam_angle), 0)
         if missing:
             rows = np.append(self.rows, np.zeros(missing, np.float32))
         else:
@@ -217,7 +217,7 @@ class LidarTable:
                 f"{path}: its format is not {FORMAT!r}; generate the model again."
             )
         parts: dict[str, Any] = dict(validate(data, TableAbout, str(path)))
-        parts |= {name: _mapped(folder / f"{name}.npy") for name in ARRAYS}
+        parts |= {name: _map_file(folder / f"{name}.npy") for name in ARRAYS}
         del parts["format"]
         table = cls(**parts)
         try:
@@ -250,7 +250,7 @@ class LidarTable:
             raise ValueError("the number of cells does not fit the grid")
         widths = self.widths * self.density.phases
         ends = self.start + widths
-        last = len(self.rows) - padding(self.beam_angle)
+        last = len(self.rows) - count_padding(self.beam_angle)
         if cells and (self.start.min() < 0 or widths.min() < 1 or ends.max() > last):
             raise ValueError("a row lies outside of the table")
         corners = np.repeat(np.diff(self.outlines.hull) // 2, counts.astype(np.int64))[
@@ -266,7 +266,7 @@ class LidarTable:
             raise ValueError("a cell names a corner that its shape does not have")
 
 
-def _mapped(path: Path) -> NDArray[Any]:
+def _map_file(path: Path) -> NDArray[Any]:
     """Map a `.npy` file into memory; writing to the array never changes the file."""
     try:
         with np.errstate(over="raise"):  # of a shape whose size is no number

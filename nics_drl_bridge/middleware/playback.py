@@ -14,7 +14,7 @@ from nics_drl_bridge.errors import RecordingError, suggest
 from nics_drl_bridge.files import hash_bytes, write_bytes, write_text
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.lidar.sectors import Reader, reader_beside
+from nics_drl_bridge.lidar.sectors import Reader, match_reader
 from nics_drl_bridge.lidar.spec import ScanHeader, from_device
 from nics_drl_bridge.middleware.ekf import ANYWHERE, START_STD
 from nics_drl_bridge.middleware.measurement import CMD_VEL, IMU, ODOM, POSE, SCAN
@@ -226,7 +226,7 @@ class Playback:
             header = ScanHeader(
                 *(float(getattr(message, name)) for name in ScanHeader._fields)
             )
-            self._reader = reader_beside(header, len(message.ranges), self._model.lidar)
+            self._reader = match_reader(header, len(message.ranges), self._model.lidar)
             self.lidar = self._reader.lidar
             self.middleware.expect_beams(self.lidar.beams)
         if self._reader is not None:

@@ -28,7 +28,7 @@ from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge import defaults, interface
 from nics_drl_bridge.arguments import list_keywords, refuse_unknown
-from nics_drl_bridge.env.guard import halts_on_error, uninterrupted
+from nics_drl_bridge.env.guard import delay_interrupts, stop_on_error
 from nics_drl_bridge.errors import BackendError, ConfigError, StaleDataError, suggest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Array, BackendFacts, RobotView, Start
@@ -197,7 +197,7 @@ class DdsBackend:
                 kind, topic, put, qos.SENSOR, raw=True
             )
 
-    @halts_on_error
+    @stop_on_error
     def reset(self, start: Start) -> RobotView:
         """Begin the episode of a seed in the simulator; see `interface.Backend`."""
         stamp_ns = self.begin(start)
@@ -233,7 +233,7 @@ class DdsBackend:
         self.send(command)
         return self.receive()
 
-    @halts_on_error
+    @stop_on_error
     def send(self, command: Array) -> None:
         """Check and publish a command (C,), the first half of a step."""
         self._link.check_open()
@@ -251,7 +251,7 @@ class DdsBackend:
         self._middleware.command(self._now_ns, self._robot.from_cmd_vel(twist))
         self._now_ns += self._period_ns
 
-    @halts_on_error
+    @stop_on_error
     def receive(self) -> tuple[RobotView, dict[str, Any]]:
         """Wait for the data at the end of the period, the second half of a step.
 
@@ -312,7 +312,7 @@ class DdsBackend:
     def _take_waiting(self) -> None:
         """Put all messages that have arrived into the inbox; quicker than a callback for each."""
         with (
-            uninterrupted()
+            delay_interrupts()
         ):  # Ctrl-C amid a call of the library would leave it undefined
             for topic, subscription in self._subscriptions.items():
                 for content in qos.take_waiting(subscription):
@@ -378,7 +378,7 @@ class FleetBackend:
             self.close()
             raise
 
-    @halts_on_error
+    @stop_on_error
     def reset(self, start: Start) -> RobotView:
         """Begin one episode for all robots, at poses (M, 3); see `DdsBackend.reset`."""
         for robot in self._robots[1:]:
@@ -390,7 +390,7 @@ class FleetBackend:
         ]
         return interface.stack_views(views)
 
-    @halts_on_error
+    @stop_on_error
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
         """Publish all commands (M, C) and wait for all data after them."""
         for robot, robot_command in zip(self._robots, command, strict=True):

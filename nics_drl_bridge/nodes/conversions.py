@@ -23,7 +23,7 @@ from std_msgs.msg import Header
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.lidar.maps import GridMap
-from nics_drl_bridge.lidar.sectors import Reader, reader_beside
+from nics_drl_bridge.lidar.sectors import Reader, match_reader
 from nics_drl_bridge.lidar.sensor import Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec, ScanHeader, to_device
 from nics_drl_bridge.recording import messages
@@ -98,7 +98,7 @@ def scan_to_ros(
 def reader_from_ros(message: LaserScan, like: LidarSpec, upside_down: bool) -> Reader:
     """Return the reader of the lidar that a header describes. Raises ConfigError."""
     header = ScanHeader(*(float(getattr(message, name)) for name in ScanHeader._fields))
-    return reader_beside(header, len(message.ranges), like, upside_down)
+    return match_reader(header, len(message.ranges), like, upside_down)
 
 
 def odometry_to_ros(

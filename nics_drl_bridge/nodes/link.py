@@ -32,7 +32,7 @@ from rclpy.publisher import Publisher
 from std_srvs.srv import Trigger
 
 from nics_drl_bridge.config import parse_namespace
-from nics_drl_bridge.env.guard import uninterrupted
+from nics_drl_bridge.env.guard import delay_interrupts
 from nics_drl_bridge.errors import BackendError, ModelError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import S_PER_NS, Start
@@ -131,7 +131,7 @@ class Link:
         no callback would ever run again.
         """
         try:
-            with uninterrupted():
+            with delay_interrupts():
                 self._executor.spin_once(timeout_sec=POLL_S)
         except ExternalShutdownException:
             self.check_open()
@@ -324,7 +324,7 @@ def _spin(executor: SingleThreadedExecutor, timeout: CommandTimeout) -> None:
 
 def _shut_down(opened: Resources) -> None:
     # Otherwise Python may exit while a thread is inside the middleware's library.
-    with uninterrupted():
+    with delay_interrupts():
         if opened.context.ok():
             if opened.timeout is not None and opened.has_peers:
                 opened.timeout.end()

@@ -14,7 +14,7 @@ from pydantic import Field, PositiveFloat, model_validator
 
 from nics_drl_bridge import defaults, geometry
 from nics_drl_bridge.config import Schema, validate
-from nics_drl_bridge.env.guard import halts_on_error
+from nics_drl_bridge.env.guard import stop_on_error
 from nics_drl_bridge.errors import BackendError, StaleDataError
 from nics_drl_bridge.gate import inputs
 from nics_drl_bridge.generator import SimulatorModel
@@ -165,7 +165,7 @@ class RealtimeBackend:
             self.close()
             raise
 
-    @halts_on_error
+    @stop_on_error
     def reset(self, start: Start) -> RobotView:
         """Begin an episode by a simulator's services, or once a vehicle is ready at the start."""
         self._link.check_open()
@@ -194,7 +194,7 @@ class RealtimeBackend:
         view, _ = self._take_view()
         return view
 
-    @halts_on_error
+    @stop_on_error
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
         """Publish a command and wait for the end of its period; see `interface.Backend`."""
         self._link.check_open()

@@ -12,7 +12,7 @@ from scipy import special
 
 from nics_drl_bridge import defaults
 from nics_drl_bridge.env.bridge_env import BridgeEnv
-from nics_drl_bridge.env.guard import uninterrupted
+from nics_drl_bridge.env.guard import delay_interrupts
 from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
@@ -150,7 +150,7 @@ def drive(
         if collisions is None:
             collisions = believed == "collision" if touched is None else touched()
         hit = bool(np.any(collisions))
-        near_goal = truly_near(
+        near_goal = is_truly_near(
             getattr(env.unwrapped, "task", None), info["true_pose"], goal
         ).all()
         wrong = (believed == "success" and not near_goal) or believed == "collision"
@@ -159,12 +159,12 @@ def drive(
     except BaseException:
         # The env does not see errors raised by the policy.
         if isinstance(env.unwrapped, BridgeEnv):
-            with uninterrupted():
+            with delay_interrupts():
                 env.unwrapped.halt()
         raise
 
 
-def truly_near(task: Any, poses: Array, goals: Array) -> Flags:
+def is_truly_near(task: Any, poses: Array, goals: Array) -> Flags:
     """Returns True if poses (..., 3) are within `DRIFT_M` of goals (..., 2), or without goals."""
     if not isinstance(task, Navigation):
         return np.ones(np.shape(poses)[:-1], np.bool_)
@@ -256,22 +256,22 @@ def _drive_once(
         reward += np.where(running, gain, 0.0)
         steps += running
         ended = running & over
-        seen = _robots(info, "collision").any(axis=1)
-        hit = _robots(
+        seen = _get_flags(info, "collision").any(axis=1)
+        hit = _get_flags(
             info, "true_collision" if "true_collision" in info else "collision"
         )
         collision |= ended & hit.any(axis=1)
-        arrived = ended & ~seen & _robots(info, "is_success").all(axis=1)
+        arrived = ended & ~seen & _get_flags(info, "is_success").all(axis=1)
         believed |= arrived
         if arrived.any() and "goal" in info:
-            near = truly_near(env.task, info["true_pose"], info["goal"])
+            near = is_truly_near(env.task, info["true_pose"], info["goal"])
             arrived = arrived & near.reshape(count, -1).all(axis=1)
         success |= arrived & ~hit.any(axis=1)
         running &= ~ended
     return success, collision, steps, length, reward, believed
 
 
-def _robots(info: dict[str, Any], name: str) -> Flags:
+def _get_flags(info: dict[str, Any], name: str) -> Flags:
     """Returns the flags (N, M) of an entry in `info`; (1, 1) False if it is missing."""
     values = np.asarray(info.get(name, [False]), np.bool_)
     return values.reshape(len(values), -1)

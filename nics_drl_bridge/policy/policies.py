@@ -111,7 +111,7 @@ POLICIES: dict[str, Callable[[Navigation, SimulatorModel | None], Policy]] = {
 }
 
 
-def shipped_policies() -> list[str]:
+def list_shipped_policies() -> list[str]:
     """Returns the names of the shipped policy files."""
     return sorted(file.stem for file in shipped().glob(f"*{SUFFIX}"))
 
@@ -121,7 +121,7 @@ def is_policy_file(name: str) -> bool:
 
     Returns False for a baseline or planner. Raises ConfigError for an unknown name.
     """
-    files = shipped_policies()
+    files = list_shipped_policies()
     if (
         name not in POLICIES
         and not name.endswith((SUFFIX, *MAPPINGS))
@@ -154,7 +154,7 @@ def make_policy(
 
     policy = load_policy(name, model)
     policy.check_fits(model, task)
-    return _acting(policy)
+    return _keep_state(policy)
 
 
 def open_policy(
@@ -177,10 +177,10 @@ def open_policy(
     if kind is None and not isinstance(opened, Navigation):
         reason = f"is {policy.contract.task.name!r}; only policies of 'navigation' can be driven."
         raise PolicyError(name, "task.name", reason)
-    return _acting(policy), opened
+    return _keep_state(policy), opened
 
 
-def _acting(policy: "PolicyFile") -> Policy:
+def _keep_state(policy: "PolicyFile") -> Policy:
     """Returns the policy of a file, wrapped to keep its state if it has one."""
     kept = policy.contract.state
     if kept is None:

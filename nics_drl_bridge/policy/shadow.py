@@ -96,16 +96,18 @@ def shadow(
                 f"{path}: {reason}, for example --topic {role}=/car/{role}."
             )
     playback = Playback(model, POSE in messages, any_lidar=True)
-    moments = _moments(playback, messages, model)
+    moments = _collect_moments(playback, messages, model)
     if not moments:
         raise RecordingError(
             f"{path}: no scan with matching odometry; see nics bag info."
         )
-    goals = _goals(moments, goal, ahead_s)
-    return _answered(moments, goals, policy, replace(model, lidar=playback.lidar))
+    goals = _choose_goals(moments, goal, ahead_s)
+    return _compare_moments(
+        moments, goals, policy, replace(model, lidar=playback.lidar)
+    )
 
 
-def _moments(
+def _collect_moments(
     playback: Playback, messages: Mapping[str, list[Message]], model: SimulatorModel
 ) -> list[_Moment]:
     pace = ActionPace(model.control_period)
@@ -141,7 +143,9 @@ def _hold(moments: list[_Moment], held: tuple[int, Array] | None) -> None:
         moments[-1].driven = held[1] if age_s <= HELD_S else None
 
 
-def _goals(moments: list[_Moment], goal: ArrayLike | None, ahead_s: float) -> Array:
+def _choose_goals(
+    moments: list[_Moment], goal: ArrayLike | None, ahead_s: float
+) -> Array:
     if goal is not None:
         return np.broadcast_to(np.asarray(goal, np.float64), (len(moments), 2))
     times = np.array([moment.stamp_ns for moment in moments]) * S_PER_NS
@@ -151,7 +155,7 @@ def _goals(moments: list[_Moment], goal: ArrayLike | None, ahead_s: float) -> Ar
     )
 
 
-def _answered(
+def _compare_moments(
     moments: list[_Moment], goals: Array, name: str, model: SimulatorModel
 ) -> Shadow:
     policy, task = open_policy(name, model)

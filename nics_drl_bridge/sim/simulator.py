@@ -264,7 +264,7 @@ class FastSimulator:
         check_memory(model, self._sizes, world.source)
         self.footprint = footprint_shape(model.robot)
         shapes = (*self.sampler.shapes, self.footprint)
-        table = with_shapes(model.lidar, model.table, shapes)
+        table = add_shapes(model.lidar, model.table, shapes)
         # Index in the lidar's table of each shape of the sampler, and of the footprint.
         self._in_table = np.array([table.outlines.index_of(shape) for shape in shapes])
         self._scanner = Scanner(model.lidar, table, renderer)

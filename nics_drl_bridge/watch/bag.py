@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from nics_drl_bridge.env.snapshot import Snapshot, hits_of
+from nics_drl_bridge.env.snapshot import Snapshot, locate_hits
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import S_PER_NS, Array
@@ -136,7 +136,7 @@ def place_of(model: SimulatorModel, shots: list[Snapshot]) -> World:
     """Returns a field without walls that contains the path and most of the lidar's hits."""
     poses = np.concatenate([shot.poses[:, :2] for shot in shots])
     samples = shots[:: max(1, len(shots) // 50)]
-    hits = [hits_of(model.lidar, shot.poses[0], shot.ranges[0]) for shot in samples]
+    hits = [locate_hits(model.lidar, shot.poses[0], shot.ranges[0]) for shot in samples]
     hits_low, hits_high = np.percentile(
         np.concatenate([poses, *hits]), [100.0 - WITHIN, WITHIN], axis=0
     )

@@ -17,7 +17,7 @@ from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, SHAPE, X, Y
 from nics_drl_bridge.lidar.shapes import Circle, Rectangle, Shape
 from nics_drl_bridge.policy.file.stateful import Policy, begin
 from nics_drl_bridge.policy.planners.twists import scale_to_actions
-from nics_drl_bridge.policy.policies import POLICIES, shipped_policies
+from nics_drl_bridge.policy.policies import POLICIES, list_shipped_policies
 from nics_drl_bridge.seeds import check_seeds
 from nics_drl_bridge.sim.scenes import scaled
 from nics_drl_bridge.sim.world import Obstacles, World, check_place
@@ -233,7 +233,7 @@ class EpisodeSource:
         """See `show.FrameSource`."""
         robot = self.model.robot.name
         first = self.lanes[0].world.name
-        fitting = [name for name in shipped_policies() if name == robot]
+        fitting = [name for name in list_shipped_policies() if name == robot]
         can = CAN | {"drive"} if self._drives else CAN
         policies = dict.fromkeys(
             [self._policy, self._given_policy, *fitting, *POLICIES]

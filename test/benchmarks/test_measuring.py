@@ -19,7 +19,7 @@ from nics_drl_bridge.config import list_shipped
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.lidar.bake import bake
-from nics_drl_bridge.policy.policies import shipped_policies
+from nics_drl_bridge.policy.policies import list_shipped_policies
 from nics_drl_bridge.recording.readers import read_recording
 from nics_drl_bridge.robot.spec import load_robot
 from nics_drl_bridge.sim.randomisation import Sampler, load_randomisation
@@ -279,9 +279,9 @@ def test_a_larger_footprint_is_the_same_outline_scaled(robot):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not shipped_policies(), reason="no policy is shipped")
+@pytest.mark.skipif(not list_shipped_policies(), reason="no policy is shipped")
 def test_the_picture_is_drawn_of_runs_robot_by_robot(policies, tmp_path):
-    names = shipped_policies()[:2]
+    names = list_shipped_policies()[:2]
     curve = dict(zip("0123", (0.97, 0.97, 0.9, 0.0), strict=True))
     kept = dict.fromkeys(policies.PERTURBATIONS, curve)
     runs = {
@@ -299,7 +299,7 @@ def test_the_picture_is_drawn_of_runs_robot_by_robot(policies, tmp_path):
     assert policies.find_worst(lost)["points"] == pytest.approx(7.0)
 
 
-@pytest.mark.skipif("jackal" not in shipped_policies(), reason="needs the policy")
+@pytest.mark.skipif("jackal" not in list_shipped_policies(), reason="needs the policy")
 def test_a_larger_footprint_is_driven_in_the_scenes_of_the_robot_it_is_believed_to_be(
     policies,
 ):

@@ -62,7 +62,7 @@ def test_options_complete_to_what_is_shipped_and_to_files(tmp_path, monkeypatch)
     assert {"cellular", "circles"} <= set(console.WORLDS("c"))
     assert console.WORLDS("barn") == ["barn"]
     offered = {each for letter in ascii_lowercase for each in console.POLICIES(letter)}
-    assert offered == {*policies.POLICIES, *policies.shipped_policies()}
+    assert offered == {*policies.POLICIES, *policies.list_shipped_policies()}
     (tmp_path / "diff_mine.yaml").write_text("")
     assert console.ROBOTS("diff") == ["differential", "diff_mine.yaml"]
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from robots import direct_model, field
 
 from nics_drl_bridge.env.bridge_env import BridgeEnv
-from nics_drl_bridge.env.guard import halts_on_error
+from nics_drl_bridge.env.guard import stop_on_error
 from nics_drl_bridge.env.pettingzoo_env import BridgeParallelEnv
 from nics_drl_bridge.env.task import Task
 from nics_drl_bridge.env.tasks.navigation import Navigation
@@ -342,7 +342,7 @@ class Stubborn:
         self.press()
         self.halted += 1
 
-    @halts_on_error
+    @stop_on_error
     def step(self):
         raise ValueError("the first")
 

@@ -25,7 +25,7 @@ def lengths_of(world, seeds=(0,), at=None):
     guide.begin(np.arange(len(seeds)), scenes)
     if at is not None:
         simulator.data.pose[...] = at
-    return guide.lengths(slice(0, len(seeds)), simulator.data)[:, 0], scenes
+    return guide.measure_lengths(slice(0, len(seeds)), simulator.data)[:, 0], scenes
 
 
 def walled(*walls, **changes):

@@ -12,7 +12,7 @@ from nics_drl_bridge import extensions
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.rendering import ROBOTS
 from nics_drl_bridge.env.sim_backend import SimBackend
-from nics_drl_bridge.env.snapshot import gate_of
+from nics_drl_bridge.env.snapshot import find_gate
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -103,7 +103,7 @@ def test_a_shot_tells_command_estimate_covariance_and_gate():
     ],
 )
 def test_a_shot_tells_what_the_gate_did(info, said):
-    assert gate_of(info) == said
+    assert find_gate(info) == said
 
 
 def test_nothing_is_drawn_without_a_mode_and_nothing_before_a_reset():

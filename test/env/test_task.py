@@ -17,9 +17,9 @@ from nics_drl_bridge.env.registry import ENVIRONMENTS, TASK, make_task
 from nics_drl_bridge.env.task import (
     DRIVES,
     bearing,
-    contact_ranges,
     discrete_commands,
     distance,
+    find_contact_ranges,
     still,
 )
 from nics_drl_bridge.env.tasks.navigation import Navigation
@@ -239,7 +239,7 @@ def mounted(mount):
 @pytest.mark.parametrize("mount", [(0.2, 0.0, 0.0), (0.1, 0.02, 1.3)])
 def test_a_return_within_the_corners_of_a_footprint_is_a_touch(footprint, mount):
     spec = mounted(mount)
-    found = contact_ranges(robot(footprint), spec, MARGIN)
+    found = find_contact_ranges(robot(footprint), spec, MARGIN)
     outline = Polygon(footprint).boundary
     for angle, leaves in zip(spec.angles[::7] + mount[2], found[::7], strict=True):
         far = (mount[0] + 3.0 * np.cos(angle), mount[1] + 3.0 * np.sin(angle))
@@ -251,7 +251,7 @@ def test_a_return_within_the_corners_of_a_footprint_is_a_touch(footprint, mount)
 
 def test_beams_that_do_not_cross_a_footprint_touch_nothing():
     spec = mounted((1.0, 0.0, 0.0))
-    found = contact_ranges(robot(TRUCK), spec, MARGIN)
+    found = find_contact_ranges(robot(TRUCK), spec, MARGIN)
     ahead = np.abs(spec.angles) < 1.0
     assert (found[ahead] == -np.inf).all()
     assert (found[~ahead] > 0.0).any()
@@ -259,7 +259,7 @@ def test_beams_that_do_not_cross_a_footprint_touch_nothing():
 
 def test_a_round_footprint_is_left_at_its_radius_from_the_middle():
     spec = load_robot("differential")
-    found = contact_ranges(spec, mounted((0.0, 0.0, 0.5)), MARGIN)
+    found = find_contact_ranges(spec, mounted((0.0, 0.0, 0.5)), MARGIN)
     assert found == pytest.approx(spec.footprint_radius + MARGIN, abs=1e-6)
 
 

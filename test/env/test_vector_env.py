@@ -286,7 +286,7 @@ def test_facts_of_some_worlds_are_copies_and_zeros_elsewhere_however_many_they_a
 ):
     values = np.array([[1, 2], [3, 4], [5, 6], [7, 8]]).astype(kind)
     mask = np.isin(np.arange(4), kept)
-    found = vector_env.masked({"of": {"these": values}}, mask, True)["of"]
+    found = vector_env.add_masks({"of": {"these": values}}, mask, True)["of"]
     expected = np.zeros_like(values)
     expected[mask] = values[mask]
     assert found["these"].dtype == values.dtype
@@ -294,4 +294,4 @@ def test_facts_of_some_worlds_are_copies_and_zeros_elsewhere_however_many_they_a
     assert found["_these"].tolist() == mask.tolist()
     assert not np.shares_memory(found["these"], values)
     with pytest.raises(IndexError):
-        vector_env.masked({"wrong": np.concatenate([values, values])}, mask, True)
+        vector_env.add_masks({"wrong": np.concatenate([values, values])}, mask, True)

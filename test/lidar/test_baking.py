@@ -5,10 +5,10 @@ import pytest
 from robots import lidar
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.lidar.bake import bake, with_shapes
+from nics_drl_bridge.lidar.bake import add_shapes, bake
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.shapes import SQUARE, STRIP, Circle
-from nics_drl_bridge.lidar.table import Density, LidarTable, padding
+from nics_drl_bridge.lidar.table import Density, LidarTable, count_padding
 
 SPEC = lidar(beams=360, range_min=0.0)
 SMALL = Density(distances=12, rotations=16)
@@ -55,13 +55,13 @@ def test_rows_lie_apart_within_the_table_and_leave_room_at_its_end():
     ends = table.start + table.cell[:, 1].astype(int) * table.density.phases
     assert table.start[0] == 0
     assert np.array_equal(table.start[1:], ends[:-1])
-    assert len(table.rows) == ends[-1] + padding(SPEC.angle_increment)
+    assert len(table.rows) == ends[-1] + count_padding(SPEC.angle_increment)
 
 
 def test_shapes_are_added_at_the_density_of_the_table():
     table = bake(SPEC, [SQUARE], SMALL)
-    assert with_shapes(SPEC, table, [SQUARE]) is table
-    more = with_shapes(SPEC, table, [STRIP])
+    assert add_shapes(SPEC, table, [SQUARE]) is table
+    more = add_shapes(SPEC, table, [STRIP])
     assert more.shapes == (SQUARE, STRIP)
     assert more.density == SMALL
 
@@ -106,6 +106,6 @@ def test_a_shape_that_covers_more_beams_than_a_row_has_is_refused_with_the_way_o
 def test_shapes_are_added_to_a_table_without_rows_at_no_cost():
     table = LidarTable.without_rows(SPEC, [SQUARE, SQUARE])
     assert table.shapes == (SQUARE,)
-    more = with_shapes(SPEC, table, [STRIP])
+    more = add_shapes(SPEC, table, [STRIP])
     assert more.shapes == (SQUARE, STRIP)
     assert not more.has_rows

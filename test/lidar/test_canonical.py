@@ -11,8 +11,8 @@ from nics_drl_bridge.lidar.sectors import (
     Reader,
     ScanLayout,
     layout_of,
+    make_reader,
     plan_of,
-    reader_of,
 )
 from nics_drl_bridge.lidar.spec import ScanHeader, load_lidar
 
@@ -165,7 +165,7 @@ def reader_sees(reader: Reader, ranges, layout=AROUND):
 def test_a_header_gives_back_its_lidar():
     for name in SHIPPED:
         spec = load_lidar(name)
-        found = reader_of(spec.header, spec.beams, spec)
+        found = make_reader(spec.header, spec.beams, spec)
         assert not found.backwards
         assert found.lidar.angles == pytest.approx(spec.angles, abs=1e-6)
 
@@ -179,7 +179,7 @@ def test_beams_that_come_clockwise_are_put_in_order():
         angle_max=spec.header.angle_min,
         angle_increment=-spec.angle_increment,
     )
-    found = reader_of(clockwise, 720, spec)
+    found = make_reader(clockwise, 720, spec)
     assert np.array_equal(
         reader_sees(found, ranges[::-1]), resampled(plan_of(spec, AROUND), ranges)
     )
@@ -188,7 +188,7 @@ def test_beams_that_come_clockwise_are_put_in_order():
 def test_a_lidar_that_hangs_upside_down_turns_the_other_way():
     spec = lidar(beams=720)
     below = room(np.array([0.3, 0.4]), -spec.angles)
-    found = reader_of(spec.header, 720, spec, upside_down=True)
+    found = make_reader(spec.header, 720, spec, upside_down=True)
     upright = room(np.array([0.3, 0.4]), spec.angles)
     assert reader_sees(found, below) == pytest.approx(
         resampled(plan_of(spec, AROUND), upright)
@@ -204,7 +204,7 @@ def test_a_lidar_that_hangs_upside_down_turns_the_other_way():
     ],
 )
 def test_odd_headers_of_a_full_circle_are_understood(beams, changes):
-    found = reader_of(header(lidar(beams=720), **changes), beams, lidar())
+    found = make_reader(header(lidar(beams=720), **changes), beams, lidar())
     assert found.lidar.beams == beams
     assert found.lidar.angle_increment == pytest.approx(2.0 * np.pi / 720, rel=2e-3)
     plan_of(found.lidar, AROUND)
@@ -222,4 +222,4 @@ def test_odd_headers_of_a_full_circle_are_understood(beams, changes):
 )
 def test_a_header_that_describes_no_lidar_is_refused(beams, changes):
     with pytest.raises(ConfigError, match="LaserScan"):
-        reader_of(header(lidar(beams=720), **changes), beams, lidar())
+        make_reader(header(lidar(beams=720), **changes), beams, lidar())

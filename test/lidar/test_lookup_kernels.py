@@ -6,7 +6,7 @@ from lidar_scenes import convex, star
 
 from nics_drl_bridge.lidar import lookup_kernels as kernels
 from nics_drl_bridge.lidar.beam_kernels import arctan2
-from nics_drl_bridge.lidar.shapes import convex_hull
+from nics_drl_bridge.lidar.shapes import find_convex_hull
 
 
 @pytest.mark.parametrize("corners", [3, 7, 1000])
@@ -15,7 +15,7 @@ def test_climbing_along_a_hull_ends_at_its_silhouette_from_wherever_it_begins(
     make, corners
 ):
     rng = np.random.default_rng(corners)
-    hull = convex_hull(make(rng, corners).outline)
+    hull = find_convex_hull(make(rng, corners).outline)
     count = len(hull)
     for _ in range(50):
         distance = np.hypot(*hull.T).max() * (1.0 + 10.0 ** rng.uniform(-6.0, 1.0))

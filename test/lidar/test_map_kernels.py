@@ -7,7 +7,7 @@ from robots import lidar
 
 from nics_drl_bridge.geometry import rotate
 from nics_drl_bridge.lidar import map_kernels
-from nics_drl_bridge.lidar.beam_kernels import LidarPose, beams_of
+from nics_drl_bridge.lidar.beam_kernels import LidarPose, make_beams
 from nics_drl_bridge.lidar.maps import NO_MAP, GridMap
 from nics_drl_bridge.lidar.scan_kernels import scan_scratch
 
@@ -29,7 +29,7 @@ def scan(kernel, grid, pose, range_max=100.0, rays=None, before=np.inf):
     c = np.cos(pose[2])
     s = np.sin(pose[2])
     arrays = grid if isinstance(grid, tuple) else grid.arrays
-    beams = beams_of(np.ascontiguousarray(rays.T), -np.pi, 2.0 * np.pi / len(rays))
+    beams = make_beams(np.ascontiguousarray(rays.T), -np.pi, 2.0 * np.pi / len(rays))
     lidar = LidarPose(*map(float, pose[:2]), c, s, float(pose[2]))
     map_kernels.scan_map(
         scratch.scan,

@@ -17,7 +17,7 @@ from nics_drl_bridge.lidar.further_lidar import FurtherLidar
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.sensor import add_sensor_kind, load_sensor, sensor_of_data
 from nics_drl_bridge.lidar.table import LidarTable
-from nics_drl_bridge.policy.file.contract import contract_of, read_contract
+from nics_drl_bridge.policy.file.contract import make_contract, read_contract
 from nics_drl_bridge.sim.simulator import FastSimulator
 
 SONAR = '''
@@ -164,7 +164,7 @@ def test_a_policy_names_the_sensors_that_it_observes(model):
         "actions": np.zeros((16, 3), np.float32),
         "commands": np.zeros((16, 3), np.float32),
     }
-    text = contract_of(task, model, golden, "0" * 64, {"command": "test"})
+    text = make_contract(task, model, golden, "0" * 64, {"command": "test"})
     assert read_contract(text, "policy").sensors == model.sensors
 
 

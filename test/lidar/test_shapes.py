@@ -15,9 +15,9 @@ from nics_drl_bridge.lidar.shapes import (
     Polygon,
     Rectangle,
     Segment,
-    convex_hull,
     describe,
-    rotational_order,
+    find_convex_hull,
+    find_rotational_order,
 )
 from nics_drl_bridge.sim.world import Obstacles
 
@@ -55,7 +55,7 @@ def test_outlines_run_counter_clockwise_whichever_way_they_were_given():
 def test_hulls_are_those_of_plane_geometry(make):
     for corners in (3, 10, 100):
         outline = make(np.random.default_rng(corners), corners).outline
-        hull = convex_hull(outline)
+        hull = find_convex_hull(outline)
         expected = shapely.MultiPoint(outline).convex_hull
         assert shapely.Polygon(hull).symmetric_difference(expected).area < 1e-12
         assert shapely.LinearRing(hull).is_ccw
@@ -64,8 +64,8 @@ def test_hulls_are_those_of_plane_geometry(make):
 
 def test_a_hull_has_no_corner_on_its_edges_and_of_a_line_only_the_ends():
     square = np.array([(0, 0), (1, 0), (2, 0), (2, 2), (1, 2), (0, 2), (0, 1)], float)
-    assert len(convex_hull(square)) == 4
-    assert convex_hull(np.array([(0, 0), (3, 3), (1, 1)], float)).tolist() == [
+    assert len(find_convex_hull(square)) == 4
+    assert find_convex_hull(np.array([(0, 0), (3, 3), (1, 1)], float)).tolist() == [
         [0, 0],
         [3, 3],
     ]
@@ -85,10 +85,10 @@ def test_a_hull_has_no_corner_on_its_edges_and_of_a_line_only_the_ends():
 )
 def test_how_often_a_shape_looks_the_same_in_a_turn(shape, order):
     outline = shape.outline
-    hull = convex_hull(outline) if len(outline) else outline
-    assert order % rotational_order(outline, hull) == 0
+    hull = find_convex_hull(outline) if len(outline) else outline
+    assert order % find_rotational_order(outline, hull) == 0
     if order > 2 or shape is STRIP:
-        assert rotational_order(outline, hull) == order
+        assert find_rotational_order(outline, hull) == order
 
 
 def test_outlines_hold_all_shapes_one_after_the_other():

@@ -59,17 +59,17 @@ def bytes_of(proto) -> bytes:
     """The content of a file with a checksum that is right again."""
     for entry in [one for one in proto.metadata_props if one.key == onnx_graph.SEAL]:
         proto.metadata_props.remove(entry)
-    return onnx_graph.sealed(proto.SerializeToString(deterministic=True))
+    return onnx_graph.add_seal(proto.SerializeToString(deterministic=True))
 
 
 def contract_in(proto) -> dict:
-    return json.loads(onnx_graph.metadata(proto, "file"))
+    return json.loads(onnx_graph.find_contract_text(proto, "file"))
 
 
 def signed(proto, data: dict | None = None):
     """The file with a contract that has the hash of its graph."""
     data = contract_in(proto) if data is None else data
-    data["graph_sha256"] = onnx_graph.graph_hash(proto)
+    data["graph_sha256"] = onnx_graph.hash_graph(proto)
     return with_contract(proto, json.dumps(data))
 
 

@@ -16,11 +16,11 @@ from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
 from nics_drl_bridge.policy.train.settings import (
     Opened,
     TrainingSettings,
+    choose_fitting_settings,
+    find_kin,
+    find_pace,
     fit_settings,
-    kin,
     load_training,
-    pace_of,
-    settings_for,
     top_speed,
 )
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
@@ -57,22 +57,22 @@ def test_the_shipped_robots_keep_the_time_limit_that_their_policies_were_learnt_
 ):
     worlds = [load_worlds(world) for world in list_shipped("worlds")]
     known = SimpleNamespace(robot=load_robot(name), control_period=0.1)
-    assert pace_of(known, worlds).steps == EPISODE_STEPS
+    assert find_pace(known, worlds).steps == EPISODE_STEPS
 
 
 def test_a_slow_robot_has_the_time_that_its_way_takes(model):
-    pace = pace_of(slow(model), [load_worlds("doorway")])
+    pace = find_pace(slow(model), [load_worlds("doorway")])
     assert pace.steps == math.ceil(1.8 * 7.0 / 0.22 / 0.1)
     assert pace.shortfall(pace.steps) is None
 
 
 def test_the_field_bounds_the_way_where_the_distance_of_goals_does_not(model):
     field = load_worlds("doorway").model_copy(update={"goal_distance": (2.0, 1e6)})
-    assert pace_of(model, [field]).far == pytest.approx(math.hypot(8.0, 5.0))
+    assert find_pace(model, [field]).far == pytest.approx(math.hypot(8.0, 5.0))
 
 
 def test_a_goal_that_cant_be_reached_in_time_is_told_and_none_at_all_is_refused(model):
-    pace = pace_of(slow(model), [load_worlds("doorway")])
+    pace = find_pace(slow(model), [load_worlds("doorway")])
     told = pace.shortfall(300)
     assert "'doorway': a goal may be 7 m away, which takes 32 s at 0.22 m/s" in told
     assert "set max_episode_steps to 573" in told
@@ -102,7 +102,7 @@ def test_top_speed_is_that_of_the_kind_or_of_the_commands():
     ],
 )
 def test_a_robot_is_kin_to_the_shipped_one_that_moves_like_it(name, like):
-    assert kin(load_robot(name)) == like
+    assert find_kin(load_robot(name)) == like
 
 
 def test_settings_that_are_inherited_keep_their_meaning_over_a_longer_episode(model):
@@ -162,7 +162,7 @@ def test_a_lidar_that_fills_no_layout_gets_sectors_over_its_own_view(
 
 @pytest.mark.slow
 def test_an_own_robot_trains_with_the_settings_of_its_kin_and_says_so():
-    settings, told, _ = settings_for(
+    settings, told, _ = choose_fitting_settings(
         "navigation", None, BURGER | {"world": ["doorway"]}
     )
     own = load_training("own_differential")
@@ -174,6 +174,8 @@ def test_an_own_robot_trains_with_the_settings_of_its_kin_and_says_so():
 
 
 def test_a_shipped_robot_trains_with_its_own_settings_unchanged():
-    settings, told, _ = settings_for("navigation", None, {"robot": "differential"})
+    settings, told, _ = choose_fitting_settings(
+        "navigation", None, {"robot": "differential"}
+    )
     assert settings == load_training("navigation_differential")
     assert told == ()

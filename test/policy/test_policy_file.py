@@ -283,7 +283,7 @@ def test_a_flipped_bit_anywhere_is_refused(file, tmp_path):
     rng = np.random.default_rng(4)
     path = tmp_path / "flipped.onnx"
     last = len(
-        onnx_graph.sealed(b"")
+        onnx_graph.add_seal(b"")
     )  # every byte of the checksum, and any of the rest
     places = [
         *range(len(whole) - last, len(whole)),
@@ -305,7 +305,7 @@ def test_a_file_without_its_checksum_or_with_an_addition_is_refused(file, tmp_pa
     proto.producer_name = "another"
     for data in (
         proto.SerializeToString(),
-        file.read_bytes()[: -len(onnx_graph.sealed(b""))],
+        file.read_bytes()[: -len(onnx_graph.add_seal(b""))],
     ):
         path.write_bytes(data)
         with pytest.raises(PolicyError, match=r"field '(file|sha256)'"):

@@ -83,8 +83,8 @@ def field(number: int, content: bytes) -> bytes:
 BOMBS = {
     "doubled": lambda proto: bytes_of(signed(doubled(proto, 31))),
     "wide": lambda proto: bytes_of(signed(wide(proto))),
-    "crowded": lambda proto: onnx_graph.sealed(crowded(proto)),
-    "nested": lambda proto: onnx_graph.sealed(nested(proto)),
+    "crowded": lambda proto: onnx_graph.add_seal(crowded(proto)),
+    "nested": lambda proto: onnx_graph.add_seal(nested(proto)),
 }
 
 

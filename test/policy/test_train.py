@@ -78,7 +78,7 @@ def test_robots_are_larger_while_they_learn_and_only_then():
     env = training.make_train_env(MODEL, worlds, learning)
     grown = env.envs[0].model.robot.footprint_radius
     assert grown == pytest.approx(MODEL.robot.footprint_radius + 0.07)
-    judged = training._env_of(MODEL, WORLD, learning, 2)
+    judged = training._make_env(MODEL, WORLD, learning, 2)
     assert judged.model.robot.footprint_radius == MODEL.robot.footprint_radius
 
 

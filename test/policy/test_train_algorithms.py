@@ -8,7 +8,7 @@ from robots import direct_model
 
 from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.policy.file.policy_file import load_policy
-from nics_drl_bridge.policy.train.algorithms import Actor, Normaliser, act_of
+from nics_drl_bridge.policy.train.algorithms import Actor, Normaliser, make_act
 from nics_drl_bridge.policy.train.export import export_policy
 
 MODEL = direct_model()
@@ -27,7 +27,7 @@ def test_a_policy_file_made_of_an_actor_does_what_the_actor_does(actions, tmp_pa
     )  # at the start all actions are near zero
     export_policy(actor, task, MODEL, tmp_path / "policy.onnx")
     seen = rng.uniform(-1.0, 1.0, (50, size)).astype(np.float32)
-    wanted = act_of(actor)(seen)
+    wanted = make_act(actor)(seen)
     if actions == "continuous":
         wanted = np.clip(wanted, -1.0, 1.0)
     else:

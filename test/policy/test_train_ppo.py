@@ -14,7 +14,7 @@ from stable_baselines3.common.logger import Logger
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.policy.train import ppo as train_ppo
 from nics_drl_bridge.policy.train.algorithms import Normaliser
-from nics_drl_bridge.policy.train.ppo import LeanPpo, Transitions, advantages_of
+from nics_drl_bridge.policy.train.ppo import LeanPpo, Transitions, estimate_advantages
 from nics_drl_bridge.policy.train.settings import TrainingSettings
 from nics_drl_bridge.policy.train.vec_env import TrainVecEnv
 
@@ -108,7 +108,7 @@ def test_advantages_are_those_of_stable_baselines3():
     buffer.episode_starts[1:] = done[:-1]
     last = torch.as_tensor(values[-1], dtype=torch.float32)
     buffer.compute_returns_and_advantage(last, done[-1])
-    ours = advantages_of(
+    ours = estimate_advantages(
         *map(torch.as_tensor, (rewards, values, done * 1.0)), 0.97, 0.9
     )
     assert buffer.advantages == pytest.approx(ours.numpy(), abs=1e-5)

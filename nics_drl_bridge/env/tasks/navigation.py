@@ -97,7 +97,7 @@ class Navigation(Task):
         out = np.empty(
             (*view.pose.shape[:-1], *self.observation_space.shape), np.float32
         )
-        self._see(out, view.pose, view, memory)
+        self._observe(out, view.pose, view, memory)
         return out
 
     def judge(
@@ -107,13 +107,13 @@ class Navigation(Task):
         out = np.empty(
             (*view.pose.shape[:-1], *self.observation_space.shape), np.float32
         )
-        return self._see(out, (before or view).pose, view, memory)
+        return self._observe(out, (before or view).pose, view, memory)
 
     def reward(
         self, before: RobotView, after: RobotView, memory: Memory
     ) -> dict[str, Array]:
         """Returns the terms (...,) whose sum is the reward of a step."""
-        return self._terms(self.judge(after, memory, before))
+        return self._make_terms(self.judge(after, memory, before))
 
     def end(self, view: RobotView, memory: Memory) -> Flags:
         """Returns True where a robot is at its goal or touches something."""
@@ -122,17 +122,17 @@ class Navigation(Task):
 
     def info(self, view: RobotView, memory: Memory) -> dict[str, NDArray[Any]]:
         """Returns success and contact of each robot."""
-        return self._facts(self.judge(view, memory))
+        return self._make_facts(self.judge(view, memory))
 
     def step_into(
         self, out: Observation, before: RobotView, after: RobotView, memory: Memory
     ) -> Outcome:
         """Computes all of the above in one pass over each scan; `out` is contiguous."""
-        progress = self._see(out, before.pose, after, memory)
+        progress = self._observe(out, before.pose, after, memory)
         over = progress.reached | progress.touched
-        return Outcome(self._terms(progress), over, self._facts(progress))
+        return Outcome(self._make_terms(progress), over, self._make_facts(progress))
 
-    def _see(
+    def _observe(
         self, out: Observation, before: Array, now: RobotView, memory: Memory
     ) -> GoalProgress:
         lead = now.pose.shape[:-1]
@@ -157,7 +157,7 @@ class Navigation(Task):
             np.concatenate([own, self.sensor_shares(now)], axis=-1, out=out)
         return GoalProgress(approach, flags[..., 0], flags[..., 1], flags[..., 2])
 
-    def _terms(self, progress: GoalProgress) -> dict[str, Array]:
+    def _make_terms(self, progress: GoalProgress) -> dict[str, Array]:
         return {
             "progress": self.progress_reward * progress.approach,
             "time": np.full(progress.approach.shape, self.time_reward, np.float64),
@@ -166,5 +166,5 @@ class Navigation(Task):
         }
 
     @staticmethod
-    def _facts(progress: GoalProgress) -> dict[str, NDArray[Any]]:
+    def _make_facts(progress: GoalProgress) -> dict[str, NDArray[Any]]:
         return {"is_success": progress.succeeded, "collision": progress.touched}

@@ -15,12 +15,12 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import Array, RobotView
 
 
-def pairs(pose: Array, points: Array) -> tuple[Array, Array]:
+def pair_points(pose: Array, points: Array) -> tuple[Array, Array]:
     """Pairs each robot (..., M, 3) with each point (..., P, 2), broadcast to (..., M, P)."""
     return pose[..., None, :], points[..., None, :, :]
 
 
-def others(of_all: Array) -> Array:
+def drop_own(of_all: Array) -> Array:
     """Drops the diagonal of (..., M, M, F), which leaves rows of the others, (..., M, M - 1, F)."""
     *lead, count, _, width = of_all.shape
     # Without its first entry, the flat row of pairs has a diagonal entry after each `count` others.
@@ -106,14 +106,14 @@ class CooperativeReaching(Task):
     def update(self, before: RobotView, after: RobotView, memory: Memory) -> None:
         """Marks the goals that a robot has reached."""
         there = (
-            task.distance(*pairs(after.pose, memory["goal"])) < self.goal_radius
+            task.distance(*pair_points(after.pose, memory["goal"])) < self.goal_radius
         ).any(axis=-2)
         memory["newly"][...] = there & ~memory["reached"]
         memory["reached"] |= there
 
     def observation(self, view: RobotView, memory: Memory) -> Observation:
         """Returns the observation (..., M, O) of views (..., M)."""
-        goals = task.bearing(*pairs(view.pose, memory["goal"]))
+        goals = task.bearing(*pair_points(view.pose, memory["goal"]))
         reached = np.broadcast_to(
             memory["reached"][..., None, :, None], (*goals.shape[:-1], 1)
         )
@@ -121,7 +121,7 @@ class CooperativeReaching(Task):
         parts = [
             self.free_share(view.ranges),
             np.concatenate([goals, reached], axis=-1).reshape(*lead, -1),
-            others(task.bearing(*pairs(view.pose, view.pose[..., :2]))).reshape(
+            drop_own(task.bearing(*pair_points(view.pose, view.pose[..., :2]))).reshape(
                 *lead, -1
             ),
             task.limited(view.twist),
@@ -134,7 +134,8 @@ class CooperativeReaching(Task):
         """Returns the reward terms (..., M)."""
         lead = after.pose.shape[:-1]
         ways = (
-            task.distance(*pairs(view.pose, memory["goal"])) for view in (before, after)
+            task.distance(*pair_points(view.pose, memory["goal"]))
+            for view in (before, after)
         )
         gaps = [way.min(axis=-2) for way in ways]
         # A goal reached in this step still earns its last approach.
@@ -256,16 +257,16 @@ class PursuitEvasion(Task):
 
     def update(self, before: RobotView, after: RobotView, memory: Memory) -> None:
         """Marks the robots that are caught or out."""
-        chased = self._gaps(after, memory)
+        chased = self._find_gaps(after, memory)
         reach = 2.0 * self.robot.footprint_radius + self.capture_gap
         caught = ~self.pursues & (chased < reach) & ~memory["out"]
         memory["newly"][...] = caught
         memory["caught"] |= caught
-        memory["out"] |= caught | self._collided(after, memory)
+        memory["out"] |= caught | self._find_collided(after, memory)
 
-    def _gaps(self, view: RobotView, memory: Memory) -> Array:
+    def _find_gaps(self, view: RobotView, memory: Memory) -> Array:
         """Returns distances (..., M) [m] to the nearest active robot of the other side, or inf."""
-        between = task.distance(*pairs(view.pose, view.pose[..., :2]))
+        between = task.distance(*pair_points(view.pose, view.pose[..., :2]))
         foe = (self.pursues[:, None] != self.pursues) & ~memory["out"][..., None, :]
         return np.asarray(np.where(foe, between, np.inf).min(axis=-1))
 
@@ -276,11 +277,11 @@ class PursuitEvasion(Task):
             self.pursues[:, None] == self.pursues, (*lead, self.robots)
         )
         out = np.broadcast_to(memory["out"][..., None, :], (*lead, self.robots))
-        places = task.bearing(*pairs(view.pose, view.pose[..., :2]))
+        places = task.bearing(*pair_points(view.pose, view.pose[..., :2]))
         known = np.concatenate([places, mates[..., None], out[..., None]], axis=-1)
         parts: list[NDArray[Any]] = [
             self.free_share(view.ranges),
-            others(known).reshape(*lead, -1),
+            drop_own(known).reshape(*lead, -1),
             np.broadcast_to(self.pursues[:, None], (*lead, 1)),
             task.limited(view.twist),
         ]
@@ -292,7 +293,7 @@ class PursuitEvasion(Task):
         """Returns the reward terms (..., M)."""
         # Evaders caught in this step still count in it.
         known = {**memory, "out": memory["out"] & ~memory["newly"]}
-        gap = [self._gaps(view, known) for view in (before, after)]
+        gap = [self._find_gaps(view, known) for view in (before, after)]
         free = np.isfinite(gap[0]) & np.isfinite(gap[1])
         nearer = np.where(
             free, np.where(free, gap[0], 0.0) - np.where(free, gap[1], 0.0), 0.0
@@ -305,11 +306,11 @@ class PursuitEvasion(Task):
             "capture": self.capture_reward * newly,
             "time": np.full(nearer.shape, self.time_reward * side),
             "collision": np.multiply(
-                self.collision_reward, self._collided(after, memory)
+                self.collision_reward, self._find_collided(after, memory)
             ),
         }
 
-    def _collided(self, view: RobotView, memory: Memory) -> Flags:
+    def _find_collided(self, view: RobotView, memory: Memory) -> Flags:
         return np.asarray(self.touches(view.ranges) & ~memory["newly"])
 
     def end(self, view: RobotView, memory: Memory) -> Flags:
@@ -326,6 +327,6 @@ class PursuitEvasion(Task):
         won = memory["caught"][..., ~self.pursues].all(-1, keepdims=True)
         return {
             "is_success": np.asarray(won == self.pursues),
-            "collision": self._collided(view, memory),
+            "collision": self._find_collided(view, memory),
             "caught": memory["caught"].copy(),
         }

@@ -22,8 +22,8 @@ from nics_drl_bridge.policy.file.contract import (
     MAPPINGS,
     SUFFIX,
     Contract,
-    contract_of,
-    golden_observations,
+    draw_golden_observations,
+    make_contract,
 )
 from nics_drl_bridge.policy.file.onnx_session import open_session, run_in_turn
 from nics_drl_bridge.policy.file.policy_file import PERIOD_TOLERANCE, Run
@@ -132,24 +132,24 @@ def _convert(foreign: ForeignNetwork, model: SimulatorModel | None) -> bytes:
         mapping, task.robot, task.scan_parts, task.sight.range_max, session, source
     )
     size = adapter.state_size
-    seen = golden_observations(task)
+    seen = draw_golden_observations(task)
     action, command = run_in_turn(adapter.run, seen, np.zeros(size, np.float32))
     if not (np.isfinite(action).all() and np.isfinite(command).all()):
         reason = (
             "returns NaN or inf for ordinary observations; check scaling and weights."
         )
         raise PolicyError(source, "network", reason)
-    text = contract_of(
+    text = make_contract(
         task,
         model,
         {"observations": seen, "actions": action, "commands": command},
-        onnx_graph.graph_hash(network),
+        onnx_graph.hash_graph(network),
         {"network": mapping.network, "network_sha256": foreign.sha256},
         (size, 0.0) if size else None,
         foreign=mapping.model_dump(mode="json"),
     )
     onnx.helper.set_model_props(network, {onnx_graph.KEY: text})
-    content = onnx_graph.sealed(network.SerializeToString(deterministic=True))
+    content = onnx_graph.add_seal(network.SerializeToString(deterministic=True))
     rehearsal.remember(content)  # the same graph, with a contract
     return content
 
@@ -164,7 +164,7 @@ def _fix_shapes(model: Any, mapping: ForeignPolicy, scan_parts: int) -> Any:
         )
         for value in model.graph.output
     }
-    for value in onnx_graph.inputs_of(fixed):
+    for value in onnx_graph.list_inputs(fixed):
         dimensions = list(value.type.tensor_type.shape.dim)
         if dimensions and not dimensions[0].dim_value:
             dimensions[0].dim_value = 1

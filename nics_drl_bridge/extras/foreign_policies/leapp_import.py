@@ -280,7 +280,7 @@ def _join(bundle: Bundle) -> Any:
             reason = f"the networks can't be connected ({onnx_graph.quote(error)})."
             raise bundle.fault("pipeline.data_flow", reason) from None
     graph = joined.graph
-    for value in onnx_graph.inputs_of(joined):
+    for value in onnx_graph.list_inputs(joined):
         if value.name not in bundle.ends:
             reason = f"no earlier node supplies {value.name!r}; connect it."
             raise bundle.fault("pipeline.data_flow", reason)

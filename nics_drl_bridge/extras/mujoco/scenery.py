@@ -169,7 +169,7 @@ def make_quaternion(heading: float) -> list[float]:
 
 def split_convex(outline: Array) -> list[Array]:
     """Splits an outline (V, 2) into convex ones; uses ear clipping (Meisters 1975) if needed."""
-    if len(convex_hull(outline)) == len(outline):
+    if len(find_convex_hull(outline)) == len(outline):
         return [outline]
     rest = list(range(len(outline)))
     parts = []

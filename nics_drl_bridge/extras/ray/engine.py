@@ -174,7 +174,7 @@ class ActorCritic(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
         hidden = list(chosen["hidden"])
         normaliser = chosen["normaliser"]
         self.actor = algorithms.Actor(seen, self.action_space, hidden, normaliser)
-        self.critic = algorithms.layers_of([int(seen.shape[0]), *hidden, 1], 1.0)
+        self.critic = algorithms.make_layers([int(seen.shape[0]), *hidden, 1], 1.0)
         if not self.actor.discrete:
             spread = torch.full(self.action_space.shape, float(chosen["log_std"]))
             self.log_std = torch.nn.Parameter(spread)
@@ -404,7 +404,7 @@ def _build_algorithm(
     env = train.make_train_env(model, worlds, settings)
     algorithms.check_serves(settings, env.envs[0])
     env.seed(int(rng.integers(train.SEEDS)))
-    normaliser = algorithms.observed(env, rng)
+    normaliser = algorithms.observe_statistics(env, rng)
     spaces = env.observation_space, env.action_space
     env.close()
     make = ray.put(functools.partial(select_worlds, model, worlds, settings))

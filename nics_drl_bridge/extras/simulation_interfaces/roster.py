@@ -10,7 +10,7 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BridgeError, ConfigError, suggest
 from nics_drl_bridge.lidar.arrays import Array
 from nics_drl_bridge.lidar.exact_kernels import RADIUS, SHAPE
-from nics_drl_bridge.lidar.shapes import Shape, convex_hull, place
+from nics_drl_bridge.lidar.shapes import Shape, find_convex_hull, place
 from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.sim.device import DeviceWorld
 from nics_drl_bridge.sim.scenes import Scenes
@@ -334,6 +334,6 @@ class Entities:
 def hull_of(shape: Shape) -> Array:
     """Return the convex hull (V, 2) of a shape [m], counter-clockwise; a circle has 32 corners."""
     if len(shape.outline):
-        return convex_hull(shape.outline)
+        return find_convex_hull(shape.outline)
     angles = np.arange(CORNERS) * (2.0 * np.pi / CORNERS)
     return np.column_stack([np.cos(angles), np.sin(angles)]) * shape.radius

@@ -86,7 +86,7 @@ class GoldenEntry(Schema):
 
     @field_validator("observations", "actions", "commands")
     @classmethod
-    def _whole(cls, text: str) -> str:
+    def _check_finite(cls, text: str) -> str:
         if not np.isfinite(decode_rows(text)).all():
             raise ValueError("must be finite numbers")
         return text
@@ -127,7 +127,7 @@ class Contract(Schema):
 
     @field_validator("provenance")
     @classmethod
-    def _plain(cls, provenance: dict[str, Any]) -> dict[str, Any]:
+    def _check_plain(cls, provenance: dict[str, Any]) -> dict[str, Any]:
         if any(
             not isinstance(v, str | int | float | bool | None)
             for v in provenance.values()
@@ -136,7 +136,7 @@ class Contract(Schema):
         return provenance
 
 
-def contract_of(
+def make_contract(
     task: Task,
     model: SimulatorModel,
     golden: Mapping[str, Rows],
@@ -151,14 +151,14 @@ def contract_of(
     A `foreign` network takes one observation at a time. Raises ConfigError if an entry has a wrong
     type.
     """
-    entry = task_entry(task)
-    observation = observation_entry(task)
+    entry = describe_task(task)
+    observation = describe_observation(task)
     data: dict[str, Any] = {
         "format": FORMAT,
         "robot": task.robot.model_dump(mode="json"),
         "lidar": task.lidar.model_dump(mode="json"),
         "scan": None if task.scan is None else task.scan.model_dump(mode="json"),
-        "task": {**entry, "sha256": _task_hash(entry, observation)},
+        "task": {**entry, "sha256": _hash_task(entry, observation)},
         "observation": observation,
         "actions": task.actions,
         "control_period": model.control_period,
@@ -183,7 +183,7 @@ def contract_of(
     return json.dumps(data, allow_nan=False)
 
 
-def golden_observations(task: Task) -> Rows:
+def draw_golden_observations(task: Task) -> Rows:
     """Returns a fixed set of observations (16, O) within the task's observation space."""
     space = task.observation_space
     low = np.maximum(space.low, -GOLDEN_SPREAD)
@@ -192,7 +192,7 @@ def golden_observations(task: Task) -> Rows:
     return rng.uniform(low, high, (GOLDEN, len(low))).astype(np.float32)
 
 
-def task_entry(task: Task) -> dict[str, Any]:
+def describe_task(task: Task) -> dict[str, Any]:
     """Returns the name, options and hash of a task."""
     kind = type(task)
     path = f"{kind.__module__}:{kind.__name__}"
@@ -205,7 +205,7 @@ def task_entry(task: Task) -> dict[str, Any]:
     return {"name": name, "options": options}
 
 
-def observation_entry(task: Task) -> dict[str, Any]:
+def describe_observation(task: Task) -> dict[str, Any]:
     """Returns a task's observation space as the fields of `ObservationEntry`."""
     space = task.observation_space
     parts = task.scan_parts
@@ -217,7 +217,7 @@ def observation_entry(task: Task) -> dict[str, Any]:
     }
 
 
-def _task_hash(entry: Mapping[str, Any], observation: Mapping[str, Any]) -> str:
+def _hash_task(entry: Mapping[str, Any], observation: Mapping[str, Any]) -> str:
     identity = {
         "name": entry["name"],
         "options": entry["options"],
@@ -242,7 +242,9 @@ def read_contract(text: str, source: str) -> Contract:
         reason = f"has {entries} entries, more than the {MOST_ENTRIES} of a contract; not read."
         raise PolicyError(source, "metadata", reason)
     try:
-        data = json.loads(text, object_pairs_hook=_once, parse_constant=_no_constant)
+        data = json.loads(
+            text, object_pairs_hook=_refuse_repeats, parse_constant=_refuse_constant
+        )
     except (ValueError, RecursionError) as error:
         reason = (
             f"is not the JSON that `export_policy` writes ({shorten(str(error), 80)})"
@@ -264,13 +266,13 @@ def read_contract(text: str, source: str) -> Contract:
     return contract
 
 
-def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _refuse_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(dict(pairs)) != len(pairs):
         raise ValueError("a key occurs twice")
     return dict(pairs)
 
 
-def _no_constant(word: str) -> Any:
+def _refuse_constant(word: str) -> Any:
     raise ValueError(f"{word} is not a number")
 
 
@@ -289,7 +291,7 @@ def _check_agreement(contract: Contract, source: str) -> None:
         reason = f"is {observation.size}, not {parts} scan elements plus {rest} others."
         raise PolicyError(source, "observation.size", reason)
     seen = observation.model_dump(mode="json")
-    if contract.task.sha256 != _task_hash(contract.task.model_dump(), seen):
+    if contract.task.sha256 != _hash_task(contract.task.model_dump(), seen):
         raise PolicyError(
             source, "task.sha256", "does not match the task and observation."
         )

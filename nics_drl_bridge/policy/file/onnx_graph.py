@@ -28,17 +28,15 @@ COMMAND = "command"
 # additional input and output of a policy with a state
 STATE_IN = "state_in"
 STATE_OUT = "state_out"
-OPERATORS = frozenset(
-    """
-    Abs Add ArgMax Atan AveragePool BatchNormalization Cast Clip Concat Constant Conv
-    Cos Div Elu Erf Exp Flatten GRU Gather Gelu Gemm GlobalAveragePool HardSigmoid
-    HardSwish Identity LSTM LayerNormalization LeakyRelu Log LogSoftmax MatMul Max
-    MaxPool Min Mish Mul Neg PRelu Pow RNN Reciprocal ReduceMax ReduceMean ReduceMin
-    ReduceSum Relu Reshape Selu Shape Sigmoid Sign Sin Slice Softmax Softplus Softsign
-    Split Sqrt Squeeze Sub Tanh Transpose Unsqueeze
-    """.split()
-)
-"""Operators of networks: no loops, branches, random numbers or data-dependent sizes."""
+# operators of networks: no loops, branches, random numbers or data-dependent sizes
+OPERATOR_NAMES = """
+Abs Add ArgMax Atan AveragePool BatchNormalization Cast Clip Concat Constant Conv Cos Div Elu
+Erf Exp Flatten GRU Gather Gelu Gemm GlobalAveragePool HardSigmoid HardSwish Identity LSTM
+LayerNormalization LeakyRelu Log LogSoftmax MatMul Max MaxPool Min Mish Mul Neg PRelu Pow RNN
+Reciprocal ReduceMax ReduceMean ReduceMin ReduceSum Relu Reshape Selu Shape Sigmoid Sign Sin
+Slice Softmax Softplus Softsign Split Sqrt Squeeze Sub Tanh Transpose Unsqueeze
+"""
+OPERATORS = frozenset(OPERATOR_NAMES.split())
 FLOATS = frozenset({TensorProto.FLOAT, TensorProto.DOUBLE, TensorProto.FLOAT16})
 NUMBERS = FLOATS | {TensorProto.INT64, TensorProto.INT32, TensorProto.BOOL}
 # For integers, division by zero, or of the minimum by -1, crashes the process.
@@ -92,7 +90,7 @@ def parse(data: bytes, source: str) -> Any:
     return model
 
 
-def metadata(model: Any, source: str) -> str:
+def find_contract_text(model: Any, source: str) -> str:
     """Returns the text of the contract. Raises PolicyError unless the model has exactly one."""
     contracts = [entry.value for entry in model.metadata_props if entry.key == KEY]
     if len(contracts) != 1:
@@ -106,7 +104,7 @@ def metadata(model: Any, source: str) -> str:
     return str(contracts[0])
 
 
-def graph_hash(model: Any) -> str:
+def hash_graph(model: Any) -> str:
     """Returns the SHA-256 of a model without its metadata."""
     bare = onnx.ModelProto()
     bare.CopyFrom(model)
@@ -114,7 +112,7 @@ def graph_hash(model: Any) -> str:
     return hash_bytes(bare.SerializeToString(deterministic=True))
 
 
-def sealed(data: bytes) -> bytes:
+def add_seal(data: bytes) -> bytes:
     """Appends a model's checksum as a metadata entry; serialised messages may be concatenated."""
     end = onnx.ModelProto()
     entry = end.metadata_props.add()
@@ -125,12 +123,12 @@ def sealed(data: bytes) -> bytes:
 def check_seal(data: bytes, source: str) -> None:
     """Raises PolicyError unless a file is bit-identical to the one that was written."""
     check_format(data, source)
-    seal = sealed(b"")
+    seal = add_seal(b"")
     mark = seal[: -len(hash_bytes(b""))]
     if not data[-len(seal) :].startswith(mark):
         reason = "does not end with the checksum of a policy file, so it is none or truncated"
         raise PolicyError(source, "file", f"{reason}; export or copy it again.")
-    if data != sealed(data[: -len(seal)]):
+    if data != add_seal(data[: -len(seal)]):
         reason = "does not match the file, which was changed or damaged; copy or export it again."
         raise PolicyError(source, SEAL, reason)
 
@@ -138,7 +136,7 @@ def check_seal(data: bytes, source: str) -> None:
 def check_graph(model: Any, source: str) -> None:
     """Raises PolicyError for a graph that is not self-contained or uses a forbidden operator."""
     for field, reason in itertools.chain(
-        _graph_faults(model), _weight_faults(model.graph)
+        _find_graph_faults(model), _find_weight_faults(model.graph)
     ):
         raise PolicyError(source, field, reason)
     try:
@@ -153,9 +151,9 @@ def quote(error: Exception) -> str:
     return shorten(str(error), 120)
 
 
-def _graph_faults(model: Any) -> Iterator[Fault]:
+def _find_graph_faults(model: Any) -> Iterator[Fault]:
     graph = model.graph
-    for tensor in _tensors(graph):
+    for tensor in _list_tensors(graph):
         name = f"weights.{tensor.name}"
         if tensor.data_type not in NUMBERS:
             yield name, "is not an array of ordinary numbers; not run."
@@ -188,32 +186,32 @@ def _graph_faults(model: Any) -> Iterator[Fault]:
                 yield "graph.node", f"{node.op_type} contains sparse weights."
 
 
-def _weight_faults(graph: Any) -> Iterator[Fault]:
-    for tensor in _tensors(graph):
+def _find_weight_faults(graph: Any) -> Iterator[Fault]:
+    for tensor in _list_tensors(graph):
         try:
             values = onnx.numpy_helper.to_array(tensor)
         except (ValueError, TypeError, KeyError, RuntimeError):
             yield f"weights.{tensor.name}", "is damaged; export the policy again."
         if values.dtype.kind == "f" and not np.isfinite(values).all():
             yield f"weights.{tensor.name}", "contains NaN or inf; train again."
-    for attribute in _attributes(graph):
+    for attribute in _list_attributes(graph):
         if not all(map(math.isfinite, [attribute.f, *attribute.floats])):
             yield f"graph.node.{attribute.name}", "is NaN or inf."
 
 
-def _attributes(graph: Any) -> Iterator[Any]:
+def _list_attributes(graph: Any) -> Iterator[Any]:
     return itertools.chain.from_iterable(node.attribute for node in graph.node)
 
 
-def _tensors(graph: Any) -> Iterator[Any]:
+def _list_tensors(graph: Any) -> Iterator[Any]:
     yield from graph.initializer
-    for attribute in _attributes(graph):
+    for attribute in _list_attributes(graph):
         if attribute.HasField("t"):
             yield attribute.t
         yield from attribute.tensors
 
 
-def inputs_of(model: Any) -> list[Any]:
+def list_inputs(model: Any) -> list[Any]:
     """Returns the inputs of a graph that are no weights, as onnx.ValueInfoProto."""
     weights = {tensor.name for tensor in model.graph.initializer}
     return [value for value in model.graph.input if value.name not in weights]
@@ -221,7 +219,7 @@ def inputs_of(model: Any) -> list[Any]:
 
 def has_open_rows(model: Any) -> bool:
     """True if an input takes any number of observations."""
-    shapes = [value.type.tensor_type.shape.dim for value in inputs_of(model)]
+    shapes = [value.type.tensor_type.shape.dim for value in list_inputs(model)]
     return any(shape and not shape[0].dim_value for shape in shapes)
 
 
@@ -230,7 +228,7 @@ def fix_rows(model: Any, rows: int) -> Any:
     bare = onnx.ModelProto()
     bare.CopyFrom(model)
     del bare.graph.value_info[:]
-    for value in inputs_of(bare):
+    for value in list_inputs(bare):
         first = value.type.tensor_type.shape.dim[:1]
         if first and not first[0].dim_value:
             first[0].dim_value = rows

@@ -32,7 +32,7 @@ def check_network(data: bytes, source: str, runs: bool) -> None:
     checked = fixed if onnx_graph.has_open_rows(model) else _fold(fixed, source)
     onnx_graph.check_sizes(checked, source)
     feeds = {}
-    for value in onnx_graph.inputs_of(fixed):
+    for value in onnx_graph.list_inputs(fixed):
         tensor = value.type.tensor_type
         shape = [dimension.dim_value for dimension in tensor.shape.dim]
         dtype = onnx.helper.tensor_dtype_to_np_dtype(tensor.elem_type)
@@ -73,7 +73,7 @@ def open_session(data: bytes, source: str, folded: Path | None = None) -> Any:
             data, options, providers=["CPUExecutionProvider"]
         )
     except Exception as error:  # noqa: BLE001 - the runtime's errors have no common base class
-        raise _cannot_run(source, error) from None
+        raise _explain_failure(source, error) from None
 
 
 def run_network(
@@ -83,10 +83,10 @@ def run_network(
     try:
         return list(session.run(None, feeds))
     except Exception as error:  # noqa: BLE001 - the runtime's errors have no common base class
-        raise _cannot_run(source, error) from None
+        raise _explain_failure(source, error) from None
 
 
-def _cannot_run(source: str, error: Exception) -> PolicyError:
+def _explain_failure(source: str, error: Exception) -> PolicyError:
     reason = f"onnxruntime can't run it ({onnx_graph.quote(error)})."
     return PolicyError(source, "graph", reason)
 

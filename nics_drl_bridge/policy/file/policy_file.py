@@ -135,12 +135,12 @@ class PolicyFile:
             self._check_robot(task.robot, task.lidar)
             self._compare(
                 {
-                    "task": {"name": contracts.task_entry(task)["name"]},
+                    "task": {"name": contracts.describe_task(task)["name"]},
                     "actions": task.actions,
                     "scan": None
                     if task.scan is None
                     else task.scan.model_dump(mode="json"),
-                    "observation": contracts.observation_entry(task),
+                    "observation": contracts.describe_observation(task),
                 }
             )
 
@@ -206,8 +206,10 @@ def policy_of(data: bytes, path: Path) -> PolicyFile:
     if path.parent != contracts.shipped():
         rehearsal.rehearse(data, source)
     model = onnx_graph.parse(data, source)
-    contract = contracts.read_contract(onnx_graph.metadata(model, source), source)
-    if onnx_graph.graph_hash(model) != contract.graph_sha256:
+    contract = contracts.read_contract(
+        onnx_graph.find_contract_text(model, source), source
+    )
+    if onnx_graph.hash_graph(model) != contract.graph_sha256:
         reason = "does not match the graph, which was changed after the export."
         raise PolicyError(source, "graph_sha256", reason)
     session = open_session(data, source)

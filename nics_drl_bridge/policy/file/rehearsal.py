@@ -30,7 +30,7 @@ _remembered: dict[str, None] = {}
 
 def rehearse(data: bytes, source: str, runs: bool = True) -> None:
     """Does `onnx_session.check_network` in another process. Raises PolicyError."""
-    digest = _digest_of(data, runs)
+    digest = _hash_request(data, runs)
     if digest in _remembered:
         return
     refusal = _answer_of(json.dumps(runs).encode() + b"\n" + data)
@@ -41,10 +41,10 @@ def rehearse(data: bytes, source: str, runs: bool = True) -> None:
 
 def remember(data: bytes) -> None:
     """Marks a policy file as rehearsed: this process made its graph, or rehearsed its parts."""
-    _remember(_digest_of(data, runs=True))
+    _remember(_hash_request(data, runs=True))
 
 
-def _digest_of(data: bytes, runs: bool) -> str:
+def _hash_request(data: bytes, runs: bool) -> str:
     return hash_bytes(bytes([runs]) + data)
 
 

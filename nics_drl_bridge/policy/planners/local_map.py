@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.env.guide_kernels import sweep
+from nics_drl_bridge.env.guide_kernels import update_ways
 from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.geometry import Array, compute_depths
 from nics_drl_bridge.kernels import kernel
@@ -216,7 +216,7 @@ def find_ways(around: Situation, prices: NDArray[np.float32]) -> None:
     for _ in range(ROUNDS):
         most = np.float32(0.0)
         for turn in range(4):
-            most = max(most, sweep(ways, prices, turn & 1, turn >> 1))
+            most = max(most, update_ways(ways, prices, turn & 1, turn >> 1))
         if most < SETTLED_M:
             break
 

@@ -78,7 +78,7 @@ def check_serves(settings: TrainingSettings, env: BridgeVectorEnv) -> None:
         raise ConfigError(f"{batch}; lower it, or raise ppo.rollout or worlds.")
 
 
-def act_of(algorithm: BaseAlgorithm | Actor) -> Act:
+def make_act(algorithm: BaseAlgorithm | Actor) -> Act:
     """Returns the deterministic policy of an algorithm, without exploration noise."""
 
     def act(observations: NDArray[np.float32]) -> NDArray[Any]:
@@ -107,7 +107,7 @@ class Normaliser(BaseFeaturesExtractor):
         super().__init__(space, features_dim=int(np.prod(space.shape)))
         self.register_buffer("mean", torch.as_tensor(mean, dtype=torch.float32))
         self.register_buffer("std", torch.as_tensor(std, dtype=torch.float32))
-        self.register_buffer("shares", torch.as_tensor(shares_of(space)))
+        self.register_buffer("shares", torch.as_tensor(find_shares(space)))
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
         """Normalises observations (N, O)."""
@@ -116,7 +116,7 @@ class Normaliser(BaseFeaturesExtractor):
         )
 
 
-def shares_of(space: gymnasium.spaces.Box) -> NDArray[np.float32]:
+def find_shares(space: gymnasium.spaces.Box) -> NDArray[np.float32]:
     """Returns 1 for the observations (O,) of a space that lie between 0 and 1, else 0."""
     shares: NDArray[np.bool_] = (space.low == 0.0) & (space.high == 1.0)
     return shares.astype(np.float32)
@@ -132,7 +132,7 @@ def bend(observations: Any, shares: Any) -> Any:
     return observations * grown / (observations * shares + least)
 
 
-def observed(env: VecEnv, rng: np.random.Generator) -> tuple[Array, Array]:
+def observe_statistics(env: VecEnv, rng: np.random.Generator) -> tuple[Array, Array]:
     """Returns mean and standard deviation (O,) of bent observations under random actions.
 
     The deviation is at least 0.05 and at least a quarter of the span or the mean, whichever is
@@ -151,7 +151,7 @@ def observed(env: VecEnv, rng: np.random.Generator) -> tuple[Array, Array]:
                 )
         seen.append(np.array(env.step(actions)[0][some]))
     rows = np.concatenate(seen).reshape(-1, seen[0].shape[-1]).astype(np.float64)
-    rows = bend(rows, shares_of(env.observation_space))
+    rows = bend(rows, find_shares(env.observation_space))
     mean = rows.mean(axis=0)
     # Later observations may vary more than those near the starts.
     span = np.minimum(
@@ -181,7 +181,7 @@ class Actor(torch.nn.Module):
         )
         self.normaliser = Normaliser(observations, *normaliser)
         widths = [self.normaliser.features_dim, *hidden, count]
-        self.layers = layers_of(widths, ACTION_GAIN, activation)
+        self.layers = make_layers(widths, ACTION_GAIN, activation)
 
     def forward(self, observations: torch.Tensor) -> Any:
         """Returns parameters of the action distribution: the mode if continuous, else logits."""
@@ -193,7 +193,7 @@ class Actor(torch.nn.Module):
         return raw.argmax(dim=1) if self.discrete else raw
 
 
-def layers_of(
+def make_layers(
     widths: Sequence[int],
     gain: float,
     activation: type[torch.nn.Module] = torch.nn.Tanh,
@@ -233,7 +233,7 @@ class Sb3Training:
         """Learns until all steps are done."""
         self.policy.set_logger(logger)
         left = self._total - self.steps
-        companion = Companion(watch, act_of(self.policy))
+        companion = Companion(watch, make_act(self.policy))
         self.policy.learn(left, companion, self._log_every, reset_num_timesteps=False)
 
     def state(self) -> dict[str, Any]:
@@ -254,7 +254,7 @@ class Sb3Training:
             "recent": list(algorithm.ep_success_buffer or ()),
             "last": tensors({name: getattr(algorithm, name) for name in LAST}),
             "replay": replay,
-            "random": _random_state(algorithm),
+            "random": _get_random_state(algorithm),
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -333,7 +333,7 @@ def make_algorithm(
     )
 
 
-def _random_state(algorithm: BaseAlgorithm) -> dict[str, Any]:
+def _get_random_state(algorithm: BaseAlgorithm) -> dict[str, Any]:
     shared = np.random.get_state(legacy=False)  # noqa: NPY002 - Stable-Baselines3 uses it
     spaces = algorithm.action_space.np_random.bit_generator.state
     return {

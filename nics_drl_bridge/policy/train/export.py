@@ -19,8 +19,8 @@ from nics_drl_bridge.policy.file.contract import (
     GOLDEN,
     SUFFIX,
     Rows,
-    contract_of,
-    golden_observations,
+    draw_golden_observations,
+    make_contract,
 )
 
 with extensions.require_modules("the export of a policy"):
@@ -50,13 +50,13 @@ class Deployed(torch.nn.Module):  # type: ignore[misc]
         self.discrete = task.actions == "discrete"
         self.limit = None if normaliser is None else float(normaliser[2])
         if normaliser is not None:
-            self.register_buffer("mean", _vector(normaliser[0]))
-            self.register_buffer("std", _vector(normaliser[1]))
+            self.register_buffer("mean", _make_vector(normaliser[0]))
+            self.register_buffer("std", _make_vector(normaliser[1]))
         if self.discrete:
-            self.register_buffer("commands", _vector(task.discrete_commands))
+            self.register_buffer("commands", _make_vector(task.discrete_commands))
         else:
-            self.register_buffer("low", _vector(task.command_limits[0]))
-            self.register_buffer("high", _vector(task.command_limits[1]))
+            self.register_buffer("low", _make_vector(task.command_limits[0]))
+            self.register_buffer("high", _make_vector(task.command_limits[1]))
 
     @property
     def state(self) -> tuple[int, float] | None:
@@ -88,7 +88,7 @@ class Deployed(torch.nn.Module):  # type: ignore[misc]
         )
 
 
-def actor_of(model: Any) -> torch.nn.Module:
+def find_actor(model: Any) -> torch.nn.Module:
     """Returns the actor of a PPO, A2C or SAC, or a module like `Actor`. Raises ConfigError.
 
     A module with a state takes it (n, S) after the observations, and also returns the next one. Its
@@ -129,20 +129,20 @@ def export_policy(
         raise ConfigError(
             f"{file}: a policy file's name ends with {SUFFIX!r}; change it."
         )
-    deployed = Deployed(actor_of(model), task, normaliser).eval().cpu()
-    graph = _graph(deployed, task)
-    golden = _golden(deployed, graph, golden_observations(task), str(file))
-    text = contract_of(
+    deployed = Deployed(find_actor(model), task, normaliser).eval().cpu()
+    graph = _export_graph(deployed, task)
+    golden = _make_golden(deployed, graph, draw_golden_observations(task), str(file))
+    text = make_contract(
         task,
         simulator_model,
         golden,
-        onnx_graph.graph_hash(graph),
+        onnx_graph.hash_graph(graph),
         provenance or {},
         deployed.state,
         max_episode_steps=max_episode_steps,
     )
     onnx.helper.set_model_props(graph, {onnx_graph.KEY: text})
-    data = onnx_graph.sealed(graph.SerializeToString(deterministic=True))
+    data = onnx_graph.add_seal(graph.SerializeToString(deterministic=True))
     check_network(data, str(file), runs=True)  # here: this process made the network
     rehearsal.remember(data)
     policy = policy_file.policy_of(data, file)
@@ -150,7 +150,9 @@ def export_policy(
     return policy
 
 
-def _golden(deployed: Deployed, graph: Any, seen: Rows, source: str) -> dict[str, Rows]:
+def _make_golden(
+    deployed: Deployed, graph: Any, seen: Rows, source: str
+) -> dict[str, Rows]:
     session = open_session(graph.SerializeToString(), source)
 
     def compute(*tensors: Rows) -> list[Rows]:
@@ -169,7 +171,7 @@ def _golden(deployed: Deployed, graph: Any, seen: Rows, source: str) -> dict[str
     return {"observations": seen, "actions": action, "commands": out[1]}
 
 
-def _graph(deployed: Deployed, task: Task) -> Any:
+def _export_graph(deployed: Deployed, task: Task) -> Any:
     inputs = [onnx_graph.INPUT]
     outputs = [onnx_graph.ACTION, onnx_graph.COMMAND]
     examples = [torch.zeros(1, task.observation_space.shape[0])]
@@ -194,5 +196,5 @@ def _graph(deployed: Deployed, task: Task) -> Any:
     return onnx.load_model_from_string(buffer.getvalue())
 
 
-def _vector(values: ArrayLike) -> torch.Tensor:
+def _make_vector(values: ArrayLike) -> torch.Tensor:
     return torch.as_tensor(np.asarray(values, np.float32))

@@ -93,7 +93,7 @@ def backward(
 
 
 @kernel(allocates=True)
-def critic_gradients(net: Net, batch: Batch, weight: np.float32) -> np.float32:
+def compute_critic_gradients(net: Net, batch: Batch, weight: np.float32) -> np.float32:
     """Writes the gradients of the critic; returns its weighted loss."""
     values = forward(net, batch.seen)
     n = values.shape[0]
@@ -109,7 +109,7 @@ def critic_gradients(net: Net, batch: Batch, weight: np.float32) -> np.float32:
 
 
 @kernel(allocates=True)
-def actor_gradients(
+def compute_actor_gradients(
     net: Net,
     batch: Batch,
     log_std: NDArray[np.float32],
@@ -136,9 +136,9 @@ def actor_gradients(
     parts = np.empty(raw.shape[1], np.float32)
     for i in range(n):
         if log_std.size > 0:
-            log_prob, mixed = _density(parts, raw[i], actions[i], log_std)
+            log_prob, mixed = _compute_density(parts, raw[i], actions[i], log_std)
         else:
-            log_prob, mixed = _probability(parts, raw[i], int(actions[i, 0]))
+            log_prob, mixed = _compute_probability(parts, raw[i], int(actions[i, 0]))
         ratio = np.exp(log_prob - batch.log_probs[i])
         gain = (gains[i] - mean) * scale
         bounded = gain * min(max(ratio, ONE - clip), ONE + clip)
@@ -159,7 +159,7 @@ def actor_gradients(
 
 
 @kernel(allocates=True)
-def _density(
+def _compute_density(
     parts: NDArray[np.float32],
     raw: NDArray[np.float32],
     action: NDArray[np.float32],
@@ -175,7 +175,7 @@ def _density(
 
 
 @kernel(allocates=True)
-def _probability(
+def _compute_probability(
     parts: NDArray[np.float32], raw: NDArray[np.float32], action: int
 ) -> tuple[np.float32, np.float32]:
     """Returns an action's log probability and the entropy; writes probabilities (C,) to `parts`."""

@@ -57,7 +57,9 @@ class Transitions(NamedTuple):
     advantages: torch.Tensor  # (R,)
     returns: torch.Tensor  # (R,) targets of the critic
 
-    def batches(self, size: int, generator: torch.Generator) -> Iterator[Transitions]:
+    def split_batches(
+        self, size: int, generator: torch.Generator
+    ) -> Iterator[Transitions]:
         """Yields batches of `size` transitions in random order; the last may be smaller."""
         for rows in torch.randperm(len(self.seen), generator=generator).split(size):
             yield Transitions(*(field[rows] for field in self))
@@ -71,7 +73,7 @@ class Networks(torch.nn.Module):
     ) -> None:
         super().__init__()
         self.actor = actor
-        self.critic = algorithms.layers_of(
+        self.critic = algorithms.make_layers(
             [actor.layers[0].in_features, *hidden, 1], 1.0, torch.nn.ReLU
         )
         outputs = actor.layers[-1].out_features
@@ -93,7 +95,7 @@ class Networks(torch.nn.Module):
         return -0.5 * apart.square().sum(1) - (self.log_std + float(LOG_NORM)).sum()
 
 
-def flattened(networks: Networks) -> torch.nn.Parameter:
+def flatten_weights(networks: Networks) -> torch.nn.Parameter:
     """Moves all weights and gradients into one vector each; the networks' weights become views.
 
     An optimiser step takes a fifth of the time it takes over many arrays.
@@ -113,8 +115,8 @@ def flattened(networks: Networks) -> torch.nn.Parameter:
     return flat
 
 
-def net_of(layers: torch.nn.Sequential, rows: int) -> Net:
-    """Returns the layers of a `flattened` network for the kernels, with memory for `rows`."""
+def make_net(layers: torch.nn.Sequential, rows: int) -> Net:
+    """Returns the layers of a `flatten_weights` network for the kernels, with memory for `rows`."""
     parameters = list(layers.parameters())
     whole = (sum(parameter.numel() for parameter in parameters),)
     weights, gradients = (
@@ -130,7 +132,7 @@ def net_of(layers: torch.nn.Sequential, rows: int) -> Net:
     return Net(weights, gradients, widths, kept, spare)
 
 
-def advantages_of(
+def estimate_advantages(
     rewards: torch.Tensor,
     values: torch.Tensor,
     done: torch.Tensor,
@@ -162,10 +164,10 @@ class Learner:
         self.networks = networks
         self.ppo = ppo
         self.generator = torch.Generator().manual_seed(seed)
-        self._all = flattened(networks)
+        self._all = flatten_weights(networks)
         self.optimiser = torch.optim.Adam([self._all], eps=ADAM_EPSILON, fused=True)
         self._nets = [
-            net_of(p, ppo.batch) for p in (networks.actor.layers, networks.critic)
+            make_net(p, ppo.batch) for p in (networks.actor.layers, networks.critic)
         ]
         self.core_is_free = threading.Event()  # set when the collecting thread is done
 
@@ -180,7 +182,7 @@ class Learner:
             rewards.view(-1)[driven.cut] += ppo.discount * networks.critic(
                 driven.final
             ).squeeze(-1)
-        gains = advantages_of(
+        gains = estimate_advantages(
             rewards, values, driven.done, ppo.discount, ppo.gae_lambda
         )
         rows = (
@@ -197,7 +199,7 @@ class Learner:
         for group in self.optimiser.param_groups:
             group["lr"] = rate
         for _ in range(self.ppo.epochs):
-            for batch in rollout.batches(self.ppo.batch, self.generator):
+            for batch in rollout.split_batches(self.ppo.batch, self.generator):
                 loss = self.differentiate(batch)
                 torch.nn.utils.clip_grad_norm_(self._all, GRADIENT_LIMIT)
                 self.optimiser.step()
@@ -213,9 +215,11 @@ class Learner:
         spread_arrays = spread.detach().numpy(), spread.grad.numpy()
         bounds = np.float32(self.ppo.clip), np.float32(self.ppo.entropy)
         jobs: list[Callable[[], Any]] = [
-            partial(kernels.actor_gradients, actor, arrays, *spread_arrays, *bounds),
             partial(
-                kernels.critic_gradients,
+                kernels.compute_actor_gradients, actor, arrays, *spread_arrays, *bounds
+            ),
+            partial(
+                kernels.compute_critic_gradients,
                 critic,
                 arrays,
                 np.float32(VALUE_WEIGHT),
@@ -253,7 +257,7 @@ class Collector:
         final = [seen[0, :0]]
         with torch.no_grad():
             for t in range(steps):
-                seen[t] = self._see(self.last)
+                seen[t] = self._normalize(self.last)
                 raw.append(networks.actor.layers(seen[t]))
                 actions.append(networks.draw(raw[t], self.generator))
                 acted = actions[t].numpy()
@@ -269,8 +273,8 @@ class Collector:
                     if info["TimeLimit.truncated"]:
                         cut.append(t * worlds + int(n))
                         last = info["terminal_observation"][None]
-                        final.append(self._see(last))
-            seen[steps] = self._see(self.last)
+                        final.append(self._normalize(last))
+            seen[steps] = self._normalize(self.last)
             beyond = torch.tensor(cut, dtype=torch.int64), torch.cat(final)
             drawn = torch.stack(actions)
             log_probs = networks.log_probs(torch.cat(raw), drawn.flatten(0, 1)).view_as(
@@ -278,7 +282,7 @@ class Collector:
             )
             return Driven(seen, drawn, log_probs, rewards, done, *beyond), ended
 
-    def _see(self, observations: NDArray[np.float32]) -> torch.Tensor:
+    def _normalize(self, observations: NDArray[np.float32]) -> torch.Tensor:
         """Returns normalised observations (n, O) for the networks."""
         seen: torch.Tensor = self.networks.actor.normaliser(
             torch.from_numpy(observations)
@@ -323,7 +327,7 @@ class LeanPpo:
             self._take(watch, *self.collector.collect())
         while self._rollout:
             watch.keep(self.steps)
-            if watch.ends(self.steps, algorithms.act_of(self.policy), logger):
+            if watch.ends(self.steps, algorithms.make_act(self.policy), logger):
                 watch.report(self.steps, self._successes, logger)
                 return
             loss = self._advance(self._rollout, watch)

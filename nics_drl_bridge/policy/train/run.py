@@ -94,7 +94,7 @@ def train(
     if content is None:
         rng = np.random.default_rng(seed)
         env.seed(int(rng.integers(SEEDS)))
-        training = engine(settings, env, seed, algorithms.observed(env, rng))
+        training = engine(settings, env, seed, algorithms.observe_statistics(env, rng))
         # Overrides the algorithm's seeds, which would overlap those of other runs.
         env.seed(int(rng.integers(SEEDS)))
     else:
@@ -211,9 +211,9 @@ def evaluate(
     episodes: int,
 ) -> Outcomes:
     """Runs the evaluation protocol's episodes in a world with an algorithm's policy."""
-    env = _env_of(model, world, settings, episodes)
+    env = _make_env(model, world, settings, episodes)
     seeds = range(FIRST_SEED, FIRST_SEED + episodes)
-    return drive_worlds(env, algorithms.act_of(algorithm), seeds)
+    return drive_worlds(env, algorithms.make_act(algorithm), seeds)
 
 
 def _stop_of(model: SimulatorModel, worlds: Worlds, settings: TrainingSettings) -> Stop:
@@ -222,13 +222,13 @@ def _stop_of(model: SimulatorModel, worlds: Worlds, settings: TrainingSettings) 
     if stop is None:
         return Stop(None, {})
     envs = {
-        name: _env_of(model, worlds[name], settings, stop.episodes)
+        name: _make_env(model, worlds[name], settings, stop.episodes)
         for name in settings.worlds
     }
     return Stop(stop, envs)
 
 
-def _env_of(
+def _make_env(
     model: SimulatorModel, world: AnyWorld, settings: TrainingSettings, episodes: int
 ) -> BridgeVectorEnv:
     """Makes copies of a world for an evaluation, one per episode, without teaching."""
@@ -262,7 +262,7 @@ class SeedResult:
 class TrainOrder:
     """A request for a training run."""
 
-    # for a resumed run, its saved settings, see `settings_of`
+    # for a resumed run, its saved settings, see `read_run_settings`
     settings: TrainingSettings
     seeds: Sequence[int]
     out: Path  # folder of the run; each seed gets a subfolder
@@ -287,7 +287,7 @@ def run(
     _check(order.settings, order.seeds, order.out, order.resumed)
     settings = order.settings
     model, worlds = opened or open_training(settings)
-    trial = _env_of(model, worlds[next(iter(settings.worlds))], settings, TRIED)
+    trial = _make_env(model, worlds[next(iter(settings.worlds))], settings, TRIED)
     algorithms.check_serves(settings, trial)
     trial.reset(seed=FIRST_SEED)
     # Refuse a task that returns non-finite numbers before creating a folder.
@@ -295,7 +295,7 @@ def run(
         trial.step(trial.action_space.sample())
     del trial
     results = []
-    with _alone(order.out):
+    with _lock_folder(order.out):
         write_text(order.out / SETTINGS, dump_yaml(settings.model_dump(mode="json")))
         for seed in order.seeds:
             folder = order.out / f"seed_{seed}"
@@ -323,7 +323,7 @@ def run(
 
 
 @contextmanager
-def _alone(out: Path) -> Iterator[None]:
+def _lock_folder(out: Path) -> Iterator[None]:
     """Locks the folder of a run against other trainings. Raises ConfigError if it is locked."""
     out.mkdir(parents=True, exist_ok=True)
     try:
@@ -381,7 +381,7 @@ def _check(
     if (
         (out / SETTINGS).is_file()
         and not resumed
-        and settings_of(out, own_task) != settings
+        and read_run_settings(out, own_task) != settings
     ):
         fix = "choose another --out, or remove it."
         raise ConfigError(f"{out}: contains a run with other settings; {fix}")
@@ -400,7 +400,7 @@ def seeds_of(out: Path) -> list[int]:
     return sorted(int(seed) for seed in begun if seed.isdecimal())
 
 
-def settings_of(out: Path, task: str | None = None) -> TrainingSettings:
+def read_run_settings(out: Path, task: str | None = None) -> TrainingSettings:
     """Reads the settings of an existing run. Raises ConfigError if there is none.
 
     If the run trains a user's task, `task` must name it again: a folder never starts a program.

@@ -22,7 +22,7 @@ from nics_drl_bridge.env.registry import find_task_class
 from nics_drl_bridge.env.teaching import Teaching
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, open_model
-from nics_drl_bridge.lidar.sectors import LAYOUTS, covers, sectors_over
+from nics_drl_bridge.lidar.sectors import LAYOUTS, count_sectors, covers
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 from nics_drl_bridge.robot.kinds import has_textbook, reach
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -119,7 +119,7 @@ class TrainingSettings(Schema):
 
     @field_validator("task_options")
     @classmethod
-    def _named(cls, options: dict[str, Any]) -> dict[str, Any]:
+    def _check_names(cls, options: dict[str, Any]) -> dict[str, Any]:
         taken = sorted({"robot", "lidar"} & set(options))
         if taken:
             raise ValueError(
@@ -128,7 +128,7 @@ class TrainingSettings(Schema):
         return options
 
     @model_validator(mode="after")
-    def _holdable(self) -> TrainingSettings:
+    def _check_size(self) -> TrainingSettings:
         if self.num_envs > MOST_WORLDS:
             raise ValueError(
                 f"all worlds together may have at most {MOST_WORLDS} copies"
@@ -241,7 +241,7 @@ class Pace:
         return reason
 
 
-def pace_of(
+def find_pace(
     model: SimulatorModel, worlds: Iterable[AnyWorld], top: float | None = None
 ) -> Pace:
     """Returns the pace of a robot in worlds; `top` limits its speed [m/s]."""
@@ -273,7 +273,7 @@ def top_speed(robot: RobotSpec) -> float:
     return max(speeds, default=math.inf)
 
 
-def kin(robot: RobotSpec) -> str:
+def find_kin(robot: RobotSpec) -> str:
     """Returns the name of the shipped robot that moves most like this one."""
     if robot.steers:
         return "ackermann"
@@ -301,7 +301,9 @@ class Fitted(NamedTuple):
     opened: Opened
 
 
-def settings_for(task: str, name: str | None, changes: dict[str, Any]) -> Fitted:
+def choose_fitting_settings(
+    task: str, name: str | None, changes: dict[str, Any]
+) -> Fitted:
     """Loads settings like `chosen_settings`; a robot without settings gets a similar robot's.
 
     Raises ConfigError, and ModelError if there is no such robot.
@@ -311,7 +313,7 @@ def settings_for(task: str, name: str | None, changes: dict[str, Any]) -> Fitted
     shipped = list_shipped("training")
     has_settings = f"{task}_{robot}" in shipped
     if name is None and robot is not None and not has_settings and task == OWN_TASK:
-        name = f"own_{kin(open_model(robot).robot)}"
+        name = f"own_{find_kin(open_model(robot).robot)}"
         notes.append(
             f"settings {name!r}, because the robot {robot!r} has none of its own"
         )
@@ -332,11 +334,11 @@ def fit_settings(settings: TrainingSettings, opened: Opened, inherited: bool) ->
     lidar = opened.model.lidar
     find_task_class(settings.task, options)
     worlds = opened.worlds.values()
-    pace = pace_of(opened.model, worlds, options.get("top_speed"))
+    pace = find_pace(opened.model, worlds, options.get("top_speed"))
     changed: dict[str, Any] = {}
     if inherited and options.get("scan") == "around" and not covers(lidar, "around"):
         scan = options["scan"] = (
-            "front" if covers(lidar, "front") else sectors_over(lidar)
+            "front" if covers(lidar, "front") else count_sectors(lidar)
         )
         far = LAYOUTS["around"].range_max
         notes.append(
@@ -350,7 +352,7 @@ def fit_settings(settings: TrainingSettings, opened: Opened, inherited: bool) ->
         limit = f"{pace.steps * pace.period:g} s ({pace.steps} steps)"
         notes.append(f"time limit {limit}, for {pace.far:g} m at {pace.speed:g} m/s")
         if inherited and pace.steps > defaults.EPISODE_STEPS:
-            changed |= _stretched(
+            changed |= _stretch(
                 settings, options, pace.steps / defaults.EPISODE_STEPS, notes
             )
     made = settings.model_copy(update={**changed, "task_options": options})
@@ -360,7 +362,7 @@ def fit_settings(settings: TrainingSettings, opened: Opened, inherited: bool) ->
     return Fitted(made, tuple(notes), opened)
 
 
-def _stretched(
+def _stretch(
     settings: TrainingSettings,
     options: dict[str, Any],
     factor: float,

@@ -60,7 +60,7 @@ class TrainVecEnv(VecEnv):
             shown.append(env.reset(seed=seeds, options=self._options[0] or None)[0])
         self._reset_seeds()
         self._reset_options()
-        return _together(shown)
+        return _join_rows(shown)
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Stores the actions for the next step."""
@@ -79,7 +79,7 @@ class TrainVecEnv(VecEnv):
             for env, rows in zip(self.envs, self._rows, strict=True)
         ]
         observation, reward, done = (
-            _together(list(rows_of_envs)) for rows_of_envs in zip(*parts, strict=True)
+            _join_rows(list(rows_of_envs)) for rows_of_envs in zip(*parts, strict=True)
         )
         self.stepping_s += time.perf_counter() - begin
         if self.on_step is not None:
@@ -157,6 +157,6 @@ class TrainVecEnv(VecEnv):
             env.close()
 
 
-def _together(parts: list[NDArray[Any]]) -> NDArray[Any]:
+def _join_rows(parts: list[NDArray[Any]]) -> NDArray[Any]:
     """Concatenates the rows of several envs; a single env's rows are returned unchanged."""
     return parts[0] if len(parts) == 1 else np.concatenate(parts)

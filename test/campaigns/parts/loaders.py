@@ -183,16 +183,16 @@ def _policy_bytes(version: int) -> bytes:
 
 
 def _open_contract(path: Path) -> Any:
-    return json.loads(onnx_graph.metadata(onnx.load(path), "file"))
+    return json.loads(onnx_graph.find_contract_text(onnx.load(path), "file"))
 
 
 def _save_contract(path: Path, data: Any) -> None:
     proto = onnx.load(path)
     if isinstance(data, dict):
-        data["graph_sha256"] = onnx_graph.graph_hash(proto)
+        data["graph_sha256"] = onnx_graph.hash_graph(proto)
     del proto.metadata_props[:]
     onnx.helper.set_model_props(proto, {onnx_graph.KEY: json.dumps(data)})
-    path.write_bytes(onnx_graph.sealed(proto.SerializeToString(deterministic=True)))
+    path.write_bytes(onnx_graph.add_seal(proto.SerializeToString(deterministic=True)))
 
 
 @lru_cache
