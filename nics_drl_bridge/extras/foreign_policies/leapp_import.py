@@ -1,10 +1,9 @@
 """Reads LEAPP bundles, ours and foreign: joins their networks, and derives their mapping."""
 
 import math
-from dataclasses import dataclass
-from functools import cached_property
+from collections import Counter
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import onnx
 import safetensors.numpy
@@ -106,107 +105,17 @@ class Description(Open):
     pipeline: Pipeline
 
 
-@dataclass(frozen=True)
-class Bundle:
+class Bundle(NamedTuple):
     """A bundle as read; inputs and outputs are named with their node only if ambiguous."""
 
     path: Path  # the YAML file
-    description: Description
-    models: dict[str, Any]  # onnx.ModelProto of each node
+    pipeline: Pipeline
+    inputs: dict[str, Tensor]  # entries of the external inputs
+    outputs: dict[str, Tensor]
+    states: dict[str, ForeignState]  # that the bundle feeds back, by input
+    network: Any  # all networks joined into one onnx.ModelProto
     sha256: str  # hash of all networks together
-
-    @cached_property
-    def ours(self) -> bytes | None:
-        """The policy file exported as this bundle; None if the bundle is foreign."""
-        models = list(self.models.values())
-        return restored(models[0]) if len(models) == 1 else None
-
-    @cached_property
-    def network(self) -> Any:
-        """All networks joined into one ModelProto. Raises PolicyError if they do not fit."""
-        return _join(self)
-
-    @cached_property
-    def inputs(self) -> dict[str, Tensor]:
-        """Entries of the external inputs."""
-        return self._entries("inputs", self.description.pipeline.inputs)
-
-    @cached_property
-    def outputs(self) -> dict[str, Tensor]:
-        """Entries of the external outputs."""
-        return self._entries("outputs", self.description.pipeline.outputs)
-
-    @cached_property
-    def ends(self) -> set[str]:
-        """All `node/input` and `node/output` that are external or fed back."""
-        pipeline = self.description.pipeline
-        ends = set[str]()
-        for names_by_node in (pipeline.inputs, pipeline.outputs):
-            for node, names in names_by_node.items():
-                ends.update(f"{node}/{name}" for name in names)
-        for source, targets in pipeline.feedback_flow.items():
-            ends.update((source, *targets))
-        return ends
-
-    def name_of(self, end: str) -> str:
-        """Returns the name of one of the `ends` in the joined network: short if unambiguous."""
-        short = end.partition("/")[2]
-        namesakes = sum(name.endswith(f"/{short}") for name in self.ends)
-        return short if namesakes == 1 else end
-
-    def _entries(self, side: str, ends: dict[str, list[str]]) -> dict[str, Tensor]:
-        entries = {}
-        for node, names in ends.items():
-            if node not in self.description.models:
-                fix = suggest(node, self.description.models)
-                raise self.fault(f"pipeline.{side}", f"names no node {node!r}; {fix}")
-            tensors = {
-                tensor.name: tensor
-                for tensor in getattr(self.description.models[node], side)
-            }
-            for name in names:
-                if name not in tensors:
-                    fix = suggest(name, tensors)
-                    raise self.fault(
-                        f"pipeline.{side}.{node}", f"has no {name!r}; {fix}"
-                    )
-                entries[self.name_of(f"{node}/{name}")] = tensors[name]
-        return entries
-
-    @cached_property
-    def states(self) -> dict[str, ForeignState]:
-        """The states that the bundle feeds back, by input."""
-        pipeline = self.description.pipeline
-        if pipeline.initial_values is None:
-            start = {}
-        else:
-            start = self._initial(pipeline.initial_values)
-        return {
-            self.name_of(target): ForeignState(
-                next=self.name_of(out), start=start.get(target, 0.0)
-            )
-            for out, targets in pipeline.feedback_flow.items()
-            for target in targets
-        }
-
-    def _initial(self, name: str) -> dict[str, tuple[float, ...]]:
-        """Returns the flattened arrays of a safetensors file, by `node/input`."""
-        data = _read(self, name, "pipeline.initial_values")
-        try:
-            arrays = safetensors.numpy.load(data)
-        except (SafetensorError, KeyError, TypeError, ValueError):
-            reason = (
-                f"{name!r} is not a valid safetensors file; export the bundle again."
-            )
-            raise self.fault("pipeline.initial_values", reason) from None
-        return {
-            key: tuple(array.astype(float).ravel().tolist())
-            for key, array in arrays.items()
-        }
-
-    def fault(self, place: str, reason: str) -> PolicyError:
-        """Makes the error for a place in the YAML file."""
-        return PolicyError(str(self.path), place, reason)
+    ours: bytes | None  # the policy file exported as this bundle; None if it is foreign
 
 
 def description_of(place: Path) -> Path | None:
@@ -229,44 +138,112 @@ def description_of(place: Path) -> Path | None:
 
 def read_bundle(path: Path) -> Bundle:
     """Reads a bundle and checks its networks. Raises ConfigError or PolicyError."""
-    description = validate(
-        parse_yaml(read_text(path), str(path)), Description, str(path)
-    )
-    models: dict[str, Any] = {}
-    bundle = Bundle(path, description, models, "")
+    source = str(path)
+    description = validate(parse_yaml(read_text(path), source), Description, source)
+    pipeline = description.pipeline
+    models = {}
     digests = []
     for name, node in description.models.items():
         place = f"models.{name}.parameters"
         parameters = node.parameters
         if parameters.backend != "onnx":
             reason = f"is {parameters.backend!r}, which is not supported; export it with 'onnx'."
-            raise bundle.fault(f"{place}.backend", reason)
-        data = _read(bundle, parameters.model_path, f"{place}.model_path")
+            raise PolicyError(source, f"{place}.backend", reason)
+        data = _read_file(path, parameters.model_path, f"{place}.model_path")
         digests.append(hash_bytes(data))
         if digests[-1] != parameters.sha256sum:
             reason = f"does not match {parameters.model_path!r}, which was changed or damaged."
-            raise bundle.fault(f"{place}.sha256sum", reason)
+            raise PolicyError(source, f"{place}.sha256sum", reason)
         file = str(path.parent / parameters.model_path)
         rehearsal.rehearse(data, file, runs=False)
         models[name] = onnx_graph.parse(data, file)
-    return Bundle(path, description, models, hash_bytes("".join(digests).encode()))
+    names = _name_ends(pipeline)
+    starts = {}
+    if pipeline.initial_values is not None:
+        starts = _read_starts(path, pipeline.initial_values)
+    states = {
+        names[target]: ForeignState(next=names[out], start=starts.get(target, 0.0))
+        for out, targets in pipeline.feedback_flow.items()
+        for target in targets
+    }
+    return Bundle(
+        path,
+        pipeline,
+        _find_tensors(description, "inputs", names, source),
+        _find_tensors(description, "outputs", names, source),
+        states,
+        _join(models, pipeline.data_flow, names, source),
+        hash_bytes("".join(digests).encode()),
+        restored(next(iter(models.values()))) if len(models) == 1 else None,
+    )
 
 
-def _read(bundle: Bundle, name: str, place: str) -> bytes:
+def _name_ends(pipeline: Pipeline) -> dict[str, str]:
+    """Names each external or fed back `node/input` and `node/output`, shortly if unambiguous."""
+    ends = set[str]()
+    for names_by_node in (pipeline.inputs, pipeline.outputs):
+        for node, names in names_by_node.items():
+            ends.update(f"{node}/{name}" for name in names)
+    for source, targets in pipeline.feedback_flow.items():
+        ends.update((source, *targets))
+    shorts = {end: end.partition("/")[2] for end in ends}
+    counts = Counter(shorts.values())
+    return {end: end if counts[short] > 1 else short for end, short in shorts.items()}
+
+
+def _find_tensors(
+    description: Description, side: str, names: dict[str, str], source: str
+) -> dict[str, Tensor]:
+    """Finds the entries of the external inputs or outputs, by their names in the network."""
+    entries = {}
+    for node, ends in getattr(description.pipeline, side).items():
+        if node not in description.models:
+            reason = f"names no node {node!r}; {suggest(node, description.models)}"
+            raise PolicyError(source, f"pipeline.{side}", reason)
+        tensors = {
+            tensor.name: tensor for tensor in getattr(description.models[node], side)
+        }
+        for name in ends:
+            if name not in tensors:
+                reason = f"has no {name!r}; {suggest(name, tensors)}"
+                raise PolicyError(source, f"pipeline.{side}.{node}", reason)
+            entries[names[f"{node}/{name}"]] = tensors[name]
+    return entries
+
+
+def _read_file(path: Path, name: str, place: str) -> bytes:
     """Reads a file of a bundle, which must lie in the bundle's folder."""
-    folder = bundle.path.parent.resolve()
+    folder = path.parent.resolve()
     file = (folder / name).resolve()
     if not file.is_relative_to(folder):
-        raise bundle.fault(place, f"{name!r} lies outside the bundle; not opened.")
-    return onnx_graph.read_network(file, str(bundle.path), place)
+        reason = f"{name!r} lies outside the bundle; not opened."
+        raise PolicyError(str(path), place, reason)
+    return onnx_graph.read_network(file, str(path), place)
 
 
-def _join(bundle: Bundle) -> Any:
+def _read_starts(path: Path, name: str) -> dict[str, tuple[float, ...]]:
+    """Reads the start of each state, flattened, by `node/input`, from a safetensors file."""
+    place = "pipeline.initial_values"
+    try:
+        arrays = safetensors.numpy.load(_read_file(path, name, place))
+    except (SafetensorError, KeyError, TypeError, ValueError):
+        reason = f"{name!r} is not a valid safetensors file; export the bundle again."
+        raise PolicyError(str(path), place, reason) from None
+    return {
+        key: tuple(array.astype(float).ravel().tolist())
+        for key, array in arrays.items()
+    }
+
+
+def _join(
+    models: dict[str, Any],
+    flow: dict[str, list[str]],
+    names: dict[str, str],
+    source: str,
+) -> Any:
     """Connects all networks, in order; their inputs and outputs get the names of the bundle."""
-    flow = bundle.description.pipeline.data_flow
     joined, *others = (
-        onnx.compose.add_prefix(model, f"{name}/")
-        for name, model in bundle.models.items()
+        onnx.compose.add_prefix(model, f"{name}/") for name, model in models.items()
     )
     for model in others:
         inputs = {end.name for end in model.graph.input}
@@ -278,13 +255,12 @@ def _join(bundle: Bundle) -> Any:
             joined = onnx.compose.merge_models(joined, model, pairs, outputs=outputs)
         except (ValueError, onnx.checker.ValidationError) as error:
             reason = f"the networks can't be connected ({onnx_graph.quote(error)})."
-            raise bundle.fault("pipeline.data_flow", reason) from None
-    graph = joined.graph
+            raise PolicyError(source, "pipeline.data_flow", reason) from None
     for value in onnx_graph.list_inputs(joined):
-        if value.name not in bundle.ends:
+        if value.name not in names:
             reason = f"no earlier node supplies {value.name!r}; connect it."
-            raise bundle.fault("pipeline.data_flow", reason)
-    names = {end: bundle.name_of(end) for end in bundle.ends}
+            raise PolicyError(source, "pipeline.data_flow", reason)
+    graph = joined.graph
     for value in (*graph.input, *graph.output):
         value.name = names.get(value.name, value.name)
     for node in graph.node:
@@ -301,15 +277,14 @@ def mapping_of(bundle: Bundle, model: SimulatorModel) -> Data:
 
     Raises PolicyError for an input whose meaning is not stated.
     """
-    frequency = bundle.description.pipeline.configs.get("frequency")
+    frequency = bundle.pipeline.configs.get("frequency")
+    period = None
     if isinstance(frequency, int | float) and frequency > 0:
-        period = 1.0 / frequency
-    else:
-        period = None
+        period = round(1.0 / frequency, 9)
     data: Data = {
         "kind": "foreign policy",
         "network": bundle.path.name,
-        "control_period": None if period is None else round(period, 9),
+        "control_period": period,
         "inputs": {},
         "outputs": {},
     }
@@ -326,7 +301,7 @@ def mapping_of(bundle: Bundle, model: SimulatorModel) -> Data:
             f"{name!r} of kind {entry.kind!r}" for name, entry in bundle.outputs.items()
         )
         reason = f"{kinds}: none is marked as the robot's velocity; {MAPPING}."
-        raise bundle.fault("pipeline.outputs", reason)
+        raise PolicyError(str(bundle.path), "pipeline.outputs", reason)
     return data
 
 
@@ -352,7 +327,7 @@ def _parts(bundle: Bundle, name: str, entry: Tensor, data: Data) -> list[Data]:
         reason = (
             f"{described} is not a known scan, goal or velocity of a robot; {MAPPING}."
         )
-        raise bundle.fault(f"pipeline.inputs.{name}", reason)
+        raise PolicyError(str(bundle.path), f"pipeline.inputs.{name}", reason)
     zero = {"of": ZERO, "value": 0.0}
     return [zero if meanings[n] == ZERO else {"of": meanings[n]} for n in names]
 
