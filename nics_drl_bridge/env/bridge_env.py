@@ -16,16 +16,19 @@ from nics_drl_bridge.env.sim_backend import complete_backend, make_backend
 from nics_drl_bridge.env.snapshot import Snapshot, find_gate, find_goals
 from nics_drl_bridge.env.task import (
     Episodes,
+    Info,
     Memory,
     Observation,
     Task,
+    Terms,
     make_team_space,
     still,
     total,
 )
 from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.generator import SimulatorModel, open_model
-from nics_drl_bridge.interface import Array, Backend, RobotView, Start
+from nics_drl_bridge.interface import Backend, RobotView, Start
+from nics_drl_bridge.lidar.arrays import Mask, Singles
 from nics_drl_bridge.lidar.sensor import unread
 from nics_drl_bridge.random_kernels import episode_seed
 from nics_drl_bridge.robot import DEFAULT_ROBOT
@@ -36,7 +39,7 @@ from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 RENDER_FPS = 10
 
 
-class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
+class BridgeEnv(gymnasium.Env[Singles, NDArray[Any]]):
     """A task for a robot, or a team, in the fast simulator or over ROS 2.
 
     ## Description
@@ -133,7 +136,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         self.action_space = make_team_space(self.task.action_space, self.robots)
         self.memory: Memory = {}
         self.scene: Scene | None = None
-        self.ended: NDArray[np.bool_] = np.zeros(self.robots, np.bool_)
+        self.ended: Mask = np.zeros(self.robots, np.bool_)
         self._view: RobotView | None = None  # always a batch of one, which tasks expect
         self._shape = (1, self.robots, self.task.observation_space.shape[0])
         self._each = (1, self.robots, *(self.task.action_space.shape or ()))
@@ -144,7 +147,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         self._picture: Any = None
         # of the last step, for pictures
         self._command = self._rest
-        self._facts = dict[str, Any]()
+        self._facts = Info()
         self._steps = 0
         if isinstance(backend, str):
             robots = self.robots if self.robots > 1 else None
@@ -163,7 +166,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
     @stop_on_error
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+    ) -> tuple[Singles, Info]:
         """Starts an episode; see Gymnasium. Raises ConfigError for a wrong seed or option."""
         guard.check_reset(seed, options)
         super().reset(seed=seed)
@@ -198,7 +201,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         self._facts = {}
         self._steps = 0
         self.ended = np.zeros(self.robots, np.bool_)
-        facts: dict[str, Any] = {
+        facts: Info = {
             "episode_seed": episode,
             "start": self._get_row(starts),
         }
@@ -207,43 +210,43 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         if drawn:
             facts["randomisation"] = drawn
         seen = self.task.observation(self._view, self.memory)
-        observation = self.task.check_result("observation", seen, self._shape)[0]
+        self.task.check_result("observation", seen, self._shape)
         if self.render_mode == "human":
             self.render()
-        return observation.reshape(-1), self._make_info(self._view, facts)
+        return seen.reshape(-1), self._make_info(self._view, facts)
 
     def _try_task(self, episodes: Episodes) -> None:
         """Runs the task once before the robot moves: it is too slow to compile while driving."""
-        free = np.full((1, self.robots, self.model.lidar.beams), np.inf, np.float32)
+        shape = (1, self.robots, self.model.lidar.beams)
+        free = np.full(shape, np.inf, np.float32)
         sensed = unread(self.model.sensors, 1, self.robots)
         starts = episodes.starts
         view = RobotView(starts.copy(), 0.0 * starts, free, 0.0, 0.0, 0.0, sensed)
         memory = self.task.start_episodes(episodes)
         with suppress(ConfigError):  # the task may refuse the made-up view
-            self.task.take_step(np.empty(self._shape, np.float32), view, view, memory)
+            out = np.empty(self._shape, np.float32)
+            self.task.take_step(out, view, view, memory)
         self._rehearsed = True
 
     @refuse_after_close
     @stop_on_error
-    def step(
-        self, action: NDArray[Any]
-    ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(self, action: NDArray[Any]) -> tuple[Observation, float, bool, bool, Info]:
         """Applies an action for one control period; see Gymnasium."""
         observation, terms, info = self.advance(action)
         # Sum in the vector env's order, for bit-identical rewards.
-        reward = float(total(sum(terms.values(), np.zeros(self.robots))))
+        rewards = sum(terms.values(), np.zeros(self.robots))
+        reward = float(total(rewards))
         info["reward_terms"] = terms
         if self.robots == 1:
             info["reward_terms"] = {name: term.item() for name, term in terms.items()}
         if self.render_mode == "human":
             self.render()
-        return observation.reshape(-1), reward, bool(self.ended.all()), False, info
+        ended = bool(self.ended.all())
+        return observation.reshape(-1), reward, ended, False, info
 
     @refuse_after_close
     @stop_on_error
-    def advance(
-        self, action: NDArray[Any]
-    ) -> tuple[NDArray[np.float32], dict[str, Array], dict[str, Any]]:
+    def advance(self, action: NDArray[Any]) -> tuple[Singles, Terms, Info]:
         """Advances one period; returns observations (M, O), reward terms (M,) by name, and `info`.
 
         Robots of a team that have `ended` (M,) get the command nearest to zero and no more reward.
@@ -253,7 +256,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
             raise gymnasium.error.ResetNeeded("call reset() before step().")
         given = guard.check_action(action, self.action_space, "action")
         command = self._get_row(
-            self.task.drive(given.reshape(self._each), self.ended[None])[0]
+            self.task.drive(given.reshape(self._each), self.ended[None])[0],
         )
         seen, facts = self._backend.step(command)
         self._command = command
@@ -294,13 +297,16 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
     def _get_row(self, rows: NDArray[Any]) -> NDArray[Any]:
         return rows[0] if self.robots == 1 else rows
 
-    def _make_info(self, view: RobotView, facts: dict[str, Any]) -> dict[str, Any]:
-        shown = {
-            name: self._get_row(self.memory[name][0]).copy() for name in self.task.shown
-        }
-        ages = {"scan_age_s": view.scan_age_s, "odom_age_s": view.odom_age_s}
-        ages |= {"sensed_age_s": view.sensed_age_s} if view.sensed else {}
-        return {**shown, "pose": self._get_row(view.pose[0]).copy(), **ages, **facts}
+    def _make_info(self, view: RobotView, facts: Info) -> Info:
+        info: Info = {}
+        for name in self.task.shown:
+            info[name] = self._get_row(self.memory[name][0]).copy()
+        info["pose"] = self._get_row(view.pose[0]).copy()
+        info["scan_age_s"] = view.scan_age_s
+        info["odom_age_s"] = view.odom_age_s
+        if view.sensed:
+            info["sensed_age_s"] = view.sensed_age_s
+        return info | facts
 
     @refuse_after_close
     @stop_on_error

@@ -81,7 +81,8 @@ def delay_interrupts() -> Iterator[None]:
 def check_reset(seed: Any, options: Any, worlds: int = 1) -> None:
     """Raises ConfigError for wrong options, or a wrong seed (one for all worlds, or one each)."""
     several = isinstance(seed, list | tuple | np.ndarray)
-    seeds = [one for one in (seed if several else [seed]) if one is not None]
+    named = seed if several else [seed]
+    seeds = [one for one in named if one is not None]
     check_seeds(seeds, GREATEST_SEED if several else GREATEST_SEED + 1 - worlds)
     if options is not None and not isinstance(options, Mapping):
         needed = "must be a dict such as {'start': (x, y, heading)}, or None."
@@ -132,7 +133,8 @@ def give(rows: NDArray[Any], name: str, value: Any) -> None:
     except ValueError:  # a ragged list
         numbers = np.asarray(None)
     option = f"reset option {name!r}, {value!r}"
-    fits = numbers.shape in [rows.shape[k:] for k in range(max(2, rows.ndim))]
+    shapes = [rows.shape[k:] for k in range(max(2, rows.ndim))]
+    fits = numbers.shape in shapes
     if not fits or numbers.dtype.kind not in "fiub":
         shape = f"{rows.shape[1:]}, or its last dimensions"
         raise ConfigError(f"{option}: must be numbers of shape {shape}.")
@@ -177,16 +179,16 @@ def _is_on(
     dx, dy = (x, y) - body[:2]
     c, s = body[[COS, SIN]]
     reach = body[RADIUS]
-    if reach <= 0.0 or dx * dx + dy * dy >= (radius + reach) ** 2:
+    if reach <= 0.0 or np.hypot(dx, dy) >= radius + reach:
         return False
     # Each shape may occur in several sizes.
     shape = shapes[int(body[SHAPE]) % len(shapes)]
     corners = shape.outline * (reach / shape.radius)
-    at = (c * dx + s * dy, c * dy - s * dx)
-    return (
-        not len(corners)
-        or outline_point(*at, Outline(corners, 0, len(corners))) < radius
-    )
+    if not len(corners):
+        return True
+    outline = Outline(corners, 0, len(corners))
+    gap = outline_point(c * dx + s * dy, c * dy - s * dx, outline)
+    return bool(gap < radius)
 
 
 def check_action(action: Any, space: gymnasium.Space[Any], name: str) -> NDArray[Any]:

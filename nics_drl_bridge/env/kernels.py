@@ -9,10 +9,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.lidar.arrays import Integers, Mask, Singles
 from nics_drl_bridge.lidar.sector_kernels import SectorPlan, resample
 from nics_drl_bridge.random_kernels import episode_seed
 
@@ -30,7 +30,7 @@ class ScanScale(NamedTuple):
     # inverse of the range that a fraction of 1 stands for [1/m], float32
     per_metre: np.float32
     # (B,) float32 range at which each beam leaves the footprint [m]
-    leaves: NDArray[np.float32]
+    leaves: Singles
     # number of neighbouring beams on either side that also decide on a contact
     beside: int
     sectors: int  # number of observed sectors; 0 if beams are observed
@@ -38,18 +38,14 @@ class ScanScale(NamedTuple):
 
 
 @kernel(allocates=True)
-def compute_episode_seeds(
-    seeds: NDArray[np.int64], numbers: NDArray[np.int64], out: NDArray[np.int64]
-) -> None:
+def compute_episode_seeds(seeds: Integers, numbers: Integers, out: Integers) -> None:
     """Computes seeds (n,) of episodes from their numbers (n,) and their envs' seeds (n,)."""
     for i in range(seeds.shape[0]):
         out[i] = episode_seed(seeds[i], numbers[i])
 
 
 @kernel(allocates=True)
-def scale_actions(
-    out: Array, actions: NDArray[np.float32], low: Array, high: Array
-) -> None:
+def scale_actions(out: Array, actions: Singles, low: Array, high: Array) -> None:
     """Scales actions (R, C), clamped to [-1, 1], to commands (R, C) between their limits (C,)."""
     for i in range(out.shape[0]):
         for c in range(out.shape[1]):
@@ -58,7 +54,7 @@ def scale_actions(
 
 
 @kernel(allocates=True)
-def is_finite(values: Array | NDArray[np.float32]) -> bool:
+def is_finite(values: Array | Singles) -> bool:
     """Returns True if all values (R, C) are finite."""
     for i in range(values.shape[0]):
         for c in range(values.shape[1]):
@@ -68,9 +64,7 @@ def is_finite(values: Array | NDArray[np.float32]) -> bool:
 
 
 @kernel(allocates=True)
-def look(
-    shares: NDArray[np.float32], ranges: NDArray[np.float32], scale: ScanScale
-) -> bool:
+def look(shares: Singles, ranges: Singles, scale: ScanScale) -> bool:
     """Writes a scan (B,) as fractions (P,), 1 free, 0 too close; returns True for a contact."""
     if scale.sectors > 0:
         resample(shares, ranges, scale.plan)
@@ -94,7 +88,7 @@ def _scale_range(value: np.float32, scale: ScanScale) -> np.float32:
 
 
 @kernel(allocates=True)
-def has_contact(ranges: NDArray[np.float32], scale: ScanScale) -> bool:
+def has_contact(ranges: Singles, scale: ScanScale) -> bool:
     """Returns True if a beam of a scan (B,) and its neighbours' mean end within the footprint.
 
     A single beam is too noisy: of hundreds, one is nearly always off by three standard deviations.
@@ -115,7 +109,7 @@ def has_contact(ranges: NDArray[np.float32], scale: ScanScale) -> bool:
 
 
 @kernel(inline=True)
-def _sum_gaps(b: int, ranges: NDArray[np.float32], scale: ScanScale) -> np.float32:
+def _sum_gaps(b: int, ranges: Singles, scale: ScanScale) -> np.float32:
     gap = np.float32(0.0)
     for k in range(
         max(b - scale.beside, 0), min(b + scale.beside + 1, ranges.shape[0])
@@ -128,9 +122,9 @@ def _sum_gaps(b: int, ranges: NDArray[np.float32], scale: ScanScale) -> np.float
 
 @kernel(allocates=True)
 def looks(
-    shares: NDArray[np.float32],
-    touched: NDArray[np.bool_],
-    ranges: NDArray[np.float32],
+    shares: Singles,
+    touched: Mask,
+    ranges: Singles,
     scale: ScanScale,
 ) -> None:
     """Applies `look` to the scans (R, B) of R robots; writes its results to touched (R,)."""
@@ -153,13 +147,13 @@ def find_bearing(dx: float, dy: float, heading: float) -> tuple[float, float, fl
 
 @kernel(allocates=True)
 def navigate(
-    out: NDArray[np.float32],
+    out: Singles,
     approach: Array,
-    flags: NDArray[np.bool_],
+    flags: Mask,
     before: Array,
     pose: Array,
     twist: Array,
-    ranges: NDArray[np.float32],
+    ranges: Singles,
     goals: Array,
     scale: ScanScale,
     radius: float,

@@ -11,19 +11,20 @@ from nics_drl_bridge import defaults, extensions
 from nics_drl_bridge.arguments import check_arguments, check_count
 from nics_drl_bridge.env.bridge_env import RENDER_FPS, BridgeEnv
 from nics_drl_bridge.env.guard import stop_on_error
-from nics_drl_bridge.env.task import Task
+from nics_drl_bridge.env.task import Info, Task
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.lidar.arrays import Singles
 from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.world_set import AnyWorld
 
 with extensions.require_modules("BridgeParallelEnv"):
     from pettingzoo import ParallelEnv
 
-Observations = dict[str, NDArray[np.float32]]
+Observations = dict[str, Singles]
 
 
-class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
+class BridgeParallelEnv(ParallelEnv[str, Singles, NDArray[Any]]):
     """A task of a team in the fast simulator; each robot is an agent.
 
     ## Description
@@ -95,7 +96,7 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
     @stop_on_error
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observations, dict[str, dict[str, Any]]]:
+    ) -> tuple[Observations, dict[str, Info]]:
         """Starts an episode with all agents; see PettingZoo."""
         # PettingZoo's checker passes an option "options".
         if isinstance(options, dict):
@@ -118,7 +119,7 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         dict[str, float],
         dict[str, bool],
         dict[str, bool],
-        dict[str, dict[str, Any]],
+        dict[str, Info],
     ]:
         """Advances one control period; see PettingZoo. Every remaining agent needs an action."""
         given: object = actions
@@ -143,18 +144,20 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
             self.env.render()
         self._steps += 1
         late = self._steps >= self._limit
-        index = {name: self.possible_agents.index(name) for name in self.agents}
         infos = {}
         rewards = {}
-        for name, m in index.items():
+        ended = {}
+        seen = {}
+        for name in self.agents:
+            m = self.possible_agents.index(name)
             paid = {key: float(term[m]) for key, term in terms.items()}
             infos[name] = {**self._of(info, m), "reward_terms": paid}
             rewards[name] = sum(paid.values())
-        ended = {name: bool(self.env.ended[m]) for name, m in index.items()}
-        cut = dict.fromkeys(self.agents, late)
-        seen = {name: observation[m] for name, m in index.items()}
-        self.agents = [] if late else [name for name in self.agents if not ended[name]]
-        return seen, rewards, ended, cut, infos
+            ended[name] = bool(self.env.ended[m])
+            seen[name] = observation[m]
+        truncated = dict.fromkeys(self.agents, late)
+        self.agents = [name for name in self.agents if not (late or ended[name])]
+        return seen, rewards, ended, truncated, infos
 
     def halt(self) -> None:
         """Stops every robot until the next reset; any exception does this, too."""

@@ -1,6 +1,7 @@
 """Top-view pictures of a world, for `render_mode="rgb_array"` and videos."""
 
 from collections.abc import Sequence
+from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.env.snapshot import Snapshot, locate_hits
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.lidar.arrays import Singles
 from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, SHAPE
 from nics_drl_bridge.sim.world_set import AnyWorld
 from nics_drl_bridge.style import DARK, EDGE, GOAL, OTHER, SERIES, VERMILION
@@ -38,10 +40,11 @@ class WorldPicture:
         self._world = world
         low, high = np.array(world.extent).reshape(2, 2)
         metre_in = SIZE_IN / (high - low).max()
-        width, depth = np.maximum(metre_in * (high - low), LEAST_SIDE_IN).tolist()
-        shown = np.array([width, depth]) / metre_in * (1.0 + 2.0 * MARGIN)
+        size = np.maximum(metre_in * (high - low), LEAST_SIDE_IN)
+        shown = size / metre_in * (1.0 + 2.0 * MARGIN)
         self._low = (low + high - shown) / 2.0
         self._high = (low + high + shown) / 2.0
+        width, depth = size.tolist()
         figure = Figure(figsize=(width, depth), dpi=DPI)
         self._canvas: Any = FigureCanvasAgg(figure)
         self._axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
@@ -59,17 +62,16 @@ class WorldPicture:
             axes.plot(
                 *goal, marker="*", color=GOAL, markersize=16, markeredgecolor=WALL
             )
-        for m, trail in enumerate(trails):
-            axes.plot(
-                *np.transpose(trail), color=ROBOTS[m % len(ROBOTS)], linewidth=1.5
-            )
-        for m, (pose, scan) in enumerate(zip(shot.poses, shot.ranges, strict=True)):
-            self._draw_robot(axes, pose, scan, ROBOTS[m % len(ROBOTS)])
+        for trail, colour in zip(trails, cycle(ROBOTS), strict=False):
+            axes.plot(*np.transpose(trail), color=colour, linewidth=1.5)
+        robots = zip(shot.poses, shot.ranges, cycle(ROBOTS), strict=False)
+        for pose, scan, colour in robots:
+            self._draw_robot(axes, pose, scan, colour)
         self._canvas.draw()
         return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
     def _draw_robot(
-        self, axes: Axes, pose: Array, ranges: NDArray[np.float32], colour: str
+        self, axes: Axes, pose: Array, ranges: Singles, colour: str
     ) -> None:
         hits = locate_hits(self._model.lidar, pose, ranges)
         robot = self._model.robot
@@ -99,10 +101,10 @@ def draw_robot(
         radius = np.max(outline, axis=0)[0]
         corners = geometry.rotate(outline, pose[2]) + pose[:2]
         axes.add_patch(Outline(corners, closed=True, zorder=zorder, **look))
-    ends = np.stack(
-        [pose[:2], pose[:2] + radius * np.array([np.cos(pose[2]), np.sin(pose[2])])]
-    )
-    axes.plot(*ends.T, color="white", linewidth=2.0, zorder=zorder + 1.0)
+    front = geometry.compose(pose, (radius, 0.0, 0.0))
+    x = (pose[0], front[0])
+    y = (pose[1], front[1])
+    axes.plot(x, y, color="white", linewidth=2.0, zorder=zorder + 1.0)
 
 
 def draw_world(
@@ -112,10 +114,20 @@ def draw_world(
     place = world.members[member]
     grid = place.grid
     if grid is not None:
-        edges = np.indices((grid.cells.shape[0] + 1, grid.cells.shape[1] + 1)) - 0.5
-        x, y = np.moveaxis(grid.cell_to_world(np.moveaxis(edges, 0, -1)), -1, 0)
-        shade = np.where(grid.free, 1.0, np.where(grid.blocked, 0.2, 0.8))
-        axes.pcolormesh(x, y, shade, cmap="gray", vmin=0.0, vmax=1.0, rasterized=True)
+        rows, columns = grid.cells.shape
+        corners = np.indices((rows + 1, columns + 1)) - 0.5
+        places = grid.cell_to_world(np.moveaxis(corners, 0, -1))
+        shade = np.where(grid.blocked, 0.2, 0.8)
+        shade[grid.free] = 1.0
+        axes.pcolormesh(
+            places[..., 0],
+            places[..., 1],
+            shade,
+            cmap="gray",
+            vmin=0.0,
+            vmax=1.0,
+            rasterized=True,
+        )
     if place.bounds is not None:
         low, high = np.array(place.bounds).reshape(2, 2)
         axes.add_patch(
@@ -133,9 +145,11 @@ def _make_patch(world: AnyWorld, body: NDArray[np.float64]) -> Patch:
     if not len(shape.outline):
         return Disc((body[0], body[1]), body[RADIUS], color=STANDING)
     outline = shape.outline * (body[RADIUS] / shape.radius)
-    c = np.cos(body[HEADING])
-    s = np.sin(body[HEADING])
-    corners = outline @ np.array([[c, s], [-s, c]]) + body[:2]
+    corners = geometry.rotate(outline, body[HEADING]) + body[:2]
     return Outline(
-        corners, closed=len(corners) > 2, facecolor=STANDING, edgecolor=STANDING, lw=2
+        corners,
+        closed=len(corners) > 2,
+        facecolor=STANDING,
+        edgecolor=STANDING,
+        lw=2,
     )

@@ -27,9 +27,11 @@ from nics_drl_bridge.sim.world_set import AnyWorld
 
 def _decode_pose(pose: Array) -> Array:
     """Returns a pose (3,) as decoded from a message: the quaternion rounds the heading."""
-    z = math.sin(float(pose[2]) / 2.0)
-    w = math.cos(float(pose[2]) / 2.0)
-    return np.array([pose[0], pose[1], math.atan2(2.0 * (w * z), 1.0 - 2.0 * (z * z))])
+    half = float(pose[2]) / 2.0
+    z = math.sin(half)
+    w = math.cos(half)
+    heading = math.atan2(2.0 * (w * z), 1.0 - 2.0 * (z * z))
+    return np.array([pose[0], pose[1], heading])
 
 
 class SimBackend:
@@ -63,12 +65,10 @@ class SimBackend:
 
     def reset(self, start: Start) -> RobotView:
         """Starts the episode of a seed; see `interface.Backend`."""
-        robots = self.simulator.data.pose.shape[1]
-        self.simulator.reset([start.seed], starts=start.pose.reshape(1, robots, 3))
+        starts = start.pose.reshape(1, -1, 3)
+        self.simulator.reset([start.seed], starts=starts)
         self._now_ns = 0
-        for middleware, pose in zip(
-            self._middlewares, start.pose.reshape(-1, 3), strict=False
-        ):
+        for middleware, pose in zip(self._middlewares, starts[0], strict=False):
             middleware.reset(self._now_ns, pose)
         return self._measure()
 
@@ -86,11 +86,11 @@ class SimBackend:
         facts = {"stamp_ns": self._now_ns, **self._get_truth()}
         view = self._measure()
         if self._middlewares:  # covariance at the time of this view
-            covariances = []
-            for middleware in self._middlewares:
-                covariances.append(middleware.estimator.covariance[:3, :3])
+            covariances = np.array(
+                [one.estimator.covariance[:3, :3] for one in self._middlewares]
+            )
             alone = len(covariances) == 1
-            facts["covariance"] = np.array(covariances[0] if alone else covariances)
+            facts["covariance"] = covariances[0] if alone else covariances
         return view, facts
 
     def facts(self) -> BackendFacts:
@@ -138,9 +138,8 @@ class SimBackend:
             return RobotView(odom, twist, ranges, now * 1e-9, 0.0, 0.0, sensed)
         views = []
         for m, middleware in enumerate(self._middlewares):
-            middleware.odometry(
-                now, now, _decode_pose(data.odom[0, m]), data.twist[0, m].copy()
-            )
+            pose = _decode_pose(data.odom[0, m])
+            middleware.odometry(now, now, pose, data.twist[0, m].copy())
             middleware.scan(now, now, data.ranges[0, m].copy())
             for name, readings in self.simulator.readings.items():
                 middleware.sense(name, now, now, readings[0, m].copy())
@@ -201,7 +200,8 @@ def complete_backend(backend: Any, still: Array) -> Backend:
     if isinstance(backend, Backend):
         return backend
     needed = ("reset", "step", "close")
-    missing = [name for name in needed if not callable(getattr(backend, name, None))]
+    methods = {name: getattr(backend, name, None) for name in needed}
+    missing = [name for name in needed if not callable(methods[name])]
     if missing:
         kind = type(backend).__name__
         lacks = ", no ".join(missing)

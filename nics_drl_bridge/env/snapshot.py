@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.lidar.arrays import Singles
 from nics_drl_bridge.lidar.spec import LidarSpec
 
 
@@ -17,7 +18,7 @@ class Snapshot:
     """One world with its M robots at one time; unknown values are None."""
 
     poses: Array  # (M, 3) x [m], y [m], heading [rad] in `map`; the truth if known
-    ranges: NDArray[np.float32]  # (M, B) [m], REP-117
+    ranges: Singles  # (M, B) [m], REP-117
     bodies: Array  # (K, 7) obstacles, see `sim.scenes.Scene`
     goals: Array  # (G, 2) [m]
     member: int = 0  # member of a world set
@@ -31,17 +32,20 @@ class Snapshot:
 
 def find_goals(memory: Mapping[str, NDArray[Any]]) -> Array:
     """Returns the goals (G, 2) in a task's memory, possibly none."""
-    return np.reshape(memory.get("goal", np.zeros((0, 2))), (-1, 2))
+    goals = memory.get("goal", np.zeros(0))
+    return np.reshape(goals, (-1, 2))
 
 
 def find_gate(info: Mapping[str, Any]) -> str | None:
     """Returns `Snapshot.gate` from the `info` of a step; None without a gate."""
     if "stopped_by" not in info:
         return None
-    return str(info["stopped_by"]) or ("shield" if info["shielded"] else "")
+    if info["stopped_by"]:
+        return str(info["stopped_by"])
+    return "shield" if info["shielded"] else ""
 
 
-def locate_hits(lidar: LidarSpec, pose: Array, ranges: NDArray[np.float32]) -> Array:
+def locate_hits(lidar: LidarSpec, pose: Array, ranges: Singles) -> Array:
     """Returns the points (n, 2) in `map` [m] that a scan (B,) hits from a robot's pose (3,)."""
     mount = geometry.compose(pose, lidar.mount)
     there = np.isfinite(ranges)

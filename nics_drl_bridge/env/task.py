@@ -14,6 +14,7 @@ from nics_drl_bridge.env import guard, kernels
 from nics_drl_bridge.env.kernels import LIMIT, ScanScale
 from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.interface import Array, RobotView
+from nics_drl_bridge.lidar.arrays import Integers, Singles
 from nics_drl_bridge.lidar.sector_kernels import SectorPlan
 from nics_drl_bridge.lidar.sectors import NO_PLAN, ScanLayout, plan_of
 from nics_drl_bridge.lidar.sensor import Sensor
@@ -26,6 +27,9 @@ Flags = NDArray[np.bool_]
 Actions = Literal["continuous", "discrete"]
 # Memory of a task during an episode: name -> array with leading (n, M), or (n,) per world.
 Memory = dict[str, NDArray[Any]]
+Facts = dict[str, NDArray[Any]]  # for `info`, by name
+Info = dict[str, Any]  # Gymnasium's `info`
+Terms = dict[str, Array]  # of the reward, by name
 DRIVES = (
     (0, 0, 0),
     (1, 0, 0),
@@ -55,7 +59,7 @@ class Episodes:
     """Starting episodes in n worlds with M robots."""
 
     # (n,) seeds, the only source of randomness, for `random_kernels.uniform`
-    seeds: NDArray[np.int64]
+    seeds: Integers
     starts: Array  # (n, M, 3) poses of the robots: x [m], y [m], heading [rad] in `map`
     goals: Array  # (n, M, 2) free points drawn by the world, one per robot [m]
 
@@ -64,15 +68,17 @@ class Episodes:
 class Outcome:
     """Outcome of a step: reward terms, whose sum is the reward; ended robots; facts for `info`."""
 
-    terms: dict[str, Array]
+    terms: Terms
     ended: Flags
-    info: dict[str, NDArray[Any]]
+    info: Facts
 
     def stop_rewards(self, ended: Flags) -> "Outcome":
         """Returns the outcome without rewards for robots that had `ended` before the step."""
         if not ended.any():
             return self
-        terms = {name: np.where(ended, 0.0, term) for name, term in self.terms.items()}
+        terms = {}
+        for name, term in self.terms.items():
+            terms[name] = np.where(ended, 0.0, term)
         return Outcome(terms, ended | self.ended, self.info)
 
 
@@ -151,7 +157,8 @@ class Task(ABC):
         """Action space of one robot: Box [-1, 1] of its commands, or Discrete."""
         if self.actions == "discrete":
             return gymnasium.spaces.Discrete(len(self.discrete_commands))
-        return gymnasium.spaces.Box(-1.0, 1.0, (len(self.robot.command),), np.float32)
+        shape = (len(self.robot.command),)
+        return gymnasium.spaces.Box(-1.0, 1.0, shape, np.float32)
 
     @abstractmethod
     def reset(self, episodes: Episodes) -> Memory:
@@ -162,16 +169,14 @@ class Task(ABC):
         """Returns the observation of each robot, (..., O) float32."""
 
     @abstractmethod
-    def reward(
-        self, before: RobotView, after: RobotView, memory: Memory
-    ) -> dict[str, Array]:
+    def reward(self, before: RobotView, after: RobotView, memory: Memory) -> Terms:
         """Returns the terms (...) of the reward for a step."""
 
     @abstractmethod
     def end(self, view: RobotView, memory: Memory) -> Flags:
         """Returns True for robots (...) whose episode is over; a team ends with its last robot."""
 
-    def info(self, view: RobotView, memory: Memory) -> dict[str, NDArray[Any]]:
+    def info(self, view: RobotView, memory: Memory) -> Facts:
         """Returns facts for `info`; an evaluation reads `is_success` and `collision`."""
         return {}
 
@@ -338,36 +343,40 @@ class Task(ABC):
         low = np.asarray(low, np.float32)
         high = np.asarray(high, np.float32)
         return gymnasium.spaces.Box(
-            np.concatenate(
-                [np.zeros(parts, np.float32), low, np.zeros(further, np.float32)]
-            ),
-            np.concatenate(
-                [np.ones(parts, np.float32), high, np.ones(further, np.float32)]
-            ),
+            np.pad(low, (parts, further)),
+            np.pad(high, (parts, further), constant_values=1.0),
             dtype=np.float32,
         )
 
-    def free_share(self, ranges: NDArray[np.float32]) -> Observation:
+    def free_share(self, ranges: Singles) -> Observation:
         """Returns ranges (..., B) as fractions (..., P): 1 free, 0 too close or unknown."""
         return self._look(ranges)[0]
 
-    def touches(self, ranges: NDArray[np.float32]) -> Flags:
+    def touches(self, ranges: Singles) -> Flags:
         """Returns True where a scan (..., B) shows a contact with the footprint, (...)."""
         return self._look(ranges)[1]
 
-    def _look(self, ranges: NDArray[np.float32]) -> tuple[Observation, Flags]:
+    def _look(self, ranges: Singles) -> tuple[Observation, Flags]:
         lead = ranges.shape[:-1]
         beams = ranges.shape[-1]
         parts = beams if self.scan is None else self.scan.sectors
         shares = np.empty((*lead, parts), np.float32)
         touched = np.empty(lead, np.bool_)
-        rows = np.ascontiguousarray(ranges, np.float32).reshape(-1, beams)
-        kernels.looks(shares.reshape(-1, parts), touched.reshape(-1), rows, self.scale)
+        rows = np.ascontiguousarray(ranges, np.float32)
+        kernels.looks(
+            shares.reshape(-1, parts),
+            touched.reshape(-1),
+            rows.reshape(-1, beams),
+            self.scale,
+        )
         return shares, touched
 
     def sensor_shares(self, view: RobotView) -> Observation:
         """Returns the fractions (..., Q) of `sensors`, in their order."""
-        shares = [sensor.shares(view.sensed[sensor.name]) for sensor in self.sensors]
+        shares = []
+        for sensor in self.sensors:
+            readings = view.sensed[sensor.name]
+            shares.append(sensor.shares(readings))
         return np.concatenate(shares, axis=-1)
 
     @property
@@ -382,9 +391,8 @@ class Task(ABC):
         if layout is not None:
             return Sight(layout.angles, np.array(layout.viewpoint), layout.range_max)
         x, y, heading = self.lidar.mount
-        return Sight(
-            self.lidar.angles + heading, np.array([x, y]), self.lidar.range_max
-        )
+        angles = self.lidar.angles + heading
+        return Sight(angles, np.array([x, y]), self.lidar.range_max)
 
     @cached_property
     def plan(self) -> SectorPlan:
@@ -404,12 +412,16 @@ class Task(ABC):
 def _is_finite(given: Any) -> bool:
     """Returns True if all entries are finite numbers."""
     values = np.asarray(given)
-    return values.dtype.kind in "fiub" and bool(np.isfinite(values).all())
+    if values.dtype.kind not in "fiub":
+        return False
+    return bool(np.isfinite(values).all())
 
 
 def discrete_commands(robot: RobotSpec) -> Array:
     """Returns the discrete actions' commands (A, C): `DRIVES`, or each command alone, at limits."""
-    drives = np.array((*DRIVES, *SIDEWAYS) if robot.moves_sideways else DRIVES)
+    drives = np.array(DRIVES)
+    if robot.moves_sideways:
+        drives = np.concatenate([drives, SIDEWAYS])
     if robot.takes_cmd_vel:
         signs = robot.from_fields(drives)
     elif has_textbook(robot):
@@ -447,13 +459,18 @@ def bearing(pose: ArrayLike, points: ArrayLike) -> Array:
     out = np.empty((*ways.shape[:-1], 3))
     headings = np.empty(ways.shape[:-1])
     headings[...] = poses[..., 2]
-    kernels.find_bearings(out.reshape(-1, 3), ways.reshape(-1, 2), headings.reshape(-1))
+    kernels.find_bearings(
+        out.reshape(-1, 3),
+        ways.reshape(-1, 2),
+        headings.reshape(-1),
+    )
     return out
 
 
 def distance(pose: ArrayLike, points: ArrayLike) -> Array:
     """Returns distances (...) [m] from poses (..., 2 or 3) to points (..., 2), broadcast."""
-    offset = np.asarray(points, np.float64) - np.asarray(pose, np.float64)[..., :2]
+    places = np.asarray(pose, np.float64)[..., :2]
+    offset = np.asarray(points, np.float64) - places
     x = offset[..., 0]
     y = offset[..., 1]
     return np.asarray(np.sqrt(x * x + y * y))
@@ -472,21 +489,21 @@ def total(values: Array) -> Array:
     return np.asarray(summed)
 
 
-def find_contact_ranges(
-    robot: RobotSpec, lidar: LidarSpec, margin: float
-) -> NDArray[np.float32]:
+def find_contact_ranges(robot: RobotSpec, lidar: LidarSpec, margin: float) -> Singles:
     """Returns ranges (B,) at which beams leave the footprint plus a margin [m]; -inf if never."""
     x, y, heading = lidar.mount
     angles = lidar.angles + heading
     ray = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     if robot.footprint is not None:
-        leaves = _leaves_outline(ray, np.array(robot.footprint) - [x, y]) + margin
+        corners = np.array(robot.footprint) - [x, y]
+        leaves = _leaves_outline(ray, corners) + margin
     else:
         start = np.array([x, y])
         radius = robot.footprint_radius + margin
         along = ray @ start
         rest = radius * radius - start @ start + along * along
-        leaves = np.where(rest >= 0.0, np.sqrt(np.maximum(rest, 0.0)) - along, -np.inf)
+        half_chord = np.sqrt(np.maximum(rest, 0.0))
+        leaves = np.where(rest >= 0.0, half_chord - along, -np.inf)
     return leaves.astype(np.float32)
 
 
@@ -497,7 +514,10 @@ def _leaves_outline(ray: Array, corners: Array) -> Array:
     steep = ray @ turned.T  # (B, V): each ray and side
     with np.errstate(divide="ignore", invalid="ignore"):
         away = np.sum(corners * turned, axis=-1) / steep
-        where = (away[..., None] * ray[:, None] - corners) * edge
-        share = where.sum(axis=-1) / np.sum(edge * edge, axis=-1)
-    crossed = (steep != 0.0) & (away >= 0.0) & (share >= -1e-9) & (share <= 1.0 + 1e-9)
-    return np.asarray(np.where(crossed, away, -np.inf).max(axis=1))
+        points = away[..., None] * ray[:, None]
+        along = np.sum((points - corners) * edge, axis=-1)
+        share = along / np.sum(edge * edge, axis=-1)
+    crossed = (share >= -1e-9) & (share <= 1.0 + 1e-9)
+    crossed &= (steep != 0.0) & (away >= 0.0)
+    crossings = np.where(crossed, away, -np.inf)
+    return np.asarray(crossings.max(axis=1))

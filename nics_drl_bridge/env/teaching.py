@@ -8,6 +8,7 @@ from nics_drl_bridge.config import Schema
 from nics_drl_bridge.env.guide import Guide
 from nics_drl_bridge.env.task import Outcome
 from nics_drl_bridge.generator import footprint_shape
+from nics_drl_bridge.lidar.arrays import Mask
 from nics_drl_bridge.sim.scenes import Scenes
 from nics_drl_bridge.sim.simulator import FastSimulator
 
@@ -70,10 +71,8 @@ class Teacher:
             ended = ended | unseen
         return Outcome(terms, ended, info)
 
-    def find_repeats(
-        self, over: NDArray[np.bool_], success: NDArray[np.bool_]
-    ) -> NDArray[np.bool_]:
+    def find_repeats(self, over: Mask, success: Mask) -> Mask:
         """Returns True for worlds (N,) that repeat the episode that just ended."""
-        again: NDArray[np.bool_] = over & ~success & (self._tries < self._given.retries)
+        again: Mask = over & ~success & (self._tries < self._given.retries)
         self._tries[over] = np.where(again, self._tries + 1, 0)[over]
         return again

@@ -17,10 +17,14 @@ from nics_drl_bridge.env import guard
 from nics_drl_bridge.env.bridge_env import RENDER_FPS, check_render_mode
 from nics_drl_bridge.env.kernels import compute_episode_seeds
 from nics_drl_bridge.env.registry import make_task
-from nics_drl_bridge.env.snapshot import Snapshot, find_goals
+from nics_drl_bridge.env.snapshot import Snapshot
 from nics_drl_bridge.env.task import (
     Episodes,
+    Facts,
+    Flags,
+    Info,
     Memory,
+    Observation,
     Outcome,
     Task,
     make_team_space,
@@ -30,16 +34,13 @@ from nics_drl_bridge.env.teaching import Teacher, Teaching
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import NS_PER_S, Array, RobotView
+from nics_drl_bridge.lidar.arrays import Integers
 from nics_drl_bridge.lidar.shapes import BODY
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 from nics_drl_bridge.sim.scenes import Scenes
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
-Observation = NDArray[np.float32]
-Flags = NDArray[np.bool_]
-# name -> array whose first dimension is the world, or a nested mapping
-Facts = Mapping[str, Any]
 Rows = slice | NDArray[np.intp] | Flags
 LARGE = 2**20  # size from which `zeros` asks the operating system for new pages [bytes]
 MODES = {
@@ -133,7 +134,9 @@ class BridgeVectorEnv(
             self.model, self.world, num_envs, self.robots, **simulation
         )
         self._teacher: Teacher | None = None
-        self._each = (num_envs, self.robots, *(self.task.action_space.shape or ()))
+        self._each = (num_envs, self.robots, -1)
+        if not self.task.action_space.shape:
+            self._each = (num_envs, self.robots)
         self._period_ns = round(self.model.control_period * NS_PER_S)
         self._allocate()
 
@@ -145,8 +148,8 @@ class BridgeVectorEnv(
         self._reward: Array = np.zeros((count, robots))
         self.ended: Flags = np.zeros((count, robots), np.bool_)
         self._over: Flags = np.zeros(count, np.bool_)
-        self._first: NDArray[np.int64] = np.zeros(count, np.int64)
-        self._episode: NDArray[np.int64] = np.full(count, -1)
+        self._first: Integers = np.zeros(count, np.int64)
+        self._episode: Integers = np.full(count, -1)
         self._starts: Array = np.zeros((count, robots, 3))
         self._bodies: Array = np.zeros((count, self.simulator.sampler.count, BODY))
         self.memory: Memory = {}
@@ -158,7 +161,7 @@ class BridgeVectorEnv(
         self._teacher = Teacher(given, self.simulator)
 
     @property
-    def changing(self) -> dict[str, NDArray[Any]]:
+    def changing(self) -> Facts:
         """Arrays that change from step to step, by name; see `policy.train.checkpoint`."""
         own = {
             "ended": self.ended,
@@ -167,6 +170,7 @@ class BridgeVectorEnv(
             "episode": self._episode,
             "starts": self._starts,
             "bodies": self._bodies,
+            "goals": self.simulator.goals,
         }
         data = {
             # Tensors have no structures, so that checkpoints hold the numbers of these.
@@ -182,7 +186,7 @@ class BridgeVectorEnv(
         *,
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
-    ) -> tuple[Observation, dict[str, Any]]:
+    ) -> tuple[Observation, Info]:
         """Starts an episode in every world; world i takes its seeds from `seed + i`."""
         guard.check_reset(seed, options, self.num_envs)
         super().reset(seed=seed if isinstance(seed, int) else None)
@@ -202,7 +206,8 @@ class BridgeVectorEnv(
         self._begin(np.flatnonzero(chosen), self._out, options)
         infos = add_masks(self._get_known() | self._get_beginnings(), chosen, True)
         self.ready = True
-        return flatten(self._out.copy() if self.copy else self._out), infos
+        out = self._out.copy() if self.copy else self._out
+        return flatten(out), infos
 
     def _begin(
         self,
@@ -251,15 +256,20 @@ class BridgeVectorEnv(
     def _make_view(self, rows: Rows) -> RobotView:
         data = self.simulator.data
         readings = self.simulator.readings
-        seen = data.odom[rows], data.twist[rows], data.ranges[rows]
         return RobotView(
-            *seen, 0.0, 0.0, 0.0, {name: readings[name][rows] for name in readings}
+            data.odom[rows],
+            data.twist[rows],
+            data.ranges[rows],
+            0.0,
+            0.0,
+            0.0,
+            {name: readings[name][rows] for name in readings},
         )
 
     @guard.refuse_after_close
     def step(
         self, actions: NDArray[Any]
-    ) -> tuple[Observation, Array, Flags, Flags, dict[str, Any]]:
+    ) -> tuple[Observation, Array, Flags, Flags, Info]:
         """Advances every world by one control period; see Gymnasium."""
         if not self.ready:
             raise gymnasium.error.ResetNeeded("call reset() before step().")
@@ -277,7 +287,7 @@ class BridgeVectorEnv(
         truncated = (self.simulator.data.steps >= self._limit) & ~begun
         reward = np.where(begun, 0.0, total(self._reward))
         over = terminated | truncated
-        infos: dict[str, Any] = {}
+        infos: Info = {}
         facts = {
             "stamp_ns": self.simulator.data.steps * self._period_ns,
             "true_pose": self._get_row(self.simulator.data.pose).copy(),
@@ -331,27 +341,28 @@ class BridgeVectorEnv(
         self,
         out: Observation,
         over: Flags,
-        facts: dict[str, Any],
-        infos: dict[str, Any],
+        facts: Info,
+        infos: Info,
     ) -> None:
         """Resets ended worlds in `SameStep`; `infos` gets their last observation and info."""
         if over.any():
             shown = np.full(self.num_envs, None, dtype=object)
             # Only for ended worlds, because each needs its own object.
+            rows = flatten(out)
             for n in np.flatnonzero(over):
-                shown[n] = flatten(out)[n].copy()
+                shown[n] = rows[n].copy()
             infos |= add_masks({"final_obs": shown}, over)
             infos |= add_masks({"final_info": self._get_known() | facts}, over, True)
             if self._teacher is not None:
-                success = np.reshape(facts.get("is_success", over), (self.num_envs, -1))
-                self._episode[
-                    self._teacher.find_repeats(over, np.asarray(success.all(axis=1)))
-                ] -= 1
+                success = facts.get("is_success", over)
+                success = success.reshape(self.num_envs, -1).all(axis=1)
+                repeats = self._teacher.find_repeats(over, success)
+                self._episode[repeats] -= 1
             run = self.simulator.run_parts
             run(lambda part: self._begin(part.start + np.flatnonzero(over[part]), out))
         self._tell(infos, facts, over)
 
-    def _tell(self, infos: dict[str, Any], facts: dict[str, Any], begun: Flags) -> None:
+    def _tell(self, infos: Info, facts: Info, begun: Flags) -> None:
         infos |= add_masks(self._get_known(), np.ones_like(begun))
         some = bool(begun.any())
         if some:
@@ -361,25 +372,28 @@ class BridgeVectorEnv(
 
     # Facts as arrays (N, ...) for worlds with one robot, or (N, M, ...) for teams.
 
-    def _get_known(self) -> dict[str, Any]:
-        shown = {
-            name: self._get_row(self.memory[name]).copy() for name in self.task.shown
-        }
-        pose = self._get_row(self.simulator.data.odom).copy()
-        ages = np.zeros((2, self.num_envs))
-        return {**shown, "pose": pose, "scan_age_s": ages[0], "odom_age_s": ages[1]}
+    def _get_known(self) -> Info:
+        known = {}
+        for name in self.task.shown:
+            known[name] = self._get_row(self.memory[name]).copy()
+        known["pose"] = self._get_row(self.simulator.data.odom).copy()
+        known["scan_age_s"] = np.zeros(self.num_envs)
+        known["odom_age_s"] = np.zeros(self.num_envs)
+        return known
 
-    def _get_beginnings(self) -> dict[str, Any]:
-        drawn = {
-            name: self._get_row(values) if values.ndim > 1 else values
-            for name, values in self.simulator.drawn.items()
-        }
-        return {
+    def _get_beginnings(self) -> Info:
+        beginnings: Info = {
             "episode_seed": self.simulator.data.seeds,
             "start": self._get_row(self._starts),
             "bodies": self._bodies,
-            **({"randomisation": drawn} if drawn else {}),
         }
+        drawn = dict(self.simulator.drawn)
+        for name, values in drawn.items():
+            if values.ndim > 1:
+                drawn[name] = self._get_row(values)
+        if drawn:
+            beginnings["randomisation"] = drawn
+        return beginnings
 
     def _get_row(self, rows: NDArray[Any]) -> NDArray[Any]:
         return rows[:, 0] if self.robots == 1 else rows
@@ -407,13 +421,17 @@ class BridgeVectorEnv(
     def snapshot(self, n: int) -> Snapshot:
         """Returns the current state of world n for a picture; `step` does not change its arrays."""
         data = self.simulator.data
-        bodies = self.simulator.obstacles_of(np.array([n]))[0]
-        goals = find_goals(
-            {name: rows[n] for name, rows in self.memory.items() if name == "goal"}
-        )
-        seen = data.pose[n].copy(), data.ranges[n].copy(), bodies, goals.copy()
+        goals = np.zeros((0, 2))
+        if "goal" in self.memory:
+            goals = self.memory["goal"][n].reshape(-1, 2).copy()
         return Snapshot(
-            *seen, int(data.member[n]), int(data.steps[n]), data.odom[n].copy()
+            data.pose[n].copy(),
+            data.ranges[n].copy(),
+            self.simulator.obstacles_of(np.array([n]))[0],
+            goals,
+            int(data.member[n]),
+            int(data.steps[n]),
+            data.odom[n].copy(),
         )
 
 
@@ -451,7 +469,7 @@ def choose_seeds(
     chosen: Flags,
     unnamed: Flags,
     rng: np.random.Generator,
-) -> tuple[NDArray[np.int64], Flags]:
+) -> tuple[Integers, Flags]:
     """Returns the seeds (N,) of a reset, and the mask (N,) of worlds that restart with them.
 
     `seed` is the first world's, or one per world (None keeps its present one), or None for all. For
@@ -462,13 +480,14 @@ def choose_seeds(
         if len(seed) != count:
             raise ConfigError(f"{len(seed)} seeds for {count} worlds; give one each.")
         is_seeded = chosen & np.array([one is not None for one in seed])
-        seeds = np.array([0 if one is None else one for one in seed], np.int64)
+        seeds = np.array([one or 0 for one in seed], np.int64)
     else:
         is_seeded = chosen & (seed is not None)
         seeds = (seed or 0) + np.arange(count, dtype=np.int64)
     new = chosen & unnamed & ~is_seeded
     if new.any():
-        seeds = np.where(new, int(rng.integers(2**31)) + np.arange(count), seeds)
+        first = int(rng.integers(2**31))
+        seeds = np.where(new, first + np.arange(count), seeds)
     return seeds, is_seeded | new
 
 
@@ -487,9 +506,9 @@ def zeros(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
     return np.frombuffer(fresh, dtype).reshape(shape)
 
 
-def add_masks(facts: Facts, mask: Flags, alone: bool = False) -> dict[str, Any]:
+def add_masks(facts: Mapping[str, Any], mask: Flags, alone: bool = False) -> Info:
     """Pairs facts (N, ...) with masks `_name` (N,), like Gymnasium; zero elsewhere if `alone`."""
-    paired: dict[str, Any] = {}
+    paired: Info = {}
     gone = ~mask
     most = 2 * np.count_nonzero(mask) > len(mask)
     for name, values in facts.items():

@@ -17,13 +17,13 @@ from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.lidar.arrays import Integers, Mask, Singles
 from nics_drl_bridge.middleware.uncertainty import Uncertainty, compute_uncertainty_gain
 from nics_drl_bridge.policy.file.stateful import Policy, begin
 from nics_drl_bridge.seeds import check_seeds
 
-Flags = NDArray[np.bool_]
 # actions (N, C) for observations (N, O)
-Act = Callable[[NDArray[np.float32]], NDArray[Any]]
+Act = Callable[[Singles], NDArray[Any]]
 
 FIRST_SEED = defaults.EVALUATION_SEED
 # allowance for odometry drift: a robot stops where it believes its goal is [m]
@@ -164,7 +164,7 @@ def drive(
         raise
 
 
-def is_truly_near(task: Any, poses: Array, goals: Array) -> Flags:
+def is_truly_near(task: Any, poses: Array, goals: Array) -> Mask:
     """Returns True if poses (..., 3) are within `DRIFT_M` of goals (..., 2), or without goals."""
     if not isinstance(task, Navigation):
         return np.ones(np.shape(poses)[:-1], np.bool_)
@@ -204,16 +204,16 @@ def deviation(first: Episode, second: Episode) -> float:
 class Outcomes:
     """Outcomes of E episodes; all arrays are (E,)."""
 
-    seeds: NDArray[np.int64]
-    success: Flags  # the robot truly reached its goal and touched nothing
-    collision: Flags  # the robot truly touched something
-    steps: NDArray[np.int64]  # control periods
+    seeds: Integers
+    success: Mask  # the robot truly reached its goal and touched nothing
+    collision: Mask  # the robot truly touched something
+    steps: Integers  # control periods
     length: Array  # true path length [m]; for a team, the mean over its robots
     reward: Array  # sum over the episode
-    believed: Flags  # the robot believes it reached its goal and touched nothing
+    believed: Mask  # the robot believes it reached its goal and touched nothing
 
     @property
-    def time_out(self) -> Flags:
+    def time_out(self) -> Mask:
         """(E,) True for episodes with neither success nor collision."""
         return ~(self.success | self.collision)
 
@@ -236,9 +236,7 @@ def drive_worlds(env: BridgeVectorEnv, act: Act, seeds: Sequence[int]) -> Outcom
     )
 
 
-def _drive_once(
-    env: BridgeVectorEnv, act: Act, seeds: NDArray[np.int64]
-) -> tuple[Any, ...]:
+def _drive_once(env: BridgeVectorEnv, act: Act, seeds: Integers) -> tuple[Any, ...]:
     """Runs one episode in each world; returns the fields of `Outcomes` except seeds, each (N,)."""
     count = env.num_envs
     driven = _drive_steps(env, act, list(seeds))
@@ -271,7 +269,7 @@ def _drive_once(
     return success, collision, steps, length, reward, believed
 
 
-def _get_flags(info: dict[str, Any], name: str) -> Flags:
+def _get_flags(info: dict[str, Any], name: str) -> Mask:
     """Returns the flags (N, M) of an entry in `info`; (1, 1) False if it is missing."""
     values = np.asarray(info.get(name, [False]), np.bool_)
     return values.reshape(len(values), -1)

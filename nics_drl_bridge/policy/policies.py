@@ -6,13 +6,13 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge.config import read_text
 from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.errors import ConfigError, PolicyError, suggest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.lidar.arrays import Singles
 from nics_drl_bridge.policy.file.contract import MAPPINGS, SUFFIX, shipped
 from nics_drl_bridge.policy.file.stateful import Policy, Stateful
 from nics_drl_bridge.policy.planners.dynamic_window import DynamicWindow
@@ -43,7 +43,7 @@ class StraightToGoal:
     # provides the twists of a robot whose kind does not define them
     model: SimulatorModel | None = None
 
-    def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+    def act(self, observation: Singles) -> Singles:
         """Chooses the action; see `Policy`."""
         robot = self.task.robot
         first = self.task.scan_parts + 1
@@ -93,7 +93,7 @@ class RandomActions:
     task: Navigation
     seed: int = 0
 
-    def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+    def act(self, observation: Singles) -> Singles:
         """Draws the action; see `Policy`."""
         shape = (*observation.shape[:-1], len(self.task.robot.command))
         return self._rng.uniform(-1.0, 1.0, shape).astype(np.float32)

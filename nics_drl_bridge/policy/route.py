@@ -9,12 +9,13 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import Array
+from nics_drl_bridge.lidar.arrays import Mask
 from nics_drl_bridge.lidar.maps import FREE, OCCUPIED, GridMap
 
 CELL = 0.1  # minimum side of a cell [m]
@@ -77,9 +78,7 @@ def _find_cell(grid: GridMap, name: str, point: ArrayLike) -> Cell:
     return row, column
 
 
-def _search(
-    passable: NDArray[np.bool_], cell_costs: Array, start: Cell, goal: Cell
-) -> list[Cell]:
+def _search(passable: Mask, cell_costs: Array, start: Cell, goal: Cell) -> list[Cell]:
     """Returns the cells of the cheapest path, or [] if there is none."""
     shape = passable.shape
     first = int(np.ravel_multi_index(start, shape))
@@ -99,7 +98,7 @@ def _search(
     return [divmod(node, shape[1]) for node in nodes]
 
 
-def _link_cells(passable: NDArray[np.bool_], cell_costs: Array) -> Any:
+def _link_cells(passable: Mask, cell_costs: Array) -> Any:
     """Returns the sparse matrix (rows * columns)^2 of the costs of all links."""
     rows, columns = passable.shape
     nodes = np.arange(passable.size).reshape(passable.shape)

@@ -2,21 +2,22 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import gymnasium
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge.env import kernels, task
 from nics_drl_bridge.env.kernels import LIMIT
 from nics_drl_bridge.env.task import (
     Episodes,
+    Facts,
     Flags,
     Memory,
     Observation,
     Outcome,
     Task,
+    Terms,
 )
 from nics_drl_bridge.interface import Array, RobotView
 
@@ -94,24 +95,15 @@ class Navigation(Task):
 
     def observation(self, view: RobotView, memory: Memory) -> Observation:
         """Returns the observation (..., B + 6) of a view, for goals (..., 2) in `map`."""
-        out = np.empty(
-            (*view.pose.shape[:-1], *self.observation_space.shape), np.float32
-        )
-        self._observe(out, view.pose, view, memory)
-        return out
+        return self._observe(view.pose, view, memory)[0]
 
     def judge(
         self, view: RobotView, memory: Memory, before: RobotView | None = None
     ) -> GoalProgress:
         """Determines which robots are at their goals and which touch something."""
-        out = np.empty(
-            (*view.pose.shape[:-1], *self.observation_space.shape), np.float32
-        )
-        return self._observe(out, (before or view).pose, view, memory)
+        return self._observe((before or view).pose, view, memory)[1]
 
-    def reward(
-        self, before: RobotView, after: RobotView, memory: Memory
-    ) -> dict[str, Array]:
+    def reward(self, before: RobotView, after: RobotView, memory: Memory) -> Terms:
         """Returns the terms (...,) whose sum is the reward of a step."""
         return self._make_terms(self.judge(after, memory, before))
 
@@ -120,7 +112,7 @@ class Navigation(Task):
         progress = self.judge(view, memory)
         return progress.reached | progress.touched
 
-    def info(self, view: RobotView, memory: Memory) -> dict[str, NDArray[Any]]:
+    def info(self, view: RobotView, memory: Memory) -> Facts:
         """Returns success and contact of each robot."""
         return self._make_facts(self.judge(view, memory))
 
@@ -128,16 +120,23 @@ class Navigation(Task):
         self, out: Observation, before: RobotView, after: RobotView, memory: Memory
     ) -> Outcome:
         """Computes all of the above in one pass over each scan; `out` is contiguous."""
-        progress = self._observe(out, before.pose, after, memory)
+        _, progress = self._observe(before.pose, after, memory, out)
         over = progress.reached | progress.touched
         return Outcome(self._make_terms(progress), over, self._make_facts(progress))
 
     def _observe(
-        self, out: Observation, before: Array, now: RobotView, memory: Memory
-    ) -> GoalProgress:
+        self,
+        before: Array,
+        now: RobotView,
+        memory: Memory,
+        out: Observation | None = None,
+    ) -> tuple[Observation, GoalProgress]:
+        """Returns the observation, which is written to `out` if given, and the progress."""
         lead = now.pose.shape[:-1]
         approach = np.empty(lead)
         flags = np.empty((*lead, 3), np.bool_)
+        if out is None:
+            out = np.empty((*lead, *self.observation_space.shape), np.float32)
         own = out
         if self.sensors:
             own = np.empty((*lead, self.scan_parts + 6), np.float32)
@@ -155,9 +154,10 @@ class Navigation(Task):
         )
         if self.sensors:
             np.concatenate([own, self.sensor_shares(now)], axis=-1, out=out)
-        return GoalProgress(approach, flags[..., 0], flags[..., 1], flags[..., 2])
+        reached, touched, succeeded = np.moveaxis(flags, -1, 0)
+        return out, GoalProgress(approach, reached, touched, succeeded)
 
-    def _make_terms(self, progress: GoalProgress) -> dict[str, Array]:
+    def _make_terms(self, progress: GoalProgress) -> Terms:
         return {
             "progress": self.progress_reward * progress.approach,
             "time": np.full(progress.approach.shape, self.time_reward, np.float64),
@@ -166,5 +166,5 @@ class Navigation(Task):
         }
 
     @staticmethod
-    def _make_facts(progress: GoalProgress) -> dict[str, NDArray[Any]]:
+    def _make_facts(progress: GoalProgress) -> Facts:
         return {"is_success": progress.succeeded, "collision": progress.touched}

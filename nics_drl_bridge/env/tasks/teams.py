@@ -10,23 +10,45 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.env import task
 from nics_drl_bridge.env.kernels import LIMIT
-from nics_drl_bridge.env.task import Episodes, Flags, Memory, Observation, Task
+from nics_drl_bridge.env.task import (
+    Episodes,
+    Facts,
+    Flags,
+    Memory,
+    Observation,
+    Task,
+    Terms,
+)
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import Array, RobotView
 
+TWIST_LOW = [-LIMIT] * 3
+TWIST_HIGH = [LIMIT] * 3
 
-def pair_points(pose: Array, points: Array) -> tuple[Array, Array]:
-    """Pairs each robot (..., M, 3) with each point (..., P, 2), broadcast to (..., M, P)."""
-    return pose[..., None, :], points[..., None, :, :]
+
+def find_bearings(pose: Array, points: Array) -> Array:
+    """Returns `task.bearing` (..., M, P, 3) of each point (..., P, 2) from each robot."""
+    return task.bearing(pose[..., None, :], points[..., None, :, :])
+
+
+def find_distances(pose: Array, points: Array) -> Array:
+    """Returns the distance (..., M, P) [m] of each point (..., P, 2) from each robot."""
+    return task.distance(pose[..., None, :], points[..., None, :, :])
 
 
 def drop_own(of_all: Array) -> Array:
-    """Drops the diagonal of (..., M, M, F), which leaves rows of the others, (..., M, M - 1, F)."""
+    """Drops the diagonal of (..., M, M, F), and joins the rows of the others."""
     *lead, count, _, width = of_all.shape
     # Without its first entry, the flat row of pairs has a diagonal entry after each `count` others.
-    flat = of_all.reshape(*lead, count * count, width)[..., 1:, :]
-    kept = flat.reshape(*lead, count - 1, count + 1, width)[..., :-1, :]
-    return np.asarray(kept.reshape(*lead, count, count - 1, width))
+    row = of_all.reshape(*lead, count * count, width)
+    groups = row[..., 1:, :].reshape(*lead, count - 1, count + 1, width)
+    kept = groups[..., :-1, :]
+    return kept.reshape(*lead, count, -1)
+
+
+def join_parts(*parts: NDArray[Any]) -> Observation:
+    """Joins the parts of an observation."""
+    return np.concatenate(parts, axis=-1, dtype=np.float32, casting="same_kind")
 
 
 @dataclass(frozen=True)
@@ -89,13 +111,10 @@ class CooperativeReaching(Task):
     @cached_property
     def observation_space(self) -> gymnasium.spaces.Box:
         """Box of one robot's observation."""
-        place = [LIMIT, 1.0, 1.0]
-        low = [0.0, -1.0, -1.0]
         mates = self.robots - 1
-        return self.box(
-            [*[*low, 0.0] * self.robots, *low * mates, *[-LIMIT] * 3],
-            [*[*place, 1.0] * self.robots, *place * mates, *[LIMIT] * 3],
-        )
+        low = [0.0, -1.0, -1.0, 0.0] * self.robots + [0.0, -1.0, -1.0] * mates
+        high = [LIMIT, 1.0, 1.0, 1.0] * self.robots + [LIMIT, 1.0, 1.0] * mates
+        return self.box(low + TWIST_LOW, high + TWIST_HIGH)
 
     def reset(self, episodes: Episodes) -> Memory:
         """Returns a memory with no goal reached; `newly` marks those reached in the last step."""
@@ -105,46 +124,35 @@ class CooperativeReaching(Task):
 
     def update(self, before: RobotView, after: RobotView, memory: Memory) -> None:
         """Marks the goals that a robot has reached."""
-        there = (
-            task.distance(*pair_points(after.pose, memory["goal"])) < self.goal_radius
-        ).any(axis=-2)
+        distances = find_distances(after.pose, memory["goal"])
+        there = (distances < self.goal_radius).any(axis=-2)
         memory["newly"][...] = there & ~memory["reached"]
         memory["reached"] |= there
 
     def observation(self, view: RobotView, memory: Memory) -> Observation:
         """Returns the observation (..., M, O) of views (..., M)."""
-        goals = task.bearing(*pair_points(view.pose, memory["goal"]))
-        reached = np.broadcast_to(
-            memory["reached"][..., None, :, None], (*goals.shape[:-1], 1)
-        )
-        lead = view.pose.shape[:-1]
-        parts = [
+        goals = find_bearings(view.pose, memory["goal"])
+        reached = memory["reached"][..., None, :, None]
+        reached = np.broadcast_to(reached, (*goals.shape[:-1], 1))
+        goals = np.concatenate([goals, reached], axis=-1)
+        mates = find_bearings(view.pose, view.pose[..., :2])
+        return join_parts(
             self.free_share(view.ranges),
-            np.concatenate([goals, reached], axis=-1).reshape(*lead, -1),
-            drop_own(task.bearing(*pair_points(view.pose, view.pose[..., :2]))).reshape(
-                *lead, -1
-            ),
+            goals.reshape(*view.pose.shape[:-1], -1),
+            drop_own(mates),
             task.limited(view.twist),
-        ]
-        return np.concatenate(parts, axis=-1, dtype=np.float32, casting="same_kind")
+        )
 
-    def reward(
-        self, before: RobotView, after: RobotView, memory: Memory
-    ) -> dict[str, Array]:
+    def reward(self, before: RobotView, after: RobotView, memory: Memory) -> Terms:
         """Returns the reward terms (..., M)."""
         lead = after.pose.shape[:-1]
-        ways = (
-            task.distance(*pair_points(view.pose, memory["goal"]))
-            for view in (before, after)
-        )
-        gaps = [way.min(axis=-2) for way in ways]
+        gap_before = find_distances(before.pose, memory["goal"]).min(axis=-2)
+        gap_after = find_distances(after.pose, memory["goal"]).min(axis=-2)
         # A goal reached in this step still earns its last approach.
-        approach = np.where(
-            ~memory["reached"] | memory["newly"], gaps[0] - gaps[1], 0.0
-        )
-        share = 1.0 / self.robots
-        nearer = task.total(approach)
+        is_open = ~memory["reached"] | memory["newly"]
+        nearer = task.total(np.where(is_open, gap_before - gap_after, 0.0))
         newly = task.total(memory["newly"].astype(np.float64))
+        share = 1.0 / self.robots
         return {
             "progress": np.full(lead, self.progress_reward * share * nearer[..., None]),
             "time": np.full(lead, self.time_reward),
@@ -154,16 +162,14 @@ class CooperativeReaching(Task):
 
     def end(self, view: RobotView, memory: Memory) -> Flags:
         """Returns True where a robot touches something, or all goals are reached."""
-        return np.asarray(
-            self.touches(view.ranges) | memory["reached"].all(-1, keepdims=True)
-        )
+        all_reached = memory["reached"].all(-1, keepdims=True)
+        return np.asarray(self.touches(view.ranges) | all_reached)
 
-    def info(self, view: RobotView, memory: Memory) -> dict[str, NDArray[Any]]:
+    def info(self, view: RobotView, memory: Memory) -> Facts:
         """Returns success of the team, contacts, and goals reached so far (..., M)."""
+        all_reached = memory["reached"].all(-1, keepdims=True)
         return {
-            "is_success": np.full(
-                view.pose.shape[:-1], memory["reached"].all(-1, keepdims=True)
-            ),
+            "is_success": np.full(view.pose.shape[:-1], all_reached),
             "collision": self.touches(view.ranges),
             "reached": memory["reached"].copy(),
         }
@@ -244,11 +250,10 @@ class PursuitEvasion(Task):
     @cached_property
     def observation_space(self) -> gymnasium.spaces.Box:
         """Box of one robot's observation."""
-        other = self.robots - 1
-        return self.box(
-            [*[0.0, -1.0, -1.0, 0.0, 0.0] * other, 0.0, *[-LIMIT] * 3],
-            [*[LIMIT, 1.0, 1.0, 1.0, 1.0] * other, 1.0, *[LIMIT] * 3],
-        )
+        others = self.robots - 1
+        low = [0.0, -1.0, -1.0, 0.0, 0.0] * others
+        high = [LIMIT, 1.0, 1.0, 1.0, 1.0] * others
+        return self.box([*low, 0.0, *TWIST_LOW], [*high, 1.0, *TWIST_HIGH])
 
     def reset(self, episodes: Episodes) -> Memory:
         """Returns a memory with no robot out; `newly` marks those caught in the last step."""
@@ -266,44 +271,44 @@ class PursuitEvasion(Task):
 
     def _find_gaps(self, view: RobotView, memory: Memory) -> Array:
         """Returns distances (..., M) [m] to the nearest active robot of the other side, or inf."""
-        between = task.distance(*pair_points(view.pose, view.pose[..., :2]))
-        foe = (self.pursues[:, None] != self.pursues) & ~memory["out"][..., None, :]
-        return np.asarray(np.where(foe, between, np.inf).min(axis=-1))
+        distances = find_distances(view.pose, view.pose[..., :2])
+        is_active = ~memory["out"][..., None, :]
+        is_foe = (self.pursues[:, None] != self.pursues) & is_active
+        gaps = np.where(is_foe, distances, np.inf)
+        return np.asarray(gaps.min(axis=-1))
 
     def observation(self, view: RobotView, memory: Memory) -> Observation:
         """Returns the observation (..., M, O) of views (..., M)."""
         lead = view.pose.shape[:-1]
-        mates = np.broadcast_to(
-            self.pursues[:, None] == self.pursues, (*lead, self.robots)
-        )
-        out = np.broadcast_to(memory["out"][..., None, :], (*lead, self.robots))
-        places = task.bearing(*pair_points(view.pose, view.pose[..., :2]))
-        known = np.concatenate([places, mates[..., None], out[..., None]], axis=-1)
-        parts: list[NDArray[Any]] = [
+        square = (*lead, self.robots)
+        are_mates = np.broadcast_to(self.pursues[:, None] == self.pursues, square)
+        are_out = np.broadcast_to(memory["out"][..., None, :], square)
+        places = find_bearings(view.pose, view.pose[..., :2])
+        others = [places, are_mates[..., None], are_out[..., None]]
+        return join_parts(
             self.free_share(view.ranges),
-            drop_own(known).reshape(*lead, -1),
+            drop_own(np.concatenate(others, axis=-1)),
             np.broadcast_to(self.pursues[:, None], (*lead, 1)),
             task.limited(view.twist),
-        ]
-        return np.concatenate(parts, axis=-1, dtype=np.float32, casting="same_kind")
+        )
 
-    def reward(
-        self, before: RobotView, after: RobotView, memory: Memory
-    ) -> dict[str, Array]:
+    def reward(self, before: RobotView, after: RobotView, memory: Memory) -> Terms:
         """Returns the reward terms (..., M)."""
         # Evaders caught in this step still count in it.
-        known = {**memory, "out": memory["out"] & ~memory["newly"]}
-        gap = [self._find_gaps(view, known) for view in (before, after)]
-        free = np.isfinite(gap[0]) & np.isfinite(gap[1])
-        nearer = np.where(
-            free, np.where(free, gap[0], 0.0) - np.where(free, gap[1], 0.0), 0.0
-        )
+        known = dict(memory)
+        known["out"] = memory["out"] & ~memory["newly"]
+        gap_before = self._find_gaps(before, known)
+        gap_after = self._find_gaps(after, known)
+        has_foe = np.isfinite(gap_before) & np.isfinite(gap_after)
+        nearer = np.zeros(gap_before.shape)
+        np.subtract(gap_before, gap_after, out=nearer, where=has_foe)
         side = np.where(self.pursues, 1.0, -1.0)
-        captures = memory["newly"].sum(axis=-1)[..., None]
-        newly = np.where(self.pursues, captures, -1.0 * memory["newly"])
+        newly = memory["newly"]
+        captures = newly.sum(axis=-1, keepdims=True)
+        captures = np.where(self.pursues, captures, -1.0 * newly)
         return {
             "pursuit": self.pursuit_reward * side * nearer,
-            "capture": self.capture_reward * newly,
+            "capture": self.capture_reward * captures,
             "time": np.full(nearer.shape, self.time_reward * side),
             "collision": np.multiply(
                 self.collision_reward, self._find_collided(after, memory)
@@ -316,15 +321,14 @@ class PursuitEvasion(Task):
     def end(self, view: RobotView, memory: Memory) -> Flags:
         """Returns True for robots that are out, or for all once a side has none left."""
         out = memory["out"]
-        over = [
-            out[..., side].all(-1, keepdims=True)
-            for side in (self.pursues, ~self.pursues)
-        ]
-        return np.asarray(out | over[0] | over[1])
+        pursuers_out = out[..., self.pursues].all(-1, keepdims=True)
+        evaders_out = out[..., ~self.pursues].all(-1, keepdims=True)
+        return np.asarray(out | pursuers_out | evaders_out)
 
-    def info(self, view: RobotView, memory: Memory) -> dict[str, NDArray[Any]]:
+    def info(self, view: RobotView, memory: Memory) -> Facts:
         """Returns success of each robot's side, contacts, and captures (..., M)."""
-        won = memory["caught"][..., ~self.pursues].all(-1, keepdims=True)
+        evaders_caught = memory["caught"][..., ~self.pursues]
+        won = evaders_caught.all(-1, keepdims=True)
         return {
             "is_success": np.asarray(won == self.pursues),
             "collision": self._find_collided(view, memory),

@@ -65,6 +65,11 @@ def part_size(part: InputPart, scan_parts: int, outputs: Mapping[str, int]) -> i
     return size * part.history
 
 
+def _is_number(output: NDArray[Any]) -> bool:
+    """Returns True for one integer, which chooses by its value."""
+    return np.issubdtype(output.dtype, np.integer) and output.size == 1
+
+
 class Adapter:
     """A foreign network with a mapping, for a robot and the layout of an observation.
 
@@ -91,8 +96,9 @@ class Adapter:
         }
         self._names = [end.name for end in session.get_outputs()]
         self._check_names()
-        outputs = self._run_network(self._empty_inputs)
-        self._output_sizes = {name: made.size for name, made in outputs.items()}
+        # of zeros
+        self._outputs = self._run_network(self._empty_inputs)
+        self._output_sizes = {name: made.size for name, made in self._outputs.items()}
         self._check_inputs()
         self._commands = self._check_commands()
         _, entries = self._step(np.zeros(scan_parts + AFTER_SCAN), {})
@@ -207,7 +213,10 @@ class Adapter:
 
     def _check_inputs(self) -> None:
         for name, mapped in self._mapping.inputs.items():
-            sizes = [self._size_of(part) for part in mapped.parts]
+            sizes = [
+                part_size(part, self._scan_parts, self._output_sizes)
+                for part in mapped.parts
+            ]
             empty = self._empty_inputs[name]
             if sum(sizes) != empty.size:
                 parts = zip(mapped.parts, sizes, strict=True)
@@ -243,7 +252,13 @@ class Adapter:
         outputs = self._mapping.outputs
         choices = self._mapping.choices
         if choices is not None:
-            self._check_choices(choices)
+            size = self._outputs[choices.of].size
+            count = len(choices.commands)
+            if size != count and not _is_number(self._outputs[choices.of]):
+                reason = (
+                    f"are {count}, but the output {choices.of!r} has {size} elements."
+                )
+                raise self._fault("choices.commands", reason)
             named = {name for row in choices.commands for name in row}
             return self._names_of(named, "choices")
         names = self._names_of(outputs, "outputs")
@@ -287,20 +302,6 @@ class Adapter:
                     reason = f"{part.of} is only available to {owners}."
                     raise self._fault(f"inputs.{name}", reason)
         return commands
-
-    def _check_choices(self, choices: Choices) -> None:
-        size = self._output_sizes[choices.of]
-        count = len(choices.commands)
-        if size != count and not (size == 1 and self._chooses_by_number(choices)):
-            reason = f"are {count}, but the output {choices.of!r} has {size} elements."
-            raise self._fault("choices.commands", reason)
-
-    def _chooses_by_number(self, choices: Choices) -> bool:
-        ends = {end.name: end.type for end in self._session.get_outputs()}
-        return np.issubdtype(DTYPES.get(ends[choices.of], np.float32), np.integer)
-
-    def _size_of(self, part: InputPart) -> int:
-        return part_size(part, self._scan_parts, self._output_sizes)
 
     # Inputs.
 
@@ -398,7 +399,7 @@ class Adapter:
         nothing = np.full(len(self._commands), np.nan)  # never sent to a robot
         if np.isnan(output.astype(float)).any():
             return nothing
-        if np.issubdtype(output.dtype, np.integer) and output.size == 1:
+        if _is_number(output):
             index = int(output[0])
         else:
             index = int(output.argmax())

@@ -6,12 +6,12 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.lidar.arrays import Integers, Singles
 from nics_drl_bridge.policy.planners import local_map as maps
 from nics_drl_bridge.policy.planners.local_map import (
     ARRIVED_M,
@@ -74,7 +74,7 @@ class DynamicWindow:
     def __post_init__(self) -> None:
         _ = self.ahead
 
-    def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+    def act(self, observation: Singles) -> Singles:
         """Chooses the action; see `Policy`."""
         parts = maps.split_observation(self.task, observation)
         chosen = np.empty(len(parts[0]), np.int64)
@@ -156,7 +156,7 @@ class DynamicWindow:
 
 @kernel(allocates=True)
 def choose_twists(
-    out: NDArray[np.int64],
+    out: Integers,
     scans: Array,
     goals: Array,
     twists: Array,

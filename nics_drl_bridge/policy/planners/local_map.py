@@ -8,15 +8,14 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge.env.guide_kernels import update_ways
 from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.geometry import Array, compute_depths
 from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.lidar.arrays import Integers, Singles
 from nics_drl_bridge.robot.spec import RobotSpec
 
-Grid = NDArray[np.float32]
 # distance to the goal at which a robot has arrived
 ARRIVED_M = 0.15
 APART_M = 0.02  # hits closer than this to the previous one are left out
@@ -54,9 +53,9 @@ class FootprintDiscs(NamedTuple):
 class LocalMap(NamedTuple):
     """Square map around `base_link`; the first index runs along y."""
 
-    distances: Grid  # (G, G) distance to the nearest hit, at most `reach` [m]
+    distances: Singles  # (G, G) distance to the nearest hit, at most `reach` [m]
     # (G / COARSE, G / COARSE) path length to the goal, weighted near obstacles [m]
-    ways: Grid
+    ways: Singles
     cell: float  # side of a cell of `distances` [m]
     reach: float  # maximum of `distances` [m]
 
@@ -85,7 +84,7 @@ class MapMaker(NamedTuple):
     clearance: Clearance
     map: LocalMap
     hits: Array  # (P, 2) [m]
-    prices: Grid  # like `LocalMap.ways`
+    prices: Singles  # like `LocalMap.ways`
 
 
 @kernel(allocates=True)
@@ -160,7 +159,7 @@ def _find_span(middle: float, reach: float, cell: float, size: int) -> tuple[int
 
 @kernel
 def interpolate(
-    grid: NDArray[np.float32], cell: float, x: float, y: float, outside: float
+    grid: Singles, cell: float, x: float, y: float, outside: float
 ) -> float:
     """Returns the value of a grid at a point, bilinear between cell centres."""
     size = grid.shape[0]
@@ -173,7 +172,7 @@ def interpolate(
 
 @kernel(inline=True)
 def interpolate_inside(
-    grid: NDArray[np.float32], u: float | np.float32, v: float | np.float32
+    grid: Singles, u: float | np.float32, v: float | np.float32
 ) -> float:
     """Returns the value of a grid at column u and row v (in cells), which lie within it."""
     j = np.uint32(np.int32(u))
@@ -187,7 +186,7 @@ def interpolate_inside(
 
 
 @kernel
-def find_ways(around: Situation, prices: NDArray[np.float32]) -> None:
+def find_ways(around: Situation, prices: Singles) -> None:
     """Writes a map's path lengths to the goal; prices (G / COARSE, G / COARSE) are scratch.
 
     Solves the eikonal equation by fast sweeping (Zhao 2005). Beyond the map, paths are straight.
@@ -279,7 +278,7 @@ def find_contact_limit(around: Situation) -> float:
 
 
 def split_observation(
-    task: Navigation, observation: NDArray[np.float32]
+    task: Navigation, observation: Singles
 ) -> tuple[Array, Array, Array]:
     """Returns scans (N, P) as fractions, goals (N, 2) in `base_link` [m], and twists (N, 3)."""
     parts = task.scan_parts
@@ -336,7 +335,7 @@ def _cover(lattice: Array, depth: Array) -> list[Array]:
     return chosen
 
 
-def _count_covered(centres: Array, radii: Array, points: Array) -> NDArray[np.int64]:
+def _count_covered(centres: Array, radii: Array, points: Array) -> Integers:
     """Returns the number of points (M, 2) within each disc (N,)."""
     count = np.zeros(len(centres), np.int64)
     for first in range(0, len(points), ROWS):

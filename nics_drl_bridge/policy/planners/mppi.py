@@ -13,7 +13,6 @@ from itertools import pairwise, product
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge.env.task import still
 from nics_drl_bridge.env.tasks.navigation import Navigation
@@ -21,6 +20,7 @@ from nics_drl_bridge.generator import BUILTIN_SEED, CONTROL_PERIOD_S, SimulatorM
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.lidar.arrays import Integers, Mask, Singles
 from nics_drl_bridge.policy.planners import local_map as maps
 from nics_drl_bridge.policy.planners.local_map import (
     ARRIVED_M,
@@ -94,7 +94,7 @@ class Sampling(NamedTuple):
     noise: Array
     between: Array  # (H, Q) weights of the knots in the action of each period
     # (C,) True for commands that are held while the robot stops
-    holds: NDArray[np.bool_]
+    holds: Mask
     rest: Array  # (C,) value of the other commands
     # maximum number of periods for the stop; 0 if the robot can stop within half a rollout
     stop: int
@@ -116,7 +116,7 @@ class RollOuts(NamedTuple):
     cost: Array  # (K,)
     way: Array  # (K,)
     # (K,) period of the contact or arrival; negative: neither
-    ended: NDArray[np.int64]
+    ended: Integers
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ class Mppi:
     def __post_init__(self) -> None:
         _ = self._sampling
 
-    def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+    def act(self, observation: Singles) -> Singles:
         """Plans the actions on all cores, each with its own memory; see `Policy`."""
         parts = maps.split_observation(self.task, observation)
         actions = np.empty((len(parts[0]), len(self.task.robot.command)))

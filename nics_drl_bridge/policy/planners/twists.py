@@ -3,12 +3,12 @@
 import itertools
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.lidar.arrays import Singles
 from nics_drl_bridge.robot.kinds import compute_steady_twist
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -54,7 +54,7 @@ def find_steady_twists(
     return geometry.log(moved) / kinematics.dt
 
 
-def scale_to_actions(task: Navigation, commands: Array) -> NDArray[np.float32]:
+def scale_to_actions(task: Navigation, commands: Array) -> Singles:
     """Returns the continuous actions (..., C) for commands (..., C), clamped to [-1, 1]."""
     low, high = task.command_limits
     return np.clip(2.0 * (commands - low) / (high - low) - 1.0, -1.0, 1.0).astype(

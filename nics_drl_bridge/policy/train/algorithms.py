@@ -24,6 +24,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.lidar.arrays import Mask, Singles
 from nics_drl_bridge.policy.evaluation import Act
 from nics_drl_bridge.policy.train.checkpoint import RECENT, Watch, tensors
 from nics_drl_bridge.policy.train.settings import TrainingSettings
@@ -81,7 +82,7 @@ def check_serves(settings: TrainingSettings, env: BridgeVectorEnv) -> None:
 def make_act(algorithm: BaseAlgorithm | Actor) -> Act:
     """Returns the deterministic policy of an algorithm, without exploration noise."""
 
-    def act(observations: NDArray[np.float32]) -> NDArray[Any]:
+    def act(observations: Singles) -> NDArray[Any]:
         seen = torch.as_tensor(observations)
         with torch.no_grad():
             if isinstance(algorithm, Actor):
@@ -116,9 +117,9 @@ class Normaliser(BaseFeaturesExtractor):
         )
 
 
-def find_shares(space: gymnasium.spaces.Box) -> NDArray[np.float32]:
+def find_shares(space: gymnasium.spaces.Box) -> Singles:
     """Returns 1 for the observations (O,) of a space that lie between 0 and 1, else 0."""
-    shares: NDArray[np.bool_] = (space.low == 0.0) & (space.high == 1.0)
+    shares: Mask = (space.low == 0.0) & (space.high == 1.0)
     return shares.astype(np.float32)
 
 
@@ -210,7 +211,10 @@ def make_layers(
 
 
 class Sb3Training:
-    """A training with a Stable-Baselines3 algorithm; `normaliser` is mean and deviation (O,)."""
+    """A training with a Stable-Baselines3 algorithm; `normaliser` is mean and deviation (O,).
+
+    Raises: see `check_serves`.
+    """
 
     def __init__(
         self,
@@ -219,10 +223,54 @@ class Sb3Training:
         seed: int,
         normaliser: tuple[Array, Array],
     ) -> None:
-        self.policy = make_algorithm(settings, env, seed, normaliser)
-        self.networks = self.policy.policy
+        check_serves(settings, env.envs[0])
+        torch.set_num_threads(settings.threads)
         self._total = settings.steps
         self._log_every = LOG_EVERY[settings.algorithm]
+        shared: dict[str, Any] = {
+            "seed": seed,
+            "device": "cpu",
+            "stats_window_size": RECENT,
+        }
+        network: dict[str, Any] = {
+            "net_arch": list(settings.hidden),
+            "features_extractor_class": Normaliser,
+            "features_extractor_kwargs": {"mean": normaliser[0], "std": normaliser[1]},
+        }
+        if settings.algorithm == "sac":
+            sac = settings.sac
+            self.policy: BaseAlgorithm = SAC(
+                "MlpPolicy",
+                env,
+                sac.learning_rate,
+                buffer_size=sac.buffer,
+                learning_starts=sac.begin_after,
+                batch_size=sac.batch,
+                tau=sac.soft_update,
+                gamma=sac.discount,
+                train_freq=1,
+                gradient_steps=sac.updates,
+                policy_kwargs=network,
+                **shared,
+            )
+        else:
+            ppo = settings.ppo
+            network |= {"log_std_init": ppo.log_std, "activation_fn": torch.nn.Tanh}
+            self.policy = PPO(
+                "MlpPolicy",
+                env,
+                lambda remaining: ppo.learning_rate * max(remaining, LEAST_RATE),
+                n_steps=ppo.rollout,
+                batch_size=ppo.batch,
+                n_epochs=ppo.epochs,
+                gamma=ppo.discount,
+                gae_lambda=ppo.gae_lambda,
+                clip_range=ppo.clip,
+                ent_coef=ppo.entropy,
+                policy_kwargs=network,
+                **shared,
+            )
+        self.networks = self.policy.policy
 
     @property
     def steps(self) -> int:
@@ -244,6 +292,8 @@ class Sb3Training:
             buffer: Any = algorithm.replay_buffer
             rows = {name: getattr(buffer, name)[: buffer.size()] for name in REPLAYED}
             replay = {"pos": buffer.pos, "full": buffer.full, **tensors(rows)}
+        shared = np.random.get_state(legacy=False)  # noqa: NPY002 - the library uses it
+        drawn = algorithm.action_space.np_random.bit_generator.state
         return {
             "parameters": algorithm.get_parameters(),
             "variables": {  # not in the networks: SAC's temperature
@@ -254,7 +304,11 @@ class Sb3Training:
             "recent": list(algorithm.ep_success_buffer or ()),
             "last": tensors({name: getattr(algorithm, name) for name in LAST}),
             "replay": replay,
-            "random": _get_random_state(algorithm),
+            "random": {
+                "torch": torch.get_rng_state(),
+                "numpy": json.dumps(shared, default=lambda array: array.tolist()),
+                "actions": json.dumps(drawn),
+            },
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -277,81 +331,14 @@ class Sb3Training:
             buffer.full = replay["full"]
             for name in REPLAYED:
                 getattr(buffer, name)[: buffer.size()] = replay[name].numpy()
-        _set_random_state(algorithm, state["random"])
-
-
-def make_algorithm(
-    settings: TrainingSettings,
-    env: TrainVecEnv,
-    seed: int,
-    normaliser: tuple[Array, Array],
-) -> BaseAlgorithm:
-    """Makes an untrained algorithm from mean and deviation (O,). Raises: see `check_serves`."""
-    check_serves(settings, env.envs[0])
-    torch.set_num_threads(settings.threads)
-    shared: dict[str, Any] = {
-        "seed": seed,
-        "device": "cpu",
-        "stats_window_size": RECENT,
-    }
-    network: dict[str, Any] = {
-        "net_arch": list(settings.hidden),
-        "features_extractor_class": Normaliser,
-        "features_extractor_kwargs": {"mean": normaliser[0], "std": normaliser[1]},
-    }
-    if settings.algorithm == "sac":
-        sac = settings.sac
-        return SAC(
-            "MlpPolicy",
-            env,
-            sac.learning_rate,
-            buffer_size=sac.buffer,
-            learning_starts=sac.begin_after,
-            batch_size=sac.batch,
-            tau=sac.soft_update,
-            gamma=sac.discount,
-            train_freq=1,
-            gradient_steps=sac.updates,
-            policy_kwargs=network,
-            **shared,
-        )
-    ppo = settings.ppo
-    network |= {"log_std_init": ppo.log_std, "activation_fn": torch.nn.Tanh}
-    return PPO(
-        "MlpPolicy",
-        env,
-        lambda remaining: ppo.learning_rate * max(remaining, LEAST_RATE),
-        n_steps=ppo.rollout,
-        batch_size=ppo.batch,
-        n_epochs=ppo.epochs,
-        gamma=ppo.discount,
-        gae_lambda=ppo.gae_lambda,
-        clip_range=ppo.clip,
-        ent_coef=ppo.entropy,
-        policy_kwargs=network,
-        **shared,
-    )
-
-
-def _get_random_state(algorithm: BaseAlgorithm) -> dict[str, Any]:
-    shared = np.random.get_state(legacy=False)  # noqa: NPY002 - Stable-Baselines3 uses it
-    spaces = algorithm.action_space.np_random.bit_generator.state
-    return {
-        "torch": torch.get_rng_state(),
-        "numpy": json.dumps(shared, default=lambda array: array.tolist()),
-        "actions": json.dumps(spaces),
-    }
-
-
-def _set_random_state(algorithm: BaseAlgorithm, content: dict[str, Any]) -> None:
-    set_random_seed(0)
-    torch.set_rng_state(content["torch"])
-    shared = json.loads(content["numpy"])
-    shared["state"]["key"] = np.array(shared["state"]["key"], np.uint32)
-    np.random.set_state(shared)  # noqa: NPY002 - as above
-    algorithm.action_space.np_random.bit_generator.state = json.loads(
-        content["actions"]
-    )
+        random = state["random"]
+        set_random_seed(0)
+        torch.set_rng_state(random["torch"])
+        shared = json.loads(random["numpy"])
+        shared["state"]["key"] = np.array(shared["state"]["key"], np.uint32)
+        np.random.set_state(shared)  # noqa: NPY002 - as above
+        drawn = json.loads(random["actions"])
+        algorithm.action_space.np_random.bit_generator.state = drawn
 
 
 class Companion(BaseCallback):

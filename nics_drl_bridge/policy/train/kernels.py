@@ -8,9 +8,9 @@ C outputs of the actor, W weights of a network.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.lidar.arrays import Integers, Singles
 
 ONE = np.float32(1.0)
 NONE = np.float32(0.0)
@@ -22,27 +22,27 @@ class Net(NamedTuple):
     """Linear layers with ReLU in between, and scratch memory for a batch."""
 
     # (W,) layer after layer: weights (outs, ins), then biases (outs,)
-    weights: NDArray[np.float32]
-    gradients: NDArray[np.float32]  # (W,)
+    weights: Singles
+    gradients: Singles  # (W,)
     # (L + 1,) number of inputs, then the number of outputs of each layer
-    widths: NDArray[np.int64]
+    widths: Integers
     # (L, at least n times the maximum width) outputs of each layer
-    kept: NDArray[np.float32]
-    spare: NDArray[np.float32]  # (2, same size) gradients of outputs
+    kept: Singles
+    spare: Singles  # (2, same size) gradients of outputs
 
 
 class Batch(NamedTuple):
     """Transitions to learn from, see `ppo.Transitions`."""
 
-    seen: NDArray[np.float32]  # (n, O)
-    actions: NDArray[np.float32]  # (n, C), or (n, 1) indices of discrete ones
-    log_probs: NDArray[np.float32]  # (n,)
-    advantages: NDArray[np.float32]  # (n,)
-    returns: NDArray[np.float32]  # (n,)
+    seen: Singles  # (n, O)
+    actions: Singles  # (n, C), or (n, 1) indices of discrete ones
+    log_probs: Singles  # (n,)
+    advantages: Singles  # (n,)
+    returns: Singles  # (n,)
 
 
 @kernel(allocates=True)
-def forward(net: Net, seen: NDArray[np.float32]) -> NDArray[np.float32]:
+def forward(net: Net, seen: Singles) -> Singles:
     """Returns the outputs (n, C) of a network for inputs (n, O); keeps all layers' outputs."""
     n = seen.shape[0]
     at = 0
@@ -64,9 +64,7 @@ def forward(net: Net, seen: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 @kernel(allocates=True)
-def backward(
-    net: Net, seen: NDArray[np.float32], gradient: NDArray[np.float32]
-) -> None:
+def backward(net: Net, seen: Singles, gradient: Singles) -> None:
     """Writes the gradients of the weights, given the outputs' gradients (n, C), after `forward`.
 
     `gradient` must be the first of the spare arrays.
@@ -112,8 +110,8 @@ def compute_critic_gradients(net: Net, batch: Batch, weight: np.float32) -> np.f
 def compute_actor_gradients(
     net: Net,
     batch: Batch,
-    log_std: NDArray[np.float32],
-    spread: NDArray[np.float32],
+    log_std: Singles,
+    spread: Singles,
     clip: np.float32,
     entropy: np.float32,
 ) -> np.float32:
@@ -160,10 +158,10 @@ def compute_actor_gradients(
 
 @kernel(allocates=True)
 def _compute_density(
-    parts: NDArray[np.float32],
-    raw: NDArray[np.float32],
-    action: NDArray[np.float32],
-    log_std: NDArray[np.float32],
+    parts: Singles,
+    raw: Singles,
+    action: Singles,
+    log_std: Singles,
 ) -> tuple[np.float32, np.float32]:
     """Returns an action's (C,) log density and the entropy; writes deviations (C,) to `parts`."""
     log_prob = mixed = NONE
@@ -176,7 +174,7 @@ def _compute_density(
 
 @kernel(allocates=True)
 def _compute_probability(
-    parts: NDArray[np.float32], raw: NDArray[np.float32], action: int
+    parts: Singles, raw: Singles, action: int
 ) -> tuple[np.float32, np.float32]:
     """Returns an action's log probability and the entropy; writes probabilities (C,) to `parts`."""
     greatest = raw.max()

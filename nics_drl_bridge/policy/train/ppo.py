@@ -18,10 +18,10 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from stable_baselines3.common.logger import Logger
 
 from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.lidar.arrays import Singles
 from nics_drl_bridge.policy.train import algorithms, kernels
 from nics_drl_bridge.policy.train.checkpoint import RECENT, Watch
 from nics_drl_bridge.policy.train.kernels import LOG_NORM, Batch, Net
@@ -282,7 +282,7 @@ class Collector:
             )
             return Driven(seen, drawn, log_probs, rewards, done, *beyond), ended
 
-    def _normalize(self, observations: NDArray[np.float32]) -> torch.Tensor:
+    def _normalize(self, observations: Singles) -> torch.Tensor:
         """Returns normalised observations (n, O) for the networks."""
         seen: torch.Tensor = self.networks.actor.normaliser(
             torch.from_numpy(observations)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from nics_drl_bridge import extensions
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.lidar.arrays import Mask, Singles
 
 with extensions.require_modules("TrainVecEnv"):
     from stable_baselines3.common.vec_env import VecEnv
@@ -68,7 +69,7 @@ class TrainVecEnv(VecEnv):
 
     def step_wait(
         self,
-    ) -> tuple[Observation, NDArray[np.float32], NDArray[np.bool_], list[Any]]:
+    ) -> tuple[Observation, Singles, Mask, list[Any]]:
         """Advances every world by one control period; see Stable-Baselines3."""
         begin = time.perf_counter()
         for n in self._ended:  # new dicts, because an algorithm may keep the old ones
@@ -88,7 +89,7 @@ class TrainVecEnv(VecEnv):
 
     def _step_env(
         self, env: BridgeVectorEnv, rows: slice
-    ) -> tuple[Observation, NDArray[np.float64], NDArray[np.bool_]]:
+    ) -> tuple[Observation, NDArray[np.float64], Mask]:
         """Steps one of the envs, and fills in the infos of its ended worlds."""
         observation, reward, terminated, truncated, info = env.step(self._actions[rows])
         done = terminated | truncated
