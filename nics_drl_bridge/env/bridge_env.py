@@ -157,8 +157,10 @@ class BridgeEnv(gymnasium.Env[Singles, NDArray[Any]]):
                 "randomisation": randomisation,
                 "simulator": simulator,
             }
-            given = {name: value for name, value in own.items() if value is not None}
-            options = {**(backend_options or {}), **given}
+            options = dict(backend_options or {})
+            for name, value in own.items():
+                if value is not None:
+                    options[name] = value
             backend = make_backend(backend, self.model, self.world, **options)
         self._backend: Backend = complete_backend(backend, self._get_row(self._rest))
 
@@ -170,24 +172,25 @@ class BridgeEnv(gymnasium.Env[Singles, NDArray[Any]]):
         """Starts an episode; see Gymnasium. Raises ConfigError for a wrong seed or option."""
         guard.check_reset(seed, options)
         super().reset(seed=seed)
-        if seed is not None or self._episode < 0:
-            if seed is None:
-                self._seed = int(self.np_random.integers(2**31))
-            else:
-                self._seed = int(seed)
+        self._episode += 1
+        if seed is not None:
+            self._seed = int(seed)
             self._episode = 0
-        else:
-            self._episode += 1
+        elif self._episode == 0:
+            self._seed = int(self.np_random.integers(2**31))
         episode = int(episode_seed(self._seed, self._episode))
         radius = self.model.robot.footprint_radius
         draw = self._backend.facts().get("scenes")
-        one = self.world, radius, episode, self.robots
-        self.scene = draw([episode])[0] if draw else sample_scene(*one)
+        if draw:
+            self.scene = draw([episode])[0]
+        else:
+            self.scene = sample_scene(self.world, radius, episode, self.robots)
         starts = np.array(self.scene.starts)
         if options and "start" in options:
             give(starts[None], "start", options["start"])
             guard.check_places("start", starts[None], [self.scene], self.world, radius)
-        episodes = Episodes(np.array([episode]), starts[None], self.scene.goals[None])
+        seeds = np.array([episode])
+        episodes = Episodes(seeds, starts[None], self.scene.goals[None])
         if not self._rehearsed:
             self._try_task(episodes)
         memory = guard.begin_task(
@@ -267,12 +270,16 @@ class BridgeEnv(gymnasium.Env[Singles, NDArray[Any]]):
         outcome = self.task.take_step(out, before, view, self.memory)
         if self.robots > 1:
             outcome = outcome.stop_rewards(self.ended[None])
-        terms = {name: term[0] for name, term in outcome.terms.items()}
+        terms = {}
+        for name, term in outcome.terms.items():
+            terms[name] = term[0]
         self.ended = outcome.ended[0]
         self._view = view
         for name, values in outcome.info.items():
-            row = self._get_row(values[0])
-            facts[name] = row.item() if row.ndim == 0 else row.copy()
+            row = self._get_row(values[0]).copy()
+            facts[name] = row
+            if row.ndim == 0:
+                facts[name] = row.item()
         return out[0], terms, self._make_info(view, facts)
 
     def halt(self) -> None:
@@ -282,7 +289,9 @@ class BridgeEnv(gymnasium.Env[Singles, NDArray[Any]]):
 
     def _lift(self, view: RobotView) -> RobotView:
         lead = (1, self.robots, -1)
-        sensed = {name: reading.reshape(lead) for name, reading in view.sensed.items()}
+        sensed = {}
+        for name, reading in view.sensed.items():
+            sensed[name] = reading.reshape(lead)
         return RobotView(
             view.pose.reshape(lead),
             view.twist.reshape(lead),

@@ -5,7 +5,6 @@ import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import wraps
-from itertools import product
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import gymnasium
@@ -69,11 +68,17 @@ def delay_interrupts() -> Iterator[None]:
         yield  # Ctrl-C never interrupts other threads
         return
     came: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
+
+    def remember(number: int, _: Any) -> None:
+        came.append(number)
+
+    before = signal.signal(signal.SIGINT, remember)
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, signal.SIG_DFL if before is None else before)
+        if before is None:
+            before = signal.SIG_DFL
+        signal.signal(signal.SIGINT, before)
         if came:
             signal.raise_signal(signal.SIGINT)
 
@@ -161,9 +166,10 @@ def check_places(
         for x, y in at[:, :2].tolist():
             check_place(f"reset option {option!r}", member, x, y, radius)
         shapes = world.shapes
-        pairs = product(at[:, :2].tolist(), scene.bodies)
         free = free or not any(
-            _is_on(x, y, radius, body, shapes) for (x, y), body in pairs
+            _is_on(x, y, radius, body, shapes)
+            for x, y in at[:, :2].tolist()
+            for body in scene.bodies
         )
     if not free and len(places):
         fix = "move it, or use another seed"

@@ -34,9 +34,8 @@ class Guide:
         extents = np.array([member.extent for member in members])
         spans = extents[:, 2:] - extents[:, :2]
         cells = np.maximum(CELL, np.sqrt(spans.prod(axis=1) / MOST_CELLS))
-        sizes = np.maximum(np.ceil(spans / cells[:, None])[:, ::-1], 2.0).astype(
-            np.int64
-        )
+        counts = np.ceil(spans / cells[:, None])
+        sizes = np.maximum(counts[:, ::-1], 2.0).astype(np.int64)
         walls = np.full((len(members), *sizes.max(axis=0)), np.inf, np.float32)
         stands = np.zeros((len(members), sampler.count), np.bool_)
         for p, scene_sampler in enumerate(sampler.samplers):
@@ -52,9 +51,9 @@ class Guide:
         frames = np.column_stack([extents[:, :2], cells])
         inner = footprint.radius
         if isinstance(footprint, Polygon):
-            inner = abs(
-                float(compute_depths(np.zeros((1, 2)), np.array(footprint.outline))[0])
-            )
+            origin = np.zeros((1, 2))
+            depths = compute_depths(origin, np.array(footprint.outline))
+            inner = abs(float(depths[0]))
         self._grid = GuideGrid(
             walls,
             frames,
@@ -64,7 +63,8 @@ class Guide:
             inner,
             footprint.radius,
         )
-        self.fields = np.zeros((worlds, sampler.robots, *walls.shape[1:]), np.float32)
+        shape = (worlds, sampler.robots, *walls.shape[1:])
+        self.fields = np.zeros(shape, np.float32)
 
     def begin(self, worlds: NDArray[np.intp], scenes: Scenes) -> None:
         """Compute the path lengths in the scenes of episodes that begin in some worlds (n,)."""

@@ -75,20 +75,22 @@ def find_ways(
     gaps = np.empty((rows, columns), np.float32)
     for n in range(worlds.shape[0]):
         p = member[n]
-        wide = grid.sizes[p]
-        space = gaps[: wide[0], : wide[1]]
-        space[...] = grid.walls[p, : wide[0], : wide[1]]
+        height = grid.sizes[p, 0]
+        width = grid.sizes[p, 1]
+        space = gaps[:height, :width]
+        space[...] = grid.walls[p, :height, :width]
         x = grid.frames[p, 0]
         y = grid.frames[p, 1]
         cell = grid.frames[p, 2]
         for k in range(bodies.shape[1]):
             if grid.stands[p, k] and bodies[n, k, RADIUS] > 0.0:
                 _lower_space(space, bodies[n, k], x, y, cell, grid)
-        for i in range(wide[0]):
-            for j in range(wide[1]):
-                space[i, j] = np.float32(cell * _find_cost(space[i, j], grid))
+        for i in range(height):
+            for j in range(width):
+                cost = _find_cost(space[i, j], grid)
+                space[i, j] = np.float32(cell * cost)
         for m in range(goals.shape[1]):
-            field = out[worlds[n], m, : wide[0], : wide[1]]
+            field = out[worlds[n], m, :height, :width]
             u = (goals[n, m, 0] - x) / cell - 0.5
             v = (goals[n, m, 1] - y) / cell - 0.5
             _spread(field, space, u, v)
@@ -111,11 +113,11 @@ def _lower_space(
     right = min(int((body[X] + far - x) / cell), space.shape[1] - 1)
     outline = collision.outline_of(body, grid.outlines)
     for i in range(first, last + 1):
+        centre_y = y + (i + 0.5) * cell
         for j in range(left, right + 1):
-            gap = _measure_gap(
-                x + (j + 0.5) * cell, y + (i + 0.5) * cell, body, outline
-            )
-            space[i, j] = min(space[i, j], np.float32(gap))
+            centre_x = x + (j + 0.5) * cell
+            gap = np.float32(_measure_gap(centre_x, centre_y, body, outline))
+            space[i, j] = min(space[i, j], gap)
 
 
 @kernel
@@ -124,8 +126,9 @@ def _measure_gap(x: float, y: float, body: Array, outline: Outline) -> float:
     dx = x - body[X]
     dy = y - body[Y]
     if outline.begin < outline.end:
+        along = body[COS] * dx + body[SIN] * dy
         across = body[COS] * dy - body[SIN] * dx
-        return collision.outline_point(body[COS] * dx + body[SIN] * dy, across, outline)
+        return collision.outline_point(along, across, outline)
     return math.sqrt(dx * dx + dy * dy) - body[RADIUS]
 
 
@@ -138,9 +141,8 @@ def _find_cost(space: float, grid: GuideGrid) -> float:
     if beside >= 0.0:
         return TIGHT + (1.0 - TIGHT) * beside / COMFORT
     if space > grid.inner:
-        return SQUEEZED + (TIGHT - SQUEEZED) * (space - grid.inner) / (
-            grid.outer - grid.inner
-        )
+        more = space - grid.inner
+        return SQUEEZED + (TIGHT - SQUEEZED) * more / (grid.outer - grid.inner)
     return BLOCKED
 
 
@@ -153,7 +155,8 @@ def _spread(field: Singles, cost: Singles, u: float, v: float) -> None:
     gj = min(max(round(u), 0), columns - 1)
     for i in range(max(gi - 1, 0), min(gi + 2, rows)):
         for j in range(max(gj - 1, 0), min(gj + 2, columns)):
-            field[i, j] = math.sqrt((u - j) ** 2 + (v - i) ** 2) * cost[i, j]
+            steps = math.sqrt((u - j) ** 2 + (v - i) ** 2)
+            field[i, j] = steps * cost[i, j]
     for _ in range(ROUNDS):
         change = np.float32(0.0)
         for way in range(4):
@@ -174,8 +177,12 @@ def update_ways(ways: Singles, prices: Singles, down: bool, left: bool) -> np.fl
         i = rows - 1 - a if down else a
         for b in range(columns):
             j = columns - 1 - b if left else b
-            beside = min(ways[i, max(j - 1, 0)], ways[i, min(j + 1, columns - 1)])
-            above = min(ways[max(i - 1, 0), j], ways[min(i + 1, rows - 1), j])
+            left_way = ways[i, max(j - 1, 0)]
+            right_way = ways[i, min(j + 1, columns - 1)]
+            below = ways[max(i - 1, 0), j]
+            over = ways[min(i + 1, rows - 1), j]
+            beside = min(left_way, right_way)
+            above = min(below, over)
             price = prices[i, j]
             apart = beside - above
             least = min(beside, above)
@@ -183,13 +190,11 @@ def update_ways(ways: Singles, prices: Singles, down: bool, left: bool) -> np.fl
                 continue
             way = least + price
             if abs(apart) < price:
-                way = np.float32(0.5) * (
-                    beside
-                    + above
-                    + math.sqrt(np.float32(2.0) * price * price - apart * apart)
-                )
+                square = np.float32(2.0) * price * price - apart * apart
+                way = np.float32(0.5) * (beside + above + math.sqrt(square))
             if way < ways[i, j]:
-                most = max(most, min(ways[i, j] - way, np.float32(1e3)))
+                change = min(ways[i, j] - way, np.float32(1e3))
+                most = max(most, change)
                 ways[i, j] = way
     return most
 
@@ -211,14 +216,16 @@ def measure_lengths(
         rows = grid.sizes[p, 0]
         columns = grid.sizes[p, 1]
         for m in range(out.shape[1]):
-            u = min(max((poses[n, m, 0] - x) / cell - 0.5, 0.0), columns - 1.000001)
-            v = min(max((poses[n, m, 1] - y) / cell - 0.5, 0.0), rows - 1.000001)
+            u = (poses[n, m, 0] - x) / cell - 0.5
+            v = (poses[n, m, 1] - y) / cell - 0.5
+            u = min(max(u, 0.0), columns - 1.000001)
+            v = min(max(v, 0.0), rows - 1.000001)
             i = int(v)
             j = int(u)
             s = v - i
             t = u - j
             row = fields[n, m, i]
             next_row = fields[n, m, i + 1]
-            out[n, m] = (1.0 - s) * ((1.0 - t) * row[j] + t * row[j + 1]) + s * (
-                (1.0 - t) * next_row[j] + t * next_row[j + 1]
-            )
+            below = (1.0 - t) * row[j] + t * row[j + 1]
+            above = (1.0 - t) * next_row[j] + t * next_row[j + 1]
+            out[n, m] = (1.0 - s) * below + s * above

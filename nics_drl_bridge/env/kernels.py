@@ -49,7 +49,8 @@ def scale_actions(out: Array, actions: Singles, low: Array, high: Array) -> None
     """Scales actions (R, C), clamped to [-1, 1], to commands (R, C) between their limits (C,)."""
     for i in range(out.shape[0]):
         for c in range(out.shape[1]):
-            share = (min(max(float(actions[i, c]), -1.0), 1.0) + 1.0) / 2.0
+            action = min(max(float(actions[i, c]), -1.0), 1.0)
+            share = (action + 1.0) / 2.0
             out[i, c] = low[c] + share * (high[c] - low[c])
 
 
@@ -73,7 +74,8 @@ def look(shares: Singles, ranges: Singles, scale: ScanScale) -> bool:
         return has_contact(ranges, scale)
     hits = np.int32(0)
     for b in range(ranges.shape[0]):
-        hits = np.int32(hits | np.int32(ranges[b] < scale.leaves[b]))
+        is_hit = ranges[b] < scale.leaves[b]
+        hits = np.int32(hits | np.int32(is_hit))
         shares[b] = _scale_range(ranges[b], scale)
     return hits != 0 and has_contact(ranges, scale)
 
@@ -84,7 +86,8 @@ def _scale_range(value: np.float32, scale: ScanScale) -> np.float32:
     share = value * scale.per_metre
     share = share if share > np.float32(0.0) else np.float32(0.0)
     # Compare as integers, which keeps the order: LLVM turns two float limits into masks.
-    return np.int32(min(np.float32(share).view(np.int32), ONE)).view(np.float32)
+    bits = np.float32(share).view(np.int32)
+    return np.int32(min(bits, ONE)).view(np.float32)
 
 
 @kernel(allocates=True)
@@ -99,21 +102,24 @@ def has_contact(ranges: Singles, scale: ScanScale) -> bool:
         hits = np.int32(0)
         for k in range(beams):
             i = np.uintp(begin + k)
-            hits = np.int32(hits | np.int32(ranges[i] < scale.leaves[i]))
-        for b in range(begin, begin + beams if hits != 0 else begin):
-            if ranges[b] < scale.leaves[b] and _sum_gaps(b, ranges, scale) < np.float32(
-                0.0
-            ):
-                return True
+            is_hit = ranges[i] < scale.leaves[i]
+            hits = np.int32(hits | np.int32(is_hit))
+        if hits == 0:
+            continue
+        for b in range(begin, begin + beams):
+            if ranges[b] < scale.leaves[b]:
+                gap = _sum_gaps(b, ranges, scale)
+                if gap < np.float32(0.0):
+                    return True
     return False
 
 
 @kernel(inline=True)
 def _sum_gaps(b: int, ranges: Singles, scale: ScanScale) -> np.float32:
     gap = np.float32(0.0)
-    for k in range(
-        max(b - scale.beside, 0), min(b + scale.beside + 1, ranges.shape[0])
-    ):
+    first = max(b - scale.beside, 0)
+    end = min(b + scale.beside + 1, ranges.shape[0])
+    for k in range(first, end):
         beyond = ranges[k] - scale.leaves[k]
         if beyond == beyond:  # False for NaN (unknown)
             gap += min(max(beyond, -FURTHEST), FURTHEST)
@@ -142,7 +148,9 @@ def find_bearing(dx: float, dy: float, heading: float) -> tuple[float, float, fl
     s = math.sin(heading)
     forward = (c * dx + s * dy) / distance
     left = (c * dy - s * dx) / distance
-    return distance, min(max(forward, -1.0), 1.0), min(max(left, -1.0), 1.0)
+    forward = min(max(forward, -1.0), 1.0)
+    left = min(max(left, -1.0), 1.0)
+    return distance, forward, left
 
 
 @kernel(allocates=True)
@@ -164,15 +172,17 @@ def navigate(
     """
     parts = out.shape[1] - 6
     for i in range(out.shape[0]):
-        flags[i, 1] = look(out[i, :parts], ranges[i], scale)
+        touched = look(out[i, :parts], ranges[i], scale)
         dx = goals[i, 0] - pose[i, 0]
         dy = goals[i, 1] - pose[i, 1]
         distance, c, s = find_bearing(dx, dy, pose[i, 2])
         dx = goals[i, 0] - before[i, 0]
         dy = goals[i, 1] - before[i, 1]
         approach[i] = math.sqrt(dx * dx + dy * dy) - distance
-        flags[i, 0] = distance < radius
-        flags[i, 2] = flags[i, 0] and not flags[i, 1]
+        reached = distance < radius
+        flags[i, 0] = reached
+        flags[i, 1] = touched
+        flags[i, 2] = reached and not touched
         out[i, parts] = min(distance, LIMIT)
         out[i, parts + 1] = c
         out[i, parts + 2] = s

@@ -106,10 +106,12 @@ class BridgeParallelEnv(ParallelEnv[str, Singles, NDArray[Any]]):
         observation, info = self.env.reset(seed=seed, options=options)
         self.agents = list(self.possible_agents)
         self._steps = 0
-        seen = dict(
-            zip(self.agents, observation.reshape(len(self.agents), -1), strict=True)
-        )
-        return seen, {name: self._of(info, m) for m, name in enumerate(self.agents)}
+        rows = observation.reshape(len(self.agents), -1)
+        seen = dict(zip(self.agents, rows, strict=True))
+        infos = {}
+        for m, name in enumerate(self.agents):
+            infos[name] = self._of(info, m)
+        return seen, infos
 
     @stop_on_error
     def step(

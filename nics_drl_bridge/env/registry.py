@@ -128,7 +128,11 @@ def _import_task_class(name: Any) -> type:
             f"task {name!r}: {path} defines no subclass of {Task.__module__}.Task; see "
             "docs/tasks.md."
         )
-    hint = suggest(attribute, own) if attribute else f"name its class, {path}:{own[0]}."
+    hint = (
+        suggest(attribute, own)
+        if attribute
+        else f"name its class, for example {path}:{own[0]}."
+    )
     raise ConfigError(f"task {name!r}: {path} has no such Task; {hint}")
 
 

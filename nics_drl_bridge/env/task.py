@@ -193,9 +193,9 @@ class Task(ABC):
         low, high = self.command_limits
         kernels.scale_actions(out.reshape(rows.shape), rows, low, high)
         # Don't teach what a vehicle can't do: a car driven by turn rates can't steer at rest.
-        return (
-            self.robot.pass_through_cmd_vel(out) if self.robot.takes_turn_rate else out
-        )
+        if self.robot.takes_turn_rate:
+            return self.robot.pass_through_cmd_vel(out)
+        return out
 
     def drive(self, actions: ArrayLike, ended: Flags) -> Array:
         """Returns the checked commands (n, M, C) of actions; robots that have ended stand still."""
@@ -246,9 +246,10 @@ class Task(ABC):
                 f"memory {sorted(memory)}", f"must keep {sorted(kept)} from `reset`"
             )
         # Copy rebound arrays into the env's rows. Read all first, because they may alias.
-        rebound = {
-            n: np.array(memory[n]) for n, rows in kept.items() if memory[n] is not rows
-        }
+        rebound = {}
+        for name, rows in kept.items():
+            if memory[name] is not rows:
+                rebound[name] = np.array(memory[name])
         for name, new in rebound.items():
             rows = memory[name] = kept[name]
             if new.shape != rows.shape or not np.can_cast(
@@ -265,7 +266,7 @@ class Task(ABC):
         terms = self.reward(before, after, memory)
         each = out.shape[:-1]
         info = self.info(after, memory)
-        for what, part in (("reward", terms), ("info", info)):
+        for what, part in {"reward": terms, "info": info}.items():
             if not isinstance(part, dict):
                 raise self._make_error(what, "must be a dictionary of arrays")
         for name, term in terms.items():

@@ -62,12 +62,15 @@ class Teacher:
         info = outcome.info
         if self._guide is not None:
             left = self._guide.measure_lengths(part, self._data)
-            terms = terms | {"path": self._given.path * (self._left[part] - left)}
+            nearer = self._left[part] - left
+            terms = terms | {"path": self._given.path * nearer}
             self._left[part] = left
         if self._given.contact is not None:
             unseen = (self._data.collided[part] != 0) & ~ended
-            terms = terms | {"contact": np.multiply(self._given.contact, unseen)}
-            info = info | {"collision": unseen | info.get("collision", unseen)}
+            reward = np.multiply(self._given.contact, unseen)
+            terms = terms | {"contact": reward}
+            collision = unseen | info.get("collision", unseen)
+            info = info | {"collision": collision}
             ended = ended | unseen
         return Outcome(terms, ended, info)
 

@@ -326,13 +326,16 @@ class BridgeVectorEnv(
             0.0,
         )
         self.simulator.step_part(part, command)
-        memory = {name: rows[part] for name, rows in self.memory.items()}
+        memory = {}
+        for name, rows in self.memory.items():
+            memory[name] = rows[part]
         outcome = self.task.take_step(out[part], before, self._make_view(part), memory)
         if self._teacher is not None:
             outcome = self._teacher.judge(part, outcome)
         if self.robots > 1:
             outcome = outcome.stop_rewards(ended)
-        self._reward[part] = sum(outcome.terms.values(), np.zeros(ended.shape))
+        nothing = np.zeros(ended.shape)
+        self._reward[part] = sum(outcome.terms.values(), nothing)
         self.ended[part] = ended | outcome.ended
         self._begin(part.start + np.flatnonzero(begun[part]), out)
         return outcome

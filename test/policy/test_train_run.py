@@ -145,26 +145,6 @@ def test_a_misspelt_task_leaves_no_folder_that_refuses_the_right_one(
             "task Reach: its reward term 'near' must be finite",
         ),
         (
-            '["goal"])}',
-            '["goal"])[0]}',
-            "'near' must be finite, of shape (8, 1), not array(",
-        ),
-        (
-            '{"near": -distance(after.pose, memory["goal"])}',
-            "-1.0",
-            "must be a dictionary of",
-        ),
-        (
-            "[self.free_share(view.ranges), seen]",
-            "[seen]",
-            "task Reach: its observation must be",
-        ),
-        (
-            "self.touches(view.ranges)",
-            "False",
-            "task Reach: its end must be finite, of shape",
-        ),
-        (
             'memory["goal"])}',
             'memory["gaol"])}',
             "mine.py:17, in reward: KeyError('gaol'); mend",

@@ -22,6 +22,9 @@ from nics_drl_bridge.env.task import (
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import Array, RobotView
 
+# limits of distance, cosine and sine, and of a twist
+PLACE_LOW = [0.0, -1.0, -1.0]
+PLACE_HIGH = [LIMIT, 1.0, 1.0]
 TWIST_LOW = [-LIMIT] * 3
 TWIST_HIGH = [LIMIT] * 3
 
@@ -111,9 +114,12 @@ class CooperativeReaching(Task):
     @cached_property
     def observation_space(self) -> gymnasium.spaces.Box:
         """Box of one robot's observation."""
+        goals = self.robots
         mates = self.robots - 1
-        low = [0.0, -1.0, -1.0, 0.0] * self.robots + [0.0, -1.0, -1.0] * mates
-        high = [LIMIT, 1.0, 1.0, 1.0] * self.robots + [LIMIT, 1.0, 1.0] * mates
+        low = [*PLACE_LOW, 0.0] * goals
+        low += PLACE_LOW * mates
+        high = [*PLACE_HIGH, 1.0] * goals
+        high += PLACE_HIGH * mates
         return self.box(low + TWIST_LOW, high + TWIST_HIGH)
 
     def reset(self, episodes: Episodes) -> Memory:
@@ -251,8 +257,8 @@ class PursuitEvasion(Task):
     def observation_space(self) -> gymnasium.spaces.Box:
         """Box of one robot's observation."""
         others = self.robots - 1
-        low = [0.0, -1.0, -1.0, 0.0, 0.0] * others
-        high = [LIMIT, 1.0, 1.0, 1.0, 1.0] * others
+        low = [*PLACE_LOW, 0.0, 0.0] * others
+        high = [*PLACE_HIGH, 1.0, 1.0] * others
         return self.box([*low, 0.0, *TWIST_LOW], [*high, 1.0, *TWIST_HIGH])
 
     def reset(self, episodes: Episodes) -> Memory:
