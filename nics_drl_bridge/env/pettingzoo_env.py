@@ -79,11 +79,11 @@ class BridgeParallelEnv(ParallelEnv[str, Singles, NDArray[Any]]):
         self.agents: list[str] = []
         of = self.env.task
         # Each agent has its own space, because a space contains a random generator.
-        agents = self.possible_agents
-        self.observation_spaces = {
-            name: deepcopy(of.observation_space) for name in agents
-        }
-        self.action_spaces = {name: deepcopy(of.action_space) for name in agents}
+        self.observation_spaces = {}
+        self.action_spaces = {}
+        for name in self.possible_agents:
+            self.observation_spaces[name] = deepcopy(of.observation_space)
+            self.action_spaces[name] = deepcopy(of.action_space)
 
     def observation_space(self, agent: str) -> gymnasium.Space[Any]:
         """Returns the observation space of an agent, always the same object."""
@@ -152,8 +152,11 @@ class BridgeParallelEnv(ParallelEnv[str, Singles, NDArray[Any]]):
         seen = {}
         for name in self.agents:
             m = self.possible_agents.index(name)
-            paid = {key: float(term[m]) for key, term in terms.items()}
-            infos[name] = {**self._of(info, m), "reward_terms": paid}
+            paid = {}
+            for key, term in terms.items():
+                paid[key] = float(term[m])
+            infos[name] = self._of(info, m)
+            infos[name]["reward_terms"] = paid
             rewards[name] = sum(paid.values())
             ended[name] = bool(self.env.ended[m])
             seen[name] = observation[m]

@@ -204,7 +204,8 @@ class BridgeVectorEnv(
                 self._make_view(slice(None)), self.memory
             )
         self._begin(np.flatnonzero(chosen), self._out, options)
-        infos = add_masks(self._get_known() | self._get_beginnings(), chosen, True)
+        facts = self._get_known() | self._get_beginnings()
+        infos = add_masks(facts, chosen, True)
         self.ready = True
         out = self._out.copy() if self.copy else self._out
         return flatten(out), infos
@@ -236,7 +237,8 @@ class BridgeVectorEnv(
             self._teacher.begin(worlds, scenes)
         self._bodies[worlds] = scenes.bodies
         self._starts[worlds] = self.simulator.data.pose[worlds]
-        episodes = Episodes(seeds, self._starts[worlds], self.simulator.goals[worlds])
+        goals = self.simulator.goals[worlds]
+        episodes = Episodes(seeds, self._starts[worlds], goals)
         fresh = guard.begin_task(
             self.task, episodes, options, scenes, self.world, "start", "reset_mask"
         )
@@ -285,7 +287,8 @@ class BridgeVectorEnv(
         )
         terminated = self.ended.all(axis=1) & ~begun
         truncated = (self.simulator.data.steps >= self._limit) & ~begun
-        reward = np.where(begun, 0.0, total(self._reward))
+        rewards = total(self._reward)
+        reward = np.where(begun, 0.0, rewards)
         over = terminated | truncated
         infos: Info = {}
         facts = {
@@ -355,7 +358,8 @@ class BridgeVectorEnv(
             for n in np.flatnonzero(over):
                 shown[n] = rows[n].copy()
             infos |= add_masks({"final_obs": shown}, over)
-            infos |= add_masks({"final_info": self._get_known() | facts}, over, True)
+            final = self._get_known() | facts
+            infos |= add_masks({"final_info": final}, over, True)
             if self._teacher is not None:
                 success = facts.get("is_success", over)
                 success = success.reshape(self.num_envs, -1).all(axis=1)

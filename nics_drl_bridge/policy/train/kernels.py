@@ -5,7 +5,7 @@ small steps would compete for it with the collecting thread. Shapes: n transitio
 C outputs of the actor, W weights of a network.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -31,14 +31,15 @@ class Net(NamedTuple):
     spare: Singles  # (2, same size) gradients of outputs
 
 
-class Batch(NamedTuple):
-    """Transitions to learn from, see `ppo.Transitions`."""
+class Transitions(NamedTuple):
+    """R transitions, step by step: arrays for the kernels, tensors elsewhere."""
 
-    seen: Singles  # (n, O)
-    actions: Singles  # (n, C), or (n, 1) indices of discrete ones
-    log_probs: Singles  # (n,)
-    advantages: Singles  # (n,)
-    returns: Singles  # (n,)
+    seen: Any  # (R, O) normalised observations
+    # (R, C), or indices of discrete ones: (R,), for the kernels (R, 1) and single
+    actions: Any
+    log_probs: Any  # (R,) of the actions when they were drawn
+    advantages: Any  # (R,)
+    returns: Any  # (R,) targets of the critic
 
 
 @kernel(allocates=True)
@@ -91,7 +92,9 @@ def backward(net: Net, seen: Singles, gradient: Singles) -> None:
 
 
 @kernel(allocates=True)
-def compute_critic_gradients(net: Net, batch: Batch, weight: np.float32) -> np.float32:
+def compute_critic_gradients(
+    net: Net, batch: Transitions, weight: np.float32
+) -> np.float32:
     """Writes the gradients of the critic; returns its weighted loss."""
     values = forward(net, batch.seen)
     n = values.shape[0]
@@ -109,7 +112,7 @@ def compute_critic_gradients(net: Net, batch: Batch, weight: np.float32) -> np.f
 @kernel(allocates=True)
 def compute_actor_gradients(
     net: Net,
-    batch: Batch,
+    batch: Transitions,
     log_std: Singles,
     spread: Singles,
     clip: np.float32,

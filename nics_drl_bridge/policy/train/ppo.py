@@ -12,7 +12,7 @@ from __future__ import annotations
 import copy
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple, cast
 
@@ -24,7 +24,7 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.arrays import Singles
 from nics_drl_bridge.policy.train import algorithms, kernels
 from nics_drl_bridge.policy.train.checkpoint import RECENT, Watch
-from nics_drl_bridge.policy.train.kernels import LOG_NORM, Batch, Net
+from nics_drl_bridge.policy.train.kernels import LOG_NORM, Net, Transitions
 from nics_drl_bridge.policy.train.settings import PpoSettings, TrainingSettings
 from nics_drl_bridge.policy.train.vec_env import TrainVecEnv
 from nics_drl_bridge.threads import one_blas_thread, run_parts
@@ -46,23 +46,6 @@ class Driven(NamedTuple):
     done: torch.Tensor  # (T, N) 1 at ends of episodes
     cut: torch.Tensor  # (K,) indices t N + n of the truncated episodes
     final: torch.Tensor  # (K, O) last observations of these episodes
-
-
-class Transitions(NamedTuple):
-    """R = T N transitions: T steps of N worlds, step by step."""
-
-    seen: torch.Tensor  # (R, O) normalised observations
-    actions: torch.Tensor  # (R, C), or (R,) discrete
-    log_probs: torch.Tensor  # (R,) of the actions when they were drawn
-    advantages: torch.Tensor  # (R,)
-    returns: torch.Tensor  # (R,) targets of the critic
-
-    def split_batches(
-        self, size: int, generator: torch.Generator
-    ) -> Iterator[Transitions]:
-        """Yields batches of `size` transitions in random order; the last may be smaller."""
-        for rows in torch.randperm(len(self.seen), generator=generator).split(size):
-            yield Transitions(*(field[rows] for field in self))
 
 
 class Networks(torch.nn.Module):
@@ -199,7 +182,9 @@ class Learner:
         for group in self.optimiser.param_groups:
             group["lr"] = rate
         for _ in range(self.ppo.epochs):
-            for batch in rollout.split_batches(self.ppo.batch, self.generator):
+            order = torch.randperm(len(rollout.seen), generator=self.generator)
+            for rows in order.split(self.ppo.batch):  # the last may be smaller
+                batch = Transitions(*(field[rows] for field in rollout))
                 loss = self.differentiate(batch)
                 torch.nn.utils.clip_grad_norm_(self._all, GRADIENT_LIMIT)
                 self.optimiser.step()
@@ -208,9 +193,8 @@ class Learner:
     def differentiate(self, batch: Transitions) -> torch.Tensor:
         """Sets the gradients of all weights for a batch; returns the loss."""
         columns = batch.actions.float().view(len(batch.seen), -1)
-        arrays = Batch(*(field.numpy() for field in batch))._replace(
-            actions=columns.numpy()
-        )
+        fields = batch._replace(actions=columns)
+        arrays = Transitions(*(field.numpy() for field in fields))
         (actor, critic), spread = self._nets, self.networks.log_std
         spread_arrays = spread.detach().numpy(), spread.grad.numpy()
         bounds = np.float32(self.ppo.clip), np.float32(self.ppo.entropy)
