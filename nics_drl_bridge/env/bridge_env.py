@@ -5,7 +5,6 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge import defaults, extensions
 from nics_drl_bridge.arguments import check_arguments, check_options, format_value
@@ -28,7 +27,7 @@ from nics_drl_bridge.env.task import (
 from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import Backend, RobotView, Start
-from nics_drl_bridge.lidar.arrays import Mask, Singles
+from nics_drl_bridge.lidar.arrays import AnyArray, Mask, Singles
 from nics_drl_bridge.lidar.sensor import unread
 from nics_drl_bridge.random_kernels import episode_seed
 from nics_drl_bridge.robot import DEFAULT_ROBOT
@@ -39,7 +38,7 @@ from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 RENDER_FPS = 10
 
 
-class BridgeEnv(gymnasium.Env[Singles, NDArray[Any]]):
+class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
     """A task for a robot, or a team, in the fast simulator or over ROS 2.
 
     ## Description
@@ -233,7 +232,7 @@ class BridgeEnv(gymnasium.Env[Singles, NDArray[Any]]):
 
     @refuse_after_close
     @stop_on_error
-    def step(self, action: NDArray[Any]) -> tuple[Observation, float, bool, bool, Info]:
+    def step(self, action: AnyArray) -> tuple[Observation, float, bool, bool, Info]:
         """Applies an action for one control period; see Gymnasium."""
         observation, terms, info = self.advance(action)
         # Sum in the vector env's order, for bit-identical rewards.
@@ -249,7 +248,7 @@ class BridgeEnv(gymnasium.Env[Singles, NDArray[Any]]):
 
     @refuse_after_close
     @stop_on_error
-    def advance(self, action: NDArray[Any]) -> tuple[Singles, Terms, Info]:
+    def advance(self, action: AnyArray) -> tuple[Singles, Terms, Info]:
         """Advances one period; returns observations (M, O), reward terms (M,) by name, and `info`.
 
         Robots of a team that have `ended` (M,) get the command nearest to zero and no more reward.
@@ -303,7 +302,7 @@ class BridgeEnv(gymnasium.Env[Singles, NDArray[Any]]):
             view.sensed_age_s,
         )
 
-    def _get_row(self, rows: NDArray[Any]) -> NDArray[Any]:
+    def _get_row(self, rows: AnyArray) -> AnyArray:
         return rows[0] if self.robots == 1 else rows
 
     def _make_info(self, view: RobotView, facts: Info) -> Info:

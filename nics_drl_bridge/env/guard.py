@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.env import kernels
 from nics_drl_bridge.errors import ConfigError, suggest
+from nics_drl_bridge.lidar.arrays import AnyArray
 from nics_drl_bridge.lidar.exact_kernels import COS, RADIUS, SHAPE, SIN
 from nics_drl_bridge.lidar.shapes import Shape
 from nics_drl_bridge.seeds import GREATEST_SEED, check_seeds
@@ -95,7 +96,7 @@ def check_reset(seed: Any, options: Any, worlds: int = 1) -> None:
 
 
 def apply_options(
-    memory: dict[str, NDArray[Any]], options: Mapping[str, Any] | None, *of_env: str
+    memory: dict[str, AnyArray], options: Mapping[str, Any] | None, *of_env: str
 ) -> None:
     """Writes values of `reset(options=...)` into all rows of the memory arrays they name.
 
@@ -119,19 +120,19 @@ def begin_task(
     scenes: Iterable[Scene],
     world: AnyWorld,
     *of_env: str,
-) -> dict[str, NDArray[Any]]:
+) -> dict[str, AnyArray]:
     """Returns the memory of a Task in starting Episodes, with values of `reset(options=...)`.
 
     Options in `of_env` belong to the env.
     """
-    memory: dict[str, NDArray[Any]] = task.start_episodes(episodes)
+    memory: dict[str, AnyArray] = task.start_episodes(episodes)
     apply_options(memory, options, *of_env)
     if options and "goal" in options:
         check_places("goal", memory["goal"], scenes, world)
     return memory
 
 
-def give(rows: NDArray[Any], name: str, value: Any) -> None:
+def give(rows: AnyArray, name: str, value: Any) -> None:
     """Writes a value of `reset(options=...)` into rows (n, ...). Raises ConfigError."""
     try:
         numbers = np.asarray(value)
@@ -179,7 +180,7 @@ def check_places(
 
 
 def _is_on(
-    x: float, y: float, radius: float, body: NDArray[Any], shapes: Sequence[Shape]
+    x: float, y: float, radius: float, body: AnyArray, shapes: Sequence[Shape]
 ) -> bool:
     """Returns True if a disc overlaps a body."""
     dx, dy = (x, y) - body[:2]
@@ -197,7 +198,7 @@ def _is_on(
     return bool(gap < radius)
 
 
-def check_action(action: Any, space: gymnasium.Space[Any], name: str) -> NDArray[Any]:
+def check_action(action: Any, space: gymnasium.Space[Any], name: str) -> AnyArray:
     """Returns an action as an array of its space's shape. Raises Gymnasium's InvalidAction."""
     try:
         array = np.asarray(action)

@@ -5,7 +5,6 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge import defaults, extensions
 from nics_drl_bridge.arguments import check_arguments, check_count
@@ -14,7 +13,7 @@ from nics_drl_bridge.env.guard import stop_on_error
 from nics_drl_bridge.env.task import Info, Task
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.lidar.arrays import Singles
+from nics_drl_bridge.lidar.arrays import AnyArray, Singles
 from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.world_set import AnyWorld
 
@@ -24,7 +23,7 @@ with extensions.require_modules("BridgeParallelEnv"):
 Observations = dict[str, Singles]
 
 
-class BridgeParallelEnv(ParallelEnv[str, Singles, NDArray[Any]]):
+class BridgeParallelEnv(ParallelEnv[str, Singles, AnyArray]):
     """A task of a team in the fast simulator; each robot is an agent.
 
     ## Description
@@ -115,7 +114,7 @@ class BridgeParallelEnv(ParallelEnv[str, Singles, NDArray[Any]]):
 
     @stop_on_error
     def step(
-        self, actions: dict[str, NDArray[Any]]
+        self, actions: dict[str, AnyArray]
     ) -> tuple[
         Observations,
         dict[str, float],

@@ -14,7 +14,7 @@ from nics_drl_bridge.env import guard, kernels
 from nics_drl_bridge.env.kernels import LIMIT, ScanScale
 from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.interface import Array, RobotView
-from nics_drl_bridge.lidar.arrays import Integers, Singles
+from nics_drl_bridge.lidar.arrays import AnyArray, Integers, Singles
 from nics_drl_bridge.lidar.sector_kernels import SectorPlan
 from nics_drl_bridge.lidar.sectors import NO_PLAN, ScanLayout, plan_of
 from nics_drl_bridge.lidar.sensor import Sensor
@@ -26,8 +26,8 @@ Observation = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 Actions = Literal["continuous", "discrete"]
 # Memory of a task during an episode: name -> array with leading (n, M), or (n,) per world.
-Memory = dict[str, NDArray[Any]]
-Facts = dict[str, NDArray[Any]]  # for `info`, by name
+Memory = dict[str, AnyArray]
+Facts = dict[str, AnyArray]  # for `info`, by name
 Info = dict[str, Any]  # Gymnasium's `info`
 Terms = dict[str, Array]  # of the reward, by name
 DRIVES = (

@@ -34,7 +34,7 @@ from nics_drl_bridge.env.teaching import Teacher, Teaching
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import NS_PER_S, Array, RobotView
-from nics_drl_bridge.lidar.arrays import Integers
+from nics_drl_bridge.lidar.arrays import AnyArray, Integers
 from nics_drl_bridge.lidar.shapes import BODY
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 from nics_drl_bridge.sim.scenes import Scenes
@@ -48,9 +48,7 @@ MODES = {
 }
 
 
-class BridgeVectorEnv(
-    gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDArray[Any]]
-):
+class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray]):
     """A task in `num_envs` worlds at once, for training.
 
     ## Description
@@ -269,9 +267,7 @@ class BridgeVectorEnv(
         )
 
     @guard.refuse_after_close
-    def step(
-        self, actions: NDArray[Any]
-    ) -> tuple[Observation, Array, Flags, Flags, Info]:
+    def step(self, actions: AnyArray) -> tuple[Observation, Array, Flags, Flags, Info]:
         """Advances every world by one control period; see Gymnasium."""
         if not self.ready:
             raise gymnasium.error.ResetNeeded("call reset() before step().")
@@ -314,7 +310,7 @@ class BridgeVectorEnv(
         return flatten(out), reward, terminated, truncated, infos
 
     def _advance(
-        self, part: slice, actions: NDArray[Any], out: Observation, begun: Flags
+        self, part: slice, actions: AnyArray, out: Observation, begun: Flags
     ) -> Outcome:
         data = self.simulator.data
         ended = self.ended[part]
@@ -402,7 +398,7 @@ class BridgeVectorEnv(
             beginnings["randomisation"] = drawn
         return beginnings
 
-    def _get_row(self, rows: NDArray[Any]) -> NDArray[Any]:
+    def _get_row(self, rows: AnyArray) -> AnyArray:
         return rows[:, 0] if self.robots == 1 else rows
 
     def close_extras(self, **_: Any) -> None:
@@ -498,7 +494,7 @@ def choose_seeds(
     return seeds, is_seeded | new
 
 
-def zeros(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
+def zeros(shape: tuple[int, ...], dtype: np.dtype[Any]) -> AnyArray:
     """Returns zeros; pages of large arrays cost neither time nor memory unless written.
 
     `numpy.zeros` does the same until the C library reuses such memory and has to clear all of it,

@@ -3,15 +3,13 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import rotate
 from nics_drl_bridge.lidar import bake_kernels
-from nics_drl_bridge.lidar.arrays import Array, Integers
+from nics_drl_bridge.lidar.arrays import AnyArray, Array, Integers
 from nics_drl_bridge.lidar.shapes import Circle, Outlines, Shape, describe
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.lidar.table import MOST_WIDE, Density, LidarTable, count_padding
@@ -135,7 +133,7 @@ def make_grid(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> 
     return Grid(distances, np.arange(count) * unit, edges[parts // 2 :: parts], cell)
 
 
-def _reduce_cells(values: NDArray[Any], parts: int, outer: np.ufunc) -> NDArray[Any]:
+def _reduce_cells(values: AnyArray, parts: int, outer: np.ufunc) -> AnyArray:
     """Outermost value in each cell (T, D) up to the next cell: two distances are blended."""
     count = len(values) // parts
     turned = outer.reduce(

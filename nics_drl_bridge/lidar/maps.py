@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,7 +20,7 @@ from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.files import write_bytes, write_text
 from nics_drl_bridge.geometry import rotate
 from nics_drl_bridge.lidar import map_kernels
-from nics_drl_bridge.lidar.arrays import Array, Integers, Mask, Singles
+from nics_drl_bridge.lidar.arrays import AnyArray, Array, Integers, Mask, Singles
 from nics_drl_bridge.lidar.map_kernels import Fixtures
 from nics_drl_bridge.lidar.shapes import Coordinate
 
@@ -320,7 +320,7 @@ def stack_fixtures(
     return Fixtures(member, np.concatenate(walls), first, squares, places, frames)
 
 
-def joined(cells: Sequence[NDArray[Any]]) -> tuple[NDArray[Any], Integers]:
+def joined(cells: Sequence[AnyArray]) -> tuple[AnyArray, Integers]:
     """Cells (rows, columns) one after the other, and first cell, rows, columns of each (P, 3).
 
     An array that occurs again, as the map of several worlds, is stored once.

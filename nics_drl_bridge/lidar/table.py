@@ -23,7 +23,13 @@ from nics_drl_bridge.files import (
     write_text,
     write_whole_folder,
 )
-from nics_drl_bridge.lidar.arrays import Array, Integers, ShortIntegers, Singles
+from nics_drl_bridge.lidar.arrays import (
+    AnyArray,
+    Array,
+    Integers,
+    ShortIntegers,
+    Singles,
+)
 from nics_drl_bridge.lidar.lookup_kernels import FEWEST, TABLE_SHAPE, TableArrays
 from nics_drl_bridge.lidar.shapes import Circle, Outlines, Shape
 from nics_drl_bridge.lidar.spec import LidarSpec, drop_sensor_model
@@ -162,7 +168,7 @@ class LidarTable:
         return sum(array.nbytes for array in self._arrays.values())
 
     @property
-    def _arrays(self) -> dict[str, NDArray[Any]]:
+    def _arrays(self) -> dict[str, AnyArray]:
         return {name: np.ascontiguousarray(getattr(self, name)) for name in ARRAYS}
 
     @property
@@ -228,7 +234,7 @@ class LidarTable:
         return table
 
     def _check(self) -> None:
-        arrays: tuple[NDArray[Any], ...] = (self.grid, self.start, self.cell, self.rows)
+        arrays: tuple[AnyArray, ...] = (self.grid, self.start, self.cell, self.rows)
         types = [array.dtype for array in arrays if array.flags.c_contiguous]
         if types != [np.float64, np.int32, np.int16, np.float32]:
             raise ValueError("an array has another number type or axis order")
@@ -266,7 +272,7 @@ class LidarTable:
             raise ValueError("a cell names a corner that its shape does not have")
 
 
-def _map_file(path: Path) -> NDArray[Any]:
+def _map_file(path: Path) -> AnyArray:
     """Map a `.npy` file into memory; writing to the array never changes the file."""
     try:
         with np.errstate(over="raise"):  # of a shape whose size is no number

@@ -8,7 +8,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import PolicyError, suggest
 from nics_drl_bridge.extras.foreign_policies.mapping import (
@@ -22,6 +21,7 @@ from nics_drl_bridge.extras.foreign_policies.mapping import (
     Scaled,
 )
 from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.lidar.arrays import AnyArray
 from nics_drl_bridge.policy.file.onnx_session import Rows, run_network
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -65,7 +65,7 @@ def part_size(part: InputPart, scan_parts: int, outputs: Mapping[str, int]) -> i
     return size * part.history
 
 
-def _is_number(output: NDArray[Any]) -> bool:
+def _is_number(output: AnyArray) -> bool:
     """Returns True for one integer, which chooses by its value."""
     return np.issubdtype(output.dtype, np.integer) and output.size == 1
 
@@ -110,7 +110,7 @@ class Adapter:
         """Number of elements of the state; it starts with zeros."""
         return sum(self._state_sizes.values())
 
-    def run(self, observation: Rows, *state: Rows) -> list[NDArray[Any]]:
+    def run(self, observation: Rows, *state: Rows) -> list[AnyArray]:
         """Returns action and command (1, C), and the next state (1, S), for (1, O) and (1, S)."""
         past: Entries = {}
         first = 0
@@ -157,7 +157,7 @@ class Adapter:
                     kept.append("twist")
         return list(dict.fromkeys(["begun", *kept])) if kept else []
 
-    def _make_empty_input(self, end: Any) -> NDArray[Any]:
+    def _make_empty_input(self, end: Any) -> AnyArray:
         """Returns zeros for an input of the session. Raises PolicyError for other types."""
         is_fixed = all(isinstance(size, int) for size in end.shape)
         if end.type not in DTYPES or not is_fixed:
@@ -165,7 +165,7 @@ class Adapter:
             raise self._fault(f"inputs.{end.name}", reason)
         return np.zeros(end.shape, DTYPES[end.type])
 
-    def _run_network(self, feeds: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
+    def _run_network(self, feeds: Mapping[str, AnyArray]) -> dict[str, Any]:
         outputs = run_network(self._session, self._source, dict(feeds))
         return dict(zip(self._names, outputs, strict=True))
 
@@ -307,7 +307,7 @@ class Adapter:
 
     def _feed(
         self, name: str, seen: Array, past: Entries, following: Entries
-    ) -> NDArray[Any]:
+    ) -> AnyArray:
         empty = self._empty_inputs[name]
         mapped = self._mapping.inputs.get(name)
         if mapped is not None:
@@ -395,7 +395,7 @@ class Adapter:
             value = clamp(element, command.limits) * command.multiply + command.add
         return float(clamp(value, command.clip))
 
-    def _choose(self, choices: Choices, output: NDArray[Any]) -> Array:
+    def _choose(self, choices: Choices, output: AnyArray) -> Array:
         nothing = np.full(len(self._commands), np.nan)  # never sent to a robot
         if np.isnan(output.astype(float)).any():
             return nothing

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge import extensions
 from nics_drl_bridge.arguments import check_path
@@ -14,6 +13,7 @@ from nics_drl_bridge.env.registry import TASKS, make_task
 from nics_drl_bridge.env.task import Task
 from nics_drl_bridge.errors import ConfigError, PolicyError, suggest
 from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.lidar.arrays import AnyArray
 from nics_drl_bridge.lidar.sectors import plan_of
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.policy.file import contract as contracts
@@ -24,7 +24,7 @@ from nics_drl_bridge.robot.spec import RobotSpec
 
 GOLDEN_TOLERANCE = 1e-5
 PERIOD_TOLERANCE = 1e-9
-Run = Callable[..., list[NDArray[Any]]]
+Run = Callable[..., list[AnyArray]]
 """Maps observations (n, O), and states (n, S) if any, to actions, commands and next states."""
 ROBOT = {"command", "footprint", "footprint_radius"}
 LIDAR = {"beams", "angle_min", "angle_max", "range_max", "mount"}
@@ -38,7 +38,7 @@ class PolicyFile:
         self.contract = contract
         self._run_network = run
 
-    def act(self, observation: Rows) -> NDArray[Any]:
+    def act(self, observation: Rows) -> AnyArray:
         """Returns the action (C,) in [-1, 1], or () discrete, for (O,); or n actions for (n, O)."""
         return self.run(observation)[0]
 
@@ -46,12 +46,12 @@ class PolicyFile:
         """Returns the command (C,) in SI, in the robot's order, for (O,); or (n, C) for (n, O)."""
         return self.run(observation)[1]
 
-    def step(self, observation: Rows, state: Rows) -> tuple[NDArray[Any], Rows]:
+    def step(self, observation: Rows, state: Rows) -> tuple[AnyArray, Rows]:
         """Returns the action, and the state (S,) or (n, S) for the next observation."""
         action, _, following = self.run(observation, state)
         return action, following
 
-    def run(self, observation: Rows, state: Rows | None = None) -> list[NDArray[Any]]:
+    def run(self, observation: Rows, state: Rows | None = None) -> list[AnyArray]:
         """Returns action, command and next state (S,) or (n, S) for (O,) or (n, O).
 
         Raises PolicyError for a wrong shape or a missing state; see `make_policy`.
@@ -77,7 +77,7 @@ class PolicyFile:
         whole = [np.concatenate(parts) for parts in zip(*out, strict=True)]
         return [part[0] if rows.ndim == 1 else part for part in whole]
 
-    def _run(self, rows: Rows, *state: Rows) -> list[NDArray[Any]]:
+    def _run(self, rows: Rows, *state: Rows) -> list[AnyArray]:
         out = self._run_network(rows, *state)
         if any(len(part) != len(rows) for part in out):
             reason = (

@@ -11,7 +11,6 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
@@ -24,7 +23,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.lidar.arrays import Mask, Singles
+from nics_drl_bridge.lidar.arrays import AnyArray, Mask, Singles
 from nics_drl_bridge.policy.evaluation import Act
 from nics_drl_bridge.policy.train.checkpoint import RECENT, Watch, tensors
 from nics_drl_bridge.policy.train.settings import TrainingSettings
@@ -82,7 +81,7 @@ def check_serves(settings: TrainingSettings, env: BridgeVectorEnv) -> None:
 def make_act(algorithm: BaseAlgorithm | Actor) -> Act:
     """Returns the deterministic policy of an algorithm, without exploration noise."""
 
-    def act(observations: Singles) -> NDArray[Any]:
+    def act(observations: Singles) -> AnyArray:
         seen = torch.as_tensor(observations)
         with torch.no_grad():
             if isinstance(algorithm, Actor):
@@ -145,7 +144,7 @@ def observe_statistics(env: VecEnv, rng: np.random.Generator) -> tuple[Array, Ar
         if k % 8 == 0:  # otherwise a robot with inertia would hardly move
             space: Any = env.action_space
             if isinstance(space, gymnasium.spaces.Discrete):
-                actions: NDArray[Any] = rng.integers(space.n, size=env.num_envs)
+                actions: AnyArray = rng.integers(space.n, size=env.num_envs)
             else:
                 actions = rng.uniform(-1.0, 1.0, (env.num_envs, *space.shape)).astype(
                     np.float32

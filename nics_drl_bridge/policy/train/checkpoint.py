@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from stable_baselines3.common.logger import Logger
 
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import check_sealed, seal, write_bytes
+from nics_drl_bridge.lidar.arrays import AnyArray
 from nics_drl_bridge.policy.evaluation import Act
 from nics_drl_bridge.policy.train.settings import TrainingSettings
 from nics_drl_bridge.policy.train.stop import Stop
@@ -96,7 +96,7 @@ def restore_envs(content: dict[str, Any], env: TrainVecEnv) -> None:
         restore(worlds, {name: value.numpy() for name, value in state.items()})
 
 
-def tensors(arrays: dict[str, NDArray[Any]]) -> dict[str, torch.Tensor]:
+def tensors(arrays: dict[str, AnyArray]) -> dict[str, torch.Tensor]:
     """Converts arrays by name to tensors."""
     return {
         name: torch.from_numpy(np.ascontiguousarray(rows))
@@ -205,7 +205,7 @@ class Watch:
         return True
 
 
-Arrays = dict[str, NDArray[Any]]
+Arrays = dict[str, AnyArray]
 MEMORY, DRAWN = "memory.", "drawn."
 """Prefixes of the arrays whose names depend on the current episodes."""
 
@@ -218,7 +218,7 @@ def snapshot(env: BridgeVectorEnv) -> Arrays:
     return {name: rows.copy() for name, rows in arrays.items()}
 
 
-def restore(env: BridgeVectorEnv, state: Mapping[str, NDArray[Any]]) -> None:
+def restore(env: BridgeVectorEnv, state: Mapping[str, AnyArray]) -> None:
     """Restores a snapshot. Raises ConfigError if worlds, robots or task of the env differ."""
     parts: dict[str, Arrays] = {"": {}, MEMORY: {}, DRAWN: {}}
     for name, rows in state.items():
@@ -240,5 +240,5 @@ def restore(env: BridgeVectorEnv, state: Mapping[str, NDArray[Any]]) -> None:
     env.ready = bool((targets["episode"] >= 0).all())
 
 
-def _kind(rows: NDArray[Any] | None) -> str:
+def _kind(rows: AnyArray | None) -> str:
     return "missing" if rows is None else f"{rows.dtype} of shape {rows.shape}"

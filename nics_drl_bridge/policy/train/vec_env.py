@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from nics_drl_bridge import extensions
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.lidar.arrays import Mask, Singles
+from nics_drl_bridge.lidar.arrays import AnyArray, Mask, Singles
 
 with extensions.require_modules("TrainVecEnv"):
     from stable_baselines3.common.vec_env import VecEnv
@@ -47,7 +47,7 @@ class TrainVecEnv(VecEnv):
         )
         self._infos: list[dict[str, Any]] = [{} for _ in range(count)]
         self._ended: list[int] = []
-        self._actions: NDArray[Any] = np.zeros(0)
+        self._actions: AnyArray = np.zeros(0)
         self.stepping_s = 0.0  # wall time in the envs [s]
         # called after each step of all worlds
         self.on_step: Callable[[], None] | None = None
@@ -63,7 +63,7 @@ class TrainVecEnv(VecEnv):
         self._reset_options()
         return _join_rows(shown)
 
-    def step_async(self, actions: NDArray[Any]) -> None:
+    def step_async(self, actions: AnyArray) -> None:
         """Stores the actions for the next step."""
         self._actions = actions
 
@@ -158,6 +158,6 @@ class TrainVecEnv(VecEnv):
             env.close()
 
 
-def _join_rows(parts: list[NDArray[Any]]) -> NDArray[Any]:
+def _join_rows(parts: list[AnyArray]) -> AnyArray:
     """Concatenates the rows of several envs; a single env's rows are returned unchanged."""
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
