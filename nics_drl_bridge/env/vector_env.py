@@ -132,7 +132,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
             self.model, self.world, num_envs, self.robots, **simulation
         )
         self._teacher: Teacher | None = None
-        self._each = (num_envs, self.robots, -1)
+        self._each: tuple[int, ...] = (num_envs, self.robots, -1)
         if not self.task.action_space.shape:
             self._each = (num_envs, self.robots)
         self._period_ns = round(self.model.control_period * NS_PER_S)

@@ -15,12 +15,14 @@ from nics_drl_bridge.env.task import Sight
 from nics_drl_bridge.geometry import compute_depths
 from nics_drl_bridge.policy.planners.local_map import (
     CELL_M,
-    Clearance,
     fill_outline,
+    make_map_maker,
+)
+from nics_drl_bridge.policy.planners.local_map_kernels import (
+    Clearance,
     find_contact_limit,
     find_room,
     find_way,
-    make_map_maker,
     map_scan,
     score_heading,
 )

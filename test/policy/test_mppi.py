@@ -12,7 +12,8 @@ from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.interface import RobotView
-from nics_drl_bridge.policy.planners.mppi import Mppi, draw, fit_command
+from nics_drl_bridge.policy.planners.mppi import Mppi
+from nics_drl_bridge.policy.planners.mppi_kernels import draw, fit_command
 from nics_drl_bridge.robot.spec import load_robot
 
 ROBOTS = ("ackermann", "differential", "mecanum", "tricycle")

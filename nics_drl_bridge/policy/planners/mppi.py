@@ -1,16 +1,10 @@
-"""Model-predictive path integral control (Williams and others 2017), as a policy.
-
-Simulates K rollouts at a time in the robot's model, over H periods and the stop after them.
-Commands are actions in [-1, 1] at knots, interpolated linearly. Shapes: N robots, S states, C
-commands, Q knots.
-"""
+"""Model-predictive path integral control (Williams and others 2017), as a policy."""
 
 import math
 import os
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise, product
-from typing import NamedTuple
 
 import numpy as np
 
@@ -19,104 +13,33 @@ from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.generator import BUILTIN_SEED, CONTROL_PERIOD_S, SimulatorModel
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.identify import identify
-from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.lidar.arrays import Integers, Mask, Singles
+from nics_drl_bridge.lidar.arrays import Singles
 from nics_drl_bridge.policy.planners import local_map as maps
-from nics_drl_bridge.policy.planners.local_map import (
-    ARRIVED_M,
-    MOST_M,
+from nics_drl_bridge.policy.planners.local_map_kernels import (
     Clearance,
     FootprintDiscs,
     MapMaker,
-    Situation,
-    find_room,
-    find_way,
 )
-from nics_drl_bridge.random_kernels import PLANNER_STREAM, normal, uniform
+from nics_drl_bridge.policy.planners.mppi_kernels import (
+    Plant,
+    RollOuts,
+    Sampling,
+    draw,
+    plan_all,
+)
 from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.robot.braking import Braking, find_braking
-from nics_drl_bridge.robot.kernels import (
-    SERIES,
-    Terms,
-    advance,
-    apply_curve,
-    make_terms,
-    rates,
-    replace_coefficients,
-    run,
-)
+from nics_drl_bridge.robot.kernels import SERIES, make_terms, replace_coefficients
 from nics_drl_bridge.robot.kinds import compute_steady_twist
 from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.threads import run_parts
 
 HORIZON_S = 2.0  # time of a rollout
 KNOTS = 4  # actions along a rollout
-SPREADS = (0.4, 0.2)  # standard deviation of the noise in the rounds after the first
-TEMPERATURE = 0.05  # of the weights of rollouts, as a path length [m]
 CLEARANCE = Clearance(margin=0.08, soft=0.4)
 SETTLED_S = 3.0  # time to the steady state of a held command
 FINEST = 0.25  # maximum rollout step as a fraction of a lag
 FEWEST = 8  # minimum number of robots per thread
-# Weights of the terms in the cost of a rollout: of driving all of it at the margin [m], of the mean
-# path length to the goal, where that at the end has the rest of 1, of the squared change of actions
-# between knots [m], and of a final heading that leads away from the goal [m]
-NEAR = 4.0
-EARLY = 0.3
-CHANGE = 0.02
-ASTRAY = 0.2
-HIT = 1e3  # cost of an immediate contact; later ones cost less
-# multiple of the range from which proposals are drawn before clamping, so many lie at its ends
-BEYOND = 1.3
-# passes over the commands when fitting them to a twist
-PASSES = 12
-EASE = 1e-6
-
-
-class Plant(NamedTuple):
-    """The model of a robot, for K rollouts at a time."""
-
-    terms: Terms  # with coefficients (T, K), one column per rollout
-    single: Terms  # with coefficients (T,), for one robot
-    series: Array
-    dt: float  # [s]
-    substeps: int  # integration steps per period
-    latency: float  # delay before a command takes effect [s]
-    settled: Array  # (S, C) steady state per unit of a held command
-    low: Array  # (C,) minimum of each command
-    high: Array
-
-
-class Sampling(NamedTuple):
-    """The rollouts of a plan, each of which ends with a stop."""
-
-    offers: Array  # (K, Q, C) proposed actions of the first round
-    # (K, Q, C) standard normal noise, added to the best actions in later rounds
-    noise: Array
-    between: Array  # (H, Q) weights of the knots in the action of each period
-    # (C,) True for commands that are held while the robot stops
-    holds: Mask
-    rest: Array  # (C,) value of the other commands
-    # maximum number of periods for the stop; 0 if the robot can stop within half a rollout
-    stop: int
-    far: float  # distance along an axis beyond which the map is unknown [m]
-
-
-class RollOuts(NamedTuple):
-    """Scratch memory of one robot's plan; a lane is one of the K rollouts."""
-
-    pose: Array  # (6, K) see `robot.kernels.run`
-    x: Array  # (S + C + 1, K)
-    dq: Array  # (3 + S, K)
-    actions: Array  # (K, Q, C)
-    nominal: Array  # (Q, C)
-    held: Array  # (C,) held command that explains the present twist
-    x_single: Array  # (S + C + 1,) of one robot
-    rate: Array  # (3 + S,)
-    start: Array  # (3,)
-    cost: Array  # (K,)
-    way: Array  # (K,)
-    # (K,) period of the contact or arrival; negative: neither
-    ended: Integers
 
 
 @dataclass(frozen=True)
@@ -270,241 +193,5 @@ class Mppi:
         longest = float(np.max(self._braking.time_s(self._top_twists), initial=0.0))
         if longest > 0.5 * HORIZON_S:
             stop = math.ceil(longest / self._period)
-            far = min(self._reach, self.task.sight.range_max, MOST_M)
+            far = min(self._reach, self.task.sight.range_max, maps.MOST_M)
         return Sampling(offers, noise, between, holds, still(robot), stop, far)
-
-
-@kernel(allocates=True)
-def draw(offers: Array, noise: Array, rest: Array, seed: int) -> None:
-    """Draws `Sampling.offers`, the first of them rest (C,), and `Sampling.noise`, by seed."""
-    for k in range(offers.shape[0]):
-        for q in range(offers.shape[1]):
-            for c in range(offers.shape[2]):
-                i = (k * offers.shape[1] + q) * offers.shape[2] + c
-                drawn = BEYOND * (2.0 * uniform(seed, PLANNER_STREAM, 3 * i) - 1.0)
-                # Half of the proposals hold one action.
-                held = k < offers.shape[0] // 2 and q > 0
-                offers[k, q, c] = (
-                    offers[k, 0, c] if held else min(max(drawn, -1.0), 1.0)
-                )
-                if k == 0:
-                    offers[k, q, c] = rest[c]
-                noise[k, q, c] = normal(seed, PLANNER_STREAM, 3 * i + 1)
-
-
-@kernel(allocates=True)
-def plan_all(
-    out: Array,
-    scans: Array,
-    goals: Array,
-    twists: Array,
-    maker: MapMaker,
-    plant: Plant,
-    sampling: Sampling,
-    lanes: RollOuts,
-) -> None:
-    """Writes the first actions (N, C) of the plans of N robots.
-
-    Scans are (N, P), goals (N, 2), twists (N, 3). Instead of warm-starting from the previous plan,
-    the first round proposes actions from the whole range. The planner therefore has no memory: its
-    actions depend only on the observation.
-    """
-    for n in range(out.shape[0]):
-        around = maps.map_scan(scans[n], goals[n], maker)
-        # pose and state when the first command takes effect
-        fit_command(twists[n], plant, lanes)
-        lanes.start[:] = 0.0
-        if plant.latency > 0.0:
-            advance(lanes.start, twists[n], plant.latency, plant.series)
-        lanes.actions[:] = sampling.offers
-        best = _roll_out(around, plant, sampling, lanes)
-        lanes.nominal[:] = lanes.actions[best]
-        for spread in SPREADS:
-            for k in range(lanes.actions.shape[0]):
-                for q in range(lanes.nominal.shape[0]):
-                    for c in range(lanes.nominal.shape[1]):
-                        action = lanes.nominal[q, c]
-                        if k > 0:
-                            action += spread * sampling.noise[k, q, c]
-                        lanes.actions[k, q, c] = min(max(action, -1.0), 1.0)
-            best = _roll_out(around, plant, sampling, lanes)
-            _average(best, lanes)
-        out[n] = lanes.nominal[0]
-
-
-@kernel
-def _average(best: int, lanes: RollOuts) -> None:
-    """Replaces the nominal actions by the cost-weighted mean of the sampled ones."""
-    lanes.nominal[:] = 0.0
-    total = 0.0
-    for k in range(lanes.cost.shape[0]):
-        weight = math.exp((lanes.cost[best] - lanes.cost[k]) / TEMPERATURE)
-        total += weight
-        for q in range(lanes.nominal.shape[0]):
-            for c in range(lanes.nominal.shape[1]):
-                lanes.nominal[q, c] += weight * lanes.actions[k, q, c]
-    for q in range(lanes.nominal.shape[0]):
-        for c in range(lanes.nominal.shape[1]):
-            lanes.nominal[q, c] /= total
-
-
-@kernel
-def fit_command(twist: Array, plant: Plant, lanes: RollOuts) -> None:
-    """Writes the held command whose steady twist is nearest to a twist (3,), and its state.
-
-    Coordinate descent on the squared difference.
-    """
-    held = lanes.held
-    x = lanes.x_single
-    dq = lanes.rate
-    terms = plant.single
-    count = plant.settled.shape[1]
-    for c in range(count):
-        held[c] = min(max(0.0, plant.low[c]), plant.high[c])
-    for _ in range(PASSES):
-        for c in range(count):
-            _settle(held, plant, lanes)
-            rates(dq, x, terms)
-            r0 = twist[0] - dq[0]
-            r1 = twist[1] - dq[1]
-            r2 = twist[2] - dq[2]
-            b0 = dq[0]
-            b1 = dq[1]
-            b2 = dq[2]
-            step = 1e-3 * (plant.high[c] - plant.low[c])
-            held[c] += step
-            _settle(held, plant, lanes)
-            rates(dq, x, terms)
-            held[c] -= step
-            g0 = (dq[0] - b0) / step
-            g1 = (dq[1] - b1) / step
-            g2 = (dq[2] - b2) / step
-            size = g0 * g0 + g1 * g1 + g2 * g2 + EASE
-            value = held[c] + (g0 * r0 + g1 * r1 + g2 * r2) / size
-            held[c] = min(max(value, plant.low[c]), plant.high[c])
-    _settle(held, plant, lanes)
-
-
-@kernel
-def _settle(command: Array, plant: Plant, lanes: RollOuts) -> None:
-    """Writes the steady state of a command (C,) and its effect into `one`."""
-    states, count = plant.settled.shape
-    x = lanes.x_single
-    for s in range(states):
-        x[s] = 0.0
-        for c in range(count):
-            x[s] += plant.settled[s, c] * command[c]
-    for c in range(count):
-        x[states + c] = apply_curve(command[c], plant.single.curves[c])
-    x[states + count] = 1.0
-
-
-@kernel
-def _roll_out(
-    around: Situation, plant: Plant, sampling: Sampling, lanes: RollOuts
-) -> int:
-    """Rolls out the actions of all lanes; writes their costs and returns the cheapest lane."""
-    _begin(plant, lanes)
-    states = plant.settled.shape[0]
-    periods = sampling.between.shape[0]
-    limit = maps.find_contact_limit(around)
-    for t in range(periods + sampling.stop):
-        for c in range(plant.low.shape[0]):
-            row = lanes.x[states + c]
-            curve = plant.single.curves[c]
-            if t < periods:
-                middle = 0.5 * (plant.low[c] + plant.high[c])
-                half = 0.5 * (plant.high[c] - plant.low[c])
-                for k in range(row.shape[0]):
-                    action = 0.0
-                    for q in range(lanes.nominal.shape[0]):
-                        action += sampling.between[t, q] * lanes.actions[k, q, c]
-                    row[k] = apply_curve(middle + half * action, curve)
-            elif not sampling.holds[c]:
-                row[:] = apply_curve(sampling.rest[c], curve)
-        run(
-            lanes.pose,
-            lanes.x,
-            lanes.dq,
-            plant.terms,
-            plant.series,
-            plant.dt,
-            plant.substeps,
-        )
-        for k in range(lanes.cost.shape[0]):
-            if lanes.ended[k] < 0:
-                _add_cost(k, t, limit, around, sampling, lanes)
-    best = 0
-    for k in range(lanes.cost.shape[0]):
-        lanes.cost[k] += (1.0 - EARLY) * lanes.way[k]
-        if lanes.cost[k] < lanes.cost[best]:
-            best = k
-    return best
-
-
-@kernel
-def _begin(plant: Plant, lanes: RollOuts) -> None:
-    """Puts all lanes at the start; begins their costs with the changes of action between knots."""
-    states, count = plant.settled.shape
-    x = lanes.start[0]
-    y = lanes.start[1]
-    heading = lanes.start[2]
-    for k in range(lanes.cost.shape[0]):
-        lanes.pose[0, k] = x
-        lanes.pose[1, k] = y
-        lanes.pose[2, k], lanes.pose[3, k] = math.cos(heading), math.sin(heading)
-        lanes.pose[4, k] = heading
-        lanes.pose[5, k] = 0.0
-        for s in range(states):
-            lanes.x[s, k] = lanes.x_single[s]
-        change = 0.0
-        for c in range(count):
-            before = (
-                2.0 * (lanes.held[c] - plant.low[c]) / (plant.high[c] - plant.low[c])
-                - 1.0
-            )
-            for q in range(lanes.nominal.shape[0]):
-                change += (lanes.actions[k, q, c] - before) ** 2
-                before = lanes.actions[k, q, c]
-        lanes.cost[k] = CHANGE * change
-        lanes.way[k] = 0.0
-        lanes.ended[k] = -1
-
-
-@kernel
-def _add_cost(
-    k: int,
-    t: int,
-    limit: float,
-    around: Situation,
-    sampling: Sampling,
-    lanes: RollOuts,
-) -> None:
-    """Adds the cost of period t in lane k: of the way and of contacts, or of those in a stop."""
-    periods = sampling.between.shape[0]
-    x = lanes.pose[0, k]
-    y = lanes.pose[1, k]
-    c = lanes.pose[2, k]
-    s = lanes.pose[3, k]
-    room = find_room(x, y, c, s, around)
-    if t >= periods:
-        if room < limit or max(abs(x), abs(y)) > sampling.far:
-            lanes.cost[k] += HIT * (1.0 - (t - periods) / sampling.stop)
-            lanes.ended[k] = t
-        return
-    way = find_way(x, y, around)
-    lanes.way[k] = way
-    lanes.cost[k] += EARLY * way / periods
-    if room < limit:
-        lanes.cost[k] += HIT * (2.0 - t / periods)
-        lanes.ended[k] = t
-        return
-    keep = around.clearance
-    near = max(keep.margin + keep.soft - room, 0.0) / keep.soft
-    lanes.cost[k] += NEAR * near * near / periods
-    if math.hypot(around.goal[0] - x, around.goal[1] - y) < ARRIVED_M:
-        lanes.ended[k] = t
-        lanes.way[k] = 0.0
-    elif t == periods - 1:
-        astray = maps.score_heading(x, y, c, s, way, around)
-        lanes.cost[k] += ASTRAY * astray * min(way, 1.0)
