@@ -275,10 +275,8 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
         self.ended = outcome.ended[0]
         self._view = view
         for name, values in outcome.info.items():
-            row = self._get_row(values[0]).copy()
-            facts[name] = row
-            if row.ndim == 0:
-                facts[name] = row.item()
+            row = self._get_row(values[0])
+            facts[name] = row.item() if row.ndim == 0 else row.copy()
         return out[0], terms, self._make_info(view, facts)
 
     def halt(self) -> None:

@@ -154,8 +154,7 @@ class Navigation(Task):
         )
         if self.sensors:
             np.concatenate([own, self.sensor_shares(now)], axis=-1, out=out)
-        reached, touched, succeeded = np.moveaxis(flags, -1, 0)
-        return out, GoalProgress(approach, reached, touched, succeeded)
+        return out, GoalProgress(approach, flags[..., 0], flags[..., 1], flags[..., 2])
 
     def _make_terms(self, progress: GoalProgress) -> Terms:
         return {
