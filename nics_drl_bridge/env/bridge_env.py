@@ -276,7 +276,10 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
         self._view = view
         for name, values in outcome.info.items():
             row = self._get_row(values[0])
-            facts[name] = row.item() if row.ndim == 0 else row.copy()
+            if row.ndim == 0:
+                facts[name] = row.item()
+            else:
+                facts[name] = row.copy()
         return out[0], terms, self._make_info(view, facts)
 
     def halt(self) -> None:
