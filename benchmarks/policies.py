@@ -710,7 +710,7 @@ def judge_robustness(result: Result) -> list[str]:
     return missed if any(result["success"].values()) else ["no policy was driven"]
 
 
-SHIPPED = some_of(shipped_policies())
+SHIPPED = some_of(list_shipped_policies())
 BENCHMARKS = {
     "training": Benchmark(
         measure_training,

@@ -34,7 +34,7 @@ from nics_drl_bridge.lidar.shapes import (
     Polygon,
     Rectangle,
     Shape,
-    convex_hull,
+    find_convex_hull,
 )
 from nics_drl_bridge.sim.world import MOST_OBSTACLES, Obstacles, Region
 
@@ -82,7 +82,7 @@ class Box(NamedTuple):
             if below * above < 0.0:
                 share = below / (below - above)
                 cuts.append(corners[a] + share * (corners[b] - corners[a]))
-        hull = convex_hull(np.array(cuts)[:, :2]) if cuts else np.zeros((0, 2))
+        hull = find_convex_hull(np.array(cuts)[:, :2]) if cuts else np.zeros((0, 2))
         if len(hull) < 3 or np.ptp(hull, axis=0).min() < SMALLEST:
             return None
         return _make_polygon(hull), pose[0, 3], pose[1, 3], 0.0

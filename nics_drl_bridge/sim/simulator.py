@@ -22,7 +22,7 @@ from nics_drl_bridge.generator import SimulatorModel, footprint_shape
 from nics_drl_bridge.kernels import pack
 from nics_drl_bridge.lidar import scan_kernels
 from nics_drl_bridge.lidar.arrays import Array, Integers
-from nics_drl_bridge.lidar.bake import with_shapes
+from nics_drl_bridge.lidar.bake import add_shapes
 from nics_drl_bridge.lidar.exact_kernels import SHAPE, OutlineArrays
 from nics_drl_bridge.lidar.maps import GridMap, joined, stack_fixtures
 from nics_drl_bridge.lidar.scanner import Renderer, Scanner

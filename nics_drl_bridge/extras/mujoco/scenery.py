@@ -10,7 +10,13 @@ from nics_drl_bridge.extras.mujoco.machines import Machine, Physics
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.lidar.exact_kernels import RADIUS, SHAPE
 from nics_drl_bridge.lidar.maps import GridMap
-from nics_drl_bridge.lidar.shapes import Circle, Rectangle, Segment, Shape, convex_hull
+from nics_drl_bridge.lidar.shapes import (
+    Circle,
+    Rectangle,
+    Segment,
+    Shape,
+    find_convex_hull,
+)
 from nics_drl_bridge.sim.world import Motion, World
 
 HEIGHT = 0.5  # height of walls and obstacles [m]
