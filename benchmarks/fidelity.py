@@ -45,11 +45,11 @@ from nics_drl_bridge.identify.open_loop import (
     HORIZON_S,
     SPACING_S,
     Windows,
-    open_loop_error,
+    measure_open_loop_error,
     predict,
-    windows,
+    select_windows,
 )
-from nics_drl_bridge.identify.yardstick import fit_yardstick, kept_twist
+from nics_drl_bridge.identify.yardstick import fit_yardstick, predict_kept_twist
 from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.middleware.measurement import ODOM
 from nics_drl_bridge.middleware.middleware import Middleware
@@ -74,7 +74,9 @@ def judge_model(found: Identified, control: str | None) -> Result:
     drive = found.drive
     calibration = found.calibration
     until = found.train_until_s
-    chosen = windows(drive, calibration, until, drive.duration_s, HORIZON_S, SPACING_S)
+    chosen = select_windows(
+        drive, calibration, until, drive.duration_s, HORIZON_S, SPACING_S
+    )
     ends = predict(found.model, calibration, drive, chosen)
     if control == "standing":
         ends = chosen.start
@@ -87,7 +89,9 @@ def judge_model(found: Identified, control: str | None) -> Result:
         "share_of_path": share,
         "heading_error_rad": heading,
         "yardstick_share": average_errors(yardstick.predict(drive, chosen), chosen)[1],
-        "constant_twist_share": average_errors(kept_twist(drive, chosen), chosen)[1],
+        "constant_twist_share": average_errors(
+            predict_kept_twist(drive, chosen), chosen
+        )[1],
         "coverage_95": float("nan") if coverage is None else coverage,
         "path_m": float(chosen.path.mean()),
         "windows": len(chosen.start_t),
@@ -132,7 +136,7 @@ def leave_out(source: Path, mapping: Path, control: str | None) -> Result:
         rest = replace(recording, pose=others)
         found = identify(rest, spec, alpha="auto", train_until=2.0 * since[-1])
         calibration = found.calibration
-        chosen = windows(drive, calibration, start, end, HORIZON_S, SPACING_S)
+        chosen = select_windows(drive, calibration, start, end, HORIZON_S, SPACING_S)
         if not len(chosen.start_t):  # its clocks were taken to share nothing
             errors.append((np.inf,) * 3)
             continue
@@ -203,7 +207,7 @@ def average_drives(
 ) -> dict[str, float]:
     """Returns mean errors of the predictions on unseen drives, each as long as the others."""
     results = [
-        open_loop_error(
+        measure_open_loop_error(
             found.model, found.calibration, Drive(d, spec), 0.0, d.pose.t[-1]
         )
         for d in drives

@@ -13,7 +13,7 @@ from nics_drl_bridge.errors import ModelError
 from nics_drl_bridge.generator import SimulatorModel, load_model, save_model
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.open_loop import predict, windows
+from nics_drl_bridge.identify.open_loop import predict, select_windows
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.shapes import Circle
@@ -160,7 +160,7 @@ def test_an_open_loop_prediction_of_a_recorded_drive_follows_the_model(commands,
     t = 0.1 * np.arange(PERIODS + 1)
     streams = Stream(t[:-1], commands), Stream(t, path[0]), Stream(t, path[1])
     drive = Drive(Recording(*streams), CAR)
-    chosen = windows(drive, Calibration(), 0.0, t[-1], 2.0, 0.3)
+    chosen = select_windows(drive, Calibration(), 0.0, t[-1], 2.0, 0.3)
     ends = predict(motors(), Calibration(), drive, chosen)
     assert len(ends) > 10
     assert_same_path(ends, chosen.end)

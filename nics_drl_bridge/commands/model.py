@@ -135,7 +135,7 @@ def drive_summary(recording: Any, parameters: dict[str, Any]) -> tuple[str, ...]
     """Returns text lines on the robot's path, the coverage of each command, and the next step."""
     import numpy as np
 
-    from nics_drl_bridge.identify.excitation import coverage
+    from nics_drl_bridge.identify.excitation import measure_coverage
     from nics_drl_bridge.robot.spec import load_robot
 
     out = Path(parameters["out"])
@@ -144,7 +144,10 @@ def drive_summary(recording: Any, parameters: dict[str, Any]) -> tuple[str, ...]
     reach = np.hypot(*place.T).max()
     return (
         f"measured: a path of {path:.1f} m, up to {reach:.2f} m from the start",
-        *(span.line() for span in coverage(recording, load_robot(parameters["robot"]))),
+        *(
+            span.line()
+            for span in measure_coverage(recording, load_robot(parameters["robot"]))
+        ),
         f"next: nics generate {out} --robot {parameters['robot']} --out {out.stem}_model",
     )
 

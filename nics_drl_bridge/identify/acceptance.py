@@ -79,12 +79,14 @@ class Assessment:
     reasons: tuple[str, ...]
 
 
-def usual(judgement: tuple[HorizonErrors, ...]) -> list[HorizonErrors]:
+def select_usual_horizon(judgement: tuple[HorizonErrors, ...]) -> list[HorizonErrors]:
     """Returns the errors after 5 s, or at the longest held-out horizon; empty if there is none."""
     return [at for at in judgement if at.horizon_s <= JUDGED_S][-1:]
 
 
-def comparison_noise(difference: Array, start_t: Array, horizon: float) -> float:
+def estimate_comparison_noise(
+    difference: Array, start_t: Array, horizon: float
+) -> float:
     """Returns the noise [m] of a mean difference (W,) between two errors on the same windows.
 
     This is its standard error, counting all windows that start within one `horizon` [s] as one
@@ -112,12 +114,15 @@ def compare(
 
 def loses_to_textbook(judgement: tuple[HorizonErrors, ...]) -> bool:
     """True if a model's predictions are worse than its fitted textbook's, beyond the noise."""
-    return any(next(shortfall_of_textbook(at), "") for at in usual(judgement))
+    return any(
+        next(describe_shortfall_of_textbook(at), "")
+        for at in select_usual_horizon(judgement)
+    )
 
 
 def is_beaten_by_textbook(judgement: tuple[HorizonErrors, ...]) -> bool:
     """True if the fitted textbook, which is simpler, predicts better than a model."""
-    for at in usual(judgement):
+    for at in select_usual_horizon(judgement):
         if at.textbook is not None:
             textbook_m = at.textbook.position_m
             limit_m = max(
@@ -128,14 +133,14 @@ def is_beaten_by_textbook(judgement: tuple[HorizonErrors, ...]) -> bool:
     return False
 
 
-def shortfall(judgement: tuple[HorizonErrors, ...]) -> Iterator[str]:
+def describe_shortfall(judgement: tuple[HorizonErrors, ...]) -> Iterator[str]:
     """Yields the yardsticks that a model does not beat after 5 s, or at the longest horizon."""
-    for at in usual(judgement):
-        yield from shortfall_of_textbook(at)
-        yield from shortfall_of_twist(at)
+    for at in select_usual_horizon(judgement):
+        yield from describe_shortfall_of_textbook(at)
+        yield from describe_shortfall_of_twist(at)
 
 
-def shortfall_of_textbook(at: HorizonErrors) -> Iterator[str]:
+def describe_shortfall_of_textbook(at: HorizonErrors) -> Iterator[str]:
     """Yields a sentence if predictions are worse than the fitted textbook's; a tie is fine."""
     if at.textbook is None:
         return
@@ -144,7 +149,7 @@ def shortfall_of_textbook(at: HorizonErrors) -> Iterator[str]:
         yield f"{_describe_errors('the fitted textbook', at, at.textbook)}."
 
 
-def shortfall_of_twist(at: HorizonErrors) -> Iterator[str]:
+def describe_shortfall_of_twist(at: HorizonErrors) -> Iterator[str]:
     """Yields a sentence if predictions are no better than those of a constant twist."""
     outcome = compare(at.model, at.kept_twist, at.kept_twist_noise_m, at.path_m)
     finding = _describe_errors("a constant twist", at, at.kept_twist)
@@ -160,7 +165,7 @@ def _describe_errors(name: str, at: HorizonErrors, errors: EndErrors) -> str:
     return f"{finding}, those of {name} {errors.position_m:.3g} m"
 
 
-def relative_error(at: HorizonErrors, radius: float) -> float:
+def compute_relative_error(at: HorizonErrors, radius: float) -> float:
     """Returns an error as a fraction of the path, or of the robot's radius [m] if longer."""
     # A robot that turns in place has no path.
     return at.model.position_m / max(at.path_m, radius, 1e-9)
@@ -173,7 +178,7 @@ def rate(
 
     A model that was never tried on unseen data gets no verdict on its errors.
     """
-    judged = usual(judgement)
+    judged = select_usual_horizon(judgement)
     if not judged:
         return Assessment(Verdict.DO_NOT_TRAIN, ())
     (at,) = judged
@@ -184,12 +189,12 @@ def rate(
         _rate_beside_standing(at, radius),
     ]
     if not textbook and loses_to_textbook(judgement):
-        reasons = tuple(shortfall_of_textbook(at))
+        reasons = tuple(describe_shortfall_of_textbook(at))
         ratings.append(Assessment(Verdict.DO_NOT_TRAIN, reasons))
-    return combined(ratings)
+    return combine_ratings(ratings)
 
 
-def combined(ratings: Iterable[Assessment]) -> Assessment:
+def combine_ratings(ratings: Iterable[Assessment]) -> Assessment:
     """Returns the least favourable verdict, with the reasons of all."""
     verdicts = []
     reasons: list[str] = []
@@ -211,7 +216,7 @@ def rate_unseen(gap_s: float, duration_s: float) -> Assessment:
 
 def _rate_error(at: HorizonErrors, radius: float) -> Assessment:
     limits = THRESHOLDS
-    share = relative_error(at, radius)
+    share = compute_relative_error(at, radius)
     if share <= limits.good_error:
         return Assessment(Verdict.GOOD, ())
     if not np.isfinite(share):
@@ -240,7 +245,8 @@ def _rate_beside_twist(at: HorizonErrors) -> Assessment:
     outcome = compare(at.model, at.kept_twist, at.kept_twist_noise_m, at.path_m)
     verdicts = {Outcome.BETTER: Verdict.GOOD, Outcome.ALIKE: Verdict.WITH_CARE}
     return Assessment(
-        verdicts.get(outcome, Verdict.DO_NOT_TRAIN), tuple(shortfall_of_twist(at))
+        verdicts.get(outcome, Verdict.DO_NOT_TRAIN),
+        tuple(describe_shortfall_of_twist(at)),
     )
 
 
@@ -260,7 +266,7 @@ def list_doubts_of_commands(
     judgement: Sequence[HorizonErrors], calibration: Calibration
 ) -> Iterator[str]:
     """Yields a sentence if the commands hardly help to predict, or take effect implausibly late."""
-    for at in usual(tuple(judgement)):
+    for at in select_usual_horizon(tuple(judgement)):
         error = at.model.position_m
         without = at.kept_twist.position_m
         if HARDLY * without < error < without:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from nics_drl_bridge.identify.verdict import Gap
-from nics_drl_bridge.identify.yardstick import structure_of
+from nics_drl_bridge.identify.yardstick import probe_structure
 from nics_drl_bridge.robot.kinds import Textbook, reach, textbook
 from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
@@ -168,7 +168,7 @@ class _Completion:
 
         It is the product of speed and steering, measured at a constant if there is one.
         """
-        structure = structure_of(self.spec)
+        structure = probe_structure(self.spec)
         state = {v.twist: v.name for v in self.spec.state}
         turned = self.spec.state[i].twist == "wz" and "vx" in state
         if structure is None or not structure[1].used or not turned:

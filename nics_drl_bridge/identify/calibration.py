@@ -16,7 +16,7 @@ from nics_drl_bridge.identify.signals import (
     average_effect,
     infer_states,
     resample,
-    unwrapped,
+    unwrap_headings,
 )
 from nics_drl_bridge.recording.recording import Recording, Samples, samples_on_one_clock
 from nics_drl_bridge.robot.curve import LONGEST_DELAY_S, InputCurve, delays
@@ -123,7 +123,7 @@ def align(drive: Drive, calibration: Calibration) -> Samples:
     shared = _find_shared_stamps(recording, period) if calibration.is_exact else None
     if shared is not None:
         samples = samples_on_one_clock(*shared)
-        return replace(samples, dt=part_of(period, samples.dt))
+        return replace(samples, dt=find_dividing_step(period, samples.dt))
     grid, step = _make_grid(recording, calibration, period)
     half_width = SMOOTHING_BURSTS * calibration.burst_period_s
     if not half_width and (
@@ -133,39 +133,41 @@ def align(drive: Drive, calibration: Calibration) -> Samples:
     begin = grid - calibration.command_latency_s
     samples = samples_on_one_clock(
         grid,
-        poses_at(drive, calibration, grid, half_width),
-        states_at(drive, calibration, grid),
+        resample_poses(drive, calibration, grid, half_width),
+        resample_states(drive, calibration, grid),
         average_effect(
             recording.command, drive.spec, calibration.inputs, begin, begin + step
         ),
     )
-    is_known = outside_gaps(
+    is_known = select_outside_gaps(
         samples.t, drive.sample_t + calibration.clock_offset_s, step
     )
     if recording.state is not None:
-        is_known &= outside_gaps(samples.t, recording.state.t, step, STATE_GAP, 0.0)
+        is_known &= select_outside_gaps(
+            samples.t, recording.state.t, step, STATE_GAP, 0.0
+        )
     return replace(samples.rows(is_known), dt=step)
 
 
-def part_of(period: float, step: float) -> float:
+def find_dividing_step(period: float, step: float) -> float:
     """Returns the step nearest to a given one that divides a period evenly, both in [s]."""
     count = period / step
     whole = max(1, round(count))
     return step if abs(count - whole) < WHOLE else period / whole
 
 
-def poses_at(
+def resample_poses(
     drive: Drive, calibration: Calibration, grid: Array, half_width: float
 ) -> Array:
     """Returns poses (T, 3) of `base_link` at times on the commands' clock, by a half-width [s]."""
     t = drive.sample_t + calibration.clock_offset_s
     pose = drive.recording.pose
     return calibration.to_base(
-        resample(t, unwrapped(pose.values), grid, half_width, pose.weights)
+        resample(t, unwrap_headings(pose.values), grid, half_width, pose.weights)
     )
 
 
-def states_at(drive: Drive, calibration: Calibration, grid: Array) -> Array:
+def resample_states(drive: Drive, calibration: Calibration, grid: Array) -> Array:
     """Returns states (T, S), measured or inferred, at uniform times (T,) on the commands' clock."""
     recording = drive.recording
     if recording.state is not None:
@@ -199,7 +201,7 @@ def _find_shared_stamps(
     usual = float(np.median(np.diff(pose.t)))
     if not usual > 0.0:
         return None
-    step = part_of(period, usual)
+    step = find_dividing_step(period, usual)
     if abs(step - usual) > SAME_STEP * usual:
         return None
     since = [s.t - pose.t[0] for s in (pose, state, command)]
@@ -236,7 +238,7 @@ def _make_grid(
         or not STEP_RANGE_S[0] <= step <= STEP_RANGE_S[1]
     ):
         step = STEP_S
-    step = part_of(period, step)
+    step = find_dividing_step(period, step)
     first = max(pose[0], recording.command.t[0] + calibration.command_latency_s)
     last = pose[-1]
     if recording.state is not None:
@@ -251,7 +253,7 @@ def _make_grid(
     return np.asarray(first + step * np.arange(count + 1)), step
 
 
-def outside_gaps(
+def select_outside_gaps(
     t: Array, samples: Array, step: float, usual: float = 3.0, least: float = MAX_GAP_S
 ) -> NDArray[np.bool_]:
     """Selects steps (T,) between samples within `least` [s] or `usual` median steps."""

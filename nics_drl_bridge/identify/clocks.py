@@ -15,10 +15,10 @@ from nics_drl_bridge.identify.drive import MIN_STAMPS, Drive, TwistIntervals
 from nics_drl_bridge.identify.signals import Motors
 from nics_drl_bridge.identify.statistics import (
     CERTAIN,
+    compute_unexplained,
+    estimate_standard_errors,
+    estimate_uncertainty,
     minimise,
-    standard_errors,
-    uncertainty,
-    unexplained,
 )
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot import taylor
@@ -80,7 +80,7 @@ class DelayEstimate:
     explained: float  # fraction of the signal's variance that the response explains
 
 
-def delay_of_response(
+def estimate_response_delay(
     command: Stream,
     spec: RobotSpec,
     target: Target,
@@ -88,10 +88,10 @@ def delay_of_response(
     lags: Array | None = None,
 ) -> DelayEstimate:
     """Estimates a signal's delay around centers [s], and the moved commands' lags if unknown."""
-    moved = signals.moved_inputs(command, spec)[: len(spec.state)]
+    moved = signals.select_moved_inputs(command, spec)[: len(spec.state)]
     free = np.flatnonzero(moved if lags is None else [])
-    base = signals.nominal_lags(spec) if lags is None else lags
-    left_over = response_residual(command, spec, target)
+    base = signals.get_nominal_lags(spec) if lags is None else lags
+    left_over = make_response_residual(command, spec, target)
 
     def residual(theta: Array) -> Array:
         tau = base.copy()
@@ -106,12 +106,12 @@ def delay_of_response(
     return replace(estimate, lags=tau, lag_sigma=sigma)
 
 
-def response_residual(
+def make_response_residual(
     command: Stream, spec: RobotSpec, target: Target, order: int = 2
 ) -> Left:
     """Returns the residual of a signal explained by commands, given lags and delays (S,) [s]."""
     start, end, signal = target
-    moved = signals.moved_inputs(command, spec)
+    moved = signals.select_moved_inputs(command, spec)
     powers = taylor.list_exponents(len(moved), order)
     powers = powers[(powers[:, ~moved] == 0).all(axis=1)]
     grid = np.arange(start.min() - LEAD_S, end.max() + STEP_S, STEP_S)
@@ -123,19 +123,21 @@ def response_residual(
             means = signals.average_held(
                 command, spec, start - delay, end - delay, powers
             )
-            return unexplained(means, signal)
+            return compute_unexplained(means, signal)
         states = signals.infer_states(command, spec, lags, delay, grid, motors)
         chi = taylor.evaluate(states, powers)
-        return unexplained(signals.interval_means(grid, chi, start, end), signal)
+        return compute_unexplained(
+            signals.average_between_stamps(grid, chi, start, end), signal
+        )
 
     return residual
 
 
-def state_residual(command: Stream, state: Stream, spec: RobotSpec) -> Residual:
+def make_state_residual(command: Stream, state: Stream, spec: RobotSpec) -> Residual:
     """Returns the residual of a measured state's rates, given a delay (1,) of the commands [s]."""
     span = np.diff(state.t)
     keep = np.flatnonzero((span > 0.0) & (span < LONG_STEP * np.median(span)))
-    keep = keep[some_of(len(keep), MAX_ROWS)]
+    keep = keep[select_some_rows(len(keep), MAX_ROWS)]
     start = state.t[keep]
     end = state.t[keep + 1]
     rates = (state.values[keep + 1] - state.values[keep]) / (end - start)[:, None]
@@ -143,14 +145,14 @@ def state_residual(command: Stream, state: Stream, spec: RobotSpec) -> Residual:
 
     def residual(theta: Array) -> Array:
         u = signals.average_held(command, spec, start - theta[0], end - theta[0])
-        return unexplained(
+        return compute_unexplained(
             np.concatenate([np.ones((len(u), 1)), middle, u], axis=1), rates
         )
 
     return residual
 
 
-def some_of(count: int, most: int) -> NDArray[np.intp]:
+def select_some_rows(count: int, most: int) -> NDArray[np.intp]:
     """Returns the indices, in order, of at most `most` of `count` rows."""
     if count <= most:
         return np.arange(count)
@@ -158,14 +160,16 @@ def some_of(count: int, most: int) -> NDArray[np.intp]:
     return np.unique((np.arange(most) * 0.6180339887 % 1.0 * count).astype(np.intp))
 
 
-def residual_by_shift(state: Stream, target: Target) -> Residual:
+def make_shift_residual(state: Stream, target: Target) -> Residual:
     """Returns the residual of the pose's rates, given a delay (1,) of the measured state [s]."""
     start, end, signal = target
     chi = taylor.evaluate(state.values, taylor.list_exponents(state.values.shape[1], 2))
 
     def residual(theta: Array) -> Array:
-        means = signals.interval_means(state.t, chi, start - theta[0], end - theta[0])
-        return unexplained(means, signal)
+        means = signals.average_between_stamps(
+            state.t, chi, start - theta[0], end - theta[0]
+        )
+        return compute_unexplained(means, signal)
 
     return residual
 
@@ -201,7 +205,7 @@ def _search(
     if float((rest**2).sum()) >= min(cost):
         theta = start
         rest = residual(start)
-    sigma = uncertainty(jacobian, rest)
+    sigma = estimate_uncertainty(jacobian, rest)
     tau = np.exp(theta[1:])
     explained = 1.0 - float((rest**2).mean())
     return DelayEstimate(
@@ -242,7 +246,7 @@ def check_state_is_known(recording: Recording, spec: RobotSpec) -> None:
     raise RecordingError(f"{place}: {fault}; {advice}.")
 
 
-def timing_of(drive: Drive) -> TimingEstimate:
+def measure_timing(drive: Drive) -> TimingEstimate:
     """Estimates clock offset, latency and lags as far as the recording allows (RecordingError)."""
     recording = drive.recording
     spec = drive.spec
@@ -258,17 +262,17 @@ def timing_of(drive: Drive) -> TimingEstimate:
         )
     if state is not None:
         return _estimate_by_measured_state(drive, state)
-    if not signals.moved_commands(command).any():
+    if not signals.select_moved_commands(command).any():
         start = command.t[0] - recording.pose.t[0]
-        return nominal_timing(drive, float(start) if abs(start) > 60.0 else 0.0)
+        return make_nominal_timing(drive, float(start) if abs(start) > 60.0 else 0.0)
     target = (twists.start, twists.end, twists.twist)
     if recording.pose.clock != command.clock:
         return _estimate_on_two_clocks(recording, spec, target)
-    delay = delay_of_response(command, spec, target)
-    latency = if_certain(max(delay.value, 0.0), delay.sigma, MIN_TIME_S)
+    delay = estimate_response_delay(command, spec, target)
+    latency = keep_if_certain(max(delay.value, 0.0), delay.sigma, MIN_TIME_S)
     sigma = {"command_latency_s": delay.sigma}
-    early = if_certain(max(-delay.value, 0.0), delay.sigma, MIN_EARLY_S)
-    left_over = response_residual(command, spec, target)
+    early = keep_if_certain(max(-delay.value, 0.0), delay.sigma, MIN_EARLY_S)
+    left_over = make_response_residual(command, spec, target)
     if early and not _is_explained(left_over, delay):
         early = 0.0
     drift = 0.0 if recording.episodes else _find_drift(command, spec, target, delay)
@@ -301,7 +305,7 @@ def _find_drift(
         if len(part) < FEW_ROWS // 10:
             return 0.0
         rows = start[part], end[part], signal[part]
-        left_over = response_residual(command, spec, rows)
+        left_over = make_response_residual(command, spec, rows)
         left = [float((left_over(delay.lags, trial) ** 2).mean()) for trial in trials]
         if min(left) > MOST_UNEXPLAINED:
             return 0.0
@@ -314,10 +318,10 @@ def _find_drift(
     return float(rate) if steady else 0.0
 
 
-def nominal_timing(drive: Drive, offset: float = 0.0) -> TimingEstimate:
+def make_nominal_timing(drive: Drive, offset: float = 0.0) -> TimingEstimate:
     """Returns nominal lags and no latency, without any estimation."""
     if drive.recording.state is None:
-        lags = signals.nominal_lags(drive.spec)
+        lags = signals.get_nominal_lags(drive.spec)
     else:
         lags = np.zeros(0)
     return TimingEstimate(offset, 0.0, {}, lags, np.full(len(lags), np.nan), False)
@@ -329,7 +333,7 @@ def _estimate_on_two_clocks(
     """Estimates offset and latency separately if the wheels follow the commands, else their sum."""
     wheels = _find_wheel_delay(recording, spec)
     lags = None if wheels is None else wheels.lags
-    delay = delay_of_response(
+    delay = estimate_response_delay(
         recording.command, spec, target, _list_likely_shifts(recording), lags
     )
     if wheels is None:
@@ -351,18 +355,20 @@ def _estimate_by_measured_state(drive: Drive, state: Stream) -> TimingEstimate:
     latency = 0.0
     offset = 0.0
     early = 0.0
-    separated = bool(signals.moved_commands(recording.command).any())
+    separated = bool(signals.select_moved_commands(recording.command).any())
     if separated:
-        delay = _search_or_zero(state_residual(recording.command, state, drive.spec))
+        delay = _search_or_zero(
+            make_state_residual(recording.command, state, drive.spec)
+        )
         sigma["command_latency_s"] = delay.sigma
         least = 0.05 * float(np.median(np.diff(state.t)))
-        latency = if_certain(max(delay.value, 0.0), delay.sigma, least)
-        early = if_certain(max(-delay.value, 0.0), delay.sigma, MIN_EARLY_S)
+        latency = keep_if_certain(max(delay.value, 0.0), delay.sigma, least)
+        early = keep_if_certain(max(-delay.value, 0.0), delay.sigma, MIN_EARLY_S)
     if recording.pose.clock != state.clock:
-        by_shift = residual_by_shift(state, (twists.start, twists.end, twists.twist))
+        by_shift = make_shift_residual(state, (twists.start, twists.end, twists.twist))
         delay = _search_or_zero(by_shift, _list_likely_shifts(recording))
         sigma["clock_offset_s"] = delay.sigma
-        offset = -if_certain(delay.value, delay.sigma, MIN_TIME_S)
+        offset = -keep_if_certain(delay.value, delay.sigma, MIN_TIME_S)
     return TimingEstimate(
         offset, latency, sigma, np.zeros(0), np.zeros(0), separated, early
     )
@@ -380,18 +386,18 @@ def _find_wheel_delay(recording: Recording, spec: RobotSpec) -> DelayEstimate | 
         return None
     tick = float(np.median(np.diff(wheels.t)))
     target = (wheels.t - tick, wheels.t, wheels.values)
-    delay = delay_of_response(recording.command, spec, target)
+    delay = estimate_response_delay(recording.command, spec, target)
     if not delay.explained > WHEELS_EXPLAINED:
         return None
     return replace(delay, sigma=float(np.hypot(delay.sigma, WITHIN_TICK * tick)))
 
 
-def if_certain(value: float, sigma: float, least: float) -> float:
+def keep_if_certain(value: float, sigma: float, least: float) -> float:
     """Returns a correction, or zero if it is too small or too uncertain."""
     return value if abs(value) > max(CERTAIN * sigma, least) else 0.0
 
 
-def expected_states(
+def average_expected_states(
     drive: Drive, twists: TwistIntervals, timing: TimingEstimate
 ) -> Array:
     """Returns the mean state (n, S) over the twists' intervals; inferred ones at a gain of 1."""
@@ -399,16 +405,16 @@ def expected_states(
     state = drive.recording.state
     start, end = twists.on_clock(timing.offset)
     if state is not None:
-        return signals.interval_means(state.t, state.values, start, end)
+        return signals.average_between_stamps(state.t, state.values, start, end)
     grid = np.arange(min(start[0], command.t[0]) - 1.0, end[-1] + 0.01, 0.01)
     late = timing.latency + timing.delays
     states = signals.infer_states(
         command, drive.spec, timing.lags, late, grid, timing.motors
     )
-    return signals.interval_means(grid, states, start, end)
+    return signals.average_between_stamps(grid, states, start, end)
 
 
-def responses_of(
+def list_responses(
     drive: Drive,
     calibration: Calibration,
     timing: TimingEstimate,
@@ -419,11 +425,11 @@ def responses_of(
     if drive.recording.state is not None:
         return ()
     gains = np.ones(len(spec.state))
-    speed = signals.speed_index(spec)
-    moved = signals.moved_inputs(drive.recording.command, spec)
+    speed = signals.find_speed_index(spec)
+    moved = signals.select_moved_inputs(drive.recording.command, spec)
     if speed is not None and expected is not None and moved[speed]:
         gains[speed] = float(
-            expected @ speed_along(drive, calibration) / (expected @ expected)
+            expected @ compute_forward_speed(drive, calibration) / (expected @ expected)
         )
     return tuple(
         Response(v.name, str(v.follows), float(lag), float(gain))
@@ -431,7 +437,7 @@ def responses_of(
     )
 
 
-def speed_along(drive: Drive, calibration: Calibration) -> Array:
+def compute_forward_speed(drive: Drive, calibration: Calibration) -> Array:
     """Returns the speed (n,) of `base_link` along x over the intervals of the twists."""
     angle = calibration.rotation_rad
     ux, uy, wz = drive.twists.twist.T
@@ -440,18 +446,18 @@ def speed_along(drive: Drive, calibration: Calibration) -> Array:
     )
 
 
-def wheel_means(drive: Drive, calibration: Calibration) -> Array | None:
+def average_wheel_speeds(drive: Drive, calibration: Calibration) -> Array | None:
     """Returns mean wheel speeds (n, 2) over the intervals of the twists; None without wheels."""
     wheels = drive.recording.wheels
     if wheels is None:
         return None
     start, end = drive.twists.on_clock(calibration.clock_offset_s)
-    return signals.interval_means(wheels.t, wheels.values, start, end)
+    return signals.average_between_stamps(wheels.t, wheels.values, start, end)
 
 
-def with_wheels(drive: Drive, calibration: Calibration) -> Calibration:
+def add_wheel_scales(drive: Drive, calibration: Calibration) -> Calibration:
     """Adds scales of wheel speeds; wheels are swapped if the left one is faster in left turns."""
-    wheels = wheel_means(drive, calibration)
+    wheels = average_wheel_speeds(drive, calibration)
     if wheels is None:
         return calibration
     difference = wheels[:, 1] - wheels[:, 0]
@@ -464,13 +470,15 @@ def with_wheels(drive: Drive, calibration: Calibration) -> Calibration:
     sigma = dict(calibration.uncertainty)
     scales: dict[str, Any] = {}
     for name, units, moved in (
-        ("wheel_scale", wheels.mean(axis=1), speed_along(drive, calibration)),
+        ("wheel_scale", wheels.mean(axis=1), compute_forward_speed(drive, calibration)),
         ("turn_scale", difference, turn),
     ):
         if not float(units @ units) > 0.0:
             continue
         scale = float(units @ moved / (units @ units))
-        error = float(standard_errors(units[:, None], moved - scale * units)[0])
+        error = float(
+            estimate_standard_errors(units[:, None], moved - scale * units)[0]
+        )
         if abs(scale) > CERTAIN * error:
             scales[name] = scale
             sigma[name] = error

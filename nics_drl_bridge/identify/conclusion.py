@@ -6,10 +6,10 @@ from typing import NamedTuple
 from nics_drl_bridge.identify.acceptance import (
     Verdict,
     list_doubts_of_commands,
-    usual,
+    select_usual_horizon,
 )
-from nics_drl_bridge.identify.excitation import narrow
-from nics_drl_bridge.identify.gyro import relative_to
+from nics_drl_bridge.identify.excitation import describe_narrow_commands
+from nics_drl_bridge.identify.gyro import describe_reference
 from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.identify.verdict import (
     Alone,
@@ -61,7 +61,7 @@ def conclude(identified: Identified) -> Conclusion:
     overdrive = describe_overdrive(spec)
     gaps = (
         *identified.gaps,
-        *narrow(identified.recording, spec),
+        *describe_narrow_commands(identified.recording, spec),
         *((overdrive,) if overdrive else ()),
     )
     ready = (
@@ -70,7 +70,9 @@ def conclude(identified: Identified) -> Conclusion:
     advice = (
         f"Next: {_choose_advice(identified, bool(wrong), bool(strange), bool(gaps))}."
     )
-    errors = f"{accuracy(identified)} {relative_to(identified.recording)}".strip()
+    errors = (
+        f"{accuracy(identified)} {describe_reference(identified.recording)}".strip()
+    )
     return Conclusion(assessment.verdict, errors, doubts, gaps, advice, ready)
 
 
@@ -103,7 +105,7 @@ def _choose_advice(
 
 def accuracy(identified: Identified) -> str:
     """Formats how far off predictions of unseen data are, compared with the yardsticks'."""
-    for at in usual(identified.judgement):
+    for at in select_usual_horizon(identified.judgement):
         if not isfinite(at.model.position_m):
             return f"On unseen data the predictions diverge within {at.horizon_s:g} s."
         yardsticks = {"a fitted textbook": at.textbook, "constant twist": at.kept_twist}

@@ -14,7 +14,7 @@ from nics_drl_bridge.identify.signals import (
     DIFFERENCE,
     DIFFERENCE_GAIN,
     GAUSSIAN_MAD,
-    unwrapped,
+    unwrap_headings,
 )
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -114,7 +114,7 @@ class Drive:
     @cached_property
     def pose_noise(self) -> tuple[float, float] | None:
         """Standard deviations of position [m] and heading [rad]; None if they can't be measured."""
-        return pose_noise(self.recording.pose, self.bursts)
+        return measure_pose_noise(self.recording.pose, self.bursts)
 
     @cached_property
     def twists(self) -> "TwistIntervals":
@@ -190,14 +190,16 @@ def spread(t: Array, bursts: Bursts | None) -> Array:
     return np.asarray(arrival[bursts.of] - span[bursts.of] * behind / count[bursts.of])
 
 
-def pose_noise(pose: Stream, bursts: Bursts | None) -> tuple[float, float] | None:
+def measure_pose_noise(
+    pose: Stream, bursts: Bursts | None
+) -> tuple[float, float] | None:
     """Returns standard deviations of position [m] and heading [rad] of poses, if measurable."""
     # Measured by sixth differences, in which smooth motion vanishes; for bursts, whose sample times
     # are too uncertain for that, by stretches at rest.
     if bursts is not None:
-        sigma = _spread_at_rest(unwrapped(pose.values))
+        sigma = _spread_at_rest(unwrap_headings(pose.values))
     else:
-        rest = pose_residual(pose)
+        rest = measure_pose_residual(pose)
         if len(rest) >= DIFFERENCE:
             sigma = np.median(np.abs(rest), axis=0) / GAUSSIAN_MAD
         else:
@@ -208,10 +210,10 @@ def pose_noise(pose: Stream, bursts: Bursts | None) -> tuple[float, float] | Non
     return float(np.hypot(sigma[0], sigma[1]) / np.sqrt(2.0)), float(sigma[2])
 
 
-def pose_residual(pose: Stream) -> Array:
+def measure_pose_residual(pose: Stream) -> Array:
     """Returns sixth differences (n, 3) at the scale of the noise, over gap-free stretches."""
     rest = np.asarray(
-        np.diff(unwrapped(pose.values), DIFFERENCE, axis=0) / DIFFERENCE_GAIN
+        np.diff(unwrap_headings(pose.values), DIFFERENCE, axis=0) / DIFFERENCE_GAIN
     )
     if not len(rest):
         return rest

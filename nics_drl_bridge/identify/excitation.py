@@ -8,7 +8,7 @@ from scipy.linalg import qr
 
 from nics_drl_bridge.errors import FitError
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify.signals import GAUSSIAN_MAD, white_noise
+from nics_drl_bridge.identify.signals import GAUSSIAN_MAD, measure_white_noise
 from nics_drl_bridge.recording.recording import Recording, Samples, samples_on_one_clock
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -53,15 +53,17 @@ class Excitation:
     @classmethod
     def of(cls, samples: Samples, spec: RobotSpec) -> "Excitation":
         """Computes the excitation from a drive's samples."""
-        return cls(unmoved_variables(samples, spec), commands_together(samples, spec))
+        return cls(
+            list_unmoved_variables(samples, spec), list_commands_together(samples, spec)
+        )
 
 
-def unmoved_variables(samples: Samples, spec: RobotSpec) -> tuple[str, ...]:
+def list_unmoved_variables(samples: Samples, spec: RobotSpec) -> tuple[str, ...]:
     """Returns the variables of X that stayed constant, or show only noise without a command."""
     limits = np.array([v.max - v.min for v in (*spec.state, *spec.command)])
     spread = samples.x.std(axis=0)
     still = spread < STILL * limits
-    noise_only = spread < NOISE_ONLY * white_noise(samples.x)
+    noise_only = spread < NOISE_ONLY * measure_white_noise(samples.x)
     named = dict(zip(spec.variable_names, still, strict=True))
     for i, variable in enumerate(spec.state):
         if variable.follows:
@@ -72,13 +74,15 @@ def unmoved_variables(samples: Samples, spec: RobotSpec) -> tuple[str, ...]:
     return tuple(n for n, s in zip(spec.variable_names, still, strict=True) if s)
 
 
-def commands_together(samples: Samples, spec: RobotSpec) -> tuple[str, ...]:
+def list_commands_together(samples: Samples, spec: RobotSpec) -> tuple[str, ...]:
     """Returns the commands that moved, but were linearly dependent."""
-    part_of = np.abs(combinations(samples, spec)).max(axis=0, initial=0.0) > 0.1
+    part_of = (
+        np.abs(find_constant_combinations(samples, spec)).max(axis=0, initial=0.0) > 0.1
+    )
     return tuple(c.name for c, part in zip(spec.command, part_of, strict=True) if part)
 
 
-def combinations(samples: Samples, spec: RobotSpec) -> Array:
+def find_constant_combinations(samples: Samples, spec: RobotSpec) -> Array:
     """Returns orthonormal combinations (N, C) of the scaled commands that stayed constant."""
     command = samples.x[:, len(spec.state) :]
     reach = np.array([c.max - c.min for c in spec.command])
@@ -92,7 +96,7 @@ def combinations(samples: Samples, spec: RobotSpec) -> Array:
     return constant
 
 
-def independent_columns(chi: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def split_independent_columns(chi: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Splits columns into an independent set and copies; earlier, low-order ones are kept first.
 
     A column of zeros counts as a copy.
@@ -103,7 +107,7 @@ def independent_columns(chi: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]
     return np.flatnonzero(apart), np.flatnonzero(~apart)
 
 
-def moved_terms(
+def select_moved_terms(
     samples: Samples,
     powers: NDArray[np.int64],
     names: tuple[str, ...],
@@ -122,7 +126,7 @@ def moved_terms(
     return moved
 
 
-def terms_through_state(
+def select_twist_terms(
     powers: NDArray[np.int64], spec: RobotSpec, unmoved: tuple[str, ...]
 ) -> NDArray[np.bool_]:
     """Selects the terms (K,) allowed in the body twist of a noisy recording."""
@@ -134,7 +138,7 @@ def terms_through_state(
     return np.asarray(allowed)
 
 
-def moving_dofs(dq: Array) -> tuple[int, ...]:
+def list_moving_dofs(dq: Array) -> tuple[int, ...]:
     """Returns indices of the rates (T, D) that move: vx, vy unless negligible, and the others."""
     size = np.sqrt((dq**2).mean(axis=0))
     return tuple(
@@ -145,10 +149,10 @@ def moving_dofs(dq: Array) -> tuple[int, ...]:
 def states_are_noisy(samples: Samples, spec: RobotSpec) -> bool:
     """True if the noise of a measured state would bias a fit."""
     width = np.array([v.max - v.min for v in spec.state])
-    return bool((white_noise(samples.x[:, : len(width)]) > NOISY * width).any())
+    return bool((measure_white_noise(samples.x[:, : len(width)]) > NOISY * width).any())
 
 
-def inliers(chi: Array, target: Array, usual: float) -> NDArray[np.bool_]:
+def select_inliers(chi: Array, target: Array, usual: float) -> NDArray[np.bool_]:
     """Selects the rows of a target (T,) on features (T, K) that are not outliers."""
     everything = np.ones(len(target), dtype=np.bool_)
     plain = _measure_residuals(chi, target)
@@ -168,7 +172,7 @@ def inliers(chi: Array, target: Array, usual: float) -> NDArray[np.bool_]:
     return everything
 
 
-def plausible(x: Array, spec: RobotSpec) -> NDArray[np.bool_]:
+def select_plausible_rows(x: Array, spec: RobotSpec) -> NDArray[np.bool_]:
     """Selects the rows (T,) of X (T, V) that are within or close to the variables' limits."""
     low, high = np.array([[v.min, v.max] for v in (*spec.state, *spec.command)]).T
     margin = BEYOND * (high - low)
@@ -198,7 +202,7 @@ def _measure_residuals(
     )
 
 
-def usual_ranges(dq: Array) -> Array:
+def measure_usual_ranges(dq: Array) -> Array:
     """Returns the width (D,) of the usual range of rates (T, D); x and y share the wider one."""
     low, high = np.percentile(dq, USUAL, axis=0)
     width = np.maximum(high - low, LEAST)
@@ -227,18 +231,20 @@ class CommandCoverage:
         return f"{self.name}: moved {moved} ({share}), {100.0 * self.own:.0f} % of it on its own"
 
 
-def narrow(recording: Recording, spec: RobotSpec) -> list[str]:
+def describe_narrow_commands(recording: Recording, spec: RobotSpec) -> list[str]:
     """Returns a sentence for each command of which a drive covers only a small part."""
     return [
         f"{c.name} covers {100.0 * c.share:.0f} % of its range, {c.low:.3g} to {c.high:.3g} "
         f"{c.unit}: beyond that the simulator guesses; drive over the whole range, or narrow it in "
         "the robot's file."
-        for c in coverage(recording, spec)
+        for c in measure_coverage(recording, spec)
         if not c.fault and c.share < NARROW
     ]
 
 
-def coverage(recording: Recording, spec: RobotSpec) -> tuple[CommandCoverage, ...]:
+def measure_coverage(
+    recording: Recording, spec: RobotSpec
+) -> tuple[CommandCoverage, ...]:
     """Measures the coverage of each command of a recording, by the same rules as a fit."""
     t = recording.command.t
     row = recording.command.values

@@ -112,4 +112,4 @@ def resample_drive(drive: Drive, findings: Findings) -> Samples:
     """Resamples a part of the drive on one time axis, by the calibration found so far."""
     if findings.motion_width_s is None:
         return align(drive, findings.calibration)
-    return motion.samples_of(drive, findings.calibration, findings.motion_width_s)
+    return motion.resample_motion(drive, findings.calibration, findings.motion_width_s)

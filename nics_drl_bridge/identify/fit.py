@@ -181,14 +181,16 @@ def regress(
     Raises:
         FitError: too few samples, or no variable changed.
     """
-    plausible = excitation.plausible(samples.x, spec)
+    plausible = excitation.select_plausible_rows(samples.x, spec)
     samples = samples.rows(plausible)
     names = spec.variable_names
     excited = excitation.Excitation.of(samples, spec)
     all_powers = taylor.list_exponents(len(names), order)
-    moved_powers = excitation.moved_terms(samples, all_powers, names, excited.unmoved)
+    moved_powers = excitation.select_moved_terms(
+        samples, all_powers, names, excited.unmoved
+    )
     chi = taylor.evaluate(samples.x, moved_powers)
-    independent, dependent = excitation.independent_columns(chi)
+    independent, dependent = excitation.split_independent_columns(chi)
     chi = chi[:, independent]
     powers = moved_powers[independent]
 
@@ -198,19 +200,19 @@ def regress(
     else:
         allowed = np.ones((dofs, len(powers)), dtype=np.bool_)
         if noisy:
-            allowed[TWIST_ROWS] = excitation.terms_through_state(
+            allowed[TWIST_ROWS] = excitation.select_twist_terms(
                 powers, spec, excited.unmoved
             )
     beta = np.zeros((dofs, len(powers)))
     inliers = np.ones((dofs, len(samples.dq)), dtype=np.bool_)
-    moving = excitation.moving_dofs(samples.dq)
-    usual_ranges = excitation.usual_ranges(samples.dq)
+    moving = excitation.list_moving_dofs(samples.dq)
+    usual_ranges = excitation.measure_usual_ranges(samples.dq)
     for d in moving:
         terms = np.flatnonzero(allowed[d])
         features = chi[:, terms]
         target = samples.dq[:, d]
         # The spreads change when outliers are left out.
-        inliers[d] = excitation.inliers(
+        inliers[d] = excitation.select_inliers(
             features / _spreads(features), target, float(usual_ranges[d])
         )
         if not inliers[d].all():
@@ -218,7 +220,7 @@ def regress(
             target = target[inliers[d]]
         standardised = features / _spreads(features)
         if noisy:
-            significant = statistics.significant(standardised, target)
+            significant = statistics.select_significant(standardised, target)
             standardised = standardised[:, significant]
             terms = terms[significant]
         if len(terms):
@@ -288,7 +290,9 @@ def prune_and_refit(regression: Regression, spec: RobotSpec, alpha: Alpha) -> Fi
         if kept.any():
             beta = np.linalg.lstsq(standardised[:, kept], target, rcond=None)[0]
             residual = target - standardised[:, kept] @ beta
-            beta_errors = statistics.standard_errors(standardised[:, kept], residual)
+            beta_errors = statistics.estimate_standard_errors(
+                standardised[:, kept], residual
+            )
             coefficients[d, kept] = beta / spreads[kept]
             errors[d, kept] = beta_errors / spreads[kept]
         if needs_instruments and d >= TWIST_ROWS.stop:
@@ -298,7 +302,7 @@ def prune_and_refit(regression: Regression, spec: RobotSpec, alpha: Alpha) -> Fi
             if by_instruments is not None:
                 terms = np.flatnonzero(coefficients[d])
                 coefficients[d, terms], errors[d, terms] = by_instruments
-        conditions[d] = statistics.condition(features[:, kept])
+        conditions[d] = statistics.compute_condition(features[:, kept])
     used = np.abs(coefficients).sum(axis=0) > 0.0
     model = TaylorModel(
         spec.variable_names,
@@ -311,11 +315,13 @@ def prune_and_refit(regression: Regression, spec: RobotSpec, alpha: Alpha) -> Fi
         samples.x.max(axis=0),
         std_errors=errors[:, used],
     )
-    rmse, r2 = statistics.errors_of(model, samples)
+    rmse, r2 = statistics.measure_rate_errors(model, samples)
     for d in regression.moving:
         inside = regression.inliers[d]
         if not inside.all():
-            rmse_inside, r2_inside = statistics.errors_of(model, samples.rows(inside))
+            rmse_inside, r2_inside = statistics.measure_rate_errors(
+                model, samples.rows(inside)
+            )
             rmse[d] = rmse_inside[d]
             r2[d] = r2_inside[d]
     outliers = 1.0 - (1.0 - regression.left_out) * regression.inliers.mean(axis=1)
@@ -343,7 +349,9 @@ def _cross_validate(
     features, target = regression.rows(d)
     standardised = features / _spreads(features)
     names = [taylor.format_term(row, variables) for row in regression.powers[by_size]]
-    return statistics.curve(dofs[d], tuple(names), standardised[:, by_size], target)
+    return statistics.make_curve(
+        dofs[d], tuple(names), standardised[:, by_size], target
+    )
 
 
 def _fit_by_instruments(
@@ -367,7 +375,7 @@ def _fit_by_instruments(
     x_earlier = x.copy()
     x_earlier[:, :state_count] = samples.x[rows - 1, :state_count]
     powers = regression.powers[terms]
-    return statistics.instrumental(
+    return statistics.fit_by_instruments(
         taylor.evaluate(x, powers),
         taylor.evaluate(x_earlier, powers),
         samples.dq[rows, d],

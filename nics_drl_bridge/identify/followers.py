@@ -12,9 +12,13 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import clocks, signals
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.excitation import moving_dofs
+from nics_drl_bridge.identify.excitation import list_moving_dofs
 from nics_drl_bridge.identify.signals import Motors
-from nics_drl_bridge.identify.statistics import CERTAIN, clustered_errors, minimise
+from nics_drl_bridge.identify.statistics import (
+    CERTAIN,
+    estimate_clustered_errors,
+    minimise,
+)
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.curve import InputCurve, delays
 from nics_drl_bridge.robot.kernels import MAX_ORDER
@@ -61,7 +65,9 @@ class _Adjusted:
     motor_sigma: Array  # (S, 3) of fall, rise and dead zone
 
 
-def apart(drive: Drive, timing: clocks.TimingEstimate) -> clocks.TimingEstimate:
+def separate_followers(
+    drive: Drive, timing: clocks.TimingEstimate
+) -> clocks.TimingEstimate:
     """Refines a timing by a separate delay and lag for each command, and the effects of motors.
 
     Dynamics beyond a single lag, such as those of a higher-order servo, add to a command's delay.
@@ -70,7 +76,9 @@ def apart(drive: Drive, timing: clocks.TimingEstimate) -> clocks.TimingEstimate:
     if drive.recording.state is not None or not drive.spec.state or not timing.sigma:
         return timing
     states = drive.spec.state
-    moved = np.flatnonzero(signals.moved_inputs(drive.recording.command, drive.spec))
+    moved = np.flatnonzero(
+        signals.select_moved_inputs(drive.recording.command, drive.spec)
+    )
     adjusted = _find_following(drive, timing, moved)
     delay = adjusted.best.delays[moved]
     sigma = adjusted.sigma
@@ -97,7 +105,7 @@ def apart(drive: Drive, timing: clocks.TimingEstimate) -> clocks.TimingEstimate:
         own = error if by_wheels else sigma[0, first]
         errors[name] = float(np.hypot(own, by_limits))
     if timing.separated and not by_wheels:
-        least = clocks.if_certain(
+        least = clocks.keep_if_certain(
             max(least, 0.0), float(sigma[0, first]), clocks.MIN_TIME_S
         )
     if timing.separated and errors["command_latency_s"] > clocks.SEPARABLE_S:
@@ -146,7 +154,7 @@ def _name_motor_errors(
     return errors
 
 
-def late_inputs(
+def list_late_inputs(
     spec: RobotSpec, timing: clocks.TimingEstimate
 ) -> tuple[InputCurve, ...]:
     """Returns the input curves of commands that have a dead zone, or act later than others."""
@@ -160,7 +168,7 @@ def late_inputs(
     return tuple(curves.values())
 
 
-def limits_of(
+def list_limits(
     spec: RobotSpec, timing: clocks.TimingEstimate
 ) -> dict[str, tuple[float, float]]:
     """Returns the maximum fall and rise of limited states, at a gain of one."""
@@ -173,7 +181,7 @@ def limits_of(
     }
 
 
-def scaled_limits(calibration: Calibration, spec: RobotSpec) -> Array:
+def scale_limits(calibration: Calibration, spec: RobotSpec) -> Array:
     """Returns the maximum fall and rise (S, 2) of the states, at the gains of their responses."""
     limits = np.tile([-np.inf, np.inf], (len(spec.state), 1))
     for i, variable in enumerate(spec.state):
@@ -182,7 +190,9 @@ def scaled_limits(calibration: Calibration, spec: RobotSpec) -> Array:
     return np.asarray(limits * np.array(gains)[:, None])
 
 
-def unlimited(samples: Samples, calibration: Calibration, spec: RobotSpec) -> Samples:
+def remove_limits(
+    samples: Samples, calibration: Calibration, spec: RobotSpec
+) -> Samples:
     """Returns samples with the rates that limited states would have without limits."""
     rates = samples.dq.copy()
     names = [c.name for c in spec.command]
@@ -202,15 +212,17 @@ def _find_following(
     twists = drive.twists
     command = drive.recording.command
     spec = drive.spec
-    rows = clocks.some_of(len(twists.start), clocks.FEW_ROWS)
-    moving = list(moving_dofs(twists.twist))
+    rows = clocks.select_some_rows(len(twists.start), clocks.FEW_ROWS)
+    moving = list(list_moving_dofs(twists.twist))
     begin = twists.start[rows]
     shift = timing.latency - timing.offset
     size = len(timing.lags)
-    start = _Following(timing.lags, np.full(size, shift), signals.free_motors(size))
+    start = _Following(
+        timing.lags, np.full(size, shift), signals.make_free_motors(size)
+    )
     for _ in range(2):  # twice, because unexplained commands hide the effects of motors
         target = (begin, twists.end[rows], twists.twist[rows][:, moving])
-        left = clocks.response_residual(command, spec, target, MAX_ORDER)
+        left = clocks.make_response_residual(command, spec, target, MAX_ORDER)
         rest = left(*vars(start).values()).reshape(len(rows), -1)
         is_explained = np.mean(rest**2, axis=0) < EXPLAINED
         if is_explained.all() or not is_explained.any():
@@ -224,7 +236,7 @@ def _find_following(
     # the effect of one may hide that of another
     for change in (with_limits, _try_dead_zones, with_limits):
         for i in moved:
-            sent = command.values[:, signals.followed(spec)[i]]
+            sent = command.values[:, signals.list_followed_commands(spec)[i]]
             least = np.inf
             for trial in change(best.best, i, sent):
                 cost = float((left(*vars(trial).values()) ** 2).sum())
@@ -309,7 +321,7 @@ def _adjust(
     by_lag = jacobian[:, count : 2 * count] / best.lags[moved]
     by_size = jacobian[:, 2 * count :] / np.abs(values[effects])
     by_sum = np.concatenate([jacobian[:, :count] - by_lag, by_lag, by_size], axis=1)
-    sigma = np.maximum(clustered_errors(by_sum, rest, cluster), clocks.EXACT)
+    sigma = np.maximum(estimate_clustered_errors(by_sum, rest, cluster), clocks.EXACT)
     effect = np.linalg.norm(by_size, axis=0) * size
     sure = (effect > NO_EFFECT * np.linalg.norm(rest)) & (sigma[2 * count :] < size)
     motor_sigma = np.zeros(first.shape)
@@ -328,7 +340,7 @@ def _name_sum(state: str) -> str:
     return f"command_latency_and_{state}_lag_s"
 
 
-def about_sums(calibration: Calibration) -> Iterator[str]:
+def describe_sums(calibration: Calibration) -> Iterator[str]:
     """Yields a sentence on latencies and lags that could not be separated."""
     commands = [response.command for response in calibration.responses]
     further = delays(commands, calibration.inputs).tolist()

@@ -14,10 +14,10 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import shooting
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.motion import as_smooth, half_width
+from nics_drl_bridge.identify.motion import choose_half_width, smooth_commands
 from nics_drl_bridge.identify.signals import average_effect
 from nics_drl_bridge.identify.terms import fit_motion_terms, tells_lever_from_wheels
-from nics_drl_bridge.identify.yardstick import structure_of
+from nics_drl_bridge.identify.yardstick import probe_structure
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec
@@ -65,9 +65,9 @@ class Candidate:
     drives: bool  # True if it is of the speed
 
 
-def curve_of(samples: Samples, spec: RobotSpec, place: int) -> Candidate | None:
+def find_input_curve(samples: Samples, spec: RobotSpec, place: int) -> Candidate | None:
     """Returns the best curve of the command at an index; None if a straight line does as well."""
-    structure = structure_of(spec)
+    structure = probe_structure(spec)
     # components of the twist that it drives
     acts = np.ones(3) if structure is None else structure[0][:, place]
     candidates = []
@@ -201,7 +201,7 @@ class Form:
         )
 
 
-def problem_of(
+def make_prediction_problem(
     drive: Drive,
     calibration: Calibration,
     samples: Samples,
@@ -232,7 +232,7 @@ def problem_of(
     return shooting.Shooting(samples, commands, shaped, trust, not spec.state, noise)
 
 
-def inputs_of(
+def list_inputs(
     drive: Drive, latency: float, samples: Samples, form: Form
 ) -> shooting.Inputs:
     """Returns the values to be estimated besides coefficients: latency, and those of a form."""
@@ -292,7 +292,7 @@ def _list_command_values(
     return rows
 
 
-def two_way(drive: Drive, samples: Samples) -> tuple[InputCurve, ...]:
+def find_two_way_curves(drive: Drive, samples: Samples) -> tuple[InputCurve, ...]:
     """Returns neutral curves of commands that drive the robot both ways."""
     spec = drive.spec
     command = samples.x[:, len(spec.state) :]
@@ -309,14 +309,14 @@ def two_way(drive: Drive, samples: Samples) -> tuple[InputCurve, ...]:
 
 def list_driving_commands(spec: RobotSpec) -> tuple[int, ...]:
     """Returns the indices of the commands that drive a robot ahead, according to its textbook."""
-    structure = structure_of(spec)
+    structure = probe_structure(spec)
     if structure is None:
         return ()
     moves, _ = structure
     return tuple(np.flatnonzero(moves[0]).tolist())
 
 
-def with_dead(form: Form, drive: Drive, samples: Samples) -> Form:
+def add_dead_zones(form: Form, drive: Drive, samples: Samples) -> Form:
     """Returns a form in which each command that drives the robot has a dead zone."""
     bent = {c.command: c for c in form.curves}
     for place in list_driving_commands(drive.spec):
@@ -330,7 +330,7 @@ def with_dead(form: Form, drive: Drive, samples: Samples) -> Form:
     return replace(form, curves=tuple(bent.values()))
 
 
-def with_back(form: Form, curves: tuple[InputCurve, ...]) -> Form:
+def add_reverse_gains(form: Form, curves: tuple[InputCurve, ...]) -> Form:
     """Returns a form in which the commands of curves have separate reverse gains."""
     curved = {curve.command for curve in form.curves}
     more = tuple(curve for curve in curves if curve.command not in curved)
@@ -338,7 +338,7 @@ def with_back(form: Form, curves: tuple[InputCurve, ...]) -> Form:
     return replace(form, curves=form.curves + more, back=back)
 
 
-def reached(
+def drop_unreached_ends(
     model: TaylorModel, drive: Drive, samples: Samples, errors: Mapping[str, float]
 ) -> TaylorModel:
     """Returns a model without curve ends that were never reached, and limits that hardly were.
@@ -380,7 +380,9 @@ def reached(
     return replace(model, inputs=tuple(curves), low=low, high=high, limits=limits)
 
 
-def likely_delay(drive: Drive, calibration: Calibration, samples: Samples) -> float:
+def find_likely_delay(
+    drive: Drive, calibration: Calibration, samples: Samples
+) -> float:
     """Returns the delay [s] of the commands that best explains the rates of the state."""
     trials, late = _delay_commands(drive, calibration, samples)
     left = [_measure_unexplained(drive.spec, samples, command) for command in late]
@@ -389,7 +391,7 @@ def likely_delay(drive: Drive, calibration: Calibration, samples: Samples) -> fl
     return calibration.command_latency_s
 
 
-def likely_delays(
+def find_likely_delays(
     drive: Drive, calibration: Calibration, samples: Samples
 ) -> tuple[tuple[str, float], ...]:
     """Returns the delay of each command separately, given the others; empty if they are alike."""
@@ -413,16 +415,16 @@ def _delay_commands(
     """Returns possible delays (N,) [s], and the commands in effect (N, T, C) for each."""
     form = Form(calibration.inputs)
     now = calibration.command_latency_s
-    inputs = inputs_of(drive, now, samples, form)
-    problem = problem_of(drive, calibration, samples, form, inputs)
+    inputs = list_inputs(drive, now, samples, form)
+    problem = make_prediction_problem(drive, calibration, samples, form, inputs)
     trials = np.arange(0.0, LONGEST_S, DELAY_STEP_S)
     if drive.recording.pose.clock != drive.recording.command.clock:
         trials = trials - LONGEST_S / 2.0
-    width = half_width(drive)
+    width = choose_half_width(drive)
     late = []
     for delay in trials:
         command = problem.commands(np.append(delay, inputs.start[1:]))
-        late.append(as_smooth(command, samples.dt, width))
+        late.append(smooth_commands(command, samples.dt, width))
     return trials, np.array(late)
 
 

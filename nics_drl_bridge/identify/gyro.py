@@ -24,7 +24,7 @@ LEAST_COVERED = 0.9  # minimum fraction of a drive that the gyro must cover
 UNLIKE_TRACKER = 0.1
 
 
-def turned_by_gyro(recording: Recording) -> Recording:
+def correct_heading_by_gyro(recording: Recording) -> Recording:
     """Returns a recording whose odometry turns by the gyro, if one was recorded and the two differ.
 
     `gyro` then holds the comparison. Other poses are compared but not changed; `repairs` gets a
@@ -58,7 +58,7 @@ def turned_by_gyro(recording: Recording) -> Recording:
     )
 
 
-def relative_to(recording: Recording) -> str:
+def describe_reference(recording: Recording) -> str:
     """States what the errors of a model learnt from a recording are relative to."""
     by = recording.measured_by
     turning = recording.gyro

@@ -12,10 +12,10 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import forms, shooting, terms
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.excitation import unmoved_variables
+from nics_drl_bridge.identify.excitation import list_unmoved_variables
 from nics_drl_bridge.identify.fit import Order
 from nics_drl_bridge.identify.open_loop import HORIZON_S
-from nics_drl_bridge.identify.statistics import CERTAIN, clustered_errors
+from nics_drl_bridge.identify.statistics import CERTAIN, estimate_clustered_errors
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -81,7 +81,7 @@ class Draft:
         if other is not None:
             model, first = terms.merge_terms(model, other)
         free = (model.coefficients != 0.0) & ~terms.select_defined_dofs(spec)[:, None]
-        fitted = shooting.fitted(
+        fitted = shooting.fit_to_predictions(
             self.problem,
             model,
             free,
@@ -104,7 +104,7 @@ class Draft:
         base, first = terms.merge_terms(base, linear)
         free = (base.coefficients != 0.0) | (first != 0.0)
         free &= ~terms.select_defined_dofs(self.spec)[:, None]
-        return shooting.fitted(
+        return shooting.fit_to_predictions(
             self.problem, base, free, self.inputs, inside, evaluations, pull, first
         )
 
@@ -121,7 +121,7 @@ class Draft:
         samples = self.problem.samples
         values = self.inputs.start
         everything = np.arange(len(samples.t))
-        unmoved = unmoved_variables(samples, self.spec)
+        unmoved = list_unmoved_variables(samples, self.spec)
         problem = replace(self.problem, spacing_s=SPACING_S, fixed=values)
         fixed = replace(self, problem=problem, inputs=shooting.NOTHING_FREE)
         nothing = np.zeros((0, len(BANDS_S)))
@@ -130,7 +130,7 @@ class Draft:
         judge = replace(problem, horizons=BANDS_S)
         for block in np.array_split(everything, FOLDS):
             unseen = np.isin(everything, block)
-            if unmoved_variables(samples.rows(~unseen), self.spec) != unmoved:
+            if list_unmoved_variables(samples.rows(~unseen), self.spec) != unmoved:
                 continue
             for hypothesis, model in fixed.models(asked, ~unseen):
                 error, path = judge.errors(model, values, unseen)
@@ -185,7 +185,7 @@ class Base:
     candidates: tuple[Candidate, ...] = ()  # forms that were tried, in this order
 
 
-def base_of(
+def fit_base(
     drive: Drive,
     calibration: Calibration,
     samples: Samples,
@@ -198,12 +198,14 @@ def base_of(
     """
 
     def fitted(form: forms.Form, before: Base | None = None) -> Base:
-        inputs = forms.inputs_of(drive, calibration.command_latency_s, samples, form)
+        inputs = forms.list_inputs(drive, calibration.command_latency_s, samples, form)
         first = None
         if before is not None:
             inputs = inputs.begun_at(before.draft.inputs)
             first = before.found.model
-        problem = forms.problem_of(drive, calibration, samples, form, inputs)
+        problem = forms.make_prediction_problem(
+            drive, calibration, samples, form, inputs
+        )
         draft = Draft(drive.spec, form, inputs, replace(problem, spacing_s=SPACING_S))
         predictive = draft.base(other=first)
         inputs = replace(inputs, start=predictive.values)
@@ -231,7 +233,7 @@ def base_of(
         if is_better:
             best = plain
             trial = plain_trial
-    for name, change, worth in changes(drive, calibration, samples):
+    for name, change, worth in list_changes(drive, calibration, samples):
         form = change(best.draft.form)
         if form == best.draft.form:
             continue
@@ -245,13 +247,13 @@ def base_of(
     return replace(best, candidates=tuple(candidates))
 
 
-def changes(
+def list_changes(
     drive: Drive, calibration: Calibration, samples: Samples
 ) -> Iterator[tuple[str, Callable[[forms.Form], forms.Form], float]]:
     """Yields changes to the form of a motion by name, and the fraction to cut the error to."""
     # Drag and friction are hard to distinguish, so both are tried, then each without the other.
     speeds = tuple(v.name for v in drive.spec.state if v.twist == "vx")
-    late = forms.likely_delays(drive, calibration, samples)
+    late = forms.find_likely_delays(drive, calibration, samples)
     delays = "a delay of each command"
     if late:  # first, because a wrong delay hides other effects and is hidden by them
         yield delays, lambda form: replace(form, delays=late), WORTH
@@ -269,7 +271,11 @@ def changes(
     if late:
         yield delays, lambda form: replace(form, delays=late), WORTH
     if speeds:
-        yield "a dead zone", lambda form: forms.with_dead(form, drive, samples), WORTH
+        yield (
+            "a dead zone",
+            lambda form: forms.add_dead_zones(form, drive, samples),
+            WORTH,
+        )
         limits = "limits of acceleration"
         yield limits, lambda form: replace(form, limits=speeds), WORTH
         others = tuple(
@@ -278,10 +284,10 @@ def changes(
         if others:
             all_limits = f"limits of {', '.join(others)}"
             yield all_limits, lambda form: replace(form, limits=others), WORTH
-        backwards = forms.two_way(drive, samples)
+        backwards = forms.find_two_way_curves(drive, samples)
         if backwards:
             gain = "a gain of its own backwards"
-            yield gain, lambda form: forms.with_back(form, backwards), WORTH
+            yield gain, lambda form: forms.add_reverse_gains(form, backwards), WORTH
 
 
 def list_candidates(
@@ -292,7 +298,7 @@ def list_candidates(
         yield from base.candidates
     if not trials:
         return
-    best = chosen(trials, order)
+    best = choose_trial(trials, order)
     for trial in trials:
         if trial.order:
             name = f"terms up to order {trial.order}"
@@ -301,13 +307,13 @@ def list_candidates(
             yield Candidate(name, trial.error, trial is best)
 
 
-def hypotheses(order: Order) -> tuple[Hypothesis, ...]:
+def list_hypotheses(order: Order) -> tuple[Hypothesis, ...]:
     """Returns the hypotheses for an order, from the most constrained to the least."""
     orders = ORDERS if order == "auto" else (order,)
     return (TEXTBOOK, *product(orders, PULLS))
 
 
-def chosen(trials: Sequence[Trial], order: Order = "auto") -> Trial:
+def choose_trial(trials: Sequence[Trial], order: Order = "auto") -> Trial:
     """Returns the first trial that no other clearly improves on; of one `order` if given."""
     eligible = [trial for trial in trials if order in ("auto", trial.order)]
     eligible = eligible or list(trials)
@@ -318,7 +324,7 @@ def chosen(trials: Sequence[Trial], order: Order = "auto") -> Trial:
     return best
 
 
-def lags_of(model: TaylorModel, spec: RobotSpec) -> dict[str, float]:
+def find_lags(model: TaylorModel, spec: RobotSpec) -> dict[str, float]:
     """Returns the lags [s] by which a base's states follow, by name, plus their own delays."""
     is_linear = model.powers.sum(axis=1) == 1
     lags = {}
@@ -331,32 +337,32 @@ def lags_of(model: TaylorModel, spec: RobotSpec) -> dict[str, float]:
     return lags
 
 
-def about_lags(latency: float, lags: dict[str, float], beside: float) -> str:
+def describe_lag_sums(latency: float, lags: dict[str, float], beside: float) -> str:
     """States that only the sum of latency [s] and lags is known; `beside` was found with lags."""
     # A model with one lag treats the second lag of a servo as latency.
     sums = ", ".join(f"{beside + lag:.3f} s for {name}" for name, lag in lags.items())
     return f"Latency ({latency:.3f} s) can't be separated from the lags: trust their sums, {sums}."
 
 
-def standard_errors(predictive: shooting.Predictive) -> Array:
+def estimate_coefficient_errors(predictive: shooting.Predictive) -> Array:
     """Returns standard errors (D, K) of the free coefficients; NaN for the others."""
     span = max(shooting.HORIZONS_S)
     cluster = np.floor((predictive.starts - predictive.starts.min()) / span).astype(
         np.intp
     )
     errors = np.full(predictive.free.shape, np.nan)
-    errors[predictive.free] = clustered_errors(
+    errors[predictive.free] = estimate_clustered_errors(
         predictive.jacobian, predictive.residual, cluster
     )
     return errors
 
 
-def with_certain_mounting(
+def drop_doubtful_mounting(
     draft: Draft, calibration: Calibration, predictive: shooting.Predictive
 ) -> Draft | None:
     """Returns a draft without the parts of its mounting below 3 standard errors; None if all stay.
 
-    Removed parts are zero in the calibration that `remounted` returns.
+    Removed parts are zero in the calibration that `add_predicted_mounting` returns.
     """
     sigma = predictive.value_errors[-3:]
     total = geometry.compose(predictive.values[-3:], calibration.mounting)
@@ -380,7 +386,9 @@ def with_certain_mounting(
     return replace(draft, inputs=replace(inputs, start=start, low=low, high=high))
 
 
-def remounted(calibration: Calibration, predictive: shooting.Predictive) -> Calibration:
+def add_predicted_mounting(
+    calibration: Calibration, predictive: shooting.Predictive
+) -> Calibration:
     """Adds the mounting found by predictions to that of the calibration."""
     x, y, heading = map(
         float, geometry.compose(predictive.values[-3:], calibration.mounting)
@@ -399,18 +407,18 @@ def remounted(calibration: Calibration, predictive: shooting.Predictive) -> Cali
     )
 
 
-def about_orders(trials: Sequence[Trial]) -> Iterator[str]:
+def describe_orders(trials: Sequence[Trial]) -> Iterator[str]:
     """Yields a sentence if the order is higher than usual."""
-    if not trials or chosen(trials) is trials[0]:
+    if not trials or choose_trial(trials) is trials[0]:
         return
     errors = ", ".join(f"{trial.error:.1%} by order {trial.order}" for trial in trials)
-    finding = f"The model has terms up to order {chosen(trials).order}"
+    finding = f"The model has terms up to order {choose_trial(trials).order}"
     yield f"{finding}: {UNSEEN} end {errors} of the path away."
 
 
-def about_forms(base: Base, trials: Sequence[Trial], order: Order) -> Iterator[str]:
+def describe_forms(base: Base, trials: Sequence[Trial], order: Order) -> Iterator[str]:
     """Lists what a motion model has besides the textbook's terms, and how much that improves it."""
-    best = chosen(trials, order)
+    best = choose_trial(trials, order)
     if not np.isfinite(best.error):
         return
     form = base.draft.form

@@ -43,21 +43,21 @@ from nics_drl_bridge.identify.findings import (
 )
 from nics_drl_bridge.identify.forms import (
     CLEAR,
-    curve_of,
-    likely_delay,
+    drop_unreached_ends,
+    find_input_curve,
+    find_likely_delay,
     list_driving_commands,
-    reached,
 )
-from nics_drl_bridge.identify.gyro import turned_by_gyro
+from nics_drl_bridge.identify.gyro import correct_heading_by_gyro
 from nics_drl_bridge.identify.judgement import (
     estimate_bands,
-    judged,
+    fit_textbook,
+    judge_predictions,
     measure_distances,
-    textbook_of,
 )
 from nics_drl_bridge.identify.motion_fit import fit_motion, refine_motion
-from nics_drl_bridge.identify.mounting import mounted, mounting_of
-from nics_drl_bridge.identify.noise import motion_noise, sensor_noise
+from nics_drl_bridge.identify.mounting import apply_mounting, estimate_mounting
+from nics_drl_bridge.identify.noise import add_motion_noise, measure_sensor_noise
 from nics_drl_bridge.identify.refine import refine_by_predictions
 from nics_drl_bridge.identify.repair import (
     check_axes,
@@ -65,16 +65,16 @@ from nics_drl_bridge.identify.repair import (
     check_encoders,
     check_pose_moves,
     check_units,
-    repaired,
+    repair_rows,
 )
-from nics_drl_bridge.identify.signals import speed_index
+from nics_drl_bridge.identify.signals import find_speed_index
 from nics_drl_bridge.identify.terms import select_terms_through_state
 from nics_drl_bridge.identify.textbook_model import (
-    actuated_spec,
+    add_actuator_state,
+    make_actuated_spec,
+    make_textbook_calibration,
+    make_textbook_model,
     needs_actuators,
-    textbook_calibration,
-    textbook_model,
-    with_actuators,
 )
 from nics_drl_bridge.identify.yardstick import Yardstick, fit_yardstick
 from nics_drl_bridge.recording.joining import LEARNT_SHARE, join
@@ -117,7 +117,7 @@ def identify(
         RecordingError: the recording is unusable for this robot.
         FitError: it does not show enough to fit a model.
     """
-    drive = Drive(turned_by_gyro(check(recording, spec)), spec)
+    drive = Drive(correct_heading_by_gyro(check(recording, spec)), spec)
     until = train_until if train_until is not None else recording.learn_until_s
     until = LEARNT_SHARE * drive.duration_s if until is None else until
     settings = Settings(
@@ -160,7 +160,7 @@ def run(
 def start_findings(drive: Drive) -> Findings:
     """Returns the findings on a drive as recorded, before the first stage."""
     training = drive.part(cut(drive.recording, drive.settings.train_until_s))
-    return Findings(training, drive, timings.nominal_timing(training))
+    return Findings(training, drive, timings.make_nominal_timing(training))
 
 
 @dataclass(frozen=True)
@@ -232,7 +232,7 @@ class Identified:
         )
         if self.model.assumed or doubtful:
             ratings.append(acceptance.Assessment(acceptance.Verdict.WITH_CARE, ()))
-        return acceptance.combined(ratings)
+        return acceptance.combine_ratings(ratings)
 
     @property
     def verdict(self) -> acceptance.Verdict:
@@ -259,7 +259,9 @@ def _make_result(trial: Findings, final: Findings) -> Identified:
     samples = require_samples(final)
     model = require_model(final)
     if final.motion_width_s is not None:
-        model = reached(model, final.whole, samples, final.calibration.uncertainty)
+        model = drop_unreached_ends(
+            model, final.whole, samples, final.calibration.uncertainty
+        )
     return Identified(
         drive=final.whole,
         model=model,
@@ -295,8 +297,8 @@ def _find_dead_zone(model: TaylorModel, driving: set[str]) -> float:
 def repair_drive(drive: Drive, findings: Findings) -> Findings:
     """Refuses other units, axes and orders; drops repeated rows and jumps, clips commands."""
     check_pose_moves(findings.training)
-    training, _ = repaired(findings.training)
-    whole, repairs = repaired(findings.whole)
+    training, _ = repair_rows(findings.training)
+    whole, repairs = repair_rows(findings.whole)
     repairs += check_commands(training, findings.training.recording.command)
     check_units(drive)
     check_axes(training)
@@ -311,18 +313,20 @@ def estimate_timing(drive: Drive, findings: Findings) -> Findings:
     spec = drive.spec
     timings.check_state_is_known(drive.recording, spec)
     responses: tuple[Response, ...] = ()
-    if motions.by_motion(spec, drive.recording):
-        by_command = replace(training, spec=motions.surrogate(spec))
-        timing = timings.timing_of(by_command)
+    if motions.has_motion_as_state(spec, drive.recording):
+        by_command = replace(training, spec=motions.make_surrogate(spec))
+        timing = timings.measure_timing(by_command)
         responses, timing = _select_followers(spec, timing)
     else:
-        timing = followers.apart(training, timings.timing_of(training))
+        timing = followers.separate_followers(
+            training, timings.measure_timing(training)
+        )
     calibration = replace(
         findings.calibration,
         responses=responses,
         uncertainty=timing.sigma,
-        inputs=followers.late_inputs(spec, timing),
-        limits=followers.limits_of(spec, timing),
+        inputs=followers.list_late_inputs(spec, timing),
+        limits=followers.list_limits(spec, timing),
         clock_offset_s=timing.offset,
         command_latency_s=timing.latency,
         burst_period_s=training.bursts.period_s if training.bursts else 0.0,
@@ -353,17 +357,21 @@ def find_mounting(drive: Drive, findings: Findings) -> Findings:
     training = findings.training
     states = None
     speed = None
-    if drive.spec.state and not motions.by_motion(drive.spec, drive.recording):
-        states = timings.expected_states(training, training.twists, findings.timing)
-        index = speed_index(drive.spec)
+    if drive.spec.state and not motions.has_motion_as_state(
+        drive.spec, drive.recording
+    ):
+        states = timings.average_expected_states(
+            training, training.twists, findings.timing
+        )
+        index = find_speed_index(drive.spec)
         if index is not None:
             speed = states[:, index]
-    mounting = mounting_of(training, findings.timing, states)
+    mounting = estimate_mounting(training, findings.timing, states)
     return replace(
         findings,
         expected_speed=speed,
         mounting=mounting,
-        calibration=mounted(findings.calibration, mounting),
+        calibration=apply_mounting(findings.calibration, mounting),
     )
 
 
@@ -371,12 +379,14 @@ def find_responses(drive: Drive, findings: Findings) -> Findings:
     """Finds how unmeasured states follow the commands, and the scale of the wheels."""
     training = findings.training
     calibration = findings.calibration
-    if not motions.by_motion(drive.spec, drive.recording):
-        responses = timings.responses_of(
+    if not motions.has_motion_as_state(drive.spec, drive.recording):
+        responses = timings.list_responses(
             training, calibration, findings.timing, findings.expected_speed
         )
         calibration = replace(calibration, responses=responses)
-    return replace(findings, calibration=timings.with_wheels(training, calibration))
+    return replace(
+        findings, calibration=timings.add_wheel_scales(training, calibration)
+    )
 
 
 def measure_noise(drive: Drive, findings: Findings) -> Findings:
@@ -385,20 +395,22 @@ def measure_noise(drive: Drive, findings: Findings) -> Findings:
     calibration = replace(
         findings.calibration, position_noise_m=position, heading_noise_rad=heading
     )
-    noise = sensor_noise(findings.whole)
+    noise = measure_sensor_noise(findings.whole)
     return replace(findings, calibration=calibration, noise=noise)
 
 
 def derive_motion(drive: Drive, findings: Findings) -> Findings:
     """Derives the state from the poses, if it is an unmeasured part of the twist."""
-    if not motions.by_motion(drive.spec, drive.recording):
+    if not motions.has_motion_as_state(drive.spec, drive.recording):
         return findings
     calibration = findings.calibration
-    width = motions.half_width(findings.training)
+    width = motions.choose_half_width(findings.training)
     parts = []
     for part in (findings.training, findings.whole):
-        grid = motions.grid_of(part, calibration, drive.settings.control_period_s)
-        parts.append(motions.with_motion(part, calibration, grid, width))
+        grid = motions.make_motion_grid(
+            part, calibration, drive.settings.control_period_s
+        )
+        parts.append(motions.add_motion(part, calibration, grid, width))
     training, whole = parts
     return replace(findings, training=training, whole=whole, motion_width_s=width)
 
@@ -413,7 +425,7 @@ def find_input_curves(drive: Drive, findings: Findings) -> Findings:
     curves = []
     clear = []
     for place in range(len(drive.spec.command)):
-        candidate = curve_of(samples, drive.spec, place)
+        candidate = find_input_curve(samples, drive.spec, place)
         if candidate is None:
             continue
         curves.append(candidate.curve)
@@ -428,7 +440,7 @@ def _with_likely_latency(findings: Findings) -> Findings:
     """Returns findings with the latency of commands that best explains a motion."""
     calibration = findings.calibration
     samples = resample_drive(findings.training, findings)
-    latency = likely_delay(findings.training, calibration, samples)
+    latency = find_likely_delay(findings.training, calibration, samples)
     calibration = replace(calibration, command_latency_s=latency)
     return replace(findings, calibration=calibration)
 
@@ -444,13 +456,13 @@ def fit_terms(drive: Drive, findings: Findings) -> Findings:
         responses = calibration.responses or None
         require(responses, "the response of each state", "find_responses")
     samples = align(findings.training, calibration)
-    samples = followers.unlimited(samples, calibration, spec)
+    samples = followers.remove_limits(samples, calibration, spec)
     is_inferred = drive.recording.state is None and not calibration.is_exact
     trials = findings.trials  # a refit reuses them
     if settings.order == "auto" and is_inferred and not trials:
         trials = _try_orders(drive, findings)
     if trials:
-        order = hypotheses.chosen(trials).order
+        order = hypotheses.choose_trial(trials).order
     else:
         order = fitting.ORDER if settings.order == "auto" else settings.order
     centred = "lever_arm_y_m" in calibration.uncertainty
@@ -471,7 +483,7 @@ def fit_terms(drive: Drive, findings: Findings) -> Findings:
 def _try_orders(drive: Drive, findings: Findings) -> tuple[hypotheses.Trial, ...]:
     """Tries each order on parts of the training part that its fits did not see."""
     training = findings.training
-    path = open_loop.windows(
+    path = open_loop.select_windows(
         training,
         findings.calibration,
         0.0,
@@ -519,7 +531,7 @@ def prune_terms(drive: Drive, findings: Findings) -> Findings:
     if findings.motion_width_s is not None:
         return findings
     linear = fitting.prune_and_refit(regression, drive.spec, drive.settings.alpha)
-    limits = followers.scaled_limits(findings.calibration, drive.spec)
+    limits = followers.scale_limits(findings.calibration, drive.spec)
     model = replace(linear.model, inputs=findings.calibration.inputs, limits=limits)
     return replace(findings, pruned_fit=replace(linear, model=model), model=model)
 
@@ -545,7 +557,7 @@ def refine_model(drive: Drive, findings: Findings) -> Findings:
         findings,
         model=model,
         calibration=calibration,
-        refinement=(note, *hypotheses.about_orders(findings.trials)),
+        refinement=(note, *hypotheses.describe_orders(findings.trials)),
     )
 
 
@@ -571,9 +583,9 @@ def judge_model(drive: Drive, findings: Findings) -> Findings:
     if unseen is not None and len(unseen.t) < verdict.MIN_ROWS:
         unseen = None
     held_out = verdict.try_model(model, calibration, whole, until)
-    yardstick = findings.yardstick or textbook_of(whole, calibration)
+    yardstick = findings.yardstick or fit_textbook(whole, calibration)
     bands = _find_bands(drive, findings)
-    judgement = judged(model, calibration, whole, bands, yardstick)
+    judgement = judge_predictions(model, calibration, whole, bands, yardstick)
     rated = verdict.add_quality(model, fit, unseen, held_out, judgement, drive.spec)
     if model is fit.model:
         fit = replace(fit, model=rated)
@@ -587,7 +599,7 @@ def judge_model(drive: Drive, findings: Findings) -> Findings:
         judgement=judgement,
         yardstick=yardstick,
         calibration=replace(calibration, notes=notes),
-        noise=motion_noise(findings.noise, whole, calibration, model, samples),
+        noise=add_motion_noise(findings.noise, whole, calibration, model, samples),
     )
     return replace(findings, notes=verdict.collect_notes(drive, findings))
 
@@ -629,7 +641,10 @@ def prefer_textbook(drive: Drive, findings: Findings) -> Findings:
 
 def _measure_error(findings: Findings) -> float:
     """Returns the error of a judged model after 5 s, or at the longest horizon [m]."""
-    errors = [at.model.position_m for at in acceptance.usual(findings.judgement)]
+    errors = [
+        at.model.position_m
+        for at in acceptance.select_usual_horizon(findings.judgement)
+    ]
     return min(errors, default=np.inf)
 
 
@@ -643,7 +658,7 @@ def _try_textbook(drive: Drive, findings: Findings, one_limit: bool) -> Findings
         findings.calibration.clock_offset_s,
         one_limit,
     )
-    calibration = textbook_calibration(yardstick, findings.calibration, spec)
+    calibration = make_textbook_calibration(yardstick, findings.calibration, spec)
     start = derive_motion(drive, replace(findings, calibration=calibration))
     is_actuated = needs_actuators(yardstick, spec)
     if is_actuated:
@@ -653,10 +668,10 @@ def _try_textbook(drive: Drive, findings: Findings, one_limit: bool) -> Findings
     if is_actuated:  # the fit was of another state's rates
         fit = fitting.fit(samples, spec, noisy=True)
         start = replace(start, regression=fit.regression, pruned_fit=fit)
-    textbook = textbook_model(yardstick, model, samples, spec)
+    textbook = make_textbook_model(yardstick, model, samples, spec)
     if textbook is None:
         return None
-    (lost,) = acceptance.usual(findings.judgement)
+    (lost,) = acceptance.select_usual_horizon(findings.judgement)
     start = replace(
         start,
         model=textbook,
@@ -674,9 +689,9 @@ def _add_actuators(
 ) -> tuple[Drive, Findings]:
     """Returns a drive of a steered robot, and its findings, with speed and angle as state."""
     calibration = findings.calibration
-    spec = actuated_spec(yardstick, findings.whole)
+    spec = make_actuated_spec(yardstick, findings.whole)
     training, whole = (
-        with_actuators(part, spec, yardstick, calibration)
+        add_actuator_state(part, spec, yardstick, calibration)
         for part in (findings.training, findings.whole)
     )
     findings = replace(findings, training=training, whole=whole, motion_width_s=None)
@@ -724,7 +739,7 @@ def _fit_whole_drive(drive: Drive, findings: Findings) -> Findings | None:
 
 def _measure_mean_error(findings: Findings, until: float) -> float:
     """Returns the mean error [m] of predictions over 5 s of the whole drive up to a time [s]."""
-    errors = open_loop.open_loop_error(
+    errors = open_loop.measure_open_loop_error(
         require_model(findings), findings.calibration, findings.whole, 0.0, until
     )
     return errors.mean_position_error_m
@@ -768,7 +783,7 @@ def join_recordings(recordings: Sequence[Recording], spec: RobotSpec) -> Recordi
     if len(recordings) == 1:
         return recordings[0]
     # a gyro's bias differs between drives
-    turned = [turned_by_gyro(item) for item in recordings]
+    turned = [correct_heading_by_gyro(item) for item in recordings]
     offsets = [_find_clock_offset(item, spec) for item in turned]
     joined = join(turned, offsets)
     gyros = [item.gyro for item in turned]

@@ -11,23 +11,23 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import hypotheses, shooting
-from nics_drl_bridge.identify.acceptance import comparison_noise
+from nics_drl_bridge.identify.acceptance import estimate_comparison_noise
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.forms import problem_of
+from nics_drl_bridge.identify.forms import make_prediction_problem
 from nics_drl_bridge.identify.open_loop import (
     SPACING_S,
     Windows,
     predict,
-    windows,
+    select_windows,
 )
-from nics_drl_bridge.identify.refine import readjust
+from nics_drl_bridge.identify.refine import adjust_to_drive
 from nics_drl_bridge.identify.terms import select_defined_dofs
 from nics_drl_bridge.identify.yardstick import (
     Yardstick,
+    estimate_twists_at,
     fit_yardstick,
-    kept_twist,
-    twists_at,
+    predict_kept_twist,
 )
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.taylor import EndErrors, HorizonErrors, TaylorModel
@@ -41,7 +41,7 @@ WITHIN = 95.0
 FEWEST = 20
 
 
-def textbook_of(drive: Drive, calibration: Calibration) -> Yardstick | None:
+def fit_textbook(drive: Drive, calibration: Calibration) -> Yardstick | None:
     """Fits the textbook to the training part; None for an exact drive, or one that is too short."""
     if calibration.is_exact:
         return None
@@ -52,7 +52,7 @@ def textbook_of(drive: Drive, calibration: Calibration) -> Yardstick | None:
     return None
 
 
-def judged(
+def judge_predictions(
     model: TaylorModel,
     calibration: Calibration,
     drive: Drive,
@@ -66,56 +66,60 @@ def judged(
     begin = drive.settings.train_until_s
     judgement = []
     for horizon in HORIZONS_S:
-        chosen = windows(
+        chosen = select_windows(
             drive, calibration, begin, drive.duration_s, horizon, SPACING_S
         )
         if not len(chosen.start_t):
             break
         ends = predict(model, calibration, drive, chosen)
-        twist = twists_at(drive, chosen.start_t)
+        twist = estimate_twists_at(drive, chosen.start_t)
         yardsticks = {
-            "kept_twist": kept_twist(drive, chosen, twist),
+            "kept_twist": predict_kept_twist(drive, chosen, twist),
             "standing": chosen.start,
         }
         if textbook is not None:
             yardsticks["textbook"] = textbook.predict(drive, chosen, twist)
         figures: dict[str, Any] = {}
         for name, theirs in yardsticks.items():
-            figures[name] = errors_of_ends(theirs, chosen)
-            figures[f"{name}_noise_m"] = noise_beside(ends, theirs, chosen, horizon)
+            figures[name] = average_end_errors(theirs, chosen)
+            figures[f"{name}_noise_m"] = estimate_noise_beside(
+                ends, theirs, chosen, horizon
+            )
         band = bands.get(horizon)
         if band is not None:
-            coverage = float((distances(ends, chosen) <= band).mean())
+            coverage = float((measure_end_distances(ends, chosen) <= band).mean())
             figures |= {"band_m": band, "coverage": coverage}
         judgement.append(
             HorizonErrors(
                 horizon_s=horizon,
                 windows=len(chosen.start_t),
                 path_m=float(chosen.path.mean()),
-                model=errors_of_ends(ends, chosen),
+                model=average_end_errors(ends, chosen),
                 **figures,
             )
         )
     return tuple(judgement)
 
 
-def distances(ends: Array, chosen: Windows) -> Array:
+def measure_end_distances(ends: Array, chosen: Windows) -> Array:
     """Returns the distances (W,) of predicted ends (W, 3) from the measured ones [m]."""
     return np.asarray(np.hypot(*(ends - chosen.end)[:, :2].T))
 
 
-def noise_beside(
+def estimate_noise_beside(
     ends: Array, yardstick: Array, chosen: Windows, horizon: float
 ) -> float:
     """Returns the noise [m] of a comparison of two predictions (W, 3) of the same ends."""
-    difference = distances(ends, chosen) - distances(yardstick, chosen)
+    difference = measure_end_distances(ends, chosen) - measure_end_distances(
+        yardstick, chosen
+    )
     # one of them diverges, so the ranking is clear
     if not np.isfinite(difference).all():
         return 0.0
-    return comparison_noise(difference, chosen.start_t, horizon)
+    return estimate_comparison_noise(difference, chosen.start_t, horizon)
 
 
-def errors_of_ends(ends: Array, chosen: Windows) -> EndErrors:
+def average_end_errors(ends: Array, chosen: Windows) -> EndErrors:
     """Returns the mean errors of predicted ends (W, 3)."""
     apart = ends - chosen.end
     heading = np.abs(geometry.wrap_angle(apart[:, 2])).mean()
@@ -144,7 +148,7 @@ def estimate_bands(
             kept = (derived[0].t < begin) | (derived[0].t > end)
             adjusted = _adjust_motion(model, calibration, training, *derived, kept)
         elif not fixed:
-            adjusted = readjust(model, calibration, rest)
+            adjusted = adjust_to_drive(model, calibration, rest)
         if adjusted is None:
             return {}
         for horizon, parts in errors.items():
@@ -161,10 +165,10 @@ def measure_distances(
     model: TaylorModel, calibration: Calibration, part: Drive, horizon: float
 ) -> Array:
     """Returns the distances (W,) [m] of all predictions over a horizon [s] in a part of a drive."""
-    chosen = windows(part, calibration, 0.0, part.duration_s, horizon, SPACING_S)
+    chosen = select_windows(part, calibration, 0.0, part.duration_s, horizon, SPACING_S)
     if not len(chosen.start_t):
         return np.zeros(0)
-    return distances(predict(model, calibration, part, chosen), chosen)
+    return measure_end_distances(predict(model, calibration, part, chosen), chosen)
 
 
 def _adjust_motion(
@@ -177,11 +181,13 @@ def _adjust_motion(
 ) -> tuple[TaylorModel, Calibration]:
     """Adjusts a model with a motion as state, and its inputs, to the rows that are kept (T,)."""
     draft = base.draft
-    problem = problem_of(training, calibration, samples, draft.form, draft.inputs)
+    problem = make_prediction_problem(
+        training, calibration, samples, draft.form, draft.inputs
+    )
     problem = replace(problem, spacing_s=hypotheses.SPACING_S)
     free = (model.coefficients != 0.0) & ~select_defined_dofs(training.spec)[:, None]
     pull = hypotheses.PULLS[-1]
-    fitted = shooting.fitted(
+    fitted = shooting.fit_to_predictions(
         problem, model, free, draft.inputs, kept, EVALUATIONS, pull
     )
     calibration = replace(
@@ -191,5 +197,5 @@ def _adjust_motion(
     )
     model = replace(fitted.model, inputs=calibration.inputs)
     if problem.mounted:
-        calibration = hypotheses.remounted(calibration, fitted)
+        calibration = hypotheses.add_predicted_mounting(calibration, fitted)
     return model, calibration

@@ -7,9 +7,17 @@ import numpy as np
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify.calibration import Calibration, outside_gaps, poses_at
+from nics_drl_bridge.identify.calibration import (
+    Calibration,
+    resample_poses,
+    select_outside_gaps,
+)
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.signals import average_effect, infer_states, unwrapped
+from nics_drl_bridge.identify.signals import (
+    average_effect,
+    infer_states,
+    unwrap_headings,
+)
 from nics_drl_bridge.recording.recording import (
     Recording,
     Samples,
@@ -33,17 +41,17 @@ COARSE_S = 0.02
 COARSE_FROM_S = 0.015
 
 
-def by_motion(spec: RobotSpec, recording: Recording) -> bool:
+def has_motion_as_state(spec: RobotSpec, recording: Recording) -> bool:
     """True if a state that is part of the body twist was not measured, or wheels are inputs."""
     if recording.state is not None:
         return False
     return any(v.twist for v in spec.state) or not (spec.state or spec.takes_cmd_vel)
 
 
-def half_width(drive: Drive) -> float:
+def choose_half_width(drive: Drive) -> float:
     """Returns the half-width [s] for smoothing poses: the shortest that reduces noise enough."""
     t = drive.dated.t
-    pose = unwrapped(drive.dated.values)
+    pose = unwrap_headings(drive.dated.values)
     span = float(t[-1] - t[0])
     every = span / max(len(t) - 1, 1)
     speed = np.hypot(*np.diff(pose[:, :2], axis=0).T).sum() / span
@@ -58,7 +66,7 @@ def half_width(drive: Drive) -> float:
     return float(max(width, SAMPLES * every))
 
 
-def with_motion(
+def add_motion(
     drive: Drive, calibration: Calibration, grid: Array, width: float
 ) -> Drive:
     """Returns a drive with the state at uniform times (T,) on the commands' clock.
@@ -68,7 +76,7 @@ def with_motion(
     """
     recording = drive.recording
     spec = drive.spec
-    twist = body_twists(drive, calibration, grid, width)
+    twist = measure_body_twists(drive, calibration, grid, width)
     columns = [
         twist[:, POSE_RATES.index(v.twist)]
         if v.twist
@@ -81,7 +89,7 @@ def with_motion(
     )
 
 
-def body_twists(
+def measure_body_twists(
     drive: Drive, calibration: Calibration, grid: Array, width: float
 ) -> Array:
     """Returns the twists (T, 3) of `base_link` at uniform times (T,) on the commands' clock.
@@ -89,14 +97,14 @@ def body_twists(
     They are slopes of parabolas through the poses within a half-width [s] on both sides.
     """
     step = float(grid[1] - grid[0])
-    pose = unwrapped(poses_at(drive, calibration, grid, 0.5 * width))
+    pose = unwrap_headings(resample_poses(drive, calibration, grid, 0.5 * width))
     rows = 2 * max(2, round(width / step)) + 1
     rates = find_slopes(pose, rows, step)
     forward = geometry.rotate(rates[:, :2], -pose[:, 2])
     return np.concatenate([forward, rates[:, 2:]], axis=1)
 
 
-def as_smooth(command: Array, step: float, width: float) -> Array:
+def smooth_commands(command: Array, step: float, width: float) -> Array:
     """Returns commands (T, C) at uniform times, smoothed like a twist derived by parabolas."""
     sums = np.cumsum(command, axis=0) * step
     rows = 2 * max(2, round(width / step)) + 1
@@ -133,26 +141,26 @@ def _infer_follower(
     return infer_states(command, alone, np.array(lag), latency, t)[:, 0]
 
 
-def samples_of(drive: Drive, calibration: Calibration, width: float) -> Samples:
-    """Resamples a drive from `with_motion` at the times of its state, with poses smoothed alike."""
-    state = known_state(drive)
+def resample_motion(drive: Drive, calibration: Calibration, width: float) -> Samples:
+    """Resamples a drive from `add_motion` at the times of its state, with poses smoothed alike."""
+    state = require_state(drive)
     spec = drive.spec
     grid = state.t
     step = round(float(grid[-1] - grid[0]) / (len(grid) - 1), 9)
-    pose = poses_at(drive, calibration, grid, 0.5 * width)
+    pose = resample_poses(drive, calibration, grid, 0.5 * width)
     begin = grid - calibration.command_latency_s
     command = average_effect(
         drive.recording.command, spec, calibration.inputs, begin, begin + step
     )
     samples = samples_on_one_clock(grid, pose, state.values, command)
-    is_known = outside_gaps(
+    is_known = select_outside_gaps(
         samples.t, drive.sample_t + calibration.clock_offset_s, step
     )
     return replace(samples.rows(is_known), dt=step)
 
 
-def known_state(drive: Drive) -> Stream:
-    """Returns the state of a drive from `with_motion`."""
+def require_state(drive: Drive) -> Stream:
+    """Returns the state of a drive from `add_motion`."""
     if drive.recording.state is None:
         raise RecordingError(
             f"{drive.recording.source}: its motion has not been derived yet."
@@ -160,7 +168,7 @@ def known_state(drive: Drive) -> Stream:
     return drive.recording.state
 
 
-def grid_of(drive: Drive, calibration: Calibration, period: float) -> Array:
+def make_motion_grid(drive: Drive, calibration: Calibration, period: float) -> Array:
     """Returns uniform times (T,) of poses on the commands' clock; the step divides a period [s]."""
     pose = drive.recording.pose.t + calibration.clock_offset_s
     usual = float(np.median(np.diff(drive.dated.t)))
@@ -173,7 +181,7 @@ def grid_of(drive: Drive, calibration: Calibration, period: float) -> Array:
     )
 
 
-def surrogate(spec: RobotSpec) -> RobotSpec:
+def make_surrogate(spec: RobotSpec) -> RobotSpec:
     """Returns a robot whose state follows its commands one by one, to find delays and lags."""
 
     def follows(command: CommandVariable) -> StateVariable:

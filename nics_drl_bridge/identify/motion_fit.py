@@ -32,7 +32,7 @@ def fit_motion(drive: Drive, findings: Findings) -> Findings:
     order = drive.settings.order
     samples = resample_drive(training, findings)
     try:
-        base = hypotheses.base_of(
+        base = hypotheses.fit_base(
             training,
             findings.calibration,
             samples,
@@ -40,10 +40,10 @@ def fit_motion(drive: Drive, findings: Findings) -> Findings:
             findings.base,
         )
         trials = findings.trials  # a refit reuses the choice
-        trials = trials or base.draft.tried(hypotheses.hypotheses(order))
+        trials = trials or base.draft.tried(hypotheses.list_hypotheses(order))
     except FitError as error:
         raise FitError(f"{drive.recording.source}: {error}") from None
-    best = hypotheses.chosen(trials, order).order
+    best = hypotheses.choose_trial(trials, order).order
     curves = base.draft.form.curves_at(base.draft.inputs, base.found.values)
     calibration = replace(findings.calibration, inputs=curves)
     findings = replace(findings, calibration=calibration)
@@ -66,15 +66,15 @@ def refine_motion(drive: Drive, findings: Findings) -> Findings:
     """Adjusts terms, delays and mounting to predictions over seconds."""
     order = drive.settings.order
     base = require(findings.base, "the base", "fit_terms")
-    best = hypotheses.chosen(findings.trials, order)
+    best = hypotheses.choose_trial(findings.trials, order)
     terms = require_fit(findings).model
     calibration = findings.calibration
     draft = base.draft
     found, has_order = _search_model(draft, base, terms, best)
     if draft.problem.mounted:
-        certain = hypotheses.with_certain_mounting(draft, calibration, found)
+        certain = hypotheses.drop_doubtful_mounting(draft, calibration, found)
         if certain is not None:
-            errors = hypotheses.remounted(calibration, found).uncertainty
+            errors = hypotheses.add_predicted_mounting(calibration, found).uncertainty
             calibration = replace(calibration, uncertainty=errors)
             draft = certain
             found, has_order = _search_model(draft, base, terms, best)
@@ -87,7 +87,7 @@ def refine_motion(drive: Drive, findings: Findings) -> Findings:
     calibration, sums = _separate_lags(base, calibration, drive.spec)
     model = replace(
         found.model,
-        std_errors=hypotheses.standard_errors(found),
+        std_errors=hypotheses.estimate_coefficient_errors(found),
         inputs=calibration.inputs,
     )
     return replace(
@@ -98,7 +98,7 @@ def refine_motion(drive: Drive, findings: Findings) -> Findings:
         refinement=(
             _describe_refinement(draft.problem.longest_horizon_s),
             *sums,
-            *hypotheses.about_forms(base, findings.trials, order),
+            *hypotheses.describe_forms(base, findings.trials, order),
             *_list_unused_options(drive, best.order, has_order),
         ),
     )
@@ -142,7 +142,7 @@ def _calibrate(
         uncertainty=calibration.uncertainty | errors,
     )
     if draft.problem.mounted:
-        return hypotheses.remounted(calibration, found)
+        return hypotheses.add_predicted_mounting(calibration, found)
     return calibration
 
 
@@ -152,11 +152,11 @@ def _separate_lags(
     """Drops the latency's error where lags hide it; returns a sentence on their sums instead."""
     draft = base.draft
     curves = draft.form.curves_at(draft.inputs, base.found.values)
-    lags = hypotheses.lags_of(replace(base.found.model, inputs=curves), spec)
+    lags = hypotheses.find_lags(replace(base.found.model, inputs=curves), spec)
     if not lags:
         return calibration, ()
     beside = draft.form.latency_at(draft.inputs, base.found.values)
-    sums = hypotheses.about_lags(calibration.command_latency_s, lags, beside)
+    sums = hypotheses.describe_lag_sums(calibration.command_latency_s, lags, beside)
     errors = dict(calibration.uncertainty)
     errors.pop("command_latency_s", None)
     return replace(calibration, uncertainty=errors), (sums,)

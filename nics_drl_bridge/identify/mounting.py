@@ -10,11 +10,15 @@ from nics_drl_bridge.geometry import Array, rotate, wrap_angle
 from nics_drl_bridge.identify import clocks
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive, TwistIntervals
-from nics_drl_bridge.identify.signals import average_held, followed, speed_index
+from nics_drl_bridge.identify.signals import (
+    average_held,
+    find_speed_index,
+    list_followed_commands,
+)
 from nics_drl_bridge.identify.statistics import (
     CERTAIN,
-    clustered_errors,
-    standard_errors,
+    estimate_clustered_errors,
+    estimate_standard_errors,
 )
 from nics_drl_bridge.identify.terms import has_slipping_tyres, list_reversed_variables
 from nics_drl_bridge.recording.recording import Stream
@@ -66,7 +70,7 @@ class Mounting:
         return why, why
 
 
-def mounting_of(
+def estimate_mounting(
     drive: Drive, timing: clocks.TimingEstimate, states: Array | None
 ) -> Mounting | None:
     """Estimates the mounting from states (n, S) at gain one; None if the drive does not show it."""
@@ -82,27 +86,29 @@ def mounting_of(
     )
     forward = _predict_twists(spec, command)[:, 0]
     _, noise = drive.pose_noise or (0.0, 0.0)
-    mounting = mounting_without_lateral_motion(twists, forward, noise)
+    mounting = estimate_mounting_without_lateral_motion(twists, forward, noise)
     if (
         mounting is not None
         and states is None
         and (has_slipping_tyres(spec) or slips(spec))
     ):
-        return with_slip(twists, mounting, spec)
+        return estimate_mounting_with_slip(twists, mounting, spec)
     if mounting is None or states is None:
         return mounting
     if drive.recording.state is None or np.isnan(mounting.lever_sigma[0]):
-        mounting = by_instruments(twists, states, forward, spec) or mounting
-    place = speed_index(spec)
+        mounting = (
+            estimate_mounting_by_instruments(twists, states, forward, spec) or mounting
+        )
+    place = find_speed_index(spec)
     if place is not None and np.isnan(mounting.lever_sigma).tolist() == [False, True]:
         speed = states[:, place]
-        mounting.lever[1], mounting.lever_sigma[1] = lateral_lever(
+        mounting.lever[1], mounting.lever_sigma[1] = estimate_lateral_lever(
             twists, mounting.rotation, speed
         )
     return mounting
 
 
-def by_instruments(
+def estimate_mounting_by_instruments(
     motion: TwistIntervals, states: Array, forward: Array, spec: RobotSpec
 ) -> Mounting | None:
     """Estimates the mounting by instruments from the states (n, S); None if these are too weak."""
@@ -127,7 +133,9 @@ def by_instruments(
         normal = -normal
     travel = float(np.arctan2(-normal[0], normal[1]))
     ahead = rotate(seen[:, :2], -travel)[:, :1]
-    sigma = standard_errors(np.hstack([ahead, seen[:, 2:]]), motion.twist @ normal)
+    sigma = estimate_standard_errors(
+        np.hstack([ahead, seen[:, 2:]]), motion.twist @ normal
+    )
     if CERTAIN * sigma[1] > spec.footprint_radius:
         return None
     across = 0.0
@@ -140,7 +148,7 @@ def by_instruments(
         beta = np.linalg.lstsq(even, along, rcond=None)[0]
         rest = along - even[:, :-1] @ beta[:-1] - beta[-1] * motion.twist[:, 2]
         across = -float(beta[-1])
-        across_sigma = float(standard_errors(even, rest)[-1])
+        across_sigma = float(estimate_standard_errors(even, rest)[-1])
     return Mounting(
         travel,
         np.array([-normal[2], across]),
@@ -150,7 +158,9 @@ def by_instruments(
     )
 
 
-def with_slip(motion: TwistIntervals, plain: Mounting, spec: RobotSpec) -> Mounting:
+def estimate_mounting_with_slip(
+    motion: TwistIntervals, plain: Mounting, spec: RobotSpec
+) -> Mounting:
     """Estimates the mounting on a robot that may slip sideways when it turns.
 
     A car's tyres yield in proportion to the lateral force: a slip of speed^2 x turn rate
@@ -163,7 +173,7 @@ def with_slip(motion: TwistIntervals, plain: Mounting, spec: RobotSpec) -> Mount
     slip = speed * turn if skids else (along**2).sum(axis=1) * turn
     chi = np.stack([speed, turn, slip], axis=1)
     beta = np.linalg.lstsq(chi, along[:, 1], rcond=None)[0]
-    sigma = standard_errors(chi, along[:, 1] - chi @ beta)
+    sigma = estimate_standard_errors(chi, along[:, 1] - chi @ beta)
     hidden = skids and _count_ways(speed * np.abs(turn)) < 2
     if hidden or not CERTAIN * sigma[1] < spec.footprint_radius:
         return replace(
@@ -187,7 +197,7 @@ def _count_ways(values: Array, certain: NDArray[np.bool_] | bool = True) -> int:
     )
 
 
-def mounted(calibration: Calibration, mounting: Mounting | None) -> Calibration:
+def apply_mounting(calibration: Calibration, mounting: Mounting | None) -> Calibration:
     """Adds the significant parts of a mounting, and all uncertainties."""
     if mounting is None:
         return calibration
@@ -199,7 +209,7 @@ def mounted(calibration: Calibration, mounting: Mounting | None) -> Calibration:
     certain = {}
     uncertainty = dict(calibration.uncertainty)
     for name, (value, sigma) in estimates.items():
-        certain[name] = clocks.if_certain(value, sigma, MIN_LENGTH)
+        certain[name] = clocks.keep_if_certain(value, sigma, MIN_LENGTH)
         if not np.isnan(sigma):
             uncertainty[name] = sigma
     return replace(
@@ -210,7 +220,7 @@ def mounted(calibration: Calibration, mounting: Mounting | None) -> Calibration:
     )
 
 
-def mounting_without_lateral_motion(
+def estimate_mounting_without_lateral_motion(
     motion: TwistIntervals, forward: Array, noise: float = 0.0
 ) -> Mounting | None:
     """Estimates the mounting of a robot that never moves sideways; None if the drive lacks motion.
@@ -257,7 +267,7 @@ def mounting_without_lateral_motion(
     )
 
 
-def lateral_lever(
+def estimate_lateral_lever(
     motion: TwistIntervals, rotation: float, speed: Array
 ) -> tuple[float, float]:
     """Estimates the lever arm along y and its uncertainty [m] from a speed (n,); may be NaN."""
@@ -268,7 +278,7 @@ def lateral_lever(
     if size[1] < 2.0 * MIN_SECOND * size[0]:
         return 0.0, float("nan")
     beta = np.linalg.lstsq(chi, along, rcond=None)[0]
-    return -float(beta[1]), float(standard_errors(chi, along - chi @ beta)[1])
+    return -float(beta[1]), float(estimate_standard_errors(chi, along - chi @ beta)[1])
 
 
 def _estimate_by_commands(
@@ -281,7 +291,7 @@ def _estimate_by_commands(
     inferred = recording.state is None and any(v.twist for v in spec.state)
     if spec.state and not inferred:
         command = _convert_to_commands(
-            clocks.expected_states(drive, twists, timing), drive, timing.latency
+            clocks.average_expected_states(drive, twists, timing), drive, timing.latency
         )
     else:
         begin = twists.start + timing.offset - timing.latency
@@ -289,10 +299,10 @@ def _estimate_by_commands(
             recording.command, spec, begin, begin + twists.end - twists.start
         )
     # of base_link, up to one factor
-    return mounting_by_expected_twists(twists, _predict_twists(spec, command))
+    return estimate_mounting_by_twists(twists, _predict_twists(spec, command))
 
 
-def mounting_by_expected_twists(
+def estimate_mounting_by_twists(
     motion: TwistIntervals, expected: Array
 ) -> Mounting | None:
     """Estimates the mounting by twists (n, 3) of `base_link` that are known up to one factor.
@@ -306,7 +316,7 @@ def mounting_by_expected_twists(
     rest = motion.twist - expected @ gain
     edges = np.linspace(motion.start[0], motion.end[-1], BLOCKS + 1)
     block = np.searchsorted(edges[1:-1], motion.start, "right")
-    errors = [clustered_errors(expected, column, block) for column in rest.T]
+    errors = [estimate_clustered_errors(expected, column, block) for column in rest.T]
     sigma = np.stack(errors, axis=1)  # of the gain
     sine = gain[0, 1] - gain[1, 0]  # both times twice the factor
     cosine = gain[0, 0] + gain[1, 1]
@@ -338,7 +348,7 @@ def _convert_to_commands(states: Array, drive: Drive, latency: float) -> Array:
     command = drive.recording.command
     spec = drive.spec
     if stream is None:
-        return states[:, np.argsort(followed(spec))]
+        return states[:, np.argsort(list_followed_commands(spec))]
     span = np.diff(stream.t)
     keep = (span > 0.0) & (span < clocks.LONG_STEP * np.median(span))
     keep &= _select_fresh(command, stream.t[:-1] - latency)

@@ -8,9 +8,9 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import open_loop
 from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.drive import Drive, find_bursts, pose_noise
+from nics_drl_bridge.identify.drive import Drive, find_bursts, measure_pose_noise
 from nics_drl_bridge.identify.refine import OUTLYING
-from nics_drl_bridge.identify.signals import white_noise
+from nics_drl_bridge.identify.signals import measure_white_noise
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.noise import (
     ASSUMED_STATE_DRIFT,
@@ -35,14 +35,14 @@ WITHIN_SIGMA = 68.27
 MIN_ROWS = 40
 
 
-def sensor_noise(drive: Drive) -> Noise:
+def measure_sensor_noise(drive: Drive) -> Noise:
     """Measures the noise of the pose sensor; its uncertainty comes from blocks of the drive."""
     pose = drive.recording.pose
     whole = drive.pose_noise
     if whole is None:
         return Noise()
     blocks = map(pose.rows, np.array_split(np.arange(len(pose.t)), BLOCKS))
-    parts = [pose_noise(block, find_bursts(block.t)) for block in blocks]
+    parts = [measure_pose_noise(block, find_bursts(block.t)) for block in blocks]
     measured = np.array([part for part in parts if part is not None])
     if len(measured) > 1:
         spread = measured.std(axis=0, ddof=1) / np.sqrt(len(measured))
@@ -55,7 +55,7 @@ def sensor_noise(drive: Drive) -> Noise:
     return Noise(pose_position=position, pose_heading=heading)
 
 
-def motion_noise(
+def add_motion_noise(
     sensor: Noise,
     drive: Drive,
     calibration: Calibration,
@@ -66,17 +66,17 @@ def motion_noise(
     measured: dict[str, Any] = {
         "state_drift": _measure_state_drift(drive, model, samples)
     }
-    rest = odometry_residual(drive, calibration, model, samples)
+    rest = measure_odometry_residual(drive, calibration, model, samples)
     if rest is not None:
         linear = (_measure_level(rest[:, i], "m/s") for i in (0, 1))
         measured["odom_linear"] = max(linear, key=lambda level: level.std)
         measured["odom_angular"] = _measure_level(rest[:, 2], "rad/s")
     measured |= _measure_pose_drift(sensor, drive, calibration, model)
-    measured |= claimed(sensor, drive.recording.pose.sigma)
+    measured |= list_claimed_levels(sensor, drive.recording.pose.sigma)
     return sensor.model_copy(update=measured)
 
 
-def claimed(sensor: Noise, sigma: Array | None) -> dict[str, Level]:
+def list_claimed_levels(sensor: Noise, sigma: Array | None) -> dict[str, Level]:
     """Returns the pose's deviations according to its covariances, where these are larger."""
     # Differences do not show an error that persists for a while, and drift does not include it.
     if sigma is None:
@@ -99,7 +99,7 @@ def _make_level(std: float, unit: str, uncertainty: float | None) -> Level:
     return Level(std=std, unit=unit, source=MEASURED, uncertainty=uncertainty)
 
 
-def level(variances: Array, unit: str) -> Level:
+def make_measured_level(variances: Array, unit: str) -> Level:
     """Returns a measured level from squares (n,) over time; its uncertainty comes from blocks."""
     std = float(np.sqrt(max(float(variances.mean()), 0.0)))
     means = np.array([part.mean() for part in np.array_split(variances, BLOCKS)])
@@ -114,7 +114,7 @@ def level(variances: Array, unit: str) -> Level:
 def _predict_errors(
     drive: Drive, calibration: Calibration, model: TaylorModel, horizon: float
 ) -> tuple[open_loop.Windows, Array] | None:
-    chosen = open_loop.windows(
+    chosen = open_loop.select_windows(
         drive, calibration, 0.0, drive.duration_s, horizon, SPACING_S
     )
     if len(chosen.start_t) < MIN_WINDOWS:
@@ -129,7 +129,7 @@ def _predict_errors(
         for i, column in enumerate(state.values.T):
             course.x[:, :, i] = np.interp(t, state.t, column)
         relative = open_loop.predict_ends(course, model)[0]
-        ends = open_loop.tracked_ends(chosen, calibration, relative)
+        ends = open_loop.convert_to_tracked(chosen, calibration, relative)
     return chosen, geometry.between(ends, chosen.end)
 
 
@@ -153,8 +153,8 @@ def _measure_pose_drift(
     aside = 0.5 * away * (heading**2 + grown / 3.0)
     shift = 0.5 * size[inside] ** 2 - 2.0 * position**2 - aside
     return {
-        "position_drift": level(shift / HORIZON_S, "m/sqrt(s)"),
-        "heading_drift": level(turn / HORIZON_S, "rad/sqrt(s)"),
+        "position_drift": make_measured_level(shift / HORIZON_S, "m/sqrt(s)"),
+        "heading_drift": make_measured_level(turn / HORIZON_S, "rad/sqrt(s)"),
     }
 
 
@@ -178,18 +178,18 @@ def _measure_state_drift(
     if len(sums) < MIN_WINDOWS:
         return nominal
     drift = {}
-    sensor = white_noise(state.values)
+    sensor = measure_white_noise(state.values)
     for i, variable in enumerate(drive.spec.state):
         usual = OUTLYING * max(float(np.median(np.abs(sums[:, i]))), TINY)
         kept = sums[np.abs(sums[:, i]) <= usual, i]
-        drift[variable.name] = level(
+        drift[variable.name] = make_measured_level(
             (kept**2 - 2.0 * float(sensor[i]) ** 2) / (steps * samples.dt),
             f"{variable.unit}/sqrt(s)",
         )
     return drift
 
 
-def odometry_residual(
+def measure_odometry_residual(
     drive: Drive, calibration: Calibration, model: TaylorModel, samples: Samples
 ) -> Array | None:
     """Returns reported minus modelled twist (n, 3); None if there is nothing to compare."""

@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify.calibration import Calibration, states_at
+from nics_drl_bridge.identify.calibration import Calibration, resample_states
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.kernels import Shot, make_used_terms, shoot, tangent
-from nics_drl_bridge.identify.signals import average_effect, followed
+from nics_drl_bridge.identify.signals import average_effect, list_followed_commands
 from nics_drl_bridge.robot.kernels import SERIES, make_terms, simulate_rollouts
 from nics_drl_bridge.robot.taylor import TaylorModel
 
@@ -53,7 +53,7 @@ class Windows:
         return Windows(*(values[keep] for values in vars(self).values()))
 
 
-def windows(
+def select_windows(
     drive: Drive,
     calibration: Calibration,
     start: float,
@@ -101,10 +101,12 @@ def predict(
     else:
         course = trace_states(model, calibration, drive, chosen)
         relative, _ = predict_ends(course, model)
-    return tracked_ends(chosen, calibration, relative)
+    return convert_to_tracked(chosen, calibration, relative)
 
 
-def tracked_ends(chosen: Windows, calibration: Calibration, relative: Array) -> Array:
+def convert_to_tracked(
+    chosen: Windows, calibration: Calibration, relative: Array
+) -> Array:
     """Returns poses (W, 3) of the tracked body after `base_link` moved by relative poses."""
     return calibration.to_tracked(
         geometry.compose(calibration.to_base(chosen.start), relative)
@@ -130,7 +132,8 @@ def _by_one_rollout(
         recording.command, spec, model.inputs, begin, begin + model.dt
     )
     state = (
-        np.array([r.gain for r in calibration.responses]) * command[0, followed(spec)]
+        np.array([r.gain for r in calibration.responses])
+        * command[0, list_followed_commands(spec)]
     )
     poses, _ = _roll(model, state[None], command[None])
     path = poses[0, :-1]
@@ -159,7 +162,7 @@ def _roll(model: TaylorModel, state: Array, command: Array) -> tuple[Array, Arra
     return poses, states
 
 
-def open_loop_error(
+def measure_open_loop_error(
     model: TaylorModel,
     calibration: Calibration,
     drive: Drive,
@@ -167,7 +170,7 @@ def open_loop_error(
     stop: float,
 ) -> OpenLoop:
     """Predicts part of a drive [s] open-loop, every 0.1 s; RecordingError if it is too short."""
-    chosen = windows(drive, calibration, start, stop, HORIZON_S, SPACING_S)
+    chosen = select_windows(drive, calibration, start, stop, HORIZON_S, SPACING_S)
     if len(chosen.start_t) == 0:
         fault = f"the {stop - start:.1f} s from {start:.1f} s on hold no window of {HORIZON_S:g} s"
         source = drive.recording.source
@@ -208,7 +211,7 @@ def trace_states(
     command = average_effect(
         drive.recording.command, drive.spec, model.inputs, begin, begin + model.dt
     )
-    _, states = _roll(model, states_at(drive, calibration, start), command)
+    _, states = _roll(model, resample_states(drive, calibration, start), command)
     steps = np.floor(exact + 1e-6).astype(np.intp)
     share = np.clip(exact - steps, 0.0, 1.0)
     x = np.concatenate([states[:, :-1], command], axis=2)
@@ -246,7 +249,7 @@ def predict_ends(
 def differentiate_ends(
     course: Course, calibration: Calibration, ends: Array, moved: Array
 ) -> Array:
-    """Returns derivatives (W, 3, P) of `tracked_ends`, from those of the relative poses."""
+    """Returns derivatives (W, 3, P) of `convert_to_tracked`, from those of the relative poses."""
     heading = calibration.to_base(course.chosen.start)[:, 2]
     arm = geometry.rotate(
         np.broadcast_to(calibration.mounting[:2], (len(ends), 2)), ends[:, 2]

@@ -21,12 +21,12 @@ from nics_drl_bridge.identify.calibration import Calibration, Response
 from nics_drl_bridge.identify.clocks import SEPARABLE_S
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.shooting import HEADING_ARM_M, SPACING_S
-from nics_drl_bridge.identify.signals import speed_index
+from nics_drl_bridge.identify.signals import find_speed_index
 from nics_drl_bridge.identify.statistics import (
     CERTAIN,
-    clustered_errors,
+    estimate_clustered_errors,
+    estimate_uncertainty,
     minimise,
-    uncertainty,
 )
 from nics_drl_bridge.identify.terms import FIRST_STATE, TWIST, VX, VY, Mask
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -99,7 +99,7 @@ def _describe_result(problem: "Problem", best: "Refined", before: Calibration) -
     return f"{adjusted} were refined by {by}: {left} is {best.error:.4f} m."
 
 
-def readjust(
+def adjust_to_drive(
     model: TaylorModel, calibration: Calibration, drive: Drive
 ) -> tuple[TaylorModel, Calibration] | None:
     """Adjusts a refined model to another drive, term by term; None if that is not possible."""
@@ -125,7 +125,7 @@ def apply_definitions(
         coefficients = model.coefficients.copy()
         coefficients[VY] = 0.0
         model = replace(model, coefficients=coefficients)
-    i = speed_index(spec)
+    i = find_speed_index(spec)
     if not calibration.responses or i is None:
         return model, calibration
     (alone,) = find_linear_terms(model, spec.state[i].name)
@@ -193,7 +193,9 @@ def make_problem(
     chosen = []
     longest = 0.0
     for horizon in HORIZONS_S:
-        windows = open_loop.windows(drive, calibration, 0.0, until, horizon, SPACING_S)
+        windows = open_loop.select_windows(
+            drive, calibration, 0.0, until, horizon, SPACING_S
+        )
         if len(windows.start_t) >= MIN_WINDOWS:
             ends = open_loop.predict(model, calibration, drive, windows)
             chosen.append(_drop_jumps(windows, ends - windows.end))
@@ -237,7 +239,7 @@ def compute_errors(
             ends = [
                 open_loop.predict_ends(course, model)[0] for course in problem.courses
             ]
-            predicted = open_loop.tracked_ends(
+            predicted = open_loop.convert_to_tracked(
                 windows, calibration, np.concatenate(ends)
             )
         else:  # all windows by a single rollout
@@ -282,7 +284,7 @@ def _differentiate_by_rotation(
 
     def predict(rotation: float) -> Array:
         rotated = replace(calibration, rotation_rad=rotation)
-        return open_loop.tracked_ends(course.chosen, rotated, ends)
+        return open_loop.convert_to_tracked(course.chosen, rotated, ends)
 
     right = predict(calibration.rotation_rad - ROTATION_STEP_RAD)
     left = predict(calibration.rotation_rad + ROTATION_STEP_RAD)
@@ -452,7 +454,7 @@ def minimise_errors(
         jacobian=jacobian if problem.courses else None,
     )
     model, calibration = free.insert(theta)
-    sigma = uncertainty(slopes, rest)[count:]
+    sigma = estimate_uncertainty(slopes, rest)[count:]
     return Refined(
         model,
         _add_uncertainty(free, model, calibration, sigma),
@@ -481,7 +483,7 @@ def _estimate_errors(
     cluster = np.floor((starts - starts.min()) / max(HORIZONS_S)).astype(np.intp)
     count = free.coefficients.sum()
     errors = np.full(model.coefficients.shape, np.nan)
-    errors[free.coefficients] = clustered_errors(slopes, rest, cluster)[:count]
+    errors[free.coefficients] = estimate_clustered_errors(slopes, rest, cluster)[:count]
     for row, state in enumerate(problem.drive.spec.state, start=FIRST_STATE):
         decay, command = find_linear_terms(model, state.name, state.follows)
         if decay is None or command is None:

@@ -14,12 +14,12 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.forms import list_driving_commands
 from nics_drl_bridge.identify.signals import (
+    average_between_stamps,
     average_held,
-    interval_means,
-    moved_commands,
-    unwrapped,
+    select_moved_commands,
+    unwrap_headings,
 )
-from nics_drl_bridge.identify.statistics import unexplained
+from nics_drl_bridge.identify.statistics import compute_unexplained
 from nics_drl_bridge.identify.verdict import Doubt, Gap, Mistake
 from nics_drl_bridge.recording import recording as recordings
 from nics_drl_bridge.recording.mapping import UNITS
@@ -84,7 +84,7 @@ TRAVEL_SHARE = 0.1
 TRAVEL_NOISE = 25.0
 
 
-def repaired(drive: Drive) -> tuple[Drive, tuple[str, ...]]:
+def repair_rows(drive: Drive) -> tuple[Drive, tuple[str, ...]]:
     """Drops rows, joins at jumps, clips commands; returns a sentence on each kind of fault."""
     notes: list[str] = []
     for repair in (
@@ -264,7 +264,7 @@ def _join_at_jumps(drive: Drive, notes: list[str]) -> recordings.Recording:
 def _limit_steps(drive: Drive, apart: Array) -> Array:
     """Returns the allowed difference of steps (2, T), in m and rad, from those around them."""
     t = drive.sample_t
-    pose = unwrapped(drive.recording.pose.values)
+    pose = unwrap_headings(drive.recording.pose.values)
     every = np.unique(np.searchsorted(t, np.arange(t[0], t[-1], SPEED_OVER_S)))
     took = np.maximum(np.diff(t[every]), 1e-9)
     gone = np.abs(np.diff(pose[every], axis=0))
@@ -433,8 +433,8 @@ def _describe_ratio(name: str, unit: str, ratio: float) -> Iterator[str]:
 def check_pose_moves(drive: Drive) -> None:
     """Refuses poses that stay in place while commands change (RecordingError)."""
     recording = drive.recording
-    values = unwrapped(drive.recording.pose.values)
-    if not moved_commands(recording.command).any():
+    values = unwrap_headings(drive.recording.pose.values)
+    if not select_moved_commands(recording.command).any():
         return
     position, heading = drive.pose_noise or (0.0, 0.0)
     reach = float(np.ptp(values[:, :2], axis=0).max())
@@ -521,7 +521,7 @@ def _average_inputs(
         return None
     start, end, driven = (values[inside] for values in (start, end, driven))
     if state is not None:
-        return interval_means(state.t, state.values, start, end), driven
+        return average_between_stamps(state.t, state.values, start, end), driven
     sent = average_held(recording.command, spec, start - delay_s, end - delay_s)
     return sent, driven
 
@@ -677,8 +677,10 @@ def _find_mirrored_heading(pose: recordings.Stream, drive: Drive) -> HeadingKeys
         return HeadingKeys.NONE
     if not recordings.has_visible_axes(pose.values):
         return HeadingKeys.NONE
-    as_recorded = _explained(pose.t, pose.values, state)
-    mirrored = _explained(pose.t, pose.values * np.array([1.0, 1.0, -1.0]), state)
+    as_recorded = _measure_explained(pose.t, pose.values, state)
+    mirrored = _measure_explained(
+        pose.t, pose.values * np.array([1.0, 1.0, -1.0]), state
+    )
     if mirrored > max(recordings.MIN_MIRRORED, recordings.BETTER + as_recorded):
         return HeadingKeys.MIRRORED
     return HeadingKeys.NONE
@@ -719,12 +721,12 @@ def _explain_velocity(drive: Drive, pose: Array) -> float:
     return max(explained)
 
 
-def _explained(t: Array, pose: Array, state: recordings.Stream) -> float:
+def _measure_explained(t: Array, pose: Array, state: recordings.Stream) -> float:
     """Returns the fraction (0 to 1) of the body velocity between poses that the state explains."""
     span = np.diff(t)
     keep = span > 0.0
     velocity = (
         geometry.log(geometry.between(pose[:-1], pose[1:]))[keep, :2] / span[keep, None]
     )
-    means = interval_means(state.t, state.values, t[:-1][keep], t[1:][keep])
-    return 1.0 - float((unexplained(means, velocity) ** 2).mean())
+    means = average_between_stamps(state.t, state.values, t[:-1][keep], t[1:][keep])
+    return 1.0 - float((compute_unexplained(means, velocity) ** 2).mean())

@@ -11,7 +11,7 @@ from nics_drl_bridge.identify.conclusion import conclude
 from nics_drl_bridge.identify.fit import Alpha
 from nics_drl_bridge.identify.hypotheses import list_candidates
 from nics_drl_bridge.identify.identify import Identified
-from nics_drl_bridge.identify.signals import moved_commands
+from nics_drl_bridge.identify.signals import select_moved_commands
 from nics_drl_bridge.identify.statistics import Curve
 from nics_drl_bridge.identify.verdict import (
     FAR_OFF,
@@ -362,7 +362,7 @@ def collect_estimates(identified: Identified) -> dict[str, CalibratedValue]:
     sigma = calibration.uncertainty
     mounting = identified.findings.mounting
     one_clock = recording.pose.clock == recording.command.clock
-    changed = bool(moved_commands(recording.command).any())
+    changed = bool(select_moved_commands(recording.command).any())
     untold = "the motion does not show it" if changed else "no command changed"
     clocks = "pose and commands are on one clock" if one_clock else untold
     both = "clock_offset_s" in sigma

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from nics_drl_bridge import geometry
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.kernels import Shot, make_used_terms, shoot, tangent
-from nics_drl_bridge.identify.statistics import clustered_errors
+from nics_drl_bridge.identify.statistics import estimate_clustered_errors
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.taylor import TaylorModel
@@ -220,7 +220,7 @@ class Predictive:
 NOTHING_FREE = Inputs((), *(np.zeros(0) for _ in range(4)))
 
 
-def fitted(
+def fit_to_predictions(
     problem: Shooting,
     model: TaylorModel,
     free: Mask,
@@ -366,5 +366,5 @@ class _Search:
         errors = np.full(len(self.inputs.start), np.nan)
         if self.count:
             late_slope = self.late(theta, rest) / self.inputs.scale[self.sought]
-            errors[self.sought] = clustered_errors(late_slope, rest, span)
+            errors[self.sought] = estimate_clustered_errors(late_slope, rest, span)
         return Predictive(best, late, slope, rest, self.free, starts, errors)

@@ -71,7 +71,7 @@ def average_held(
     """
     # Before its first command a robot is at rest, so commands that ever change are zero then.
     at_rest = np.clip(0.0, spec.command_low, spec.command_high)
-    before = np.where(moved_commands(command), at_rest, command.values[0])
+    before = np.where(select_moved_commands(command), at_rest, command.values[0])
     values = np.concatenate([before[None], command.values])
     if powers is not None:
         values = taylor.evaluate(values, powers)
@@ -83,7 +83,7 @@ def average_held(
     return _average(edges, integrals, start, end)
 
 
-def interval_means(t: Array, values: Array, start: Array, end: Array) -> Array:
+def average_between_stamps(t: Array, values: Array, start: Array, end: Array) -> Array:
     """Returns means (n, K) over intervals (n,) of values (T, K), linear between stamps (T,)."""
     trapezoids = np.diff(t)[:, None] * (values[1:] + values[:-1]) / 2.0
     return _average(t, trapezoids, start, end)
@@ -99,30 +99,30 @@ def _average(edges: Array, integrals: Array, start: Array, end: Array) -> Array:
     return means / (end - start)[..., None]
 
 
-def moved_commands(command: Stream) -> NDArray[np.bool_]:
+def select_moved_commands(command: Stream) -> NDArray[np.bool_]:
     """Returns a mask (C,) of the commands that ever changed."""
     return np.asarray(np.ptp(command.values, axis=0) > 0.0)
 
 
-def moved_inputs(command: Stream, spec: RobotSpec) -> NDArray[np.bool_]:
+def select_moved_inputs(command: Stream, spec: RobotSpec) -> NDArray[np.bool_]:
     """Returns a mask (S,) of the states whose command changed, or (C,) without any state."""
-    moved = moved_commands(command)
-    return moved[followed(spec)] if spec.state else moved
+    moved = select_moved_commands(command)
+    return moved[list_followed_commands(spec)] if spec.state else moved
 
 
-def followed(spec: RobotSpec) -> NDArray[np.intp]:
+def list_followed_commands(spec: RobotSpec) -> NDArray[np.intp]:
     """Returns the index (S,) of the command that each state variable follows."""
     names = [c.name for c in spec.command]
     return np.array([names.index(str(v.follows)) for v in spec.state], dtype=np.intp)
 
 
-def speed_index(spec: RobotSpec) -> int | None:
+def find_speed_index(spec: RobotSpec) -> int | None:
     """Returns the index of the speed along the direction of travel; None if not unique."""
     speeds = [i for i, v in enumerate(spec.state) if v.unit == "m/s"]
     return speeds[0] if len(speeds) == 1 else None
 
 
-def nominal_lags(spec: RobotSpec) -> Array:
+def get_nominal_lags(spec: RobotSpec) -> Array:
     """Returns the spec's time constants (S,) `NAME_lag` [s], or a typical one."""
     return np.array(
         [spec.parameters.get(f"{v.name}_lag", DEFAULT_LAG_S) for v in spec.state]
@@ -142,7 +142,7 @@ class Motors(NamedTuple):
         return np.isfinite(self.fall) | np.isfinite(self.rise)
 
 
-def free_motors(states: int) -> Motors:
+def make_free_motors(states: int) -> Motors:
     """Returns motors without any limits."""
     return Motors(np.full(states, -np.inf), np.full(states, np.inf), np.zeros(states))
 
@@ -166,8 +166,8 @@ def infer_states(
         motors: limits and dead zones; by default none.
     """
     dt = float(grid[1] - grid[0])
-    follows = followed(spec)
-    fall, rise, dead = motors or free_motors(len(follows))
+    follows = list_followed_commands(spec)
+    fall, rise, dead = motors or make_free_motors(len(follows))
     command = _subtract_dead_zones(command, follows, dead)
     targets = np.empty((len(grid), len(follows)))
     for late in np.unique(latency):
@@ -201,7 +201,7 @@ def _subtract_dead_zones(
     return replace(command, values=np.sign(command.values) * size)
 
 
-def white_noise(values: Array) -> Array:
+def measure_white_noise(values: Array) -> Array:
     """Returns the standard deviation (D,) of white noise on otherwise smooth series (T, D)."""
     rest = np.diff(values, DIFFERENCE, axis=0) / DIFFERENCE_GAIN
     if len(rest) < DIFFERENCE:
@@ -209,7 +209,7 @@ def white_noise(values: Array) -> Array:
     return np.asarray(np.median(np.abs(rest), axis=0) / GAUSSIAN_MAD)
 
 
-def unwrapped(pose: Array) -> Array:
+def unwrap_headings(pose: Array) -> Array:
     """Returns poses (T, 3) with unwrapped headings."""
     return np.concatenate([pose[:, :2], np.unwrap(pose[:, 2])[:, None]], axis=1)
 

@@ -27,7 +27,7 @@ BLOCKS = 5
 WORTH = 1e-3
 
 
-def unexplained(chi: Array, signal: Array) -> Array:
+def compute_unexplained(chi: Array, signal: Array) -> Array:
     """Returns the flat residual of a signal (n, D) on features (n, K), in units of its spread."""
     spread = signal.std(axis=0)
     scaled = (signal - signal.mean(axis=0)) / np.where(spread > 1e-9, spread, 1e9)
@@ -68,7 +68,7 @@ def minimise(
     )
 
 
-def uncertainty(jacobian: Array, residual: Array) -> Array:
+def estimate_uncertainty(jacobian: Array, residual: Array) -> Array:
     """Returns standard uncertainties (P,) of least squares, widened for correlated residuals."""
     rest = residual - residual.mean()
     power = float((rest**2).sum())
@@ -84,32 +84,32 @@ def _deviations(covariance: Array) -> Array:
     return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
 
 
-def standard_errors(chi: Array, residual: Array) -> Array:
+def estimate_standard_errors(chi: Array, residual: Array) -> Array:
     """Returns standard errors (K,) for correlated residuals (T,) by time (Newey, West 1987)."""
     count, terms = chi.shape
     if terms == 0 or count <= terms:
         return np.full(terms, np.nan)
     scale = np.maximum(np.linalg.norm(chi, axis=0), np.finfo(np.float64).tiny)
     unit = chi / scale
-    middle = long_run(unit, residual)
+    middle = estimate_long_run_covariance(unit, residual)
     inverse = np.linalg.pinv(unit.T @ unit, hermitian=True)
     return np.asarray(
         _deviations(inverse @ middle @ inverse * count / (count - terms)) / scale
     )
 
 
-def long_run(chi: Array, residual: Array) -> Array:
+def estimate_long_run_covariance(chi: Array, residual: Array) -> Array:
     """Returns the covariance (K, K) of summed features (T, K) x autocorrelated residuals (T,)."""
     scores = chi * residual[:, None]
     middle = scores.T @ scores
-    reach = correlation_reach(residual)
+    reach = find_correlation_reach(residual)
     for lag in range(1, reach + 1):
         cross = scores[lag:].T @ scores[:-lag]
         middle += (1.0 - lag / (reach + 1.0)) * (cross + cross.T)
     return np.asarray(middle)
 
 
-def clustered_errors(
+def estimate_clustered_errors(
     jacobian: Array, residual: Array, cluster: NDArray[np.intp]
 ) -> Array:
     """Returns cluster-robust standard errors (P,) (Cameron, Miller 2015), even for few clusters."""
@@ -126,7 +126,7 @@ def clustered_errors(
     return _deviations(inverse @ (sums.T @ sums) @ inverse * few)
 
 
-def correlation_reach(residual: Array) -> int:
+def find_correlation_reach(residual: Array) -> int:
     """Returns the largest lag [rows] at which residuals (T,) are treated as correlated."""
     count = len(residual)
     usual = int(4.0 * (count / 100.0) ** (2.0 / 9.0))
@@ -145,7 +145,7 @@ def correlation_reach(residual: Array) -> int:
     return min(max(usual, 2 * apart), longest, count - 1)
 
 
-def condition(chi: Array) -> float:
+def compute_condition(chi: Array) -> float:
     """Returns the condition number of the standardised features (T, K); inf if singular."""
     if chi.shape[1] == 0:
         return 1.0
@@ -154,7 +154,7 @@ def condition(chi: Array) -> float:
     return float(size[0] / size[-1]) if size[-1] > 0.0 else float("inf")
 
 
-def errors_of(model: TaylorModel, samples: Samples) -> tuple[Array, Array]:
+def measure_rate_errors(model: TaylorModel, samples: Samples) -> tuple[Array, Array]:
     """Returns RMSE (D,) and R2 (D,) of the rates of a model on samples."""
     residual = samples.dq - model.rates(samples.x)
     rmse = np.sqrt((residual**2).mean(axis=0))
@@ -163,7 +163,7 @@ def errors_of(model: TaylorModel, samples: Samples) -> tuple[Array, Array]:
     return rmse, np.where(variance > 1e-18, 1.0 - unexplained, 1.0)
 
 
-def significant(chi: Array, target: Array) -> NDArray[np.bool_]:
+def select_significant(chi: Array, target: Array) -> NDArray[np.bool_]:
     """Selects features (K,) of a noisy target (T,) that exceed `CERTAIN` times their errors."""
     rest = target - chi @ np.linalg.lstsq(chi, target, rcond=None)[0]
     power = max(float(rest @ rest), np.finfo(np.float64).tiny)
@@ -185,7 +185,7 @@ def significant(chi: Array, target: Array) -> NDArray[np.bool_]:
     return keep
 
 
-def instrumental(
+def fit_by_instruments(
     chi: Array, instruments: Array, target: Array
 ) -> tuple[Array, Array] | None:
     """Returns coefficients (K,) and errors by instruments (T, K); None if these are too weak."""
@@ -199,7 +199,7 @@ def instrumental(
         return None
     inverse = np.linalg.inv(bread)
     beta = inverse @ (instruments.T @ target)
-    middle = long_run(instruments, target - chi @ beta)
+    middle = estimate_long_run_covariance(instruments, target - chi @ beta)
     return beta / scale, np.sqrt(np.diag(inverse @ middle @ inverse.T)) / scale
 
 
@@ -219,7 +219,7 @@ class Curve:
         return self.error / max(float(self.error[0]), np.finfo(np.float64).tiny)
 
 
-def curve(dof: str, terms: tuple[str, ...], chi: Array, target: Array) -> Curve:
+def make_curve(dof: str, terms: tuple[str, ...], chi: Array, target: Array) -> Curve:
     """Returns the curve of features (T, n), largest weight first; `kept` is its knee."""
     squares = cross_validated(chi, target)
     error = np.sqrt(squares.mean(axis=0))
@@ -228,10 +228,10 @@ def curve(dof: str, terms: tuple[str, ...], chi: Array, target: Array) -> Curve:
         / np.sqrt(len(squares))
         / (2.0 * np.maximum(error, 1e-300))
     )
-    return Curve(dof, terms, error, knee(error, sigma))
+    return Curve(dof, terms, error, find_knee(error, sigma))
 
 
-def knee(error: Array, sigma: Array) -> int:
+def find_knee(error: Array, sigma: Array) -> int:
     """Returns the fewest terms within one standard error of the minimum (Breiman's rule)."""
     least = int(np.argmin(error))
     limit = error[least] + max(float(sigma[least]), WORTH * float(error[0]))

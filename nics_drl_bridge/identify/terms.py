@@ -27,7 +27,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import excitation
 from nics_drl_bridge.identify.fit import Fit, prune_and_refit, regress
-from nics_drl_bridge.identify.yardstick import structure_of
+from nics_drl_bridge.identify.yardstick import probe_structure
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.kinds import compute_steady_twist
 from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec, StateVariable
@@ -79,7 +79,7 @@ def fit_motion_terms(
 def _find_constant_variables(samples: Samples, spec: RobotSpec) -> dict[str, float]:
     """Returns the values of the variables that never moved, by name; 0 if close to it."""
     variables = (*spec.state, *spec.command)
-    unmoved = excitation.unmoved_variables(samples, spec)
+    unmoved = excitation.list_unmoved_variables(samples, spec)
     constants = {}
     for variable, mean in zip(variables, samples.x.mean(axis=0), strict=True):
         if variable.name in unmoved:
@@ -190,7 +190,7 @@ def select_textbook_terms(
     names = spec.variable_names
     states = len(spec.state)
     allowed = select_motion_terms(powers, spec, held) & (powers.sum(axis=1) <= 1)
-    structure = structure_of(spec)
+    structure = probe_structure(spec)
     if structure is None or not states:
         return np.asarray(allowed)
     moves, bicycle = structure
@@ -243,7 +243,7 @@ def select_terms_through_state(powers: Powers, spec: RobotSpec, centred: bool) -
         name for name, most in zip(names, powers.max(axis=0), strict=True) if most == 0
     )
     allowed = np.ones((len(spec.dof_names), len(powers)), dtype=np.bool_)
-    allowed[TWIST] = excitation.terms_through_state(powers, spec, unmoved)
+    allowed[TWIST] = excitation.select_twist_terms(powers, spec, unmoved)
     if reversed_names is not None and centred:
         is_odd = _are_odd(powers, names, reversed_names)
         allowed[VX] &= ~is_odd
@@ -314,7 +314,7 @@ def tells_lever_from_wheels(spec: RobotSpec) -> bool:
 
 def has_slipping_tyres(spec: RobotSpec) -> bool:
     """True for a front-steered car whose motion is its state: it may slip sideways."""
-    structure = structure_of(spec)
+    structure = probe_structure(spec)
     if structure is None or not {v.twist for v in spec.state} >= set(POSE_RATES):
         return False
     _, bicycle = structure
@@ -327,7 +327,7 @@ def share_effects(model: TaylorModel, spec: RobotSpec, samples: Samples) -> Tayl
     Uses the minimum-norm coefficients, for example for four wheels and three degrees of freedom:
     commands u are replaced by P u, where P projects out the combinations that stayed constant.
     """
-    combinations = excitation.combinations(samples, spec)
+    combinations = excitation.find_constant_combinations(samples, spec)
     command = samples.x[:, len(spec.state) :]
     is_part = np.abs(combinations).max(axis=0, initial=0.0) > NOTHING
     parts = [c for c, part in zip(spec.command, is_part.tolist(), strict=True) if part]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.calibration import Calibration, Response
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.motion import known_state
+from nics_drl_bridge.identify.motion import require_state
 from nics_drl_bridge.identify.signals import infer_states
 from nics_drl_bridge.identify.yardstick import LIMIT_RANGE, TextbookResponse, Yardstick
 from nics_drl_bridge.recording.recording import Samples, Stream
@@ -29,7 +29,7 @@ NEGLIGIBLE = 1e-3  # fraction of a rate below which a term of the expansion is l
 UNLIMITED = 0.5
 
 
-def textbook_calibration(
+def make_textbook_calibration(
     yardstick: Yardstick, calibration: Calibration, spec: RobotSpec
 ) -> Calibration:
     """Returns the calibration of a drive according to the fitted textbook."""
@@ -55,7 +55,7 @@ def textbook_calibration(
     )
 
 
-def textbook_model(
+def make_textbook_model(
     yardstick: Yardstick, model: TaylorModel, samples: Samples, spec: RobotSpec
 ) -> TaylorModel | None:
     """Returns the fitted textbook as terms, with the step and range of a model of the same drive.
@@ -85,7 +85,7 @@ def needs_actuators(yardstick: Yardstick, spec: RobotSpec) -> bool:
     return yardstick.response.bicycle.used and any(v.twist for v in spec.state)
 
 
-def actuated_spec(yardstick: Yardstick, drive: Drive) -> RobotSpec:
+def make_actuated_spec(yardstick: Yardstick, drive: Drive) -> RobotSpec:
     """Returns a steered robot whose state is its speed and its steering angle."""
     response = yardstick.response
     spec = drive.spec
@@ -94,7 +94,7 @@ def actuated_spec(yardstick: Yardstick, drive: Drive) -> RobotSpec:
     angle_gain = abs(float(response.gain[2, steering]))
     largest = np.maximum(spec.command_high, -spec.command_low)
     forward = [v.twist for v in spec.state].index("vx")
-    fastest = np.abs(known_state(drive).values[:, forward]).max()
+    fastest = np.abs(require_state(drive).values[:, forward]).max()
     fastest = max(fastest, speed_gain * largest[speed])
     if spec.command[speed].unit == "m/s":
         fastest = max(fastest, largest[speed])
@@ -129,7 +129,7 @@ def actuated_spec(yardstick: Yardstick, drive: Drive) -> RobotSpec:
     return RobotSpec.model_validate(data)
 
 
-def with_actuators(
+def add_actuator_state(
     drive: Drive, spec: RobotSpec, yardstick: Yardstick, calibration: Calibration
 ) -> Drive:
     """Returns a drive, with known motion, of a robot whose state is speed and steering angle.
@@ -137,7 +137,7 @@ def with_actuators(
     The speed is that of the motion, the angle that of the textbook for the commands.
     """
     response = yardstick.response
-    state = known_state(drive)
+    state = require_state(drive)
     forward = [v.twist for v in drive.spec.state].index("vx")
     _, steering = _find_bicycle_commands(response)
     alone = spec.model_copy(update={"state": spec.state[1:]})

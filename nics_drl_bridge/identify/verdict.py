@@ -10,11 +10,11 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import FitError, RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import followers
-from nics_drl_bridge.identify.acceptance import THRESHOLDS, shortfall
+from nics_drl_bridge.identify.acceptance import THRESHOLDS, describe_shortfall
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.clocks import TimingEstimate
 from nics_drl_bridge.identify.drive import MAX_GAP_S, Drive
-from nics_drl_bridge.identify.excitation import Excitation, plausible
+from nics_drl_bridge.identify.excitation import Excitation, select_plausible_rows
 from nics_drl_bridge.identify.findings import (
     Findings,
     require_fit,
@@ -26,12 +26,12 @@ from nics_drl_bridge.identify.mounting import Mounting
 from nics_drl_bridge.identify.open_loop import (
     HORIZON_S,
     OpenLoop,
-    open_loop_error,
+    measure_open_loop_error,
     predict,
-    windows,
+    select_windows,
 )
-from nics_drl_bridge.identify.signals import moved_commands
-from nics_drl_bridge.identify.statistics import CERTAIN, errors_of
+from nics_drl_bridge.identify.signals import select_moved_commands
+from nics_drl_bridge.identify.statistics import CERTAIN, measure_rate_errors
 from nics_drl_bridge.recording.recording import Recording, Samples, Stream
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import HorizonErrors, Quality, TaylorModel
@@ -184,7 +184,7 @@ def describe_clocks(
         yield Mistake(
             f"{finding}: stamp both by one clock, or correct the rate of the slower one."
         )
-    if not moved_commands(recording.command).any():
+    if not select_moved_commands(recording.command).any():
         yield Gap(
             "No command ever changed, so clock offset and latency could not be learnt."
         )
@@ -251,7 +251,7 @@ def describe_responses(
     drive: Drive, calibration: Calibration, timing: TimingEstimate
 ) -> Iterator[str]:
     """Yields sentences on unmeasured states and the wheels."""
-    moved = moved_commands(drive.recording.command)
+    moved = select_moved_commands(drive.recording.command)
     names = [c.name for c, m in zip(drive.spec.command, moved, strict=True) if m]
     for response, sigma in zip(calibration.responses, timing.lag_sigma, strict=True):
         state = response.state
@@ -422,7 +422,7 @@ def try_model(
 ) -> OpenLoop | None:
     """Tries a model on a drive from t [s] on; None if the rest is too short."""
     try:
-        return open_loop_error(model, calibration, drive, t, drive.duration_s)
+        return measure_open_loop_error(model, calibration, drive, t, drive.duration_s)
     except RecordingError:
         return None
 
@@ -473,7 +473,12 @@ def add_quality(
         "judgement": judgement,
     }
     if unseen is not None:
-        errors = map(by_dof, errors_of(model, unseen.rows(plausible(unseen.x, spec))))
+        errors = map(
+            by_dof,
+            measure_rate_errors(
+                model, unseen.rows(select_plausible_rows(unseen.x, spec))
+            ),
+        )
         figures |= zip(("held_out_rmse", "held_out_r2"), errors, strict=True)
     if held_out is not None:
         figures |= {
@@ -526,13 +531,13 @@ class ErrorOfRecording(NamedTuple):
         return self.position_m / max(self.path_m, 1e-9)
 
 
-def errors_by_recording(
+def measure_errors_by_recording(
     model: TaylorModel, calibration: Calibration, drive: Drive
 ) -> list[ErrorOfRecording]:
     """Predicts each recording of a drive over the longest horizon that fits into all of them."""
     sources = [episode.source for episode in drive.recording.episodes]
     for horizon in HORIZONS_OF_RECORDING_S:
-        chosen = windows(
+        chosen = select_windows(
             drive, calibration, 0.0, drive.duration_s, horizon, SPACING_OF_RECORDING_S
         )
         if not len(chosen.start_t):
@@ -559,13 +564,13 @@ def errors_by_recording(
     return []
 
 
-def about_recordings(
+def describe_recordings(
     model: TaylorModel, calibration: Calibration, drive: Drive
 ) -> Iterator[str]:
     """Yields a sentence on the errors by recording, and one per recording that alone is off."""
     if not drive.recording.episodes:
         return
-    errors = errors_by_recording(model, calibration, drive)
+    errors = measure_errors_by_recording(model, calibration, drive)
     if len(errors) < 2:
         return
     for error in errors:
@@ -589,13 +594,13 @@ def collect_notes(drive: Drive, findings: Findings) -> tuple[str, ...]:
     calibration = findings.calibration
     beaten = [findings.replacement]
     if not findings.replacement:
-        beaten = list(shortfall(findings.judgement))
+        beaten = list(describe_shortfall(findings.judgement))
     doubts: Iterator[str] = iter(())
     if findings.motion_width_s is None:
         doubts = list_doubts_of_fit(fit, calibration.is_exact)
     levels = count_levels(findings.training.recording.command, spec)
     return (
-        *about_recordings(model, calibration, findings.whole),
+        *describe_recordings(model, calibration, findings.whole),
         *beaten,
         *_explain_replacement(drive, findings),
         *drive.recording.repairs,
@@ -625,7 +630,7 @@ def collect_calibration_notes(findings: Findings) -> tuple[str, ...]:
     return (
         *describe_stamps(training),
         *describe_clocks(training, calibration, findings.timing),
-        *followers.about_sums(calibration),
+        *followers.describe_sums(calibration),
         *describe_mounting(training, calibration, findings.mounting),
         *describe_responses(training, calibration, findings.timing),
     )

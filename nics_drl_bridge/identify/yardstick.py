@@ -14,10 +14,10 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.kernels import STRAIGHT, BicycleGeometry, roll_windows
-from nics_drl_bridge.identify.motion import body_twists, half_width
-from nics_drl_bridge.identify.open_loop import Windows, windows
+from nics_drl_bridge.identify.motion import choose_half_width, measure_body_twists
+from nics_drl_bridge.identify.open_loop import Windows, select_windows
 from nics_drl_bridge.identify.shooting import HEADING_ARM_M
-from nics_drl_bridge.identify.signals import average_held, unwrapped
+from nics_drl_bridge.identify.signals import average_held, unwrap_headings
 from nics_drl_bridge.robot.kinds import compute_steady_twist
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.threads import one_blas_thread
@@ -75,20 +75,22 @@ class Yardstick:
         """Predicts poses (W, 3) at windows' ends from twists (W, 3) at their starts, if known."""
         duration = (chosen.end_t - chosen.start_t)[:, None]
         course = _sample_commands(drive, chosen.start_t + self.clock_offset_s, duration)
-        twist = twists_at(drive, chosen.start_t) if twist is None else twist
+        twist = estimate_twists_at(drive, chosen.start_t) if twist is None else twist
         return geometry.compose(
             chosen.start, _predict_ends(self.response, course, twist)[:, 0]
         )
 
 
-def kept_twist(drive: Drive, chosen: Windows, twist: Array | None = None) -> Array:
+def predict_kept_twist(
+    drive: Drive, chosen: Windows, twist: Array | None = None
+) -> Array:
     """Predicts poses (W, 3) at windows' ends for a robot that keeps the twist at their starts."""
-    twist = twists_at(drive, chosen.start_t) if twist is None else twist
+    twist = estimate_twists_at(drive, chosen.start_t) if twist is None else twist
     moved = twist * (chosen.end_t - chosen.start_t)[:, None]
     return geometry.compose(chosen.start, geometry.exp(moved))
 
 
-def twists_at(drive: Drive, at: Array) -> Array:
+def estimate_twists_at(drive: Drive, at: Array) -> Array:
     """Estimates twists (W, 3) of the tracked body at times (W,) of poses.
 
     A yardstick starts from the same information as a model whose state is its motion: parabolas
@@ -102,21 +104,21 @@ def twists_at(drive: Drive, at: Array) -> Array:
 def _measure_twists(drive: Drive) -> tuple[Array, Array]:
     """Returns uniform times (T,) on the pose's clock, and twists (T, 3) of the tracked body."""
     t = drive.dated.t
-    width = half_width(drive)
+    width = choose_half_width(drive)
     count = max(int((t[-1] - t[0]) / STEP_S), MIN_GRID)
     grid = np.linspace(t[0], t[-1], count + 1)
-    return grid, body_twists(drive, Calibration(), grid, width)
+    return grid, measure_body_twists(drive, Calibration(), grid, width)
 
 
 def _select_windows(
     drive: Drive, until_s: float, horizon: float, spacing: float
 ) -> tuple[Windows, Array]:
     """Selects windows without localiser jumps, and twists (W, 3) at their starts."""
-    chosen = windows(drive, Calibration(), 0.0, until_s, horizon, spacing)
+    chosen = select_windows(drive, Calibration(), 0.0, until_s, horizon, spacing)
     if not len(chosen.start_t):
         return chosen, np.zeros((0, 3))
-    brief = windows(drive, Calibration(), 0.0, until_s, GUESS_S, SPACING_S)
-    twist = twists_at(drive, chosen.start_t)
+    brief = select_windows(drive, Calibration(), 0.0, until_s, GUESS_S, SPACING_S)
+    twist = estimate_twists_at(drive, chosen.start_t)
     fastest = JUMP * np.percentile(brief.path, 90) / GUESS_S
     moved = np.hypot(*(chosen.end - chosen.start)[:, :2].T) / horizon
     calm = np.maximum(moved, np.hypot(twist[:, 0], twist[:, 1])) <= fastest
@@ -238,7 +240,7 @@ class _Form:
         )
 
 
-def structure_of(spec: RobotSpec) -> tuple[Array, BicycleGeometry] | None:
+def probe_structure(spec: RobotSpec) -> tuple[Array, BicycleGeometry] | None:
     """Asks the textbook what each command moves (3, C), and for a bicycle; None without one."""
     half = PROBE * np.maximum(spec.command_high, -spec.command_low)
     try:
@@ -273,12 +275,12 @@ def _guess_response(
     drive: Drive, until_s: float, clock_offset: float, offsets: bool
 ) -> _Form:
     """Fits gains, lags, maybe offsets linearly to motions over `GUESS_S` at the best delay."""
-    structure = structure_of(drive.spec)
+    structure = probe_structure(drive.spec)
     book, bicycle = structure or (np.ones((3, len(drive.spec.command))), STRAIGHT)
     seen, before = _select_windows(drive, until_s, GUESS_S, SPACING_S)
     span = (seen.end_t - seen.start_t)[:, None]
     twist = geometry.log(geometry.between(seen.start, seen.end)) / span
-    change = (twists_at(drive, seen.end_t) - before) / span
+    change = (estimate_twists_at(drive, seen.end_t) - before) / span
     command = drive.recording.command
     one_clock = command.clock == drive.recording.pose.clock
     candidates = []
@@ -371,7 +373,7 @@ def fit_yardstick(
     horizons = np.tile(HORIZONS_S, (len(chosen.start_t), 1))
     course = _sample_commands(drive, chosen.start_t + clock_offset_s, horizons)
     at = chosen.start_t[:, None] + horizons
-    pose = unwrapped(drive.dated.values)
+    pose = unwrap_headings(drive.dated.values)
     ends = np.stack(
         [np.interp(at, drive.dated.t, column) for column in pose.T], axis=-1
     )

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from nics_drl_bridge.files import write_text
-from nics_drl_bridge.identify.acceptance import Verdict, usual
+from nics_drl_bridge.identify.acceptance import Verdict, select_usual_horizon
 from nics_drl_bridge.identify.conclusion import (
     Conclusion,
     conclude,
@@ -27,7 +27,7 @@ Tile = tuple[str, str, bool]
 
 def fit_tile(identified: Identified) -> Tile:
     """Returns the accuracy of a fit as a figure, its meaning, and False if it is doubtful."""
-    for at in usual(identified.judgement):
+    for at in select_usual_horizon(identified.judgement):
         figure = format_error(at.model, at.path_m)
         yardsticks = {"fitted textbook": at.textbook, "constant twist": at.kept_twist}
         beside = [

@@ -12,7 +12,12 @@ from numpy.typing import NDArray
 from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.identify import Identified
-from nics_drl_bridge.identify.open_loop import HORIZON_S, Windows, predict, windows
+from nics_drl_bridge.identify.open_loop import (
+    HORIZON_S,
+    Windows,
+    predict,
+    select_windows,
+)
 from nics_drl_bridge.identify.signals import average_held
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot import taylor
@@ -126,7 +131,7 @@ def _collect_unseen_paths(identified: Identified) -> list[tuple[Array, Array, fl
     pose = identified.recording.pose
     free = max(drive.duration_s - identified.train_until_s - HORIZON_S, 0.0)
     span = identified.train_until_s, drive.duration_s
-    chosen = windows(drive, calibration, *span, HORIZON_S, free / PATHS)
+    chosen = select_windows(drive, calibration, *span, HORIZON_S, free / PATHS)
     paths = []
     for n, path in enumerate(_predict_rates(identified, chosen)[:PATHS]):
         during = (pose.t >= chosen.start_t[n]) & (pose.t <= chosen.end_t[n])

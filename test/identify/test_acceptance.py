@@ -11,14 +11,14 @@ from nics_drl_bridge.generator import generate, load_model, mount_lidar, save_mo
 from nics_drl_bridge.identify.acceptance import (
     Outcome,
     Verdict,
-    combined,
+    combine_ratings,
     compare,
-    comparison_noise,
+    describe_shortfall,
+    estimate_comparison_noise,
     is_beaten_by_textbook,
     loses_to_textbook,
     rate,
     rate_unseen,
-    shortfall,
 )
 from nics_drl_bridge.identify.conclusion import conclude
 from nics_drl_bridge.identify.identify import identify
@@ -116,7 +116,7 @@ def test_the_least_favourable_verdict_counts():
         rate(after_5_s(3.0), RADIUS_M, False),
         rate_unseen(9.0, 10),
     ]
-    both = combined(ratings)
+    both = combine_ratings(ratings)
     assert both.verdict is Verdict.DO_NOT_TRAIN
     assert len(both.reasons) == 2
 
@@ -141,7 +141,7 @@ def test_the_fitted_textbook_beats_a_model_that_is_farther_off(error_m, beaten):
 def test_a_tie_with_the_textbook_is_no_shortfall():
     tie = after_5_s(0.1005, path=2.0, textbook=0.1)
     assert not loses_to_textbook(tie)
-    assert list(shortfall(tie)) == []
+    assert list(describe_shortfall(tie)) == []
     assert rate(tie, RADIUS_M, textbook=False).verdict is Verdict.GOOD
 
 
@@ -149,8 +149,10 @@ def test_the_noise_of_a_comparison_is_that_of_stretches_and_not_of_windows():
     """Windows of one stretch are copies of each other: ten times as many tell no more."""
     rng = np.random.default_rng(0)
     means = rng.normal(size=20)
-    few = comparison_noise(np.repeat(means, 5), np.repeat(5.0 * np.arange(20), 5), 5.0)
-    many = comparison_noise(
+    few = estimate_comparison_noise(
+        np.repeat(means, 5), np.repeat(5.0 * np.arange(20), 5), 5.0
+    )
+    many = estimate_comparison_noise(
         np.repeat(means, 50), np.repeat(5.0 * np.arange(20), 50), 5.0
     )
     assert few == pytest.approx(many)
@@ -159,7 +161,7 @@ def test_the_noise_of_a_comparison_is_that_of_stretches_and_not_of_windows():
 
 def test_in_one_stretch_the_noise_is_that_of_a_single_window():
     difference = np.array([0.1, 0.3, 0.2, 0.4])
-    noise = comparison_noise(difference, np.linspace(0.0, 1.0, 4), 5.0)
+    noise = estimate_comparison_noise(difference, np.linspace(0.0, 1.0, 4), 5.0)
     assert noise == pytest.approx(difference.std())
 
 

@@ -9,7 +9,12 @@ from pydantic import TypeAdapter
 
 from identify.drives import calibrate, drive, with_wheels
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.identify.calibration import Calibration, Response, align, part_of
+from nics_drl_bridge.identify.calibration import (
+    Calibration,
+    Response,
+    align,
+    find_dividing_step,
+)
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.recording.recording import samples_on_one_clock
 from nics_drl_bridge.recording.textbook import record
@@ -28,7 +33,7 @@ from nics_drl_bridge.robot.spec import load_robot
     ],
 )
 def test_a_step_becomes_a_part_of_the_control_period(step, part):
-    assert part_of(0.1, step) == part
+    assert find_dividing_step(0.1, step) == part
 
 
 def test_stamps_that_were_rounded_are_taken_as_they_are(car):

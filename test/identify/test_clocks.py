@@ -9,7 +9,7 @@ import pytest
 from identify.drives import MOTOR, calibrate, drive, servoed, tricycle
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.clocks import SEPARABLE_S, timing_of
+from nics_drl_bridge.identify.clocks import SEPARABLE_S, measure_timing
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.verdict import describe_clocks
 
@@ -63,7 +63,7 @@ def test_a_robot_that_moves_before_its_commands_has_poses_of_another_clock(car, 
     )
     pose = replace(recording.pose, t=recording.pose.t - ahead)
     tried = Drive(replace(recording, pose=pose), car)
-    timing = timing_of(tried)
+    timing = measure_timing(tried)
     assert timing.latency == pytest.approx(0.0 if ahead else 0.05, abs=0.01)
     told = " ".join(describe_clocks(tried, Calibration(), timing))
     assert ("The robot moves 0.15 s before its commands" in told) == (ahead > 0.0)
@@ -76,7 +76,7 @@ def test_a_measured_state_that_moves_before_its_commands_is_of_another_clock(car
         for name, stream in (("pose", recording.pose), ("state", recording.state))
     }
     tried = Drive(replace(recording, **ahead), car)
-    told = " ".join(describe_clocks(tried, Calibration(), timing_of(tried)))
+    told = " ".join(describe_clocks(tried, Calibration(), measure_timing(tried)))
     assert (
         "The robot moves 0.15 s before its commands: its state is stamped by another"
         in told
@@ -97,4 +97,4 @@ def test_what_the_pose_tells_is_not_asked_to_be_measured(car, differential):
         ".*`nics inspect .* --map my.yaml`"
     )
     with pytest.raises(RecordingError, match=sentence):
-        timing_of(Drive(recording, untold))
+        measure_timing(Drive(recording, untold))

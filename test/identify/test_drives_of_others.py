@@ -6,7 +6,12 @@ from functools import cache
 from pathlib import Path
 
 from nics_drl_bridge.config import parse_yaml
-from nics_drl_bridge.identify.acceptance import Outcome, Verdict, compare, usual
+from nics_drl_bridge.identify.acceptance import (
+    Outcome,
+    Verdict,
+    compare,
+    select_usual_horizon,
+)
 from nics_drl_bridge.identify.conclusion import conclude
 from nics_drl_bridge.identify.identify import Identified, identify
 from nics_drl_bridge.recording.guess import propose_mapping
@@ -29,7 +34,7 @@ def test_the_validation_drive_of_a_car_is_predicted_to_eight_per_cent(
     shared_recordings,
 ):
     path = shared_recordings / "jetracer_dart" / "long_prediction_69s.csv"
-    (at,) = usual(identify_by_draft(path).judgement)
+    (at,) = select_usual_horizon(identify_by_draft(path).judgement)
     assert at.horizon_s == 5.0
     assert at.model.position_m <= 0.08 * at.path_m
 
@@ -48,6 +53,6 @@ def test_the_gap_of_a_drive_on_slippery_floors_is_named_and_limits_the_verdict(
 
 def test_a_plain_drive_is_predicted_no_worse_than_by_its_textbook(shared_recordings):
     found = identify_by_draft(shared_recordings / "f110_frictionmaps" / "DS5")
-    (at,) = usual(found.judgement)
+    (at,) = select_usual_horizon(found.judgement)
     outcome = compare(at.model, at.textbook, at.textbook_noise_m, at.path_m)
     assert outcome is not Outcome.WORSE

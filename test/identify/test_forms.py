@@ -15,13 +15,13 @@ from nics_drl_bridge.identify.drive import Drive, Settings
 from nics_drl_bridge.identify.findings import Findings, resample_drive
 from nics_drl_bridge.identify.forms import (
     Form,
-    curve_of,
-    inputs_of,
-    problem_of,
-    reached,
-    two_way,
-    with_back,
-    with_dead,
+    add_dead_zones,
+    add_reverse_gains,
+    drop_unreached_ends,
+    find_input_curve,
+    find_two_way_curves,
+    list_inputs,
+    make_prediction_problem,
 )
 from nics_drl_bridge.identify.identify import (
     STAGES,
@@ -51,11 +51,11 @@ def samples(found) -> Samples:
 
 
 def form_inputs(found, samples, form):
-    return inputs_of(found.training, 0.05, samples, form)
+    return list_inputs(found.training, 0.05, samples, form)
 
 
 def test_a_dead_zone_is_seen_in_the_speed_that_a_throttle_makes(found, samples):
-    candidate = curve_of(samples, found.training.spec, 0)
+    candidate = find_input_curve(samples, found.training.spec, 0)
     assert candidate is not None
     assert candidate.curve.command == "throttle"
     assert candidate.curve.dead == pytest.approx(0.1, abs=0.05)
@@ -67,7 +67,7 @@ def test_a_command_in_proportion_to_what_it_does_has_no_curve(found, samples):
     share = 1.0 - np.exp(-samples.dt / 0.4)
     follows.x[:, 0] = lfilter([share], [1.0, share - 1.0], samples.x[:, 3])
     follows.x[:, 1:3] = 0.0
-    assert curve_of(follows, found.training.spec, 0) is None
+    assert find_input_curve(follows, found.training.spec, 0) is None
 
 
 def test_a_command_that_does_not_drive_a_robot_has_no_curve_by_its_speed(
@@ -76,7 +76,7 @@ def test_a_command_that_does_not_drive_a_robot_has_no_curve_by_its_speed(
     slower = replace(samples, x=samples.x.copy())
     slower.x[:, 0] -= 2.0 * np.maximum(np.abs(samples.x[:, 4]) - 0.4, 0.0)
     slower.x[:, 1:3] = 0.0
-    assert curve_of(slower, found.training.spec, 1) is None
+    assert find_input_curve(slower, found.training.spec, 1) is None
 
 
 def test_values_are_sought_by_name_from_what_the_motion_shows(found, samples):
@@ -114,15 +114,15 @@ def test_the_least_delay_of_the_commands_is_their_latency(found, samples):
     assert form.latency_at(sought, sought.start) == 0.02
     (curve,) = form.curves_at(sought, sought.start)
     assert (curve.command, curve.delay) == ("throttle", pytest.approx(0.06))
-    delayed = problem_of(found.training, Calibration(), samples, form, sought).commands(
-        sought.start
-    )
+    delayed = make_prediction_problem(
+        found.training, Calibration(), samples, form, sought
+    ).commands(sought.start)
     shared = replace(
         sought, start=np.where(np.arange(len(sought.start)) == 1, 0.02, sought.start)
     )
-    alike = problem_of(found.training, Calibration(), samples, form, shared).commands(
-        shared.start
-    )
+    alike = make_prediction_problem(
+        found.training, Calibration(), samples, form, shared
+    ).commands(shared.start)
     step = round(0.06 / samples.dt)
     assert delayed[step:, 0] == pytest.approx(alike[:-step, 0])
     assert np.array_equal(delayed[:, 1], alike[:, 1])
@@ -145,25 +145,25 @@ def test_values_become_curves_friction_limits_and_drag(found, samples):
 
 
 def test_a_dead_zone_is_tried_of_the_command_that_drives_alone(found, samples):
-    (curve,) = with_dead(Form(), found.training, samples).curves
+    (curve,) = add_dead_zones(Form(), found.training, samples).curves
     assert curve.command == "throttle"
     assert 0.0 < curve.dead < 0.05
-    assert with_dead(Form((CURVE,)), found.training, samples).curves == (CURVE,)
-    assert with_back(with_dead(Form(), found.training, samples), (curve,)).back == (
-        "throttle",
-    )
+    assert add_dead_zones(Form((CURVE,)), found.training, samples).curves == (CURVE,)
+    assert add_reverse_gains(
+        add_dead_zones(Form(), found.training, samples), (curve,)
+    ).back == ("throttle",)
 
 
 def test_only_a_command_that_drives_both_ways_may_have_a_gain_of_its_own_backwards(
     found, samples
 ):
-    (both,) = two_way(found.training, samples)
+    (both,) = find_two_way_curves(found.training, samples)
     assert both.command == "throttle"
-    form = with_back(Form(), (both,))
+    form = add_reverse_gains(Form(), (both,))
     assert form.back == ("throttle",)
     assert len(form_inputs(found, samples, form).sought) == 4  # it has no dead zone
     forwards = replace(samples, x=np.abs(samples.x))
-    assert two_way(found.training, forwards) == ()
+    assert find_two_way_curves(found.training, forwards) == ()
 
 
 def test_ends_and_limits_that_the_drive_never_reached_are_left_out(found, samples):
@@ -179,7 +179,7 @@ def test_ends_and_limits_that_the_drive_never_reached_are_left_out(found, sample
         limits[0] = 2.0 * asked.min(), rise
         pushed = {"d_vx": {"throttle": 5.0}}
         model = make_model(spec, pushed, inputs=(curve,), limits=limits)
-        return reached(model, found.training, samples, {})
+        return drop_unreached_ends(model, found.training, samples, {})
 
     beyond = written(1.1 * sent.max(), 2.0 * asked.max())
     assert beyond.inputs == (InputCurve(command="throttle", dead=0.1),)

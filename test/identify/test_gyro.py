@@ -9,7 +9,7 @@ import pytest
 from skid_steer import BIAS, OVER_REPORTED, drive_skid_steer
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.identify.gyro import relative_to, turned_by_gyro
+from nics_drl_bridge.identify.gyro import correct_heading_by_gyro, describe_reference
 from nics_drl_bridge.identify.identify import join_recordings
 from nics_drl_bridge.identify.verdict import Mistake
 from nics_drl_bridge.recording.recording import Recording, Stream
@@ -51,7 +51,7 @@ def off_the_truth(drive, pose):
 def test_the_heading_of_slipping_wheels_is_taken_from_the_gyro(slipping):
     recording = recorded(slipping)
     before, turned_before = off_the_truth(slipping, recording.pose.values)
-    found = turned_by_gyro(recording)
+    found = correct_heading_by_gyro(recording)
     after, turned_after = off_the_truth(slipping, found.pose.values)
     assert turned_before > 0.5
     assert before > 0.5
@@ -69,7 +69,7 @@ def test_the_heading_of_slipping_wheels_is_taken_from_the_gyro(slipping):
 
 def test_the_bias_is_found_while_driving_if_the_robot_never_stood():
     drive = drive_skid_steer(np.random.default_rng(5), rest_s=0.0)
-    found = turned_by_gyro(recorded(drive))
+    found = correct_heading_by_gyro(recorded(drive))
     assert found.gyro.rest_s == 0.0
     assert abs(found.gyro.bias - BIAS) < 5.0 * found.gyro.bias_std
     assert off_the_truth(drive, found.pose.values)[1] < 0.5
@@ -78,10 +78,10 @@ def test_the_bias_is_found_while_driving_if_the_robot_never_stood():
 def test_a_gyro_that_agrees_changes_nothing_and_confirms_the_heading():
     drive = drive_skid_steer(np.random.default_rng(6), over_reported=1.0)
     recording = recorded(drive)
-    found = turned_by_gyro(recording)
+    found = correct_heading_by_gyro(recording)
     assert np.array_equal(found.pose.values, recording.pose.values)
     assert found.gyro is not None
-    assert "confirms" in relative_to(found)
+    assert "confirms" in describe_reference(found)
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def test_a_gyro_that_agrees_changes_nothing_and_confirms_the_heading():
 def test_a_gyro_of_another_sign_or_unit_is_not_used_and_told(slipping, factor, word):
     recording = recorded(slipping)
     wrong = replace(recording.imu, values=recording.imu.values * factor)
-    found = turned_by_gyro(replace(recording, imu=wrong))
+    found = correct_heading_by_gyro(replace(recording, imu=wrong))
     assert np.array_equal(found.pose.values, recording.pose.values)
     assert found.gyro is None
     if word:
@@ -100,13 +100,13 @@ def test_a_gyro_of_another_sign_or_unit_is_not_used_and_told(slipping, factor, w
 
 def test_poses_of_a_tracker_are_never_turned(slipping):
     recording = recorded(slipping, measured_by="tracker")
-    found = turned_by_gyro(recording)
+    found = correct_heading_by_gyro(recording)
     assert np.array_equal(found.pose.values, recording.pose.values)
     assert "contradicts the tracker" in found.repairs[-1]
 
 
 def test_poses_of_unknown_origin_are_not_turned_but_the_fix_is_told(slipping):
-    found = turned_by_gyro(recorded(slipping, measured_by=""))
+    found = correct_heading_by_gyro(recorded(slipping, measured_by=""))
     assert found.gyro is None
     assert "measured_by: odometry" in found.repairs[-1]
 
@@ -127,8 +127,8 @@ def test_poses_of_unknown_origin_are_not_turned_but_the_fix_is_told(slipping):
 def test_the_report_says_relative_to_what_the_error_is(
     slipping, measured_by, gyro, said
 ):
-    recording = turned_by_gyro(recorded(slipping, measured_by, gyro))
-    assert said in relative_to(recording)
+    recording = correct_heading_by_gyro(recorded(slipping, measured_by, gyro))
+    assert said in describe_reference(recording)
 
 
 def test_each_of_several_recordings_turns_by_its_own_bias():

@@ -13,12 +13,12 @@ from nics_drl_bridge.identify.drive import Drive, Settings
 from nics_drl_bridge.identify.findings import resample_drive
 from nics_drl_bridge.identify.hypotheses import (
     Trial,
-    about_lags,
-    base_of,
-    chosen,
-    hypotheses,
-    lags_of,
+    choose_trial,
+    describe_lag_sums,
+    find_lags,
+    fit_base,
     list_candidates,
+    list_hypotheses,
 )
 from nics_drl_bridge.identify.identify import STAGES, fit_terms, identify, run
 from nics_drl_bridge.identify.report import format_report
@@ -30,7 +30,7 @@ def base(**given):
     drive = replace(drive, settings=Settings(train_until_s=drive.duration_s))
     found = run(STAGES[: STAGES.index(fit_terms)], drive)
     samples = resample_drive(found.training, found)
-    best = base_of(found.training, found.calibration, samples, found.clear_curves)
+    best = fit_base(found.training, found.calibration, samples, found.clear_curves)
     names = best.draft.inputs.names
     values = best.found.values.tolist()
     return best.draft.form, dict(zip(names, values, strict=True))
@@ -86,17 +86,28 @@ def trial(order, error):
 
 
 def test_a_higher_order_has_to_be_worth_its_terms():
-    assert chosen([trial(0, 0.10), trial(1, 0.096), trial(2, 0.12)]).order == 0
-    assert chosen([trial(0, 0.10), trial(1, 0.09), trial(2, 0.0857)]).order == 1
+    assert choose_trial([trial(0, 0.10), trial(1, 0.096), trial(2, 0.12)]).order == 0
+    assert choose_trial([trial(0, 0.10), trial(1, 0.09), trial(2, 0.0857)]).order == 1
 
 
 def test_hypotheses_go_from_the_textbook_to_the_freest():
-    assert [order for order, _ in hypotheses("auto")] == [0, 1, 1, 1, 2, 2, 2, 3, 3, 3]
-    assert {order for order, _ in hypotheses(2)} == {0, 2}
+    assert [order for order, _ in list_hypotheses("auto")] == [
+        0,
+        1,
+        1,
+        1,
+        2,
+        2,
+        2,
+        3,
+        3,
+        3,
+    ]
+    assert {order for order, _ in list_hypotheses(2)} == {0, 2}
 
 
 def test_a_latency_is_told_as_its_sums_with_the_lags():
-    sentence = about_lags(0.02, {"vx": 0.2, "wz": 0.1}, beside=0.05)
+    sentence = describe_lag_sums(0.02, {"vx": 0.2, "wz": 0.1}, beside=0.05)
     assert sentence.startswith("Latency (0.020 s) can't be separated")
     assert "trust their sums, 0.250 s for vx, 0.150 s for wz" in sentence
 
@@ -105,9 +116,9 @@ def test_a_lag_is_what_the_state_itself_takes_from_its_rate():
     spec, _ = slipping_car(duration=1.0)
     states = {f"d_{name}": {name: -4.0} for name in ("vx", "vy", "wz")}
     model = make_model(spec, states)
-    assert lags_of(model, spec) == {"vx": 0.25, "vy": 0.25, "wz": 0.25}
+    assert find_lags(model, spec) == {"vx": 0.25, "vy": 0.25, "wz": 0.25}
     rolling = replace(model, coefficients=0.01 * model.coefficients)
-    assert lags_of(rolling, spec) == {}
+    assert find_lags(rolling, spec) == {}
 
 
 @pytest.mark.parametrize("duration", [4.0, 8.0])
@@ -119,7 +130,7 @@ def test_a_drive_too_short_for_predictions_over_seconds_gets_the_textbook_in_sil
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         found = identify(recording, spec, alpha="auto")
-    assert chosen(found.findings.trials).order == 0
+    assert choose_trial(found.findings.trials).order == 0
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.identify.assume import assume_textbook
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.identify import Identified, cut, identify
-from nics_drl_bridge.identify.open_loop import predict, windows
+from nics_drl_bridge.identify.open_loop import predict, select_windows
 from nics_drl_bridge.robot.spec import RobotSpec, build_robot, load_robot
 from nics_drl_bridge.robot.taylor import TaylorModel
 
@@ -69,7 +69,7 @@ def test_the_held_out_part_is_not_used_for_the_model(car):
 def test_a_prediction_knows_no_pose_after_its_start(car):
     found = noisy()
     recording = noisy().recording
-    chosen = windows(found.drive, found.calibration, 30.0, 36.0, 5.0, 0.1)
+    chosen = select_windows(found.drive, found.calibration, 30.0, 36.0, 5.0, 0.1)
     values = recording.pose.values.copy()
     values[recording.pose.t > chosen.start_t[-1]] = 7.0
     blind = Drive(with_values(recording, pose=values), car)

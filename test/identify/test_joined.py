@@ -78,7 +78,7 @@ def test_no_prediction_window_crosses_from_one_drive_to_another():
     joined = join_recordings([STRAIGHT, TURNING], ROBOT)
     drive = Drive(joined, ROBOT)
     for horizon in (0.5, 2.0, 5.0):
-        chosen = open_loop.windows(
+        chosen = open_loop.select_windows(
             drive, Calibration(), 0.0, drive.duration_s, horizon, 0.1
         )
         assert len(chosen.start_t) > 50
@@ -110,7 +110,9 @@ def test_not_even_episodes_without_a_gap_are_crossed():
         replace(joined.episodes[0], start_s=a, end_s=b) for a, b in ((0, 12), (12, 24))
     )
     cut = replace(whole, episodes=(start, end))
-    chosen = open_loop.windows(Drive(cut, ROBOT), Calibration(), 0.0, 24.0, 2.0, 0.1)
+    chosen = open_loop.select_windows(
+        Drive(cut, ROBOT), Calibration(), 0.0, 24.0, 2.0, 0.1
+    )
     crossing = (chosen.start_t < 12.0) & (chosen.end_t > 12.0)
     assert len(chosen.start_t) > 100
     assert not crossing.any()

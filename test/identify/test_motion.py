@@ -14,15 +14,15 @@ from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.identify.motion import (
     WIDTHS_S,
-    as_smooth,
-    by_motion,
+    add_motion,
+    choose_half_width,
     find_slopes,
-    grid_of,
-    half_width,
-    known_state,
-    samples_of,
-    surrogate,
-    with_motion,
+    has_motion_as_state,
+    make_motion_grid,
+    make_surrogate,
+    require_state,
+    resample_motion,
+    smooth_commands,
 )
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.recording.textbook import record
@@ -45,22 +45,23 @@ def drive() -> Drive:
 
 
 def test_a_twist_that_was_not_measured_is_taken_from_the_pose(drive, car):
-    assert by_motion(drive.spec, drive.recording)
-    assert not by_motion(car, drive.recording)
+    assert has_motion_as_state(drive.spec, drive.recording)
+    assert not has_motion_as_state(car, drive.recording)
     measured = Stream(
         drive.recording.pose.t, np.zeros((len(drive.recording.pose.t), 3))
     )
-    assert not by_motion(drive.spec, replace(drive.recording, state=measured))
+    assert not has_motion_as_state(drive.spec, replace(drive.recording, state=measured))
 
 
 def test_noisier_poses_are_smoothed_over_longer(drive):
-    assert half_width(drive) == WIDTHS_S[0]
+    assert choose_half_width(drive) == WIDTHS_S[0]
     noise = np.random.default_rng(0).normal(
         0.0, 0.01, drive.recording.pose.values.shape
     )
     pose = replace(drive.recording.pose, values=drive.recording.pose.values + noise)
     assert (
-        half_width(Drive(replace(drive.recording, pose=pose), drive.spec)) > WIDTHS_S[0]
+        choose_half_width(Drive(replace(drive.recording, pose=pose), drive.spec))
+        > WIDTHS_S[0]
     )
 
 
@@ -72,25 +73,25 @@ def test_the_step_divides_the_control_period_whatever_the_poses_rate(
 ):
     pose = drive.recording.pose
     other = replace(pose, t=every * np.arange(len(pose.t)))
-    grid = grid_of(
+    grid = make_motion_grid(
         Drive(replace(drive.recording, pose=other), drive.spec), Calibration(), 0.1
     )
     assert np.diff(grid) == pytest.approx(step)
 
 
 def test_the_twist_is_that_of_the_base_wherever_the_tracked_body_sits(drive):
-    grid = grid_of(drive, MOUNTED, 0.1)
-    moved = with_motion(drive, MOUNTED, grid, 0.07)
-    speed, aside, turn = known_state(moved).values.T
+    grid = make_motion_grid(drive, MOUNTED, 0.1)
+    moved = add_motion(drive, MOUNTED, grid, 0.07)
+    speed, aside, turn = require_state(moved).values.T
     assert aside == pytest.approx(-0.015 * speed**2 * turn, abs=0.03)
-    bare = known_state(with_motion(drive, Calibration(), grid, 0.07)).values[:, 1]
+    bare = require_state(add_motion(drive, Calibration(), grid, 0.07)).values[:, 1]
     assert np.abs(bare).mean() > 5.0 * np.abs(aside + 0.015 * speed**2 * turn).mean()
 
 
 def test_samples_have_the_commands_in_effect_after_their_latency(drive):
     late = replace(MOUNTED, command_latency_s=0.1)
-    grid = grid_of(drive, late, 0.1)
-    at = samples_of(with_motion(drive, late, grid, 0.07), late, 0.07)
+    grid = make_motion_grid(drive, late, 0.1)
+    at = resample_motion(add_motion(drive, late, grid, 0.07), late, 0.07)
     command = drive.recording.command
     row = 500
     before = np.searchsorted(command.t, at.t[row] - 0.1 + 1e-9, "right") - 1
@@ -98,7 +99,7 @@ def test_samples_have_the_commands_in_effect_after_their_latency(drive):
 
 
 def test_a_surrogate_has_a_state_for_each_command(drive):
-    names = [(v.name, v.follows) for v in surrogate(drive.spec).state]
+    names = [(v.name, v.follows) for v in make_surrogate(drive.spec).state]
     assert names == [("throttle_state", "throttle"), ("steering_state", "steering")]
 
 
@@ -110,13 +111,13 @@ def test_poses_that_are_known_to_be_doubtful_do_not_bend_the_motion(drive):
         lost[:, None], rng.normal(0.0, 0.05, pose.values.shape), 0.0
     )
     sigma = np.where(lost, 0.05, 0.0005)[:, None] * np.ones(3)
-    grid = grid_of(drive, MOUNTED, 0.1)
+    grid = make_motion_grid(drive, MOUNTED, 0.1)
     off = []
-    truth = known_state(with_motion(drive, MOUNTED, grid, 0.07)).values
+    truth = require_state(add_motion(drive, MOUNTED, grid, 0.07)).values
     for known in (None, sigma):
         stream = replace(pose, values=values, sigma=known)
         seen = Drive(replace(drive.recording, pose=stream), drive.spec)
-        found = known_state(with_motion(seen, MOUNTED, grid, 0.07)).values
+        found = require_state(add_motion(seen, MOUNTED, grid, 0.07)).values
         off.append(np.abs(found - truth).mean())
     assert off[1] < 0.1 * off[0]
 
@@ -125,7 +126,7 @@ def test_commands_are_as_smooth_as_the_twist_so_that_they_begin_and_end_together
     step = 0.02
     width = 0.25
     speed = np.where(np.arange(400) * step < 4.0, 0.2, 0.6)[:, None]
-    smooth = as_smooth(speed, step, width)[:, 0]
+    smooth = smooth_commands(speed, step, width)[:, 0]
     changed = np.flatnonzero((smooth > 0.201) & (smooth < 0.599)) * step
     assert changed[[0, -1]] == pytest.approx([4.0 - width, 4.0 + width], abs=0.05)
     assert smooth[100:-100].mean() == pytest.approx(0.4, abs=0.01)

@@ -6,10 +6,10 @@ import pytest
 from nics_drl_bridge import geometry
 from nics_drl_bridge.identify.drive import TwistIntervals
 from nics_drl_bridge.identify.mounting import (
-    by_instruments,
-    mounting_by_expected_twists,
-    mounting_without_lateral_motion,
-    with_slip,
+    estimate_mounting_by_instruments,
+    estimate_mounting_by_twists,
+    estimate_mounting_with_slip,
+    estimate_mounting_without_lateral_motion,
 )
 from nics_drl_bridge.robot.spec import build_robot
 
@@ -25,7 +25,7 @@ def test_what_lasts_for_a_block_widens_the_uncertainty():
         lasting = lasting * expected.sum(axis=1, keepdims=True)
         turned = geometry.rotate(expected[:, :2], 0.4)
         twist = np.column_stack([turned, expected[:, 2]]) + lasting + noise
-        found = mounting_by_expected_twists(TwistIntervals(n, n + 1.0, twist), expected)
+        found = estimate_mounting_by_twists(TwistIntervals(n, n + 1.0, twist), expected)
         sigma.append([found.rotation_sigma, *found.lever_sigma])
         assert abs(found.rotation - 0.4) < 3.0 * found.rotation_sigma
     assert (np.divide(*sigma[::-1]) > 3.0).all()
@@ -36,7 +36,7 @@ def test_a_robot_that_keeps_its_heading_and_goes_anywhere_tells_nothing_of_its_m
     n = np.arange(50.0)
     twist = np.stack([np.cos(course), np.sin(course), 0.0 * course], axis=1)
     motion = TwistIntervals(n, n + 1.0, twist)
-    assert mounting_without_lateral_motion(motion, np.ones(50)) is None
+    assert estimate_mounting_without_lateral_motion(motion, np.ones(50)) is None
 
 
 def seen_by(car, curvature, lever, seed=0, count=900):
@@ -56,12 +56,12 @@ def test_the_lever_of_a_car_that_turned_little_both_ways_is_found_with_its_error
     for seed in range(8):
         bends = np.random.default_rng(100 + seed).uniform(-0.4, 0.4, 90)
         motion, states = seen_by(car, np.repeat(bends, 10), (0.08, -0.03), seed)
-        plain = mounting_without_lateral_motion(motion, states[:, 0])
+        plain = estimate_mounting_without_lateral_motion(motion, states[:, 0])
         assert plain is not None
         assert np.isnan(
             plain.lever_sigma[0]
         )  # its noise is too large for the plain one
-        found = by_instruments(motion, states, states[:, 0], car)
+        found = estimate_mounting_by_instruments(motion, states, states[:, 0], car)
         assert found is not None
         assert (found.lever_sigma < 0.008).all()
         off.append(
@@ -80,13 +80,13 @@ def test_a_path_of_one_curvature_tells_no_lever(car, spread):
         np.random.default_rng(0).uniform(-1.0, 1.0, 90), 10
     )
     motion, states = seen_by(car, bends, (0.08, 0.0))
-    assert by_instruments(motion, states, states[:, 0], car) is None
+    assert estimate_mounting_by_instruments(motion, states, states[:, 0], car) is None
 
 
 def test_a_car_that_drives_backwards_first_faces_where_it_is_told_to(car):
     bends = np.repeat(np.random.default_rng(1).uniform(-2.0, 2.0, 90), 10)
     motion, states = seen_by(car, bends, (0.08, 0.0))
-    found = by_instruments(motion, states, -states[:, 0], car)
+    found = estimate_mounting_by_instruments(motion, states, -states[:, 0], car)
     assert found is not None
     assert abs(found.rotation) == pytest.approx(np.pi, abs=0.01)
     assert found.lever[0] == pytest.approx(-0.08, abs=0.005)
@@ -102,7 +102,9 @@ def test_the_noise_of_a_heading_is_no_turning(bend, ways):
         [0.5 + 0.0 * n, 0.0 * n, 0.5 * bend + np.diff(heading) / 0.1], axis=1
     )
     motion = TwistIntervals(0.1 * n, 0.1 * n + 0.1, twist)
-    found = mounting_without_lateral_motion(motion, np.ones(900), heading_noise)
+    found = estimate_mounting_without_lateral_motion(
+        motion, np.ones(900), heading_noise
+    )
     assert found is not None
     assert found.ways == ways
     assert np.isnan(found.lever_sigma[0])
@@ -123,8 +125,8 @@ def skidded(slip: float, slowest: float, seed: int = 0) -> TwistIntervals:
 def test_a_lever_is_told_from_the_slip_of_a_robot_that_skids_both_ways(slip):
     spec = build_robot({"kind": "skid_steer", "footprint_radius": 0.4}, {})
     motion = skidded(slip, -0.6)
-    plain = mounting_without_lateral_motion(motion, motion.twist[:, 0])
-    found = with_slip(motion, plain, spec)
+    plain = estimate_mounting_without_lateral_motion(motion, motion.twist[:, 0])
+    found = estimate_mounting_with_slip(motion, plain, spec)
     assert found.lever[0] == pytest.approx(0.1, abs=0.005)
     assert found.lever_sigma[0] < 0.005
 
@@ -133,9 +135,9 @@ def test_a_lever_is_told_from_the_slip_of_a_robot_that_skids_both_ways(slip):
 def test_slip_of_a_robot_that_skids_forwards_only_is_no_lever(slip):
     spec = build_robot({"kind": "skid_steer", "footprint_radius": 0.4}, {})
     motion = skidded(slip, 0.2)
-    plain = mounting_without_lateral_motion(motion, motion.twist[:, 0])
+    plain = estimate_mounting_without_lateral_motion(motion, motion.twist[:, 0])
     assert plain.lever_sigma[0] < 0.005  # as if it were certain
-    found = with_slip(motion, plain, spec)
+    found = estimate_mounting_with_slip(motion, plain, spec)
     assert np.isnan(found.lever_sigma).all()
     assert not found.lever.any()
     assert found.slip

@@ -13,7 +13,7 @@ from nics_drl_bridge.files import SUMS
 from nics_drl_bridge.generator import builtin_model, load_model, save_model
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.identify import identify
-from nics_drl_bridge.identify.noise import claimed, sensor_noise
+from nics_drl_bridge.identify.noise import list_claimed_levels, measure_sensor_noise
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot.noise import MEASURED, Level, Noise
@@ -125,13 +125,13 @@ def test_a_level_in_another_unit_is_refused(tmp_path):
 def test_the_noise_of_a_pose_is_no_less_than_its_covariances_say():
     spec, recording = slipping_car(duration=10.0)
     pose = recording.pose
-    shown = sensor_noise(Drive(recording, spec))
+    shown = measure_sensor_noise(Drive(recording, spec))
     assert shown.pose_position.std < 0.001
     sigma = np.tile([0.02, 0.03, 0.05], (len(pose.t), 1))
     sigma[::2], sigma[1, 0], sigma[:, 1] = np.nan, np.inf, 0.0  # unknown
     sigma[1::2, 1] = 0.03
-    told = shown.model_copy(update=claimed(shown, sigma))
+    told = shown.model_copy(update=list_claimed_levels(shown, sigma))
     assert told.pose == pytest.approx((0.025, 0.025, 0.05))
     assert not told.pose_position.measured
     for none in (None, 1e-9 * sigma, np.nan * sigma):
-        assert claimed(shown, none) == {}
+        assert list_claimed_levels(shown, none) == {}

@@ -10,12 +10,12 @@ from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.open_loop import (
+    convert_to_tracked,
     differentiate_ends,
     predict,
     predict_ends,
+    select_windows,
     trace_states,
-    tracked_ends,
-    windows,
 )
 
 MOUNTING = Calibration(rotation_rad=0.4, lever_arm_m=(0.1, -0.05))
@@ -28,14 +28,14 @@ def courses(request):
     spec = builtin_model("mecanum").robot
     model = builtin_model("mecanum").kinematics
     driven = Drive(drive(spec, duration=20.0), spec)
-    chosen = windows(driven, MOUNTING, 0.0, 20.0, 1.0, 1.0)
+    chosen = select_windows(driven, MOUNTING, 0.0, 20.0, 1.0, 1.0)
     chosen = replace(chosen, end_t=chosen.start_t + request.param * 2.0)
     return model, driven, chosen, trace_states(model, MOUNTING, driven, chosen)
 
 
 def test_a_course_ends_where_the_prediction_does(courses):
     model, driven, chosen, course = courses
-    ends = tracked_ends(course.chosen, MOUNTING, predict_ends(course, model)[0])
+    ends = convert_to_tracked(course.chosen, MOUNTING, predict_ends(course, model)[0])
     expected = predict(model, MOUNTING, driven, chosen)
     assert ends == pytest.approx(expected, abs=1e-9)
 
@@ -55,7 +55,7 @@ def test_the_derivatives_are_those_of_finite_differences(courses):
             coefficients[d, k] += sign * STEP
             changed = replace(model, coefficients=coefficients)
             sides.append(
-                tracked_ends(
+                convert_to_tracked(
                     course.chosen, MOUNTING, predict_ends(course, changed, free)[0]
                 )
             )

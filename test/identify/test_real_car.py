@@ -5,7 +5,7 @@ import pytest
 from identify.drives import calibrate, without
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.identify import identify
-from nics_drl_bridge.identify.open_loop import open_loop_error
+from nics_drl_bridge.identify.open_loop import measure_open_loop_error
 from nics_drl_bridge.recording.readers import read_recording
 
 CAMPAIGN = pytest.mark.campaign
@@ -52,7 +52,7 @@ def test_its_model_predicts_five_seconds_of_unseen_drive_to_three_centimetres(
 def test_its_model_predicts_other_drives_too(real_drives, car, found, name):
     other = Drive(read_recording(real_drives / name), car)
     end = float(other.recording.pose.t[-1])
-    result = open_loop_error(found.model, found.calibration, other, 2.0, end)
+    result = measure_open_loop_error(found.model, found.calibration, other, 2.0, end)
     assert result.mean_position_error_m < 0.03
 
 

@@ -20,7 +20,7 @@ from nics_drl_bridge.identify.repair import (
     check_commands,
     check_encoders,
     check_units,
-    repaired,
+    repair_rows,
 )
 from nics_drl_bridge.identify.verdict import Gap, Mistake
 from nics_drl_bridge.recording.recording import (
@@ -71,7 +71,7 @@ def same_motion(a, b, share: float) -> None:
 def test_a_recording_without_faults_is_not_touched(name, noise):
     spec = load_robot(name)
     whole = Drive(drive(spec, duration=20.0, noise=noise), spec)
-    found, notes = repaired(whole)
+    found, notes = repair_rows(whole)
     assert notes == ()
     assert found is whole
 
@@ -85,7 +85,7 @@ def test_a_drive_goes_on_after_a_jump_of_the_localiser_as_it_moved(name, jump):
     values = plain.pose.values.copy()
     values[late] = geometry.compose(np.array(jump), values[late])
     jumped = Drive(with_values(plain, pose=values), spec)
-    found, (note,) = repaired(jumped)
+    found, (note,) = repair_rows(jumped)
     assert "jumps at 12.01 s (" in note
     assert "the drive is split there" in note
     moved, true = (
@@ -100,7 +100,7 @@ def test_a_drive_goes_on_after_a_jump_of_the_localiser_as_it_moved(name, jump):
 
 def test_a_gap_in_the_poses_is_no_jump(differential):
     gappy = without(drive(differential, duration=20.0, noise=(5e-4, 1e-3)), 8.0, 11.0)
-    assert repaired(Drive(gappy, differential))[1] == ()
+    assert repair_rows(Drive(gappy, differential))[1] == ()
 
 
 def held(recording: Recording, begin: float, end: float) -> Recording:
@@ -114,7 +114,7 @@ def held(recording: Recording, begin: float, end: float) -> Recording:
 
 def test_a_pose_that_was_held_is_left_out_and_told(differential):
     plain = drive(differential, duration=20.0, noise=(5e-4, 1e-3))
-    mended, notes = repaired(Drive(held(plain, 8.0, 11.0), differential))
+    mended, notes = repair_rows(Drive(held(plain, 8.0, 11.0), differential))
     (told,) = notes
     assert "keeps one value from 8.0 s to 11.0 s and then leaps by" in told
     t = mended.recording.pose.t
@@ -124,13 +124,13 @@ def test_a_pose_that_was_held_is_left_out_and_told(differential):
 def test_a_drive_ends_where_its_pose_froze_though_commands_went_on(differential):
     plain = drive(differential, duration=20.0, noise=(5e-4, 1e-3))
     frozen = held(plain, 16.0, 99.0)
-    mended, (told,) = repaired(Drive(frozen, differential))
+    mended, (told,) = repair_rows(Drive(frozen, differential))
     assert isinstance(told, Gap)
     assert "keeps one value from 16.0 s to its end, 20.0 s, though commands" in told
     assert mended.duration_s == pytest.approx(16.0, abs=0.05)
     values = np.where(frozen.command.t[:, None] > 16.0, 0.0, frozen.command.values)
     parked = with_values(frozen, command=values)
-    mended, notes = repaired(Drive(parked, differential))
+    mended, notes = repair_rows(Drive(parked, differential))
     assert mended.recording is parked
     assert notes == ()
 
@@ -142,7 +142,7 @@ def test_a_robot_that_stood_and_goes_on_from_there_was_not_held(differential):
     later = np.maximum(np.minimum(t, 8.0), t - 3.0)  # it stands from 8 s to 11 s
     stood = np.stack([np.interp(later, t, each) for each in values.T], axis=1)
     paused = with_values(plain, pose=stood)
-    notes = repaired(Drive(paused, differential))[1]
+    notes = repair_rows(Drive(paused, differential))[1]
     assert not any("keeps one value" in note for note in notes)
 
 

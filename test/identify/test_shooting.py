@@ -9,7 +9,12 @@ import pytest
 
 from identify.drives import make_model, slipping_car
 from nics_drl_bridge import geometry
-from nics_drl_bridge.identify.shooting import NOTHING_FREE, Inputs, Shooting, fitted
+from nics_drl_bridge.identify.shooting import (
+    NOTHING_FREE,
+    Inputs,
+    Shooting,
+    fit_to_predictions,
+)
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.kernels import SERIES, make_terms, simulate_rollouts
 from nics_drl_bridge.robot.taylor import TaylorModel
@@ -68,7 +73,7 @@ def test_coefficients_and_a_delay_are_found_together(car, problem):
         car, coefficients=car.coefficients * np.where(car.coefficients == 1.0, 1.0, 1.3)
     )
     free = (car.coefficients != 0.0) & (np.arange(6) >= 3)[:, None]
-    found = fitted(problem, off, free, DELAYS)
+    found = fit_to_predictions(problem, off, free, DELAYS)
     assert found.model.coefficients[free] == pytest.approx(
         car.coefficients[free], rel=0.02
     )
@@ -104,7 +109,7 @@ def test_a_value_between_equal_bounds_stays_and_has_no_error(car, problem):
     known = replace(
         DELAYS, start=np.array([0.08]), low=np.array([0.08]), high=np.array([0.08])
     )
-    found = fitted(problem, car, car.coefficients == 4.0, known)
+    found = fit_to_predictions(problem, car, car.coefficients == 4.0, known)
     assert found.values.tolist() == [0.08]
     assert np.isnan(found.value_errors).all()
 
@@ -136,7 +141,9 @@ def test_predictions_are_seen_from_where_the_tracked_body_is(car, problem):
 
 def test_nothing_free_leaves_the_model(car, problem):
     fixed = replace(problem, fixed=np.array([DELAY]))
-    found = fitted(fixed, car, np.zeros((6, 4), dtype=np.bool_), NOTHING_FREE)
+    found = fit_to_predictions(
+        fixed, car, np.zeros((6, 4), dtype=np.bool_), NOTHING_FREE
+    )
     assert np.array_equal(found.model.coefficients, car.coefficients)
     assert np.sqrt(np.mean(found.residual**2)) < 0.005
 

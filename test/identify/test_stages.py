@@ -12,7 +12,7 @@ from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.identify import clocks, verdict
 from nics_drl_bridge.identify import identify as stages
 from nics_drl_bridge.identify.calibration import Response
-from nics_drl_bridge.identify.clocks import nominal_timing
+from nics_drl_bridge.identify.clocks import make_nominal_timing
 from nics_drl_bridge.identify.drive import Drive, Settings
 from nics_drl_bridge.identify.findings import StageOrderError
 from nics_drl_bridge.identify.identify import (
@@ -42,7 +42,7 @@ def test_a_follower_beside_a_motion_has_the_lag_and_the_error_of_its_own_command
     data["textbook"] = None
     followed = RobotSpec.model_validate(data)
     timing = replace(
-        nominal_timing(Drive(recording, spec)),
+        make_nominal_timing(Drive(recording, spec)),
         lags=np.array([0.3, 0.1]),  # of throttle and steering
         lag_sigma=np.array([0.03, 0.01]),
     )

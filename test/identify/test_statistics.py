@@ -5,15 +5,15 @@ import pytest
 from scipy.signal import lfilter
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.identify.excitation import commands_together
+from nics_drl_bridge.identify.excitation import list_commands_together
 from nics_drl_bridge.identify.fit import fit, parse_alpha
 from nics_drl_bridge.identify.statistics import (
-    clustered_errors,
-    condition,
-    correlation_reach,
+    compute_condition,
     cross_validated,
-    knee,
-    standard_errors,
+    estimate_clustered_errors,
+    estimate_standard_errors,
+    find_correlation_reach,
+    find_knee,
 )
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.recording.textbook import record
@@ -96,9 +96,11 @@ def test_errors_of_white_noise_are_the_textbooks():
     chi = rng.normal(size=(5000, 3)) * [1.0, 10.0, 0.1]
     residual = rng.normal(size=5000) * 0.3
     plain = 0.3 * np.sqrt(np.diag(np.linalg.inv(chi.T @ chi)))
-    assert standard_errors(chi, residual) == pytest.approx(plain, rel=0.15)
+    assert estimate_standard_errors(chi, residual) == pytest.approx(plain, rel=0.15)
     blocks = np.arange(5000) // 50
-    assert clustered_errors(chi, residual, blocks) == pytest.approx(plain, rel=0.25)
+    assert estimate_clustered_errors(chi, residual, blocks) == pytest.approx(
+        plain, rel=0.25
+    )
 
 
 def test_errors_grow_with_residuals_that_resemble_their_neighbours():
@@ -106,21 +108,23 @@ def test_errors_grow_with_residuals_that_resemble_their_neighbours():
     chi = lfilter([1.0], [1.0, -0.95], rng.normal(size=(4000, 1)), axis=0)
     residual = lfilter([1.0], [1.0, -0.95], rng.normal(size=4000))
     plain = residual.std() * np.sqrt(1.0 / (chi.T @ chi)[0, 0])
-    assert standard_errors(chi, residual)[0] > 3.0 * plain
-    assert correlation_reach(residual) > 40
+    assert estimate_standard_errors(chi, residual)[0] > 3.0 * plain
+    assert find_correlation_reach(residual) > 40
 
 
 def test_the_condition_number_does_not_depend_on_units():
     chi = np.random.default_rng(2).normal(size=(500, 4))
-    assert condition(chi * [1.0, 1e3, 1e-3, 1.0]) == pytest.approx(condition(chi))
-    assert condition(np.zeros((10, 0))) == 1.0
+    assert compute_condition(chi * [1.0, 1e3, 1e-3, 1.0]) == pytest.approx(
+        compute_condition(chi)
+    )
+    assert compute_condition(np.zeros((10, 0))) == 1.0
 
 
 def test_the_knee_is_where_further_terms_gain_nothing():
     none = np.zeros(5)
-    assert knee(np.array([1.0, 0.5, 0.1, 0.0999, 0.0998]), none) == 2
-    assert knee(np.array([1.0, 0.5, 0.1, 0.05, 0.049]), none + 0.06) == 2
-    assert knee(np.array([1.0, 1.1, 1e-9, 1e-9, 2e-9]), none) == 2
+    assert find_knee(np.array([1.0, 0.5, 0.1, 0.0999, 0.0998]), none) == 2
+    assert find_knee(np.array([1.0, 0.5, 0.1, 0.05, 0.049]), none + 0.06) == 2
+    assert find_knee(np.array([1.0, 1.1, 1e-9, 1e-9, 2e-9]), none) == 2
 
 
 def test_cross_validation_is_that_of_separate_fits():
@@ -151,11 +155,11 @@ def test_auto_keeps_what_is_worth_it_at_every_order(order):
 def test_commands_that_move_apart_are_not_together():
     spec = load_robot("differential")
     samples = noisy_samples(spec, 5)
-    assert commands_together(samples, spec) == ()
+    assert list_commands_together(samples, spec) == ()
     x = samples.x.copy()
     x[:, 3] = -1.5 * x[:, 2]
     joined = Samples(samples.t, samples.q, x, samples.dq, samples.dt)
-    assert commands_together(joined, spec) == ("forward_command", "turn_command")
+    assert list_commands_together(joined, spec) == ("forward_command", "turn_command")
 
 
 @pytest.mark.parametrize("text", ["1.5", "-0.1", "nan", "automatic", ""])

@@ -10,7 +10,7 @@ from identify.drives import drive, with_values
 from nics_drl_bridge.identify import acceptance
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.identify import identify
-from nics_drl_bridge.identify.open_loop import open_loop_error
+from nics_drl_bridge.identify.open_loop import measure_open_loop_error
 from nics_drl_bridge.identify.report import explain_uselessness, is_useless
 from nics_drl_bridge.identify.verdict import describe_coarsest_state
 from nics_drl_bridge.recording.recording import Recording
@@ -70,7 +70,7 @@ def test_standing_still_is_off_by_the_way_from_start_to_end(car):
     straight = np.stack([3.0 + 0.6 * along, 0.8 * along, 0.0 * along], axis=1)
     found = identify(recording, car)
     moved = Drive(with_values(recording, pose=straight), car)
-    result = open_loop_error(found.model, found.calibration, moved, 0.0, 20.0)
+    result = measure_open_loop_error(found.model, found.calibration, moved, 0.0, 20.0)
     assert result.median_displacement_m == pytest.approx(1.0)
     assert result.mean_path_m == pytest.approx(1.0)
 

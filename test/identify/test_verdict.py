@@ -10,7 +10,7 @@ import pytest
 from identify.drives import drive
 from nics_drl_bridge.errors import FitError
 from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.clocks import timing_of
+from nics_drl_bridge.identify.clocks import measure_timing
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.excitation import Excitation
 from nics_drl_bridge.identify.mounting import Mounting
@@ -96,5 +96,5 @@ def test_a_latency_below_three_standard_errors_is_not_told(car, sigma, told):
     calibration = Calibration(
         command_latency_s=0.0003, uncertainty={"command_latency_s": sigma}
     )
-    sentences = " ".join(describe_clocks(tried, calibration, timing_of(tried)))
+    sentences = " ".join(describe_clocks(tried, calibration, measure_timing(tried)))
     assert ("Commands take effect 0.0003 s" in sentences) == told

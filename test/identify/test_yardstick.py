@@ -11,8 +11,12 @@ from identify.drives import drive, with_values
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.open_loop import windows
-from nics_drl_bridge.identify.yardstick import fit_yardstick, kept_twist, twists_at
+from nics_drl_bridge.identify.open_loop import select_windows
+from nics_drl_bridge.identify.yardstick import (
+    estimate_twists_at,
+    fit_yardstick,
+    predict_kept_twist,
+)
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
@@ -26,7 +30,7 @@ def share(ends, chosen):
 
 
 def held_out(driven):
-    return windows(driven, Calibration(), LEARNT_S, driven.duration_s, 5.0, 0.1)
+    return select_windows(driven, Calibration(), LEARNT_S, driven.duration_s, 5.0, 0.1)
 
 
 def without_a_textbook(spec):
@@ -45,7 +49,7 @@ def test_a_fitted_textbook_predicts_a_robot_of_its_kind(kind):
     chosen = held_out(driven)
     predicted = share(fit_yardstick(driven, LEARNT_S).predict(driven, chosen), chosen)
     assert predicted < 0.03
-    assert predicted < 0.2 * share(kept_twist(driven, chosen), chosen)
+    assert predicted < 0.2 * share(predict_kept_twist(driven, chosen), chosen)
 
 
 def test_it_finds_the_latency_and_the_place_of_the_tracked_body():
@@ -74,11 +78,11 @@ def test_a_robot_that_keeps_its_twist_is_predicted_by_it():
     driven = Drive(
         Recording(Stream(t[:1], np.array([[0.5, 0.5]])), Stream(t, pose)), spec
     )
-    chosen = windows(driven, Calibration(), 1.0, 10.0, 5.0, 0.1)
-    assert twists_at(driven, chosen.start_t) == pytest.approx(
+    chosen = select_windows(driven, Calibration(), 1.0, 10.0, 5.0, 0.1)
+    assert estimate_twists_at(driven, chosen.start_t) == pytest.approx(
         np.tile([0.5, 0.0, 0.5], (len(chosen.start_t), 1)), abs=1e-3
     )
-    assert share(kept_twist(driven, chosen), chosen) < 1e-3
+    assert share(predict_kept_twist(driven, chosen), chosen) < 1e-3
 
 
 def test_a_drive_too_short_to_learn_from_is_refused():
@@ -105,5 +109,5 @@ def test_a_robot_that_never_moved_has_one_too(values):
     still = drive(spec, duration=20.0)
     pose = values * np.random.default_rng(0).normal(size=still.pose.values.shape)
     driven = Drive(with_values(still, pose=pose), spec)
-    chosen = windows(driven, Calibration(), 5.0, 20.0, 5.0, 0.5)
+    chosen = select_windows(driven, Calibration(), 5.0, 20.0, 5.0, 0.5)
     assert np.isfinite(fit_yardstick(driven, LEARNT_S).predict(driven, chosen)).all()

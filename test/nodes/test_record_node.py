@@ -15,7 +15,7 @@ from nav_msgs.msg import Odometry
 from robots import open_field
 
 from nics_drl_bridge.generator import builtin_model, save_model
-from nics_drl_bridge.identify.excitation import coverage
+from nics_drl_bridge.identify.excitation import measure_coverage
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.nodes import conversions, qos, record_node
 from nics_drl_bridge.recording.readers import read_recording
@@ -277,4 +277,6 @@ def test_a_recorded_drive_of_a_simulator_generates_it_again(
     poses = np.array([pose_of(message) for message in odom])
     away = np.hypot(*(poses - poses[0])[:, :2].T) + spec.footprint_radius
     assert 0.5 < away.max() < 2.0
-    assert all(each.share > 0.6 and not each.fault for each in coverage(drive, spec))
+    assert all(
+        each.share > 0.6 and not each.fault for each in measure_coverage(drive, spec)
+    )

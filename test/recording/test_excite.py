@@ -8,8 +8,8 @@ from steps import integrate
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.identify.excitation import (
-    commands_together,
-    unmoved_variables,
+    list_commands_together,
+    list_unmoved_variables,
 )
 from nics_drl_bridge.recording.excite import (
     PERIOD_S,
@@ -86,8 +86,8 @@ def test_every_command_is_moved_by_the_rules_that_a_fit_judges_a_drive_by(
     none = np.zeros((len(t), 0))
     stateless = robot.model_copy(update={"state": ()})
     samples = samples_on_one_clock(t, pattern.pose[:-1], none, pattern.command)
-    assert unmoved_variables(samples, stateless) == ()
-    assert commands_together(samples, stateless) == ()
+    assert list_unmoved_variables(samples, stateless) == ()
+    assert list_commands_together(samples, stateless) == ()
     assert all(len(np.unique(column)) >= 10 for column in pattern.command.T)
     # Each also changes while the others are held: on its own.
     changes = np.abs(np.diff(pattern.command, axis=0)) > 1e-9
