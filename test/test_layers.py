@@ -253,7 +253,6 @@ def test_an_env_in_process_imports_neither_ros_nor_pictures_nor_slow_libraries()
         "typer",
         "mujoco",
         "scipy.signal",
-        "scipy.stats",
     }
 
 

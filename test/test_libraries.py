@@ -124,7 +124,8 @@ def test_a_module_whose_extra_is_missing_names_it(
 ):
     name = f"nics_drl_bridge.{module}"
     monkeypatch.delitem(sys.modules, name, raising=False)
-    monkeypatch.setitem(sys.modules, library, None)
+    for loaded in [library, *(m for m in sys.modules if m.startswith(f"{library}."))]:
+        monkeypatch.setitem(sys.modules, loaded, None)
     with pytest.raises(ConfigError) as refused:
         import_module(name)
     sentence = str(refused.value)

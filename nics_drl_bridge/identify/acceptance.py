@@ -50,7 +50,9 @@ class Thresholds:
     # A model that is farther off than its fitted textbook by this ratio has terms that do not pay,
     # even where the drive is too short to prove it.
     simpler: float = 1.02
-    simpler_from: float = 0.0005  # by this fraction of the path at least
+    simpler_from: float = (
+        0.0035  # by this fraction of the path at least; less changes no policy
+    )
     # Two simulators that differ by less train the same policy.
     alike: float = 0.005  # fraction of the path
     # Motion while the pose was missing was neither learnt nor tested.

@@ -90,6 +90,11 @@ def reset_marks(n: int, data: State, plans: Records) -> None:
         mark.vy = 0.0
         mark.index = 0
         mark.rest = 0.0
+        mark.speed = 0.0
+        mark.goal_x = 0.0
+        mark.goal_y = 0.0
+        mark.until = 0.0
+        mark.way = 0
         if row.kind == STILL:
             continue
         low = row.slowest

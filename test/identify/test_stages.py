@@ -46,7 +46,7 @@ def test_a_follower_beside_a_motion_has_the_lag_and_the_error_of_its_own_command
         lags=np.array([0.3, 0.1]),  # of throttle and steering
         lag_sigma=np.array([0.03, 0.01]),
     )
-    monkeypatch.setattr(clocks, "timing_of", lambda drive: timing)
+    monkeypatch.setattr(clocks, "measure_timing", lambda drive: timing)
     driven = Drive(recording, followed)
     found = run(STAGES[: STAGES.index(stages.find_mounting)], driven)
     assert found.calibration.responses == (Response("angle", "steering", 0.1),)

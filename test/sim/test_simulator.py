@@ -191,7 +191,7 @@ def test_goals_are_those_of_the_scene():
         (1, 1, {"threads": 0}, "at least 1 world, robot and thread"),
         (1, 1, {"longest_delay": -1}, "longest_delay of at least"),
         (1, 1, {"longest_age": -1}, "longest_age of at least 0"),
-        (1, 10**9, {}, "a world may have 1000 robots"),
+        (1, 10**9, {}, "1000000000 robots: a world may have 1000"),
         (10**9, 1, {}, "copies of it are the most"),
         (10**4, 1, {"longest_age": 10**6}, "copies of it are the most"),
         (10**4, 1, {"longest_delay": 10**6}, "copies of it are the most"),
