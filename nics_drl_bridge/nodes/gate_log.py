@@ -69,7 +69,7 @@ class GateLog:
             self._change_rule(rule)
         self._cause = cause
         # what is the case is always logged in the end, maybe later
-        if self._is_untold and self._may_log("rule"):
+        if self._is_untold and self._may_log(f"rule {rule}"):
             self._is_untold = False
             if cause is None:
                 self._logger.info("commands pass")

@@ -214,7 +214,7 @@ def test_a_simulation_is_armed_driven_stopped_and_ended_by_nics_alone(start):
         stopped = up.tell("stop")
         assert stopped.returncode == 0, stopped.stderr
         assert "/command_gate has stopped its robot" in stopped.stdout
-        refused = up.tell("arm --wait 1")
+        refused = up.tell("arm --wait 5")
         assert refused.returncode == 1
         assert "refuses to arm" in refused.stderr
         assert "e_stop_released: e_stop_pressed" in refused.stderr
@@ -222,7 +222,7 @@ def test_a_simulation_is_armed_driven_stopped_and_ended_by_nics_alone(start):
         assert again.returncode == 0, again.stderr
         behind = up.tell("goal -1 0 --frame base_link")
         assert behind.returncode == 0, behind.stderr
-        nowhere = up.tell("goal 1 0 --frame kitchen --wait 3")
+        nowhere = up.tell("goal 1 0 --frame kitchen --wait 10")
         assert nowhere.returncode == 1
         assert "a goal in the frame 'kitchen' is refused" in nowhere.stderr
     children = up.children
