@@ -291,17 +291,24 @@ class _Cache(FunctionCache):  # type: ignore[misc]
         self._cache_file = _Index(self._cache_path, name, stamp)
         self._carried: _Index | None = None
         file = Path(function.__code__.co_filename)
-        if not kind and CARRIED.is_dir() and file.is_relative_to(PACKAGE):
-            folder = ".".join(file.relative_to(PACKAGE).parent.parts)
-            self._carried = _Index(str(CARRIED), f"{folder}.{name}", stamp)
-            if self.writes_carried:
-                self._cache_file = self._carried
+        if not kind and file.is_relative_to(PACKAGE):
+            parts = (*file.relative_to(PACKAGE).parent.parts, name)
+            self._carried = _Index(str(CARRIED), ".".join(parts), stamp)
 
     @property
     def is_warm(self) -> bool:
         return any(
             index._load_index() for index in (self._cache_file, self._carried) if index
         )
+
+    def _save_overload(self, signature: Any, data: Any) -> None:
+        kept = self._cache_file
+        if self.writes_carried and self._carried is not None:
+            self._cache_file = self._carried
+        try:
+            super()._save_overload(signature, data)
+        finally:
+            self._cache_file = kept
 
     def _load_overload(self, signature: Any, target_context: Any) -> Any:
         overload = super()._load_overload(signature, target_context)
