@@ -106,7 +106,7 @@ CAMPAIGNS: dict[str, Campaign] = {
             "no_checksum": Control(
                 "the checksums of recordings, models, tables, policies and checkpoints",
                 "accepted ",
-                "--rounds 60",
+                "--rounds 60 --seed 2",
             ),
         },
         FILES,
