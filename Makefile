@@ -167,7 +167,7 @@ types: setup ## mypy
 # Tests that wait for other processes may fail on a busy machine, so failed tests run again, alone.
 # Kernels are compiled first, or several workers and their processes would each compile the same ones.
 pytest: setup
-	$(BIN)/nics warmup
+	$(BIN)/nics warmup --all
 	@status=0; $(BIN)/python -m pytest $(PARALLEL:auto=$(WORKERS)) -m "not ($(OTHER_RINGS))" $(DURATIONS) $(PYTEST_ARGS) || status=$$?; \
 	if [ $$status = 1 ]; then \
 		echo "make: once more, alone, the tests that failed:"; \

@@ -26,7 +26,7 @@ from numba import types
 from numba.core import event
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
 from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import Compiler, Flags, compile_result
+from numba.core.compiler import Compiler, compile_result
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import CPUDispatcher
 from numba.core.sigutils import normalize_signature
@@ -50,9 +50,6 @@ _IMPORT = re.compile(
     r"^[ \t]*(?:from[ \t]+([.\w]+)[ \t]+import[ \t]+(\([^)]*\)|[^\n]*)|import[ \t]+([^\n]*))",
     re.MULTILINE,
 )
-_DEFAULTS = {name: option.default for name, option in Flags.options.items()}
-# numba calls this half a million times, 5 % of the compile time; this version runs in C.
-Flags.values = lambda flags: _DEFAULTS | flags._values
 _ALIAS = re.compile(r"\bas\s+\w+")
 
 
@@ -188,7 +185,12 @@ class _Kernel(CPUDispatcher):  # type: ignore[misc]
         return any(cache.is_warm for cache in (self._cache, self._inner_cache))
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
-        """Called by numba when it compiles a kernel that calls this one."""
+        """Called by numba when it compiles a kernel that calls this one.
+
+        A literal argument counts as its type, or each number would be compiled anew.
+        """
+        args = tuple(map(types.unliteral, args))
+        kws = {name: types.unliteral(given) for name, given in kws.items()}
         before = self._inner, self._cache
         self._inner = True
         self._cache = self._inner_cache

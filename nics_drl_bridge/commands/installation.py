@@ -112,5 +112,7 @@ def _check_kernels() -> Check:
     cold = sum(not kernel.is_warm for kernel in KERNELS)
     text = f"{len(KERNELS) - cold} of {len(KERNELS)} are compiled"
     seconds = max(1, round(cold * SECONDS_EACH))
-    fix = f"nics warmup, about {seconds} s; else each is compiled at its first use"
+    fix = (
+        f"nics warmup --all, about {seconds} s; else each is compiled at its first use"
+    )
     return Check("kernels", cold == 0, text, fix)

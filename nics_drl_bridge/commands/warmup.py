@@ -1,4 +1,4 @@
-"""`nics warmup`: compiles the kernels in advance, on two cores."""
+"""`nics warmup`: compiles kernels in advance, on two cores."""
 
 import os
 import signal
@@ -13,30 +13,40 @@ from nics_drl_bridge.commands.console import JsonOption, show_progress
 from nics_drl_bridge.files import format_json
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
+AllOption = Annotated[
+    bool,
+    typer.Option(
+        "--all",
+        help="Also those of the planners, the gate and the estimator, as for a robot.",
+    ),
+]
 WheelOption = Annotated[
     bool,
     typer.Option(
         "--for-wheel",
-        help="Compile for x86-64-v3 into the package's folder, as `make wheel` does.",
+        help="All for x86-64-v3, into the package's folder, as `make wheel` does.",
     ),
 ]
 
 
-def warmup(for_wheel: WheelOption = False, as_json: JsonOption = False) -> None:
-    """Compiles all kernels in advance, once per machine, on two cores."""
+def warmup(
+    all_kernels: AllOption = False,
+    for_wheel: WheelOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Compiles the kernels of the simulator in advance, once per machine."""
     begin = time.monotonic()
     if for_wheel:  # numba reads these at its import
         os.environ |= {"NUMBA_CPU_NAME": "x86-64-v3", "NUMBA_CPU_FEATURES": ""}
     typer.echo("compiling the kernels: a minute or two, once on this machine", err=True)
+    parts = [_simulate, _drive] if all_kernels or for_wheel else [_simulate]
     # Spawned, not forked: a fork could inherit a lock that is never released.
     with (
         show_progress("compiling"),
         get_context("spawn").Pool(2, _begin, (for_wheel,)) as pool,
     ):
         *first, model = pool.apply(_compile_by, (_model,))
-        jobs = [
-            pool.apply_async(_compile_by, (part, model)) for part in (_simulate, _drive)
-        ]
+        jobs = [pool.apply_async(_compile_by, (part, model)) for part in parts]
         done = [first, *(job.get()[:2] for job in jobs)]
     count = sum(result[0] for result in done)
     cpu_s = sum(result[1] for result in done)

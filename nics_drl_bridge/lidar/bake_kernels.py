@@ -83,8 +83,11 @@ def scan_ahead(scan: ShortIntegers, beams: Beams, shape: ShapeAhead) -> None:
 @kernel(allocates=True)
 def find_range(angle: float, shape: ShapeAhead) -> np.float32:
     """Find the range to a shape in one direction [rad]."""
-    direction = np.array([[math.cos(angle)], [math.sin(angle)]])
-    scan = np.full(1, INF, np.int32)
+    direction = np.empty((2, 1))
+    direction[0, 0] = math.cos(angle)
+    direction[1, 0] = math.sin(angle)
+    scan = np.empty(1, np.int32)
+    scan[0] = INF
     scan_ahead(scan, make_beams(direction, angle, 1.0), shape)
     nearest = scan.view(np.float32)[0]
     if not np.isfinite(nearest):  # a wall seen edge-on
@@ -106,10 +109,14 @@ def fill_row(
     first = max(math.ceil(edges[0] / step) - start, 0)
     last = min(math.floor(edges[1] / step) - start, fine.shape[0] - 1)
     if first <= last:
-        angles = (start + np.arange(first, last + 1)) * step
-        directions = np.stack((np.cos(angles), np.sin(angles)))
+        directions = np.empty((2, last + 1 - first))
+        for i in range(directions.shape[1]):
+            angle = (start + first + i) * step
+            directions[0, i] = math.cos(angle)
+            directions[1, i] = math.sin(angle)
         scan = fine.view(np.int32)[first : last + 1]
-        scan_ahead(scan, make_beams(directions, angles[0], step), shape)
+        beams = make_beams(directions, (start + first) * step, step)
+        scan_ahead(scan, beams, shape)
     while first <= last and not np.isfinite(fine[first]):
         first += 1
     while last > first and not np.isfinite(fine[last]):
@@ -144,10 +151,11 @@ def fill_rows_of_turn(
     corners, radius = shape
     for d in range(distances.shape[0]):
         start = layout[0, d]
-        points = layout[2, d] * phases
-        fine = np.empty(points, np.float32)
+        width = layout[2, d]
+        fine = np.empty(width * phases, np.float32)
         ahead = ShapeAhead(corners, radius, distances[d], c, s)
         fill_row(fine, layout[1, d] * phases, step / phases, ahead, edges[d])
         # All points of one phase, then those of the next.
-        by_phase = fine.reshape((layout[2, d], phases)).T
-        rows[start : start + points] = np.ascontiguousarray(by_phase).reshape(-1)
+        for phase in range(phases):
+            for beam in range(width):
+                rows[start + phase * width + beam] = fine[beam * phases + phase]

@@ -62,8 +62,11 @@ def make_beams(directions: Array, first: float, step: float) -> Beams:
     # Half of the angle without beams, less half a step so that rounding does not matter.
     blind = min(max(math.pi - 0.5 * step * count, 0.0), HALF_PI)
     back = first + 0.5 * step * (count - 1) + math.pi
-    sides = np.array([back + blind - HALF_PI, back - blind + HALF_PI])
-    behind = np.stack((np.cos(sides), np.sin(sides)), axis=1)
+    behind = np.empty((2, 2))
+    for side in range(2):
+        angle = back + (1 - 2 * side) * (blind - HALF_PI)
+        behind[side, 0] = math.cos(angle)
+        behind[side, 1] = math.sin(angle)
     return Beams(directions, first, step, behind)
 
 

@@ -431,7 +431,8 @@ def simulate_rollouts(
         px, py, heading = poses[w, 0]
         c = math.cos(heading)
         s = math.sin(heading)
-        x[:size] = states[w, 0]
+        for i in range(size):
+            x[i] = states[w, 0, i]
         for n in range(commands.shape[1]):
             for i in range(width):
                 x[size + i] = commands[w, n, i]

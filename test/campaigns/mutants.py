@@ -494,7 +494,7 @@ class Laboratory:
         """Compiles all kernels of the snapshot, most of which were copied."""
         self.call(
             self.snapshot,
-            ["-m", f"{PACKAGE}.commands.start", "warmup"],
+            ["-m", f"{PACKAGE}.commands.start", "warmup", "--all"],
             CLEAN_TIMEOUT_S,
         )
 
