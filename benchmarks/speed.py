@@ -31,7 +31,7 @@ from bench import (
 )
 from measuring import peers
 from measuring.grids import MAPS, RESOLUTION, draw_poses, scan_map
-from measuring.rates import interleaved, medians
+from measuring.rates import interleaved, medians, slowed
 from measuring.scenes import BATCH, CIRCLE, errors
 from numpy.typing import NDArray
 
@@ -52,8 +52,6 @@ from nics_drl_bridge.lidar.table import LidarTable
 from nics_drl_bridge.sim.scenes import Scene, sample_scene
 from nics_drl_bridge.sim.world import World
 from nics_drl_bridge.sim.world_set import AnyWorld, WorldSet
-
-TIMES_SLOWER = 10  # under the control `slow`
 
 # Environments beside peers
 
@@ -131,7 +129,6 @@ class Worlds:
         self.env = BridgeVectorEnv(worlds, case.model, case.world, **further)
         self.seen, _ = self.env.reset(seed=0)
         self.actions = case.make_actions(self.env.action_space)
-        self.times = TIMES_SLOWER if case.control == "slow" else 1
         self.steps = CHUNK * worlds
 
     @property
@@ -146,7 +143,7 @@ class Worlds:
 
     def run_chunk(self) -> None:
         """Makes a chunk of steps."""
-        for k in range(CHUNK * self.times):
+        for k in range(CHUNK):
             self.env.step(self.actions[k % ACTIONS])
 
 
@@ -159,7 +156,6 @@ class Alone:
             NAVIGATION, model=case.model, world=case.world, estimator=estimator
         )
         self.actions = case.make_actions(self.env.action_space)
-        self.times = TIMES_SLOWER if case.control == "slow" else 1
         self.steps = SINGLE_CHUNK
         self.places = np.zeros((1, 2))
         self._reset()
@@ -179,7 +175,7 @@ class Alone:
 
     def run_chunk(self) -> None:
         """Makes a chunk of steps."""
-        for k in range(SINGLE_CHUNK * self.times):
+        for k in range(SINGLE_CHUNK):
             _, _, ended, cut, _ = self.env.step(self.actions[k % ACTIONS])
             if ended or cut:
                 self.env.reset()
@@ -256,9 +252,7 @@ def measure_throughput(given: Given) -> Result:
     if not case.is_usual:
         ours["usual"] = Worlds(given.worlds, 1, usual)
     if case.lidar is not None:
-        same = None if case.control == "slow" else case.control
-        clean = replace(case, clean=True, control=same)
-        ours["clean"] = Worlds(given.worlds, 1, clean)
+        ours["clean"] = Worlds(given.worlds, 1, replace(case, clean=True))
     cartpole = gymnasium.make("CartPole-v1")
     cartpole.reset(seed=0)
     written = np.zeros((given.worlds, case.model.lidar.beams + 6), np.float32)
@@ -267,6 +261,8 @@ def measure_throughput(given: Given) -> Result:
         "write": partial(write_chunk, written, np.ones_like(written)),
         "cartpole": partial(step_cartpole, cartpole),
     }
+    for name in ("one", "all", "plain", "estimator"):
+        calls[name] = slowed(calls[name], case.control)
     found = peers.measure(calls, rivals, peers.make_scenes(SCENES), repeats)
     rate = {name: one.steps / found.seconds[name] for name, one in ours.items()}
     rate["all"] = ours["all"].steps / found.wall["all"]
@@ -560,7 +556,7 @@ def measure_lidar_peers(given: Given) -> Result:
     table = bake(SPREAD, (CIRCLE,))
     batch = Scans(table, peers.make_scenes(given.scans))
     calls: dict[str, Callable[[], object]] = {
-        name: partial(batch.render, name) for name in RENDERERS
+        name: slowed(partial(batch.render, name), given.control) for name in RENDERERS
     }
     calls["write"] = partial(batch.out.fill, 1.0)
     drawn = peers.make_scenes(given.scenes)
@@ -682,7 +678,7 @@ BENCHMARKS = {
         measure_throughput,
         judge_throughput,
         {
-            "slow": Control("the speed: each env step that counts is ten", "share of"),
+            "slow": Control("the speed: each step is made ten times", "share of"),
             "standing": Control(
                 "the motion: the robots stand still",
                 "our env 'one': moved_m_per_period",
@@ -723,6 +719,7 @@ BENCHMARKS = {
             "shifted": Control(
                 "the same scan: the exact one is turned by one beam", "RMSE [m]: baked"
             ),
+            "slow": Control("the speed: each scan is made ten times", "share of"),
         },
         {
             "scans": (BATCH, "of one of our batches"),

@@ -9,6 +9,7 @@ from typing import TypeVar
 import numpy as np
 
 WARM_UP = 3
+TIMES_SLOWER = 10
 Name = TypeVar("Name", bound=Hashable)
 
 
@@ -35,6 +36,16 @@ def interleaved(
             call()
             times[name].append(clock() - begin)
     return times
+
+
+def slowed(call: Callable[[], object], control: str | None) -> Callable[[], object]:
+    """Makes a call ten times under the control `slow`."""
+
+    def make_calls() -> None:
+        for _ in range(TIMES_SLOWER):
+            call()
+
+    return make_calls if control == "slow" else call
 
 
 def medians(times: Mapping[Name, list[float]]) -> dict[Name, float]:
