@@ -125,6 +125,7 @@ class RobotPort:
         self.inlet: CommandInlet  # of the robot's commands
         self.command_ns = 0  # time of the newest command
         self.has_command = False  # in lock-step: since the last step
+        self._joint_writer = conversions.JointWriter(model.robot)
         self._send = partial(outbox.send, late=time.odom_late_ns)
         self._send_scan = partial(outbox.send, late=time.scan_late_ns)
 
@@ -194,7 +195,7 @@ class RobotPort:
         )
         self._send(self._odoms, odometry, now_ns)
         if self._joints.get_subscription_count():
-            joints = conversions.joints_to_ros(self._model.robot, sensed.state, now_ns)
+            joints = self._joint_writer.write(sensed.state, now_ns)
             self._send(self._joints, joints, now_ns)
         if self._truths.get_subscription_count():
             self._truths.publish(

@@ -23,6 +23,7 @@ from std_srvs.srv import SetBool, Trigger
 from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.extras.simulation_interfaces.roster import Entities
 from nics_drl_bridge.nodes import conversions, simulator_node
+from nics_drl_bridge.robot.spec import load_robot
 from nics_drl_bridge.sim.world import load_world
 from nodes.peer import pose_of, stamp_ns
 
@@ -293,6 +294,27 @@ def test_its_joints_tell_the_state_at_the_stamps_of_its_odometry(
         lambda: stamp_ns(joints[-1]) in {stamp_ns(each) for each in odom},
         "its odometry",
     )
+
+
+def test_wheels_turn_as_far_as_the_robot_drives(launch, meet, domain_id):
+    launch("simulator_node", domain_id, model="differential", world="empty")
+    peer = meet(domain_id)
+    joints = peer.listen(JointState, "joint_states")
+    truth = peer.listen(Odometry, "ground_truth")
+    command = peer.speak(Twist, "cmd_vel")
+    ahead = conversions.twist_to_ros([0.5, 0.0, 0.0])
+    peer.until(
+        lambda: command.publish(ahead) or (joints and joints[-1].position[0] > 10.0),
+        "turning wheels",
+    )
+    poses = {stamp_ns(message): pose_of(message) for message in truth}
+    both = [message for message in joints if stamp_ns(message) in poses]
+    first, last = both[0], both[-1]
+    radius = load_robot("differential").parameters["wheel_radius"]
+    way = poses[stamp_ns(last)] - poses[stamp_ns(first)]
+    turned = np.subtract(last.position, first.position)
+    assert last.name == ["left_wheel", "right_wheel"]
+    assert radius * turned == pytest.approx([np.hypot(*way[:2])] * 2, rel=0.02)
 
 
 @pytest.mark.parametrize(
