@@ -41,6 +41,7 @@ from nics_drl_bridge.nodes.frames import odom_in_map, transform_to_ros
 from nics_drl_bridge.nodes.link import identity
 from nics_drl_bridge.nodes.message_packages import how_to_install
 from nics_drl_bridge.nodes.parts import open_parts
+from nics_drl_bridge.nodes.runner import OK, WARN
 from nics_drl_bridge.nodes.world_topics import WorldTopics
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.device import LEAST_VARIANCE, DeviceWorld, Sensed, variances
@@ -52,6 +53,7 @@ CLOCK = "/clock"
 CLOCK_NS = 15_000_000
 WATCH_S = 2.0
 QUIET_S = 5.0
+LAGGING_S = 5.0  # diagnostics warn for so long after it fell behind real time
 # longest time between two checks for delayed data that are due [s]
 LONGEST_TICK_S = 0.005
 
@@ -319,6 +321,7 @@ class DeviceNode(qos.BridgeNode):
         self.use_world(load_worlds(runner.get_text(self, "world")))
         self.paused = False
         self._lags = 0
+        self._lagged_s = -math.inf  # last time that it fell behind, on the steady clock
         self._hardware = model.robot.name
         self._told_ns = 0  # newest time on `/clock`
         self.device.advance()  # compiles before any peer waits
@@ -469,7 +472,11 @@ class DeviceNode(qos.BridgeNode):
             **self._identity,
         }
         message = "paused" if self.paused else "running"
-        return runner.Condition(message, False, facts, self._hardware)
+        level = OK
+        if time.monotonic() - self._lagged_s < LAGGING_S:
+            message = "behind real time"
+            level = WARN
+        return runner.Condition(message, level, facts, self._hardware)
 
     def _too_old(self, stamp_ns: int) -> bool:
         """Return whether a command of a time is over; in lock-step it never is."""
@@ -498,6 +505,7 @@ class DeviceNode(qos.BridgeNode):
         steady_ns = time.monotonic_ns()
         if self._real_time.lost(steady_ns, self.now_ns):
             self._lags += 1
+            self._lagged_s = time.monotonic()
             fix = "choose a lower rate, scan_rate or odom_rate, or fewer robots"
             warning = f"this machine does not keep up with real time; {fix}"
             self.get_logger().warning(warning, throttle_duration_sec=5.0)
