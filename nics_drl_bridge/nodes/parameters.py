@@ -23,6 +23,7 @@ HIGHEST_PRIORITY = 99
 PLAIN_TWISTS = ("humble", "iron", "jazzy")
 STAMPED = "enable_stamped_cmd_vel"
 GREATEST_FLEET = 256
+GREATEST_SEED = 2**63 - 1
 NAMESPACE = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
 FRAME = re.compile(r"[^\s/]\S{0,254}")
 MAY_BE_EMPTY = ("footprint_frame",)
@@ -368,17 +369,17 @@ def device(laser_frame: str = "") -> list[Row]:
             (0.0, 3600.0),
             fixed=False,
         ),
-        Row("episode_seed", 0, "Seed of the episode that ~/reset begins.", fixed=False),
         Row(
-            "episode_start",
-            [0.0, 0.0, 0.0],
-            "Start pose x, y, heading of each robot [m, m, rad]; applies once set.",
+            "episode_seed",
+            0,
+            "Seed of the episode that ~/reset begins.",
+            (0, GREATEST_SEED),
             fixed=False,
         ),
         Row(
-            "episode_start_given",
-            False,
-            "Start at episode_start, not at the seed's start; true once episode_start is set.",
+            "episode_start",
+            [math.nan] * 3,
+            "Start pose x, y, heading of each robot [m, m, rad]; NaN: the seed's.",
             fixed=False,
         ),
     ]
@@ -625,7 +626,7 @@ TOLD = (
     "/tf, /tf_static (with tf2_msgs)",
     "/diagnostics",
 )
-SERVED = ("~/reset", "~/pause", "~/repeat", "~/touched")
+SERVED = ("~/reset", "~/pause", "~/repeat", "~/self_test", "~/touched")
 HEARD = (
     "scan",
     "odom",

@@ -1,5 +1,4 @@
 import contextlib
-import json
 import math
 from dataclasses import replace
 
@@ -21,6 +20,7 @@ from std_srvs.srv import Trigger
 
 from nics_drl_bridge.middleware.measurement import Health, Rejection, TopicHealth
 from nics_drl_bridge.nodes import conversions
+from nics_drl_bridge.nodes.link import EPISODE_NS
 from nics_drl_bridge.nodes.middleware_node import MiddlewareNode, judge_topics
 from nics_drl_bridge.nodes.runner import ERROR, OK, STALE
 from nodes.peer import odometry, pose_of, stamp_ns
@@ -72,9 +72,8 @@ def driven(launch, meet, module_domain_id, tmp_path_factory):
         """Resets both, and steps until all have found each other."""
         for _ in range(10):
             assert peer.call(Trigger, "middleware_node/reset").success
-            stamp = json.loads(peer.call(Trigger, "simulator_node/reset").message)[
-                "stamp_ns"
-            ]
+            assert peer.call(Trigger, "simulator_node/reset").success
+            stamp = int(peer.read_episode()[EPISODE_NS])
             try:
                 peer.until(
                     lambda stamp=stamp: newest_ns() >= stamp, "the first estimate", 2.0
