@@ -568,6 +568,13 @@ def gate() -> list[Row]:
 
 def drive() -> list[Row]:
     """Return the parameters of `record_node`."""
+    from nics_drl_bridge.recording.excite import (
+        LONGEST_S,
+        MIN_DRIVE_S,
+        SLOWEST,
+        WIDEST_M,
+    )
+
     return [
         Row("robot", DEFAULT_ROBOT, "Name of a shipped robot, or a robot's YAML file."),
         Row(
@@ -579,10 +586,16 @@ def drive() -> list[Row]:
             "bound",
             defaults.DRIVE_BOUND_M,
             "Radius of the circle around the start that the robot stays within [m].",
+            (0.0, WIDEST_M),
         ),
-        Row("duration", defaults.DRIVE_S, "Duration of the drive [s]."),
-        Row("speed", 1.0, "Fraction of the maximum speeds to use."),
-        Row("seed", 0, "Seed of the pattern."),
+        Row(
+            "duration",
+            defaults.DRIVE_S,
+            "Duration of the drive [s].",
+            (MIN_DRIVE_S, LONGEST_S),
+        ),
+        Row("speed", 1.0, "Fraction of the maximum speeds to use.", (SLOWEST, 1.0)),
+        Row("seed", 0, "Seed of the pattern.", (0, GREATEST_SEED)),
         Row("topics", "", "YAML file that names the joints; empty: none."),
         Row(
             IMU,
@@ -595,7 +608,7 @@ def drive() -> list[Row]:
             "Stop after this silence of odom [s].",
             (0.05, 10.0),
         ),
-        stamped()._replace(name="stamped"),
+        stamped(),
     ]
 
 
