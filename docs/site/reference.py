@@ -21,7 +21,7 @@ from nics_drl_bridge.extras.foreign_policies.mapping import ForeignPolicy
 from nics_drl_bridge.gate.limits import LimitsFile
 from nics_drl_bridge.lidar.maps import MapFile
 from nics_drl_bridge.lidar.spec import LidarSpec
-from nics_drl_bridge.nodes.parameters import NODES, STAMPED, Row
+from nics_drl_bridge.nodes.parameters import GREATEST_SEED, NODES, STAMPED, Row
 from nics_drl_bridge.policy.train.settings import TrainingSettings
 from nics_drl_bridge.recording.mapping import Mapping
 from nics_drl_bridge.recording.topic_roles import TopicRoles
@@ -304,9 +304,12 @@ def cell(text: str) -> str:
 def parameter_row(row: Row) -> str:
     """What a node's parameter means, its default and its range."""
     usual = row.shown or shown(row.default)
-    if row.name in (STAMPED, "stamped"):
+    if row.name == STAMPED:
         usual = "true since Kilted"
-    span = "" if row.span is None else f"{row.span[0]:g} to {row.span[1]:g}"
+    span = ""
+    if row.span is not None:
+        low, high = row.span
+        span = f"{low:g} or more" if high == GREATEST_SEED else f"{low:g} to {high:g}"
     told = row.about if row.fixed else f"{row.about} May be set while it runs."
     return f"| `{row.name}` | {cell(usual)} | {span} | {cell(told)} |"
 

@@ -15,6 +15,7 @@ from nics_drl_bridge.config import parse_namespace
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.exit_codes import EXIT_INTERRUPTED
 from nics_drl_bridge.files import format_json
+from nics_drl_bridge.nodes.parameters import STAMPED
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 if TYPE_CHECKING:
@@ -70,7 +71,7 @@ def record(
         "topics": str(topics or ""),
         "use_sim_time": use_sim_time,
         "imu": imu,
-    } | ({} if stamped is None else {"stamped": stamped})
+    } | ({} if stamped is None else {STAMPED: stamped})
     plan = check_drive(parameters)
     if not preview:
         # This comes first because ROS 2 from wheels restarts Python.

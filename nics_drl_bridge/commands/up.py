@@ -85,13 +85,10 @@ def format_arguments(launch: Launch) -> str:
     """Returns the arguments of a launch as a table."""
     rows = []
     for argument in launch.arguments:
-        default = (
-            f"that of {argument.same_as}" if argument.same_as else argument.default
-        )
         about = argument.about
         if argument.choices:
             about = f"{about} ({' or '.join(argument.choices)})"
-        rows.append((f"{argument.name}:=", default, about))
+        rows.append((f"{argument.name}:=", argument.default, about))
     return f"{launch.about}\n\n{console.format_table(('argument', 'default', 'meaning'), rows)}"
 
 

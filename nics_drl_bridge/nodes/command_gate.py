@@ -347,7 +347,10 @@ class CommandGate(qos.BridgeNode):
             return condition
         warning = f"others publish on cmd_vel too ({others}) and bypass this gate"
         self.get_logger().warning(warning, throttle_duration_sec=10.0)
-        return condition._replace(message=f"{condition.message}; {warning}", warns=True)
+        level = max(condition.level, runner.WARN)
+        return condition._replace(
+            message=f"{condition.message}; {warning}", level=level
+        )
 
     def stop(self) -> None:
         """Leave a zero command behind."""

@@ -208,18 +208,33 @@ def map_from_ros(message: OccupancyGrid) -> GridMap:
     )
 
 
-def joints_to_ros(spec: RobotSpec, state: ArrayLike, time_ns: int) -> JointState:
-    """Return a state (S,) as a JointState: angles and lengths as positions, the rest as rates."""
-    message = JointState()
-    message.header.stamp = stamp_to_ros(time_ns)
-    for variable, value in zip(
-        spec.state, np.asarray(state, dtype=np.float64), strict=True
-    ):
-        still = variable.unit in messages.POSITION_UNITS
-        message.name.append(variable.name)
-        message.position.append(float(value) if still else 0.0)
-        message.velocity.append(0.0 if still else float(value))
-    return message
+class JointWriter:
+    """Writes states (S,) of a robot as JointStates.
+
+    A state is a position if it is an angle or a length, and its rate is unknown (NaN). Any other is
+    a rate, and its integral is the position, which begins at zero.
+    """
+
+    def __init__(self, spec: RobotSpec) -> None:
+        self._names = [variable.name for variable in spec.state]
+        units = [variable.unit for variable in spec.state]
+        self._is_position = np.isin(units, messages.POSITION_UNITS)
+        self._integral = np.zeros(len(units))
+        self._last: tuple[int, Array] | None = None  # time [ns] and state
+
+    def write(self, state: Array, time_ns: int) -> JointState:
+        """Return a message with the state at a time [ns]."""
+        if self._last is not None:
+            last_ns, last = self._last
+            elapsed_s = max(0, time_ns - last_ns) / NS_PER_S  # a clock may be set back
+            self._integral += 0.5 * elapsed_s * (last + state)
+        self._last = time_ns, state.copy()
+        return JointState(
+            header=header_to_ros(time_ns, ""),
+            name=self._names,
+            position=np.where(self._is_position, state, self._integral),
+            velocity=np.where(self._is_position, np.nan, state),
+        )
 
 
 def message_type(kind: str) -> Any | None:

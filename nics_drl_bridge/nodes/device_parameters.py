@@ -12,7 +12,7 @@ from rclpy.parameter import Parameter
 
 from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.nodes.parameters import (
     LOCKSTEP,
     MODES,
@@ -21,13 +21,11 @@ from nics_drl_bridge.nodes.parameters import (
     frame_fault,
     name_fleet,
 )
-from nics_drl_bridge.nodes.qos import given_values
 from nics_drl_bridge.nodes.runner import declare_row, get_number, get_text
 from nics_drl_bridge.robot.noise import Delay
 from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
 
 START = "episode_start"
-GIVEN = "episode_start_given"
 # fraction of a step by which it may be early, because timers are no more precise
 SLACK = 0.1
 # a backlog longer than this is dropped instead of made up for [ns]
@@ -65,15 +63,13 @@ class Frames(NamedTuple):
 
 def declare_device(node: Node, laser_frame: str) -> None:
     """Declare and check the parameters that all simulators share. Raises ConfigError."""
-    # Added first, so that it also checks the values at startup.
-    node.add_on_set_parameters_callback(partial(_check_episode, node))
     fleet = ParameterDescriptor(
         description=ROBOTS.about, read_only=True, dynamic_typing=True
     )
     node.declare_parameter(ROBOTS.name, ROBOTS.default, fleet)
+    # Added before the others are declared, so that it also checks the values at startup.
+    node.add_on_set_parameters_callback(partial(_check_episode, node))
     for row in device(laser_frame):
-        if row.name == GIVEN:
-            row = row._replace(default=START in given_values(node))
         declare_row(node, row)
     fault = frame_fault(node.get_parameters_by_prefix("").values())
     if fault:
@@ -153,27 +149,24 @@ def frames(node: Node, namespace: str) -> Frames:
 
 def _check_episode(node: Node, parameters: list[Parameter]) -> SetParametersResult:
     reason = ""
+    needed = 3 * len(name_fleet(node.get_parameter(ROBOTS.name).value))
     for parameter in parameters:
-        if parameter.name == START:
-            values = np.array(parameter.value, dtype=np.float64)
-            if not values.size or values.size % 3 or not np.isfinite(values).all():
-                reason = "episode_start must be three finite numbers per robot: x, y, heading."
-            elif node.has_parameter(GIVEN):
-                needed = 3 * len(name_fleet(node.get_parameter(ROBOTS.name).value))
-                if values.size != needed:
-                    reason = f"episode_start has {values.size} numbers; give {needed}, 3 per robot."
-        elif parameter.name == "episode_seed" and parameter.value < 0:
-            reason = "episode_seed must be 0 or more."
-    names = {parameter.name for parameter in parameters}
-    # Setting a start alone makes it apply; at declaration it comes before its flag.
-    if (
-        not reason
-        and START in names
-        and GIVEN not in names
-        and node.has_parameter(GIVEN)
-    ):
-        node.set_parameters([Parameter(GIVEN, value=True)])
+        if parameter.name != START:
+            continue
+        values = np.array(parameter.value, dtype=np.float64)
+        if np.isnan(values).all():
+            continue
+        if not np.isfinite(values).all():
+            reason = f"{START} must be three finite numbers per robot: x, y, heading."
+        elif values.size != needed:
+            reason = f"{START} has {values.size} numbers; give {needed}, 3 per robot."
     return SetParametersResult(successful=not reason, reason=reason)
+
+
+def episode_start(node: Node) -> Array | None:
+    """Return x, y, heading of each robot (3 M,) for the next episode; None: by its seed."""
+    start = np.array(node.get_parameter(START).value, dtype=np.float64)
+    return None if np.isnan(start).all() else start
 
 
 class TopicPace:

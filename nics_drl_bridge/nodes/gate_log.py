@@ -19,7 +19,7 @@ from nics_drl_bridge.nodes import black_box_writer
 from nics_drl_bridge.nodes.black_box_writer import FILES_KEPT
 from nics_drl_bridge.nodes.listener import holds
 from nics_drl_bridge.nodes.node_process import module_command
-from nics_drl_bridge.nodes.runner import Condition
+from nics_drl_bridge.nodes.runner import ERROR, OK, STALE, WARN, Condition
 
 BURST_S = (
     3.0  # commands must pass for this long before a stop counts as a new burst [s]
@@ -32,6 +32,13 @@ STATE_S = 10.0  # time between two states of the gate in the black box [s]
 MOST_ENTRIES = 5_000  # between two states
 MOST_LINES = 18_000  # fewer than a replay takes
 MOST_BYTES = 48 * 2**20
+# What diagnostics call a stop by these rules; any other one is an error.
+LEVELS = {
+    "disarmed": WARN,
+    "scan_silent": STALE,
+    "odom_silent": STALE,
+    "sensor_silent": STALE,
+}
 
 
 class GateLog:
@@ -126,8 +133,10 @@ class GateLog:
             "latched": state.latched is not None,
         }
         facts |= dict(sorted(self.counters.items()))
-        message = self._cause.line if self._cause else "commands pass"
-        return Condition(message, self._cause is not None, facts, self._hardware)
+        if self._cause is None:
+            return Condition("commands pass", OK, facts, self._hardware)
+        level = LEVELS.get(self._cause.rule, ERROR)
+        return Condition(self._cause.line, level, facts, self._hardware)
 
     def close(self) -> None:
         """Wait briefly for files that are being written."""

@@ -8,7 +8,7 @@ and arguments of `starting`, as in `describe(Launch("...", [bridge], [*common("f
 from typing import Any
 
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
-from launch.substitutions import LaunchConfiguration, TextSubstitution
+from launch.substitutions import TextSubstitution
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterFile, ParameterValue
 
@@ -34,12 +34,9 @@ def describe(launch: Launch) -> Any:
 
 def declaration_of(argument: Argument) -> DeclareLaunchArgument:
     """Return the `launch` declaration of an argument."""
-    default: Any = argument.default
-    if argument.same_as:
-        default = LaunchConfiguration(argument.same_as)
     return DeclareLaunchArgument(
         argument.name,
-        default_value=default,
+        default_value=argument.default,
         description=argument.about,
         choices=list(argument.choices) or None,
     )

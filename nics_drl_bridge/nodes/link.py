@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import gc
-import json
 import math
 import signal
 import sys
@@ -21,6 +20,7 @@ from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
+from diagnostic_msgs.srv import SelfTest
 from geometry_msgs.msg import Twist, TwistStamped
 from numpy.typing import NDArray
 from rcl_interfaces.srv import SetParametersAtomically
@@ -52,6 +52,8 @@ SPIN_S = 0.2
 # the same, because rclpy drops callbacks that are ready when the timeout changes.
 POLL_S = 0.01
 NO_RANDOMISATION = "none"
+# key of the stamp of an episode's first data in a simulator's diagnostics
+EPISODE_NS = "episode began [ns]"
 # a request to repeat data counts as lost if unanswered for this long [s]
 LOST_S = 1.0
 
@@ -398,9 +400,10 @@ class EpisodeServices:
         self._parameters = client(SetParametersAtomically, setting)
         self._reset = client(Trigger, f"{simulator}/reset")
         self._repeat = client(Trigger, f"{simulator}/repeat")
+        self._test = client(SelfTest, f"{simulator}/self_test")
         self._repeating: Any = None
         self._asked_s = 0.0
-        self.clients = [self._reset, self._parameters]
+        self.clients = [self._reset, self._parameters, self._test]
 
     @property
     def there(self) -> bool:
@@ -421,12 +424,9 @@ class EpisodeServices:
 
     def begin(self, start: Start, timeout_s: float) -> int:
         """Begin an episode; return the stamp of its first data [ns]. Raises BridgeError."""
-        seed = int(start.seed)
-        pose = start.pose.ravel().tolist()
         chosen = {
-            "episode_seed": seed,
-            "episode_start": pose,
-            "episode_start_given": True,
+            "episode_seed": int(start.seed),
+            "episode_start": start.pose.ravel().tolist(),
         }
         settings = [
             Parameter(name, value=value).to_parameter_msg()
@@ -439,12 +439,13 @@ class EpisodeServices:
         response = self._link.call(self._reset, Trigger.Request(), timeout_s)
         if not response.success:
             raise BackendError(f"the simulator could not reset: {response.message}")
-        answer: dict[str, Any] = json.loads(response.message)
+        told = self._link.call(self._test, SelfTest.Request(), timeout_s)
+        facts = {pair.key: pair.value for pair in told.status[0].values}
         for key, mine in self._identity.items():
-            if answer.get(key) != mine:
-                runs = f"the simulator runs the {key} {answer.get(key)!r}, this env {mine!r}"
+            if facts.get(key) != mine:
+                runs = f"the simulator runs the {key} {facts.get(key)!r}, this env {mine!r}"
                 raise ModelError(f"{runs}; start both with the same {key}.")
-        return int(answer["stamp_ns"])
+        return int(facts[EPISODE_NS])
 
 
 T = TypeVar("T")

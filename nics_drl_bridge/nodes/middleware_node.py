@@ -15,10 +15,15 @@ from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes import conversions, qos, runner
 from nics_drl_bridge.nodes.frames import MapToOdom, odom_in_map
 from nics_drl_bridge.nodes.parameters import BASE_FRAME, MAP_FRAME, middleware
-from nics_drl_bridge.nodes.robot_topics import RobotTopics
-from nics_drl_bridge.nodes.runner import ACTIVE, UNCONFIGURED, ManagedNode
-
-SILENCE_S = 5.0  # diagnostics warn of a topic that has been silent for this long [s]
+from nics_drl_bridge.nodes.robot_topics import SILENCE_S, RobotTopics
+from nics_drl_bridge.nodes.runner import (
+    ACTIVE,
+    ERROR,
+    OK,
+    STALE,
+    UNCONFIGURED,
+    ManagedNode,
+)
 
 
 class MiddlewareNode(ManagedNode):
@@ -81,7 +86,7 @@ class MiddlewareNode(ManagedNode):
 
     def _look(self) -> runner.Condition:
         if self.state == UNCONFIGURED:
-            return runner.Condition(self.state, warns=False, facts={})
+            return runner.Condition(self.state, OK, facts={})
         health = self._topics.middleware.health(self._topics.now_ns())
         new = sorted(health.rejected.keys() - self._rejected.keys())
         if new:
@@ -96,19 +101,21 @@ class MiddlewareNode(ManagedNode):
             self.get_logger().warning(f"imu: {missing}", once=True)
         else:
             awaited = tuple(dict.fromkeys((*awaited, *self._topics.hoped_for)))
-        trouble = silence(health, awaited, self._rejected)
+        level, trouble = judge_topics(health, awaited, self._rejected)
         self._rejected = health.rejected
         message = trouble or ("receiving" if self.state == ACTIVE else self.state)
         shown = facts(health) | ({"imu": missing} if missing else {})
-        return runner.Condition(message, bool(trouble), shown, self._hardware)
+        return runner.Condition(message, level, shown, self._hardware)
 
 
-def silence(
+def judge_topics(
     health: Health, expected: Sequence[str], before: Mapping[Rejection, int]
-) -> str:
-    """Return a sentence about expected topics without usable data; empty if there are none.
+) -> tuple[bytes, str]:
+    """Return the level of a diagnosis, and a sentence about expected topics without usable data.
 
-    `before` holds earlier counts of `health.rejected`: a topic whose count grew is not silent.
+    Silent topics are stale, and those whose data are refused an error. The sentence is empty if
+    there are none. `before` holds earlier counts of `health.rejected`: a topic whose count grew is
+    not silent.
     """
     unusable = [topic for topic in expected if topic not in health.topics]
     since = "yet"
@@ -132,7 +139,10 @@ def silence(
         else:
             silent.append(topic)
     clauses = [f"nothing on {', '.join(silent)} {since}"] if silent else []
-    return "; ".join([*clauses, *refused])
+    level = OK
+    if unusable:
+        level = ERROR if refused else STALE
+    return level, "; ".join([*clauses, *refused])
 
 
 def facts(health: Health) -> dict[str, str]:

@@ -68,32 +68,42 @@ def insist(ask: Callable[[], Answer], deadline: float, tell: Tell, what: str) ->
 
 
 class Call:
-    """A request to a service of a gate, which is sent once the service is there."""
+    """A request to a service of a node, which is sent once the service is there."""
 
-    def __init__(self, node: Node, gate: str, service: str) -> None:
+    def __init__(
+        self, node: Node, server: str, service: str, kind: Any = Trigger
+    ) -> None:
         self._node = node
-        self._gate = gate
-        self._client = node.create_client(Trigger, f"{gate}/{service}")
+        self._server = server
+        self._kind = kind
+        self._client = node.create_client(kind, f"{server}/{service}")
         self._future: Any = None
+
+    def wait_for_response(self, seconds: float) -> Any:
+        """Return the response, and end the call. Raises BackendError if none comes for so long."""
+        try:
+            holds(self.is_answered, max(seconds, 0.0), POLL_S)
+            if self._future is None:
+                raise BackendError("it has ended")
+            if not self._future.done():
+                reason = "it did not answer in time; the request may still take effect"
+                raise BackendError(reason)
+            return self._future.result()
+        finally:
+            self._node.destroy_client(self._client)
 
     def wait_for_answer(self, seconds: float) -> TriggerAnswer:
         """Return the answer, or why there is none after so long; end the call."""
         try:
-            holds(self.is_answered, max(seconds, 0.0), POLL_S)
-            if self._future is None:
-                return TriggerAnswer(self._gate, False, "it has ended")
-            if not self._future.done():
-                reason = "it did not answer in time; the request may still take effect"
-                return TriggerAnswer(self._gate, False, reason)
-            answer = self._future.result()
-            return TriggerAnswer(self._gate, bool(answer.success), str(answer.message))
-        finally:
-            self._node.destroy_client(self._client)
+            answer = self.wait_for_response(seconds)
+        except BackendError as error:
+            return TriggerAnswer(self._server, False, str(error))
+        return TriggerAnswer(self._server, bool(answer.success), str(answer.message))
 
     def is_answered(self) -> bool:
         """Send the request once the service is there; return whether the answer has come."""
         if self._future is None and self._client.service_is_ready():
-            self._future = self._client.call_async(Trigger.Request())
+            self._future = self._client.call_async(self._kind.Request())
         return self._future is not None and bool(self._future.done())
 
 

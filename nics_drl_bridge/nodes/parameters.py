@@ -23,6 +23,7 @@ HIGHEST_PRIORITY = 99
 PLAIN_TWISTS = ("humble", "iron", "jazzy")
 STAMPED = "enable_stamped_cmd_vel"
 GREATEST_FLEET = 256
+GREATEST_SEED = 2**63 - 1
 NAMESPACE = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
 FRAME = re.compile(r"[^\s/]\S{0,254}")
 MAY_BE_EMPTY = ("footprint_frame",)
@@ -368,17 +369,17 @@ def device(laser_frame: str = "") -> list[Row]:
             (0.0, 3600.0),
             fixed=False,
         ),
-        Row("episode_seed", 0, "Seed of the episode that ~/reset begins.", fixed=False),
         Row(
-            "episode_start",
-            [0.0, 0.0, 0.0],
-            "Start pose x, y, heading of each robot [m, m, rad]; applies once set.",
+            "episode_seed",
+            0,
+            "Seed of the episode that ~/reset begins.",
+            (0, GREATEST_SEED),
             fixed=False,
         ),
         Row(
-            "episode_start_given",
-            False,
-            "Start at episode_start, not at the seed's start; true once episode_start is set.",
+            "episode_start",
+            [math.nan] * 3,
+            "Start pose x, y, heading of each robot [m, m, rad]; NaN: the seed's.",
             fixed=False,
         ),
     ]
@@ -567,6 +568,13 @@ def gate() -> list[Row]:
 
 def drive() -> list[Row]:
     """Return the parameters of `record_node`."""
+    from nics_drl_bridge.recording.excite import (
+        LONGEST_S,
+        MIN_DRIVE_S,
+        SLOWEST,
+        WIDEST_M,
+    )
+
     return [
         Row("robot", DEFAULT_ROBOT, "Name of a shipped robot, or a robot's YAML file."),
         Row(
@@ -578,10 +586,16 @@ def drive() -> list[Row]:
             "bound",
             defaults.DRIVE_BOUND_M,
             "Radius of the circle around the start that the robot stays within [m].",
+            (0.0, WIDEST_M),
         ),
-        Row("duration", defaults.DRIVE_S, "Duration of the drive [s]."),
-        Row("speed", 1.0, "Fraction of the maximum speeds to use."),
-        Row("seed", 0, "Seed of the pattern."),
+        Row(
+            "duration",
+            defaults.DRIVE_S,
+            "Duration of the drive [s].",
+            (MIN_DRIVE_S, LONGEST_S),
+        ),
+        Row("speed", 1.0, "Fraction of the maximum speeds to use.", (SLOWEST, 1.0)),
+        Row("seed", 0, "Seed of the pattern.", (0, GREATEST_SEED)),
         Row("topics", "", "YAML file that names the joints; empty: none."),
         Row(
             IMU,
@@ -594,7 +608,7 @@ def drive() -> list[Row]:
             "Stop after this silence of odom [s].",
             (0.05, 10.0),
         ),
-        stamped()._replace(name="stamped"),
+        stamped(),
     ]
 
 
@@ -625,7 +639,7 @@ TOLD = (
     "/tf, /tf_static (with tf2_msgs)",
     "/diagnostics",
 )
-SERVED = ("~/reset", "~/pause", "~/repeat", "~/touched")
+SERVED = ("~/reset", "~/pause", "~/repeat", "~/self_test", "~/touched")
 HEARD = (
     "scan",
     "odom",

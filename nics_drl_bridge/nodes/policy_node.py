@@ -22,7 +22,7 @@ from nics_drl_bridge.nodes.frames import GoalFrames
 from nics_drl_bridge.nodes.goal_answer import GoalAnswer
 from nics_drl_bridge.nodes.parameters import policy
 from nics_drl_bridge.nodes.parts import Wish, open_parts
-from nics_drl_bridge.nodes.robot_topics import RobotTopics
+from nics_drl_bridge.nodes.robot_topics import SILENCE_S, RobotTopics
 from nics_drl_bridge.nodes.runner import ACTIVE, UNCONFIGURED, ManagedNode
 from nics_drl_bridge.policy.file.stateful import begin, resume
 from nics_drl_bridge.policy.pacing import ActionPace, Answer, Deadline
@@ -114,6 +114,8 @@ class PolicyNode(ManagedNode):
     def _open_policy(self, model: SimulatorModel) -> None:
         name = runner.get_text(self, "policy")
         self._policy, self._task = open_policy(name, model)
+        sensors = (sensor.name for sensor in self._task.sensors)
+        self._needed = (SCAN, ODOM, *sensors)  # topics for an action
         view = rehearse(model)  # compiles everything now
         self._task.judge(view, {"goal": np.zeros(2)})
         self._asked(view, np.zeros(2))
@@ -155,8 +157,7 @@ class PolicyNode(ManagedNode):
             self._raw.publish(self._message(np.zeros(3), self._acted_ns))
         newest = self._topics.middleware.cache.newest
         begin_s = time.monotonic()
-        needed = (SCAN, ODOM, *(sensor.name for sensor in self._task.sensors))
-        if not newest.keys() >= set(needed):
+        if not newest.keys() >= set(self._needed):
             return
         scan_ns = newest[SCAN].stamp_ns
         if scan_ns < self._acted_ns:  # a simulation's clock was set back
@@ -181,7 +182,7 @@ class PolicyNode(ManagedNode):
 
     def _look(self) -> runner.Condition:
         if self.state == UNCONFIGURED:
-            return runner.Condition(self.state, warns=False, facts={})
+            return runner.Condition(self.state, runner.OK, facts={})
         done = self._deadline
         longest = f"{1e3 * self._deadline.longest_s:.2f}"
         facts: dict[str, object] = {
@@ -191,9 +192,16 @@ class PolicyNode(ManagedNode):
         }
         if self._answer is not None:
             facts.update(self._answer.to_facts())
-        return runner.Condition(
-            f"{self.state}; {done.late} late inferences", done.late > 0, facts
-        )
+        message = f"{self.state}; {done.late} late inferences"
+        level = runner.WARN if done.late else runner.OK
+        silent = self._topics.list_silent(self._needed, SILENCE_S)
+        if silent:
+            message = f"{message}; nothing on {', '.join(silent)}"
+            level = runner.STALE
+        elif done.stops:
+            message = f"{message}, the robot is stopped"
+            level = runner.ERROR
+        return runner.Condition(message, level, facts, self._model.robot.name)
 
     def _twist(self) -> Array:
         for leader in self._leaders:

@@ -1,6 +1,5 @@
 """Processes of the package's nodes with a reliable end, and a witness of what they do."""
 
-import json
 import os
 import random
 import time
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from diagnostic_msgs.srv import SelfTest
 from nav_msgs.msg import Odometry
 from numpy.typing import ArrayLike, NDArray
 
@@ -121,21 +121,26 @@ class Witness(AbstractContextManager["Witness", None]):
 
     def arms(self, gate: str, timeout_s: float) -> str:
         """Ask a gate to arm until it agrees; return its last reason for refusing, or ''."""
-        answer = self._ask(gate, "arm", timeout_s)
+
+        def arm() -> TriggerAnswer:
+            return Call(self._node, gate, "arm").wait_for_answer(REPLY_S)
+
+        answer = insist(arm, time.monotonic() + timeout_s, lambda _: None, gate)
         return "" if answer.granted else answer.told
 
     def touched(self, simulator: str, timeout_s: float) -> bool:
         """True if the simulated robot touched something in this episode. Raises BackendError."""
-        answer = self._ask(simulator, "touched", timeout_s)
-        if not answer.granted:
-            raise BackendError(f"the episode can't be judged: {answer.told}.")
-        return bool(np.any(json.loads(answer.told)))
-
-    def _ask(self, node: str, service: str, timeout_s: float) -> TriggerAnswer:
-        def call() -> TriggerAnswer:
-            return Call(self._node, node, service).wait_for_answer(REPLY_S)
-
-        return insist(call, time.monotonic() + timeout_s, lambda _: None, node)
+        deadline = time.monotonic() + timeout_s
+        while True:
+            call = Call(self._node, simulator, "self_test", SelfTest)
+            try:
+                response = call.wait_for_response(REPLY_S)
+            except BackendError as error:
+                if time.monotonic() > deadline:
+                    reason = f"the episode can't be judged: {error}."
+                    raise BackendError(reason) from None
+            else:
+                return not any(response.passed)
 
     def __exit__(self, *_: object) -> None:
         self._node.close()

@@ -24,8 +24,13 @@ from nics_drl_bridge.exit_codes import EXIT_BAD_INPUT
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.middleware.measurement import CMD_VEL
 from nics_drl_bridge.nodes import conversions, qos, runner
-from nics_drl_bridge.nodes.command_types import deaf_subscribers, heard_stamped
-from nics_drl_bridge.nodes.parameters import IMU, drive
+from nics_drl_bridge.nodes.command_types import (
+    SETTINGS,
+    deaf_subscribers,
+    heard_stamped,
+    name_of,
+)
+from nics_drl_bridge.nodes.parameters import IMU, STAMPED, drive
 from nics_drl_bridge.recording.bag_file import Message
 from nics_drl_bridge.recording.excite import PERIOD_S, STILL_S, DrivePlan
 from nics_drl_bridge.recording.imu_axis import GyroReader
@@ -193,8 +198,8 @@ class RecordNode(qos.BridgeNode):
         self._steady_origin_ns = time.time_ns() - time.monotonic_ns()
         self._log = DriveLog(self._plan.robot, roles, self._now_ns)
         self._topic: Publisher | None = None
-        if "stamped" in qos.given_values(self):
-            self._speak(runner.get_flag(self, "stamped"))
+        if STAMPED in qos.given_values(self):
+            self._speak(runner.get_flag(self, STAMPED))
         self.create_subscription(Odometry, "odom", self._on_odometry, qos.SENSOR)
         self.create_subscription(
             JointState, "joint_states", self._log.joints, qos.SENSOR
@@ -269,7 +274,7 @@ class RecordNode(qos.BridgeNode):
         topic = self.resolve_topic_name(CMD_VEL)
         if self._topic is None and self.count_subscribers(topic):
             heard = heard_stamped(self, CMD_VEL)
-            self._speak(runner.get_flag(self, "stamped") if heard is None else heard)
+            self._speak(runner.get_flag(self, STAMPED) if heard is None else heard)
         listened = self._topic is not None and self._topic.get_subscription_count() > 0
         if listened and self._pose is not None and self._now_ns() > 0:
             others = self.count_publishers(topic) - 1
@@ -291,7 +296,8 @@ class RecordNode(qos.BridgeNode):
             if self._pose is not None and self._topic is not None:
                 deaf = deaf_subscribers(self, CMD_VEL, self._stamped)
                 if deaf:
-                    fix = f"set stamped:={str(not self._stamped).lower()}, or leave it out."
+                    setting = SETTINGS[name_of(not self._stamped)]
+                    fix = f"set {setting}, or leave it out."
                     raise BackendError(f"topic {self._place(name)}: {deaf}; {fix}")
             raise BackendError(f"topic {self._place(name)}: {reason}; {fix}")
         return False

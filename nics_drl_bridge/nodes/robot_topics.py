@@ -1,7 +1,7 @@
 """A robot's topics, fed into the middleware; used by all listening nodes."""
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
 
@@ -19,7 +19,7 @@ from sensor_msgs.msg import Imu, LaserScan
 from nics_drl_bridge import defaults, geometry
 from nics_drl_bridge.errors import BridgeError, ConfigError, suggest
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import S_PER_NS, Array, RobotView
+from nics_drl_bridge.interface import NS_PER_S, S_PER_NS, Array, RobotView
 from nics_drl_bridge.lidar.sectors import Reader
 from nics_drl_bridge.lidar.sensor import Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec, from_device
@@ -41,6 +41,7 @@ from nics_drl_bridge.recording import messages
 from nics_drl_bridge.recording.imu_axis import GyroReader
 from nics_drl_bridge.recording.topic_roles import IMU_NAMES, list_imu_topics
 
+SILENCE_S = 5.0  # diagnostics call a topic stale that has been silent for this long [s]
 KINDS_OF_POSE = {
     kind.__name__: kind for kind in (PoseStamped, PoseWithCovarianceStamped)
 }
@@ -223,6 +224,16 @@ class RobotTopics:
         """True if the robot's position in the map is known."""
         is_placed = self._placed is not None or not self._posed
         return is_placed or measurement.POSE in self.middleware.cache.newest
+
+    def list_silent(self, topics: Iterable[str], longest_s: float) -> list[str]:
+        """Return the topics without a usable datum for so long [s]."""
+        newest = self.middleware.cache.newest
+        oldest_ns = self.now_ns() - longest_s * NS_PER_S
+        return [
+            topic
+            for topic in topics
+            if topic not in newest or newest[topic].arrival_ns < oldest_ns
+        ]
 
     def view(self) -> RobotView:
         """Return the view at the stamp of the newest datum."""

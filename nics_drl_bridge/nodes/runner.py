@@ -238,32 +238,41 @@ def unknown(node: Node) -> list[str]:
     return sentences
 
 
+OK = DiagnosticStatus.OK
+WARN = DiagnosticStatus.WARN  # it needs attention
+ERROR = DiagnosticStatus.ERROR  # a fault stops the robot
+STALE = DiagnosticStatus.STALE  # data have stopped to arrive
+
+
 class Condition(NamedTuple):
     """Condition of a node."""
 
     message: str  # one line
-    warns: bool  # it needs attention
-    facts: Mapping[str, object]  # further ones, for people
+    level: bytes  # `OK`, `WARN`, `ERROR` or `STALE`
+    facts: Mapping[str, object]  # further ones
     hardware: str = ""  # concerned, such as the robot's name
+
+
+def status_to_ros(node: Node, part: str, condition: Condition) -> DiagnosticStatus:
+    """Return the condition of a node, or of a part of it, as it is diagnosed."""
+    return DiagnosticStatus(
+        level=condition.level,
+        name=f"{node.get_fully_qualified_name()}: {part}",
+        message=condition.message,
+        hardware_id=condition.hardware,
+        values=[
+            KeyValue(key=key, value=str(value))
+            for key, value in condition.facts.items()
+        ],
+    )
 
 
 def diagnose(node: Node, part: str, look: Callable[[], Condition]) -> None:
     """Publish a node's finding about itself, which `look` returns, once a second."""
     topic = node.create_publisher(DiagnosticArray, "/diagnostics", qos.DIAGNOSTICS)
-    name = f"{node.get_fully_qualified_name()}: {part}"
 
     def publish() -> None:
-        condition = look()
-        level = DiagnosticStatus.WARN if condition.warns else DiagnosticStatus.OK
-        values = [
-            KeyValue(key=key, value=str(value))
-            for key, value in condition.facts.items()
-        ]
-        status = DiagnosticStatus(
-            level=level, name=name, message=condition.message, values=values
-        )
-        status.hardware_id = condition.hardware
-        message = DiagnosticArray(status=[status])
+        message = DiagnosticArray(status=[status_to_ros(node, part, look())])
         message.header.stamp = node.get_clock().now().to_msg()
         topic.publish(message)
 

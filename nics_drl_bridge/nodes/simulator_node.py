@@ -2,7 +2,6 @@
 
 import heapq
 import itertools
-import json
 import math
 import time
 from collections.abc import Callable, Collection, Sequence
@@ -10,6 +9,7 @@ from functools import partial
 from typing import Any, cast
 
 import numpy as np
+from diagnostic_msgs.srv import SelfTest
 from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
@@ -38,9 +38,10 @@ from nics_drl_bridge.nodes import (
 from nics_drl_bridge.nodes.command_types import KINDS, TypeWatch, name_of
 from nics_drl_bridge.nodes.conversions import sensor_to_ros, sensor_type
 from nics_drl_bridge.nodes.frames import odom_in_map, transform_to_ros
-from nics_drl_bridge.nodes.link import identity
+from nics_drl_bridge.nodes.link import EPISODE_NS, identity
 from nics_drl_bridge.nodes.message_packages import how_to_install
 from nics_drl_bridge.nodes.parts import open_parts
+from nics_drl_bridge.nodes.runner import OK, WARN
 from nics_drl_bridge.nodes.world_topics import WorldTopics
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.device import LEAST_VARIANCE, DeviceWorld, Sensed, variances
@@ -52,6 +53,8 @@ CLOCK = "/clock"
 CLOCK_NS = 15_000_000
 WATCH_S = 2.0
 QUIET_S = 5.0
+LAGGING_S = 5.0  # diagnostics warn for so long after it fell behind real time
+PART = "simulator"  # how the name of its status ends
 # longest time between two checks for delayed data that are due [s]
 LONGEST_TICK_S = 0.005
 
@@ -119,12 +122,14 @@ class RobotPort:
     ) -> None:
         self._node = node
         self._model = model
+        self.name = namespace.strip("/") or model.robot.name
         self.frames = frames
         self._outbox = outbox
         self._publishers: list[Publisher] = []
         self.inlet: CommandInlet  # of the robot's commands
         self.command_ns = 0  # time of the newest command
         self.has_command = False  # in lock-step: since the last step
+        self._joint_writer = conversions.JointWriter(model.robot)
         self._send = partial(outbox.send, late=time.odom_late_ns)
         self._send_scan = partial(outbox.send, late=time.scan_late_ns)
 
@@ -194,7 +199,7 @@ class RobotPort:
         )
         self._send(self._odoms, odometry, now_ns)
         if self._joints.get_subscription_count():
-            joints = conversions.joints_to_ros(self._model.robot, sensed.state, now_ns)
+            joints = self._joint_writer.write(sensed.state, now_ns)
             self._send(self._joints, joints, now_ns)
         if self._truths.get_subscription_count():
             self._truths.publish(
@@ -318,6 +323,7 @@ class DeviceNode(qos.BridgeNode):
         self.use_world(load_worlds(runner.get_text(self, "world")))
         self.paused = False
         self._lags = 0
+        self._lagged_s = -math.inf  # last time that it fell behind, on the steady clock
         self._hardware = model.robot.name
         self._told_ns = 0  # newest time on `/clock`
         self.device.advance()  # compiles before any peer waits
@@ -369,8 +375,9 @@ class DeviceNode(qos.BridgeNode):
         runner.serve(self, "~/reset", self._reset)
         self.create_service(SetBool, "~/pause", self._on_pause)
         runner.serve(self, "~/repeat", self._repeat)
-        runner.serve(self, "~/touched", lambda: (True, json.dumps(self.device.touched)))
-        runner.diagnose(self, "simulator", self._look)
+        runner.serve(self, "~/touched", self._list_touched)
+        self.create_service(SelfTest, "~/self_test", self._test)
+        runner.diagnose(self, PART, self._look)
 
     def _open_robot(self, name: str) -> None:
         space = f"{name}/" if name else ""
@@ -465,10 +472,31 @@ class DeviceNode(qos.BridgeNode):
             "robots": len(self._names),
             "simulated time [s]": f"{self.now_ns / NS_PER_S:.3f}",
             "times it fell behind real time": self._lags,
+            EPISODE_NS: self._episode_ns,
             **self._identity,
         }
+        for port, touched in zip(self._ports, self.device.touched, strict=True):
+            facts[f"touched, {port.name}"] = touched
         message = "paused" if self.paused else "running"
-        return runner.Condition(message, False, facts, self._hardware)
+        level = OK
+        if time.monotonic() - self._lagged_s < LAGGING_S:
+            message = "behind real time"
+            level = WARN
+        return runner.Condition(message, level, facts, self._hardware)
+
+    def _test(
+        self, _: SelfTest.Request, response: SelfTest.Response
+    ) -> SelfTest.Response:
+        """Answer what is simulated since when; it passes unless a robot touched something."""
+        response.id = self._hardware
+        response.passed = bytes([not any(self.device.touched)])
+        response.status = [runner.status_to_ros(self, PART, self._look())]
+        return response
+
+    def _list_touched(self) -> tuple[bool, str]:
+        touched = zip(self._ports, self.device.touched, strict=True)
+        names = [port.name for port, has_touched in touched if has_touched]
+        return True, f"touched something: {', '.join(names) or 'nobody'}"
 
     def _too_old(self, stamp_ns: int) -> bool:
         """Return whether a command of a time is over; in lock-step it never is."""
@@ -497,6 +525,7 @@ class DeviceNode(qos.BridgeNode):
         steady_ns = time.monotonic_ns()
         if self._real_time.lost(steady_ns, self.now_ns):
             self._lags += 1
+            self._lagged_s = time.monotonic()
             fix = "choose a lower rate, scan_rate or odom_rate, or fewer robots"
             warning = f"this machine does not keep up with real time; {fix}"
             self.get_logger().warning(warning, throttle_duration_sec=5.0)
@@ -534,16 +563,15 @@ class DeviceNode(qos.BridgeNode):
 
     def begin(self, rewind: bool = False) -> None:
         """Begin the episode of the parameters; if `rewind`, set time back to its start."""
-        is_given = runner.get_flag(self, "episode_start_given")
-        start = np.array(self.get_parameter("episode_start").value, dtype=np.float64)
-        seed = int(runner.get_number(self, "episode_seed"))
+        seed = int(self.get_parameter("episode_seed").value)
         # comes first: if it raises, the present episode goes on
-        self.device.begin(seed, start if is_given else None)
+        self.device.begin(seed, device_parameters.episode_start(self))
         if rewind:
             self.now_ns = self._first_ns
         for port in self._ports:
             port.has_command = False
         self.now_ns += self._time.step_ns
+        self._episode_ns = self.now_ns
         self._publish_after_jump()
 
     def rewind(self) -> None:
@@ -586,7 +614,7 @@ class DeviceNode(qos.BridgeNode):
             self.begin()
         except BridgeError as error:
             return False, str(error)
-        return True, json.dumps({"stamp_ns": self.now_ns, **self._identity})
+        return True, f"an episode began at {self._episode_ns / NS_PER_S:.3f} s"
 
     def _on_pause(
         self, request: SetBool.Request, response: SetBool.Response

@@ -50,7 +50,6 @@ FLAGS = (
     "rviz",
     "stamped",
     "use_robot_state_pub",
-    "use_rviz",
     "use_sim_time",
 )
 FLAG_WORDS = {"true": "true", "1": "true", "false": "false", "0": "false", "": ""}
@@ -65,7 +64,6 @@ class Argument:
     default: str
     about: str
     choices: tuple[str, ...] = ()
-    same_as: str = ""  # another argument whose value is the default
 
 
 @dataclass(frozen=True)
@@ -233,9 +231,8 @@ def complete(arguments: Sequence[Argument], chosen: Values) -> dict[str, str]:
         if name not in names:
             raise ConfigError(f"unknown argument {name!r}; {suggest(name, names)}")
     values: dict[str, str] = {}
-    for argument in arguments:  # an argument comes after the one that is its default
-        default = values[argument.same_as] if argument.same_as else argument.default
-        value = chosen.get(argument.name, default)
+    for argument in arguments:
+        value = chosen.get(argument.name, argument.default)
         if argument.choices and value not in argument.choices:
             hint = suggest(value, argument.choices)
             raise ConfigError(f"launch argument {argument.name!r} is {value!r}; {hint}")
@@ -418,8 +415,7 @@ def of_description() -> list[Argument]:
     return [
         Argument("use_robot_state_pub", installed, "Start robot_state_publisher"),
         Argument("urdf", "", "URDF file of the robot; empty: the model's"),
-        Argument("use_rviz", "false", "Nav2's name for rviz"),
-        Argument("rviz", "", "Start RViz", same_as="use_rviz"),
+        Argument("rviz", "false", "Start RViz"),
         Argument("rviz_config", view, "Configuration file for RViz"),
     ]
 

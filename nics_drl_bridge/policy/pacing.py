@@ -38,6 +38,11 @@ class Deadline:
         self.answered = self.late = self._in_a_row = 0
         self.longest_s = 0.0
 
+    @property
+    def stops(self) -> bool:
+        """True while the robot is stopped because of late inferences."""
+        return self._in_a_row >= self._patience
+
     def judge(self, taken_s: float) -> Answer:
         """Decides what to do with a command whose inference took `taken_s`."""
         self.longest_s = max(self.longest_s, taken_s)
@@ -47,4 +52,4 @@ class Deadline:
             return Answer.SEND
         self.late += 1
         self._in_a_row += 1
-        return Answer.STOP if self._in_a_row >= self._patience else Answer.DROP
+        return Answer.STOP if self.stops else Answer.DROP

@@ -45,6 +45,8 @@ NEARER = 0.6
 MAX_FAILURES = 8
 MIN_DRIVE_S = 20.0
 LONGEST_S = 3600.0
+WIDEST_M = 1000.0  # maximum radius of the circle
+SLOWEST = 0.05  # minimum fraction of the maximum speeds
 # minimum standard deviation of a command, as a fraction of its range (0.29 if uniform)
 SPREAD = 0.17
 MAX_COMMAND_CORRELATION = 0.6  # maximum correlation of two commands
@@ -384,9 +386,9 @@ class DrivePlan:
     def __post_init__(self) -> None:
         check_seeds(self.seed)
         for name, value, low, high, unit in (
-            ("bound", self.bound, self.robot.footprint_radius, 1000.0, " m"),
+            ("bound", self.bound, self.robot.footprint_radius, WIDEST_M, " m"),
             ("duration", self.duration, MIN_DRIVE_S, LONGEST_S, " s"),
-            ("speed", self.speed, 0.05, 1.0, ""),
+            ("speed", self.speed, SLOWEST, 1.0, ""),
         ):
             if not low <= value <= high:
                 raise ConfigError(

@@ -108,11 +108,10 @@ def starter(
             **parameters: Any,
         ) -> Any:
             folder: Path = tmp_path_factory.mktemp(f"{node}_{next(numbers)}")
-            stamped = "stamped" if node == "record_node" else "enable_stamped_cmd_vel"
             own = {"model": model_folder}
             if node == "record_node":
                 own = {"robot": "ackermann"}
-            parameters = {**own, stamped: False} | parameters
+            parameters = {**own, "enable_stamped_cmd_vel": False} | parameters
             LAUNCHED.append(kind(node, folder, parameters, domain_id, namespace, remap))
             return started.enter_context(LAUNCHED[-1])
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from diagnostic_msgs.srv import SelfTest
 from nav_msgs.msg import Odometry
 from numpy.typing import ArrayLike
 from rcl_interfaces.srv import GetParameters, SetParametersAtomically
@@ -107,6 +108,11 @@ class Peer:
         )
         self.node.destroy_client(client)
         return answered()[0]
+
+    def read_episode(self, simulator: str = "simulator_node") -> dict[str, str]:
+        """What a simulator tells of the present episode."""
+        (status,) = self.call(SelfTest, f"{simulator}/self_test").status
+        return {pair.key: pair.value for pair in status.values}
 
     def be_known_to(self, node: str) -> None:
         """Waits until a node knows all that listens here: its answer shows that it does.

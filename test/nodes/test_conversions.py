@@ -137,11 +137,16 @@ def test_a_device_that_turns_while_it_measures_says_so_in_the_header():
 
 def test_a_state_is_told_by_joints_of_its_names():
     car = load_robot("ackermann")
-    message = over_the_wire(conversions.joints_to_ros(car, [0.7, -0.3], 5_000_000_007))
+    writer = conversions.JointWriter(car)
+    writer.write(np.array([0.5, 0.0]), 4_000_000_007)
+    message = over_the_wire(writer.write(np.array([0.7, -0.3]), 5_000_000_007))
     assert conversions.stamp_from_ros(message.header.stamp) == 5_000_000_007
     assert message.name == ["speed", "steering"]
-    assert list(message.velocity) == [0.7, 0.0]
-    assert list(message.position) == [0.0, -0.3]
+    assert list(message.velocity) == pytest.approx([0.7, np.nan], nan_ok=True)
+    assert list(message.position) == pytest.approx([0.6, -0.3])
+    # A clock that is set back turns no joint.
+    message = writer.write(np.array([0.7, -0.3]), 1_000_000_000)
+    assert list(message.position) == pytest.approx([0.6, -0.3])
 
 
 def test_an_imu_gives_its_yaw_rate_and_variance_unless_it_has_none():

@@ -1,4 +1,3 @@
-import json
 from dataclasses import replace
 from importlib import import_module
 from importlib.util import find_spec
@@ -10,6 +9,7 @@ from nics_drl_bridge.interface import NS_PER_S
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
+from diagnostic_msgs.srv import SelfTest
 from domains import claimed_domain
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
@@ -19,6 +19,7 @@ from std_srvs.srv import Trigger
 
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.device_parameters import declare_device, timing
+from nics_drl_bridge.nodes.link import EPISODE_NS
 from nics_drl_bridge.robot.noise import Delay, Latency
 from nodes.peer import pose_of, stamp_ns
 
@@ -37,13 +38,13 @@ class Fleet:
         self.commands = {name: peer.speak(Twist, f"{name}/cmd_vel") for name in NAMES}
 
     def reset(self, start):
-        given = {"episode_start": start, "episode_start_given": True}
-        assert self.peer.set_parameters("simulator_node", **given).successful
+        set_start = self.peer.set_parameters("simulator_node", episode_start=start)
+        assert set_start.successful
         for _ in range(20):
             answer = self.peer.call(Trigger, "simulator_node/reset")
             if not answer.success:
                 return answer
-            stamp = json.loads(answer.message)["stamp_ns"]
+            stamp = int(self.peer.read_episode()[EPISODE_NS])
             try:
                 self.peer.until(
                     lambda stamp=stamp: self.stamps() == {stamp}, "first data", 1.5
@@ -95,6 +96,28 @@ def test_a_fleet_moves_when_each_of_its_robots_has_a_command(fleet):
         lambda: fleet.stamps() == {now + NS_PER_S // 10}, "a step of the fleet"
     )
     assert fleet.x("left") > 0.0
+
+
+def test_who_has_touched_something_is_told_by_a_self_test_and_in_words(fleet):
+    def has_passed():
+        return any(fleet.peer.call(SelfTest, "simulator_node/self_test").passed)
+
+    def read_words():
+        return fleet.peer.call(Trigger, "simulator_node/touched").message
+
+    fleet.reset(FACING)
+    assert has_passed()
+    assert read_words() == "touched something: nobody"
+    for _ in range(20):
+        (now,) = fleet.stamps()
+        for name in NAMES:
+            fleet.command(name, 0.5)
+        after = {now + NS_PER_S // 10}
+        fleet.peer.until(lambda after=after: fleet.stamps() == after, "a step")
+    assert not has_passed()
+    facts = fleet.peer.read_episode()
+    assert [facts[f"touched, {name}"] for name in NAMES] == ["True", "True"]
+    assert read_words() == "touched something: left, right"
 
 
 def test_the_frames_of_a_fleet_begin_with_the_namespace_of_each_robot(fleet):

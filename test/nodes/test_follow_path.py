@@ -112,7 +112,7 @@ def path(*points, frame="map"):
 
 @pytest.fixture(scope="module")
 def tree(launch, meet, module_domain_id):
-    start = {"episode_start": [-2.0, -2.0, 0.0], "episode_start_given": True}
+    start = {"episode_start": [-2.0, -2.0, 0.0]}
     simulator = launch(
         "simulator_node", module_domain_id, mode="lockstep", world="empty", **start
     )

@@ -9,6 +9,7 @@ pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
 from gate.rig import Rig, config
 
+from nics_drl_bridge.gate import inputs
 from nics_drl_bridge.gate.black_box import MOST_INPUTS, Entry, replay
 from nics_drl_bridge.nodes import gate_log
 from nics_drl_bridge.nodes.black_box_writer import FILES_KEPT, prune
@@ -20,6 +21,7 @@ from nics_drl_bridge.nodes.gate_log import (
     BlackBox,
     GateLog,
 )
+from nics_drl_bridge.nodes.runner import ERROR, OK, STALE, WARN
 
 DEADLINE_S = 20.0
 LONG_S = 60.0
@@ -77,6 +79,28 @@ def log(tmp_path, logger):
     made = GateLog(config(), tmp_path, "car", logger)
     yield made
     made.close()
+
+
+def test_its_level_tells_an_unarmed_gate_a_fault_and_a_silent_source_apart(log):
+    rig = Recorded(log)
+    rig.run(0.2)
+    levels = {"unarmed": log.finding(rig.state).level}
+    rig.drive()
+    levels["driving"] = log.finding(rig.state).level
+    rig.stop_by_nonsense()
+    levels["nonsense"] = log.finding(rig.state).level
+    rig.go_on(1.0)
+    rig.run(0.5, without="scan")
+    levels["no scan"] = log.finding(rig.state).level
+    rig.give(inputs.EStop(True))
+    levels["e-stop"] = log.finding(rig.state).level
+    assert levels == {
+        "unarmed": WARN,
+        "driving": OK,
+        "nonsense": ERROR,
+        "no scan": STALE,
+        "e-stop": ERROR,
+    }
 
 
 def files(folder):

@@ -19,7 +19,7 @@ GIVEN = [
         "model": "mecanum",
         "namespace": "hall",
         "use_robot_state_pub": "true",
-        "use_rviz": "1",
+        "rviz": "1",
     },
 ]
 

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.ros
 def managed(launch, meet, module_domain_id):
     """A driving simulator, and a policy and a middleware that wait to be led."""
     peer = meet(module_domain_id)
-    start = {"episode_start": [-2.0, 0.0, 0.0], "episode_start_given": True}
+    start = {"episode_start": [-2.0, 0.0, 0.0]}
     simulator = launch("simulator_node", module_domain_id, world="empty", **start)
     nodes = [
         launch("policy_node", module_domain_id, autostart=False, goal=[2.0, 0.0]),

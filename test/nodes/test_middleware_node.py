@@ -1,5 +1,4 @@
 import contextlib
-import json
 import math
 from dataclasses import replace
 
@@ -21,7 +20,9 @@ from std_srvs.srv import Trigger
 
 from nics_drl_bridge.middleware.measurement import Health, Rejection, TopicHealth
 from nics_drl_bridge.nodes import conversions
-from nics_drl_bridge.nodes.middleware_node import MiddlewareNode, silence
+from nics_drl_bridge.nodes.link import EPISODE_NS
+from nics_drl_bridge.nodes.middleware_node import MiddlewareNode, judge_topics
+from nics_drl_bridge.nodes.runner import ERROR, OK, STALE
 from nodes.peer import odometry, pose_of, stamp_ns
 
 pytestmark = pytest.mark.ros
@@ -71,9 +72,8 @@ def driven(launch, meet, module_domain_id, tmp_path_factory):
         """Resets both, and steps until all have found each other."""
         for _ in range(10):
             assert peer.call(Trigger, "middleware_node/reset").success
-            stamp = json.loads(peer.call(Trigger, "simulator_node/reset").message)[
-                "stamp_ns"
-            ]
+            assert peer.call(Trigger, "simulator_node/reset").success
+            stamp = int(peer.read_episode()[EPISODE_NS])
             try:
                 peer.until(
                     lambda stamp=stamp: newest_ns() >= stamp, "the first estimate", 2.0
@@ -135,7 +135,7 @@ def test_what_it_can_not_use_is_counted_in_the_diagnostics(
         return diagnostics[-1].status[0]
 
     peer.until(lambda: diagnostics, "diagnostics")
-    assert status().level == DiagnosticStatus.WARN
+    assert status().level == DiagnosticStatus.STALE
     assert status().message == "nothing on scan, odom yet"
     assert status().name == "/car/middleware_node: topics"
     assert status().hardware_id == "ackermann"
@@ -309,14 +309,21 @@ def test_topics_whose_data_are_refused_are_told_apart_from_silent_ones():
     heard = TopicHealth(1, 10.0, 0.1)
     told = "scan: 41 refused, the last: shape (7,), not (720,)"
     first = Health({}, counts)
-    assert silence(first, expected, {}) == f"nothing on odom yet; {told}"
-    assert silence(first, expected, counts) == "nothing on scan, odom yet"
+    assert judge_topics(first, expected, {}) == (ERROR, f"nothing on odom yet; {told}")
+    assert judge_topics(first, expected, counts) == (STALE, "nothing on scan, odom yet")
     before = counts | {Rejection("scan", "shape (7,), not (720,)"): 30}
-    assert silence(Health({"odom": heard}, counts), expected, before) == told
+    assert judge_topics(Health({"odom": heard}, counts), expected, before) == (
+        ERROR,
+        told,
+    )
     stale = {"scan": replace(heard, age_s=6.0), "odom": heard}
-    assert silence(Health(stale, counts), expected, before) == told
-    assert silence(Health(stale, counts), expected, counts) == "nothing on scan for 5 s"
-    assert not silence(Health(dict.fromkeys(expected, heard), counts), expected, before)
+    assert judge_topics(Health(stale, counts), expected, before) == (ERROR, told)
+    assert judge_topics(Health(stale, counts), expected, counts) == (
+        STALE,
+        "nothing on scan for 5 s",
+    )
+    well = Health(dict.fromkeys(expected, heard), counts)
+    assert judge_topics(well, expected, before) == (OK, "")
 
 
 def test_a_pose_type_that_does_not_exist_is_refused_with_the_nearest(make_node):

@@ -32,11 +32,7 @@ def test_a_client_without_ros_reads_scans_and_drives(library, launch, meet, doma
     if not installed(library):
         pytest.skip(f"{library} is not installed; run nox -s clients")
     # The wall ahead is within the lidar's reach.
-    start = {
-        "world": "empty",
-        "episode_start": [1.0, 0.0, 0.0],
-        "episode_start_given": True,
-    }
+    start = {"world": "empty", "episode_start": [1.0, 0.0, 0.0]}
     simulator = launch("simulator_node", domain_id, **start)
     peer = meet(domain_id)
     scans = peer.listen(LaserScan, "scan")

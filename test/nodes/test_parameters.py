@@ -130,8 +130,7 @@ def test_commands_are_stamped_since_kilted(monkeypatch, distribution, stamped):
     assert stamped_by_default() is stamped
     for node in NODES:
         rows = {row.name: row.default for row in NODES[node]().parameters}
-        name = "stamped" if node == "record_node" else "enable_stamped_cmd_vel"
-        assert rows[name] is stamped
+        assert rows["enable_stamped_cmd_vel"] is stamped
 
 
 def test_without_a_sourced_distribution_its_wheels_tell_which_it_is(monkeypatch):

@@ -37,7 +37,7 @@ def driving(launch, meet, module_domain_id):
         lambda raw: commands.publish(raw.twist),
         qos.COMMAND,
     )
-    start = {"episode_start": [-2.0, 0.0, 0.0], "episode_start_given": True}
+    start = {"episode_start": [-2.0, 0.0, 0.0]}
     simulator = launch(
         "simulator_node", module_domain_id, world="empty", rate=RATE, **start
     )
@@ -105,7 +105,7 @@ def test_with_a_pose_sensor_it_waits_until_it_knows_where_in_the_map_it_is(
     launch, meet, domain_id
 ):
     peer = meet(domain_id)
-    start = {"episode_start": [-2.0, 0.0, 0.0], "episode_start_given": True}
+    start = {"episode_start": [-2.0, 0.0, 0.0]}
     simulator = launch("simulator_node", domain_id, world="empty", **start)
     policy = launch("policy_node", domain_id, pose_type="PoseStamped", goal=[0.0, 0.0])
     raw = peer.listen(TwistStamped, "cmd_vel_raw", qos.EVERY_COMMAND)

@@ -117,6 +117,7 @@ def test_beside_a_pose_of_motion_capture_the_twist_of_the_odometry_is_taken():
 
 def test_measured_wheels_are_the_state():
     drive = Drive(WHEELED).goes(0, 5)
+    joints = conversions.JointWriter(WHEELED)
     with pytest.raises(
         BackendError, match="'joint_states': nothing has arrived, but left_wheel"
     ):
@@ -124,7 +125,7 @@ def test_measured_wheels_are_the_state():
     for k in range(5, 30):
         drive.goes(k, k + 1)
         stamp = START_NS + k * PERIOD_NS
-        drive.log.joints(conversions.joints_to_ros(WHEELED, [0.5 * k, -0.5 * k], stamp))
+        drive.log.joints(joints.write(np.array([0.5 * k, -0.5 * k]), stamp))
     drive.log.check()
     assert drive.log.recording().state.values[-1] == pytest.approx([14.5, -14.5])
 

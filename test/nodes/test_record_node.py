@@ -97,7 +97,8 @@ def test_ctrl_c_leaves_a_zero_command_and_a_whole_recording(
 def test_sigterm_and_stamped_commands_in_a_namespace(launch, meet, domain_id, tmp_path):
     robot = FakeRobot(meet(domain_id, "bot"), TwistStamped)
     out = tmp_path / "drive.npz"
-    node = launch("record_node", domain_id, "bot", out=str(out), stamped=True)
+    stamped = {"enable_stamped_cmd_vel": True}
+    node = launch("record_node", domain_id, "bot", out=str(out), **stamped)
     robot.until(lambda: robot.heard and robot.heard[-1].twist != Twist(), "it drives")
     assert conversions.stamp_from_ros(robot.heard[-1].header.stamp) > 0
     node._process.send_signal(signal.SIGTERM)

@@ -1,5 +1,4 @@
 import itertools
-import json
 import math
 import time
 from types import SimpleNamespace
@@ -16,6 +15,7 @@ from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
 from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState, LaserScan
 from std_srvs.srv import SetBool, Trigger
@@ -23,6 +23,9 @@ from std_srvs.srv import SetBool, Trigger
 from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.extras.simulation_interfaces.roster import Entities
 from nics_drl_bridge.nodes import conversions, simulator_node
+from nics_drl_bridge.nodes.link import EPISODE_NS
+from nics_drl_bridge.robot.spec import load_robot
+from nics_drl_bridge.sim.simulator import EpisodeSampler
 from nics_drl_bridge.sim.world import load_world
 from nodes.peer import pose_of, stamp_ns
 
@@ -53,8 +56,8 @@ class Watched:
         for _ in range(20):
             answer = self.peer.call(Trigger, "simulator_node/reset")
             assert answer.success, answer.message
-            facts = json.loads(answer.message)
-            if self.has(facts["stamp_ns"], patience_s=1.5):
+            facts = self.peer.read_episode()
+            if self.has(int(facts[EPISODE_NS]), patience_s=1.5):
                 return facts
         raise AssertionError(f"no data after a reset: {facts}")
 
@@ -119,7 +122,7 @@ def period_ns(model):
 def test_each_command_brings_exactly_one_scan_and_odometry_one_period_later(
     lockstep, period_ns
 ):
-    now = lockstep.reset()["stamp_ns"]
+    now = int(lockstep.reset()[EPISODE_NS])
     for _ in range(
         3
     ):  # each call makes the node spin, and without a command time stands
@@ -131,7 +134,7 @@ def test_each_command_brings_exactly_one_scan_and_odometry_one_period_later(
 
 
 def test_a_paused_simulator_ignores_commands_until_it_goes_on(lockstep, period_ns):
-    now = lockstep.reset()["stamp_ns"]
+    now = int(lockstep.reset()[EPISODE_NS])
     lockstep.peer.call(SetBool, "simulator_node/pause", SetBool.Request(data=True))
     lockstep.command(0.5)
     lockstep.peer.call(SetBool, "simulator_node/pause", SetBool.Request(data=False))
@@ -155,19 +158,30 @@ def test_the_clock_and_all_stamps_only_ever_grow_also_across_resets(lockstep):
 def test_a_reset_begins_where_the_parameters_say_and_tells_what_it_runs(
     lockstep, model
 ):
-    given = {"episode_seed": 3, "episode_start_given": True}
-    facts = lockstep.reset(episode_start=[0.5, -0.25, 1.0], **given)
-    assert set(lockstep.newest()) == {facts["stamp_ns"]}
+    facts = lockstep.reset(episode_seed=3, episode_start=[0.5, -0.25, 1.0])
+    assert set(lockstep.newest()) == {int(facts[EPISODE_NS])}
     assert facts["model"] == model.fingerprint
     assert facts["world"] == load_world("arena").fingerprint
     for topic in ("odom", "ground_truth"):
         pose, twist = conversions.odometry_from_ros(lockstep.said[topic][-1])
         assert pose == pytest.approx([0.5, -0.25, 1.0])
         assert twist.tolist() == [0.0, 0.0, 0.0]
-    lockstep.reset(episode_start_given=False)
-    lockstep.reset(episode_start=[-0.5, 0.75, 2.0])  # alone it holds too
-    pose = pose_of(lockstep.said["ground_truth"][-1])
-    assert pose == pytest.approx([-0.5, 0.75, 2.0])
+    lockstep.reset(episode_start=[math.nan] * 3)
+    (drawn,) = EpisodeSampler(model, load_world("arena")).draw([3])[0].starts[0]
+    assert pose_of(lockstep.said["ground_truth"][-1]) == pytest.approx(drawn)
+
+
+def test_setting_a_start_changes_no_other_parameter(make_node):
+    node = make_node("world:=empty", kind=simulator_node.SimulatorNode)
+
+    def values():
+        parameters = node.get_parameters_by_prefix("").items()
+        return {(name, str(parameter.value)) for name, parameter in parameters}
+
+    before = values()
+    start = Parameter("episode_start", value=[0.5, 0.0, 1.0])
+    assert node.set_parameters([start])[0].successful
+    assert {name for name, _ in values() - before} == {"episode_start"}
 
 
 def test_commands_are_as_old_as_before_when_time_is_put_back(make_node, model_folder):
@@ -188,8 +202,9 @@ def test_commands_are_as_old_as_before_when_time_is_put_back(make_node, model_fo
 @pytest.mark.parametrize(
     ("values", "reason"),
     [
-        ({"episode_seed": -1}, "episode_seed must be 0 or more"),
+        ({"episode_seed": -1}, "episode_seed"),
         ({"episode_start": [1.0, 2.0, math.inf]}, "three finite numbers"),
+        ({"episode_start": [1.0, 2.0, math.nan]}, "three finite numbers"),
         ({"episode_start": 6 * [1.0]}, "episode_start has 6 numbers; give 3"),
         ({"episode_seed": 1.5}, "type"),
         ({"world": "empty"}, "read-only"),
@@ -206,7 +221,7 @@ def test_a_command_that_can_not_be_used_is_ignored_and_told(lockstep, period_ns)
         lockstep.commands.publish(b"\0\7\0\0" + bytes(48))
         return "can't be read" in lockstep.log.read_text()
 
-    now = lockstep.reset()["stamp_ns"]
+    now = int(lockstep.reset()[EPISODE_NS])
     lockstep.peer.until(said, "a warning")
     for bad in (math.nan, math.inf, -math.inf):
         lockstep.command(bad)
@@ -295,6 +310,27 @@ def test_its_joints_tell_the_state_at_the_stamps_of_its_odometry(
     )
 
 
+def test_wheels_turn_as_far_as_the_robot_drives(launch, meet, domain_id):
+    launch("simulator_node", domain_id, model="differential", world="empty")
+    peer = meet(domain_id)
+    joints = peer.listen(JointState, "joint_states")
+    truth = peer.listen(Odometry, "ground_truth")
+    command = peer.speak(Twist, "cmd_vel")
+    ahead = conversions.twist_to_ros([0.5, 0.0, 0.0])
+    peer.until(
+        lambda: command.publish(ahead) or (joints and joints[-1].position[0] > 10.0),
+        "turning wheels",
+    )
+    poses = {stamp_ns(message): pose_of(message) for message in truth}
+    both = [message for message in joints if stamp_ns(message) in poses]
+    first, last = both[0], both[-1]
+    radius = load_robot("differential").parameters["wheel_radius"]
+    way = poses[stamp_ns(last)] - poses[stamp_ns(first)]
+    turned = np.subtract(last.position, first.position)
+    assert last.name == ["left_wheel", "right_wheel"]
+    assert radius * turned == pytest.approx([np.hypot(*way[:2])] * 2, rel=0.02)
+
+
 @pytest.mark.parametrize(
     ("parameter", "error", "reason"),
     [
@@ -303,7 +339,7 @@ def test_its_joints_tell_the_state_at_the_stamps_of_its_odometry(
         ("world:=areena", BridgeError, "did you mean 'arena'"),
         ("rate:=fast", ParameterException, "rate"),
         ("rate:=-1.0", ParameterException, "rate"),
-        ("episode_start:=[1.0, 2.0]", ParameterException, "three finite numbers"),
+        ("episode_start:=[1.0, 2.0]", ParameterException, "has 2 numbers; give 3"),
         ("base_frame:=map", BridgeError, "must differ"),
     ],
 )

@@ -101,9 +101,11 @@ def test_a_drive_whose_chosen_type_nobody_hears_names_who_hears_the_other(
     odom = peer.node.create_publisher(Odometry, "odom", qos.SENSOR_RELIABLE)
     peer.node.create_timer(0.02, lambda: odom.publish(Odometry()))
     out = str(tmp_path / "d.npz")
-    node = launch("record_node", domain_id, out=out, stamped=not other)
+    chosen = {"enable_stamped_cmd_vel": not other}
+    node = launch("record_node", domain_id, out=out, **chosen)
+    fix = f"set enable_stamped_cmd_vel:={str(other).lower()}"
     peer.until(
-        lambda: f"set stamped:={str(other).lower()}" in node.read_text(),
+        lambda: fix in node.read_text(),
         "the reason",
     )
     assert "expects geometry_msgs/msg/" in node.read_text()

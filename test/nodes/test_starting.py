@@ -149,14 +149,13 @@ def test_every_parameter_has_the_type_that_its_node_declares(monkeypatch):
     )
 
 
-def test_rviz_starts_by_either_name_and_shows_the_first_robot():
-    for name in ("rviz", "use_rviz"):
-        nodes = LAUNCHES["fleet"]().nodes({name: "true"})
-        (view,) = [node for node in nodes if node.package == starting.RVIZ]
-        assert view.namespace == "robot1"
-        assert view.arguments[0] == "-d"
-        assert ("/scan", "scan") in view.remappings
-        assert not view.params_file
+def test_rviz_shows_the_first_robot():
+    nodes = LAUNCHES["fleet"]().nodes({"rviz": "true"})
+    (view,) = [node for node in nodes if node.package == starting.RVIZ]
+    assert view.namespace == "robot1"
+    assert view.arguments[0] == "-d"
+    assert ("/scan", "scan") in view.remappings
+    assert not view.params_file
 
 
 def test_every_launch_file_starts_the_launch_of_its_name():

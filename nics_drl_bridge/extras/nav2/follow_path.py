@@ -371,14 +371,7 @@ class PathActions:
             return True
         longest = runner.get_number(self._node, "costmap_update_timeout")
         longest = max(longest, PATIENT_PERIODS * self._period_s)
-        newest = self._topics.middleware.cache.newest
-        now_ns = self._topics.now_ns()
-        silent = [
-            topic
-            for topic in (SCAN, ODOM)
-            if topic not in newest
-            or (now_ns - newest[topic].arrival_ns) * S_PER_NS > longest
-        ]
+        silent = self._topics.list_silent((SCAN, ODOM), longest)
         if silent and time.monotonic() - run.valid_s > longest:
             self._run = None
             sentence = f"nothing on {' and '.join(silent)} for {longest:g} s."

@@ -5,7 +5,7 @@ import re
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import Accel, Twist
+from geometry_msgs.msg import Accel
 from simulation_interfaces.msg import EntityFilters, EntityState, Result, SpawnResult
 from simulation_interfaces.srv import SetEntityState
 
@@ -120,11 +120,9 @@ class EntityServices:
                 raise RefusalError(FAILED, fault)
             twist[:2] = geometry.rotate(twist[:2], base[2])
         still = entity.robot < 0 and entity.motion is None
-        pushed = request.set_acceleration and asked.acceleration != Accel()
-        if still and (pushed or (request.set_twist and asked.twist != Twist())):
-            what = "acceleration" if pushed else "twist"
-            fault = f"{entity.name!r} stands still and takes no {what}; leave it out."
-            raise RefusalError(FAILED, fault)
+        if still and request.set_acceleration and asked.acceleration != Accel():
+            fault = f"{entity.name!r} stands still and takes no acceleration"
+            raise RefusalError(FAILED, f"{fault}; leave it out.")
         try:
             entities.move(entity, pose, twist)
         except OutsideError as error:

@@ -24,7 +24,7 @@ class ModelFile(Schema):
     """Keys of an entity's YAML file; a single shape may stand alone, without these keys."""
 
     name: str = ""
-    description: str = ""
+    description: str = ""  # for people, like the tags
     tags: tuple[str, ...] = ()
     shapes: tuple[Shape, ...] = Field(min_length=1, max_length=MOST_PARTS)
     # pose of each shape in the entity [m, m, rad]; at its origin by default
@@ -43,8 +43,6 @@ class Model(NamedTuple):
     """An entity to spawn."""
 
     name: str
-    description: str
-    tags: tuple[str, ...]
     parts: tuple[Placed, ...]
 
 
@@ -55,9 +53,7 @@ def model_of_yaml(text: str, source: str = TEXT) -> Model:
         content = {"shapes": [content]}
     file = validate(content, ModelFile, source)
     at = file.at or ((0.0, 0.0, 0.0),) * len(file.shapes)
-    return Model(
-        file.name, file.description, file.tags, tuple(zip(file.shapes, at, strict=True))
-    )
+    return Model(file.name, tuple(zip(file.shapes, at, strict=True)))
 
 
 def model_of_sdf(text: str, z: float, source: str = TEXT) -> Model:
@@ -85,7 +81,7 @@ def model_of_sdf(text: str, z: float, source: str = TEXT) -> Model:
             standing = read_sdf(file, 0.0)
     if len(standing.placed) > MOST_PARTS:
         raise BridgeError(f"{source}: holds more than {MOST_PARTS} shapes; split it.")
-    return Model(models[0].get("name", ""), "", (), standing.placed)
+    return Model(models[0].get("name", ""), standing.placed)
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BridgeError, ConfigError, suggest
 from nics_drl_bridge.lidar.arrays import Array
 from nics_drl_bridge.lidar.exact_kernels import RADIUS, SHAPE
-from nics_drl_bridge.lidar.shapes import Shape, find_convex_hull, place
+from nics_drl_bridge.lidar.shapes import Shape, place
 from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.sim.device import DeviceWorld
 from nics_drl_bridge.sim.scenes import Scenes
@@ -22,7 +22,6 @@ from nics_drl_bridge.sim.world_set import AnyWorld
 OBSTACLE = "obstacle_"  # prefix of the name of a world's obstacle, before its number
 NAME = re.compile(r"(?=.{1,120}\Z)[A-Za-z0-9_][A-Za-z0-9_./-]*")
 REACH = 10.0  # limit of a twist set on a robot, as a multiple of its maximum command
-CORNERS = 32  # number of corners of the outline that represents a circle
 
 
 class UnknownEntityError(BridgeError):
@@ -150,15 +149,6 @@ class Entities:
             return np.zeros(3)
         moving: Array = self.simulator.data.velocity[0, entity.slots[0]].copy()
         return moving
-
-    def outlines(self, entity: Entity) -> list[Array]:
-        """Return the convex hulls (V, 2) of an entity's shapes in its own frame [m]."""
-        if entity.robot >= 0:
-            return [hull_of(self.simulator.footprint)]
-        return [
-            geometry.rotate(hull_of(shape), part[2]) + part[:2]
-            for shape, part in entity.parts
-        ]
 
     def require_inside(self, pose: Array) -> None:
         """Raise OutsideError for a pose (3,) outside the world."""
@@ -329,11 +319,3 @@ class Entities:
         self._spare = list(spare)
         self._table = table
         self.device.exchange(new, np.array(robots, np.int64))
-
-
-def hull_of(shape: Shape) -> Array:
-    """Return the convex hull (V, 2) of a shape [m], counter-clockwise; a circle has 32 corners."""
-    if len(shape.outline):
-        return find_convex_hull(shape.outline)
-    angles = np.arange(CORNERS) * (2.0 * np.pi / CORNERS)
-    return np.column_stack([np.cos(angles), np.sin(angles)]) * shape.radius

@@ -8,12 +8,12 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from diagnostic_msgs.srv import SelfTest
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistStamped
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from numpy.typing import NDArray
 from parts.spun_node import SpunNode
 from rclpy.action import ActionClient
-from std_srvs.srv import Trigger
 
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.policy.route import route
@@ -124,7 +124,7 @@ class StandIn(SpunNode):
 
     def touched(self) -> bool:
         """True if the robot has touched something."""
-        return "true" in self.call(Trigger, "simulator_node/touched").message
+        return not any(self.call(SelfTest, "simulator_node/self_test").passed)
 
 
 def path_to_ros(points: Array) -> Path:

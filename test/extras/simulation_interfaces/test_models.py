@@ -72,7 +72,7 @@ def test_every_shipped_entity_is_read():
     for file in files:
         assert model_of_yaml(
             read_text(find_config(file.stem, "entities")), str(file)
-        ).description
+        ).parts
 
 
 def test_an_sdf_model_may_hold_prefixes_that_nothing_binds():
