@@ -7,6 +7,7 @@ python benchmarks/policies.py transfer | robustness
 from __future__ import annotations
 
 import dataclasses
+import json
 import sys
 import tempfile
 import time
@@ -625,8 +626,13 @@ def measure_robustness(given: Given) -> Result:
     with one of them at parts and multiples of its declared range: with the greatest value that the
     randomisation of its training draws. The footprint is no part of that, and time constants need
     not be; they are declared in measuring/perturbations.py. Lidar, gate, shield and estimator are
-    those of a deployment, and know nothing of the perturbation; success is by the truth.
+    those of a deployment, and know nothing of the perturbation; success is by the truth. `--of
+    RESULTS` only draws the picture of earlier runs.
     """
+    if given.of:
+        runs = json.loads(given.of.read_text(encoding="utf-8"))["runs"]
+        perturbations.draw(collect_curves(runs), given.picture, MULTIPLES)
+        raise SystemExit(0)
     jobs = [
         Job(robot, world, given.episodes, tuple(given.only), given.control)
         for robot, world in product(given.robots, given.worlds)
@@ -656,6 +662,16 @@ def measure_robustness(given: Given) -> Result:
         "lost_points": lost,
         "worst": find_worst(lost),
         "episodes": episodes,
+    }
+
+
+def collect_curves(runs: Mapping[str, Any]) -> dict[str, dict[str, list[float]]]:
+    """Returns the success of all robots in results: robot -> perturbation -> by multiple."""
+    return {
+        robot: {each: list(some.values()) for each, some in own.items()}
+        for name, run in sorted(runs.items())
+        if name.startswith("robustness_") and run["result"]
+        for robot, own in run["result"]["success"].items()
     }
 
 
@@ -777,6 +793,7 @@ BENCHMARKS = {
             "worlds": some_of(ROBUST_WORLDS),
             "only": some_of(PERTURBATIONS),
             "picture": {"type": Path, "help": "draw the curves into this file"},
+            "of": {"type": Path, "help": "draw the picture of these results only"},
         },
         short="--episodes 2 --robots differential --worlds circles --only drift",
         unsettled=("",),
