@@ -234,6 +234,15 @@ def test_importing_the_package_imports_nothing_heavy():
 
 
 @pytest.mark.process
+@pytest.mark.ros
+def test_the_gate_loads_no_part_of_scipy():
+    pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+    loaded = modules_after(f"import {PACKAGE}.nodes.command_gate")
+    assert "rclpy" in loaded
+    assert not loaded & {"scipy.linalg", "scipy.ndimage", "scipy.stats", "matplotlib"}
+
+
+@pytest.mark.process
 @pytest.mark.slow
 @pytest.mark.timeout(300)  # without numba's caches, all kernels are compiled here
 def test_an_env_in_process_imports_neither_ros_nor_pictures_nor_slow_libraries():

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # its parts load slowly, when used
 from numpy.typing import NDArray
-from scipy.linalg import qr
 
 from nics_drl_bridge.errors import FitError
 from nics_drl_bridge.geometry import Array
@@ -103,7 +103,7 @@ def split_independent_columns(chi: Array) -> tuple[NDArray[np.intp], NDArray[np.
     """
     unit = chi / np.maximum(np.linalg.norm(chi, axis=0), np.finfo(np.float64).tiny)
     # no pivoting: each column is compared with its predecessors
-    apart = np.abs(np.diag(qr(unit, mode="r")[0])) > DEPENDENT
+    apart = np.abs(np.diag(scipy.linalg.qr(unit, mode="r")[0])) > DEPENDENT
     return np.flatnonzero(apart), np.flatnonzero(~apart)
 
 

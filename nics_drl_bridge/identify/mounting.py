@@ -3,8 +3,8 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy  # its parts load slowly, when used
 from numpy.typing import NDArray
-from scipy.linalg import eigh, orth
 
 from nics_drl_bridge.geometry import Array, rotate, wrap_angle
 from nics_drl_bridge.identify import clocks
@@ -118,13 +118,13 @@ def estimate_mounting_by_instruments(
     chi = taylor.evaluate(
         states / np.maximum(np.abs(states).max(axis=0), STILL), powers
     )
-    basis = orth(chi, rcond=SAME)
+    basis = scipy.linalg.orth(chi, rcond=SAME)
     count, size = basis.shape
     seen = basis @ (basis.T @ motion.twist)
     noise = (motion.twist - seen).T @ (motion.twist - seen)
     power = seen.T @ seen
     noise += RIDGE * np.trace(power + noise) * np.eye(3)
-    strength, axes = eigh(power, noise)
+    strength, axes = scipy.linalg.eigh(power, noise)
     flat = float(np.hypot(*axes[:2, 0]) / np.linalg.norm(axes[:, 0]))
     if not strength[1] * (count - size) / size > STRONG or flat < FLAT:
         return None
@@ -143,7 +143,7 @@ def estimate_mounting_by_instruments(
     odd = list_reversed_variables(spec) or ()
     aside = powers[:, [v.name in odd for v in spec.state]].sum(axis=1) % 2 == 1
     if aside.any():  # motion along x is even in what a mirror reverses
-        even = np.hstack([orth(chi[:, ~aside], rcond=SAME), seen[:, 2:]])
+        even = np.hstack([scipy.linalg.orth(chi[:, ~aside], rcond=SAME), seen[:, 2:]])
         along = rotate(motion.twist[:, :2], -travel)[:, 0]
         beta = np.linalg.lstsq(even, along, rcond=None)[0]
         rest = along - even[:, :-1] @ beta[:-1] - beta[-1] * motion.twist[:, 2]

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import scipy  # its parts load slowly, when used
 from numpy.typing import NDArray
-from scipy.linalg import qr, solve_triangular
 
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording.recording import Samples
@@ -243,16 +242,17 @@ def cross_validated(chi: Array, target: Array) -> Array:
     rows = np.array_split(np.arange(len(target)), BLOCKS)
     both = np.concatenate([chi, target[:, None]], axis=1)
     triangles = [
-        np.atleast_2d(qr(both[r], mode="r", check_finite=False)[0]) for r in rows
+        np.atleast_2d(scipy.linalg.qr(both[r], mode="r", check_finite=False)[0])
+        for r in rows
     ]
     triangles = [t[: both.shape[1]] for t in triangles]
     result = np.empty((BLOCKS, chi.shape[1] + 1))
     for block, unseen in enumerate(triangles):
         others = np.concatenate([t for b, t in enumerate(triangles) if b != block])
-        r = qr(others, mode="economic", check_finite=False)[1]
+        r = scipy.linalg.qr(others, mode="economic", check_finite=False)[1]
         for n in range(chi.shape[1] + 1):
             beta = (
-                solve_triangular(_make_solvable(r[:n, :n]), r[:n, -1])
+                scipy.linalg.solve_triangular(_make_solvable(r[:n, :n]), r[:n, -1])
                 if n
                 else np.zeros(0)
             )

@@ -20,8 +20,8 @@ from functools import partial
 from itertools import product
 
 import numpy as np
+import scipy  # its parts load slowly, when used
 from numpy.typing import NDArray
-from scipy.linalg import orth
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array
@@ -336,7 +336,7 @@ def share_effects(model: TaylorModel, spec: RobotSpec, samples: Samples) -> Tayl
     constant = combinations / np.maximum(command.std(axis=0), NOTHING)
     if np.abs(constant @ command.mean(axis=0)).max() > excitation.TOGETHER:
         return model
-    normal = orth(constant.T)
+    normal = scipy.linalg.orth(constant.T)
     projection = np.eye(len(model.variables))
     projection[len(spec.state) :, len(spec.state) :] -= normal @ normal.T
     effects: dict[tuple[int, ...], Array] = {}

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import scipy  # its parts load slowly, when used
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 from pydantic import Field, model_validator
-from scipy import ndimage
 
 from nics_drl_bridge.config import Heading, Schema, dump_yaml, find_config, load_yaml
 from nics_drl_bridge.errors import ConfigError, suggest
@@ -104,7 +104,7 @@ class GridMap:
             for right in range(3):
                 clear[2 * at + down, 2 * to + right] = False
         # The nearest lattice points take far less memory than distances at every lattice point.
-        nearest = ndimage.distance_transform_edt(
+        nearest = scipy.ndimage.distance_transform_edt(
             clear, return_distances=False, return_indices=True
         )
         distances = np.empty((rows, columns), np.float32)

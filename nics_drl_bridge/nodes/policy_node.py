@@ -1,5 +1,6 @@
 """policy_node: runs a policy on a robot's topics."""
 
+import math
 import time
 import traceback
 from dataclasses import replace
@@ -12,7 +13,7 @@ from geometry_msgs.msg import PoseStamped, TwistStamped
 from nics_drl_bridge.errors import BridgeError, ConfigError, shorten
 from nics_drl_bridge.gate import inputs
 from nics_drl_bridge.generator import SimulatorModel, open_model
-from nics_drl_bridge.interface import S_PER_NS, Array, RobotView
+from nics_drl_bridge.interface import NS_PER_S, S_PER_NS, Array, RobotView
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 from nics_drl_bridge.middleware.middleware import rehearse
@@ -28,9 +29,8 @@ from nics_drl_bridge.policy.file.stateful import begin, resume
 from nics_drl_bridge.policy.pacing import ActionPace, Answer, Deadline
 from nics_drl_bridge.policy.policies import open_policy
 
-POLLS = (
-    0.1  # time between two checks whether to act, as a fraction of the control period
-)
+# time between two looks at cancelled goals and silent data, as a fraction of the control period
+POLLS = 0.5
 LONGEST_REASON = 300  # maximum length of a policy's error text [characters]
 
 
@@ -98,6 +98,9 @@ class PolicyNode(ManagedNode):
             )
         timer = runner.steadily(self, POLLS * model.control_period, self._act)
         self.undo.callback(self.destroy_timer, timer)
+        self._due = runner.steadily(self, model.control_period, self._act)
+        self._due.cancel()  # until a scan comes before an action is due
+        self.undo.callback(self.destroy_timer, self._due)
 
     def activate(self) -> None:
         """Start with a fresh state of the policy."""
@@ -164,7 +167,13 @@ class PolicyNode(ManagedNode):
             self._acted_ns = 0
             begin(self._policy)
         fresh = newest[ODOM].stamp_ns >= scan_ns > self._acted_ns
-        if not fresh or not self._pace.due(begin_s):
+        if not fresh:
+            return
+        self._due.cancel()
+        wait_s = self._pace.get_wait(begin_s)
+        if wait_s > 0.0:
+            self._due.timer_period_ns = math.ceil(wait_s * NS_PER_S)
+            self._due.reset()
             return
         self._pace.acted(begin_s)
         self._acted_ns = scan_ns

@@ -10,9 +10,9 @@ class ActionPace:
         self._period_s = period_s
         self._due_s = -float("inf")
 
-    def due(self, now_s: float) -> bool:
-        """Returns True if an action is due."""
-        return now_s >= self._due_s
+    def get_wait(self, now_s: float) -> float:
+        """Returns the time until an action is due [s]; 0 if it is."""
+        return max(self._due_s - now_s, 0.0)
 
     def acted(self, now_s: float) -> None:
         """Records the start of an action."""

@@ -125,10 +125,11 @@ def _collect_moments(
         if role not in (SCAN, ODOM) or SCAN not in newest or ODOM not in newest:
             continue
         scan_ns = newest[SCAN].stamp_ns
-        early = not pace.due(scan_ns * S_PER_NS + JITTER * model.control_period)
+        scan_s = scan_ns * S_PER_NS
+        early = pace.get_wait(scan_s + JITTER * model.control_period) > 0.0
         if newest[ODOM].stamp_ns < scan_ns or scan_ns <= acted_ns or early:
             continue
-        pace.acted(scan_ns * S_PER_NS)
+        pace.acted(scan_s)
         acted_ns = scan_ns
         _hold(moments, held)
         view = playback.middleware.view(playback.middleware.newest_ns or scan_ns)

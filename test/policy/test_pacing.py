@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from nics_drl_bridge.policy.pacing import ActionPace, Answer, Deadline
 
@@ -8,7 +9,7 @@ from nics_drl_bridge.policy.pacing import ActionPace, Answer, Deadline
 def actions(pace, times):
     done = []
     for now in times:
-        if pace.due(now):
+        if not pace.get_wait(now):
             pace.acted(now)
             done.append(now)
     return done
@@ -23,7 +24,7 @@ def test_jitter_of_the_data_does_not_slow_it_down():
     used = -1
     for now in polled:
         newest = int(np.searchsorted(arrivals, now, side="right")) - 1
-        if newest > used and pace.due(now):
+        if newest > used and not pace.get_wait(now):
             pace.acted(now)
             done = done + 1
             used = newest
@@ -36,6 +37,13 @@ def test_late_data_are_acted_on_at_once_and_not_made_up_for():
         0.35,
         0.45,
     ]
+
+
+def test_what_comes_early_waits_until_it_is_due():
+    pace = ActionPace(0.1)
+    pace.acted(1.0)
+    assert pace.get_wait(1.07) == pytest.approx(0.03)
+    assert pace.get_wait(1.1) == 0.0
 
 
 def test_without_a_period_everything_is_acted_on():

@@ -21,6 +21,9 @@ SIZE_LIMIT = 32 * 2**20
 CONTRACT_LIMIT = 4 * 2**20
 # maximum number of observations per run; a file is first opened with as many, see `rehearsal`
 MOST_ROWS = 256
+# maximum number of operators; a shipped policy has 30, and the time to open a graph grows faster
+# than their number
+MOST_OPERATORS = 2000
 STANDARD = ("", "ai.onnx")  # names of the domain of the standard operators
 INPUT = "observation"
 ACTION = "action"
@@ -172,6 +175,9 @@ def _find_graph_faults(model: Any) -> Iterator[Fault]:
         or len(graph.sparse_initializer)
     ):
         yield "graph", "contains functions, training or sparse weights; remove them."
+    if len(graph.node) > MOST_OPERATORS:
+        reason = f"has {len(graph.node)} operators, more than the {MOST_OPERATORS} of a policy"
+        yield "graph.node", f"{reason}; simplify the network."
     for node in graph.node:
         if node.domain not in STANDARD or node.op_type not in OPERATORS:
             name = f"{node.domain}.{node.op_type}" if node.domain else node.op_type

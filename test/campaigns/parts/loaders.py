@@ -246,7 +246,7 @@ WRITTEN = (
     Loader(
         "policy.onnx",
         lambda path, version: write_bytes(path, _policy_bytes(version)),
-        lambda path: load_policy(path).contract.provenance["seed"],
+        lambda path: load_policy(path).contract.provenance.get("seed"),
         tree=(_open_contract, _save_contract),
         bombs=grow_policies(_open_contract, _save_contract),
         command=("policy", "info"),
