@@ -307,7 +307,6 @@ def describe_machine() -> dict[str, Any]:
         "memory_gb": round(
             os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9, 1
         ),
-        "system": f"{platform.system()} {platform.release()}",
         "python": platform.python_version(),
         "libraries": libraries,
     }

@@ -126,7 +126,7 @@ def find_errors(model: TaylorModel, robot: Subject, seed: int) -> Array:
     return np.sqrt((np.concatenate([apart, turned], axis=1) ** 2).mean(axis=0))
 
 
-def time_batched(model: TaylorModel, robot: Subject, control: str | None) -> float:
+def time_batched(model: TaylorModel, robot: Subject) -> float:
     """Returns robot-steps per second of many robots, at the origin under random inputs."""
     terms = kernels.make_terms(model)
     rng = np.random.default_rng(3)
@@ -141,11 +141,11 @@ def time_batched(model: TaylorModel, robot: Subject, control: str | None) -> flo
     dq = np.zeros((len(model.dofs), ROBOTS))
     series = kernels.SERIES
     call = partial(kernels.run, pose, x, dq, terms, series, model.dt, BATCHED_STEPS)
-    times = interleaved({"run": slowed(call, control)}, REPEATS)
+    times = interleaved({"run": call}, REPEATS)
     return ROBOTS * BATCHED_STEPS / shortest(times)["run"]
 
 
-def time_single(model: TaylorModel, robot: Subject, control: str | None) -> float:
+def time_single(model: TaylorModel, robot: Subject) -> float:
     """Returns steps per second of one robot, with a command per step, many steps in one call."""
     rng = np.random.default_rng(4)
     low = robot.spec.command_low
@@ -156,8 +156,7 @@ def time_single(model: TaylorModel, robot: Subject, control: str | None) -> floa
     call = partial(
         kernels.simulate_rollouts, poses, states, commands, terms, kernels.SERIES, DT
     )
-    times = interleaved({"run": slowed(call, control)}, REPEATS)
-    return SINGLE_STEPS / shortest(times)["run"]
+    return SINGLE_STEPS / shortest(interleaved({"run": call}, REPEATS))["run"]
 
 
 def time_python(robot: Subject) -> float:
@@ -185,8 +184,8 @@ def measure_robot(name: str, control: str | None) -> Result:
         **dict(zip(ERRORS, step.tolist(), strict=True)),
         "terms_kept": model.terms_kept,
         "terms_total": found.regression.terms_total,
-        "steps_per_s_single": time_single(model, robot, control),
-        "steps_per_s_batched": time_batched(model, robot, control),
+        "steps_per_s_single": time_single(model, robot),
+        "steps_per_s_batched": time_batched(model, robot),
     }
 
 
@@ -197,9 +196,12 @@ def measure_table1(given: Given) -> Result:
     random every step moves along exact arcs; the model is fitted to the first drive and tried on
     another. Errors are root mean squares per step of 1 ms, in the body frame, in float64.
     """
+    python = time_python(make_subject("ackermann"))
+    if given.control == "slow":
+        python *= 10.0
     return {
         "robots": {name: measure_robot(name, given.control) for name in PARAMETERS},
-        "python_reference_steps_per_s": time_python(make_subject("ackermann")),
+        "python_reference_steps_per_s": python,
     }
 
 
@@ -529,7 +531,9 @@ BENCHMARKS = {
         judge_table1,
         {
             "rounded": Control("all but two digits of the coefficients", "rmse_x_m"),
-            "slow": Control("the speed: each step is made 10 times", "steps_per_s"),
+            "slow": Control(
+                "the speed: Python counts as ten times as fast", "steps_per_s"
+            ),
         },
         unsettled=("steps_per_s",),
     ),
