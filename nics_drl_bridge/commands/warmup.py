@@ -34,7 +34,7 @@ def warmup(
     for_wheel: WheelOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Compiles the kernels of the simulator in advance, once per machine."""
+    """Compiles the simulator in advance, once per machine."""
     begin = time.monotonic()
     if for_wheel:  # numba reads these at its import
         os.environ |= {"NUMBA_CPU_NAME": "x86-64-v3", "NUMBA_CPU_FEATURES": ""}
