@@ -170,6 +170,7 @@ NEEDED: dict[str, dict[str, tuple[str, ...]]] = {
 }
 # command -> option -> options that can't be combined with it
 APART: dict[str, dict[str, tuple[str, ...]]] = {
+    "doctor": {"load": ("bag", "namespace", "duration", "imu", "install")},
     "evaluate": {
         "hardware": ("places", "shadow", "lidar", "randomisation", "gate"),
         "shadow": ("places", "lidar", "randomisation", "gate", "task"),

@@ -1,5 +1,6 @@
 """`nics doctor` and `nics explain`: find a robot's faults, and explain why its gate stopped it."""
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
@@ -13,6 +14,10 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 EXIT_FINDINGS = 1
+LOAD_NOTE = (
+    "CPU and memory of middleware, policy and gate, on one core. Latencies from the stamp of a "
+    "scan: median, 99th percentile. The gate sends motion every 20 ms."
+)
 
 
 def doctor(
@@ -36,11 +41,18 @@ def doctor(
     install: Annotated[
         bool, Option("--install", help="Check this machine instead: what works here.")
     ] = False,
+    load: Annotated[
+        bool,
+        Option("--load", help="Measure a vehicle's nodes on this machine instead."),
+    ] = False,
     as_json: console.JsonOption = False,
 ) -> None:
-    """Checks a robot or a bag against a model; sends nothing."""
+    """Checks a robot or a bag against a model; sends nothing to it."""
     if install:
         _tell_installation(as_json)
+        return
+    if load:
+        _tell_load(model or DEFAULT_ROBOT, policy, as_json)
         return
     from nics_drl_bridge.generator import open_model
     from nics_drl_bridge.policy.file.policy_file import load_policy
@@ -93,6 +105,49 @@ def _tell_installation(as_json: bool) -> None:
         console.format_table(heads, rows),
         checks=[check._asdict() for check in results],
     )
+
+
+def _tell_load(name: str, policy: str | None, as_json: bool) -> None:
+    from nics_drl_bridge.generator import open_model
+    from nics_drl_bridge.policy.policies import list_shipped_policies
+
+    model = open_model(name)
+    if policy is None:
+        policy = name if name in list_shipped_policies() else "dynamic_window"
+    with extensions.require_modules("nics doctor"):
+        from nics_drl_bridge.nodes.load import measure_load
+    with console.show_progress("starting the nodes") as tell:
+        loads, unlimited = measure_load(model, policy, tell=tell)
+    heads = (
+        "cores",
+        "scans [Hz]",
+        "answered",
+        "CPU [% of a core]",
+        "memory [MB]",
+        "to cmd_vel_raw [ms]",
+        "to cmd_vel [ms]",
+    )
+    rows = [
+        (
+            f"{load.cores:g}",
+            f"{load.rate:g}",
+            f"{load.answered:.0%}",
+            _format_sum([100.0 * part for part in load.cpu.values()]),
+            _format_sum(list(load.memory_mb.values())),
+            f"{load.policy.median_ms:.1f}, {load.policy.p99_ms:.1f}",
+            f"{load.gate.median_ms:.1f}, {load.gate.p99_ms:.1f}",
+        )
+        for load in loads
+    ]
+    text = f"{console.format_table(heads, rows)}\n\n{LOAD_NOTE}"
+    if unlimited:
+        text += f" Half a core and less are only measured as root ({unlimited})."
+    facts = [asdict(load) for load in loads]
+    console.print_line(as_json, text, policy=policy, loads=facts, unlimited=unlimited)
+
+
+def _format_sum(parts: Sequence[float]) -> str:
+    return f"{' + '.join(f'{part:.0f}' for part in parts)} = {sum(parts):.0f}"
 
 
 def explain(

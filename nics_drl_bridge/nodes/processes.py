@@ -32,16 +32,23 @@ def free_domain_id() -> int:
     """Return the environment's domain id, or a random unused one. ConfigError if it is invalid."""
     variable = os.environ.get("ROS_DOMAIN_ID")
     if not variable:
-        every = range(1, LAST_DOMAIN_ID + 1)
-        return random.SystemRandom().choice(
-            sorted(set(every) - domains_in_use()) or every
-        )
+        return unused_domain_id()
     if not variable.isdecimal() or int(variable) > GREATEST_DOMAIN_ID:
         fix = f"it must be a number from 0 to {GREATEST_DOMAIN_ID}, or unset."
         raise ConfigError(
             f"the environment variable ROS_DOMAIN_ID is {variable!r}; {fix}"
         )
     return int(variable)
+
+
+def unused_domain_id() -> int:
+    """Return a random domain id that nobody on this machine uses, unless all are used."""
+    every = range(1, LAST_DOMAIN_ID + 1)
+    own = {
+        int(word) for word in [os.environ.get("ROS_DOMAIN_ID", "0")] if word.isdecimal()
+    }
+    unused = set(every) - domains_in_use() - own
+    return random.SystemRandom().choice(sorted(unused) or every)
 
 
 class NodeProcess(ChildProcess):

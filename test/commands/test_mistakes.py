@@ -17,7 +17,7 @@ import typer
 from command_line import nics
 from numba.core.caching import CacheImpl
 
-from nics_drl_bridge.commands import console, evaluate, interrupts, start, watch
+from nics_drl_bridge.commands import console, doctor, evaluate, interrupts, start, watch
 from nics_drl_bridge.commands.first_checks import check_settings
 from nics_drl_bridge.config import share_folder
 from nics_drl_bridge.errors import ConfigError
@@ -239,7 +239,8 @@ def test_a_mistake_is_one_sentence(words, folder):
 def test_an_option_without_its_partner_or_with_a_foe_is_refused(
     command, option, partners, rule, capsys
 ):
-    function = {"evaluate": evaluate.evaluate, "watch": watch.watch}[command]
+    modules = {"doctor": doctor, "evaluate": evaluate, "watch": watch}
+    function = getattr(modules[command], command)
     given = [option] if rule == "NEEDED" else [option, partners[0]]
     with pytest.raises(typer.Exit):
         console.check_options(function)(**dict.fromkeys(given, "x"))
