@@ -11,8 +11,6 @@ show, with machine, commit and load; it is rewritten after each run. `tables.md`
 runs, `figures.py` makes the tables.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import math
@@ -106,8 +104,8 @@ class Benchmark:
         needs: modules to import.
     """
 
-    measure: Callable[[argparse.Namespace], dict[str, Any]]
-    judge: Mapping[str, Bar] | Callable[[dict[str, Any]], list[str]]
+    measure: Callable[[Given], Result]
+    judge: Mapping[str, Bar] | Callable[[Result], list[str]]
     controls: Mapping[str, Control]
     options: Mapping[str, Any] = field(default_factory=dict)
     short: str | None = ""
@@ -481,7 +479,7 @@ def summarize(name: str, entry: Mapping[str, Any]) -> str:
     return f"{name:<30}{entry['state']:<8}{entry['seconds']:>8.1f} s  {wrong[:160]}\n"
 
 
-def run_all(given: argparse.Namespace, plan: Mapping[str, Any]) -> int:
+def run_all(given: Given, plan: Mapping[str, Any]) -> int:
     """Runs what is asked for, one after the other, and writes the file after each."""
     from figures import paths_of
 

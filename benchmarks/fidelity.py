@@ -3,8 +3,6 @@
 python benchmarks/fidelity.py real_drives | generate_from_mujoco | estimator
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections import deque
 from collections.abc import Callable

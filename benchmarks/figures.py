@@ -4,8 +4,6 @@
 `<!-- /results -->` of a document is the table `NAME`, filled in from `results.json`.
 """
 
-from __future__ import annotations
-
 import re
 import sys
 from collections import Counter

@@ -7,19 +7,17 @@ not committed is not in the clone. Typing and reading are not in the times. `com
 `nics warmup` takes of all cores to compile the kernels into an empty cache.
 """
 
-from __future__ import annotations
-
-import argparse
 import json
 import shlex
 import tempfile
 from pathlib import Path
-from typing import Any
 
 from bench import (
     ROOT,
     Benchmark,
     Control,
+    Given,
+    Result,
     at_least,
     at_most,
     missed_bars,
@@ -97,7 +95,7 @@ def travelled(
     return taken, told
 
 
-def measure(given: argparse.Namespace) -> dict[str, Any]:
+def measure(given: Given) -> Result:
     """How far does a newcomer get within the first hour, from a clean clone?
 
     See the head of this file.
@@ -111,7 +109,7 @@ def measure(given: argparse.Namespace) -> dict[str, Any]:
         empty = around | {"NUMBA_CACHE_DIR": str(folder / "kernels")}
         warmup = [str(clone / ".venv/bin/nics"), "warmup", "--json"]
         compiled = json.loads(wait_for(warmup, clone, empty)[1])
-        result: dict[str, Any] = {
+        result: Result = {
             "seconds": {},
             "setup_s": setup_s,
             "success": {},
@@ -134,7 +132,7 @@ def measure(given: argparse.Namespace) -> dict[str, Any]:
     return result
 
 
-def judge(result: dict[str, Any]) -> list[str]:
+def judge(result: Result) -> list[str]:
     longest = {name: at_most(LONGEST_S[name]) for name in result["seconds"]}
     success = {name: at_least(SUCCESS[name]) for name in result["success"]}
     extents = {name: bar for name, bar in EXTENTS.items() if name in result}

@@ -5,8 +5,6 @@ python benchmarks/paper.py table2_lidar | table3_density | lidar_complexity
 python benchmarks/paper.py fig4_pointcloud
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -39,11 +37,11 @@ from measuring.scenes import (
     random_batch,
     scan,
 )
-from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import write_bytes
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.fit import fit
 from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.scanner import Scanner, make_scanner
@@ -56,8 +54,6 @@ from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.robot.spec import CommandVariable, RobotSpec, load_robot
 from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.style import render_png
-
-Array = NDArray[np.float64]
 
 # Table I
 

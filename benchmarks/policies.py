@@ -4,9 +4,6 @@ python benchmarks/policies.py training | baselines | barn
 python benchmarks/policies.py transfer | robustness
 """
 
-from __future__ import annotations
-
-import dataclasses
 import json
 import sys
 import tempfile
@@ -15,7 +12,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import product
 from multiprocessing import get_context
 from pathlib import Path
@@ -56,6 +53,7 @@ from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import BridgeError, ConfigError
 from nics_drl_bridge.gate.gated_backend import GatedBackend
 from nics_drl_bridge.generator import open_model
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.policy.evaluation import (
     DRIFT_M,
     FIRST_SEED,
@@ -79,7 +77,6 @@ from nics_drl_bridge.sim.simulator import EpisodeSampler
 from nics_drl_bridge.sim.world import World, load_world
 from nics_drl_bridge.sim.world_set import BARN, AnyWorld, WorldSet, load_worlds
 
-Array = NDArray[np.float64]
 ROBOTS = ("differential", "ackermann", "mecanum")
 STANDS = Control("the driving: the policy stands still", "success")
 
@@ -192,7 +189,7 @@ def measure_baselines(given: Given) -> Result:
         own = [robot] if robot in list_shipped_policies() else []
         for name in [*own, *given.policy]:
             summary = drive_episodes(robot, name, world, given.episodes, given.control)
-            figures[f"{world}/{robot}/{name}"] = dataclasses.asdict(summary)
+            figures[f"{world}/{robot}/{name}"] = asdict(summary)
     return figures
 
 

@@ -1,15 +1,12 @@
 """The drives of others that are measured, by which mapping they go in, and their bars."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from bench import at_most, missed_bars
+from bench import ROOT, at_most, missed_bars
 
-ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES = ROOT / "examples" / "recordings"
 SHIPPED = ROOT / "config" / "recordings"
 RECORDINGS = ROOT.parent / "shared" / "recordings"

@@ -3,8 +3,6 @@
 python -m measuring.echoes NAMESPACE near|far
 """
 
-from __future__ import annotations
-
 import array
 import json
 import os
@@ -18,6 +16,7 @@ from pathlib import Path
 
 import gymnasium
 import numpy as np
+from bench import SCRIPTS
 from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
 from rclpy.context import Context
@@ -31,7 +30,6 @@ from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 
-BENCHMARKS = Path(__file__).resolve().parents[1]
 ROBOT = "ackermann"
 BEAMS = 720
 DEPTH = 10
@@ -120,11 +118,11 @@ def open_echo(domain_id: int) -> Iterator[Chunk]:
     environment = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"} | os.environ
     environment["ROS_DOMAIN_ID"] = str(domain_id)
     with (
-        subprocess.Popen([*order, "far"], env=environment, cwd=BENCHMARKS) as far,
+        subprocess.Popen([*order, "far"], env=environment, cwd=SCRIPTS) as far,
         subprocess.Popen(
             [*order, "near"],
             env=environment,
-            cwd=BENCHMARKS,
+            cwd=SCRIPTS,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,

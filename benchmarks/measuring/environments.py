@@ -1,7 +1,5 @@
 """Environments of their own for other projects: they conflict with each other and with ours."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

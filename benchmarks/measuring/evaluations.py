@@ -4,8 +4,6 @@
 to be at its goal, or a policy that stands still, with which every benchmark of driving must fail.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -18,6 +16,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from bench import SCRIPTS
 from numpy.typing import NDArray
 
 from nics_drl_bridge.commands import episodes
@@ -26,7 +25,6 @@ from nics_drl_bridge.env.task import Task, still
 from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.middleware.middleware import Middleware
 
-BENCHMARKS = Path(__file__).resolve().parents[1]
 AT_ONCE = 2
 
 
@@ -50,7 +48,7 @@ def evaluate_all(
     program = "nics_drl_bridge.commands.cli"
     if control:
         program = f"measuring.evaluations {control}"
-    known = filter(None, [str(BENCHMARKS), os.environ.get("PYTHONPATH")])
+    known = filter(None, [str(SCRIPTS), os.environ.get("PYTHONPATH")])
     around = os.environ | {"PYTHONPATH": os.pathsep.join(known)}
     # Without a domain, the command takes one that nobody uses when it needs it.
     around.pop("ROS_DOMAIN_ID", None)

@@ -1,7 +1,5 @@
 """The paper's Fig. 4: a path among obstacles, point clouds, MuJoCo's rays, a map by SLAM."""
 
-from __future__ import annotations
-
 import tempfile
 from pathlib import Path
 
@@ -13,11 +11,11 @@ from scipy.spatial import cKDTree
 from measuring.environments import clean, python_with, wait_for
 from nics_drl_bridge import geometry
 from nics_drl_bridge.extras.mujoco.machines import load_mujoco
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.shapes import Circle, Polygon, Rectangle, Shape
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.style import MEASURED, MODEL, OTHER, make_panels
 
-Array = NDArray[np.float64]
 HERE = Path(__file__).resolve().parent
 SLAM = (
     "yag-slam==0.3.0",

@@ -8,8 +8,6 @@ What a recorder sees: commands at 20 Hz that act after a latency, poses of a mot
 tracked body sits somewhere on the robot, or encoders that overflow. Everything follows from a seed.
 """
 
-from __future__ import annotations
-
 import csv
 import math
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Maps of an office, and of the office as SLAM leaves it, and scans in them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import Any

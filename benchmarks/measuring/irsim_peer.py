@@ -4,8 +4,6 @@ Reads a JSON file of scenes, says the ranges of each scene, and then answers eac
 reads with the times of one more round. What is told on standard output is JSON, an object a line.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import os

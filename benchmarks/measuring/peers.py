@@ -16,8 +16,6 @@ Readings of a peer, all from the same process and scenes:
 - `period_with_ten_scans`: the same by ten of their steps, which is what their users get.
 """
 
-from __future__ import annotations
-
 import json
 import subprocess
 import tempfile

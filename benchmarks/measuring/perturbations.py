@@ -1,7 +1,5 @@
 """Perturbations of a policy's robot, one at a time, and the picture of what they cost."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import cycle

@@ -1,7 +1,5 @@
 """How long calls take on a machine that does other things at the same time."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Hashable, Mapping
 from typing import TypeVar

@@ -1,19 +1,17 @@
 """The paper's four scenes (Sec. V-B), and what a renderer gets wrong in them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.scanner import Renderer, Scanner
 from nics_drl_bridge.lidar.shapes import SQUARE, STRIP, Circle, Rectangle, Shape
 from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
 from nics_drl_bridge.lidar.table import LidarTable
 
-Array = NDArray[np.float64]
 Ranges = NDArray[np.float32]
 CIRCLE = Circle(radius=0.15)
 SCENES: dict[str, tuple[Shape, ...]] = {

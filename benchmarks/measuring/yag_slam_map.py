@@ -3,8 +3,6 @@
 Reads ranges and odometry from an `.npz` file; writes corrected poses and the map to another.
 """
 
-from __future__ import annotations
-
 import sys
 
 import numpy as np
