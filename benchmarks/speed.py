@@ -1,17 +1,15 @@
-"""Speed beside peers: environments, scans among obstacles and in maps, steps over ROS 2.
+"""Speed beside peers: environments, scans among obstacles and in maps, nodes of ROS 2.
 
 python benchmarks/speed.py env_throughput | env_scaling
 python benchmarks/speed.py lidar_peers | map_lidar
-python benchmarks/speed.py ros_lockstep
+python benchmarks/speed.py ros_lockstep | vehicle_load
 """
-
-from __future__ import annotations
 
 import math
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import cycle
 from pathlib import Path
@@ -41,7 +39,6 @@ from nics_drl_bridge.env.tasks.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.lidar import map_kernels
 from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.beam_kernels import make_beams
 from nics_drl_bridge.lidar.faults import LidarFaults
@@ -611,10 +608,7 @@ def measure_maps(given: Given) -> Result:
     rows = []
     for name, make in MAPS.items():
         grid = GridMap((make(given.seed) * OCCUPIED).astype(np.int8), RESOLUTION)
-        map_kernels.find_free_squares(grid.blocked)  # compiles
-        begin = time.perf_counter()
         squares, _ = grid.arrays
-        bake_s = time.perf_counter() - begin
         poses = draw_poses(grid, given.seed + 1)
         for lidar in MAP_LIDARS:
             spec = load_lidar(lidar)
@@ -637,7 +631,6 @@ def measure_maps(given: Given) -> Result:
                     "rmse_m": float(np.sqrt((error**2).mean())),
                     "beams_off": float((np.abs(error) > 1e-3).mean()),
                     "table_bytes": squares.nbytes,
-                    "bake_s": bake_s,
                 }
             )
     return {"rows": rows}
@@ -673,6 +666,48 @@ def measure_lockstep(given: Given) -> Result:
     from measuring.echoes import measure_in_turns
 
     return measure_in_turns(given.chunks, given.size, given.control)
+
+
+# What the nodes take on a vehicle
+
+VEHICLE_BARS = {
+    "cores": at_most(0.25, "least share of a core"),
+    "p99_ms": at_most(10.0, "p99 [ms]"),
+    "memory_mb": at_most(250.0, "memory [MB]"),
+    "median_ms": at_most(50.0, "median [ms]"),
+}
+SLOW_POLICY = """
+import time
+from nics_drl_bridge.policy.file.policy_file import PolicyFile
+act = PolicyFile.act
+PolicyFile.act = lambda self, seen: time.sleep(0.06) or act(self, seen)
+from"""
+
+
+def measure_vehicle(given: Given) -> Result:
+    """What do middleware, policy and gate take of a core, and how soon do they answer a scan?
+
+    What `nics doctor --load` measures: the real nodes on one core, half of it and a quarter, beside
+    a robot that publishes scans of 720 beams and odometry, both at 10 or 20 Hz, over DDS. The bars
+    of p99 (to `cmd_vel_raw`) and memory are for a quarter of a core at 20 Hz, that of the median
+    for a core at 10 Hz.
+    """
+    from nics_drl_bridge.nodes import load, node_process
+
+    if given.control == "slow":
+        make_command = node_process.module_command
+        node_process.module_command = lambda module: [
+            word.replace("; from", SLOW_POLICY) for word in make_command(module)
+        ]
+    loads, _ = load.measure_load(peers.MODEL, "differential", given.seconds)
+    hardest = loads[-1]
+    return {
+        "rows": {f"{100 * row.cores:g}_{row.rate:g}": asdict(row) for row in loads},
+        "cores": hardest.cores,
+        "p99_ms": hardest.policy.p99_ms,
+        "memory_mb": sum(hardest.memory_mb.values()),
+        "median_ms": loads[0].policy.median_ms,
+    }
 
 
 REPEATED = (10, "timed rounds")
@@ -756,6 +791,15 @@ BENCHMARKS = {
         },
         short="--chunks 2 --size 20",
         unsettled=("ratio",),
+        needs=("rclpy",),
+    ),
+    "vehicle_load": Benchmark(
+        measure_vehicle,
+        VEHICLE_BARS,
+        {"slow": Control("speed: the policy node rests before it answers", "median")},
+        {"seconds": (60.0, "of each share of a core and rate")},
+        short="--seconds 3",
+        unsettled=("p99", "memory", "least share"),
         needs=("rclpy",),
     ),
 }
