@@ -654,9 +654,9 @@ def measure_lockstep(given: Given) -> Result:
 
 VEHICLE_BARS = {
     "cores": at_most(0.25, "least share of a core"),
-    "p99_ms": at_most(10.0, "p99 to cmd_vel_raw, a quarter of a core, 20 Hz [ms]"),
-    "memory_mb": at_most(250.0),
-    "median_ms": at_most(50.0, "median to cmd_vel_raw, one core, 10 Hz [ms]"),
+    "p99_ms": at_most(10.0, "p99 [ms]"),
+    "memory_mb": at_most(250.0, "memory [MB]"),
+    "median_ms": at_most(50.0, "median [ms]"),
 }
 SLOW_POLICY = """
 import time
@@ -670,7 +670,9 @@ def measure_vehicle(given: Given) -> Result:
     """What do middleware, policy and gate take of a core, and how soon do they answer a scan?
 
     What `nics doctor --load` measures: the real nodes on one core, half of it and a quarter, beside
-    a robot that publishes scans of 720 beams and odometry, both at 10 or 20 Hz, over DDS.
+    a robot that publishes scans of 720 beams and odometry, both at 10 or 20 Hz, over DDS. The bars
+    of p99 (to `cmd_vel_raw`) and memory are for a quarter of a core at 20 Hz, that of the median
+    for a core at 10 Hz.
     """
     from nics_drl_bridge.nodes import load, node_process
 
@@ -780,7 +782,7 @@ BENCHMARKS = {
         {"slow": Control("speed: the policy node rests before it answers", "median")},
         {"seconds": (60.0, "of each share of a core and rate")},
         short="--seconds 3",
-        unsettled=("p99", "memory_mb", "least share"),
+        unsettled=("p99", "memory", "least share"),
         needs=("rclpy",),
     ),
 }

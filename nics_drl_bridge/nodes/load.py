@@ -222,9 +222,9 @@ def _run_nodes(
                 group.add(node.pid)
         os.sched_setaffinity(0, all_cores - {core} or all_cores)
         robot = StandIn(model, domain_id)
+        robot.start()
         stack.callback(robot.close)
         _wait_until_running(nodes)
-        robot.start()
         yield nodes, robot
 
 

@@ -239,14 +239,11 @@ def test_a_mistake_is_one_sentence(words, folder):
 def test_an_option_without_its_partner_or_with_a_foe_is_refused(
     command, option, partners, rule, capsys
 ):
-    functions = {
-        "doctor": doctor.doctor,
-        "evaluate": evaluate.evaluate,
-        "watch": watch.watch,
-    }
+    modules = {"doctor": doctor, "evaluate": evaluate, "watch": watch}
+    function = getattr(modules[command], command)
     given = [option] if rule == "NEEDED" else [option, partners[0]]
     with pytest.raises(typer.Exit):
-        console.check_options(functions[command])(**dict.fromkeys(given, "x"))
+        console.check_options(function)(**dict.fromkeys(given, "x"))
     sentence = capsys.readouterr().err
     words = "belongs to" if rule == "NEEDED" else "does not go with"
     assert words in sentence

@@ -30,6 +30,7 @@ SHORT = {
 }
 ELSEWHERE = {
     r"nics (record|doctor (--model|--policy|--namespace)|bag record|watch --ros)": "hears a robot",
+    r"nics doctor --load": "starts nodes",
     r"nics evaluate .*--hardware": "drives a robot",
     r"nics bag replay drive( --rate| --lockstep)": "feeds nodes",
     r"nics watch (?!.*--record)": "serves until Ctrl-C",

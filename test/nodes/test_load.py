@@ -1,5 +1,7 @@
 """What a vehicle's nodes take of a machine is measured beside a robot that nobody hears."""
 
+import json
+import math
 import os
 import subprocess
 import sys
@@ -8,8 +10,10 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
+from nics_drl_bridge.commands.doctor import doctor
+from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.generator import builtin_model
-from nics_drl_bridge.nodes import node_process
+from nics_drl_bridge.nodes import load, node_process
 from nics_drl_bridge.nodes.load import measure_load, read_memory_mb
 from nics_drl_bridge.nodes.processes import unused_domain_id
 
@@ -36,19 +40,19 @@ with subprocess.Popen([sys.executable, "-c", {HOLD!r}]) as child:
 
 def measure():
     model = builtin_model("differential")
-    ((load,), _) = measure_load(model, "straight", 2.0, (1.0,), (10.0,))
-    return load
+    ((measured,), _) = measure_load(model, "straight", 2.0, (1.0,), (10.0,))
+    return measured
 
 
 def test_each_node_is_measured_while_commands_go_through_to_the_robot():
     cores = os.sched_getaffinity(0)
-    load = measure()
-    assert list(load.cpu) == list(load.memory_mb) == NODES
-    assert all(0.0 < part < 1.0 for part in load.cpu.values())
-    assert all(30.0 < part < 1000.0 for part in load.memory_mb.values())
-    assert load.scans == pytest.approx(20, abs=3)
-    assert load.answered > 0.5
-    assert 0.0 < load.policy.median_ms < load.gate.median_ms
+    measured = measure()
+    assert list(measured.cpu) == list(measured.memory_mb) == NODES
+    assert all(0.0 < part < 1.0 for part in measured.cpu.values())
+    assert all(30.0 < part < 1000.0 for part in measured.memory_mb.values())
+    assert measured.scans == pytest.approx(20, abs=3)
+    assert measured.answered > 0.5
+    assert 0.0 < measured.policy.median_ms < measured.gate.median_ms
     assert os.sched_getaffinity(0) == cores
 
 
@@ -62,6 +66,34 @@ def test_a_policy_that_takes_long_answers_late(monkeypatch):
 
     monkeypatch.setattr(node_process, "module_command", make_slow)
     assert measure().policy.median_ms > 1e3 * LATE_S
+
+
+def test_a_policy_that_is_none_ends_it_with_the_words_of_its_node():
+    with pytest.raises(BackendError, match="unknown policy 'nothing'"):
+        load.measure_load(builtin_model("differential"), "nothing", 1.0)
+
+
+def test_the_doctor_prints_what_was_measured(monkeypatch, capsys):
+    told = load.Load(
+        0.25,
+        20.0,
+        100,
+        0.5,
+        dict(zip(NODES, (0.1, 0.2, 0.3), strict=True)),
+        dict(zip(NODES, (100.0, 120.0, 90.0), strict=True)),
+        load.Latency(5.25, 9.75),
+        load.Latency(math.nan, math.nan),
+    )
+    denied = "/sys/fs/cgroup: Permission denied"
+    monkeypatch.setattr(load, "measure_load", lambda *_, **__: ([told], denied))
+    doctor(load=True)
+    printed = capsys.readouterr().out
+    for words in ("0.25", "50%", "10 + 20 + 30 = 60", "= 310", "5.2, 9.8", denied):
+        assert words in printed
+    doctor(load=True, as_json=True)
+    (row,) = json.loads(capsys.readouterr().out)["loads"]
+    assert row["policy"] == {"median_ms": 5.25, "p99_ms": 9.75}
+    assert row["gate"]["p99_ms"] is None
 
 
 def test_no_robot_hears_it(monkeypatch):
