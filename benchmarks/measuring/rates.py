@@ -7,7 +7,6 @@ from typing import TypeVar
 import numpy as np
 
 WARM_UP = 3
-TIMES_SLOWER = 10
 Name = TypeVar("Name", bound=Hashable)
 
 
@@ -40,7 +39,7 @@ def slowed(call: Callable[[], object], control: str | None) -> Callable[[], obje
     """Returns a call that under the control `slow` is made ten times."""
     if control != "slow":
         return call
-    return lambda: [call() for _ in range(TIMES_SLOWER)]
+    return lambda: [call() for _ in range(10)]
 
 
 def medians(times: Mapping[Name, list[float]]) -> dict[Name, float]:
