@@ -193,14 +193,21 @@ class Task(ABC):
         low, high = self.command_limits
         kernels.scale_actions(out.reshape(rows.shape), rows, low, high)
         # Don't teach what a vehicle can't do: a car driven by turn rates can't steer at rest.
-        if self.robot.takes_turn_rate:
+        if self._takes_turn_rate:
             return self.robot.pass_through_cmd_vel(out)
         return out
+
+    @cached_property
+    def _takes_turn_rate(self) -> bool:
+        return self.robot.takes_turn_rate
 
     def drive(self, actions: ArrayLike, ended: Flags) -> Array:
         """Returns the checked commands (n, M, C) of actions; robots that have ended stand still."""
         shape = (*ended.shape, len(self.robot.command))
-        command = guard.check_command(self.command(actions), shape)
+        command = self.command(actions)
+        # Between finite limits, only a user's own command may be infinite.
+        if type(self).command is not Task.command or command.shape != shape:
+            command = guard.check_command(command, shape)
         if self.robots > 1 and ended.any():
             command = np.where(ended[..., None], still(self.robot), command)
         return command
