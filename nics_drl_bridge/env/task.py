@@ -14,6 +14,7 @@ from nics_drl_bridge.env import guard, kernels
 from nics_drl_bridge.env.kernels import LIMIT, ScanScale
 from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.interface import Array, RobotView
+from nics_drl_bridge.kernels import Packed, pack
 from nics_drl_bridge.lidar.arrays import AnyArray, Integers, Singles
 from nics_drl_bridge.lidar.sector_kernels import SectorPlan
 from nics_drl_bridge.lidar.sectors import NO_PLAN, ScanLayout, plan_of
@@ -408,13 +409,20 @@ class Task(ABC):
         return NO_PLAN if self.scan is None else plan_of(self.lidar, self.scan)
 
     @cached_property
-    def scale(self) -> ScanScale:
-        """Conversion of a scan, for the kernels."""
+    def scale(self) -> Any:
+        """Conversion of a scan, for the kernels: a ScanScale, packed."""
         leaves = find_contact_ranges(self.robot, self.lidar, self.contact_margin)
         sectors = 0 if self.scan is None else self.scan.sectors
         per_metre = np.float32(1.0 / self.sight.range_max)
         beside = int(CONTACT_ANGLE / 2.0 / abs(self.lidar.angle_increment))
-        return ScanScale(per_metre, leaves, beside, sectors, self.plan)
+        return pack(ScanScale(per_metre, leaves, beside, sectors, self.plan))
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = {}
+        for name, value in vars(self).items():
+            if not isinstance(value, Packed):  # a copy packs its own
+                state[name] = value
+        return state
 
 
 def _is_finite(given: Any) -> bool:
