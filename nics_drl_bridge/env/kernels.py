@@ -48,6 +48,18 @@ class NavigationRules(NamedTuple):
     collision_reward: float
 
 
+class NavigationStep(NamedTuple):
+    """Arguments of `navigate` that stay in place from step to step."""
+
+    out: Singles
+    terms: Array
+    flags: Mask
+    pose: Array
+    twist: Array
+    ranges: Singles
+    rules: Any  # NavigationRules, packed
+
+
 @kernel(allocates=True)
 def compute_episode_seeds(seeds: Integers, numbers: Integers, out: Integers) -> None:
     """Computes seeds (n,) of episodes from their numbers (n,) and their envs' seeds (n,)."""
@@ -210,6 +222,23 @@ def navigate(
         out[i, parts + 2] = s
         for k in range(3):
             out[i, parts + 3 + k] = min(max(twist[i, k], -LIMIT), LIMIT)
+
+
+@kernel(allocates=True)
+def navigate_in_place(packed: Any, before: Array, goals: Array) -> None:
+    """Takes a step like `navigate`, with a packed NavigationStep, which saves time."""
+    step = packed.content
+    navigate(
+        step.out,
+        step.terms,
+        step.flags,
+        before,
+        step.pose,
+        step.twist,
+        step.ranges,
+        goals,
+        step.rules,
+    )
 
 
 @kernel(allocates=True)

@@ -2,6 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, Literal
@@ -31,6 +32,8 @@ Memory = dict[str, AnyArray]
 Facts = dict[str, AnyArray]  # for `info`, by name
 Info = dict[str, Any]  # Gymnasium's `info`
 Terms = dict[str, Array]  # of the reward, by name
+BoundStep = Callable[[Array, Memory], tuple[Observation, dict[str, float], bool, Info]]
+"""A step from a pose (1, 3): observation (O,), reward terms, True at the end, facts for `info`."""
 DRIVES = (
     (0, 0, 0),
     (1, 0, 0),
@@ -213,12 +216,12 @@ class Task(ABC):
             command = np.where(ended[..., None], still(self.robot), command)
         return command
 
-    def _covers_all(self, declared: str) -> bool:
-        """Returns True if no class below the one that declares a name overrides one of `PARTS`."""
+    def _covers_all(self, declared: str, parts: Iterable[str] = PARTS) -> bool:
+        """Returns True if no class below the one that declares a name overrides a part."""
         for base in type(self).__mro__:
             if declared in vars(base):
                 return True
-            if any(part in vars(base) for part in PARTS):
+            if any(part in vars(base) for part in parts):
                 return False
         return False
 
@@ -226,6 +229,11 @@ class Task(ABC):
     def is_fused(self) -> bool:
         """True if `step_into` of the task's class does all parts of a step in its own way."""
         return self._covers_all("step_into")
+
+    @cached_property
+    def binds_all(self) -> bool:
+        """True if `bind` of the task's class does all parts of a step in its own way."""
+        return self._covers_all("bind", (*PARTS, "step_into", "take_step"))
 
     @cached_property
     def needs_last_scan(self) -> bool:
@@ -288,6 +296,15 @@ class Task(ABC):
                 "end", f"must be True or False for each robot, not {kind}"
             )
         return Outcome(terms, ended, info)
+
+    def bind(self, view: RobotView) -> BoundStep | None:
+        """Binds the steps of one robot to its view (1, 1), whose arrays change in place.
+
+        A class may override it to do all parts of a step in one small call of a kernel, which saves
+        most of the time in the fast simulator. It is left out if a subclass overrides a part, or
+        `step_into`.
+        """
+        return None
 
     def start_episodes(self, episodes: Episodes) -> Memory:
         """Returns the memory of `reset`. Raises ConfigError if it does not fit or lacks `shown`."""

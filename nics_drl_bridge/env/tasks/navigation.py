@@ -8,11 +8,13 @@ import gymnasium
 import numpy as np
 
 from nics_drl_bridge.env import kernels, task
-from nics_drl_bridge.env.kernels import LIMIT, NavigationRules
+from nics_drl_bridge.env.kernels import LIMIT, NavigationRules, NavigationStep
 from nics_drl_bridge.env.task import (
+    BoundStep,
     Episodes,
     Facts,
     Flags,
+    Info,
     Memory,
     Observation,
     Outcome,
@@ -135,6 +137,36 @@ class Navigation(Task):
         _, terms, flags = self._observe(before.pose, after, memory, out)
         facts = {"is_success": flags[2], "collision": flags[1]}
         return Outcome(dict(zip(TERMS, terms, strict=False)), flags[3], facts)
+
+    def bind(self, view: RobotView) -> BoundStep | None:
+        """Binds steps to a view; see `Task.bind`. There are none with further sensors."""
+        if self.sensors:
+            return None
+        out = np.empty((1, *self.observation_space.shape), np.float32)
+        terms = np.empty(5)
+        flags = np.empty(4, np.bool_)
+        step = pack(
+            NavigationStep(
+                out,
+                terms[:, None],
+                flags[:, None],
+                view.pose[0],
+                view.twist[0],
+                view.ranges[0],
+                self._rules,
+            )
+        )
+
+        def take_step(
+            before: Array, memory: Memory
+        ) -> tuple[Observation, dict[str, float], bool, Info]:
+            kernels.navigate_in_place(step, before, memory["goal"][0])
+            _, touched, succeeded, ended = flags.tolist()
+            facts = {"is_success": succeeded, "collision": touched}
+            paid = dict(zip(TERMS, terms.tolist(), strict=False))
+            return out[0].copy(), paid, ended, facts
+
+        return take_step
 
     def _observe(
         self,
