@@ -58,7 +58,7 @@ SHARES = {
     "share_of_write_limit": at_least(
         0.01, "share of the rate at which observations alone can be written"
     ),
-    "share_of_cartpole": at_least(0.04, "share of CartPole's rate, single env"),
+    "share_of_cartpole": at_least(0.1, "share of CartPole's rate, single env"),
     "share_of_cartpole_with_estimator": at_least(
         0.007, "share of CartPole's rate, single env with the estimator"
     ),

@@ -1,7 +1,8 @@
 """BridgeEnv: one task over one backend, as a Gymnasium environment."""
 
 from contextlib import suppress
-from typing import Any
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -11,9 +12,10 @@ from nics_drl_bridge.arguments import check_arguments, check_options, format_val
 from nics_drl_bridge.env import guard
 from nics_drl_bridge.env.guard import give, refuse_after_close, stop_on_error
 from nics_drl_bridge.env.registry import make_task
-from nics_drl_bridge.env.sim_backend import complete_backend, make_backend
+from nics_drl_bridge.env.sim_backend import SimBackend, complete_backend, make_backend
 from nics_drl_bridge.env.snapshot import Snapshot, find_gate, find_goals
 from nics_drl_bridge.env.task import (
+    BoundStep,
     Episodes,
     Info,
     Memory,
@@ -36,6 +38,14 @@ from nics_drl_bridge.sim.scenes import Scene, sample_scene
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
 RENDER_FPS = 10
+
+
+class Direct(NamedTuple):
+    """A simulator whose arrays a task judges without copies."""
+
+    backend: SimBackend
+    view: RobotView  # its arrays change in place
+    step: BoundStep
 
 
 class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
@@ -138,6 +148,7 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
         self.ended: Mask = np.zeros(self.robots, np.bool_)
         self._view: RobotView | None = None  # always a batch of one, which tasks expect
         self._shape = (1, self.robots, self.task.observation_space.shape[0])
+        self._row: Any = (0, 0) if self.robots == 1 else 0
         self._each = (1, self.robots, *(self.task.action_space.shape or ()))
         self._rest = np.tile(still(self.model.robot), (self.robots, 1))
         self._seed = 0
@@ -145,7 +156,7 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
         self._rehearsed = False
         self._picture: Any = None
         # of the last step, for pictures
-        self._command = self._rest
+        self._commands = self._rest[None]
         self._facts = Info()
         self._steps = 0
         if isinstance(backend, str):
@@ -198,8 +209,10 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
         self._view = self._lift(
             self._backend.reset(Start(episode, self._get_row(starts)))
         )
+        if self._direct is not None:
+            self._view = self._direct.view
         self.memory = memory
-        self._command = self._rest
+        self._commands = self._rest[None]
         self._facts = {}
         self._steps = 0
         self.ended = np.zeros(self.robots, np.bool_)
@@ -230,21 +243,38 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
             self.task.take_step(out, view, view, memory)
         self._rehearsed = True
 
+    @cached_property
+    def _direct(self) -> Direct | None:
+        backend = self._backend
+        if self.robots > 1 or type(backend) is not SimBackend:
+            return None  # a subclass of the backend may move and measure in its own way
+        view = backend.get_live_view()
+        if view is None or not self.task.binds_all:
+            return None
+        step = self.task.bind(view)
+        return None if step is None else Direct(backend, view, step)
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = dict(vars(self))
+        state.pop("_direct", None)  # a copy binds its own simulator
+        return state
+
     @refuse_after_close
     @stop_on_error
     def step(self, action: AnyArray) -> tuple[Observation, float, bool, bool, Info]:
         """Applies an action for one control period; see Gymnasium."""
-        observation, terms, info = self.advance(action)
+        observation, terms, info = self._advance(action)
         # Sum in the vector env's order, for bit-identical rewards.
-        rewards = sum(terms.values(), np.zeros(self.robots))
-        reward = float(total(rewards))
-        info["reward_terms"] = terms
         if self.robots == 1:
-            info["reward_terms"] = {name: term.item() for name, term in terms.items()}
+            reward = 0.0
+            for term in terms.values():
+                reward += term
+        else:
+            reward = float(total(sum(terms.values(), np.zeros(self.robots))))
+        info["reward_terms"] = terms
         if self.render_mode == "human":
             self.render()
-        ended = bool(self.ended.all())
-        return observation.reshape(-1), reward, ended, False, info
+        return observation, reward, all(self.ended.tolist()), False, info
 
     @refuse_after_close
     @stop_on_error
@@ -253,17 +283,22 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
 
         Robots of a team that have `ended` (M,) get the command nearest to zero and no more reward.
         """
+        observation, terms, info = self._advance(action)
+        rows = {name: np.reshape(term, self.robots) for name, term in terms.items()}
+        return observation.reshape(self._shape[1:]), rows, info
+
+    def _advance(self, action: AnyArray) -> tuple[Singles, dict[str, Any], Info]:
+        """Returns the observation (M O,), reward terms (M,), as numbers if M = 1, and `info`."""
         before = self._view
         if before is None:
             raise gymnasium.error.ResetNeeded("call reset() before step().")
         given = guard.check_action(action, self.action_space, "action")
-        command = self._get_row(
-            self.task.drive(given.reshape(self._each), self.ended[None])[0],
-        )
-        seen, facts = self._backend.step(command)
-        self._command = command
+        self._commands = self.task.drive(given.reshape(self._each), self.ended[None])
+        self._steps += 1
+        if self._direct is not None:
+            return self._advance_directly(self._direct)
+        seen, facts = self._backend.step(self._commands[self._row])
         self._facts = facts
-        self._steps = self._steps + 1
         view = self._lift(seen)
         out = np.empty(self._shape, np.float32)
         outcome = self.task.take_step(out, before, view, self.memory)
@@ -271,16 +306,22 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
             outcome = outcome.stop_rewards(self.ended[None])
         terms = {}
         for name, term in outcome.terms.items():
-            terms[name] = term[0]
+            terms[name] = term[0] if self.robots > 1 else term.item()
         self.ended = outcome.ended[0]
         self._view = view
         for name, values in outcome.info.items():
-            row = self._get_row(values[0])
-            if row.ndim == 0:
-                facts[name] = row.item()
-            else:
-                facts[name] = row.copy()
-        return out[0], terms, self._make_info(view, facts)
+            row = values[self._row]
+            facts[name] = row.copy() if row.ndim else row.item()
+        return out.reshape(-1), terms, self._make_info(view, facts)
+
+    def _advance_directly(
+        self, direct: Direct
+    ) -> tuple[Singles, dict[str, float], Info]:
+        before = direct.view.pose[0].copy()
+        self._facts = direct.backend.move(self._commands)
+        observation, terms, ended, judged = direct.step(before, self.memory)
+        self.ended[0] = ended
+        return observation, terms, self._make_info(direct.view, self._facts | judged)
 
     def halt(self) -> None:
         """Stops the robot until the next reset; any exception does this, too."""
@@ -309,8 +350,8 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
     def _make_info(self, view: RobotView, facts: Info) -> Info:
         info: Info = {}
         for name in self.task.shown:
-            info[name] = self._get_row(self.memory[name][0]).copy()
-        info["pose"] = self._get_row(view.pose[0]).copy()
+            info[name] = self.memory[name][self._row].copy()
+        info["pose"] = view.pose[self._row].copy()
         info["scan_age_s"] = view.scan_age_s
         info["odom_age_s"] = view.odom_age_s
         if view.sensed:
@@ -347,16 +388,16 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
         covariance = known.get("covariance")
         return Snapshot(
             poses=np.reshape(facts.get("true_pose", view.pose), (self.robots, 3)),
-            ranges=view.ranges[0],
+            ranges=view.ranges[0].copy(),
             bodies=facts.get("bodies", self.scene.bodies),
             goals=find_goals(self.memory).copy(),
             member=int(np.asarray(self.scene.member)),
             step=self._steps,
-            estimates=view.pose[0],
+            estimates=view.pose[0].copy(),
             covariance=None
             if covariance is None
             else np.reshape(covariance, (-1, 3, 3)),
-            commands=np.reshape(self._command, (self.robots, -1)),
+            commands=self._commands[0],
             gate=find_gate(known),
         )
 

@@ -6,7 +6,7 @@ B beams, C commands, P scan parts of an observation.
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -35,6 +35,29 @@ class ScanScale(NamedTuple):
     beside: int
     sectors: int  # number of observed sectors; 0 if beams are observed
     plan: SectorPlan  # mapping of beams to sectors
+
+
+class NavigationRules(NamedTuple):
+    """What `navigation.Navigation` is made with; see its fields."""
+
+    scale: Any  # a ScanScale, packed
+    goal_radius: float
+    progress_reward: float
+    time_reward: float
+    success_reward: float
+    collision_reward: float
+
+
+class NavigationStep(NamedTuple):
+    """Arguments of `navigate` that stay in place from step to step."""
+
+    out: Singles
+    terms: Array
+    flags: Mask
+    pose: Array
+    twist: Array
+    ranges: Singles
+    rules: Any  # NavigationRules, packed
 
 
 @kernel(allocates=True)
@@ -131,11 +154,14 @@ def looks(
     shares: Singles,
     touched: Mask,
     ranges: Singles,
-    scale: ScanScale,
+    packed: Any,
 ) -> None:
-    """Applies `look` to the scans (R, B) of R robots; writes its results to touched (R,)."""
+    """Applies `look` to the scans (R, B) of R robots; writes its results to touched (R,).
+
+    `packed` is a ScanScale, packed by `kernels.pack`.
+    """
     for i in range(ranges.shape[0]):
-        touched[i] = look(shares[i], ranges[i], scale)
+        touched[i] = look(shares[i], ranges[i], packed.content)
 
 
 @kernel(allocates=True)
@@ -156,38 +182,63 @@ def find_bearing(dx: float, dy: float, heading: float) -> tuple[float, float, fl
 @kernel(allocates=True)
 def navigate(
     out: Singles,
-    approach: Array,
+    terms: Array,
     flags: Mask,
     before: Array,
     pose: Array,
     twist: Array,
     ranges: Singles,
     goals: Array,
-    scale: ScanScale,
-    radius: float,
+    packed: Any,
 ) -> None:
-    """Writes the observations (R, P + 6) of `navigation.Navigation`, and its `GoalProgress`.
+    """Takes a step of `navigation.Navigation`, whose NavigationRules are packed.
 
-    The columns of flags (R, 3) are reached, touched, and succeeded.
+    Writes the observations (R, P + 6); the terms (5, R) progress, time, success, collision, and
+    last the approach [m]; and the flags (4, R) reached, touched, succeeded, and ended.
     """
+    rules = packed.content
     parts = out.shape[1] - 6
     for i in range(out.shape[0]):
-        touched = look(out[i, :parts], ranges[i], scale)
+        touched = look(out[i, :parts], ranges[i], rules.scale.content)
         dx = goals[i, 0] - pose[i, 0]
         dy = goals[i, 1] - pose[i, 1]
         distance, c, s = find_bearing(dx, dy, pose[i, 2])
         dx = goals[i, 0] - before[i, 0]
         dy = goals[i, 1] - before[i, 1]
-        approach[i] = math.sqrt(dx * dx + dy * dy) - distance
-        reached = distance < radius
-        flags[i, 0] = reached
-        flags[i, 1] = touched
-        flags[i, 2] = reached and not touched
+        approach = math.sqrt(dx * dx + dy * dy) - distance
+        reached = distance < rules.goal_radius
+        succeeded = reached and not touched
+        terms[0, i] = rules.progress_reward * approach
+        terms[1, i] = rules.time_reward
+        terms[2, i] = rules.success_reward * succeeded
+        terms[3, i] = rules.collision_reward * touched
+        terms[4, i] = approach
+        flags[0, i] = reached
+        flags[1, i] = touched
+        flags[2, i] = succeeded
+        flags[3, i] = reached or touched
         out[i, parts] = min(distance, LIMIT)
         out[i, parts + 1] = c
         out[i, parts + 2] = s
         for k in range(3):
             out[i, parts + 3 + k] = min(max(twist[i, k], -LIMIT), LIMIT)
+
+
+@kernel(allocates=True)
+def navigate_in_place(packed: Any, before: Array, goals: Array) -> None:
+    """Takes a step like `navigate`, with a packed NavigationStep, which saves time."""
+    step = packed.content
+    navigate(
+        step.out,
+        step.terms,
+        step.flags,
+        before,
+        step.pose,
+        step.twist,
+        step.ranges,
+        goals,
+        step.rules,
+    )
 
 
 @kernel(allocates=True)

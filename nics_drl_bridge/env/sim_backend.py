@@ -74,16 +74,7 @@ class SimBackend:
 
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
         """Moves the robots by one control period; see `interface.Backend`."""
-        data = self.simulator.data
-        if self._middlewares:
-            # Round like a message, so that both backends agree.
-            command = self._robot.pass_through_cmd_vel(command)
-        commands = command.reshape(data.pose.shape[1], -1)
-        for middleware, one in zip(self._middlewares, commands, strict=False):
-            middleware.command(self._now_ns, one)
-        self.simulator.step(commands[None])
-        self._now_ns += self._period_ns
-        facts = {"stamp_ns": self._now_ns, **self._get_truth()}
+        facts = self.move(command.reshape(1, self.simulator.data.pose.shape[1], -1))
         view = self._measure()
         if self._middlewares:  # covariance at the time of this view
             covariances = np.array(
@@ -92,6 +83,24 @@ class SimBackend:
             alone = len(covariances) == 1
             facts["covariance"] = covariances[0] if alone else covariances
         return view, facts
+
+    def move(self, commands: Array) -> dict[str, Any]:
+        """Moves the robots like `step`, by commands (1, M, C), and returns only the facts."""
+        if self._middlewares:
+            # Round like a message, so that both backends agree.
+            commands = self._robot.pass_through_cmd_vel(commands)
+            for middleware, one in zip(self._middlewares, commands[0], strict=True):
+                middleware.command(self._now_ns, one)
+        self.simulator.step(commands)
+        self._now_ns += self._period_ns
+        return {"stamp_ns": self._now_ns, **self._get_truth()}
+
+    def get_live_view(self) -> RobotView | None:
+        """Returns a view (1, M) of arrays that `move` changes; None if there is more to a view."""
+        if self._middlewares or self.simulator.readings:
+            return None
+        data = self.simulator.data
+        return RobotView(data.odom, data.twist, data.ranges, 0.0, 0.0, 0.0)
 
     def facts(self) -> BackendFacts:
         """Returns the truth, the obstacles and the drawn values; see `interface.Backend`."""

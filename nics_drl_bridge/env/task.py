@@ -2,6 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, Literal
@@ -14,6 +15,7 @@ from nics_drl_bridge.env import guard, kernels
 from nics_drl_bridge.env.kernels import LIMIT, ScanScale
 from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.interface import Array, RobotView
+from nics_drl_bridge.kernels import Packed, pack
 from nics_drl_bridge.lidar.arrays import AnyArray, Integers, Singles
 from nics_drl_bridge.lidar.sector_kernels import SectorPlan
 from nics_drl_bridge.lidar.sectors import NO_PLAN, ScanLayout, plan_of
@@ -30,6 +32,8 @@ Memory = dict[str, AnyArray]
 Facts = dict[str, AnyArray]  # for `info`, by name
 Info = dict[str, Any]  # Gymnasium's `info`
 Terms = dict[str, Array]  # of the reward, by name
+BoundStep = Callable[[Array, Memory], tuple[Observation, dict[str, float], bool, Info]]
+"""A step from a pose (1, 3): observation (O,), reward terms, True at the end, facts for `info`."""
 DRIVES = (
     (0, 0, 0),
     (1, 0, 0),
@@ -193,24 +197,31 @@ class Task(ABC):
         low, high = self.command_limits
         kernels.scale_actions(out.reshape(rows.shape), rows, low, high)
         # Don't teach what a vehicle can't do: a car driven by turn rates can't steer at rest.
-        if self.robot.takes_turn_rate:
+        if self._takes_turn_rate:
             return self.robot.pass_through_cmd_vel(out)
         return out
+
+    @cached_property
+    def _takes_turn_rate(self) -> bool:
+        return self.robot.takes_turn_rate
 
     def drive(self, actions: ArrayLike, ended: Flags) -> Array:
         """Returns the checked commands (n, M, C) of actions; robots that have ended stand still."""
         shape = (*ended.shape, len(self.robot.command))
-        command = guard.check_command(self.command(actions), shape)
+        command = self.command(actions)
+        # Between finite limits, only a user's own command may be infinite.
+        if type(self).command is not Task.command or command.shape != shape:
+            command = guard.check_command(command, shape)
         if self.robots > 1 and ended.any():
             command = np.where(ended[..., None], still(self.robot), command)
         return command
 
-    def _covers_all(self, declared: str) -> bool:
-        """Returns True if no class below the one that declares a name overrides one of `PARTS`."""
+    def _covers_all(self, declared: str, parts: Iterable[str] = PARTS) -> bool:
+        """Returns True if no class below the one that declares a name overrides a part."""
         for base in type(self).__mro__:
             if declared in vars(base):
                 return True
-            if any(part in vars(base) for part in PARTS):
+            if any(part in vars(base) for part in parts):
                 return False
         return False
 
@@ -218,6 +229,11 @@ class Task(ABC):
     def is_fused(self) -> bool:
         """True if `step_into` of the task's class does all parts of a step in its own way."""
         return self._covers_all("step_into")
+
+    @cached_property
+    def binds_all(self) -> bool:
+        """True if `bind` of the task's class does all parts of a step in its own way."""
+        return self._covers_all("bind", (*PARTS, "step_into", "take_step"))
 
     @cached_property
     def needs_last_scan(self) -> bool:
@@ -280,6 +296,15 @@ class Task(ABC):
                 "end", f"must be True or False for each robot, not {kind}"
             )
         return Outcome(terms, ended, info)
+
+    def bind(self, view: RobotView) -> BoundStep | None:
+        """Binds the steps of one robot to its view (1, 1), whose arrays change in place.
+
+        A class may override it to do all parts of a step in one small call of a kernel, which saves
+        most of the time in the fast simulator. It is left out if a subclass overrides a part, or
+        `step_into`.
+        """
+        return None
 
     def start_episodes(self, episodes: Episodes) -> Memory:
         """Returns the memory of `reset`. Raises ConfigError if it does not fit or lacks `shown`."""
@@ -401,13 +426,20 @@ class Task(ABC):
         return NO_PLAN if self.scan is None else plan_of(self.lidar, self.scan)
 
     @cached_property
-    def scale(self) -> ScanScale:
-        """Conversion of a scan, for the kernels."""
+    def scale(self) -> Any:
+        """Conversion of a scan, for the kernels: a ScanScale, packed."""
         leaves = find_contact_ranges(self.robot, self.lidar, self.contact_margin)
         sectors = 0 if self.scan is None else self.scan.sectors
         per_metre = np.float32(1.0 / self.sight.range_max)
         beside = int(CONTACT_ANGLE / 2.0 / abs(self.lidar.angle_increment))
-        return ScanScale(per_metre, leaves, beside, sectors, self.plan)
+        return pack(ScanScale(per_metre, leaves, beside, sectors, self.plan))
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = {}
+        for name, value in vars(self).items():
+            if not isinstance(value, Packed):  # a copy packs its own
+                state[name] = value
+        return state
 
 
 def _is_finite(given: Any) -> bool:

@@ -325,8 +325,12 @@ class FastSimulator:
 
     def step(self, commands: ArrayLike) -> None:
         """Move every world by one control period under commands (N, M, C), see `data`."""
-        checked = self._check_commands(slice(0, len(self.data.steps)), commands)
-        self.run_parts(lambda part: self._step(part, checked[part]))
+        if len(self.parts) == 1:
+            part = self.parts[0]
+            self._step(part, self._check_commands(part, commands))
+        else:
+            checked = self._check_commands(slice(0, len(self.data.steps)), commands)
+            self.run_parts(lambda part: self._step(part, checked[part]))
 
     def step_part(self, part: slice, commands: ArrayLike) -> None:
         """Move the worlds of one of `parts` under commands (n, M, C), in the calling thread."""

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import contextlib
+import copy
+import pickle
 from dataclasses import replace
 
 import gymnasium
@@ -154,11 +156,39 @@ def test_infos_of_earlier_steps_do_not_change(env):
     assert np.array_equal(second["true_pose"], pose)
 
 
+@pytest.mark.parametrize(
+    "copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))]
+)
+def test_a_copy_of_an_env_goes_on_by_itself(env, copied):
+    env.reset(seed=0, options={"start": (0.0, 0.0, 0.0), "goal": (2.0, 0.0)})
+    ahead = np.array([0.2, 0.1, 0.0], np.float32)
+    env.step(ahead)
+    other = copied(env)
+    steps = [env.step(ahead) for _ in range(3)]
+    np.testing.assert_equal([other.step(ahead) for _ in range(3)], steps)
+
+
+def test_a_snapshot_stays_what_it_was_when_the_robot_moves_on(env):
+    env.reset(seed=0)
+    shot = env.snapshot()
+    kept = copy.deepcopy(shot)
+    env.step(np.ones(3, np.float32))
+    np.testing.assert_equal(vars(shot), vars(kept))
+
+
+def test_a_goal_that_is_moved_amid_an_episode_counts_from_the_next_step_on(env):
+    env.reset(seed=0, options={"start": (0.0, 0.0, 0.0), "goal": (2.0, 0.0)})
+    env.memory["goal"][...] = 0.0, 1.5
+    assert env.step(STILL)[0][-6] == 1.5
+    env.memory["goal"] = np.array([[[0.0, 1.0]]])
+    assert env.step(STILL)[0][-6] == 1.0
+
+
 class Recorder:
     """A backend of one's own: it remembers what it was told."""
 
-    def __init__(self):
-        self.inner = SimBackend(direct_model(), field())
+    def __init__(self, world=None):
+        self.inner = SimBackend(direct_model(), world or field())
         self.commands = []
         self.closed = 0
 
@@ -182,6 +212,32 @@ def test_any_backendwith_reset_step_and_close_is_a_backend_that_a_still_command_
     env.close()
     assert np.array_equal(backend.commands, [[2.0, -2.0, 0.0], [0.0, 0.0, 0.0]])
     assert backend.closed == 1
+
+
+class Apart(Navigation):
+    """Navigation whose steps are taken part by part."""
+
+    def end(self, view, memory):
+        return super().end(view, memory)
+
+
+def test_steps_are_the_same_in_one_call_over_another_backend_and_part_by_part():
+    world = field(count=4)
+    given = {"model": direct_model(), "world": world}
+    envs = [BridgeEnv(**given), BridgeEnv(Recorder(world), **given)]
+    envs.append(BridgeEnv(**given, task=Apart))
+    ends = []
+    for seed in range(8):
+        begun = [env.reset(seed=seed)[0] for env in envs]
+        np.testing.assert_equal(begun, begun[:1] * 3)
+        for action in random_actions(envs[0], 40, seed):
+            steps = [env.step(action) for env in envs]
+            np.testing.assert_equal(steps, steps[:1] * 3)
+            if steps[0][2]:
+                ends.append(steps[0][4]["is_success"])
+                break
+    assert [env._direct is not None for env in envs] == [True, False, False]
+    assert False in ends  # with a contact, at least
 
 
 def test_facts_of_a_backend_of_ones_own_are_those_of_its_last_step_unless_it_has_some():

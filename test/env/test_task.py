@@ -16,6 +16,7 @@ from shapely.geometry import LineString, Polygon
 from nics_drl_bridge.env.registry import ENVIRONMENTS, TASK, make_task
 from nics_drl_bridge.env.task import (
     DRIVES,
+    PARTS,
     bearing,
     discrete_commands,
     distance,
@@ -339,6 +340,22 @@ def test_a_part_of_navigation_that_is_overridden_alone_counts(task):
     assert terms["changed"] > 0.0
     both = several.step(ahead)[4]["reward_terms"]
     assert terms == {name: both[name][0] for name in terms}
+
+
+@pytest.mark.parametrize("part", [*PARTS, "step_into", "take_step", "command", "drive"])
+def test_each_step_calls_a_method_that_a_subclass_of_navigation_overrides(part):
+    called = []
+
+    def call(self, *given):
+        called.append(part)
+        return getattr(Navigation, part)(self, *given)
+
+    task = type("Calling", (Navigation,), {part: call})
+    env = gymnasium.make(TASK, model=direct_model(), world=field(), task=task)
+    env.reset(seed=0)
+    called.clear()
+    env.step(np.zeros(3, np.float32))
+    assert called
 
 
 class Shifting(Navigation):

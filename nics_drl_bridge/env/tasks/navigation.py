@@ -2,17 +2,19 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import gymnasium
 import numpy as np
 
 from nics_drl_bridge.env import kernels, task
-from nics_drl_bridge.env.kernels import LIMIT
+from nics_drl_bridge.env.kernels import LIMIT, NavigationRules, NavigationStep
 from nics_drl_bridge.env.task import (
+    BoundStep,
     Episodes,
     Facts,
     Flags,
+    Info,
     Memory,
     Observation,
     Outcome,
@@ -20,6 +22,10 @@ from nics_drl_bridge.env.task import (
     Terms,
 )
 from nics_drl_bridge.interface import Array, RobotView
+from nics_drl_bridge.kernels import pack
+
+# rewards in the order of `kernels.navigate`, whose last row is none
+TERMS = ("progress", "time", "success", "collision")
 
 
 class GoalProgress(NamedTuple):
@@ -101,11 +107,18 @@ class Navigation(Task):
         self, view: RobotView, memory: Memory, before: RobotView | None = None
     ) -> GoalProgress:
         """Determines which robots are at their goals and which touch something."""
-        return self._observe((before or view).pose, view, memory)[1]
+        _, terms, flags = self._observe((before or view).pose, view, memory)
+        return GoalProgress(terms[4], flags[0], flags[1], flags[2])
 
     def reward(self, before: RobotView, after: RobotView, memory: Memory) -> Terms:
         """Returns the terms (...,) whose sum is the reward of a step."""
-        return self._make_terms(self.judge(after, memory, before))
+        progress = self.judge(after, memory, before)
+        return {
+            "progress": self.progress_reward * progress.approach,
+            "time": np.full(progress.approach.shape, self.time_reward, np.float64),
+            "success": np.multiply(self.success_reward, progress.succeeded),
+            "collision": np.multiply(self.collision_reward, progress.touched),
+        }
 
     def end(self, view: RobotView, memory: Memory) -> Flags:
         """Returns True where a robot is at its goal or touches something."""
@@ -114,15 +127,46 @@ class Navigation(Task):
 
     def info(self, view: RobotView, memory: Memory) -> Facts:
         """Returns success and contact of each robot."""
-        return self._make_facts(self.judge(view, memory))
+        progress = self.judge(view, memory)
+        return {"is_success": progress.succeeded, "collision": progress.touched}
 
     def step_into(
         self, out: Observation, before: RobotView, after: RobotView, memory: Memory
     ) -> Outcome:
         """Computes all of the above in one pass over each scan; `out` is contiguous."""
-        _, progress = self._observe(before.pose, after, memory, out)
-        over = progress.reached | progress.touched
-        return Outcome(self._make_terms(progress), over, self._make_facts(progress))
+        _, terms, flags = self._observe(before.pose, after, memory, out)
+        facts = {"is_success": flags[2], "collision": flags[1]}
+        return Outcome(dict(zip(TERMS, terms, strict=False)), flags[3], facts)
+
+    def bind(self, view: RobotView) -> BoundStep | None:
+        """Binds steps to a view; see `Task.bind`. There are none with further sensors."""
+        if self.sensors:
+            return None
+        out = np.empty((1, *self.observation_space.shape), np.float32)
+        terms = np.empty(5)
+        flags = np.empty(4, np.bool_)
+        step = pack(
+            NavigationStep(
+                out,
+                terms[:, None],
+                flags[:, None],
+                view.pose[0],
+                view.twist[0],
+                view.ranges[0],
+                self._rules,
+            )
+        )
+
+        def take_step(
+            before: Array, memory: Memory
+        ) -> tuple[Observation, dict[str, float], bool, Info]:
+            kernels.navigate_in_place(step, before, memory["goal"][0])
+            _, touched, succeeded, ended = flags.tolist()
+            facts = {"is_success": succeeded, "collision": touched}
+            paid = dict(zip(TERMS, terms.tolist(), strict=False))
+            return out[0].copy(), paid, ended, facts
+
+        return take_step
 
     def _observe(
         self,
@@ -130,11 +174,11 @@ class Navigation(Task):
         now: RobotView,
         memory: Memory,
         out: Observation | None = None,
-    ) -> tuple[Observation, GoalProgress]:
-        """Returns the observation, which is written to `out` if given, and the progress."""
+    ) -> tuple[Observation, Array, Flags]:
+        """Returns what `kernels.navigate` writes; the observation is `out` if given."""
         lead = now.pose.shape[:-1]
-        approach = np.empty(lead)
-        flags = np.empty((*lead, 3), np.bool_)
+        terms = np.empty((5, *lead))
+        flags = np.empty((4, *lead), np.bool_)
         if out is None:
             out = np.empty((*lead, *self.observation_space.shape), np.float32)
         own = out
@@ -142,28 +186,27 @@ class Navigation(Task):
             own = np.empty((*lead, self.scan_parts + 6), np.float32)
         kernels.navigate(
             own.reshape(-1, own.shape[-1]),
-            approach.reshape(-1),
-            flags.reshape(-1, 3),
+            terms.reshape(5, -1),
+            flags.reshape(4, -1),
             before.reshape(-1, 3),
             now.pose.reshape(-1, 3),
             now.twist.reshape(-1, 3),
             now.ranges.reshape(-1, now.ranges.shape[-1]),
             memory["goal"].reshape(-1, 2),
-            self.scale,
-            self.goal_radius,
+            self._rules,
         )
         if self.sensors:
             np.concatenate([own, self.sensor_shares(now)], axis=-1, out=out)
-        return out, GoalProgress(approach, flags[..., 0], flags[..., 1], flags[..., 2])
+        return out, terms, flags
 
-    def _make_terms(self, progress: GoalProgress) -> Terms:
-        return {
-            "progress": self.progress_reward * progress.approach,
-            "time": np.full(progress.approach.shape, self.time_reward, np.float64),
-            "success": np.multiply(self.success_reward, progress.succeeded),
-            "collision": np.multiply(self.collision_reward, progress.touched),
-        }
-
-    @staticmethod
-    def _make_facts(progress: GoalProgress) -> Facts:
-        return {"is_success": progress.succeeded, "collision": progress.touched}
+    @cached_property
+    def _rules(self) -> Any:
+        """NavigationRules, packed for the kernels."""
+        rewards = (
+            self.progress_reward,
+            self.time_reward,
+            self.success_reward,
+            self.collision_reward,
+        )
+        numbers = map(float, (self.goal_radius, *rewards))
+        return pack(NavigationRules(self.scale, *numbers))
