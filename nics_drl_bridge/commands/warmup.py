@@ -1,4 +1,4 @@
-"""`nics warmup`: compiles kernels in advance, on two cores."""
+"""`nics warmup`: compiles kernels in advance; all of them on two cores."""
 
 import os
 import signal
@@ -43,7 +43,7 @@ def warmup(
     # Spawned, not forked: a fork could inherit a lock that is never released.
     with (
         show_progress("compiling"),
-        get_context("spawn").Pool(2, _begin, (for_wheel,)) as pool,
+        get_context("spawn").Pool(len(parts), _begin, (for_wheel,)) as pool,
     ):
         *first, model = pool.apply(_compile_by, (_model,))
         jobs = [pool.apply_async(_compile_by, (part, model)) for part in parts]
