@@ -96,7 +96,7 @@ class SimBackend:
         return {"stamp_ns": self._now_ns, **self._get_truth()}
 
     def get_live_view(self) -> RobotView | None:
-        """Returns a view (1, M) of arrays that `move` changes; None if there is more to a view."""
+        """Returns a view (1, M) of the simulator's own arrays; None if a view needs more."""
         if self._middlewares or self.simulator.readings:
             return None
         data = self.simulator.data
