@@ -555,9 +555,7 @@ BENCHMARKS = {
     "table3_density": Benchmark(
         measure_table3,
         judge_table3,
-        {
-            "plain": Control("our look-up: the plain one stands in", "area [m2]"),
-        },
+        {"plain": Control("our look-up: the plain one stands in", "area [m2]")},
         {"scans": SCANS},
         short="--scans 256",
     ),

@@ -273,9 +273,8 @@ def measure_throughput(given: Given) -> Result:
         }
     if not case.is_usual:
         result["share_of_usual"] = rate["one"] / rate["usual"]
-        result["least_share_of_usual"] = OF_USUAL[
-            "lidar" if case.lidar else "obstacles"
-        ]
+        changed = "lidar" if case.lidar else "obstacles"
+        result["least_share_of_usual"] = OF_USUAL[changed]
     if case.lidar is not None:
         result["times_as_long_as_clean"] = rate["clean"] / rate["one"]
     return result

@@ -68,9 +68,8 @@ class Load:
     scans: int
     answered: float  # fraction of the scans with a `cmd_vel_raw`
     cpu: dict[str, float]  # fraction of a core that each node took
-    memory_mb: dict[
-        str, float
-    ]  # of each node and its children, shared pages in part (PSS)
+    # of each node and its children, shared pages in part (PSS)
+    memory_mb: dict[str, float]
     policy: Latency  # until `cmd_vel_raw`
     gate: Latency  # until the first `cmd_vel` after it
 
