@@ -61,7 +61,6 @@ PICTURES = (
 )
 DRAWN_FILES = (REPORT_PAGE, *(f"{PICTURES_FOLDER}/{name}.png" for name in PICTURES))
 CONTROL_PERIOD_S = Settings.control_period_s
-MOTORS = "inputs", "limits"  # fields of a calibration
 DEFAULT_LIDAR = "paper"
 BUILTIN_SEED = 0
 
@@ -121,10 +120,9 @@ class SimulatorModel:
     @cached_property
     def text(self) -> str:
         """The content of `model.yaml`."""
-        # The kinematics already hold the motors' parameters; a new calibration has a copy.
-        calibration = {
-            k: v for k, v in asdict(self.calibration).items() if k not in MOTORS
-        }
+        # The kinematics already hold the input curves; a new calibration has a copy.
+        calibration = asdict(self.calibration)
+        del calibration["inputs"]
         kinematics = self.kinematics.named.model_dump(
             exclude_none=True, exclude_defaults=True
         )
@@ -217,7 +215,7 @@ def generate(
     model = SimulatorModel(
         robot,
         identified.model,
-        replace(identified.calibration, inputs=(), limits={}),
+        replace(identified.calibration, inputs=()),
         lidar,
         bake(lidar, (*shapes, footprint_shape(robot))),
         identified.noise,
@@ -377,7 +375,7 @@ def load_model(folder: str | Path) -> SimulatorModel:
     file = validate(data, _File, str(path))
     # A file must state its calibration; the defaults are for a robot without any offset.
     for key in fields(Calibration):
-        if key.name not in (*data["calibration"], *MOTORS):
+        if key.name not in ("inputs", *data["calibration"]):
             raise ConfigError(
                 f"{path}: the key 'calibration.{key.name}' is missing; add it."
             )

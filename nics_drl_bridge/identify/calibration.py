@@ -12,7 +12,6 @@ from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.drive import MAX_GAP_S, MIN_STAMPS, Drive
 from nics_drl_bridge.identify.signals import (
-    Motors,
     average_effect,
     infer_states,
     resample,
@@ -60,8 +59,6 @@ class Calibration:
     responses: tuple[Response, ...] = ()
     # of commands with an input curve or a delay of their own
     inputs: tuple[InputCurve, ...] = ()
-    # maximum fall and rise of inferred states' rates
-    limits: dict[str, tuple[float, float]] = field(default_factory=dict)
     # time between bursts of poses; 0 without bursts
     burst_period_s: NonNegativeFloat = 0.0
     # standard deviation of x and y of the pose
@@ -86,19 +83,9 @@ class Calibration:
         return (
             self.clock_offset_s == self.command_latency_s == self.rotation_rad == 0.0
             and self.lever_arm_m == (0.0, 0.0)
-            and not (self.responses or self.inputs or self.limits)
+            and not (self.responses or self.inputs)
             and self.burst_period_s == 0.0
             and self.position_noise_m == self.heading_noise_rad == 0.0
-        )
-
-    @property
-    def motors(self) -> Motors:
-        """Motors, which limit states that follow commands, in addition to delays and lags."""
-        limits = [self.limits.get(r.state, (-np.inf, np.inf)) for r in self.responses]
-        fall, rise = np.array(limits).reshape(-1, 2).T
-        dead = {curve.command: curve.dead for curve in self.inputs}
-        return Motors(
-            fall, rise, np.array([dead.get(r.command, 0.0) for r in self.responses])
         )
 
     @property
@@ -182,10 +169,7 @@ def resample_states(drive: Drive, calibration: Calibration, grid: Array) -> Arra
     longer = np.concatenate([grid[0] + step * np.arange(-lead, 0), grid])
     late = delays([r.command for r in calibration.responses], calibration.inputs)
     latency = calibration.command_latency_s + late
-    motors = calibration.motors
-    inferred = infer_states(
-        recording.command, drive.spec, lags, latency, longer, motors
-    )
+    inferred = infer_states(recording.command, drive.spec, lags, latency, longer)
     return np.asarray(gains * inferred[lead:])
 
 

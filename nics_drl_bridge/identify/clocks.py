@@ -1,7 +1,7 @@
 """Clocks: offset, latency and lags of a drive, each the shift that best explains it by commands."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,6 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import signals
 from nics_drl_bridge.identify.calibration import Calibration, Response
 from nics_drl_bridge.identify.drive import MIN_STAMPS, Drive, TwistIntervals
-from nics_drl_bridge.identify.signals import Motors
 from nics_drl_bridge.identify.statistics import (
     CERTAIN,
     compute_unexplained,
@@ -28,7 +27,7 @@ from nics_drl_bridge.robot.spec import RobotSpec
 Target = tuple[Array, Array, Array]
 # residual as a function of a trial delay [s] and possibly the logarithms of lags
 Residual = Callable[[Array], Array]
-# residual as a function of lags (S,), delays () or (S,) [s], and possibly motors
+# residual as a function of lags (S,), and delays () or (S,) [s]
 Left = Callable[..., Array]
 
 STEP_S = 0.01
@@ -116,15 +115,13 @@ def make_response_residual(
     powers = powers[(powers[:, ~moved] == 0).all(axis=1)]
     grid = np.arange(start.min() - LEAD_S, end.max() + STEP_S, STEP_S)
 
-    def residual(
-        lags: Array, delay: Array | float, motors: Motors | None = None
-    ) -> Array:
+    def residual(lags: Array, delay: Array | float) -> Array:
         if not spec.state:
             means = signals.average_held(
                 command, spec, start - delay, end - delay, powers
             )
             return compute_unexplained(means, signal)
-        states = signals.infer_states(command, spec, lags, delay, grid, motors)
+        states = signals.infer_states(command, spec, lags, delay, grid)
         chi = taylor.evaluate(states, powers)
         return compute_unexplained(
             signals.average_between_stamps(grid, chi, start, end), signal
@@ -227,10 +224,6 @@ class TimingEstimate:
     early: float = 0.0
     # rate at which the pose's clock gains on the commands' [s/s]; 0 if none is found
     drift: float = 0.0
-    # (S,) delays of inferred states after the latency, in addition to lags [s]
-    delays: Array = field(default_factory=lambda: np.zeros(1))
-    # motors of inferred states; None if nothing limits them
-    motors: Motors | None = None
 
 
 def check_state_is_known(recording: Recording, spec: RobotSpec) -> None:
@@ -407,9 +400,8 @@ def average_expected_states(
     if state is not None:
         return signals.average_between_stamps(state.t, state.values, start, end)
     grid = np.arange(min(start[0], command.t[0]) - 1.0, end[-1] + 0.01, 0.01)
-    late = timing.latency + timing.delays
     states = signals.infer_states(
-        command, drive.spec, timing.lags, late, grid, timing.motors
+        command, drive.spec, timing.lags, timing.latency, grid
     )
     return signals.average_between_stamps(grid, states, start, end)
 

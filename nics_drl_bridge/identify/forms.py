@@ -1,4 +1,4 @@
-"""Forms: effects of motors and tyres on commands, detected in a motion and tested by predictions.
+"""Forms: effects of motors, delays and tyres, which predictions of a drive confirm or refuse.
 
 Input curves are those of Hammerstein models: dead zone, saturation, a separate reverse gain.
 """
@@ -6,6 +6,7 @@ Input curves are those of Hammerstein models: dead zone, saturation, a separate 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import product
 
 import numpy as np
 import scipy  # its parts load slowly, when used
@@ -15,8 +16,20 @@ from nics_drl_bridge.identify import shooting
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.motion import choose_half_width, smooth_commands
-from nics_drl_bridge.identify.signals import average_effect
-from nics_drl_bridge.identify.terms import fit_motion_terms, tells_lever_from_wheels
+from nics_drl_bridge.identify.open_loop import MIDDLE_OF_STEP, roll
+from nics_drl_bridge.identify.signals import (
+    average_effect,
+    find_speed_index,
+    list_followed_commands,
+    select_moved_inputs,
+)
+from nics_drl_bridge.identify.terms import (
+    Kind,
+    Library,
+    find_linear_term,
+    fit_motion_terms,
+    tells_lever_from_wheels,
+)
 from nics_drl_bridge.identify.yardstick import probe_structure
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.curve import InputCurve
@@ -54,6 +67,13 @@ SELDOM = 1.0  # percentage of a drive that must exceed a rate limit for it to co
 STRONG = 95.0  # percentile of the rates at which the search for limits starts
 LEVER_SCALE_M = 0.05
 TURN_SCALE = 0.1
+LAG_SCALE_S = 0.02
+# where limits of a state may start, relative to its command's range per second, and all delays
+# and lags, which these limits may explain in part
+RATES = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0)
+SHARES = (1.0, 0.5, 0.25)
+START_SPACING_S = 1.0
+LAG_RANGE_S = (0.002, 3.0)
 
 
 @dataclass(frozen=True)
@@ -146,6 +166,11 @@ class Form:
     tyres: bool = False
     # initial delays of all commands [s]; empty if they share one
     delays: tuple[tuple[str, float], ...] = ()
+    # (state, command) pairs of states that were not measured
+    followed: tuple[tuple[str, str], ...] = ()
+    # parts of the mounting that predictions adjust: `x`, `y` and `heading`
+    mounted: tuple[str, ...] = ()
+    is_timed: bool = False  # True if a measured state tells the latency
 
     def latency_at(self, inputs: shooting.Inputs, values: Array) -> float:
         """Returns the common latency of the commands for values (I,): their minimum delay [s]."""
@@ -179,7 +204,7 @@ class Form:
     def actuated(
         self, model: TaylorModel, inputs: shooting.Inputs, values: Array
     ) -> TaylorModel:
-        """Returns a model with friction, drag and limits for values (I,)."""
+        """Returns a model with lags, friction, drag and limits for values (I,)."""
         at = dict(zip(inputs.names, values.tolist(), strict=True))
         states = model.variables[: model.state_size]
         friction = [max(at.get(f"{name}.friction", 0.0), 0.0) for name in states]
@@ -192,13 +217,106 @@ class Form:
         for i, state in enumerate(states):
             for j, command in enumerate(commands):
                 emf[i, j] = max(at.get(f"{state}.back_emf.{command}", 0.0), 0.0)
-        return replace(
+        model = replace(
             model,
             friction=np.array(friction),
             drag=np.array(drag),
             back_emf=emf,
             limits=np.array(limits).reshape(-1, 2),
         )
+        for state, command in self.followed:
+            gain = at.get(f"{state}.gain", 1.0)
+            model = set_lag(model, state, command, at[f"{state}.lag"], gain)
+        return model
+
+
+def are_lags_measured(calibration: Calibration) -> bool:
+    """True if both offset and latency are known: only the wheels' response separates them."""
+    return {"clock_offset_s", "command_latency_s"} <= set(calibration.uncertainty)
+
+
+def list_followed(drive: Drive) -> tuple[tuple[str, str], ...]:
+    """Returns (state, command) pairs of unmeasured states whose command moved."""
+    if drive.recording.state is not None:
+        return ()
+    moved = select_moved_inputs(drive.recording.command, drive.spec)
+    pairs = zip(drive.spec.state, moved.tolist(), strict=False)
+    return tuple((v.name, str(v.follows)) for v, has_moved in pairs if has_moved)
+
+
+def add_limits(form: Form, state: str) -> Form:
+    """Returns a form in which a state has a maximum fall and rise."""
+    return replace(form, limits=(*form.limits, state))
+
+
+def make_form(drive: Drive, calibration: Calibration, library: Library) -> Form:
+    """Returns the plainest form of a drive's model."""
+    spec = drive.spec
+    if not spec.state:
+        if tells_lever_from_wheels(spec):
+            return Form(mounted=("x", "y", "heading"))
+        return Form(mounted=("x", "heading"))
+    if library.kind is Kind.MOTION:
+        return Form()
+    known = calibration.uncertainty
+    mounted = []
+    if "lever_arm_x_m" in known:
+        mounted.append("x")
+    if "lever_arm_y_m" in known and tells_lever_from_wheels(spec):
+        mounted.append("y")
+    if "rotation_rad" in known:
+        mounted.append("heading")
+    if spec.moves_sideways:
+        mounted = []
+    return Form(
+        followed=list_followed(drive),
+        mounted=tuple(mounted),
+        is_timed=library.kind is Kind.MEASURED,
+    )
+
+
+def choose_start(
+    problem: shooting.Shooting,
+    model: TaylorModel,
+    inputs: shooting.Inputs,
+    before: shooting.Inputs,
+) -> shooting.Inputs:
+    """Starts the limits of a state where predictions are best, together with its lag."""
+    names = list(inputs.names)
+    times = [k for k, name in enumerate(names) if name.endswith((".lag", ".delay"))]
+    times.append(names.index("latency"))
+    coarse = replace(problem, spacing_s=START_SPACING_S)
+    for name in names:
+        state = name.removesuffix(".rise")
+        if state == name or name in before.names or f"{state}.lag" not in names:
+            continue
+        places = [names.index(f"{state}.{word}") for word in ("rise", "fall")]
+        trials = []
+        for rate, share in product(RATES, SHARES):
+            start = inputs.start.copy()
+            start[places] *= rate
+            start[times] *= share
+            start = np.clip(start, inputs.low, inputs.high)
+            error, _ = coarse.errors(model, start)
+            far = np.hypot(error[..., 0], error[..., 1])
+            trials.append((float(np.nanmean(far)), start))
+        best = min(trials, key=lambda trial: trial[0])
+        inputs = replace(inputs, start=best[1])
+    return inputs
+
+
+def set_lag(
+    model: TaylorModel, state: str, command: str, lag_s: float, gain: float
+) -> TaylorModel:
+    """Returns a model in which a state follows a command with a lag [s] and a gain."""
+    names = np.array(model.variables)
+    row = 3 + int(np.flatnonzero(names == state)[0])
+    rate = -np.expm1(-model.dt / lag_s) / model.dt
+    coefficients = model.coefficients.copy()
+    coefficients[row] = 0.0
+    coefficients[row, find_linear_term(model, state)] = -rate
+    coefficients[row, find_linear_term(model, command)] = rate * gain
+    return replace(model, coefficients=coefficients)
 
 
 def make_prediction_problem(
@@ -211,15 +329,36 @@ def make_prediction_problem(
     """Returns the prediction problem of a drive on one time axis."""
     command = drive.recording.command
     spec = drive.spec
-    t = samples.t
     dt = samples.dt
+    t = samples.t
+    rows = np.arange(len(t))
+    if form.followed:  # states that follow the commands do so from the first one on
+        lead = int(np.ceil(max(0.0, t[0] - command.t[0]) / dt)) + 1
+        rows = np.round((t - t[0]) / dt).astype(np.intp) + lead
+        t = t[0] + dt * (np.arange(-lead, rows[-1] - lead + 1) + MIDDLE_OF_STEP)
 
     @lru_cache(maxsize=8)  # most values of a form do not affect the commands
     def late(latency: float, curves: tuple[InputCurve, ...]) -> Array:
         return average_effect(command, spec, curves, t - latency, t - latency + dt)
 
-    def commands(values: Array) -> Array:
+    def all_commands(values: Array) -> Array:
         return late(form.latency_at(inputs, values), form.curves_at(inputs, values))
+
+    def commands(values: Array) -> Array:
+        return all_commands(values)[rows]
+
+    @lru_cache(maxsize=8)  # nor do the coefficients affect such a state
+    def follow(values: tuple[float, ...]) -> Array:
+        sent = all_commands(np.array(values))
+        at = dict(zip(inputs.names, values, strict=True))
+        gains = [at.get(f"{v.name}.gain", 1.0) for v in spec.state]
+        begin = np.array(gains) * sent[0, list_followed_commands(spec)]
+        model = form.actuated(_make_follower(spec, dt), inputs, np.array(values))
+        _, states = roll(model, begin[None], sent[None])
+        return np.asarray(states[0][rows])
+
+    def inferred(values: Array) -> Array:
+        return follow(tuple(values.tolist()))
 
     def shaped(model: TaylorModel, values: Array) -> TaylorModel:
         return form.actuated(model, inputs, values)
@@ -229,15 +368,42 @@ def make_prediction_problem(
         return drive.trust(start - offset, end - offset)
 
     noise, _ = drive.pose_noise or (0.0, 0.0)
-    return shooting.Shooting(samples, commands, shaped, trust, not spec.state, noise)
+    return shooting.Shooting(
+        samples,
+        commands,
+        shaped,
+        trust,
+        inferred if form.followed else None,
+        bool(form.mounted),
+        noise,
+    )
+
+
+def _make_follower(spec: RobotSpec, dt: float) -> TaylorModel:
+    """Returns a model without motion, with a term of each variable alone."""
+    count = len(spec.variable_names)
+    return TaylorModel(
+        spec.variable_names,
+        spec.dof_names,
+        spec.dof_units,
+        powers=np.eye(count, dtype=np.int64),
+        coefficients=np.zeros((len(spec.dof_names), count)),
+        dt=dt,
+        low=np.full(count, -np.inf),
+        high=np.full(count, np.inf),
+    )
 
 
 def list_inputs(
-    drive: Drive, latency: float, samples: Samples, form: Form
+    drive: Drive, calibration: Calibration, samples: Samples, form: Form
 ) -> shooting.Inputs:
     """Returns the values to be estimated besides coefficients: latency, and those of a form."""
-    rows = _list_command_values(drive, latency, form)
+    rows = _list_command_values(drive, calibration.command_latency_s, form)
+    rows |= _list_follower_values(drive, calibration, form)
     rates = {v.name: samples.dq[:, 3 + i] for i, v in enumerate(drive.spec.state)}
+    for state, command in form.followed:
+        sent = samples.x[:, drive.spec.variable_names.index(command)]
+        rates[state] = np.array([-np.ptp(sent), np.ptp(sent)])
     for name in form.friction:
         size = float(np.percentile(np.abs(rates[name]), STRONG))
         rows[f"{name}.friction"] = (0.1 * size, 0.1 * size, 0.0, size)
@@ -254,14 +420,39 @@ def list_inputs(
     for name in form.limits:
         for word, rate in (("fall", -rates[name]), ("rise", rates[name])):
             size = max(float(np.percentile(rate, STRONG)), 1e-3)
-            rows[f"{name}.{word}"] = (size, 0.3 * size, 0.1 * size, 10.0 * size)
-    if not drive.spec.state:  # the remaining error of the mounting
+            rows[f"{name}.{word}"] = (size, 0.3 * size, 0.05 * size, 20.0 * size)
+    if form.mounted:  # the remaining error of the mounting
         reach = 2.0 * drive.spec.footprint_radius
-        aside = reach if tells_lever_from_wheels(drive.spec) else 0.0
-        rows["x"] = (0.0, LEVER_SCALE_M, -reach, reach)
-        rows["y"] = (0.0, LEVER_SCALE_M, -aside, aside)
-        rows["heading"] = (0.0, TURN_SCALE, -np.pi, np.pi)
+        for name, scale, most in (
+            ("x", LEVER_SCALE_M, reach),
+            ("y", LEVER_SCALE_M, reach),
+            ("heading", TURN_SCALE, np.pi),
+        ):
+            most = most if name in form.mounted else 0.0
+            rows[name] = (0.0, scale, -most, most)
     return shooting.Inputs(tuple(rows), *np.array(list(rows.values())).T)
+
+
+def _list_follower_values(
+    drive: Drive, calibration: Calibration, form: Form
+) -> dict[str, tuple[float, float, float, float]]:
+    """Returns start, scale and bounds of lags [s] and gains of states that follow commands."""
+    rows = {}
+    scaled = find_speed_index(drive.spec)
+    names = [v.name for v in drive.spec.state]
+    for response in calibration.responses:
+        if (response.state, response.command) not in form.followed:
+            continue
+        lag = float(np.clip(response.lag_s, *LAG_RANGE_S))
+        bounds = LAG_RANGE_S
+        if are_lags_measured(calibration) and not form.limits:
+            bounds = (lag, lag)
+        rows[f"{response.state}.lag"] = (lag, LAG_SCALE_S, *bounds)
+        if scaled is not None and names[scaled] == response.state:
+            size = abs(response.gain)
+            low, high = sorted((0.2 * response.gain, 5.0 * response.gain))
+            rows[f"{response.state}.gain"] = (response.gain, 0.1 * size, low, high)
+    return rows
 
 
 def _list_command_values(
@@ -273,7 +464,8 @@ def _list_command_values(
         min(latency, 0.0) if one_clock else latency - LONGEST_S,
         latency + LONGEST_S,
     )
-    shared = (latency, latency) if form.delays else bounds
+    is_known = form.is_timed or form.delays
+    shared = (latency, latency) if is_known else bounds
     rows = {"latency": (latency, DELAY_SCALE_S, *shared)}
     rows |= {f"{name}.delay": (at, DELAY_SCALE_S, *bounds) for name, at in form.delays}
     for curve in form.curves:
@@ -414,8 +606,7 @@ def _delay_commands(
 ) -> tuple[Array, Array]:
     """Returns possible delays (N,) [s], and the commands in effect (N, T, C) for each."""
     form = Form(calibration.inputs)
-    now = calibration.command_latency_s
-    inputs = list_inputs(drive, now, samples, form)
+    inputs = list_inputs(drive, calibration, samples, form)
     problem = make_prediction_problem(drive, calibration, samples, form, inputs)
     trials = np.arange(0.0, LONGEST_S, DELAY_STEP_S)
     if drive.recording.pose.clock != drive.recording.command.clock:

@@ -1,4 +1,4 @@
-"""Hypotheses on a motion: the textbook as a base, and orders of terms beyond it."""
+"""Hypotheses on a drive: the textbook as a base, effects beside it, and orders of terms beyond."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -13,24 +13,31 @@ from nics_drl_bridge.identify import forms, shooting, terms
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.excitation import list_unmoved_variables
-from nics_drl_bridge.identify.fit import Order
+from nics_drl_bridge.identify.fit import Alpha, Order, prune
 from nics_drl_bridge.identify.open_loop import HORIZON_S
 from nics_drl_bridge.identify.statistics import CERTAIN, estimate_clustered_errors
 from nics_drl_bridge.recording.recording import Samples
+from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
 
 ORDERS = (1, 2, 3)  # orders that `auto` chooses from
 PULLS = (0.1, 0.01, 0.001)  # pulls that are tried for each order
+ORDERS_OF_FOLLOWERS = (2, 3, 4)
+ORDERS_OF_MEASURED = (2,)
 WORTH = 0.95  # a higher order must reduce the error to this fraction
 FOLDS = 3
 # spacing of trials' windows
 SPACING_S = 0.5
 EVALUATIONS = 25
 BASE_ORDER = 3
+PRUNING = 0.99  # threshold (Eq. 2) of `auto` for a model that was found by predictions
 BASE_EVALUATIONS = 100
 NOTHING = 1e-4  # m, rad: size below which a removed part of a mounting counts as zero
+# A model uses the values at the start of a step, so a time is uncertain by the standard deviation
+# of a uniform distribution over the step.
+WITHIN_STEP = 12.0**-0.5
 LONGEST_LAG_S = 2.0  # a state that takes longer is coasting, so it hides no latency
 BANDS_S = (0.5, 1.0, 2.0, HORIZON_S)
 UNSEEN = f"predictions over {HORIZON_S:g} s of parts that a fit did not see"
@@ -62,29 +69,36 @@ class Trial:
 class Draft:
     """A form, and the prediction problem by which its models are fitted."""
 
-    spec: RobotSpec
+    library: terms.Library
     form: forms.Form
     inputs: shooting.Inputs
     problem: shooting.Shooting
 
+    @property
+    def spec(self) -> RobotSpec:
+        """The robot."""
+        return self.library.spec
+
+    def select(self, inside: terms.Mask | None) -> Samples:
+        """Returns the samples inside (T,), with the states that follow the commands."""
+        samples = self.problem.resample(self.inputs.start)
+        return samples if inside is None else samples.rows(inside)
+
     def base(
         self, inside: terms.Mask | None = None, other: TaylorModel | None = None
     ) -> shooting.Predictive:
-        """Fits the textbook's terms, gains and lags; the search may start at another model."""
+        """Fits the base's terms, gains and lags; the search may start at another model."""
         spec = self.spec
-        samples = self.problem.samples
-        if inside is not None:
-            samples = samples.rows(inside)
-        allowed = partial(terms.select_textbook_terms, tyres=self.form.tyres)
-        model = terms.fit_motion_terms(samples, spec, BASE_ORDER, allowed).model
+        model = self.library.fit_base(self.select(inside), self.form.tyres)
+        if self.form.followed:
+            model = terms.add_linear_terms(model)
         first = None
         if other is not None:
             model, first = terms.merge_terms(model, other)
-        free = (model.coefficients != 0.0) & ~terms.select_defined_dofs(spec)[:, None]
         fitted = shooting.fit_to_predictions(
             self.problem,
             model,
-            free,
+            self.library.select_free(model),
             self.inputs,
             inside,
             BASE_EVALUATIONS,
@@ -101,9 +115,13 @@ class Draft:
         pull: float = shooting.PULL,
     ) -> shooting.Predictive:
         """Adjusts the terms of a linear fit, and those of a base that they are pulled towards."""
+        if self.library.kind is terms.Kind.MEASURED:
+            base = linear  # rates of a measured state are fitted to that state itself
         base, first = terms.merge_terms(base, linear)
-        free = (base.coefficients != 0.0) | (first != 0.0)
-        free &= ~terms.select_defined_dofs(self.spec)[:, None]
+        both = replace(
+            base, coefficients=np.where(first != 0.0, first, base.coefficients)
+        )
+        free = self.library.select_free(both)
         return shooting.fit_to_predictions(
             self.problem, base, free, self.inputs, inside, evaluations, pull, first
         )
@@ -112,6 +130,101 @@ class Draft:
         """Returns the mean distance of predicted from measured ends, over all horizons [m]."""
         error = self.problem.errors(predictive.model, predictive.values)[0]
         return float(np.nanmean(np.hypot(error[..., 0], error[..., 1])))
+
+    def calibrate(
+        self, found: shooting.Predictive, calibration: Calibration
+    ) -> Calibration:
+        """Returns a calibration with delays, input curves, lags and mounting of a search."""
+        at = dict(zip(self.inputs.names, found.values.tolist(), strict=True))
+        responses = (
+            replace(
+                response,
+                lag_s=at.get(f"{response.state}.lag", response.lag_s),
+                gain=at.get(f"{response.state}.gain", response.gain),
+            )
+            for response in calibration.responses
+        )
+        latency = self.form.latency_at(self.inputs, found.values)
+        known = calibration.uncertainty | found.named_errors(self.inputs.names)
+        within_step = WITHIN_STEP * self.problem.samples.dt
+        for name, _ in self.form.delays:
+            key = f"{name}.delay"
+            if key in known:
+                known[key] = float(np.hypot(known[key], within_step))
+        time_error = self._estimate_time_error(found)
+        offset = calibration.clock_offset_s
+        if (
+            "clock_offset_s" in known
+        ):  # a delay between two clocks is a part of their offset
+            offset -= latency - calibration.command_latency_s
+            latency = calibration.command_latency_s
+            beside = known.get("command_latency_s", 0.0)
+            known["clock_offset_s"] = float(np.hypot(time_error, beside))
+        elif not np.isnan(time_error):
+            known["command_latency_s"] = time_error
+        calibration = replace(
+            calibration,
+            clock_offset_s=offset,
+            command_latency_s=latency,
+            inputs=self.form.curves_at(self.inputs, found.values),
+            responses=tuple(responses),
+            uncertainty=known,
+        )
+        if self.problem.mounted:
+            return add_predicted_mounting(calibration, found)
+        return calibration
+
+    def _estimate_time_error(self, found: shooting.Predictive) -> float:
+        """Returns the standard error of the latency [s], which the model's step widens."""
+        names = list(self.inputs.names)
+        name = "latency"
+        if self.form.delays:
+            at = dict(zip(names, found.values.tolist(), strict=True))
+            name = min(
+                (f"{key}.delay" for key, _ in self.form.delays), key=at.__getitem__
+            )
+        error = float(found.value_errors[names.index(name)])
+        return float(np.hypot(error, WITHIN_STEP * self.problem.samples.dt))
+
+    def add_errors(
+        self, found: shooting.Predictive, linear: TaylorModel
+    ) -> TaylorModel:
+        """Returns a found model with standard errors; those of other terms are a linear fit's."""
+        model = found.model
+        errors = estimate_coefficient_errors(found)
+        at = dict(zip(self.inputs.names, found.values.tolist(), strict=True))
+        sigma = dict(zip(self.inputs.names, found.value_errors.tolist(), strict=True))
+        for state, command in self.form.followed:
+            row = terms.FIRST_STATE + model.variables.index(state)
+            own = terms.find_linear_term(model, state)
+            driven = terms.find_linear_term(model, command)
+            rate, gained = np.abs(model.coefficients[row, [own, driven]])
+            relative = sigma[f"{state}.lag"] / at[f"{state}.lag"]
+            by_gain = rate * sigma.get(f"{state}.gain", 0.0)
+            errors[row, own] = rate * relative
+            errors[row, driven] = np.hypot(gained * relative, by_gain)
+        named = {dof: dict(by_term) for dof, by_term in linear.named_errors.items()}
+        refined = replace(model, std_errors=errors).named_errors
+        for dof, by_term in refined.items():
+            named.setdefault(dof, {}).update(by_term)
+        return model.add_errors(named)
+
+    def prune(self, found: shooting.Predictive, alpha: Alpha) -> shooting.Predictive:
+        """Prunes the twist of a found model (Eq. 2), and adjusts the terms that are kept."""
+        model = found.model
+        chi = taylor.evaluate(self.select(None).x, model.powers)
+        spread = chi.std(axis=0)
+        beta = model.coefficients * np.where(spread > 0.0, spread, 1.0)
+        coefficients = model.coefficients.copy()
+        threshold = PRUNING if alpha == "auto" else alpha
+        for row in range(terms.FIRST_STATE):
+            coefficients[row, ~prune(beta[row], threshold)] = 0.0
+        if (coefficients == model.coefficients).all():
+            return found
+        pruned = replace(model, coefficients=coefficients)
+        free = self.library.select_free(pruned)
+        inputs = replace(self.inputs, start=found.values)
+        return shooting.fit_to_predictions(self.problem, pruned, free, inputs)
 
     def tried(self, asked: tuple[Hypothesis, ...]) -> tuple[Trial, ...]:
         """Cross-validates each hypothesis over `FOLDS` parts of a drive.
@@ -151,16 +264,15 @@ class Draft:
         self, asked: tuple[Hypothesis, ...], inside: terms.Mask
     ) -> Iterator[tuple[Hypothesis, TaylorModel]]:
         """Yields the model of each hypothesis, fitted to the rows inside (T,)."""
-        samples = self.problem.samples.rows(inside)
+        samples = self.select(inside)
         base = self.base(inside).model
         starts: dict[int, TaylorModel] = {}  # of the searches, by order
         for order, pull in asked:
-            if not order:
+            if not pull:
                 yield (order, pull), base
                 continue
             if order not in starts:
-                fit = terms.fit_motion_terms(samples, self.spec, order)
-                starts[order] = fit.model
+                starts[order] = self.library.fit(samples, order).model
             refined = self.refined(base, starts[order], inside, EVALUATIONS, pull)
             starts[order] = refined.model  # near the best model of the next pull
             yield (order, pull), refined.model
@@ -189,6 +301,7 @@ def fit_base(
     drive: Drive,
     calibration: Calibration,
     samples: Samples,
+    library: terms.Library,
     clear: tuple[InputCurve, ...],
     former: Base | None = None,
 ) -> Base:
@@ -198,7 +311,7 @@ def fit_base(
     """
 
     def fitted(form: forms.Form, before: Base | None = None) -> Base:
-        inputs = forms.list_inputs(drive, calibration.command_latency_s, samples, form)
+        inputs = forms.list_inputs(drive, calibration, samples, form)
         first = None
         if before is not None:
             inputs = inputs.begun_at(before.draft.inputs)
@@ -206,7 +319,11 @@ def fit_base(
         problem = forms.make_prediction_problem(
             drive, calibration, samples, form, inputs
         )
-        draft = Draft(drive.spec, form, inputs, replace(problem, spacing_s=SPACING_S))
+        if before is not None:
+            inputs = forms.choose_start(
+                problem, before.found.model, inputs, before.draft.inputs
+            )
+        draft = Draft(library, form, inputs, replace(problem, spacing_s=SPACING_S))
         predictive = draft.base(other=first)
         inputs = replace(inputs, start=predictive.values)
         return Base(replace(draft, inputs=inputs, problem=problem), predictive)
@@ -214,15 +331,17 @@ def fit_base(
     def cross_validate(base: Base) -> Trial:
         return base.draft.tried((TEXTBOOK,))[0]
 
+    plain_form = forms.make_form(drive, calibration, library)
+
     if former is not None:
         refitted = fitted(replace(former.draft.form, curves=calibration.inputs))
         return replace(refitted, candidates=former.candidates)
-    best = fitted(forms.Form(calibration.inputs))
+    best = fitted(replace(plain_form, curves=calibration.inputs))
     trial = cross_validate(best)
     start = "textbook with input curves" if calibration.inputs else "textbook"
     candidates = [Candidate(start, trial.error, kept=True)]
     if len(calibration.inputs) > len(clear):
-        plain = fitted(forms.Form(clear))
+        plain = fitted(replace(plain_form, curves=clear))
         plain_trial = cross_validate(plain)
         # an infinite level: too short to judge
         is_better = plain_trial.level < trial.level or np.isinf(plain_trial.level)
@@ -233,13 +352,15 @@ def fit_base(
         if is_better:
             best = plain
             trial = plain_trial
-    for name, change, worth in list_changes(drive, calibration, samples):
+    for name, change, worth in list_changes(drive, calibration, samples, library):
         form = change(best.draft.form)
         if form == best.draft.form:
             continue
         changed = fitted(form, best)
         changed_trial = cross_validate(changed)
-        is_better = changed_trial.level < worth * trial.level
+        is_better = changed_trial.level < worth * trial.level and _is_certain(
+            changed, best
+        )
         candidates.append(Candidate(name, changed_trial.error, kept=is_better))
         if is_better:
             best = changed
@@ -248,9 +369,12 @@ def fit_base(
 
 
 def list_changes(
-    drive: Drive, calibration: Calibration, samples: Samples
+    drive: Drive, calibration: Calibration, samples: Samples, library: terms.Library
 ) -> Iterator[tuple[str, Callable[[forms.Form], forms.Form], float]]:
     """Yields changes to the form of a motion by name, and the fraction to cut the error to."""
+    if library.kind is not terms.Kind.MOTION:
+        yield from _list_follower_changes(drive, calibration, samples)
+        return
     # Drag and friction are hard to distinguish, so both are tried, then each without the other.
     speeds = tuple(v.name for v in drive.spec.state if v.twist == "vx")
     late = forms.find_likely_delays(drive, calibration, samples)
@@ -290,6 +414,40 @@ def list_changes(
             yield gain, lambda form: forms.add_reverse_gains(form, backwards), WORTH
 
 
+def _is_certain(changed: Base, before: Base) -> bool:
+    """True if dead zones and limits that a change added clearly exceed their standard errors."""
+    values = zip(
+        changed.draft.inputs.names,
+        changed.found.values.tolist(),
+        changed.found.value_errors.tolist(),
+        strict=True,
+    )
+    return not any(
+        value < CERTAIN * error
+        for name, value, error in values
+        if name.endswith((".dead", ".fall", ".rise"))
+        and name not in before.draft.inputs.names
+    )
+
+
+def _list_follower_changes(
+    drive: Drive, calibration: Calibration, samples: Samples
+) -> Iterator[tuple[str, Callable[[forms.Form], forms.Form], float]]:
+    """Yields changes to the form of states that follow commands, as `list_changes` does."""
+    followed = forms.list_followed(drive)
+    if not followed:
+        return
+    late = tuple((c, calibration.command_latency_s) for _, c in followed)
+    delays = "a delay of each command"
+    if len(late) > 1:
+        yield delays, lambda form: replace(form, delays=late), WORTH
+    for state, _ in followed:
+        yield f"limits of {state}", partial(forms.add_limits, state=state), WORTH
+    if len(late) > 1:
+        yield delays, lambda form: replace(form, delays=late), WORTH
+    yield "a dead zone", lambda form: forms.add_dead_zones(form, drive, samples), WORTH
+
+
 def list_candidates(
     base: Base | None, trials: Sequence[Trial], order: Order = "auto"
 ) -> Iterator[Candidate]:
@@ -307,10 +465,17 @@ def list_candidates(
             yield Candidate(name, trial.error, trial is best)
 
 
-def list_hypotheses(order: Order) -> tuple[Hypothesis, ...]:
+def list_hypotheses(order: Order, library: terms.Library) -> tuple[Hypothesis, ...]:
     """Returns the hypotheses for an order, from the most constrained to the least."""
-    orders = ORDERS if order == "auto" else (order,)
-    return (TEXTBOOK, *product(orders, PULLS))
+    if library.kind is terms.Kind.MOTION:
+        orders = ORDERS if order == "auto" else (order,)
+        return (TEXTBOOK, *product(orders, PULLS))
+    if library.kind is terms.Kind.FOLLOWER:
+        asked = ORDERS_OF_FOLLOWERS if order == "auto" else (order,)
+        return (TEXTBOOK, *product(asked, PULLS[1:2]))
+    if order == "auto":
+        return (TEXTBOOK, *product(ORDERS_OF_MEASURED, PULLS[2:]))
+    return (TEXTBOOK,)
 
 
 def choose_trial(trials: Sequence[Trial], order: Order = "auto") -> Trial:
@@ -394,26 +559,20 @@ def add_predicted_mounting(
         float, geometry.compose(predictive.values[-3:], calibration.mounting)
     )
     names = ("lever_arm_x_m", "lever_arm_y_m", "rotation_rad")
-    errors = zip(names, map(float, predictive.value_errors[-3:]), strict=True)
-    sigma = {name: error for name, error in errors if not np.isnan(error)}
-    if "lever_arm_y_m" not in sigma:
+    known = dict(calibration.uncertainty)
+    errors = dict(zip(names, predictive.value_errors[-3:].tolist(), strict=True))
+    if np.isnan(errors["lever_arm_y_m"]):
         y = calibration.lever_arm_m[1]
+    for name, error in errors.items():
+        if not np.isnan(error):  # what the model lacks bends each of both estimates
+            known[name] = max(error, known.get(name, 0.0))
     x, y, heading = (0.0 if abs(part) < NOTHING else part for part in (x, y, heading))
     return replace(
         calibration,
         rotation_rad=-heading,
         lever_arm_m=(x, y),
-        uncertainty={**calibration.uncertainty, **sigma},
+        uncertainty=known,
     )
-
-
-def describe_orders(trials: Sequence[Trial]) -> Iterator[str]:
-    """Yields a sentence if the order is higher than usual."""
-    if not trials or choose_trial(trials) is trials[0]:
-        return
-    errors = ", ".join(f"{trial.error:.1%} by order {trial.order}" for trial in trials)
-    finding = f"The model has terms up to order {choose_trial(trials).order}"
-    yield f"{finding}: {UNSEEN} end {errors} of the path away."
 
 
 def describe_forms(base: Base, trials: Sequence[Trial], order: Order) -> Iterator[str]:

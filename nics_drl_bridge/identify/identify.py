@@ -13,17 +13,13 @@ A stage is a function `(drive, findings) -> findings`. It may take its data from
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 from nics_drl_bridge.errors import FitError, RecordingError
-from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import (
     acceptance,
-    followers,
-    hypotheses,
     open_loop,
     verdict,
 )
@@ -53,12 +49,13 @@ from nics_drl_bridge.identify.judgement import (
     estimate_bands,
     fit_textbook,
     judge_predictions,
-    measure_distances,
 )
-from nics_drl_bridge.identify.motion_fit import fit_motion, refine_motion
 from nics_drl_bridge.identify.mounting import apply_mounting, estimate_mounting
 from nics_drl_bridge.identify.noise import add_motion_noise, measure_sensor_noise
-from nics_drl_bridge.identify.refine import refine_by_predictions
+from nics_drl_bridge.identify.prediction_fit import (
+    fit_by_predictions,
+    refine_by_predictions,
+)
 from nics_drl_bridge.identify.repair import (
     check_axes,
     check_commands,
@@ -68,7 +65,6 @@ from nics_drl_bridge.identify.repair import (
     repair_rows,
 )
 from nics_drl_bridge.identify.signals import find_speed_index
-from nics_drl_bridge.identify.terms import select_terms_through_state
 from nics_drl_bridge.identify.textbook_model import (
     add_actuator_state,
     make_actuated_spec,
@@ -83,10 +79,6 @@ from nics_drl_bridge.robot.noise import Noise
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import HorizonErrors, TaylorModel
 from nics_drl_bridge.threads import one_blas_thread
-
-# orders that `auto` chooses from if the state follows commands
-ORDERS_OF_INFERRED = (2, 3, 4)
-NO_PATH_M = 1e-9  # length of a path that counts as none
 
 Stage = Callable[[Drive, Findings], Findings]
 
@@ -258,7 +250,7 @@ def _make_result(trial: Findings, final: Findings) -> Identified:
     """Returns the result of a trial and of the final fit, which may be the same."""
     samples = require_samples(final)
     model = require_model(final)
-    if final.motion_width_s is not None:
+    if final.base is not None:
         model = drop_unreached_ends(
             model, final.whole, samples, final.calibration.uncertainty
         )
@@ -318,15 +310,11 @@ def estimate_timing(drive: Drive, findings: Findings) -> Findings:
         timing = timings.measure_timing(by_command)
         responses, timing = _select_followers(spec, timing)
     else:
-        timing = followers.separate_followers(
-            training, timings.measure_timing(training)
-        )
+        timing = timings.measure_timing(training)
     calibration = replace(
         findings.calibration,
         responses=responses,
         uncertainty=timing.sigma,
-        inputs=followers.list_late_inputs(spec, timing),
-        limits=followers.list_limits(spec, timing),
         clock_offset_s=timing.offset,
         command_latency_s=timing.latency,
         burst_period_s=training.bursts.period_s if training.bursts else 0.0,
@@ -446,119 +434,39 @@ def _with_likely_latency(findings: Findings) -> Findings:
 
 
 def fit_terms(drive: Drive, findings: Findings) -> Findings:
-    """Resamples the streams on one time axis, and fits all terms by least squares (Eq. 1)."""
-    if findings.motion_width_s is not None:
-        return fit_motion(drive, findings)
+    """Resamples the streams on one time axis, and fits all terms by least squares (Eq. 1).
+
+    Unless the drive is exact, predictions choose these terms and effects of motors beside them.
+    """
     calibration = findings.calibration
-    spec = drive.spec
+    if not calibration.is_exact:
+        return fit_by_predictions(drive, findings)
     settings = drive.settings
-    if spec.state and drive.recording.state is None:
-        responses = calibration.responses or None
-        require(responses, "the response of each state", "find_responses")
     samples = align(findings.training, calibration)
-    samples = followers.remove_limits(samples, calibration, spec)
-    is_inferred = drive.recording.state is None and not calibration.is_exact
-    trials = findings.trials  # a refit reuses them
-    if settings.order == "auto" and is_inferred and not trials:
-        trials = _try_orders(drive, findings)
-    if trials:
-        order = hypotheses.choose_trial(trials).order
-    else:
-        order = fitting.ORDER if settings.order == "auto" else settings.order
-    centred = "lever_arm_y_m" in calibration.uncertainty
-    library = None
-    if is_inferred:
-        library = partial(select_terms_through_state, centred=centred)
+    order = fitting.ORDER if settings.order == "auto" else settings.order
     try:
-        regression = fitting.regress(
-            samples, spec, order, not calibration.is_exact, library
-        )
+        regression = fitting.regress(samples, drive.spec, order)
     except FitError as error:
         raise FitError(f"{drive.recording.source}: {error}") from None
     if settings.strict:
-        verdict.refuse_unexcited(regression.excitation, spec)
-    return replace(findings, samples=samples, regression=regression, trials=trials)
-
-
-def _try_orders(drive: Drive, findings: Findings) -> tuple[hypotheses.Trial, ...]:
-    """Tries each order on parts of the training part that its fits did not see."""
-    training = findings.training
-    path = open_loop.select_windows(
-        training,
-        findings.calibration,
-        0.0,
-        training.duration_s,
-        open_loop.HORIZON_S,
-        open_loop.SPACING_S,
-    ).path
-    trials = []
-    for order in ORDERS_OF_INFERRED:
-        errors = _cross_validate(drive, findings, order)
-        if open_loop.HORIZON_S not in errors:
-            break
-        error_m = errors[open_loop.HORIZON_S].mean()
-        share = float(error_m / max(float(path.mean()), NO_PATH_M))
-        trials.append(hypotheses.Trial(order, 0.0, share, errors))
-    return tuple(trials)
-
-
-def _cross_validate(drive: Drive, findings: Findings, order: int) -> dict[float, Array]:
-    """Returns errors (W,) [m] of an order by horizon [s], on parts that its fits did not see.
-
-    Errors of predictions that diverged are infinite; the result is empty if a fit is impossible.
-    """
-    settings = replace(drive.settings, order=order, train_until_s=np.inf)
-    errors: dict[float, list[Array]] = {h: [] for h in hypotheses.BANDS_S}
-    for others, part in findings.training.folds(hypotheses.FOLDS):
-        rest = others.under(settings)
-        start = replace(findings, training=rest)
-        try:
-            fitted = run((fit_terms, prune_terms, refine_model), rest, start)
-        except (FitError, RecordingError):
-            return {}
-        model = require_model(fitted)
-        for horizon, errors_m in errors.items():
-            far = measure_distances(model, fitted.calibration, part, horizon)
-            errors_m.append(np.where(np.isnan(far), np.inf, far))
-    joined = {h: np.concatenate(parts) for h, parts in errors.items()}
-    return {h: errors_m for h, errors_m in joined.items() if len(errors_m)}
+        verdict.refuse_unexcited(regression.excitation, drive.spec)
+    return replace(findings, samples=samples, regression=regression)
 
 
 def prune_terms(drive: Drive, findings: Findings) -> Findings:
-    """Keeps the terms of Eq. 2, and refits them."""
+    """Keeps the terms of Eq. 2, and refits them, unless predictions choose the terms."""
     regression = require(findings.regression, "the fit of all terms", "fit_terms")
-    # keeps what mirror symmetry allows, because predictions weight these terms
-    if findings.motion_width_s is not None:
+    if not findings.calibration.is_exact:
         return findings
     linear = fitting.prune_and_refit(regression, drive.spec, drive.settings.alpha)
-    limits = followers.scale_limits(findings.calibration, drive.spec)
-    model = replace(linear.model, inputs=findings.calibration.inputs, limits=limits)
-    return replace(findings, pruned_fit=replace(linear, model=model), model=model)
+    return replace(findings, pruned_fit=linear, model=linear.model)
 
 
 def refine_model(drive: Drive, findings: Findings) -> Findings:
     """Adjusts model and calibration to predictions over seconds, unless the drive is exact."""
-    if findings.motion_width_s is not None:
-        return refine_motion(drive, findings)
-    model = require_model(findings)
-    calibration = findings.calibration
-    training = findings.training
-    settings = drive.settings
-    if calibration.is_exact:
+    if findings.calibration.is_exact:
         return findings
-    errors = verdict.try_model(model, calibration, training, 0.0)
-    may_lower_order = settings.order == "auto" and not findings.trials
-    if may_lower_order and verdict.runs_away(errors):
-        linear = replace(drive, settings=replace(settings, order=1))
-        refined = run((fit_terms, prune_terms, refine_model), linear, findings)
-        return replace(refined, refinement=(*refined.refinement, verdict.LINEAR))
-    model, calibration, note = refine_by_predictions(model, calibration, training)
-    return replace(
-        findings,
-        model=model,
-        calibration=calibration,
-        refinement=(note, *hypotheses.describe_orders(findings.trials)),
-    )
+    return refine_by_predictions(drive, findings)
 
 
 def complete_model(drive: Drive, findings: Findings) -> Findings:

@@ -21,8 +21,6 @@ from nics_drl_bridge.identify.open_loop import (
     predict,
     select_windows,
 )
-from nics_drl_bridge.identify.refine import adjust_to_drive
-from nics_drl_bridge.identify.terms import select_defined_dofs
 from nics_drl_bridge.identify.yardstick import (
     Yardstick,
     estimate_twists_at,
@@ -141,16 +139,12 @@ def estimate_bands(
     """
     errors: dict[float, list[Array]] = {h: [] for h in hypotheses.BANDS_S}
     folds = [(training, training)] if fixed else training.folds(FOLDS)
-    for rest, part in folds:
-        adjusted: tuple[TaylorModel, Calibration] | None = model, calibration
+    for _, part in folds:
+        adjusted = model, calibration
         if derived is not None:
             begin, end = part.recording.pose.t[[0, -1]] + calibration.clock_offset_s
             kept = (derived[0].t < begin) | (derived[0].t > end)
             adjusted = _adjust_motion(model, calibration, training, *derived, kept)
-        elif not fixed:
-            adjusted = adjust_to_drive(model, calibration, rest)
-        if adjusted is None:
-            return {}
         for horizon, parts in errors.items():
             parts.append(measure_distances(*adjusted, part, horizon))
     bands = {}
@@ -185,17 +179,10 @@ def _adjust_motion(
         training, calibration, samples, draft.form, draft.inputs
     )
     problem = replace(problem, spacing_s=hypotheses.SPACING_S)
-    free = (model.coefficients != 0.0) & ~select_defined_dofs(training.spec)[:, None]
+    free = draft.library.select_free(model)
     pull = hypotheses.PULLS[-1]
     fitted = shooting.fit_to_predictions(
         problem, model, free, draft.inputs, kept, EVALUATIONS, pull
     )
-    calibration = replace(
-        calibration,
-        command_latency_s=draft.form.latency_at(draft.inputs, fitted.values),
-        inputs=draft.form.curves_at(draft.inputs, fitted.values),
-    )
-    model = replace(fitted.model, inputs=calibration.inputs)
-    if problem.mounted:
-        calibration = hypotheses.add_predicted_mounting(calibration, fitted)
-    return model, calibration
+    calibration = replace(draft, problem=problem).calibrate(fitted, calibration)
+    return replace(fitted.model, inputs=calibration.inputs), calibration

@@ -342,14 +342,6 @@ def _hold(
         slope[:] = 0.0
 
 
-@kernel
-def limp(states: Array, targets: Array, share: float, fall: float, rise: float) -> None:
-    """Follows targets (T,) from the first state, a fraction of the rest per step, within limits."""
-    for k in range(1, states.shape[0]):
-        change = share * (targets[k - 1] - states[k - 1])
-        states[k] = states[k - 1] + min(max(change, fall), rise)
-
-
 class BicycleGeometry(NamedTuple):
     """Geometry of a robot that steers."""
 

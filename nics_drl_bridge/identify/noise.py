@@ -9,7 +9,6 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import open_loop
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive, find_bursts, measure_pose_noise
-from nics_drl_bridge.identify.refine import OUTLYING
 from nics_drl_bridge.identify.signals import measure_white_noise
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.noise import (
@@ -25,6 +24,7 @@ HORIZON_S = 1.0
 SPACING_S = 0.25
 STATE_HORIZON_S = 0.1
 MIN_WINDOWS = 20
+OUTLYING = 10.0  # an error beyond this many medians is a jump of the pose
 # a larger error of a prediction over a second is divergence, not drift
 RUN_AWAY_M = 1e4
 BLOCKS = 8
@@ -119,17 +119,10 @@ def _predict_errors(
     )
     if len(chosen.start_t) < MIN_WINDOWS:
         return None
-    state = drive.recording.state
-    if state is None:
+    if drive.recording.state is None:
         ends = open_loop.predict(model, calibration, drive, chosen)
     else:  # restart from the measured state, so that its drift is not counted twice
-        course = open_loop.trace_states(model, calibration, drive, chosen)
-        begin = chosen.start_t + calibration.clock_offset_s
-        t = begin[:, None] + model.dt * np.arange(course.x.shape[1])
-        for i, column in enumerate(state.values.T):
-            course.x[:, :, i] = np.interp(t, state.t, column)
-        relative = open_loop.predict_ends(course, model)[0]
-        ends = open_loop.convert_to_tracked(chosen, calibration, relative)
+        ends = open_loop.predict_along_states(model, calibration, drive, chosen)
     return chosen, geometry.between(ends, chosen.end)
 
 

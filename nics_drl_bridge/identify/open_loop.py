@@ -10,7 +10,6 @@ from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.calibration import Calibration, resample_states
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.kernels import Shot, make_used_terms, shoot, tangent
 from nics_drl_bridge.identify.signals import average_effect, list_followed_commands
 from nics_drl_bridge.robot.kernels import SERIES, make_terms, simulate_rollouts
 from nics_drl_bridge.robot.taylor import TaylorModel
@@ -19,6 +18,9 @@ HORIZON_S = 5.0
 SPACING_S = 0.1
 # windows start at least this long after the first command if the state is inferred
 SETTLE_S = 1.0
+# A robot moves through a step by the state at its start. So that a latency is not shorter by half
+# a step than it is, commands act on an inferred state half a step earlier.
+MIDDLE_OF_STEP = 0.5
 # maximum distance from a window's end to the nearest sample, as a fraction of the period
 END_TOLERANCE = 0.6
 
@@ -99,9 +101,60 @@ def predict(
     if drive.recording.state is None:
         relative = _by_one_rollout(model, calibration, drive, chosen)
     else:
-        course = trace_states(model, calibration, drive, chosen)
-        relative, _ = predict_ends(course, model)
+        relative = _by_windows(model, calibration, drive, chosen)
     return convert_to_tracked(chosen, calibration, relative)
+
+
+def predict_along_states(
+    model: TaylorModel, calibration: Calibration, drive: Drive, chosen: Windows
+) -> Array:
+    """Predicts poses (W, 3) at windows' ends from the states that were measured on the way."""
+    relative = _by_windows(model, calibration, drive, chosen, states_known=True)
+    return convert_to_tracked(chosen, calibration, relative)
+
+
+def _by_windows(
+    model: TaylorModel,
+    calibration: Calibration,
+    drive: Drive,
+    chosen: Windows,
+    states_known: bool = False,
+) -> Array:
+    """Returns relative poses (W, 3) from rollouts, each from the state measured at its start.
+
+    With `states_known`, the states are those measured all along a window.
+    """
+    begin = chosen.start_t + calibration.clock_offset_s
+    length = (chosen.end_t - chosen.start_t) / model.dt
+    count = int(np.ceil(float(length.max()) - 1e-6)) + 1
+    t = begin[:, None] + model.dt * np.arange(count)
+    sent_t = t - calibration.command_latency_s
+    command = average_effect(
+        drive.recording.command, drive.spec, model.inputs, sent_t, sent_t + model.dt
+    )
+    if states_known:
+        states = resample_states(drive, calibration, t)
+        rates = model.rates(np.concatenate([states, command], axis=2))
+        poses = _integrate_twists(rates[..., :3], model.dt)
+    else:
+        states = resample_states(drive, calibration, begin)
+        poses, _ = roll(model, states, command)
+    steps = np.floor(length + 1e-6).astype(np.intp)
+    share = np.clip(length - steps, 0.0, 1.0)[:, None]
+    window = np.arange(len(begin))
+    return (1.0 - share) * poses[window, steps] + share * poses[window, steps + 1]
+
+
+def _integrate_twists(twist: Array, dt: float) -> Array:
+    """Returns poses (W, T + 1, 3) of bodies that move along arcs by twists (W, T, 3)."""
+    turn = dt * twist[..., 2]
+    heading = np.cumsum(turn, axis=1)
+    chord = dt * np.sinc(turn / (2.0 * np.pi))[..., None]
+    moved = geometry.rotate(chord * twist[..., :2], heading - turn / 2.0)
+    poses = np.zeros((twist.shape[0], twist.shape[1] + 1, 3))
+    poses[:, 1:, :2] = np.cumsum(moved, axis=1)
+    poses[:, 1:, 2] = heading
+    return poses
 
 
 def convert_to_tracked(
@@ -127,7 +180,7 @@ def _by_one_rollout(
     grid = start.min() + model.dt * np.arange(
         -lead, (end.max() - start.min()) / model.dt + 2.0
     )
-    begin = grid - calibration.command_latency_s
+    begin = grid - calibration.command_latency_s + MIDDLE_OF_STEP * model.dt
     command = average_effect(
         recording.command, spec, model.inputs, begin, begin + model.dt
     )
@@ -135,7 +188,7 @@ def _by_one_rollout(
         np.array([r.gain for r in calibration.responses])
         * command[0, list_followed_commands(spec)]
     )
-    poses, _ = _roll(model, state[None], command[None])
+    poses, _ = roll(model, state[None], command[None])
     path = poses[0, :-1]
     starts = np.zeros((len(start), 3))
     ends = np.zeros((len(end), 3))
@@ -145,7 +198,7 @@ def _by_one_rollout(
     return geometry.between(starts, ends)
 
 
-def _roll(model: TaylorModel, state: Array, command: Array) -> tuple[Array, Array]:
+def roll(model: TaylorModel, state: Array, command: Array) -> tuple[Array, Array]:
     """Rolls commands (W, T, C) out to unwrapped poses (W, T + 1, 3) from the origin, and states."""
     count, steps = command.shape[:2]
     poses = np.zeros((count, steps + 1, 3))
@@ -188,78 +241,3 @@ def measure_open_loop_error(
         float(chosen.path.mean()),
         float(np.median(np.hypot(moved[:, 0], moved[:, 1]))),
     )
-
-
-@dataclass(frozen=True)
-class Course:
-    """X over windows, step by step, of a drive whose state was measured."""
-
-    chosen: Windows  # the windows
-    x: Array  # (W, T, V) X during each step
-    steps: NDArray[np.intp]  # (W,) whole steps to the end of each window
-    share: Array  # (W,) remaining fraction of one more step
-
-
-def trace_states(
-    model: TaylorModel, calibration: Calibration, drive: Drive, chosen: Windows
-) -> Course:
-    """Returns the course of X over windows, each started from its measured state."""
-    start = chosen.start_t + calibration.clock_offset_s
-    exact = (chosen.end_t - chosen.start_t) / model.dt
-    count = int(np.ceil(float(exact.max()) - 1e-6)) + 1
-    begin = start[:, None] + model.dt * np.arange(count) - calibration.command_latency_s
-    command = average_effect(
-        drive.recording.command, drive.spec, model.inputs, begin, begin + model.dt
-    )
-    _, states = _roll(model, resample_states(drive, calibration, start), command)
-    steps = np.floor(exact + 1e-6).astype(np.intp)
-    share = np.clip(exact - steps, 0.0, 1.0)
-    x = np.concatenate([states[:, :-1], command], axis=2)
-    return Course(chosen, np.ascontiguousarray(x), steps, share)
-
-
-def predict_ends(
-    course: Course, model: TaylorModel, free: NDArray[np.bool_] | None = None
-) -> tuple[Array, Array]:
-    """Returns relative ends (W, 3), unwrapped, their slopes (W, 3, P) by `free` coefficients."""
-    if free is None:
-        free = np.zeros(model.coefficients.shape, dtype=np.bool_)
-    used = (model.coefficients != 0.0) | free
-    used[3:] = False
-    terms, moving = make_used_terms(model, used, free)
-    # X is known, so it takes the place of the commands of a robot without a state
-    terms = terms._replace(emf=terms.emf[:0])
-    count, length, variables = course.x.shape
-    shot = Shot(
-        state=np.zeros((count, 0)),
-        first=length * np.arange(count),
-        command=course.x.reshape(count * length, variables),
-        stop=np.stack([course.steps, course.steps + 1], axis=1),
-        end=np.zeros((count, 2, 3)),
-        slope=np.zeros((count, 2, 3, len(moving))),
-    )
-    scratch = tangent(0, variables, len(terms.dof), len(moving))
-    shoot(shot, terms, moving, model.dt, scratch)
-    share = course.share[:, None]
-    ends = (1.0 - share) * shot.end[:, 0] + share * shot.end[:, 1]
-    share = share[..., None]
-    return ends, (1.0 - share) * shot.slope[:, 0] + share * shot.slope[:, 1]
-
-
-def differentiate_ends(
-    course: Course, calibration: Calibration, ends: Array, moved: Array
-) -> Array:
-    """Returns derivatives (W, 3, P) of `convert_to_tracked`, from those of the relative poses."""
-    heading = calibration.to_base(course.chosen.start)[:, 2]
-    arm = geometry.rotate(
-        np.broadcast_to(calibration.mounting[:2], (len(ends), 2)), ends[:, 2]
-    )
-    inside = (
-        moved[:, :2]
-        + np.stack([-arm[:, 1], arm[:, 0]], axis=1)[:, :, None] * moved[:, 2:]
-    )
-    c = np.cos(heading)[:, None]
-    s = np.sin(heading)[:, None]
-    x = inside[:, 0]
-    y = inside[:, 1]
-    return np.stack([c * x - s * y, s * x + c * y, moved[:, 2]], axis=1)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from nics_drl_bridge import geometry
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.kernels import Shot, make_used_terms, shoot, tangent
-from nics_drl_bridge.identify.statistics import estimate_clustered_errors
+from nics_drl_bridge.identify.statistics import estimate_clustered_covariance
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.taylor import TaylorModel
@@ -25,6 +25,8 @@ Rows = NDArray[np.intp]
 Commands = Callable[[Array], Array]
 # a model with friction and limits, by values
 Shape = Callable[[TaylorModel, Array], TaylorModel]
+# states (T, S) that follow the commands, by values (I,)
+States = Callable[[Array], Array]
 
 # weights of motions from start to end, usually 1
 Trust = Callable[[Array, Array], Array]
@@ -47,6 +49,7 @@ TOLERANCE = 1e-4
 INSIDE = 0.05
 LEAST_SCALE = 0.02  # scale of the loss, below which errors count by their squares [m/s]
 NO_ERROR = 1e-9
+STEEPEST = 1e6  # derivatives of a diverging model are clipped
 SAME_STEP = 0.01  # fraction of a step by which two steps may differ
 
 
@@ -64,6 +67,17 @@ class Inputs:
     def sought(self) -> Rows:
         """Indices of the unknown values."""
         return np.flatnonzero(self.high > self.low)
+
+    def shifted(self, latency_s: float) -> "Inputs":
+        """Returns the same delays relative to stamps that are later by a time [s]."""
+        is_time = [name == "latency" or name.endswith(".delay") for name in self.names]
+        later = np.where(is_time, latency_s, 0.0)
+        return replace(
+            self,
+            start=self.start - later,
+            low=self.low - later,
+            high=self.high - later,
+        )
 
     def begun_at(self, other: "Inputs") -> "Inputs":
         """Starts from the values of other inputs, where these have them."""
@@ -83,6 +97,8 @@ class Shooting:
     commands: Commands
     shaped: Shape
     trust: Trust
+    # of states that were not measured; None if the samples have the states
+    inferred: States | None = None
     # True if the last three values are the pose of the body that `q` describes, in the base
     mounted: bool = False
     noise_m: float = 0.0  # standard deviation of measured positions
@@ -144,12 +160,14 @@ class Shooting:
         """Returns poses (W, H, 3), derivatives (W, H, 3, P) by the `free` (D, K) coefficients."""
         values = values if self.fixed is None else self.fixed
         model = self.shaped(model, values)
+        state = (
+            self.samples.q[:, 3:] if self.inferred is None else self.inferred(values)
+        )
         if free is None:
             free = np.zeros(model.coefficients.shape, dtype=np.bool_)
         used = (model.coefficients != 0.0) | free
         terms, moving = make_used_terms(model, used, free)
         command = self.commands(values)
-        state = self.samples.q[:, 3:]
         shot = Shot(
             np.ascontiguousarray(state[first]),
             first,
@@ -161,6 +179,23 @@ class Shooting:
         sizes = state.shape[1], command.shape[1], len(terms.dof), len(moving)
         shoot(shot, terms, moving, model.dt, tangent(*sizes))
         return _seen_from(values[-3:], shot) if self.mounted else (shot.end, shot.slope)
+
+    def resample(self, values: Array) -> Samples:
+        """Returns the samples with the commands in effect, and with inferred states."""
+        if self.inferred is None:
+            return self.samples
+        values = values if self.fixed is None else self.fixed
+        command = self.commands(values)
+        state = self.inferred(values)
+        dq = self.samples.dq.copy()
+        dq[:-1, 3:] = np.diff(state, axis=0) / self.samples.dt
+        dq[-1, 3:] = 0.0
+        return replace(
+            self.samples,
+            x=np.concatenate([state, command], axis=1),
+            q=np.concatenate([self.samples.q[:, :3], state], axis=1),
+            dq=dq,
+        )
 
     def errors(
         self, model: TaylorModel, values: Array, inside: Mask | None = None
@@ -203,8 +238,13 @@ class Predictive:
     residual: Array  # (n,) scaled errors [m/s]
     free: Mask  # (D, K)
     starts: Array  # (n,) start of the window of each residual [s]
-    # (I,) standard errors of the values; NaN for known ones
-    value_errors: Array
+    # (I, I) covariance of the values; NaN for known ones
+    value_covariance: Array
+
+    @property
+    def value_errors(self) -> Array:
+        """Standard errors (I,) of the values; NaN for known ones."""
+        return np.asarray(np.sqrt(np.maximum(np.diag(self.value_covariance), 0.0)))
 
     def named_errors(self, names: tuple[str, ...]) -> dict[str, float]:
         """Returns the errors of values that belong to a command or state, such as `throttle.dead`.
@@ -304,7 +344,7 @@ class _Search:
         unit = self.unit
         rest, slope = self.shot(theta, True)
         late = self.late(theta, rest)
-        slope = np.clip(np.nan_to_num(slope * unit), -1e6, 1e6)
+        slope = np.clip(np.nan_to_num(slope * unit), -STEEPEST, STEEPEST)
         own = np.concatenate(
             [np.zeros((len(unit), count)), self.pull * np.eye(len(unit))], axis=1
         )
@@ -312,11 +352,16 @@ class _Search:
 
     def late(self, theta: Array, rest: Array) -> Array:
         """Returns derivatives (n, I) of errors (n,) by the scaled values."""
-        aside = theta + DIFFERENCE * np.eye(self.count, len(theta))
         slopes = np.zeros((len(rest), self.count))
-        for i, trial in enumerate(aside):
+        for i, value in enumerate(self.sought):
+            step = DIFFERENCE
+            if self.inputs.names[value].endswith(("latency", ".delay")):
+                # A limited state starts to move at a whole step.
+                step = self.model.dt / self.inputs.scale[value]
+            trial = theta.copy()
+            trial[i] += step
             errors, _ = self.shot(trial, False)
-            slopes[:, i] = (errors - rest) / DIFFERENCE
+            slopes[:, i] = (errors - rest) / step
         return slopes
 
     def run(self, first: Array | None, evaluations: int) -> Predictive:
@@ -339,7 +384,8 @@ class _Search:
         at = self.sought
         low[:count] = ((inputs.low - inputs.start) / inputs.scale)[at]
         high[:count] = ((inputs.high - inputs.start) / inputs.scale)[at]
-        aside = INSIDE * (high - low)[:count]  # at a bound the search would not move
+        # At a bound the search would not move.
+        aside = np.minimum(INSIDE * (high - low)[:count], 1.0)
         start[:count] = np.clip(0.0, low[:count] + aside, high[:count] - aside)
         solution = scipy.optimize.least_squares(
             self.residual,
@@ -359,12 +405,19 @@ class _Search:
         best, late = self.at(theta)
         best = self.problem.shaped(best, late)
         rest, slope = self.shot(theta, True)
+        slope = np.clip(np.nan_to_num(slope), -STEEPEST, STEEPEST)
         starts = np.repeat(
             self.problem.samples.t[self.first], 3 * self.wanted.sum(axis=1)
         )
         span = np.floor(starts / max(self.problem.horizons)).astype(np.intp)
-        errors = np.full(len(self.inputs.start), np.nan)
+        size = len(self.inputs.start)
+        covariance = np.full((size, size), np.nan)
         if self.count:
-            late_slope = self.late(theta, rest) / self.inputs.scale[self.sought]
-            errors[self.sought] = estimate_clustered_errors(late_slope, rest, span)
-        return Predictive(best, late, slope, rest, self.free, starts, errors)
+            by_values = self.late(theta, rest)
+            both = np.concatenate([by_values, slope * self.unit], axis=1)
+            prior = np.append(np.zeros(self.count), np.full(len(self.unit), self.pull))
+            joint = estimate_clustered_covariance(both, rest, span, prior**2)
+            scale = self.inputs.scale[self.sought]
+            known = joint[: self.count, : self.count] * np.outer(scale, scale)
+            covariance[np.ix_(self.sought, self.sought)] = known
+        return Predictive(best, late, slope, rest, self.free, starts, covariance)

@@ -7,18 +7,16 @@ A command takes effect in this order:
 2. The stream of commands holds a value until the next stamp. `average_held` integrates it, so that
    any interval gets its exact mean.
 3. `infer_states` lets unmeasured states follow the commands by first-order lags: over a step `dt`,
-   a state keeps `exp(-dt / lag)` of its distance from the command. Motors may limit its rate.
+   a state keeps `exp(-dt / lag)` of its distance from the command.
 """
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 import scipy  # its parts load slowly, when used
 from numpy.typing import NDArray
 
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify.kernels import limp
 from nics_drl_bridge.recording.recording import Stream
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.curve import InputCurve, apply_curves, delays
@@ -129,31 +127,8 @@ def get_nominal_lags(spec: RobotSpec) -> Array:
     )
 
 
-class Motors(NamedTuple):
-    """Motors, which limit states that follow commands with a gain of one, in addition to lags."""
-
-    fall: Array  # (S,) minimum and maximum rates [unit of the command / s]
-    rise: Array
-    dead: Array  # (S,) maximum command without an effect [its unit]
-
-    @property
-    def limited(self) -> NDArray[np.bool_]:
-        """(S,) True where rates have limits."""
-        return np.isfinite(self.fall) | np.isfinite(self.rise)
-
-
-def make_free_motors(states: int) -> Motors:
-    """Returns motors without any limits."""
-    return Motors(np.full(states, -np.inf), np.full(states, np.inf), np.zeros(states))
-
-
 def infer_states(
-    command: Stream,
-    spec: RobotSpec,
-    lags: Array,
-    latency: Array | float,
-    grid: Array,
-    motors: Motors | None = None,
+    command: Stream, spec: RobotSpec, lags: Array, latency: Array | float, grid: Array
 ) -> Array:
     """Infers states (T, S) at uniform times (T,) from commands, with a gain of one.
 
@@ -163,12 +138,9 @@ def infer_states(
         lags: (S,) time constants [s].
         latency: () or (S,) from a command's stamp to its effect [s].
         grid: (T,) uniform times [s].
-        motors: limits and dead zones; by default none.
     """
     dt = float(grid[1] - grid[0])
     follows = list_followed_commands(spec)
-    fall, rise, dead = motors or make_free_motors(len(follows))
-    command = _subtract_dead_zones(command, follows, dead)
     targets = np.empty((len(grid), len(follows)))
     for late in np.unique(latency):
         means = average_held(command, spec, grid - late, grid + dt - late)
@@ -178,27 +150,11 @@ def infer_states(
     initial = average_held(command, spec, at_rest, at_rest + 1.0)[0, follows]
     states = np.empty((len(grid), len(follows)))
     for i, kept in enumerate(np.exp(-dt / np.maximum(lags, SHORTEST_LAG_S))):
-        if np.isinf([fall[i], rise[i]]).all():
-            # x[k + 1] = kept * x[k] + (1 - kept) * target[k]
-            lag = ([0.0, 1.0 - kept], [1.0, -kept])
-            begin = initial[i : i + 1]
-            states[:, i] = scipy.signal.lfilter(*lag, targets[:, i], zi=begin)[0]
-        else:
-            states[0, i] = initial[i]
-            limp(states[:, i], targets[:, i], 1.0 - kept, dt * fall[i], dt * rise[i])
+        # x[k + 1] = kept * x[k] + (1 - kept) * target[k]
+        lag = ([0.0, 1.0 - kept], [1.0, -kept])
+        begin = initial[i : i + 1]
+        states[:, i] = scipy.signal.lfilter(*lag, targets[:, i], zi=begin)[0]
     return states
-
-
-def _subtract_dead_zones(
-    command: Stream, follows: NDArray[np.intp], dead: Array
-) -> Stream:
-    """Returns commands that are smaller by the dead zones (S,) of the states that follow them."""
-    if not dead.any():
-        return command
-    zones = np.zeros(command.values.shape[1])
-    zones[follows] = dead
-    size = np.maximum(np.abs(command.values) - zones, 0.0)
-    return replace(command, values=np.sign(command.values) * size)
 
 
 def measure_white_noise(values: Array) -> Array:

@@ -112,17 +112,33 @@ def estimate_clustered_errors(
     jacobian: Array, residual: Array, cluster: NDArray[np.intp]
 ) -> Array:
     """Returns cluster-robust standard errors (P,) (Cameron, Miller 2015), even for few clusters."""
+    return _deviations(estimate_clustered_covariance(jacobian, residual, cluster))
+
+
+def estimate_clustered_covariance(
+    jacobian: Array,
+    residual: Array,
+    cluster: NDArray[np.intp],
+    prior: Array | None = None,
+) -> Array:
+    """Returns a cluster-robust covariance (P, P) of least squares; NaN for too few clusters.
+
+    `prior` are the squared weights (P,) that pull each parameter towards its first value.
+    """
     groups = np.unique(cluster)
     count, terms = jacobian.shape
     if len(groups) < 2 or count <= terms:
-        return np.full(terms, np.nan)
+        return np.full((terms, terms), np.nan)
     scores = jacobian * residual[:, None]
     sums = np.stack([scores[cluster == g].sum(axis=0) for g in groups])
-    inverse = np.linalg.pinv(jacobian.T @ jacobian, hermitian=True)
+    normal = jacobian.T @ jacobian
+    if prior is not None:
+        normal = normal + np.diag(prior)
+    inverse = np.linalg.pinv(normal, hermitian=True)
     few = len(groups) / (len(groups) - 1.0) * (count - 1.0) / (count - terms)
     if len(groups) > 3:  # variance of Student's t
         few *= (len(groups) - 1.0) / (len(groups) - 3.0)
-    return _deviations(inverse @ (sums.T @ sums) @ inverse * few)
+    return np.asarray(inverse @ (sums.T @ sums) @ inverse * few)
 
 
 def find_correlation_reach(residual: Array) -> int:

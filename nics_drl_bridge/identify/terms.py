@@ -7,7 +7,7 @@ may have (D, K). Least squares then fits only these.
   order that mirror symmetry allows; a state that is a component of the twist is so by definition.
 - `select_textbook_terms`: for the same state; only the terms by which textbooks describe it.
 - `select_terms_through_state`: for a state that follows commands and was not measured. The twist
-  depends on the state alone.
+  depends on the state alone, as the textbook's does.
 
 A mirror image of a robot exchanges left and right: vy and wz change sign, and so do the variables
 that cause them, such as a steering angle. The motion of the image is the image of the motion, so
@@ -15,7 +15,8 @@ that vx is even in these variables, and vy and wz are odd.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from enum import StrEnum, auto
 from functools import partial
 from itertools import product
 
@@ -26,12 +27,14 @@ from numpy.typing import NDArray
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import excitation
-from nics_drl_bridge.identify.fit import Fit, prune_and_refit, regress
+from nics_drl_bridge.identify.fit import ORDER, Alpha, Fit, prune_and_refit, regress
+from nics_drl_bridge.identify.signals import find_speed_index
 from nics_drl_bridge.identify.yardstick import probe_structure
 from nics_drl_bridge.recording.recording import Samples
-from nics_drl_bridge.robot.kinds import compute_steady_twist
+from nics_drl_bridge.robot.kernels import MAX_ORDER
+from nics_drl_bridge.robot.kinds import compute_steady_twist, textbook
 from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec, StateVariable
-from nics_drl_bridge.robot.taylor import TaylorModel
+from nics_drl_bridge.robot.taylor import TaylorModel, evaluate, list_exponents
 
 Mask = NDArray[np.bool_]
 Powers = NDArray[np.int64]
@@ -42,7 +45,89 @@ VX = POSE_RATES.index("vx")
 VY = POSE_RATES.index("vy")
 MIRRORED_RATES = ("vy", "wz")
 IN_MIRROR = np.array([1.0, -1.0, -1.0])  # signs of vx, vy and wz
+# share of the states' ranges, and number of states, at which a textbook is expanded
+PROBED = 0.7
+PROBES = 400
+VISIBLE = 0.01  # share of the largest term that a term of an expansion must have
 NOTHING = 1e-9  # spread of a rate, or size of a coefficient, that counts as zero
+
+
+class Kind(StrEnum):
+    """Where the state of a robot comes from."""
+
+    MOTION = auto()  # it is the motion, derived from the poses; or there is no state
+    FOLLOWER = auto()  # it was not measured and follows the commands
+    MEASURED = auto()
+
+
+@dataclass(frozen=True)
+class Library:
+    """The terms that a model may have, and their linear fit (Eq. 1 and 2).
+
+    Attributes:
+        spec: the robot.
+        kind: where its state comes from.
+        centred: True if poses are those of the robot's reference point.
+        alpha: threshold of the pruning (Eq. 2); a motion's terms are not pruned.
+        order: of the base, from which other models depart; a motion's base is its textbook.
+    """
+
+    spec: RobotSpec
+    kind: Kind
+    centred: bool
+    alpha: Alpha
+    order: int
+
+    def fit(self, samples: Samples, order: int) -> Fit:
+        """Fits the terms up to an order."""
+        if self.kind is Kind.MOTION:
+            return fit_motion_terms(samples, self.spec, order)
+        allowed = None
+        if self.kind is Kind.FOLLOWER:
+            allowed = partial(select_terms_through_state, centred=self.centred)
+        regression = regress(samples, self.spec, order, True, allowed)
+        fit = prune_and_refit(regression, self.spec, self.alpha)
+        return replace(fit, model=self._define(fit.model))
+
+    def _define(self, model: TaylorModel) -> TaylorModel:
+        """Drops lateral motion that is noise; an inferred speed is that along x."""
+        coefficients = model.coefficients.copy()
+        slips = any(variable.twist == "vy" for variable in self.spec.state)
+        if not (self.spec.moves_sideways or slips):
+            coefficients[VY] = 0.0
+        speed = find_speed_index(self.spec)
+        if self.kind is Kind.FOLLOWER and speed is not None:
+            alone = np.eye(len(model.variables), dtype=np.int64)[speed]
+            is_speed = (model.powers == alone).all(axis=1)
+            if (coefficients[VX, is_speed] > 0.0).any():
+                coefficients[VX, is_speed] = 1.0
+        return replace(model, coefficients=coefficients)
+
+    def fit_base(self, samples: Samples, tyres: bool) -> TaylorModel:
+        """Fits the base: the textbook's terms of a motion, else those up to its order."""
+        if self.kind is Kind.MEASURED:
+            return self.fit(samples, self.order).model
+        if self.kind is Kind.FOLLOWER:
+            through = partial(
+                select_terms_through_state, centred=self.centred, by_book=True
+            )
+            regression = regress(samples, self.spec, self.order, False, through)
+            return self._define(prune_and_refit(regression, self.spec, 1.0).model)
+        allowed = partial(select_textbook_terms, tyres=tyres)
+        return fit_motion_terms(samples, self.spec, self.order, allowed).model
+
+    def select_free(self, model: TaylorModel) -> Mask:
+        """Selects the coefficients (D, K) that no definition and no measurement fixes."""
+        free = model.coefficients != 0.0
+        if self.kind is Kind.MOTION:
+            return np.asarray(free & ~select_defined_dofs(self.spec)[:, None])
+        free[FIRST_STATE:] = False
+        speed = find_speed_index(self.spec)
+        if self.kind is Kind.FOLLOWER and speed is not None:
+            alone = np.eye(len(model.variables), dtype=np.int64)[speed]
+            is_speed = (model.powers == alone).all(axis=1)
+            free[VX, is_speed & (model.coefficients[VX] == 1.0)] = False
+        return np.asarray(free)
 
 
 def fit_motion_terms(
@@ -225,7 +310,9 @@ def select_textbook_terms(
     return np.asarray(allowed)
 
 
-def select_terms_through_state(powers: Powers, spec: RobotSpec, centred: bool) -> Mask:
+def select_terms_through_state(
+    powers: Powers, spec: RobotSpec, centred: bool, by_book: bool = False
+) -> Mask:
     """Selects the terms (D, K) of a robot whose states follow commands and were not measured.
 
     The twist depends on the state alone, and the rate of a state on itself and its command.
@@ -235,6 +322,7 @@ def select_terms_through_state(powers: Powers, spec: RobotSpec, centred: bool) -
         spec: the robot.
         centred: True if poses are those of the robot's reference point, so that mirror symmetry
             must hold: for vx in all terms, for vy and wz beyond the first order.
+        by_book: allows only the terms by which the textbook's twist can be expanded.
     """
     names = spec.variable_names
     reversed_names = list_reversed_variables(spec)
@@ -244,6 +332,8 @@ def select_terms_through_state(powers: Powers, spec: RobotSpec, centred: bool) -
     )
     allowed = np.ones((len(spec.dof_names), len(powers)), dtype=np.bool_)
     allowed[TWIST] = excitation.select_twist_terms(powers, spec, unmoved)
+    if by_book:
+        allowed[TWIST] &= _select_textbook_twist(powers, spec)
     if reversed_names is not None and centred:
         is_odd = _are_odd(powers, names, reversed_names)
         allowed[VX] &= ~is_odd
@@ -252,6 +342,51 @@ def select_terms_through_state(powers: Powers, spec: RobotSpec, centred: bool) -
         own = [i, find_followed_command(spec, variable)]
         allowed[FIRST_STATE + i] = (order == 1) & powers[:, own].any(axis=1)
     return allowed
+
+
+def _select_textbook_twist(powers: Powers, spec: RobotSpec) -> Mask:
+    """Selects the terms (3, K) by which the twist of a textbook can be expanded.
+
+    A variable that never moved, which is in none of the terms, is a constant factor.
+    """
+    never_moved = ~powers.any(axis=0)
+    allowed = np.zeros((3, len(powers)), dtype=np.bool_)
+    for row, expansion in zip(allowed, _expand_textbook_twist(spec), strict=True):
+        for term in expansion:
+            row |= (powers == np.where(never_moved, 0, term)).all(axis=1)
+    return allowed & powers.any(axis=1)
+
+
+def _expand_textbook_twist(spec: RobotSpec) -> tuple[tuple[Array, ...], ...]:
+    """Returns the terms (V,) of the expanded twist of a textbook, and those of a trim, by part.
+
+    A trim, a wheel that steers a little to one side, leaves an angle out of a term.
+    """
+    count = len(spec.state)
+    powers = list_exponents(count, MAX_ORDER)
+    rng = np.random.default_rng(0)
+    low, high = np.array([[v.min, v.max] for v in spec.state]).T
+    state = rng.uniform(PROBED * low, PROBED * high, (PROBES, count))
+    chi = evaluate(state, powers)
+    size = np.sqrt((chi**2).mean(axis=0))
+    try:
+        twist = textbook(spec).twist(state)
+        effect = np.linalg.lstsq(chi / size, twist, rcond=None)[0].T
+    except ConfigError:
+        effect = np.tile((powers.sum(axis=1) <= ORDER) * 1.0, (3, 1))
+    commands = np.zeros(len(spec.command), dtype=np.int64)
+    expansions = []
+    for part in np.abs(effect):
+        terms = powers[part > max(VISIBLE * part.max(), NOTHING)]
+        trims = [
+            term - np.eye(count, dtype=np.int64)[factor]
+            for term in terms
+            for factor in np.flatnonzero(term)
+            if spec.state[factor].unit == "rad"
+        ]
+        both = (*terms, *trims)
+        expansions.append(tuple(np.append(term, commands) for term in both))
+    return tuple(expansions)
 
 
 def find_followed_command(spec: RobotSpec, variable: StateVariable) -> int:
@@ -380,6 +515,38 @@ def stabilise(model: TaylorModel, spec: RobotSpec) -> TaylorModel:
         decay = is_linear & (model.powers[:, i] == 1)
         coefficients[row, decay] = np.minimum(coefficients[row, decay], 0.0)
     return replace(model, coefficients=coefficients)
+
+
+def find_linear_term(model: TaylorModel, name: str) -> int:
+    """Returns the index of the term of a variable alone, which the model must have."""
+    alone = np.array([v == name for v in model.variables], dtype=np.int64)
+    return int(np.flatnonzero((model.powers == alone).all(axis=1))[0])
+
+
+def add_linear_terms(model: TaylorModel) -> TaylorModel:
+    """Returns a model that has a term, maybe of zero, of each variable alone."""
+    linear = np.eye(len(model.variables), dtype=np.int64)
+    more = [row for row in linear if not (model.powers == row).all(axis=1).any()]
+    powers = np.concatenate(
+        [model.powers, np.reshape(more, (-1, len(linear))).astype(np.int64)]
+    )
+    coefficients = np.zeros((len(model.dofs), len(powers)))
+    coefficients[:, : len(model.powers)] = model.coefficients
+    return replace(
+        model, powers=powers, coefficients=coefficients, std_errors=np.zeros((0, 0))
+    )
+
+
+def drop_unused_terms(model: TaylorModel) -> TaylorModel:
+    """Returns a model without terms that no degree of freedom has."""
+    used = model.coefficients.any(axis=0)
+    errors = model.std_errors
+    return replace(
+        model,
+        powers=model.powers[used],
+        coefficients=np.ascontiguousarray(model.coefficients[:, used]),
+        std_errors=errors[:, used] if errors.size else errors,
+    )
 
 
 def merge_terms(base: TaylorModel, other: TaylorModel) -> tuple[TaylorModel, Array]:

@@ -50,7 +50,6 @@ def make_textbook_calibration(
         lever_arm_m=(x, y),
         responses=tuple(_update_responses(response, calibration, spec)),
         inputs=tuple(_find_dead_zones(response, spec)),
-        limits={},
         uncertainty={k: v for k, v in calibration.uncertainty.items() if k in kept},
     )
 

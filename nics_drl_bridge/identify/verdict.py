@@ -9,7 +9,6 @@ import numpy as np
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import FitError, RecordingError
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify import followers
 from nics_drl_bridge.identify.acceptance import THRESHOLDS, describe_shortfall
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.clocks import TimingEstimate
@@ -33,6 +32,7 @@ from nics_drl_bridge.identify.open_loop import (
 from nics_drl_bridge.identify.signals import select_moved_commands
 from nics_drl_bridge.identify.statistics import CERTAIN, measure_rate_errors
 from nics_drl_bridge.recording.recording import Recording, Samples, Stream
+from nics_drl_bridge.robot.curve import delays
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import HorizonErrors, Quality, TaylorModel
 
@@ -50,10 +50,6 @@ BACKWARDS = 0.3  # angle [rad] from half a turn, below which a body faces backwa
 GAP_STEPS = 3.0
 # maximum number of gaps to report individually: the longest, in order of time
 MOST_GAPS_LISTED = 12
-LINEAR = (
-    "Predictions by terms of a higher order ended farther away than the robot drove, so the model "
-    "has only those of order 1."
-)
 # fraction of a state's range between two rows that is sampled too coarsely
 COARSE = 2.0 / 3.0
 ENDS = (1.0, 99.0)  # percentiles that bound the range of a state
@@ -260,9 +256,10 @@ def describe_responses(
             finding = f"{command} never changed, so how {state} follows it could not be learnt"
             yield Gap(f"{finding}; drive with {command} changing over its whole range.")
         else:
-            lag = f"{response.lag_s:.4f} s" + (
-                "" if np.isnan(sigma) else f" (+- {sigma:.4f} s)"
-            )
+            error = calibration.uncertainty.get(f"{state}.lag", sigma)
+            lag = f"{response.lag_s:.4f} s"
+            if not np.isnan(error):
+                lag += f" (+- {error:.4f} s)"
             taken = f"with a lag of {lag} and a gain of {response.gain:.4f}"
             yield f"{state} was not measured: it is taken to follow {command} {taken}."
     if calibration.wheel_scale is not None:
@@ -272,6 +269,23 @@ def describe_responses(
     if calibration.wheels_swapped:
         why = "is the faster one when the robot turns left, and the slower one when it turns right"
         yield f"Left and right wheel look interchanged: the wheel recorded as the left one {why}."
+
+
+def name_sum(state: str) -> str:
+    """Returns the name of the uncertainty of a latency and a lag together."""
+    return f"command_latency_and_{state}_lag_s"
+
+
+def describe_sums(calibration: Calibration) -> Iterator[str]:
+    """Yields a sentence on latencies and lags that could not be separated."""
+    commands = [response.command for response in calibration.responses]
+    further = delays(commands, calibration.inputs).tolist()
+    for response, delay in zip(calibration.responses, further, strict=True):
+        sigma = calibration.uncertainty.get(name_sum(response.state))
+        if sigma is not None and not np.isnan(sigma):
+            both = calibration.command_latency_s + delay + response.lag_s
+            finding = f"Latency and the lag of {response.state} can hardly be separated"
+            yield f"{finding}: trust their sum, {both:.4f} s (+- {sigma:.4f} s)."
 
 
 def refuse_unexcited(excitation: Excitation, spec: RobotSpec) -> None:
@@ -430,11 +444,6 @@ def try_model(
 def is_worse(error_m: float, reference_m: float) -> bool:
     """True if an error [m] clearly exceeds a reference [m], or is not a number."""
     return bool(np.isnan(error_m)) or error_m > WORSE * reference_m
-
-
-def runs_away(errors: OpenLoop | None) -> bool:
-    """True if predictions end farther away than the robot drove."""
-    return errors is not None and not errors.mean_position_error_m <= errors.mean_path_m
 
 
 def describe_untried(
@@ -630,7 +639,7 @@ def collect_calibration_notes(findings: Findings) -> tuple[str, ...]:
     return (
         *describe_stamps(training),
         *describe_clocks(training, calibration, findings.timing),
-        *followers.describe_sums(calibration),
+        *describe_sums(calibration),
         *describe_mounting(training, calibration, findings.mounting),
         *describe_responses(training, calibration, findings.timing),
     )

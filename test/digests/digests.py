@@ -123,7 +123,10 @@ def table_2() -> Found:
 
 
 def identified() -> Found:
-    """Models, calibrations and noise identified from recordings with known defects."""
+    """Models identified from exact recordings, and errors of those from noisy ones [m].
+
+    A search ends at other digits, and may keep another small term, on another processor.
+    """
     from identify.drives import drive
 
     from nics_drl_bridge.identify.identify import identify
@@ -152,6 +155,10 @@ def identified() -> Found:
             if robot != "ackermann" and disturbed:
                 continue
             result = identify(drive(spec, **disturbed), spec, alpha=0.99)
+            if disturbed:
+                errors = [at.model.position_m for at in result.judgement]
+                found[f"{robot} {name}"] = errors
+                continue
             for each, of in ((result.trial, ""), (result, ", all data")):
                 numbers = [
                     *each.model.coefficients.ravel(),
@@ -219,11 +226,13 @@ DIGESTS: dict[str, Callable[[], Found]] = {
         estimates,
     )
 }
+SEARCHED = [
+    f"ackermann {name}" for name in ("late and noisy", "turned", "bursts", "poses only")
+]
 TOLERANCES = {
     "motion_state_errors": 0.05,
     "training": 1e-5,
-    "ackermann bursts": 1e-3,
-    "ackermann bursts, all data": 1e-3,
+    **dict.fromkeys(SEARCHED, 0.05),
 }
 """Of digests, and parts of them, whose bits are not those of every processor: of what numerical
 searches find, and of what matrix products in single precision give."""

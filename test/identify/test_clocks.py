@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import pytest
 
-from identify.drives import MOTOR, calibrate, drive, servoed, tricycle
+from identify.drives import MOTOR, drive, servoed, tricycle
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.clocks import SEPARABLE_S, measure_timing
 from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.identify.verdict import describe_clocks
 
 SUM = "command_latency_and_speed_lag_s"
@@ -18,7 +19,7 @@ SUM = "command_latency_and_speed_lag_s"
 
 @pytest.mark.slow
 def test_a_servo_of_second_order_is_not_taken_for_latency():
-    found = calibrate(servoed(), tricycle())
+    found = identify(servoed(), tricycle()).calibration
     assert found.command_latency_s == pytest.approx(0.1, abs=0.003)
     assert found.uncertainty["command_latency_s"] < SEPARABLE_S
     speed, steering = found.responses
@@ -32,7 +33,8 @@ def test_a_servo_of_second_order_is_not_taken_for_latency():
 
 @pytest.mark.slow
 def test_a_command_that_acts_later_than_the_others_has_a_delay():
-    found = calibrate(servoed(steering_servo=MOTOR, later=0.12), tricycle())
+    recording = servoed(steering_servo=MOTOR, later=0.12)
+    found = identify(recording, tricycle()).calibration
     assert found.command_latency_s == pytest.approx(0.1, abs=0.003)
     (curve,) = found.inputs
     assert curve.command == "steering_command"
@@ -44,9 +46,9 @@ def test_a_command_that_acts_later_than_the_others_has_a_delay():
 @pytest.mark.slow
 def test_of_latency_and_lag_that_noise_hides_the_sum_is_told(car):
     recording = drive(
-        car, 4, 20.0, latency=0.05, noise=(0.003, 0.006), measured_state=False
+        car, 4, 20.0, latency=0.05, noise=(0.04, 0.08), measured_state=False
     )
-    found = calibrate(recording, car)
+    found = identify(recording, car).calibration
     assert found.uncertainty["command_latency_s"] > SEPARABLE_S
     sigma = found.uncertainty[SUM]
     both = found.command_latency_s + found.responses[0].lag_s

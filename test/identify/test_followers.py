@@ -12,7 +12,6 @@ from identify.drives import MOTOR, servoed, tricycle
 from nics_drl_bridge import geometry
 from nics_drl_bridge.identify.identify import Identified, identify
 from nics_drl_bridge.recording.recording import Stream
-from nics_drl_bridge.robot.curve import InputCurve
 
 SPEED = "speed_command"
 
@@ -105,16 +104,3 @@ def test_motors_are_found_where_the_wheels_tell_the_latency_of_a_pose_on_another
         identify(replace(recording, wheels=wheels, pose=tracked), tricycle())
     )
     assert error < 0.6 * textbook
-
-
-@pytest.mark.slow
-def test_what_holds_a_state_back_is_written_at_the_gain_of_the_state():
-    identified = found(slew=0.7)
-    (response, _), limits = (
-        identified.calibration.responses,
-        identified.calibration.limits,
-    )
-    assert identified.model.limits[0] == pytest.approx(
-        np.multiply(limits["speed"], response.gain), rel=0.05
-    )
-    assert InputCurve(command=SPEED) not in identified.model.inputs

@@ -51,7 +51,8 @@ def samples(found) -> Samples:
 
 
 def form_inputs(found, samples, form):
-    return list_inputs(found.training, 0.05, samples, form)
+    calibration = replace(found.calibration, command_latency_s=0.05)
+    return list_inputs(found.training, calibration, samples, form)
 
 
 def test_a_dead_zone_is_seen_in_the_speed_that_a_throttle_makes(found, samples):

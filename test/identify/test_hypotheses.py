@@ -22,7 +22,11 @@ from nics_drl_bridge.identify.hypotheses import (
     list_hypotheses,
 )
 from nics_drl_bridge.identify.identify import STAGES, fit_terms, identify, run
+from nics_drl_bridge.identify.prediction_fit import make_library
 from nics_drl_bridge.identify.report import format_report
+from nics_drl_bridge.identify.terms import Kind, Library
+
+MOTION = Library(slipping_car(duration=4.0)[0], Kind.MOTION, True, 1.0, 3)
 
 
 def base(**given):
@@ -31,7 +35,10 @@ def base(**given):
     drive = replace(drive, settings=Settings(train_until_s=drive.duration_s))
     found = run(STAGES[: STAGES.index(fit_terms)], drive)
     samples = resample_drive(found.training, found)
-    best = fit_base(found.training, found.calibration, samples, found.clear_curves)
+    library = make_library(drive, found)
+    best = fit_base(
+        found.training, found.calibration, samples, library, found.clear_curves
+    )
     names = best.draft.inputs.names
     values = best.found.values.tolist()
     return best.draft.form, dict(zip(names, values, strict=True))
@@ -92,7 +99,7 @@ def test_a_higher_order_has_to_be_worth_its_terms():
 
 
 def test_hypotheses_go_from_the_textbook_to_the_freest():
-    assert [order for order, _ in list_hypotheses("auto")] == [
+    assert [order for order, _ in list_hypotheses("auto", MOTION)] == [
         0,
         1,
         1,
@@ -104,7 +111,7 @@ def test_hypotheses_go_from_the_textbook_to_the_freest():
         3,
         3,
     ]
-    assert {order for order, _ in list_hypotheses(2)} == {0, 2}
+    assert {order for order, _ in list_hypotheses(2, MOTION)} == {0, 2}
 
 
 def test_a_latency_is_told_as_its_sums_with_the_lags():

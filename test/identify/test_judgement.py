@@ -84,7 +84,7 @@ def test_a_refit_that_knows_the_first_part_worse_is_not_believed(
 ):
     monkeypatch.setattr(verdict, "WORSE", 0.0)
     found = identify(recording, load_robot("differential"))
-    assert found.model is found.trial.model
+    assert np.array_equal(found.model.coefficients, found.trial.model.coefficients)
     assert any("covers only the first 26.7 s" in note for note in found.notes)
 
 

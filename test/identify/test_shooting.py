@@ -157,3 +157,13 @@ def test_the_error_of_a_prediction_that_diverged_is_infinite_and_none_is_left_ou
     fits = np.isfinite(path)
     assert fits.any()
     assert np.isinf(error[fits]).any(axis=-1).all()
+
+
+def test_delays_alone_move_to_later_stamps():
+    names = ("latency", "throttle.delay", "throttle.dead")
+    start = np.array([0.1, 0.2, 0.3])
+    inputs = Inputs(names, start, np.ones(3), start - 0.1, start + 0.1)
+    later = inputs.shifted(0.05)
+    assert later.start == pytest.approx([0.05, 0.15, 0.3])
+    assert later.low == pytest.approx([-0.05, 0.05, 0.2])
+    assert later.high == pytest.approx([0.15, 0.25, 0.4])

@@ -18,6 +18,8 @@ from nics_drl_bridge.identify.identify import (
     run,
 )
 from nics_drl_bridge.identify.terms import (
+    Kind,
+    Library,
     fit_motion_terms,
     has_slipping_tyres,
     list_reversed_variables,
@@ -26,7 +28,7 @@ from nics_drl_bridge.identify.terms import (
     select_textbook_terms,
     share_effects,
 )
-from nics_drl_bridge.recording.recording import samples_on_one_clock
+from nics_drl_bridge.recording.recording import Samples, samples_on_one_clock
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.spec import build_robot
 
@@ -58,9 +60,7 @@ def off(calibration: Calibration, mounting: tuple[float, float, float]) -> np.nd
 def test_a_tricycle_that_steers_far_gets_its_order_and_mounting_by_itself():
     found = identify(servoed(), tricycle(), alpha="auto")
     trials = found.findings.trials
-    assert [trial.order for trial in trials] == [2, 3, 4]
-    assert trials[0].error > 3.0 * trials[2].error
-    assert any("The model has terms up to order 4" in note for note in found.notes)
+    assert [trial.order for trial in trials] == [0, 2, 3, 4]
     assert found.model.powers.sum(axis=1).max() >= 3
     assert share(found) < 0.02
     assert np.abs(off(found.calibration, (0.25, 0.12, 0.5))).max() < 3.0
@@ -90,6 +90,44 @@ def test_a_dead_zone_is_not_taken_for_a_mounting(seed):
     )
     assert np.abs(off(found.calibration, mounting)).max() < 3.0
     assert found.calibration.rotation_rad == pytest.approx(0.0, abs=0.003)
+
+
+def test_a_textbook_of_a_front_driven_tricycle_is_expanded_with_its_trim():
+    spec = tricycle()
+    powers = taylor.list_exponents(4, 4)
+    allowed = select_terms_through_state(powers, spec, centred=True, by_book=True)
+    names = np.array([taylor.format_term(row, spec.variable_names) for row in powers])
+    along, across, turn = ({*names[row]} for row in allowed[:3])
+    assert along == {"speed", "speed*steering^2"}
+    assert across == set()
+    assert turn == {"speed", "speed*steering", "speed*steering^3"}
+
+
+def test_a_variable_that_never_moved_is_a_factor_of_the_textbooks_terms():
+    spec = tricycle()
+    powers = np.array([[0, 0, 0, 0], [1, 0, 0, 0], [2, 0, 0, 0], [0, 0, 1, 0]])
+    allowed = select_terms_through_state(powers, spec, centred=True, by_book=True)
+    assert allowed[:3].tolist() == [
+        [False, True, False, False],
+        [False, False, False, False],
+        [False, True, False, False],
+    ]
+
+
+def test_lateral_motion_is_kept_where_a_state_measures_it():
+    spec = tricycle()
+    rng = np.random.default_rng(0)
+    x = rng.uniform(-0.5, 0.5, (400, 4))
+    dq = np.stack([x[:, 0], 0.3 * x[:, 1], x[:, 0] * x[:, 1], *x[:, 2:].T], axis=1)
+    t = 0.01 * np.arange(400)
+    samples = Samples(t, np.zeros((400, 5)), x, dq, 0.01)
+    plain = Library(spec, Kind.MEASURED, True, 1.0, 2).fit(samples, 2).model
+    assert not plain.coefficients[1].any()
+    speed, steering = spec.state
+    slip = steering.model_copy(update={"twist": "vy", "follows": None, "unit": "m/s"})
+    slides = spec.model_copy(update={"state": (speed, slip)})
+    kept = Library(slides, Kind.MEASURED, True, 1.0, 2).fit(samples, 2).model
+    assert kept.coefficients[1].any()
 
 
 def test_a_mirror_leaves_even_terms_along_x_and_odd_ones_across():

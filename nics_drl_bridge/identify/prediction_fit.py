@@ -1,16 +1,23 @@
-"""Fit of a robot whose state is its motion, derived from the poses: a textbook, and more terms.
+"""Fit of a model by what it predicts: from a textbook, to more effects and more terms.
 
-1. `fit_motion` fits the textbook's terms with the best-predicting form (dead zones, drag, ...),
-   cross-validates orders of terms beyond them, and fits the best order by least squares (Eq. 1).
-2. `refine_motion` adjusts these terms, delays and mounting to predictions over seconds.
+It serves every drive that is not exact, whether its state is the motion, follows the commands, or
+was measured (`terms.Kind`).
+
+1. `fit_by_predictions` fits a base, the textbook, with the best-predicting form (delays, limits,
+   drag, ...), cross-validates orders of terms beyond it, and fits the best by Eq. 1.
+2. `refine_by_predictions` adjusts terms, delays, lags and mounting to predictions over seconds, and
+   prunes the terms (Eq. 2) unless the state is the motion.
 """
 
 from collections.abc import Iterator
 from dataclasses import replace
 
+import numpy as np
+
 from nics_drl_bridge.errors import FitError
 from nics_drl_bridge.identify import hypotheses, shooting, verdict
 from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.clocks import SEPARABLE_S
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.findings import (
     Findings,
@@ -19,36 +26,52 @@ from nics_drl_bridge.identify.findings import (
     require_samples,
     resample_drive,
 )
-from nics_drl_bridge.identify.refine import TOO_SHORT
-from nics_drl_bridge.identify.terms import fit_motion_terms, share_effects
+from nics_drl_bridge.identify.terms import (
+    Kind,
+    Library,
+    drop_unused_terms,
+    share_effects,
+)
+from nics_drl_bridge.robot.kernels import MAX_ORDER
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
 
+LINEAR = 1  # order from which the model of a measured state starts
+TOO_SHORT = (
+    "The training part is too short to refine the model by its errors over seconds; record a "
+    "longer drive."
+)
 
-def fit_motion(drive: Drive, findings: Findings) -> Findings:
+
+def fit_by_predictions(drive: Drive, findings: Findings) -> Findings:
     """Fits the order that best predicts parts of the training part that its fits did not see."""
     training = findings.training
     spec = drive.spec
     order = drive.settings.order
+    library = make_library(drive, findings)
     samples = resample_drive(training, findings)
     try:
         base = hypotheses.fit_base(
             training,
             findings.calibration,
             samples,
+            library,
             findings.clear_curves,
             findings.base,
         )
         trials = findings.trials  # a refit reuses the choice
-        trials = trials or base.draft.tried(hypotheses.list_hypotheses(order))
+        trials = trials or base.draft.tried(hypotheses.list_hypotheses(order, library))
     except FitError as error:
         raise FitError(f"{drive.recording.source}: {error}") from None
-    best = hypotheses.choose_trial(trials, order).order
+    best = hypotheses.choose_trial(trials, order)
     curves = base.draft.form.curves_at(base.draft.inputs, base.found.values)
-    calibration = replace(findings.calibration, inputs=curves)
-    findings = replace(findings, calibration=calibration)
-    samples = resample_drive(training, findings)
-    fit = fit_motion_terms(samples, spec, best or hypotheses.BASE_ORDER)
+    if library.kind is Kind.MOTION:
+        calibration = replace(findings.calibration, inputs=curves)
+        findings = replace(findings, calibration=calibration)
+        samples = resample_drive(training, findings)
+    else:
+        samples = base.draft.select(None)
+    fit = library.fit(samples, best.order or library.order)
     if drive.settings.strict:
         verdict.refuse_unexcited(fit.regression.excitation, spec)
     return replace(
@@ -62,7 +85,19 @@ def fit_motion(drive: Drive, findings: Findings) -> Findings:
     )
 
 
-def refine_motion(drive: Drive, findings: Findings) -> Findings:
+def make_library(drive: Drive, findings: Findings) -> Library:
+    """Returns the terms that the model of a drive may have."""
+    order = drive.settings.order
+    if not drive.spec.state or findings.motion_width_s is not None:
+        return Library(drive.spec, Kind.MOTION, True, 1.0, hypotheses.BASE_ORDER)
+    kind = Kind.FOLLOWER if drive.recording.state is None else Kind.MEASURED
+    centred = "lever_arm_y_m" in findings.calibration.uncertainty
+    if order == "auto":
+        order = MAX_ORDER if kind is Kind.FOLLOWER else LINEAR
+    return Library(drive.spec, kind, centred, drive.settings.alpha, order)
+
+
+def refine_by_predictions(drive: Drive, findings: Findings) -> Findings:
     """Adjusts terms, delays and mounting to predictions over seconds."""
     order = drive.settings.order
     base = require(findings.base, "the base", "fit_terms")
@@ -78,30 +113,55 @@ def refine_motion(drive: Drive, findings: Findings) -> Findings:
             calibration = replace(calibration, uncertainty=errors)
             draft = certain
             found, has_order = _search_model(draft, base, terms, best)
-    calibration = _calibrate(draft, found, calibration)
+    if draft.library.kind is not Kind.MOTION:
+        found = draft.prune(found, drive.settings.alpha)
+    before = draft.form.latency_at(draft.inputs, found.values)
+    calibration = draft.calibrate(found, calibration)
     values = found.values.copy()
     if draft.problem.mounted:  # the calibration has the mounting now
         values[-3:] = 0.0
-    draft = replace(draft, inputs=replace(draft.inputs, start=values))
-    base = replace(base, draft=draft)
-    calibration, sums = _separate_lags(base, calibration, drive.spec)
-    model = replace(
-        found.model,
-        std_errors=hypotheses.estimate_coefficient_errors(found),
-        inputs=calibration.inputs,
+    inputs = replace(draft.inputs, start=values)
+    draft = replace(
+        draft, inputs=inputs.shifted(before - calibration.command_latency_s)
     )
+    base = replace(base, draft=draft)
+    if draft.library.kind is Kind.MOTION:
+        calibration, sums = _separate_lags(base, calibration, drive.spec)
+    else:
+        calibration = _add_sums(calibration, found, draft)
+        sums = ()
+    model = draft.add_errors(found, terms)
+    model = replace(model, inputs=calibration.inputs)
+    model = share_effects(model, drive.spec, require_samples(findings))
     return replace(
         findings,
         calibration=calibration,
-        model=share_effects(model, drive.spec, require_samples(findings)),
+        model=drop_unused_terms(model),
         base=base,
         refinement=(
             _describe_refinement(draft.problem.longest_horizon_s),
             *sums,
             *hypotheses.describe_forms(base, findings.trials, order),
-            *_list_unused_options(drive, best.order, has_order),
+            *_list_unused_options(drive, draft.library, best.order, has_order),
         ),
     )
+
+
+def _add_sums(
+    calibration: Calibration, found: shooting.Predictive, draft: hypotheses.Draft
+) -> Calibration:
+    """Adds the errors of sums of latency and lag, which are told where noise hides the parts."""
+    errors = dict(calibration.uncertainty)
+    if not errors.get("command_latency_s", 0.0) > SEPARABLE_S:
+        return calibration
+    names = list(draft.inputs.names)
+    for state, command in draft.form.followed:
+        delay = f"{command}.delay"
+        pair = [names.index(delay if delay in names else "latency")]
+        pair.append(names.index(f"{state}.lag"))
+        variance = float(found.value_covariance[np.ix_(pair, pair)].sum())
+        errors[verdict.name_sum(state)] = float(np.sqrt(max(variance, 0.0)))
+    return replace(calibration, uncertainty=errors)
 
 
 def _search_model(
@@ -121,29 +181,12 @@ def _search_model(
         terms: the terms beyond the textbook's, as fitted by least squares.
         best: the chosen order.
     """
-    if best.order:
+    if best.pull:
         refined = draft.refined(base.found.model, terms, pull=best.pull)
         if not verdict.is_worse(draft.error_of(refined), draft.error_of(base.found)):
             return refined, True
     textbook = draft.base(other=base.found.model)
-    return textbook, best.order == 0
-
-
-def _calibrate(
-    draft: hypotheses.Draft, found: shooting.Predictive, calibration: Calibration
-) -> Calibration:
-    """Returns a calibration with latency, input curves and mounting of a search."""
-    values = found.values
-    errors = found.named_errors(draft.inputs.names)
-    calibration = replace(
-        calibration,
-        command_latency_s=draft.form.latency_at(draft.inputs, values),
-        inputs=draft.form.curves_at(draft.inputs, values),
-        uncertainty=calibration.uncertainty | errors,
-    )
-    if draft.problem.mounted:
-        return hypotheses.add_predicted_mounting(calibration, found)
-    return calibration
+    return textbook, best.pull == 0.0
 
 
 def _separate_lags(
@@ -170,10 +213,12 @@ def _describe_refinement(horizon_s: float) -> str:
     return f"Coefficients and latency were refined by {by}."
 
 
-def _list_unused_options(drive: Drive, order: int, has_order: bool) -> Iterator[str]:
+def _list_unused_options(
+    drive: Drive, library: Library, order: int, has_order: bool
+) -> Iterator[str]:
     """Yields a sentence per option that had no effect on the model."""
     settings = drive.settings
-    if settings.alpha != "auto":
+    if settings.alpha != "auto" and library.kind is Kind.MOTION:
         why = "where the state is the motion, predictions of parts of the drive weight the terms"
         yield f"alpha = {settings.alpha:g} was not used: {why}."
     if settings.order != "auto" and not has_order:
