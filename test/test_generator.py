@@ -15,7 +15,6 @@ from nics_drl_bridge.files import SUMS
 from nics_drl_bridge.generator import (
     MODEL_FILE,
     MODEL_FILES,
-    MOTORS,
     TABLE_FOLDER,
     builtin_model,
     load_model,
@@ -191,7 +190,7 @@ PLACES = [
     *(
         (f"calibration.{key.name}", GONE)
         for key in fields(Calibration)
-        if key.name not in MOTORS
+        if key.name != "inputs"
     ),
     ("format", "nics_drl_bridge/simulator_model/3"),
     ("calibration.burst_period_s", -1.0),

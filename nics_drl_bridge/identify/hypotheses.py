@@ -334,7 +334,8 @@ def fit_base(
     plain_form = forms.make_form(drive, calibration, library)
 
     if former is not None:
-        refitted = fitted(replace(former.draft.form, curves=calibration.inputs))
+        form = replace(former.draft.form, curves=calibration.inputs)
+        refitted = fitted(form, former if form.followed else None)
         return replace(refitted, candidates=former.candidates)
     best = fitted(replace(plain_form, curves=calibration.inputs))
     trial = cross_validate(best)

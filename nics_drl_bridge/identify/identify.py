@@ -250,7 +250,7 @@ def _make_result(trial: Findings, final: Findings) -> Identified:
     """Returns the result of a trial and of the final fit, which may be the same."""
     samples = require_samples(final)
     model = require_model(final)
-    if final.base is not None:
+    if final.base is not None and not final.replacement:
         model = drop_unreached_ends(
             model, final.whole, samples, final.calibration.uncertainty
         )
