@@ -108,22 +108,23 @@ def split_independent_columns(chi: Array) -> tuple[NDArray[np.intp], NDArray[np.
 
 
 def select_moved_terms(
-    samples: Samples,
-    powers: NDArray[np.int64],
-    names: tuple[str, ...],
-    unmoved: tuple[str, ...],
+    powers: NDArray[np.int64], names: tuple[str, ...], unmoved: tuple[str, ...]
 ) -> NDArray[np.int64]:
-    """Returns the terms (K, V) of variables that moved; FitError if the samples are too few."""
-    still = [names.index(name) for name in unmoved]
-    moved: NDArray[np.int64] = powers[(powers[:, still] == 0).all(axis=1)]
-    if len(samples.t) < MIN_SAMPLES_PER_TERM * len(moved):
-        few = f"{len(samples.t)} samples are too few for {len(moved)} terms"
-        raise FitError(f"{few}; drive for longer, or lower the order.")
+    """Returns the terms (K, V) of variables that moved; FitError if none did."""
     if len(unmoved) == len(names):
         raise FitError(
             "no command ever changed, so nothing can be learnt; vary each command."
         )
+    still = [names.index(name) for name in unmoved]
+    moved: NDArray[np.int64] = powers[(powers[:, still] == 0).all(axis=1)]
     return moved
+
+
+def check_sample_count(samples: Samples, terms: int) -> None:
+    """Raises FitError if the samples are too few for a number of terms."""
+    if len(samples.t) < MIN_SAMPLES_PER_TERM * terms:
+        few = f"{len(samples.t)} samples are too few for {terms} terms"
+        raise FitError(f"{few}; drive for longer, or lower the order.")
 
 
 def select_twist_terms(

@@ -186,9 +186,11 @@ def regress(
     names = spec.variable_names
     excited = excitation.Excitation.of(samples, spec)
     all_powers = taylor.list_exponents(len(names), order)
-    moved_powers = excitation.select_moved_terms(
-        samples, all_powers, names, excited.unmoved
-    )
+    moved_powers = excitation.select_moved_terms(all_powers, names, excited.unmoved)
+    count = len(moved_powers)
+    if term_filter is not None:
+        count = int(term_filter(moved_powers, spec).any(axis=0).sum())
+    excitation.check_sample_count(samples, count)
     chi = taylor.evaluate(samples.x, moved_powers)
     independent, dependent = excitation.split_independent_columns(chi)
     chi = chi[:, independent]

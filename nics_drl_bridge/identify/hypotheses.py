@@ -25,7 +25,7 @@ from nics_drl_bridge.robot.taylor import TaylorModel
 ORDERS = (1, 2, 3)  # orders that `auto` chooses from
 PULLS = (0.1, 0.01, 0.001)  # pulls that are tried for each order
 ORDERS_OF_FOLLOWERS = (2, 3, 4)
-ORDERS_OF_MEASURED = (2,)
+ORDERS_OF_MEASURED = (1,)  # besides that of the base
 WORTH = 0.95  # a higher order must reduce the error to this fraction
 FOLDS = 3
 # spacing of trials' windows

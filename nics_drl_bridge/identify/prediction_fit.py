@@ -26,6 +26,7 @@ from nics_drl_bridge.identify.findings import (
     require_samples,
     resample_drive,
 )
+from nics_drl_bridge.identify.fit import ORDER
 from nics_drl_bridge.identify.terms import (
     Kind,
     Library,
@@ -36,7 +37,6 @@ from nics_drl_bridge.robot.kernels import MAX_ORDER
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
 
-LINEAR = 1  # order from which the model of a measured state starts
 TOO_SHORT = (
     "The training part is too short to refine the model by its errors over seconds; record a "
     "longer drive."
@@ -93,7 +93,7 @@ def make_library(drive: Drive, findings: Findings) -> Library:
     kind = Kind.FOLLOWER if drive.recording.state is None else Kind.MEASURED
     centred = "lever_arm_y_m" in findings.calibration.uncertainty
     if order == "auto":
-        order = MAX_ORDER if kind is Kind.FOLLOWER else LINEAR
+        order = MAX_ORDER if kind is Kind.FOLLOWER else ORDER
     return Library(drive.spec, kind, centred, drive.settings.alpha, order)
 
 
