@@ -8,6 +8,7 @@ from itertools import product
 import numpy as np
 
 from nics_drl_bridge import geometry
+from nics_drl_bridge.errors import FitError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import forms, shooting, terms
 from nics_drl_bridge.identify.calibration import Calibration
@@ -229,7 +230,8 @@ class Draft:
     def tried(self, asked: tuple[Hypothesis, ...]) -> tuple[Trial, ...]:
         """Cross-validates each hypothesis over `FOLDS` parts of a drive.
 
-        A part is not left out if a variable would not have moved without it.
+        A part is not left out if a variable would not have moved without it, or if the rest is too
+        short to fit a model.
         """
         samples = self.problem.samples
         values = self.inputs.start
@@ -245,7 +247,11 @@ class Draft:
             unseen = np.isin(everything, block)
             if list_unmoved_variables(samples.rows(~unseen), self.spec) != unmoved:
                 continue
-            for hypothesis, model in fixed.models(asked, ~unseen):
+            try:
+                models = list(fixed.models(asked, ~unseen))
+            except FitError:
+                continue
+            for hypothesis, model in models:
                 error, path = judge.errors(model, values, unseen)
                 far = np.hypot(error[..., 0], error[..., 1])
                 distances[hypothesis] = np.concatenate([distances[hypothesis], far])

@@ -37,6 +37,7 @@ from nics_drl_bridge.robot.kernels import MAX_ORDER
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
 
+SHORT_S = 5.0  # a shorter drive can't tell the third and fourth order of a textbook
 TOO_SHORT = (
     "The training part is too short to refine the model by its errors over seconds; record a "
     "longer drive."
@@ -93,7 +94,8 @@ def make_library(drive: Drive, findings: Findings) -> Library:
     kind = Kind.FOLLOWER if drive.recording.state is None else Kind.MEASURED
     centred = "lever_arm_y_m" in findings.calibration.uncertainty
     if order == "auto":
-        order = MAX_ORDER if kind is Kind.FOLLOWER else ORDER
+        is_short = findings.training.duration_s < SHORT_S
+        order = ORDER if kind is Kind.MEASURED or is_short else MAX_ORDER
     return Library(drive.spec, kind, centred, drive.settings.alpha, order)
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from identify.drives import make_model, slipping_car
+from identify.drives import drive, make_model, slipping_car
 from nics_drl_bridge.identify import acceptance
 from nics_drl_bridge.identify.drive import Drive, Settings
 from nics_drl_bridge.identify.findings import resample_drive
@@ -151,3 +151,10 @@ def test_no_state_grows_by_itself_however_little_it_moved(monkeypatch):
         assert (
             model.coefficients[3 + i, alone & (model.powers[:, i] == 1)] <= 0.0
         ).all()
+
+
+def test_a_drive_whose_parts_are_too_short_to_be_left_out_is_still_fitted(mecanum):
+    recording = drive(mecanum, duration=3.0, noise=(0.001, 0.002))
+    found = identify(recording, mecanum)
+    assert np.isnan([trial.error for trial in found.findings.trials]).all()
+    assert found.held_out is None
