@@ -27,7 +27,7 @@ from nics_drl_bridge.robot.spec import RobotSpec
 Target = tuple[Array, Array, Array]
 # residual as a function of a trial delay [s] and possibly the logarithms of lags
 Residual = Callable[[Array], Array]
-# residual as a function of lags (S,), and delays () or (S,) [s]
+# residual as a function of lags (S,) and a delay [s]
 Left = Callable[..., Array]
 
 STEP_S = 0.01
@@ -49,7 +49,6 @@ WHEELS_EXPLAINED = 0.5
 # report instantaneous ones: times are uncertain by the spread of a uniform distribution.
 WITHIN_TICK = 12.0**-0.5
 MIN_TIME_S = 5e-4
-CLUSTER_S = 2.5  # residuals further apart count as independent
 NO_LAG_S = 0.005
 # fraction of unexplained variance above which no delay is believed
 MOST_UNEXPLAINED = 0.5
@@ -105,13 +104,11 @@ def estimate_response_delay(
     return replace(estimate, lags=tau, lag_sigma=sigma)
 
 
-def make_response_residual(
-    command: Stream, spec: RobotSpec, target: Target, order: int = 2
-) -> Left:
-    """Returns the residual of a signal explained by commands, given lags and delays (S,) [s]."""
+def make_response_residual(command: Stream, spec: RobotSpec, target: Target) -> Left:
+    """Returns the residual of a signal explained by commands, given lags (S,) and a delay [s]."""
     start, end, signal = target
     moved = signals.select_moved_inputs(command, spec)
-    powers = taylor.list_exponents(len(moved), order)
+    powers = taylor.list_exponents(len(moved), 2)
     powers = powers[(powers[:, ~moved] == 0).all(axis=1)]
     grid = np.arange(start.min() - LEAD_S, end.max() + STEP_S, STEP_S)
 

@@ -252,6 +252,12 @@ def add_limits(form: Form, state: str) -> Form:
 def make_form(drive: Drive, calibration: Calibration, library: Library) -> Form:
     """Returns the plainest form of a drive's model."""
     spec = drive.spec
+    if spec.moves_sideways and (spec.state or spec.takes_cmd_vel):
+        # The terms of the twist may be those of a body that is turned or moved.
+        return Form(
+            followed=list_followed(drive) if library.kind is Kind.FOLLOWER else (),
+            is_timed=library.kind is Kind.MEASURED,
+        )
     if not spec.state:
         if tells_lever_from_wheels(spec):
             return Form(mounted=("x", "y", "heading"))
@@ -266,8 +272,6 @@ def make_form(drive: Drive, calibration: Calibration, library: Library) -> Form:
         mounted.append("y")
     if "rotation_rad" in known:
         mounted.append("heading")
-    if spec.moves_sideways:
-        mounted = []
     return Form(
         followed=list_followed(drive),
         mounted=tuple(mounted),
@@ -401,9 +405,11 @@ def list_inputs(
     rows = _list_command_values(drive, calibration.command_latency_s, form)
     rows |= _list_follower_values(drive, calibration, form)
     rates = {v.name: samples.dq[:, 3 + i] for i, v in enumerate(drive.spec.state)}
+    gains = {response.state: response.gain for response in calibration.responses}
     for state, command in form.followed:
         sent = samples.x[:, drive.spec.variable_names.index(command)]
-        rates[state] = np.array([-np.ptp(sent), np.ptp(sent)])
+        size = abs(gains[state]) * float(np.ptp(sent))
+        rates[state] = np.array([-size, size])
     for name in form.friction:
         size = float(np.percentile(np.abs(rates[name]), STRONG))
         rows[f"{name}.friction"] = (0.1 * size, 0.1 * size, 0.0, size)
@@ -508,11 +514,19 @@ def list_driving_commands(spec: RobotSpec) -> tuple[int, ...]:
     return tuple(np.flatnonzero(moves[0]).tolist())
 
 
-def add_dead_zones(form: Form, drive: Drive, samples: Samples) -> Form:
-    """Returns a form in which each command that drives the robot has a dead zone."""
+def add_dead_zones(
+    form: Form,
+    drive: Drive,
+    samples: Samples,
+    commands: tuple[str, ...] | None = None,
+) -> Form:
+    """Returns a form in which commands, by default those that drive ahead, have a dead zone."""
+    names = [command.name for command in drive.spec.command]
+    if commands is None:
+        commands = tuple(names[place] for place in list_driving_commands(drive.spec))
     bent = {c.command: c for c in form.curves}
-    for place in list_driving_commands(drive.spec):
-        name = drive.spec.command[place].name
+    for name in commands:
+        place = names.index(name)
         reach = samples.x[:, len(drive.spec.state) + place]
         low = min(float(reach.min()), 0.0)
         high = max(float(reach.max()), 0.0)

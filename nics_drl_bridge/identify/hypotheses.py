@@ -154,14 +154,15 @@ class Draft:
                 known[key] = float(np.hypot(known[key], within_step))
         time_error = self._estimate_time_error(found)
         offset = calibration.clock_offset_s
-        if (
-            "clock_offset_s" in known
-        ):  # a delay between two clocks is a part of their offset
+        is_told = not np.isnan(time_error)
+        # A delay between two clocks is a part of their offset, unless that dates a derived state.
+        if "clock_offset_s" in known and self.problem.inferred is not None:
             offset -= latency - calibration.command_latency_s
             latency = calibration.command_latency_s
             beside = known.get("command_latency_s", 0.0)
-            known["clock_offset_s"] = float(np.hypot(time_error, beside))
-        elif not np.isnan(time_error):
+            if is_told:
+                known["clock_offset_s"] = float(np.hypot(time_error, beside))
+        elif is_told:
             known["command_latency_s"] = time_error
         calibration = replace(
             calibration,
@@ -340,7 +341,9 @@ def fit_base(
     plain_form = forms.make_form(drive, calibration, library)
 
     if former is not None:
-        form = replace(former.draft.form, curves=calibration.inputs)
+        form = replace(
+            former.draft.form, curves=calibration.inputs, followed=plain_form.followed
+        )
         refitted = fitted(form, former if form.followed else None)
         return replace(refitted, candidates=former.candidates)
     best = fitted(replace(plain_form, curves=calibration.inputs))
@@ -452,7 +455,11 @@ def _list_follower_changes(
         yield f"limits of {state}", partial(forms.add_limits, state=state), WORTH
     if len(late) > 1:
         yield delays, lambda form: replace(form, delays=late), WORTH
-    yield "a dead zone", lambda form: forms.add_dead_zones(form, drive, samples), WORTH
+    for _, command in followed:
+        bent = partial(
+            forms.add_dead_zones, drive=drive, samples=samples, commands=(command,)
+        )
+        yield f"a dead zone of {command}", bent, WORTH
 
 
 def list_candidates(
@@ -568,7 +575,8 @@ def add_predicted_mounting(
     names = ("lever_arm_x_m", "lever_arm_y_m", "rotation_rad")
     known = dict(calibration.uncertainty)
     errors = dict(zip(names, predictive.value_errors[-3:].tolist(), strict=True))
-    if np.isnan(errors["lever_arm_y_m"]):
+    was_mounted = predictive.values[-2] != 0.0
+    if np.isnan(errors["lever_arm_y_m"]) and not was_mounted:
         y = calibration.lever_arm_m[1]
     for name, error in errors.items():
         if not np.isnan(error):  # what the model lacks bends each of both estimates
@@ -604,6 +612,8 @@ def describe_forms(base: Base, trials: Sequence[Trial], order: Order) -> Iterato
     if form.tyres:
         parts.append("tyres that slip")
     finding = "The model is the textbook"
+    if base.draft.library.kind is terms.Kind.MEASURED:
+        finding = f"The model has terms up to order {base.draft.library.order}"
     if parts:
         finding += f" with {', '.join(parts)}"
     shares = f"{trials[0].error:.1%} of the path away"

@@ -486,6 +486,8 @@ def judge_model(drive: Drive, findings: Findings) -> Findings:
     calibration = findings.calibration
     until = drive.settings.train_until_s
     samples = resample_drive(whole, findings)
+    if calibration.responses and findings.motion_width_s is None:
+        samples = open_loop.infer_samples(model, calibration, whole, samples)
     held_out_from = whole.recording.pose.t[0] + calibration.clock_offset_s + until
     unseen: Samples | None = samples.rows(samples.t > held_out_from)
     if unseen is not None and len(unseen.t) < verdict.MIN_ROWS:

@@ -1,6 +1,6 @@
 """Open-loop prediction: windows of a drive, and the poses that a model predicts at their ends."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.calibration import Calibration, resample_states
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.signals import average_effect, list_followed_commands
+from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.kernels import SERIES, make_terms, simulate_rollouts
 from nics_drl_bridge.robot.taylor import TaylorModel
 
@@ -21,6 +22,7 @@ SETTLE_S = 1.0
 # A robot moves through a step by the state at its start. So that a latency is not shorter by half
 # a step than it is, commands act on an inferred state half a step earlier.
 MIDDLE_OF_STEP = 0.5
+GAP = 1.5  # rows further apart than this many steps are not consecutive
 # maximum distance from a window's end to the nearest sample, as a fraction of the period
 END_TOLERANCE = 0.6
 
@@ -170,17 +172,64 @@ def _by_one_rollout(
     model: TaylorModel, calibration: Calibration, drive: Drive, chosen: Windows
 ) -> Array:
     """Returns relative poses (W, 3) from one rollout: an inferred state needs only commands."""
-    recording = drive.recording
-    spec = drive.spec
     start, end = (
         t + calibration.clock_offset_s for t in (chosen.start_t, chosen.end_t)
     )
-    lead = np.ceil((max(0.0, start.min() - recording.command.t[0]) + 1.0) / model.dt)
-    # Whole steps before the first window, so that windows of regular poses lie on the grid.
-    grid = start.min() + model.dt * np.arange(
-        -lead, (end.max() - start.min()) / model.dt + 2.0
+    grid, path, _ = _roll_drive(model, calibration, drive, start.min(), end.max())
+    starts = np.zeros((len(start), 3))
+    ends = np.zeros((len(end), 3))
+    for i, column in enumerate(path.T):
+        starts[:, i] = np.interp(start, grid, column)
+        ends[:, i] = np.interp(end, grid, column)
+    return geometry.between(starts, ends)
+
+
+def infer_samples(
+    model: TaylorModel, calibration: Calibration, drive: Drive, samples: Samples
+) -> Samples:
+    """Returns samples with states that follow the commands as a model says."""
+    t = samples.t
+    grid, _, rolled = _roll_drive(model, calibration, drive, t[0], t[-1])
+    state = np.stack([np.interp(t, grid, column) for column in rolled.T], axis=-1)
+    return put_states(samples, state)
+
+
+def put_states(samples: Samples, state: Array) -> Samples:
+    """Returns samples with other states (T, S), and their rates; a gap keeps the rate before it."""
+    count = state.shape[1]
+    step = np.diff(samples.t)
+    rates = np.diff(state, axis=0) / samples.dt
+    is_next = step < GAP * samples.dt
+    before = np.maximum.accumulate(np.where(is_next, np.arange(len(step)), 0))
+    dq = samples.dq.copy()
+    dq[:-1, 3:] = rates[before]
+    dq[-1, 3:] = dq[-2, 3:]
+    return replace(
+        samples,
+        x=np.concatenate([state, samples.x[:, count:]], axis=1),
+        q=np.concatenate([samples.q[:, :3], state], axis=1),
+        dq=dq,
     )
-    begin = grid - calibration.command_latency_s + MIDDLE_OF_STEP * model.dt
+
+
+def _roll_drive(
+    model: TaylorModel,
+    calibration: Calibration,
+    drive: Drive,
+    first: float,
+    last: float,
+) -> tuple[Array, Array, Array]:
+    """Rolls a model out over the commands of a drive, from the first one on.
+
+    Returns times (T,) on the commands' clock, which are whole steps from `first` and reach to
+    `last` [s], and poses (T, 3) and states (T, S) at them.
+    """
+    recording = drive.recording
+    spec = drive.spec
+    lead = np.ceil((max(0.0, first - recording.command.t[0]) + 1.0) / model.dt)
+    grid = first + model.dt * np.arange(-lead, (last - first) / model.dt + 2.0)
+    middle = MIDDLE_OF_STEP * model.dt if spec.state else 0.0
+    begin = grid - calibration.command_latency_s + middle
     command = average_effect(
         recording.command, spec, model.inputs, begin, begin + model.dt
     )
@@ -188,14 +237,8 @@ def _by_one_rollout(
         np.array([r.gain for r in calibration.responses])
         * command[0, list_followed_commands(spec)]
     )
-    poses, _ = roll(model, state[None], command[None])
-    path = poses[0, :-1]
-    starts = np.zeros((len(start), 3))
-    ends = np.zeros((len(end), 3))
-    for i, column in enumerate(path.T):
-        starts[:, i] = np.interp(start, grid, column)
-        ends[:, i] = np.interp(end, grid, column)
-    return geometry.between(starts, ends)
+    poses, states = roll(model, state[None], command[None])
+    return grid, poses[0, :-1], states[0, :-1]
 
 
 def roll(model: TaylorModel, state: Array, command: Array) -> tuple[Array, Array]:

@@ -212,7 +212,7 @@ def _describe_refinement(horizon_s: float) -> str:
     if horizon_s == 0.0:
         return TOO_SHORT
     by = f"the open-loop errors over up to {horizon_s:g} s"
-    return f"Coefficients and latency were refined by {by}."
+    return f"Coefficients and calibration were refined by {by}."
 
 
 def _list_unused_options(
@@ -221,7 +221,7 @@ def _list_unused_options(
     """Yields a sentence per option that had no effect on the model."""
     settings = drive.settings
     if settings.alpha != "auto" and library.kind is Kind.MOTION:
-        why = "where the state is the motion, predictions of parts of the drive weight the terms"
+        why = "where the state is the motion, or there is none, predictions weight the terms"
         yield f"alpha = {settings.alpha:g} was not used: {why}."
     if settings.order != "auto" and not has_order:
         off = f"more than {verdict.WORSE:g} times as far off as the textbook's, or diverge"

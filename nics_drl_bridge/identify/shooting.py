@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from nics_drl_bridge import geometry
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.kernels import Shot, make_used_terms, shoot, tangent
+from nics_drl_bridge.identify.open_loop import put_states
 from nics_drl_bridge.identify.statistics import estimate_clustered_covariance
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot import taylor
@@ -185,17 +186,9 @@ class Shooting:
         if self.inferred is None:
             return self.samples
         values = values if self.fixed is None else self.fixed
-        command = self.commands(values)
         state = self.inferred(values)
-        dq = self.samples.dq.copy()
-        dq[:-1, 3:] = np.diff(state, axis=0) / self.samples.dt
-        dq[-1, 3:] = 0.0
-        return replace(
-            self.samples,
-            x=np.concatenate([state, command], axis=1),
-            q=np.concatenate([self.samples.q[:, :3], state], axis=1),
-            dq=dq,
-        )
+        x = np.concatenate([state, self.commands(values)], axis=1)
+        return put_states(replace(self.samples, x=x), state)
 
     def errors(
         self, model: TaylorModel, values: Array, inside: Mask | None = None

@@ -168,7 +168,7 @@ def describe_clocks(
         )
         finding = "Pose and commands are stamped by different clocks"
         yield f"{finding}: add {offset} to the pose's stamps to get the commands' clock."
-    if timing.early > 0.0 and calibration.command_latency_s <= 0.0:
+    if timing.early > 0.0 and calibration.command_latency_s < timing.early:
         finding = f"The robot moves {timing.early:.2f} s before its commands"
         cause = "the pose is stamped by another clock; give it a `clock:` of its own in the mapping"
         if recording.state is not None:
@@ -605,7 +605,7 @@ def collect_notes(drive: Drive, findings: Findings) -> tuple[str, ...]:
     if not findings.replacement:
         beaten = list(describe_shortfall(findings.judgement))
     doubts: Iterator[str] = iter(())
-    if findings.motion_width_s is None:
+    if findings.base is None:
         doubts = list_doubts_of_fit(fit, calibration.is_exact)
     levels = count_levels(findings.training.recording.command, spec)
     return (
