@@ -52,11 +52,11 @@ class Findings:
     samples: Samples | None = None
     # all terms (Eq. 1), from `fit_terms`
     regression: Regression | None = None
-    # the textbook's terms for a derived motion, from `fit_terms`
+    # the textbook of a noisy drive and its effects, from which models depart, from `fit_terms`
     base: hypotheses.Base | None = None
     # of orders, cross-validated within the training part, from `fit_terms`
     trials: tuple[hypotheses.Trial, ...] = ()
-    # the pruned fit (Eq. 2), from `prune_terms`
+    # the pruned fit (Eq. 2), from `prune_terms`; of a noisy drive from `fit_terms`
     pruned_fit: Fit | None = None
     # from `prune_terms`; then from `refine_model` and `complete_model`
     model: TaylorModel | None = None

@@ -155,7 +155,7 @@ def _make_curve(name: str, reach: Array, dead: float, full: float) -> InputCurve
 
 @dataclass(frozen=True)
 class Form:
-    """Effects in a motion model besides gains and lags."""
+    """Effects in a model besides gains and lags."""
 
     curves: tuple[InputCurve, ...] = ()
     friction: tuple[str, ...] = ()  # states with dry friction

@@ -591,7 +591,7 @@ def add_predicted_mounting(
 
 
 def describe_forms(base: Base, trials: Sequence[Trial], order: Order) -> Iterator[str]:
-    """Lists what a motion model has besides the textbook's terms, and how much that improves it."""
+    """Lists what a model has besides the terms of its base, and how much that improves it."""
     best = choose_trial(trials, order)
     if not np.isfinite(best.error):
         return

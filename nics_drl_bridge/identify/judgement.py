@@ -134,7 +134,7 @@ def estimate_bands(
     """Returns the distances [m] within which 95 % of predictions are expected to end, by horizon.
 
     Each fold of the training part is predicted by the model adjusted to the others. `derived` are
-    the samples of a motion derived from the poses, and the base that the model departed from. A
+    the samples of the training part, and the base that the model departed from. A
     `fixed` model is not adjusted, and predicts the whole part.
     """
     errors: dict[float, list[Array]] = {h: [] for h in hypotheses.BANDS_S}
@@ -144,7 +144,7 @@ def estimate_bands(
         if derived is not None:
             begin, end = part.recording.pose.t[[0, -1]] + calibration.clock_offset_s
             kept = (derived[0].t < begin) | (derived[0].t > end)
-            adjusted = _adjust_motion(model, calibration, training, *derived, kept)
+            adjusted = _adjust_to_rows(model, calibration, training, *derived, kept)
         for horizon, parts in errors.items():
             parts.append(measure_distances(*adjusted, part, horizon))
     bands = {}
@@ -165,7 +165,7 @@ def measure_distances(
     return measure_end_distances(predict(model, calibration, part, chosen), chosen)
 
 
-def _adjust_motion(
+def _adjust_to_rows(
     model: TaylorModel,
     calibration: Calibration,
     training: Drive,
@@ -173,7 +173,7 @@ def _adjust_motion(
     base: hypotheses.Base,
     kept: NDArray[np.bool_],
 ) -> tuple[TaylorModel, Calibration]:
-    """Adjusts a model with a motion as state, and its inputs, to the rows that are kept (T,)."""
+    """Adjusts a model, and its inputs, to the rows that are kept (T,)."""
     draft = base.draft
     problem = make_prediction_problem(
         training, calibration, samples, draft.form, draft.inputs

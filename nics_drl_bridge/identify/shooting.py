@@ -1,7 +1,7 @@
 """Prediction-error method: fits a model to its prediction errors over seconds (Ljung, ch. 7).
 
-Each window starts at a measured state and follows the commands; the derivatives of its end by the
-coefficients are computed along the way.
+Each window starts at a state that was measured, or that follows the commands, and goes on by the
+commands; the derivatives of its end by the coefficients are computed along the way.
 """
 
 from collections.abc import Callable
