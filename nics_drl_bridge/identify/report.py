@@ -98,8 +98,9 @@ def _list_items(sentences: Iterable[str]) -> Iterator[str]:
 
 
 def _is_pruned(identified: Identified) -> bool:
-    """True if the terms come from the pruned fit, and were not found by predictions."""
-    return identified.findings.base is None and not identified.findings.replacement
+    """True if the terms come from the pruned fit, unlike those of a motion or a textbook."""
+    findings = identified.findings
+    return findings.motion_width_s is None and not findings.replacement
 
 
 def _describe_size(identified: Identified) -> str:

@@ -605,7 +605,7 @@ def collect_notes(drive: Drive, findings: Findings) -> tuple[str, ...]:
     if not findings.replacement:
         beaten = list(describe_shortfall(findings.judgement))
     doubts: Iterator[str] = iter(())
-    if findings.base is None:
+    if findings.motion_width_s is None:
         doubts = list_doubts_of_fit(fit, calibration.is_exact)
     levels = count_levels(findings.training.recording.command, spec)
     return (
