@@ -16,7 +16,7 @@ that vx is even in these variables, and vy and wz are odd.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from enum import StrEnum, auto
+from enum import Enum, auto
 from functools import partial
 from itertools import product
 
@@ -52,12 +52,12 @@ VISIBLE = 0.01  # share of the largest term that a term of an expansion must hav
 NOTHING = 1e-9  # spread of a rate, or size of a coefficient, that counts as zero
 
 
-class Kind(StrEnum):
+class Kind(Enum):
     """Where the state of a robot comes from."""
 
     MOTION = auto()  # it is the motion, derived from the poses; or there is no state
     FOLLOWER = auto()  # it was not measured and follows the commands
-    MEASURED = auto()
+    MEASURED = auto()  # it is a stream of the recording
 
 
 @dataclass(frozen=True)
