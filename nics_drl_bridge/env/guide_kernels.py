@@ -45,7 +45,7 @@ def sample_walls(out: Singles, extent: Array, cell: float, cells: MapField) -> N
 
     The field is `extent` (4,), beyond which nothing is free.
     """
-    for i in range(out.shape[0]):
+    for i in range(len(out)):
         for j in range(out.shape[1]):
             x = extent[0] + (j + 0.5) * cell
             y = extent[1] + (i + 0.5) * cell
@@ -73,7 +73,7 @@ def find_ways(
     rows = grid.walls.shape[1]
     columns = grid.walls.shape[2]
     gaps = np.empty((rows, columns), np.float32)
-    for n in range(worlds.shape[0]):
+    for n in range(len(worlds)):
         p = member[n]
         height = grid.sizes[p, 0]
         width = grid.sizes[p, 1]
@@ -108,7 +108,7 @@ def _lower_space(
     """Lower the space (rows, columns) around cells to that beside a body [m]."""
     far = body[RADIUS] + grid.outer + COMFORT
     first = max(int((body[Y] - far - y) / cell), 0)
-    last = min(int((body[Y] + far - y) / cell), space.shape[0] - 1)
+    last = min(int((body[Y] + far - y) / cell), len(space) - 1)
     left = max(int((body[X] - far - x) / cell), 0)
     right = min(int((body[X] + far - x) / cell), space.shape[1] - 1)
     outline = collision.outline_of(body, grid.outlines)
@@ -208,7 +208,7 @@ def measure_lengths(
     grid: GuideGrid,
 ) -> None:
     """Write the path lengths (N, M) [m] from poses (N, M, 3), interpolated linearly."""
-    for n in range(out.shape[0]):
+    for n in range(len(out)):
         p = member[n]
         x = grid.frames[p, 0]
         y = grid.frames[p, 1]

@@ -63,14 +63,14 @@ class NavigationStep(NamedTuple):
 @kernel(allocates=True)
 def compute_episode_seeds(seeds: Integers, numbers: Integers, out: Integers) -> None:
     """Computes seeds (n,) of episodes from their numbers (n,) and their envs' seeds (n,)."""
-    for i in range(seeds.shape[0]):
+    for i in range(len(seeds)):
         out[i] = episode_seed(seeds[i], numbers[i])
 
 
 @kernel(allocates=True)
 def scale_actions(out: Array, actions: Singles, low: Array, high: Array) -> None:
     """Scales actions (R, C), clamped to [-1, 1], to commands (R, C) between their limits (C,)."""
-    for i in range(out.shape[0]):
+    for i in range(len(out)):
         for c in range(out.shape[1]):
             action = min(max(float(actions[i, c]), -1.0), 1.0)
             share = (action + 1.0) / 2.0
@@ -80,7 +80,7 @@ def scale_actions(out: Array, actions: Singles, low: Array, high: Array) -> None
 @kernel(allocates=True)
 def is_finite(values: Array | Singles) -> bool:
     """Returns True if all values (R, C) are finite."""
-    for i in range(values.shape[0]):
+    for i in range(len(values)):
         for c in range(values.shape[1]):
             if not math.isfinite(values[i, c]):
                 return False
@@ -92,11 +92,11 @@ def look(shares: Singles, ranges: Singles, scale: ScanScale) -> bool:
     """Writes a scan (B,) as fractions (P,), 1 free, 0 too close; returns True for a contact."""
     if scale.sectors > 0:
         resample(shares, ranges, scale.plan)
-        for s in range(shares.shape[0]):
+        for s in range(len(shares)):
             shares[s] = _scale_range(shares[s], scale)
         return has_contact(ranges, scale)
     hits = np.int32(0)
-    for b in range(ranges.shape[0]):
+    for b in range(len(ranges)):
         is_hit = ranges[b] < scale.leaves[b]
         hits = np.int32(hits | np.int32(is_hit))
         shares[b] = _scale_range(ranges[b], scale)
@@ -119,7 +119,7 @@ def has_contact(ranges: Singles, scale: ScanScale) -> bool:
 
     A single beam is too noisy: of hundreds, one is nearly always off by three standard deviations.
     """
-    count = ranges.shape[0]
+    count = len(ranges)
     for begin in range(0, count, BLOCK):
         beams = min(BLOCK, count - begin)
         hits = np.int32(0)
@@ -141,7 +141,7 @@ def has_contact(ranges: Singles, scale: ScanScale) -> bool:
 def _sum_gaps(b: int, ranges: Singles, scale: ScanScale) -> np.float32:
     gap = np.float32(0.0)
     first = max(b - scale.beside, 0)
-    end = min(b + scale.beside + 1, ranges.shape[0])
+    end = min(b + scale.beside + 1, len(ranges))
     for k in range(first, end):
         beyond = ranges[k] - scale.leaves[k]
         if beyond == beyond:  # False for NaN (unknown)
@@ -160,7 +160,7 @@ def looks(
 
     `packed` is a ScanScale, packed by `kernels.pack`.
     """
-    for i in range(ranges.shape[0]):
+    for i in range(len(ranges)):
         touched[i] = look(shares[i], ranges[i], packed.content)
 
 
@@ -198,7 +198,7 @@ def navigate(
     """
     rules = packed.content
     parts = out.shape[1] - 6
-    for i in range(out.shape[0]):
+    for i in range(len(out)):
         touched = look(out[i, :parts], ranges[i], rules.scale.content)
         dx = goals[i, 0] - pose[i, 0]
         dy = goals[i, 1] - pose[i, 1]
@@ -244,7 +244,7 @@ def navigate_in_place(packed: Any, before: Array, goals: Array) -> None:
 @kernel(allocates=True)
 def find_bearings(out: Array, ways: Array, headings: Array) -> None:
     """Writes `find_bearing` (R, 3) of points at displacements `ways` (R, 2) from headings (R,)."""
-    for r in range(out.shape[0]):
+    for r in range(len(out)):
         distance, out[r, 1], out[r, 2] = find_bearing(
             ways[r, 0], ways[r, 1], headings[r]
         )

@@ -194,7 +194,7 @@ def _miss(
         true = edge[k:][: count * parts : parts]
         corner = rotate(hull[two], turn[:, None, None])
         for later in (0, 1):
-            last = distances.shape[0] - later
+            last = len(distances) - later
             x = corner[:, :last, :, 0] + distances[later:, None]
             off = np.abs(
                 np.arctan2(corner[:, :last, :, 1], x) - true[:, later:, None]

@@ -150,7 +150,7 @@ def finish(
     low = np.float32(range_min)
     high = np.float32(range_max)
     distances = scan.view(np.float32)
-    for k in range(ranges.shape[0]):
+    for k in range(len(ranges)):
         i = np.uintp(k)
         value = distances[i]
         value = value if value <= high else np.float32(np.inf)

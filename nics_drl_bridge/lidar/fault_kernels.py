@@ -73,7 +73,7 @@ def distort(
             ranges, device, random.key(seed, random.RANGE_STREAM, counter), False
         )
     elif coarse:
-        for i in range(ranges.shape[0]):
+        for i in range(len(ranges)):
             ranges[i] = _report(ranges[i], _quantize(ranges[i], device), device)
     if faults[DROPOUT] > 0.0 or faults[DROPOUT_FAR] > 0.0:
         by = random.key(seed, random.DROPOUT_STREAM, counter)
@@ -118,7 +118,7 @@ def _prepare_device(limits: tuple[float, float], faults: Array) -> Distortion:
 @kernel(allocates=True)
 def _add_ghosts(ranges: Singles, device: Distortion, by: int) -> None:
     whole = ranges.view(np.int32)
-    for i in range(ranges.shape[0]):
+    for i in range(len(ranges)):
         ghost = device.least + random.share_of(random.bits(by, i)) * (
             device.most - device.least
         )
@@ -130,18 +130,16 @@ def _add_ghosts(ranges: Singles, device: Distortion, by: int) -> None:
 def _close(ranges: Singles, close: np.float32) -> None:
     whole = ranges.view(np.int32)
     value = np.float32(close).view(np.int32)
-    for i in range(ranges.shape[0]):
+    for i in range(len(ranges)):
         whole[i] = max(whole[i], value if whole[i] == MINUS_INF else NONE)
 
 
 @kernel(allocates=True, inline=True)
 def _add_noise(ranges: Singles, device: Distortion, by: int, coarse: bool) -> None:
-    runs = ranges.shape[0] // random.RUN
+    runs = len(ranges) // random.RUN
     for k in range(runs):
         _add_noise_run(ranges, random.RUN, device, by, k, coarse)
-    _add_noise_run(
-        ranges, ranges.shape[0] - runs * random.RUN, device, by, runs, coarse
-    )
+    _add_noise_run(ranges, len(ranges) - runs * random.RUN, device, by, runs, coarse)
 
 
 @kernel(contracts=True, inline=True)
@@ -202,7 +200,7 @@ def _drop(
     share = np.float32(share)
     far = np.float32(far)
     whole = ranges.view(np.int32)
-    for i in range(ranges.shape[0]):
+    for i in range(len(ranges)):
         reach = ranges[i] if ranges[i] > np.float32(0.0) else np.float32(0.0)
         lost = random.share_of(random.bits(by, i)) < share + far * reach * reach
         whole[i] = max(whole[i], INF if lost else NONE)
@@ -249,7 +247,7 @@ def slice_poses(
         direction: a value of SKEW; the newest beam is the last, or beam 0 if it turns clockwise.
         moving: for how long the robot has been moving [s]; before that it stood where it began.
     """
-    count = out.shape[0]
+    count = len(out)
     for g in range(count):
         ago = 0.0
         if direction != AT_ONCE:

@@ -156,7 +156,7 @@ def fuse_look_ups(scan: ShortIntegers, rows: Singles, found: Any) -> None:
 
     Whole blocks of beams are fused, also beyond the last beam.
     """
-    for m in range(found.shape[0]):
+    for m in range(len(found)):
         part = found[m]
         first = np.uintp(part.first)
         near = np.uintp(part.near)

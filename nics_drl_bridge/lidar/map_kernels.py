@@ -136,7 +136,7 @@ def walk(
 
     That is where the beam enters a solid cell, or leaves it if it starts inside. Outside is free.
     """
-    rows = squares.shape[0] - 2
+    rows = len(squares) - 2
     columns = squares.shape[1] - 2
     x = math.floor(u)
     y = math.floor(v)

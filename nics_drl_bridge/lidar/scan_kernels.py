@@ -141,7 +141,7 @@ def scan_robot(
         scratch: scratch memory.
     """
     scan = scratch.scan
-    for i in range(scan.shape[0]):
+    for i in range(len(scan)):
         scan[i] = INF
     fuse_bodies(pose, bodies, nearby, own_body, lidar, scratch)
     scan_walls(scan, lidar.beams, pose, walls_of(n, fixtures), lidar.range_max)

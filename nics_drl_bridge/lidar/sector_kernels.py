@@ -51,7 +51,7 @@ def _fill_by_beam(
     count: ShortIntegers,
 ) -> None:
     """Fill each sector from its own beams; as whole numbers, ranges have the same order."""
-    beams = ranges.shape[0]
+    beams = len(ranges)
     whole = ranges.view(np.int32)
     nearest = out.view(np.int32)
     known = np.empty(2 * beams, np.int32)  # twice, because a sector may span the seam
@@ -59,7 +59,7 @@ def _fill_by_beam(
         is_known = np.int32(whole[b] & np.int32(0x7FFFFFFF)) <= INF
         known[b] = whole[b] if is_known else UNKNOWN
         known[beams + b] = known[b]
-    for s in range(out.shape[0]):
+    for s in range(len(out)):
         begin = np.uintp(first[s])
         near = UNKNOWN
         for b in range(count[s]):
@@ -70,8 +70,8 @@ def _fill_by_beam(
 @kernel(allocates=True)
 def _fill_by_place(out: Singles, ranges: Singles, plan: SectorPlan) -> None:
     """Fill each sector from its returns, or the nearer of the neighbouring beams around it."""
-    sectors = out.shape[0]
-    beams = ranges.shape[0]
+    sectors = len(out)
+    beams = len(ranges)
     where = np.empty(beams, np.int32)
     value = np.empty(beams, np.float32)
     has_return = np.zeros(sectors, np.bool_)

@@ -258,7 +258,7 @@ def find_gap(
             gap = away - one.radius - other.radius
             least = min(least, gap)
             count = listed.number[0]
-            if OVERLAP < gap < skin and count < listed.touches.shape[0]:
+            if OVERLAP < gap < skin and count < len(listed.touches):
                 touch = listed.touches[count]
                 touch.other = other.body
                 touch.nx = (other.cos * nx - other.sin * ny) / away
@@ -303,7 +303,7 @@ def wall_gap(
     """Clearance of a solid from straight walls (W, 4), see the module."""
     corners = walls.reshape((-1, 2))
     least = limit
-    for w in range(walls.shape[0]):
+    for w in range(len(walls)):
         far = one.reach + max(least, skin)
         if wall_distance2(one.x, one.y, walls[w]) <= far * far:
             outline = Outline(corners, 2 * w, 2 * w + 2)
@@ -335,7 +335,7 @@ def on_wall(x: float, y: float, wall: Array) -> tuple[float, float]:
 def wall_distance(x: float, y: float, walls: Array) -> float:
     """Distance from a point to the nearest straight wall (W, 4) [m]; inf if there is none."""
     least = np.inf
-    for w in range(walls.shape[0]):
+    for w in range(len(walls)):
         wall = walls[w]
         dx, dy = from_segment(x, y, wall[0], wall[1], wall[2], wall[3])
         least = min(least, np.hypot(dx, dy))
@@ -474,22 +474,21 @@ def sort_into_cells(n: int, bodies: Array, standing: int, cells: BodyCells) -> N
     cell_of = cells.found
     then = cells.then[0 if cells.ordered else n]
     first[:] = 0
-    for k in range(bodies.shape[0]):
+    for k in range(len(bodies)):
         if bodies[k, RADIUS] > 0.0:
             cell_of[k] = _cell(bodies[k], k < standing, frame)
             first[cell_of[k] + 1] += 1
-    for cell in range(first.shape[0] - 1):
+    for cell in range(len(first) - 1):
         first[cell + 1] += first[cell]
-    end = first[first.shape[0] - 1]
-    for k in range(bodies.shape[0] - 1, -1, -1):
+    end = first[-1]
+    for k in range(len(bodies) - 1, -1, -1):
         if bodies[k, RADIUS] > 0.0:
             first[cell_of[k] + 1] -= 1
             then[first[cell_of[k] + 1]] = k
-    for cell in range(
-        first.shape[0] - 1
-    ):  # shift: each entry is the count of the cell before it
+    # Shift: each entry is the count of the cell before it.
+    for cell in range(len(first) - 1):
         first[cell] = first[cell + 1]
-    first[first.shape[0] - 1] = end
+    first[-1] = end
 
 
 @kernel(inline=True)
@@ -523,7 +522,7 @@ def put_in_order(
         if spare[k, RADIUS] <= 0.0:
             _copy(spare[k], bodies[count])
             count += 1
-    first[end] = bodies.shape[0]  # the absent, and those that move, are always found
+    first[end] = len(bodies)  # the absent, and those that move, are always found
 
 
 @kernel
@@ -531,8 +530,8 @@ def find_around(n: int, x: float, y: float, reach: float, cells: BodyCells) -> i
     """Write the sorted bodies that may be within `reach` [m] to `cells.found`; return how many."""
     first = cells.first
     found = cells.found
-    if first.shape[0] == 0:
-        return found.shape[0]  # which lists all bodies
+    if len(first) == 0:
+        return len(found)  # which lists all bodies
     frame = cells.frame[n]
     per_metre = frame[PER_METRE]
     side = int(frame[SIDE])

@@ -84,7 +84,7 @@ def find_contacts(m: int, limit: float, skin: float, world: World) -> tuple[floa
     listed.number[0] = 0
     if meets & BODIES:
         is_listed = near[m, 0] <= SEVERAL
-        for i in range(near[m, 0] if is_listed else world.bodies.shape[0]):
+        for i in range(near[m, 0] if is_listed else len(world.bodies)):
             k = near[m, 1 + i] if is_listed else i
             if k == me or world.bodies[k, RADIUS] <= 0.0:
                 continue
@@ -324,7 +324,7 @@ def _find_fastest(obstacles_move: bool, world: World) -> float:
         vy = world.velocity[k, 1]
         rim = abs(world.velocity[k, 2]) * world.bodies[k, RADIUS]
         fastest = max(fastest, math.sqrt(vx * vx + vy * vy) + rim)
-    for m in range(meets.shape[0] if meets.shape[0] > 1 else 0):
+    for m in range(len(meets) if len(meets) > 1 else 0):
         if meets[m] != FREE:
             fastest = max(fastest, world.tight.motions[m].bound)
     return fastest
@@ -335,7 +335,7 @@ def advance(begin: float, duration: float, obstacles_move: bool, world: World) -
     """Move the robots that may meet something, and the obstacles, by a duration [s]."""
     meets = world.nearby.meets
     motions = world.tight.motions
-    robots = meets.shape[0]
+    robots = len(meets)
     fastest = _find_fastest(obstacles_move, world)
     world.tight.fastest[0] = fastest
     # Robots that are judged at nearly the same time are judged together: there are fewer steps.
@@ -382,12 +382,12 @@ def find_near(
     near = nearby.near
     reach = nearby.reach
     walls = scene.walls
-    me = bodies.shape[1] - near.shape[0] + m
+    me = bodies.shape[1] - len(near) + m
     x = bodies[n, me, X]
     y = bodies[n, me, Y]
     own_reach = reach[me]
     count = 0
-    standing = bodies.shape[1] - near.shape[0] if scene.standing else 0
+    standing = bodies.shape[1] - len(near) if scene.standing else 0
     for f in range(find_around(n, x, y, own_reach, cells)):
         k = cells.found[f]
         other_reach = bodies[n, k, RADIUS] if k < standing else reach[k]
@@ -405,7 +405,7 @@ def find_near(
             count += 1
     near[m, 0] = count
     meets = BODIES if count > 0 else FREE
-    for w in range(walls.shape[0]):
+    for w in range(len(walls)):
         d2 = collision.segment_distance2(
             x, y, walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3]
         )

@@ -83,7 +83,7 @@ def reset_marks(n: int, data: State, plans: Records) -> None:
     """Reset the memory of the obstacles of world n for an episode; draw their speeds."""
     seed = data.seeds[n]
     bodies = data.bodies
-    for k in range(plans.shape[0]):
+    for k in range(len(plans)):
         mark = data.marks[n, k]
         row = plans[k]
         mark.vx = 0.0
@@ -121,7 +121,7 @@ def steer(
     seed = data.seeds[n]
     step = data.steps[n]
     movers = scene.movers
-    count = velocity.shape[0]
+    count = len(velocity)
     plans = movers.plans
     bodies = data.bodies[n]
     traffic = Traffic(
@@ -247,7 +247,7 @@ def _from_bodies(
     row = traffic.plans[k]
     ax = 0.0
     ay = 0.0
-    for j in range(bodies.shape[0]):
+    for j in range(len(bodies)):
         if j == k or bodies[j, RADIUS] <= 0.0:
             continue
         rx = bodies[k, X] - bodies[j, X]
@@ -296,7 +296,7 @@ def _from_walls(k: int, traffic: Traffic) -> tuple[float, float]:
     radius = body[RADIUS]
     reach = row.wall_range
     far = radius + FAR * reach
-    for w in range(walls.shape[0]):
+    for w in range(len(walls)):
         px, py = on_wall(x, y, walls[w])
         ox = x - px
         oy = y - py
@@ -435,14 +435,14 @@ def clearance(x: float, y: float, k: int, traffic: Traffic) -> float:
     walls = traffic.walls
     field = traffic.field
     least = min(min(x - field[0], field[2] - x), min(y - field[1], field[3] - y))
-    for w in range(walls.shape[0]):
+    for w in range(len(walls)):
         px, py = on_wall(x, y, walls[w])
         ox = px - x
         oy = py - y
         away2 = ox * ox + oy * oy
         if least > 0.0 and 0.0 < away2 < least * least:
             least = math.sqrt(away2)
-    for j in range(bodies.shape[0]):
+    for j in range(len(bodies)):
         if j != k and bodies[j, RADIUS] > 0.0:
             ox = bodies[j, X] - x
             oy = bodies[j, Y] - y
@@ -488,7 +488,7 @@ def _hold_bodies(
     y = bodies[k, Y]
     radius = bodies[k, RADIUS]
     length = math.sqrt(dx * dx + dy * dy)
-    for j in range(bodies.shape[0]):
+    for j in range(len(bodies)):
         if j == k or bodies[j, RADIUS] <= 0.0:
             continue
         ox = bodies[j, X] - x
@@ -536,7 +536,7 @@ def _hold_walls(
         dx, dy = _hold(
             dx, dy, 0.0, side, side * field[bound + 1] - radius - side * y, bend
         )
-    for w in range(walls.shape[0]):
+    for w in range(len(walls)):
         px, py = on_wall(x, y, walls[w])
         ox = px - x
         oy = py - y

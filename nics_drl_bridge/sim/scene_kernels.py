@@ -125,7 +125,7 @@ class SceneScratch(NamedTuple):
 def wall_distances(cells: MapField, walls: Array) -> None:
     """Lower the distances of cells to the distances to the walls, in place."""
     distances = cells.distances
-    for i in range(distances.shape[0]):
+    for i in range(len(distances)):
         for j in range(distances.shape[1]):
             x, y = place_in(i + 0.5, j + 0.5, cells)
             distances[i, j] = min(distances[i, j], collision.wall_distance(x, y, walls))
@@ -328,9 +328,9 @@ def _draw_point(
     chosen: ShortIntegers, cells: MapField, scratch: SceneScratch
 ) -> tuple[float, float]:
     """Draw a point in one of the chosen cells, given by row-major indices."""
-    cell = int(_draw(scratch) * chosen.shape[0])
+    cell = int(_draw(scratch) * len(chosen))
     # if all cells are allowed, the look-up would only miss the cache
-    if chosen.shape[0] < cells.distances.size:
+    if len(chosen) < cells.distances.size:
         cell = chosen[cell]
     row = cell // cells.distances.shape[1] + _draw(scratch)
     column = cell % cells.distances.shape[1] + _draw(scratch)
@@ -395,7 +395,7 @@ def _place_obstacles(plan: ScenePlan, bodies: Array, scratch: SceneScratch) -> b
     outlines = plan.outlines
     gaps = scratch.gaps
     trial = scratch.trial
-    for k in range(bodies.shape[0]):
+    for k in range(len(bodies)):
         group = plan.groups[plan.group[k]]
         gaps[k] = max(group.gap, MARGIN)
         bodies[k, RADIUS] = 0.0
@@ -403,7 +403,7 @@ def _place_obstacles(plan: ScenePlan, bodies: Array, scratch: SceneScratch) -> b
             pose = plan.poses[k]
             shape = int(bodies[k, SHAPE])
             _put(bodies[k], pose[0], pose[1], pose[2], shape, plan)
-    for k in range(bodies.shape[0]):
+    for k in range(len(bodies)):
         if plan.groups[plan.group[k]].is_fixed or not scratch.active[k]:
             continue
         shape = int(bodies[k, SHAPE])
@@ -430,7 +430,7 @@ def _is_apart(k: int, plan: ScenePlan, bodies: Array, scratch: SceneScratch) -> 
     """True if the trial of obstacle k keeps its gap from those that are placed."""
     trial = scratch.trial
     gaps = scratch.gaps
-    for j in range(bodies.shape[0]):
+    for j in range(len(bodies)):
         gap = max(gaps[k], gaps[j])
         if bodies[j, RADIUS] > 0.0 and not _clear_of(
             trial, bodies[j], gap, plan.outlines, scratch.listed
@@ -444,12 +444,12 @@ def _draw_place(
     places: Records, space: FreeSpace, scratch: SceneScratch
 ) -> tuple[float, float, float]:
     """Draw x, y, heading of a start or goal in one of the places."""
-    if places.shape[0] == 0:
+    if len(places) == 0:
         x, y = _draw_point(space.for_robots, space.cells, scratch)
         return x, y, (2.0 * _draw(scratch) - 1.0) * math.pi
     share = _draw(scratch)
     p = 0
-    while p < places.shape[0] - 1 and share >= places[p].share:
+    while p < len(places) - 1 and share >= places[p].share:
         p += 1
     place = places[p]
     x = place.x1 + _draw(scratch) * (place.x2 - place.x1)
@@ -495,7 +495,7 @@ def _place_robots(
 ) -> bool:
     """Draw a start and a goal for each robot; return True if there are some for all of them."""
     between = 2.0 * plan.footprint + plan.clearance
-    for m in range(starts.shape[0]):
+    for m in range(len(starts)):
         placed = False
         detours = 0
         for _ in range(TRIES):
@@ -531,7 +531,7 @@ def _place_robots(
 @kernel
 def choose_members(seeds: Integers, members: int, out: Integers) -> None:
     """Write the index of the world of each seed (n,) among the members of a set."""
-    for n in range(seeds.shape[0]):
+    for n in range(len(seeds)):
         share = random.uniform(seeds[n], random.MEMBER_STREAM, 0)
         out[n] = min(int(share * members), members - 1)
 
@@ -554,11 +554,11 @@ def draw_scenes(
     row that could not be drawn, or n, and the reason.
     """
     plan: ScenePlan = packed.content
-    count = plan.group.shape[0]
+    count = len(plan.group)
     disc = scratch.disc
-    _put(disc, 0.0, 0.0, 0.0, plan.radii.shape[0] - 1, plan)
+    _put(disc, 0.0, 0.0, 0.0, len(plan.radii) - 1, plan)
     disc[RADIUS] = plan.footprint
-    for n in range(seeds.shape[0]):
+    for n in range(len(seeds)):
         state = NO_OBSTACLES
         obstacles = bodies[n, :count]
         scratch.draws[0].source = random.source(seeds[n], random.SCENE_STREAM)
@@ -573,4 +573,4 @@ def draw_scenes(
                     break
         if state != DRAWN:
             return n, state
-    return seeds.shape[0], DRAWN
+    return len(seeds), DRAWN

@@ -83,14 +83,14 @@ def step_worlds(packed: Any, commands: Array, first_world: int) -> None:
 def begin_episodes(packed: Any, chosen: Integers) -> None:
     """Begin episodes in the worlds `chosen` (n,), where everything is in place and stands still."""
     part = packed.content
-    for i in range(chosen.shape[0]):
+    for i in range(len(chosen)):
         n = chosen[i]
         part.scratch.scans.waiting[i] = n
         scene = get_surroundings(n, part.world_set)
         if part.world_set.moves:
             obstacles.reset_marks(n, part.data, scene.movers.plans)
         _sort_bodies(n, scene, part)
-    sensing.scan_together(chosen.shape[0], part)
+    sensing.scan_together(len(chosen), part)
     for n in chosen:
         sensing.distort_scans(n, n + 1, part)
 
@@ -107,7 +107,7 @@ def sort_worlds(packed: Any, first_world: int, end_world: int) -> None:
 def begin_period(packed: Any) -> None:
     """Begin a period of worlds whose robots another engine moves."""
     part = packed.content
-    for n in range(part.data.pose.shape[0]):
+    for n in range(len(part.data.pose)):
         _begin_period_of_world(n, 0, part)
 
 
@@ -131,7 +131,7 @@ def end_period(
     part = packed.content
     data = part.data
     waiting_count = 0
-    for n in range(data.pose.shape[0]):
+    for n in range(len(data.pose)):
         data.steps[n] += 1
         for m in range(data.pose.shape[1]):
             start = wheel_start[n, m]
@@ -150,7 +150,7 @@ def end_period(
         _sort_bodies(n, get_surroundings(n, part.world_set), part)
         waiting_count = sensing.scan_or_wait(n, waiting_count, part)
     sensing.scan_together(waiting_count, part)
-    sensing.distort_scans(0, data.pose.shape[0], part)
+    sensing.distort_scans(0, len(data.pose), part)
 
 
 @kernel
@@ -163,7 +163,7 @@ def _step_part(part: Part, commands: Array, first_world: int) -> None:
     """
     data = part.data
     robots = data.pose.shape[1]
-    end_world = first_world + commands.shape[0]
+    end_world = first_world + len(commands)
     _queue_commands(data.history, commands, first_world, part.motion.terms.curves)
     worlds_per_block = part.scratch.lanes.pose.shape[1] // robots
     for block_begin in range(first_world, end_world, worlds_per_block):
@@ -193,10 +193,10 @@ def _queue_commands(
     history: Array, commands: Array, first_world: int, curves: Array
 ) -> None:
     """Put the effects of commands (n, M, C) in front of the earlier ones, history (N, M, H, C)."""
-    for i in range(commands.shape[0]):
+    for i in range(len(commands)):
         for m in range(commands.shape[1]):
             queue = history[first_world + i, m]
-            for h in range(queue.shape[0] - 1, 0, -1):
+            for h in range(len(queue) - 1, 0, -1):
                 for c in range(commands.shape[2]):
                     queue[h, c] = queue[h - 1, c]
             for c in range(commands.shape[2]):
@@ -262,7 +262,7 @@ def _sort_bodies(n: int, scene: Surroundings, part: Part) -> None:
     bodies = part.data.bodies[n]
     cells = part.scratch.cells
     if scene.crowded:
-        sort_into_cells(n, bodies, bodies.shape[0], cells)
+        sort_into_cells(n, bodies, len(bodies), cells)
     elif scene.standing:
         spare = part.scratch.scans.bodies
         put_in_order(n, bodies, part.data.velocity.shape[1], spare, cells)
@@ -400,12 +400,12 @@ def _move_carefully(
         period,
     )
     stops[:] = period
-    for m in range(meets.shape[0]):
+    for m in range(len(meets)):
         if meets[m] != FREE:
             contacts.put_body(world.bodies[world.first + m], data.pose[n, m])
             tight.motions[m].room = 0.0
     for j in range(motion.substeps):
-        for m in range(meets.shape[0]):
+        for m in range(len(meets)):
             if meets[m] != FREE:
                 compute_rates(n, m, j, data, motion, single)
                 dq = single.dq
@@ -418,14 +418,14 @@ def _move_carefully(
                     )
         contacts.advance(j * motion.dt, motion.dt, obstacles_move, world)
     drifts = False
-    for m in range(meets.shape[0]):
+    for m in range(len(meets)):
         if meets[m] != FREE:
             ahead, left, turn = draw_drift(n, m, data, motion)
             contacts.start_motion(m, ahead, left, turn, world)
             drifts = drifts or ahead != 0.0 or left != 0.0 or turn != 0.0
     if drifts:
         contacts.advance(motion.substeps * motion.dt, 1.0, False, world)
-    for m in range(meets.shape[0]):
+    for m in range(len(meets)):
         if meets[m] != FREE:
             body = world.bodies[world.first + m]
             data.pose[n, m, 0] = body[X]
@@ -477,7 +477,7 @@ def draw_drift(
     noise = data.noise[n, m]
     seed = data.seeds[n]
     counter = data.steps[n] * data.pose.shape[1] + m
-    count = noise.shape[0] - DRIFT_X
+    count = len(noise) - DRIFT_X
     period = motion.dt * motion.substeps
     scale = math.sqrt(12.0 * period)
     ahead = left = turn = 0.0
@@ -557,10 +557,10 @@ def _fill_lanes(
             pose[LANE_PATH, lane] = 0.0
             for s in range(data.state.shape[2]):
                 lanes.x[s, lane] = data.state[n, m, s]
-            for t in range(lanes.coefficient.shape[0]):
+            for t in range(len(lanes.coefficient)):
                 lanes.coefficient[t, lane] = data.coefficient[n, m, t]
             # Each command changes once in a period, at this substep.
-            for c in range(lanes.change.shape[0]):
+            for c in range(len(lanes.change)):
                 delay = data.delay[n, m] + motion.terms.late[c]
                 lanes.change[c, lane] = delay % motion.substeps
 
@@ -583,7 +583,7 @@ def _apply_commands(
     substeps = motion.substeps
     change = lanes.change
     next_change = substeps
-    for c in range(change.shape[0]):
+    for c in range(len(change)):
         for lane in range(lane_count):
             if change[c, lane] > substep:
                 next_change = min(next_change, change[c, lane])

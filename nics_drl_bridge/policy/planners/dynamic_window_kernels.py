@@ -57,14 +57,14 @@ def choose_twists(
     Candidates within the window are preferred.
     """
     brakes = ahead.slowness > 0.0
-    for n in range(out.shape[0]):
+    for n in range(len(out)):
         around = maps.map_scan(scans[n], goals[n], maker)
         twist = twists[n]
         # If braking takes time, a robot that could no longer stop one period later must stop now.
         late = brakes and math.hypot(twist[0], twist[1]) > MOVING
         late = late and find_cost(around, twist, twist, ahead) > INADMISSIBLE
         least = math.inf
-        for k in range(candidates.shape[0]):
+        for k in range(len(candidates)):
             far = False
             moves = False
             for i in range(3):

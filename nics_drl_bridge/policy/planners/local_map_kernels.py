@@ -96,7 +96,7 @@ def find_hits(hits: Array, shares: Array, rays: ScanRays) -> int:
     Fractions of 0 are left out: they are unknown, or too close to tell from the robot itself.
     """
     count = 0
-    for p in range(shares.shape[0]):
+    for p in range(len(shares)):
         if 0.0 < shares[p] < 1.0:
             share = shares[p] * rays.range_max
             x = rays.origin[0] + share * rays.directions[p, 0]
@@ -117,12 +117,12 @@ def measure_distances(seen: LocalMap, hits: Array) -> None:
     """Writes the distances of a map to hits (H, 2)."""
     grid = seen.distances
     cell = seen.cell
-    size = grid.shape[0]
+    size = len(grid)
     half = 0.5 * size * cell
     far = np.float32(seen.reach * seen.reach)
     grid[:] = far
     step = np.float32(cell)
-    for h in range(hits.shape[0]):
+    for h in range(len(hits)):
         x = hits[h, 0] + half
         y = hits[h, 1] + half
         left, right = _find_span(x, seen.reach, cell, size)
@@ -132,7 +132,7 @@ def measure_distances(seen: LocalMap, hits: Array) -> None:
             dy = np.float32((i + 0.5) * cell - y)
             row = grid[i, left:right]
             dy2 = dy * dy
-            for j in range(row.shape[0]):
+            for j in range(len(row)):
                 dx = np.float32(j) * step + first
                 away = dx * dx + dy2
                 row[j] = away if away < row[j] else row[j]
@@ -154,7 +154,7 @@ def interpolate(
     grid: Singles, cell: float, x: float, y: float, outside: float
 ) -> float:
     """Returns the value of a grid at a point, bilinear between cell centres."""
-    size = grid.shape[0]
+    size = len(grid)
     u = x / cell + 0.5 * size - 0.5
     v = y / cell + 0.5 * size - 0.5
     if not (0.0 <= u < size - 1.0 and 0.0 <= v < size - 1.0):
@@ -188,7 +188,7 @@ def find_ways(around: Situation, prices: Singles) -> None:
     soft = around.clearance.soft
     ways = seen.ways
     side = COARSE * seen.cell
-    size = ways.shape[0]
+    size = len(ways)
     half = 0.5 * size * side
     blocked = around.outline.inner + around.clearance.margin
     inside = max(abs(goal[0]), abs(goal[1])) < half - side
@@ -235,9 +235,9 @@ def find_room(x: float, y: float, c: float, s: float, around: Situation) -> floa
     at_x = x + c * centre[0] - s * centre[1]
     at_y = y + s * centre[0] + c * centre[1]
     away = interpolate(grid, seen.cell, at_x, at_y, seen.reach)
-    if discs.shape[0] == 0 or away >= seen.reach - seen.cell:
+    if len(discs) == 0 or away >= seen.reach - seen.cell:
         return away - outline.outer
-    middle = 0.5 * grid.shape[0] - 0.5
+    middle = 0.5 * len(grid) - 0.5
     per_cell = 1.0 / seen.cell
     if max(abs(at_x), abs(at_y)) + outline.outer > (middle - 1.0) * seen.cell:
         return away - outline.inner  # off the map
@@ -246,7 +246,7 @@ def find_room(x: float, y: float, c: float, s: float, around: Situation) -> floa
     c = c * per_cell
     s = s * per_cell
     least = seen.reach
-    for d in range(discs.shape[0]):
+    for d in range(len(discs)):
         px = discs[d, 0]
         py = discs[d, 1]
         away = interpolate_inside(grid, u + c * px - s * py, v + s * px + c * py)

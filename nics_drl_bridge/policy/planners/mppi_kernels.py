@@ -89,13 +89,13 @@ class RollOuts(NamedTuple):
 @kernel(allocates=True)
 def draw(offers: Array, noise: Array, rest: Array, seed: int) -> None:
     """Draws `Sampling.offers`, the first of them rest (C,), and `Sampling.noise`, by seed."""
-    for k in range(offers.shape[0]):
+    for k in range(len(offers)):
         for q in range(offers.shape[1]):
             for c in range(offers.shape[2]):
                 i = (k * offers.shape[1] + q) * offers.shape[2] + c
                 drawn = BEYOND * (2.0 * uniform(seed, PLANNER_STREAM, 3 * i) - 1.0)
                 # Half of the proposals hold one action.
-                held = k < offers.shape[0] // 2 and q > 0
+                held = k < len(offers) // 2 and q > 0
                 offers[k, q, c] = (
                     offers[k, 0, c] if held else min(max(drawn, -1.0), 1.0)
                 )
@@ -121,7 +121,7 @@ def plan_all(
     the first round proposes actions from the whole range. The planner therefore has no memory: its
     actions depend only on the observation.
     """
-    for n in range(out.shape[0]):
+    for n in range(len(out)):
         around = maps.map_scan(scans[n], goals[n], maker)
         # pose and state when the first command takes effect
         fit_command(twists[n], plant, lanes)
@@ -132,8 +132,8 @@ def plan_all(
         best = _roll_out(around, plant, sampling, lanes)
         lanes.nominal[:] = lanes.actions[best]
         for spread in SPREADS:
-            for k in range(lanes.actions.shape[0]):
-                for q in range(lanes.nominal.shape[0]):
+            for k in range(len(lanes.actions)):
+                for q in range(len(lanes.nominal)):
                     for c in range(lanes.nominal.shape[1]):
                         action = lanes.nominal[q, c]
                         if k > 0:
@@ -149,13 +149,13 @@ def _average(best: int, lanes: RollOuts) -> None:
     """Replaces the nominal actions by the cost-weighted mean of the sampled ones."""
     lanes.nominal[:] = 0.0
     total = 0.0
-    for k in range(lanes.cost.shape[0]):
+    for k in range(len(lanes.cost)):
         weight = math.exp((lanes.cost[best] - lanes.cost[k]) / TEMPERATURE)
         total += weight
-        for q in range(lanes.nominal.shape[0]):
+        for q in range(len(lanes.nominal)):
             for c in range(lanes.nominal.shape[1]):
                 lanes.nominal[q, c] += weight * lanes.actions[k, q, c]
-    for q in range(lanes.nominal.shape[0]):
+    for q in range(len(lanes.nominal)):
         for c in range(lanes.nominal.shape[1]):
             lanes.nominal[q, c] /= total
 
@@ -217,19 +217,19 @@ def _roll_out(
 ) -> int:
     """Rolls out the actions of all lanes; writes their costs and returns the cheapest lane."""
     _begin(plant, lanes)
-    states = plant.settled.shape[0]
-    periods = sampling.between.shape[0]
+    states = len(plant.settled)
+    periods = len(sampling.between)
     limit = maps.find_contact_limit(around)
     for t in range(periods + sampling.stop):
-        for c in range(plant.low.shape[0]):
+        for c in range(len(plant.low)):
             row = lanes.x[states + c]
             curve = plant.single.curves[c]
             if t < periods:
                 middle = 0.5 * (plant.low[c] + plant.high[c])
                 half = 0.5 * (plant.high[c] - plant.low[c])
-                for k in range(row.shape[0]):
+                for k in range(len(row)):
                     action = 0.0
-                    for q in range(lanes.nominal.shape[0]):
+                    for q in range(len(lanes.nominal)):
                         action += sampling.between[t, q] * lanes.actions[k, q, c]
                     row[k] = apply_curve(middle + half * action, curve)
             elif not sampling.holds[c]:
@@ -243,11 +243,11 @@ def _roll_out(
             plant.dt,
             plant.substeps,
         )
-        for k in range(lanes.cost.shape[0]):
+        for k in range(len(lanes.cost)):
             if lanes.ended[k] < 0:
                 _add_cost(k, t, limit, around, sampling, lanes)
     best = 0
-    for k in range(lanes.cost.shape[0]):
+    for k in range(len(lanes.cost)):
         lanes.cost[k] += (1.0 - EARLY) * lanes.way[k]
         if lanes.cost[k] < lanes.cost[best]:
             best = k
@@ -261,7 +261,7 @@ def _begin(plant: Plant, lanes: RollOuts) -> None:
     x = lanes.start[0]
     y = lanes.start[1]
     heading = lanes.start[2]
-    for k in range(lanes.cost.shape[0]):
+    for k in range(len(lanes.cost)):
         lanes.pose[0, k] = x
         lanes.pose[1, k] = y
         lanes.pose[2, k], lanes.pose[3, k] = math.cos(heading), math.sin(heading)
@@ -275,7 +275,7 @@ def _begin(plant: Plant, lanes: RollOuts) -> None:
                 2.0 * (lanes.held[c] - plant.low[c]) / (plant.high[c] - plant.low[c])
                 - 1.0
             )
-            for q in range(lanes.nominal.shape[0]):
+            for q in range(len(lanes.nominal)):
                 change += (lanes.actions[k, q, c] - before) ** 2
                 before = lanes.actions[k, q, c]
         lanes.cost[k] = CHANGE * change
@@ -293,7 +293,7 @@ def _add_cost(
     lanes: RollOuts,
 ) -> None:
     """Adds the cost of period t in lane k: of the way and of contacts, or of those in a stop."""
-    periods = sampling.between.shape[0]
+    periods = len(sampling.between)
     x = lanes.pose[0, k]
     y = lanes.pose[1, k]
     c = lanes.pose[2, k]

@@ -45,10 +45,10 @@ class Transitions(NamedTuple):
 @kernel(allocates=True)
 def forward(net: Net, seen: Singles) -> Singles:
     """Returns the outputs (n, C) of a network for inputs (n, O); keeps all layers' outputs."""
-    n = seen.shape[0]
+    n = len(seen)
     at = 0
     rows = seen
-    for k in range(net.widths.shape[0] - 1):
+    for k in range(len(net.widths) - 1):
         ins = net.widths[k]
         outs = net.widths[k + 1]
         middle = at + ins * outs
@@ -57,7 +57,7 @@ def forward(net: Net, seen: Singles) -> Singles:
         at = middle + outs
         rows = out
         bias = net.weights[middle:at]
-        least = NONE if k + 2 < net.widths.shape[0] else -np.inf
+        least = NONE if k + 2 < len(net.widths) else -np.inf
         for i in range(n):
             for j in range(outs):
                 out[i, j] = max(out[i, j] + bias[j], np.float32(least))
@@ -70,10 +70,10 @@ def backward(net: Net, seen: Singles, gradient: Singles) -> None:
 
     `gradient` must be the first of the spare arrays.
     """
-    n = seen.shape[0]
-    at = net.weights.shape[0]
+    n = len(seen)
+    at = len(net.weights)
     side = 0
-    for k in range(net.widths.shape[0] - 2, -1, -1):
+    for k in range(len(net.widths) - 2, -1, -1):
         ins = net.widths[k]
         outs = net.widths[k + 1]
         middle = at - outs
@@ -97,7 +97,7 @@ def compute_critic_gradients(
 ) -> np.float32:
     """Writes the gradients of the critic; returns its weighted loss."""
     values = forward(net, batch.seen)
-    n = values.shape[0]
+    n = len(values)
     out = net.spare[0, :n].reshape(n, 1)
     loss = NONE
     share = weight / np.float32(n)
@@ -124,7 +124,7 @@ def compute_actor_gradients(
     """
     raw = forward(net, batch.seen)
     gains = batch.advantages
-    n = raw.shape[0]
+    n = len(raw)
     actions = batch.actions
     out = net.spare[0, : raw.size].reshape(raw.shape)
     mean = gains.mean()
@@ -145,7 +145,7 @@ def compute_actor_gradients(
         bounded = gain * min(max(ratio, ONE - clip), ONE + clip)
         loss -= share * (min(gain * ratio, bounded) + entropy * mixed)
         pull = share * gain * ratio if gain * ratio <= bounded else NONE
-        for j in range(parts.shape[0]):
+        for j in range(len(parts)):
             if log_std.size > 0:
                 out[i, j] = -pull * parts[j] * np.exp(-log_std[j])
                 spread[j] -= pull * (parts[j] * parts[j] - ONE)
@@ -168,7 +168,7 @@ def _compute_density(
 ) -> tuple[np.float32, np.float32]:
     """Returns an action's (C,) log density and the entropy; writes deviations (C,) to `parts`."""
     log_prob = mixed = NONE
-    for j in range(raw.shape[0]):
+    for j in range(len(raw)):
         parts[j] = (action[j] - raw[j]) * np.exp(-log_std[j])
         log_prob -= np.float32(0.5) * parts[j] * parts[j] + log_std[j] + LOG_NORM
         mixed += log_std[j] + np.float32(0.5) + LOG_NORM
@@ -183,9 +183,9 @@ def _compute_probability(
     greatest = raw.max()
     total = NONE
     mixed = NONE
-    for j in range(raw.shape[0]):
+    for j in range(len(raw)):
         total += np.exp(raw[j] - greatest)
-    for j in range(raw.shape[0]):
+    for j in range(len(raw)):
         parts[j] = raw[j] - greatest - np.log(total)
         mixed -= np.exp(parts[j]) * parts[j]
     return parts[action], mixed
