@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.lidar.arrays import Array, ShortIntegers, Singles
+from nics_drl_bridge.lidar.arrays import Array, ShortIntegers, Singles, structure_of
 from nics_drl_bridge.lidar.beam_kernels import (
     TWO_PI,
     Beams,
@@ -42,20 +42,23 @@ from nics_drl_bridge.lidar.beam_kernels import (
 )
 from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SHAPE, SIN, X, Y
 
-TABLE_SHAPE = np.dtype(
-    [  # one shape of the table
-        ("distances_per_metre", np.float64),  # grid distances
-        ("rotations", np.float64),  # grid rotations in a full turn, 0 for a circle
-        # A period is the smallest rotation after which the shape looks the same.
-        ("periods_per_rotation", np.float64),
-        ("first_cell", np.int64),
-        ("cells_per_period", np.int64),
-        ("second_hull", np.int64),  # first corner of the second copy of its hull
-        ("corners_per_period", np.int64),
-        ("corners", np.int64),  # of the hull
-        ("round_radius", np.float64),  # radius of a circle [m], 0 for other shapes
-    ]
-)
+
+class TableShape:
+    """One shape of the table."""
+
+    distances_per_metre: float  # grid distances
+    rotations: float  # grid rotations in a full turn, 0 for a circle
+    # A period is the smallest rotation after which the shape looks the same.
+    periods_per_rotation: float
+    first_cell: int
+    cells_per_period: int
+    second_hull: int  # first corner of the second copy of its hull
+    corners_per_period: int
+    corners: int  # of the hull
+    round_radius: float  # radius of a circle [m], 0 for other shapes
+
+
+TABLE_SHAPE = structure_of(TableShape)
 # Columns of `TableArrays.cells`.
 ROW_START, ROW_EXTENT, RIGHT_CORNERS, LEFT_CORNERS = range(4)
 # Sides of a shape as seen from the lidar.
@@ -79,19 +82,21 @@ class TableArrays(NamedTuple):
     hulls: Array  # (sum V, 2) corners [m], see `shapes.Outlines`; each hull twice
 
 
-LOOK_UP = np.dtype(
-    [  # beams of a scan that hit one body, and where the table has their ranges
-        ("first", np.int64),  # the first beam
-        ("hits", np.int32),  # number of beams
-        # indices in `TableArrays.rows` of the points around the first beam
-        ("near", np.int64),
-        ("near_next", np.int64),
-        ("far", np.int64),
-        ("far_next", np.int64),
-        ("next_weight", np.float32),  # v
-        ("far_weight", np.float32),  # w
-    ]
-)
+class LookUp:
+    """Beams of a scan that hit one body, and where the table has their ranges."""
+
+    first: int  # the first beam
+    hits: np.int32  # number of beams
+    # indices in `TableArrays.rows` of the points around the first beam
+    near: int
+    near_next: int
+    far: int
+    far_next: int
+    next_weight: np.float32  # v
+    far_weight: np.float32  # w
+
+
+LOOK_UP = structure_of(LookUp)
 
 
 @kernel(contracts=True, inline=True)

@@ -13,7 +13,13 @@ import numpy as np
 from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import exact_kernels
-from nics_drl_bridge.lidar.arrays import Array, Integers, Mask, ShortIntegers
+from nics_drl_bridge.lidar.arrays import (
+    Array,
+    Integers,
+    Mask,
+    ShortIntegers,
+    structure_of,
+)
 from nics_drl_bridge.lidar.exact_kernels import (
     COS,
     HEADING,
@@ -38,36 +44,45 @@ DRAWN = 0
 NO_OBSTACLES = 1
 NO_ROBOTS = 2
 
-GROUP = np.dtype(
-    [
-        ("least", np.int64),  # number of obstacles
-        ("greatest", np.int64),
-        ("gap", np.float64),  # [m]
-        ("first_shape", np.int64),  # in `ScenePlan.choices`
-        ("shapes", np.int64),
-        ("is_fixed", np.bool_),
-        ("moves", np.bool_),
-    ],
-    align=True,
-)
-"""A group of obstacles."""
 
-PLACE = np.dtype(
-    [
-        ("x1", np.float64),  # region [m]
-        ("y1", np.float64),
-        ("x2", np.float64),
-        ("y2", np.float64),
-        ("least_heading", np.float64),  # [rad]
-        ("greatest_heading", np.float64),
-        ("share", np.float64),  # cumulative fraction of the places up to it
-    ],
-    align=True,
-)
-"""A place of starts or goals."""
+class ObstacleGroup:
+    """A group of obstacles."""
 
-DRAWS = np.dtype([("source", np.uint64), ("counter", np.int64)], align=True)
-"""The next draw of a scene, see `random_kernels.uniform_of`."""
+    least: int  # number of obstacles
+    greatest: int
+    gap: float  # [m]
+    first_shape: int  # in `ScenePlan.choices`
+    shapes: int
+    is_fixed: bool
+    moves: bool
+
+
+GROUP = structure_of(ObstacleGroup)
+
+
+class DrawnPlace:
+    """A place of starts or goals."""
+
+    x1: float  # region [m]
+    y1: float
+    x2: float
+    y2: float
+    least_heading: float  # [rad]
+    greatest_heading: float
+    share: float  # cumulative fraction of the places up to it
+
+
+PLACE = structure_of(DrawnPlace)
+
+
+class NextDraw:
+    """The next draw of a scene, see `random_kernels.uniform_of`."""
+
+    source: np.uint64
+    counter: int
+
+
+DRAWS = structure_of(NextDraw)
 
 
 class FreeSpace(NamedTuple):
