@@ -125,8 +125,9 @@ class BridgeParallelEnv(ParallelEnv[str, Singles, AnyArray]):
         """Advances one control period; see PettingZoo. Every remaining agent needs an action."""
         given: object = actions
         if not isinstance(given, dict):
-            needed = "must be a dict with an action per agent"
-            raise ConfigError(f"actions of type {type(given).__name__}: {needed}.")
+            raise ConfigError(
+                f"actions of type {type(given).__name__}: must be a dict with an action per agent."
+            )
         missing = sorted(set(self.agents) - set(actions))
         if missing:
             raise ConfigError(

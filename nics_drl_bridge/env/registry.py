@@ -41,8 +41,10 @@ def make_task(
     if "sensors" in options:
         names = options["sensors"]
         if isinstance(names, str) or not isinstance(names, Iterable):
-            fix = "must be a list of names of the model's sensors"
-            raise ConfigError(f"task option sensors={format_value(names)}: {fix}.")
+            raise ConfigError(
+                f"task option sensors={format_value(names)}: must be a list of "
+                "names of the model's sensors."
+            )
         known = {sensor.name: sensor for sensor in model.sensors}
         names = [getattr(name, "name", str(name)) for name in names]
         for name in names:
@@ -103,15 +105,18 @@ def find_task_class(task: Any, options: dict[str, Any]) -> type[Task]:
 def _import_task_class(name: Any) -> type:
     """Imports a class by the name of a shipped task, or by `path/to/file.py:ClassName`."""
     if not isinstance(name, str):
-        fix = "a name, path/to/file.py:ClassName, a subclass of Task, or a Task"
-        raise ConfigError(f"task={format_value(name)}: must be {fix}.")
+        raise ConfigError(
+            f"task={format_value(name)}: must be a name, path/to/file.py:ClassName, a "
+            "subclass of Task, or a Task."
+        )
     path, _, attribute = TASKS.get(name, name).rpartition(":")
     if not path and name.endswith(".py"):
         path = name
         attribute = ""
     if not path:
-        hint = f"{suggest(name, TASKS)} (or give path/to/file.py:ClassName)."
-        raise ConfigError(f"unknown task {name!r}; {hint}")
+        raise ConfigError(
+            f"unknown task {name!r}; {suggest(name, TASKS)} (or give path/to/file.py:ClassName)."
+        )
     module = extensions.load_module(path, "task")
     task_class = getattr(module, attribute, None)
     if isinstance(task_class, type):

@@ -333,16 +333,20 @@ class Task(ABC):
     def check_result(self, what: str, given: Any, shape: tuple[int, ...]) -> Any:
         """Returns a user's result. Raises ConfigError unless it is finite and of this shape."""
         if np.shape(given) != shape or not _is_finite(given):
-            fault = f"must be finite, of shape {shape}, not {given!r:.80} of {np.shape(given)}"
-            raise self._make_error(what, fault)
+            raise self._make_error(
+                what,
+                f"must be finite, of shape {shape}, not {given!r:.80} of {np.shape(given)}",
+            )
         return given
 
     def check_observation_space(self) -> None:
         """Raises ConfigError unless `observation_space` is a Box (O,), as `box` makes it."""
         space: Any = self.observation_space
         if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1:
-            fix = "must be a property that returns a Box of one dimension; see `box`"
-            raise self._make_error("observation_space", fix)
+            raise self._make_error(
+                "observation_space",
+                "must be a property that returns a Box of one dimension; see `box`",
+            )
 
     @cached_property
     def command_limits(self) -> tuple[Array, Array]:

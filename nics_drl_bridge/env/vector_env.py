@@ -462,8 +462,10 @@ def choose_worlds(options: dict[str, Any] | None, count: int) -> Flags:
         return np.ones(count, np.bool_)
     chosen = np.asarray(options["reset_mask"])
     if chosen.shape != (count,) or chosen.dtype != np.bool_ or not chosen.any():
-        mask = f"options['reset_mask'] of shape {chosen.shape}, {chosen.dtype}"
-        raise ConfigError(f"{mask}: must be ({count},) bool with at least one True.")
+        raise ConfigError(
+            f"options['reset_mask'] of shape {chosen.shape}, {chosen.dtype}: must be ({count},) "
+            "bool with at least one True."
+        )
     return chosen.copy()
 
 

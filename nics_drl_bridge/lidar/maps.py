@@ -264,8 +264,9 @@ def read_image(path: Path, source: str) -> tuple[NDArray[np.uint8], Mask | None]
                     raise Image.DecompressionBombError
                 return _read_pixels(image)
     except Image.DecompressionBombError:
-        reason = f"has too many pixels, a map may have {MAX_CELLS}; cut or coarsen it."
-        raise ConfigError(f"{path}: {reason}") from None
+        raise ConfigError(
+            f"{path}: has too many pixels, a map may have {MAX_CELLS}; cut or coarsen it."
+        ) from None
     except (
         EOFError,
         IndexError,
@@ -275,8 +276,9 @@ def read_image(path: Path, source: str) -> tuple[NDArray[np.uint8], Mask | None]
         ValueError,
         struct.error,
     ):
-        reason = "is no whole PGM, PNG or BMP image; save the map again in one of them."
-        raise ConfigError(f"{path}: {reason}") from None
+        raise ConfigError(
+            f"{path}: is no whole PGM, PNG or BMP image; save the map again in one of them."
+        ) from None
 
 
 def _read_pixels(image: Image.Image) -> tuple[NDArray[np.uint8], Mask | None]:

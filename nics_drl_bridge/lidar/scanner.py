@@ -65,15 +65,17 @@ class Scanner:
         if not table.has_rows:
             reason = f"has no rows to look up with the renderer {self.renderer!r}"
         elif not math.isclose(table.beam_angle, spec.angle_increment, rel_tol=1e-9):
-            apart = (
-                f"{table.beam_angle:.6g} rad apart, not {spec.angle_increment:.6g} rad"
+            reason = (
+                f"is for beams that are {table.beam_angle:.6g} rad apart, not "
+                f"{spec.angle_increment:.6g} rad"
             )
-            reason = f"is for beams that are {apart}"
         elif reach < spec.range_max * (1.0 - 1e-9):
             reason = f"reaches {reach:g} m, not {spec.range_max:g} m"
         if reason:
-            fix = f"bake one for the lidar {spec.name!r}, or scan with `exact`."
-            raise ModelError(f"the lidar table {reason}; {fix}")
+            raise ModelError(
+                f"the lidar table {reason}; bake one for the lidar "
+                f"{spec.name!r}, or scan with `exact`."
+            )
 
     @cached_property
     def arguments(self) -> LidarArrays:
@@ -188,8 +190,9 @@ class Scanner:
             bodies.shape[1],
             BODY,
         ):
-            shapes = f"poses {poses.shape} and bodies {bodies.shape}"
-            raise ConfigError(f"{shapes} must be (N, 3) and (N, K, {BODY}).")
+            raise ConfigError(
+                f"poses {poses.shape} and bodies {bodies.shape} must be (N, 3) and (N, K, {BODY})."
+            )
         if walls.shape != (len(walls), 4):
             raise ConfigError(f"walls {walls.shape} must be (W, 4).")
         index = bodies[..., SHAPE]

@@ -232,8 +232,10 @@ def make_reader(
         step = -step
     if not (np.isfinite([begin, step]).all() and step != 0.0 and beams > 1):
         angles = f"angle_min {header.angle_min:g}, angle_increment {header.angle_increment:g}"
-        reason = "describes no lidar; fix the driver's parameters."
-        raise ConfigError(f"LaserScan of {beams} beams, {angles}: {reason}")
+        raise ConfigError(
+            f"LaserScan of {beams} beams, {angles}: describes no lidar; fix "
+            "the driver's parameters."
+        )
     backwards = step < 0.0
     if backwards:
         begin = begin + step * (beams - 1)

@@ -273,8 +273,10 @@ class Outlines:
             return self.shapes.index(shape)
         except ValueError:
             held = ", ".join(map(describe, self.shapes)) or "none"
-            reason = f"is not in the lidar table, which holds {held}; bake it as well."
-            raise ModelError(f"the shape {describe(shape)} {reason}") from None
+            raise ModelError(
+                f"the shape {describe(shape)} is not in the lidar table, which holds "
+                f"{held}; bake it as well."
+            ) from None
 
 
 def describe(shape: Shape) -> str:

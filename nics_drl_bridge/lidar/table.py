@@ -229,8 +229,9 @@ class LidarTable:
         try:
             table._check()
         except (ArithmeticError, IndexError, ValueError) as error:
-            reason = f"is not a lidar table ({error}); generate the model again."
-            raise ModelError(f"{folder}: {reason}") from None
+            raise ModelError(
+                f"{folder}: is not a lidar table ({error}); generate the model again."
+            ) from None
         return table
 
     def _check(self) -> None:

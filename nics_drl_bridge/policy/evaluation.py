@@ -102,8 +102,9 @@ def _drive_steps(
         step += 1
         action = act(observation)
         if not np.isfinite(action).all():
-            problem = f"the policy's action in step {step} contains NaN or inf"
-            raise ConfigError(f"{problem}; train it again.")
+            raise ConfigError(
+                f"the policy's action in step {step} contains NaN or inf; train it again."
+            )
         observation, reward, terminated, truncated, info = env.step(action)
         ended = np.logical_or(terminated, truncated)
         yield reward, ended, info

@@ -91,9 +91,9 @@ def shadow(
     messages = read_messages(path, topics, model.gyro)
     for role in (SCAN, CMD_VEL):
         if role not in messages:
-            reason = f"has no {role}, which the comparison needs; name its topic"
             raise RecordingError(
-                f"{path}: {reason}, for example --topic {role}=/car/{role}."
+                f"{path}: has no {role}, which the comparison needs; name its topic, for example "
+                f"--topic {role}=/car/{role}."
             )
     playback = Playback(model, POSE in messages, any_lidar=True)
     moments = _collect_moments(playback, messages, model)

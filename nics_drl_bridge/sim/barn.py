@@ -66,8 +66,9 @@ def _centres(cells: NDArray[Any], corner: tuple[float, float]) -> Array:
 
 def _index(number: int) -> int:
     if number not in barn_numbers():
-        reason = "the numbers are 1 to 299 without multiples of 6"
-        raise ConfigError(f"there is no BARN world {number}; {reason}.")
+        raise ConfigError(
+            f"there is no BARN world {number}; the numbers are 1 to 299 without multiples of 6."
+        )
     return barn_numbers().index(number)
 
 

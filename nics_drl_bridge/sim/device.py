@@ -68,8 +68,10 @@ class DeviceWorld:
         """Begin the episode of a seed, at x, y, heading of each robot (3 M,) if given."""
         robots = self._given
         if starts is not None and starts.size != 3 * robots:
-            needed = f"{robots} robots need {3 * robots}: x, y, heading of each."
-            raise ConfigError(f"episode_start has {starts.size} numbers; {needed}")
+            raise ConfigError(
+                f"episode_start has {starts.size} numbers; {robots} robots need "
+                f"{3 * robots}: x, y, heading of each."
+            )
         placed = None if starts is None else starts.reshape(1, robots, 3)
 
         def arranged(scenes: Scenes) -> Array | None:

@@ -354,8 +354,10 @@ def _coefficients(ranges: KinematicRanges, model: TaylorModel, where: str) -> Bo
         for term, span in terms.items():
             spans[d, _term(d, term, model, place)] = span
     if ranges.response != AS_IT_IS and not model.state_size:
-        none = "the model has no state, so it has no time constants"
-        raise ConfigError(f"{where}: key 'kinematics.response': {none}; leave it out.")
+        raise ConfigError(
+            f"{where}: key 'kinematics.response': the model has no state, so it has no time "
+            "constants; leave it out."
+        )
     spread = spans.copy()
     spread[3:] /= ranges.response[::-1]
     _check_stable(model, spread, where)
@@ -422,8 +424,10 @@ def _levels(ranges: Randomisation, model: SimulatorModel, where: str) -> Bounds:
             continue
         if not base[part].any():
             lacks = f"the model of {model.robot.name!r} has no measured {key} to scale"
-            fix = f"give {names[0]!r} and {names[1]!r} instead."
-            raise ConfigError(f"{where}: key 'odometry.{key}': {lacks}; {fix}")
+            raise ConfigError(
+                f"{where}: key 'odometry.{key}': {lacks}; give {names[0]!r} "
+                f"and {names[1]!r} instead."
+            )
         low[part] = base[part] * factor[0]
         high[part] = base[part] * factor[1]
     for column, name in enumerate(NOISE_NAMES):

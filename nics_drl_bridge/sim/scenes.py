@@ -146,8 +146,10 @@ class MemberSampler:
         scene = f"in the scene of seed {seed}"
         if why == kernels.NO_OBSTACLES:
             reason = f"no free place for {self.count} obstacles {scene}"
-            fix = "lower `count` or `gap`, or enlarge the field."
-            return ConfigError(f"{where}: key 'obstacles': {reason}; {fix}")
+            return ConfigError(
+                f"{where}: key 'obstacles': {reason}; lower `count` or "
+                "`gap`, or enlarge the field."
+            )
         least, greatest = self.world.goal_distance
         return ConfigError(
             f"{where}: key 'goal_distance': no free places for {self.robots} start(s) and goal(s) "
@@ -463,5 +465,6 @@ def _check(
     for place, (free, value) in fits.items():
         if not free:
             robot = f"a robot with {world.clearance:g} m around it does not fit there, at {value}"
-            fix = "move it, or lower `clearance`."
-            raise ConfigError(f"{world.source}: key {place!r}: {robot}; {fix}")
+            raise ConfigError(
+                f"{world.source}: key {place!r}: {robot}; move it, or lower `clearance`."
+            )

@@ -305,9 +305,9 @@ class FastSimulator:
         if starts is not None:
             poses = np.asarray(starts, dtype=np.float64)
         if len(scenes) != len(chosen) or poses.shape != scenes.starts.shape:
-            needed = f"{len(chosen)} worlds with {self.data.pose.shape[1]} robots each."
             raise ConfigError(
-                f"{len(scenes)} seeds and starts {poses.shape} do not fit {needed}"
+                f"{len(scenes)} seeds and starts {poses.shape} do not fit {len(chosen)} worlds "
+                f"with {self.data.pose.shape[1]} robots each."
             )
         self._place_scenes(chosen, np.asarray(seeds, dtype=np.int64), scenes, poses)
         if draws is not None:
@@ -541,8 +541,10 @@ class FastSimulator:
         robots, _, width = self.data.history.shape[1:]
         expected = (part.stop - part.start, robots, width)
         if checked.shape != expected:
-            needed = f"they must be {expected}: worlds, robots, and a robot's commands."
-            raise ConfigError(f"commands are {checked.shape}; {needed}")
+            raise ConfigError(
+                f"commands are {checked.shape}; they must be {expected}: worlds, "
+                "robots, and a robot's commands."
+            )
         if self.data.steps[part.start] % CHECK_INTERVAL == 0:
             self._command_range.check(checked)
         return checked

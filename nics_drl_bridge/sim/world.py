@@ -122,10 +122,9 @@ class Obstacles(Schema):
         if count is not None and not (
             whole and 0 <= several[0] <= several[1] <= MOST_OBSTACLES
         ):
-            needed = (
-                f"a whole number, or [minimum, maximum], from 0 to {MOST_OBSTACLES}"
+            raise ValueError(
+                f"count must be a whole number, or [minimum, maximum], from 0 to {MOST_OBSTACLES}"
             )
-            raise ValueError(f"count must be {needed}")
         return count
 
     @model_validator(mode="after")
@@ -207,8 +206,9 @@ class World(Schema):
         across = math.hypot(*field)
         if across > MOST_ACROSS_M:
             fix = f"a field may be {MOST_ACROSS_M:g} m across, the largest distance in observations"
-            sides = f"{field[0]:g} m x {field[1]:g} m"
-            raise ValueError(f"the field of {sides} is {across:.0f} m across; {fix}")
+            raise ValueError(
+                f"the field of {field[0]:g} m x {field[1]:g} m is {across:.0f} m across; {fix}"
+            )
         if not 0.0 <= self.goal_distance[0] < self.goal_distance[1]:
             raise ValueError("goal_distance must be [minimum, maximum] in metres")
         if sum(group.counts[1] for group in self.obstacles) > MOST_OBSTACLES:
@@ -339,8 +339,10 @@ def check_places(world: World) -> None:
         waypoints = group.motion.waypoints if isinstance(group.motion, Patrol) else ()
         for n, point in enumerate(waypoints):
             if room_at(world, *point) < radius:
-                reason = f"an obstacle of radius {radius:g} m does not fit there, at {list(point)}"
-                raise ConfigError(f"{where}.motion.waypoints.{n}': {reason}; move it.")
+                raise ConfigError(
+                    f"{where}.motion.waypoints.{n}': an obstacle of radius {radius:g} m does not "
+                    f"fit there, at {list(point)}; move it."
+                )
 
 
 def check_place(
@@ -356,8 +358,10 @@ def check_place(
     if room <= max(radius, solid):
         reason = "is in a wall" if room >= 0.0 else "lies outside the world"
         x1, y1, x2, y2 = world.extent
-        field = f"the field is {x1:g} to {x2:g} m by {y1:g} to {y2:g} m"
-        raise ConfigError(f"{what}: ({x:g}, {y:g}) m {reason}; {field}.")
+        raise ConfigError(
+            f"{what}: ({x:g}, {y:g}) m {reason}; the field is {x1:g} to {x2:g} "
+            f"m by {y1:g} to {y2:g} m."
+        )
 
 
 def _inside(world: World, x: float, y: float) -> bool:

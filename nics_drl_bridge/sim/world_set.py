@@ -145,8 +145,10 @@ def load_worlds(name: str | Path | Sequence[str | Path]) -> AnyWorld:
     if not isinstance(name, str | Path):
         several = isinstance(name, list | tuple)
         if not several or not all(isinstance(member, str | Path) for member in name):
-            needed = "a name, the path of a YAML file or a folder, a World, or a list of names"
-            raise ConfigError(f"world={format_value(name)}: must be {needed}.")
+            raise ConfigError(
+                f"world={format_value(name)}: must be a name, the path of a YAML file or a "
+                "folder, a World, or a list of names."
+            )
         return _set_of("worlds", _members([str(member) for member in name], Path()))
     text = str(name)
     sets = share_folder() / "config" / "world_sets"
@@ -221,8 +223,10 @@ def _members(names: Sequence[str], base: Path) -> list[World]:
             ]
             files = [file for file in every if _content(file, MAP_KEYS) is None]
             if not files:
-                fix = f"check the path, or make worlds of Gazebo's and of maps by `{IMPORT}`"
-                raise ConfigError(f"{pattern}: no world file (.yaml) there; {fix}.")
+                raise ConfigError(
+                    f"{pattern}: no world file (.yaml) there; check the path, or make worlds of "
+                    f"Gazebo's and of maps by `{IMPORT}`."
+                )
             members += map(_member, files)
         elif name.endswith((*YAML, *GAZEBO)):
             members.append(_member(path))

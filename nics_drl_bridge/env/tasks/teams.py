@@ -240,8 +240,10 @@ class PursuitEvasion(Task):
         super().__post_init__()
         self.check_above_zero("capture_gap", self.capture_gap)
         if min(self.pursuers, self.evaders) < 1:
-            counts = f"pursuers={self.pursuers}, evaders={self.evaders}"
-            raise ConfigError(f"task options {counts}: need at least 1 each.")
+            raise ConfigError(
+                f"task options pursuers={self.pursuers}, "
+                f"evaders={self.evaders}: need at least 1 each."
+            )
 
     @property
     def robots(self) -> int:

@@ -56,9 +56,8 @@ def open_session(data: bytes, source: str, folded: Path | None = None) -> Any:
     try:
         import onnxruntime
     except ImportError:
-        fix = "pip install 'nics_drl_bridge[deploy]'."
         raise ConfigError(
-            f"a policy file needs the module 'onnxruntime'; {fix}"
+            "a policy file needs the module 'onnxruntime'; pip install 'nics_drl_bridge[deploy]'."
         ) from None
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
@@ -87,8 +86,9 @@ def run_network(
 
 
 def _explain_failure(source: str, error: Exception) -> PolicyError:
-    reason = f"onnxruntime can't run it ({onnx_graph.quote(error)})."
-    return PolicyError(source, "graph", reason)
+    return PolicyError(
+        source, "graph", f"onnxruntime can't run it ({onnx_graph.quote(error)})."
+    )
 
 
 def run_rows(session: Any, source: str, *tensors: Rows) -> list[NDArray[Any]]:

@@ -67,9 +67,9 @@ def read_checkpoint(path: Path, kind: str = FORMAT) -> dict[str, Any]:
         format_name = str(content["format"])
         read = {**content, "about": json.loads(content["about"])}
     except Exception:  # noqa: BLE001 - a damaged file breaks torch in any way
-        reason = "is not a training checkpoint, or is damaged"
         raise ConfigError(
-            f"{path}: {reason}; leave out --resume to start again."
+            f"{path}: is not a training checkpoint, or is damaged; leave out "
+            "--resume to start again."
         ) from None
     if format_name != kind:
         raise ConfigError(
@@ -230,8 +230,9 @@ def restore(env: BridgeVectorEnv, state: Mapping[str, AnyArray]) -> None:
         was, now = (_kind(rows.get(name)) for rows in (arrays, targets))
         if was != now:
             reason = f"{name!r} is {was}, but this env's is {now}"
-            advice = "make the env with the original arguments"
-            raise ConfigError(f"state of a vector env: {reason}; {advice}.")
+            raise ConfigError(
+                f"state of a vector env: {reason}; make the env with the original arguments."
+            )
     for name, target in targets.items():
         target[...] = arrays[name]  # in place: the compiled steps refer to these arrays
     env.memory = parts[MEMORY]

@@ -106,8 +106,9 @@ def find_actor(model: Any) -> torch.nn.Module:
         return torch.nn.Sequential(*parts)
     if isinstance(policy, torch.nn.Module):
         return policy
-    fix = "give a PPO, A2C or SAC, or a torch module."
-    raise ConfigError(f"a {type(model).__name__} can't be exported; {fix}")
+    raise ConfigError(
+        f"a {type(model).__name__} can't be exported; give a PPO, A2C or SAC, or a torch module."
+    )
 
 
 def export_policy(
@@ -165,8 +166,11 @@ def _make_golden(
     for name, ours, theirs in zip(("actions", "commands"), out, wanted, strict=True):
         error = float(np.abs(ours - theirs).max())
         if not error <= policy_file.GOLDEN_TOLERANCE:
-            reason = f"onnxruntime and torch differ by {error:.3g}; the model can't be exported."
-            raise PolicyError(source, f"golden.{name}", reason)
+            raise PolicyError(
+                source,
+                f"golden.{name}",
+                f"onnxruntime and torch differ by {error:.3g}; the model can't be exported.",
+            )
     action = np.asarray(out[0], np.float32).reshape(GOLDEN, -1)
     return {"observations": seen, "actions": action, "commands": out[1]}
 

@@ -129,8 +129,10 @@ def refuse_diverged(training: LeanPpo | Sb3Training, bound: float = math.inf) ->
     if not all(
         bool((part.abs() < bound).all()) for part in training.networks.parameters()
     ):
-        fault = f"after {training.steps} steps its weights are too large or not finite"
-        raise ConfigError(f"the training diverged: {fault}; lower its learning_rate.")
+        raise ConfigError(
+            f"the training diverged: after {training.steps} steps its weights are too large or "
+            "not finite; lower its learning_rate."
+        )
 
 
 def make_train_env(
@@ -176,8 +178,10 @@ def _restore(
         TypeError,
         ValueError,
     ) as error:
-        reason = f"is not the checkpoint of a training ({shorten(str(error), 120)})"
-        raise ConfigError(f"{path}: {reason}; train again.") from None
+        raise ConfigError(
+            f"{path}: is not the checkpoint of a training "
+            f"({shorten(str(error), 120)}); train again."
+        ) from None
 
 
 def check_same(old: dict[str, Any], new: dict[str, Any], path: Path) -> None:
@@ -193,9 +197,9 @@ def check_same(old: dict[str, Any], new: dict[str, Any], path: Path) -> None:
     for key, value in new["settings"].items():
         then = old["settings"].get(key)
         if then != value:
-            reason = f"was trained with {key} {then!r}, not {value!r}"
             raise ConfigError(
-                f"{path}: {reason}; resume with the same settings, or train in another folder."
+                f"{path}: was trained with {key} {then!r}, not {value!r}; resume with the same "
+                "settings, or train in another folder."
             )
     if old["seed"] != new["seed"]:
         raise ConfigError(
@@ -337,8 +341,10 @@ def _lock_folder(out: Path) -> Iterator[None]:
                     (out / SETTINGS).unlink(missing_ok=True)
                 raise
     except filelock.Timeout:
-        fix = "wait until it ends, or choose another --out"
-        raise ConfigError(f"{out}: another training is running there; {fix}.") from None
+        raise ConfigError(
+            f"{out}: another training is running there; wait until it ends, "
+            "or choose another --out."
+        ) from None
 
 
 def export(
@@ -375,16 +381,18 @@ def _check(
         raise ConfigError(f"seeds {list(seeds)}: give one or more, without duplicates.")
     begun = any((out / f"seed_{seed}" / CHECKPOINT).is_file() for seed in seeds)
     if begun and not resumed:
-        fix = "add --resume, or choose another --out."
-        raise ConfigError(f"{out}: contains checkpoints of these seeds; {fix}")
+        raise ConfigError(
+            f"{out}: contains checkpoints of these seeds; add --resume, or choose another --out."
+        )
     own_task = settings.task if is_code(settings.task) else None
     if (
         (out / SETTINGS).is_file()
         and not resumed
         and read_run_settings(out, own_task) != settings
     ):
-        fix = "choose another --out, or remove it."
-        raise ConfigError(f"{out}: contains a run with other settings; {fix}")
+        raise ConfigError(
+            f"{out}: contains a run with other settings; choose another --out, or remove it."
+        )
     if resumed and not begun:
         started = seeds_of(out)
         fix = f"name one of {started} with --seeds" if started else "leave out --resume"

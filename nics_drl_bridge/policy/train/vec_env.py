@@ -30,14 +30,18 @@ class TrainVecEnv(VecEnv):
                 env.metadata["autoreset_mode"] is not AutoresetMode.SAME_STEP
                 or not env.copy
             ):
-                needed = "autoreset_mode='SameStep', copy=True"
-                raise ConfigError(f"Stable-Baselines3 needs BridgeVectorEnv({needed}).")
+                raise ConfigError(
+                    "Stable-Baselines3 needs "
+                    "BridgeVectorEnv(autoreset_mode='SameStep', copy=True)."
+                )
         first = envs[0]
         spaces = [env.single_observation_space for env in envs]
         for space in spaces:
             if space != spaces[0]:
-                shown = f"{spaces[0]} and {space}; use the same robot, lidar and task."
-                raise ConfigError(f"the combined vector envs have the spaces {shown}")
+                raise ConfigError(
+                    f"the combined vector envs have the spaces {spaces[0]} and {space}; use the "
+                    "same robot, lidar and task."
+                )
         self.envs = envs
         edges = np.cumsum([0, *(env.num_envs for env in envs)])
         self._rows = [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
