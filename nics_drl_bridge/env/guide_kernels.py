@@ -15,7 +15,6 @@ from nics_drl_bridge.lidar.arrays import Array, Integers, Mask, Singles
 from nics_drl_bridge.lidar.exact_kernels import COS, RADIUS, SIN, OutlineArrays, X, Y
 from nics_drl_bridge.sim import collision_kernels as collision
 from nics_drl_bridge.sim import scene_kernels
-from nics_drl_bridge.sim.collision_kernels import Outline
 from nics_drl_bridge.sim.state import MapField
 
 # free space around the robot's circle above which a path is no longer tight [m]
@@ -113,23 +112,16 @@ def _lower_space(
     right = min(int((body[X] + far - x) / cell), space.shape[1] - 1)
     outline = collision.outline_of(body, grid.outlines)
     for i in range(first, last + 1):
-        centre_y = y + (i + 0.5) * cell
+        dy = y + (i + 0.5) * cell - body[Y]
         for j in range(left, right + 1):
-            centre_x = x + (j + 0.5) * cell
-            gap = np.float32(_measure_gap(centre_x, centre_y, body, outline))
-            space[i, j] = min(space[i, j], gap)
-
-
-@kernel
-def _measure_gap(x: float, y: float, body: Array, outline: Outline) -> float:
-    """Distance of a point from a body with an outline [m]."""
-    dx = x - body[X]
-    dy = y - body[Y]
-    if outline.begin < outline.end:
-        along = body[COS] * dx + body[SIN] * dy
-        across = body[COS] * dy - body[SIN] * dx
-        return collision.outline_point(along, across, outline)
-    return math.sqrt(dx * dx + dy * dy) - body[RADIUS]
+            dx = x + (j + 0.5) * cell - body[X]
+            if outline.begin < outline.end:
+                along = body[COS] * dx + body[SIN] * dy
+                across = body[COS] * dy - body[SIN] * dx
+                gap = collision.outline_point(along, across, outline)
+            else:
+                gap = math.sqrt(dx * dx + dy * dy) - body[RADIUS]
+            space[i, j] = min(space[i, j], np.float32(gap))
 
 
 @kernel

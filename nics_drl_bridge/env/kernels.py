@@ -90,27 +90,18 @@ def is_finite(values: Array | Singles) -> bool:
 @kernel(allocates=True)
 def look(shares: Singles, ranges: Singles, scale: ScanScale) -> bool:
     """Writes a scan (B,) as fractions (P,), 1 free, 0 too close; returns True for a contact."""
+    seen = ranges
     if scale.sectors > 0:
         resample(shares, ranges, scale.plan)
-        for s in range(len(shares)):
-            shares[s] = _scale_range(shares[s], scale)
-        return has_contact(ranges, scale)
-    hits = np.int32(0)
-    for b in range(len(ranges)):
-        is_hit = ranges[b] < scale.leaves[b]
-        hits = np.int32(hits | np.int32(is_hit))
-        shares[b] = _scale_range(ranges[b], scale)
-    return hits != 0 and has_contact(ranges, scale)
-
-
-@kernel(inline=True)
-def _scale_range(value: np.float32, scale: ScanScale) -> np.float32:
-    # NaN (unknown) compares False, so it becomes 0, as does -inf (too close).
-    share = value * scale.per_metre
-    share = share if share > np.float32(0.0) else np.float32(0.0)
-    # Compare as integers, which keeps the order: LLVM turns two float limits into masks.
-    bits = np.float32(share).view(np.int32)
-    return np.int32(min(bits, ONE)).view(np.float32)
+        seen = shares
+    for p in range(len(shares)):
+        # NaN (unknown) compares False, so it becomes 0, as does -inf (too close).
+        share = seen[p] * scale.per_metre
+        share = share if share > np.float32(0.0) else np.float32(0.0)
+        # Compare as integers, which keeps the order: LLVM turns two float limits into masks.
+        bits = np.float32(share).view(np.int32)
+        shares[p] = np.int32(min(bits, ONE)).view(np.float32)
+    return has_contact(ranges, scale)
 
 
 @kernel(allocates=True)

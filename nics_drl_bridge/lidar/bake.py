@@ -64,7 +64,7 @@ def bake(
         shapes,
         density,
         spec.angle_increment,
-        np.array(about, dtype=np.float64).reshape(-1, 3),
+        np.array(about, np.float64).reshape(-1, 3),
         (np.cumsum(sizes) - sizes).astype(np.int32),
         cells.astype(np.int16),
         np.zeros(int(sizes.sum()) + count_padding(spec.angle_increment), np.float32),

@@ -207,25 +207,6 @@ def _drop(
 
 
 @kernel(allocates=True)
-def slice_pose(out: Array, pose: Array, twist: Array, ago: float) -> None:
-    """Write the pose (3,) `ago` [s] earlier on the arc of a twist (3,); heading unwrapped."""
-    turn = -twist[2] * ago
-    half = 0.5 * turn
-    # The chord of the arc is rotated by half the turn: |chord| = arc * sin(half) / half.
-    if abs(half) < 1e-4:
-        chord = 1.0 - half * half / 6.0
-    else:
-        chord = math.sin(half) / half
-    c = math.cos(pose[2] + half)
-    s = math.sin(pose[2] + half)
-    x = -twist[0] * ago * chord
-    y = -twist[1] * ago * chord
-    out[0] = pose[0] + c * x - s * y
-    out[1] = pose[1] + s * x + c * y
-    out[2] = pose[2] + turn
-
-
-@kernel(allocates=True)
 def slice_poses(
     out: Array,
     pose: Array,
@@ -255,7 +236,21 @@ def slice_poses(
             if direction > AT_ONCE:
                 later = count - 1 - g
             ago = min(sweep * (later + 0.5) / count, moving)
-        slice_pose(out[g], pose, twist, ago)
+        # Back on the arc of the twist, whose chord is rotated by half the turn:
+        # |chord| = arc * sin(half) / half.
+        turn = -twist[2] * ago
+        half = 0.5 * turn
+        if abs(half) < 1e-4:
+            chord = 1.0 - half * half / 6.0
+        else:
+            chord = math.sin(half) / half
+        c = math.cos(pose[2] + half)
+        s = math.sin(pose[2] + half)
+        x = -twist[0] * ago * chord
+        y = -twist[1] * ago * chord
+        out[g, 0] = pose[0] + c * x - s * y
+        out[g, 1] = pose[1] + s * x + c * y
+        out[g, 2] = pose[2] + turn
 
 
 @kernel(allocates=True)

@@ -72,14 +72,14 @@ class GridMap:
     def world_to_cell(self, points: ArrayLike) -> Integers:
         """Return row and column (..., 2) of points (..., 2) x, y [m]; may be outside the map."""
         place = rotate(
-            np.asarray(points, dtype=np.float64) - self.origin[:2], -self.origin[2]
+            np.asarray(points, np.float64) - self.origin[:2], -self.origin[2]
         )
         return np.floor(place[..., ::-1] / self.resolution).astype(np.int64)
 
     def cell_to_world(self, cells: ArrayLike) -> Array:
         """Return the centres (..., 2) x, y [m] of cells (..., 2) row, column."""
         x, y, heading = self.origin
-        place = (np.asarray(cells, dtype=np.float64) + 0.5) * self.resolution
+        place = (np.asarray(cells, np.float64) + 0.5) * self.resolution
         c = np.cos(heading)
         s = np.sin(heading)
         across = place[..., 1]

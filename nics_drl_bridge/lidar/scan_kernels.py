@@ -143,7 +143,21 @@ def scan_robot(
     scan = scratch.scan
     for i in range(len(scan)):
         scan[i] = INF
-    fuse_bodies(pose, bodies, nearby, own_body, lidar, scratch)
+    count = 0
+    rows = lidar.table.rows
+    for k in nearby:
+        body = bodies[np.uintp(k)]
+        is_visible, is_looked_up = classify_body(body, pose, lidar)
+        if not is_visible or k == own_body:
+            continue
+        if not is_looked_up:
+            scan_body(scan, lidar.beams, pose, body, lidar.outlines)
+            continue
+        if count > MOST_FOUND - 2:
+            fuse_look_ups(scan, rows, scratch.found[:count])
+            count = 0
+        count = look_up_body(body, pose, lidar.beams, lidar.table, scratch.found, count)
+    fuse_look_ups(scan, rows, scratch.found[:count])
     scan_walls(scan, lidar.beams, pose, walls_of(n, fixtures), lidar.range_max)
     if fixtures.squares.size > 0:
         map_kernels.scan_map(
@@ -157,33 +171,6 @@ def scan_robot(
             scratch.integers,
         )
     finish(ranges, scan, lidar.range_min, lidar.range_max)
-
-
-@kernel
-def fuse_bodies(
-    pose: LidarPose,
-    bodies: Array,
-    nearby: ShortIntegers,
-    own_body: int,
-    lidar: LidarArrays,
-    scratch: ScanScratch,
-) -> None:
-    """Fuse the visible bodies (K, 7) of one world into a scan, see `scan_robot`."""
-    count = 0
-    rows = lidar.table.rows
-    for k in nearby:
-        body = bodies[np.uintp(k)]
-        is_visible, is_looked_up = classify_body(body, pose, lidar)
-        if not is_visible or k == own_body:
-            continue
-        if not is_looked_up:
-            scan_body(scratch.scan, lidar.beams, pose, body, lidar.outlines)
-            continue
-        if count > MOST_FOUND - 2:
-            fuse_look_ups(scratch.scan, rows, scratch.found[:count])
-            count = 0
-        count = look_up_body(body, pose, lidar.beams, lidar.table, scratch.found, count)
-    fuse_look_ups(scratch.scan, rows, scratch.found[:count])
 
 
 @kernel(contracts=True, inline=True)

@@ -176,8 +176,8 @@ class Scanner:
     def _check_scene(
         self, poses: ArrayLike, bodies: ArrayLike, walls: ArrayLike
     ) -> tuple[Array, ...]:
-        poses = np.atleast_2d(np.asarray(poses, dtype=np.float64))
-        bodies = np.asarray(bodies, dtype=np.float64)
+        poses = np.atleast_2d(np.asarray(poses, np.float64))
+        bodies = np.asarray(bodies, np.float64)
         if bodies.size == 0:
             bodies = np.zeros((len(poses), 0, BODY))
         elif bodies.ndim == 2:

@@ -238,7 +238,7 @@ def make_reader(
         )
     backwards = step < 0.0
     if backwards:
-        begin = begin + step * (beams - 1)
+        begin += step * (beams - 1)
         step = -step
     turn = 2.0 * np.pi
     if begin < -turn or begin + step * (beams - 1) > turn:

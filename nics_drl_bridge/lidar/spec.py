@@ -165,7 +165,7 @@ Ranges = Singles
 
 def to_device(ranges: ArrayLike, spec: LidarSpec) -> Ranges:
     """Convert ranges (..., B) to the device's convention; only `inf` is replaced."""
-    out = np.array(ranges, dtype=np.float32)
+    out = np.array(ranges, np.float32)
     if spec.no_return != "inf":
         out[out == np.inf] = _get_no_return(spec)
     return out
@@ -176,7 +176,7 @@ def from_device(values: ArrayLike, spec: LidarSpec) -> Ranges:
 
     A finite value below range_min is too close, unless it means no return: that is not free space.
     """
-    out = np.array(values, dtype=np.float32)
+    out = np.array(values, np.float32)
     if spec.no_return != "inf":
         no_return = _get_no_return(spec)
         if np.isnan(no_return):

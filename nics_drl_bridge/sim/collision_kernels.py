@@ -319,8 +319,8 @@ def wall_distance2(x: float, y: float, wall: Array) -> float:
 
 
 @kernel
-def on_wall(x: float, y: float, wall: Array) -> tuple[float, float]:
-    """Return the point of a straight wall nearest to a point."""
+def find_wall(x: float, y: float, wall: Array) -> tuple[float, float, float]:
+    """Return the vector to the nearest point of a straight wall, and its length squared."""
     ex = wall[2] - wall[0]
     ey = wall[3] - wall[1]
     length2 = ex * ex + ey * ey
@@ -328,7 +328,9 @@ def on_wall(x: float, y: float, wall: Array) -> tuple[float, float]:
     if length2 > 0.0:
         share = ((x - wall[0]) * ex + (y - wall[1]) * ey) / length2
         share = min(max(share, 0.0), 1.0)
-    return wall[0] + share * ex, wall[1] + share * ey
+    dx = wall[0] + share * ex - x
+    dy = wall[1] + share * ey - y
+    return dx, dy, dx * dx + dy * dy
 
 
 @kernel
@@ -536,8 +538,8 @@ def find_around(n: int, x: float, y: float, reach: float, cells: BodyCells) -> i
     per_metre = frame[PER_METRE]
     side = int(frame[SIDE])
     far = reach + frame[LARGEST] + frame[MOVED]
-    x = x - frame[LEFT]
-    y = y - frame[BOTTOM]
+    x -= frame[LEFT]
+    y -= frame[BOTTOM]
     left = _place(x - far, per_metre, side)
     right = _place(x + far, per_metre, side)
     high = _place(y + far, per_metre, side)

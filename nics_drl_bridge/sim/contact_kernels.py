@@ -406,10 +406,7 @@ def find_near(
     near[m, 0] = count
     meets = BODIES if count > 0 else FREE
     for w in range(len(walls)):
-        d2 = collision.segment_distance2(
-            x, y, walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3]
-        )
-        if d2 <= own_reach * own_reach:
+        if collision.wall_distance2(x, y, walls[w]) <= own_reach * own_reach:
             meets |= WALLS
             break
     if (

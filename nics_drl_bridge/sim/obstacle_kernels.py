@@ -24,7 +24,7 @@ from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.arrays import Array
 from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, X, Y
 from nics_drl_bridge.robot.kernels import wrap
-from nics_drl_bridge.sim.collision_kernels import in_grid, on_wall
+from nics_drl_bridge.sim.collision_kernels import find_wall, in_grid
 from nics_drl_bridge.sim.state import (
     PATROL,
     PEDESTRIAN,
@@ -176,20 +176,20 @@ def _follow(
     left = period
     for _ in range(MOST_CORNERS):
         pause = min(rest, left)
-        rest = rest - pause
-        left = left - pause
+        rest -= pause
+        left -= pause
         if left <= 0.0:
             break
         goal = waypoints[row.first + index]
         away = math.hypot(goal[0] - x, goal[1] - y)
         reach = mark.speed * left
         if away > reach:
-            x = x + (goal[0] - x) * reach / away
-            y = y + (goal[1] - y) * reach / away
+            x += (goal[0] - x) * reach / away
+            y += (goal[1] - y) * reach / away
             break
         x = goal[0]
         y = goal[1]
-        left = left - away / mark.speed
+        left -= away / mark.speed
         rest = row.pause
         if row.loop:
             index = (index + 1) % row.count
@@ -258,8 +258,8 @@ def _from_bodies(
         else:
             vx = traffic.speeds[j - first, 0]
             vy = traffic.speeds[j - first, 1]
-        vx = vx - marks[k].vx
-        vy = vy - marks[k].vy
+        vx -= marks[k].vx
+        vy -= marks[k].vy
         near = bodies[k, RADIUS] + bodies[j, RADIUS]
         far = near + FAR * row.range + math.sqrt(vx * vx + vy * vy) * row.foresight
         away2 = rx * rx + ry * ry
@@ -279,8 +279,8 @@ def _from_bodies(
         # Less (8) from outside the angle of sight of a walker that looks along e.
         seen = -(ex * fx + ey * fy) >= row.cos_view * math.sqrt(fx * fx + fy * fy)
         weight = 1.0 if seen else row.behind
-        ax = ax + weight * fx
-        ay = ay + weight * fy
+        ax += weight * fx
+        ay += weight * fy
     return ax, ay
 
 
@@ -297,23 +297,20 @@ def _from_walls(k: int, traffic: Traffic) -> tuple[float, float]:
     reach = row.wall_range
     far = radius + FAR * reach
     for w in range(len(walls)):
-        px, py = on_wall(x, y, walls[w])
-        ox = x - px
-        oy = y - py
-        away2 = ox * ox + oy * oy
+        ox, oy, away2 = find_wall(x, y, walls[w])
         if 0.0 < away2 < far * far:
             away = math.sqrt(away2)
             size = (
                 row.wall_repulsion / reach * math.exp(-max(away - radius, 0.0) / reach)
             )
-            ax = ax + size * ox / away
-            ay = ay + size * oy / away
+            ax -= size * ox / away
+            ay -= size * oy / away
     away = map_distance(x, y, traffic.grid)
     if away < far:
         nx, ny = map_direction(x, y, traffic.grid)
         size = row.wall_repulsion / reach * math.exp(-max(away - radius, 0.0) / reach)
-        ax = ax - size * nx
-        ay = ay - size * ny
+        ax -= size * nx
+        ay -= size * ny
     return ax, ay
 
 
@@ -409,8 +406,8 @@ def map_distance(x: float, y: float, grid: MapField) -> float:
     i = min(int(v), rows - 2)
     if distances[i, j] == np.inf:
         return np.inf
-    u = u - j
-    v = v - i
+    u -= j
+    v -= i
     low = distances[i, j] * (1.0 - u) + distances[i, j + 1] * u
     high = distances[i + 1, j] * (1.0 - u) + distances[i + 1, j + 1] * u
     return low * (1.0 - v) + high * v
@@ -436,10 +433,7 @@ def clearance(x: float, y: float, k: int, traffic: Traffic) -> float:
     field = traffic.field
     least = min(min(x - field[0], field[2] - x), min(y - field[1], field[3] - y))
     for w in range(len(walls)):
-        px, py = on_wall(x, y, walls[w])
-        ox = px - x
-        oy = py - y
-        away2 = ox * ox + oy * oy
+        ox, oy, away2 = find_wall(x, y, walls[w])
         if least > 0.0 and 0.0 < away2 < least * least:
             least = math.sqrt(away2)
     for j in range(len(bodies)):
@@ -537,10 +531,7 @@ def _hold_walls(
             dx, dy, 0.0, side, side * field[bound + 1] - radius - side * y, bend
         )
     for w in range(len(walls)):
-        px, py = on_wall(x, y, walls[w])
-        ox = px - x
-        oy = py - y
-        away2 = ox * ox + oy * oy
+        ox, oy, away2 = find_wall(x, y, walls[w])
         if 0.0 < away2 < reach * reach:
             away = math.sqrt(away2)
             dx, dy = _hold(dx, dy, ox / away, oy / away, away - radius, bend)

@@ -161,8 +161,8 @@ def place_in(row: float, column: float, cells: MapField) -> tuple[float, float]:
 def cell_of(x: float, y: float, cells: MapField) -> tuple[int, int, float]:
     """Return row and column of a point, and its distance from the centre of that cell [m]."""
     u, v = collision.in_grid(x, y, cells)
-    u = u / cells.cell
-    v = v / cells.cell
+    u /= cells.cell
+    v /= cells.cell
     i = math.floor(v)
     j = math.floor(u)
     return i, j, cells.cell * math.sqrt((u - j - 0.5) ** 2 + (v - i - 0.5) ** 2)

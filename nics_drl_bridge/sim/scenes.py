@@ -223,7 +223,7 @@ class SceneSampler:
             wanted = np.maximum(np.asarray(count, np.int64), 0)
         sizes = np.zeros(n, np.int64)
         if size is not None:
-            sizes = np.asarray(size, dtype=np.int64)
+            sizes = np.asarray(size, np.int64)
         if wanted.shape != (n,) or sizes.shape != (n,):
             raise ConfigError(
                 f"count {wanted.shape} and size {sizes.shape} must be ({n},)."
@@ -324,8 +324,8 @@ def _plan(
         outlines.arguments,
         outlines.radii,
         groups,
-        np.array(slots, dtype=np.int64),
-        np.array(choices, dtype=np.int64),
+        np.array(slots, np.int64),
+        np.array(choices, np.int64),
         np.arange(len(catalogue.shapes)).reshape(-1, max(len(catalogue.place), 1)),
         poses,
         _places(world.starts),

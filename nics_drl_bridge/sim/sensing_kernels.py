@@ -86,7 +86,7 @@ def measure_odometry(
     s = math.sin(heading)
     x = last[ODOM] + (c * ahead - s * left)
     y = last[ODOM + 1] + (s * ahead + c * left)
-    heading = heading + turn
+    heading += turn
     if noise_x != 0.0 or noise_y != 0.0 or noise_turn != 0.0:
         period = motion.dt * substeps
         c = math.cos(heading)

@@ -303,13 +303,13 @@ class FastSimulator:
             starts = starts(scenes)
         poses = scenes.starts
         if starts is not None:
-            poses = np.asarray(starts, dtype=np.float64)
+            poses = np.asarray(starts, np.float64)
         if len(scenes) != len(chosen) or poses.shape != scenes.starts.shape:
             raise ConfigError(
                 f"{len(scenes)} seeds and starts {poses.shape} do not fit {len(chosen)} worlds "
                 f"with {self.data.pose.shape[1]} robots each."
             )
-        self._place_scenes(chosen, np.asarray(seeds, dtype=np.int64), scenes, poses)
+        self._place_scenes(chosen, np.asarray(seeds, np.int64), scenes, poses)
         if draws is not None:
             self._apply_draws(chosen, draws)
         for part in self.parts:
@@ -537,7 +537,7 @@ class FastSimulator:
 
     def _check_commands(self, part: slice, commands: ArrayLike) -> Array:
         """Return commands (n, M, C) as an array; report those outside the range of the fit."""
-        checked = np.ascontiguousarray(commands, dtype=np.float64)
+        checked = np.ascontiguousarray(commands, np.float64)
         robots, _, width = self.data.history.shape[1:]
         expected = (part.stop - part.start, robots, width)
         if checked.shape != expected:

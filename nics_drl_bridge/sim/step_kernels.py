@@ -7,7 +7,7 @@
 3. `_move_world` takes that motion for robots that can meet nothing, and moves the obstacles. A
    robot that may meet something is moved carefully instead, from where it stood, see
    `contact_kernels`. All robots then drift.
-4. `_measure_world` measures the odometry.
+4. The bodies of the robots are put at their present poses, and their odometry is measured.
 5. Each robot scans, and its lidar's faults are applied, see `sensing_kernels`.
 
 `begin_episodes` resets worlds whose robots and obstacles are in place. `begin_period` and
@@ -162,15 +162,26 @@ def _step_part(part: Part, commands: Array, first_world: int) -> None:
     the part's arrays, which takes longer than the step.
     """
     data = part.data
+    motion = part.motion
+    single = part.scratch.single
+    frame = part.scratch.cells.frame
     robots = data.pose.shape[1]
     end_world = first_world + len(commands)
-    _queue_commands(data.history, commands, first_world, part.motion.terms.curves)
+    # The effects of the commands go in front of the earlier ones.
+    for i in range(len(commands)):
+        for m in range(robots):
+            queue = data.history[first_world + i, m]
+            for h in range(len(queue) - 1, 0, -1):
+                for c in range(commands.shape[2]):
+                    queue[h, c] = queue[h - 1, c]
+            for c in range(commands.shape[2]):
+                queue[0, c] = apply_curve(commands[i, m, c], motion.terms.curves[c])
     worlds_per_block = part.scratch.lanes.pose.shape[1] // robots
     for block_begin in range(first_world, end_world, worlds_per_block):
         block_end = min(block_begin + worlds_per_block, end_world)
         for n in range(block_begin, block_end):
             _begin_period_of_world(n, (n - block_begin) * robots, part)
-        move_freely(block_begin, block_end, data, part.motion, part.scratch.lanes)
+        move_freely(block_begin, block_end, data, motion, part.scratch.lanes)
         waiting_count = np.int64(0)
         first_to_distort = block_begin
         for n in range(block_begin, block_end):
@@ -178,7 +189,18 @@ def _step_part(part: Part, commands: Array, first_world: int) -> None:
             first_lane = (n - block_begin) * robots
             scene = get_surroundings(n, part.world_set)
             _move_world(n, first_lane, scene, part)
-            _measure_world(n, first_lane, scene, part)
+            for m in range(robots):
+                pose = data.pose[n, m]
+                start = part.scratch.scans.start_poses[first_lane + m]
+                contacts.put_body(data.bodies[n, data.velocity.shape[1] + m], pose)
+                compute_rates(n, m, motion.substeps - 1, data, motion, single)
+                sensing.measure_odometry(n, m, start, pose, single.dq, data, motion)
+                # The cells must know how far any body may be from where it was sorted.
+                if scene.crowded:
+                    dx = pose[0] - start[0]
+                    dy = pose[1] - start[1]
+                    moved = math.sqrt(dx * dx + dy * dy)
+                    frame[n, MOVED] = max(frame[n, MOVED], moved)
             waiting_count = sensing.scan_or_wait(n, waiting_count, part)
             is_last = n + 1 == block_end
             if is_last or (n + 1 - first_to_distort) * robots >= SCANNED_TOGETHER:
@@ -186,21 +208,6 @@ def _step_part(part: Part, commands: Array, first_world: int) -> None:
                 sensing.distort_scans(first_to_distort, n + 1, part)
                 waiting_count = np.int64(0)
                 first_to_distort = n + 1
-
-
-@kernel
-def _queue_commands(
-    history: Array, commands: Array, first_world: int, curves: Array
-) -> None:
-    """Put the effects of commands (n, M, C) in front of the earlier ones, history (N, M, H, C)."""
-    for i in range(len(commands)):
-        for m in range(commands.shape[1]):
-            queue = history[first_world + i, m]
-            for h in range(len(queue) - 1, 0, -1):
-                for c in range(commands.shape[2]):
-                    queue[h, c] = queue[h - 1, c]
-            for c in range(commands.shape[2]):
-                queue[0, c] = apply_curve(commands[i, m, c], curves[c])
 
 
 @kernel(inline=True)
@@ -233,27 +240,6 @@ def _begin_period_of_world(n: int, first_lane: int, part: Part) -> None:
     if part.world_set.moves:
         scene = get_surroundings(n, part.world_set)
         obstacles.steer(n, data, scene, part.motion.dt * part.motion.substeps, speeds)
-
-
-@kernel(inline=True)
-def _measure_world(n: int, first_lane: int, scene: Surroundings, part: Part) -> None:
-    """Put the robots' bodies at their present poses, and measure their odometry."""
-    data = part.data
-    motion = part.motion
-    single = part.scratch.single
-    frame = part.scratch.cells.frame
-    for m in range(data.pose.shape[1]):
-        pose = data.pose[n, m]
-        start = part.scratch.scans.start_poses[first_lane + m]
-        contacts.put_body(data.bodies[n, data.velocity.shape[1] + m], pose)
-        compute_rates(n, m, motion.substeps - 1, data, motion, single)
-        sensing.measure_odometry(n, m, start, pose, single.dq, data, motion)
-        # The cells must know how far any body may be from where it was sorted.
-        if scene.crowded:
-            dx = pose[0] - start[0]
-            dy = pose[1] - start[1]
-            moved = math.sqrt(dx * dx + dy * dy)
-            frame[n, MOVED] = max(frame[n, MOVED], moved)
 
 
 @kernel
@@ -514,36 +500,9 @@ def move_freely(
     The result is in the lanes: robot m of world n is in lane (n - first_world) M + m. The period is
     integrated from one change of a command to the next.
     """
-    _fill_lanes(first_world, end_world, data, motion, lanes)
-    terms = robot.replace_coefficients(motion.terms, lanes.coefficient)
-    lane_count = (end_world - first_world) * data.pose.shape[1]
-    substep = 0
-    while substep < motion.substeps:
-        next_change = _apply_commands(
-            substep, first_world, lane_count, data, motion, lanes
-        )
-        robot.run(
-            lanes.pose,
-            lanes.x,
-            lanes.dq,
-            terms,
-            motion.series,
-            motion.dt,
-            next_change - substep,
-        )
-        substep = next_change
-
-
-@kernel(inline=True)
-def _fill_lanes(
-    first_world: int,
-    end_world: int,
-    data: State,
-    motion: Dynamics,
-    lanes: Lanes,
-) -> None:
-    """Copy poses, states and coefficients of robots to the lanes; note when commands change."""
     robots = data.pose.shape[1]
+    substeps = motion.substeps
+    change = lanes.change
     pose = lanes.pose
     for n in range(first_world, end_world):
         for m in range(robots):
@@ -560,39 +519,34 @@ def _fill_lanes(
             for t in range(len(lanes.coefficient)):
                 lanes.coefficient[t, lane] = data.coefficient[n, m, t]
             # Each command changes once in a period, at this substep.
-            for c in range(len(lanes.change)):
+            for c in range(len(change)):
                 delay = data.delay[n, m] + motion.terms.late[c]
-                lanes.change[c, lane] = delay % motion.substeps
-
-
-@kernel(inline=True)
-def _apply_commands(
-    substep: int,
-    first_world: int,
-    lane_count: int,
-    data: State,
-    motion: Dynamics,
-    lanes: Lanes,
-) -> int:
-    """Put the commands that take effect at a substep into the lanes; return the next such substep.
-
-    If no command changes any more, that is the end of the period.
-    """
-    robots = data.pose.shape[1]
-    size = data.state.shape[2]
-    substeps = motion.substeps
-    change = lanes.change
-    next_change = substeps
-    for c in range(len(change)):
-        for lane in range(lane_count):
-            if change[c, lane] > substep:
-                next_change = min(next_change, change[c, lane])
-            if change[c, lane] == substep or substep == 0:
-                n = first_world + lane // robots
-                m = lane % robots
-                delay = data.delay[n, m] + motion.terms.late[c]
-                row = robot.find_delayed_command(
-                    substep, delay, substeps, data.history.shape[2]
-                )
-                lanes.x[size + c, lane] = data.history[n, m, row, c]
-    return next_change
+                change[c, lane] = delay % substeps
+    terms = robot.replace_coefficients(motion.terms, lanes.coefficient)
+    substep = 0
+    while substep < substeps:
+        # If no command changes any more, the next change is the end of the period.
+        next_change = substeps
+        for c in range(len(change)):
+            for lane in range((end_world - first_world) * robots):
+                if change[c, lane] > substep:
+                    next_change = min(next_change, change[c, lane])
+                if change[c, lane] == substep or substep == 0:
+                    n = first_world + lane // robots
+                    m = lane % robots
+                    delay = data.delay[n, m] + motion.terms.late[c]
+                    row = robot.find_delayed_command(
+                        substep, delay, substeps, data.history.shape[2]
+                    )
+                    command = data.history[n, m, row, c]
+                    lanes.x[data.state.shape[2] + c, lane] = command
+        robot.run(
+            pose,
+            lanes.x,
+            lanes.dq,
+            terms,
+            motion.series,
+            motion.dt,
+            next_change - substep,
+        )
+        substep = next_change

@@ -287,7 +287,7 @@ class World(Schema):
             x = self.size[0] / 2.0
             y = self.size[1] / 2.0
             sides = [(-x, -y, x, -y), (x, -y, x, y), (x, y, -x, y), (-x, y, -x, -y)]
-        return np.array([*sides, *self.walls], dtype=np.float64).reshape(-1, 4)
+        return np.array([*sides, *self.walls], np.float64).reshape(-1, 4)
 
 
 def plan_arrays(

@@ -243,8 +243,8 @@ def find_room(x: float, y: float, c: float, s: float, around: Situation) -> floa
         return away - outline.inner  # off the map
     u = middle + x * per_cell
     v = middle + y * per_cell
-    c = c * per_cell
-    s = s * per_cell
+    c *= per_cell
+    s *= per_cell
     least = seen.reach
     for d in range(len(discs)):
         px = discs[d, 0]

@@ -103,6 +103,7 @@ class Mppi:
             x,
             rate,
             np.zeros(3),
+            np.zeros(3),
             np.zeros(many),
             np.zeros(many),
             np.zeros(many, np.int64),

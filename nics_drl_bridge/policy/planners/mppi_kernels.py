@@ -80,6 +80,7 @@ class RollOuts(NamedTuple):
     x_single: Array  # (S + C + 1,) of one robot
     rate: Array  # (3 + S,)
     start: Array  # (3,)
+    reached: Array  # (3,) twist of the held command
     cost: Array  # (K,)
     way: Array  # (K,)
     # (K,) period of the contact or arrival; negative: neither
@@ -177,22 +178,20 @@ def fit_command(twist: Array, plant: Plant, lanes: RollOuts) -> None:
         for c in range(count):
             _settle(held, plant, lanes)
             rates(dq, x, terms)
-            r0 = twist[0] - dq[0]
-            r1 = twist[1] - dq[1]
-            r2 = twist[2] - dq[2]
-            b0 = dq[0]
-            b1 = dq[1]
-            b2 = dq[2]
+            for i in range(3):
+                lanes.reached[i] = dq[i]
             step = 1e-3 * (plant.high[c] - plant.low[c])
             held[c] += step
             _settle(held, plant, lanes)
             rates(dq, x, terms)
             held[c] -= step
-            g0 = (dq[0] - b0) / step
-            g1 = (dq[1] - b1) / step
-            g2 = (dq[2] - b2) / step
-            size = g0 * g0 + g1 * g1 + g2 * g2 + EASE
-            value = held[c] + (g0 * r0 + g1 * r1 + g2 * r2) / size
+            size = 0.0
+            gain = 0.0
+            for i in range(3):
+                slope = (dq[i] - lanes.reached[i]) / step
+                size += slope * slope
+                gain += slope * (twist[i] - lanes.reached[i])
+            value = held[c] + gain / (size + EASE)
             held[c] = min(max(value, plant.low[c]), plant.high[c])
     _settle(held, plant, lanes)
 

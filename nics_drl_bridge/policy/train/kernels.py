@@ -136,10 +136,24 @@ def compute_actor_gradients(
     loss = NONE
     parts = np.empty(raw.shape[1], np.float32)
     for i in range(n):
+        # The log density or log probability of the action, the entropy of all actions, and the
+        # deviations or log probabilities in the parts.
+        log_prob = mixed = NONE
         if log_std.size > 0:
-            log_prob, mixed = _compute_density(parts, raw[i], actions[i], log_std)
+            for j in range(len(parts)):
+                parts[j] = (actions[i, j] - raw[i, j]) * np.exp(-log_std[j])
+                density = np.float32(0.5) * parts[j] * parts[j] + log_std[j]
+                log_prob -= density + LOG_NORM
+                mixed += log_std[j] + np.float32(0.5) + LOG_NORM
         else:
-            log_prob, mixed = _compute_probability(parts, raw[i], int(actions[i, 0]))
+            greatest = raw[i].max()
+            total = NONE
+            for j in range(len(parts)):
+                total += np.exp(raw[i, j] - greatest)
+            for j in range(len(parts)):
+                parts[j] = raw[i, j] - greatest - np.log(total)
+                mixed -= np.exp(parts[j]) * parts[j]
+            log_prob = parts[int(actions[i, 0])]
         ratio = np.exp(log_prob - batch.log_probs[i])
         gain = (gains[i] - mean) * scale
         bounded = gain * min(max(ratio, ONE - clip), ONE + clip)
@@ -157,35 +171,3 @@ def compute_actor_gradients(
             out[i, int(actions[i, 0])] -= pull
     backward(net, batch.seen, out)
     return loss
-
-
-@kernel(allocates=True)
-def _compute_density(
-    parts: Singles,
-    raw: Singles,
-    action: Singles,
-    log_std: Singles,
-) -> tuple[np.float32, np.float32]:
-    """Returns an action's (C,) log density and the entropy; writes deviations (C,) to `parts`."""
-    log_prob = mixed = NONE
-    for j in range(len(raw)):
-        parts[j] = (action[j] - raw[j]) * np.exp(-log_std[j])
-        log_prob -= np.float32(0.5) * parts[j] * parts[j] + log_std[j] + LOG_NORM
-        mixed += log_std[j] + np.float32(0.5) + LOG_NORM
-    return log_prob, mixed
-
-
-@kernel(allocates=True)
-def _compute_probability(
-    parts: Singles, raw: Singles, action: int
-) -> tuple[np.float32, np.float32]:
-    """Returns an action's log probability and the entropy; writes probabilities (C,) to `parts`."""
-    greatest = raw.max()
-    total = NONE
-    mixed = NONE
-    for j in range(len(raw)):
-        total += np.exp(raw[j] - greatest)
-    for j in range(len(raw)):
-        parts[j] = raw[j] - greatest - np.log(total)
-        mixed -= np.exp(parts[j]) * parts[j]
-    return parts[action], mixed
