@@ -98,24 +98,6 @@ def check_reset(seed: Any, options: Any, worlds: int = 1) -> None:
         )
 
 
-def apply_options(
-    memory: dict[str, AnyArray], options: Mapping[str, Any] | None, *of_env: str
-) -> None:
-    """Writes values of `reset(options=...)` into all rows of the memory arrays they name.
-
-    Options in `of_env` belong to the env, even if the task's memory has an entry of that name.
-    """
-    for name, value in (options or {}).items():
-        if name in of_env:
-            continue
-        if name not in memory:
-            valid = {*memory, *of_env}
-            raise ConfigError(
-                f"unknown reset option {name!r}; {suggest(str(name), valid)}"
-            )
-        give(memory[name], name, value)
-
-
 def begin_task(
     task: Any,
     episodes: Any,
@@ -126,10 +108,17 @@ def begin_task(
 ) -> dict[str, AnyArray]:
     """Returns the memory of a Task in starting Episodes, with values of `reset(options=...)`.
 
-    Options in `of_env` belong to the env.
+    The values are written into all rows of the arrays that they name. Options in `of_env` belong to
+    the env, even if the task's memory has an entry of that name.
     """
     memory: dict[str, AnyArray] = task.start_episodes(episodes)
-    apply_options(memory, options, *of_env)
+    for name, value in (options or {}).items():
+        if name in of_env:
+            continue
+        if name not in memory:
+            hint = suggest(str(name), {*memory, *of_env})
+            raise ConfigError(f"unknown reset option {name!r}; {hint}")
+        give(memory[name], name, value)
     if options and "goal" in options:
         check_places("goal", memory["goal"], scenes, world)
     return memory

@@ -31,7 +31,18 @@ def make_task(
     Options are arguments of the class: `scan` as in `sectors.layout_of`, `sensors` as names.
     """
     if isinstance(task, Task):
-        _check_same(task, model, options)
+        name = type(task).__name__
+        if options:
+            raise ConfigError(
+                f"task {name} already exists; set {sorted(options)} when making it."
+            )
+        if task.robot != model.robot or task.lidar != model.lidar:
+            raise ConfigError(
+                f"task {name} is for the robot {task.robot.name!r} with {task.lidar.beams} beams, "
+                f"the model is {model.robot.name!r} with {model.lidar.beams}; make it with "
+                "model.robot and model.lidar."
+            )
+        task.check_observation_space()
         return task
     check_options("task_options", options)
     options = dict(options or {})
@@ -64,22 +75,6 @@ def make_task(
         ) from None
     made.check_observation_space()
     return made
-
-
-def _check_same(task: Task, model: SimulatorModel, options: Any) -> None:
-    """Raises ConfigError unless a task was made for a model's robot, without `options`."""
-    name = type(task).__name__
-    if options:
-        raise ConfigError(
-            f"task {name} already exists; set {sorted(options)} when making it."
-        )
-    if task.robot != model.robot or task.lidar != model.lidar:
-        raise ConfigError(
-            f"task {name} is for the robot {task.robot.name!r} with {task.lidar.beams} beams, the "
-            f"model is {model.robot.name!r} with {model.lidar.beams}; make it with model.robot and "
-            "model.lidar."
-        )
-    task.check_observation_space()
 
 
 def find_task_class(task: Any, options: dict[str, Any]) -> type[Task]:

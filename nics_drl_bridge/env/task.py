@@ -80,9 +80,7 @@ class Outcome:
         """Returns the outcome without rewards for robots that had `ended` before the step."""
         if not ended.any():
             return self
-        terms = {}
-        for name, term in self.terms.items():
-            terms[name] = np.where(ended, 0.0, term)
+        terms = {name: np.where(ended, 0.0, term) for name, term in self.terms.items()}
         return Outcome(terms, ended | self.ended, self.info)
 
 
@@ -197,13 +195,9 @@ class Task(ABC):
         low, high = self.command_limits
         kernels.scale_actions(out.reshape(rows.shape), rows, low, high)
         # Don't teach what a vehicle can't do: a car driven by turn rates can't steer at rest.
-        if self._takes_turn_rate:
+        if self.robot.takes_turn_rate:
             return self.robot.pass_through_cmd_vel(out)
         return out
-
-    @cached_property
-    def _takes_turn_rate(self) -> bool:
-        return self.robot.takes_turn_rate
 
     def drive(self, actions: ArrayLike, ended: Flags) -> Array:
         """Returns the checked commands (n, M, C) of actions; robots that have ended stand still."""
@@ -262,10 +256,11 @@ class Task(ABC):
                 f"memory {sorted(memory)}", f"must keep {sorted(kept)} from `reset`"
             )
         # Copy rebound arrays into the env's rows. Read all first, because they may alias.
-        rebound = {}
-        for name, rows in kept.items():
-            if memory[name] is not rows:
-                rebound[name] = np.array(memory[name])
+        rebound = {
+            name: np.array(memory[name])
+            for name, rows in kept.items()
+            if memory[name] is not rows
+        }
         for name, new in rebound.items():
             rows = memory[name] = kept[name]
             if new.shape != rows.shape or not np.can_cast(

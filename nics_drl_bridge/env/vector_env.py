@@ -17,7 +17,7 @@ from nics_drl_bridge.env import guard
 from nics_drl_bridge.env.bridge_env import RENDER_FPS, check_render_mode
 from nics_drl_bridge.env.kernels import compute_episode_seeds
 from nics_drl_bridge.env.registry import make_task
-from nics_drl_bridge.env.snapshot import Snapshot
+from nics_drl_bridge.env.snapshot import Snapshot, find_goals
 from nics_drl_bridge.env.task import (
     Episodes,
     Facts,
@@ -119,7 +119,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
         self._mode = MODES[mode]
         self.metadata = {**self.metadata, "autoreset_mode": self._mode}
         self.model = open_model(DEFAULT_ROBOT if model is None else model)
-        self.world = world if isinstance(world, AnyWorld) else load_worlds(world)
+        self.world = load_worlds(world)
         self.task = make_task(task, self.model, task_options)
         self.robots = self.task.robots
         self.single_observation_space = make_team_space(
@@ -301,11 +301,14 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
                 name: self._get_row(t).copy() for name, t in outcome.terms.items()
             },
         }
-        if self._mode is AutoresetMode.SAME_STEP:
-            self._end_at_once(out, over, facts, infos)
-        else:
+        if self._mode is AutoresetMode.NEXT_STEP:
             self._over = over
             self._tell(infos, facts, begun)
+        else:
+            if over.any():
+                infos |= self._get_final(flatten(out), over, facts)
+                run(lambda p: self._begin(p.start + np.flatnonzero(over[p]), out))
+            self._tell(infos, facts, over)
         self.ready = True
         return flatten(out), reward, terminated, truncated, infos
 
@@ -325,9 +328,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
             0.0,
         )
         self.simulator.step_part(part, command)
-        memory = {}
-        for name, rows in self.memory.items():
-            memory[name] = rows[part]
+        memory = {name: rows[part] for name, rows in self.memory.items()}
         outcome = self.task.take_step(out[part], before, self._make_view(part), memory)
         if self._teacher is not None:
             outcome = self._teacher.judge(part, outcome)
@@ -339,31 +340,19 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
         self._begin(part.start + np.flatnonzero(begun[part]), out)
         return outcome
 
-    def _end_at_once(
-        self,
-        out: Observation,
-        over: Flags,
-        facts: Info,
-        infos: Info,
-    ) -> None:
-        """Resets ended worlds in `SameStep`; `infos` gets their last observation and info."""
-        if over.any():
-            shown = np.full(self.num_envs, None, dtype=object)
-            # Only for ended worlds, because each needs its own object.
-            rows = flatten(out)
-            for n in np.flatnonzero(over):
-                shown[n] = rows[n].copy()
-            infos |= add_masks({"final_obs": shown}, over)
-            final = self._get_known() | facts
-            infos |= add_masks({"final_info": final}, over, True)
-            if self._teacher is not None:
-                success = facts.get("is_success", over)
-                success = success.reshape(self.num_envs, -1).all(axis=1)
-                repeats = self._teacher.find_repeats(over, success)
-                self._episode[repeats] -= 1
-            run = self.simulator.run_parts
-            run(lambda part: self._begin(part.start + np.flatnonzero(over[part]), out))
-        self._tell(infos, facts, over)
+    def _get_final(self, rows: Observation, over: Flags, facts: Info) -> Info:
+        """Returns the last observation and info of ended worlds; notes which of them repeat."""
+        shown = np.full(self.num_envs, None, dtype=object)
+        # Only for ended worlds, because each needs its own object.
+        for n in np.flatnonzero(over):
+            shown[n] = rows[n].copy()
+        if self._teacher is not None:
+            success = facts.get("is_success", over)
+            success = success.reshape(self.num_envs, -1).all(axis=1)
+            self._episode[self._teacher.find_repeats(over, success)] -= 1
+        final = self._get_known() | facts
+        final_info = add_masks({"final_info": final}, over, True)
+        return add_masks({"final_obs": shown}, over) | final_info
 
     def _tell(self, infos: Info, facts: Info, begun: Flags) -> None:
         infos |= add_masks(self._get_known(), np.ones_like(begun))
@@ -376,9 +365,9 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
     # Facts as arrays (N, ...) for worlds with one robot, or (N, M, ...) for teams.
 
     def _get_known(self) -> Info:
-        known = {}
-        for name in self.task.shown:
-            known[name] = self._get_row(self.memory[name]).copy()
+        known = {
+            name: self._get_row(self.memory[name]).copy() for name in self.task.shown
+        }
         known["pose"] = self._get_row(self.simulator.data.odom).copy()
         known["scan_age_s"] = np.zeros(self.num_envs)
         known["odom_age_s"] = np.zeros(self.num_envs)
@@ -424,14 +413,11 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
     def snapshot(self, n: int) -> Snapshot:
         """Returns the current state of world n for a picture; `step` does not change its arrays."""
         data = self.simulator.data
-        goals = np.zeros((0, 2))
-        if "goal" in self.memory:
-            goals = self.memory["goal"][n].reshape(-1, 2).copy()
         return Snapshot(
             data.pose[n].copy(),
             data.ranges[n].copy(),
             self.simulator.obstacles_of(np.array([n]))[0],
-            goals,
+            find_goals(self.memory, n),
             int(data.member[n]),
             int(data.steps[n]),
             data.odom[n].copy(),
@@ -447,12 +433,14 @@ def join_outcomes(parts: Sequence[Outcome]) -> Outcome:
     """Joins the outcomes of consecutive parts of the worlds."""
     if len(parts) == 1:
         return parts[0]
-    terms = {}
-    for name in parts[0].terms:
-        terms[name] = np.concatenate([part.terms[name] for part in parts])
-    info = {}
-    for name in parts[0].info:
-        info[name] = np.concatenate([part.info[name] for part in parts])
+    terms = {
+        name: np.concatenate([part.terms[name] for part in parts])
+        for name in parts[0].terms
+    }
+    info = {
+        name: np.concatenate([part.info[name] for part in parts])
+        for name in parts[0].info
+    }
     return Outcome(terms, np.concatenate([part.ended for part in parts]), info)
 
 

@@ -16,7 +16,8 @@ Mask = NDArray[np.bool_]
 
 def structure_of(record: type) -> np.dtype[Any]:
     """Return the structure for the kernels that has the fields of a class."""
-    fields = []
-    for name, kind in record.__annotations__.items():
-        fields.append((name, np.int64 if kind is int else kind))
+    fields = [
+        (name, np.int64 if kind is int else kind)
+        for name, kind in record.__annotations__.items()
+    ]
     return np.dtype(fields, align=True)

@@ -225,9 +225,9 @@ def scan_map(
         for j in range(LANES):
             k = np.uintp(j)
             # idle lanes repeat the last beam
-            i = np.uintp(min(first + j, count - 1))
-            across = np.float32(beams.directions[0, i])
-            ahead = np.float32(beams.directions[1, i])
+            beam = np.uintp(min(first + j, count - 1))
+            across = np.float32(beams.directions[0, beam])
+            ahead = np.float32(beams.directions[1, beam])
             du = cosine * across - sine * ahead
             dv = sine * across + cosine * ahead
             right = du > zero

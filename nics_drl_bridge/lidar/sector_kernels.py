@@ -39,18 +39,8 @@ def resample(out: Singles, ranges: Singles, plan: SectorPlan) -> None:
     """
     if plan.shift[0] != 0.0 or plan.shift[1] != 0.0:
         _fill_by_place(out, ranges, plan)
-    else:
-        _fill_by_beam(out, ranges, plan.first, plan.hits)
-
-
-@kernel(allocates=True)
-def _fill_by_beam(
-    out: Singles,
-    ranges: Singles,
-    first: ShortIntegers,
-    count: ShortIntegers,
-) -> None:
-    """Fill each sector from its own beams; as whole numbers, ranges have the same order."""
+        return
+    # Each sector from its own beams; as whole numbers, ranges have the same order.
     beams = len(ranges)
     whole = ranges.view(np.int32)
     nearest = out.view(np.int32)
@@ -60,9 +50,9 @@ def _fill_by_beam(
         known[b] = whole[b] if is_known else UNKNOWN
         known[beams + b] = known[b]
     for s in range(len(out)):
-        begin = np.uintp(first[s])
+        begin = np.uintp(plan.first[s])
         near = UNKNOWN
-        for b in range(count[s]):
+        for b in range(plan.hits[s]):
             near = min(near, known[begin + np.uintp(b)])
         nearest[s] = near
 

@@ -101,7 +101,13 @@ def shadow(
         raise RecordingError(
             f"{path}: no scan with matching odometry; see nics bag info."
         )
-    goals = _choose_goals(moments, goal, ahead_s)
+    if goal is None:
+        times = np.array([moment.stamp_ns for moment in moments]) * S_PER_NS
+        places = np.array([moment.view.pose[:2] for moment in moments])
+        later = [np.interp(times + ahead_s, times, place) for place in places.T]
+        goals = np.stack(later, axis=-1)
+    else:
+        goals = np.broadcast_to(np.asarray(goal, np.float64), (len(moments), 2))
     return _compare_moments(
         moments, goals, policy, replace(model, lidar=playback.lidar)
     )
@@ -142,18 +148,6 @@ def _hold(moments: list[_Moment], held: tuple[int, Array] | None) -> None:
     if moments and moments[-1].driven is None and held is not None:
         age_s = (moments[-1].receive_ns - held[0]) * S_PER_NS
         moments[-1].driven = held[1] if age_s <= HELD_S else None
-
-
-def _choose_goals(
-    moments: list[_Moment], goal: ArrayLike | None, ahead_s: float
-) -> Array:
-    if goal is not None:
-        return np.broadcast_to(np.asarray(goal, np.float64), (len(moments), 2))
-    times = np.array([moment.stamp_ns for moment in moments]) * S_PER_NS
-    places = np.array([moment.view.pose[:2] for moment in moments])
-    return np.stack(
-        [np.interp(times + ahead_s, times, place) for place in places.T], axis=-1
-    )
 
 
 def _compare_moments(

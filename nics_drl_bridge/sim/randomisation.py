@@ -294,11 +294,10 @@ class Sampler:
 
     def _name(self, model: SimulatorModel) -> Iterator[Label]:
         kept = zip(*np.nonzero(model.kinematics.coefficients), strict=True)
-        terms = []
-        for d, k in kept:
-            terms.append(
-                f"kinematics.{model.kinematics.dofs[d]}.{model.kinematics.term_names[k]}"
-            )
+        terms = [
+            f"kinematics.{model.kinematics.dofs[d]}.{model.kinematics.term_names[k]}"
+            for d, k in kept
+        ]
         noise = [name and f"odometry.{name}" for name in NOISE_NAMES]
         noise += [
             f"odometry.state_drift.{variable.name}" for variable in model.robot.state

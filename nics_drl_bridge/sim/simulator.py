@@ -23,7 +23,7 @@ from nics_drl_bridge.kernels import pack
 from nics_drl_bridge.lidar import scan_kernels
 from nics_drl_bridge.lidar.arrays import Array, Integers
 from nics_drl_bridge.lidar.bake import add_shapes
-from nics_drl_bridge.lidar.exact_kernels import SHAPE, OutlineArrays
+from nics_drl_bridge.lidar.exact_kernels import SHAPE
 from nics_drl_bridge.lidar.maps import GridMap, joined, stack_fixtures
 from nics_drl_bridge.lidar.scanner import Renderer, Scanner
 from nics_drl_bridge.lidar.sensor import Render, SensedWorlds, unread
@@ -44,7 +44,7 @@ from nics_drl_bridge.sim.randomisation import (
 )
 from nics_drl_bridge.sim.scenes import Scenes, SceneSampler
 from nics_drl_bridge.sim.state import POSE, TRUE_TWIST, WorldSetArrays
-from nics_drl_bridge.sim.world import Motion, World, plan_arrays
+from nics_drl_bridge.sim.world import Motion, plan_arrays
 from nics_drl_bridge.sim.world_set import AnyWorld
 from nics_drl_bridge.threads import run_parts
 
@@ -464,12 +464,27 @@ class FastSimulator:
 
     @cached_property
     def _world_set(self) -> WorldSetArrays:
-        return stack_members(
-            self.world.members,
-            self.sampler.motions,
+        """The surroundings of the members of the world set, stacked."""
+        members = self.world.members
+        motions = self.sampler.motions
+        crowded = self._sizes.crowded
+        grids = _share_equal_maps([world.grid for world in members])
+        distances, places = joined([map_field(grid).distances for grid in grids])
+        moves = any(motion is not None for group in motions for motion in group)
+        standing = not (crowded or moves) and self.sampler.count >= STANDING
+        plans, waypoints = _stack_plans(motions if moves else [() for _ in members])
+        walls = [world.all_walls() for world in members]
+        return WorldSetArrays(
+            stack_fixtures(walls, grids, self.data.member),
+            distances,
+            places,
             self._scanner.table.outlines.arguments,
-            self._sizes,
-            self.data.member,
+            crowded,
+            standing,
+            moves,
+            plans,
+            waypoints,
+            np.array([world.extent for world in members]),
         )
 
     @cached_property
@@ -656,42 +671,6 @@ def allocate_state(model: SimulatorModel, sizes: Sizes) -> records.State:
         velocity=np.zeros((sizes.worlds, sizes.obstacles, 3)),
         past=np.zeros(past),
         marks=np.zeros((sizes.worlds, sizes.obstacles), records.MARK),
-    )
-
-
-def stack_members(
-    worlds: Sequence[World],
-    motions: Sequence[Sequence[Motion | None]],
-    outlines: OutlineArrays,
-    sizes: Sizes,
-    member: Integers,
-) -> WorldSetArrays:
-    """Stack the surroundings of the members of a world set.
-
-    Args:
-        worlds: the P members.
-        motions: (P, K) of their obstacles.
-        outlines: of all shapes.
-        sizes: of the simulation.
-        member: (N,) the member that each world is a copy of; it changes as episodes begin.
-    """
-    grids = _share_equal_maps([world.grid for world in worlds])
-    distances, map_places = joined([map_field(grid).distances for grid in grids])
-    moves = any(motion is not None for group in motions for motion in group)
-    standing = not (sizes.crowded or moves) and sizes.obstacles >= STANDING
-    plans, waypoints = _stack_plans(motions if moves else [() for _ in worlds])
-    bounds = np.array([world.extent for world in worlds])
-    return WorldSetArrays(
-        stack_fixtures([world.all_walls() for world in worlds], grids, member),
-        distances,
-        map_places,
-        outlines,
-        sizes.crowded,
-        standing,
-        moves,
-        plans,
-        waypoints,
-        bounds,
     )
 
 

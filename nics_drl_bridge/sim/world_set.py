@@ -134,14 +134,16 @@ class WorldSet:
 AnyWorld: TypeAlias = World | WorldSet
 
 
-def load_worlds(name: str | Path | Sequence[str | Path]) -> AnyWorld:
-    """Load a world or a world set.
+def load_worlds(name: AnyWorld | str | Path | Sequence[str | Path]) -> AnyWorld:
+    """Load a world or a world set, unless it is given itself.
 
     A world is given by the name of a shipped one (`arena`, `barn/7`) or the path of a YAML file; a
     set by the name of a shipped one (`cellular`; `barn`, see `sim.barn`), a list of worlds,
     a folder, a glob (`worlds/*.yaml`), or a YAML file with the key `worlds` or `generate`. Raises
     ConfigError for a missing or wrong file, naming the member that failed.
     """
+    if isinstance(name, AnyWorld):
+        return name
     if not isinstance(name, str | Path):
         several = isinstance(name, list | tuple)
         if not several or not all(isinstance(member, str | Path) for member in name):

@@ -142,21 +142,10 @@ def make_train_env(
     margin = settings.teaching.margin
     if margin:
         model = replace(model, robot=model.robot.grow_footprint(margin))
-    envs = [
-        BridgeVectorEnv(
-            count,
-            model,
-            worlds[world],
-            settings.task,
-            settings.task_options,
-            settings.max_episode_steps,
-            "SameStep",
-            randomisation=settings.randomisation,
-        )
-        for world, count in settings.worlds.items()
-    ]
-    for env in envs:
-        env.teach(settings.teaching)
+    envs = []
+    for world, count in settings.worlds.items():
+        envs.append(_make_env(model, worlds[world], settings, count, "SameStep"))
+        envs[-1].teach(settings.teaching)
     return TrainVecEnv(*envs)
 
 
@@ -169,7 +158,9 @@ def _restore(
     try:
         for part in parts:
             part.restore(content["state"])
-        checkpoints.restore_envs(content, env)
+        for worlds, state in zip(env.envs, content["envs"], strict=True):
+            arrays = {name: value.numpy() for name, value in state.items()}
+            checkpoints.restore(worlds, arrays)
     except (
         AttributeError,
         IndexError,
@@ -233,16 +224,21 @@ def _stop_of(model: SimulatorModel, worlds: Worlds, settings: TrainingSettings) 
 
 
 def _make_env(
-    model: SimulatorModel, world: AnyWorld, settings: TrainingSettings, episodes: int
+    model: SimulatorModel,
+    world: AnyWorld,
+    settings: TrainingSettings,
+    count: int,
+    mode: str = "NextStep",
 ) -> BridgeVectorEnv:
-    """Makes copies of a world for an evaluation, one per episode, without teaching."""
+    """Makes copies of a world without teaching; for an evaluation, one per episode."""
     return BridgeVectorEnv(
-        episodes,
+        count,
         model,
         world,
         settings.task,
         settings.task_options,
         settings.max_episode_steps,
+        mode,
         randomisation=settings.randomisation,
     )
 

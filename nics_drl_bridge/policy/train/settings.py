@@ -354,29 +354,19 @@ def fit_settings(settings: TrainingSettings, opened: Opened, inherited: bool) ->
             f"{pace.far:g} m at {pace.speed:g} m/s"
         )
         if inherited and pace.steps > defaults.EPISODE_STEPS:
-            changed |= _stretch(
-                settings, options, pace.steps / defaults.EPISODE_STEPS, notes
-            )
+            # The episodes are so many times as long as those of the other robot.
+            factor = pace.steps / defaults.EPISODE_STEPS
+            reward = options.get("time_reward")
+            if reward:
+                options["time_reward"] = round(reward / factor, 6)
+                notes.append(f"time_reward {options['time_reward']:g}, was {reward:g}")
+            name = settings.algorithm
+            learner = settings.ppo if name == "ppo" else settings.sac
+            discount = round(1.0 - (1.0 - learner.discount) / factor, 6)
+            notes.append(f"{name}.discount {discount:g}, was {learner.discount:g}")
+            changed[name] = learner.model_copy(update={"discount": discount})
     made = settings.model_copy(update={**changed, "task_options": options})
     short = pace.shortfall(made.max_episode_steps)
     if short is not None:
         notes.append(short)
     return Fitted(made, tuple(notes), opened)
-
-
-def _stretch(
-    settings: TrainingSettings,
-    options: dict[str, Any],
-    factor: float,
-    notes: list[str],
-) -> dict[str, Any]:
-    """Returns the settings to change for episodes `factor` times as long; updates `options`."""
-    reward = options.get("time_reward")
-    if reward:
-        options["time_reward"] = round(reward / factor, 6)
-        notes.append(f"time_reward {options['time_reward']:g}, was {reward:g}")
-    name = settings.algorithm
-    learner = settings.ppo if name == "ppo" else settings.sac
-    discount = round(1.0 - (1.0 - learner.discount) / factor, 6)
-    notes.append(f"{name}.discount {discount:g}, was {learner.discount:g}")
-    return {name: learner.model_copy(update={"discount": discount})}
