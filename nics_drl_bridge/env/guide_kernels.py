@@ -38,7 +38,7 @@ class GuideGrid(NamedTuple):
     outer: float
 
 
-@kernel(allocates=True)
+@kernel
 def sample_walls(out: Singles, extent: Array, cell: float, cells: MapField) -> None:
     """Write the distances of `cells` to walls and map for coarser cells (rows, columns).
 
@@ -191,7 +191,7 @@ def update_ways(ways: Singles, prices: Singles, down: bool, left: bool) -> np.fl
     return most
 
 
-@kernel(allocates=True)
+@kernel
 def measure_lengths(
     out: Array,
     poses: Array,

@@ -60,14 +60,14 @@ class NavigationStep(NamedTuple):
     rules: Any  # NavigationRules, packed
 
 
-@kernel(allocates=True)
+@kernel
 def compute_episode_seeds(seeds: Integers, numbers: Integers, out: Integers) -> None:
     """Computes seeds (n,) of episodes from their numbers (n,) and their envs' seeds (n,)."""
     for i in range(len(seeds)):
         out[i] = episode_seed(seeds[i], numbers[i])
 
 
-@kernel(allocates=True)
+@kernel
 def scale_actions(out: Array, actions: Singles, low: Array, high: Array) -> None:
     """Scales actions (R, C), clamped to [-1, 1], to commands (R, C) between their limits (C,)."""
     for i in range(len(out)):
@@ -77,7 +77,7 @@ def scale_actions(out: Array, actions: Singles, low: Array, high: Array) -> None
             out[i, c] = low[c] + share * (high[c] - low[c])
 
 
-@kernel(allocates=True)
+@kernel
 def is_finite(values: Array | Singles) -> bool:
     """Returns True if all values (R, C) are finite."""
     for i in range(len(values)):
@@ -104,7 +104,7 @@ def look(shares: Singles, ranges: Singles, scale: ScanScale) -> bool:
     return has_contact(ranges, scale)
 
 
-@kernel(allocates=True)
+@kernel
 def has_contact(ranges: Singles, scale: ScanScale) -> bool:
     """Returns True if a beam of a scan (B,) and its neighbours' mean end within the footprint.
 
@@ -155,7 +155,7 @@ def looks(
         touched[i] = look(shares[i], ranges[i], packed.content)
 
 
-@kernel(allocates=True)
+@kernel
 def find_bearing(dx: float, dy: float, heading: float) -> tuple[float, float, float]:
     """Returns the distance [m] to a point at (dx, dy), and cosine and sine of its bearing."""
     distance = math.sqrt(dx * dx + dy * dy)
@@ -232,7 +232,7 @@ def navigate_in_place(packed: Any, before: Array, goals: Array) -> None:
     )
 
 
-@kernel(allocates=True)
+@kernel
 def find_bearings(out: Array, ways: Array, headings: Array) -> None:
     """Writes `find_bearing` (R, 3) of points at displacements `ways` (R, 2) from headings (R,)."""
     for r in range(len(out)):

@@ -17,7 +17,7 @@ from nics_drl_bridge.lidar.exact_kernels import (
 EDGE = 1e-6  # ranges at an edge are taken this far inside it, as a fraction of the whole width
 
 
-@kernel(allocates=True)
+@kernel
 def find_edges(
     hull: Array,
     radius: float,

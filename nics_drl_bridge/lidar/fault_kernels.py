@@ -45,7 +45,7 @@ class Distortion(NamedTuple):
     last: np.float32
 
 
-@kernel(allocates=True)
+@kernel
 def distort(
     ranges: Singles,
     limits: Array | tuple[float, float],
@@ -115,7 +115,7 @@ def _prepare_device(limits: tuple[float, float], faults: Array) -> Distortion:
     )
 
 
-@kernel(allocates=True)
+@kernel
 def _add_ghosts(ranges: Singles, device: Distortion, by: int) -> None:
     whole = ranges.view(np.int32)
     for i in range(len(ranges)):
@@ -126,7 +126,7 @@ def _add_ghosts(ranges: Singles, device: Distortion, by: int) -> None:
         whole[i] = max(whole[i], value if whole[i] == MINUS_INF else NONE)
 
 
-@kernel(allocates=True)
+@kernel
 def _close(ranges: Singles, close: np.float32) -> None:
     whole = ranges.view(np.int32)
     value = np.float32(close).view(np.int32)
@@ -134,7 +134,7 @@ def _close(ranges: Singles, close: np.float32) -> None:
         whole[i] = max(whole[i], value if whole[i] == MINUS_INF else NONE)
 
 
-@kernel(allocates=True, inline=True)
+@kernel(inline=True)
 def _add_noise(ranges: Singles, device: Distortion, by: int, coarse: bool) -> None:
     runs = len(ranges) // random.RUN
     for k in range(runs):
@@ -190,7 +190,7 @@ def _limit(value: np.float32, device: Distortion) -> np.float32:
     return device.most if value > device.most else value
 
 
-@kernel(allocates=True)
+@kernel
 def _drop(
     ranges: Singles,
     share: float | np.float32,
@@ -206,7 +206,7 @@ def _drop(
         whole[i] = max(whole[i], INF if lost else NONE)
 
 
-@kernel(allocates=True)
+@kernel
 def slice_poses(
     out: Array,
     pose: Array,
@@ -253,7 +253,7 @@ def slice_poses(
         out[g, 2] = pose[2] + turn
 
 
-@kernel(allocates=True)
+@kernel
 def distort_worlds(
     ranges: Singles,
     chosen: Integers,

@@ -93,7 +93,7 @@ def _fill_by_place(out: Singles, ranges: Singles, plan: SectorPlan) -> None:
                 out[s] = _choose_nearer(out[s], near)
 
 
-@kernel(allocates=True)
+@kernel
 def _locate_return(
     r: np.float32, direction: Array, plan: SectorPlan
 ) -> tuple[int, np.float32]:
@@ -112,6 +112,6 @@ def _locate_return(
     return s, np.float32(math.sqrt(x * x + y * y))
 
 
-@kernel(allocates=True)
+@kernel
 def _choose_nearer(first: np.float32, second: np.float32) -> np.float32:
     return first if first <= second else second

@@ -120,12 +120,11 @@ def steer(
     velocity = data.velocity[n]
     seed = data.seeds[n]
     step = data.steps[n]
-    movers = scene.movers
     count = len(velocity)
-    plans = movers.plans
+    plans = scene.plans
     bodies = data.bodies[n]
     traffic = Traffic(
-        bodies, count, speeds, plans, scene.walls, movers.bounds, scene.grid, period
+        bodies, count, speeds, plans, scene.walls, scene.bounds, scene.grid, period
     )
     draws = (step + 1) * MOST
     # walkers first: they react to the velocities of the last period
@@ -144,12 +143,12 @@ def steer(
         dx = velocity[k, 0] * period
         dy = velocity[k, 1] * period
         if kind == PATROL:
-            dx, dy = _follow(mark, body, plans[k], movers.waypoints, period, False)
+            dx, dy = _follow(mark, body, plans[k], scene.waypoints, period, False)
         wished_x = dx
         wished_y = dy
         dx, dy = restrain(dx, dy, k, traffic, kind != PATROL)
         if kind == PATROL and dx == wished_x and dy == wished_y:
-            _follow(mark, body, plans[k], movers.waypoints, period, True)
+            _follow(mark, body, plans[k], scene.waypoints, period, True)
         mark.vx = dx / period
         mark.vy = dy / period
         velocity[k, 0], velocity[k, 1] = mark.vx, mark.vy

@@ -151,15 +151,6 @@ class MapField(NamedTuple):
 NO_FIELD = MapField(np.zeros((0, 0), np.float32), 0.0, 0.0, 1.0, 0.0, 1.0)
 
 
-class Movers(NamedTuple):
-    """Motion of the obstacles of one world."""
-
-    moves: bool  # True if an obstacle of any member moves
-    plans: Records  # (K,) of `PLAN`
-    waypoints: Array  # (Q, 2) of all patrols [m]
-    bounds: Array  # (4,) minimum x, y and maximum x, y that obstacles stay in [m]
-
-
 class Surroundings(NamedTuple):
     """Everything that stands in one world, and how its bodies are searched."""
 
@@ -168,7 +159,9 @@ class Surroundings(NamedTuple):
     outlines: OutlineArrays
     crowded: bool  # True if all bodies are sorted into cells in each period
     standing: bool  # True if the obstacles are put in the order of cells: none may get a velocity
-    movers: Movers
+    plans: Records  # (K,) of `PLAN`, the motions of the obstacles
+    waypoints: Array  # (Q, 2) of all patrols [m]
+    bounds: Array  # (4,) minimum x, y and maximum x, y that obstacles stay in [m]
 
 
 class WorldSetArrays(NamedTuple):
@@ -186,7 +179,7 @@ class WorldSetArrays(NamedTuple):
     moves: bool  # True if an obstacle of any member moves
     plans: Records  # (P, K) of `PLAN`
     waypoints: Array  # (Q, 2) of all patrols of all members [m]
-    bounds: Array  # (P, 4) as in `Movers`
+    bounds: Array  # (P, 4) as in `Surroundings`
 
 
 class Dynamics(NamedTuple):

@@ -60,7 +60,6 @@ from nics_drl_bridge.sim.state import (
     Integers,
     Lanes,
     MapField,
-    Movers,
     Part,
     Single,
     State,
@@ -88,7 +87,7 @@ def begin_episodes(packed: Any, chosen: Integers) -> None:
         part.scratch.scans.waiting[i] = n
         scene = get_surroundings(n, part.world_set)
         if part.world_set.moves:
-            obstacles.reset_marks(n, part.data, scene.movers.plans)
+            obstacles.reset_marks(n, part.data, scene.plans)
         _sort_bodies(n, scene, part)
     sensing.scan_together(len(chosen), part)
     for n in chosen:
@@ -256,24 +255,20 @@ def _sort_bodies(n: int, scene: Surroundings, part: Part) -> None:
 
 @kernel(view=True)
 def get_surroundings(n: int, world_set: WorldSetArrays) -> Surroundings:
-    """Return the walls, map and movers of world n: those of the world of the set that it copies."""
+    """Return the walls, map and motions of world n: those of the member that it copies."""
     member = world_set.fixtures.member[n]
     frame = world_set.fixtures.frames[member]
     distances = cells_of(world_set.distances, world_set.map_places[member])
     grid = MapField(distances, frame[0], frame[1], frame[2], frame[3], frame[4])
-    movers = Movers(
-        world_set.moves,
-        world_set.plans[member],
-        world_set.waypoints,
-        world_set.bounds[member],
-    )
     return Surroundings(
         walls_of(n, world_set.fixtures),
         grid,
         world_set.outlines,
         world_set.crowded,
         world_set.standing,
-        movers,
+        world_set.plans[member],
+        world_set.waypoints,
+        world_set.bounds[member],
     )
 
 

@@ -9,7 +9,6 @@ from nics_drl_bridge.lidar.arrays import Integers
 from nics_drl_bridge.policy.planners import local_map_kernels as maps
 from nics_drl_bridge.policy.planners.local_map_kernels import (
     ARRIVED_M,
-    MapMaker,
     Situation,
     find_room,
     find_way,
@@ -42,7 +41,7 @@ class LookAhead(NamedTuple):
     far: float  # distance along an axis beyond which the map is unknown [m]
 
 
-@kernel(allocates=True)
+@kernel
 def choose_twists(
     out: Integers,
     scans: Array,
@@ -50,7 +49,7 @@ def choose_twists(
     twists: Array,
     candidates: Array,
     ahead: LookAhead,
-    maker: MapMaker,
+    around: Situation,
 ) -> None:
     """Writes the index of the cheapest candidate (K, 3) for each of N robots into out (N,).
 
@@ -58,7 +57,7 @@ def choose_twists(
     """
     brakes = ahead.slowness > 0.0
     for n in range(len(out)):
-        around = maps.map_scan(scans[n], goals[n], maker)
+        maps.map_scan(scans[n], goals[n], around)
         twist = twists[n]
         # If braking takes time, a robot that could no longer stop one period later must stop now.
         late = brakes and math.hypot(twist[0], twist[1]) > MOVING

@@ -60,33 +60,25 @@ class Clearance(NamedTuple):
 
 
 class Situation(NamedTuple):
-    """The map, the goal, and the robot that has to keep clear of obstacles."""
-
-    map: LocalMap
-    goal: Array  # (2,) [m]
-    outline: FootprintDiscs
-    clearance: Clearance
-
-
-class MapMaker(NamedTuple):
-    """What makes the map of a robot, with scratch memory for one map at a time."""
+    """A robot that has to keep clear of obstacles, its goal, and the map of its latest scan."""
 
     rays: ScanRays
     outline: FootprintDiscs
     clearance: Clearance
     map: LocalMap
+    goal: Array  # (2,) in `base_link` [m]
     hits: Array  # (P, 2) [m]
     prices: Singles  # like `LocalMap.ways`
 
 
-@kernel(allocates=True)
-def map_scan(shares: Array, goal: Array, maker: MapMaker) -> Situation:
+@kernel
+def map_scan(shares: Array, goal: Array, around: Situation) -> None:
     """Maps a scan of range fractions (P,) around a robot whose goal (2,) is in `base_link` [m]."""
-    count = find_hits(maker.hits, shares, maker.rays)
-    measure_distances(maker.map, maker.hits[:count])
-    around = Situation(maker.map, goal, maker.outline, maker.clearance)
-    find_ways(around, maker.prices)
-    return around
+    around.goal[0] = goal[0]
+    around.goal[1] = goal[1]
+    count = find_hits(around.hits, shares, around.rays)
+    measure_distances(around.map, around.hits[:count])
+    find_ways(around)
 
 
 @kernel
@@ -178,8 +170,8 @@ def interpolate_inside(
 
 
 @kernel
-def find_ways(around: Situation, prices: Singles) -> None:
-    """Writes a map's path lengths to the goal; prices (G / COARSE, G / COARSE) are scratch.
+def find_ways(around: Situation) -> None:
+    """Writes a map's path lengths to the goal.
 
     Solves the eikonal equation by fast sweeping (Zhao 2005). Beyond the map, paths are straight.
     """
@@ -199,7 +191,7 @@ def find_ways(around: Situation, prices: Singles) -> None:
             away = interpolate(seen.distances, seen.cell, x, y, seen.reach)
             near = min(max((blocked + soft - away) / soft, 0.0), 1.0)
             price = BLOCKED if away < blocked else 1.0 + NEAR * near * near
-            prices[i, j] = price * side
+            around.prices[i, j] = price * side
             edge = i == 0 or j == 0 or i == size - 1 or j == size - 1
             gap = math.hypot(goal[0] - x, goal[1] - y)
             is_start = gap < 1.5 * side if inside else edge
@@ -207,7 +199,7 @@ def find_ways(around: Situation, prices: Singles) -> None:
     for _ in range(ROUNDS):
         most = np.float32(0.0)
         for turn in range(4):
-            most = max(most, update_ways(ways, prices, turn & 1, turn >> 1))
+            most = max(most, update_ways(ways, around.prices, turn & 1, turn >> 1))
         if most < SETTLED_M:
             break
 

@@ -14,7 +14,6 @@ from nics_drl_bridge.lidar.arrays import Integers, Mask
 from nics_drl_bridge.policy.planners import local_map_kernels as maps
 from nics_drl_bridge.policy.planners.local_map_kernels import (
     ARRIVED_M,
-    MapMaker,
     Situation,
     find_room,
     find_way,
@@ -87,7 +86,7 @@ class RollOuts(NamedTuple):
     ended: Integers
 
 
-@kernel(allocates=True)
+@kernel
 def draw(offers: Array, noise: Array, rest: Array, seed: int) -> None:
     """Draws `Sampling.offers`, the first of them rest (C,), and `Sampling.noise`, by seed."""
     for k in range(len(offers)):
@@ -105,13 +104,13 @@ def draw(offers: Array, noise: Array, rest: Array, seed: int) -> None:
                 noise[k, q, c] = normal(seed, PLANNER_STREAM, 3 * i + 1)
 
 
-@kernel(allocates=True)
+@kernel
 def plan_all(
     out: Array,
     scans: Array,
     goals: Array,
     twists: Array,
-    maker: MapMaker,
+    around: Situation,
     plant: Plant,
     sampling: Sampling,
     lanes: RollOuts,
@@ -123,7 +122,7 @@ def plan_all(
     actions depend only on the observation.
     """
     for n in range(len(out)):
-        around = maps.map_scan(scans[n], goals[n], maker)
+        maps.map_scan(scans[n], goals[n], around)
         # pose and state when the first command takes effect
         fit_command(twists[n], plant, lanes)
         lanes.start[:] = 0.0
