@@ -29,7 +29,7 @@ from nics_drl_bridge.env.task import (
 from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import Backend, RobotView, Start
-from nics_drl_bridge.lidar.arrays import AnyArray, Mask, Singles
+from nics_drl_bridge.lidar.arrays import AnyArray, Singles
 from nics_drl_bridge.lidar.sensor import unread
 from nics_drl_bridge.random_kernels import episode_seed
 from nics_drl_bridge.robot import DEFAULT_ROBOT
@@ -137,7 +137,7 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
         self.action_space = make_team_space(self.task.action_space, self.robots)
         self.memory: Memory = {}
         self.scene: Scene | None = None
-        self.ended: Mask = np.zeros(self.robots, np.bool_)
+        self.ended = np.zeros(self.robots, np.bool_)
         self._view: RobotView | None = None  # always a batch of one, which tasks expect
         self._shape = (1, self.robots, self.task.observation_space.shape[0])
         self._row: Any = (0, 0) if self.robots == 1 else 0
@@ -164,7 +164,7 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
                 if value is not None:
                     options[name] = value
             backend = make_backend(backend, self.model, self.world, **options)
-        self._backend: Backend = complete_backend(backend, self._get_row(self._rest))
+        self._backend = complete_backend(backend, self._get_row(self._rest))
 
     @refuse_after_close
     @stop_on_error

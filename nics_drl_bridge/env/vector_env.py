@@ -142,14 +142,14 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
         count = self.num_envs
         robots = self.robots
         parts = self.task.observation_space.shape[0]
-        self._out: Observation = np.zeros((count, robots, parts), np.float32)
-        self._reward: Array = np.zeros((count, robots))
-        self.ended: Flags = np.zeros((count, robots), np.bool_)
-        self._over: Flags = np.zeros(count, np.bool_)
-        self._first: Integers = np.zeros(count, np.int64)
-        self._episode: Integers = np.full(count, -1)
-        self._starts: Array = np.zeros((count, robots, 3))
-        self._bodies: Array = np.zeros((count, self.simulator.sampler.count, BODY))
+        self._out = np.zeros((count, robots, parts), np.float32)
+        self._reward = np.zeros((count, robots))
+        self.ended = np.zeros((count, robots), np.bool_)
+        self._over = np.zeros(count, np.bool_)
+        self._first = np.zeros(count, np.int64)
+        self._episode = np.full(count, -1)
+        self._starts = np.zeros((count, robots, 3))
+        self._bodies = np.zeros((count, self.simulator.sampler.count, BODY))
         self.memory: Memory = {}
         # False also after an exception, which may leave some worlds a step behind
         self.ready = False

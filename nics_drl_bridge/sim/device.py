@@ -50,7 +50,7 @@ class DeviceWorld:
         )
         self._given = robots
         self._added = step_covariance(model.noise.odometry, self._period)
-        self.commands: Array = np.zeros((robots, len(model.robot.command)))
+        self.commands = np.zeros((robots, len(model.robot.command)))
         self._covariance = np.tile(self._added, (robots, 1, 1))
         self._before = simulator.data.pose[0].copy()
 
@@ -176,7 +176,7 @@ class DrivenSimulator(FastSimulator):
     ) -> Scenes:
         """Begin an episode, see `FastSimulator.reset`."""
         scenes = super().reset(seeds, worlds, starts)
-        self.wheels: Array = self.data.pose[0].copy()
+        self.wheels = self.data.pose[0].copy()
         return scenes
 
     def begin_period(self, commands: Array) -> None:

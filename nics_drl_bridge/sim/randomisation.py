@@ -24,7 +24,6 @@ from nics_drl_bridge.robot.kernels import make_terms
 from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.seeds import check_seeds
 
-__all__ = ["Draws", "LidarRanges", "Randomisation", "Sampler", "load_randomisation"]
 Bounds = tuple[Array, Array]
 MOST_OBSTACLES = 10_000
 # Columns of the noise, before those of the state; the drift of y equals that of x.

@@ -131,7 +131,19 @@ class MemberSampler:
         try:
             scratch = self.scratches.pop()
         except IndexError:
-            scratch = _scratch(*self.room)
+            cells, count = self.room
+            scratch = SceneScratch(
+                np.zeros(1, kernels.DRAWS),
+                np.zeros(cells, np.int64),
+                np.zeros(cells, np.int64),
+                np.zeros(1, np.int64),
+                np.zeros(count, np.bool_),
+                np.zeros(count),
+                np.zeros(BODY),
+                np.zeros(BODY),
+                allocate_touches(),
+                body_cells(1, count),
+            )
         numbers, wanted, sizes = (values[rows] for values in draws)
         into = scenes.bodies[rows], scenes.starts[rows], scenes.goals[rows]
         drawn, why = kernels.draw_scenes(
@@ -350,21 +362,6 @@ def _places(places: Starts | Goals | None) -> Records:
     shares = sizes if sizes.all() else np.ones(len(rows))
     array["share"] = np.cumsum(shares) / shares.sum()
     return array
-
-
-def _scratch(cells: int, count: int) -> SceneScratch:
-    return SceneScratch(
-        np.zeros(1, kernels.DRAWS),
-        np.zeros(cells, np.int64),
-        np.zeros(cells, np.int64),
-        np.zeros(1, np.int64),
-        np.zeros(count, np.bool_),
-        np.zeros(count),
-        np.zeros(BODY),
-        np.zeros(BODY),
-        allocate_touches(),
-        body_cells(1, count),
-    )
 
 
 def _free_space(world: World, footprint: float, drawn: bool) -> FreeSpace:

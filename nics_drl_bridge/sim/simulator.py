@@ -121,10 +121,10 @@ class CommandRange:
         for curve in model.inputs:
             c = self._names.index(curve.command)
             fitted[:, c] = curve.invert(fitted[:, c])
-        self._fitted: Array = fitted
+        self._fitted = fitted
         margin = TOLERANCE * (robot.command_high - robot.command_low)
-        self._low: Array = fitted[0] - margin
-        self._high: Array = fitted[1] + margin
+        self._low = fitted[0] - margin
+        self._high = fitted[1] + margin
         for _, term in model.assumed:
             powers = taylor.parse_term(term, model.variables)
             assumed = powers[model.state_size :] > 0
@@ -155,7 +155,6 @@ class CommandRange:
             )
 
 
-Indices = Integers
 Result = TypeVar("Result")
 # Poses of robots (n, M, 3), or a function that returns them for scenes; None: the scenes' poses
 Starts = ArrayLike | Callable[[Scenes], Array | None] | None
@@ -269,7 +268,7 @@ class FastSimulator:
         self._in_table = np.array([table.outlines.index_of(shape) for shape in shapes])
         self._scanner = Scanner(model.lidar, table, renderer)
         self.data = allocate_state(model, self._sizes)
-        self.goals: Array = np.zeros((worlds, robots, 2))
+        self.goals = np.zeros((worlds, robots, 2))
         self.drawn: dict[str, NDArray[Any]] = {}
         self.readings = unread(model.sensors, worlds, robots)
         edges = np.arange(min(threads, worlds) + 1) * worlds // min(threads, worlds)
@@ -309,7 +308,21 @@ class FastSimulator:
                 f"{len(scenes)} seeds and starts {poses.shape} do not fit {len(chosen)} worlds "
                 f"with {self.data.pose.shape[1]} robots each."
             )
-        self._place_scenes(chosen, np.asarray(seeds, np.int64), scenes, poses)
+        data = self.data
+        data.pose[chosen] = poses
+        data.odom[chosen] = poses
+        for name in ("state", "history", "twist", "collided", "steps", "velocity"):
+            getattr(data, name)[chosen] = 0
+        data.seeds[chosen] = np.asarray(seeds, np.int64)
+        data.member[chosen] = scenes.member
+        count = self.sampler.count
+        shapes = scenes.bodies[..., SHAPE].astype(np.int64)
+        data.bodies[chosen, :count] = scenes.bodies
+        data.bodies[chosen, :count, SHAPE] = self._in_table[shapes]
+        data.bodies[chosen, count:] = place(
+            poses, self.footprint.radius, self._in_table[-1]
+        )
+        self.goals[chosen] = scenes.goals
         if draws is not None:
             self._apply_draws(chosen, draws)
         for part in self.parts:
@@ -317,7 +330,7 @@ class FastSimulator:
             if len(of_part):
                 step_kernels.begin_episodes(self.packed[part.start], of_part)
                 self.sense(of_part)
-        if self.sampler.count < STANDING:
+        if count < STANDING:
             return scenes
         return Scenes(
             self.obstacles_of(chosen), scenes.starts, scenes.goals, scenes.member
@@ -326,8 +339,7 @@ class FastSimulator:
     def step(self, commands: ArrayLike) -> None:
         """Move every world by one control period under commands (N, M, C), see `data`."""
         if len(self.parts) == 1:
-            part = self.parts[0]
-            self._step(part, self._check_commands(part, commands))
+            self.step_part(self.parts[0], commands)
         else:
             checked = self._check_commands(slice(0, len(self.data.steps)), commands)
             self.run_parts(lambda part: self._step(part, checked[part]))
@@ -340,7 +352,7 @@ class FastSimulator:
         """Run a function for each of `parts`, one thread per part; return the results."""
         return run_parts(function, self.parts)
 
-    def sense(self, worlds: Indices) -> None:
+    def sense(self, worlds: Integers) -> None:
         """Render the readings of the further sensors in some worlds (n,)."""
         for name, render in self._renders.items():
             render(self.readings[name], worlds)
@@ -359,7 +371,7 @@ class FastSimulator:
         """(N, K, 7) the obstacles at their present poses, in the format of `scenes`."""
         return self.obstacles_of(np.arange(len(self.data.steps)))
 
-    def obstacles_of(self, worlds: Indices) -> Array:
+    def obstacles_of(self, worlds: Integers) -> Array:
         """Return the obstacles (n, K, 7) of some worlds (n,), in the format of `scenes`."""
         bodies = self.data.bodies[worlds, : self.sampler.count]
         of_obstacles = self._in_table[:-1]
@@ -400,7 +412,7 @@ class FastSimulator:
             step_kernels.sort_worlds(self.packed[part.start], part.start, part.stop)
 
     def take_over(
-        self, source: "FastSimulator", robots: Indices, obstacles: Indices
+        self, source: "FastSimulator", robots: Integers, obstacles: Integers
     ) -> None:
         """Continue the episode of another simulator of this model, in its first world.
 
@@ -498,7 +510,7 @@ class FastSimulator:
         )
         return {sensor.name: sensor.renderer(sensed) for sensor in self.model.sensors}
 
-    def _choose_worlds(self, worlds: ArrayLike | None) -> Indices:
+    def _choose_worlds(self, worlds: ArrayLike | None) -> Integers:
         """Return the indices of the worlds to reset; kernels do not check them."""
         count = len(self.data.steps)
         if worlds is None:
@@ -515,31 +527,7 @@ class FastSimulator:
             f"{count - 1}, each at most once."
         )
 
-    def _place_scenes(
-        self,
-        chosen: Indices,
-        seeds: Indices,
-        scenes: Scenes,
-        starts: Array,
-    ) -> None:
-        """Put the robots at `starts` (n, M, 3) and the obstacles of the scenes, all at rest."""
-        data = self.data
-        data.pose[chosen] = starts
-        data.odom[chosen] = starts
-        for name in ("state", "history", "twist", "collided", "steps", "velocity"):
-            getattr(data, name)[chosen] = 0
-        data.seeds[chosen] = seeds
-        data.member[chosen] = scenes.member
-        count = self.sampler.count
-        shapes = scenes.bodies[..., SHAPE].astype(np.int64)
-        data.bodies[chosen, :count] = scenes.bodies
-        data.bodies[chosen, :count, SHAPE] = self._in_table[shapes]
-        data.bodies[chosen, count:] = place(
-            starts, self.footprint.radius, self._in_table[-1]
-        )
-        self.goals[chosen] = scenes.goals
-
-    def _apply_draws(self, chosen: Indices, draws: Draws) -> None:
+    def _apply_draws(self, chosen: Integers, draws: Draws) -> None:
         """Give the worlds the numbers that a randomisation drew."""
         data = self.data
         for name in ("coefficient", "noise", "delay", "age", "faults"):

@@ -28,7 +28,6 @@ ODOM_LINEAR = 0
 ODOM_ANGULAR = 1
 DRIFT_X = 2
 DRIFT_Y = 3
-DRIFT_HEADING = 4
 DRIFT_STATE = 5
 
 # Columns of `State.past`. The true twist is the model's at the end of a period: for a robot that is
