@@ -195,9 +195,13 @@ class Task(ABC):
         low, high = self.command_limits
         kernels.scale_actions(out.reshape(rows.shape), rows, low, high)
         # Don't teach what a vehicle can't do: a car driven by turn rates can't steer at rest.
-        if self.robot.takes_turn_rate:
+        if self._takes_turn_rate:
             return self.robot.pass_through_cmd_vel(out)
         return out
+
+    @cached_property
+    def _takes_turn_rate(self) -> bool:
+        return self.robot.takes_turn_rate
 
     def drive(self, actions: ArrayLike, ended: Flags) -> Array:
         """Returns the checked commands (n, M, C) of actions; robots that have ended stand still."""
@@ -518,7 +522,7 @@ def total(values: Array) -> Array:
     summed = values[..., 0].copy()
     for k in range(1, values.shape[-1]):
         summed += values[..., k]
-    return np.asarray(summed)
+    return summed
 
 
 def find_contact_ranges(robot: RobotSpec, lidar: LidarSpec, margin: float) -> Singles:

@@ -58,7 +58,7 @@ class GridMap:
         """(rows, columns) cells that stop a beam."""
         if self.unknown_stops:
             return ~self.free
-        return np.asarray(self.cells >= self.occupied_from)
+        return self.cells >= self.occupied_from
 
     @cached_property
     def arrays(self) -> map_kernels.GridArrays:

@@ -323,7 +323,7 @@ class RobotSpec(Schema):
         """True if every command has a field of `cmd_vel`, which nodes need."""
         return all(command.cmd_vel is not None for command in self.command)
 
-    @cached_property
+    @property
     def takes_turn_rate(self) -> bool:
         """True if `angular.z` is a turn rate for a robot that is commanded by a steering angle."""
         return self.angular_is == "turn_rate" and self.steers

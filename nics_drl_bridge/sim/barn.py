@@ -61,7 +61,7 @@ def barn_path(number: int) -> Array:
 
 def _centres(cells: NDArray[Any], corner: tuple[float, float]) -> Array:
     """Return x, y (n, 2) [m] of cells (n, 2), row and column."""
-    return np.asarray(np.round(cells[:, ::-1] * CELL + corner, 6))
+    return np.round(cells[:, ::-1] * CELL + corner, 6)
 
 
 def _index(number: int) -> int:

@@ -161,7 +161,7 @@ def propagate(
     derivative = np.tile(np.eye(3), (len(covariance), 1, 1))
     derivative[:, 0, 2] = -moved[:, 1]
     derivative[:, 1, 2] = moved[:, 0]
-    return np.asarray(derivative @ covariance @ derivative.transpose(0, 2, 1) + added)
+    return derivative @ covariance @ derivative.transpose(0, 2, 1) + added
 
 
 class DrivenSimulator(FastSimulator):

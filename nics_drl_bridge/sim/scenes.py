@@ -436,7 +436,7 @@ def _large_enough(area: ShortIntegers, cell: float, least: float) -> ShortIntege
     for number, parts in enumerate(ndimage.find_objects(area), 1):
         span = cell * math.hypot(*(part.stop - part.start for part in parts))
         keep.append(number if span >= least else 0)
-    return np.asarray(np.array(keep, np.int32)[area])
+    return np.array(keep, np.int32)[area]
 
 
 def _check(
