@@ -121,23 +121,17 @@ def has_contact(ranges: Singles, scale: ScanScale) -> bool:
         if hits == 0:
             continue
         for b in range(begin, begin + beams):
-            if ranges[b] < scale.leaves[b]:
-                gap = _sum_gaps(b, ranges, scale)
-                if gap < np.float32(0.0):
-                    return True
+            if not ranges[b] < scale.leaves[b]:
+                continue
+            gap = np.float32(0.0)
+            end = min(b + scale.beside + 1, count)
+            for k in range(max(b - scale.beside, 0), end):
+                beyond = ranges[k] - scale.leaves[k]
+                if beyond == beyond:  # False for NaN (unknown)
+                    gap += min(max(beyond, -FURTHEST), FURTHEST)
+            if gap < np.float32(0.0):
+                return True
     return False
-
-
-@kernel(inline=True)
-def _sum_gaps(b: int, ranges: Singles, scale: ScanScale) -> np.float32:
-    gap = np.float32(0.0)
-    first = max(b - scale.beside, 0)
-    end = min(b + scale.beside + 1, len(ranges))
-    for k in range(first, end):
-        beyond = ranges[k] - scale.leaves[k]
-        if beyond == beyond:  # False for NaN (unknown)
-            gap += min(max(beyond, -FURTHEST), FURTHEST)
-    return gap
 
 
 @kernel(allocates=True)

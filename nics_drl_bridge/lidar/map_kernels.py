@@ -38,7 +38,7 @@ LONGEST = 255  # side of the largest square that fits in a byte [cells]
 PARALLEL = np.float32(
     1e-12
 )  # minimum component of a direction: its inverse stays finite
-# a return at exactly range_max must not be lost to rounding; `finish` decides
+# a return at exactly range_max must not be lost to rounding; `scan_robot` decides
 SLACK = 1.0 + 1e-6
 
 

@@ -165,7 +165,10 @@ def load_map(
     path = find_config(name, "maps")
     file = load_yaml(path, MapFile)
     grey, opaque = read_image(path.parent / file.image, str(path))
-    cells = np.ascontiguousarray(convert_pixels(grey, opaque, file)[::-1])
+    cells = _convert_brightness(file)[grey]
+    if opaque is not None and file.mode != "raw":
+        cells[~opaque] = UNKNOWN
+    cells = np.ascontiguousarray(cells[::-1])
     return GridMap(cells, file.resolution, file.origin, unknown_stops, occupied_from)
 
 
@@ -200,16 +203,6 @@ def map_files(grid: GridMap, path: Path) -> None:
         "mode": mode,
     }
     write_text(path, dump_yaml(about))
-
-
-def convert_pixels(
-    grey: NDArray[np.uint8], opaque: Mask | None, file: MapFile
-) -> NDArray[np.int8]:
-    """Cells (rows, columns) of an image from brightness and opacity, in the image's row order."""
-    cells: NDArray[np.int8] = _convert_brightness(file)[grey]
-    if opaque is not None and file.mode != "raw":
-        cells[~opaque] = UNKNOWN
-    return cells
 
 
 def _convert_brightness(file: MapFile) -> NDArray[np.int8]:

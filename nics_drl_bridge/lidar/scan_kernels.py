@@ -11,7 +11,6 @@ from nics_drl_bridge.lidar.beam_kernels import (
     INF,
     Beams,
     LidarPose,
-    finish,
     locate_lidar,
 )
 from nics_drl_bridge.lidar.exact_kernels import (
@@ -170,7 +169,15 @@ def scan_robot(
             scratch.singles,
             scratch.integers,
         )
-    finish(ranges, scan, lidar.range_min, lidar.range_max)
+    # Too far becomes `inf`, too close `-inf` (REP-117).
+    low = np.float32(lidar.range_min)
+    high = np.float32(lidar.range_max)
+    distances = scan.view(np.float32)
+    for b in range(len(ranges)):
+        i = np.uintp(b)
+        value = distances[i]
+        value = value if value <= high else np.float32(np.inf)
+        ranges[i] = value if value >= low else np.float32(-np.inf)
 
 
 @kernel(contracts=True, inline=True)

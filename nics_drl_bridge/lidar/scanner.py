@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,7 +24,7 @@ from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.lidar.table import LidarTable
 
 Renderer = Literal["auto", "baked", "exact"]
-RENDERERS: tuple[Renderer, ...] = ("auto", "baked", "exact")
+RENDERERS = get_args(Renderer)
 DEFAULT_RENDERER: Renderer = "auto"
 NO_WALLS = np.zeros((0, 4))
 # `auto` looks up at distances where the ranges' RMSE is at most this [m]

@@ -17,7 +17,6 @@ from nics_drl_bridge.middleware.playback import Playback, merge_messages, read_m
 from nics_drl_bridge.policy.file.stateful import resume
 from nics_drl_bridge.policy.pacing import ActionPace
 from nics_drl_bridge.policy.policies import open_policy
-from nics_drl_bridge.recording.bag_file import Message
 from nics_drl_bridge.recording.messages import read_robot_command
 
 JITTER = 0.25  # maximum earliness of a scan, in control periods
@@ -96,26 +95,6 @@ def shadow(
                 f"--topic {role}=/car/{role}."
             )
     playback = Playback(model, POSE in messages, any_lidar=True)
-    moments = _collect_moments(playback, messages, model)
-    if not moments:
-        raise RecordingError(
-            f"{path}: no scan with matching odometry; see nics bag info."
-        )
-    if goal is None:
-        times = np.array([moment.stamp_ns for moment in moments]) * S_PER_NS
-        places = np.array([moment.view.pose[:2] for moment in moments])
-        later = [np.interp(times + ahead_s, times, place) for place in places.T]
-        goals = np.stack(later, axis=-1)
-    else:
-        goals = np.broadcast_to(np.asarray(goal, np.float64), (len(moments), 2))
-    return _compare_moments(
-        moments, goals, policy, replace(model, lidar=playback.lidar)
-    )
-
-
-def _collect_moments(
-    playback: Playback, messages: Mapping[str, list[Message]], model: SimulatorModel
-) -> list[_Moment]:
     pace = ActionPace(model.control_period)
     moments = list[_Moment]()
     held: tuple[int, Array] | None = None
@@ -141,7 +120,20 @@ def _collect_moments(
         view = playback.middleware.view(playback.middleware.newest_ns or scan_ns)
         moments.append(_Moment(message.receive_ns, scan_ns, view))
     _hold(moments, held)
-    return moments
+    if not moments:
+        raise RecordingError(
+            f"{path}: no scan with matching odometry; see nics bag info."
+        )
+    if goal is None:
+        times = np.array([moment.stamp_ns for moment in moments]) * S_PER_NS
+        places = np.array([moment.view.pose[:2] for moment in moments])
+        later = [np.interp(times + ahead_s, times, place) for place in places.T]
+        goals = np.stack(later, axis=-1)
+    else:
+        goals = np.broadcast_to(np.asarray(goal, np.float64), (len(moments), 2))
+    return _compare_moments(
+        moments, goals, policy, replace(model, lidar=playback.lidar)
+    )
 
 
 def _hold(moments: list[_Moment], held: tuple[int, Array] | None) -> None:

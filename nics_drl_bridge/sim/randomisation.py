@@ -55,7 +55,7 @@ PLACES = 1 << 20
 UNIT = (np.zeros(1), np.ones(1))
 
 
-def _ordered(span: tuple[float, float]) -> tuple[float, float]:
+def _check_order(span: tuple[float, float]) -> tuple[float, float]:
     if span[0] > span[1]:
         raise ValueError("a range is [minimum, maximum]")
     return span
@@ -64,9 +64,9 @@ def _ordered(span: tuple[float, float]) -> tuple[float, float]:
 NotNegative = Annotated[float, Field(ge=0.0, le=1e6)]
 Positive = Annotated[float, Field(ge=1e-3, le=1e3)]
 Periods = Annotated[float, Field(ge=0.0, le=50.0)]  # the simulator stores as many
-Level = Annotated[tuple[NotNegative, NotNegative], AfterValidator(_ordered)]
-Factor = Annotated[tuple[Positive, Positive], AfterValidator(_ordered)]
-Latency = Annotated[tuple[Periods, Periods], AfterValidator(_ordered)]
+Level = Annotated[tuple[NotNegative, NotNegative], AfterValidator(_check_order)]
+Factor = Annotated[tuple[Positive, Positive], AfterValidator(_check_order)]
+Latency = Annotated[tuple[Periods, Periods], AfterValidator(_check_order)]
 AS_IT_IS: Factor = (1.0, 1.0)
 
 
@@ -94,7 +94,7 @@ class OdometryRanges(Schema):
     heading_drift: Level | None = None  # [rad/sqrt(s)]
 
     @model_validator(mode="after")
-    def _once(self) -> "OdometryRanges":
+    def _check_once(self) -> "OdometryRanges":
         for factor, (_, levels) in SCALED.items():
             for level in levels:
                 if (
@@ -121,7 +121,7 @@ class LidarRanges(Schema):
     too_close: tuple[TooClose, ...] | None = Field(default=None, min_length=1)
 
     @model_validator(mode="after")
-    def _probable(self) -> "LidarRanges":
+    def _check_probable(self) -> "LidarRanges":
         likely = [name for name in ("dropout", "dropout_far") if getattr(self, name)]
         if sum(getattr(self, name)[1] for name in likely) > 1.0:
             raise ValueError(
@@ -139,7 +139,7 @@ class ObstacleRanges(Schema):
     rungs: int = Field(default=5, ge=2, le=100)
 
     @model_validator(mode="after")
-    def _countable(self) -> "ObstacleRanges":
+    def _check_countable(self) -> "ObstacleRanges":
         if self.count and not 0 <= self.count[0] <= self.count[1] <= MOST_OBSTACLES:
             raise ValueError(
                 f"count must be [minimum, maximum] from 0 to {MOST_OBSTACLES}"

@@ -429,27 +429,17 @@ def _place_obstacles(plan: ScenePlan, bodies: Array, scratch: SceneScratch) -> b
             if outlines.first[shape] < outlines.first[shape + 1]:
                 heading = (2.0 * _draw(scratch) - 1.0) * math.pi
             _put(trial, x, y, heading, shape, plan)
-            placed = _is_apart(k, plan, bodies, scratch) and _clear_of_walls(
-                trial, MARGIN, plan, scratch.listed
-            )
+            # It keeps its gap from those that are placed, and from the walls.
+            placed = True
+            for j in range(len(bodies)):
+                if placed and bodies[j, RADIUS] > 0.0:
+                    gap = max(gaps[k], gaps[j])
+                    placed = _clear_of(trial, bodies[j], gap, outlines, scratch.listed)
+            placed = placed and _clear_of_walls(trial, MARGIN, plan, scratch.listed)
             if placed:
                 _put(bodies[k], x, y, heading, shape, plan)
                 break
         if not placed:
-            return False
-    return True
-
-
-@kernel
-def _is_apart(k: int, plan: ScenePlan, bodies: Array, scratch: SceneScratch) -> bool:
-    """True if the trial of obstacle k keeps its gap from those that are placed."""
-    trial = scratch.trial
-    gaps = scratch.gaps
-    for j in range(len(bodies)):
-        gap = max(gaps[k], gaps[j])
-        if bodies[j, RADIUS] > 0.0 and not _clear_of(
-            trial, bodies[j], gap, plan.outlines, scratch.listed
-        ):
             return False
     return True
 
@@ -471,23 +461,6 @@ def _draw_place(
     y = place.y1 + _draw(scratch) * (place.y2 - place.y1)
     spread = place.greatest_heading - place.least_heading
     return x, y, place.least_heading + _draw(scratch) * spread
-
-
-@kernel
-def _draw_goal(
-    x: float, y: float, plan: ScenePlan, scratch: SceneScratch
-) -> tuple[float, float]:
-    """Draw a goal, for some worlds uniformly in the ring around the start."""
-    if not plan.around:
-        gx, gy, _ = _draw_place(plan.goals, plan.space, scratch)
-        return gx, gy
-    least = plan.least
-    greatest = plan.greatest
-    turn = 2.0 * math.pi * _draw(scratch)
-    share = _draw(scratch)
-    scratch.draws[0].counter += 2  # as many as a place takes
-    far = math.sqrt(least * least + share * (greatest * greatest - least * least))
-    return x + far * math.cos(turn), y + far * math.sin(turn)
 
 
 @kernel
@@ -518,7 +491,16 @@ def _place_robots(
             area = area_of(x, y, plan.space)
             if area == 0 or not _is_free(x, y, plan, bodies, scratch):
                 continue
-            gx, gy = _draw_goal(x, y, plan, scratch)
+            if plan.around:  # uniformly in the ring around the start
+                turn = 2.0 * math.pi * _draw(scratch)
+                inner = plan.least * plan.least
+                ring = plan.greatest * plan.greatest - inner
+                far = math.sqrt(inner + _draw(scratch) * ring)
+                scratch.draws[0].counter += 2  # as many as a place takes
+                gx = x + far * math.cos(turn)
+                gy = y + far * math.sin(turn)
+            else:
+                gx, gy, _ = _draw_place(plan.goals, plan.space, scratch)
             distance2 = (gx - x) * (gx - x) + (gy - y) * (gy - y)
             fits = plan.least * plan.least <= distance2 <= plan.greatest * plan.greatest
             fits = fits and area_of(gx, gy, plan.space) == area

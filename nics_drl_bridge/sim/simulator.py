@@ -324,7 +324,13 @@ class FastSimulator:
         )
         self.goals[chosen] = scenes.goals
         if draws is not None:
-            self._apply_draws(chosen, draws)
+            for name in ("coefficient", "noise", "delay", "age", "faults"):
+                getattr(data, name)[chosen] = getattr(draws, name)
+            for name, values in draws.named().items():
+                if name not in self.drawn:
+                    shape = (len(data.steps), *values.shape[1:])
+                    self.drawn[name] = np.zeros(shape, values.dtype)
+                self.drawn[name][chosen] = values
         for part in self.parts:
             of_part = chosen[(chosen >= part.start) & (chosen < part.stop)]
             if len(of_part):
@@ -526,17 +532,6 @@ class FastSimulator:
             f"worlds {np.array2string(indices, threshold=10)} must be indices from 0 to "
             f"{count - 1}, each at most once."
         )
-
-    def _apply_draws(self, chosen: Integers, draws: Draws) -> None:
-        """Give the worlds the numbers that a randomisation drew."""
-        data = self.data
-        for name in ("coefficient", "noise", "delay", "age", "faults"):
-            getattr(data, name)[chosen] = getattr(draws, name)
-        for name, values in draws.named().items():
-            if name not in self.drawn:
-                shape = (len(data.steps), *values.shape[1:])
-                self.drawn[name] = np.zeros(shape, values.dtype)
-            self.drawn[name][chosen] = values
 
     def _check_commands(self, part: slice, commands: ArrayLike) -> Array:
         """Return commands (n, M, C) as an array; report those outside the range of the fit."""

@@ -55,7 +55,7 @@ class Patrol(Schema):
     pause: float = Field(default=0.0, ge=0.0, le=1e6)
 
     @model_validator(mode="after")
-    def _apart(self) -> "Patrol":
+    def _check_apart(self) -> "Patrol":
         corners = [*self.waypoints, *self.waypoints[: int(self.loop)]]
         if any(corner == next_corner for corner, next_corner in pairwise(corners)):
             raise ValueError("consecutive waypoints must differ")
@@ -90,7 +90,7 @@ class Pedestrian(Schema):
 
     @field_validator("speed")
     @classmethod
-    def _fast(cls, speed: tuple[float, float]) -> tuple[float, float]:
+    def _check_speed(cls, speed: tuple[float, float]) -> tuple[float, float]:
         if not 0.0 < speed[0] <= speed[1] <= FASTEST:
             raise ValueError(
                 f"speed must be [minimum, maximum], above 0 and at most {FASTEST:g} m/s"
@@ -116,7 +116,7 @@ class Obstacles(Schema):
 
     @field_validator("count", mode="before")
     @classmethod
-    def _numbers(cls, count: object) -> object:
+    def _check_numbers(cls, count: object) -> object:
         several = count if isinstance(count, list | tuple) else (count, count)
         whole = len(several) == 2 and all(type(n) is int for n in several)
         if count is not None and not (
@@ -128,7 +128,7 @@ class Obstacles(Schema):
         return count
 
     @model_validator(mode="after")
-    def _consistent(self) -> "Obstacles":
+    def _check_consistent(self) -> "Obstacles":
         if (self.count is None) == (not self.at):
             raise ValueError("a group needs either `count` or `at`")
         return self
@@ -149,7 +149,7 @@ class Places(Schema):
     at: tuple[Pose | Point, ...] = Field(default=(), max_length=MOST_PLACES)
 
     @model_validator(mode="after")
-    def _one(self) -> "Places":
+    def _check_one(self) -> "Places":
         if bool(self.regions) == bool(self.at):
             raise ValueError("give either `regions` or `at`")
         return self
@@ -190,7 +190,7 @@ class World(Schema):
     _spare: tuple[Shape, ...] = PrivateAttr(default=())
 
     @model_validator(mode="after")
-    def _consistent(self) -> "World":
+    def _check_consistent(self) -> "World":
         if self.size is None and self.bounds is None and self.map is None:
             raise ValueError("a world needs a `size`, `bounds`, or a `map`")
         if self.size is not None and self.bounds is not None:

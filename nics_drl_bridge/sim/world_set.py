@@ -58,7 +58,7 @@ class Cellular(Schema):
     passage: float = Field(default=0.5, ge=0.0, le=100.0)
 
     @model_validator(mode="after")
-    def _consistent(self) -> Cellular:
+    def _check_consistent(self) -> Cellular:
         if self.columns * self.rows > MOST_CELLS:
             raise ValueError(f"columns times rows may be {MOST_CELLS}")
         if not 0.0 <= self.fill[0] <= self.fill[1] < 1.0:

@@ -1,6 +1,7 @@
 """Policy files: an `.onnx` with network, normaliser, commands and contract; never a pickle."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -30,13 +31,13 @@ ROBOT = {"command", "footprint", "footprint_radius"}
 LIDAR = {"beams", "angle_min", "angle_max", "range_max", "mount"}
 
 
+@dataclass(eq=False)
 class PolicyFile:
     """A loaded and checked policy, with the path of its file and its contract."""
 
-    def __init__(self, path: Path, contract: Contract, run: Run) -> None:
-        self.path = path
-        self.contract = contract
-        self._run_network = run
+    path: Path
+    contract: Contract
+    _run_network: Run
 
     def act(self, observation: Rows) -> AnyArray:
         """Returns the action (C,) in [-1, 1], or () discrete, for (O,); or n actions for (n, O)."""

@@ -140,24 +140,19 @@ def plan_all(
                             action += spread * sampling.noise[k, q, c]
                         lanes.actions[k, q, c] = min(max(action, -1.0), 1.0)
             best = _roll_out(around, plant, sampling, lanes)
-            _average(best, lanes)
+            # The nominal actions become the mean of the sampled ones, weighted by their costs.
+            lanes.nominal[:] = 0.0
+            total = 0.0
+            for k in range(len(lanes.cost)):
+                weight = math.exp((lanes.cost[best] - lanes.cost[k]) / TEMPERATURE)
+                total += weight
+                for q in range(len(lanes.nominal)):
+                    for c in range(lanes.nominal.shape[1]):
+                        lanes.nominal[q, c] += weight * lanes.actions[k, q, c]
+            for q in range(len(lanes.nominal)):
+                for c in range(lanes.nominal.shape[1]):
+                    lanes.nominal[q, c] /= total
         out[n] = lanes.nominal[0]
-
-
-@kernel
-def _average(best: int, lanes: RollOuts) -> None:
-    """Replaces the nominal actions by the cost-weighted mean of the sampled ones."""
-    lanes.nominal[:] = 0.0
-    total = 0.0
-    for k in range(len(lanes.cost)):
-        weight = math.exp((lanes.cost[best] - lanes.cost[k]) / TEMPERATURE)
-        total += weight
-        for q in range(len(lanes.nominal)):
-            for c in range(lanes.nominal.shape[1]):
-                lanes.nominal[q, c] += weight * lanes.actions[k, q, c]
-    for q in range(len(lanes.nominal)):
-        for c in range(lanes.nominal.shape[1]):
-            lanes.nominal[q, c] /= total
 
 
 @kernel
