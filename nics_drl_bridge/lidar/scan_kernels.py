@@ -174,10 +174,10 @@ def scan_robot(
     high = np.float32(lidar.range_max)
     distances = scan.view(np.float32)
     for b in range(len(ranges)):
-        i = np.uintp(b)
-        value = distances[i]
+        beam = np.uintp(b)
+        value = distances[beam]
         value = value if value <= high else np.float32(np.inf)
-        ranges[i] = value if value >= low else np.float32(-np.inf)
+        ranges[beam] = value if value >= low else np.float32(-np.inf)
 
 
 @kernel(contracts=True, inline=True)
