@@ -58,14 +58,22 @@ def distort(
     A return stays within the limits, range_min and range_max [m]; `counter` is that of the scan.
     """
     device = _prepare_device(limits, faults)
+    whole = ranges.view(np.int32)
     noisy = device.std > 0.0 or device.grows > 0.0
     coarse = device.step > 0.0 and device.first <= device.last
     if faults[TOO_CLOSE] == AS_GHOST:
-        _add_ghosts(ranges, device, random.key(seed, random.GHOST_STREAM, counter))
+        by = random.key(seed, random.GHOST_STREAM, counter)
+        width = device.most - device.least
+        for i in range(len(ranges)):
+            ghost = device.least + random.share_of(random.bits(by, i)) * width
+            value = np.float32(ghost).view(np.int32)
+            whole[i] = max(whole[i], value if whole[i] == MINUS_INF else NONE)
     if faults[TOO_CLOSE] == AS_RANGE_MIN or not (
         noisy or coarse or device.close == -np.inf
     ):
-        _close(ranges, device.close)
+        close = np.float32(device.close).view(np.int32)
+        for i in range(len(ranges)):
+            whole[i] = max(whole[i], close if whole[i] == MINUS_INF else NONE)
     if noisy and coarse:
         _add_noise(ranges, device, random.key(seed, random.RANGE_STREAM, counter), True)
     elif noisy:
@@ -77,9 +85,12 @@ def distort(
             ranges[i] = _report(ranges[i], _quantize(ranges[i], device), device)
     if faults[DROPOUT] > 0.0 or faults[DROPOUT_FAR] > 0.0:
         by = random.key(seed, random.DROPOUT_STREAM, counter)
-        _drop(
-            ranges, faults[DROPOUT], faults[DROPOUT_FAR] / (limits[1] * limits[1]), by
-        )
+        share = np.float32(faults[DROPOUT])
+        far = np.float32(faults[DROPOUT_FAR] / (limits[1] * limits[1]))
+        for i in range(len(ranges)):
+            reach = ranges[i] if ranges[i] > np.float32(0.0) else np.float32(0.0)
+            lost = random.share_of(random.bits(by, i)) < share + far * reach * reach
+            whole[i] = max(whole[i], INF if lost else NONE)
 
 
 @kernel(inline=True)
@@ -113,25 +124,6 @@ def _prepare_device(limits: tuple[float, float], faults: Array) -> Distortion:
         first,
         last,
     )
-
-
-@kernel
-def _add_ghosts(ranges: Singles, device: Distortion, by: int) -> None:
-    whole = ranges.view(np.int32)
-    for i in range(len(ranges)):
-        ghost = device.least + random.share_of(random.bits(by, i)) * (
-            device.most - device.least
-        )
-        value = np.float32(ghost).view(np.int32)
-        whole[i] = max(whole[i], value if whole[i] == MINUS_INF else NONE)
-
-
-@kernel
-def _close(ranges: Singles, close: np.float32) -> None:
-    whole = ranges.view(np.int32)
-    value = np.float32(close).view(np.int32)
-    for i in range(len(ranges)):
-        whole[i] = max(whole[i], value if whole[i] == MINUS_INF else NONE)
 
 
 @kernel(inline=True)
@@ -188,22 +180,6 @@ def _multiply_step(count: np.float32, step: np.float32, rest: np.float32) -> np.
 def _limit(value: np.float32, device: Distortion) -> np.float32:
     value = device.least if value < device.least else value
     return device.most if value > device.most else value
-
-
-@kernel
-def _drop(
-    ranges: Singles,
-    share: float | np.float32,
-    far: float | np.float32,
-    by: int,
-) -> None:
-    share = np.float32(share)
-    far = np.float32(far)
-    whole = ranges.view(np.int32)
-    for i in range(len(ranges)):
-        reach = ranges[i] if ranges[i] > np.float32(0.0) else np.float32(0.0)
-        lost = random.share_of(random.bits(by, i)) < share + far * reach * reach
-        whole[i] = max(whole[i], INF if lost else NONE)
 
 
 @kernel

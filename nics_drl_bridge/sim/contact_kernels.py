@@ -29,7 +29,6 @@ from nics_drl_bridge.sim.collision_kernels import find_around
 from nics_drl_bridge.sim.state import (
     Array,
     BodyCells,
-    Nearby,
     Record,
     Surroundings,
     Tight,
@@ -60,7 +59,6 @@ class World(NamedTuple):
     velocity: Array  # (K, 3) of the obstacles
     first: int  # index of the first robot
     scene: Surroundings
-    nearby: Nearby
     tight: Tight
     touched: Array  # (M,) 1 for robots in contact
     series: Array  # see `robot.kernels`
@@ -74,8 +72,8 @@ def find_contacts(m: int, limit: float, skin: float, world: World) -> tuple[floa
     What it touches within `skin` [m] is in `world.tight.listed`.
     """
     scene = world.scene
-    near = world.nearby.near
-    meets = world.nearby.meets[m]
+    near = world.tight.near
+    meets = world.tight.meets[m]
     listed = world.tight.listed
     me = world.first + m
     body = collision.solid_of(me, world.bodies[me], scene.outlines)
@@ -317,7 +315,7 @@ def _halt(m: int, begin: float, time: float, end: float, world: World) -> bool:
 @kernel
 def _find_fastest(obstacles_move: bool, world: World) -> float:
     """Greatest speed of any body but an only robot [m/s]."""
-    meets = world.nearby.meets
+    meets = world.tight.meets
     fastest = 0.0
     for k in range(world.first if obstacles_move else 0):
         vx = world.velocity[k, 0]
@@ -333,7 +331,7 @@ def _find_fastest(obstacles_move: bool, world: World) -> float:
 @kernel
 def advance(begin: float, duration: float, obstacles_move: bool, world: World) -> None:
     """Move the robots that may meet something, and the obstacles, by a duration [s]."""
-    meets = world.nearby.meets
+    meets = world.tight.meets
     motions = world.tight.motions
     robots = len(meets)
     fastest = _find_fastest(obstacles_move, world)
@@ -375,12 +373,12 @@ def find_near(
     m: int,
     bodies: Array,
     scene: Surroundings,
-    nearby: Nearby,
+    tight: Tight,
     cells: BodyCells,
 ) -> int:
-    """Return flags of what robot m of world n may meet; write row m of `nearby.near`."""
-    near = nearby.near
-    reach = nearby.reach
+    """Return flags of what robot m of world n may meet; write row m of `tight.near`."""
+    near = tight.near
+    reach = tight.reach
     walls = scene.walls
     me = bodies.shape[1] - len(near) + m
     x = bodies[n, me, X]

@@ -314,37 +314,6 @@ def _from_walls(k: int, traffic: Traffic) -> tuple[float, float]:
 
 
 @kernel
-def _new_goal(
-    mark: Record,
-    k: int,
-    traffic: Traffic,
-    seed: int,
-    counter: int,
-    step: int,
-) -> None:
-    body = traffic.bodies[k]
-    field = traffic.field
-    x = body[X]
-    y = body[Y]
-    radius = body[RADIUS]
-    middle_x = (field[0] + field[2]) / 2.0
-    middle_y = (field[1] + field[3]) / 2.0
-    wide = max((field[2] - field[0]) / 2.0 - radius - ROOM, 0.0)
-    deep = max((field[3] - field[1]) / 2.0 - radius - ROOM, 0.0)
-    for i in range(CANDIDATES):
-        gx = middle_x + (2.0 * _share(seed, counter + 2 * i) - 1.0) * wide
-        gy = middle_y + (2.0 * _share(seed, counter + 2 * i + 1) - 1.0) * deep
-        mark.goal_x = gx
-        mark.goal_y = gy
-        if math.hypot(gx - x, gy - y) >= LEAST_WALK:
-            free = clearance(gx, gy, k, traffic)
-            if free >= radius + ROOM:
-                break
-    way = math.hypot(mark.goal_x - x, mark.goal_y - y)
-    mark.until = step + (2.0 * way / mark.speed + PATIENCE) / traffic.period
-
-
-@kernel
 def _walk(
     marks: Records,
     k: int,
@@ -362,8 +331,21 @@ def _walk(
     y = body[Y]
     away = math.hypot(mark.goal_x - x, mark.goal_y - y)
     if step >= mark.until or away < ARRIVED:
-        _new_goal(mark, k, traffic, seed, counter + 4, step)
-        away = math.hypot(mark.goal_x - x, mark.goal_y - y)
+        # A new goal, where there is room for it, if one is found.
+        field = traffic.field
+        room = body[RADIUS] + ROOM
+        wide = max((field[2] - field[0]) / 2.0 - body[RADIUS] - ROOM, 0.0)
+        deep = max((field[3] - field[1]) / 2.0 - body[RADIUS] - ROOM, 0.0)
+        for i in range(2, 2 + CANDIDATES):
+            right = 2.0 * _share(seed, counter + 2 * i) - 1.0
+            up = 2.0 * _share(seed, counter + 2 * i + 1) - 1.0
+            mark.goal_x = (field[0] + field[2]) / 2.0 + right * wide
+            mark.goal_y = (field[1] + field[3]) / 2.0 + up * deep
+            away = math.hypot(mark.goal_x - x, mark.goal_y - y)
+            is_far = away >= LEAST_WALK
+            if is_far and clearance(mark.goal_x, mark.goal_y, k, traffic) >= room:
+                break
+        mark.until = step + (2.0 * away / mark.speed + PATIENCE) / period
     ex = 0.0
     ey = 0.0
     if away > 0.0:
@@ -558,8 +540,8 @@ def _hold_map(
     if clearance <= SLACK and dx * nx + dy * ny <= 0.0 and nx * nx + ny * ny > 0.0:
         # In contact with the map, it may only move where the clearance does not decrease.
         if map_distance(x + dx, y + dy, grid) - radius >= clearance:
-            return (dx, dy)
-        return (0.0, 0.0)
+            return dx, dy
+        return 0.0, 0.0
     free = 0.0
     way = 0.0
     room = clearance

@@ -52,13 +52,6 @@ class Scenes(Scene):
 
     member: Integers
 
-    @classmethod
-    def of(cls, n: int, obstacles: int, robots: int) -> "Scenes":
-        """Allocate n empty scenes."""
-        starts = np.zeros((n, robots, 3))
-        goals = np.zeros((n, robots, 2))
-        return cls(np.zeros((n, obstacles, BODY)), starts, goals, np.zeros(n, np.int64))
-
     def __len__(self) -> int:
         return len(self.bodies)
 
@@ -79,13 +72,6 @@ class Catalogue:
     place: Mapping[Shape, int]  # of each shape in the first size
     outlines: Outlines  # of the shapes, and of a disc
     spaces: dict[str, FreeSpace]  # shared by worlds that differ only in their obstacles
-
-    @classmethod
-    def of(cls, world: AnyWorld, sizes: Sequence[float]) -> "Catalogue":
-        """List the shapes of a world or set, scaled."""
-        shapes = tuple(scaled(shape, size) for size in sizes for shape in world.shapes)
-        place = {shape: i for i, shape in enumerate(world.shapes)}
-        return cls(shapes, place, Outlines.of((*shapes, Circle(radius=1.0))), {})
 
 
 class MemberSampler:
@@ -189,7 +175,10 @@ class SceneSampler:
         sizes: Sequence[float] = (1.0,),
         most: int | None = None,
     ) -> None:
-        catalogue = Catalogue.of(world, sizes)
+        shapes = tuple(scaled(shape, size) for size in sizes for shape in world.shapes)
+        places = {shape: i for i, shape in enumerate(world.shapes)}
+        outlines = Outlines.of((*shapes, Circle(radius=1.0)))
+        catalogue = Catalogue(shapes, places, outlines, {})
         self.samplers = [
             MemberSampler(member, footprint_radius, robots, most, catalogue)
             for member in world.members
@@ -243,7 +232,12 @@ class SceneSampler:
         if n and not 0 <= sizes.min() <= sizes.max() < self._sizes:
             raise ConfigError(f"size must be from 0 to {self._sizes - 1}.")
         draws = numbers, wanted, sizes
-        scenes = Scenes.of(n, self.count, self.robots)
+        scenes = Scenes(
+            np.zeros((n, self.count, BODY)),
+            np.zeros((n, self.robots, 3)),
+            np.zeros((n, self.robots, 2)),
+            np.zeros(n, np.int64),
+        )
         if len(self.samplers) == 1:
             self.samplers[0].draw_into(scenes, draws, slice(0, len(scenes)))
             return scenes

@@ -721,8 +721,6 @@ def _allocate_scratch(
             start=np.zeros((obstacles, 3)),
             stops=np.zeros(obstacles),
             fastest=np.zeros(1),
-        ),
-        nearby=records.Nearby(
             near=np.zeros((robots, 1 + SEVERAL), np.int64),
             meets=np.zeros(robots, np.int64),
             reach=np.zeros(bodies),

@@ -272,13 +272,17 @@ class BodyCells(NamedTuple):
 
 
 class Tight(NamedTuple):
-    """Scratch memory of one world whose robots may meet something, see `contact_kernels`."""
+    """Scratch memory of one world, and what its robots may meet, see `contact_kernels`."""
 
     motions: Records  # (M,) of `MOTION`
     listed: Touches
     start: Array  # (K, 3) poses of the obstacles at the start of the period
     stops: Array  # (K,) time in the period at which each obstacle stops [s]
     fastest: Array  # (1,) speed of the fastest other body [m/s]
+    near: Integers  # (M, 1 + SEVERAL) number and indices of the bodies near each robot
+    meets: Integers  # (M,) bit flags of `contact_kernels`
+    reach: Array  # (K + M,) how far each body may reach from its present centre [m]
+    speeds: Array  # (M, 2) velocity of the robots in `map` [m/s]
 
 
 class Single(NamedTuple):
@@ -286,15 +290,6 @@ class Single(NamedTuple):
 
     x: Array  # (S + C + 1,)
     dq: Array  # (3 + S,) rates
-
-
-class Nearby(NamedTuple):
-    """Bodies and walls that the robots of one world may meet in the period."""
-
-    near: Integers  # (M, 1 + SEVERAL) number and indices of the bodies near each robot
-    meets: Integers  # (M,) bit flags of `contact_kernels`
-    reach: Array  # (K + M,) how far each body may reach from its present centre [m]
-    speeds: Array  # (M, 2) velocity of the robots in `map` [m/s]
 
 
 class Scans(NamedTuple):
@@ -317,7 +312,6 @@ class Scratch(NamedTuple):
     lanes: Lanes
     single: Single
     tight: Tight
-    nearby: Nearby
     cells: BodyCells  # the cells of all worlds, with a list of found bodies per thread
     scans: Scans
 

@@ -216,7 +216,7 @@ def _begin_period_of_world(n: int, first_lane: int, part: Part) -> None:
     Where an episode begins, also record its start, at which the robots stand still.
     """
     data = part.data
-    speeds = part.scratch.nearby.speeds
+    speeds = part.scratch.tight.speeds
     newest = data.steps[n] % data.past.shape[2]
     for m in range(data.pose.shape[1]):
         pose = data.pose[n, m]
@@ -286,7 +286,7 @@ def _move_world(n: int, first_lane: int, scene: Surroundings, part: Part) -> Non
                 start[k, i] = data.bodies[n, k, i]
     any_meets = False
     for m in range(data.pose.shape[1]):
-        if part.scratch.nearby.meets[m] != FREE:
+        if part.scratch.tight.meets[m] != FREE:
             any_meets = True
             continue
         lane = first_lane + m
@@ -318,20 +318,20 @@ def _find_what_is_near(
     """Find what each robot may meet in the period; return True if an obstacle moves."""
     data = part.data
     lane_poses = part.scratch.lanes.pose
-    nearby = part.scratch.nearby
+    tight = part.scratch.tight
     cells = part.scratch.cells
     first = data.velocity.shape[1]
     period = part.motion.dt * part.motion.substeps
     longest = 0.0  # path of any body
     obstacles_move = False
     for k in range(0 if scene.standing else first):
-        nearby.reach[k] = data.bodies[n, k, RADIUS]
+        tight.reach[k] = data.bodies[n, k, RADIUS]
         vx = data.velocity[n, k, 0]
         vy = data.velocity[n, k, 1]
         moves = vx != 0.0 or vy != 0.0 or data.velocity[n, k, 2] != 0.0
-        if moves and nearby.reach[k] > 0.0:
+        if moves and tight.reach[k] > 0.0:
             moved = math.sqrt(vx * vx + vy * vy) * period
-            nearby.reach[k] += moved
+            tight.reach[k] += moved
             longest = max(longest, moved)
             obstacles_move = True
     for m in range(data.pose.shape[1]):
@@ -344,13 +344,13 @@ def _find_what_is_near(
             turned = lane_poses[LANE_HEADING, first_lane + m] - data.pose[n, m, 2]
             path += abs(turned) * body[RADIUS]
         path += math.sqrt(3.0 * period) * sum_of_deviations
-        nearby.reach[first + m] = body[RADIUS] + path
+        tight.reach[first + m] = body[RADIUS] + path
         longest = max(longest, path)
     if scene.crowded:
         sort_into_cells(n, data.bodies[n], data.bodies.shape[1], cells)
         cells.frame[n, MOVED] = longest
     for m in range(data.pose.shape[1]):
-        nearby.meets[m] = contacts.find_near(n, m, data.bodies, scene, nearby, cells)
+        tight.meets[m] = contacts.find_near(n, m, data.bodies, scene, tight, cells)
     return obstacles_move
 
 
@@ -366,7 +366,7 @@ def _move_carefully(
     motion = part.motion
     single = part.scratch.single
     tight = part.scratch.tight
-    meets = part.scratch.nearby.meets
+    meets = part.scratch.tight.meets
     stops = tight.stops
     period = motion.dt * motion.substeps
     world = World(
@@ -374,7 +374,6 @@ def _move_carefully(
         data.velocity[n],
         data.velocity.shape[1],
         scene,
-        part.scratch.nearby,
         tight,
         data.collided[n],
         motion.series,

@@ -175,12 +175,7 @@ class Actor(torch.nn.Module):
     ) -> None:
         super().__init__()
         self.discrete = isinstance(actions, gymnasium.spaces.Discrete)
-        size = actions.shape or ()
-        count = int(
-            actions.n
-            if isinstance(actions, gymnasium.spaces.Discrete)
-            else np.prod(size)
-        )
+        count = gymnasium.spaces.flatdim(actions)
         self.normaliser = Normaliser(observations, *normaliser)
         widths = [self.normaliser.features_dim, *hidden, count]
         self.layers = make_layers(widths, ACTION_GAIN, activation)
