@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.env import guard, kernels
-from nics_drl_bridge.env.kernels import LIMIT, ScanScale
 from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.interface import Array, RobotView
 from nics_drl_bridge.kernels import Packed, pack
@@ -435,7 +434,7 @@ class Task(ABC):
         sectors = 0 if self.scan is None else self.scan.sectors
         per_metre = np.float32(1.0 / self.sight.range_max)
         beside = int(CONTACT_ANGLE / 2.0 / abs(self.lidar.angle_increment))
-        return pack(ScanScale(per_metre, leaves, beside, sectors, self.plan))
+        return pack(kernels.ScanScale(per_metre, leaves, beside, sectors, self.plan))
 
     def __getstate__(self) -> dict[str, Any]:
         state = {}
@@ -514,7 +513,7 @@ def distance(pose: ArrayLike, points: ArrayLike) -> Array:
 
 def limited(twist: Array) -> Array:
     """Clamps a twist (..., 3) to +-`kernels.LIMIT`, so that observations stay in their space."""
-    return np.minimum(np.maximum(twist, -LIMIT), LIMIT)
+    return np.minimum(np.maximum(twist, -kernels.LIMIT), kernels.LIMIT)
 
 
 def total(values: Array) -> Array:

@@ -21,7 +21,6 @@ from nics_drl_bridge.files import write_bytes, write_text
 from nics_drl_bridge.geometry import rotate
 from nics_drl_bridge.lidar import map_kernels
 from nics_drl_bridge.lidar.arrays import AnyArray, Array, Integers, Mask, Singles
-from nics_drl_bridge.lidar.map_kernels import Fixtures
 from nics_drl_bridge.lidar.shapes import Coordinate
 
 FREE = 0
@@ -304,7 +303,7 @@ def stack_fixtures(
     walls: Sequence[Array],
     grids: Sequence[GridMap | None],
     member: Integers,
-) -> Fixtures:
+) -> map_kernels.Fixtures:
     """Stack the fixtures of P worlds: walls (W, 4) and the map of each."""
     maps = [NO_MAP if grid is None else grid.arrays for grid in grids]
     squares, places = joined([grid_arrays.squares for grid_arrays in maps])
@@ -312,7 +311,9 @@ def stack_fixtures(
     for frame, grid_arrays in zip(frames, maps, strict=True):
         frame[: len(grid_arrays.frame)] = grid_arrays.frame
     first = np.cumsum([0, *map(len, walls)])
-    return Fixtures(member, np.concatenate(walls), first, squares, places, frames)
+    return map_kernels.Fixtures(
+        member, np.concatenate(walls), first, squares, places, frames
+    )
 
 
 def joined(cells: Sequence[AnyArray]) -> tuple[AnyArray, Integers]:

@@ -29,7 +29,6 @@ from nics_drl_bridge.lidar.lookup_kernels import (
     fuse_look_ups,
     look_up_body,
 )
-from nics_drl_bridge.lidar.map_kernels import Fixtures, grid_of, walls_of
 
 # Look-ups that wait to be fused: while one waits for memory, the next ones go on.
 MOST_FOUND = 64
@@ -77,7 +76,7 @@ def scan_worlds(
     bodies: Array,
     nearby: ShortIntegers,
     first_robot: int,
-    fixtures: Fixtures,
+    fixtures: map_kernels.Fixtures,
     lidar: LidarArrays,
     scratch: ScanScratch,
 ) -> None:
@@ -122,7 +121,7 @@ def scan_robot(
     bodies: Array,
     nearby: ShortIntegers,
     own_body: int,
-    fixtures: Fixtures,
+    fixtures: map_kernels.Fixtures,
     lidar: LidarArrays,
     scratch: ScanScratch,
 ) -> None:
@@ -157,14 +156,16 @@ def scan_robot(
             count = 0
         count = look_up_body(body, pose, lidar.beams, lidar.table, scratch.found, count)
     fuse_look_ups(scan, rows, scratch.found[:count])
-    scan_walls(scan, lidar.beams, pose, walls_of(n, fixtures), lidar.range_max)
+    scan_walls(
+        scan, lidar.beams, pose, map_kernels.walls_of(n, fixtures), lidar.range_max
+    )
     if fixtures.squares.size > 0:
         map_kernels.scan_map(
             scan,
             lidar.beams,
             pose,
             lidar.range_max,
-            grid_of(n, fixtures),
+            map_kernels.grid_of(n, fixtures),
             lidar.exact,
             scratch.singles,
             scratch.integers,

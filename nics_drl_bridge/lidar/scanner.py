@@ -18,7 +18,6 @@ from nics_drl_bridge.lidar.exact_kernels import SHAPE
 from nics_drl_bridge.lidar.lookup_error import find_lookup_distances
 from nics_drl_bridge.lidar.map_kernels import Fixtures
 from nics_drl_bridge.lidar.maps import GridMap, stack_fixtures
-from nics_drl_bridge.lidar.scan_kernels import LidarArrays
 from nics_drl_bridge.lidar.shapes import BODY, Shape, place
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.lidar.table import LidarTable
@@ -78,11 +77,11 @@ class Scanner:
             )
 
     @cached_property
-    def arguments(self) -> LidarArrays:
+    def arguments(self) -> scan_kernels.LidarArrays:
         """Lidar and table for the kernels."""
         spec = self.spec
         table = self.table
-        return LidarArrays(
+        return scan_kernels.LidarArrays(
             np.array(spec.mount),
             make_beams(
                 np.ascontiguousarray(spec.directions.T),

@@ -25,7 +25,6 @@ from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SIN, X, Y
 from nics_drl_bridge.robot.kernels import move, wrap
 from nics_drl_bridge.sim import collision_kernels as collision
-from nics_drl_bridge.sim.collision_kernels import find_around
 from nics_drl_bridge.sim.state import (
     Array,
     BodyCells,
@@ -386,7 +385,7 @@ def find_near(
     own_reach = reach[me]
     count = 0
     standing = bodies.shape[1] - len(near) if scene.standing else 0
-    for f in range(find_around(n, x, y, own_reach, cells)):
+    for f in range(collision.find_around(n, x, y, own_reach, cells)):
         k = cells.found[f]
         other_reach = bodies[n, k, RADIUS] if k < standing else reach[k]
         dx = bodies[n, k, X] - x

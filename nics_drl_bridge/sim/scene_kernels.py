@@ -12,7 +12,6 @@ import numpy as np
 
 from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.lidar import exact_kernels
 from nics_drl_bridge.lidar.arrays import (
     Array,
     Integers,
@@ -30,9 +29,7 @@ from nics_drl_bridge.lidar.exact_kernels import (
     X,
     Y,
 )
-from nics_drl_bridge.random_kernels import uniform_of
 from nics_drl_bridge.sim import collision_kernels as collision
-from nics_drl_bridge.sim.collision_kernels import find_around, sort_into_cells
 from nics_drl_bridge.sim.state import BodyCells, MapField, Records, Touches
 
 TRIES = 2000
@@ -105,7 +102,7 @@ class ScenePlan(NamedTuple):
     """Basis of the scenes of a world: K obstacles in G groups, of H shapes in S sizes."""
 
     space: FreeSpace
-    outlines: exact_kernels.OutlineArrays  # of all shapes, the last of which is a disc
+    outlines: OutlineArrays  # of all shapes, the last of which is a disc
     radii: Array  # (H,) of the circles around them [m]
     groups: Records  # (G,) of `GROUP`
     group: Integers  # (K,) of each obstacle
@@ -250,7 +247,7 @@ def _is_clear(
     disc[X] = x
     disc[Y] = y
     cells = scratch.cells
-    for i in range(find_around(0, x, y, disc[RADIUS] + room, cells)):
+    for i in range(collision.find_around(0, x, y, disc[RADIUS] + room, cells)):
         k = cells.found[i]
         counts = moving or not plan.groups[plan.group[k]].moves
         if counts and not _clear_of(
@@ -335,7 +332,7 @@ def _draw(scratch: SceneScratch) -> float:
     """Draw the next number of the scene, uniform from 0 to below 1."""
     draws = scratch.draws[0]
     draws.counter += 1
-    return uniform_of(draws.source, draws.counter - 1)
+    return random.uniform_of(draws.source, draws.counter - 1)
 
 
 @kernel
@@ -552,7 +549,7 @@ def draw_scenes(
                 k += 1
         for _ in range(RESTARTS):
             if _place_obstacles(plan, obstacles, scratch):
-                sort_into_cells(0, obstacles, count, scratch.cells)
+                collision.sort_into_cells(0, obstacles, count, scratch.cells)
                 state = NO_ROBOTS
                 if _place_robots(plan, obstacles, starts[n], goals[n], scratch):
                     state = DRAWN

@@ -31,7 +31,6 @@ from nics_drl_bridge.lidar.shapes import BODY, place
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.kernels import SERIES, allocate_scratch, make_terms
 from nics_drl_bridge.robot.spec import RobotSpec
-from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.sim import state as records
 from nics_drl_bridge.sim import step_kernels
 from nics_drl_bridge.sim.collision_kernels import body_cells
@@ -110,7 +109,7 @@ class CommandRange:
 
     def __init__(
         self,
-        model: TaylorModel,
+        model: taylor.TaylorModel,
         robot: RobotSpec,
         tell: Callable[[str], None] = warn_caller,
     ) -> None:
@@ -584,7 +583,7 @@ class EpisodeSampler:
         return self.scenes.draw(seeds, draws.count, draws.size), draws
 
 
-def check_speed(model: TaylorModel, robot: RobotSpec, world: AnyWorld) -> None:
+def check_speed(model: taylor.TaylorModel, robot: RobotSpec, world: AnyWorld) -> None:
     """Raise ConfigError if a robot could cross a whole world in one step of its kinematics."""
     # the greatest absolute value of each variable: states of the fit, commands within their limits
     largest = np.maximum(np.abs(model.low), np.abs(model.high))

@@ -30,7 +30,6 @@ from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, X, Y
 from nics_drl_bridge.lidar.map_kernels import cells_of, walls_of
 from nics_drl_bridge.robot import kernels as robot
-from nics_drl_bridge.robot.kernels import apply_curve
 from nics_drl_bridge.sim import contact_kernels as contacts
 from nics_drl_bridge.sim import obstacle_kernels as obstacles
 from nics_drl_bridge.sim import sensing_kernels as sensing
@@ -174,7 +173,9 @@ def _step_part(part: Part, commands: Array, first_world: int) -> None:
                 for c in range(commands.shape[2]):
                     queue[h, c] = queue[h - 1, c]
             for c in range(commands.shape[2]):
-                queue[0, c] = apply_curve(commands[i, m, c], motion.terms.curves[c])
+                queue[0, c] = robot.apply_curve(
+                    commands[i, m, c], motion.terms.curves[c]
+                )
     worlds_per_block = part.scratch.lanes.pose.shape[1] // robots
     for block_begin in range(first_world, end_world, worlds_per_block):
         block_end = min(block_begin + worlds_per_block, end_world)

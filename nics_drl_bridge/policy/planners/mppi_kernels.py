@@ -12,12 +12,6 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.arrays import Integers, Mask
 from nics_drl_bridge.policy.planners import local_map_kernels as maps
-from nics_drl_bridge.policy.planners.local_map_kernels import (
-    ARRIVED_M,
-    Situation,
-    find_room,
-    find_way,
-)
 from nics_drl_bridge.random_kernels import PLANNER_STREAM, normal, uniform
 from nics_drl_bridge.robot.kernels import Terms, advance, apply_curve, rates, run
 
@@ -110,7 +104,7 @@ def plan_all(
     scans: Array,
     goals: Array,
     twists: Array,
-    around: Situation,
+    around: maps.Situation,
     plant: Plant,
     sampling: Sampling,
     lanes: RollOuts,
@@ -206,7 +200,7 @@ def _settle(command: Array, plant: Plant, lanes: RollOuts) -> None:
 
 @kernel
 def _roll_out(
-    around: Situation, plant: Plant, sampling: Sampling, lanes: RollOuts
+    around: maps.Situation, plant: Plant, sampling: Sampling, lanes: RollOuts
 ) -> int:
     """Rolls out the actions of all lanes; writes their costs and returns the cheapest lane."""
     _begin(plant, lanes)
@@ -281,7 +275,7 @@ def _add_cost(
     k: int,
     t: int,
     limit: float,
-    around: Situation,
+    around: maps.Situation,
     sampling: Sampling,
     lanes: RollOuts,
 ) -> None:
@@ -291,13 +285,13 @@ def _add_cost(
     y = lanes.pose[1, k]
     c = lanes.pose[2, k]
     s = lanes.pose[3, k]
-    room = find_room(x, y, c, s, around)
+    room = maps.find_room(x, y, c, s, around)
     if t >= periods:
         if room < limit or max(abs(x), abs(y)) > sampling.far:
             lanes.cost[k] += HIT * (1.0 - (t - periods) / sampling.stop)
             lanes.ended[k] = t
         return
-    way = find_way(x, y, around)
+    way = maps.find_way(x, y, around)
     lanes.way[k] = way
     lanes.cost[k] += EARLY * way / periods
     if room < limit:
@@ -307,7 +301,7 @@ def _add_cost(
     keep = around.clearance
     near = max(keep.margin + keep.soft - room, 0.0) / keep.soft
     lanes.cost[k] += NEAR * near * near / periods
-    if math.hypot(around.goal[0] - x, around.goal[1] - y) < ARRIVED_M:
+    if math.hypot(around.goal[0] - x, around.goal[1] - y) < maps.ARRIVED_M:
         lanes.ended[k] = t
         lanes.way[k] = 0.0
     elif t == periods - 1:
