@@ -34,7 +34,7 @@ from nics_drl_bridge.env.teaching import Teacher, Teaching
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import NS_PER_S, Array, RobotView
-from nics_drl_bridge.lidar.arrays import AnyArray, Integers
+from nics_drl_bridge.lidar.arrays import AnyArray
 from nics_drl_bridge.lidar.shapes import BODY
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 from nics_drl_bridge.sim.scenes import Scenes
@@ -188,12 +188,37 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
         """Starts an episode in every world; world i takes its seeds from `seed + i`."""
         guard.check_reset(seed, options, self.num_envs)
         super().reset(seed=seed if isinstance(seed, int) else None)
-        chosen = choose_worlds(options, self.num_envs)
+        count = self.num_envs
+        chosen = np.ones(count, np.bool_)
+        if options and "reset_mask" in options:
+            mask = np.asarray(options["reset_mask"])
+            if mask.shape != (count,) or mask.dtype != np.bool_ or not mask.any():
+                raise ConfigError(
+                    f"options['reset_mask'] of shape {mask.shape}, {mask.dtype}: must be "
+                    f"({count},) bool with at least one True."
+                )
+            chosen = mask.copy()
         if not (self.ready or chosen.all()):
             raise gymnasium.error.ResetNeeded(
                 "reset all worlds before you reset some of them."
             )
-        seeds, fresh = choose_seeds(seed, chosen, self._episode < 0, self.np_random)
+        # These worlds restart with a seed: their own one, or that of the first world plus theirs.
+        if isinstance(seed, Sequence | np.ndarray):
+            if len(seed) != count:
+                raise ConfigError(
+                    f"{len(seed)} seeds for {count} worlds; give one each."
+                )
+            fresh = chosen & np.array([one is not None for one in seed])
+            seeds = np.array([one or 0 for one in seed], np.int64)
+        else:
+            fresh = chosen & (seed is not None)
+            seeds = (seed or 0) + np.arange(count, dtype=np.int64)
+        # Seeds are drawn for worlds that never had one.
+        new = chosen & (self._episode < 0) & ~fresh
+        if new.any():
+            first = int(self.np_random.integers(2**31))
+            seeds = np.where(new, first + np.arange(count), seeds)
+            fresh = fresh | new
         self.ready = False
         self._first[fresh] = seeds[fresh]
         self._episode[fresh] = -1
@@ -442,46 +467,6 @@ def join_outcomes(parts: Sequence[Outcome]) -> Outcome:
         for name in parts[0].info
     }
     return Outcome(terms, np.concatenate([part.ended for part in parts]), info)
-
-
-def choose_worlds(options: dict[str, Any] | None, count: int) -> Flags:
-    """Returns the mask (N,) of worlds to reset. Raises ConfigError for a wrong `reset_mask`."""
-    if not options or "reset_mask" not in options:
-        return np.ones(count, np.bool_)
-    chosen = np.asarray(options["reset_mask"])
-    if chosen.shape != (count,) or chosen.dtype != np.bool_ or not chosen.any():
-        raise ConfigError(
-            f"options['reset_mask'] of shape {chosen.shape}, {chosen.dtype}: must be ({count},) "
-            "bool with at least one True."
-        )
-    return chosen.copy()
-
-
-def choose_seeds(
-    seed: int | Sequence[int | None] | None,
-    chosen: Flags,
-    unnamed: Flags,
-    rng: np.random.Generator,
-) -> tuple[Integers, Flags]:
-    """Returns the seeds (N,) of a reset, and the mask (N,) of worlds that restart with them.
-
-    `seed` is the first world's, or one per world (None keeps its present one), or None for all. For
-    `chosen` worlds that are `unnamed`, having never had a seed, seeds are drawn if needed.
-    """
-    count = len(chosen)
-    if isinstance(seed, Sequence | np.ndarray):
-        if len(seed) != count:
-            raise ConfigError(f"{len(seed)} seeds for {count} worlds; give one each.")
-        is_seeded = chosen & np.array([one is not None for one in seed])
-        seeds = np.array([one or 0 for one in seed], np.int64)
-    else:
-        is_seeded = chosen & (seed is not None)
-        seeds = (seed or 0) + np.arange(count, dtype=np.int64)
-    new = chosen & unnamed & ~is_seeded
-    if new.any():
-        first = int(rng.integers(2**31))
-        seeds = np.where(new, first + np.arange(count), seeds)
-    return seeds, is_seeded | new
 
 
 def zeros(shape: tuple[int, ...], dtype: np.dtype[Any]) -> AnyArray:

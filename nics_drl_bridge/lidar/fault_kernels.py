@@ -149,7 +149,11 @@ def _add_noise_run(
         i = begin + np.uintp(j)
         value = ranges[i]
         noisy = value + (device.std + device.grows * value) * random.normal_of(run, j)
-        noisy = _quantize(noisy, device) if coarse else _limit(noisy, device)
+        if coarse:
+            noisy = _quantize(noisy, device)
+        else:
+            noisy = device.least if noisy < device.least else noisy
+            noisy = device.most if noisy > device.most else noisy
         ranges[i] = _report(value, noisy, device)
 
 
@@ -174,12 +178,6 @@ def _quantize(value: np.float32, device: Distortion) -> np.float32:
 @kernel(contracts=True, inline=True)
 def _multiply_step(count: np.float32, step: np.float32, rest: np.float32) -> np.float32:
     return count * step + count * rest  # rounded once
-
-
-@kernel(inline=True)
-def _limit(value: np.float32, device: Distortion) -> np.float32:
-    value = device.least if value < device.least else value
-    return device.most if value > device.most else value
 
 
 @kernel

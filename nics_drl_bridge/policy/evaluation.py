@@ -365,13 +365,10 @@ class Tally(Summary):
         """Returns the tally as plain data: intervals as lists, non-finite values as null."""
         figures: dict[str, Any] = {}
         for name, value in vars(self).items():
-            ends = [value]
-            if isinstance(value, ConfidenceInterval):
-                ends = list(vars(value).values())
-            finite = [value if math.isfinite(value) else None for value in ends]
-            figures[name] = (
-                finite if isinstance(value, ConfidenceInterval) else finite[0]
-            )
+            is_interval = isinstance(value, ConfidenceInterval)
+            ends = vars(value).values() if is_interval else [value]
+            finite = [end if math.isfinite(end) else None for end in ends]
+            figures[name] = finite if is_interval else finite[0]
         return figures
 
 

@@ -118,22 +118,17 @@ def steer(
     An obstacle stays in the field, off walls and others, and off robots that keep their velocity.
     """
     velocity = data.velocity[n]
-    seed = data.seeds[n]
-    step = data.steps[n]
     count = len(velocity)
     plans = scene.plans
     bodies = data.bodies[n]
     traffic = Traffic(
         bodies, count, speeds, plans, scene.walls, scene.bounds, scene.grid, period
     )
-    draws = (step + 1) * MOST
     # walkers first: they react to the velocities of the last period
     for k in range(count):
         velocity[k, :] = 0.0
         if plans[k].kind == PEDESTRIAN and bodies[k, RADIUS] > 0.0:
-            velocity[k, 0], velocity[k, 1] = _walk(
-                data.marks[n], k, traffic, seed, (draws + k) * DRAWS, step
-            )
+            velocity[k, 0], velocity[k, 1] = _walk(k, n, traffic, data)
     for k in range(count):
         kind = plans[k].kind
         mark = data.marks[n, k]
@@ -314,16 +309,12 @@ def _from_walls(k: int, traffic: Traffic) -> tuple[float, float]:
 
 
 @kernel
-def _walk(
-    marks: Records,
-    k: int,
-    traffic: Traffic,
-    seed: int,
-    counter: int,
-    step: int,
-) -> tuple[float, float]:
+def _walk(k: int, n: int, traffic: Traffic, data: State) -> tuple[float, float]:
     """Return the next velocity of walker k in `map` [m/s], after fewer than `DRAWS` draws."""
-    mark = marks[k]
+    seed = data.seeds[n]
+    step = data.steps[n]
+    counter = ((step + 1) * MOST + k) * DRAWS
+    mark = data.marks[n, k]
     row = traffic.plans[k]
     body = traffic.bodies[k]
     period = traffic.period
@@ -351,7 +342,7 @@ def _walk(
     if away > 0.0:
         ex = (mark.goal_x - x) / away
         ey = (mark.goal_y - y) / away
-    ax, ay = _from_bodies(k, ex, ey, marks, traffic)
+    ax, ay = _from_bodies(k, ex, ey, data.marks[n], traffic)
     bx, by = _from_walls(k, traffic)
     ax += bx + (mark.speed * ex - mark.vx) / row.relaxation
     ay += by + (mark.speed * ey - mark.vy) / row.relaxation

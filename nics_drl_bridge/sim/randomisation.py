@@ -349,8 +349,20 @@ def _coefficients(ranges: KinematicRanges, model: TaylorModel, where: str) -> Bo
     for dof, terms in ranges.terms.items():
         d = model.dofs.index(dof)
         place = f"{where}: key 'kinematics.terms', rate {dof!r}"
+        known = {model.term_names[k]: k for k in np.flatnonzero(model.coefficients[d])}
         for term, span in terms.items():
-            spans[d, _term(d, term, model, place)] = span
+            name = term
+            with suppress(ValueError):
+                powers = taylor.parse_term(term, model.variables)
+                name = taylor.format_term(powers, model.variables)
+            if name not in known:
+                hint = "it has none at all: remove it."
+                if known:
+                    hint = suggest(term, known)
+                raise ConfigError(
+                    f"{place}: the model has no term {term!r} there; {hint}"
+                )
+            spans[d, known[name]] = span
     if ranges.response != AS_IT_IS and not model.state_size:
         raise ConfigError(
             f"{where}: key 'kinematics.response': the model has no state, so it has no time "
@@ -362,18 +374,6 @@ def _coefficients(ranges: KinematicRanges, model: TaylorModel, where: str) -> Bo
     kept = np.nonzero(model.coefficients)
     base = make_terms(model).coefficient
     return base * spans[kept][:, 0], base * spans[kept][:, 1]
-
-
-def _term(d: int, name: str, model: TaylorModel, where: str) -> int:
-    terms = {model.term_names[k]: int(k) for k in np.flatnonzero(model.coefficients[d])}
-    with suppress(ValueError, KeyError):
-        return terms[
-            taylor.format_term(
-                taylor.parse_term(name, model.variables), model.variables
-            )
-        ]
-    hint = suggest(name, terms) if terms else "it has none at all: remove it."
-    raise ConfigError(f"{where}: the model has no term {name!r} there; {hint}")
 
 
 def _check_stable(model: TaylorModel, spans: Array, where: str) -> None:

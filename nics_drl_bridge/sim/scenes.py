@@ -136,20 +136,17 @@ class MemberSampler:
             self._packed, numbers, wanted, sizes, *into, scratch
         )
         self.scratches.append(scratch)
-        if drawn < len(numbers):
-            raise self._no_room(int(numbers[drawn]), why)
-
-    def _no_room(self, seed: int, why: int) -> ConfigError:
+        if drawn == len(numbers):
+            return
         where = self.world.source
-        scene = f"in the scene of seed {seed}"
+        scene = f"in the scene of seed {numbers[drawn]}"
         if why == kernels.NO_OBSTACLES:
-            reason = f"no free place for {self.count} obstacles {scene}"
-            return ConfigError(
-                f"{where}: key 'obstacles': {reason}; lower `count` or "
-                "`gap`, or enlarge the field."
+            raise ConfigError(
+                f"{where}: key 'obstacles': no free place for {self.count} obstacles {scene}; "
+                "lower `count` or `gap`, or enlarge the field."
             )
         least, greatest = self.world.goal_distance
-        return ConfigError(
+        raise ConfigError(
             f"{where}: key 'goal_distance': no free places for {self.robots} start(s) and goal(s) "
             f"of robots of radius {self.plan.footprint:g} m, {least:g} to {greatest:g} m apart "
             f"with a path between them, {self.count} obstacles, {scene}; change `goal_distance`, "

@@ -344,7 +344,8 @@ class FastSimulator:
     def step(self, commands: ArrayLike) -> None:
         """Move every world by one control period under commands (N, M, C), see `data`."""
         if len(self.parts) == 1:
-            self.step_part(self.parts[0], commands)
+            part = self.parts[0]
+            self._step(part, self._check_commands(part, commands))
         else:
             checked = self._check_commands(slice(0, len(self.data.steps)), commands)
             self.run_parts(lambda part: self._step(part, checked[part]))
@@ -713,8 +714,9 @@ def _allocate_scratch(
             change=np.zeros((commands, lanes), np.int64),
             coefficient=np.zeros((np.count_nonzero(kinematics.coefficients), lanes)),
         ),
-        single=records.Single(x, dq),
         tight=records.Tight(
+            x=x,
+            dq=dq,
             motions=np.zeros(robots, records.MOTION),
             listed=records.allocate_touches(),
             start=np.zeros((obstacles, 3)),

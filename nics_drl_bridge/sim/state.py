@@ -274,6 +274,8 @@ class BodyCells(NamedTuple):
 class Tight(NamedTuple):
     """Scratch memory of one world, and what its robots may meet, see `contact_kernels`."""
 
+    x: Array  # (S + C + 1,) of one robot, see `robot.kernels.allocate_scratch`
+    dq: Array  # (3 + S,) its rates
     motions: Records  # (M,) of `MOTION`
     listed: Touches
     start: Array  # (K, 3) poses of the obstacles at the start of the period
@@ -283,13 +285,6 @@ class Tight(NamedTuple):
     meets: Integers  # (M,) bit flags of `contact_kernels`
     reach: Array  # (K + M,) how far each body may reach from its present centre [m]
     speeds: Array  # (M, 2) velocity of the robots in `map` [m/s]
-
-
-class Single(NamedTuple):
-    """Scratch memory of one robot, see `robot.kernels.allocate_scratch`."""
-
-    x: Array  # (S + C + 1,)
-    dq: Array  # (3 + S,) rates
 
 
 class Scans(NamedTuple):
@@ -310,7 +305,6 @@ class Scratch(NamedTuple):
     """Memory that one thread needs to itself."""
 
     lanes: Lanes
-    single: Single
     tight: Tight
     cells: BodyCells  # the cells of all worlds, with a list of found bodies per thread
     scans: Scans

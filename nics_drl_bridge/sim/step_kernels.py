@@ -60,9 +60,9 @@ from nics_drl_bridge.sim.state import (
     Lanes,
     MapField,
     Part,
-    Single,
     State,
     Surroundings,
+    Tight,
     WorldSetArrays,
 )
 
@@ -161,7 +161,7 @@ def _step_part(part: Part, commands: Array, first_world: int) -> None:
     """
     data = part.data
     motion = part.motion
-    single = part.scratch.single
+    tight = part.scratch.tight
     frame = part.scratch.cells.frame
     robots = data.pose.shape[1]
     end_world = first_world + len(commands)
@@ -193,8 +193,8 @@ def _step_part(part: Part, commands: Array, first_world: int) -> None:
                 pose = data.pose[n, m]
                 start = part.scratch.scans.start_poses[first_lane + m]
                 contacts.put_body(data.bodies[n, data.velocity.shape[1] + m], pose)
-                compute_rates(n, m, motion.substeps - 1, data, motion, single)
-                sensing.measure_odometry(n, m, start, pose, single.dq, data, motion)
+                compute_rates(n, m, motion.substeps - 1, data, motion, tight)
+                sensing.measure_odometry(n, m, start, pose, tight.dq, data, motion)
                 # The cells must know how far any body may be from where it was sorted.
                 if scene.crowded:
                     dx = pose[0] - start[0]
@@ -279,15 +279,43 @@ def _move_world(n: int, first_lane: int, scene: Surroundings, part: Part) -> Non
     data = part.data
     motion = part.motion
     lanes = part.scratch.lanes
-    start = part.scratch.tight.start
-    obstacles_move = _find_what_is_near(n, first_lane, scene, part)
-    if obstacles_move:
-        for k in range(data.velocity.shape[1]):
-            for i in range(3):
-                start[k, i] = data.bodies[n, k, i]
+    cells = part.scratch.cells
+    tight = part.scratch.tight
+    first = data.velocity.shape[1]
+    period = motion.dt * motion.substeps
+    longest = 0.0  # path of any body
+    obstacles_move = False
+    for k in range(0 if scene.standing else first):
+        for i in range(3):
+            tight.start[k, i] = data.bodies[n, k, i]
+        tight.reach[k] = data.bodies[n, k, RADIUS]
+        vx = data.velocity[n, k, 0]
+        vy = data.velocity[n, k, 1]
+        moves = vx != 0.0 or vy != 0.0 or data.velocity[n, k, 2] != 0.0
+        if moves and tight.reach[k] > 0.0:
+            moved = math.sqrt(vx * vx + vy * vy) * period
+            tight.reach[k] += moved
+            longest = max(longest, moved)
+            obstacles_move = True
+    for m in range(data.pose.shape[1]):
+        # Each component is uniform, so at most sqrt(3) of its standard deviations.
+        sum_of_deviations = data.noise[n, m, DRIFT_X] + data.noise[n, m, DRIFT_Y]
+        path = lanes.pose[LANE_PATH, first_lane + m]
+        body = data.bodies[n, first + m]
+        if not is_round(body, scene.outlines):
+            # Where a corner touches something, a turn moves the robot away.
+            turned = lanes.pose[LANE_HEADING, first_lane + m] - data.pose[n, m, 2]
+            path += abs(turned) * body[RADIUS]
+        path += math.sqrt(3.0 * period) * sum_of_deviations
+        tight.reach[first + m] = body[RADIUS] + path
+        longest = max(longest, path)
+    if scene.crowded:
+        sort_into_cells(n, data.bodies[n], data.bodies.shape[1], cells)
+        cells.frame[n, MOVED] = longest
     any_meets = False
     for m in range(data.pose.shape[1]):
-        if part.scratch.tight.meets[m] != FREE:
+        tight.meets[m] = contacts.find_near(n, m, data.bodies, scene, tight, cells)
+        if tight.meets[m] != FREE:
             any_meets = True
             continue
         lane = first_lane + m
@@ -308,51 +336,7 @@ def _move_world(n: int, first_lane: int, scene: Surroundings, part: Part) -> Non
     if any_meets:
         _move_carefully(n, obstacles_move, scene, part)
     elif obstacles_move:
-        period = motion.dt * motion.substeps
-        contacts.move_obstacles(data.bodies, start, data.velocity, n, period)
-
-
-@kernel(inline=True)
-def _find_what_is_near(
-    n: int, first_lane: int, scene: Surroundings, part: Part
-) -> bool:
-    """Find what each robot may meet in the period; return True if an obstacle moves."""
-    data = part.data
-    lane_poses = part.scratch.lanes.pose
-    tight = part.scratch.tight
-    cells = part.scratch.cells
-    first = data.velocity.shape[1]
-    period = part.motion.dt * part.motion.substeps
-    longest = 0.0  # path of any body
-    obstacles_move = False
-    for k in range(0 if scene.standing else first):
-        tight.reach[k] = data.bodies[n, k, RADIUS]
-        vx = data.velocity[n, k, 0]
-        vy = data.velocity[n, k, 1]
-        moves = vx != 0.0 or vy != 0.0 or data.velocity[n, k, 2] != 0.0
-        if moves and tight.reach[k] > 0.0:
-            moved = math.sqrt(vx * vx + vy * vy) * period
-            tight.reach[k] += moved
-            longest = max(longest, moved)
-            obstacles_move = True
-    for m in range(data.pose.shape[1]):
-        # Each component is uniform, so at most sqrt(3) of its standard deviations.
-        sum_of_deviations = data.noise[n, m, DRIFT_X] + data.noise[n, m, DRIFT_Y]
-        path = lane_poses[LANE_PATH, first_lane + m]
-        body = data.bodies[n, first + m]
-        if not is_round(body, scene.outlines):
-            # Where a corner touches something, a turn moves the robot away.
-            turned = lane_poses[LANE_HEADING, first_lane + m] - data.pose[n, m, 2]
-            path += abs(turned) * body[RADIUS]
-        path += math.sqrt(3.0 * period) * sum_of_deviations
-        tight.reach[first + m] = body[RADIUS] + path
-        longest = max(longest, path)
-    if scene.crowded:
-        sort_into_cells(n, data.bodies[n], data.bodies.shape[1], cells)
-        cells.frame[n, MOVED] = longest
-    for m in range(data.pose.shape[1]):
-        tight.meets[m] = contacts.find_near(n, m, data.bodies, scene, tight, cells)
-    return obstacles_move
+        contacts.move_obstacles(data.bodies, tight.start, data.velocity, n, period)
 
 
 @kernel
@@ -365,7 +349,6 @@ def _move_carefully(
     """
     data = part.data
     motion = part.motion
-    single = part.scratch.single
     tight = part.scratch.tight
     meets = part.scratch.tight.meets
     stops = tight.stops
@@ -388,8 +371,8 @@ def _move_carefully(
     for j in range(motion.substeps):
         for m in range(len(meets)):
             if meets[m] != FREE:
-                compute_rates(n, m, j, data, motion, single)
-                dq = single.dq
+                compute_rates(n, m, j, data, motion, tight)
+                dq = tight.dq
                 contacts.start_motion(m, dq[0], dq[1], dq[2], world)
                 for s in range(data.state.shape[2]):
                     now = data.state[n, m, s]
@@ -425,20 +408,20 @@ def compute_rates(
     j: int,
     data: State,
     motion: Dynamics,
-    single: Single,
+    tight: Tight,
 ) -> None:
-    """Write to `single.dq` the rates of robot m in substep j, by the command then in effect."""
+    """Write to `tight.dq` the rates of robot m in substep j, by the command then in effect."""
     size = data.state.shape[2]
     sent = data.history.shape[2]
     for s in range(size):
-        single.x[s] = data.state[n, m, s]
+        tight.x[s] = data.state[n, m, s]
     for c in range(data.history.shape[3]):
         delay = data.delay[n, m] + motion.terms.late[c]
         row = robot.find_delayed_command(j, delay, motion.substeps, sent)
-        single.x[size + c] = data.history[n, m, row, c]
+        tight.x[size + c] = data.history[n, m, row, c]
     robot.rates(
-        single.dq,
-        single.x,
+        tight.dq,
+        tight.x,
         robot.replace_coefficients(motion.terms, data.coefficient[n, m]),
     )
 

@@ -98,7 +98,7 @@ def draw(offers: Array, noise: Array, rest: Array, seed: int) -> None:
                 noise[k, q, c] = normal(seed, PLANNER_STREAM, 3 * i + 1)
 
 
-@kernel
+@kernel(allocates=True)
 def plan_all(
     out: Array,
     scans: Array,
