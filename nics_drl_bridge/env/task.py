@@ -550,4 +550,4 @@ def find_contact_ranges(robot: RobotSpec, lidar: LidarSpec, margin: float) -> Si
         rest = radius * radius - start @ start + along * along
         half_chord = np.sqrt(np.maximum(rest, 0.0))
         leaves = np.where(rest >= 0.0, half_chord - along, -np.inf)
-    return leaves.astype(np.float32)
+    return np.asarray(leaves, np.float32)

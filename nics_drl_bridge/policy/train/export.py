@@ -130,7 +130,8 @@ def export_policy(
         raise ConfigError(
             f"{file}: a policy file's name ends with {SUFFIX!r}; change it."
         )
-    deployed = Deployed(find_actor(model), task, normaliser).eval().cpu()
+    deployed = Deployed(find_actor(model), task, normaliser)
+    deployed.eval().cpu()
     graph = _export_graph(deployed, task)
     seen = draw_golden_observations(task)
     session = open_session(graph.SerializeToString(), str(file))
