@@ -28,6 +28,7 @@ from nics_drl_bridge.sim import collision_kernels as collision
 from nics_drl_bridge.sim.state import (
     Array,
     BodyCells,
+    Integers,
     Record,
     Surroundings,
     Tight,
@@ -372,12 +373,11 @@ def find_near(
     m: int,
     bodies: Array,
     scene: Surroundings,
-    tight: Tight,
+    near: Integers,
+    reach: Array,
     cells: BodyCells,
 ) -> int:
-    """Return flags of what robot m of world n may meet; write row m of `tight.near`."""
-    near = tight.near
-    reach = tight.reach
+    """Return flags of what robot m of world n may meet; write row m of `near`."""
     walls = scene.walls
     me = bodies.shape[1] - len(near) + m
     x = bodies[n, me, X]

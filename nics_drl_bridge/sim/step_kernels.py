@@ -62,7 +62,6 @@ from nics_drl_bridge.sim.state import (
     Part,
     State,
     Surroundings,
-    Tight,
     WorldSetArrays,
 )
 
@@ -193,7 +192,9 @@ def _step_part(part: Part, commands: Array, first_world: int) -> None:
                 pose = data.pose[n, m]
                 start = part.scratch.scans.start_poses[first_lane + m]
                 contacts.put_body(data.bodies[n, data.velocity.shape[1] + m], pose)
-                compute_rates(n, m, motion.substeps - 1, data, motion, tight)
+                compute_rates(
+                    n, m, motion.substeps - 1, data, motion, tight.x, tight.dq
+                )
                 sensing.measure_odometry(n, m, start, pose, tight.dq, data, motion)
                 # The cells must know how far any body may be from where it was sorted.
                 if scene.crowded:
@@ -314,7 +315,9 @@ def _move_world(n: int, first_lane: int, scene: Surroundings, part: Part) -> Non
         cells.frame[n, MOVED] = longest
     any_meets = False
     for m in range(data.pose.shape[1]):
-        tight.meets[m] = contacts.find_near(n, m, data.bodies, scene, tight, cells)
+        tight.meets[m] = contacts.find_near(
+            n, m, data.bodies, scene, tight.near, tight.reach, cells
+        )
         if tight.meets[m] != FREE:
             any_meets = True
             continue
@@ -371,7 +374,7 @@ def _move_carefully(
     for j in range(motion.substeps):
         for m in range(len(meets)):
             if meets[m] != FREE:
-                compute_rates(n, m, j, data, motion, tight)
+                compute_rates(n, m, j, data, motion, tight.x, tight.dq)
                 dq = tight.dq
                 contacts.start_motion(m, dq[0], dq[1], dq[2], world)
                 for s in range(data.state.shape[2]):
@@ -408,20 +411,21 @@ def compute_rates(
     j: int,
     data: State,
     motion: Dynamics,
-    tight: Tight,
+    x: Array,
+    dq: Array,
 ) -> None:
-    """Write to `tight.dq` the rates of robot m in substep j, by the command then in effect."""
+    """Write to `dq` the rates of robot m in substep j, by the command then in effect."""
     size = data.state.shape[2]
     sent = data.history.shape[2]
     for s in range(size):
-        tight.x[s] = data.state[n, m, s]
+        x[s] = data.state[n, m, s]
     for c in range(data.history.shape[3]):
         delay = data.delay[n, m] + motion.terms.late[c]
         row = robot.find_delayed_command(j, delay, motion.substeps, sent)
-        tight.x[size + c] = data.history[n, m, row, c]
+        x[size + c] = data.history[n, m, row, c]
     robot.rates(
-        tight.dq,
-        tight.x,
+        dq,
+        x,
         robot.replace_coefficients(motion.terms, data.coefficient[n, m]),
     )
 
