@@ -82,27 +82,8 @@ def find_ways(
         y = grid.frames[p, 1]
         cell = grid.frames[p, 2]
         for k in range(bodies.shape[1]):
-            body = bodies[n, k]
-            if not grid.stands[p, k] or body[RADIUS] <= 0.0:
-                continue
-            # Around it, no cell has more space than beside it.
-            far = body[RADIUS] + grid.outer + COMFORT
-            first = max(int((body[Y] - far - y) / cell), 0)
-            last = min(int((body[Y] + far - y) / cell), height - 1)
-            left = max(int((body[X] - far - x) / cell), 0)
-            right = min(int((body[X] + far - x) / cell), width - 1)
-            outline = collision.outline_of(body, grid.outlines)
-            for i in range(first, last + 1):
-                dy = y + (i + 0.5) * cell - body[Y]
-                for j in range(left, right + 1):
-                    dx = x + (j + 0.5) * cell - body[X]
-                    if outline.begin < outline.end:
-                        along = body[COS] * dx + body[SIN] * dy
-                        across = body[COS] * dy - body[SIN] * dx
-                        gap = collision.outline_point(along, across, outline)
-                    else:
-                        gap = math.sqrt(dx * dx + dy * dy) - body[RADIUS]
-                    space[i, j] = min(space[i, j], np.float32(gap))
+            if grid.stands[p, k] and bodies[n, k, RADIUS] > 0.0:
+                _lower_space(space, bodies[n, k], x, y, cell, grid)
         for i in range(height):
             for j in range(width):
                 cost = _find_cost(space[i, j], grid)
@@ -112,6 +93,35 @@ def find_ways(
             u = (goals[n, m, 0] - x) / cell - 0.5
             v = (goals[n, m, 1] - y) / cell - 0.5
             _spread(field, space, u, v)
+
+
+@kernel
+def _lower_space(
+    space: Singles,
+    body: Array,
+    x: float,
+    y: float,
+    cell: float,
+    grid: GuideGrid,
+) -> None:
+    """Lower the space (rows, columns) around cells to that beside a body [m]."""
+    far = body[RADIUS] + grid.outer + COMFORT
+    first = max(int((body[Y] - far - y) / cell), 0)
+    last = min(int((body[Y] + far - y) / cell), len(space) - 1)
+    left = max(int((body[X] - far - x) / cell), 0)
+    right = min(int((body[X] + far - x) / cell), space.shape[1] - 1)
+    outline = collision.outline_of(body, grid.outlines)
+    for i in range(first, last + 1):
+        dy = y + (i + 0.5) * cell - body[Y]
+        for j in range(left, right + 1):
+            dx = x + (j + 0.5) * cell - body[X]
+            if outline.begin < outline.end:
+                along = body[COS] * dx + body[SIN] * dy
+                across = body[COS] * dy - body[SIN] * dx
+                gap = collision.outline_point(along, across, outline)
+            else:
+                gap = math.sqrt(dx * dx + dy * dy) - body[RADIUS]
+            space[i, j] = min(space[i, j], np.float32(gap))
 
 
 @kernel
