@@ -7,7 +7,7 @@
 3. `_move_world` takes that motion for robots that can meet nothing, and moves the obstacles. A
    robot that may meet something is moved carefully instead, from where it stood, see
    `contact_kernels`. All robots then drift.
-4. The bodies of the robots are put at their present poses, and their odometry is measured.
+4. `_measure_world` measures the odometry.
 5. Each robot scans, and its lidar's faults are applied, see `sensing_kernels`.
 
 `begin_episodes` resets worlds whose robots and obstacles are in place. `begin_period` and
@@ -159,28 +159,15 @@ def _step_part(part: Part, commands: Array, first_world: int) -> None:
     the part's arrays, which takes longer than the step.
     """
     data = part.data
-    motion = part.motion
-    tight = part.scratch.tight
-    frame = part.scratch.cells.frame
     robots = data.pose.shape[1]
     end_world = first_world + len(commands)
-    # The effects of the commands go in front of the earlier ones.
-    for i in range(len(commands)):
-        for m in range(robots):
-            queue = data.history[first_world + i, m]
-            for h in range(len(queue) - 1, 0, -1):
-                for c in range(commands.shape[2]):
-                    queue[h, c] = queue[h - 1, c]
-            for c in range(commands.shape[2]):
-                queue[0, c] = robot.apply_curve(
-                    commands[i, m, c], motion.terms.curves[c]
-                )
+    _queue_commands(data.history, commands, first_world, part.motion.terms.curves)
     worlds_per_block = part.scratch.lanes.pose.shape[1] // robots
     for block_begin in range(first_world, end_world, worlds_per_block):
         block_end = min(block_begin + worlds_per_block, end_world)
         for n in range(block_begin, block_end):
             _begin_period_of_world(n, (n - block_begin) * robots, part)
-        move_freely(block_begin, block_end, data, motion, part.scratch.lanes)
+        move_freely(block_begin, block_end, data, part.motion, part.scratch.lanes)
         waiting_count = np.int64(0)
         first_to_distort = block_begin
         for n in range(block_begin, block_end):
@@ -188,20 +175,7 @@ def _step_part(part: Part, commands: Array, first_world: int) -> None:
             first_lane = (n - block_begin) * robots
             scene = get_surroundings(n, part.world_set)
             _move_world(n, first_lane, scene, part)
-            for m in range(robots):
-                pose = data.pose[n, m]
-                start = part.scratch.scans.start_poses[first_lane + m]
-                contacts.put_body(data.bodies[n, data.velocity.shape[1] + m], pose)
-                compute_rates(
-                    n, m, motion.substeps - 1, data, motion, tight.x, tight.dq
-                )
-                sensing.measure_odometry(n, m, start, pose, tight.dq, data, motion)
-                # The cells must know how far any body may be from where it was sorted.
-                if scene.crowded:
-                    dx = pose[0] - start[0]
-                    dy = pose[1] - start[1]
-                    moved = math.sqrt(dx * dx + dy * dy)
-                    frame[n, MOVED] = max(frame[n, MOVED], moved)
+            _measure_world(n, first_lane, scene, part)
             waiting_count = sensing.scan_or_wait(n, waiting_count, part)
             is_last = n + 1 == block_end
             if is_last or (n + 1 - first_to_distort) * robots >= SCANNED_TOGETHER:
@@ -209,6 +183,21 @@ def _step_part(part: Part, commands: Array, first_world: int) -> None:
                 sensing.distort_scans(first_to_distort, n + 1, part)
                 waiting_count = np.int64(0)
                 first_to_distort = n + 1
+
+
+@kernel
+def _queue_commands(
+    history: Array, commands: Array, first_world: int, curves: Array
+) -> None:
+    """Put the effects of commands (n, M, C) in front of the earlier ones, history (N, M, H, C)."""
+    for i in range(len(commands)):
+        for m in range(commands.shape[1]):
+            queue = history[first_world + i, m]
+            for h in range(len(queue) - 1, 0, -1):
+                for c in range(commands.shape[2]):
+                    queue[h, c] = queue[h - 1, c]
+            for c in range(commands.shape[2]):
+                queue[0, c] = robot.apply_curve(commands[i, m, c], curves[c])
 
 
 @kernel(inline=True)
@@ -241,6 +230,27 @@ def _begin_period_of_world(n: int, first_lane: int, part: Part) -> None:
     if part.world_set.moves:
         scene = get_surroundings(n, part.world_set)
         obstacles.steer(n, data, scene, part.motion.dt * part.motion.substeps, speeds)
+
+
+@kernel(inline=True)
+def _measure_world(n: int, first_lane: int, scene: Surroundings, part: Part) -> None:
+    """Put the robots' bodies at their present poses, and measure their odometry."""
+    data = part.data
+    motion = part.motion
+    tight = part.scratch.tight
+    frame = part.scratch.cells.frame
+    for m in range(data.pose.shape[1]):
+        pose = data.pose[n, m]
+        start = part.scratch.scans.start_poses[first_lane + m]
+        contacts.put_body(data.bodies[n, data.velocity.shape[1] + m], pose)
+        compute_rates(n, m, motion.substeps - 1, data, motion, tight.x, tight.dq)
+        sensing.measure_odometry(n, m, start, pose, tight.dq, data, motion)
+        # The cells must know how far any body may be from where it was sorted.
+        if scene.crowded:
+            dx = pose[0] - start[0]
+            dy = pose[1] - start[1]
+            moved = math.sqrt(dx * dx + dy * dy)
+            frame[n, MOVED] = max(frame[n, MOVED], moved)
 
 
 @kernel
@@ -280,45 +290,15 @@ def _move_world(n: int, first_lane: int, scene: Surroundings, part: Part) -> Non
     data = part.data
     motion = part.motion
     lanes = part.scratch.lanes
-    cells = part.scratch.cells
-    tight = part.scratch.tight
-    first = data.velocity.shape[1]
-    period = motion.dt * motion.substeps
-    longest = 0.0  # path of any body
-    obstacles_move = False
-    for k in range(0 if scene.standing else first):
-        for i in range(3):
-            tight.start[k, i] = data.bodies[n, k, i]
-        tight.reach[k] = data.bodies[n, k, RADIUS]
-        vx = data.velocity[n, k, 0]
-        vy = data.velocity[n, k, 1]
-        moves = vx != 0.0 or vy != 0.0 or data.velocity[n, k, 2] != 0.0
-        if moves and tight.reach[k] > 0.0:
-            moved = math.sqrt(vx * vx + vy * vy) * period
-            tight.reach[k] += moved
-            longest = max(longest, moved)
-            obstacles_move = True
-    for m in range(data.pose.shape[1]):
-        # Each component is uniform, so at most sqrt(3) of its standard deviations.
-        sum_of_deviations = data.noise[n, m, DRIFT_X] + data.noise[n, m, DRIFT_Y]
-        path = lanes.pose[LANE_PATH, first_lane + m]
-        body = data.bodies[n, first + m]
-        if not is_round(body, scene.outlines):
-            # Where a corner touches something, a turn moves the robot away.
-            turned = lanes.pose[LANE_HEADING, first_lane + m] - data.pose[n, m, 2]
-            path += abs(turned) * body[RADIUS]
-        path += math.sqrt(3.0 * period) * sum_of_deviations
-        tight.reach[first + m] = body[RADIUS] + path
-        longest = max(longest, path)
-    if scene.crowded:
-        sort_into_cells(n, data.bodies[n], data.bodies.shape[1], cells)
-        cells.frame[n, MOVED] = longest
+    start = part.scratch.tight.start
+    obstacles_move = _find_what_is_near(n, first_lane, scene, part)
+    if obstacles_move:
+        for k in range(len(start)):
+            for i in range(3):
+                start[k, i] = data.bodies[n, k, i]
     any_meets = False
     for m in range(data.pose.shape[1]):
-        tight.meets[m] = contacts.find_near(
-            n, m, data.bodies, scene, tight.near, tight.reach, cells
-        )
-        if tight.meets[m] != FREE:
+        if part.scratch.tight.meets[m] != FREE:
             any_meets = True
             continue
         lane = first_lane + m
@@ -339,7 +319,54 @@ def _move_world(n: int, first_lane: int, scene: Surroundings, part: Part) -> Non
     if any_meets:
         _move_carefully(n, obstacles_move, scene, part)
     elif obstacles_move:
-        contacts.move_obstacles(data.bodies, tight.start, data.velocity, n, period)
+        period = motion.dt * motion.substeps
+        contacts.move_obstacles(data.bodies, start, data.velocity, n, period)
+
+
+@kernel(inline=True)
+def _find_what_is_near(
+    n: int, first_lane: int, scene: Surroundings, part: Part
+) -> bool:
+    """Find what each robot may meet in the period; return True if an obstacle moves."""
+    data = part.data
+    lane_poses = part.scratch.lanes.pose
+    tight = part.scratch.tight
+    reach = tight.reach
+    cells = part.scratch.cells
+    first = data.velocity.shape[1]
+    period = part.motion.dt * part.motion.substeps
+    longest = 0.0  # path of any body
+    obstacles_move = False
+    for k in range(0 if scene.standing else first):
+        reach[k] = data.bodies[n, k, RADIUS]
+        vx = data.velocity[n, k, 0]
+        vy = data.velocity[n, k, 1]
+        moves = vx != 0.0 or vy != 0.0 or data.velocity[n, k, 2] != 0.0
+        if moves and reach[k] > 0.0:
+            moved = math.sqrt(vx * vx + vy * vy) * period
+            reach[k] += moved
+            longest = max(longest, moved)
+            obstacles_move = True
+    for m in range(data.pose.shape[1]):
+        # Each component is uniform, so at most sqrt(3) of its standard deviations.
+        sum_of_deviations = data.noise[n, m, DRIFT_X] + data.noise[n, m, DRIFT_Y]
+        path = lane_poses[LANE_PATH, first_lane + m]
+        body = data.bodies[n, first + m]
+        if not is_round(body, scene.outlines):
+            # Where a corner touches something, a turn moves the robot away.
+            turned = lane_poses[LANE_HEADING, first_lane + m] - data.pose[n, m, 2]
+            path += abs(turned) * body[RADIUS]
+        path += math.sqrt(3.0 * period) * sum_of_deviations
+        reach[first + m] = body[RADIUS] + path
+        longest = max(longest, path)
+    if scene.crowded:
+        sort_into_cells(n, data.bodies[n], data.bodies.shape[1], cells)
+        cells.frame[n, MOVED] = longest
+    for m in range(data.pose.shape[1]):
+        tight.meets[m] = contacts.find_near(
+            n, m, data.bodies, scene, tight.near, reach, cells
+        )
+    return obstacles_move
 
 
 @kernel
