@@ -531,18 +531,7 @@ def find_contact_ranges(robot: RobotSpec, lidar: LidarSpec, margin: float) -> Si
     ray = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     if robot.footprint is not None:
         corners = np.array(robot.footprint) - [x, y]
-        # Each ray and side: where the ray last crosses the outline.
-        edge = np.roll(corners, -1, axis=0) - corners
-        turned = np.stack([-edge[:, 1], edge[:, 0]], axis=-1)
-        steep = ray @ turned.T  # (B, V)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            away = np.sum(corners * turned, axis=-1) / steep
-            points = away[..., None] * ray[:, None]
-            along = np.sum((points - corners) * edge, axis=-1)
-            share = along / np.sum(edge * edge, axis=-1)
-        crossed = (share >= -1e-9) & (share <= 1.0 + 1e-9)
-        crossed &= (steep != 0.0) & (away >= 0.0)
-        leaves = np.where(crossed, away, -np.inf).max(axis=1) + margin
+        leaves = _leaves_outline(ray, corners) + margin
     else:
         start = np.array([x, y])
         radius = robot.footprint_radius + margin
@@ -551,3 +540,18 @@ def find_contact_ranges(robot: RobotSpec, lidar: LidarSpec, margin: float) -> Si
         half_chord = np.sqrt(np.maximum(rest, 0.0))
         leaves = np.where(rest >= 0.0, half_chord - along, -np.inf)
     return np.asarray(leaves, np.float32)
+
+
+def _leaves_outline(ray: Array, corners: Array) -> Array:
+    """Returns distances (B,) at which rays (B, 2) from the origin last cross an outline (V, 2)."""
+    edge = np.roll(corners, -1, axis=0) - corners
+    turned = np.stack([-edge[:, 1], edge[:, 0]], axis=-1)
+    steep = ray @ turned.T  # (B, V): each ray and side
+    with np.errstate(divide="ignore", invalid="ignore"):
+        away = np.sum(corners * turned, axis=-1) / steep
+        points = away[..., None] * ray[:, None]
+        along = np.sum((points - corners) * edge, axis=-1)
+        share = along / np.sum(edge * edge, axis=-1)
+    crossed = (share >= -1e-9) & (share <= 1.0 + 1e-9)
+    crossed &= (steep != 0.0) & (away >= 0.0)
+    return np.asarray(np.where(crossed, away, -np.inf).max(axis=1))

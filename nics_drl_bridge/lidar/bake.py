@@ -118,18 +118,7 @@ def make_grid(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> 
                 hull, hints[..., side], edges[..., side] - turns[:, None] + side * np.pi
             )
             two, climb = _choose_corners(wound, parts, len(hull))
-            # the error of the nearer of two corners against the edge at the rim of a cell [rad]
-            miss = np.zeros(two.shape[:2])
-            for k in range(parts + 1):
-                turn = turns[k:][: count * parts : parts]
-                true = edges[k:, :, side][: count * parts : parts]
-                corner = rotate(hull[two], turn[:, None, None])
-                for later in (0, 1):
-                    last = len(distances) - later
-                    x = corner[:, :last, :, 0] + distances[later:, None]
-                    angle = np.arctan2(corner[:, :last, :, 1], x)
-                    off = np.abs(angle - true[:, later:, None]).min(axis=-1)
-                    miss[:, :last] = np.maximum(miss[:, :last], off)
+            miss = _miss(hull, two, edges[..., side], turns, distances, parts)
             far_off = miss > MISS * spec.angle_increment
             # close to contact, the rim of a cell does not bound its interior
             far_off[:, 0] = True
@@ -187,6 +176,31 @@ def _choose_corners(
     stride = np.exp2(np.floor(np.log2(away))).astype(np.int64)
     two = np.stack([(low + quarter) % corners, (high - quarter) % corners], axis=-1)
     return two, np.stack([first % corners, -stride], axis=-1)
+
+
+def _miss(
+    hull: Array,
+    two: Integers,
+    edge: Array,
+    turns: Array,
+    distances: Array,
+    parts: int,
+) -> Array:
+    """Error (T, D) of the nearer of two corners against the edge at the rim of a cell [rad]."""
+    count = len(two)
+    worst = np.zeros(two.shape[:2])
+    for k in range(parts + 1):
+        turn = turns[k:][: count * parts : parts]
+        true = edge[k:][: count * parts : parts]
+        corner = rotate(hull[two], turn[:, None, None])
+        for later in (0, 1):
+            last = len(distances) - later
+            x = corner[:, :last, :, 0] + distances[later:, None]
+            off = np.abs(
+                np.arctan2(corner[:, :last, :, 1], x) - true[:, later:, None]
+            ).min(axis=-1)
+            worst[:, :last] = np.maximum(worst[:, :last], off)
+    return worst
 
 
 def _fill(table: LidarTable, grids: Sequence[Grid]) -> None:

@@ -253,21 +253,29 @@ def find_gap(
                 touch.y = other.y + other.sin * px + other.cos * py
                 touch.gap = gap
                 listed.number[0] = count + 1
-    overlaps = least < OVERLAP
-    # One of two solids whose outlines do not meet may be inside the other.
-    if may_contain and not overlaps:
-        if other.radius > 0.0 or _count_edges(other.outline) > 1:
-            p = _place_edge(_get_edge(0, one.outline), x, y, c, s)
-            overlaps = _measure_origin(p.ax, p.ay, other) < 0.0
-        if not overlaps and (one.radius > 0.0 or _count_edges(one.outline) > 1):
-            q = _get_edge(0, other.outline)
-            qx = c * (q.ax - x) + s * (q.ay - y)
-            qy = c * (q.ay - y) - s * (q.ax - x)
-            overlaps = _measure_origin(qx, qy, one) < 0.0
+    overlaps = least < OVERLAP or (may_contain and _contain(one, other, x, y, c, s))
     if not overlaps:
         return min(least, limit)
     listed.number[0] = earlier
     return min(_measure_origin(x, y, other) - one.reach, -OVERLAP)
+
+
+@kernel
+def _contain(one: Solid, other: Solid, x: float, y: float, c: float, s: float) -> bool:
+    """True if one of two solids whose outlines do not meet is inside the other.
+
+    The first one is at (x, y) in the other's frame, turned by an angle with cosine c and sine s.
+    """
+    if other.radius > 0.0 or _count_edges(other.outline) > 1:
+        p = _place_edge(_get_edge(0, one.outline), x, y, c, s)
+        if _measure_origin(p.ax, p.ay, other) < 0.0:
+            return True
+    if one.radius > 0.0 or _count_edges(one.outline) > 1:
+        q = _get_edge(0, other.outline)
+        qx = c * (q.ax - x) + s * (q.ay - y)
+        qy = c * (q.ay - y) - s * (q.ax - x)
+        return _measure_origin(qx, qy, one) < 0.0
+    return False
 
 
 @kernel

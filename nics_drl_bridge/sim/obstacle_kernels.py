@@ -309,6 +309,29 @@ def _from_walls(k: int, traffic: Traffic) -> tuple[float, float]:
 
 
 @kernel
+def _choose_goal(
+    mark: Record, k: int, traffic: Traffic, seed: int, counter: int
+) -> float:
+    """Draw the next goal of walker k, with room around it if found; return its distance [m]."""
+    body = traffic.bodies[k]
+    field = traffic.field
+    room = body[RADIUS] + ROOM
+    wide = max((field[2] - field[0]) / 2.0 - body[RADIUS] - ROOM, 0.0)
+    deep = max((field[3] - field[1]) / 2.0 - body[RADIUS] - ROOM, 0.0)
+    away = 0.0
+    for i in range(CANDIDATES):
+        right = 2.0 * _share(seed, counter + 2 * i) - 1.0
+        up = 2.0 * _share(seed, counter + 2 * i + 1) - 1.0
+        mark.goal_x = (field[0] + field[2]) / 2.0 + right * wide
+        mark.goal_y = (field[1] + field[3]) / 2.0 + up * deep
+        away = math.hypot(mark.goal_x - body[X], mark.goal_y - body[Y])
+        is_far = away >= LEAST_WALK
+        if is_far and clearance(mark.goal_x, mark.goal_y, k, traffic) >= room:
+            break
+    return away
+
+
+@kernel
 def _walk(k: int, n: int, traffic: Traffic, data: State) -> tuple[float, float]:
     """Return the next velocity of walker k in `map` [m/s], after fewer than `DRAWS` draws."""
     seed = data.seeds[n]
@@ -322,20 +345,7 @@ def _walk(k: int, n: int, traffic: Traffic, data: State) -> tuple[float, float]:
     y = body[Y]
     away = math.hypot(mark.goal_x - x, mark.goal_y - y)
     if step >= mark.until or away < ARRIVED:
-        # A new goal, where there is room for it, if one is found.
-        field = traffic.field
-        room = body[RADIUS] + ROOM
-        wide = max((field[2] - field[0]) / 2.0 - body[RADIUS] - ROOM, 0.0)
-        deep = max((field[3] - field[1]) / 2.0 - body[RADIUS] - ROOM, 0.0)
-        for i in range(2, 2 + CANDIDATES):
-            right = 2.0 * _share(seed, counter + 2 * i) - 1.0
-            up = 2.0 * _share(seed, counter + 2 * i + 1) - 1.0
-            mark.goal_x = (field[0] + field[2]) / 2.0 + right * wide
-            mark.goal_y = (field[1] + field[3]) / 2.0 + up * deep
-            away = math.hypot(mark.goal_x - x, mark.goal_y - y)
-            is_far = away >= LEAST_WALK
-            if is_far and clearance(mark.goal_x, mark.goal_y, k, traffic) >= room:
-                break
+        away = _choose_goal(mark, k, traffic, seed, counter + 4)
         mark.until = step + (2.0 * away / mark.speed + PATIENCE) / period
     ex = 0.0
     ey = 0.0

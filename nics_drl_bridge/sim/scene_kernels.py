@@ -368,6 +368,39 @@ def _put(
 
 
 @kernel
+def _choose_obstacles(
+    wanted: int,
+    size: int,
+    plan: ScenePlan,
+    bodies: Array,
+    scratch: SceneScratch,
+) -> None:
+    """Draw which obstacles the scene has, and the shape of each."""
+    total = 0
+    before = 0
+    k = 0
+    for group in plan.groups:
+        if not group.is_fixed:
+            total += group.greatest
+    for group in plan.groups:
+        span = group.greatest - group.least + 1
+        count = group.least + int(_draw(scratch) * span)
+        if not group.is_fixed:
+            if wanted >= 0:  # each group gets its share
+                most = min(wanted, total)
+                up_to = most * before + total // 2
+                count = (up_to + most * group.greatest) // total - up_to // total
+            before += group.greatest
+        for number in range(group.greatest):
+            choice = group.first_shape + int(_draw(scratch) * group.shapes)
+            scratch.active[k] = number < count
+            bodies[k, :] = 0.0
+            bodies[k, COS] = 1.0
+            bodies[k, SHAPE] = plan.variants[size, plan.choices[choice]]
+            k += 1
+
+
+@kernel
 def _place_obstacles(plan: ScenePlan, bodies: Array, scratch: SceneScratch) -> bool:
     """Place the obstacles of the scene; return True if there was space for all of them."""
     space = plan.space
@@ -393,17 +426,27 @@ def _place_obstacles(plan: ScenePlan, bodies: Array, scratch: SceneScratch) -> b
             if outlines.first[shape] < outlines.first[shape + 1]:
                 heading = (2.0 * _draw(scratch) - 1.0) * math.pi
             _put(trial, x, y, heading, shape, plan)
-            # It keeps its gap from those that are placed, and from the walls.
-            placed = True
-            for j in range(len(bodies)):
-                if placed and bodies[j, RADIUS] > 0.0:
-                    gap = max(gaps[k], gaps[j])
-                    placed = _clear_of(trial, bodies[j], gap, outlines, scratch.listed)
-            placed = placed and _clear_of_walls(trial, MARGIN, plan, scratch.listed)
+            placed = _is_apart(k, plan, bodies, scratch) and _clear_of_walls(
+                trial, MARGIN, plan, scratch.listed
+            )
             if placed:
                 _put(bodies[k], x, y, heading, shape, plan)
                 break
         if not placed:
+            return False
+    return True
+
+
+@kernel
+def _is_apart(k: int, plan: ScenePlan, bodies: Array, scratch: SceneScratch) -> bool:
+    """True if the trial of obstacle k keeps its gap from those that are placed."""
+    trial = scratch.trial
+    gaps = scratch.gaps
+    for j in range(len(bodies)):
+        gap = max(gaps[k], gaps[j])
+        if bodies[j, RADIUS] > 0.0 and not _clear_of(
+            trial, bodies[j], gap, plan.outlines, scratch.listed
+        ):
             return False
     return True
 
@@ -519,34 +562,12 @@ def draw_scenes(
     disc = scratch.disc
     _put(disc, 0.0, 0.0, 0.0, len(plan.radii) - 1, plan)
     disc[RADIUS] = plan.footprint
-    total = 0
-    for group in plan.groups:
-        if not group.is_fixed:
-            total += group.greatest
     for n in range(len(seeds)):
         state = NO_OBSTACLES
         obstacles = bodies[n, :count]
         scratch.draws[0].source = random.source(seeds[n], random.SCENE_STREAM)
         scratch.draws[0].counter = 0
-        # The obstacles that the scene has, and the shape of each.
-        before = 0
-        k = 0
-        for group in plan.groups:
-            span = group.greatest - group.least + 1
-            number = group.least + int(_draw(scratch) * span)
-            if not group.is_fixed:
-                if wanted[n] >= 0:  # each group gets its share
-                    most = min(wanted[n], total)
-                    up_to = most * before + total // 2
-                    number = (up_to + most * group.greatest) // total - up_to // total
-                before += group.greatest
-            for i in range(group.greatest):
-                choice = group.first_shape + int(_draw(scratch) * group.shapes)
-                scratch.active[k] = i < number
-                obstacles[k, :] = 0.0
-                obstacles[k, COS] = 1.0
-                obstacles[k, SHAPE] = plan.variants[sizes[n], plan.choices[choice]]
-                k += 1
+        _choose_obstacles(wanted[n], sizes[n], plan, obstacles, scratch)
         for _ in range(RESTARTS):
             if _place_obstacles(plan, obstacles, scratch):
                 collision.sort_into_cells(0, obstacles, count, scratch.cells)

@@ -284,8 +284,7 @@ class World(Schema):
         """Return (W, 4) the four sides of the field, if any, then the further walls [m]."""
         sides: list[Region] = []
         if self.size is not None:
-            x = self.size[0] / 2.0
-            y = self.size[1] / 2.0
+            x, y = self.extent[2:]
             sides = [(-x, -y, x, -y), (x, -y, x, y), (x, y, -x, y), (-x, y, -x, -y)]
         return np.array([*sides, *self.walls], np.float64).reshape(-1, 4)
 

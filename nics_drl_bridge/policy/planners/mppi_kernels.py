@@ -124,29 +124,26 @@ def plan_all(
             advance(lanes.start, twists[n], plant.latency, plant.series)
         lanes.actions[:] = sampling.offers
         best = _roll_out(around, plant, sampling, lanes)
-        lanes.nominal[:] = lanes.actions[best]
+        nominal = lanes.nominal
+        nominal[:] = lanes.actions[best]
         for spread in SPREADS:
             for k in range(len(lanes.actions)):
-                for q in range(len(lanes.nominal)):
-                    for c in range(lanes.nominal.shape[1]):
-                        action = lanes.nominal[q, c]
+                for q in range(len(nominal)):
+                    for c in range(nominal.shape[1]):
+                        action = nominal[q, c]
                         if k > 0:
                             action += spread * sampling.noise[k, q, c]
                         lanes.actions[k, q, c] = min(max(action, -1.0), 1.0)
             best = _roll_out(around, plant, sampling, lanes)
             # The nominal actions become the mean of the sampled ones, weighted by their costs.
-            lanes.nominal[:] = 0.0
+            nominal[:] = 0.0
             total = 0.0
             for k in range(len(lanes.cost)):
                 weight = math.exp((lanes.cost[best] - lanes.cost[k]) / TEMPERATURE)
                 total += weight
-                for q in range(len(lanes.nominal)):
-                    for c in range(lanes.nominal.shape[1]):
-                        lanes.nominal[q, c] += weight * lanes.actions[k, q, c]
-            for q in range(len(lanes.nominal)):
-                for c in range(lanes.nominal.shape[1]):
-                    lanes.nominal[q, c] /= total
-        out[n] = lanes.nominal[0]
+                nominal += weight * lanes.actions[k]
+            nominal /= total
+        out[n] = nominal[0]
 
 
 @kernel

@@ -133,26 +133,7 @@ def export_policy(
     deployed = Deployed(find_actor(model), task, normaliser)
     deployed.eval().cpu()
     graph = _export_graph(deployed, task)
-    seen = draw_golden_observations(task)
-    session = open_session(graph.SerializeToString(), str(file))
-
-    def compute(*tensors: Rows) -> list[Rows]:
-        with torch.no_grad():
-            return [part.numpy() for part in deployed(*map(torch.as_tensor, tensors))]
-
-    start = None if deployed.state is None else np.full(*deployed.state, np.float32)
-    out = run_in_turn(partial(run_rows, session, str(file)), seen, start)
-    wanted = run_in_turn(compute, seen, start)
-    for name, ours, theirs in zip(("actions", "commands"), out, wanted, strict=True):
-        error = float(np.abs(ours - theirs).max())
-        if not error <= policy_file.GOLDEN_TOLERANCE:
-            raise PolicyError(
-                str(file),
-                f"golden.{name}",
-                f"onnxruntime and torch differ by {error:.3g}; the model can't be exported.",
-            )
-    action = np.asarray(out[0], np.float32).reshape(GOLDEN, -1)
-    golden = {"observations": seen, "actions": action, "commands": out[1]}
+    golden = _make_golden(deployed, graph, draw_golden_observations(task), str(file))
     text = make_contract(
         task,
         simulator_model,
@@ -169,6 +150,30 @@ def export_policy(
     policy = policy_file.policy_of(data, file)
     write_bytes(file, data)
     return policy
+
+
+def _make_golden(
+    deployed: Deployed, graph: Any, seen: Rows, source: str
+) -> dict[str, Rows]:
+    session = open_session(graph.SerializeToString(), source)
+
+    def compute(*tensors: Rows) -> list[Rows]:
+        with torch.no_grad():
+            return [part.numpy() for part in deployed(*map(torch.as_tensor, tensors))]
+
+    start = None if deployed.state is None else np.full(*deployed.state, np.float32)
+    out = run_in_turn(partial(run_rows, session, source), seen, start)
+    wanted = run_in_turn(compute, seen, start)
+    for name, ours, theirs in zip(("actions", "commands"), out, wanted, strict=True):
+        error = float(np.abs(ours - theirs).max())
+        if not error <= policy_file.GOLDEN_TOLERANCE:
+            raise PolicyError(
+                source,
+                f"golden.{name}",
+                f"onnxruntime and torch differ by {error:.3g}; the model can't be exported.",
+            )
+    action = np.asarray(out[0], np.float32).reshape(GOLDEN, -1)
+    return {"observations": seen, "actions": action, "commands": out[1]}
 
 
 def _export_graph(deployed: Deployed, task: Task) -> Any:
