@@ -704,7 +704,6 @@ def _allocate_scratch(
     bodies = obstacles + robots
     blocks = -(-worlds * robots // LANES)
     lanes = robots * min(worlds, -(-worlds // blocks))
-    x, dq = allocate_scratch(kinematics)
     commands = len(kinematics.variables) - kinematics.state_size
     return records.Scratch(
         lanes=records.Lanes(
@@ -714,9 +713,8 @@ def _allocate_scratch(
             change=np.zeros((commands, lanes), np.int64),
             coefficient=np.zeros((np.count_nonzero(kinematics.coefficients), lanes)),
         ),
+        single=records.Single(*allocate_scratch(kinematics)),
         tight=records.Tight(
-            x=x,
-            dq=dq,
             motions=np.zeros(robots, records.MOTION),
             listed=records.allocate_touches(),
             start=np.zeros((obstacles, 3)),

@@ -271,11 +271,16 @@ class BodyCells(NamedTuple):
     found: ShortIntegers  # (K,) scratch for one thread: the bodies around a point
 
 
+class Single(NamedTuple):
+    """Scratch memory of one robot, see `robot.kernels.allocate_scratch`."""
+
+    x: Array  # (S + C + 1,)
+    dq: Array  # (3 + S,) rates
+
+
 class Tight(NamedTuple):
     """Scratch memory of one world, and what its robots may meet, see `contact_kernels`."""
 
-    x: Array  # (S + C + 1,) of one robot, see `robot.kernels.allocate_scratch`
-    dq: Array  # (3 + S,) its rates
     motions: Records  # (M,) of `MOTION`
     listed: Touches
     start: Array  # (K, 3) poses of the obstacles at the start of the period
@@ -305,6 +310,7 @@ class Scratch(NamedTuple):
     """Memory that one thread needs to itself."""
 
     lanes: Lanes
+    single: Single
     tight: Tight
     cells: BodyCells  # the cells of all worlds, with a list of found bodies per thread
     scans: Scans

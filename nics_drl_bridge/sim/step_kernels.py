@@ -60,6 +60,7 @@ from nics_drl_bridge.sim.state import (
     Lanes,
     MapField,
     Part,
+    Single,
     State,
     Surroundings,
     WorldSetArrays,
@@ -237,14 +238,14 @@ def _measure_world(n: int, first_lane: int, scene: Surroundings, part: Part) -> 
     """Put the robots' bodies at their present poses, and measure their odometry."""
     data = part.data
     motion = part.motion
-    tight = part.scratch.tight
+    single = part.scratch.single
     frame = part.scratch.cells.frame
     for m in range(data.pose.shape[1]):
         pose = data.pose[n, m]
         start = part.scratch.scans.start_poses[first_lane + m]
         contacts.put_body(data.bodies[n, data.velocity.shape[1] + m], pose)
-        compute_rates(n, m, motion.substeps - 1, data, motion, tight.x, tight.dq)
-        sensing.measure_odometry(n, m, start, pose, tight.dq, data, motion)
+        compute_rates(n, m, motion.substeps - 1, data, motion, single)
+        sensing.measure_odometry(n, m, start, pose, single.dq, data, motion)
         # The cells must know how far any body may be from where it was sorted.
         if scene.crowded:
             dx = pose[0] - start[0]
@@ -379,8 +380,9 @@ def _move_carefully(
     """
     data = part.data
     motion = part.motion
+    single = part.scratch.single
     tight = part.scratch.tight
-    meets = part.scratch.tight.meets
+    meets = tight.meets
     stops = tight.stops
     period = motion.dt * motion.substeps
     world = World(
@@ -401,8 +403,8 @@ def _move_carefully(
     for j in range(motion.substeps):
         for m in range(len(meets)):
             if meets[m] != FREE:
-                compute_rates(n, m, j, data, motion, tight.x, tight.dq)
-                dq = tight.dq
+                compute_rates(n, m, j, data, motion, single)
+                dq = single.dq
                 contacts.start_motion(m, dq[0], dq[1], dq[2], world)
                 for s in range(data.state.shape[2]):
                     now = data.state[n, m, s]
@@ -438,21 +440,20 @@ def compute_rates(
     j: int,
     data: State,
     motion: Dynamics,
-    x: Array,
-    dq: Array,
+    single: Single,
 ) -> None:
-    """Write to `dq` the rates of robot m in substep j, by the command then in effect."""
+    """Write to `single.dq` the rates of robot m in substep j, by the command then in effect."""
     size = data.state.shape[2]
     sent = data.history.shape[2]
     for s in range(size):
-        x[s] = data.state[n, m, s]
+        single.x[s] = data.state[n, m, s]
     for c in range(data.history.shape[3]):
         delay = data.delay[n, m] + motion.terms.late[c]
         row = robot.find_delayed_command(j, delay, motion.substeps, sent)
-        x[size + c] = data.history[n, m, row, c]
+        single.x[size + c] = data.history[n, m, row, c]
     robot.rates(
-        dq,
-        x,
+        single.dq,
+        single.x,
         robot.replace_coefficients(motion.terms, data.coefficient[n, m]),
     )
 
