@@ -9,7 +9,7 @@ import numpy as np
 from nics_drl_bridge.lidar.exact_kernels import OutlineArrays
 from nics_drl_bridge.lidar.shapes import place
 from nics_drl_bridge.sim import obstacle_kernels as kernels
-from nics_drl_bridge.sim.state import MARK, NO_FIELD, Movers, State, Surroundings
+from nics_drl_bridge.sim.state import MARK, NO_FIELD, State, Surroundings
 from nics_drl_bridge.sim.world import plan_arrays
 
 PERIOD = 0.1
@@ -109,8 +109,8 @@ def surroundings_of(motions, half, walls, grid=NO_FIELD):
     """A field in which obstacles move."""
     outlines = OutlineArrays(np.zeros((0, 2)), np.zeros(2, np.int64))
     field = np.concatenate([np.negative(half), half]).astype(np.float64)
-    movers = Movers(True, *plan_arrays(motions), field)
-    return Surroundings(walls, grid, outlines, False, False, movers)
+    plans = plan_arrays(motions)
+    return Surroundings(walls, grid, outlines, False, False, *plans, field)
 
 
 def watch(
@@ -135,7 +135,7 @@ def watch(
     seen = []
     scene = surroundings_of(motions, half, walls, grid)
     still = np.zeros((len(places) - count, 2))
-    kernels.reset_marks(0, state, scene.movers.plans)
+    kernels.reset_marks(0, state, scene.plans)
     where = [bodies[0, :, :2].copy()]
     headings = [bodies[0, :count, 2].copy()]
     for t in range(steps):

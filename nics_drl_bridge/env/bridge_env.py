@@ -2,7 +2,7 @@
 
 from contextlib import suppress
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -29,7 +29,7 @@ from nics_drl_bridge.env.task import (
 from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import Backend, RobotView, Start
-from nics_drl_bridge.lidar.arrays import AnyArray, Mask, Singles
+from nics_drl_bridge.lidar.arrays import AnyArray, Singles
 from nics_drl_bridge.lidar.sensor import unread
 from nics_drl_bridge.random_kernels import episode_seed
 from nics_drl_bridge.robot import DEFAULT_ROBOT
@@ -38,14 +38,6 @@ from nics_drl_bridge.sim.scenes import Scene, sample_scene
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
 RENDER_FPS = 10
-
-
-class Direct(NamedTuple):
-    """A simulator whose arrays a task judges without copies."""
-
-    backend: SimBackend
-    view: RobotView  # its arrays change in place
-    step: BoundStep
 
 
 class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
@@ -136,7 +128,7 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
         self.render_mode = render_mode
         self._closed = False
         self.model = open_model(DEFAULT_ROBOT if model is None else model)
-        self.world = world if isinstance(world, AnyWorld) else load_worlds(world)
+        self.world = load_worlds(world)
         self.task = make_task(task, self.model, task_options)
         self.robots = self.task.robots
         self.observation_space = make_team_space(
@@ -145,7 +137,7 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
         self.action_space = make_team_space(self.task.action_space, self.robots)
         self.memory: Memory = {}
         self.scene: Scene | None = None
-        self.ended: Mask = np.zeros(self.robots, np.bool_)
+        self.ended = np.zeros(self.robots, np.bool_)
         self._view: RobotView | None = None  # always a batch of one, which tasks expect
         self._shape = (1, self.robots, self.task.observation_space.shape[0])
         self._row: Any = (0, 0) if self.robots == 1 else 0
@@ -172,7 +164,7 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
                 if value is not None:
                     options[name] = value
             backend = make_backend(backend, self.model, self.world, **options)
-        self._backend: Backend = complete_backend(backend, self._get_row(self._rest))
+        self._backend = complete_backend(backend, self._get_row(self._rest))
 
     @refuse_after_close
     @stop_on_error
@@ -210,7 +202,7 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
             self._backend.reset(Start(episode, self._get_row(starts)))
         )
         if self._direct is not None:
-            self._view = self._direct.view
+            self._view = self._direct[0]
         self.memory = memory
         self._commands = self._rest[None]
         self._facts = {}
@@ -244,7 +236,8 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
         self._rehearsed = True
 
     @cached_property
-    def _direct(self) -> Direct | None:
+    def _direct(self) -> tuple[RobotView, BoundStep] | None:
+        """A view of the simulator's own arrays, and the task's step on it, without copies."""
         backend = self._backend
         if self.robots > 1 or type(backend) is not SimBackend:
             return None  # a subclass of the backend may move and measure in its own way
@@ -252,7 +245,7 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
         if view is None or not self.task.binds_all:
             return None
         step = self.task.bind(view)
-        return None if step is None else Direct(backend, view, step)
+        return None if step is None else (view, step)
 
     def __getstate__(self) -> dict[str, Any]:
         state = dict(vars(self))
@@ -296,7 +289,7 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
         self._commands = self.task.drive(given.reshape(self._each), self.ended[None])
         self._steps += 1
         if self._direct is not None:
-            return self._advance_directly(self._direct)
+            return self._advance_directly(*self._direct)
         seen, facts = self._backend.step(self._commands[self._row])
         self._facts = facts
         view = self._lift(seen)
@@ -304,9 +297,10 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
         outcome = self.task.take_step(out, before, view, self.memory)
         if self.robots > 1:
             outcome = outcome.stop_rewards(self.ended[None])
-        terms = {}
-        for name, term in outcome.terms.items():
-            terms[name] = term[0] if self.robots > 1 else term.item()
+        terms = {
+            name: term[0] if self.robots > 1 else term.item()
+            for name, term in outcome.terms.items()
+        }
         self.ended = outcome.ended[0]
         self._view = view
         for name, values in outcome.info.items():
@@ -315,13 +309,14 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
         return out.reshape(-1), terms, self._make_info(view, facts)
 
     def _advance_directly(
-        self, direct: Direct
+        self, view: RobotView, step: BoundStep
     ) -> tuple[Singles, dict[str, float], Info]:
-        before = direct.view.pose[0].copy()
-        self._facts = direct.backend.move(self._commands)
-        observation, terms, ended, judged = direct.step(before, self.memory)
+        before = view.pose[0].copy()
+        backend: Any = self._backend
+        self._facts = backend.move(self._commands)
+        observation, terms, ended, judged = step(before, self.memory)
         self.ended[0] = ended
-        return observation, terms, self._make_info(direct.view, self._facts | judged)
+        return observation, terms, self._make_info(view, self._facts | judged)
 
     def halt(self) -> None:
         """Stops the robot until the next reset; any exception does this, too."""
@@ -330,9 +325,7 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
 
     def _lift(self, view: RobotView) -> RobotView:
         lead = (1, self.robots, -1)
-        sensed = {}
-        for name, reading in view.sensed.items():
-            sensed[name] = reading.reshape(lead)
+        sensed = {name: reading.reshape(lead) for name, reading in view.sensed.items()}
         return RobotView(
             view.pose.reshape(lead),
             view.twist.reshape(lead),
@@ -348,9 +341,9 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
         return rows[0] if self.robots == 1 else rows
 
     def _make_info(self, view: RobotView, facts: Info) -> Info:
-        info: Info = {}
-        for name in self.task.shown:
-            info[name] = self.memory[name][self._row].copy()
+        info: Info = {
+            name: self.memory[name][self._row].copy() for name in self.task.shown
+        }
         info["pose"] = view.pose[self._row].copy()
         info["scan_age_s"] = view.scan_age_s
         info["odom_age_s"] = view.odom_age_s
@@ -390,7 +383,7 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
             poses=np.reshape(facts.get("true_pose", view.pose), (self.robots, 3)),
             ranges=view.ranges[0].copy(),
             bodies=facts.get("bodies", self.scene.bodies),
-            goals=find_goals(self.memory).copy(),
+            goals=find_goals(self.memory),
             member=int(np.asarray(self.scene.member)),
             step=self._steps,
             estimates=view.pose[0].copy(),

@@ -55,8 +55,9 @@ def refuse_after_close(
     @wraps(method)
     def call_guarded(self: Any, /, *args: P.args, **kwargs: P.kwargs) -> T:
         if self._closed:
-            call = f"{method.__name__}() after close()"
-            raise ClosedEnvError(f"{call}: the env is closed; make a new one.")
+            raise ClosedEnvError(
+                f"{method.__name__}() after close(): the env is closed; make a new one."
+            )
         return method(self, *args, **kwargs)
 
     return call_guarded
@@ -91,26 +92,10 @@ def check_reset(seed: Any, options: Any, worlds: int = 1) -> None:
     seeds = [one for one in named if one is not None]
     check_seeds(seeds, GREATEST_SEED if several else GREATEST_SEED + 1 - worlds)
     if options is not None and not isinstance(options, Mapping):
-        needed = "must be a dict such as {'start': (x, y, heading)}, or None."
-        raise ConfigError(f"reset options of type {type(options).__name__}: {needed}")
-
-
-def apply_options(
-    memory: dict[str, AnyArray], options: Mapping[str, Any] | None, *of_env: str
-) -> None:
-    """Writes values of `reset(options=...)` into all rows of the memory arrays they name.
-
-    Options in `of_env` belong to the env, even if the task's memory has an entry of that name.
-    """
-    for name, value in (options or {}).items():
-        if name in of_env:
-            continue
-        if name not in memory:
-            valid = {*memory, *of_env}
-            raise ConfigError(
-                f"unknown reset option {name!r}; {suggest(str(name), valid)}"
-            )
-        give(memory[name], name, value)
+        raise ConfigError(
+            f"reset options of type {type(options).__name__}: must be a dict such as {{'start': "
+            "(x, y, heading)}, or None."
+        )
 
 
 def begin_task(
@@ -123,10 +108,17 @@ def begin_task(
 ) -> dict[str, AnyArray]:
     """Returns the memory of a Task in starting Episodes, with values of `reset(options=...)`.
 
-    Options in `of_env` belong to the env.
+    The values are written into all rows of the arrays that they name. Options in `of_env` belong to
+    the env, even if the task's memory has an entry of that name.
     """
     memory: dict[str, AnyArray] = task.start_episodes(episodes)
-    apply_options(memory, options, *of_env)
+    for name, value in (options or {}).items():
+        if name in of_env:
+            continue
+        if name not in memory:
+            hint = suggest(str(name), {*memory, *of_env})
+            raise ConfigError(f"unknown reset option {name!r}; {hint}")
+        give(memory[name], name, value)
     if options and "goal" in options:
         check_places("goal", memory["goal"], scenes, world)
     return memory
@@ -142,8 +134,9 @@ def give(rows: AnyArray, name: str, value: Any) -> None:
     shapes = [rows.shape[k:] for k in range(max(2, rows.ndim))]
     fits = numbers.shape in shapes
     if not fits or numbers.dtype.kind not in "fiub":
-        shape = f"{rows.shape[1:]}, or its last dimensions"
-        raise ConfigError(f"{option}: must be numbers of shape {shape}.")
+        raise ConfigError(
+            f"{option}: must be numbers of shape {rows.shape[1:]}, or its last dimensions."
+        )
     rows[...] = numbers
     if not np.isfinite(rows).all():
         raise ConfigError(f"{option}: must be finite.")
@@ -173,9 +166,9 @@ def check_places(
             for body in scene.bodies
         )
     if not free and len(places):
-        fix = "move it, or use another seed"
         raise ConfigError(
-            f"reset option {option!r}: {at.tolist()} is on an obstacle; {fix}."
+            f"reset option {option!r}: {at.tolist()} is on an obstacle; move "
+            "it, or use another seed."
         )
 
 
@@ -209,8 +202,9 @@ def check_action(action: Any, space: gymnasium.Space[Any], name: str) -> AnyArra
             f"{name} of {array.dtype}: must be real numbers."
         )
     if array.shape != space.shape:
-        needed = f"must be of shape {space.shape}."
-        raise gymnasium.error.InvalidAction(f"{name} of shape {array.shape}: {needed}")
+        raise gymnasium.error.InvalidAction(
+            f"{name} of shape {array.shape}: must be of shape {space.shape}."
+        )
     if isinstance(space, gymnasium.spaces.Box) and space.dtype == np.float32:
         if array.dtype.char not in "fd":
             # The kernels are compiled only for float32 and float64.
@@ -228,6 +222,8 @@ def check_command(command: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
     """Returns a task's command as an array. Raises ConfigError unless finite, of this shape."""
     made = np.asarray(command, np.float64)
     if made.shape != shape or not kernels.is_finite(made.reshape(1, -1)):
-        needed = f"must be finite and of shape {shape}; check its `command`."
-        raise ConfigError(f"the task's command {made!r:.80}: {needed}")
+        raise ConfigError(
+            f"the task's command {made!r:.80}: must be finite and of shape "
+            f"{shape}; check its `command`."
+        )
     return made

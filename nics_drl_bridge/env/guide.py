@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.env import guide_kernels as kernels
-from nics_drl_bridge.env.guide_kernels import GuideGrid
 from nics_drl_bridge.geometry import compute_depths
 from nics_drl_bridge.lidar.arrays import Array
 from nics_drl_bridge.lidar.shapes import Circle, Polygon
@@ -54,7 +53,7 @@ class Guide:
             origin = np.zeros((1, 2))
             depths = compute_depths(origin, np.array(footprint.outline))
             inner = abs(float(depths[0]))
-        self._grid = GuideGrid(
+        self._grid = kernels.GuideGrid(
             walls,
             frames,
             sizes,

@@ -15,7 +15,6 @@ from nics_drl_bridge.lidar.arrays import Array, Integers, Mask, Singles
 from nics_drl_bridge.lidar.exact_kernels import COS, RADIUS, SIN, OutlineArrays, X, Y
 from nics_drl_bridge.sim import collision_kernels as collision
 from nics_drl_bridge.sim import scene_kernels
-from nics_drl_bridge.sim.collision_kernels import Outline
 from nics_drl_bridge.sim.state import MapField
 
 # free space around the robot's circle above which a path is no longer tight [m]
@@ -39,13 +38,13 @@ class GuideGrid(NamedTuple):
     outer: float
 
 
-@kernel(allocates=True)
+@kernel
 def sample_walls(out: Singles, extent: Array, cell: float, cells: MapField) -> None:
     """Write the distances of `cells` to walls and map for coarser cells (rows, columns).
 
     The field is `extent` (4,), beyond which nothing is free.
     """
-    for i in range(out.shape[0]):
+    for i in range(len(out)):
         for j in range(out.shape[1]):
             x = extent[0] + (j + 0.5) * cell
             y = extent[1] + (i + 0.5) * cell
@@ -73,7 +72,7 @@ def find_ways(
     rows = grid.walls.shape[1]
     columns = grid.walls.shape[2]
     gaps = np.empty((rows, columns), np.float32)
-    for n in range(worlds.shape[0]):
+    for n in range(len(worlds)):
         p = member[n]
         height = grid.sizes[p, 0]
         width = grid.sizes[p, 1]
@@ -108,28 +107,21 @@ def _lower_space(
     """Lower the space (rows, columns) around cells to that beside a body [m]."""
     far = body[RADIUS] + grid.outer + COMFORT
     first = max(int((body[Y] - far - y) / cell), 0)
-    last = min(int((body[Y] + far - y) / cell), space.shape[0] - 1)
+    last = min(int((body[Y] + far - y) / cell), len(space) - 1)
     left = max(int((body[X] - far - x) / cell), 0)
     right = min(int((body[X] + far - x) / cell), space.shape[1] - 1)
     outline = collision.outline_of(body, grid.outlines)
     for i in range(first, last + 1):
-        centre_y = y + (i + 0.5) * cell
+        dy = y + (i + 0.5) * cell - body[Y]
         for j in range(left, right + 1):
-            centre_x = x + (j + 0.5) * cell
-            gap = np.float32(_measure_gap(centre_x, centre_y, body, outline))
-            space[i, j] = min(space[i, j], gap)
-
-
-@kernel
-def _measure_gap(x: float, y: float, body: Array, outline: Outline) -> float:
-    """Distance of a point from a body with an outline [m]."""
-    dx = x - body[X]
-    dy = y - body[Y]
-    if outline.begin < outline.end:
-        along = body[COS] * dx + body[SIN] * dy
-        across = body[COS] * dy - body[SIN] * dx
-        return collision.outline_point(along, across, outline)
-    return math.sqrt(dx * dx + dy * dy) - body[RADIUS]
+            dx = x + (j + 0.5) * cell - body[X]
+            if outline.begin < outline.end:
+                along = body[COS] * dx + body[SIN] * dy
+                across = body[COS] * dy - body[SIN] * dx
+                gap = collision.outline_point(along, across, outline)
+            else:
+                gap = math.sqrt(dx * dx + dy * dy) - body[RADIUS]
+            space[i, j] = min(space[i, j], np.float32(gap))
 
 
 @kernel
@@ -199,7 +191,7 @@ def update_ways(ways: Singles, prices: Singles, down: bool, left: bool) -> np.fl
     return most
 
 
-@kernel(allocates=True)
+@kernel
 def measure_lengths(
     out: Array,
     poses: Array,
@@ -208,7 +200,7 @@ def measure_lengths(
     grid: GuideGrid,
 ) -> None:
     """Write the path lengths (N, M) [m] from poses (N, M, 3), interpolated linearly."""
-    for n in range(out.shape[0]):
+    for n in range(len(out)):
         p = member[n]
         x = grid.frames[p, 0]
         y = grid.frames[p, 1]

@@ -60,27 +60,27 @@ class NavigationStep(NamedTuple):
     rules: Any  # NavigationRules, packed
 
 
-@kernel(allocates=True)
+@kernel
 def compute_episode_seeds(seeds: Integers, numbers: Integers, out: Integers) -> None:
     """Computes seeds (n,) of episodes from their numbers (n,) and their envs' seeds (n,)."""
-    for i in range(seeds.shape[0]):
+    for i in range(len(seeds)):
         out[i] = episode_seed(seeds[i], numbers[i])
 
 
-@kernel(allocates=True)
+@kernel
 def scale_actions(out: Array, actions: Singles, low: Array, high: Array) -> None:
     """Scales actions (R, C), clamped to [-1, 1], to commands (R, C) between their limits (C,)."""
-    for i in range(out.shape[0]):
+    for i in range(len(out)):
         for c in range(out.shape[1]):
             action = min(max(float(actions[i, c]), -1.0), 1.0)
             share = (action + 1.0) / 2.0
             out[i, c] = low[c] + share * (high[c] - low[c])
 
 
-@kernel(allocates=True)
+@kernel
 def is_finite(values: Array | Singles) -> bool:
     """Returns True if all values (R, C) are finite."""
-    for i in range(values.shape[0]):
+    for i in range(len(values)):
         for c in range(values.shape[1]):
             if not math.isfinite(values[i, c]):
                 return False
@@ -90,36 +90,27 @@ def is_finite(values: Array | Singles) -> bool:
 @kernel(allocates=True)
 def look(shares: Singles, ranges: Singles, scale: ScanScale) -> bool:
     """Writes a scan (B,) as fractions (P,), 1 free, 0 too close; returns True for a contact."""
+    seen = ranges
     if scale.sectors > 0:
         resample(shares, ranges, scale.plan)
-        for s in range(shares.shape[0]):
-            shares[s] = _scale_range(shares[s], scale)
-        return has_contact(ranges, scale)
-    hits = np.int32(0)
-    for b in range(ranges.shape[0]):
-        is_hit = ranges[b] < scale.leaves[b]
-        hits = np.int32(hits | np.int32(is_hit))
-        shares[b] = _scale_range(ranges[b], scale)
-    return hits != 0 and has_contact(ranges, scale)
+        seen = shares
+    for p in range(len(shares)):
+        # NaN (unknown) compares False, so it becomes 0, as does -inf (too close).
+        share = seen[p] * scale.per_metre
+        share = share if share > np.float32(0.0) else np.float32(0.0)
+        # Compare as integers, which keeps the order: LLVM turns two float limits into masks.
+        bits = np.float32(share).view(np.int32)
+        shares[p] = np.int32(min(bits, ONE)).view(np.float32)
+    return has_contact(ranges, scale)
 
 
-@kernel(inline=True)
-def _scale_range(value: np.float32, scale: ScanScale) -> np.float32:
-    # NaN (unknown) compares False, so it becomes 0, as does -inf (too close).
-    share = value * scale.per_metre
-    share = share if share > np.float32(0.0) else np.float32(0.0)
-    # Compare as integers, which keeps the order: LLVM turns two float limits into masks.
-    bits = np.float32(share).view(np.int32)
-    return np.int32(min(bits, ONE)).view(np.float32)
-
-
-@kernel(allocates=True)
+@kernel
 def has_contact(ranges: Singles, scale: ScanScale) -> bool:
     """Returns True if a beam of a scan (B,) and its neighbours' mean end within the footprint.
 
     A single beam is too noisy: of hundreds, one is nearly always off by three standard deviations.
     """
-    count = ranges.shape[0]
+    count = len(ranges)
     for begin in range(0, count, BLOCK):
         beams = min(BLOCK, count - begin)
         hits = np.int32(0)
@@ -130,23 +121,17 @@ def has_contact(ranges: Singles, scale: ScanScale) -> bool:
         if hits == 0:
             continue
         for b in range(begin, begin + beams):
-            if ranges[b] < scale.leaves[b]:
-                gap = _sum_gaps(b, ranges, scale)
-                if gap < np.float32(0.0):
-                    return True
+            if not ranges[b] < scale.leaves[b]:
+                continue
+            gap = np.float32(0.0)
+            end = min(b + scale.beside + 1, count)
+            for k in range(max(b - scale.beside, 0), end):
+                beyond = ranges[k] - scale.leaves[k]
+                if beyond == beyond:  # False for NaN (unknown)
+                    gap += min(max(beyond, -FURTHEST), FURTHEST)
+            if gap < np.float32(0.0):
+                return True
     return False
-
-
-@kernel(inline=True)
-def _sum_gaps(b: int, ranges: Singles, scale: ScanScale) -> np.float32:
-    gap = np.float32(0.0)
-    first = max(b - scale.beside, 0)
-    end = min(b + scale.beside + 1, ranges.shape[0])
-    for k in range(first, end):
-        beyond = ranges[k] - scale.leaves[k]
-        if beyond == beyond:  # False for NaN (unknown)
-            gap += min(max(beyond, -FURTHEST), FURTHEST)
-    return gap
 
 
 @kernel(allocates=True)
@@ -160,11 +145,11 @@ def looks(
 
     `packed` is a ScanScale, packed by `kernels.pack`.
     """
-    for i in range(ranges.shape[0]):
+    for i in range(len(ranges)):
         touched[i] = look(shares[i], ranges[i], packed.content)
 
 
-@kernel(allocates=True)
+@kernel
 def find_bearing(dx: float, dy: float, heading: float) -> tuple[float, float, float]:
     """Returns the distance [m] to a point at (dx, dy), and cosine and sine of its bearing."""
     distance = math.sqrt(dx * dx + dy * dy)
@@ -198,7 +183,7 @@ def navigate(
     """
     rules = packed.content
     parts = out.shape[1] - 6
-    for i in range(out.shape[0]):
+    for i in range(len(out)):
         touched = look(out[i, :parts], ranges[i], rules.scale.content)
         dx = goals[i, 0] - pose[i, 0]
         dy = goals[i, 1] - pose[i, 1]
@@ -241,10 +226,10 @@ def navigate_in_place(packed: Any, before: Array, goals: Array) -> None:
     )
 
 
-@kernel(allocates=True)
+@kernel
 def find_bearings(out: Array, ways: Array, headings: Array) -> None:
     """Writes `find_bearing` (R, 3) of points at displacements `ways` (R, 2) from headings (R,)."""
-    for r in range(out.shape[0]):
+    for r in range(len(out)):
         distance, out[r, 1], out[r, 2] = find_bearing(
             ways[r, 0], ways[r, 1], headings[r]
         )

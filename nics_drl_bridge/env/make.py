@@ -50,6 +50,8 @@ def make_vec(
         )
     if "vectorization_mode" in arguments:
         mode = format_value(arguments["vectorization_mode"])
-        reason = "one process steps all worlds together; leave it out; threads=2 uses two cores"
-        raise ConfigError(f"make_vec: vectorization_mode={mode}: {reason}.")
+        raise ConfigError(
+            f"make_vec: vectorization_mode={mode}: one process steps all worlds together; leave "
+            "it out; threads=2 uses two cores."
+        )
     return BridgeVectorEnv(num_envs, task=task, **arguments)

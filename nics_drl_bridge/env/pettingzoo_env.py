@@ -107,9 +107,7 @@ class BridgeParallelEnv(ParallelEnv[str, Singles, AnyArray]):
         self._steps = 0
         rows = observation.reshape(len(self.agents), -1)
         seen = dict(zip(self.agents, rows, strict=True))
-        infos = {}
-        for m, name in enumerate(self.agents):
-            infos[name] = self._of(info, m)
+        infos = {name: self._of(info, m) for m, name in enumerate(self.agents)}
         return seen, infos
 
     @stop_on_error
@@ -125,8 +123,9 @@ class BridgeParallelEnv(ParallelEnv[str, Singles, AnyArray]):
         """Advances one control period; see PettingZoo. Every remaining agent needs an action."""
         given: object = actions
         if not isinstance(given, dict):
-            needed = "must be a dict with an action per agent"
-            raise ConfigError(f"actions of type {type(given).__name__}: {needed}.")
+            raise ConfigError(
+                f"actions of type {type(given).__name__}: must be a dict with an action per agent."
+            )
         missing = sorted(set(self.agents) - set(actions))
         if missing:
             raise ConfigError(
@@ -151,9 +150,7 @@ class BridgeParallelEnv(ParallelEnv[str, Singles, AnyArray]):
         seen = {}
         for name in self.agents:
             m = self.possible_agents.index(name)
-            paid = {}
-            for key, term in terms.items():
-                paid[key] = float(term[m])
+            paid = {key: float(term[m]) for key, term in terms.items()}
             infos[name] = self._of(info, m)
             infos[name]["reward_terms"] = paid
             rewards[name] = sum(paid.values())

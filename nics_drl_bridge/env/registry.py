@@ -31,7 +31,18 @@ def make_task(
     Options are arguments of the class: `scan` as in `sectors.layout_of`, `sensors` as names.
     """
     if isinstance(task, Task):
-        _check_same(task, model, options)
+        name = type(task).__name__
+        if options:
+            raise ConfigError(
+                f"task {name} already exists; set {sorted(options)} when making it."
+            )
+        if task.robot != model.robot or task.lidar != model.lidar:
+            raise ConfigError(
+                f"task {name} is for the robot {task.robot.name!r} with {task.lidar.beams} beams, "
+                f"the model is {model.robot.name!r} with {model.lidar.beams}; make it with "
+                "model.robot and model.lidar."
+            )
+        task.check_observation_space()
         return task
     check_options("task_options", options)
     options = dict(options or {})
@@ -41,8 +52,10 @@ def make_task(
     if "sensors" in options:
         names = options["sensors"]
         if isinstance(names, str) or not isinstance(names, Iterable):
-            fix = "must be a list of names of the model's sensors"
-            raise ConfigError(f"task option sensors={format_value(names)}: {fix}.")
+            raise ConfigError(
+                f"task option sensors={format_value(names)}: must be a list of "
+                "names of the model's sensors."
+            )
         known = {sensor.name: sensor for sensor in model.sensors}
         names = [getattr(name, "name", str(name)) for name in names]
         for name in names:
@@ -62,22 +75,6 @@ def make_task(
         ) from None
     made.check_observation_space()
     return made
-
-
-def _check_same(task: Task, model: SimulatorModel, options: Any) -> None:
-    """Raises ConfigError unless a task was made for a model's robot, without `options`."""
-    name = type(task).__name__
-    if options:
-        raise ConfigError(
-            f"task {name} already exists; set {sorted(options)} when making it."
-        )
-    if task.robot != model.robot or task.lidar != model.lidar:
-        raise ConfigError(
-            f"task {name} is for the robot {task.robot.name!r} with {task.lidar.beams} beams, the "
-            f"model is {model.robot.name!r} with {model.lidar.beams}; make it with model.robot and "
-            "model.lidar."
-        )
-    task.check_observation_space()
 
 
 def find_task_class(task: Any, options: dict[str, Any]) -> type[Task]:
@@ -103,15 +100,18 @@ def find_task_class(task: Any, options: dict[str, Any]) -> type[Task]:
 def _import_task_class(name: Any) -> type:
     """Imports a class by the name of a shipped task, or by `path/to/file.py:ClassName`."""
     if not isinstance(name, str):
-        fix = "a name, path/to/file.py:ClassName, a subclass of Task, or a Task"
-        raise ConfigError(f"task={format_value(name)}: must be {fix}.")
+        raise ConfigError(
+            f"task={format_value(name)}: must be a name, path/to/file.py:ClassName, a "
+            "subclass of Task, or a Task."
+        )
     path, _, attribute = TASKS.get(name, name).rpartition(":")
     if not path and name.endswith(".py"):
         path = name
         attribute = ""
     if not path:
-        hint = f"{suggest(name, TASKS)} (or give path/to/file.py:ClassName)."
-        raise ConfigError(f"unknown task {name!r}; {hint}")
+        raise ConfigError(
+            f"unknown task {name!r}; {suggest(name, TASKS)} (or give path/to/file.py:ClassName)."
+        )
     module = extensions.load_module(path, "task")
     task_class = getattr(module, attribute, None)
     if isinstance(task_class, type):

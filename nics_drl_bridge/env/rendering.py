@@ -17,7 +17,6 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.env.snapshot import Snapshot, locate_hits
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.lidar.arrays import Singles
 from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, SHAPE
 from nics_drl_bridge.sim.world_set import AnyWorld
 from nics_drl_bridge.style import DARK, EDGE, GOAL, OTHER, SERIES, VERMILION
@@ -64,26 +63,21 @@ class WorldPicture:
             )
         for trail, colour in zip(trails, cycle(ROBOTS), strict=False):
             axes.plot(*np.transpose(trail), color=colour, linewidth=1.5)
+        robot = self._model.robot
         robots = zip(shot.poses, shot.ranges, cycle(ROBOTS), strict=False)
         for pose, scan, colour in robots:
-            self._draw_robot(axes, pose, scan, colour)
+            hits = locate_hits(self._model.lidar, pose, scan)
+            axes.plot(hits[:, 0], hits[:, 1], ".", color=SCAN, markersize=2.0)
+            draw_robot(
+                axes,
+                pose,
+                robot.footprint_radius,
+                robot.footprint,
+                color=colour,
+                zorder=1.0,
+            )
         self._canvas.draw()
         return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
-
-    def _draw_robot(
-        self, axes: Axes, pose: Array, ranges: Singles, colour: str
-    ) -> None:
-        hits = locate_hits(self._model.lidar, pose, ranges)
-        robot = self._model.robot
-        axes.plot(hits[:, 0], hits[:, 1], ".", color=SCAN, markersize=2.0)
-        draw_robot(
-            axes,
-            pose,
-            robot.footprint_radius,
-            robot.footprint,
-            color=colour,
-            zorder=1.0,
-        )
 
 
 def draw_robot(

@@ -5,7 +5,6 @@ from inspect import signature
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge import extensions
 from nics_drl_bridge.arguments import check_arguments, check_count
@@ -110,11 +109,12 @@ class SimBackend:
             "bodies": simulator.obstacles[0],
             "scenes": simulator.scenes,
         }
-        drawn = simulator.drawn
-        if drawn:
-            known["randomisation"] = {
-                name: self._get_draw(values) for name, values in drawn.items()
-            }
+        if simulator.drawn:
+            drawn = {}
+            for name, values in simulator.drawn.items():
+                own = values[0] if values.ndim == 1 else values[self._row]
+                drawn[name] = own.copy() if own.ndim else own.item()
+            known["randomisation"] = drawn
         return known
 
     def _get_truth(self) -> BackendFacts:
@@ -127,10 +127,6 @@ class SimBackend:
             if collided.ndim == 0
             else collided.astype(np.bool_),
         }
-
-    def _get_draw(self, draws: NDArray[Any]) -> Any:
-        drawn = draws[0] if draws.ndim == 1 else draws[self._row]
-        return drawn.copy() if drawn.ndim else drawn.item()
 
     def _measure(self) -> RobotView:
         data = self.simulator.data

@@ -30,10 +30,10 @@ class Snapshot:
     gate: str | None = None
 
 
-def find_goals(memory: Mapping[str, NDArray[Any]]) -> Array:
-    """Returns the goals (G, 2) in a task's memory, possibly none."""
-    goals = memory.get("goal", np.zeros(0))
-    return np.reshape(goals, (-1, 2))
+def find_goals(memory: Mapping[str, NDArray[Any]], n: int = 0) -> Array:
+    """Copies the goals (G, 2) of world n from a task's memory, possibly none."""
+    goals = memory["goal"][n] if "goal" in memory else ()
+    return np.array(goals, np.float64).reshape(-1, 2)
 
 
 def find_gate(info: Mapping[str, Any]) -> str | None:

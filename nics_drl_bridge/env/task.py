@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.env import guard, kernels
-from nics_drl_bridge.env.kernels import LIMIT, ScanScale
 from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.interface import Array, RobotView
 from nics_drl_bridge.kernels import Packed, pack
@@ -80,9 +79,7 @@ class Outcome:
         """Returns the outcome without rewards for robots that had `ended` before the step."""
         if not ended.any():
             return self
-        terms = {}
-        for name, term in self.terms.items():
-            terms[name] = np.where(ended, 0.0, term)
+        terms = {name: np.where(ended, 0.0, term) for name, term in self.terms.items()}
         return Outcome(terms, ended | self.ended, self.info)
 
 
@@ -262,10 +259,11 @@ class Task(ABC):
                 f"memory {sorted(memory)}", f"must keep {sorted(kept)} from `reset`"
             )
         # Copy rebound arrays into the env's rows. Read all first, because they may alias.
-        rebound = {}
-        for name, rows in kept.items():
-            if memory[name] is not rows:
-                rebound[name] = np.array(memory[name])
+        rebound = {
+            name: np.array(memory[name])
+            for name, rows in kept.items()
+            if memory[name] is not rows
+        }
         for name, new in rebound.items():
             rows = memory[name] = kept[name]
             if new.shape != rows.shape or not np.can_cast(
@@ -333,16 +331,20 @@ class Task(ABC):
     def check_result(self, what: str, given: Any, shape: tuple[int, ...]) -> Any:
         """Returns a user's result. Raises ConfigError unless it is finite and of this shape."""
         if np.shape(given) != shape or not _is_finite(given):
-            fault = f"must be finite, of shape {shape}, not {given!r:.80} of {np.shape(given)}"
-            raise self._make_error(what, fault)
+            raise self._make_error(
+                what,
+                f"must be finite, of shape {shape}, not {given!r:.80} of {np.shape(given)}",
+            )
         return given
 
     def check_observation_space(self) -> None:
         """Raises ConfigError unless `observation_space` is a Box (O,), as `box` makes it."""
         space: Any = self.observation_space
         if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1:
-            fix = "must be a property that returns a Box of one dimension; see `box`"
-            raise self._make_error("observation_space", fix)
+            raise self._make_error(
+                "observation_space",
+                "must be a property that returns a Box of one dimension; see `box`",
+            )
 
     @cached_property
     def command_limits(self) -> tuple[Array, Array]:
@@ -432,7 +434,7 @@ class Task(ABC):
         sectors = 0 if self.scan is None else self.scan.sectors
         per_metre = np.float32(1.0 / self.sight.range_max)
         beside = int(CONTACT_ANGLE / 2.0 / abs(self.lidar.angle_increment))
-        return pack(ScanScale(per_metre, leaves, beside, sectors, self.plan))
+        return pack(kernels.ScanScale(per_metre, leaves, beside, sectors, self.plan))
 
     def __getstate__(self) -> dict[str, Any]:
         state = {}
@@ -511,7 +513,7 @@ def distance(pose: ArrayLike, points: ArrayLike) -> Array:
 
 def limited(twist: Array) -> Array:
     """Clamps a twist (..., 3) to +-`kernels.LIMIT`, so that observations stay in their space."""
-    return np.minimum(np.maximum(twist, -LIMIT), LIMIT)
+    return np.minimum(np.maximum(twist, -kernels.LIMIT), kernels.LIMIT)
 
 
 def total(values: Array) -> Array:
@@ -519,7 +521,7 @@ def total(values: Array) -> Array:
     summed = values[..., 0].copy()
     for k in range(1, values.shape[-1]):
         summed += values[..., k]
-    return np.asarray(summed)
+    return summed
 
 
 def find_contact_ranges(robot: RobotSpec, lidar: LidarSpec, margin: float) -> Singles:
@@ -537,7 +539,7 @@ def find_contact_ranges(robot: RobotSpec, lidar: LidarSpec, margin: float) -> Si
         rest = radius * radius - start @ start + along * along
         half_chord = np.sqrt(np.maximum(rest, 0.0))
         leaves = np.where(rest >= 0.0, half_chord - along, -np.inf)
-    return leaves.astype(np.float32)
+    return np.asarray(leaves, np.float32)
 
 
 def _leaves_outline(ray: Array, corners: Array) -> Array:
@@ -552,5 +554,4 @@ def _leaves_outline(ray: Array, corners: Array) -> Array:
         share = along / np.sum(edge * edge, axis=-1)
     crossed = (share >= -1e-9) & (share <= 1.0 + 1e-9)
     crossed &= (steep != 0.0) & (away >= 0.0)
-    crossings = np.where(crossed, away, -np.inf)
-    return np.asarray(crossings.max(axis=1))
+    return np.asarray(np.where(crossed, away, -np.inf).max(axis=1))

@@ -17,7 +17,7 @@ from nics_drl_bridge.env import guard
 from nics_drl_bridge.env.bridge_env import RENDER_FPS, check_render_mode
 from nics_drl_bridge.env.kernels import compute_episode_seeds
 from nics_drl_bridge.env.registry import make_task
-from nics_drl_bridge.env.snapshot import Snapshot
+from nics_drl_bridge.env.snapshot import Snapshot, find_goals
 from nics_drl_bridge.env.task import (
     Episodes,
     Facts,
@@ -34,7 +34,7 @@ from nics_drl_bridge.env.teaching import Teacher, Teaching
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import NS_PER_S, Array, RobotView
-from nics_drl_bridge.lidar.arrays import AnyArray, Integers
+from nics_drl_bridge.lidar.arrays import AnyArray
 from nics_drl_bridge.lidar.shapes import BODY
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 from nics_drl_bridge.sim.scenes import Scenes
@@ -119,7 +119,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
         self._mode = MODES[mode]
         self.metadata = {**self.metadata, "autoreset_mode": self._mode}
         self.model = open_model(DEFAULT_ROBOT if model is None else model)
-        self.world = world if isinstance(world, AnyWorld) else load_worlds(world)
+        self.world = load_worlds(world)
         self.task = make_task(task, self.model, task_options)
         self.robots = self.task.robots
         self.single_observation_space = make_team_space(
@@ -142,14 +142,14 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
         count = self.num_envs
         robots = self.robots
         parts = self.task.observation_space.shape[0]
-        self._out: Observation = np.zeros((count, robots, parts), np.float32)
-        self._reward: Array = np.zeros((count, robots))
-        self.ended: Flags = np.zeros((count, robots), np.bool_)
-        self._over: Flags = np.zeros(count, np.bool_)
-        self._first: Integers = np.zeros(count, np.int64)
-        self._episode: Integers = np.full(count, -1)
-        self._starts: Array = np.zeros((count, robots, 3))
-        self._bodies: Array = np.zeros((count, self.simulator.sampler.count, BODY))
+        self._out = np.zeros((count, robots, parts), np.float32)
+        self._reward = np.zeros((count, robots))
+        self.ended = np.zeros((count, robots), np.bool_)
+        self._over = np.zeros(count, np.bool_)
+        self._first = np.zeros(count, np.int64)
+        self._episode = np.full(count, -1)
+        self._starts = np.zeros((count, robots, 3))
+        self._bodies = np.zeros((count, self.simulator.sampler.count, BODY))
         self.memory: Memory = {}
         # False also after an exception, which may leave some worlds a step behind
         self.ready = False
@@ -188,12 +188,37 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
         """Starts an episode in every world; world i takes its seeds from `seed + i`."""
         guard.check_reset(seed, options, self.num_envs)
         super().reset(seed=seed if isinstance(seed, int) else None)
-        chosen = choose_worlds(options, self.num_envs)
+        count = self.num_envs
+        chosen = np.ones(count, np.bool_)
+        if options and "reset_mask" in options:
+            mask = np.asarray(options["reset_mask"])
+            if mask.shape != (count,) or mask.dtype != np.bool_ or not mask.any():
+                raise ConfigError(
+                    f"options['reset_mask'] of shape {mask.shape}, {mask.dtype}: must be "
+                    f"({count},) bool with at least one True."
+                )
+            chosen = mask.copy()
         if not (self.ready or chosen.all()):
             raise gymnasium.error.ResetNeeded(
                 "reset all worlds before you reset some of them."
             )
-        seeds, fresh = choose_seeds(seed, chosen, self._episode < 0, self.np_random)
+        # These worlds restart with a seed: their own one, or that of the first world plus theirs.
+        if isinstance(seed, Sequence | np.ndarray):
+            if len(seed) != count:
+                raise ConfigError(
+                    f"{len(seed)} seeds for {count} worlds; give one each."
+                )
+            fresh = chosen & np.array([one is not None for one in seed])
+            seeds = np.array([one or 0 for one in seed], np.int64)
+        else:
+            fresh = chosen & (seed is not None)
+            seeds = (seed or 0) + np.arange(count, dtype=np.int64)
+        # Seeds are drawn for worlds that never had one.
+        new = chosen & (self._episode < 0) & ~fresh
+        if new.any():
+            first = int(self.np_random.integers(2**31))
+            seeds = np.where(new, first + np.arange(count), seeds)
+            fresh = fresh | new
         self.ready = False
         self._first[fresh] = seeds[fresh]
         self._episode[fresh] = -1
@@ -301,11 +326,14 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
                 name: self._get_row(t).copy() for name, t in outcome.terms.items()
             },
         }
-        if self._mode is AutoresetMode.SAME_STEP:
-            self._end_at_once(out, over, facts, infos)
-        else:
+        if self._mode is AutoresetMode.NEXT_STEP:
             self._over = over
             self._tell(infos, facts, begun)
+        else:
+            if over.any():
+                infos |= self._get_final(flatten(out), over, facts)
+                run(lambda p: self._begin(p.start + np.flatnonzero(over[p]), out))
+            self._tell(infos, facts, over)
         self.ready = True
         return flatten(out), reward, terminated, truncated, infos
 
@@ -325,9 +353,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
             0.0,
         )
         self.simulator.step_part(part, command)
-        memory = {}
-        for name, rows in self.memory.items():
-            memory[name] = rows[part]
+        memory = {name: rows[part] for name, rows in self.memory.items()}
         outcome = self.task.take_step(out[part], before, self._make_view(part), memory)
         if self._teacher is not None:
             outcome = self._teacher.judge(part, outcome)
@@ -339,31 +365,19 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
         self._begin(part.start + np.flatnonzero(begun[part]), out)
         return outcome
 
-    def _end_at_once(
-        self,
-        out: Observation,
-        over: Flags,
-        facts: Info,
-        infos: Info,
-    ) -> None:
-        """Resets ended worlds in `SameStep`; `infos` gets their last observation and info."""
-        if over.any():
-            shown = np.full(self.num_envs, None, dtype=object)
-            # Only for ended worlds, because each needs its own object.
-            rows = flatten(out)
-            for n in np.flatnonzero(over):
-                shown[n] = rows[n].copy()
-            infos |= add_masks({"final_obs": shown}, over)
-            final = self._get_known() | facts
-            infos |= add_masks({"final_info": final}, over, True)
-            if self._teacher is not None:
-                success = facts.get("is_success", over)
-                success = success.reshape(self.num_envs, -1).all(axis=1)
-                repeats = self._teacher.find_repeats(over, success)
-                self._episode[repeats] -= 1
-            run = self.simulator.run_parts
-            run(lambda part: self._begin(part.start + np.flatnonzero(over[part]), out))
-        self._tell(infos, facts, over)
+    def _get_final(self, rows: Observation, over: Flags, facts: Info) -> Info:
+        """Returns the last observation and info of ended worlds; notes which of them repeat."""
+        shown = np.full(self.num_envs, None, dtype=object)
+        # Only for ended worlds, because each needs its own object.
+        for n in np.flatnonzero(over):
+            shown[n] = rows[n].copy()
+        if self._teacher is not None:
+            success = facts.get("is_success", over)
+            success = success.reshape(self.num_envs, -1).all(axis=1)
+            self._episode[self._teacher.find_repeats(over, success)] -= 1
+        final = self._get_known() | facts
+        final_info = add_masks({"final_info": final}, over, True)
+        return add_masks({"final_obs": shown}, over) | final_info
 
     def _tell(self, infos: Info, facts: Info, begun: Flags) -> None:
         infos |= add_masks(self._get_known(), np.ones_like(begun))
@@ -376,9 +390,9 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
     # Facts as arrays (N, ...) for worlds with one robot, or (N, M, ...) for teams.
 
     def _get_known(self) -> Info:
-        known = {}
-        for name in self.task.shown:
-            known[name] = self._get_row(self.memory[name]).copy()
+        known = {
+            name: self._get_row(self.memory[name]).copy() for name in self.task.shown
+        }
         known["pose"] = self._get_row(self.simulator.data.odom).copy()
         known["scan_age_s"] = np.zeros(self.num_envs)
         known["odom_age_s"] = np.zeros(self.num_envs)
@@ -424,14 +438,11 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
     def snapshot(self, n: int) -> Snapshot:
         """Returns the current state of world n for a picture; `step` does not change its arrays."""
         data = self.simulator.data
-        goals = np.zeros((0, 2))
-        if "goal" in self.memory:
-            goals = self.memory["goal"][n].reshape(-1, 2).copy()
         return Snapshot(
             data.pose[n].copy(),
             data.ranges[n].copy(),
             self.simulator.obstacles_of(np.array([n]))[0],
-            goals,
+            find_goals(self.memory, n),
             int(data.member[n]),
             int(data.steps[n]),
             data.odom[n].copy(),
@@ -447,51 +458,15 @@ def join_outcomes(parts: Sequence[Outcome]) -> Outcome:
     """Joins the outcomes of consecutive parts of the worlds."""
     if len(parts) == 1:
         return parts[0]
-    terms = {}
-    for name in parts[0].terms:
-        terms[name] = np.concatenate([part.terms[name] for part in parts])
-    info = {}
-    for name in parts[0].info:
-        info[name] = np.concatenate([part.info[name] for part in parts])
+    terms = {
+        name: np.concatenate([part.terms[name] for part in parts])
+        for name in parts[0].terms
+    }
+    info = {
+        name: np.concatenate([part.info[name] for part in parts])
+        for name in parts[0].info
+    }
     return Outcome(terms, np.concatenate([part.ended for part in parts]), info)
-
-
-def choose_worlds(options: dict[str, Any] | None, count: int) -> Flags:
-    """Returns the mask (N,) of worlds to reset. Raises ConfigError for a wrong `reset_mask`."""
-    if not options or "reset_mask" not in options:
-        return np.ones(count, np.bool_)
-    chosen = np.asarray(options["reset_mask"])
-    if chosen.shape != (count,) or chosen.dtype != np.bool_ or not chosen.any():
-        mask = f"options['reset_mask'] of shape {chosen.shape}, {chosen.dtype}"
-        raise ConfigError(f"{mask}: must be ({count},) bool with at least one True.")
-    return chosen.copy()
-
-
-def choose_seeds(
-    seed: int | Sequence[int | None] | None,
-    chosen: Flags,
-    unnamed: Flags,
-    rng: np.random.Generator,
-) -> tuple[Integers, Flags]:
-    """Returns the seeds (N,) of a reset, and the mask (N,) of worlds that restart with them.
-
-    `seed` is the first world's, or one per world (None keeps its present one), or None for all. For
-    `chosen` worlds that are `unnamed`, having never had a seed, seeds are drawn if needed.
-    """
-    count = len(chosen)
-    if isinstance(seed, Sequence | np.ndarray):
-        if len(seed) != count:
-            raise ConfigError(f"{len(seed)} seeds for {count} worlds; give one each.")
-        is_seeded = chosen & np.array([one is not None for one in seed])
-        seeds = np.array([one or 0 for one in seed], np.int64)
-    else:
-        is_seeded = chosen & (seed is not None)
-        seeds = (seed or 0) + np.arange(count, dtype=np.int64)
-    new = chosen & unnamed & ~is_seeded
-    if new.any():
-        first = int(rng.integers(2**31))
-        seeds = np.where(new, first + np.arange(count), seeds)
-    return seeds, is_seeded | new
 
 
 def zeros(shape: tuple[int, ...], dtype: np.dtype[Any]) -> AnyArray:

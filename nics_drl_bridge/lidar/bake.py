@@ -52,9 +52,9 @@ def bake(
     )
     sizes = cells[:, 1] * density.phases
     if sizes.sum() > MOST_NUMBERS:
-        size = f"a lidar table of {len(cells)} cells with {spec.beams} beams"
         raise ConfigError(
-            f"{size} is too large; lower `distances`, `rotations` or `phases`."
+            f"a lidar table of {len(cells)} cells with {spec.beams} beams is too large; lower "
+            "`distances`, `rotations` or `phases`."
         )
     first = np.cumsum([0, *(len(g.turns) * density.distances for g in grids)])
     about = [
@@ -64,7 +64,7 @@ def bake(
         shapes,
         density,
         spec.angle_increment,
-        np.array(about, dtype=np.float64).reshape(-1, 3),
+        np.array(about, np.float64).reshape(-1, 3),
         (np.cumsum(sizes) - sizes).astype(np.int32),
         cells.astype(np.int16),
         np.zeros(int(sizes.sum()) + count_padding(spec.angle_increment), np.float32),
@@ -126,9 +126,9 @@ def make_grid(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> 
                 far_off[..., None], climb, two
             )
     if cell[..., 1].max() > MOST_WIDE or cell[..., 0].min() < FIRST_BEAM:
-        apart = f"{spec.angle_increment:.2g} rad apart; scan with the renderer `exact`."
         raise ConfigError(
-            f"{describe(shape)} covers too many beams to be baked: they are {apart}"
+            f"{describe(shape)} covers too many beams to be baked: they are "
+            f"{spec.angle_increment:.2g} rad apart; scan with the renderer `exact`."
         )
     return Grid(distances, np.arange(count) * unit, edges[parts // 2 :: parts], cell)
 
@@ -194,7 +194,7 @@ def _miss(
         true = edge[k:][: count * parts : parts]
         corner = rotate(hull[two], turn[:, None, None])
         for later in (0, 1):
-            last = distances.shape[0] - later
+            last = len(distances) - later
             x = corner[:, :last, :, 0] + distances[later:, None]
             off = np.abs(
                 np.arctan2(corner[:, :last, :, 1], x) - true[:, later:, None]

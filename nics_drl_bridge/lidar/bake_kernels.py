@@ -17,7 +17,7 @@ from nics_drl_bridge.lidar.exact_kernels import (
 EDGE = 1e-6  # ranges at an edge are taken this far inside it, as a fraction of the whole width
 
 
-@kernel(allocates=True)
+@kernel
 def find_edges(
     hull: Array,
     radius: float,
@@ -31,10 +31,10 @@ def find_edges(
     Both results are (T, D, 2), for rotations (T,) [rad] and distances (D,) [m] of its origin. The
     convex hull is (V, 2) [m], unused for a circle; `radius` [m] is 0 for any other shape.
     """
-    for t in range(turns.shape[0]):
+    for t in range(len(turns)):
         c = math.cos(turns[t])
         s = math.sin(turns[t])
-        for d in range(distances.shape[0]):
+        for d in range(len(distances)):
             if radius > 0.0:
                 half = math.asin(min(radius / distances[d], 1.0))
                 edges[t, d, 0] = -half
@@ -45,7 +45,7 @@ def find_edges(
             ly = ry
             right = 0
             left = 0
-            for v in range(1, hull.shape[0]):
+            for v in range(1, len(hull)):
                 x, y = place_corner(distances[d], 0.0, c, s, hull[v])
                 if rx * y - ry * x < 0.0:
                     rx = x
@@ -74,7 +74,7 @@ class ShapeAhead(NamedTuple):
 @kernel
 def scan_ahead(scan: ShortIntegers, beams: Beams, shape: ShapeAhead) -> None:
     """Fuse a shape into a scan (B,), see `beam_kernels`."""
-    if shape.corners.shape[0] == 0:
+    if len(shape.corners) == 0:
         scan_circle(scan, beams, shape.distance, 0.0, shape.radius)
     else:
         scan_polygon(scan, beams, shape.distance, 0.0, shape.c, shape.s, shape.corners)
@@ -91,7 +91,7 @@ def find_range(angle: float, shape: ShapeAhead) -> np.float32:
     scan_ahead(scan, make_beams(direction, angle, 1.0), shape)
     nearest = scan.view(np.float32)[0]
     if not np.isfinite(nearest):  # a wall seen edge-on
-        for v in range(shape.corners.shape[0]):
+        for v in range(len(shape.corners)):
             x, y = place_corner(shape.distance, 0.0, shape.c, shape.s, shape.corners[v])
             nearest = min(nearest, np.float32(math.hypot(x, y)))
     return nearest
@@ -107,7 +107,7 @@ def fill_row(
     """
     fine[:] = np.inf
     first = max(math.ceil(edges[0] / step) - start, 0)
-    last = min(math.floor(edges[1] / step) - start, fine.shape[0] - 1)
+    last = min(math.floor(edges[1] / step) - start, len(fine) - 1)
     if first <= last:
         directions = np.empty((2, last + 1 - first))
         for i in range(directions.shape[1]):
@@ -149,7 +149,7 @@ def fill_rows_of_turn(
     c = math.cos(turn)
     s = math.sin(turn)
     corners, radius = shape
-    for d in range(distances.shape[0]):
+    for d in range(len(distances)):
         start = layout[0, d]
         width = layout[2, d]
         fine = np.empty(width * phases, np.float32)

@@ -2,7 +2,7 @@
 
 While a scan (B,) is made, its ranges [m], float32, are kept as the whole numbers of the same bits:
 those of positive floats have the same order, and LLVM would mask the store of a float's minimum.
-`lower` takes the minimum of Eq. 4 for one beam, and `finish` applies the limits of the lidar.
+`lower` takes the minimum of Eq. 4 for one beam.
 """
 
 import math
@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.lidar.arrays import Array, ShortIntegers, Singles
+from nics_drl_bridge.lidar.arrays import Array, ShortIntegers
 
 TWO_PI = 2.0 * math.pi
 HALF_PI = 0.5 * math.pi
@@ -140,18 +140,3 @@ def beams_within(span: Span, turned_by: float, beam_count: int) -> tuple[int, in
 def lower(scan: ShortIntegers, i: int, distance: float | np.float32) -> None:
     """Lower the range of beam i of a scan to a distance [m], if it is nearer (Eq. 4)."""
     scan[i] = min(scan[i], np.float32(distance).view(np.int32))
-
-
-@kernel(inline=True)
-def finish(
-    ranges: Singles, scan: ShortIntegers, range_min: float, range_max: float
-) -> None:
-    """Write the ranges (B,) of a scan: too far becomes `inf`, too close `-inf` (REP-117)."""
-    low = np.float32(range_min)
-    high = np.float32(range_max)
-    distances = scan.view(np.float32)
-    for k in range(ranges.shape[0]):
-        i = np.uintp(k)
-        value = distances[i]
-        value = value if value <= high else np.float32(np.inf)
-        ranges[i] = value if value >= low else np.float32(-np.inf)

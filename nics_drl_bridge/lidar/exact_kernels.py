@@ -104,9 +104,9 @@ def scan_polygon(
     corners: Array,
 ) -> None:
     """Fuse the exact ranges to the outline `corners` (V, 2), turned by (c, s), at (x, y)."""
-    corner_x, corner_y = place_corner(x, y, c, s, corners[corners.shape[0] - 1])
+    corner_x, corner_y = place_corner(x, y, c, s, corners[-1])
     start = corner_x, corner_y, arctan2(corner_y, corner_x)
-    for v in range(corners.shape[0]):
+    for v in range(len(corners)):
         corner_x, corner_y = place_corner(x, y, c, s, corners[v])
         end = corner_x, corner_y, arctan2(corner_y, corner_x)
         scan_edge(scan, beams, start, end)
@@ -126,7 +126,7 @@ def scan_walls(
     scan: ShortIntegers, beams: Beams, lidar: LidarPose, walls: Array, range_max: float
 ) -> None:
     """Fuse walls (W, 4) of the world; those out of range are skipped."""
-    for w in range(walls.shape[0]):
+    for w in range(len(walls)):
         start_x, start_y = _transform_point(walls[w, 0], walls[w, 1], lidar)
         end_x, end_y = _transform_point(walls[w, 2], walls[w, 3], lidar)
         ex = end_x - start_x

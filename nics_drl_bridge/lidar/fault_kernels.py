@@ -45,7 +45,7 @@ class Distortion(NamedTuple):
     last: np.float32
 
 
-@kernel(allocates=True)
+@kernel
 def distort(
     ranges: Singles,
     limits: Array | tuple[float, float],
@@ -58,14 +58,22 @@ def distort(
     A return stays within the limits, range_min and range_max [m]; `counter` is that of the scan.
     """
     device = _prepare_device(limits, faults)
+    whole = ranges.view(np.int32)
     noisy = device.std > 0.0 or device.grows > 0.0
     coarse = device.step > 0.0 and device.first <= device.last
     if faults[TOO_CLOSE] == AS_GHOST:
-        _add_ghosts(ranges, device, random.key(seed, random.GHOST_STREAM, counter))
+        by = random.key(seed, random.GHOST_STREAM, counter)
+        width = device.most - device.least
+        for i in range(len(ranges)):
+            ghost = device.least + random.share_of(random.bits(by, i)) * width
+            value = np.float32(ghost).view(np.int32)
+            whole[i] = max(whole[i], value if whole[i] == MINUS_INF else NONE)
     if faults[TOO_CLOSE] == AS_RANGE_MIN or not (
         noisy or coarse or device.close == -np.inf
     ):
-        _close(ranges, device.close)
+        close = np.float32(device.close).view(np.int32)
+        for i in range(len(ranges)):
+            whole[i] = max(whole[i], close if whole[i] == MINUS_INF else NONE)
     if noisy and coarse:
         _add_noise(ranges, device, random.key(seed, random.RANGE_STREAM, counter), True)
     elif noisy:
@@ -73,13 +81,16 @@ def distort(
             ranges, device, random.key(seed, random.RANGE_STREAM, counter), False
         )
     elif coarse:
-        for i in range(ranges.shape[0]):
+        for i in range(len(ranges)):
             ranges[i] = _report(ranges[i], _quantize(ranges[i], device), device)
     if faults[DROPOUT] > 0.0 or faults[DROPOUT_FAR] > 0.0:
         by = random.key(seed, random.DROPOUT_STREAM, counter)
-        _drop(
-            ranges, faults[DROPOUT], faults[DROPOUT_FAR] / (limits[1] * limits[1]), by
-        )
+        share = np.float32(faults[DROPOUT])
+        far = np.float32(faults[DROPOUT_FAR] / (limits[1] * limits[1]))
+        for i in range(len(ranges)):
+            reach = ranges[i] if ranges[i] > np.float32(0.0) else np.float32(0.0)
+            lost = random.share_of(random.bits(by, i)) < share + far * reach * reach
+            whole[i] = max(whole[i], INF if lost else NONE)
 
 
 @kernel(inline=True)
@@ -115,33 +126,12 @@ def _prepare_device(limits: tuple[float, float], faults: Array) -> Distortion:
     )
 
 
-@kernel(allocates=True)
-def _add_ghosts(ranges: Singles, device: Distortion, by: int) -> None:
-    whole = ranges.view(np.int32)
-    for i in range(ranges.shape[0]):
-        ghost = device.least + random.share_of(random.bits(by, i)) * (
-            device.most - device.least
-        )
-        value = np.float32(ghost).view(np.int32)
-        whole[i] = max(whole[i], value if whole[i] == MINUS_INF else NONE)
-
-
-@kernel(allocates=True)
-def _close(ranges: Singles, close: np.float32) -> None:
-    whole = ranges.view(np.int32)
-    value = np.float32(close).view(np.int32)
-    for i in range(ranges.shape[0]):
-        whole[i] = max(whole[i], value if whole[i] == MINUS_INF else NONE)
-
-
-@kernel(allocates=True, inline=True)
+@kernel(inline=True)
 def _add_noise(ranges: Singles, device: Distortion, by: int, coarse: bool) -> None:
-    runs = ranges.shape[0] // random.RUN
+    runs = len(ranges) // random.RUN
     for k in range(runs):
         _add_noise_run(ranges, random.RUN, device, by, k, coarse)
-    _add_noise_run(
-        ranges, ranges.shape[0] - runs * random.RUN, device, by, runs, coarse
-    )
+    _add_noise_run(ranges, len(ranges) - runs * random.RUN, device, by, runs, coarse)
 
 
 @kernel(contracts=True, inline=True)
@@ -159,7 +149,11 @@ def _add_noise_run(
         i = begin + np.uintp(j)
         value = ranges[i]
         noisy = value + (device.std + device.grows * value) * random.normal_of(run, j)
-        noisy = _quantize(noisy, device) if coarse else _limit(noisy, device)
+        if coarse:
+            noisy = _quantize(noisy, device)
+        else:
+            noisy = device.least if noisy < device.least else noisy
+            noisy = device.most if noisy > device.most else noisy
         ranges[i] = _report(value, noisy, device)
 
 
@@ -186,48 +180,7 @@ def _multiply_step(count: np.float32, step: np.float32, rest: np.float32) -> np.
     return count * step + count * rest  # rounded once
 
 
-@kernel(inline=True)
-def _limit(value: np.float32, device: Distortion) -> np.float32:
-    value = device.least if value < device.least else value
-    return device.most if value > device.most else value
-
-
-@kernel(allocates=True)
-def _drop(
-    ranges: Singles,
-    share: float | np.float32,
-    far: float | np.float32,
-    by: int,
-) -> None:
-    share = np.float32(share)
-    far = np.float32(far)
-    whole = ranges.view(np.int32)
-    for i in range(ranges.shape[0]):
-        reach = ranges[i] if ranges[i] > np.float32(0.0) else np.float32(0.0)
-        lost = random.share_of(random.bits(by, i)) < share + far * reach * reach
-        whole[i] = max(whole[i], INF if lost else NONE)
-
-
-@kernel(allocates=True)
-def slice_pose(out: Array, pose: Array, twist: Array, ago: float) -> None:
-    """Write the pose (3,) `ago` [s] earlier on the arc of a twist (3,); heading unwrapped."""
-    turn = -twist[2] * ago
-    half = 0.5 * turn
-    # The chord of the arc is rotated by half the turn: |chord| = arc * sin(half) / half.
-    if abs(half) < 1e-4:
-        chord = 1.0 - half * half / 6.0
-    else:
-        chord = math.sin(half) / half
-    c = math.cos(pose[2] + half)
-    s = math.sin(pose[2] + half)
-    x = -twist[0] * ago * chord
-    y = -twist[1] * ago * chord
-    out[0] = pose[0] + c * x - s * y
-    out[1] = pose[1] + s * x + c * y
-    out[2] = pose[2] + turn
-
-
-@kernel(allocates=True)
+@kernel
 def slice_poses(
     out: Array,
     pose: Array,
@@ -249,7 +202,7 @@ def slice_poses(
         direction: a value of SKEW; the newest beam is the last, or beam 0 if it turns clockwise.
         moving: for how long the robot has been moving [s]; before that it stood where it began.
     """
-    count = out.shape[0]
+    count = len(out)
     for g in range(count):
         ago = 0.0
         if direction != AT_ONCE:
@@ -257,10 +210,24 @@ def slice_poses(
             if direction > AT_ONCE:
                 later = count - 1 - g
             ago = min(sweep * (later + 0.5) / count, moving)
-        slice_pose(out[g], pose, twist, ago)
+        # Back on the arc of the twist, whose chord is rotated by half the turn:
+        # |chord| = arc * sin(half) / half.
+        turn = -twist[2] * ago
+        half = 0.5 * turn
+        if abs(half) < 1e-4:
+            chord = 1.0 - half * half / 6.0
+        else:
+            chord = math.sin(half) / half
+        c = math.cos(pose[2] + half)
+        s = math.sin(pose[2] + half)
+        x = -twist[0] * ago * chord
+        y = -twist[1] * ago * chord
+        out[g, 0] = pose[0] + c * x - s * y
+        out[g, 1] = pose[1] + s * x + c * y
+        out[g, 2] = pose[2] + turn
 
 
-@kernel(allocates=True)
+@kernel
 def distort_worlds(
     ranges: Singles,
     chosen: Integers,

@@ -9,7 +9,7 @@ by their range. For each ring, `find_lookup_distances`
 3. adds up the squared errors of the random placements by placement and band, and keeps the largest
    error of any beam, also of the slanted placements.
 
-Then `_find_widest` takes the widest interval of rings in which no beam is off by more than
+Then it takes the widest interval of rings in which no beam is off by more than
 `OUTLIER` and `_is_small` holds in each ring, and in each band over all rings of the interval:
 
     mean + DEVIATIONS * spread <= greatest^2
@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.lidar import scan_kernels
-from nics_drl_bridge.lidar.arrays import Array, Mask
+from nics_drl_bridge.lidar.arrays import Array
 from nics_drl_bridge.lidar.maps import stack_fixtures
 from nics_drl_bridge.lidar.scan_kernels import LidarArrays
 from nics_drl_bridge.lidar.shapes import place
@@ -84,7 +84,17 @@ def find_lookup_distances(
             poses = _turn_edge_on(poses, outline, SEED + i)
             errors = _compare(place(poses[:, None], radius, shape), exact, baked)
             worst[i] = max(worst[i], np.abs(errors.error).max(initial=0.0))
-    return _find_widest(rings, squares, counts, worst <= OUTLIER, greatest)
+    # The widest interval of rings with small errors, if one is wide enough.
+    best = (np.inf, np.inf)
+    width = NARROWEST * (rings[-1] - rings[0])
+    for i in range(RINGS):
+        for j in range(i + 1, RINGS + 1):
+            if rings[j] - rings[i] <= width or worst[i:j].max() > OUTLIER:
+                continue
+            if _is_small(squares[i:j], counts[i:j], greatest):
+                best = (float(rings[i]), float(rings[j]))
+                width = rings[j] - rings[i]
+    return best
 
 
 class _Errors(NamedTuple):
@@ -93,26 +103,6 @@ class _Errors(NamedTuple):
     placement: NDArray[np.int_]  # index of the placement
     truth: Array  # exact range [m]
     error: Array  # looked-up range minus exact range [m]
-
-
-def _find_widest(
-    rings: Array,
-    squares: Array,
-    counts: Array,
-    has_no_outlier: Mask,
-    greatest: float,
-) -> tuple[float, float]:
-    """Edges of the widest interval of rings with small errors; inf if none is wide enough."""
-    best = (np.inf, np.inf)
-    width = NARROWEST * (rings[-1] - rings[0])
-    for i in range(RINGS):
-        for j in range(i + 1, RINGS + 1):
-            if rings[j] - rings[i] <= width or not has_no_outlier[i:j].all():
-                continue
-            if _is_small(squares[i:j], counts[i:j], greatest):
-                best = (float(rings[i]), float(rings[j]))
-                width = rings[j] - rings[i]
-    return best
 
 
 def _is_small(squares: Array, counts: Array, greatest: float) -> bool:

@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.lidar.arrays import Array, ShortIntegers, Singles
+from nics_drl_bridge.lidar.arrays import Array, ShortIntegers, Singles, structure_of
 from nics_drl_bridge.lidar.beam_kernels import (
     TWO_PI,
     Beams,
@@ -42,20 +42,23 @@ from nics_drl_bridge.lidar.beam_kernels import (
 )
 from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SHAPE, SIN, X, Y
 
-TABLE_SHAPE = np.dtype(
-    [  # one shape of the table
-        ("distances_per_metre", np.float64),  # grid distances
-        ("rotations", np.float64),  # grid rotations in a full turn, 0 for a circle
-        # A period is the smallest rotation after which the shape looks the same.
-        ("periods_per_rotation", np.float64),
-        ("first_cell", np.int64),
-        ("cells_per_period", np.int64),
-        ("second_hull", np.int64),  # first corner of the second copy of its hull
-        ("corners_per_period", np.int64),
-        ("corners", np.int64),  # of the hull
-        ("round_radius", np.float64),  # radius of a circle [m], 0 for other shapes
-    ]
-)
+
+class TableShape:
+    """One shape of the table."""
+
+    distances_per_metre: float  # grid distances
+    rotations: float  # grid rotations in a full turn, 0 for a circle
+    # A period is the smallest rotation after which the shape looks the same.
+    periods_per_rotation: float
+    first_cell: int
+    cells_per_period: int
+    second_hull: int  # first corner of the second copy of its hull
+    corners_per_period: int
+    corners: int  # of the hull
+    round_radius: float  # radius of a circle [m], 0 for other shapes
+
+
+TABLE_SHAPE = structure_of(TableShape)
 # Columns of `TableArrays.cells`.
 ROW_START, ROW_EXTENT, RIGHT_CORNERS, LEFT_CORNERS = range(4)
 # Sides of a shape as seen from the lidar.
@@ -79,19 +82,21 @@ class TableArrays(NamedTuple):
     hulls: Array  # (sum V, 2) corners [m], see `shapes.Outlines`; each hull twice
 
 
-LOOK_UP = np.dtype(
-    [  # beams of a scan that hit one body, and where the table has their ranges
-        ("first", np.int64),  # the first beam
-        ("hits", np.int32),  # number of beams
-        # indices in `TableArrays.rows` of the points around the first beam
-        ("near", np.int64),
-        ("near_next", np.int64),
-        ("far", np.int64),
-        ("far_next", np.int64),
-        ("next_weight", np.float32),  # v
-        ("far_weight", np.float32),  # w
-    ]
-)
+class LookUp:
+    """Beams of a scan that hit one body, and where the table has their ranges."""
+
+    first: int  # the first beam
+    hits: np.int32  # number of beams
+    # indices in `TableArrays.rows` of the points around the first beam
+    near: int
+    near_next: int
+    far: int
+    far_next: int
+    next_weight: np.float32  # v
+    far_weight: np.float32  # w
+
+
+LOOK_UP = structure_of(LookUp)
 
 
 @kernel(contracts=True, inline=True)
@@ -114,9 +119,21 @@ def look_up_body(
     distance = math.sqrt(dx * dx + dy * dy)
     bearing = arctan2(dy, dx)
     shape = table.shapes[np.uintp(np.int32(body[SHAPE]))]
-    cell = find_cell(distance, body[HEADING] - bearing, body[RADIUS], shape, table)
-    near = table.cells[np.uintp(cell.place)]
-    far = table.cells[np.uintp(cell.place + 1)]
+    # i and j number the grid distances and the grid rotations, see the formula above.
+    exact_i = (distance - body[RADIUS]) * shape.distances_per_metre
+    last_i = np.int32(table.distances - 2)
+    i = np.int32(max(min(np.int32(exact_i), last_i), np.int32(0)))
+    turns = (body[HEADING] - bearing) * (1.0 / TWO_PI)
+    turns -= np.floor(turns)
+    j = np.int32(turns * shape.rotations + 0.5)
+    j = np.int32(max(min(j, np.int32(shape.rotations)), np.int32(0)))
+    # Only one period of the rotational symmetry is in the table.
+    period = np.int32((j + 0.5) * shape.periods_per_rotation)
+    place = shape.first_cell - period * shape.cells_per_period
+    place += j * table.distances + i
+    hull = shape.second_hull - period * shape.corners_per_period
+    near = table.cells[np.uintp(place)]
+    far = table.cells[np.uintp(place + 1)]
     # The silhouettes, and the beams between them
     view = ShapeView(
         distance * distance,
@@ -124,8 +141,8 @@ def look_up_body(
         body[SIN] * dx - body[COS] * dy,
     )
     hulls = table.hulls
-    right = find_silhouette(view, near[RIGHT_CORNERS], cell.hull, hulls, shape, RIGHT)
-    left = find_silhouette(view, near[LEFT_CORNERS], cell.hull, hulls, shape, LEFT)
+    right = find_silhouette(view, near[RIGHT_CORNERS], hull, hulls, shape, RIGHT)
+    left = find_silhouette(view, near[LEFT_CORNERS], hull, hulls, shape, LEFT)
     span = span_beams(bearing - lidar.heading + right, left - right, beams)
     centre = span.right - right / beams.step
     # c_p and c_(p+1) of the first beam, in both rows
@@ -142,7 +159,7 @@ def look_up_body(
         part.near, part.near_next = find_points(near, np.int64(point), hits, table)
         part.far, part.far_next = find_points(far, np.int64(point), hits, table)
         part.next_weight = np.float32(exact_point - point)
-        part.far_weight = cell.far_weight
+        part.far_weight = np.float32(exact_i - i)
         count += int(hits > 0)
         turned_by = span.full_turn
         if span.left < turned_by:
@@ -156,7 +173,7 @@ def fuse_look_ups(scan: ShortIntegers, rows: Singles, found: Any) -> None:
 
     Whole blocks of beams are fused, also beyond the last beam.
     """
-    for m in range(found.shape[0]):
+    for m in range(len(found)):
         part = found[m]
         first = np.uintp(part.first)
         near = np.uintp(part.near)
@@ -175,46 +192,6 @@ def fuse_look_ups(scan: ShortIntegers, rows: Singles, found: Any) -> None:
             distance = near_range + far_weight * (far_range - near_range)
             is_hit = np.int32(k) < hits
             lower(scan, first + j, distance if is_hit else np.float32(np.inf))
-
-
-class TableCell(NamedTuple):
-    """A place in the table: a grid distance and the nearest grid rotation."""
-
-    # Index in `TableArrays.cells`; the next cell is that of the next grid distance.
-    place: int
-    hull: int  # index in `TableArrays.hulls` from which the cell's corners are counted
-    far_weight: np.float32  # weight of the row of the next grid distance
-
-
-@kernel(contracts=True, inline=True)
-def find_cell(
-    distance: float, rotation: float, radius: float, shape: Any, table: TableArrays
-) -> TableCell:
-    """Find the cell of the grid distance below and of the nearest grid rotation.
-
-    Args:
-        distance: d [m].
-        rotation: phi [rad].
-        radius: of the circle around the body [m], the first grid distance.
-        shape: its `TABLE_SHAPE`.
-        table: the table.
-    """
-    # i and j number the grid distances and the grid rotations, see the formula above.
-    exact_i = (distance - radius) * shape.distances_per_metre
-    last_i = np.int32(table.distances - 2)
-    i = np.int32(max(min(np.int32(exact_i), last_i), np.int32(0)))
-    turns = rotation * (1.0 / TWO_PI)
-    turns -= np.floor(turns)
-    j = np.int32(turns * shape.rotations + 0.5)
-    j = np.int32(max(min(j, np.int32(shape.rotations)), np.int32(0)))
-    # Only one period of the rotational symmetry is in the table.
-    period = np.int32((j + 0.5) * shape.periods_per_rotation)
-    first = shape.first_cell - period * shape.cells_per_period
-    return TableCell(
-        first + j * table.distances + i,
-        shape.second_hull - period * shape.corners_per_period,
-        np.float32(exact_i - i),
-    )
 
 
 class ShapeView(NamedTuple):
@@ -244,7 +221,7 @@ def find_silhouette(
         packed: two corners of the hull, as shorts, either of which may be the silhouette in a cell.
             If there are more than two, the second is negative: minus the first stride of
             `climb_hull`, which starts at the first.
-        hull: `TableCell.hull`.
+        hull: index in `hulls` from which its corners are counted.
         hulls: see `TableArrays.hulls`.
         shape: its `TABLE_SHAPE`.
         side: `RIGHT` or `LEFT`.

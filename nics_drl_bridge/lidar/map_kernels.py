@@ -38,7 +38,7 @@ LONGEST = 255  # side of the largest square that fits in a byte [cells]
 PARALLEL = np.float32(
     1e-12
 )  # minimum component of a direction: its inverse stays finite
-# a return at exactly range_max must not be lost to rounding; `finish` decides
+# a return at exactly range_max must not be lost to rounding; `scan_robot` decides
 SLACK = 1.0 + 1e-6
 
 
@@ -136,7 +136,7 @@ def walk(
 
     That is where the beam enters a solid cell, or leaves it if it starts inside. Outside is free.
     """
-    rows = squares.shape[0] - 2
+    rows = len(squares) - 2
     columns = squares.shape[1] - 2
     x = math.floor(u)
     y = math.floor(v)
@@ -159,11 +159,11 @@ def walk(
     while True:
         if x_line < y_line:
             t = x_line
-            x = x + (1 if du > 0.0 else -1)
+            x += 1 if du > 0.0 else -1
             x_line = _find_line(u, du, x)
         else:
             t = y_line
-            y = y + (1 if dv > 0.0 else -1)
+            y += 1 if dv > 0.0 else -1
             y_line = _find_line(v, dv, y)
         if t > limit:
             return np.inf
@@ -211,76 +211,54 @@ def scan_map(
             steps = walk(squares, u, v, c * a - s * b, s * a + c * b, limit)
             lower(scan, i, cell * steps)
         return
-    start = (int(y) + 1) * squares.shape[1] + int(x) + 1
-    for first in range(0, count, LANES):
-        _begin(
-            beams.directions,
-            first,
-            u - x,
-            v - y,
-            c,
-            s,
-            squares.shape[1],
-            singles,
-            wholes,
-        )
-        while _jump(squares.reshape(-1), start, np.float32(limit), singles, wholes):
-            pass
-        _end(
-            scan[first : first + LANES],
-            int(x),
-            int(y),
-            squares.shape,
-            np.float32(limit),
-            cell,
-            singles,
-            wholes,
-        )
-
-
-@kernel
-def _begin(
-    directions: Array,
-    first: int,
-    u: float | np.float32,
-    v: float | np.float32,
-    c: float | np.float32,
-    s: float | np.float32,
-    columns: int,
-    singles: Singles,
-    wholes: ShortIntegers,
-) -> None:
-    """Put the beams from `first` on into lanes, each mirrored so that it points right and up."""
-    c = np.float32(c)
-    s = np.float32(s)
-    u = np.float32(u)
-    v = np.float32(v)
+    columns = squares.shape[1]
+    start = (int(y) + 1) * columns + int(x) + 1
+    cosine = np.float32(c)
+    sine = np.float32(s)
+    beyond_u = np.float32(u - x)
+    beyond_v = np.float32(v - y)
+    most = np.float32(limit)
     unit = np.float32(1.0)
     zero = np.float32(0.0)
-    for j in range(LANES):
-        # idle lanes repeat the last beam
-        k = np.uintp(j)
-        i = np.uintp(min(first + j, directions.shape[1] - 1))
-        a = np.float32(directions[0, i])
-        b = np.float32(directions[1, i])
-        du = c * a - s * b
-        dv = s * a + c * b
-        right = du > zero
-        up = dv > zero
-        du = max(abs(du), PARALLEL)
-        dv = max(abs(dv), PARALLEL)
-        singles[k + DU] = du
-        singles[k + DV] = dv
-        singles[k + PER_U] = unit / du
-        singles[k + PER_V] = unit / dv
-        singles[k + U] = u if right else unit - u
-        singles[k + V] = v if up else unit - v
-        singles[k + T] = zero
-        wholes[k + COLUMN] = 0
-        wholes[k + ROW] = 0
-        wholes[k + ASIDE] = 1 if right else -1
-        wholes[k + ABOVE] = columns if up else -columns
-        wholes[k + QUADRANT] = (0 if right else 8) + (0 if up else 16)
+    for first in range(0, count, LANES):
+        # Put the beams into lanes, each mirrored so that it points right and up.
+        for j in range(LANES):
+            k = np.uintp(j)
+            # idle lanes repeat the last beam
+            beam = np.uintp(min(first + j, count - 1))
+            across = np.float32(beams.directions[0, beam])
+            ahead = np.float32(beams.directions[1, beam])
+            du = cosine * across - sine * ahead
+            dv = sine * across + cosine * ahead
+            right = du > zero
+            up = dv > zero
+            du = max(abs(du), PARALLEL)
+            dv = max(abs(dv), PARALLEL)
+            singles[k + DU] = du
+            singles[k + DV] = dv
+            singles[k + PER_U] = unit / du
+            singles[k + PER_V] = unit / dv
+            singles[k + U] = beyond_u if right else unit - beyond_u
+            singles[k + V] = beyond_v if up else unit - beyond_v
+            singles[k + T] = zero
+            wholes[k + COLUMN] = 0
+            wholes[k + ROW] = 0
+            wholes[k + ASIDE] = 1 if right else -1
+            wholes[k + ABOVE] = columns if up else -columns
+            wholes[k + QUADRANT] = (0 if right else 8) + (0 if up else 16)
+        while _jump(squares.reshape(-1), start, most, singles, wholes):
+            pass
+        # Fuse the lanes that ended at a solid cell, not in the border around the map.
+        for j in range(LANES):
+            k = np.uintp(j)
+            column = int(x) + wholes[k + COLUMN] * wholes[k + ASIDE]
+            above = wholes[k + ROW] if wholes[k + ABOVE] > 0 else -wholes[k + ROW]
+            row = int(y) + above
+            hit = (column >= 0) & (column < columns - 2)
+            hit &= (row >= 0) & (row < len(squares) - 2)
+            hit &= singles[k + T] < most
+            distance = np.float32(cell) * singles[k + T]
+            lower(scan, first + j, distance if hit else np.float32(np.inf))
 
 
 @kernel
@@ -326,27 +304,3 @@ def _jump(
         singles[k + T] = ahead if goes else t
         moved |= np.int32(goes)
     return moved > 0
-
-
-@kernel
-def _end(
-    scan: ShortIntegers,
-    x: int,
-    y: int,
-    shape: tuple[int, int],
-    limit: np.float32,
-    resolution: float,
-    singles: Singles,
-    wholes: ShortIntegers,
-) -> None:
-    """Fuse the lanes that ended at a solid cell, not in the border around the map."""
-    for j in range(LANES):
-        k = np.uintp(j)
-        column = x + wholes[k + COLUMN] * wholes[k + ASIDE]
-        row = y + (wholes[k + ROW] if wholes[k + ABOVE] > 0 else -wholes[k + ROW])
-        hit = (
-            (column >= 0) & (column < shape[1] - 2) & (row >= 0) & (row < shape[0] - 2)
-        )
-        t = singles[k + T]
-        distance = np.float32(resolution) * t
-        lower(scan, k, distance if hit & (t < limit) else np.float32(np.inf))

@@ -21,7 +21,6 @@ from nics_drl_bridge.files import write_bytes, write_text
 from nics_drl_bridge.geometry import rotate
 from nics_drl_bridge.lidar import map_kernels
 from nics_drl_bridge.lidar.arrays import AnyArray, Array, Integers, Mask, Singles
-from nics_drl_bridge.lidar.map_kernels import Fixtures
 from nics_drl_bridge.lidar.shapes import Coordinate
 
 FREE = 0
@@ -58,7 +57,7 @@ class GridMap:
         """(rows, columns) cells that stop a beam."""
         if self.unknown_stops:
             return ~self.free
-        return np.asarray(self.cells >= self.occupied_from)
+        return self.cells >= self.occupied_from
 
     @cached_property
     def arrays(self) -> map_kernels.GridArrays:
@@ -72,14 +71,14 @@ class GridMap:
     def world_to_cell(self, points: ArrayLike) -> Integers:
         """Return row and column (..., 2) of points (..., 2) x, y [m]; may be outside the map."""
         place = rotate(
-            np.asarray(points, dtype=np.float64) - self.origin[:2], -self.origin[2]
+            np.asarray(points, np.float64) - self.origin[:2], -self.origin[2]
         )
         return np.floor(place[..., ::-1] / self.resolution).astype(np.int64)
 
     def cell_to_world(self, cells: ArrayLike) -> Array:
         """Return the centres (..., 2) x, y [m] of cells (..., 2) row, column."""
         x, y, heading = self.origin
-        place = (np.asarray(cells, dtype=np.float64) + 0.5) * self.resolution
+        place = (np.asarray(cells, np.float64) + 0.5) * self.resolution
         c = np.cos(heading)
         s = np.sin(heading)
         across = place[..., 1]
@@ -165,7 +164,10 @@ def load_map(
     path = find_config(name, "maps")
     file = load_yaml(path, MapFile)
     grey, opaque = read_image(path.parent / file.image, str(path))
-    cells = np.ascontiguousarray(convert_pixels(grey, opaque, file)[::-1])
+    cells = _convert_brightness(file)[grey]
+    if opaque is not None and file.mode != "raw":
+        cells[~opaque] = UNKNOWN
+    cells = np.ascontiguousarray(cells[::-1])
     return GridMap(cells, file.resolution, file.origin, unknown_stops, occupied_from)
 
 
@@ -200,16 +202,6 @@ def map_files(grid: GridMap, path: Path) -> None:
         "mode": mode,
     }
     write_text(path, dump_yaml(about))
-
-
-def convert_pixels(
-    grey: NDArray[np.uint8], opaque: Mask | None, file: MapFile
-) -> NDArray[np.int8]:
-    """Cells (rows, columns) of an image from brightness and opacity, in the image's row order."""
-    cells: NDArray[np.int8] = _convert_brightness(file)[grey]
-    if opaque is not None and file.mode != "raw":
-        cells[~opaque] = UNKNOWN
-    return cells
 
 
 def _convert_brightness(file: MapFile) -> NDArray[np.int8]:
@@ -264,8 +256,9 @@ def read_image(path: Path, source: str) -> tuple[NDArray[np.uint8], Mask | None]
                     raise Image.DecompressionBombError
                 return _read_pixels(image)
     except Image.DecompressionBombError:
-        reason = f"has too many pixels, a map may have {MAX_CELLS}; cut or coarsen it."
-        raise ConfigError(f"{path}: {reason}") from None
+        raise ConfigError(
+            f"{path}: has too many pixels, a map may have {MAX_CELLS}; cut or coarsen it."
+        ) from None
     except (
         EOFError,
         IndexError,
@@ -275,8 +268,9 @@ def read_image(path: Path, source: str) -> tuple[NDArray[np.uint8], Mask | None]
         ValueError,
         struct.error,
     ):
-        reason = "is no whole PGM, PNG or BMP image; save the map again in one of them."
-        raise ConfigError(f"{path}: {reason}") from None
+        raise ConfigError(
+            f"{path}: is no whole PGM, PNG or BMP image; save the map again in one of them."
+        ) from None
 
 
 def _read_pixels(image: Image.Image) -> tuple[NDArray[np.uint8], Mask | None]:
@@ -309,7 +303,7 @@ def stack_fixtures(
     walls: Sequence[Array],
     grids: Sequence[GridMap | None],
     member: Integers,
-) -> Fixtures:
+) -> map_kernels.Fixtures:
     """Stack the fixtures of P worlds: walls (W, 4) and the map of each."""
     maps = [NO_MAP if grid is None else grid.arrays for grid in grids]
     squares, places = joined([grid_arrays.squares for grid_arrays in maps])
@@ -317,7 +311,9 @@ def stack_fixtures(
     for frame, grid_arrays in zip(frames, maps, strict=True):
         frame[: len(grid_arrays.frame)] = grid_arrays.frame
     first = np.cumsum([0, *map(len, walls)])
-    return Fixtures(member, np.concatenate(walls), first, squares, places, frames)
+    return map_kernels.Fixtures(
+        member, np.concatenate(walls), first, squares, places, frames
+    )
 
 
 def joined(cells: Sequence[AnyArray]) -> tuple[AnyArray, Integers]:

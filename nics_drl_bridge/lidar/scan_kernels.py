@@ -11,7 +11,6 @@ from nics_drl_bridge.lidar.beam_kernels import (
     INF,
     Beams,
     LidarPose,
-    finish,
     locate_lidar,
 )
 from nics_drl_bridge.lidar.exact_kernels import (
@@ -30,7 +29,6 @@ from nics_drl_bridge.lidar.lookup_kernels import (
     fuse_look_ups,
     look_up_body,
 )
-from nics_drl_bridge.lidar.map_kernels import Fixtures, grid_of, walls_of
 
 # Look-ups that wait to be fused: while one waits for memory, the next ones go on.
 MOST_FOUND = 64
@@ -78,7 +76,7 @@ def scan_worlds(
     bodies: Array,
     nearby: ShortIntegers,
     first_robot: int,
-    fixtures: Fixtures,
+    fixtures: map_kernels.Fixtures,
     lidar: LidarArrays,
     scratch: ScanScratch,
 ) -> None:
@@ -123,7 +121,7 @@ def scan_robot(
     bodies: Array,
     nearby: ShortIntegers,
     own_body: int,
-    fixtures: Fixtures,
+    fixtures: map_kernels.Fixtures,
     lidar: LidarArrays,
     scratch: ScanScratch,
 ) -> None:
@@ -141,34 +139,8 @@ def scan_robot(
         scratch: scratch memory.
     """
     scan = scratch.scan
-    for i in range(scan.shape[0]):
+    for i in range(len(scan)):
         scan[i] = INF
-    fuse_bodies(pose, bodies, nearby, own_body, lidar, scratch)
-    scan_walls(scan, lidar.beams, pose, walls_of(n, fixtures), lidar.range_max)
-    if fixtures.squares.size > 0:
-        map_kernels.scan_map(
-            scan,
-            lidar.beams,
-            pose,
-            lidar.range_max,
-            grid_of(n, fixtures),
-            lidar.exact,
-            scratch.singles,
-            scratch.integers,
-        )
-    finish(ranges, scan, lidar.range_min, lidar.range_max)
-
-
-@kernel
-def fuse_bodies(
-    pose: LidarPose,
-    bodies: Array,
-    nearby: ShortIntegers,
-    own_body: int,
-    lidar: LidarArrays,
-    scratch: ScanScratch,
-) -> None:
-    """Fuse the visible bodies (K, 7) of one world into a scan, see `scan_robot`."""
     count = 0
     rows = lidar.table.rows
     for k in nearby:
@@ -177,13 +149,36 @@ def fuse_bodies(
         if not is_visible or k == own_body:
             continue
         if not is_looked_up:
-            scan_body(scratch.scan, lidar.beams, pose, body, lidar.outlines)
+            scan_body(scan, lidar.beams, pose, body, lidar.outlines)
             continue
         if count > MOST_FOUND - 2:
-            fuse_look_ups(scratch.scan, rows, scratch.found[:count])
+            fuse_look_ups(scan, rows, scratch.found[:count])
             count = 0
         count = look_up_body(body, pose, lidar.beams, lidar.table, scratch.found, count)
-    fuse_look_ups(scratch.scan, rows, scratch.found[:count])
+    fuse_look_ups(scan, rows, scratch.found[:count])
+    scan_walls(
+        scan, lidar.beams, pose, map_kernels.walls_of(n, fixtures), lidar.range_max
+    )
+    if fixtures.squares.size > 0:
+        map_kernels.scan_map(
+            scan,
+            lidar.beams,
+            pose,
+            lidar.range_max,
+            map_kernels.grid_of(n, fixtures),
+            lidar.exact,
+            scratch.singles,
+            scratch.integers,
+        )
+    # Too far becomes `inf`, too close `-inf` (REP-117).
+    low = np.float32(lidar.range_min)
+    high = np.float32(lidar.range_max)
+    distances = scan.view(np.float32)
+    for b in range(len(ranges)):
+        beam = np.uintp(b)
+        value = distances[beam]
+        value = value if value <= high else np.float32(np.inf)
+        ranges[beam] = value if value >= low else np.float32(-np.inf)
 
 
 @kernel(contracts=True, inline=True)

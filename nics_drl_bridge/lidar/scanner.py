@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,13 +18,12 @@ from nics_drl_bridge.lidar.exact_kernels import SHAPE
 from nics_drl_bridge.lidar.lookup_error import find_lookup_distances
 from nics_drl_bridge.lidar.map_kernels import Fixtures
 from nics_drl_bridge.lidar.maps import GridMap, stack_fixtures
-from nics_drl_bridge.lidar.scan_kernels import LidarArrays
 from nics_drl_bridge.lidar.shapes import BODY, Shape, place
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.lidar.table import LidarTable
 
 Renderer = Literal["auto", "baked", "exact"]
-RENDERERS: tuple[Renderer, ...] = ("auto", "baked", "exact")
+RENDERERS = get_args(Renderer)
 DEFAULT_RENDERER: Renderer = "auto"
 NO_WALLS = np.zeros((0, 4))
 # `auto` looks up at distances where the ranges' RMSE is at most this [m]
@@ -65,22 +64,24 @@ class Scanner:
         if not table.has_rows:
             reason = f"has no rows to look up with the renderer {self.renderer!r}"
         elif not math.isclose(table.beam_angle, spec.angle_increment, rel_tol=1e-9):
-            apart = (
-                f"{table.beam_angle:.6g} rad apart, not {spec.angle_increment:.6g} rad"
+            reason = (
+                f"is for beams that are {table.beam_angle:.6g} rad apart, not "
+                f"{spec.angle_increment:.6g} rad"
             )
-            reason = f"is for beams that are {apart}"
         elif reach < spec.range_max * (1.0 - 1e-9):
             reason = f"reaches {reach:g} m, not {spec.range_max:g} m"
         if reason:
-            fix = f"bake one for the lidar {spec.name!r}, or scan with `exact`."
-            raise ModelError(f"the lidar table {reason}; {fix}")
+            raise ModelError(
+                f"the lidar table {reason}; bake one for the lidar "
+                f"{spec.name!r}, or scan with `exact`."
+            )
 
     @cached_property
-    def arguments(self) -> LidarArrays:
+    def arguments(self) -> scan_kernels.LidarArrays:
         """Lidar and table for the kernels."""
         spec = self.spec
         table = self.table
-        return LidarArrays(
+        return scan_kernels.LidarArrays(
             np.array(spec.mount),
             make_beams(
                 np.ascontiguousarray(spec.directions.T),
@@ -174,8 +175,8 @@ class Scanner:
     def _check_scene(
         self, poses: ArrayLike, bodies: ArrayLike, walls: ArrayLike
     ) -> tuple[Array, ...]:
-        poses = np.atleast_2d(np.asarray(poses, dtype=np.float64))
-        bodies = np.asarray(bodies, dtype=np.float64)
+        poses = np.atleast_2d(np.asarray(poses, np.float64))
+        bodies = np.asarray(bodies, np.float64)
         if bodies.size == 0:
             bodies = np.zeros((len(poses), 0, BODY))
         elif bodies.ndim == 2:
@@ -188,8 +189,9 @@ class Scanner:
             bodies.shape[1],
             BODY,
         ):
-            shapes = f"poses {poses.shape} and bodies {bodies.shape}"
-            raise ConfigError(f"{shapes} must be (N, 3) and (N, K, {BODY}).")
+            raise ConfigError(
+                f"poses {poses.shape} and bodies {bodies.shape} must be (N, 3) and (N, K, {BODY})."
+            )
         if walls.shape != (len(walls), 4):
             raise ConfigError(f"walls {walls.shape} must be (W, 4).")
         index = bodies[..., SHAPE]

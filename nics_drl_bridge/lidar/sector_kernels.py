@@ -39,19 +39,9 @@ def resample(out: Singles, ranges: Singles, plan: SectorPlan) -> None:
     """
     if plan.shift[0] != 0.0 or plan.shift[1] != 0.0:
         _fill_by_place(out, ranges, plan)
-    else:
-        _fill_by_beam(out, ranges, plan.first, plan.hits)
-
-
-@kernel(allocates=True)
-def _fill_by_beam(
-    out: Singles,
-    ranges: Singles,
-    first: ShortIntegers,
-    count: ShortIntegers,
-) -> None:
-    """Fill each sector from its own beams; as whole numbers, ranges have the same order."""
-    beams = ranges.shape[0]
+        return
+    # Each sector from its own beams; as whole numbers, ranges have the same order.
+    beams = len(ranges)
     whole = ranges.view(np.int32)
     nearest = out.view(np.int32)
     known = np.empty(2 * beams, np.int32)  # twice, because a sector may span the seam
@@ -59,10 +49,10 @@ def _fill_by_beam(
         is_known = np.int32(whole[b] & np.int32(0x7FFFFFFF)) <= INF
         known[b] = whole[b] if is_known else UNKNOWN
         known[beams + b] = known[b]
-    for s in range(out.shape[0]):
-        begin = np.uintp(first[s])
+    for s in range(len(out)):
+        begin = np.uintp(plan.first[s])
         near = UNKNOWN
-        for b in range(count[s]):
+        for b in range(plan.hits[s]):
             near = min(near, known[begin + np.uintp(b)])
         nearest[s] = near
 
@@ -70,8 +60,8 @@ def _fill_by_beam(
 @kernel(allocates=True)
 def _fill_by_place(out: Singles, ranges: Singles, plan: SectorPlan) -> None:
     """Fill each sector from its returns, or the nearer of the neighbouring beams around it."""
-    sectors = out.shape[0]
-    beams = ranges.shape[0]
+    sectors = len(out)
+    beams = len(ranges)
     where = np.empty(beams, np.int32)
     value = np.empty(beams, np.float32)
     has_return = np.zeros(sectors, np.bool_)
@@ -103,7 +93,7 @@ def _fill_by_place(out: Singles, ranges: Singles, plan: SectorPlan) -> None:
                 out[s] = _choose_nearer(out[s], near)
 
 
-@kernel(allocates=True)
+@kernel
 def _locate_return(
     r: np.float32, direction: Array, plan: SectorPlan
 ) -> tuple[int, np.float32]:
@@ -122,6 +112,6 @@ def _locate_return(
     return s, np.float32(math.sqrt(x * x + y * y))
 
 
-@kernel(allocates=True)
+@kernel
 def _choose_nearer(first: np.float32, second: np.float32) -> np.float32:
     return first if first <= second else second

@@ -132,9 +132,18 @@ def plan_of(lidar: LidarSpec, layout: ScanLayout) -> SectorPlan:
     _check(lidar, layout, angles)
     first, count = np.zeros((2, layout.sectors), np.int32)
     for s, middle in enumerate(layout.angles):
-        first[s], count[s] = _find_beams(
-            wrap_angle(angles - middle), 0.5 * layout.width + BORDER_RAD
-        )
+        away = wrap_angle(angles - middle)
+        inside = np.abs(away) <= 0.5 * layout.width + BORDER_RAD
+        begins = np.flatnonzero(inside & ~np.roll(inside, 1))
+        if inside.any():
+            first[s] = begins[0] if len(begins) > 0 else 0
+            count[s] = inside.sum()
+        else:  # the adjacent ones
+            below = int(np.argmax(np.where(away < 0.0, away, -np.inf)))
+            above = int(np.argmin(np.where(away >= 0.0, away, np.inf)))
+            beside = [b for b in (below, above) if abs(away[b]) <= COARSEST_RAD]
+            first[s] = beside[0]
+            count[s] = len(beside)
     left_open = 2.0 * np.pi - (lidar.angles[-1] - lidar.angles[0])
     closed = left_open <= max(COARSEST_RAD, lidar.angle_increment)
     return SectorPlan(
@@ -148,21 +157,6 @@ def plan_of(lidar: LidarSpec, layout: ScanLayout) -> SectorPlan:
         float(lidar.range_max),
         bool(closed),
     )
-
-
-def _find_beams(away: Array, half: float) -> tuple[int, int]:
-    """First beam and number of beams `away` (B,) by at most `half` [rad], or the adjacent ones."""
-    inside = np.abs(away) <= half
-    if not inside.any():
-        below = int(np.argmax(np.where(away < 0.0, away, -np.inf)))
-        above = int(np.argmin(np.where(away >= 0.0, away, np.inf)))
-        beside = [b for b in (below, above) if abs(away[b]) <= COARSEST_RAD]
-        return beside[0], len(beside)
-    begins = np.flatnonzero(inside & ~np.roll(inside, 1))
-    begin = 0
-    if len(begins) > 0:
-        begin = int(begins[0])
-    return begin, int(inside.sum())
 
 
 def _check(lidar: LidarSpec, layout: ScanLayout, angles: Array) -> None:
@@ -232,11 +226,13 @@ def make_reader(
         step = -step
     if not (np.isfinite([begin, step]).all() and step != 0.0 and beams > 1):
         angles = f"angle_min {header.angle_min:g}, angle_increment {header.angle_increment:g}"
-        reason = "describes no lidar; fix the driver's parameters."
-        raise ConfigError(f"LaserScan of {beams} beams, {angles}: {reason}")
+        raise ConfigError(
+            f"LaserScan of {beams} beams, {angles}: describes no lidar; fix "
+            "the driver's parameters."
+        )
     backwards = step < 0.0
     if backwards:
-        begin = begin + step * (beams - 1)
+        begin += step * (beams - 1)
         step = -step
     turn = 2.0 * np.pi
     if begin < -turn or begin + step * (beams - 1) > turn:

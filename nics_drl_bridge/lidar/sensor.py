@@ -158,9 +158,9 @@ def check_sensors(sensors: tuple[Sensor, ...], frames: tuple[str, ...]) -> None:
     used = list(frames)
     for sensor in sensors:
         if sensor.name in names or sensor.frame in used:
-            reason = "another has that name or frame already; choose others."
             raise ConfigError(
-                f"sensor {sensor.name!r} with frame {sensor.frame!r}: {reason}"
+                f"sensor {sensor.name!r} with frame {sensor.frame!r}: another has that name or "
+                "frame already; choose others."
             )
         names.append(sensor.name)
         used.append(sensor.frame)

@@ -112,7 +112,7 @@ class Polygon(Outlined):
     @property
     def outline(self) -> Array:
         """(V, 2) corners, counter-clockwise [m]."""
-        corners = np.array(self.points, dtype=np.float64)
+        corners = np.array(self.points, np.float64)
         x, y = corners.T
         twice_area = np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)
         if twice_area >= 0.0:
@@ -138,7 +138,7 @@ class Segment(Outlined):
     @property
     def outline(self) -> Array:
         """(2, 2) ends [m]."""
-        return np.array(self.ends, dtype=np.float64)
+        return np.array(self.ends, np.float64)
 
 
 Shape = Annotated[Circle | Rectangle | Polygon | Segment, Field(discriminator="kind")]
@@ -155,7 +155,7 @@ def _reach(outline: Array) -> float:
 
 def place(poses: ArrayLike, radii: ArrayLike, shapes: ArrayLike) -> Array:
     """Place shapes (...) of radii (...) [m], 0 if absent, at poses (..., 3) as bodies (..., 7)."""
-    poses = np.asarray(poses, dtype=np.float64)
+    poses = np.asarray(poses, np.float64)
     bodies = np.empty((*poses.shape[:-1], BODY))
     bodies[..., :3] = poses
     # a body with an infinite heading is NaN, and not visible
@@ -251,7 +251,7 @@ class Outlines:
             orders.append(find_rotational_order(outline, hull))
         twice = [np.concatenate([hull, hull]) for hull in hulls]
         nothing = np.zeros((0, 2))
-        radii = np.array([shape.radius for shape in shapes], dtype=np.float64)
+        radii = np.array([shape.radius for shape in shapes], np.float64)
         return cls(
             tuple(shapes),
             np.concatenate([nothing, *outlines]),
@@ -259,7 +259,7 @@ class Outlines:
             np.concatenate([nothing, *twice]),
             np.cumsum([0, *map(len, twice)]),
             radii,
-            np.array(orders, dtype=np.int64),
+            np.array(orders, np.int64),
         )
 
     @property
@@ -273,8 +273,10 @@ class Outlines:
             return self.shapes.index(shape)
         except ValueError:
             held = ", ".join(map(describe, self.shapes)) or "none"
-            reason = f"is not in the lidar table, which holds {held}; bake it as well."
-            raise ModelError(f"the shape {describe(shape)} {reason}") from None
+            raise ModelError(
+                f"the shape {describe(shape)} is not in the lidar table, which holds "
+                f"{held}; bake it as well."
+            ) from None
 
 
 def describe(shape: Shape) -> str:

@@ -47,18 +47,22 @@ def check_angles(angle_min: float, angle_max: float) -> None:
         raise ValueError("angle_min and angle_max must lie within -2 pi and 2 pi")
 
 
-def drop_sensor_model(data: Any) -> Any:
-    """Take an empty `sensor_model` of an earlier version out of a file's content."""
-    if not isinstance(data, dict) or "sensor_model" not in data:
-        return data
-    if data["sensor_model"]:
-        raise ValueError(
-            "sensor models are no longer simulated; take the key sensor_model out"
-        )
-    return {key: value for key, value in data.items() if key != "sensor_model"}
+class WithoutSensorModel(Schema):
+    """A schema whose files may hold an empty `sensor_model`, as an earlier version wrote it."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _drop_sensor_model(cls, data: Any) -> Any:
+        if not isinstance(data, dict) or "sensor_model" not in data:
+            return data
+        if data["sensor_model"]:
+            raise ValueError(
+                "sensor models are no longer simulated; take the key sensor_model out"
+            )
+        return {key: value for key, value in data.items() if key != "sensor_model"}
 
 
-class LidarSpec(Schema):
+class LidarSpec(WithoutSensorModel):
     """A planar lidar. Beam 0 points at `angle_min`, the others follow counter-clockwise.
 
     If the limits span a full circle, the last beam is one increment short of it.
@@ -79,11 +83,6 @@ class LidarSpec(Schema):
         "inf"  # the device's value for no return; the package uses `inf`
     )
     faults: LidarFaults = LidarFaults()  # further faults of the device's ranges
-
-    @model_validator(mode="before")
-    @classmethod
-    def _drop_sensor_model(cls, data: Any) -> Any:
-        return drop_sensor_model(data)
 
     @model_validator(mode="after")
     def _check_consistent(self) -> "LidarSpec":
@@ -165,7 +164,7 @@ Ranges = Singles
 
 def to_device(ranges: ArrayLike, spec: LidarSpec) -> Ranges:
     """Convert ranges (..., B) to the device's convention; only `inf` is replaced."""
-    out = np.array(ranges, dtype=np.float32)
+    out = np.array(ranges, np.float32)
     if spec.no_return != "inf":
         out[out == np.inf] = _get_no_return(spec)
     return out
@@ -176,7 +175,7 @@ def from_device(values: ArrayLike, spec: LidarSpec) -> Ranges:
 
     A finite value below range_min is too close, unless it means no return: that is not free space.
     """
-    out = np.array(values, dtype=np.float32)
+    out = np.array(values, np.float32)
     if spec.no_return != "inf":
         no_return = _get_no_return(spec)
         if np.isnan(no_return):

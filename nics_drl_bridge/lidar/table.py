@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from nics_drl_bridge.config import Schema, read_text, validate
 from nics_drl_bridge.errors import ModelError
@@ -32,7 +32,7 @@ from nics_drl_bridge.lidar.arrays import (
 )
 from nics_drl_bridge.lidar.lookup_kernels import FEWEST, TABLE_SHAPE, TableArrays
 from nics_drl_bridge.lidar.shapes import Circle, Outlines, Shape
-from nics_drl_bridge.lidar.spec import LidarSpec, drop_sensor_model
+from nics_drl_bridge.lidar.spec import LidarSpec, WithoutSensorModel
 
 FORMAT = "nics_drl_bridge/lidar_table/4"
 ABOUT_FILE = "about.json"
@@ -59,18 +59,13 @@ class Density(Schema):
         return cls.model_validate({"phases": min(2**wanted, MOST_PHASES)})
 
 
-class TableAbout(Schema):
+class TableAbout(WithoutSensorModel):
     """The content of `about.json`; see `LidarTable`."""
 
     format: str
     shapes: tuple[Shape, ...]
     density: Density
     beam_angle: float = Field(gt=0.0, lt=7.0)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _drop_sensor_model(cls, data: Any) -> Any:
-        return drop_sensor_model(data)
 
 
 def count_padding(beam_angle: float) -> int:
@@ -173,17 +168,13 @@ class LidarTable:
 
     @property
     def _about(self) -> str:
-        kept = {
-            name: getattr(self, name)
-            for name in TableAbout.model_fields
-            if name != "format"
-        }
-        return (
-            TableAbout(format=FORMAT, **kept).model_dump_json(
-                indent=1, exclude_none=True
-            )
-            + "\n"
+        about = TableAbout(
+            format=FORMAT,
+            shapes=self.shapes,
+            density=self.density,
+            beam_angle=self.beam_angle,
         )
+        return about.model_dump_json(indent=1, exclude_none=True) + "\n"
 
     @cached_property
     def fingerprint(self) -> str:
@@ -229,8 +220,9 @@ class LidarTable:
         try:
             table._check()
         except (ArithmeticError, IndexError, ValueError) as error:
-            reason = f"is not a lidar table ({error}); generate the model again."
-            raise ModelError(f"{folder}: {reason}") from None
+            raise ModelError(
+                f"{folder}: is not a lidar table ({error}); generate the model again."
+            ) from None
         return table
 
     def _check(self) -> None:

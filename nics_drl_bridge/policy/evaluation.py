@@ -102,8 +102,9 @@ def _drive_steps(
         step += 1
         action = act(observation)
         if not np.isfinite(action).all():
-            problem = f"the policy's action in step {step} contains NaN or inf"
-            raise ConfigError(f"{problem}; train it again.")
+            raise ConfigError(
+                f"the policy's action in step {step} contains NaN or inf; train it again."
+            )
         observation, reward, terminated, truncated, info = env.step(action)
         ended = np.logical_or(terminated, truncated)
         yield reward, ended, info
@@ -364,13 +365,10 @@ class Tally(Summary):
         """Returns the tally as plain data: intervals as lists, non-finite values as null."""
         figures: dict[str, Any] = {}
         for name, value in vars(self).items():
-            ends = [value]
-            if isinstance(value, ConfidenceInterval):
-                ends = list(vars(value).values())
-            finite = [value if math.isfinite(value) else None for value in ends]
-            figures[name] = (
-                finite if isinstance(value, ConfidenceInterval) else finite[0]
-            )
+            is_interval = isinstance(value, ConfidenceInterval)
+            ends = vars(value).values() if is_interval else [value]
+            finite = [end if math.isfinite(end) else None for end in ends]
+            figures[name] = finite if is_interval else finite[0]
         return figures
 
 

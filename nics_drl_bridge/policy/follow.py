@@ -112,46 +112,46 @@ class PlannedPath:
         )
 
 
+@dataclass
 class GoalChecker:
     """Judges whether a path has been followed to its end."""
 
-    def __init__(self, check: GoalCheck, turns: bool) -> None:
-        self._check = check
-        self._turns = turns
-        self._there = False
+    check: GoalCheck
+    turns: bool  # True for a robot that turns at the goal
+    there: bool = False  # True once its position has been reached
 
     def turn_left(self, place: Place, pose: Array, end: Array) -> float | None:
         """Returns the remaining turn [rad], 0 at the goal; None before its position is reached."""
-        check = self._check
+        check = self.check
         near = place.distance <= check.xy_goal_tolerance
         reached = near and place.remaining <= check.path_length_tolerance
-        self._there = reached or (self._there and check.stateful)
-        if not self._there:
+        self.there = reached or (self.there and check.stateful)
+        if not self.there:
             return None
-        if self._turns and len(end) > 2:
+        if self.turns and len(end) > 2:
             turn = float(wrap_angle(end[2] - pose[2]))
         else:
             turn = 0.0
         return turn if abs(turn) > check.yaw_goal_tolerance else 0.0
 
 
+@dataclass
 class ProgressChecker:
     """Judges whether a robot makes progress."""
 
-    def __init__(self, check: ProgressCheck) -> None:
-        self.check = check
-        self._base: tuple[float, Array] | None = None
+    check: ProgressCheck
+    base: tuple[float, Array] | None = None  # time and pose of the latest progress
 
     def stuck(self, time_s: float, pose: Array) -> bool:
         """Returns True if a robot at a pose (3,) has not moved enough for too long."""
         check = self.check
         # Restart without a starting point, or if it is later than now: the clock was set back.
-        since, place = self._base or (
+        since, place = self.base or (
             math.inf,
             pose,
         )
         moved = math.dist(pose[:2], place[:2]) > check.required_movement_radius
         turned = abs(wrap_angle(pose[2] - place[2])) > check.required_movement_angle
         if time_s < since or moved or turned:
-            self._base = since, _ = time_s, pose
+            self.base = since, _ = time_s, pose
         return time_s - since > check.movement_time_allowance

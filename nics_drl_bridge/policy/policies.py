@@ -166,8 +166,10 @@ def open_policy(
     """
     if not is_policy_file(name):
         if kind is not None:
-            reason = "only drives the task 'navigation'; use another policy, or leave out --task"
-            raise ConfigError(f"policy {name!r} {reason}.")
+            raise ConfigError(
+                f"policy {name!r} only drives the task 'navigation'; use another "
+                "policy, or leave out --task."
+            )
         task = Navigation(model.robot, model.lidar)
         return POLICIES[name](task, model), task
     from nics_drl_bridge.policy.file.policy_file import load_policy
@@ -175,8 +177,11 @@ def open_policy(
     policy = load_policy(name, model)
     opened: Any = policy.make_task(model, kind)  # any task, if `kind` names its class
     if kind is None and not isinstance(opened, Navigation):
-        reason = f"is {policy.contract.task.name!r}; only policies of 'navigation' can be driven."
-        raise PolicyError(name, "task.name", reason)
+        raise PolicyError(
+            name,
+            "task.name",
+            f"is {policy.contract.task.name!r}; only policies of 'navigation' can be driven.",
+        )
     return _keep_state(policy), opened
 
 

@@ -50,8 +50,10 @@ def route(grid: GridMap, start: ArrayLike, goal: ArrayLike, radius: float) -> Ar
     closeness = np.clip(1.0 - (clearance - radius) / COMFORT, 0.0, 1.0)
     cells = _search(passable, 1.0 + DEARER * closeness, start_cell, goal_cell)
     if not cells:
-        reason = f"for a robot of radius {radius:g} m there is no path to the goal on the map"
-        raise ConfigError(f"{reason}; give a goal that it can reach.")
+        raise ConfigError(
+            f"for a robot of radius {radius:g} m there is no path to the goal on the map; give "
+            "a goal that it can reach."
+        )
     between = coarse.cell_to_world(np.reshape(cells[1:-1], (-1, 2)))
     first = np.asarray(start, np.float64)[:2]
     last = np.asarray(goal, np.float64)[:2]

@@ -17,7 +17,6 @@ from nics_drl_bridge.middleware.playback import Playback, merge_messages, read_m
 from nics_drl_bridge.policy.file.stateful import resume
 from nics_drl_bridge.policy.pacing import ActionPace
 from nics_drl_bridge.policy.policies import open_policy
-from nics_drl_bridge.recording.bag_file import Message
 from nics_drl_bridge.recording.messages import read_robot_command
 
 JITTER = 0.25  # maximum earliness of a scan, in control periods
@@ -91,25 +90,11 @@ def shadow(
     messages = read_messages(path, topics, model.gyro)
     for role in (SCAN, CMD_VEL):
         if role not in messages:
-            reason = f"has no {role}, which the comparison needs; name its topic"
             raise RecordingError(
-                f"{path}: {reason}, for example --topic {role}=/car/{role}."
+                f"{path}: has no {role}, which the comparison needs; name its topic, for example "
+                f"--topic {role}=/car/{role}."
             )
     playback = Playback(model, POSE in messages, any_lidar=True)
-    moments = _collect_moments(playback, messages, model)
-    if not moments:
-        raise RecordingError(
-            f"{path}: no scan with matching odometry; see nics bag info."
-        )
-    goals = _choose_goals(moments, goal, ahead_s)
-    return _compare_moments(
-        moments, goals, policy, replace(model, lidar=playback.lidar)
-    )
-
-
-def _collect_moments(
-    playback: Playback, messages: Mapping[str, list[Message]], model: SimulatorModel
-) -> list[_Moment]:
     pace = ActionPace(model.control_period)
     moments = list[_Moment]()
     held: tuple[int, Array] | None = None
@@ -135,25 +120,26 @@ def _collect_moments(
         view = playback.middleware.view(playback.middleware.newest_ns or scan_ns)
         moments.append(_Moment(message.receive_ns, scan_ns, view))
     _hold(moments, held)
-    return moments
+    if not moments:
+        raise RecordingError(
+            f"{path}: no scan with matching odometry; see nics bag info."
+        )
+    if goal is None:
+        times = np.array([moment.stamp_ns for moment in moments]) * S_PER_NS
+        places = np.array([moment.view.pose[:2] for moment in moments])
+        later = [np.interp(times + ahead_s, times, place) for place in places.T]
+        goals = np.stack(later, axis=-1)
+    else:
+        goals = np.broadcast_to(np.asarray(goal, np.float64), (len(moments), 2))
+    return _compare_moments(
+        moments, goals, policy, replace(model, lidar=playback.lidar)
+    )
 
 
 def _hold(moments: list[_Moment], held: tuple[int, Array] | None) -> None:
     if moments and moments[-1].driven is None and held is not None:
         age_s = (moments[-1].receive_ns - held[0]) * S_PER_NS
         moments[-1].driven = held[1] if age_s <= HELD_S else None
-
-
-def _choose_goals(
-    moments: list[_Moment], goal: ArrayLike | None, ahead_s: float
-) -> Array:
-    if goal is not None:
-        return np.broadcast_to(np.asarray(goal, np.float64), (len(moments), 2))
-    times = np.array([moment.stamp_ns for moment in moments]) * S_PER_NS
-    places = np.array([moment.view.pose[:2] for moment in moments])
-    return np.stack(
-        [np.interp(times + ahead_s, times, place) for place in places.T], axis=-1
-    )
 
 
 def _compare_moments(

@@ -61,13 +61,14 @@ def barn_path(number: int) -> Array:
 
 def _centres(cells: NDArray[Any], corner: tuple[float, float]) -> Array:
     """Return x, y (n, 2) [m] of cells (n, 2), row and column."""
-    return np.asarray(np.round(cells[:, ::-1] * CELL + corner, 6))
+    return np.round(cells[:, ::-1] * CELL + corner, 6)
 
 
 def _index(number: int) -> int:
     if number not in barn_numbers():
-        reason = "the numbers are 1 to 299 without multiples of 6"
-        raise ConfigError(f"there is no BARN world {number}; {reason}.")
+        raise ConfigError(
+            f"there is no BARN world {number}; the numbers are 1 to 299 without multiples of 6."
+        )
     return barn_numbers().index(number)
 
 

@@ -94,19 +94,12 @@ def solid_of(k: int, body: Array, outlines: OutlineArrays) -> Solid:
 
 
 @kernel
-def from_segment(
-    x: float,
-    y: float,
-    ax: float,
-    ay: float,
-    bx: float,
-    by: float,
-) -> tuple[float, float]:
-    """Return the vector to (x, y) from the nearest point of the segment (ax, ay) to (bx, by)."""
-    ex = bx - ax
-    ey = by - ay
-    dx = x - ax
-    dy = y - ay
+def from_edge(x: float, y: float, edge: Edge) -> tuple[float, float]:
+    """Return the vector to (x, y) from the nearest point of an edge."""
+    ex = edge.bx - edge.ax
+    ey = edge.by - edge.ay
+    dx = x - edge.ax
+    dy = y - edge.ay
     along = dx * ex + dy * ey
     if along > 0.0:
         share = min(along / (ex * ex + ey * ey), 1.0)
@@ -115,16 +108,9 @@ def from_segment(
 
 
 @kernel
-def segment_distance2(
-    x: float,
-    y: float,
-    ax: float,
-    ay: float,
-    bx: float,
-    by: float,
-) -> float:
-    """Square of the distance from (x, y) to the segment from (ax, ay) to (bx, by) [m^2]."""
-    dx, dy = from_segment(x, y, ax, ay, bx, by)
+def edge_distance2(x: float, y: float, edge: Edge) -> float:
+    """Square of the distance from (x, y) to an edge [m^2]."""
+    dx, dy = from_edge(x, y, edge)
     return dx * dx + dy * dy
 
 
@@ -141,11 +127,11 @@ def outline_point(x: float, y: float, outline: Outline) -> float:
     if end - begin == CORNERS_OF_WALL:
         bx = corners[begin, 0]
         by = corners[begin, 1]
-        return math.sqrt(segment_distance2(x, y, bx, by, ax, ay))
+        return math.sqrt(edge_distance2(x, y, Edge(bx, by, ax, ay)))
     for v in range(begin, end):
         bx = corners[v, 0]
         by = corners[v, 1]
-        least = min(least, segment_distance2(x, y, ax, ay, bx, by))
+        least = min(least, edge_distance2(x, y, Edge(ax, ay, bx, by)))
         if (ay > y) != (by > y) and x < ax + (y - ay) / (by - ay) * (bx - ax):
             inside = not inside
         ax = bx
@@ -190,7 +176,7 @@ def _side(edge: Edge, x: float, y: float) -> float:
 @kernel
 def _find_nearest(p: Edge, q: Edge) -> tuple[float, float, float, float]:
     """Return the vector from the nearest point of q to that of p, and the nearest point of p."""
-    nx, ny = from_segment(p.ax, p.ay, q.ax, q.ay, q.bx, q.by)
+    nx, ny = from_edge(p.ax, p.ay, q)
     x = p.ax
     y = p.ay
     if p.ax == p.bx and p.ay == p.by:
@@ -199,14 +185,14 @@ def _find_nearest(p: Edge, q: Edge) -> tuple[float, float, float, float]:
     q_crosses = (_side(p, q.ax, q.ay) > 0.0) != (_side(p, q.bx, q.by) > 0.0)
     if p_crosses and q_crosses:
         return 0.0, 0.0, x, y
-    ox, oy = from_segment(p.bx, p.by, q.ax, q.ay, q.bx, q.by)
+    ox, oy = from_edge(p.bx, p.by, q)
     if ox * ox + oy * oy < nx * nx + ny * ny:
         nx = ox
         ny = oy
         x = p.bx
         y = p.by
     for cx, cy in ((q.ax, q.ay), (q.bx, q.by)):
-        ox, oy = from_segment(cx, cy, p.ax, p.ay, p.bx, p.by)
+        ox, oy = from_edge(cx, cy, p)
         if ox * ox + oy * oy < nx * nx + ny * ny:
             nx = -ox
             ny = -oy
@@ -248,7 +234,7 @@ def find_gap(
     for v in range(_count_edges(other.outline)):
         q = _get_edge(v, other.outline)
         far = one.reach + other.radius + max(least, skin)
-        if segment_distance2(x, y, q.ax, q.ay, q.bx, q.by) > far * far:
+        if edge_distance2(x, y, q) > far * far:
             continue
         may_contain = True
         for w in range(_count_edges(one.outline)):
@@ -258,7 +244,7 @@ def find_gap(
             gap = away - one.radius - other.radius
             least = min(least, gap)
             count = listed.number[0]
-            if OVERLAP < gap < skin and count < listed.touches.shape[0]:
+            if OVERLAP < gap < skin and count < len(listed.touches):
                 touch = listed.touches[count]
                 touch.other = other.body
                 touch.nx = (other.cos * nx - other.sin * ny) / away
@@ -303,7 +289,7 @@ def wall_gap(
     """Clearance of a solid from straight walls (W, 4), see the module."""
     corners = walls.reshape((-1, 2))
     least = limit
-    for w in range(walls.shape[0]):
+    for w in range(len(walls)):
         far = one.reach + max(least, skin)
         if wall_distance2(one.x, one.y, walls[w]) <= far * far:
             outline = Outline(corners, 2 * w, 2 * w + 2)
@@ -315,12 +301,12 @@ def wall_gap(
 @kernel
 def wall_distance2(x: float, y: float, wall: Array) -> float:
     """Square of the distance from a point to a straight wall (4,) [m^2]."""
-    return segment_distance2(x, y, wall[0], wall[1], wall[2], wall[3])
+    return edge_distance2(x, y, Edge(wall[0], wall[1], wall[2], wall[3]))
 
 
 @kernel
-def on_wall(x: float, y: float, wall: Array) -> tuple[float, float]:
-    """Return the point of a straight wall nearest to a point."""
+def find_wall(x: float, y: float, wall: Array) -> tuple[float, float, float]:
+    """Return the vector to the nearest point of a straight wall, and its length squared."""
     ex = wall[2] - wall[0]
     ey = wall[3] - wall[1]
     length2 = ex * ex + ey * ey
@@ -328,16 +314,18 @@ def on_wall(x: float, y: float, wall: Array) -> tuple[float, float]:
     if length2 > 0.0:
         share = ((x - wall[0]) * ex + (y - wall[1]) * ey) / length2
         share = min(max(share, 0.0), 1.0)
-    return wall[0] + share * ex, wall[1] + share * ey
+    dx = wall[0] + share * ex - x
+    dy = wall[1] + share * ey - y
+    return dx, dy, dx * dx + dy * dy
 
 
 @kernel
 def wall_distance(x: float, y: float, walls: Array) -> float:
     """Distance from a point to the nearest straight wall (W, 4) [m]; inf if there is none."""
     least = np.inf
-    for w in range(walls.shape[0]):
+    for w in range(len(walls)):
         wall = walls[w]
-        dx, dy = from_segment(x, y, wall[0], wall[1], wall[2], wall[3])
+        dx, dy = from_edge(x, y, Edge(wall[0], wall[1], wall[2], wall[3]))
         least = min(least, np.hypot(dx, dy))
     return least
 
@@ -474,22 +462,21 @@ def sort_into_cells(n: int, bodies: Array, standing: int, cells: BodyCells) -> N
     cell_of = cells.found
     then = cells.then[0 if cells.ordered else n]
     first[:] = 0
-    for k in range(bodies.shape[0]):
+    for k in range(len(bodies)):
         if bodies[k, RADIUS] > 0.0:
             cell_of[k] = _cell(bodies[k], k < standing, frame)
             first[cell_of[k] + 1] += 1
-    for cell in range(first.shape[0] - 1):
+    for cell in range(len(first) - 1):
         first[cell + 1] += first[cell]
-    end = first[first.shape[0] - 1]
-    for k in range(bodies.shape[0] - 1, -1, -1):
+    end = first[-1]
+    for k in range(len(bodies) - 1, -1, -1):
         if bodies[k, RADIUS] > 0.0:
             first[cell_of[k] + 1] -= 1
             then[first[cell_of[k] + 1]] = k
-    for cell in range(
-        first.shape[0] - 1
-    ):  # shift: each entry is the count of the cell before it
+    # Shift: each entry is the count of the cell before it.
+    for cell in range(len(first) - 1):
         first[cell] = first[cell + 1]
-    first[first.shape[0] - 1] = end
+    first[-1] = end
 
 
 @kernel(inline=True)
@@ -523,7 +510,7 @@ def put_in_order(
         if spare[k, RADIUS] <= 0.0:
             _copy(spare[k], bodies[count])
             count += 1
-    first[end] = bodies.shape[0]  # the absent, and those that move, are always found
+    first[end] = len(bodies)  # the absent, and those that move, are always found
 
 
 @kernel
@@ -531,14 +518,14 @@ def find_around(n: int, x: float, y: float, reach: float, cells: BodyCells) -> i
     """Write the sorted bodies that may be within `reach` [m] to `cells.found`; return how many."""
     first = cells.first
     found = cells.found
-    if first.shape[0] == 0:
-        return found.shape[0]  # which lists all bodies
+    if len(first) == 0:
+        return len(found)  # which lists all bodies
     frame = cells.frame[n]
     per_metre = frame[PER_METRE]
     side = int(frame[SIDE])
     far = reach + frame[LARGEST] + frame[MOVED]
-    x = x - frame[LEFT]
-    y = y - frame[BOTTOM]
+    x -= frame[LEFT]
+    y -= frame[BOTTOM]
     left = _place(x - far, per_metre, side)
     right = _place(x + far, per_metre, side)
     high = _place(y + far, per_metre, side)

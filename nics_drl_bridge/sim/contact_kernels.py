@@ -25,11 +25,10 @@ from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SIN, X, Y
 from nics_drl_bridge.robot.kernels import move, wrap
 from nics_drl_bridge.sim import collision_kernels as collision
-from nics_drl_bridge.sim.collision_kernels import find_around
 from nics_drl_bridge.sim.state import (
     Array,
     BodyCells,
-    Nearby,
+    Integers,
     Record,
     Surroundings,
     Tight,
@@ -60,7 +59,6 @@ class World(NamedTuple):
     velocity: Array  # (K, 3) of the obstacles
     first: int  # index of the first robot
     scene: Surroundings
-    nearby: Nearby
     tight: Tight
     touched: Array  # (M,) 1 for robots in contact
     series: Array  # see `robot.kernels`
@@ -74,8 +72,8 @@ def find_contacts(m: int, limit: float, skin: float, world: World) -> tuple[floa
     What it touches within `skin` [m] is in `world.tight.listed`.
     """
     scene = world.scene
-    near = world.nearby.near
-    meets = world.nearby.meets[m]
+    near = world.tight.near
+    meets = world.tight.meets[m]
     listed = world.tight.listed
     me = world.first + m
     body = collision.solid_of(me, world.bodies[me], scene.outlines)
@@ -84,7 +82,7 @@ def find_contacts(m: int, limit: float, skin: float, world: World) -> tuple[floa
     listed.number[0] = 0
     if meets & BODIES:
         is_listed = near[m, 0] <= SEVERAL
-        for i in range(near[m, 0] if is_listed else world.bodies.shape[0]):
+        for i in range(near[m, 0] if is_listed else len(world.bodies)):
             k = near[m, 1 + i] if is_listed else i
             if k == me or world.bodies[k, RADIUS] <= 0.0:
                 continue
@@ -317,14 +315,14 @@ def _halt(m: int, begin: float, time: float, end: float, world: World) -> bool:
 @kernel
 def _find_fastest(obstacles_move: bool, world: World) -> float:
     """Greatest speed of any body but an only robot [m/s]."""
-    meets = world.nearby.meets
+    meets = world.tight.meets
     fastest = 0.0
     for k in range(world.first if obstacles_move else 0):
         vx = world.velocity[k, 0]
         vy = world.velocity[k, 1]
         rim = abs(world.velocity[k, 2]) * world.bodies[k, RADIUS]
         fastest = max(fastest, math.sqrt(vx * vx + vy * vy) + rim)
-    for m in range(meets.shape[0] if meets.shape[0] > 1 else 0):
+    for m in range(len(meets) if len(meets) > 1 else 0):
         if meets[m] != FREE:
             fastest = max(fastest, world.tight.motions[m].bound)
     return fastest
@@ -333,9 +331,9 @@ def _find_fastest(obstacles_move: bool, world: World) -> float:
 @kernel
 def advance(begin: float, duration: float, obstacles_move: bool, world: World) -> None:
     """Move the robots that may meet something, and the obstacles, by a duration [s]."""
-    meets = world.nearby.meets
+    meets = world.tight.meets
     motions = world.tight.motions
-    robots = meets.shape[0]
+    robots = len(meets)
     fastest = _find_fastest(obstacles_move, world)
     world.tight.fastest[0] = fastest
     # Robots that are judged at nearly the same time are judged together: there are fewer steps.
@@ -375,20 +373,19 @@ def find_near(
     m: int,
     bodies: Array,
     scene: Surroundings,
-    nearby: Nearby,
+    near: Integers,
+    reach: Array,
     cells: BodyCells,
 ) -> int:
-    """Return flags of what robot m of world n may meet; write row m of `nearby.near`."""
-    near = nearby.near
-    reach = nearby.reach
+    """Return flags of what robot m of world n may meet; write row m of `near`."""
     walls = scene.walls
-    me = bodies.shape[1] - near.shape[0] + m
+    me = bodies.shape[1] - len(near) + m
     x = bodies[n, me, X]
     y = bodies[n, me, Y]
     own_reach = reach[me]
     count = 0
-    standing = bodies.shape[1] - near.shape[0] if scene.standing else 0
-    for f in range(find_around(n, x, y, own_reach, cells)):
+    standing = bodies.shape[1] - len(near) if scene.standing else 0
+    for f in range(collision.find_around(n, x, y, own_reach, cells)):
         k = cells.found[f]
         other_reach = bodies[n, k, RADIUS] if k < standing else reach[k]
         dx = bodies[n, k, X] - x
@@ -405,11 +402,8 @@ def find_near(
             count += 1
     near[m, 0] = count
     meets = BODIES if count > 0 else FREE
-    for w in range(walls.shape[0]):
-        d2 = collision.segment_distance2(
-            x, y, walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3]
-        )
-        if d2 <= own_reach * own_reach:
+    for w in range(len(walls)):
+        if collision.wall_distance2(x, y, walls[w]) <= own_reach * own_reach:
             meets |= WALLS
             break
     if (

@@ -50,7 +50,7 @@ class DeviceWorld:
         )
         self._given = robots
         self._added = step_covariance(model.noise.odometry, self._period)
-        self.commands: Array = np.zeros((robots, len(model.robot.command)))
+        self.commands = np.zeros((robots, len(model.robot.command)))
         self._covariance = np.tile(self._added, (robots, 1, 1))
         self._before = simulator.data.pose[0].copy()
 
@@ -68,8 +68,10 @@ class DeviceWorld:
         """Begin the episode of a seed, at x, y, heading of each robot (3 M,) if given."""
         robots = self._given
         if starts is not None and starts.size != 3 * robots:
-            needed = f"{robots} robots need {3 * robots}: x, y, heading of each."
-            raise ConfigError(f"episode_start has {starts.size} numbers; {needed}")
+            raise ConfigError(
+                f"episode_start has {starts.size} numbers; {robots} robots need "
+                f"{3 * robots}: x, y, heading of each."
+            )
         placed = None if starts is None else starts.reshape(1, robots, 3)
 
         def arranged(scenes: Scenes) -> Array | None:
@@ -159,7 +161,7 @@ def propagate(
     derivative = np.tile(np.eye(3), (len(covariance), 1, 1))
     derivative[:, 0, 2] = -moved[:, 1]
     derivative[:, 1, 2] = moved[:, 0]
-    return np.asarray(derivative @ covariance @ derivative.transpose(0, 2, 1) + added)
+    return derivative @ covariance @ derivative.transpose(0, 2, 1) + added
 
 
 class DrivenSimulator(FastSimulator):
@@ -174,7 +176,7 @@ class DrivenSimulator(FastSimulator):
     ) -> Scenes:
         """Begin an episode, see `FastSimulator.reset`."""
         scenes = super().reset(seeds, worlds, starts)
-        self.wheels: Array = self.data.pose[0].copy()
+        self.wheels = self.data.pose[0].copy()
         return scenes
 
     def begin_period(self, commands: Array) -> None:

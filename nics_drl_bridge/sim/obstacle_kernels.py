@@ -24,7 +24,7 @@ from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.arrays import Array
 from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, X, Y
 from nics_drl_bridge.robot.kernels import wrap
-from nics_drl_bridge.sim.collision_kernels import in_grid, on_wall
+from nics_drl_bridge.sim.collision_kernels import find_wall, in_grid
 from nics_drl_bridge.sim.state import (
     PATROL,
     PEDESTRIAN,
@@ -83,7 +83,7 @@ def reset_marks(n: int, data: State, plans: Records) -> None:
     """Reset the memory of the obstacles of world n for an episode; draw their speeds."""
     seed = data.seeds[n]
     bodies = data.bodies
-    for k in range(plans.shape[0]):
+    for k in range(len(plans)):
         mark = data.marks[n, k]
         row = plans[k]
         mark.vx = 0.0
@@ -118,23 +118,17 @@ def steer(
     An obstacle stays in the field, off walls and others, and off robots that keep their velocity.
     """
     velocity = data.velocity[n]
-    seed = data.seeds[n]
-    step = data.steps[n]
-    movers = scene.movers
-    count = velocity.shape[0]
-    plans = movers.plans
+    count = len(velocity)
+    plans = scene.plans
     bodies = data.bodies[n]
     traffic = Traffic(
-        bodies, count, speeds, plans, scene.walls, movers.bounds, scene.grid, period
+        bodies, count, speeds, plans, scene.walls, scene.bounds, scene.grid, period
     )
-    draws = (step + 1) * MOST
     # walkers first: they react to the velocities of the last period
     for k in range(count):
         velocity[k, :] = 0.0
         if plans[k].kind == PEDESTRIAN and bodies[k, RADIUS] > 0.0:
-            velocity[k, 0], velocity[k, 1] = _walk(
-                data.marks[n], k, traffic, seed, (draws + k) * DRAWS, step
-            )
+            velocity[k, 0], velocity[k, 1] = _walk(k, n, traffic, data)
     for k in range(count):
         kind = plans[k].kind
         mark = data.marks[n, k]
@@ -144,12 +138,12 @@ def steer(
         dx = velocity[k, 0] * period
         dy = velocity[k, 1] * period
         if kind == PATROL:
-            dx, dy = _follow(mark, body, plans[k], movers.waypoints, period, False)
+            dx, dy = _follow(mark, body, plans[k], scene.waypoints, period, False)
         wished_x = dx
         wished_y = dy
         dx, dy = restrain(dx, dy, k, traffic, kind != PATROL)
         if kind == PATROL and dx == wished_x and dy == wished_y:
-            _follow(mark, body, plans[k], movers.waypoints, period, True)
+            _follow(mark, body, plans[k], scene.waypoints, period, True)
         mark.vx = dx / period
         mark.vy = dy / period
         velocity[k, 0], velocity[k, 1] = mark.vx, mark.vy
@@ -176,20 +170,20 @@ def _follow(
     left = period
     for _ in range(MOST_CORNERS):
         pause = min(rest, left)
-        rest = rest - pause
-        left = left - pause
+        rest -= pause
+        left -= pause
         if left <= 0.0:
             break
         goal = waypoints[row.first + index]
         away = math.hypot(goal[0] - x, goal[1] - y)
         reach = mark.speed * left
         if away > reach:
-            x = x + (goal[0] - x) * reach / away
-            y = y + (goal[1] - y) * reach / away
+            x += (goal[0] - x) * reach / away
+            y += (goal[1] - y) * reach / away
             break
         x = goal[0]
         y = goal[1]
-        left = left - away / mark.speed
+        left -= away / mark.speed
         rest = row.pause
         if row.loop:
             index = (index + 1) % row.count
@@ -247,7 +241,7 @@ def _from_bodies(
     row = traffic.plans[k]
     ax = 0.0
     ay = 0.0
-    for j in range(bodies.shape[0]):
+    for j in range(len(bodies)):
         if j == k or bodies[j, RADIUS] <= 0.0:
             continue
         rx = bodies[k, X] - bodies[j, X]
@@ -258,8 +252,8 @@ def _from_bodies(
         else:
             vx = traffic.speeds[j - first, 0]
             vy = traffic.speeds[j - first, 1]
-        vx = vx - marks[k].vx
-        vy = vy - marks[k].vy
+        vx -= marks[k].vx
+        vy -= marks[k].vy
         near = bodies[k, RADIUS] + bodies[j, RADIUS]
         far = near + FAR * row.range + math.sqrt(vx * vx + vy * vy) * row.foresight
         away2 = rx * rx + ry * ry
@@ -279,8 +273,8 @@ def _from_bodies(
         # Less (8) from outside the angle of sight of a walker that looks along e.
         seen = -(ex * fx + ey * fy) >= row.cos_view * math.sqrt(fx * fx + fy * fy)
         weight = 1.0 if seen else row.behind
-        ax = ax + weight * fx
-        ay = ay + weight * fy
+        ax += weight * fx
+        ay += weight * fy
     return ax, ay
 
 
@@ -296,69 +290,54 @@ def _from_walls(k: int, traffic: Traffic) -> tuple[float, float]:
     radius = body[RADIUS]
     reach = row.wall_range
     far = radius + FAR * reach
-    for w in range(walls.shape[0]):
-        px, py = on_wall(x, y, walls[w])
-        ox = x - px
-        oy = y - py
-        away2 = ox * ox + oy * oy
+    for w in range(len(walls)):
+        ox, oy, away2 = find_wall(x, y, walls[w])
         if 0.0 < away2 < far * far:
             away = math.sqrt(away2)
             size = (
                 row.wall_repulsion / reach * math.exp(-max(away - radius, 0.0) / reach)
             )
-            ax = ax + size * ox / away
-            ay = ay + size * oy / away
+            ax -= size * ox / away
+            ay -= size * oy / away
     away = map_distance(x, y, traffic.grid)
     if away < far:
         nx, ny = map_direction(x, y, traffic.grid)
         size = row.wall_repulsion / reach * math.exp(-max(away - radius, 0.0) / reach)
-        ax = ax - size * nx
-        ay = ay - size * ny
+        ax -= size * nx
+        ay -= size * ny
     return ax, ay
 
 
 @kernel
-def _new_goal(
-    mark: Record,
-    k: int,
-    traffic: Traffic,
-    seed: int,
-    counter: int,
-    step: int,
-) -> None:
+def _choose_goal(
+    mark: Record, k: int, traffic: Traffic, seed: int, counter: int
+) -> float:
+    """Draw the next goal of walker k, with room around it if found; return its distance [m]."""
     body = traffic.bodies[k]
     field = traffic.field
-    x = body[X]
-    y = body[Y]
-    radius = body[RADIUS]
-    middle_x = (field[0] + field[2]) / 2.0
-    middle_y = (field[1] + field[3]) / 2.0
-    wide = max((field[2] - field[0]) / 2.0 - radius - ROOM, 0.0)
-    deep = max((field[3] - field[1]) / 2.0 - radius - ROOM, 0.0)
+    room = body[RADIUS] + ROOM
+    wide = max((field[2] - field[0]) / 2.0 - body[RADIUS] - ROOM, 0.0)
+    deep = max((field[3] - field[1]) / 2.0 - body[RADIUS] - ROOM, 0.0)
+    away = 0.0
     for i in range(CANDIDATES):
-        gx = middle_x + (2.0 * _share(seed, counter + 2 * i) - 1.0) * wide
-        gy = middle_y + (2.0 * _share(seed, counter + 2 * i + 1) - 1.0) * deep
-        mark.goal_x = gx
-        mark.goal_y = gy
-        if math.hypot(gx - x, gy - y) >= LEAST_WALK:
-            free = clearance(gx, gy, k, traffic)
-            if free >= radius + ROOM:
-                break
-    way = math.hypot(mark.goal_x - x, mark.goal_y - y)
-    mark.until = step + (2.0 * way / mark.speed + PATIENCE) / traffic.period
+        right = 2.0 * _share(seed, counter + 2 * i) - 1.0
+        up = 2.0 * _share(seed, counter + 2 * i + 1) - 1.0
+        mark.goal_x = (field[0] + field[2]) / 2.0 + right * wide
+        mark.goal_y = (field[1] + field[3]) / 2.0 + up * deep
+        away = math.hypot(mark.goal_x - body[X], mark.goal_y - body[Y])
+        is_far = away >= LEAST_WALK
+        if is_far and clearance(mark.goal_x, mark.goal_y, k, traffic) >= room:
+            break
+    return away
 
 
 @kernel
-def _walk(
-    marks: Records,
-    k: int,
-    traffic: Traffic,
-    seed: int,
-    counter: int,
-    step: int,
-) -> tuple[float, float]:
+def _walk(k: int, n: int, traffic: Traffic, data: State) -> tuple[float, float]:
     """Return the next velocity of walker k in `map` [m/s], after fewer than `DRAWS` draws."""
-    mark = marks[k]
+    seed = data.seeds[n]
+    step = data.steps[n]
+    counter = ((step + 1) * MOST + k) * DRAWS
+    mark = data.marks[n, k]
     row = traffic.plans[k]
     body = traffic.bodies[k]
     period = traffic.period
@@ -366,14 +345,14 @@ def _walk(
     y = body[Y]
     away = math.hypot(mark.goal_x - x, mark.goal_y - y)
     if step >= mark.until or away < ARRIVED:
-        _new_goal(mark, k, traffic, seed, counter + 4, step)
-        away = math.hypot(mark.goal_x - x, mark.goal_y - y)
+        away = _choose_goal(mark, k, traffic, seed, counter + 4)
+        mark.until = step + (2.0 * away / mark.speed + PATIENCE) / period
     ex = 0.0
     ey = 0.0
     if away > 0.0:
         ex = (mark.goal_x - x) / away
         ey = (mark.goal_y - y) / away
-    ax, ay = _from_bodies(k, ex, ey, marks, traffic)
+    ax, ay = _from_bodies(k, ex, ey, data.marks[n], traffic)
     bx, by = _from_walls(k, traffic)
     ax += bx + (mark.speed * ex - mark.vx) / row.relaxation
     ay += by + (mark.speed * ey - mark.vy) / row.relaxation
@@ -409,8 +388,8 @@ def map_distance(x: float, y: float, grid: MapField) -> float:
     i = min(int(v), rows - 2)
     if distances[i, j] == np.inf:
         return np.inf
-    u = u - j
-    v = v - i
+    u -= j
+    v -= i
     low = distances[i, j] * (1.0 - u) + distances[i, j + 1] * u
     high = distances[i + 1, j] * (1.0 - u) + distances[i + 1, j + 1] * u
     return low * (1.0 - v) + high * v
@@ -435,14 +414,11 @@ def clearance(x: float, y: float, k: int, traffic: Traffic) -> float:
     walls = traffic.walls
     field = traffic.field
     least = min(min(x - field[0], field[2] - x), min(y - field[1], field[3] - y))
-    for w in range(walls.shape[0]):
-        px, py = on_wall(x, y, walls[w])
-        ox = px - x
-        oy = py - y
-        away2 = ox * ox + oy * oy
+    for w in range(len(walls)):
+        ox, oy, away2 = find_wall(x, y, walls[w])
         if least > 0.0 and 0.0 < away2 < least * least:
             least = math.sqrt(away2)
-    for j in range(bodies.shape[0]):
+    for j in range(len(bodies)):
         if j != k and bodies[j, RADIUS] > 0.0:
             ox = bodies[j, X] - x
             oy = bodies[j, Y] - y
@@ -488,7 +464,7 @@ def _hold_bodies(
     y = bodies[k, Y]
     radius = bodies[k, RADIUS]
     length = math.sqrt(dx * dx + dy * dy)
-    for j in range(bodies.shape[0]):
+    for j in range(len(bodies)):
         if j == k or bodies[j, RADIUS] <= 0.0:
             continue
         ox = bodies[j, X] - x
@@ -536,11 +512,8 @@ def _hold_walls(
         dx, dy = _hold(
             dx, dy, 0.0, side, side * field[bound + 1] - radius - side * y, bend
         )
-    for w in range(walls.shape[0]):
-        px, py = on_wall(x, y, walls[w])
-        ox = px - x
-        oy = py - y
-        away2 = ox * ox + oy * oy
+    for w in range(len(walls)):
+        ox, oy, away2 = find_wall(x, y, walls[w])
         if 0.0 < away2 < reach * reach:
             away = math.sqrt(away2)
             dx, dy = _hold(dx, dy, ox / away, oy / away, away - radius, bend)
@@ -568,8 +541,8 @@ def _hold_map(
     if clearance <= SLACK and dx * nx + dy * ny <= 0.0 and nx * nx + ny * ny > 0.0:
         # In contact with the map, it may only move where the clearance does not decrease.
         if map_distance(x + dx, y + dy, grid) - radius >= clearance:
-            return (dx, dy)
-        return (0.0, 0.0)
+            return dx, dy
+        return 0.0, 0.0
     free = 0.0
     way = 0.0
     room = clearance

@@ -168,7 +168,7 @@ def _fill(made: GridMap, shape: Shape, pose: Array) -> None:
 def _inside(shape: Shape, points: Array) -> Mask:
     """Return True (...) for the points (..., 2) in a shape, by the even-odd rule."""
     if isinstance(shape, Circle):
-        return np.asarray(np.hypot(points[..., 0], points[..., 1]) <= shape.radius)
+        return np.hypot(points[..., 0], points[..., 1]) <= shape.radius
     within = np.zeros(points.shape[:-1], np.bool_)
     corners = shape.outline
     if len(corners) < 3:  # a segment has no inside

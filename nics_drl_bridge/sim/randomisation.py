@@ -24,7 +24,6 @@ from nics_drl_bridge.robot.kernels import make_terms
 from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.seeds import check_seeds
 
-__all__ = ["Draws", "LidarRanges", "Randomisation", "Sampler", "load_randomisation"]
 Bounds = tuple[Array, Array]
 MOST_OBSTACLES = 10_000
 # Columns of the noise, before those of the state; the drift of y equals that of x.
@@ -56,7 +55,7 @@ PLACES = 1 << 20
 UNIT = (np.zeros(1), np.ones(1))
 
 
-def _ordered(span: tuple[float, float]) -> tuple[float, float]:
+def _check_order(span: tuple[float, float]) -> tuple[float, float]:
     if span[0] > span[1]:
         raise ValueError("a range is [minimum, maximum]")
     return span
@@ -65,9 +64,9 @@ def _ordered(span: tuple[float, float]) -> tuple[float, float]:
 NotNegative = Annotated[float, Field(ge=0.0, le=1e6)]
 Positive = Annotated[float, Field(ge=1e-3, le=1e3)]
 Periods = Annotated[float, Field(ge=0.0, le=50.0)]  # the simulator stores as many
-Level = Annotated[tuple[NotNegative, NotNegative], AfterValidator(_ordered)]
-Factor = Annotated[tuple[Positive, Positive], AfterValidator(_ordered)]
-Latency = Annotated[tuple[Periods, Periods], AfterValidator(_ordered)]
+Level = Annotated[tuple[NotNegative, NotNegative], AfterValidator(_check_order)]
+Factor = Annotated[tuple[Positive, Positive], AfterValidator(_check_order)]
+Latency = Annotated[tuple[Periods, Periods], AfterValidator(_check_order)]
 AS_IT_IS: Factor = (1.0, 1.0)
 
 
@@ -95,7 +94,7 @@ class OdometryRanges(Schema):
     heading_drift: Level | None = None  # [rad/sqrt(s)]
 
     @model_validator(mode="after")
-    def _once(self) -> "OdometryRanges":
+    def _check_once(self) -> "OdometryRanges":
         for factor, (_, levels) in SCALED.items():
             for level in levels:
                 if (
@@ -122,7 +121,7 @@ class LidarRanges(Schema):
     too_close: tuple[TooClose, ...] | None = Field(default=None, min_length=1)
 
     @model_validator(mode="after")
-    def _probable(self) -> "LidarRanges":
+    def _check_probable(self) -> "LidarRanges":
         likely = [name for name in ("dropout", "dropout_far") if getattr(self, name)]
         if sum(getattr(self, name)[1] for name in likely) > 1.0:
             raise ValueError(
@@ -140,7 +139,7 @@ class ObstacleRanges(Schema):
     rungs: int = Field(default=5, ge=2, le=100)
 
     @model_validator(mode="after")
-    def _countable(self) -> "ObstacleRanges":
+    def _check_countable(self) -> "ObstacleRanges":
         if self.count and not 0 <= self.count[0] <= self.count[1] <= MOST_OBSTACLES:
             raise ValueError(
                 f"count must be [minimum, maximum] from 0 to {MOST_OBSTACLES}"
@@ -294,11 +293,10 @@ class Sampler:
 
     def _name(self, model: SimulatorModel) -> Iterator[Label]:
         kept = zip(*np.nonzero(model.kinematics.coefficients), strict=True)
-        terms = []
-        for d, k in kept:
-            terms.append(
-                f"kinematics.{model.kinematics.dofs[d]}.{model.kinematics.term_names[k]}"
-            )
+        terms = [
+            f"kinematics.{model.kinematics.dofs[d]}.{model.kinematics.term_names[k]}"
+            for d, k in kept
+        ]
         noise = [name and f"odometry.{name}" for name in NOISE_NAMES]
         noise += [
             f"odometry.state_drift.{variable.name}" for variable in model.robot.state
@@ -351,29 +349,31 @@ def _coefficients(ranges: KinematicRanges, model: TaylorModel, where: str) -> Bo
     for dof, terms in ranges.terms.items():
         d = model.dofs.index(dof)
         place = f"{where}: key 'kinematics.terms', rate {dof!r}"
+        known = {model.term_names[k]: k for k in np.flatnonzero(model.coefficients[d])}
         for term, span in terms.items():
-            spans[d, _term(d, term, model, place)] = span
+            name = term
+            with suppress(ValueError):
+                powers = taylor.parse_term(term, model.variables)
+                name = taylor.format_term(powers, model.variables)
+            if name not in known:
+                hint = "it has none at all: remove it."
+                if known:
+                    hint = suggest(term, known)
+                raise ConfigError(
+                    f"{place}: the model has no term {term!r} there; {hint}"
+                )
+            spans[d, known[name]] = span
     if ranges.response != AS_IT_IS and not model.state_size:
-        none = "the model has no state, so it has no time constants"
-        raise ConfigError(f"{where}: key 'kinematics.response': {none}; leave it out.")
+        raise ConfigError(
+            f"{where}: key 'kinematics.response': the model has no state, so it has no time "
+            "constants; leave it out."
+        )
     spread = spans.copy()
     spread[3:] /= ranges.response[::-1]
     _check_stable(model, spread, where)
     kept = np.nonzero(model.coefficients)
     base = make_terms(model).coefficient
     return base * spans[kept][:, 0], base * spans[kept][:, 1]
-
-
-def _term(d: int, name: str, model: TaylorModel, where: str) -> int:
-    terms = {model.term_names[k]: int(k) for k in np.flatnonzero(model.coefficients[d])}
-    with suppress(ValueError, KeyError):
-        return terms[
-            taylor.format_term(
-                taylor.parse_term(name, model.variables), model.variables
-            )
-        ]
-    hint = suggest(name, terms) if terms else "it has none at all: remove it."
-    raise ConfigError(f"{where}: the model has no term {name!r} there; {hint}")
 
 
 def _check_stable(model: TaylorModel, spans: Array, where: str) -> None:
@@ -422,8 +422,10 @@ def _levels(ranges: Randomisation, model: SimulatorModel, where: str) -> Bounds:
             continue
         if not base[part].any():
             lacks = f"the model of {model.robot.name!r} has no measured {key} to scale"
-            fix = f"give {names[0]!r} and {names[1]!r} instead."
-            raise ConfigError(f"{where}: key 'odometry.{key}': {lacks}; {fix}")
+            raise ConfigError(
+                f"{where}: key 'odometry.{key}': {lacks}; give {names[0]!r} "
+                f"and {names[1]!r} instead."
+            )
         low[part] = base[part] * factor[0]
         high[part] = base[part] * factor[1]
     for column, name in enumerate(NOISE_NAMES):

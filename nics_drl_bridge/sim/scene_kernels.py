@@ -12,8 +12,13 @@ import numpy as np
 
 from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.lidar import exact_kernels
-from nics_drl_bridge.lidar.arrays import Array, Integers, Mask, ShortIntegers
+from nics_drl_bridge.lidar.arrays import (
+    Array,
+    Integers,
+    Mask,
+    ShortIntegers,
+    structure_of,
+)
 from nics_drl_bridge.lidar.exact_kernels import (
     COS,
     HEADING,
@@ -24,9 +29,7 @@ from nics_drl_bridge.lidar.exact_kernels import (
     X,
     Y,
 )
-from nics_drl_bridge.random_kernels import uniform_of
 from nics_drl_bridge.sim import collision_kernels as collision
-from nics_drl_bridge.sim.collision_kernels import find_around, sort_into_cells
 from nics_drl_bridge.sim.state import BodyCells, MapField, Records, Touches
 
 TRIES = 2000
@@ -38,36 +41,45 @@ DRAWN = 0
 NO_OBSTACLES = 1
 NO_ROBOTS = 2
 
-GROUP = np.dtype(
-    [
-        ("least", np.int64),  # number of obstacles
-        ("greatest", np.int64),
-        ("gap", np.float64),  # [m]
-        ("first_shape", np.int64),  # in `ScenePlan.choices`
-        ("shapes", np.int64),
-        ("is_fixed", np.bool_),
-        ("moves", np.bool_),
-    ],
-    align=True,
-)
-"""A group of obstacles."""
 
-PLACE = np.dtype(
-    [
-        ("x1", np.float64),  # region [m]
-        ("y1", np.float64),
-        ("x2", np.float64),
-        ("y2", np.float64),
-        ("least_heading", np.float64),  # [rad]
-        ("greatest_heading", np.float64),
-        ("share", np.float64),  # cumulative fraction of the places up to it
-    ],
-    align=True,
-)
-"""A place of starts or goals."""
+class ObstacleGroup:
+    """A group of obstacles."""
 
-DRAWS = np.dtype([("source", np.uint64), ("counter", np.int64)], align=True)
-"""The next draw of a scene, see `random_kernels.uniform_of`."""
+    least: int  # number of obstacles
+    greatest: int
+    gap: float  # [m]
+    first_shape: int  # in `ScenePlan.choices`
+    shapes: int
+    is_fixed: bool
+    moves: bool
+
+
+GROUP = structure_of(ObstacleGroup)
+
+
+class DrawnPlace:
+    """A place of starts or goals."""
+
+    x1: float  # region [m]
+    y1: float
+    x2: float
+    y2: float
+    least_heading: float  # [rad]
+    greatest_heading: float
+    share: float  # cumulative fraction of the places up to it
+
+
+PLACE = structure_of(DrawnPlace)
+
+
+class NextDraw:
+    """The next draw of a scene, see `random_kernels.uniform_of`."""
+
+    source: np.uint64
+    counter: int
+
+
+DRAWS = structure_of(NextDraw)
 
 
 class FreeSpace(NamedTuple):
@@ -90,7 +102,7 @@ class ScenePlan(NamedTuple):
     """Basis of the scenes of a world: K obstacles in G groups, of H shapes in S sizes."""
 
     space: FreeSpace
-    outlines: exact_kernels.OutlineArrays  # of all shapes, the last of which is a disc
+    outlines: OutlineArrays  # of all shapes, the last of which is a disc
     radii: Array  # (H,) of the circles around them [m]
     groups: Records  # (G,) of `GROUP`
     group: Integers  # (K,) of each obstacle
@@ -125,7 +137,7 @@ class SceneScratch(NamedTuple):
 def wall_distances(cells: MapField, walls: Array) -> None:
     """Lower the distances of cells to the distances to the walls, in place."""
     distances = cells.distances
-    for i in range(distances.shape[0]):
+    for i in range(len(distances)):
         for j in range(distances.shape[1]):
             x, y = place_in(i + 0.5, j + 0.5, cells)
             distances[i, j] = min(distances[i, j], collision.wall_distance(x, y, walls))
@@ -146,8 +158,8 @@ def place_in(row: float, column: float, cells: MapField) -> tuple[float, float]:
 def cell_of(x: float, y: float, cells: MapField) -> tuple[int, int, float]:
     """Return row and column of a point, and its distance from the centre of that cell [m]."""
     u, v = collision.in_grid(x, y, cells)
-    u = u / cells.cell
-    v = v / cells.cell
+    u /= cells.cell
+    v /= cells.cell
     i = math.floor(v)
     j = math.floor(u)
     return i, j, cells.cell * math.sqrt((u - j - 0.5) ** 2 + (v - i - 0.5) ** 2)
@@ -235,7 +247,7 @@ def _is_clear(
     disc[X] = x
     disc[Y] = y
     cells = scratch.cells
-    for i in range(find_around(0, x, y, disc[RADIUS] + room, cells)):
+    for i in range(collision.find_around(0, x, y, disc[RADIUS] + room, cells)):
         k = cells.found[i]
         counts = moving or not plan.groups[plan.group[k]].moves
         if counts and not _clear_of(
@@ -320,7 +332,7 @@ def _draw(scratch: SceneScratch) -> float:
     """Draw the next number of the scene, uniform from 0 to below 1."""
     draws = scratch.draws[0]
     draws.counter += 1
-    return uniform_of(draws.source, draws.counter - 1)
+    return random.uniform_of(draws.source, draws.counter - 1)
 
 
 @kernel
@@ -328,9 +340,9 @@ def _draw_point(
     chosen: ShortIntegers, cells: MapField, scratch: SceneScratch
 ) -> tuple[float, float]:
     """Draw a point in one of the chosen cells, given by row-major indices."""
-    cell = int(_draw(scratch) * chosen.shape[0])
+    cell = int(_draw(scratch) * len(chosen))
     # if all cells are allowed, the look-up would only miss the cache
-    if chosen.shape[0] < cells.distances.size:
+    if len(chosen) < cells.distances.size:
         cell = chosen[cell]
     row = cell // cells.distances.shape[1] + _draw(scratch)
     column = cell % cells.distances.shape[1] + _draw(scratch)
@@ -395,7 +407,7 @@ def _place_obstacles(plan: ScenePlan, bodies: Array, scratch: SceneScratch) -> b
     outlines = plan.outlines
     gaps = scratch.gaps
     trial = scratch.trial
-    for k in range(bodies.shape[0]):
+    for k in range(len(bodies)):
         group = plan.groups[plan.group[k]]
         gaps[k] = max(group.gap, MARGIN)
         bodies[k, RADIUS] = 0.0
@@ -403,7 +415,7 @@ def _place_obstacles(plan: ScenePlan, bodies: Array, scratch: SceneScratch) -> b
             pose = plan.poses[k]
             shape = int(bodies[k, SHAPE])
             _put(bodies[k], pose[0], pose[1], pose[2], shape, plan)
-    for k in range(bodies.shape[0]):
+    for k in range(len(bodies)):
         if plan.groups[plan.group[k]].is_fixed or not scratch.active[k]:
             continue
         shape = int(bodies[k, SHAPE])
@@ -430,7 +442,7 @@ def _is_apart(k: int, plan: ScenePlan, bodies: Array, scratch: SceneScratch) -> 
     """True if the trial of obstacle k keeps its gap from those that are placed."""
     trial = scratch.trial
     gaps = scratch.gaps
-    for j in range(bodies.shape[0]):
+    for j in range(len(bodies)):
         gap = max(gaps[k], gaps[j])
         if bodies[j, RADIUS] > 0.0 and not _clear_of(
             trial, bodies[j], gap, plan.outlines, scratch.listed
@@ -444,35 +456,18 @@ def _draw_place(
     places: Records, space: FreeSpace, scratch: SceneScratch
 ) -> tuple[float, float, float]:
     """Draw x, y, heading of a start or goal in one of the places."""
-    if places.shape[0] == 0:
+    if len(places) == 0:
         x, y = _draw_point(space.for_robots, space.cells, scratch)
         return x, y, (2.0 * _draw(scratch) - 1.0) * math.pi
     share = _draw(scratch)
     p = 0
-    while p < places.shape[0] - 1 and share >= places[p].share:
+    while p < len(places) - 1 and share >= places[p].share:
         p += 1
     place = places[p]
     x = place.x1 + _draw(scratch) * (place.x2 - place.x1)
     y = place.y1 + _draw(scratch) * (place.y2 - place.y1)
     spread = place.greatest_heading - place.least_heading
     return x, y, place.least_heading + _draw(scratch) * spread
-
-
-@kernel
-def _draw_goal(
-    x: float, y: float, plan: ScenePlan, scratch: SceneScratch
-) -> tuple[float, float]:
-    """Draw a goal, for some worlds uniformly in the ring around the start."""
-    if not plan.around:
-        gx, gy, _ = _draw_place(plan.goals, plan.space, scratch)
-        return gx, gy
-    least = plan.least
-    greatest = plan.greatest
-    turn = 2.0 * math.pi * _draw(scratch)
-    share = _draw(scratch)
-    scratch.draws[0].counter += 2  # as many as a place takes
-    far = math.sqrt(least * least + share * (greatest * greatest - least * least))
-    return x + far * math.cos(turn), y + far * math.sin(turn)
 
 
 @kernel
@@ -495,7 +490,7 @@ def _place_robots(
 ) -> bool:
     """Draw a start and a goal for each robot; return True if there are some for all of them."""
     between = 2.0 * plan.footprint + plan.clearance
-    for m in range(starts.shape[0]):
+    for m in range(len(starts)):
         placed = False
         detours = 0
         for _ in range(TRIES):
@@ -503,7 +498,16 @@ def _place_robots(
             area = area_of(x, y, plan.space)
             if area == 0 or not _is_free(x, y, plan, bodies, scratch):
                 continue
-            gx, gy = _draw_goal(x, y, plan, scratch)
+            if plan.around:  # uniformly in the ring around the start
+                turn = 2.0 * math.pi * _draw(scratch)
+                inner = plan.least * plan.least
+                ring = plan.greatest * plan.greatest - inner
+                far = math.sqrt(inner + _draw(scratch) * ring)
+                scratch.draws[0].counter += 2  # as many as a place takes
+                gx = x + far * math.cos(turn)
+                gy = y + far * math.sin(turn)
+            else:
+                gx, gy, _ = _draw_place(plan.goals, plan.space, scratch)
             distance2 = (gx - x) * (gx - x) + (gy - y) * (gy - y)
             fits = plan.least * plan.least <= distance2 <= plan.greatest * plan.greatest
             fits = fits and area_of(gx, gy, plan.space) == area
@@ -531,7 +535,7 @@ def _place_robots(
 @kernel
 def choose_members(seeds: Integers, members: int, out: Integers) -> None:
     """Write the index of the world of each seed (n,) among the members of a set."""
-    for n in range(seeds.shape[0]):
+    for n in range(len(seeds)):
         share = random.uniform(seeds[n], random.MEMBER_STREAM, 0)
         out[n] = min(int(share * members), members - 1)
 
@@ -554,11 +558,11 @@ def draw_scenes(
     row that could not be drawn, or n, and the reason.
     """
     plan: ScenePlan = packed.content
-    count = plan.group.shape[0]
+    count = len(plan.group)
     disc = scratch.disc
-    _put(disc, 0.0, 0.0, 0.0, plan.radii.shape[0] - 1, plan)
+    _put(disc, 0.0, 0.0, 0.0, len(plan.radii) - 1, plan)
     disc[RADIUS] = plan.footprint
-    for n in range(seeds.shape[0]):
+    for n in range(len(seeds)):
         state = NO_OBSTACLES
         obstacles = bodies[n, :count]
         scratch.draws[0].source = random.source(seeds[n], random.SCENE_STREAM)
@@ -566,11 +570,11 @@ def draw_scenes(
         _choose_obstacles(wanted[n], sizes[n], plan, obstacles, scratch)
         for _ in range(RESTARTS):
             if _place_obstacles(plan, obstacles, scratch):
-                sort_into_cells(0, obstacles, count, scratch.cells)
+                collision.sort_into_cells(0, obstacles, count, scratch.cells)
                 state = NO_ROBOTS
                 if _place_robots(plan, obstacles, starts[n], goals[n], scratch):
                     state = DRAWN
                     break
         if state != DRAWN:
             return n, state
-    return seeds.shape[0], DRAWN
+    return len(seeds), DRAWN

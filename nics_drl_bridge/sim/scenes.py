@@ -52,13 +52,6 @@ class Scenes(Scene):
 
     member: Integers
 
-    @classmethod
-    def of(cls, n: int, obstacles: int, robots: int) -> "Scenes":
-        """Allocate n empty scenes."""
-        starts = np.zeros((n, robots, 3))
-        goals = np.zeros((n, robots, 2))
-        return cls(np.zeros((n, obstacles, BODY)), starts, goals, np.zeros(n, np.int64))
-
     def __len__(self) -> int:
         return len(self.bodies)
 
@@ -79,13 +72,6 @@ class Catalogue:
     place: Mapping[Shape, int]  # of each shape in the first size
     outlines: Outlines  # of the shapes, and of a disc
     spaces: dict[str, FreeSpace]  # shared by worlds that differ only in their obstacles
-
-    @classmethod
-    def of(cls, world: AnyWorld, sizes: Sequence[float]) -> "Catalogue":
-        """List the shapes of a world or set, scaled."""
-        shapes = tuple(scaled(shape, size) for size in sizes for shape in world.shapes)
-        place = {shape: i for i, shape in enumerate(world.shapes)}
-        return cls(shapes, place, Outlines.of((*shapes, Circle(radius=1.0))), {})
 
 
 class MemberSampler:
@@ -131,25 +117,36 @@ class MemberSampler:
         try:
             scratch = self.scratches.pop()
         except IndexError:
-            scratch = _scratch(*self.room)
+            cells, count = self.room
+            scratch = SceneScratch(
+                np.zeros(1, kernels.DRAWS),
+                np.zeros(cells, np.int64),
+                np.zeros(cells, np.int64),
+                np.zeros(1, np.int64),
+                np.zeros(count, np.bool_),
+                np.zeros(count),
+                np.zeros(BODY),
+                np.zeros(BODY),
+                allocate_touches(),
+                body_cells(1, count),
+            )
         numbers, wanted, sizes = (values[rows] for values in draws)
         into = scenes.bodies[rows], scenes.starts[rows], scenes.goals[rows]
         drawn, why = kernels.draw_scenes(
             self._packed, numbers, wanted, sizes, *into, scratch
         )
         self.scratches.append(scratch)
-        if drawn < len(numbers):
-            raise self._no_room(int(numbers[drawn]), why)
-
-    def _no_room(self, seed: int, why: int) -> ConfigError:
+        if drawn == len(numbers):
+            return
         where = self.world.source
-        scene = f"in the scene of seed {seed}"
+        scene = f"in the scene of seed {numbers[drawn]}"
         if why == kernels.NO_OBSTACLES:
-            reason = f"no free place for {self.count} obstacles {scene}"
-            fix = "lower `count` or `gap`, or enlarge the field."
-            return ConfigError(f"{where}: key 'obstacles': {reason}; {fix}")
+            raise ConfigError(
+                f"{where}: key 'obstacles': no free place for {self.count} obstacles {scene}; "
+                "lower `count` or `gap`, or enlarge the field."
+            )
         least, greatest = self.world.goal_distance
-        return ConfigError(
+        raise ConfigError(
             f"{where}: key 'goal_distance': no free places for {self.robots} start(s) and goal(s) "
             f"of robots of radius {self.plan.footprint:g} m, {least:g} to {greatest:g} m apart "
             f"with a path between them, {self.count} obstacles, {scene}; change `goal_distance`, "
@@ -175,7 +172,10 @@ class SceneSampler:
         sizes: Sequence[float] = (1.0,),
         most: int | None = None,
     ) -> None:
-        catalogue = Catalogue.of(world, sizes)
+        shapes = tuple(scaled(shape, size) for size in sizes for shape in world.shapes)
+        places = {shape: i for i, shape in enumerate(world.shapes)}
+        outlines = Outlines.of((*shapes, Circle(radius=1.0)))
+        catalogue = Catalogue(shapes, places, outlines, {})
         self.samplers = [
             MemberSampler(member, footprint_radius, robots, most, catalogue)
             for member in world.members
@@ -221,7 +221,7 @@ class SceneSampler:
             wanted = np.maximum(np.asarray(count, np.int64), 0)
         sizes = np.zeros(n, np.int64)
         if size is not None:
-            sizes = np.asarray(size, dtype=np.int64)
+            sizes = np.asarray(size, np.int64)
         if wanted.shape != (n,) or sizes.shape != (n,):
             raise ConfigError(
                 f"count {wanted.shape} and size {sizes.shape} must be ({n},)."
@@ -229,7 +229,12 @@ class SceneSampler:
         if n and not 0 <= sizes.min() <= sizes.max() < self._sizes:
             raise ConfigError(f"size must be from 0 to {self._sizes - 1}.")
         draws = numbers, wanted, sizes
-        scenes = Scenes.of(n, self.count, self.robots)
+        scenes = Scenes(
+            np.zeros((n, self.count, BODY)),
+            np.zeros((n, self.robots, 3)),
+            np.zeros((n, self.robots, 2)),
+            np.zeros(n, np.int64),
+        )
         if len(self.samplers) == 1:
             self.samplers[0].draw_into(scenes, draws, slice(0, len(scenes)))
             return scenes
@@ -322,8 +327,8 @@ def _plan(
         outlines.arguments,
         outlines.radii,
         groups,
-        np.array(slots, dtype=np.int64),
-        np.array(choices, dtype=np.int64),
+        np.array(slots, np.int64),
+        np.array(choices, np.int64),
         np.arange(len(catalogue.shapes)).reshape(-1, max(len(catalogue.place), 1)),
         poses,
         _places(world.starts),
@@ -348,21 +353,6 @@ def _places(places: Starts | Goals | None) -> Records:
     shares = sizes if sizes.all() else np.ones(len(rows))
     array["share"] = np.cumsum(shares) / shares.sum()
     return array
-
-
-def _scratch(cells: int, count: int) -> SceneScratch:
-    return SceneScratch(
-        np.zeros(1, kernels.DRAWS),
-        np.zeros(cells, np.int64),
-        np.zeros(cells, np.int64),
-        np.zeros(1, np.int64),
-        np.zeros(count, np.bool_),
-        np.zeros(count),
-        np.zeros(BODY),
-        np.zeros(BODY),
-        allocate_touches(),
-        body_cells(1, count),
-    )
 
 
 def _free_space(world: World, footprint: float, drawn: bool) -> FreeSpace:
@@ -437,7 +427,7 @@ def _large_enough(area: ShortIntegers, cell: float, least: float) -> ShortIntege
     for number, parts in enumerate(ndimage.find_objects(area), 1):
         span = cell * math.hypot(*(part.stop - part.start for part in parts))
         keep.append(number if span >= least else 0)
-    return np.asarray(np.array(keep, np.int32)[area])
+    return np.array(keep, np.int32)[area]
 
 
 def _check(
@@ -463,5 +453,6 @@ def _check(
     for place, (free, value) in fits.items():
         if not free:
             robot = f"a robot with {world.clearance:g} m around it does not fit there, at {value}"
-            fix = "move it, or lower `clearance`."
-            raise ConfigError(f"{world.source}: key {place!r}: {robot}; {fix}")
+            raise ConfigError(
+                f"{world.source}: key {place!r}: {robot}; move it, or lower `clearance`."
+            )

@@ -245,8 +245,9 @@ class _Order:
     def count(self, file: Path) -> None:
         self._models += 1
         if self._models > MOST_MODELS:
-            reason = f": holds more than {MOST_MODELS} models; split the world."
-            raise SdfError(file, reason)
+            raise SdfError(
+                file, f": holds more than {MOST_MODELS} models; split the world."
+            )
 
 
 class _Scope:
@@ -335,10 +336,9 @@ class _Scope:
             near = suggest(name, self._named) if self._named else "there are none here."
             raise self.where.error(f": there is no frame {name!r}; {near}")
         if name in self._open:
-            reason = (
-                f"the pose of {name!r} is relative to itself; give it another frame"
+            raise self.where.error(
+                f": the pose of {name!r} is relative to itself; give it another frame."
             )
-            raise self.where.error(f": {reason}.")
         self._open.add(name)
         if isinstance(named, _Scope):
             pose = self.of_model(named)
@@ -421,11 +421,14 @@ class _Body(NamedTuple):
         if len(points) > 1 and points[0] == points[-1]:
             points.pop()
         if len(set(points)) < 3:
-            reason = ": <polyline> needs three different points; add some."
-            raise self.where.error(reason)
+            raise self.where.error(
+                ": <polyline> needs three different points; add some."
+            )
         if len(points) > MOST_CORNERS:
-            most = f"has {len(points)} points, a shape at most {MOST_CORNERS}"
-            raise self.where.error(f": <polyline> {most}; coarsen it.")
+            raise self.where.error(
+                f": <polyline> has {len(points)} points, a shape at most "
+                f"{MOST_CORNERS}; coarsen it."
+            )
         return Prism(tuple(points), *self._lengths(polyline, "height"))
 
     def _lengths(self, shape: Element, key: str, count: int = 1) -> tuple[float, ...]:
@@ -435,8 +438,9 @@ class _Body(NamedTuple):
             raise where.error(" is missing; add it.")
         lengths = _floats(text, count, where)
         if not all(SMALLEST <= length <= LARGEST for length in lengths):
-            reason = f" must be above 0 and at most {LARGEST:g} m, not {text!r}."
-            raise where.error(reason)
+            raise where.error(
+                f" must be above 0 and at most {LARGEST:g} m, not {text!r}."
+            )
         return lengths
 
 
@@ -479,11 +483,12 @@ def read_sdf(
                 placed.append(obstacle)
             if len(placed) > MOST_OBSTACLES:
                 reason = f"holds more than {MOST_OBSTACLES} bodies at a height of {height:g} m"
-                fix = "leave some out by --without MODEL, or split the world"
-                raise SdfError(path, f": {reason}; {fix}.")
+                raise SdfError(
+                    path,
+                    f": {reason}; leave some out by --without MODEL, or split the world.",
+                )
     except RecursionError:
-        reason = ": is nested too deeply; flatten its models."
-        raise SdfError(path, reason) from None
+        raise SdfError(path, ": is nested too deeply; flatten its models.") from None
     left_out = tuple(
         f"model {name!r} has {', '.join(what)}" for name, what in unknown.items()
     )
@@ -516,10 +521,10 @@ def _section_of(body: "_Body", height: float) -> Placed | None:
         problem = error.errors(include_url=False)[0]["msg"].removeprefix(
             "Value error, "
         )
-        reason = (
-            f"its shape at a height of {height:g} m can't stand in a world ({problem})"
-        )
-        raise body.where.error(f": {reason}; change it.") from None
+        raise body.where.error(
+            f": its shape at a height of {height:g} m can't stand in a "
+            f"world ({problem}); change it."
+        ) from None
 
 
 def _bodies(scope: _Scope, pose: Array) -> Iterator[_Body]:
@@ -629,14 +634,16 @@ def root_of(path: Path) -> Element:
     """Return the root of an SDF file, with tags as they stand there. Raises ConfigError."""
     root = _tree(path)
     if root.tag != "sdf":
-        reason = f": is not SDF but <{root.tag}>; give a .world or .sdf file."
-        raise SdfError(path, reason)
+        raise SdfError(
+            path, f": is not SDF but <{root.tag}>; give a .world or .sdf file."
+        )
     version = root.get("version", "")
     if not OLDEST <= _version(version) <= NEWEST:
         span = " to ".join(".".join(map(str, end)) for end in (OLDEST, NEWEST))
-        fix = "convert it by `gz sdf -p`"
-        reason = f": SDF version {version!r} is not supported, only {span}; {fix}."
-        raise SdfError(path, reason)
+        raise SdfError(
+            path,
+            f": SDF version {version!r} is not supported, only {span}; convert it by `gz sdf -p`.",
+        )
     return root
 
 
@@ -644,8 +651,9 @@ def _tree(path: Path) -> Element:
     """Read XML. Raises ConfigError with line and column, and for entity declarations."""
     try:
         if check_no_device(path).stat().st_size > MOST_BYTES:
-            reason = f"is larger than {MOST_BYTES // 2**20} MB"
-            raise SdfError(path, f": {reason}; give a smaller file.")
+            raise SdfError(
+                path, f": is larger than {MOST_BYTES // 2**20} MB; give a smaller file."
+            )
         data = path.read_bytes()
     except OSError as error:
         raise SdfError(path, f": can't be read ({error.strerror}).") from None

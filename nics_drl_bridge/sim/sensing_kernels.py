@@ -86,7 +86,7 @@ def measure_odometry(
     s = math.sin(heading)
     x = last[ODOM] + (c * ahead - s * left)
     y = last[ODOM + 1] + (s * ahead + c * left)
-    heading = heading + turn
+    heading += turn
     if noise_x != 0.0 or noise_y != 0.0 or noise_turn != 0.0:
         period = motion.dt * substeps
         c = math.cos(heading)
@@ -151,8 +151,8 @@ def interpolate_past(
     """
     newer = steps - lag // substeps
     fraction = (lag % substeps) / substeps
-    new = past[newer % past.shape[0]]
-    old = past[(newer - 1) % past.shape[0]]
+    new = past[newer % len(past)]
+    old = past[(newer - 1) % len(past)]
     is_pose = column in (POSE, ODOM)
     for i in range(3):
         out[i] = new[column + i]
@@ -233,7 +233,7 @@ def _scan_from_past(n: int, m: int, part: Part) -> None:
     pose = scans.pose
     twist = scans.twist
     past = data.past[n, m]
-    lag = limit_lag(data.age[n, m], steps, past.shape[0], substeps)
+    lag = limit_lag(data.age[n, m], steps, len(past), substeps)
     interpolate_past(past, POSE, lag, steps, substeps, pose)
     interpolate_past(past, TRUE_TWIST, lag, steps, substeps, twist)
     reach = lidar.range_max + math.hypot(lidar.mount[0], lidar.mount[1])
@@ -241,8 +241,8 @@ def _scan_from_past(n: int, m: int, part: Part) -> None:
         reach += math.hypot(twist[0], twist[1]) * lidar.sweep_time
     nearby = scans.everybody[: _gather_bodies(n, m, lag, reach, part)]
     ranges = data.ranges[n, m]
-    beams = ranges.shape[0]
-    groups = 1 if skew == 0.0 else scans.slice_poses.shape[0]
+    beams = len(ranges)
+    groups = 1 if skew == 0.0 else len(scans.slice_poses)
     if groups > 1:
         moving = (steps * substeps - lag) * part.motion.dt
         fault_kernels.slice_poses(

@@ -23,7 +23,7 @@ from nics_drl_bridge.kernels import pack
 from nics_drl_bridge.lidar import scan_kernels
 from nics_drl_bridge.lidar.arrays import Array, Integers
 from nics_drl_bridge.lidar.bake import add_shapes
-from nics_drl_bridge.lidar.exact_kernels import SHAPE, OutlineArrays
+from nics_drl_bridge.lidar.exact_kernels import SHAPE
 from nics_drl_bridge.lidar.maps import GridMap, joined, stack_fixtures
 from nics_drl_bridge.lidar.scanner import Renderer, Scanner
 from nics_drl_bridge.lidar.sensor import Render, SensedWorlds, unread
@@ -31,7 +31,6 @@ from nics_drl_bridge.lidar.shapes import BODY, place
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.kernels import SERIES, allocate_scratch, make_terms
 from nics_drl_bridge.robot.spec import RobotSpec
-from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.sim import state as records
 from nics_drl_bridge.sim import step_kernels
 from nics_drl_bridge.sim.collision_kernels import body_cells
@@ -44,7 +43,7 @@ from nics_drl_bridge.sim.randomisation import (
 )
 from nics_drl_bridge.sim.scenes import Scenes, SceneSampler
 from nics_drl_bridge.sim.state import POSE, TRUE_TWIST, WorldSetArrays
-from nics_drl_bridge.sim.world import Motion, World, plan_arrays
+from nics_drl_bridge.sim.world import Motion, plan_arrays
 from nics_drl_bridge.sim.world_set import AnyWorld
 from nics_drl_bridge.threads import run_parts
 
@@ -110,7 +109,7 @@ class CommandRange:
 
     def __init__(
         self,
-        model: TaylorModel,
+        model: taylor.TaylorModel,
         robot: RobotSpec,
         tell: Callable[[str], None] = warn_caller,
     ) -> None:
@@ -121,10 +120,10 @@ class CommandRange:
         for curve in model.inputs:
             c = self._names.index(curve.command)
             fitted[:, c] = curve.invert(fitted[:, c])
-        self._fitted: Array = fitted
+        self._fitted = fitted
         margin = TOLERANCE * (robot.command_high - robot.command_low)
-        self._low: Array = fitted[0] - margin
-        self._high: Array = fitted[1] + margin
+        self._low = fitted[0] - margin
+        self._high = fitted[1] + margin
         for _, term in model.assumed:
             powers = taylor.parse_term(term, model.variables)
             assumed = powers[model.state_size :] > 0
@@ -155,7 +154,6 @@ class CommandRange:
             )
 
 
-Indices = Integers
 Result = TypeVar("Result")
 # Poses of robots (n, M, 3), or a function that returns them for scenes; None: the scenes' poses
 Starts = ArrayLike | Callable[[Scenes], Array | None] | None
@@ -269,7 +267,7 @@ class FastSimulator:
         self._in_table = np.array([table.outlines.index_of(shape) for shape in shapes])
         self._scanner = Scanner(model.lidar, table, renderer)
         self.data = allocate_state(model, self._sizes)
-        self.goals: Array = np.zeros((worlds, robots, 2))
+        self.goals = np.zeros((worlds, robots, 2))
         self.drawn: dict[str, NDArray[Any]] = {}
         self.readings = unread(model.sensors, worlds, robots)
         edges = np.arange(min(threads, worlds) + 1) * worlds // min(threads, worlds)
@@ -303,21 +301,41 @@ class FastSimulator:
             starts = starts(scenes)
         poses = scenes.starts
         if starts is not None:
-            poses = np.asarray(starts, dtype=np.float64)
+            poses = np.asarray(starts, np.float64)
         if len(scenes) != len(chosen) or poses.shape != scenes.starts.shape:
-            needed = f"{len(chosen)} worlds with {self.data.pose.shape[1]} robots each."
             raise ConfigError(
-                f"{len(scenes)} seeds and starts {poses.shape} do not fit {needed}"
+                f"{len(scenes)} seeds and starts {poses.shape} do not fit {len(chosen)} worlds "
+                f"with {self.data.pose.shape[1]} robots each."
             )
-        self._place_scenes(chosen, np.asarray(seeds, dtype=np.int64), scenes, poses)
+        data = self.data
+        data.pose[chosen] = poses
+        data.odom[chosen] = poses
+        for name in ("state", "history", "twist", "collided", "steps", "velocity"):
+            getattr(data, name)[chosen] = 0
+        data.seeds[chosen] = np.asarray(seeds, np.int64)
+        data.member[chosen] = scenes.member
+        count = self.sampler.count
+        shapes = scenes.bodies[..., SHAPE].astype(np.int64)
+        data.bodies[chosen, :count] = scenes.bodies
+        data.bodies[chosen, :count, SHAPE] = self._in_table[shapes]
+        data.bodies[chosen, count:] = place(
+            poses, self.footprint.radius, self._in_table[-1]
+        )
+        self.goals[chosen] = scenes.goals
         if draws is not None:
-            self._apply_draws(chosen, draws)
+            for name in ("coefficient", "noise", "delay", "age", "faults"):
+                getattr(data, name)[chosen] = getattr(draws, name)
+            for name, values in draws.named().items():
+                if name not in self.drawn:
+                    shape = (len(data.steps), *values.shape[1:])
+                    self.drawn[name] = np.zeros(shape, values.dtype)
+                self.drawn[name][chosen] = values
         for part in self.parts:
             of_part = chosen[(chosen >= part.start) & (chosen < part.stop)]
             if len(of_part):
                 step_kernels.begin_episodes(self.packed[part.start], of_part)
                 self.sense(of_part)
-        if self.sampler.count < STANDING:
+        if count < STANDING:
             return scenes
         return Scenes(
             self.obstacles_of(chosen), scenes.starts, scenes.goals, scenes.member
@@ -340,7 +358,7 @@ class FastSimulator:
         """Run a function for each of `parts`, one thread per part; return the results."""
         return run_parts(function, self.parts)
 
-    def sense(self, worlds: Indices) -> None:
+    def sense(self, worlds: Integers) -> None:
         """Render the readings of the further sensors in some worlds (n,)."""
         for name, render in self._renders.items():
             render(self.readings[name], worlds)
@@ -359,7 +377,7 @@ class FastSimulator:
         """(N, K, 7) the obstacles at their present poses, in the format of `scenes`."""
         return self.obstacles_of(np.arange(len(self.data.steps)))
 
-    def obstacles_of(self, worlds: Indices) -> Array:
+    def obstacles_of(self, worlds: Integers) -> Array:
         """Return the obstacles (n, K, 7) of some worlds (n,), in the format of `scenes`."""
         bodies = self.data.bodies[worlds, : self.sampler.count]
         of_obstacles = self._in_table[:-1]
@@ -400,7 +418,7 @@ class FastSimulator:
             step_kernels.sort_worlds(self.packed[part.start], part.start, part.stop)
 
     def take_over(
-        self, source: "FastSimulator", robots: Indices, obstacles: Indices
+        self, source: "FastSimulator", robots: Integers, obstacles: Integers
     ) -> None:
         """Continue the episode of another simulator of this model, in its first world.
 
@@ -464,12 +482,27 @@ class FastSimulator:
 
     @cached_property
     def _world_set(self) -> WorldSetArrays:
-        return stack_members(
-            self.world.members,
-            self.sampler.motions,
+        """The surroundings of the members of the world set, stacked."""
+        members = self.world.members
+        motions = self.sampler.motions
+        crowded = self._sizes.crowded
+        grids = _share_equal_maps([world.grid for world in members])
+        distances, places = joined([map_field(grid).distances for grid in grids])
+        moves = any(motion is not None for group in motions for motion in group)
+        standing = not (crowded or moves) and self.sampler.count >= STANDING
+        plans, waypoints = _stack_plans(motions if moves else [() for _ in members])
+        walls = [world.all_walls() for world in members]
+        return WorldSetArrays(
+            stack_fixtures(walls, grids, self.data.member),
+            distances,
+            places,
             self._scanner.table.outlines.arguments,
-            self._sizes,
-            self.data.member,
+            crowded,
+            standing,
+            moves,
+            plans,
+            waypoints,
+            np.array([world.extent for world in members]),
         )
 
     @cached_property
@@ -483,7 +516,7 @@ class FastSimulator:
         )
         return {sensor.name: sensor.renderer(sensed) for sensor in self.model.sensors}
 
-    def _choose_worlds(self, worlds: ArrayLike | None) -> Indices:
+    def _choose_worlds(self, worlds: ArrayLike | None) -> Integers:
         """Return the indices of the worlds to reset; kernels do not check them."""
         count = len(self.data.steps)
         if worlds is None:
@@ -500,49 +533,16 @@ class FastSimulator:
             f"{count - 1}, each at most once."
         )
 
-    def _place_scenes(
-        self,
-        chosen: Indices,
-        seeds: Indices,
-        scenes: Scenes,
-        starts: Array,
-    ) -> None:
-        """Put the robots at `starts` (n, M, 3) and the obstacles of the scenes, all at rest."""
-        data = self.data
-        data.pose[chosen] = starts
-        data.odom[chosen] = starts
-        for name in ("state", "history", "twist", "collided", "steps", "velocity"):
-            getattr(data, name)[chosen] = 0
-        data.seeds[chosen] = seeds
-        data.member[chosen] = scenes.member
-        count = self.sampler.count
-        shapes = scenes.bodies[..., SHAPE].astype(np.int64)
-        data.bodies[chosen, :count] = scenes.bodies
-        data.bodies[chosen, :count, SHAPE] = self._in_table[shapes]
-        data.bodies[chosen, count:] = place(
-            starts, self.footprint.radius, self._in_table[-1]
-        )
-        self.goals[chosen] = scenes.goals
-
-    def _apply_draws(self, chosen: Indices, draws: Draws) -> None:
-        """Give the worlds the numbers that a randomisation drew."""
-        data = self.data
-        for name in ("coefficient", "noise", "delay", "age", "faults"):
-            getattr(data, name)[chosen] = getattr(draws, name)
-        for name, values in draws.named().items():
-            if name not in self.drawn:
-                shape = (len(data.steps), *values.shape[1:])
-                self.drawn[name] = np.zeros(shape, values.dtype)
-            self.drawn[name][chosen] = values
-
     def _check_commands(self, part: slice, commands: ArrayLike) -> Array:
         """Return commands (n, M, C) as an array; report those outside the range of the fit."""
-        checked = np.ascontiguousarray(commands, dtype=np.float64)
+        checked = np.ascontiguousarray(commands, np.float64)
         robots, _, width = self.data.history.shape[1:]
         expected = (part.stop - part.start, robots, width)
         if checked.shape != expected:
-            needed = f"they must be {expected}: worlds, robots, and a robot's commands."
-            raise ConfigError(f"commands are {checked.shape}; {needed}")
+            raise ConfigError(
+                f"commands are {checked.shape}; they must be {expected}: worlds, "
+                "robots, and a robot's commands."
+            )
         if self.data.steps[part.start] % CHECK_INTERVAL == 0:
             self._command_range.check(checked)
         return checked
@@ -584,7 +584,7 @@ class EpisodeSampler:
         return self.scenes.draw(seeds, draws.count, draws.size), draws
 
 
-def check_speed(model: TaylorModel, robot: RobotSpec, world: AnyWorld) -> None:
+def check_speed(model: taylor.TaylorModel, robot: RobotSpec, world: AnyWorld) -> None:
     """Raise ConfigError if a robot could cross a whole world in one step of its kinematics."""
     # the greatest absolute value of each variable: states of the fit, commands within their limits
     largest = np.maximum(np.abs(model.low), np.abs(model.high))
@@ -657,42 +657,6 @@ def allocate_state(model: SimulatorModel, sizes: Sizes) -> records.State:
     )
 
 
-def stack_members(
-    worlds: Sequence[World],
-    motions: Sequence[Sequence[Motion | None]],
-    outlines: OutlineArrays,
-    sizes: Sizes,
-    member: Integers,
-) -> WorldSetArrays:
-    """Stack the surroundings of the members of a world set.
-
-    Args:
-        worlds: the P members.
-        motions: (P, K) of their obstacles.
-        outlines: of all shapes.
-        sizes: of the simulation.
-        member: (N,) the member that each world is a copy of; it changes as episodes begin.
-    """
-    grids = _share_equal_maps([world.grid for world in worlds])
-    distances, map_places = joined([map_field(grid).distances for grid in grids])
-    moves = any(motion is not None for group in motions for motion in group)
-    standing = not (sizes.crowded or moves) and sizes.obstacles >= STANDING
-    plans, waypoints = _stack_plans(motions if moves else [() for _ in worlds])
-    bounds = np.array([world.extent for world in worlds])
-    return WorldSetArrays(
-        stack_fixtures([world.all_walls() for world in worlds], grids, member),
-        distances,
-        map_places,
-        outlines,
-        sizes.crowded,
-        standing,
-        moves,
-        plans,
-        waypoints,
-        bounds,
-    )
-
-
 def _share_equal_maps(grids: Sequence[GridMap | None]) -> list[GridMap | None]:
     """Return one object for all maps of equal content, which is then baked and stored once."""
     distinct: dict[Any, GridMap | None] = {}
@@ -740,7 +704,6 @@ def _allocate_scratch(
     bodies = obstacles + robots
     blocks = -(-worlds * robots // LANES)
     lanes = robots * min(worlds, -(-worlds // blocks))
-    x, dq = allocate_scratch(kinematics)
     commands = len(kinematics.variables) - kinematics.state_size
     return records.Scratch(
         lanes=records.Lanes(
@@ -750,15 +713,13 @@ def _allocate_scratch(
             change=np.zeros((commands, lanes), np.int64),
             coefficient=np.zeros((np.count_nonzero(kinematics.coefficients), lanes)),
         ),
-        single=records.Single(x, dq),
+        single=records.Single(*allocate_scratch(kinematics)),
         tight=records.Tight(
             motions=np.zeros(robots, records.MOTION),
             listed=records.allocate_touches(),
             start=np.zeros((obstacles, 3)),
             stops=np.zeros(obstacles),
             fastest=np.zeros(1),
-        ),
-        nearby=records.Nearby(
             near=np.zeros((robots, 1 + SEVERAL), np.int64),
             meets=np.zeros(robots, np.int64),
             reach=np.zeros(bodies),

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.lidar.arrays import Array as Array
 from nics_drl_bridge.lidar.arrays import Integers as Integers
-from nics_drl_bridge.lidar.arrays import ShortIntegers, Singles
+from nics_drl_bridge.lidar.arrays import ShortIntegers, Singles, structure_of
 from nics_drl_bridge.lidar.exact_kernels import OutlineArrays
 from nics_drl_bridge.lidar.map_kernels import Fixtures
 from nics_drl_bridge.lidar.scan_kernels import LidarArrays, ScanScratch
@@ -28,7 +28,6 @@ ODOM_LINEAR = 0
 ODOM_ANGULAR = 1
 DRIFT_X = 2
 DRIFT_Y = 3
-DRIFT_HEADING = 4
 DRIFT_STATE = 5
 
 # Columns of `State.past`. The true twist is the model's at the end of a period: for a robot that is
@@ -62,47 +61,49 @@ STILL = 0
 PATROL = 1
 PEDESTRIAN = 2
 
-PLAN = np.dtype(
-    [
-        ("kind", np.int64),
-        # of the desired speed, which is drawn per episode [m/s]
-        ("slowest", np.float64),
-        ("fastest", np.float64),
-        # of a patrol: its waypoints, and how it goes through them
-        ("first", np.int64),
-        ("count", np.int64),
-        ("loop", np.bool_),
-        ("pause", np.float64),
-        # of a pedestrian, see `world.Pedestrian`
-        ("relaxation", np.float64),
-        ("repulsion", np.float64),
-        ("range", np.float64),
-        ("wall_repulsion", np.float64),
-        ("wall_range", np.float64),
-        ("foresight", np.float64),
-        ("cos_view", np.float64),  # of half the angle of sight
-        ("behind", np.float64),
-        ("fluctuation", np.float64),
-    ],
-    align=True,
-)
-"""Motion of an obstacle."""
 
-MARK = np.dtype(
-    [
-        ("speed", np.float64),  # desired in this episode [m/s]
-        ("vx", np.float64),  # velocity in the last period [m/s]
-        ("vy", np.float64),
-        ("goal_x", np.float64),  # of a pedestrian [m]
-        ("goal_y", np.float64),
-        ("until", np.float64),  # step at which it gives this goal up
-        ("index", np.int64),  # of the next waypoint of a patrol
-        ("way", np.int64),  # 1 forwards through its waypoints, -1 backwards
-        ("rest", np.float64),  # waiting time that is left [s]
-    ],
-    align=True,
-)
-"""Memory of a moving obstacle."""
+class ObstaclePlan:
+    """Motion of an obstacle."""
+
+    kind: int
+    # of the desired speed, which is drawn per episode [m/s]
+    slowest: float
+    fastest: float
+    # of a patrol: its waypoints, and how it goes through them
+    first: int
+    count: int
+    loop: bool
+    pause: float
+    # of a pedestrian, see `world.Pedestrian`
+    relaxation: float
+    repulsion: float
+    range: float
+    wall_repulsion: float
+    wall_range: float
+    foresight: float
+    cos_view: float  # of half the angle of sight
+    behind: float
+    fluctuation: float
+
+
+PLAN = structure_of(ObstaclePlan)
+
+
+class ObstacleMark:
+    """Memory of a moving obstacle."""
+
+    speed: float  # desired in this episode [m/s]
+    vx: float  # velocity in the last period [m/s]
+    vy: float
+    goal_x: float  # of a pedestrian [m]
+    goal_y: float
+    until: float  # step at which it gives this goal up
+    index: int  # of the next waypoint of a patrol
+    way: int  # 1 forwards through its waypoints, -1 backwards
+    rest: float  # waiting time that is left [s]
+
+
+MARK = structure_of(ObstacleMark)
 
 
 class State(NamedTuple):
@@ -149,15 +150,6 @@ class MapField(NamedTuple):
 NO_FIELD = MapField(np.zeros((0, 0), np.float32), 0.0, 0.0, 1.0, 0.0, 1.0)
 
 
-class Movers(NamedTuple):
-    """Motion of the obstacles of one world."""
-
-    moves: bool  # True if an obstacle of any member moves
-    plans: Records  # (K,) of `PLAN`
-    waypoints: Array  # (Q, 2) of all patrols [m]
-    bounds: Array  # (4,) minimum x, y and maximum x, y that obstacles stay in [m]
-
-
 class Surroundings(NamedTuple):
     """Everything that stands in one world, and how its bodies are searched."""
 
@@ -166,7 +158,9 @@ class Surroundings(NamedTuple):
     outlines: OutlineArrays
     crowded: bool  # True if all bodies are sorted into cells in each period
     standing: bool  # True if the obstacles are put in the order of cells: none may get a velocity
-    movers: Movers
+    plans: Records  # (K,) of `PLAN`, the motions of the obstacles
+    waypoints: Array  # (Q, 2) of all patrols [m]
+    bounds: Array  # (4,) minimum x, y and maximum x, y that obstacles stay in [m]
 
 
 class WorldSetArrays(NamedTuple):
@@ -184,7 +178,7 @@ class WorldSetArrays(NamedTuple):
     moves: bool  # True if an obstacle of any member moves
     plans: Records  # (P, K) of `PLAN`
     waypoints: Array  # (Q, 2) of all patrols of all members [m]
-    bounds: Array  # (P, 4) as in `Movers`
+    bounds: Array  # (P, 4) as in `Surroundings`
 
 
 class Dynamics(NamedTuple):
@@ -208,49 +202,47 @@ class Lanes(NamedTuple):
     change: Integers  # (C, L) substep of the period at which each command changes
 
 
-MOTION = np.dtype(
-    [
-        # where the robot was when its present twist began: pose, time in the interval [s]
-        ("x", np.float64),
-        ("y", np.float64),
-        ("heading", np.float64),
-        ("cos", np.float64),
-        ("sin", np.float64),
-        ("since", np.float64),
-        # twist in the robot's frame [m/s, m/s, rad/s]; what it would be without contacts
-        ("vx", np.float64),
-        ("vy", np.float64),
-        ("turn", np.float64),
-        ("wish_x", np.float64),
-        ("wish_y", np.float64),
-        ("wish_turn", np.float64),
-        ("bound", np.float64),  # of the speed of any of its points [m/s]
-        ("clock", np.float64),  # time until when it cannot meet anything [s]
-        ("room", np.float64),  # what it may approach anything before it is judged [m]
-        ("gap", np.float64),  # its latest clearance, negative where it overlaps [m]
-        ("touches", np.bool_),  # True if it may meet something before its clock
-        (
-            "halts",
-            np.int64,
-        ),  # 1 once it may only turn in this interval, 2 once it stands
-    ],
-    align=True,
-)
-"""Motion of a robot that may meet something, see `contact_kernels`."""
+class RobotMotion:
+    """Motion of a robot that may meet something, see `contact_kernels`."""
 
-TOUCH = np.dtype(
-    [
-        ("x", np.float64),  # nearest point of the robot [m]
-        ("y", np.float64),
-        ("nx", np.float64),  # unit vector to it from what it touches
-        ("ny", np.float64),
-        ("gap", np.float64),  # [m]
-        ("rate", np.float64),  # speed of what it touches along the unit vector [m/s]
-        ("other", np.int64),  # body that it touches; -1 for a wall or the map
-    ],
-    align=True,
-)
-"""A point of a robot that nearly touches something."""
+    # where the robot was when its present twist began: pose, time in the interval [s]
+    x: float
+    y: float
+    heading: float
+    cos: float
+    sin: float
+    since: float
+    # twist in the robot's frame [m/s, m/s, rad/s]; what it would be without contacts
+    vx: float
+    vy: float
+    turn: float
+    wish_x: float
+    wish_y: float
+    wish_turn: float
+    bound: float  # of the speed of any of its points [m/s]
+    clock: float  # time until when it cannot meet anything [s]
+    room: float  # what it may approach anything before it is judged [m]
+    gap: float  # its latest clearance, negative where it overlaps [m]
+    touches: bool  # True if it may meet something before its clock
+    halts: int  # 1 once it may only turn in this interval, 2 once it stands
+
+
+MOTION = structure_of(RobotMotion)
+
+
+class Touch:
+    """A point of a robot that nearly touches something."""
+
+    x: float  # nearest point of the robot [m]
+    y: float
+    nx: float  # unit vector to it from what it touches
+    ny: float
+    gap: float  # [m]
+    rate: float  # speed of what it touches along the unit vector [m/s]
+    other: int  # body that it touches; -1 for a wall or the map
+
+
+TOUCH = structure_of(Touch)
 
 
 class Touches(NamedTuple):
@@ -279,16 +271,6 @@ class BodyCells(NamedTuple):
     found: ShortIntegers  # (K,) scratch for one thread: the bodies around a point
 
 
-class Tight(NamedTuple):
-    """Scratch memory of one world whose robots may meet something, see `contact_kernels`."""
-
-    motions: Records  # (M,) of `MOTION`
-    listed: Touches
-    start: Array  # (K, 3) poses of the obstacles at the start of the period
-    stops: Array  # (K,) time in the period at which each obstacle stops [s]
-    fastest: Array  # (1,) speed of the fastest other body [m/s]
-
-
 class Single(NamedTuple):
     """Scratch memory of one robot, see `robot.kernels.allocate_scratch`."""
 
@@ -296,9 +278,14 @@ class Single(NamedTuple):
     dq: Array  # (3 + S,) rates
 
 
-class Nearby(NamedTuple):
-    """Bodies and walls that the robots of one world may meet in the period."""
+class Tight(NamedTuple):
+    """Scratch memory of one world, and what its robots may meet, see `contact_kernels`."""
 
+    motions: Records  # (M,) of `MOTION`
+    listed: Touches
+    start: Array  # (K, 3) poses of the obstacles at the start of the period
+    stops: Array  # (K,) time in the period at which each obstacle stops [s]
+    fastest: Array  # (1,) speed of the fastest other body [m/s]
     near: Integers  # (M, 1 + SEVERAL) number and indices of the bodies near each robot
     meets: Integers  # (M,) bit flags of `contact_kernels`
     reach: Array  # (K + M,) how far each body may reach from its present centre [m]
@@ -325,7 +312,6 @@ class Scratch(NamedTuple):
     lanes: Lanes
     single: Single
     tight: Tight
-    nearby: Nearby
     cells: BodyCells  # the cells of all worlds, with a list of found bodies per thread
     scans: Scans
 

@@ -30,7 +30,6 @@ from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, X, Y
 from nics_drl_bridge.lidar.map_kernels import cells_of, walls_of
 from nics_drl_bridge.robot import kernels as robot
-from nics_drl_bridge.robot.kernels import apply_curve
 from nics_drl_bridge.sim import contact_kernels as contacts
 from nics_drl_bridge.sim import obstacle_kernels as obstacles
 from nics_drl_bridge.sim import sensing_kernels as sensing
@@ -60,7 +59,6 @@ from nics_drl_bridge.sim.state import (
     Integers,
     Lanes,
     MapField,
-    Movers,
     Part,
     Single,
     State,
@@ -83,14 +81,14 @@ def step_worlds(packed: Any, commands: Array, first_world: int) -> None:
 def begin_episodes(packed: Any, chosen: Integers) -> None:
     """Begin episodes in the worlds `chosen` (n,), where everything is in place and stands still."""
     part = packed.content
-    for i in range(chosen.shape[0]):
+    for i in range(len(chosen)):
         n = chosen[i]
         part.scratch.scans.waiting[i] = n
         scene = get_surroundings(n, part.world_set)
         if part.world_set.moves:
-            obstacles.reset_marks(n, part.data, scene.movers.plans)
+            obstacles.reset_marks(n, part.data, scene.plans)
         _sort_bodies(n, scene, part)
-    sensing.scan_together(chosen.shape[0], part)
+    sensing.scan_together(len(chosen), part)
     for n in chosen:
         sensing.distort_scans(n, n + 1, part)
 
@@ -107,7 +105,7 @@ def sort_worlds(packed: Any, first_world: int, end_world: int) -> None:
 def begin_period(packed: Any) -> None:
     """Begin a period of worlds whose robots another engine moves."""
     part = packed.content
-    for n in range(part.data.pose.shape[0]):
+    for n in range(len(part.data.pose)):
         _begin_period_of_world(n, 0, part)
 
 
@@ -131,7 +129,7 @@ def end_period(
     part = packed.content
     data = part.data
     waiting_count = 0
-    for n in range(data.pose.shape[0]):
+    for n in range(len(data.pose)):
         data.steps[n] += 1
         for m in range(data.pose.shape[1]):
             start = wheel_start[n, m]
@@ -150,7 +148,7 @@ def end_period(
         _sort_bodies(n, get_surroundings(n, part.world_set), part)
         waiting_count = sensing.scan_or_wait(n, waiting_count, part)
     sensing.scan_together(waiting_count, part)
-    sensing.distort_scans(0, data.pose.shape[0], part)
+    sensing.distort_scans(0, len(data.pose), part)
 
 
 @kernel
@@ -163,7 +161,7 @@ def _step_part(part: Part, commands: Array, first_world: int) -> None:
     """
     data = part.data
     robots = data.pose.shape[1]
-    end_world = first_world + commands.shape[0]
+    end_world = first_world + len(commands)
     _queue_commands(data.history, commands, first_world, part.motion.terms.curves)
     worlds_per_block = part.scratch.lanes.pose.shape[1] // robots
     for block_begin in range(first_world, end_world, worlds_per_block):
@@ -193,14 +191,14 @@ def _queue_commands(
     history: Array, commands: Array, first_world: int, curves: Array
 ) -> None:
     """Put the effects of commands (n, M, C) in front of the earlier ones, history (N, M, H, C)."""
-    for i in range(commands.shape[0]):
+    for i in range(len(commands)):
         for m in range(commands.shape[1]):
             queue = history[first_world + i, m]
-            for h in range(queue.shape[0] - 1, 0, -1):
+            for h in range(len(queue) - 1, 0, -1):
                 for c in range(commands.shape[2]):
                     queue[h, c] = queue[h - 1, c]
             for c in range(commands.shape[2]):
-                queue[0, c] = apply_curve(commands[i, m, c], curves[c])
+                queue[0, c] = robot.apply_curve(commands[i, m, c], curves[c])
 
 
 @kernel(inline=True)
@@ -210,7 +208,7 @@ def _begin_period_of_world(n: int, first_lane: int, part: Part) -> None:
     Where an episode begins, also record its start, at which the robots stand still.
     """
     data = part.data
-    speeds = part.scratch.nearby.speeds
+    speeds = part.scratch.tight.speeds
     newest = data.steps[n] % data.past.shape[2]
     for m in range(data.pose.shape[1]):
         pose = data.pose[n, m]
@@ -262,7 +260,7 @@ def _sort_bodies(n: int, scene: Surroundings, part: Part) -> None:
     bodies = part.data.bodies[n]
     cells = part.scratch.cells
     if scene.crowded:
-        sort_into_cells(n, bodies, bodies.shape[0], cells)
+        sort_into_cells(n, bodies, len(bodies), cells)
     elif scene.standing:
         spare = part.scratch.scans.bodies
         put_in_order(n, bodies, part.data.velocity.shape[1], spare, cells)
@@ -270,24 +268,20 @@ def _sort_bodies(n: int, scene: Surroundings, part: Part) -> None:
 
 @kernel(view=True)
 def get_surroundings(n: int, world_set: WorldSetArrays) -> Surroundings:
-    """Return the walls, map and movers of world n: those of the world of the set that it copies."""
+    """Return the walls, map and motions of world n: those of the member that it copies."""
     member = world_set.fixtures.member[n]
     frame = world_set.fixtures.frames[member]
     distances = cells_of(world_set.distances, world_set.map_places[member])
     grid = MapField(distances, frame[0], frame[1], frame[2], frame[3], frame[4])
-    movers = Movers(
-        world_set.moves,
-        world_set.plans[member],
-        world_set.waypoints,
-        world_set.bounds[member],
-    )
     return Surroundings(
         walls_of(n, world_set.fixtures),
         grid,
         world_set.outlines,
         world_set.crowded,
         world_set.standing,
-        movers,
+        world_set.plans[member],
+        world_set.waypoints,
+        world_set.bounds[member],
     )
 
 
@@ -300,12 +294,12 @@ def _move_world(n: int, first_lane: int, scene: Surroundings, part: Part) -> Non
     start = part.scratch.tight.start
     obstacles_move = _find_what_is_near(n, first_lane, scene, part)
     if obstacles_move:
-        for k in range(data.velocity.shape[1]):
+        for k in range(len(start)):
             for i in range(3):
                 start[k, i] = data.bodies[n, k, i]
     any_meets = False
     for m in range(data.pose.shape[1]):
-        if part.scratch.nearby.meets[m] != FREE:
+        if part.scratch.tight.meets[m] != FREE:
             any_meets = True
             continue
         lane = first_lane + m
@@ -337,20 +331,21 @@ def _find_what_is_near(
     """Find what each robot may meet in the period; return True if an obstacle moves."""
     data = part.data
     lane_poses = part.scratch.lanes.pose
-    nearby = part.scratch.nearby
+    tight = part.scratch.tight
+    reach = tight.reach
     cells = part.scratch.cells
     first = data.velocity.shape[1]
     period = part.motion.dt * part.motion.substeps
     longest = 0.0  # path of any body
     obstacles_move = False
     for k in range(0 if scene.standing else first):
-        nearby.reach[k] = data.bodies[n, k, RADIUS]
+        reach[k] = data.bodies[n, k, RADIUS]
         vx = data.velocity[n, k, 0]
         vy = data.velocity[n, k, 1]
         moves = vx != 0.0 or vy != 0.0 or data.velocity[n, k, 2] != 0.0
-        if moves and nearby.reach[k] > 0.0:
+        if moves and reach[k] > 0.0:
             moved = math.sqrt(vx * vx + vy * vy) * period
-            nearby.reach[k] += moved
+            reach[k] += moved
             longest = max(longest, moved)
             obstacles_move = True
     for m in range(data.pose.shape[1]):
@@ -363,13 +358,15 @@ def _find_what_is_near(
             turned = lane_poses[LANE_HEADING, first_lane + m] - data.pose[n, m, 2]
             path += abs(turned) * body[RADIUS]
         path += math.sqrt(3.0 * period) * sum_of_deviations
-        nearby.reach[first + m] = body[RADIUS] + path
+        reach[first + m] = body[RADIUS] + path
         longest = max(longest, path)
     if scene.crowded:
         sort_into_cells(n, data.bodies[n], data.bodies.shape[1], cells)
         cells.frame[n, MOVED] = longest
     for m in range(data.pose.shape[1]):
-        nearby.meets[m] = contacts.find_near(n, m, data.bodies, scene, nearby, cells)
+        tight.meets[m] = contacts.find_near(
+            n, m, data.bodies, scene, tight.near, reach, cells
+        )
     return obstacles_move
 
 
@@ -385,7 +382,7 @@ def _move_carefully(
     motion = part.motion
     single = part.scratch.single
     tight = part.scratch.tight
-    meets = part.scratch.nearby.meets
+    meets = tight.meets
     stops = tight.stops
     period = motion.dt * motion.substeps
     world = World(
@@ -393,19 +390,18 @@ def _move_carefully(
         data.velocity[n],
         data.velocity.shape[1],
         scene,
-        part.scratch.nearby,
         tight,
         data.collided[n],
         motion.series,
         period,
     )
     stops[:] = period
-    for m in range(meets.shape[0]):
+    for m in range(len(meets)):
         if meets[m] != FREE:
             contacts.put_body(world.bodies[world.first + m], data.pose[n, m])
             tight.motions[m].room = 0.0
     for j in range(motion.substeps):
-        for m in range(meets.shape[0]):
+        for m in range(len(meets)):
             if meets[m] != FREE:
                 compute_rates(n, m, j, data, motion, single)
                 dq = single.dq
@@ -418,14 +414,14 @@ def _move_carefully(
                     )
         contacts.advance(j * motion.dt, motion.dt, obstacles_move, world)
     drifts = False
-    for m in range(meets.shape[0]):
+    for m in range(len(meets)):
         if meets[m] != FREE:
             ahead, left, turn = draw_drift(n, m, data, motion)
             contacts.start_motion(m, ahead, left, turn, world)
             drifts = drifts or ahead != 0.0 or left != 0.0 or turn != 0.0
     if drifts:
         contacts.advance(motion.substeps * motion.dt, 1.0, False, world)
-    for m in range(meets.shape[0]):
+    for m in range(len(meets)):
         if meets[m] != FREE:
             body = world.bodies[world.first + m]
             data.pose[n, m, 0] = body[X]
@@ -477,7 +473,7 @@ def draw_drift(
     noise = data.noise[n, m]
     seed = data.seeds[n]
     counter = data.steps[n] * data.pose.shape[1] + m
-    count = noise.shape[0] - DRIFT_X
+    count = len(noise) - DRIFT_X
     period = motion.dt * motion.substeps
     scale = math.sqrt(12.0 * period)
     ahead = left = turn = 0.0
@@ -514,36 +510,9 @@ def move_freely(
     The result is in the lanes: robot m of world n is in lane (n - first_world) M + m. The period is
     integrated from one change of a command to the next.
     """
-    _fill_lanes(first_world, end_world, data, motion, lanes)
-    terms = robot.replace_coefficients(motion.terms, lanes.coefficient)
-    lane_count = (end_world - first_world) * data.pose.shape[1]
-    substep = 0
-    while substep < motion.substeps:
-        next_change = _apply_commands(
-            substep, first_world, lane_count, data, motion, lanes
-        )
-        robot.run(
-            lanes.pose,
-            lanes.x,
-            lanes.dq,
-            terms,
-            motion.series,
-            motion.dt,
-            next_change - substep,
-        )
-        substep = next_change
-
-
-@kernel(inline=True)
-def _fill_lanes(
-    first_world: int,
-    end_world: int,
-    data: State,
-    motion: Dynamics,
-    lanes: Lanes,
-) -> None:
-    """Copy poses, states and coefficients of robots to the lanes; note when commands change."""
     robots = data.pose.shape[1]
+    substeps = motion.substeps
+    change = lanes.change
     pose = lanes.pose
     for n in range(first_world, end_world):
         for m in range(robots):
@@ -557,42 +526,37 @@ def _fill_lanes(
             pose[LANE_PATH, lane] = 0.0
             for s in range(data.state.shape[2]):
                 lanes.x[s, lane] = data.state[n, m, s]
-            for t in range(lanes.coefficient.shape[0]):
+            for t in range(len(lanes.coefficient)):
                 lanes.coefficient[t, lane] = data.coefficient[n, m, t]
             # Each command changes once in a period, at this substep.
-            for c in range(lanes.change.shape[0]):
+            for c in range(len(change)):
                 delay = data.delay[n, m] + motion.terms.late[c]
-                lanes.change[c, lane] = delay % motion.substeps
-
-
-@kernel(inline=True)
-def _apply_commands(
-    substep: int,
-    first_world: int,
-    lane_count: int,
-    data: State,
-    motion: Dynamics,
-    lanes: Lanes,
-) -> int:
-    """Put the commands that take effect at a substep into the lanes; return the next such substep.
-
-    If no command changes any more, that is the end of the period.
-    """
-    robots = data.pose.shape[1]
-    size = data.state.shape[2]
-    substeps = motion.substeps
-    change = lanes.change
-    next_change = substeps
-    for c in range(change.shape[0]):
-        for lane in range(lane_count):
-            if change[c, lane] > substep:
-                next_change = min(next_change, change[c, lane])
-            if change[c, lane] == substep or substep == 0:
-                n = first_world + lane // robots
-                m = lane % robots
-                delay = data.delay[n, m] + motion.terms.late[c]
-                row = robot.find_delayed_command(
-                    substep, delay, substeps, data.history.shape[2]
-                )
-                lanes.x[size + c, lane] = data.history[n, m, row, c]
-    return next_change
+                change[c, lane] = delay % substeps
+    terms = robot.replace_coefficients(motion.terms, lanes.coefficient)
+    substep = 0
+    while substep < substeps:
+        # If no command changes any more, the next change is the end of the period.
+        next_change = substeps
+        for c in range(len(change)):
+            for lane in range((end_world - first_world) * robots):
+                if change[c, lane] > substep:
+                    next_change = min(next_change, change[c, lane])
+                if change[c, lane] == substep or substep == 0:
+                    n = first_world + lane // robots
+                    m = lane % robots
+                    delay = data.delay[n, m] + motion.terms.late[c]
+                    row = robot.find_delayed_command(
+                        substep, delay, substeps, data.history.shape[2]
+                    )
+                    command = data.history[n, m, row, c]
+                    lanes.x[data.state.shape[2] + c, lane] = command
+        robot.run(
+            pose,
+            lanes.x,
+            lanes.dq,
+            terms,
+            motion.series,
+            motion.dt,
+            next_change - substep,
+        )
+        substep = next_change

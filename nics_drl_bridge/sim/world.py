@@ -55,7 +55,7 @@ class Patrol(Schema):
     pause: float = Field(default=0.0, ge=0.0, le=1e6)
 
     @model_validator(mode="after")
-    def _apart(self) -> "Patrol":
+    def _check_apart(self) -> "Patrol":
         corners = [*self.waypoints, *self.waypoints[: int(self.loop)]]
         if any(corner == next_corner for corner, next_corner in pairwise(corners)):
             raise ValueError("consecutive waypoints must differ")
@@ -90,7 +90,7 @@ class Pedestrian(Schema):
 
     @field_validator("speed")
     @classmethod
-    def _fast(cls, speed: tuple[float, float]) -> tuple[float, float]:
+    def _check_speed(cls, speed: tuple[float, float]) -> tuple[float, float]:
         if not 0.0 < speed[0] <= speed[1] <= FASTEST:
             raise ValueError(
                 f"speed must be [minimum, maximum], above 0 and at most {FASTEST:g} m/s"
@@ -116,20 +116,19 @@ class Obstacles(Schema):
 
     @field_validator("count", mode="before")
     @classmethod
-    def _numbers(cls, count: object) -> object:
+    def _check_numbers(cls, count: object) -> object:
         several = count if isinstance(count, list | tuple) else (count, count)
         whole = len(several) == 2 and all(type(n) is int for n in several)
         if count is not None and not (
             whole and 0 <= several[0] <= several[1] <= MOST_OBSTACLES
         ):
-            needed = (
-                f"a whole number, or [minimum, maximum], from 0 to {MOST_OBSTACLES}"
+            raise ValueError(
+                f"count must be a whole number, or [minimum, maximum], from 0 to {MOST_OBSTACLES}"
             )
-            raise ValueError(f"count must be {needed}")
         return count
 
     @model_validator(mode="after")
-    def _consistent(self) -> "Obstacles":
+    def _check_consistent(self) -> "Obstacles":
         if (self.count is None) == (not self.at):
             raise ValueError("a group needs either `count` or `at`")
         return self
@@ -150,7 +149,7 @@ class Places(Schema):
     at: tuple[Pose | Point, ...] = Field(default=(), max_length=MOST_PLACES)
 
     @model_validator(mode="after")
-    def _one(self) -> "Places":
+    def _check_one(self) -> "Places":
         if bool(self.regions) == bool(self.at):
             raise ValueError("give either `regions` or `at`")
         return self
@@ -191,7 +190,7 @@ class World(Schema):
     _spare: tuple[Shape, ...] = PrivateAttr(default=())
 
     @model_validator(mode="after")
-    def _consistent(self) -> "World":
+    def _check_consistent(self) -> "World":
         if self.size is None and self.bounds is None and self.map is None:
             raise ValueError("a world needs a `size`, `bounds`, or a `map`")
         if self.size is not None and self.bounds is not None:
@@ -207,8 +206,9 @@ class World(Schema):
         across = math.hypot(*field)
         if across > MOST_ACROSS_M:
             fix = f"a field may be {MOST_ACROSS_M:g} m across, the largest distance in observations"
-            sides = f"{field[0]:g} m x {field[1]:g} m"
-            raise ValueError(f"the field of {sides} is {across:.0f} m across; {fix}")
+            raise ValueError(
+                f"the field of {field[0]:g} m x {field[1]:g} m is {across:.0f} m across; {fix}"
+            )
         if not 0.0 <= self.goal_distance[0] < self.goal_distance[1]:
             raise ValueError("goal_distance must be [minimum, maximum] in metres")
         if sum(group.counts[1] for group in self.obstacles) > MOST_OBSTACLES:
@@ -284,10 +284,9 @@ class World(Schema):
         """Return (W, 4) the four sides of the field, if any, then the further walls [m]."""
         sides: list[Region] = []
         if self.size is not None:
-            x = self.size[0] / 2.0
-            y = self.size[1] / 2.0
+            x, y = self.extent[2:]
             sides = [(-x, -y, x, -y), (x, -y, x, y), (x, y, -x, y), (-x, y, -x, -y)]
-        return np.array([*sides, *self.walls], dtype=np.float64).reshape(-1, 4)
+        return np.array([*sides, *self.walls], np.float64).reshape(-1, 4)
 
 
 def plan_arrays(
@@ -339,8 +338,10 @@ def check_places(world: World) -> None:
         waypoints = group.motion.waypoints if isinstance(group.motion, Patrol) else ()
         for n, point in enumerate(waypoints):
             if room_at(world, *point) < radius:
-                reason = f"an obstacle of radius {radius:g} m does not fit there, at {list(point)}"
-                raise ConfigError(f"{where}.motion.waypoints.{n}': {reason}; move it.")
+                raise ConfigError(
+                    f"{where}.motion.waypoints.{n}': an obstacle of radius {radius:g} m does not "
+                    f"fit there, at {list(point)}; move it."
+                )
 
 
 def check_place(
@@ -356,8 +357,10 @@ def check_place(
     if room <= max(radius, solid):
         reason = "is in a wall" if room >= 0.0 else "lies outside the world"
         x1, y1, x2, y2 = world.extent
-        field = f"the field is {x1:g} to {x2:g} m by {y1:g} to {y2:g} m"
-        raise ConfigError(f"{what}: ({x:g}, {y:g}) m {reason}; {field}.")
+        raise ConfigError(
+            f"{what}: ({x:g}, {y:g}) m {reason}; the field is {x1:g} to {x2:g} "
+            f"m by {y1:g} to {y2:g} m."
+        )
 
 
 def _inside(world: World, x: float, y: float) -> bool:

@@ -58,7 +58,7 @@ class Cellular(Schema):
     passage: float = Field(default=0.5, ge=0.0, le=100.0)
 
     @model_validator(mode="after")
-    def _consistent(self) -> Cellular:
+    def _check_consistent(self) -> Cellular:
         if self.columns * self.rows > MOST_CELLS:
             raise ValueError(f"columns times rows may be {MOST_CELLS}")
         if not 0.0 <= self.fill[0] <= self.fill[1] < 1.0:
@@ -134,19 +134,23 @@ class WorldSet:
 AnyWorld: TypeAlias = World | WorldSet
 
 
-def load_worlds(name: str | Path | Sequence[str | Path]) -> AnyWorld:
-    """Load a world or a world set.
+def load_worlds(name: AnyWorld | str | Path | Sequence[str | Path]) -> AnyWorld:
+    """Load a world or a world set, unless it is given itself.
 
     A world is given by the name of a shipped one (`arena`, `barn/7`) or the path of a YAML file; a
     set by the name of a shipped one (`cellular`; `barn`, see `sim.barn`), a list of worlds,
     a folder, a glob (`worlds/*.yaml`), or a YAML file with the key `worlds` or `generate`. Raises
     ConfigError for a missing or wrong file, naming the member that failed.
     """
+    if isinstance(name, AnyWorld):
+        return name
     if not isinstance(name, str | Path):
         several = isinstance(name, list | tuple)
         if not several or not all(isinstance(member, str | Path) for member in name):
-            needed = "a name, the path of a YAML file or a folder, a World, or a list of names"
-            raise ConfigError(f"world={format_value(name)}: must be {needed}.")
+            raise ConfigError(
+                f"world={format_value(name)}: must be a name, the path of a YAML file or a "
+                "folder, a World, or a list of names."
+            )
         return _set_of("worlds", _members([str(member) for member in name], Path()))
     text = str(name)
     sets = share_folder() / "config" / "world_sets"
@@ -221,8 +225,10 @@ def _members(names: Sequence[str], base: Path) -> list[World]:
             ]
             files = [file for file in every if _content(file, MAP_KEYS) is None]
             if not files:
-                fix = f"check the path, or make worlds of Gazebo's and of maps by `{IMPORT}`"
-                raise ConfigError(f"{pattern}: no world file (.yaml) there; {fix}.")
+                raise ConfigError(
+                    f"{pattern}: no world file (.yaml) there; check the path, or make worlds of "
+                    f"Gazebo's and of maps by `{IMPORT}`."
+                )
             members += map(_member, files)
         elif name.endswith((*YAML, *GAZEBO)):
             members.append(_member(path))

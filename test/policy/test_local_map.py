@@ -16,7 +16,7 @@ from nics_drl_bridge.geometry import compute_depths
 from nics_drl_bridge.policy.planners.local_map import (
     CELL_M,
     fill_outline,
-    make_map_maker,
+    make_situation,
 )
 from nics_drl_bridge.policy.planners.local_map_kernels import (
     Clearance,
@@ -38,7 +38,9 @@ def map_rays(shares, directions, origin, robot="jackal", goal=GOAL):
     sight = Sight(np.arctan2(*np.transpose(directions)[::-1]), np.array(origin), 10.0)
     task = SimpleNamespace(sight=sight, scan_parts=len(shares))
     outline = fill_outline(load_robot(robot))
-    return map_scan(shares, goal, make_map_maker(task, outline, CLOSE, 3.0))
+    around = make_situation(task, outline, CLOSE, 3.0)
+    map_scan(shares, goal, around)
+    return around
 
 
 def seen(points, robot="jackal"):

@@ -169,7 +169,7 @@ class CooperativeReaching(Task):
     def end(self, view: RobotView, memory: Memory) -> Flags:
         """Returns True where a robot touches something, or all goals are reached."""
         all_reached = memory["reached"].all(-1, keepdims=True)
-        return np.asarray(self.touches(view.ranges) | all_reached)
+        return self.touches(view.ranges) | all_reached
 
     def info(self, view: RobotView, memory: Memory) -> Facts:
         """Returns success of the team, contacts, and goals reached so far (..., M)."""
@@ -240,8 +240,10 @@ class PursuitEvasion(Task):
         super().__post_init__()
         self.check_above_zero("capture_gap", self.capture_gap)
         if min(self.pursuers, self.evaders) < 1:
-            counts = f"pursuers={self.pursuers}, evaders={self.evaders}"
-            raise ConfigError(f"task options {counts}: need at least 1 each.")
+            raise ConfigError(
+                f"task options pursuers={self.pursuers}, "
+                f"evaders={self.evaders}: need at least 1 each."
+            )
 
     @property
     def robots(self) -> int:
@@ -322,14 +324,14 @@ class PursuitEvasion(Task):
         }
 
     def _find_collided(self, view: RobotView, memory: Memory) -> Flags:
-        return np.asarray(self.touches(view.ranges) & ~memory["newly"])
+        return self.touches(view.ranges) & ~memory["newly"]
 
     def end(self, view: RobotView, memory: Memory) -> Flags:
         """Returns True for robots that are out, or for all once a side has none left."""
         out = memory["out"]
         pursuers_out = out[..., self.pursues].all(-1, keepdims=True)
         evaders_out = out[..., ~self.pursues].all(-1, keepdims=True)
-        return np.asarray(out | pursuers_out | evaders_out)
+        return out | pursuers_out | evaders_out
 
     def info(self, view: RobotView, memory: Memory) -> Facts:
         """Returns success of each robot's side, contacts, and captures (..., M)."""

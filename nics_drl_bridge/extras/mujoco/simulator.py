@@ -19,6 +19,7 @@ from nics_drl_bridge.extras.mujoco.machines import (
 )
 from nics_drl_bridge.generator import SimulatorModel, footprint_shape
 from nics_drl_bridge.interface import Array
+from nics_drl_bridge.lidar.arrays import Integers
 from nics_drl_bridge.lidar.exact_kernels import RADIUS
 from nics_drl_bridge.lidar.scanner import Renderer
 from nics_drl_bridge.recording.recording import Recording, Stream
@@ -28,7 +29,7 @@ from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.device import DrivenSimulator
 from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.scenes import Scenes
-from nics_drl_bridge.sim.simulator import FastSimulator, Indices, Starts
+from nics_drl_bridge.sim.simulator import FastSimulator, Starts
 from nics_drl_bridge.sim.world_set import AnyWorld
 
 # approximate period of encoder readings and of updates of moving obstacles
@@ -247,7 +248,7 @@ class MujocoSimulator(DrivenSimulator):
         self._mujoco.mj_forward(self._simulation, self._data)
 
     def take_over(
-        self, source: FastSimulator, robots: Indices, obstacles: Indices
+        self, source: FastSimulator, robots: Integers, obstacles: Integers
     ) -> None:
         """Continues the episode of another simulator; see `FastSimulator.take_over`."""
         super().take_over(source, robots, obstacles)

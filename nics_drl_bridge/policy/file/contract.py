@@ -239,24 +239,29 @@ def read_contract(text: str, source: str) -> Contract:
     """Reads and checks the contract of a policy file. Raises PolicyError, which names the field."""
     entries = sum(map(text.count, ",[{"))
     if entries > MOST_ENTRIES:
-        reason = f"has {entries} entries, more than the {MOST_ENTRIES} of a contract; not read."
-        raise PolicyError(source, "metadata", reason)
+        raise PolicyError(
+            source,
+            "metadata",
+            f"has {entries} entries, more than the {MOST_ENTRIES} of a contract; not read.",
+        )
     try:
         data = json.loads(
             text, object_pairs_hook=_refuse_repeats, parse_constant=_refuse_constant
         )
     except (ValueError, RecursionError) as error:
-        reason = (
-            f"is not the JSON that `export_policy` writes ({shorten(str(error), 80)})"
-        )
         raise PolicyError(
-            source, "metadata", f"{reason}; export the policy again."
+            source,
+            "metadata",
+            f"is not the JSON that `export_policy` writes ({shorten(str(error), 80)}); "
+            "export the policy again.",
         ) from None
     file_format = data.get("format") if isinstance(data, dict) else None
     if file_format != FORMAT:
-        fix = "export the policy with this version"
-        reason = f"is {reprlib.repr(file_format)}, not {FORMAT!r}; {fix}."
-        raise PolicyError(source, "format", reason)
+        raise PolicyError(
+            source,
+            "format",
+            f"is {reprlib.repr(file_format)}, not {FORMAT!r}; export the policy with this version.",
+        )
     try:
         # A missing field can't be added to a signed file.
         contract = validate(data, Contract, source, "export the policy again")
@@ -283,13 +288,17 @@ def _check_agreement(contract: Contract, source: str) -> None:
     name = "lidar.beams" if scan is None else "scan.sectors"
     rest = len(observation.rest_low)
     if observation.scan_parts != parts:
-        reason = (
-            f"is {parts}, but observations have {observation.scan_parts} scan elements."
+        raise PolicyError(
+            source,
+            name,
+            f"is {parts}, but observations have {observation.scan_parts} scan elements.",
         )
-        raise PolicyError(source, name, reason)
     if observation.size != parts + rest or len(observation.rest_high) != rest:
-        reason = f"is {observation.size}, not {parts} scan elements plus {rest} others."
-        raise PolicyError(source, "observation.size", reason)
+        raise PolicyError(
+            source,
+            "observation.size",
+            f"is {observation.size}, not {parts} scan elements plus {rest} others.",
+        )
     seen = observation.model_dump(mode="json")
     if contract.task.sha256 != _hash_task(contract.task.model_dump(), seen):
         raise PolicyError(

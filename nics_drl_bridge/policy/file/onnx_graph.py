@@ -60,14 +60,16 @@ def read_network(file: Path, source: str, field: str) -> bytes:
     name = "" if str(file) == source else f"{file.name!r} "
     try:
         if not file.is_file():
-            reason = f"{name}does not exist or is not a file; check its path."
-            raise PolicyError(source, field, reason)
+            raise PolicyError(
+                source, field, f"{name}does not exist or is not a file; check its path."
+            )
         size = file.stat().st_size
         if size <= SIZE_LIMIT:
             return file.read_bytes()
     except OSError as error:
-        reason = f"{name}can't be read ({error.strerror})."
-        raise PolicyError(source, field, reason) from None
+        raise PolicyError(
+            source, field, f"{name}can't be read ({error.strerror})."
+        ) from None
     sizes = f"{size / 2**20:.0f} MB, more than the {SIZE_LIMIT // 2**20} MB of a policy"
     raise PolicyError(source, field, f"{name}has {sizes}; not opened.")
 
@@ -76,8 +78,11 @@ def check_format(data: bytes, source: str) -> None:
     """Raises PolicyError for a file of a training framework."""
     for start, kind in OTHER_FORMATS:
         if data.startswith(start):
-            reason = f"is {kind}, which is not a policy; export the policy with `export_policy`."
-            raise PolicyError(source, "file", reason)
+            raise PolicyError(
+                source,
+                "file",
+                f"is {kind}, which is not a policy; export the policy with `export_policy`.",
+            )
 
 
 def parse(data: bytes, source: str) -> Any:
@@ -88,8 +93,11 @@ def parse(data: bytes, source: str) -> Any:
         if not model.HasField("graph"):
             raise ValueError
     except (DecodeError, ValueError, TypeError):
-        reason = "is not an ONNX model, or is truncated; export or copy it again."
-        raise PolicyError(source, "file", reason) from None
+        raise PolicyError(
+            source,
+            "file",
+            "is not an ONNX model, or is truncated; export or copy it again.",
+        ) from None
     return model
 
 
@@ -97,13 +105,17 @@ def find_contract_text(model: Any, source: str) -> str:
     """Returns the text of the contract. Raises PolicyError unless the model has exactly one."""
     contracts = [entry.value for entry in model.metadata_props if entry.key == KEY]
     if len(contracts) != 1:
-        reason = f"has {len(contracts)} contracts; only files of `export_policy` are policies."
-        raise PolicyError(source, "metadata", reason)
-    if len(contracts[0]) > CONTRACT_LIMIT:
-        reason = (
-            f"has {len(contracts[0])} characters, more than {CONTRACT_LIMIT}; not read."
+        raise PolicyError(
+            source,
+            "metadata",
+            f"has {len(contracts)} contracts; only files of `export_policy` are policies.",
         )
-        raise PolicyError(source, "metadata", reason)
+    if len(contracts[0]) > CONTRACT_LIMIT:
+        raise PolicyError(
+            source,
+            "metadata",
+            f"has {len(contracts[0])} characters, more than {CONTRACT_LIMIT}; not read.",
+        )
     return str(contracts[0])
 
 
@@ -132,8 +144,11 @@ def check_seal(data: bytes, source: str) -> None:
         reason = "does not end with the checksum of a policy file, so it is none or truncated"
         raise PolicyError(source, "file", f"{reason}; export or copy it again.")
     if data != add_seal(data[: -len(seal)]):
-        reason = "does not match the file, which was changed or damaged; copy or export it again."
-        raise PolicyError(source, SEAL, reason)
+        raise PolicyError(
+            source,
+            SEAL,
+            "does not match the file, which was changed or damaged; copy or export it again.",
+        )
 
 
 def check_graph(model: Any, source: str) -> None:
@@ -145,8 +160,9 @@ def check_graph(model: Any, source: str) -> None:
     try:
         onnx.checker.check_model(model)
     except (onnx.checker.ValidationError, ValueError) as error:
-        reason = f"is not a valid ONNX graph ({quote(error)})."
-        raise PolicyError(source, "graph", reason) from None
+        raise PolicyError(
+            source, "graph", f"is not a valid ONNX graph ({quote(error)})."
+        ) from None
 
 
 def quote(error: Exception) -> str:
@@ -266,8 +282,14 @@ def check_sizes(model: Any, source: str) -> None:
             known.add(value.name)
     for node in graph.node:
         if node.op_type in DIVIDING and kinds.get(node.input[0]) not in FLOATS:
-            reason = f"{node.op_type} of integers may crash the process; use float32."
-            raise PolicyError(source, "graph.node", reason)
+            raise PolicyError(
+                source,
+                "graph.node",
+                f"{node.op_type} of integers may crash the process; use float32.",
+            )
         if not known.issuperset(node.output):
-            reason = f"the output size of {node.op_type} can't be known before it runs."
-            raise PolicyError(source, "graph.node", reason)
+            raise PolicyError(
+                source,
+                "graph.node",
+                f"the output size of {node.op_type} can't be known before it runs.",
+            )

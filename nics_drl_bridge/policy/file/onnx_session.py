@@ -27,9 +27,14 @@ def check_network(data: bytes, source: str, runs: bool) -> None:
     if not runs:
         return
     fixed = onnx_graph.fix_rows(model, onnx_graph.MOST_ROWS)
+    checked = fixed
     # With a number of rows that stays open, nothing that depends on it may be folded: it would be
-    # checked for this number alone.
-    checked = fixed if onnx_graph.has_open_rows(model) else _fold(fixed, source)
+    # checked for this number alone. Else onnxruntime computes all that does not depend on values.
+    if not onnx_graph.has_open_rows(model):
+        with TemporaryDirectory() as folder:
+            file = Path(folder) / "folded.onnx"
+            open_session(fixed.SerializeToString(), source, file)
+            checked = onnx.load(file)
     onnx_graph.check_sizes(checked, source)
     feeds = {}
     for value in onnx_graph.list_inputs(fixed):
@@ -40,14 +45,6 @@ def check_network(data: bytes, source: str, runs: bool) -> None:
     run_network(open_session(data, source), source, feeds)
 
 
-def _fold(model: Any, source: str) -> Any:
-    """Returns the model after onnxruntime has computed all that its inputs' values don't change."""
-    with TemporaryDirectory() as folder:
-        file = Path(folder) / "folded.onnx"
-        open_session(model.SerializeToString(), source, file)
-        return onnx.load(file)
-
-
 def open_session(data: bytes, source: str, folded: Path | None = None) -> Any:
     """Opens a session on one thread. Raises ConfigError without onnxruntime, or PolicyError.
 
@@ -56,9 +53,8 @@ def open_session(data: bytes, source: str, folded: Path | None = None) -> Any:
     try:
         import onnxruntime
     except ImportError:
-        fix = "pip install 'nics_drl_bridge[deploy]'."
         raise ConfigError(
-            f"a policy file needs the module 'onnxruntime'; {fix}"
+            "a policy file needs the module 'onnxruntime'; pip install 'nics_drl_bridge[deploy]'."
         ) from None
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
@@ -87,8 +83,9 @@ def run_network(
 
 
 def _explain_failure(source: str, error: Exception) -> PolicyError:
-    reason = f"onnxruntime can't run it ({onnx_graph.quote(error)})."
-    return PolicyError(source, "graph", reason)
+    return PolicyError(
+        source, "graph", f"onnxruntime can't run it ({onnx_graph.quote(error)})."
+    )
 
 
 def run_rows(session: Any, source: str, *tensors: Rows) -> list[NDArray[Any]]:

@@ -1,6 +1,7 @@
 """Policy files: an `.onnx` with network, normaliser, commands and contract; never a pickle."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -30,13 +31,13 @@ ROBOT = {"command", "footprint", "footprint_radius"}
 LIDAR = {"beams", "angle_min", "angle_max", "range_max", "mount"}
 
 
+@dataclass(eq=False)
 class PolicyFile:
     """A loaded and checked policy, with the path of its file and its contract."""
 
-    def __init__(self, path: Path, contract: Contract, run: Run) -> None:
-        self.path = path
-        self.contract = contract
-        self._run_network = run
+    path: Path
+    contract: Contract
+    _run_network: Run
 
     def act(self, observation: Rows) -> AnyArray:
         """Returns the action (C,) in [-1, 1], or () discrete, for (O,); or n actions for (n, O)."""
@@ -60,8 +61,11 @@ class PolicyFile:
         size = self.contract.observation.size
         kept = self.contract.state
         if rows.ndim not in (1, 2) or rows.shape[-1] != size:
-            reason = f"is {size}, but observations are {rows.shape}; use the policy's own task."
-            raise PolicyError(str(self.path), "observation.size", reason)
+            raise PolicyError(
+                str(self.path),
+                "observation.size",
+                f"is {size}, but observations are {rows.shape}; use the policy's own task.",
+            )
         wanted = None if kept is None else (*rows.shape[:-1], kept.size)
         if wanted != (None if state is None else np.shape(state)):
             reason = f"must have shape {wanted}, not {None if state is None else np.shape(state)}"
@@ -80,10 +84,11 @@ class PolicyFile:
     def _run(self, rows: Rows, *state: Rows) -> list[AnyArray]:
         out = self._run_network(rows, *state)
         if any(len(part) != len(rows) for part in out):
-            reason = (
-                f"returns {[part.shape for part in out]} for {len(rows)} observations."
+            raise PolicyError(
+                str(self.path),
+                "graph",
+                f"returns {[part.shape for part in out]} for {len(rows)} observations.",
             )
-            raise PolicyError(str(self.path), "graph", reason)
         return out
 
     @cached_property
@@ -105,8 +110,11 @@ class PolicyFile:
         name = self.contract.task.name
         if kind is None and name not in TASKS:
             place = f"path/to/file.py:{name if name.isidentifier() else 'ClassName'}"
-            reason = f"{name!r} is not a shipped task; give --task {place}, or task= in Python."
-            raise PolicyError(str(self.path), "task.name", reason)
+            raise PolicyError(
+                str(self.path),
+                "task.name",
+                f"{name!r} is not a shipped task; give --task {place}, or task= in Python.",
+            )
         self.check_fits(model)
         task = make_task(kind or name, model, self.task_options)
         self.check_fits(model, task)
@@ -153,8 +161,11 @@ class PolicyFile:
                 plan_of(lidar, self.contract.scan)
             except ConfigError as error:
                 reason = f"needs more than this lidar sees: {error.reason}"
-                fix = "use another lidar, or a policy trained for this one"
-                raise PolicyError(str(self.path), "scan", f"{reason}; {fix}.") from None
+                raise PolicyError(
+                    str(self.path),
+                    "scan",
+                    f"{reason}; use another lidar, or a policy trained for this one.",
+                ) from None
         self._compare(theirs)
 
     def _compare(self, theirs: Mapping[str, Any]) -> None:
@@ -210,8 +221,11 @@ def policy_of(data: bytes, path: Path) -> PolicyFile:
         onnx_graph.find_contract_text(model, source), source
     )
     if onnx_graph.hash_graph(model) != contract.graph_sha256:
-        reason = "does not match the graph, which was changed after the export."
-        raise PolicyError(source, "graph_sha256", reason)
+        raise PolicyError(
+            source,
+            "graph_sha256",
+            "does not match the graph, which was changed after the export.",
+        )
     session = open_session(data, source)
     if contract.foreign is None:
         _check_ends(contract, session, source)
@@ -238,8 +252,11 @@ def _check_ends(contract: Contract, session: Any, source: str) -> None:
     ):
         found = [(end.name, end.type) for end in ends]
         if found != wanted:
-            reason = f"are {found}, not {wanted}; export the policy again."
-            raise PolicyError(source, f"graph.{name}", reason)
+            raise PolicyError(
+                source,
+                f"graph.{name}",
+                f"are {found}, not {wanted}; export the policy again.",
+            )
 
 
 def _check_golden(policy: PolicyFile, source: str) -> None:
@@ -250,20 +267,29 @@ def _check_golden(policy: PolicyFile, source: str) -> None:
     for name, width in (("actions", actions), ("commands", commands)):
         columns = golden.rows(name).shape[1]
         if columns != width:
-            reason = f"have {columns} columns, but {width} are needed."
-            raise PolicyError(source, f"golden.{name}", reason)
+            raise PolicyError(
+                source,
+                f"golden.{name}",
+                f"have {columns} columns, but {width} are needed.",
+            )
     start = None if state is None else np.full(state.size, state.start, np.float32)
     action, command = run_in_turn(policy.run, golden.rows("observations"), start)
     computed = {"actions": action.reshape(len(command), -1), "commands": command}
     for name, rows in computed.items():
         wanted = golden.rows(name)
         if rows.shape != wanted.shape:
-            reason = f"have shape {wanted.shape}, but the graph's outputs {rows.shape}."
-            raise PolicyError(source, f"golden.{name}", reason)
+            raise PolicyError(
+                source,
+                f"golden.{name}",
+                f"have shape {wanted.shape}, but the graph's outputs {rows.shape}.",
+            )
         gap = np.abs(rows - wanted).max()
         if not gap <= GOLDEN_TOLERANCE:
-            reason = f"differ by {gap:.3g} from the graph's outputs on this machine; not used."
-            raise PolicyError(source, f"golden.{name}", reason)
+            raise PolicyError(
+                source,
+                f"golden.{name}",
+                f"differ by {gap:.3g} from the graph's outputs on this machine; not used.",
+            )
     robot = policy.contract.robot
     beyond = (command < robot.command_low - GOLDEN_TOLERANCE).any()
     if beyond or (command > robot.command_high + GOLDEN_TOLERANCE).any():

@@ -52,9 +52,9 @@ class Stateful:
             return ""
         self.reset()
         self._time = time_s
-        limit = f"the {self._longest_gap:g} s for which the policy's state stays valid"
         return (
-            f"no observation for {gap:.3g} s, longer than {limit}; the state was reset."
+            f"no observation for {gap:.3g} s, longer than the {self._longest_gap:g} s for which "
+            "the policy's state stays valid; the state was reset."
         )
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -63,8 +63,10 @@ class Stateful:
         if self._state is None:
             self._state = np.tile(self._start, (*lead, 1))
         if self._state.shape[:-1] != lead:
-            problem = f"the state is of {self._state.shape[:-1]} worlds, the observations of {lead}"
-            raise ConfigError(f"{problem}; reset the policy when episodes begin.")
+            raise ConfigError(
+                f"the state is of {self._state.shape[:-1]} worlds, the observations of {lead}; "
+                "reset the policy when episodes begin."
+            )
         action, self._state = self._step(observation, self._state)
         return action
 

@@ -15,7 +15,7 @@ from nics_drl_bridge.policy.planners.dynamic_window_kernels import (
     LookAhead,
     choose_twists,
 )
-from nics_drl_bridge.policy.planners.local_map_kernels import Clearance, MapMaker
+from nics_drl_bridge.policy.planners.local_map_kernels import Clearance, Situation
 from nics_drl_bridge.policy.planners.twists import (
     find_steady_twists,
     list_commands,
@@ -47,7 +47,7 @@ class DynamicWindow:
         """Chooses the action; see `Policy`."""
         parts = maps.split_observation(self.task, observation)
         chosen = np.empty(len(parts[0]), np.int64)
-        choose_twists(chosen, *parts, self.twists, self.ahead, self._map_maker)
+        choose_twists(chosen, *parts, self.twists, self.ahead, self._situation)
         actions = scale_to_actions(self.task, self.commands)
         return actions[chosen[0] if observation.ndim == 1 else chosen]
 
@@ -116,8 +116,8 @@ class DynamicWindow:
         )
 
     @cached_property
-    def _map_maker(self) -> MapMaker:
+    def _situation(self) -> Situation:
         outline = maps.fill_outline(self.task.robot)
         far = self._fastest * self.ahead.period * self.ahead.steps
         half = min(far, self.task.sight.range_max) + outline.outer
-        return maps.make_map_maker(self.task, outline, CLEARANCE, half)
+        return maps.make_situation(self.task, outline, CLEARANCE, half)

@@ -7,13 +7,6 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.arrays import Integers
 from nics_drl_bridge.policy.planners import local_map_kernels as maps
-from nics_drl_bridge.policy.planners.local_map_kernels import (
-    ARRIVED_M,
-    MapMaker,
-    Situation,
-    find_room,
-    find_way,
-)
 
 # Weights of the terms in the cost of a twist: of the path length left to the goal [1/m], of the
 # heading error, which is 0 towards the goal and 1 away from it, of the nearest obstacle on the
@@ -42,7 +35,7 @@ class LookAhead(NamedTuple):
     far: float  # distance along an axis beyond which the map is unknown [m]
 
 
-@kernel(allocates=True)
+@kernel
 def choose_twists(
     out: Integers,
     scans: Array,
@@ -50,21 +43,21 @@ def choose_twists(
     twists: Array,
     candidates: Array,
     ahead: LookAhead,
-    maker: MapMaker,
+    around: maps.Situation,
 ) -> None:
     """Writes the index of the cheapest candidate (K, 3) for each of N robots into out (N,).
 
     Candidates within the window are preferred.
     """
     brakes = ahead.slowness > 0.0
-    for n in range(out.shape[0]):
-        around = maps.map_scan(scans[n], goals[n], maker)
+    for n in range(len(out)):
+        maps.map_scan(scans[n], goals[n], around)
         twist = twists[n]
         # If braking takes time, a robot that could no longer stop one period later must stop now.
         late = brakes and math.hypot(twist[0], twist[1]) > MOVING
         late = late and find_cost(around, twist, twist, ahead) > INADMISSIBLE
         least = math.inf
-        for k in range(candidates.shape[0]):
+        for k in range(len(candidates)):
             far = False
             moves = False
             for i in range(3):
@@ -81,7 +74,9 @@ def choose_twists(
 
 
 @kernel
-def find_cost(around: Situation, aimed: Array, twist: Array, ahead: LookAhead) -> float:
+def find_cost(
+    around: maps.Situation, aimed: Array, twist: Array, ahead: LookAhead
+) -> float:
     """Returns the cost of holding a twist (3,), inadmissible if it hits something before stopping.
 
     If braking takes time, the robot starts from its present twist (3,), which may be faster.
@@ -94,7 +89,7 @@ def find_cost(around: Situation, aimed: Array, twist: Array, ahead: LookAhead) -
     heading = 0.0
     c = 1.0
     s = 0.0
-    least = find_way(x, y, around)
+    least = maps.find_way(x, y, around)
     near = math.inf
     free = steps
     limit = maps.find_contact_limit(around)
@@ -105,15 +100,15 @@ def find_cost(around: Situation, aimed: Array, twist: Array, ahead: LookAhead) -
         heading += aimed[2] * period
         c = math.cos(heading)
         s = math.sin(heading)
-        room = find_room(x, y, c, s, around)
+        room = maps.find_room(x, y, c, s, around)
         if room < limit or max(abs(x), abs(y)) > ahead.far:
             free = step
             break
         near = min(near, room - keep.margin)
-        least = min(least, find_way(x, y, around))
-        if math.hypot(around.goal[0] - x, around.goal[1] - y) < ARRIVED_M:
+        least = min(least, maps.find_way(x, y, around))
+        if math.hypot(around.goal[0] - x, around.goal[1] - y) < maps.ARRIVED_M:
             break
-    turn = maps.score_heading(x, y, c, s, find_way(x, y, around), around)
+    turn = maps.score_heading(x, y, c, s, maps.find_way(x, y, around), around)
     cost = WAY_WEIGHT * least + AIM_WEIGHT * turn * min(least, 1.0)
     cost += CLEARANCE_WEIGHT * (1.0 - min(max(near, 0.0), keep.soft) / keep.soft)
     cost += TIME_WEIGHT * (1.0 - free / steps)

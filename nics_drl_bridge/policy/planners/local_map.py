@@ -12,8 +12,8 @@ from nics_drl_bridge.policy.planners.local_map_kernels import (
     Clearance,
     FootprintDiscs,
     LocalMap,
-    MapMaker,
     ScanRays,
+    Situation,
 )
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -92,9 +92,9 @@ def _count_covered(centres: Array, radii: Array, points: Array) -> Integers:
     return count
 
 
-def make_map_maker(
+def make_situation(
     task: Navigation, outline: FootprintDiscs, clearance: Clearance, half: float
-) -> MapMaker:
+) -> Situation:
     """Allocates maps of a task's scans that extend `half` [m] to each side, `MOST_M` at most."""
     sight = task.sight
     directions = np.stack([np.cos(sight.angles), np.sin(sight.angles)], axis=-1)
@@ -102,11 +102,12 @@ def make_map_maker(
     distances = np.zeros((COARSE * coarse, COARSE * coarse), np.float32)
     ways, prices = np.zeros((2, coarse, coarse), np.float32)
     reach = outline.outer + clearance.margin + clearance.soft + CELL_M
-    return MapMaker(
+    return Situation(
         ScanRays(directions, sight.origin, float(sight.range_max)),
         outline,
         clearance,
         LocalMap(distances, ways, CELL_M, reach),
+        np.zeros(2),
         np.zeros((task.scan_parts, 2)),
         prices,
     )

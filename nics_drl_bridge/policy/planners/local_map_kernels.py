@@ -60,33 +60,25 @@ class Clearance(NamedTuple):
 
 
 class Situation(NamedTuple):
-    """The map, the goal, and the robot that has to keep clear of obstacles."""
-
-    map: LocalMap
-    goal: Array  # (2,) [m]
-    outline: FootprintDiscs
-    clearance: Clearance
-
-
-class MapMaker(NamedTuple):
-    """What makes the map of a robot, with scratch memory for one map at a time."""
+    """A robot that has to keep clear of obstacles, its goal, and the map of its latest scan."""
 
     rays: ScanRays
     outline: FootprintDiscs
     clearance: Clearance
     map: LocalMap
+    goal: Array  # (2,) in `base_link` [m]
     hits: Array  # (P, 2) [m]
     prices: Singles  # like `LocalMap.ways`
 
 
-@kernel(allocates=True)
-def map_scan(shares: Array, goal: Array, maker: MapMaker) -> Situation:
+@kernel
+def map_scan(shares: Array, goal: Array, around: Situation) -> None:
     """Maps a scan of range fractions (P,) around a robot whose goal (2,) is in `base_link` [m]."""
-    count = find_hits(maker.hits, shares, maker.rays)
-    measure_distances(maker.map, maker.hits[:count])
-    around = Situation(maker.map, goal, maker.outline, maker.clearance)
-    find_ways(around, maker.prices)
-    return around
+    around.goal[0] = goal[0]
+    around.goal[1] = goal[1]
+    count = find_hits(around.hits, shares, around.rays)
+    measure_distances(around.map, around.hits[:count])
+    find_ways(around)
 
 
 @kernel
@@ -96,7 +88,7 @@ def find_hits(hits: Array, shares: Array, rays: ScanRays) -> int:
     Fractions of 0 are left out: they are unknown, or too close to tell from the robot itself.
     """
     count = 0
-    for p in range(shares.shape[0]):
+    for p in range(len(shares)):
         if 0.0 < shares[p] < 1.0:
             share = shares[p] * rays.range_max
             x = rays.origin[0] + share * rays.directions[p, 0]
@@ -117,12 +109,12 @@ def measure_distances(seen: LocalMap, hits: Array) -> None:
     """Writes the distances of a map to hits (H, 2)."""
     grid = seen.distances
     cell = seen.cell
-    size = grid.shape[0]
+    size = len(grid)
     half = 0.5 * size * cell
     far = np.float32(seen.reach * seen.reach)
     grid[:] = far
     step = np.float32(cell)
-    for h in range(hits.shape[0]):
+    for h in range(len(hits)):
         x = hits[h, 0] + half
         y = hits[h, 1] + half
         left, right = _find_span(x, seen.reach, cell, size)
@@ -132,7 +124,7 @@ def measure_distances(seen: LocalMap, hits: Array) -> None:
             dy = np.float32((i + 0.5) * cell - y)
             row = grid[i, left:right]
             dy2 = dy * dy
-            for j in range(row.shape[0]):
+            for j in range(len(row)):
                 dx = np.float32(j) * step + first
                 away = dx * dx + dy2
                 row[j] = away if away < row[j] else row[j]
@@ -154,7 +146,7 @@ def interpolate(
     grid: Singles, cell: float, x: float, y: float, outside: float
 ) -> float:
     """Returns the value of a grid at a point, bilinear between cell centres."""
-    size = grid.shape[0]
+    size = len(grid)
     u = x / cell + 0.5 * size - 0.5
     v = y / cell + 0.5 * size - 0.5
     if not (0.0 <= u < size - 1.0 and 0.0 <= v < size - 1.0):
@@ -178,8 +170,8 @@ def interpolate_inside(
 
 
 @kernel
-def find_ways(around: Situation, prices: Singles) -> None:
-    """Writes a map's path lengths to the goal; prices (G / COARSE, G / COARSE) are scratch.
+def find_ways(around: Situation) -> None:
+    """Writes a map's path lengths to the goal.
 
     Solves the eikonal equation by fast sweeping (Zhao 2005). Beyond the map, paths are straight.
     """
@@ -188,7 +180,7 @@ def find_ways(around: Situation, prices: Singles) -> None:
     soft = around.clearance.soft
     ways = seen.ways
     side = COARSE * seen.cell
-    size = ways.shape[0]
+    size = len(ways)
     half = 0.5 * size * side
     blocked = around.outline.inner + around.clearance.margin
     inside = max(abs(goal[0]), abs(goal[1])) < half - side
@@ -199,7 +191,7 @@ def find_ways(around: Situation, prices: Singles) -> None:
             away = interpolate(seen.distances, seen.cell, x, y, seen.reach)
             near = min(max((blocked + soft - away) / soft, 0.0), 1.0)
             price = BLOCKED if away < blocked else 1.0 + NEAR * near * near
-            prices[i, j] = price * side
+            around.prices[i, j] = price * side
             edge = i == 0 or j == 0 or i == size - 1 or j == size - 1
             gap = math.hypot(goal[0] - x, goal[1] - y)
             is_start = gap < 1.5 * side if inside else edge
@@ -207,7 +199,7 @@ def find_ways(around: Situation, prices: Singles) -> None:
     for _ in range(ROUNDS):
         most = np.float32(0.0)
         for turn in range(4):
-            most = max(most, update_ways(ways, prices, turn & 1, turn >> 1))
+            most = max(most, update_ways(ways, around.prices, turn & 1, turn >> 1))
         if most < SETTLED_M:
             break
 
@@ -235,18 +227,18 @@ def find_room(x: float, y: float, c: float, s: float, around: Situation) -> floa
     at_x = x + c * centre[0] - s * centre[1]
     at_y = y + s * centre[0] + c * centre[1]
     away = interpolate(grid, seen.cell, at_x, at_y, seen.reach)
-    if discs.shape[0] == 0 or away >= seen.reach - seen.cell:
+    if len(discs) == 0 or away >= seen.reach - seen.cell:
         return away - outline.outer
-    middle = 0.5 * grid.shape[0] - 0.5
+    middle = 0.5 * len(grid) - 0.5
     per_cell = 1.0 / seen.cell
     if max(abs(at_x), abs(at_y)) + outline.outer > (middle - 1.0) * seen.cell:
         return away - outline.inner  # off the map
     u = middle + x * per_cell
     v = middle + y * per_cell
-    c = c * per_cell
-    s = s * per_cell
+    c *= per_cell
+    s *= per_cell
     least = seen.reach
-    for d in range(discs.shape[0]):
+    for d in range(len(discs)):
         px = discs[d, 0]
         py = discs[d, 1]
         away = interpolate_inside(grid, u + c * px - s * py, v + s * px + c * py)

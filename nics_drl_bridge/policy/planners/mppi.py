@@ -18,7 +18,7 @@ from nics_drl_bridge.policy.planners import local_map as maps
 from nics_drl_bridge.policy.planners.local_map_kernels import (
     Clearance,
     FootprintDiscs,
-    MapMaker,
+    Situation,
 )
 from nics_drl_bridge.policy.planners.mppi_kernels import (
     Plant,
@@ -66,34 +66,34 @@ class Mppi:
         cuts = np.linspace(0, len(actions), count + 1).astype(int).tolist()
 
         def plan_part(rows: slice) -> None:
-            maker, lanes = self._free.pop() if self._free else self._make_memory()
+            around, lanes = self._free.pop() if self._free else self._make_memory()
             arrays = [array[rows] for array in (actions, *parts)]
-            plan_all(*arrays, maker, self._plant, self._sampling, lanes)
-            self._free.append((maker, lanes))
+            plan_all(*arrays, around, self._plant, self._sampling, lanes)
+            self._free.append((around, lanes))
 
         run_parts(plan_part, [slice(*ends) for ends in pairwise(cuts)])
         planned = actions.astype(np.float32)
         return planned[0] if observation.ndim == 1 else planned
 
     @cached_property
-    def _free(self) -> list[tuple[MapMaker, RollOuts]]:
+    def _free(self) -> list[tuple[Situation, RollOuts]]:
         return []  # memory that no thread is using
 
     @cached_property
     def _outline(self) -> FootprintDiscs:
         return maps.fill_outline(self.task.robot)
 
-    def _make_memory(self) -> tuple[MapMaker, RollOuts]:
+    def _make_memory(self) -> tuple[Situation, RollOuts]:
         half = self._fastest * HORIZON_S
         if self._sampling.stop > 0:
             half = self._reach
         half = min(half, self.task.sight.range_max) + self._outline.outer
-        maker = maps.make_map_maker(self.task, self._outline, CLEARANCE, half)
+        around = maps.make_situation(self.task, self._outline, CLEARANCE, half)
         states, count = self._plant.settled.shape
         many = self.samples
         x = np.ones(states + count + 1)
         rate = np.zeros(3 + states)
-        return maker, RollOuts(
+        return around, RollOuts(
             np.zeros((6, many)),
             np.repeat(x[:, None], many, 1),
             np.repeat(rate[:, None], many, 1),
@@ -102,6 +102,7 @@ class Mppi:
             np.zeros(count),
             x,
             rate,
+            np.zeros(3),
             np.zeros(3),
             np.zeros(many),
             np.zeros(many),

@@ -12,13 +12,6 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.arrays import Integers, Mask
 from nics_drl_bridge.policy.planners import local_map_kernels as maps
-from nics_drl_bridge.policy.planners.local_map_kernels import (
-    ARRIVED_M,
-    MapMaker,
-    Situation,
-    find_room,
-    find_way,
-)
 from nics_drl_bridge.random_kernels import PLANNER_STREAM, normal, uniform
 from nics_drl_bridge.robot.kernels import Terms, advance, apply_curve, rates, run
 
@@ -80,22 +73,23 @@ class RollOuts(NamedTuple):
     x_single: Array  # (S + C + 1,) of one robot
     rate: Array  # (3 + S,)
     start: Array  # (3,)
+    reached: Array  # (3,) twist of the held command
     cost: Array  # (K,)
     way: Array  # (K,)
     # (K,) period of the contact or arrival; negative: neither
     ended: Integers
 
 
-@kernel(allocates=True)
+@kernel
 def draw(offers: Array, noise: Array, rest: Array, seed: int) -> None:
     """Draws `Sampling.offers`, the first of them rest (C,), and `Sampling.noise`, by seed."""
-    for k in range(offers.shape[0]):
+    for k in range(len(offers)):
         for q in range(offers.shape[1]):
             for c in range(offers.shape[2]):
                 i = (k * offers.shape[1] + q) * offers.shape[2] + c
                 drawn = BEYOND * (2.0 * uniform(seed, PLANNER_STREAM, 3 * i) - 1.0)
                 # Half of the proposals hold one action.
-                held = k < offers.shape[0] // 2 and q > 0
+                held = k < len(offers) // 2 and q > 0
                 offers[k, q, c] = (
                     offers[k, 0, c] if held else min(max(drawn, -1.0), 1.0)
                 )
@@ -110,7 +104,7 @@ def plan_all(
     scans: Array,
     goals: Array,
     twists: Array,
-    maker: MapMaker,
+    around: maps.Situation,
     plant: Plant,
     sampling: Sampling,
     lanes: RollOuts,
@@ -121,8 +115,8 @@ def plan_all(
     the first round proposes actions from the whole range. The planner therefore has no memory: its
     actions depend only on the observation.
     """
-    for n in range(out.shape[0]):
-        around = maps.map_scan(scans[n], goals[n], maker)
+    for n in range(len(out)):
+        maps.map_scan(scans[n], goals[n], around)
         # pose and state when the first command takes effect
         fit_command(twists[n], plant, lanes)
         lanes.start[:] = 0.0
@@ -130,34 +124,26 @@ def plan_all(
             advance(lanes.start, twists[n], plant.latency, plant.series)
         lanes.actions[:] = sampling.offers
         best = _roll_out(around, plant, sampling, lanes)
-        lanes.nominal[:] = lanes.actions[best]
+        nominal = lanes.nominal
+        nominal[:] = lanes.actions[best]
         for spread in SPREADS:
-            for k in range(lanes.actions.shape[0]):
-                for q in range(lanes.nominal.shape[0]):
-                    for c in range(lanes.nominal.shape[1]):
-                        action = lanes.nominal[q, c]
+            for k in range(len(lanes.actions)):
+                for q in range(len(nominal)):
+                    for c in range(nominal.shape[1]):
+                        action = nominal[q, c]
                         if k > 0:
                             action += spread * sampling.noise[k, q, c]
                         lanes.actions[k, q, c] = min(max(action, -1.0), 1.0)
             best = _roll_out(around, plant, sampling, lanes)
-            _average(best, lanes)
-        out[n] = lanes.nominal[0]
-
-
-@kernel
-def _average(best: int, lanes: RollOuts) -> None:
-    """Replaces the nominal actions by the cost-weighted mean of the sampled ones."""
-    lanes.nominal[:] = 0.0
-    total = 0.0
-    for k in range(lanes.cost.shape[0]):
-        weight = math.exp((lanes.cost[best] - lanes.cost[k]) / TEMPERATURE)
-        total += weight
-        for q in range(lanes.nominal.shape[0]):
-            for c in range(lanes.nominal.shape[1]):
-                lanes.nominal[q, c] += weight * lanes.actions[k, q, c]
-    for q in range(lanes.nominal.shape[0]):
-        for c in range(lanes.nominal.shape[1]):
-            lanes.nominal[q, c] /= total
+            # The nominal actions become the mean of the sampled ones, weighted by their costs.
+            nominal[:] = 0.0
+            total = 0.0
+            for k in range(len(lanes.cost)):
+                weight = math.exp((lanes.cost[best] - lanes.cost[k]) / TEMPERATURE)
+                total += weight
+                nominal += weight * lanes.actions[k]
+            nominal /= total
+        out[n] = nominal[0]
 
 
 @kernel
@@ -177,22 +163,20 @@ def fit_command(twist: Array, plant: Plant, lanes: RollOuts) -> None:
         for c in range(count):
             _settle(held, plant, lanes)
             rates(dq, x, terms)
-            r0 = twist[0] - dq[0]
-            r1 = twist[1] - dq[1]
-            r2 = twist[2] - dq[2]
-            b0 = dq[0]
-            b1 = dq[1]
-            b2 = dq[2]
+            for i in range(3):
+                lanes.reached[i] = dq[i]
             step = 1e-3 * (plant.high[c] - plant.low[c])
             held[c] += step
             _settle(held, plant, lanes)
             rates(dq, x, terms)
             held[c] -= step
-            g0 = (dq[0] - b0) / step
-            g1 = (dq[1] - b1) / step
-            g2 = (dq[2] - b2) / step
-            size = g0 * g0 + g1 * g1 + g2 * g2 + EASE
-            value = held[c] + (g0 * r0 + g1 * r1 + g2 * r2) / size
+            size = 0.0
+            gain = 0.0
+            for i in range(3):
+                slope = (dq[i] - lanes.reached[i]) / step
+                size += slope * slope
+                gain += slope * (twist[i] - lanes.reached[i])
+            value = held[c] + gain / (size + EASE)
             held[c] = min(max(value, plant.low[c]), plant.high[c])
     _settle(held, plant, lanes)
 
@@ -213,23 +197,23 @@ def _settle(command: Array, plant: Plant, lanes: RollOuts) -> None:
 
 @kernel
 def _roll_out(
-    around: Situation, plant: Plant, sampling: Sampling, lanes: RollOuts
+    around: maps.Situation, plant: Plant, sampling: Sampling, lanes: RollOuts
 ) -> int:
     """Rolls out the actions of all lanes; writes their costs and returns the cheapest lane."""
     _begin(plant, lanes)
-    states = plant.settled.shape[0]
-    periods = sampling.between.shape[0]
+    states = len(plant.settled)
+    periods = len(sampling.between)
     limit = maps.find_contact_limit(around)
     for t in range(periods + sampling.stop):
-        for c in range(plant.low.shape[0]):
+        for c in range(len(plant.low)):
             row = lanes.x[states + c]
             curve = plant.single.curves[c]
             if t < periods:
                 middle = 0.5 * (plant.low[c] + plant.high[c])
                 half = 0.5 * (plant.high[c] - plant.low[c])
-                for k in range(row.shape[0]):
+                for k in range(len(row)):
                     action = 0.0
-                    for q in range(lanes.nominal.shape[0]):
+                    for q in range(len(lanes.nominal)):
                         action += sampling.between[t, q] * lanes.actions[k, q, c]
                     row[k] = apply_curve(middle + half * action, curve)
             elif not sampling.holds[c]:
@@ -243,11 +227,11 @@ def _roll_out(
             plant.dt,
             plant.substeps,
         )
-        for k in range(lanes.cost.shape[0]):
+        for k in range(len(lanes.cost)):
             if lanes.ended[k] < 0:
                 _add_cost(k, t, limit, around, sampling, lanes)
     best = 0
-    for k in range(lanes.cost.shape[0]):
+    for k in range(len(lanes.cost)):
         lanes.cost[k] += (1.0 - EARLY) * lanes.way[k]
         if lanes.cost[k] < lanes.cost[best]:
             best = k
@@ -261,7 +245,7 @@ def _begin(plant: Plant, lanes: RollOuts) -> None:
     x = lanes.start[0]
     y = lanes.start[1]
     heading = lanes.start[2]
-    for k in range(lanes.cost.shape[0]):
+    for k in range(len(lanes.cost)):
         lanes.pose[0, k] = x
         lanes.pose[1, k] = y
         lanes.pose[2, k], lanes.pose[3, k] = math.cos(heading), math.sin(heading)
@@ -275,7 +259,7 @@ def _begin(plant: Plant, lanes: RollOuts) -> None:
                 2.0 * (lanes.held[c] - plant.low[c]) / (plant.high[c] - plant.low[c])
                 - 1.0
             )
-            for q in range(lanes.nominal.shape[0]):
+            for q in range(len(lanes.nominal)):
                 change += (lanes.actions[k, q, c] - before) ** 2
                 before = lanes.actions[k, q, c]
         lanes.cost[k] = CHANGE * change
@@ -288,23 +272,23 @@ def _add_cost(
     k: int,
     t: int,
     limit: float,
-    around: Situation,
+    around: maps.Situation,
     sampling: Sampling,
     lanes: RollOuts,
 ) -> None:
     """Adds the cost of period t in lane k: of the way and of contacts, or of those in a stop."""
-    periods = sampling.between.shape[0]
+    periods = len(sampling.between)
     x = lanes.pose[0, k]
     y = lanes.pose[1, k]
     c = lanes.pose[2, k]
     s = lanes.pose[3, k]
-    room = find_room(x, y, c, s, around)
+    room = maps.find_room(x, y, c, s, around)
     if t >= periods:
         if room < limit or max(abs(x), abs(y)) > sampling.far:
             lanes.cost[k] += HIT * (1.0 - (t - periods) / sampling.stop)
             lanes.ended[k] = t
         return
-    way = find_way(x, y, around)
+    way = maps.find_way(x, y, around)
     lanes.way[k] = way
     lanes.cost[k] += EARLY * way / periods
     if room < limit:
@@ -314,7 +298,7 @@ def _add_cost(
     keep = around.clearance
     near = max(keep.margin + keep.soft - room, 0.0) / keep.soft
     lanes.cost[k] += NEAR * near * near / periods
-    if math.hypot(around.goal[0] - x, around.goal[1] - y) < ARRIVED_M:
+    if math.hypot(around.goal[0] - x, around.goal[1] - y) < maps.ARRIVED_M:
         lanes.ended[k] = t
         lanes.way[k] = 0.0
     elif t == periods - 1:

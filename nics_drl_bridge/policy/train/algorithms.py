@@ -65,17 +65,19 @@ REPLAYED = (
 def check_serves(settings: TrainingSettings, env: BridgeVectorEnv) -> None:
     """Raises ConfigError if the algorithm does not suit task and settings, or for a team's task."""
     if env.robots > 1:
-        fix = (
-            "train a single-robot task, or use your own learner (docs/environments.md)"
+        raise ConfigError(
+            f"task {settings.task!r}: has {env.robots} robots; train a single-robot task, or use "
+            "your own learner (docs/environments.md)."
         )
-        raise ConfigError(f"task {settings.task!r}: has {env.robots} robots; {fix}.")
     continuous = isinstance(env.single_action_space, gymnasium.spaces.Box)
     if settings.algorithm == "sac" and not continuous:
         raise ConfigError("algorithm 'sac' needs continuous actions; use 'ppo'.")
     size = settings.ppo.rollout * settings.num_envs
     if settings.algorithm == "ppo" and settings.ppo.batch > size:
-        batch = f"ppo.batch {settings.ppo.batch}: exceeds the {size} transitions of a rollout"
-        raise ConfigError(f"{batch}; lower it, or raise ppo.rollout or worlds.")
+        raise ConfigError(
+            f"ppo.batch {settings.ppo.batch}: exceeds the {size} transitions of a rollout; lower "
+            "it, or raise ppo.rollout or worlds."
+        )
 
 
 def make_act(algorithm: BaseAlgorithm | Actor) -> Act:
@@ -173,12 +175,7 @@ class Actor(torch.nn.Module):
     ) -> None:
         super().__init__()
         self.discrete = isinstance(actions, gymnasium.spaces.Discrete)
-        size = actions.shape or ()
-        count = int(
-            actions.n
-            if isinstance(actions, gymnasium.spaces.Discrete)
-            else np.prod(size)
-        )
+        count = gymnasium.spaces.flatdim(actions)
         self.normaliser = Normaliser(observations, *normaliser)
         widths = [self.normaliser.features_dim, *hidden, count]
         self.layers = make_layers(widths, ACTION_GAIN, activation)

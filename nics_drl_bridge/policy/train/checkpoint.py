@@ -67,9 +67,9 @@ def read_checkpoint(path: Path, kind: str = FORMAT) -> dict[str, Any]:
         format_name = str(content["format"])
         read = {**content, "about": json.loads(content["about"])}
     except Exception:  # noqa: BLE001 - a damaged file breaks torch in any way
-        reason = "is not a training checkpoint, or is damaged"
         raise ConfigError(
-            f"{path}: {reason}; leave out --resume to start again."
+            f"{path}: is not a training checkpoint, or is damaged; leave out "
+            "--resume to start again."
         ) from None
     if format_name != kind:
         raise ConfigError(
@@ -88,12 +88,6 @@ def _check_tensors(content: Any, size: int) -> None:
         and content.numel() * content.element_size() > size
     ):
         raise ValueError("a tensor is larger than the file")
-
-
-def restore_envs(content: dict[str, Any], env: TrainVecEnv) -> None:
-    """Restores the worlds of a checkpoint into an env made with the same arguments."""
-    for worlds, state in zip(env.envs, content["envs"], strict=True):
-        restore(worlds, {name: value.numpy() for name, value in state.items()})
 
 
 def tensors(arrays: dict[str, AnyArray]) -> dict[str, torch.Tensor]:
@@ -134,74 +128,68 @@ class Progress:
         return f"{rate}, {self.steps_per_s:,.0f} steps/s"
 
 
-Save = Callable[[], None]
 Tell = Callable[[Progress], None]
 
 
+@dataclass
 class Watch:
     """Reports the progress of a training and saves it at intervals, between two rollouts."""
 
-    def __init__(
-        self,
-        env: TrainVecEnv,
-        seed: int,
-        settings: TrainingSettings,
-        save: Save,
-        tell: Tell,
-        stop: Stop,
-    ) -> None:
-        self._env = env
-        self._seed = seed
-        self._save = save
-        self._tell = tell
-        self._stop = stop
-        self._total = settings.steps
-        self._every = settings.checkpoint_every
+    env: TrainVecEnv
+    seed: int
+    settings: TrainingSettings
+    save: Callable[[], None]
+    tell: Tell
+    stop: Stop
+
+    def __post_init__(self) -> None:
         self.collisions: deque[bool] = deque(maxlen=RECENT)  # latest episodes
 
     def begin(self, steps: int) -> None:
         """Starts the clock of a training that has already done `steps`."""
         self._begin = self._told = time.perf_counter()
-        self._busy = self._env.stepping_s
+        self._busy = self.env.stepping_s
         self._first = self._saved = steps
 
     def keep(self, steps: int) -> None:
         """Saves the training if it is due."""
-        if steps // self._every > self._saved // self._every:
-            self._save()
+        every = self.settings.checkpoint_every
+        if steps // every > self._saved // every:
+            self.save()
             self._saved = steps
 
     def ends(self, steps: int, act: Act, logger: Logger) -> bool:
         """Evaluates on held-out episodes if due; returns True if the training should end."""
-        if self._stop.judge(steps, act):
-            for world, share in self._stop.shares.items():
+        if self.stop.judge(steps, act):
+            for world, share in self.stop.shares.items():
                 logger.record(f"held_out/{world}", share)
             logger.dump(steps)
-        return self._stop.over
+        return self.stop.over
 
     def report(self, steps: int, successes: Sequence[bool], logger: Logger) -> bool:
         """Reports and logs the progress if due; returns True if it did."""
         now = time.perf_counter()
-        if now - self._told < TOLD_S and steps < self._total and not self._stop.over:
+        total = self.settings.steps
+        if now - self._told < TOLD_S and steps < total and not self.stop.over:
             return False
         self._told = now
         taken = max(now - self._begin, 1e-9)
         recent = successes, self.collisions
         success, collision = (float(np.mean(r)) if r else np.nan for r in recent)
         progress = Progress(
-            self._seed,
+            self.seed,
             steps,
-            self._total,
+            total,
             success,
             collision,
             (steps - self._first) / taken,
-            (self._env.stepping_s - self._busy) / taken,
-            self._stop.least,
+            (self.env.stepping_s - self._busy) / taken,
+            self.stop.least,
         )
         logger.record("rollout/success_rate", progress.success)
         logger.record("rollout/collision_rate", progress.collision)
         logger.record("time/env_share", progress.env_share)
-        self._tell(progress)
+        self.tell(progress)
         return True
 
 
@@ -230,8 +218,9 @@ def restore(env: BridgeVectorEnv, state: Mapping[str, AnyArray]) -> None:
         was, now = (_kind(rows.get(name)) for rows in (arrays, targets))
         if was != now:
             reason = f"{name!r} is {was}, but this env's is {now}"
-            advice = "make the env with the original arguments"
-            raise ConfigError(f"state of a vector env: {reason}; {advice}.")
+            raise ConfigError(
+                f"state of a vector env: {reason}; make the env with the original arguments."
+            )
     for name, target in targets.items():
         target[...] = arrays[name]  # in place: the compiled steps refer to these arrays
     env.memory = parts[MEMORY]

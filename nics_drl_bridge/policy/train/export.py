@@ -106,8 +106,9 @@ def find_actor(model: Any) -> torch.nn.Module:
         return torch.nn.Sequential(*parts)
     if isinstance(policy, torch.nn.Module):
         return policy
-    fix = "give a PPO, A2C or SAC, or a torch module."
-    raise ConfigError(f"a {type(model).__name__} can't be exported; {fix}")
+    raise ConfigError(
+        f"a {type(model).__name__} can't be exported; give a PPO, A2C or SAC, or a torch module."
+    )
 
 
 def export_policy(
@@ -129,7 +130,8 @@ def export_policy(
         raise ConfigError(
             f"{file}: a policy file's name ends with {SUFFIX!r}; change it."
         )
-    deployed = Deployed(find_actor(model), task, normaliser).eval().cpu()
+    deployed = Deployed(find_actor(model), task, normaliser)
+    deployed.eval().cpu()
     graph = _export_graph(deployed, task)
     golden = _make_golden(deployed, graph, draw_golden_observations(task), str(file))
     text = make_contract(
@@ -165,8 +167,11 @@ def _make_golden(
     for name, ours, theirs in zip(("actions", "commands"), out, wanted, strict=True):
         error = float(np.abs(ours - theirs).max())
         if not error <= policy_file.GOLDEN_TOLERANCE:
-            reason = f"onnxruntime and torch differ by {error:.3g}; the model can't be exported."
-            raise PolicyError(source, f"golden.{name}", reason)
+            raise PolicyError(
+                source,
+                f"golden.{name}",
+                f"onnxruntime and torch differ by {error:.3g}; the model can't be exported.",
+            )
     action = np.asarray(out[0], np.float32).reshape(GOLDEN, -1)
     return {"observations": seen, "actions": action, "commands": out[1]}
 

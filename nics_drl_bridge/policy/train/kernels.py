@@ -45,10 +45,10 @@ class Transitions(NamedTuple):
 @kernel(allocates=True)
 def forward(net: Net, seen: Singles) -> Singles:
     """Returns the outputs (n, C) of a network for inputs (n, O); keeps all layers' outputs."""
-    n = seen.shape[0]
+    n = len(seen)
     at = 0
     rows = seen
-    for k in range(net.widths.shape[0] - 1):
+    for k in range(len(net.widths) - 1):
         ins = net.widths[k]
         outs = net.widths[k + 1]
         middle = at + ins * outs
@@ -57,7 +57,7 @@ def forward(net: Net, seen: Singles) -> Singles:
         at = middle + outs
         rows = out
         bias = net.weights[middle:at]
-        least = NONE if k + 2 < net.widths.shape[0] else -np.inf
+        least = NONE if k + 2 < len(net.widths) else -np.inf
         for i in range(n):
             for j in range(outs):
                 out[i, j] = max(out[i, j] + bias[j], np.float32(least))
@@ -70,10 +70,10 @@ def backward(net: Net, seen: Singles, gradient: Singles) -> None:
 
     `gradient` must be the first of the spare arrays.
     """
-    n = seen.shape[0]
-    at = net.weights.shape[0]
+    n = len(seen)
+    at = len(net.weights)
     side = 0
-    for k in range(net.widths.shape[0] - 2, -1, -1):
+    for k in range(len(net.widths) - 2, -1, -1):
         ins = net.widths[k]
         outs = net.widths[k + 1]
         middle = at - outs
@@ -97,7 +97,7 @@ def compute_critic_gradients(
 ) -> np.float32:
     """Writes the gradients of the critic; returns its weighted loss."""
     values = forward(net, batch.seen)
-    n = values.shape[0]
+    n = len(values)
     out = net.spare[0, :n].reshape(n, 1)
     loss = NONE
     share = weight / np.float32(n)
@@ -124,7 +124,7 @@ def compute_actor_gradients(
     """
     raw = forward(net, batch.seen)
     gains = batch.advantages
-    n = raw.shape[0]
+    n = len(raw)
     actions = batch.actions
     out = net.spare[0, : raw.size].reshape(raw.shape)
     mean = gains.mean()
@@ -136,16 +136,30 @@ def compute_actor_gradients(
     loss = NONE
     parts = np.empty(raw.shape[1], np.float32)
     for i in range(n):
+        # The log density or log probability of the action, the entropy of all actions, and the
+        # deviations or log probabilities in the parts.
+        log_prob = mixed = NONE
         if log_std.size > 0:
-            log_prob, mixed = _compute_density(parts, raw[i], actions[i], log_std)
+            for j in range(len(parts)):
+                parts[j] = (actions[i, j] - raw[i, j]) * np.exp(-log_std[j])
+                density = np.float32(0.5) * parts[j] * parts[j] + log_std[j]
+                log_prob -= density + LOG_NORM
+                mixed += log_std[j] + np.float32(0.5) + LOG_NORM
         else:
-            log_prob, mixed = _compute_probability(parts, raw[i], int(actions[i, 0]))
+            greatest = raw[i].max()
+            total = NONE
+            for j in range(len(parts)):
+                total += np.exp(raw[i, j] - greatest)
+            for j in range(len(parts)):
+                parts[j] = raw[i, j] - greatest - np.log(total)
+                mixed -= np.exp(parts[j]) * parts[j]
+            log_prob = parts[int(actions[i, 0])]
         ratio = np.exp(log_prob - batch.log_probs[i])
         gain = (gains[i] - mean) * scale
         bounded = gain * min(max(ratio, ONE - clip), ONE + clip)
         loss -= share * (min(gain * ratio, bounded) + entropy * mixed)
         pull = share * gain * ratio if gain * ratio <= bounded else NONE
-        for j in range(parts.shape[0]):
+        for j in range(len(parts)):
             if log_std.size > 0:
                 out[i, j] = -pull * parts[j] * np.exp(-log_std[j])
                 spread[j] -= pull * (parts[j] * parts[j] - ONE)
@@ -157,35 +171,3 @@ def compute_actor_gradients(
             out[i, int(actions[i, 0])] -= pull
     backward(net, batch.seen, out)
     return loss
-
-
-@kernel(allocates=True)
-def _compute_density(
-    parts: Singles,
-    raw: Singles,
-    action: Singles,
-    log_std: Singles,
-) -> tuple[np.float32, np.float32]:
-    """Returns an action's (C,) log density and the entropy; writes deviations (C,) to `parts`."""
-    log_prob = mixed = NONE
-    for j in range(raw.shape[0]):
-        parts[j] = (action[j] - raw[j]) * np.exp(-log_std[j])
-        log_prob -= np.float32(0.5) * parts[j] * parts[j] + log_std[j] + LOG_NORM
-        mixed += log_std[j] + np.float32(0.5) + LOG_NORM
-    return log_prob, mixed
-
-
-@kernel(allocates=True)
-def _compute_probability(
-    parts: Singles, raw: Singles, action: int
-) -> tuple[np.float32, np.float32]:
-    """Returns an action's log probability and the entropy; writes probabilities (C,) to `parts`."""
-    greatest = raw.max()
-    total = NONE
-    mixed = NONE
-    for j in range(raw.shape[0]):
-        total += np.exp(raw[j] - greatest)
-    for j in range(raw.shape[0]):
-        parts[j] = raw[j] - greatest - np.log(total)
-        mixed -= np.exp(parts[j]) * parts[j]
-    return parts[action], mixed

@@ -129,8 +129,10 @@ def refuse_diverged(training: LeanPpo | Sb3Training, bound: float = math.inf) ->
     if not all(
         bool((part.abs() < bound).all()) for part in training.networks.parameters()
     ):
-        fault = f"after {training.steps} steps its weights are too large or not finite"
-        raise ConfigError(f"the training diverged: {fault}; lower its learning_rate.")
+        raise ConfigError(
+            f"the training diverged: after {training.steps} steps its weights are too large or "
+            "not finite; lower its learning_rate."
+        )
 
 
 def make_train_env(
@@ -140,21 +142,10 @@ def make_train_env(
     margin = settings.teaching.margin
     if margin:
         model = replace(model, robot=model.robot.grow_footprint(margin))
-    envs = [
-        BridgeVectorEnv(
-            count,
-            model,
-            worlds[world],
-            settings.task,
-            settings.task_options,
-            settings.max_episode_steps,
-            "SameStep",
-            randomisation=settings.randomisation,
-        )
-        for world, count in settings.worlds.items()
-    ]
-    for env in envs:
-        env.teach(settings.teaching)
+    envs = []
+    for world, count in settings.worlds.items():
+        envs.append(_make_env(model, worlds[world], settings, count, "SameStep"))
+        envs[-1].teach(settings.teaching)
     return TrainVecEnv(*envs)
 
 
@@ -167,7 +158,9 @@ def _restore(
     try:
         for part in parts:
             part.restore(content["state"])
-        checkpoints.restore_envs(content, env)
+        for worlds, state in zip(env.envs, content["envs"], strict=True):
+            arrays = {name: value.numpy() for name, value in state.items()}
+            checkpoints.restore(worlds, arrays)
     except (
         AttributeError,
         IndexError,
@@ -176,8 +169,10 @@ def _restore(
         TypeError,
         ValueError,
     ) as error:
-        reason = f"is not the checkpoint of a training ({shorten(str(error), 120)})"
-        raise ConfigError(f"{path}: {reason}; train again.") from None
+        raise ConfigError(
+            f"{path}: is not the checkpoint of a training "
+            f"({shorten(str(error), 120)}); train again."
+        ) from None
 
 
 def check_same(old: dict[str, Any], new: dict[str, Any], path: Path) -> None:
@@ -193,9 +188,9 @@ def check_same(old: dict[str, Any], new: dict[str, Any], path: Path) -> None:
     for key, value in new["settings"].items():
         then = old["settings"].get(key)
         if then != value:
-            reason = f"was trained with {key} {then!r}, not {value!r}"
             raise ConfigError(
-                f"{path}: {reason}; resume with the same settings, or train in another folder."
+                f"{path}: was trained with {key} {then!r}, not {value!r}; resume with the same "
+                "settings, or train in another folder."
             )
     if old["seed"] != new["seed"]:
         raise ConfigError(
@@ -229,16 +224,21 @@ def _stop_of(model: SimulatorModel, worlds: Worlds, settings: TrainingSettings) 
 
 
 def _make_env(
-    model: SimulatorModel, world: AnyWorld, settings: TrainingSettings, episodes: int
+    model: SimulatorModel,
+    world: AnyWorld,
+    settings: TrainingSettings,
+    count: int,
+    mode: str = "NextStep",
 ) -> BridgeVectorEnv:
-    """Makes copies of a world for an evaluation, one per episode, without teaching."""
+    """Makes copies of a world without teaching; for an evaluation, one per episode."""
     return BridgeVectorEnv(
-        episodes,
+        count,
         model,
         world,
         settings.task,
         settings.task_options,
         settings.max_episode_steps,
+        mode,
         randomisation=settings.randomisation,
     )
 
@@ -337,8 +337,10 @@ def _lock_folder(out: Path) -> Iterator[None]:
                     (out / SETTINGS).unlink(missing_ok=True)
                 raise
     except filelock.Timeout:
-        fix = "wait until it ends, or choose another --out"
-        raise ConfigError(f"{out}: another training is running there; {fix}.") from None
+        raise ConfigError(
+            f"{out}: another training is running there; wait until it ends, "
+            "or choose another --out."
+        ) from None
 
 
 def export(
@@ -375,16 +377,18 @@ def _check(
         raise ConfigError(f"seeds {list(seeds)}: give one or more, without duplicates.")
     begun = any((out / f"seed_{seed}" / CHECKPOINT).is_file() for seed in seeds)
     if begun and not resumed:
-        fix = "add --resume, or choose another --out."
-        raise ConfigError(f"{out}: contains checkpoints of these seeds; {fix}")
+        raise ConfigError(
+            f"{out}: contains checkpoints of these seeds; add --resume, or choose another --out."
+        )
     own_task = settings.task if is_code(settings.task) else None
     if (
         (out / SETTINGS).is_file()
         and not resumed
         and read_run_settings(out, own_task) != settings
     ):
-        fix = "choose another --out, or remove it."
-        raise ConfigError(f"{out}: contains a run with other settings; {fix}")
+        raise ConfigError(
+            f"{out}: contains a run with other settings; choose another --out, or remove it."
+        )
     if resumed and not begun:
         started = seeds_of(out)
         fix = f"name one of {started} with --seeds" if started else "leave out --resume"

@@ -136,11 +136,9 @@ class TrainingSettings(Schema):
         rows = self.num_envs * self.ppo.rollout
         kept = rows if self.algorithm == "ppo" else self.sac.buffer
         if kept > MOST_KEPT:
-            kept_by = (
-                f"{self.algorithm} would keep {kept} transitions, more than {MOST_KEPT}"
-            )
             raise ValueError(
-                f"{kept_by}; lower the copies of worlds, ppo.rollout or sac.buffer"
+                f"{self.algorithm} would keep {kept} transitions, more than {MOST_KEPT}; lower "
+                "the copies of worlds, ppo.rollout or sac.buffer"
             )
         return self
 
@@ -175,8 +173,10 @@ def read_settings(path: Path, task: str | None) -> TrainingSettings:
     settings = load_yaml(path, TrainingSettings)
     if is_code(settings.task) and not (task is not None and is_code(task)):
         reason = "is a program, which a data file must not start"
-        fix = "name it yourself: --task path/to/file.py:ClassName, or task= in Python"
-        raise ConfigError(f"{path}: key 'task' {settings.task!r}: {reason}; {fix}.")
+        raise ConfigError(
+            f"{path}: key 'task' {settings.task!r}: {reason}; name it yourself: --task "
+            "path/to/file.py:ClassName, or task= in Python."
+        )
     return settings if task is None else settings.model_copy(update={"task": task})
 
 
@@ -349,32 +349,24 @@ def fit_settings(settings: TrainingSettings, opened: Opened, inherited: bool) ->
         and pace.steps != defaults.EPISODE_STEPS
     ):
         changed["max_episode_steps"] = pace.steps
-        limit = f"{pace.steps * pace.period:g} s ({pace.steps} steps)"
-        notes.append(f"time limit {limit}, for {pace.far:g} m at {pace.speed:g} m/s")
+        notes.append(
+            f"time limit {pace.steps * pace.period:g} s ({pace.steps} steps), for "
+            f"{pace.far:g} m at {pace.speed:g} m/s"
+        )
         if inherited and pace.steps > defaults.EPISODE_STEPS:
-            changed |= _stretch(
-                settings, options, pace.steps / defaults.EPISODE_STEPS, notes
-            )
+            # The episodes are so many times as long as those of the other robot.
+            factor = pace.steps / defaults.EPISODE_STEPS
+            reward = options.get("time_reward")
+            if reward:
+                options["time_reward"] = round(reward / factor, 6)
+                notes.append(f"time_reward {options['time_reward']:g}, was {reward:g}")
+            name = settings.algorithm
+            learner = settings.ppo if name == "ppo" else settings.sac
+            discount = round(1.0 - (1.0 - learner.discount) / factor, 6)
+            notes.append(f"{name}.discount {discount:g}, was {learner.discount:g}")
+            changed[name] = learner.model_copy(update={"discount": discount})
     made = settings.model_copy(update={**changed, "task_options": options})
     short = pace.shortfall(made.max_episode_steps)
     if short is not None:
         notes.append(short)
     return Fitted(made, tuple(notes), opened)
-
-
-def _stretch(
-    settings: TrainingSettings,
-    options: dict[str, Any],
-    factor: float,
-    notes: list[str],
-) -> dict[str, Any]:
-    """Returns the settings to change for episodes `factor` times as long; updates `options`."""
-    reward = options.get("time_reward")
-    if reward:
-        options["time_reward"] = round(reward / factor, 6)
-        notes.append(f"time_reward {options['time_reward']:g}, was {reward:g}")
-    name = settings.algorithm
-    learner = settings.ppo if name == "ppo" else settings.sac
-    discount = round(1.0 - (1.0 - learner.discount) / factor, 6)
-    notes.append(f"{name}.discount {discount:g}, was {learner.discount:g}")
-    return {name: learner.model_copy(update={"discount": discount})}

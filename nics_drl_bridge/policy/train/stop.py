@@ -6,6 +6,7 @@ of two consecutive ones only about once in sixty. The weights of the second one 
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
@@ -17,28 +18,22 @@ HELD_OUT_SEED = 2**41
 IN_A_ROW = 2
 
 
+@dataclass
 class Stop:
-    """Decides when a training ends early; without settings, it never does.
+    """Decides when a training ends early; without settings, it never does."""
 
-    Args:
-        given: the settings.
-        envs: vector envs by world name, each with one world per episode of an evaluation.
-    """
-
-    def __init__(
-        self, settings: StopSettings | None, envs: Mapping[str, BridgeVectorEnv]
-    ) -> None:
-        self._settings = settings
-        self._envs = envs
-        self._due = 0  # number of the latest evaluation
-        self._reached = 0  # consecutive evaluations that passed
-        # success rate by world in the latest evaluation
-        self.shares: dict[str, float] = {}
+    settings: StopSettings | None
+    # by world name, each with one world per episode of an evaluation
+    envs: Mapping[str, BridgeVectorEnv]
+    due: int = 0  # number of the latest evaluation
+    reached: int = 0  # consecutive evaluations that passed
+    # success rate by world in the latest evaluation
+    shares: dict[str, float] = field(default_factory=dict)
 
     @property
     def over(self) -> bool:
         """True if the training should end."""
-        return self._reached >= IN_A_ROW
+        return self.reached >= IN_A_ROW
 
     @property
     def least(self) -> float:
@@ -47,31 +42,31 @@ class Stop:
 
     def judge(self, steps: int, act: Act) -> bool:
         """Evaluates the policy `act` if due after `steps`; returns True if it did."""
-        settings = self._settings
-        if settings is None or steps // settings.every <= self._due:
+        settings = self.settings
+        if settings is None or steps // settings.every <= self.due:
             return False
-        self._due = steps // settings.every
-        first = HELD_OUT_SEED + self._due * settings.episodes
+        self.due = steps // settings.every
+        first = HELD_OUT_SEED + self.due * settings.episodes
         seeds = range(first, first + settings.episodes)
         driven = {
-            world: drive_worlds(env, act, seeds) for world, env in self._envs.items()
+            world: drive_worlds(env, act, seeds) for world, env in self.envs.items()
         }
         self.shares = {
             world: float(outcomes.success.mean()) for world, outcomes in driven.items()
         }
-        self._reached = self._reached + 1 if self.least >= settings.success else 0
+        self.reached = self.reached + 1 if self.least >= settings.success else 0
         return True
 
     def state(self) -> dict[str, Any]:
         """Returns everything that changes, for a checkpoint."""
         return {
-            "stop": {"due": self._due, "reached": self._reached, "shares": self.shares}
+            "stop": {"due": self.due, "reached": self.reached, "shares": self.shares}
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continues from a saved state; starts afresh if the checkpoint has none."""
         saved = state.get("stop")
         if saved:
-            self._due = saved["due"]
-            self._reached = saved["reached"]
+            self.due = saved["due"]
+            self.reached = saved["reached"]
             self.shares = dict(saved["shares"])

@@ -30,14 +30,18 @@ class TrainVecEnv(VecEnv):
                 env.metadata["autoreset_mode"] is not AutoresetMode.SAME_STEP
                 or not env.copy
             ):
-                needed = "autoreset_mode='SameStep', copy=True"
-                raise ConfigError(f"Stable-Baselines3 needs BridgeVectorEnv({needed}).")
+                raise ConfigError(
+                    "Stable-Baselines3 needs "
+                    "BridgeVectorEnv(autoreset_mode='SameStep', copy=True)."
+                )
         first = envs[0]
         spaces = [env.single_observation_space for env in envs]
         for space in spaces:
             if space != spaces[0]:
-                shown = f"{spaces[0]} and {space}; use the same robot, lidar and task."
-                raise ConfigError(f"the combined vector envs have the spaces {shown}")
+                raise ConfigError(
+                    f"the combined vector envs have the spaces {spaces[0]} and {space}; use the "
+                    "same robot, lidar and task."
+                )
         self.envs = envs
         edges = np.cumsum([0, *(env.num_envs for env in envs)])
         self._rows = [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
@@ -75,10 +79,13 @@ class TrainVecEnv(VecEnv):
         for n in self._ended:  # new dicts, because an algorithm may keep the old ones
             self._infos[n] = {}
         self._ended = []
-        parts = [
-            self._step_env(env, rows)
-            for env, rows in zip(self.envs, self._rows, strict=True)
-        ]
+        parts = []
+        for env, rows in zip(self.envs, self._rows, strict=True):
+            seen, gain, terminated, truncated, info = env.step(self._actions[rows])
+            ended = terminated | truncated
+            parts.append((seen, gain, ended))
+            if ended.any():
+                self._fill_infos(rows.start, ended, truncated & ~terminated, info)
         observation, reward, done = (
             _join_rows(list(rows_of_envs)) for rows_of_envs in zip(*parts, strict=True)
         )
@@ -87,27 +94,19 @@ class TrainVecEnv(VecEnv):
             self.on_step()
         return observation, reward.astype(np.float32), done, list(self._infos)
 
-    def _step_env(
-        self, env: BridgeVectorEnv, rows: slice
-    ) -> tuple[Observation, NDArray[np.float64], Mask]:
-        """Steps one of the envs, and fills in the infos of its ended worlds."""
-        observation, reward, terminated, truncated, info = env.step(self._actions[rows])
-        done = terminated | truncated
-        over = np.flatnonzero(done).tolist()
-        if over:
-            flags = {"TimeLimit.truncated": truncated & ~terminated}
-            for name in {"is_success", "collision"} & info["final_info"].keys():
-                flags[name] = (
-                    info["final_info"][name].reshape(len(done), -1).all(axis=1)
-                )
-            flag_lists = {name: flag.tolist() for name, flag in flags.items()}
-            for n in over:
-                self._ended.append(rows.start + n)
-                world_flags = {name: values[n] for name, values in flag_lists.items()}
-                self._infos[rows.start + n] = world_flags | {
-                    "terminal_observation": info["final_obs"][n]
-                }
-        return observation, reward, done
+    def _fill_infos(
+        self, first: int, ended: Mask, cut: Mask, info: dict[str, Any]
+    ) -> None:
+        """Fills in the infos of ended worlds of an env, the first of whose worlds is `first`."""
+        flags = {"TimeLimit.truncated": cut}
+        for name in {"is_success", "collision"} & info["final_info"].keys():
+            values = info["final_info"][name]
+            flags[name] = values.reshape(len(ended), -1).all(axis=1)
+        for n in np.flatnonzero(ended).tolist():
+            self._ended.append(first + n)
+            known = {name: bool(values[n]) for name, values in flags.items()}
+            known["terminal_observation"] = info["final_obs"][n]
+            self._infos[first + n] = known
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """Reads an attribute of each world's vector env."""
