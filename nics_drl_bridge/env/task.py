@@ -32,8 +32,8 @@ Memory = dict[str, AnyArray]
 Facts = dict[str, AnyArray]  # for `info`, by name
 Info = dict[str, Any]  # Gymnasium's `info`
 Terms = dict[str, Array]  # of the reward, by name
-BoundStep = Callable[[Array, Memory], tuple[Observation, dict[str, float], bool, Info]]
-"""A step from a pose (1, 3): observation (O,), reward terms, True at the end, facts for `info`."""
+BoundStep = Callable[[Memory], tuple[Observation, dict[str, float], bool, Info]]
+"""Judges a step: observation (O,), reward terms, True at the end, and facts for `info`."""
 DRIVES = (
     (0, 0, 0),
     (1, 0, 0),
@@ -205,6 +205,13 @@ class Task(ABC):
     def _takes_turn_rate(self) -> bool:
         return self.robot.takes_turn_rate
 
+    @cached_property
+    def scales_actions(self) -> bool:
+        """True if commands are actions, scaled between `command_limits`, and nothing else."""
+        if self.actions == "discrete" or self._takes_turn_rate:
+            return False
+        return all(getattr(type(self), name) is getattr(Task, name) for name in ("command", "drive"))
+
     def drive(self, actions: ArrayLike, ended: Flags) -> Array:
         """Returns the checked commands (n, M, C) of actions; robots that have ended stand still."""
         shape = (*ended.shape, len(self.robot.command))
@@ -297,8 +304,8 @@ class Task(ABC):
             )
         return Outcome(terms, ended, info)
 
-    def bind(self, view: RobotView) -> BoundStep | None:
-        """Binds the steps of one robot to its view (1, 1), whose arrays change in place.
+    def bind(self, before: Array, view: RobotView) -> BoundStep | None:
+        """Binds the steps of one robot to its view (1, 1) and its pose before (1, 1, 3), in place.
 
         A class may override it to do all parts of a step in one small call of a kernel, which saves
         most of the time in the fast simulator. It is left out if a subclass overrides a part, or
