@@ -277,7 +277,7 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
         self._steps += 1
         direct = self._direct
         if direct is not None:
-            if not direct.scale_action(action):
+            if not direct.take_action(action):
                 direct.commands[...] = self._make_commands(action)
             self._commands = direct.commands
             observation, terms, ended, info = direct.advance(self.memory)
@@ -343,6 +343,8 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
     @guard_call
     def render(self) -> Any:
         """Draws the current world from above; see Gymnasium."""
+        if self.scene is None:
+            raise gymnasium.error.ResetNeeded("call reset() before render().")
         if self.render_mode is None:
             return None
         if self._picture is None:

@@ -1,6 +1,7 @@
 """Steps of one robot whose task judges the simulator's own arrays, in less than half the time."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -9,7 +10,6 @@ from nics_drl_bridge.env.sim_backend import SimBackend
 from nics_drl_bridge.env.task import BoundStep, Info, Memory, Observation, Task
 from nics_drl_bridge.interface import Array, Backend, RobotView
 from nics_drl_bridge.kernels import bind
-from nics_drl_bridge.lidar.arrays import AnyArray
 
 
 class DirectSteps:
@@ -18,6 +18,7 @@ class DirectSteps:
     Attributes:
         view: what the robot knows, (1, 1).
         commands: (1, 1, C) of the next step.
+        take_action: writes `commands`; returns False if an action is for `Task.drive`, or wrong.
     """
 
     def __init__(
@@ -31,7 +32,7 @@ class DirectSteps:
         simulator = backend.simulator
         self.view = view
         self.commands: Array = np.zeros((1, 1, len(task.robot.command)))
-        self._shown = task.shown
+        self._task = task
         self._before = before[0, 0]
         self._pose = view.pose[0, 0]
         self._true_pose = simulator.data.pose[0, 0]
@@ -40,19 +41,31 @@ class DirectSteps:
         self._period_ns = backend.period_ns
         self._action = np.zeros(len(task.robot.command))
         self._shape = self._action.shape
-        self._scale: Callable[[], bool] | None = None
-        if task.scales_actions:
-            rows = self._action[None]
-            limits = task.command_limits
-            self._scale = bind(kernels.scale_actions, self.commands[0], rows, *limits)
+        self._scale: Callable[[], bool] = bind(
+            kernels.scale_actions,
+            self.commands[0],
+            self._action[None],
+            *task.command_limits,
+        )
+        self.take_action: Callable[[Any], bool] = self._scale_action
+        if task.actions == "discrete":
+            self.take_action = self._look_up_action
+        if not task.commands_plainly:
+            self.take_action = lambda _: False
         self._move = simulator.bind_step(self.commands)
         self._judge = judge
 
-    def scale_action(self, action: AnyArray) -> bool:
-        """Writes `commands`; returns False if the action is for `Task.drive`, or wrong."""
-        if type(action) is not np.ndarray or self._scale is None:
+    def _look_up_action(self, action: Any) -> bool:
+        table = self._task.discrete_commands
+        if type(action) not in (int, np.int64) or not 0 <= action < len(table):
             return False
-        if action.shape != self._shape or action.dtype.kind != "f":
+        self.commands[0, 0] = table[action]
+        return True
+
+    def _scale_action(self, action: Any) -> bool:
+        if type(action) is not np.ndarray or action.shape != self._shape:
+            return False
+        if action.dtype.kind != "f":
             return False
         self._action[:] = action
         return self._scale()
@@ -65,7 +78,7 @@ class DirectSteps:
         self._move()
         observation, terms, ended, judged = self._judge(memory)
         info: Info = {}
-        for name in self._shown:
+        for name in self._task.shown:
             info[name] = memory[name][0, 0].copy()
         info["pose"] = self._pose.copy()
         info["scan_age_s"] = 0.0

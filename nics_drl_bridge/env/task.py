@@ -206,11 +206,12 @@ class Task(ABC):
         return self.robot.takes_turn_rate
 
     @cached_property
-    def scales_actions(self) -> bool:
-        """True if commands are actions, scaled between `command_limits`, and nothing else."""
-        if self.actions == "discrete" or self._takes_turn_rate:
+    def commands_plainly(self) -> bool:
+        """True if `drive` only looks discrete actions up, or scales others to `command_limits`."""
+        own = type(self)
+        if own.command is not Task.command or own.drive is not Task.drive:
             return False
-        return all(getattr(type(self), name) is getattr(Task, name) for name in ("command", "drive"))
+        return self.actions == "discrete" or not self._takes_turn_rate
 
     def drive(self, actions: ArrayLike, ended: Flags) -> Array:
         """Returns the checked commands (n, M, C) of actions; robots that have ended stand still."""

@@ -142,13 +142,13 @@ class Navigation(Task):
         """Binds steps to a view; see `Task.bind`. There are none with further sensors."""
         if self.sensors:
             return None
-        out = np.empty((1, *self.observation_space.shape), np.float32)
+        observation = np.empty(self.observation_space.shape, np.float32)
         terms = np.empty(5)
         flags = np.empty(4, np.bool_)
         goals = np.empty((1, 2))
         navigate = bind(
             kernels.navigate,
-            out,
+            observation[None],
             terms[:, None],
             flags[:, None],
             before[0],
@@ -173,7 +173,7 @@ class Navigation(Task):
             }
             _, touched, succeeded, ended = flags.tolist()
             facts = {"is_success": succeeded, "collision": touched}
-            return out[0].copy(), paid, ended, facts
+            return observation.copy(), paid, ended, facts
 
         return judge
 
