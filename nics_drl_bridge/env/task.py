@@ -208,9 +208,9 @@ class Task(ABC):
     @cached_property
     def commands_plainly(self) -> bool:
         """True if `drive` only looks discrete actions up, or scales others to `command_limits`."""
-        own = type(self)
-        if own.command is not Task.command or own.drive is not Task.drive:
-            return False
+        for name in ("action_space", "command", "drive"):
+            if getattr(type(self), name) is not getattr(Task, name):
+                return False
         return self.actions == "discrete" or not self._takes_turn_rate
 
     def drive(self, actions: ArrayLike, ended: Flags) -> Array:
