@@ -59,7 +59,7 @@ class SimBackend:
         self._middlewares = [
             Middleware(model) for _ in range(robots if estimator else 0)
         ]
-        self.period_ns = round(model.control_period * NS_PER_S)
+        self._period_ns = round(model.control_period * NS_PER_S)
         self._row: Any = (0, 0) if robots == 1 else 0
 
     def reset(self, start: Start) -> RobotView:
@@ -92,7 +92,7 @@ class SimBackend:
     @property
     def now_ns(self) -> int:
         """Time since the start of the episode."""
-        return self.simulator.data.steps.item(0) * self.period_ns
+        return self.simulator.data.steps.item(0) * self._period_ns
 
     def get_live_view(self) -> RobotView | None:
         """Returns a view (1, M) of the simulator's own arrays; None if a view needs more."""

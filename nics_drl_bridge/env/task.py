@@ -205,14 +205,6 @@ class Task(ABC):
     def _takes_turn_rate(self) -> bool:
         return self.robot.takes_turn_rate
 
-    @cached_property
-    def commands_plainly(self) -> bool:
-        """True if `drive` only looks discrete actions up, or scales others to `command_limits`."""
-        for name in ("action_space", "command", "drive"):
-            if getattr(type(self), name) is not getattr(Task, name):
-                return False
-        return self.actions == "discrete" or not self._takes_turn_rate
-
     def drive(self, actions: ArrayLike, ended: Flags) -> Array:
         """Returns the checked commands (n, M, C) of actions; robots that have ended stand still."""
         shape = (*ended.shape, len(self.robot.command))
