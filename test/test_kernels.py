@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge import kernels
+from nics_drl_bridge.env.kernels import scale_actions
 
 LOW = """
 from nics_drl_bridge.constants import STEP
@@ -213,3 +214,15 @@ def test_asking_for_any_place_of_an_array_changes_nothing(index):
     values = np.array([1.0, 2.0, 4.0])
     assert _asked(values, index) == 5.0
     assert values.tolist() == [1.0, 2.0, 4.0]
+
+
+def test_a_bound_kernel_takes_what_its_arrays_hold_when_it_is_called():
+    out = np.zeros((1, 2))
+    actions = np.zeros((1, 2))
+    scale = kernels.bind(scale_actions, out, actions, np.zeros(2), np.full(2, 4.0))
+    for number in (-1.0, 0.0, 1.0):
+        actions[:] = number
+        assert scale() is True
+        assert np.array_equal(out, np.full((1, 2), 2.0 + 2.0 * number))
+    actions[0, 1] = np.nan
+    assert scale() is False

@@ -10,12 +10,12 @@ import numpy as np
 from nics_drl_bridge import defaults, extensions
 from nics_drl_bridge.arguments import check_arguments, check_options, format_value
 from nics_drl_bridge.env import guard
-from nics_drl_bridge.env.guard import give, refuse_after_close, stop_on_error
+from nics_drl_bridge.env.direct import DirectSteps, bind_steps
+from nics_drl_bridge.env.guard import give, guard_call, stop_on_error
 from nics_drl_bridge.env.registry import make_task
-from nics_drl_bridge.env.sim_backend import SimBackend, complete_backend, make_backend
+from nics_drl_bridge.env.sim_backend import complete_backend, make_backend
 from nics_drl_bridge.env.snapshot import Snapshot, find_gate, find_goals
 from nics_drl_bridge.env.task import (
-    BoundStep,
     Episodes,
     Info,
     Memory,
@@ -28,7 +28,7 @@ from nics_drl_bridge.env.task import (
 )
 from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.generator import SimulatorModel, open_model
-from nics_drl_bridge.interface import Backend, RobotView, Start
+from nics_drl_bridge.interface import Array, Backend, RobotView, Start
 from nics_drl_bridge.lidar.arrays import AnyArray, Singles
 from nics_drl_bridge.lidar.sensor import unread
 from nics_drl_bridge.random_kernels import episode_seed
@@ -166,8 +166,7 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
             backend = make_backend(backend, self.model, self.world, **options)
         self._backend = complete_backend(backend, self._get_row(self._rest))
 
-    @refuse_after_close
-    @stop_on_error
+    @guard_call
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Singles, Info]:
@@ -236,24 +235,15 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
         self._rehearsed = True
 
     @cached_property
-    def _direct(self) -> tuple[RobotView, BoundStep] | None:
-        """A view of the simulator's own arrays, and the task's step on it, without copies."""
-        backend = self._backend
-        if self.robots > 1 or type(backend) is not SimBackend:
-            return None  # a subclass of the backend may move and measure in its own way
-        view = backend.get_live_view()
-        if view is None or not self.task.binds_all:
-            return None
-        step = self.task.bind(view)
-        return None if step is None else (view, step)
+    def _direct(self) -> DirectSteps | None:
+        return bind_steps(self._backend, self.task)
 
     def __getstate__(self) -> dict[str, Any]:
         state = dict(vars(self))
         state.pop("_direct", None)  # a copy binds its own simulator
         return state
 
-    @refuse_after_close
-    @stop_on_error
+    @guard_call
     def step(self, action: AnyArray) -> tuple[Observation, float, bool, bool, Info]:
         """Applies an action for one control period; see Gymnasium."""
         observation, terms, info = self._advance(action)
@@ -269,8 +259,7 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
             self.render()
         return observation, reward, all(self.ended.tolist()), False, info
 
-    @refuse_after_close
-    @stop_on_error
+    @guard_call
     def advance(self, action: AnyArray) -> tuple[Singles, Terms, Info]:
         """Advances one period; returns observations (M, O), reward terms (M,) by name, and `info`.
 
@@ -285,11 +274,16 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
         before = self._view
         if before is None:
             raise gymnasium.error.ResetNeeded("call reset() before step().")
-        given = guard.check_action(action, self.action_space, "action")
-        self._commands = self.task.drive(given.reshape(self._each), self.ended[None])
         self._steps += 1
-        if self._direct is not None:
-            return self._advance_directly(*self._direct)
+        direct = self._direct
+        if direct is not None:
+            if not direct.take_action(action):
+                direct.commands[...] = self._make_commands(action)
+            self._commands = direct.commands
+            observation, terms, ended, info = direct.advance(self.memory)
+            self.ended[0] = ended
+            return observation, terms, info
+        self._commands = self._make_commands(action)
         seen, facts = self._backend.step(self._commands[self._row])
         self._facts = facts
         view = self._lift(seen)
@@ -308,15 +302,9 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
             facts[name] = row.copy() if row.ndim else row.item()
         return out.reshape(-1), terms, self._make_info(view, facts)
 
-    def _advance_directly(
-        self, view: RobotView, step: BoundStep
-    ) -> tuple[Singles, dict[str, float], Info]:
-        before = view.pose[0].copy()
-        backend: Any = self._backend
-        self._facts = backend.move(self._commands)
-        observation, terms, ended, judged = step(before, self.memory)
-        self.ended[0] = ended
-        return observation, terms, self._make_info(view, self._facts | judged)
+    def _make_commands(self, action: AnyArray) -> Array:
+        given = guard.check_action(action, self.action_space, "action")
+        return self.task.drive(given.reshape(self._each), self.ended[None])
 
     def halt(self) -> None:
         """Stops the robot until the next reset; any exception does this, too."""
@@ -351,10 +339,11 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
             info["sensed_age_s"] = view.sensed_age_s
         return info | facts
 
-    @refuse_after_close
-    @stop_on_error
+    @guard_call
     def render(self) -> Any:
         """Draws the current world from above; see Gymnasium."""
+        if self.scene is None:
+            raise gymnasium.error.ResetNeeded("call reset() before render().")
         if self.render_mode is None:
             return None
         if self._picture is None:
@@ -390,7 +379,7 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
             covariance=None
             if covariance is None
             else np.reshape(covariance, (-1, 3, 3)),
-            commands=self._commands[0],
+            commands=self._commands[0].copy(),
             gate=find_gate(known),
         )
 

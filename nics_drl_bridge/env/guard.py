@@ -47,6 +47,11 @@ class ClosedEnvError(ConfigError, gymnasium.error.ClosedEnvironmentError):
     """A method was called after `close`."""
 
 
+def _make_closed_error(method: Callable[..., Any]) -> ClosedEnvError:
+    call = f"{method.__name__}() after close()"
+    return ClosedEnvError(f"{call}: the env is closed; make a new one.")
+
+
 def refuse_after_close(
     method: Callable[Concatenate[Any, P], T],
 ) -> Callable[Concatenate[Any, P], T]:
@@ -55,10 +60,27 @@ def refuse_after_close(
     @wraps(method)
     def call_guarded(self: Any, /, *args: P.args, **kwargs: P.kwargs) -> T:
         if self._closed:
-            raise ClosedEnvError(
-                f"{method.__name__}() after close(): the env is closed; make a new one."
-            )
+            raise _make_closed_error(method)
         return method(self, *args, **kwargs)
+
+    return call_guarded
+
+
+def guard_call(
+    method: Callable[Concatenate[Any, P], T],
+) -> Callable[Concatenate[Any, P], T]:
+    """Does what `refuse_after_close` and `stop_on_error` do, in one call, which saves time."""
+
+    @wraps(method)
+    def call_guarded(self: Any, /, *args: P.args, **kwargs: P.kwargs) -> T:
+        if self._closed:
+            raise _make_closed_error(method)
+        try:
+            return method(self, *args, **kwargs)
+        except BaseException:
+            with delay_interrupts():
+                self.halt()
+            raise
 
     return call_guarded
 

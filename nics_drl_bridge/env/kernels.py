@@ -48,18 +48,6 @@ class NavigationRules(NamedTuple):
     collision_reward: float
 
 
-class NavigationStep(NamedTuple):
-    """Arguments of `navigate` that stay in place from step to step."""
-
-    out: Singles
-    terms: Array
-    flags: Mask
-    pose: Array
-    twist: Array
-    ranges: Singles
-    rules: Any  # NavigationRules, packed
-
-
 @kernel
 def compute_episode_seeds(seeds: Integers, numbers: Integers, out: Integers) -> None:
     """Computes seeds (n,) of episodes from their numbers (n,) and their envs' seeds (n,)."""
@@ -68,13 +56,17 @@ def compute_episode_seeds(seeds: Integers, numbers: Integers, out: Integers) -> 
 
 
 @kernel
-def scale_actions(out: Array, actions: Singles, low: Array, high: Array) -> None:
-    """Scales actions (R, C), clamped to [-1, 1], to commands (R, C) between their limits (C,)."""
+def scale_actions(out: Array, actions: Singles, low: Array, high: Array) -> bool:
+    """Scales actions (R, C), clamped to [-1, 1], to commands (R, C) between their limits (C,).
+
+    Returns False if an action is not finite.
+    """
     for i in range(len(out)):
         for c in range(out.shape[1]):
             action = min(max(float(actions[i, c]), -1.0), 1.0)
             share = (action + 1.0) / 2.0
             out[i, c] = low[c] + share * (high[c] - low[c])
+    return is_finite(actions)
 
 
 @kernel
@@ -207,23 +199,6 @@ def navigate(
         out[i, parts + 2] = s
         for k in range(3):
             out[i, parts + 3 + k] = min(max(twist[i, k], -LIMIT), LIMIT)
-
-
-@kernel(allocates=True)
-def navigate_in_place(packed: Any, before: Array, goals: Array) -> None:
-    """Takes a step like `navigate`, with a packed NavigationStep, which saves time."""
-    step = packed.content
-    navigate(
-        step.out,
-        step.terms,
-        step.flags,
-        before,
-        step.pose,
-        step.twist,
-        step.ranges,
-        goals,
-        step.rules,
-    )
 
 
 @kernel

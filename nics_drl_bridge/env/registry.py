@@ -157,6 +157,7 @@ def register_envs() -> None:
                 entry_point="nics_drl_bridge.env.bridge_env:BridgeEnv",
                 vector_entry_point="nics_drl_bridge.env.vector_env:BridgeVectorEnv",
                 max_episode_steps=defaults.EPISODE_STEPS,
+                order_enforce=False,  # the env does
                 kwargs=dict(arguments),
             )
 

@@ -60,21 +60,26 @@ class SimBackend:
         ]
         self._period_ns = round(model.control_period * NS_PER_S)
         self._row: Any = (0, 0) if robots == 1 else 0
-        self._now_ns = 0
 
     def reset(self, start: Start) -> RobotView:
         """Starts the episode of a seed; see `interface.Backend`."""
         starts = start.pose.reshape(1, -1, 3)
         self.simulator.reset([start.seed], starts=starts)
-        self._now_ns = 0
         for middleware, pose in zip(self._middlewares, starts[0], strict=False):
-            middleware.reset(self._now_ns, pose)
+            middleware.reset(self.now_ns, pose)
         return self._measure()
 
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
         """Moves the robots by one control period; see `interface.Backend`."""
-        facts = self.move(command.reshape(1, self.simulator.data.pose.shape[1], -1))
+        commands = command.reshape(1, self.simulator.data.pose.shape[1], -1)
+        if self._middlewares:
+            # Round like a message, so that both backends agree.
+            commands = self._robot.pass_through_cmd_vel(commands)
+            for middleware, one in zip(self._middlewares, commands[0], strict=True):
+                middleware.command(self.now_ns, one)
+        self.simulator.step(commands)
         view = self._measure()
+        facts = {"stamp_ns": self.now_ns, **self._get_truth()}
         if self._middlewares:  # covariance at the time of this view
             covariances = np.array(
                 [one.estimator.covariance[:3, :3] for one in self._middlewares]
@@ -83,16 +88,10 @@ class SimBackend:
             facts["covariance"] = covariances[0] if alone else covariances
         return view, facts
 
-    def move(self, commands: Array) -> dict[str, Any]:
-        """Moves the robots like `step`, by commands (1, M, C), and returns only the facts."""
-        if self._middlewares:
-            # Round like a message, so that both backends agree.
-            commands = self._robot.pass_through_cmd_vel(commands)
-            for middleware, one in zip(self._middlewares, commands[0], strict=True):
-                middleware.command(self._now_ns, one)
-        self.simulator.step(commands)
-        self._now_ns += self._period_ns
-        return {"stamp_ns": self._now_ns, **self._get_truth()}
+    @property
+    def now_ns(self) -> int:
+        """Time since the start of the episode."""
+        return self.simulator.data.steps.item(0) * self._period_ns
 
     def get_live_view(self) -> RobotView | None:
         """Returns a view (1, M) of the simulator's own arrays; None if a view needs more."""
@@ -130,7 +129,7 @@ class SimBackend:
 
     def _measure(self) -> RobotView:
         data = self.simulator.data
-        now = self._now_ns
+        now = self.now_ns
         row = self._row
         odom = data.odom[row].copy()
         twist = data.twist[row].copy()

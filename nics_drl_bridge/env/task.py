@@ -31,8 +31,8 @@ Memory = dict[str, AnyArray]
 Facts = dict[str, AnyArray]  # for `info`, by name
 Info = dict[str, Any]  # Gymnasium's `info`
 Terms = dict[str, Array]  # of the reward, by name
-BoundStep = Callable[[Array, Memory], tuple[Observation, dict[str, float], bool, Info]]
-"""A step from a pose (1, 3): observation (O,), reward terms, True at the end, facts for `info`."""
+BoundStep = Callable[[Memory], tuple[Observation, dict[str, float], bool, Info]]
+"""Judges a step: observation (O,), reward terms, True at the end, and facts for `info`."""
 DRIVES = (
     (0, 0, 0),
     (1, 0, 0),
@@ -295,8 +295,8 @@ class Task(ABC):
             )
         return Outcome(terms, ended, info)
 
-    def bind(self, view: RobotView) -> BoundStep | None:
-        """Binds the steps of one robot to its view (1, 1), whose arrays change in place.
+    def bind(self, before: Array, view: RobotView) -> BoundStep | None:
+        """Binds the steps of one robot to its view (1, 1) and its pose before (1, 1, 3), in place.
 
         A class may override it to do all parts of a step in one small call of a kernel, which saves
         most of the time in the fast simulator. It is left out if a subclass overrides a part, or

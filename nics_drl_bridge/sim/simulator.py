@@ -19,7 +19,7 @@ from nics_drl_bridge import defaults
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import hash_bytes
 from nics_drl_bridge.generator import SimulatorModel, footprint_shape
-from nics_drl_bridge.kernels import pack
+from nics_drl_bridge.kernels import bind, pack
 from nics_drl_bridge.lidar import scan_kernels
 from nics_drl_bridge.lidar.arrays import Array, Integers
 from nics_drl_bridge.lidar.bake import add_shapes
@@ -137,16 +137,15 @@ class CommandRange:
         if not self._unreported:
             return
         flat = commands.reshape(-1, commands.shape[-1])
-        lowest = flat.min(axis=0)
-        highest = flat.max(axis=0)
-        outside = (lowest < self._low) | (highest > self._high)
+        outside = (flat < self._low) | (flat > self._high)
         if not outside.any():
             return
-        for c in np.flatnonzero(outside).tolist():
+        for c in np.flatnonzero(outside.any(axis=0)).tolist():
             name = self._names[c]
             if not self._unreported.pop(name, False):
                 continue
-            value = lowest[c] if lowest[c] < self._low[c] else highest[c]
+            lowest = flat[:, c].min()
+            value = lowest if lowest < self._low[c] else flat[:, c].max()
             low, high = self._fitted[:, c]
             self._tell(
                 f"{name} is {value:.4g}, but the model was fitted to {low:.4g} to {high:.4g} only: "
@@ -272,6 +271,7 @@ class FastSimulator:
         self.readings = unread(model.sensors, worlds, robots)
         edges = np.arange(min(threads, worlds) + 1) * worlds // min(threads, worlds)
         self.parts = tuple(slice(*ends) for ends in itertools.pairwise(edges.tolist()))
+        self._command_shape = (robots, len(model.robot.command))
         self._command_range = CommandRange(model.kinematics, model.robot, tell)
 
     def reset(
@@ -353,6 +353,18 @@ class FastSimulator:
     def step_part(self, part: slice, commands: ArrayLike) -> None:
         """Move the worlds of one of `parts` under commands (n, M, C), in the calling thread."""
         self._step(part, self._check_commands(part, commands))
+
+    def bind_step(self, commands: Array) -> Callable[[], None]:
+        """Return `step` by commands that change in place, of one part without further sensors."""
+        step_worlds = bind(step_kernels.step_worlds, self.packed[0], commands, 0)
+        steps = self.data.steps
+
+        def step() -> None:
+            if steps.item(0) % CHECK_INTERVAL == 0:
+                self._command_range.check(commands)
+            step_worlds()
+
+        return step
 
     def run_parts(self, function: Callable[[slice], Result]) -> list[Result]:
         """Run a function for each of `parts`, one thread per part; return the results."""
@@ -535,15 +547,12 @@ class FastSimulator:
 
     def _check_commands(self, part: slice, commands: ArrayLike) -> Array:
         """Return commands (n, M, C) as an array; report those outside the range of the fit."""
-        checked = np.ascontiguousarray(commands, np.float64)
-        robots, _, width = self.data.history.shape[1:]
-        expected = (part.stop - part.start, robots, width)
+        checked = np.ascontiguousarray(commands, dtype=np.float64)
+        expected = (part.stop - part.start, *self._command_shape)
         if checked.shape != expected:
-            raise ConfigError(
-                f"commands are {checked.shape}; they must be {expected}: worlds, "
-                "robots, and a robot's commands."
-            )
-        if self.data.steps[part.start] % CHECK_INTERVAL == 0:
+            needed = f"they must be {expected}: worlds, robots, and a robot's commands."
+            raise ConfigError(f"commands are {checked.shape}; {needed}")
+        if self.data.steps.item(part.start) % CHECK_INTERVAL == 0:
             self._command_range.check(checked)
         return checked
 

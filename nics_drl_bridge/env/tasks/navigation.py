@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 
 from nics_drl_bridge.env import kernels, task
-from nics_drl_bridge.env.kernels import LIMIT, NavigationRules, NavigationStep
+from nics_drl_bridge.env.kernels import LIMIT, NavigationRules
 from nics_drl_bridge.env.task import (
     BoundStep,
     Episodes,
@@ -22,7 +22,7 @@ from nics_drl_bridge.env.task import (
     Terms,
 )
 from nics_drl_bridge.interface import Array, RobotView
-from nics_drl_bridge.kernels import pack
+from nics_drl_bridge.kernels import bind, pack
 
 # rewards in the order of `kernels.navigate`, whose last row is none
 TERMS = ("progress", "time", "success", "collision")
@@ -138,35 +138,44 @@ class Navigation(Task):
         facts = {"is_success": flags[2], "collision": flags[1]}
         return Outcome(dict(zip(TERMS, terms, strict=False)), flags[3], facts)
 
-    def bind(self, view: RobotView) -> BoundStep | None:
+    def bind(self, before: Array, view: RobotView) -> BoundStep | None:
         """Binds steps to a view; see `Task.bind`. There are none with further sensors."""
         if self.sensors:
             return None
-        out = np.empty((1, *self.observation_space.shape), np.float32)
+        observation = np.empty(self.observation_space.shape, np.float32)
         terms = np.empty(5)
         flags = np.empty(4, np.bool_)
-        step = pack(
-            NavigationStep(
-                out,
-                terms[:, None],
-                flags[:, None],
-                view.pose[0],
-                view.twist[0],
-                view.ranges[0],
-                self._rules,
-            )
+        goals = np.empty((1, 2))
+        navigate = bind(
+            kernels.navigate,
+            observation[None],
+            terms[:, None],
+            flags[:, None],
+            before[0],
+            view.pose[0],
+            view.twist[0],
+            view.ranges[0],
+            goals,
+            self._rules,
         )
 
-        def take_step(
-            before: Array, memory: Memory
+        def judge(
+            memory: Memory,
         ) -> tuple[Observation, dict[str, float], bool, Info]:
-            kernels.navigate_in_place(step, before, memory["goal"][0])
+            goals[0] = memory["goal"]
+            navigate()
+            progress, time, success, collision, _ = terms.tolist()
+            paid = {
+                "progress": progress,
+                "time": time,
+                "success": success,
+                "collision": collision,
+            }
             _, touched, succeeded, ended = flags.tolist()
             facts = {"is_success": succeeded, "collision": touched}
-            paid = dict(zip(TERMS, terms.tolist(), strict=False))
-            return out[0].copy(), paid, ended, facts
+            return observation.copy(), paid, ended, facts
 
-        return take_step
+        return judge
 
     def _observe(
         self,

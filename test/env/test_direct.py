@@ -1,0 +1,100 @@
+"""Direct steps: the same as those through the task's and the backend's own methods."""
+
+import gymnasium
+import numpy as np
+import pytest
+from robots import direct_model, field
+
+from nics_drl_bridge.env.bridge_env import BridgeEnv
+from nics_drl_bridge.env.registry import NAVIGATION
+from nics_drl_bridge.env.tasks.navigation import Navigation
+
+
+class Driving(Navigation):
+    """Navigation that drives by a method of its own."""
+
+    def drive(self, actions, ended):
+        return super().drive(actions, ended)
+
+
+ACTION = [0.3, -2.0, 0.1]
+WAYS_TO_SAY = {
+    "a list": ACTION,
+    "doubles": np.array(ACTION),
+    "floats": np.array(ACTION, np.float32),
+    "half floats": np.array(ACTION, np.float16),
+    "every second number": np.repeat(ACTION, 2)[::2],
+    "integers": np.array([1, -1, 0]),
+}
+NUMBERS = {"an int": 2, "an int64": np.int64(2), "an array": np.array(2)}
+
+
+def take_step(task, actions, action):
+    env = BridgeEnv("sim", direct_model(), field(), task, {"actions": actions})
+    assert env._direct is not None
+    env.reset(seed=0)
+    return env.step(action)
+
+
+@pytest.mark.parametrize("name", WAYS_TO_SAY)
+def test_an_action_of_any_type_is_driven_as_by_the_task(name):
+    steps = [
+        take_step(task, "continuous", WAYS_TO_SAY[name])
+        for task in (Navigation, Driving)
+    ]
+    np.testing.assert_equal(steps[0], steps[1])
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_a_discrete_action_of_any_type_is_driven_as_by_the_task(name):
+    steps = [
+        take_step(task, "discrete", NUMBERS[name]) for task in (Navigation, Driving)
+    ]
+    np.testing.assert_equal(steps[0], steps[1])
+
+
+@pytest.mark.parametrize(
+    ("actions", "action"),
+    [
+        ("continuous", np.array([0.0, np.nan, 0.0], np.float32)),
+        ("continuous", np.array([0.0, np.inf, 0.0])),
+        ("continuous", np.zeros(1, np.float32)),
+        ("continuous", 1.0),
+        ("discrete", -1),
+        ("discrete", 9),
+        ("discrete", True),
+        ("discrete", 1.0),
+    ],
+)
+def test_an_action_that_is_none_is_refused_and_ends_the_episode(actions, action):
+    env = gymnasium.make(
+        NAVIGATION,
+        model=direct_model(),
+        world=field(),
+        task_options={"actions": actions},
+    )
+    env.reset(seed=0)
+    with pytest.raises(gymnasium.error.InvalidAction):
+        env.step(action)
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(env.action_space.sample())
+
+
+@pytest.mark.parametrize("mode", [None, "rgb_array"])
+def test_a_made_env_neither_steps_nor_draws_before_its_first_reset(mode):
+    env = gymnasium.make(
+        NAVIGATION, model=direct_model(), world=field(), render_mode=mode
+    )
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(env.action_space.sample())
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.render()
+
+
+def test_commands_beyond_what_was_fitted_are_told_of(recwarn):
+    """Direct steps do not pass the simulator's own check."""
+    env = BridgeEnv()
+    env._backend.simulator._command_range._low[:] = np.inf
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    assert any("was fitted to" in str(warning.message) for warning in recwarn)
