@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge import geometry
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.shapes import (
@@ -30,6 +31,14 @@ class Box:
     middle: Array  # (2,) x, y [m]
     heading: float  # [rad]
     size: tuple[float, float]  # length and width [m]
+
+    @property
+    def corners(self) -> Array:
+        """(4, 2) [m]."""
+        signs = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)])
+        return self.middle + geometry.rotate(
+            0.5 * signs * np.array(self.size), self.heading
+        )
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,317 @@
+"""Robots in DART: one on an infinite floor, or several in a world, like FastSimulator."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.errors import BackendError
+from nics_drl_bridge.extras.dart import scenery
+from nics_drl_bridge.extras.dart.machines import GRAVITY, Builder
+from nics_drl_bridge.extras.physics.machines import (
+    STEERING_TORQUE,
+    Machine,
+    Physics,
+    design_machine,
+)
+from nics_drl_bridge.extras.physics.scenery import (
+    cut_shape,
+    cut_world,
+)
+from nics_drl_bridge.extras.physics.simulator import (
+    PhysicsRobot,
+    PhysicsSimulator,
+    Reading,
+    Rig,
+)
+from nics_drl_bridge.generator import SimulatorModel, footprint_shape
+from nics_drl_bridge.interface import Array
+from nics_drl_bridge.lidar import fault_kernels
+from nics_drl_bridge.lidar.exact_kernels import RADIUS, SHAPE
+from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.sim.randomisation import Randomisation
+from nics_drl_bridge.sim.scenes import Scenes
+from nics_drl_bridge.sim.simulator import Starts
+from nics_drl_bridge.sim.world_set import AnyWorld
+
+PHYSICS = Physics(timestep=0.002)
+
+
+class DartRig(Rig):
+    """Access to one robot in a world of DART, and its motors.
+
+    Motors follow a wanted state with their lag, and hold its speeds while the tyres can. A
+    differential between driven wheels gives each the speed of its own circle.
+    """
+
+    def __init__(
+        self,
+        dart: Any,
+        world: Any,
+        spec: RobotSpec,
+        machine: Machine,
+        skeleton: Any,
+        physics: Physics,
+    ) -> None:
+        super().__init__(spec, machine)
+        self._world = world
+        self._skeleton = skeleton
+        self._frame = dart.dynamics.Frame.World()
+        self.base = skeleton.getRootBodyNode()
+        self._joints = [
+            skeleton.getJoint(name).getIndexInSkeleton(0) for name in machine.joints
+        ]
+        weight = skeleton.getMass() * GRAVITY
+        torque = physics.friction * weight * machine.radius
+        for name, dof in zip(machine.joints, self._joints, strict=True):
+            servo = dart.dynamics.ActuatorType.SERVO
+            skeleton.getJoint(name).setActuatorType(servo)
+            steers = name.startswith("steer")
+            limit = STEERING_TORQUE if steers else torque
+            skeleton.getDof(dof).setForceLimits(-limit, limit)
+        self._timestep = physics.timestep
+        self._follows = -np.expm1(-physics.timestep / np.array(machine.lags))
+        self._wanted = np.zeros(len(machine.lags))
+        self._followed = np.zeros(len(machine.lags))
+
+    def put(self, pose: ArrayLike) -> None:
+        """See `Rig`."""
+        scenery.place_body(self.base, np.asarray(pose), self.machine.radius)
+        self._wanted = np.zeros_like(self._wanted)
+        self._followed = np.zeros_like(self._wanted)
+
+    def launch(self, twist: Array, state: Array) -> None:
+        """See `Rig`."""
+        speeds = np.zeros(self._skeleton.getNumDofs())
+        speeds[2] = twist[2]
+        speeds[3:5] = geometry.rotate(twist[:2], self.heading())
+        self._skeleton.setVelocities(speeds)
+        self._followed = np.array(state)
+
+    def motion(self) -> tuple[Array, ...]:
+        """See `Rig`."""
+        skeleton = self._skeleton
+        moves = skeleton.getPositions(), skeleton.getVelocities()
+        return *moves, self._wanted, self._followed
+
+    def resume(self, motion: tuple[Array, ...]) -> None:
+        """See `Rig`."""
+        positions, speeds, self._wanted, self._followed = motion
+        self._skeleton.setPositions(positions)
+        self._skeleton.setVelocities(speeds)
+
+    def drive(self, wanted: Array) -> None:
+        """See `Rig`."""
+        self._wanted = wanted
+
+    def turn_wheels(self) -> None:
+        """Sets the speeds of the joints for the next time step."""
+        self._followed = self._followed + self._follows * (
+            self._wanted - self._followed
+        )
+        speeds = self.machine.controls(self._followed)
+        if self.machine.kind == "ackermann":
+            split = self.machine.half_ratio * np.tan(self._followed[1])
+            engine, *angles = speeds
+            missing = (angles - self.encoders()[2:]) / self._timestep
+            speeds = np.array(
+                [engine * (1.0 - split), engine * (1.0 + split), *missing]
+            )
+        self._skeleton.setCommands(self._joints, speeds)
+
+    def read(self) -> Reading:
+        """See `Rig`."""
+        place = self.base.getTransform().translation()
+        velocity = self.base.getLinearVelocity(self._frame, self.base)
+        turning = self.base.getAngularVelocity(self._frame, self.base)
+        return Reading(
+            time=float(self._world.getTime()),
+            pose=np.array([place[0], place[1], self.heading()]),
+            twist=np.array([velocity[0], velocity[1], turning[2]]),
+            state=self.machine.state(
+                self.encoders(), self._skeleton.getVelocities(self._joints)
+            ),
+        )
+
+    def heading(self) -> float:
+        """See `Rig`."""
+        rotation = self.base.getTransform().rotation()
+        return float(np.arctan2(rotation[1, 0], rotation[0, 0]))
+
+    def encoders(self) -> Array:
+        """See `Rig`."""
+        return np.array(self._skeleton.getPositions(self._joints))
+
+    def cosine_of_tilt(self) -> float:
+        """See `Rig`."""
+        return float(self.base.getTransform().rotation()[2, 2])
+
+
+class DartRobot(PhysicsRobot):
+    """A robot on an infinite floor in DART."""
+
+    engine = "DART"
+
+    def __init__(self, spec: RobotSpec, physics: Physics = PHYSICS) -> None:
+        self._dart = scenery.load_dart()
+        self.spec = spec
+        self.machine = design_machine(spec, physics, self.engine)
+        self._physics = physics
+        self.timestep = physics.timestep
+        self.reset(np.zeros(3))
+
+    def reset(self, pose: ArrayLike) -> Reading:
+        """See `PhysicsRobot`."""
+        self._world = scenery.make_world(self._dart, self._physics)
+        skeleton = Builder(self._dart, self.machine, self._physics).build("robot")
+        self._world.addSkeleton(skeleton)
+        parts = self.spec, self.machine, skeleton, self._physics
+        self.rig = self._rig = DartRig(self._dart, self._world, *parts)
+        self.rig.put(pose)
+        return self.read()
+
+    def advance(self, steps: int) -> None:
+        """See `PhysicsRobot`."""
+        for _ in range(steps):
+            self._rig.turn_wheels()
+            self._world.step()
+
+
+class DartSimulator(PhysicsSimulator):
+    """One world of robots in DART, which also casts the lidar's rays.
+
+    Scans that are late or skewed are the FastSimulator's, because they need the past.
+    """
+
+    def __init__(
+        self,
+        model: SimulatorModel,
+        world: AnyWorld,
+        robots: int = 1,
+        physics: Physics = PHYSICS,
+        randomisation: Randomisation | None = None,
+    ) -> None:
+        self._dart = scenery.load_dart()
+        super().__init__(model, world, robots, physics, randomisation=randomisation)
+
+    def design(self, spec: RobotSpec, physics: Physics) -> Machine:
+        """See `PhysicsSimulator`."""
+        return design_machine(spec, physics, "DART")
+
+    def compile(self, bodies: Array) -> list[DartRig]:
+        """See `PhysicsSimulator`."""
+        dart = self._dart
+        self._engine = scenery.make_world(dart, self._physics)
+        fixed = scenery.add_fixed_body(dart, self._engine, "scenery")
+        member = int(self.data.member[0])
+        level = self._machine.radius
+        seen = [
+            scenery.add_solid(dart, fixed, solid, level)
+            for solid in cut_world(self.world.members[member])
+        ]
+        self._moving = {}
+        for k in np.flatnonzero(bodies[:, RADIUS] > 0.0).tolist():
+            pose = bodies[k, :3]
+            body = fixed
+            if self.sampler.motions[member][k] is not None:
+                body = scenery.add_fixed_body(dart, self._engine, f"obstacle_{k}")
+                scenery.place_body(body, pose)
+                self._moving[k] = body
+                pose = scenery.ORIGIN
+            for solid in cut_shape(self.sampler.shapes[int(bodies[k, SHAPE])]):
+                seen.append(scenery.add_solid(dart, body, solid, level, pose=pose))
+        self._dart_rigs = self._add_robots(seen, [fixed, *self._moving.values()])
+        self._bumped: set[int] = set()
+        return self._dart_rigs
+
+    def _add_robots(self, seen: list[Any], obstacles: list[Any]) -> list[DartRig]:
+        """Adds the robots, of which only bumpers touch obstacles, and lets them see."""
+        dart = self._dart
+        spec = self.model.robot
+        height = self._machine.radius
+        builder = Builder(dart, self._machine, self._physics)
+        rigs = []
+        bumpers = []
+        for m in range(self.data.pose.shape[1]):
+            skeleton = builder.build(f"robot_{m}")
+            base = skeleton.getRootBodyNode()
+            solids = cut_shape(footprint_shape(spec))
+            bumpers.append(
+                [scenery.add_solid(dart, base, solid, 0.0, height) for solid in solids]
+            )
+            self._engine.addSkeleton(skeleton)
+            parts = self._machine, skeleton, self._physics
+            rigs.append(DartRig(dart, self._engine, spec, *parts))
+        bases = [rig.base for rig in rigs]
+        for rig in rigs:
+            wheels = rig.base.getSkeleton().getBodyNodes()[1:]
+            scenery.forbid_contact(self._engine, wheels, obstacles + bases)
+        floor = self._engine.getSkeleton("floor").getBodyNode(0)
+        scenery.forbid_contact(self._engine, bases, [floor])
+        self._groups = []
+        for bumper in bumpers:
+            others = [one for one in bumpers if one is not bumper]
+            self._groups.append(scenery.make_group(dart, sum(others, seen)))
+        return rigs
+
+    def refresh(self) -> None:
+        """See `PhysicsSimulator`."""
+
+    def place_obstacles(self, bodies: Array) -> None:
+        """See `PhysicsSimulator`."""
+        for k, body in self._moving.items():
+            scenery.place_body(body, bodies[k, :3])
+
+    def advance(self, steps: int) -> None:
+        """See `PhysicsSimulator`."""
+        self._bumped.clear()
+        for _ in range(steps):
+            for rig in self._dart_rigs:
+                rig.turn_wheels()
+            self._engine.step()
+            contacts = self._engine.getLastCollisionResult()
+            for m, rig in enumerate(self._dart_rigs):
+                if contacts.inCollision(rig.base):
+                    self._bumped.add(m)
+
+    def find_bumped(self) -> list[int]:
+        """See `PhysicsSimulator`."""
+        return list(self._bumped)
+
+    def step(self, commands: ArrayLike) -> None:
+        """See `PhysicsSimulator`."""
+        super().step(commands)
+        self._scan()
+
+    def check_motion(self) -> float:
+        """See `PhysicsSimulator`."""
+        time = float(self._engine.getTime())
+        if not all(np.isfinite(rig.encoders()).all() for rig in self._rigs):
+            what = f"the motion of robot {self.model.robot.name!r} diverges"
+            fix = "shorten the timestep of its Physics."
+            raise BackendError(f"DART has no number at {time:.2f} s: {what}; {fix}")
+        return time
+
+    def reset(
+        self, seeds: ArrayLike, worlds: ArrayLike | None = None, starts: Starts = None
+    ) -> Scenes:
+        """Starts the episode of a seed (1,) at poses (1, M, 3); see `FastSimulator.reset`."""
+        scenes = super().reset(seeds, worlds, starts)
+        self._scan()
+        return scenes
+
+    def _scan(self) -> None:
+        data = self.data
+        lidar = self.model.lidar
+        limits = lidar.range_min, lidar.range_max
+        robots = data.ranges.shape[1]
+        for m, group in enumerate(self._groups):
+            faults = data.faults[0, m]
+            if data.age[0, m] > 0 or faults[fault_kernels.SKEW] != 0.0:
+                continue
+            height = self._machine.radius
+            scan = scenery.cast_scan(self._dart, group, lidar, data.pose[0, m], height)
+            counter = int(data.steps[0]) * robots + m
+            fault_kernels.distort(scan, limits, faults, int(data.seeds[0]), counter)
+            data.ranges[0, m] = scan
