@@ -367,10 +367,10 @@ def of_nodes() -> list[Argument]:
 
 def of_simulator(robots: str = "1") -> list[Argument]:
     """Return the arguments of a simulator."""
-    kinds = ("simulator", "mujoco")
+    kinds = ("simulator", "mujoco", "dart")
     start = "Start x, y, heading [m, m, rad] of each robot; empty: drawn at random"
     return [
-        Argument("simulator", kinds[0], "The fast simulator, or MuJoCo", kinds),
+        Argument("simulator", kinds[0], "The fast simulator, MuJoCo or DART", kinds),
         Argument("world", "", "Shipped world, or a YAML file; empty: from params_file"),
         Argument(
             "robots", robots, "Number of robots, or their namespaces, as in '[a, b]'"

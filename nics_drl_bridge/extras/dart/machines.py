@@ -1,5 +1,6 @@
 """Robots as skeletons of DART; tyres are spheres, which touch the floor in one point."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,6 @@ from nics_drl_bridge.extras.physics.machines import (
 )
 from nics_drl_bridge.interface import Array
 
-GRAVITY = 9.81  # [m/s^2]
 Z = np.array([0.0, 0.0, 1.0])
 Y = np.array([0.0, 1.0, 0.0])
 SPHERES = 9  # that form a roller
@@ -27,21 +27,36 @@ CASTOR_MASS = 0.03  # [kg]
 PIVOT_MASS = 0.02  # of what steers a wheel [kg]
 PIVOT_INERTIA = 1e-4  # [kg m^2]
 ROTOR_INERTIA = 2e-7  # added to a roller's, which is too small to compute with [kg m^2]
-UPRIGHT = 0.9  # minimum component of an axle along y, or of a pivot along z
+ALIGNED = 0.9  # minimum component of an axle along y, or of a pivot along z
 
 
-class Builder:
-    """Builds skeletons of one machine."""
+@dataclass(frozen=True)
+class DartBody:
+    """A robot that is not yet in a world."""
 
+    skeleton: Any
+    joints: list[Any]  # those with encoders, in the order of the machine
+    height: float  # of its root above the floor [m]
+
+
+def make_body(
+    dart: Any, machine: Machine, physics: Physics, file: Path | None = None
+) -> DartBody:
+    """Returns a machine's robot, read from a file if there is one. Raises ConfigError."""
+    if file is not None:
+        return _read_robot(dart, file, machine, physics)
+    return _Builder(dart, machine, physics).build()
+
+
+class _Builder:
     def __init__(self, dart: Any, machine: Machine, physics: Physics) -> None:
         self._dart = dart
         self._machine = machine
         self._physics = physics
 
-    def build(self, name: str) -> Any:
-        """Returns a robot, whose root is `base_link`, with its motors."""
+    def build(self) -> DartBody:
         machine = self._machine
-        skeleton = self._dart.dynamics.Skeleton(name)
+        skeleton = self._dart.dynamics.Skeleton("robot")
         _, base = skeleton.createFreeJointAndBodyNodePair()
         base.setName("base_link")
         mass = self._physics.mass
@@ -52,7 +67,8 @@ class Builder:
             self._add_castor(base, *machine.castor)
         for wheel in machine.wheels:
             self._add_wheel(base, wheel)
-        return skeleton
+        joints = [skeleton.getJoint(joint) for joint in machine.joints]
+        return DartBody(skeleton, joints, machine.radius)
 
     def _weigh(
         self,
@@ -129,18 +145,78 @@ class Builder:
         self._weigh(body, ROLLER_MASS, np.full(3, across + ROTOR_INERTIA))
 
 
-def read_robot(dart: Any, path: Path, machine: Machine) -> Any:
-    """Reads a robot from a URDF or SDF file, and names its joints as the machine's.
+def _read_robot(dart: Any, path: Path, machine: Machine, physics: Physics) -> DartBody:
+    """Reads a robot from a URDF or SDF file; its wheels are found by axles and places.
 
-    Raises ConfigError if it can't be read, or its joints do not match.
+    Raises ConfigError if it can't be read, or has no wheel, or several, where the machine has one.
     """
-    uri = dart.common.Uri(path.absolute().as_uri())
     if not path.is_file():
         raise ConfigError(f"robot {str(path)!r}: no such file.")
+    uri = dart.common.Uri(path.absolute().as_uri())
+    reader = dart.utils.DartLoader().parseSkeleton
     if path.suffix == ".sdf":
-        skeleton = dart.utils.SdfParser.readSkeleton(uri)
-    else:
-        skeleton = dart.utils.DartLoader().parseSkeleton(uri)
+        reader = dart.utils.SdfParser.readSkeleton
+    try:
+        skeleton = reader(uri)
+    except RuntimeError as error:
+        raise ConfigError(f"robot {str(path)!r}: {error}; mend the file.") from None
     if skeleton is None:
         raise ConfigError(f"robot {str(path)!r}: DART can't read it; mend the file.")
-    return skeleton
+    skeleton.resetPositions()
+    root = skeleton.getRootBodyNode()
+    hinges = [
+        _Hinge(dart, joint, root)
+        for joint in skeleton.getJoints()
+        if joint.getType() == "RevoluteJoint"
+    ]
+    wheels = [hinge for hinge in hinges if abs(hinge.axis[1]) > ALIGNED]
+    pivots = [hinge for hinge in hinges if abs(hinge.axis[2]) > ALIGNED]
+    for wheel in wheels:
+        for node in wheel.joint.getChildBodyNode().getShapeNodes():
+            if node.hasDynamicsAspect():
+                node.getDynamicsAspect().setFrictionCoeff(physics.friction)
+    joints = []
+    for name in machine.joints:
+        fitting = _find_fitting(name, pivots if name.startswith("steer") else wheels)
+        if len(fitting) != 1:
+            there = ", ".join(hinge.joint.getName() for hinge in hinges) or "none"
+            raise ConfigError(
+                f"robot {str(path)!r}: needs one joint as {name!r}, not {len(fitting)}; "
+                f"it has {there}."
+            )
+        fitting[0].turn_positive()
+        joints.append(fitting[0].joint)
+    height = machine.radius - float(np.mean([wheel.place[2] for wheel in wheels]))
+    return DartBody(skeleton, joints, height)
+
+
+class _Hinge:
+    """A joint of a robot at rest, seen from its root."""
+
+    def __init__(self, dart: Any, joint: Any, root: Any) -> None:
+        self.joint = joint
+        transform = joint.getChildBodyNode().getTransform(root)
+        self.axis = transform.rotation() @ joint.getAxis()
+        self.place = transform.translation()
+
+    def turn_positive(self) -> None:
+        """Lets positive speeds drive ahead, or turn to the left."""
+        if self.axis.sum() < 0.0:
+            self.joint.setAxis(-self.joint.getAxis())
+
+
+def _find_fitting(name: str, hinges: list[_Hinge]) -> list[_Hinge]:
+    """Returns the hinges on the side, and at the end, that the words of a name say."""
+    x, y, _ = np.array([hinge.place for hinge in hinges]).reshape(-1, 3).T
+    half_width = 0.5 * np.abs(y).max(initial=0.0)
+    middle = 0.5 * (x.min(initial=np.inf) + x.max(initial=-np.inf))
+    places = {
+        "left": y > half_width,
+        "right": y < -half_width,
+        "front": x > middle,
+        "rear": x < middle,
+    }
+    fits = np.ones(len(hinges), np.bool_)
+    for word in name.split("_"):
+        fits &= places.get(word, True)
+    return [hinge for hinge, is_fit in zip(hinges, fits, strict=True) if is_fit]

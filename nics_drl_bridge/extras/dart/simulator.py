@@ -1,5 +1,6 @@
 """Robots in DART: one on an infinite floor, or several in a world, like FastSimulator."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,7 @@ from numpy.typing import ArrayLike
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.extras.dart import scenery
-from nics_drl_bridge.extras.dart.machines import GRAVITY, Builder
+from nics_drl_bridge.extras.dart.machines import DartBody, make_body
 from nics_drl_bridge.extras.physics.machines import (
     STEERING_TORQUE,
     Machine,
@@ -36,6 +37,7 @@ from nics_drl_bridge.sim.simulator import Starts
 from nics_drl_bridge.sim.world_set import AnyWorld
 
 PHYSICS = Physics(timestep=0.002)
+GRAVITY = 9.81  # [m/s^2]
 
 
 class DartRig(Rig):
@@ -51,25 +53,23 @@ class DartRig(Rig):
         world: Any,
         spec: RobotSpec,
         machine: Machine,
-        skeleton: Any,
+        body: DartBody,
         physics: Physics,
     ) -> None:
         super().__init__(spec, machine)
         self._world = world
-        self._skeleton = skeleton
+        self._skeleton = body.skeleton
+        self._height = body.height
         self._frame = dart.dynamics.Frame.World()
-        self.base = skeleton.getRootBodyNode()
-        self._joints = [
-            skeleton.getJoint(name).getIndexInSkeleton(0) for name in machine.joints
-        ]
-        weight = skeleton.getMass() * GRAVITY
-        torque = physics.friction * weight * machine.radius
-        for name, dof in zip(machine.joints, self._joints, strict=True):
-            servo = dart.dynamics.ActuatorType.SERVO
-            skeleton.getJoint(name).setActuatorType(servo)
-            steers = name.startswith("steer")
-            limit = STEERING_TORQUE if steers else torque
-            skeleton.getDof(dof).setForceLimits(-limit, limit)
+        self.base = body.skeleton.getRootBodyNode()
+        self._joints = [joint.getIndexInSkeleton(0) for joint in body.joints]
+        # enough to let one tyre slide that carries all
+        torque = physics.friction * body.skeleton.getMass() * GRAVITY * machine.radius
+        for name, joint in zip(machine.joints, body.joints, strict=True):
+            joint.setActuatorType(dart.dynamics.ActuatorType.SERVO)
+            limit = STEERING_TORQUE if name.startswith("steer") else torque
+            joint.setForceLowerLimit(0, -limit)
+            joint.setForceUpperLimit(0, limit)
         self._timestep = physics.timestep
         self._follows = -np.expm1(-physics.timestep / np.array(machine.lags))
         self._wanted = np.zeros(len(machine.lags))
@@ -77,7 +77,7 @@ class DartRig(Rig):
 
     def put(self, pose: ArrayLike) -> None:
         """See `Rig`."""
-        scenery.place_body(self.base, np.asarray(pose), self.machine.radius)
+        scenery.place_body(self.base, np.asarray(pose), self._height)
         self._wanted = np.zeros_like(self._wanted)
         self._followed = np.zeros_like(self._wanted)
 
@@ -149,13 +149,16 @@ class DartRig(Rig):
 
 
 class DartRobot(PhysicsRobot):
-    """A robot on an infinite floor in DART."""
+    """A robot on an infinite floor in DART: built by its spec, or from a URDF or SDF file."""
 
     engine = "DART"
 
-    def __init__(self, spec: RobotSpec, physics: Physics = PHYSICS) -> None:
+    def __init__(
+        self, spec: RobotSpec, physics: Physics = PHYSICS, file: Path | None = None
+    ) -> None:
         self._dart = scenery.load_dart()
         self.spec = spec
+        self._file = file
         self.machine = design_machine(spec, physics, self.engine)
         self._physics = physics
         self.timestep = physics.timestep
@@ -164,9 +167,9 @@ class DartRobot(PhysicsRobot):
     def reset(self, pose: ArrayLike) -> Reading:
         """See `PhysicsRobot`."""
         self._world = scenery.make_world(self._dart, self._physics)
-        skeleton = Builder(self._dart, self.machine, self._physics).build("robot")
-        self._world.addSkeleton(skeleton)
-        parts = self.spec, self.machine, skeleton, self._physics
+        body = make_body(self._dart, self.machine, self._physics, self._file)
+        self._world.addSkeleton(body.skeleton)
+        parts = self.spec, self.machine, body, self._physics
         self.rig = self._rig = DartRig(self._dart, self._world, *parts)
         self.rig.put(pose)
         return self.read()
@@ -179,7 +182,7 @@ class DartRobot(PhysicsRobot):
 
 
 class DartSimulator(PhysicsSimulator):
-    """One world of robots in DART, which also casts the lidar's rays.
+    """One world of robots in DART, which also casts the lidar's rays; for `file` see DartRobot.
 
     Scans that are late or skewed are the FastSimulator's, because they need the past.
     """
@@ -191,8 +194,10 @@ class DartSimulator(PhysicsSimulator):
         robots: int = 1,
         physics: Physics = PHYSICS,
         randomisation: Randomisation | None = None,
+        file: Path | None = None,
     ) -> None:
         self._dart = scenery.load_dart()
+        self._file = file
         super().__init__(model, world, robots, physics, randomisation=randomisation)
 
     def design(self, spec: RobotSpec, physics: Physics) -> Machine:
@@ -230,18 +235,21 @@ class DartSimulator(PhysicsSimulator):
         dart = self._dart
         spec = self.model.robot
         height = self._machine.radius
-        builder = Builder(dart, self._machine, self._physics)
         rigs = []
         bumpers = []
         for m in range(self.data.pose.shape[1]):
-            skeleton = builder.build(f"robot_{m}")
-            base = skeleton.getRootBodyNode()
-            solids = cut_shape(footprint_shape(spec))
+            body = make_body(dart, self._machine, self._physics, self._file)
+            body.skeleton.setName(f"robot_{m}")
+            base = body.skeleton.getRootBodyNode()
+            level = height - body.height
             bumpers.append(
-                [scenery.add_solid(dart, base, solid, 0.0, height) for solid in solids]
+                [
+                    scenery.add_solid(dart, base, solid, level, height)
+                    for solid in cut_shape(footprint_shape(spec))
+                ]
             )
-            self._engine.addSkeleton(skeleton)
-            parts = self._machine, skeleton, self._physics
+            self._engine.addSkeleton(body.skeleton)
+            parts = self._machine, body, self._physics
             rigs.append(DartRig(dart, self._engine, spec, *parts))
         bases = [rig.base for rig in rigs]
         for rig in rigs:

@@ -36,6 +36,9 @@ class Physics:
     softness: float = 0.005
     bearing: float = 1e-6  # viscous friction of free wheels and rollers [N m s/rad]
     rollers: int = 12  # per mecanum wheel
+    # of robots that take the turn rate from a gyro, read every 0.01 s
+    gyro_bias: float = 0.0  # [rad/s]
+    gyro_noise: float = 0.0  # standard deviation of a reading [rad/s]
 
 
 @dataclass(frozen=True)

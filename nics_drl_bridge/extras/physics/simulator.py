@@ -198,6 +198,7 @@ class PhysicsSimulator(DrivenSimulator, ABC):
     ) -> Scenes:
         """Starts the episode of a seed (1,) at poses (1, M, 3); see `FastSimulator.reset`."""
         scenes = super().reset(seeds, worlds, starts)
+        self._gyro_noise = np.random.default_rng(int(self.data.seeds[0]))
         self._rigs = self.compile(scenes.bodies[0])
         for rig, pose in zip(self._rigs, self.data.pose[0], strict=True):
             rig.put(pose)
@@ -278,13 +279,19 @@ class PhysicsSimulator(DrivenSimulator, ABC):
             ]
             counted = self._twist(np.array(means)) * self._machine.calibrated
             if self._machine.gyro:
-                counted[:, 2] = geometry.wrap_angle(np.subtract(facing, faced)) / part_s
+                turned_by = geometry.wrap_angle(np.subtract(facing, faced))
+                counted[:, 2] = turned_by / part_s + self._draw_gyro_errors()
             wheels = geometry.compose(wheels, geometry.exp(counted * part_s))
         readings = [rig.read() for rig in rigs]
         pose, twist, state = (
             np.array([getattr(r, n) for r in readings]) for n in MOTION
         )
         self.end_period(pose, twist, state, wheels, counted, touched)
+
+    def _draw_gyro_errors(self) -> Array:
+        physics = self._physics
+        noise = self._gyro_noise.standard_normal(len(self._rigs))
+        return physics.gyro_bias + physics.gyro_noise * noise
 
 
 def divide(period: float, longest: float) -> tuple[int, int, float]:

@@ -21,6 +21,7 @@ NAMES = [
     *(pytest.param(name, marks=pytest.mark.campaign) for name in OTHERS),
 ]
 NOTCHED = [(-0.4, -0.4), (0.4, -0.4), (0.4, 0.4), (0.1, 0.4), (0.0, 0.0), (-0.4, 0.3)]
+BIASED = replace(PHYSICS, gyro_bias=0.05, gyro_noise=0.1)
 pytestmark = pytest.mark.slow
 
 
@@ -146,6 +147,29 @@ def test_wheel_odometry_is_wrong_after_a_turn_in_which_the_wheels_skid():
         errors[floor] = float(np.hypot(*off[:2]))
     assert errors["dry"] < 0.02
     assert errors["ice"] > 0.1
+
+
+def test_a_gyro_has_a_bias_and_noise_that_the_seed_draws():
+    model = builtin_model("jackal")
+    world = load_world("empty")
+    exact_turns, turns, again = (
+        stand(DartSimulator(model, world, physics=physics))
+        for physics in (PHYSICS, BIASED, BIASED)
+    )
+    assert np.array_equal(turns, again)
+    errors = turns - exact_turns
+    assert errors.mean() == pytest.approx(0.05, abs=0.01)
+    assert errors.std() == pytest.approx(0.1 / np.sqrt(10), rel=0.5)
+
+
+def stand(simulator: DartSimulator) -> np.ndarray:
+    """Turn rates by odometry of a robot at rest, by period [rad/s]."""
+    simulator.reset([3])
+    headings = [simulator.wheels[0, 2]]
+    for _ in range(20):
+        drive(simulator, forward(simulator.model, 0.0), 1)
+        headings.append(simulator.wheels[0, 2])
+    return np.diff(headings) / simulator.model.control_period
 
 
 @pytest.mark.parametrize("name", NAMES)
