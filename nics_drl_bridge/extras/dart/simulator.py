@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.extras.dart import scenery
 from nics_drl_bridge.extras.dart.machines import DartBody, make_body
 from nics_drl_bridge.extras.physics.machines import (
@@ -107,17 +106,15 @@ class DartRig(Rig):
 
     def turn_wheels(self) -> None:
         """Sets the speeds of the joints for the next time step."""
-        self._followed = self._followed + self._follows * (
-            self._wanted - self._followed
-        )
+        missing = self._wanted - self._followed
+        self._followed = self._followed + self._follows * missing
         speeds = self.machine.controls(self._followed)
         if self.machine.kind == "ackermann":
             split = self.machine.half_ratio * np.tan(self._followed[1])
             engine, *angles = speeds
-            missing = (angles - self.encoders()[2:]) / self._timestep
-            speeds = np.array(
-                [engine * (1.0 - split), engine * (1.0 + split), *missing]
-            )
+            turning = (angles - self.encoders()[2:]) / self._timestep
+            wheels = engine * (1.0 - split), engine * (1.0 + split)
+            speeds = np.array([*wheels, *turning])
         self._skeleton.setCommands(self._joints, speeds)
 
     def read(self) -> Reading:
@@ -170,14 +167,14 @@ class DartRobot(PhysicsRobot):
         body = make_body(self._dart, self.machine, self._physics, self._file)
         self._world.addSkeleton(body.skeleton)
         parts = self.spec, self.machine, body, self._physics
-        self.rig = self._rig = DartRig(self._dart, self._world, *parts)
+        self.rig = DartRig(self._dart, self._world, *parts)
         self.rig.put(pose)
         return self.read()
 
     def advance(self, steps: int) -> None:
         """See `PhysicsRobot`."""
         for _ in range(steps):
-            self._rig.turn_wheels()
+            self.rig.turn_wheels()
             self._world.step()
 
 
@@ -226,9 +223,7 @@ class DartSimulator(PhysicsSimulator):
                 pose = scenery.ORIGIN
             for solid in cut_shape(self.sampler.shapes[int(bodies[k, SHAPE])]):
                 seen.append(scenery.add_solid(dart, body, solid, level, pose=pose))
-        self._dart_rigs = self._add_robots(seen, [fixed, *self._moving.values()])
-        self._bumped: set[int] = set()
-        return self._dart_rigs
+        return self._add_robots(seen, [fixed, *self._moving.values()])
 
     def _add_robots(self, seen: list[Any], obstacles: list[Any]) -> list[DartRig]:
         """Adds the robots, of which only bumpers touch obstacles, and lets them see."""
@@ -263,43 +258,28 @@ class DartSimulator(PhysicsSimulator):
             self._groups.append(scenery.make_group(dart, sum(others, seen)))
         return rigs
 
-    def refresh(self) -> None:
-        """See `PhysicsSimulator`."""
-
     def place_obstacles(self, bodies: Array) -> None:
         """See `PhysicsSimulator`."""
         for k, body in self._moving.items():
             scenery.place_body(body, bodies[k, :3])
 
-    def advance(self, steps: int) -> None:
+    def advance(self, steps: int) -> list[int]:
         """See `PhysicsSimulator`."""
-        self._bumped.clear()
+        bumped = []
         for _ in range(steps):
-            for rig in self._dart_rigs:
+            for rig in self._rigs:
                 rig.turn_wheels()
             self._engine.step()
             contacts = self._engine.getLastCollisionResult()
-            for m, rig in enumerate(self._dart_rigs):
-                if contacts.inCollision(rig.base):
-                    self._bumped.add(m)
-
-    def find_bumped(self) -> list[int]:
-        """See `PhysicsSimulator`."""
-        return list(self._bumped)
+            bumped += [
+                m for m, rig in enumerate(self._rigs) if contacts.inCollision(rig.base)
+            ]
+        return bumped
 
     def step(self, commands: ArrayLike) -> None:
         """See `PhysicsSimulator`."""
         super().step(commands)
         self._scan()
-
-    def check_motion(self) -> float:
-        """See `PhysicsSimulator`."""
-        time = float(self._engine.getTime())
-        if not all(np.isfinite(rig.encoders()).all() for rig in self._rigs):
-            what = f"the motion of robot {self.model.robot.name!r} diverges"
-            fix = "shorten the timestep of its Physics."
-            raise BackendError(f"DART has no number at {time:.2f} s: {what}; {fix}")
-        return time
 
     def reset(
         self, seeds: ArrayLike, worlds: ArrayLike | None = None, starts: Starts = None
@@ -318,8 +298,10 @@ class DartSimulator(PhysicsSimulator):
             faults = data.faults[0, m]
             if data.age[0, m] > 0 or faults[fault_kernels.SKEW] != 0.0:
                 continue
-            height = self._machine.radius
-            scan = scenery.cast_scan(self._dart, group, lidar, data.pose[0, m], height)
+            pose = data.pose[0, m]
+            scan = scenery.cast_scan(
+                self._dart, group, lidar, pose, self._machine.radius
+            )
             counter = int(data.steps[0]) * robots + m
             fault_kernels.distort(scan, limits, faults, int(data.seeds[0]), counter)
             data.ranges[0, m] = scan

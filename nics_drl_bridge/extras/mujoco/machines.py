@@ -19,6 +19,7 @@ from nics_drl_bridge.robot.spec import RobotSpec
 
 # torque limit of a motor, relative to the torque of the maximum acceleration
 TORQUE_RESERVE = 1.5
+ROTOR = 0.25  # inertia of a geared motor, relative to its share of the robot's inertia
 SERVO_LAG_S = 0.005  # lag of a motor behind its set point
 # the same for a motor that keeps its speed although its tyres are dragged sideways
 STIFF_SERVO_LAG_S = 0.001
@@ -122,7 +123,7 @@ def _write_tyre(wheel: Wheel, machine: Machine, physics: Physics) -> str:
     radius = machine.radius
     width = 0.4 * radius
     damping = 0.0 if wheel.driven else physics.bearing
-    rotor = machine.rotor if wheel.driven else 0.0
+    rotor = _compute_rotor(machine, physics) if wheel.driven else 0.0
     return f"""
         <joint name="{wheel.name}" axis="0 1 0" damping="{damping}" armature="{rotor:.8g}"/>
         <geom type="cylinder" mass="{physics.wheel_mass}" size="{radius:.6g} {0.5 * width:.6g}"
@@ -133,6 +134,7 @@ def _write_tyre(wheel: Wheel, machine: Machine, physics: Physics) -> str:
 
 def _write_rollers(wheel: Wheel, machine: Machine, physics: Physics) -> str:
     radius = machine.radius
+    rotor = _compute_rotor(machine, physics)
     hub = physics.wheel_mass - physics.rollers * ROLLER_MASS
     rows = ""
     for roller in place_rollers(radius, physics.rollers, wheel.lean):
@@ -145,9 +147,19 @@ def _write_rollers(wheel: Wheel, machine: Machine, physics: Physics) -> str:
           <geom class="tread" type="ellipsoid" mass="{ROLLER_MASS}" size="{a:.8g} {a:.8g} {b:.8g}"/>
         </body>"""
     return f"""
-        <joint name="{wheel.name}" axis="0 1 0" armature="{machine.rotor:.8g}"/>
+        <joint name="{wheel.name}" axis="0 1 0" armature="{rotor:.8g}"/>
         <geom type="cylinder" mass="{hub:.6g}" size="{0.7 * radius:.6g} {0.3 * radius:.6g}"
               zaxis="0 1 0"/>{rows}"""
+
+
+def _count_driven(machine: Machine) -> int:
+    return sum(wheel.driven for wheel in machine.wheels)
+
+
+def _compute_rotor(machine: Machine, physics: Physics) -> float:
+    """Returns the inertia of a driven wheel's rotor [kg m^2]."""
+    share = physics.mass / _count_driven(machine)
+    return ROTOR * share * machine.radius**2
 
 
 def _write_motor(
@@ -155,7 +167,12 @@ def _write_motor(
 ) -> str:
     # Torque = gain x (wanted - actual speed), up to a limit. The wanted speed follows the command
     # with a first-order lag [s], so that the servo is stiff and keeps its speed under load.
-    inertia = machine.inertia
+    rotor = _compute_rotor(machine, physics)
+    mass = physics.mass / _count_driven(machine) + 1.5 * physics.wheel_mass
+    inertia = mass * machine.radius**2 + rotor
+    if machine.kind == "ackermann":  # one motor moves the robot, and four wheels
+        mass = physics.mass + 6.0 * physics.wheel_mass
+        inertia = mass * machine.radius**2 + 2.0 * rotor
     lag = machine.lags[0] - servo_lag
     gain = inertia / servo_lag
     torque = inertia * TORQUE_RESERVE * physics.acceleration / machine.radius

@@ -209,20 +209,13 @@ class MujocoSimulator(PhysicsSimulator):
             self._data.mocap_pos[mocap, :2] = bodies[k, :2]
             self._data.mocap_quat[mocap] = scenery.make_quaternion(bodies[k, 2])
 
-    def advance(self, steps: int) -> None:
+    def advance(self, steps: int) -> list[int]:
         """See `PhysicsSimulator`."""
-        self._mujoco.mj_step(self._simulation, self._data, nstep=steps)
-
-    def find_bumped(self) -> list[int]:
-        """See `PhysicsSimulator`."""
-        bumped = self._bumper_of[self._data.contact.geom.ravel()]
-        return [m for m in bumped.tolist() if m >= 0]
-
-    def check_motion(self) -> float:
-        """See `PhysicsSimulator`."""
-        time = float(self._data.time)
-        if any(warning.number for warning in self._data.warning):
+        data = self._data
+        self._mujoco.mj_step(self._simulation, data, nstep=steps)
+        if any(warning.number for warning in data.warning):
             what = f"the motion of robot {self.model.robot.name!r} diverges"
             fix = "shorten the timestep of its Physics."
-            raise BackendError(f"MuJoCo warns at {time:.2f} s that {what}; {fix}")
-        return time
+            raise BackendError(f"MuJoCo warns at {data.time:.2f} s that {what}; {fix}")
+        bumped = self._bumper_of[data.contact.geom.ravel()]
+        return [m for m in bumped.tolist() if m >= 0]

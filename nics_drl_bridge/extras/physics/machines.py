@@ -13,7 +13,6 @@ from nics_drl_bridge.robot.spec import RobotSpec
 
 Parameters = dict[str, float]
 
-ROTOR = 0.25  # inertia of a geared motor, relative to its share of the robot's inertia
 # torque limit of a steering servo, as of a small hobby servo [N m]
 STEERING_TORQUE = 1.0
 # maximum radius of a roller, relative to the radius of the wheel
@@ -62,8 +61,6 @@ class Machine:
     centre: tuple[float, float, float]  # of the chassis' mass in `base_link` [m]
     size: tuple[float, float, float]  # of the chassis [m]
     wheels: tuple[Wheel, ...]
-    rotor: float  # inertia of a driven wheel's rotor [kg m^2]
-    inertia: float  # at the shaft of a motor, with its share of the robot [kg m^2]
     lags: tuple[float, ...]  # (S,) of the motors behind each wanted state [s]
     joints: tuple[str, ...]  # names of the J joints with encoders
     # maps a wanted state (S,) to the actuators' inputs (U,)
@@ -94,7 +91,7 @@ def design_machine(spec: RobotSpec, physics: Physics, engine: str) -> Machine:
         (max(-v.min, v.max) for v in spec.state if v.unit == "rad"), default=0.0
     )
     try:
-        machine = _DESIGNS[kind](spec.parameters, physics)
+        machine = _DESIGNS[kind](spec.parameters)
     except KeyError as error:
         reason = f"the {kind} machine needs the parameter {error}; add it under `parameters:`."
         raise ConfigError(f"robot {spec.name!r}: {reason}") from None
@@ -105,12 +102,10 @@ def design_machine(spec: RobotSpec, physics: Physics, engine: str) -> Machine:
     return replace(machine, lags=lags, steepest=steepest)
 
 
-def _design_ackermann(p: Parameters, physics: Physics) -> Machine:
+def _design_ackermann(p: Parameters) -> Machine:
     # One motor turns both rear wheels by a differential.
     wheelbase = p["wheelbase"]
     track, radius = track_and_radius(p)
-    total = physics.mass + 4 * physics.wheel_mass
-    rotor = ROTOR * 0.5 * physics.mass * radius**2
     half_ratio = 0.5 * track / wheelbase
     wheels = []
     for side, y in (("left", 0.5 * track), ("right", -0.5 * track)):
@@ -139,8 +134,6 @@ def _design_ackermann(p: Parameters, physics: Physics) -> Machine:
         centre=(0.45 * wheelbase, 0.0, 0.0),
         size=(1.3 * wheelbase, 0.7 * track, 0.04),
         wheels=tuple(wheels),
-        rotor=rotor,
-        inertia=(total + 2 * physics.wheel_mass) * radius**2 + 2 * rotor,
         lags=(p["speed_lag"], p["steering_lag"]),
         joints=("rear_left", "rear_right", "steer_left", "steer_right"),
         controls=controls,
@@ -149,11 +142,9 @@ def _design_ackermann(p: Parameters, physics: Physics) -> Machine:
     )
 
 
-def _design_differential(p: Parameters, physics: Physics) -> Machine:
+def _design_differential(p: Parameters) -> Machine:
     radius = p["wheel_radius"]
     track = p["track"]
-    total = physics.mass + 2 * physics.wheel_mass
-    rotor = ROTOR * 0.5 * physics.mass * radius**2
     return Machine(
         kind="differential",
         radius=radius,
@@ -162,8 +153,6 @@ def _design_differential(p: Parameters, physics: Physics) -> Machine:
         centre=(-0.06 * track, 0.0, -0.55 * radius),
         size=(track, 0.7 * track, 0.03),
         wheels=(Wheel("left", (0.0, 0.5 * track)), Wheel("right", (0.0, -0.5 * track))),
-        rotor=rotor,
-        inertia=0.5 * (total + physics.wheel_mass) * radius**2 + rotor,
         lags=(p["wheel_lag"],),
         joints=("left", "right"),
         controls=lambda state: state,
@@ -172,12 +161,10 @@ def _design_differential(p: Parameters, physics: Physics) -> Machine:
     )
 
 
-def _design_mecanum(p: Parameters, physics: Physics) -> Machine:
+def _design_mecanum(p: Parameters) -> Machine:
     # Engines can't align anisotropic friction with the roller at the bottom of a turning wheel.
     # Free rollers are robust, and reproduce the slight vibration of real wheels.
     radius = p["wheel_radius"]
-    total = physics.mass + 4 * physics.wheel_mass
-    rotor = ROTOR * 0.25 * physics.mass * radius**2
     x = p["half_length"]
     y = p["half_width"]
     wheels = (
@@ -192,8 +179,6 @@ def _design_mecanum(p: Parameters, physics: Physics) -> Machine:
         centre=(0, 0, 0),
         size=(2.2 * x, 1.4 * y, 0.04),
         wheels=wheels,
-        rotor=rotor,
-        inertia=(0.25 * total + 0.5 * physics.wheel_mass) * radius**2 + rotor,
         lags=(p["wheel_lag"],),
         joints=tuple(wheel.name for wheel in wheels),
         controls=lambda state: state,
@@ -205,20 +190,17 @@ def _design_mecanum(p: Parameters, physics: Physics) -> Machine:
     )
 
 
-def _design_skid_steer(p: Parameters, physics: Physics) -> Machine:
+def _design_skid_steer(p: Parameters) -> Machine:
     # Each wheel has one contact point, so the skidding in a turn follows from the wheels' places.
     radius = p["wheel_radius"]
     places = places_of_four(p)
     x, y = places["front_left"]
-    rotor = ROTOR * 0.25 * physics.mass * radius**2
     return Machine(
         kind="skid_steer",
         radius=radius,
         centre=(0.0, 0.0, 0.0),
         size=(2.0 * x + radius, 1.4 * y, 0.1),
         wheels=tuple(Wheel(name, place) for name, place in places.items()),
-        rotor=rotor,
-        inertia=(0.25 * physics.mass + 1.5 * physics.wheel_mass) * radius**2 + rotor,
         lags=(p["wheel_lag"],),
         joints=tuple(places),
         controls=lambda state: np.tile(state, 2),
@@ -228,7 +210,7 @@ def _design_skid_steer(p: Parameters, physics: Physics) -> Machine:
     )
 
 
-_DESIGNS: dict[str, Callable[[Parameters, Physics], Machine]] = {
+_DESIGNS: dict[str, Callable[[Parameters], Machine]] = {
     "ackermann": _design_ackermann,
     "differential": _design_differential,
     "mecanum": _design_mecanum,

@@ -95,11 +95,11 @@ class Rig(ABC):
         clipped = np.clip(command, self.spec.command_low, self.spec.command_high)
         self.drive(self._target(clipped))
 
-    def require_upright(self, time: float) -> None:
-        """Raises BackendError if the robot has fallen over by a time [s]."""
+    def require_upright(self) -> None:
+        """Raises BackendError if the robot has fallen over."""
         if not self.cosine_of_tilt() > np.cos(LARGEST_TILT_RAD):
             fix = "lower the acceleration of its Physics, or its command limits."
-            when = f"at {time:.2f} s"
+            when = f"at {self.read().time:.2f} s"
             raise BackendError(
                 f"robot {self.spec.name!r} has fallen over {when}; {fix}"
             )
@@ -112,7 +112,7 @@ class PhysicsRobot(ABC):
     spec: RobotSpec
     machine: Machine
     timestep: float  # [s]
-    rig: Rig
+    rig: Any  # a Rig
 
     @abstractmethod
     def reset(self, pose: ArrayLike) -> Reading:
@@ -129,13 +129,13 @@ class PhysicsRobot(ABC):
         """
         self.rig.command(command)
         self.advance(round(duration / self.timestep))
-        reading = self.read()
-        self.rig.require_upright(reading.time)
-        return reading
+        self.rig.require_upright()
+        return self.read()
 
     def read(self) -> Reading:
         """Returns the current reading."""
-        return self.rig.read()
+        reading: Reading = self.rig.read()
+        return reading
 
 
 class PhysicsSimulator(DrivenSimulator, ABC):
@@ -173,7 +173,6 @@ class PhysicsSimulator(DrivenSimulator, ABC):
     def compile(self, bodies: Array) -> list[Any]:
         """Builds the scene with obstacles (K, 7), and returns the rigs of robots to be placed."""
 
-    @abstractmethod
     def refresh(self) -> None:
         """Derives what depends on the robots' poses, after they were placed."""
 
@@ -182,16 +181,11 @@ class PhysicsSimulator(DrivenSimulator, ABC):
         """Moves the obstacles to the poses of bodies (K, 7)."""
 
     @abstractmethod
-    def advance(self, steps: int) -> None:
-        """Moves the robots by whole time steps."""
+    def advance(self, steps: int) -> list[int]:
+        """Moves by whole time steps; returns the robots that touch something, maybe repeatedly.
 
-    @abstractmethod
-    def find_bumped(self) -> list[int]:
-        """Returns the indices of robots whose bumper touches something; they may repeat."""
-
-    @abstractmethod
-    def check_motion(self) -> float:
-        """Returns the time [s]. Raises BackendError if the engine diverges."""
+        Raises BackendError if the engine diverges.
+        """
 
     def reset(
         self, seeds: ArrayLike, worlds: ArrayLike | None = None, starts: Starts = None
@@ -199,7 +193,7 @@ class PhysicsSimulator(DrivenSimulator, ABC):
         """Starts the episode of a seed (1,) at poses (1, M, 3); see `FastSimulator.reset`."""
         scenes = super().reset(seeds, worlds, starts)
         self._gyro_noise = np.random.default_rng(int(self.data.seeds[0]))
-        self._rigs = self.compile(scenes.bodies[0])
+        self._rigs: list[Any] = self.compile(scenes.bodies[0])
         for rig, pose in zip(self._rigs, self.data.pose[0], strict=True):
             rig.put(pose)
         self.refresh()
@@ -248,10 +242,9 @@ class PhysicsSimulator(DrivenSimulator, ABC):
             raise BackendError(f"commands {commands.tolist()} {needed}")
         self.begin_period(commands[0])
         self._move()
-        time = self.check_motion()
         for rig, collided in zip(self._rigs, self.data.collided[0], strict=True):
             if not collided:
-                rig.require_upright(time)
+                rig.require_upright()
 
     def _move(self) -> None:
         rigs = self._rigs
@@ -265,8 +258,7 @@ class PhysicsSimulator(DrivenSimulator, ABC):
             for rig, command in zip(rigs, self.in_force(part * part_s), strict=True):
                 rig.command(command)
             self.place_obstacles(self.move_obstacles((part + 1) * part_s))
-            self.advance(self._steps)
-            touched[self.find_bumped()] = True
+            touched[self.advance(self._steps)] = True
             before = turned
             turned = [rig.encoders() for rig in rigs]
             faced = facing
