@@ -287,6 +287,8 @@ def simulator(setup: Setup) -> Iterator[NodeStart]:
         BASE_FRAME.name: setup.text(BASE_FRAME.name),
         "laser_frame": setup.text("laser_frame"),
     }
+    if setup["simulator"] == "dart":
+        parameters["urdf"] = setup.text("urdf")
     yield setup.node(PACKAGE, setup.simulator, Robot(space, "", space), parameters)
 
 

@@ -15,6 +15,8 @@ from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import Obstacles, World, load_world
 
+from .test_dart import PLACES, write_urdf
+
 OTHERS = ("ackermann", "mecanum", "jackal")
 NAMES = [
     "differential",
@@ -128,6 +130,19 @@ def test_a_footprint_of_corners_touches_by_its_corners():
     drive(simulator, forward(model, 0.5), 15)
     assert simulator.data.collided[0, 0] == 1
     assert simulator.data.pose[0, 0, 0] == pytest.approx(3.0 - 0.25, abs=0.02)
+
+
+def test_a_robot_of_a_file_touches_by_the_footprint_of_its_spec(tmp_path):
+    model = builtin_model("jackal")
+    file = write_urdf(tmp_path, PLACES)
+    simulator = DartSimulator(model, load_world("empty"), file=file)
+    simulator.reset([0], starts=np.array([[[2.0, 0.0, 0.0]]]))
+    drive(simulator, forward(model, 0.7), 8)
+    assert simulator.data.collided[0, 0] == 0
+    drive(simulator, forward(model, 0.7), 20)
+    assert simulator.data.collided[0, 0] == 1
+    free = 3.0 - max(x for x, _ in model.robot.footprint)
+    assert simulator.data.pose[0, 0, 0] == pytest.approx(free, abs=0.02)
 
 
 def test_wheel_odometry_is_wrong_after_a_turn_in_which_the_wheels_skid():
