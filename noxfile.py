@@ -36,7 +36,9 @@ def jazzy(session: nox.Session) -> None:
     )
     # The wheels of another distribution have the same names as those in constraints.txt.
     constraints = write_constraints(session, left_out="ros-")
-    install(session, constraints, ".[bags,dart,deploy,mujoco,multi,test]", "onnx", *wheels)
+    install(
+        session, constraints, ".[bags,dart,deploy,mujoco,multi,test]", "onnx", *wheels
+    )
     session.run("pytest", *(session.posargs or ["test/nodes"]))
 
 

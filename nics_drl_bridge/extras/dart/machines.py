@@ -20,7 +20,7 @@ from nics_drl_bridge.interface import Array
 
 Z = np.array([0.0, 0.0, 1.0])
 Y = np.array([0.0, 1.0, 0.0])
-SPHERES = 9  # that form a roller
+SPHERES = 5  # that form a roller; nine take twice the time, and move it the same
 # fraction of a roller's length beyond which its spheres would end in a point
 ROLLER_END = 0.95
 CASTOR_MASS = 0.03  # [kg]
