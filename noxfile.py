@@ -36,7 +36,9 @@ def jazzy(session: nox.Session) -> None:
     )
     # The wheels of another distribution have the same names as those in constraints.txt.
     constraints = write_constraints(session, left_out="ros-")
-    install(session, constraints, ".[bags,deploy,mujoco,multi,test]", "onnx", *wheels)
+    install(
+        session, constraints, ".[bags,dart,deploy,mujoco,multi,test]", "onnx", *wheels
+    )
     session.run("pytest", *(session.posargs or ["test/nodes"]))
 
 
@@ -78,7 +80,7 @@ def upstream(session: nox.Session) -> None:
         session.skip(f"needs {needed} in {UPSTREAM} (or UPSTREAM=folder)")
     build_messages(session)
     constraints = write_constraints(session)
-    extras = "bags,deploy,mujoco,multi,ros,test"
+    extras = "bags,dart,deploy,mujoco,multi,ros,test"
     install(session, constraints, f".[{extras}]", "osrf-pycommon", "psutil", "pip")
     session.run("uv", "pip", "uninstall", "nics_drl_bridge")  # colcon installs it
     folder = session.virtualenv.location

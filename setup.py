@@ -36,6 +36,9 @@ EXTRAS = {
     ],
     "bags": ["mcap>=1.3,<2", "rosbags>=0.11,<0.12"],
     "mujoco": ["mujoco>=3.3"],
+    "dart": [
+        f"dartpy>=6.20; {ROS_WHEELS_EXIST}"
+    ],  # it has wheels for this platform only
     "multi": ["pettingzoo>=1.25,<1.28"],
     # Before 2.6, torch.load unpickles whatever a file says unless told not to, and its reader of
     # weights alone could be made to run code (CVE-2025-32434). Of its releases for Linux only some
@@ -71,7 +74,6 @@ EXTRAS = {
         "colcon-bash",
         "colcon-package-selection",
         "colcon-ros",
-        f"dartpy>=6.20; {ROS_WHEELS_EXIST}",  # a physics engine of others
         "dockerfile-parse",
         "flake8",
         "hypothesis",
@@ -92,7 +94,7 @@ EXTRAS = {
 # All that a user may want. ROS 2 comes from a ROS 2 installation, or from `ros` beside this.
 EXTRAS["all"] = [
     one
-    for name in ("bags", "deploy", "mujoco", "multi", "train", "video", "view")
+    for name in ("bags", "dart", "deploy", "mujoco", "multi", "train", "video", "view")
     for one in EXTRAS[name]
 ]
 # What `make setup` installs: where a ROS 2 is sourced, and where none is.
@@ -153,6 +155,7 @@ setup(
             f"nics = {PACKAGE}.commands.start:main",
             f"simulator_node = {PACKAGE}.nodes.start:simulator_node",
             f"mujoco_node = {PACKAGE}.nodes.start:mujoco_node",
+            f"dart_node = {PACKAGE}.nodes.start:dart_node",
             f"middleware_node = {PACKAGE}.nodes.start:middleware_node",
             f"policy_node = {PACKAGE}.nodes.start:policy_node",
             f"command_gate = {PACKAGE}.nodes.start:command_gate",
@@ -172,7 +175,10 @@ setup(
             f"device.simulation_interfaces = {PACKAGE}.extras.simulation_interfaces:open_services",
             f"policy.nav2 = {PACKAGE}.extras.nav2.follow_path:PathActions",
         ],
-        f"{PACKAGE}.nodes": [f"mujoco_node = {PACKAGE}.extras.mujoco.node:main"],
+        f"{PACKAGE}.nodes": [
+            f"dart_node = {PACKAGE}.extras.dart.node:main",
+            f"mujoco_node = {PACKAGE}.extras.mujoco.node:main",
+        ],
         f"{PACKAGE}.sensors": [f"lidar = {PACKAGE}.lidar.further_lidar:FurtherLidar"],
         f"{PACKAGE}.viewers": [f"human = {PACKAGE}.watch.human:HumanView"],
     },

@@ -272,7 +272,8 @@ def measure_mujoco(given: Given) -> Result:
     times, and the model predicts the pose 5 s ahead by the commands alone, from every tenth of a
     second. Speed is simulated seconds per second of one thread, both sides in this run.
     """
-    from nics_drl_bridge.extras.mujoco.simulator import MujocoRobot, record
+    from nics_drl_bridge.extras.mujoco.simulator import MujocoRobot
+    from nics_drl_bridge.extras.physics.simulator import record
 
     robots = {}
     for name in given.robots:

@@ -37,6 +37,8 @@ from measuring.perturbations import PERTURBATIONS
 from numpy.typing import NDArray
 
 from nics_drl_bridge.commands.episodes import (
+    BY_DEFAULT,
+    DART,
     DDS,
     FAST,
     LABELS,
@@ -445,6 +447,7 @@ MOST_BELIEVED = 0.05  # part of the episodes that may be successes to the robot 
 APART_POINTS = {
     DDS: 2.0,
     MUJOCO: 4.0,
+    DART: 4.0,
 }  # how far the success may be from that in process
 TRANSFER_LIDAR = "rplidar_a2"
 TRANSFER_SEED = 2_000_000
@@ -770,7 +773,7 @@ BENCHMARKS = {
             "episodes": (100, "in each place"),
             "robots": SHIPPED,
             "worlds": some_of(tuple(TRANSFER_FLOORS)),
-            "in": some_of(PLACES) | {"dest": "places"},
+            "in": some_of(PLACES) | {"dest": "places", "default": list(BY_DEFAULT)},
             "out": {"type": Path, "help": "keep all files there, as trajectories"},
         },
         short="--episodes 1 --robots differential --worlds circles",

@@ -32,6 +32,7 @@ ROS = ("rclpy", "_msgs", "std_srvs", "builtin_interfaces", "rcl_interfaces")
 INSTALL_ROS = f"source your ROS 2 installation, or pip install '{PACKAGE}[ros]'"
 # library -> the extra of this package that installs it
 INSTALL = {
+    "dartpy": "dart",
     "filelock": "train",
     "imageio_ffmpeg": "video",
     "leapp": "leapp",

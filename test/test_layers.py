@@ -59,6 +59,7 @@ HOMES = {
     "PIL": ("lidar/maps.py", "watch/record.py"),
     "llvmlite": ("*kernels.py",),
     "mujoco": ("extras/mujoco/*",),
+    "dartpy": ("extras/dart/*",),
     "torch": ("policy/train/*", "extras/ray/*"),
     "stable_baselines3": ("policy/train/*", "extras/ray/*"),
     "onnx": ("policy/*", "extras/foreign_policies/*"),
@@ -261,6 +262,7 @@ def test_an_env_in_process_imports_neither_ros_nor_pictures_nor_slow_libraries()
         "matplotlib",
         "typer",
         "mujoco",
+        "dartpy",
         "scipy.signal",
     }
 

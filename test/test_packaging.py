@@ -30,6 +30,7 @@ EXECUTABLES = {
     "nics",
     "simulator_node",
     "mujoco_node",
+    "dart_node",
     "middleware_node",
     "policy_node",
     "command_gate",

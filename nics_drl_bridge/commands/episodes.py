@@ -42,13 +42,16 @@ from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 FAST = "fast"
 DDS = "dds"
 MUJOCO = "mujoco_dds"
+DART = "dart_dds"
 VEHICLE = "vehicle"
-NODES = {DDS: "simulator_node", MUJOCO: "mujoco_node"}
+NODES = {DDS: "simulator_node", MUJOCO: "mujoco_node", DART: "dart_node"}
 PLACES = (FAST, *NODES)
+BY_DEFAULT = (FAST, DDS, MUJOCO)  # what one lacks, later ones lack, too
 LABELS = {
     FAST: "in process",
     DDS: "over DDS",
     MUJOCO: "MuJoCo over DDS",
+    DART: "DART over DDS",
     VEHICLE: "on the vehicle",
 }
 EVALUATION = "evaluation.json"
@@ -213,11 +216,10 @@ def check_place(place: str, robot: RobotSpec) -> None:
         return
     robot.require_cmd_vel()
     extensions.require(f"the world {place!r}", "rclpy")
-    if place == MUJOCO:
-        extensions.load("nodes", NODES[MUJOCO])
-        import_module(extensions.find_extensions("nodes")[NODES[MUJOCO]].module).check(
-            robot
-        )
+    if place != DDS:
+        extensions.load("nodes", NODES[place])
+        module = extensions.find_extensions("nodes")[NODES[place]].module
+        import_module(module).check(robot)
 
 
 def find_robot(policy: str, contract: Contract) -> str:
@@ -260,7 +262,7 @@ class EvaluationOrder:
     world: str = defaults.EVALUATION_WORLD  # name or YAML file
     episodes: int = defaults.EVALUATION_EPISODES
     seed: int = defaults.EVALUATION_SEED
-    # some of `PLACES`, the first of which is the reference; empty: all that work
+    # some of `PLACES`, the first of which is the reference; empty: the usual ones that work
     places: Sequence[str] = ()
     conditions: Conditions = NO_CONDITIONS
 
@@ -335,9 +337,9 @@ def limit_time(
 
 
 def select_places(order: EvaluationOrder, robot: RobotSpec, say: Say) -> Sequence[str]:
-    """Returns the places of an order, or else all that work here; says why others don't."""
+    """Returns the places of an order, or the usual ones that work here; says why others don't."""
     places = list[str]()
-    for place in order.places or PLACES:  # what one place lacks, later ones lack, too
+    for place in order.places or BY_DEFAULT:
         try:
             check_place(place, robot)
         except ConfigError as error:

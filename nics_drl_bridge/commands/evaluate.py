@@ -35,7 +35,8 @@ def evaluate(
         list[str] | None,
         Option(
             "--in",
-            help="fast, dds or mujoco_dds; repeatable; by default all that work here.",
+            help="fast, dds, mujoco_dds or dart_dds; repeatable; "
+            "by default the first three, as far as they work here.",
         ),
     ] = None,
     episodes: Annotated[

@@ -24,6 +24,7 @@ EXTRAS = {  # extra -> purpose, modules that it installs
     "view": ("the page of nics watch", ("websockets",)),
     "video": ("MP4 files of nics watch", ("imageio_ffmpeg",)),
     "mujoco": ("robots with real wheels, in MuJoCo", ("mujoco",)),
+    "dart": ("robots with real wheels, in DART", ("dartpy",)),
     "distributed": ("training on a Ray cluster", ("ray",)),
 }
 MESSAGES = {  # message package without a wheel -> what does not work without it

@@ -20,7 +20,7 @@ from nics_drl_bridge.nodes.starting import LAUNCHES, Launch, NodeStart, complete
 
 EXIT_NODE_ENDED = 1
 POLL_S = 0.1
-SIMULATORS = ("simulator_node", "mujoco_node")
+SIMULATORS = ("simulator_node", "mujoco_node", "dart_node")
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 
 

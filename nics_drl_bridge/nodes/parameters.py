@@ -415,6 +415,18 @@ FRICTION = Row(
     span=(0.01, 2.0),
 )
 
+GYRO_BIAS = Row(
+    "gyro_bias", 0.0, "Bias of a gyro in the odometry [rad/s].", (-1.0, 1.0)
+)
+GYRO_NOISE = Row(
+    "gyro_noise", 0.0, "Standard deviation of its readings [rad/s].", (0.0, 1.0)
+)
+URDF = Row(
+    "urdf",
+    "",
+    "URDF or SDF file of the robots; empty: built by the parameters of the model's robot.",
+)
+
 
 def renderer(default: str) -> Row:
     """Return the parameter that selects the renderer of a simulator's lidar."""
@@ -664,6 +676,14 @@ NODES: dict[str, Callable[[], NodeFacts]] = {
         SERVED,
         [MODEL, ROBOTS, *device(), renderer(defaults.MUJOCO_RENDERER), FRICTION],
         "-p model:=mecanum -p world:=empty",
+    ),
+    "dart_node": lambda: NodeFacts(
+        "Simulates robots in DART, Gazebo's physics engine, behind the topics of the hardware.",
+        DRIVEN_BY,
+        TOLD,
+        SERVED,
+        [MODEL, ROBOTS, *device(), FRICTION, GYRO_BIAS, GYRO_NOISE, URDF],
+        "-p model:=jackal -p gyro_bias:=0.01",
     ),
     "middleware_node": lambda: NodeFacts(
         "Caches a robot's topics and publishes an estimate of its state; a managed node.",

@@ -141,6 +141,7 @@ def _main_of(node: str) -> Any:
 
 simulator_node = partial(start, "simulator_node")
 mujoco_node = partial(start, "mujoco_node")
+dart_node = partial(start, "dart_node")
 middleware_node = partial(start, "middleware_node")
 policy_node = partial(start, "policy_node")
 command_gate = partial(start, "command_gate")

@@ -287,6 +287,8 @@ def simulator(setup: Setup) -> Iterator[NodeStart]:
         BASE_FRAME.name: setup.text(BASE_FRAME.name),
         "laser_frame": setup.text("laser_frame"),
     }
+    if setup["simulator"] == "dart":
+        parameters["urdf"] = setup.text("urdf")
     yield setup.node(PACKAGE, setup.simulator, Robot(space, "", space), parameters)
 
 
@@ -367,10 +369,10 @@ def of_nodes() -> list[Argument]:
 
 def of_simulator(robots: str = "1") -> list[Argument]:
     """Return the arguments of a simulator."""
-    kinds = ("simulator", "mujoco")
+    kinds = ("simulator", "mujoco", "dart")
     start = "Start x, y, heading [m, m, rad] of each robot; empty: drawn at random"
     return [
-        Argument("simulator", kinds[0], "The fast simulator, or MuJoCo", kinds),
+        Argument("simulator", kinds[0], "The fast simulator, MuJoCo or DART", kinds),
         Argument("world", "", "Shipped world, or a YAML file; empty: from params_file"),
         Argument(
             "robots", robots, "Number of robots, or their namespaces, as in '[a, b]'"

@@ -21,7 +21,10 @@ from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.nodes.record_node import RecordNode
 
 ENDS_S = 30.0
-MODULES = {"mujoco_node": "nics_drl_bridge.extras.mujoco.node"}
+MODULES = {
+    "dart_node": "nics_drl_bridge.extras.dart.node",
+    "mujoco_node": "nics_drl_bridge.extras.mujoco.node",
+}
 
 
 class NodeThread(AbstractContextManager["NodeThread", None]):

@@ -149,7 +149,8 @@ class TestWhatTheNodesDo:
         peer.until(lambda: rights - optional <= does(node, "/recording"), "its ends")
         assert does(node, "/recording") - rights == set()
 
-    def test_mujoco_may_do_what_the_simulator_may(self):
+    @pytest.mark.parametrize("engine", ["dart_node", "mujoco_node"])
+    def test_an_engine_may_do_what_the_simulator_may(self, engine):
         rights = allowed("policy.xml")
 
         def of(node):
@@ -157,4 +158,4 @@ class TestWhatTheNodesDo:
                 (what, name.replace(f"/{node}/", "/~/")) for what, name in rights[node]
             }
 
-        assert of("mujoco_node") == of("simulator_node")
+        assert of(engine) == of("simulator_node")

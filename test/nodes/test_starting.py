@@ -149,6 +149,15 @@ def test_every_parameter_has_the_type_that_its_node_declares(monkeypatch):
     )
 
 
+def test_dart_simulates_the_robot_of_a_urdf_file(tmp_path):
+    file = tmp_path / "own.urdf"
+    file.write_text("<robot name='own'/>")
+    for engine, told in (("dart", str(file)), ("mujoco", None)):
+        (node,) = starting.simulator(setup_of(simulator=engine, urdf=str(file)))
+        assert node.executable == f"{engine}_node"
+        assert node.parameters.get("urdf") == told
+
+
 def test_rviz_shows_the_first_robot():
     nodes = LAUNCHES["fleet"]().nodes({"rviz": "true"})
     (view,) = [node for node in nodes if node.package == starting.RVIZ]

@@ -150,7 +150,10 @@ def test_what_is_not_given_stands_in_the_file_of_parameters(launch, told, tmp_pa
     [
         ({"start": "1.0"}, "launch argument 'start' is '1.0'; give x, y, heading"),
         ({"model": "ackerman"}, "did you mean 'ackermann'"),
-        ({"simulator": "gazebo"}, "Valid options are: \\['simulator', 'mujoco'\\]"),
+        (
+            {"simulator": "gazebo"},
+            "Valid options are: \\['simulator', 'mujoco', 'dart'\\]",
+        ),
         ({"params_file": "none.yaml"}, "none.yaml: no such file"),
     ],
 )

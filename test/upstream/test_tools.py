@@ -16,6 +16,7 @@ pytestmark = [pytest.mark.ros, pytest.mark.process, pytest.mark.slow]
 
 NODES = {
     "command_gate",
+    "dart_node",
     "middleware_node",
     "mujoco_node",
     "policy_node",

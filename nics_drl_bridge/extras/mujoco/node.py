@@ -6,8 +6,9 @@ from functools import partial
 from rclpy.node import Node
 
 from nics_drl_bridge import defaults
-from nics_drl_bridge.extras.mujoco.machines import Physics, build_machine, load_mujoco
+from nics_drl_bridge.extras.mujoco.machines import build_machine, load_mujoco
 from nics_drl_bridge.extras.mujoco.simulator import MujocoSimulator
+from nics_drl_bridge.extras.physics.machines import Physics
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.nodes.device_parameters import randomisation
 from nics_drl_bridge.nodes.parameters import FRICTION

@@ -1,9 +1,9 @@
 """A skid-steer robot in DART, Gazebo's physics engine, behind the topics of an ordinary driver.
 
-Nothing here uses this package's kinematics or lidar: four wheels roll and slip by DART's contacts,
-and the lidar is an analytic ray cast. The wheels turn the robot less than the driver's odometry
-believes, because the driver computes with one effective track. A gyro measures the true turn rate,
-with noise and a constant bias.
+The extra `dart` builds the place. Nothing here uses this package's kinematics or lidar: four wheels
+roll and slip by DART's contacts, and the lidar is an analytic ray cast. The wheels turn the robot
+less than the driver's odometry believes, because the driver computes with one effective track. A
+gyro measures the true turn rate, with noise and a constant bias.
 
 Subscribes to `cmd_vel` (TwistStamped), publishes `odom`, `scan`, `imu` and, for the judge alone,
 `true_pose` and `touched`. `hold` (Bool) fixes the body to the ground while its wheels go on.
@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,6 +29,9 @@ from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Imu, LaserScan
 from std_msgs.msg import Bool
 
+from nics_drl_bridge.extras.dart import scenery
+from nics_drl_bridge.extras.physics.scenery import Box, Cylinder
+
 Array = NDArray[np.float64]
 
 STEP_S = 0.002
@@ -41,6 +43,7 @@ FRICTION = 0.6
 MOTOR_TORQUE = 80.0  # [N m]
 WHEEL_ACCELERATION = 12.0  # [rad/s^2]
 BODY = (0.9, 0.4, 0.2)  # [m]
+THICK = 0.2  # of walls [m]
 BELIEVED_TRACK = (
     1.35 * TRACK
 )  # by which the driver converts wheel speeds and turn rates
@@ -148,20 +151,6 @@ def robot_urdf() -> str:
     </robot>"""
 
 
-def _fixed_body(
-    name: str, shape: dartpy.dynamics.Shape, at: Sequence[float]
-) -> dartpy.dynamics.Skeleton:
-    skeleton = dartpy.dynamics.Skeleton(name)
-    joint, body = skeleton.createWeldJointAndBodyNodePair()
-    node = body.createShapeNode(shape)
-    node.createCollisionAspect()
-    node.createDynamicsAspect()
-    transform = dartpy.math.Isometry3()
-    transform.set_translation(at)
-    joint.setTransformFromParentBodyNode(transform)
-    return skeleton
-
-
 class Engine:
     """The world of DART with the robot in a place."""
 
@@ -169,33 +158,32 @@ class Engine:
         self.world = dartpy.simulation.World()
         self.world.setTimeStep(STEP_S)
         self.world.setCollisionDetector(dartpy.simulation.CollisionDetectorType.ODE)
-        ground = dartpy.dynamics.BoxShape([80.0, 80.0, 0.2])
-        self.world.addSkeleton(_fixed_body("ground", ground, (0.0, 0.0, -0.1)))
+        ground = scenery.add_fixed_body(dartpy, self.world, "ground")
+        slab = dartpy.dynamics.BoxShape([80.0, 80.0, 0.2])
+        below = scenery.make_transform(dartpy, [0.0, 0.0, -0.1])
+        scenery.let_touch(scenery.add_shape(ground, slab, below), friction=1.0)
         self._add_walls(place)
-        for k, (x, y, radius) in enumerate(place.pillars):
-            pillar = dartpy.dynamics.CylinderShape(radius, 1.0)
-            self.world.addSkeleton(_fixed_body(f"pillar_{k}", pillar, (x, y, 0.5)))
         self._robot = dartpy.utils.DartLoader().parseSkeletonString(robot_urdf(), "")
         self._base = self._robot.getBodyNode("base_link")
         self._prepare_wheels()
-        start = dartpy.math.Isometry3()
-        start.set_translation([pose[0], pose[1], 0.0])
-        start.set_rotation(_rotation_about_z(pose[2]))
-        self._robot.getRootBodyNode().getParentJoint().setTransform(start)
+        scenery.place_body(self._base, pose)
         self.world.addSkeleton(self._robot)
         self._weld: dartpy.constraint.WeldJointConstraint | None = None
         self.wheel_speeds = np.zeros(4)  # asked of the motors [rad/s]
 
     def _add_walls(self, place: Place) -> None:
-        length, width = place.size
-        thick = 0.2
-        long_wall = dartpy.dynamics.BoxShape([length + 2 * thick, thick, 1.0])
-        short_wall = dartpy.dynamics.BoxShape([thick, width, 1.0])
+        body = scenery.add_fixed_body(dartpy, self.world, "walls")
+        length, width = place.size + THICK
         for sign in (-1, 1):
-            beside = (0.0, sign * 0.5 * (width + thick), 0.5)
-            ahead = (sign * 0.5 * (length + thick), 0.0, 0.5)
-            self.world.addSkeleton(_fixed_body(f"long_wall_{sign}", long_wall, beside))
-            self.world.addSkeleton(_fixed_body(f"short_wall_{sign}", short_wall, ahead))
+            beside = Box(np.array([0.0, sign * 0.5 * width]), 0.0, (length, THICK))
+            ahead = Box(np.array([sign * 0.5 * length, 0.0]), 0.0, (THICK, width))
+            for wall in (beside, ahead):
+                scenery.add_solid(dartpy, body, wall, level=0.5, height=1.0)
+        for x, y, radius in place.pillars:
+            pose = np.array([x, y, 0.0])
+            scenery.add_solid(
+                dartpy, body, Cylinder(radius), level=0.5, height=1.0, pose=pose
+            )
 
     def _prepare_wheels(self) -> None:
         names = [degree.getName() for degree in self._robot.getDofs()]
@@ -263,12 +251,6 @@ class Engine:
             if "skid_steer" in names and "ground" not in names and len(names) == 2:
                 return True
         return False
-
-
-def _rotation_about_z(angle: float) -> Array:
-    cos = math.cos(angle)
-    sin = math.sin(angle)
-    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
 
 class Driver(Node):

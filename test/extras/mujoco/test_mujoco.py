@@ -6,13 +6,10 @@ import pytest
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BackendError, ConfigError
-from nics_drl_bridge.extras.mujoco.machines import (
-    Physics,
-    build_machine,
-    fit_roller,
-    load_mujoco,
-)
-from nics_drl_bridge.extras.mujoco.simulator import MujocoRobot, Reading, record
+from nics_drl_bridge.extras.mujoco.machines import build_machine, load_mujoco
+from nics_drl_bridge.extras.mujoco.simulator import MujocoRobot
+from nics_drl_bridge.extras.physics.machines import Physics, fit_roller
+from nics_drl_bridge.extras.physics.simulator import Reading, record
 from nics_drl_bridge.recording.recording import check
 from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot

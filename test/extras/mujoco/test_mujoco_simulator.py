@@ -10,8 +10,9 @@ import mujoco
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BackendError, ConfigError
-from nics_drl_bridge.extras.mujoco.machines import Physics
-from nics_drl_bridge.extras.mujoco.simulator import MujocoSimulator, divide
+from nics_drl_bridge.extras.mujoco.simulator import MujocoSimulator
+from nics_drl_bridge.extras.physics.machines import Physics
+from nics_drl_bridge.extras.physics.simulator import divide
 from nics_drl_bridge.generator import SimulatorModel, builtin_model
 from nics_drl_bridge.lidar.exact_kernels import X, Y
 from nics_drl_bridge.robot.spec import RobotSpec

@@ -3,7 +3,7 @@ import pytest
 from shapely.geometry import Polygon
 from shapely.ops import unary_union
 
-from nics_drl_bridge.extras.mujoco.scenery import merge_into_rectangles, split_convex
+from nics_drl_bridge.extras.physics.scenery import merge_into_rectangles, split_convex
 
 L_SHAPE = [
     [-0.3, -0.3],

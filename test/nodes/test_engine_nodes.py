@@ -1,19 +1,20 @@
+"""Nodes of other physics engines: the same robots over topics as in this process."""
+
 import subprocess
 import sys
+from importlib import import_module
 
 import gymnasium
 import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
-pytest.importorskip("mujoco", reason="needs MuJoCo: the extra `mujoco`")
 
 from nics_drl_bridge.defaults import EPISODE_STEPS
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.registry import NAVIGATION
 from nics_drl_bridge.env.sim_backend import SimBackend
 from nics_drl_bridge.errors import ModelError
-from nics_drl_bridge.extras.mujoco.simulator import MujocoSimulator
 from nics_drl_bridge.generator import builtin_model, save_model
 from nics_drl_bridge.interface import Start
 from nics_drl_bridge.nodes.backends import DdsBackend
@@ -25,15 +26,20 @@ pytestmark = pytest.mark.ros
 
 TIMEOUT_S = 60.0
 SEEDS = (11, 12)
-NODE = "mujoco_node"
+# node -> library, its extra, and the name in sentences
+ENGINES = {
+    "dart_node": ("dartpy", "dart", "DART"),
+    "mujoco_node": ("mujoco", "mujoco", "MuJoCo"),
+}
 
 
-class MujocoBackend(SimBackend):
+class EngineBackend(SimBackend):
     """The same robots in this process."""
 
-    def __init__(self, model, world):
+    def __init__(self, model, world, name):
         super().__init__(model, world, estimator=True)
-        self.simulator = MujocoSimulator(model, world, renderer="exact")
+        module = import_module(f"nics_drl_bridge.extras.{name.lower()}.simulator")
+        self.simulator = getattr(module, f"{name.capitalize()}Simulator")(model, world)
         self.simulator.drawn = {}
 
 
@@ -46,33 +52,37 @@ def robot(tmp_path_factory):
     return model, str(folder)
 
 
-@pytest.fixture(scope="module")
-def node(launch, module_domain_id, robot):
-    """The domain of robots in MuJoCo, in lock-step."""
-    process = launch(NODE, module_domain_id, model=robot[1], mode="lockstep")
-    yield module_domain_id
+@pytest.fixture(scope="module", params=ENGINES)
+def node(request, launch_process, module_domain_id, robot):
+    """A node in a process of its own, in lock-step, and the options of its backend."""
+    pytest.importorskip(ENGINES[request.param][0])
+    process = launch_process(
+        request.param, module_domain_id, model=robot[1], mode="lockstep"
+    )
+    yield (
+        request.param,
+        {
+            "domain_id": module_domain_id,
+            "simulator": request.param,
+            "truth": True,
+            "timeout_s": TIMEOUT_S,
+        },
+    )
     process.check()
+    process.close()
 
 
-def options(domain_id):
-    return {
-        "domain_id": domain_id,
-        "simulator": NODE,
-        "truth": True,
-        "timeout_s": TIMEOUT_S,
-    }
-
-
+@pytest.mark.process
 def test_whole_episodes_over_topics_reach_the_goal_as_in_this_process(node, robot):
+    name, options = node
     model = robot[0]
     world = load_world("arena")
     arguments = {"model": model, "world": world}
     there = gymnasium.make(
-        NAVIGATION, backend="dds", backend_options=options(node), **arguments
+        NAVIGATION, backend="dds", backend_options=options, **arguments
     )
-    here = gymnasium.wrappers.TimeLimit(
-        BridgeEnv(MujocoBackend(model, world), **arguments), EPISODE_STEPS
-    )
+    backend = EngineBackend(model, world, ENGINES[name][2])
+    here = gymnasium.wrappers.TimeLimit(BridgeEnv(backend, **arguments), EPISODE_STEPS)
     policy = make_policy("dynamic_window", there.unwrapped.task)
     try:
         over_topics = drive_all(there, policy, SEEDS)
@@ -85,9 +95,10 @@ def test_whole_episodes_over_topics_reach_the_goal_as_in_this_process(node, robo
         assert np.abs(one.path - other.path).max() < 1e-12
 
 
+@pytest.mark.process
 def test_it_refuses_to_be_taken_for_another_model(node, robot):
     other = builtin_model("mecanum")
-    backend = DdsBackend(other, load_world("arena"), **options(node))
+    backend = DdsBackend(other, load_world("arena"), **node[1])
     try:
         with pytest.raises(ModelError, match="same model"):
             backend.reset(Start(seed=0, pose=np.zeros(3)))
@@ -96,18 +107,18 @@ def test_it_refuses_to_be_taken_for_another_model(node, robot):
 
 
 @pytest.mark.process
-def test_without_mujoco_the_node_ends_with_one_sentence():
+@pytest.mark.parametrize("node", ENGINES)
+def test_without_its_engine_a_node_ends_with_one_sentence(node):
+    library, extra, name = ENGINES[node]
     code = (
-        "import sys; sys.modules['mujoco'] = None; sys.argv = ['mujoco_node']\n"
-        "from nics_drl_bridge.nodes.start import mujoco_node; mujoco_node()"
+        f"import sys; sys.modules[{library!r}] = None; sys.argv = [{node!r}]\n"
+        f"from nics_drl_bridge.nodes.start import {node}; {node}()"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=200
     )
     assert done.returncode == 2
     first, sentence = done.stderr.strip().splitlines()
-    assert first.endswith("[mujoco_node]: starting")
-    assert (
-        sentence
-        == "MuJoCo is not installed; run pip install 'nics_drl_bridge[mujoco]'."
-    )
+    assert first.endswith(f"[{node}]: starting")
+    fix = f"run pip install 'nics_drl_bridge[{extra}]'."
+    assert sentence == f"{name} is not installed; {fix}"

@@ -1,0 +1,1 @@
+"""Detailed robots in DART, Gazebo's default physics engine."""

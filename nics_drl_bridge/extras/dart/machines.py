@@ -1,0 +1,222 @@
+"""Robots as skeletons of DART; tyres are spheres, which touch the floor in one point."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.extras.dart import scenery
+from nics_drl_bridge.extras.physics.machines import (
+    ROLLER_MASS,
+    Machine,
+    Physics,
+    Roller,
+    Wheel,
+    place_rollers,
+)
+from nics_drl_bridge.interface import Array
+
+Z = np.array([0.0, 0.0, 1.0])
+Y = np.array([0.0, 1.0, 0.0])
+SPHERES = 5  # that form a roller; nine take twice the time, and move it the same
+# fraction of a roller's length beyond which its spheres would end in a point
+ROLLER_END = 0.95
+CASTOR_MASS = 0.03  # [kg]
+PIVOT_MASS = 0.02  # of what steers a wheel [kg]
+PIVOT_INERTIA = 1e-4  # [kg m^2]
+ROTOR_INERTIA = 2e-7  # added to a roller's, which is too small to compute with [kg m^2]
+ALIGNED = 0.9  # minimum component of an axle along y, or of a pivot along z
+
+
+@dataclass(frozen=True)
+class DartBody:
+    """A robot that is not yet in a world."""
+
+    skeleton: Any
+    joints: list[Any]  # those with encoders, in the order of the machine
+    height: float  # of its root above the floor [m]
+
+
+def make_body(
+    dart: Any, machine: Machine, physics: Physics, file: Path | None = None
+) -> DartBody:
+    """Returns a machine's robot, read from a file if there is one. Raises ConfigError."""
+    if file is not None:
+        return _read_robot(dart, file, machine, physics)
+    return _Builder(dart, machine, physics).build()
+
+
+class _Builder:
+    def __init__(self, dart: Any, machine: Machine, physics: Physics) -> None:
+        self._dart = dart
+        self._machine = machine
+        self._physics = physics
+
+    def build(self) -> DartBody:
+        machine = self._machine
+        skeleton = self._dart.dynamics.Skeleton("robot")
+        _, base = skeleton.createFreeJointAndBodyNodePair()
+        base.setName("base_link")
+        mass = self._physics.mass
+        squares = np.square(machine.size)
+        moment = mass * (squares.sum() - squares) / 12.0
+        self._weigh(base, mass, moment, machine.centre)
+        if machine.castor is not None:
+            self._add_castor(base, *machine.castor)
+        for wheel in machine.wheels:
+            self._add_wheel(base, wheel)
+        joints = [skeleton.getJoint(joint) for joint in machine.joints]
+        return DartBody(skeleton, joints, machine.radius)
+
+    def _weigh(
+        self,
+        body: Any,
+        mass: float,
+        moment: Array,
+        centre: tuple[float, ...] = (0, 0, 0),
+    ) -> None:
+        inertia = self._dart.dynamics.Inertia(mass, np.array(centre), np.diag(moment))
+        body.setInertia(inertia)
+
+    def _tread(self, body: Any, shape: Any) -> None:
+        scenery.let_touch(scenery.add_shape(body, shape), self._physics.friction)
+
+    def _add_joint(self, parent: Any, name: str, axis: Array, place: Array) -> Any:
+        joint, body = parent.getSkeleton().createRevoluteJointAndBodyNodePair(parent)
+        joint.setName(name)
+        body.setName(f"{name}_link")
+        joint.setAxis(axis)
+        transform = scenery.make_transform(self._dart, place)
+        joint.setTransformFromParentBodyNode(transform)
+        return body
+
+    def _add_castor(self, base: Any, behind: float, radius: float) -> None:
+        joint, body = base.getSkeleton().createBallJointAndBodyNodePair(base)
+        place = np.array([behind, 0.0, radius - self._machine.radius])
+        transform = scenery.make_transform(self._dart, place)
+        joint.setTransformFromParentBodyNode(transform)
+        self._weigh(body, CASTOR_MASS, np.full(3, 0.4 * CASTOR_MASS * radius**2))
+        ball = self._dart.dynamics.SphereShape(radius)
+        self._tread(body, ball)
+
+    def _add_wheel(self, base: Any, wheel: Wheel) -> None:
+        radius = self._machine.radius
+        parent = base
+        place = np.array([*wheel.place, 0.0])
+        if wheel.steering:
+            parent = self._add_joint(base, wheel.steering, Z, place)
+            self._weigh(parent, PIVOT_MASS, np.full(3, PIVOT_INERTIA))
+            place = np.zeros(3)
+        body = self._add_joint(parent, wheel.name, Y, place)
+        mass = self._physics.wheel_mass
+        width = 0.4 * radius
+        if wheel.lean:
+            mass -= self._physics.rollers * ROLLER_MASS
+            radius *= 0.7
+            for roller in place_rollers(
+                self._machine.radius, self._physics.rollers, wheel.lean
+            ):
+                self._add_roller(body, roller)
+        else:
+            tyre = self._dart.dynamics.SphereShape(radius)
+            self._tread(body, tyre)
+        across = mass * (3.0 * radius**2 + width**2) / 12.0
+        self._weigh(body, mass, np.array([across, 0.5 * mass * radius**2, across]))
+
+    def _add_roller(self, wheel: Any, roller: Roller) -> None:
+        x, z = roller.place
+        axle = np.array(roller.axle) / np.linalg.norm(roller.axle)
+        name = f"{wheel.getName()}_{wheel.getNumChildBodyNodes()}"
+        body = self._add_joint(wheel, name, axle, np.array([x, 0.0, z]))
+        a = roller.across
+        b = roller.along
+        # Each sphere touches the ellipsoid from within.
+        places = np.linspace(-ROLLER_END, ROLLER_END, SPHERES) * (b - a * a / b)
+        radii = a * np.sqrt(1.0 - places**2 / (b * b - a * a))
+        for r, s in zip(radii, places, strict=True):
+            transform = scenery.make_transform(self._dart, s * axle)
+            ball = scenery.add_shape(
+                body, self._dart.dynamics.SphereShape(r), transform
+            )
+            scenery.let_touch(ball, self._physics.friction)
+        across = 0.2 * ROLLER_MASS * (a * a + b * b)
+        self._weigh(body, ROLLER_MASS, np.full(3, across + ROTOR_INERTIA))
+
+
+def _read_robot(dart: Any, path: Path, machine: Machine, physics: Physics) -> DartBody:
+    """Reads a robot from a URDF or SDF file; its wheels are found by axles and places.
+
+    Raises ConfigError if it can't be read, or has no wheel, or several, where the machine has one.
+    """
+    if not path.is_file():
+        raise ConfigError(f"robot {str(path)!r}: no such file.")
+    uri = dart.common.Uri(path.absolute().as_uri())
+    reader = dart.utils.DartLoader().parseSkeleton
+    if path.suffix == ".sdf":
+        reader = dart.utils.SdfParser.readSkeleton
+    try:
+        skeleton = reader(uri)
+    except RuntimeError as error:
+        raise ConfigError(f"robot {str(path)!r}: {error}; mend the file.") from None
+    if skeleton is None:
+        raise ConfigError(f"robot {str(path)!r}: DART can't read it; mend the file.")
+    skeleton.resetPositions()
+    root = skeleton.getRootBodyNode()
+    hinges = [
+        _Hinge(dart, joint, root)
+        for joint in skeleton.getJoints()
+        if joint.getType() == "RevoluteJoint"
+    ]
+    wheels = [hinge for hinge in hinges if abs(hinge.axis[1]) > ALIGNED]
+    pivots = [hinge for hinge in hinges if abs(hinge.axis[2]) > ALIGNED]
+    for wheel in wheels:
+        for node in wheel.joint.getChildBodyNode().getShapeNodes():
+            if node.hasDynamicsAspect():
+                node.getDynamicsAspect().setFrictionCoeff(physics.friction)
+    joints = []
+    for name in machine.joints:
+        fitting = _find_fitting(name, pivots if name.startswith("steer") else wheels)
+        if len(fitting) != 1:
+            there = ", ".join(hinge.joint.getName() for hinge in hinges) or "none"
+            raise ConfigError(
+                f"robot {str(path)!r}: needs one joint as {name!r}, not {len(fitting)}; "
+                f"it has {there}."
+            )
+        fitting[0].turn_positive()
+        joints.append(fitting[0].joint)
+    height = machine.radius - float(np.mean([wheel.place[2] for wheel in wheels]))
+    return DartBody(skeleton, joints, height)
+
+
+class _Hinge:
+    """A joint of a robot at rest, seen from its root."""
+
+    def __init__(self, dart: Any, joint: Any, root: Any) -> None:
+        self.joint = joint
+        transform = joint.getChildBodyNode().getTransform(root)
+        self.axis = transform.rotation() @ joint.getAxis()
+        self.place = transform.translation()
+
+    def turn_positive(self) -> None:
+        """Lets positive speeds drive ahead, or turn to the left."""
+        if self.axis.sum() < 0.0:
+            self.joint.setAxis(-self.joint.getAxis())
+
+
+def _find_fitting(name: str, hinges: list[_Hinge]) -> list[_Hinge]:
+    """Returns the hinges on the side, and at the end, that the words of a name say."""
+    x, y, _ = np.array([hinge.place for hinge in hinges]).reshape(-1, 3).T
+    half_width = 0.5 * np.abs(y).max(initial=0.0)
+    middle = 0.5 * (x.min(initial=np.inf) + x.max(initial=-np.inf))
+    places = {
+        "left": y > half_width,
+        "right": y < -half_width,
+        "front": x > middle,
+        "rear": x < middle,
+    }
+    fits = np.ones(len(hinges), np.bool_)
+    for word in name.split("_"):
+        fits &= places.get(word, True)
+    return [hinge for hinge, is_fit in zip(hinges, fits, strict=True) if is_fit]

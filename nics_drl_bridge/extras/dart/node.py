@@ -1,0 +1,46 @@
+"""dart_node: robots in DART behind the same topics as hardware."""
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+from rclpy.node import Node
+
+from nics_drl_bridge.extras.dart.scenery import load_dart
+from nics_drl_bridge.extras.dart.simulator import PHYSICS, DartSimulator
+from nics_drl_bridge.extras.physics.machines import design_machine
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.nodes.device_parameters import randomisation
+from nics_drl_bridge.nodes.parameters import FRICTION, GYRO_BIAS, GYRO_NOISE, URDF
+from nics_drl_bridge.nodes.runner import declare_row, run_node
+from nics_drl_bridge.nodes.simulator_node import DeviceNode
+from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.sim.world_set import AnyWorld
+
+
+def check(robot: RobotSpec) -> None:
+    """Raises ConfigError without DART, or for a robot without a machine."""
+    load_dart()
+    design_machine(robot, PHYSICS, "DART")
+
+
+def dart_simulator(
+    node: Node, model: SimulatorModel, world: AnyWorld, robots: int
+) -> DartSimulator:
+    """Makes robots in DART, with the floor, gyro and robot of the node's parameters."""
+    rows = {
+        row.name: declare_row(node, row) for row in (FRICTION, GYRO_BIAS, GYRO_NOISE)
+    }
+    file = declare_row(node, URDF)
+    return DartSimulator(
+        model,
+        world,
+        robots,
+        replace(PHYSICS, **rows),
+        randomisation(node),
+        Path(file) if file else None,
+    )
+
+
+DartNode = partial(DeviceNode, "dart_node", dart_simulator)
+main = partial(run_node, DartNode, sole_name="dart_node")

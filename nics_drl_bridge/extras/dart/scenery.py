@@ -1,0 +1,183 @@
+"""Worlds of DART: floor, solids, collisions, and scans by DART's own ray casting."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.extras.physics.machines import Physics
+from nics_drl_bridge.extras.physics.scenery import (
+    BUMPER_FRICTION,
+    HEIGHT,
+    Box,
+    Cylinder,
+    Solid,
+)
+from nics_drl_bridge.interface import Array
+from nics_drl_bridge.lidar.arrays import Singles
+from nics_drl_bridge.lidar.spec import LidarSpec
+
+ORIGIN = np.zeros(3)
+EDGE = 1e-5  # radius of the edges of a prism [m]
+RIM = 0.01  # thickness of the sides of a prism [m]
+# of the solver of contacts: its results are measured against the textbook
+TOLERANCE = 1e-3
+MOST_SWEEPS = 30
+
+
+def load_dart() -> Any:
+    """Returns the module `dartpy`. Raises ConfigError if it is not installed."""
+    try:
+        import dartpy
+    except ImportError:
+        fix = "run pip install 'nics_drl_bridge[dart]'."
+        raise ConfigError(f"DART is not installed; {fix}") from None
+    return dartpy
+
+
+def make_world(dart: Any, physics: Physics) -> Any:
+    """Returns a world with a floor, whose skeleton is the first."""
+    world = dart.simulation.World()
+    world.setTimeStep(physics.timestep)
+    # Gazebo's choice; Bullet, which casts the rays, rounds what touches by 0.04 m.
+    world.setCollisionDetector(dart.collision.OdeCollisionDetector())
+    sleep = world.getDeactivationOptions()
+    sleep.mEnabled = False
+    world.setDeactivationOptions(sleep)
+    # By default, friction is limited along x and y apart, and robots skid too little in turns.
+    solver = dart.constraint.NsgsFrictionSolver()
+    options = solver.getOptions()
+    options.tolerance = TOLERANCE
+    options.maxSweeps = MOST_SWEEPS
+    solver.setOptions(options)
+    world.getConstraintSolver().setBoxedLcpSolver(solver)
+    floor = add_fixed_body(dart, world, "floor")
+    plane = dart.dynamics.PlaneShape([0.0, 0.0, 1.0], 0.0)
+    let_touch(add_shape(floor, plane), physics.friction)
+    return world
+
+
+def add_fixed_body(dart: Any, world: Any, name: str) -> Any:
+    """Adds a body at the origin that nothing moves; returns it."""
+    skeleton = dart.dynamics.Skeleton(name)
+    _, body = skeleton.createFreeJointAndBodyNodePair()
+    body.setName(name)
+    skeleton.setMobile(False)
+    world.addSkeleton(skeleton)
+    return body
+
+
+def place_body(body: Any, pose: Array, height: float = 0.0) -> None:
+    """Puts a free body at x, y, heading (3,) and a height [m], at rest."""
+    x, y, heading = pose
+    skeleton = body.getSkeleton()
+    positions = np.zeros(skeleton.getNumDofs())
+    positions[2:6] = heading, x, y, height
+    skeleton.setPositions(positions)
+    skeleton.resetVelocities()
+
+
+def add_shape(body: Any, shape: Any, transform: Any = None) -> Any:
+    """Adds a shape to a body, which rays may see but nothing touches; returns its node."""
+    node = body.createShapeNode(shape)
+    if transform is not None:
+        node.setRelativeTransform(transform)
+    return node
+
+
+def let_touch(node: Any, friction: float = BUMPER_FRICTION) -> None:
+    """Lets the shape of a node touch others."""
+    node.createCollisionAspect()
+    node.createDynamicsAspect()
+    node.getDynamicsAspect().setFrictionCoeff(friction)
+
+
+def add_solid(
+    dart: Any,
+    body: Any,
+    solid: Solid,
+    level: float,
+    height: float = HEIGHT,
+    pose: Array = ORIGIN,
+) -> Any:
+    """Adds a solid at a pose (3,) in a body's frame; returns the node that rays see.
+
+    The solid reaches as far above as below the `level` [m]. Rays see a cylinder or a hull, in whose
+    place a capsule or boxes along the sides touch others, because ODE computes those exactly.
+    """
+    shapes = dart.dynamics
+    if isinstance(solid, Box):
+        x, y, heading = geometry.compose(pose, [*solid.middle, solid.heading])
+        transform = make_transform(dart, [x, y, level], heading)
+        node = add_shape(body, shapes.BoxShape([*solid.size, height]), transform)
+        let_touch(node)
+        return node
+    if isinstance(solid, Cylinder):
+        transform = make_transform(dart, [*pose[:2], level])
+        capsule = shapes.CapsuleShape(solid.radius, height)
+        let_touch(add_shape(body, capsule, transform))
+        return add_shape(body, shapes.CylinderShape(solid.radius, height), transform)
+    corners = pose[:2] + geometry.rotate(solid.corners, pose[2])
+    for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        along = end - start
+        length = float(np.hypot(*along))
+        inward = np.array([-along[1], along[0]]) / length
+        middle = 0.5 * (start + end + RIM * inward)
+        heading = float(np.arctan2(along[1], along[0]))
+        side = shapes.BoxShape([length, RIM, height])
+        transform = make_transform(dart, [*middle, level], heading)
+        let_touch(add_shape(body, side, transform))
+    middle = corners.mean(axis=0)
+    ends = (-0.5 * height, 0.5 * height)
+    spheres = [(EDGE, [x, y, end]) for x, y in corners - middle for end in ends]
+    hull = shapes.MultiSphereConvexHullShape(spheres)
+    return add_shape(body, hull, make_transform(dart, [*middle, level]))
+
+
+def make_transform(dart: Any, place: ArrayLike, heading: float = 0.0) -> Any:
+    """Returns a transform by a place (3,) [m] and a rotation about the vertical [rad]."""
+    transform = dart.math.Isometry3()
+    transform.set_translation(place)
+    c = np.cos(heading)
+    s = np.sin(heading)
+    transform.set_rotation(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]))
+    return transform
+
+
+def forbid_contact(world: Any, bodies: Iterable[Any], others: Iterable[Any]) -> None:
+    """Lets bodies pass through others."""
+    forbidden = world.getConstraintSolver().getCollisionOption().collisionFilter
+    others = list(others)
+    for body in bodies:
+        for other in others:
+            forbidden.addBodyNodePairToBlackList(body, other)
+
+
+def make_group(dart: Any, nodes: Iterable[Any]) -> Any:
+    """Returns the shapes of nodes as a group for `cast_scan`."""
+    group = dart.collision.BulletCollisionDetector().createCollisionGroup()
+    for node in nodes:
+        group.addShapeFrame(node)
+    return group
+
+
+def cast_scan(
+    dart: Any, group: Any, lidar: LidarSpec, pose: Array, height: float
+) -> Singles:
+    """Scans (B,) [m], REP-117, from a robot's pose (3,), at a height [m] among a group's shapes."""
+    x, y, heading = geometry.compose(pose, np.array(lidar.mount))
+    start = np.array([x, y, height])
+    ends = np.full((lidar.beams, 3), height)
+    ends[:, :2] = [x, y] + lidar.range_max * geometry.rotate(lidar.directions, heading)
+    option = dart.collision.RaycastOption()
+    result = dart.collision.RaycastResult()
+    ranges = np.full(lidar.beams, np.inf)
+    for i, end in enumerate(ends):
+        result.clear()
+        if group.raycast(start, end, option, result):
+            ranges[i] = lidar.range_max * result.mRayHits[0].mFraction
+    ranges[ranges < lidar.range_min] = -np.inf
+    return ranges.astype(np.float32)

@@ -1,0 +1,307 @@
+"""Robots in DART: one on an infinite floor, or several in a world, like FastSimulator."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.extras.dart import scenery
+from nics_drl_bridge.extras.dart.machines import DartBody, make_body
+from nics_drl_bridge.extras.physics.machines import (
+    STEERING_TORQUE,
+    Machine,
+    Physics,
+    design_machine,
+)
+from nics_drl_bridge.extras.physics.scenery import (
+    cut_shape,
+    cut_world,
+)
+from nics_drl_bridge.extras.physics.simulator import (
+    PhysicsRobot,
+    PhysicsSimulator,
+    Reading,
+    Rig,
+)
+from nics_drl_bridge.generator import SimulatorModel, footprint_shape
+from nics_drl_bridge.interface import Array
+from nics_drl_bridge.lidar import fault_kernels
+from nics_drl_bridge.lidar.exact_kernels import RADIUS, SHAPE
+from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.sim.randomisation import Randomisation
+from nics_drl_bridge.sim.scenes import Scenes
+from nics_drl_bridge.sim.simulator import Starts
+from nics_drl_bridge.sim.world_set import AnyWorld
+
+PHYSICS = Physics(timestep=0.002)
+GRAVITY = 9.81  # [m/s^2]
+
+
+class DartRig(Rig):
+    """Access to one robot in a world of DART, and its motors.
+
+    Motors follow a wanted state with their lag, and hold its speeds while the tyres can. A
+    differential between driven wheels gives each the speed of its own circle.
+    """
+
+    def __init__(
+        self,
+        dart: Any,
+        world: Any,
+        spec: RobotSpec,
+        machine: Machine,
+        body: DartBody,
+        physics: Physics,
+    ) -> None:
+        super().__init__(spec, machine)
+        self._world = world
+        self._skeleton = body.skeleton
+        self._height = body.height
+        self._frame = dart.dynamics.Frame.World()
+        self.base = body.skeleton.getRootBodyNode()
+        self._joints = [joint.getIndexInSkeleton(0) for joint in body.joints]
+        # enough to let one tyre slide that carries all
+        torque = physics.friction * body.skeleton.getMass() * GRAVITY * machine.radius
+        for name, joint in zip(machine.joints, body.joints, strict=True):
+            joint.setActuatorType(dart.dynamics.ActuatorType.SERVO)
+            limit = STEERING_TORQUE if name.startswith("steer") else torque
+            joint.setForceLowerLimit(0, -limit)
+            joint.setForceUpperLimit(0, limit)
+        self._timestep = physics.timestep
+        self._follows = -np.expm1(-physics.timestep / np.array(machine.lags))
+        self._wanted = np.zeros(len(machine.lags))
+        self._followed = np.zeros(len(machine.lags))
+
+    def put(self, pose: ArrayLike) -> None:
+        """See `Rig`."""
+        scenery.place_body(self.base, np.asarray(pose), self._height)
+        self._wanted = np.zeros_like(self._wanted)
+        self._followed = np.zeros_like(self._wanted)
+
+    def launch(self, twist: Array, state: Array) -> None:
+        """See `Rig`."""
+        speeds = np.zeros(self._skeleton.getNumDofs())
+        speeds[2] = twist[2]
+        speeds[3:5] = geometry.rotate(twist[:2], self.heading())
+        self._skeleton.setVelocities(speeds)
+        self._followed = np.array(state)
+
+    def motion(self) -> tuple[Array, ...]:
+        """See `Rig`."""
+        skeleton = self._skeleton
+        moves = skeleton.getPositions(), skeleton.getVelocities()
+        return *moves, self._wanted, self._followed
+
+    def resume(self, motion: tuple[Array, ...]) -> None:
+        """See `Rig`."""
+        positions, speeds, self._wanted, self._followed = motion
+        self._skeleton.setPositions(positions)
+        self._skeleton.setVelocities(speeds)
+
+    def drive(self, wanted: Array) -> None:
+        """See `Rig`."""
+        self._wanted = wanted
+
+    def turn_wheels(self) -> None:
+        """Sets the speeds of the joints for the next time step."""
+        missing = self._wanted - self._followed
+        self._followed = self._followed + self._follows * missing
+        speeds = self.machine.controls(self._followed)
+        if self.machine.kind == "ackermann":
+            split = self.machine.half_ratio * np.tan(self._followed[1])
+            engine, *angles = speeds
+            turning = (angles - self.encoders()[2:]) / self._timestep
+            wheels = engine * (1.0 - split), engine * (1.0 + split)
+            speeds = np.array([*wheels, *turning])
+        self._skeleton.setCommands(self._joints, speeds)
+
+    def read(self) -> Reading:
+        """See `Rig`."""
+        place = self.base.getTransform().translation()
+        velocity = self.base.getLinearVelocity(self._frame, self.base)
+        turning = self.base.getAngularVelocity(self._frame, self.base)
+        return Reading(
+            time=float(self._world.getTime()),
+            pose=np.array([place[0], place[1], self.heading()]),
+            twist=np.array([velocity[0], velocity[1], turning[2]]),
+            state=self.machine.state(
+                self.encoders(), self._skeleton.getVelocities(self._joints)
+            ),
+        )
+
+    def heading(self) -> float:
+        """See `Rig`."""
+        rotation = self.base.getTransform().rotation()
+        return float(np.arctan2(rotation[1, 0], rotation[0, 0]))
+
+    def encoders(self) -> Array:
+        """See `Rig`."""
+        return np.array(self._skeleton.getPositions(self._joints))
+
+    def cosine_of_tilt(self) -> float:
+        """See `Rig`."""
+        return float(self.base.getTransform().rotation()[2, 2])
+
+
+class DartRobot(PhysicsRobot):
+    """A robot on an infinite floor in DART: built by its spec, or from a URDF or SDF file."""
+
+    engine = "DART"
+
+    def __init__(
+        self, spec: RobotSpec, physics: Physics = PHYSICS, file: Path | None = None
+    ) -> None:
+        self._dart = scenery.load_dart()
+        self.spec = spec
+        self._file = file
+        self.machine = design_machine(spec, physics, self.engine)
+        self._physics = physics
+        self.timestep = physics.timestep
+        self.reset(np.zeros(3))
+
+    def reset(self, pose: ArrayLike) -> Reading:
+        """See `PhysicsRobot`."""
+        self._world = scenery.make_world(self._dart, self._physics)
+        body = make_body(self._dart, self.machine, self._physics, self._file)
+        self._world.addSkeleton(body.skeleton)
+        parts = self.spec, self.machine, body, self._physics
+        self.rig = DartRig(self._dart, self._world, *parts)
+        self.rig.put(pose)
+        return self.read()
+
+    def advance(self, steps: int) -> None:
+        """See `PhysicsRobot`."""
+        for _ in range(steps):
+            self.rig.turn_wheels()
+            self._world.step()
+
+
+class DartSimulator(PhysicsSimulator):
+    """One world of robots in DART, which also casts the lidar's rays; for `file` see DartRobot.
+
+    Scans that are late or skewed are the FastSimulator's, because they need the past.
+    """
+
+    def __init__(
+        self,
+        model: SimulatorModel,
+        world: AnyWorld,
+        robots: int = 1,
+        physics: Physics = PHYSICS,
+        randomisation: Randomisation | None = None,
+        file: Path | None = None,
+    ) -> None:
+        self._dart = scenery.load_dart()
+        self._file = file
+        super().__init__(model, world, robots, physics, randomisation=randomisation)
+
+    def design(self, spec: RobotSpec, physics: Physics) -> Machine:
+        """See `PhysicsSimulator`."""
+        return design_machine(spec, physics, "DART")
+
+    def compile(self, bodies: Array) -> list[DartRig]:
+        """See `PhysicsSimulator`."""
+        dart = self._dart
+        self._engine = scenery.make_world(dart, self._physics)
+        fixed = scenery.add_fixed_body(dart, self._engine, "scenery")
+        member = int(self.data.member[0])
+        level = self._machine.radius
+        seen = [
+            scenery.add_solid(dart, fixed, solid, level)
+            for solid in cut_world(self.world.members[member])
+        ]
+        self._moving = {}
+        for k in np.flatnonzero(bodies[:, RADIUS] > 0.0).tolist():
+            pose = bodies[k, :3]
+            body = fixed
+            if self.sampler.motions[member][k] is not None:
+                body = scenery.add_fixed_body(dart, self._engine, f"obstacle_{k}")
+                scenery.place_body(body, pose)
+                self._moving[k] = body
+                pose = scenery.ORIGIN
+            for solid in cut_shape(self.sampler.shapes[int(bodies[k, SHAPE])]):
+                seen.append(scenery.add_solid(dart, body, solid, level, pose=pose))
+        return self._add_robots(seen, [fixed, *self._moving.values()])
+
+    def _add_robots(self, seen: list[Any], obstacles: list[Any]) -> list[DartRig]:
+        """Adds the robots, of which only bumpers touch obstacles, and lets them see."""
+        dart = self._dart
+        spec = self.model.robot
+        height = self._machine.radius
+        rigs = []
+        bumpers = []
+        for m in range(self.data.pose.shape[1]):
+            body = make_body(dart, self._machine, self._physics, self._file)
+            body.skeleton.setName(f"robot_{m}")
+            base = body.skeleton.getRootBodyNode()
+            level = height - body.height
+            bumpers.append(
+                [
+                    scenery.add_solid(dart, base, solid, level, height)
+                    for solid in cut_shape(footprint_shape(spec))
+                ]
+            )
+            self._engine.addSkeleton(body.skeleton)
+            parts = self._machine, body, self._physics
+            rigs.append(DartRig(dart, self._engine, spec, *parts))
+        bases = [rig.base for rig in rigs]
+        for rig in rigs:
+            wheels = rig.base.getSkeleton().getBodyNodes()[1:]
+            scenery.forbid_contact(self._engine, wheels, obstacles + bases)
+        floor = self._engine.getSkeleton("floor").getBodyNode(0)
+        scenery.forbid_contact(self._engine, bases, [floor])
+        self._groups = []
+        for bumper in bumpers:
+            others = [one for one in bumpers if one is not bumper]
+            self._groups.append(scenery.make_group(dart, sum(others, seen)))
+        return rigs
+
+    def place_obstacles(self, bodies: Array) -> None:
+        """See `PhysicsSimulator`."""
+        for k, body in self._moving.items():
+            scenery.place_body(body, bodies[k, :3])
+
+    def advance(self, steps: int) -> list[int]:
+        """See `PhysicsSimulator`."""
+        bumped = []
+        for _ in range(steps):
+            for rig in self._rigs:
+                rig.turn_wheels()
+            self._engine.step()
+            contacts = self._engine.getLastCollisionResult()
+            bumped += [
+                m for m, rig in enumerate(self._rigs) if contacts.inCollision(rig.base)
+            ]
+        return bumped
+
+    def step(self, commands: ArrayLike) -> None:
+        """See `PhysicsSimulator`."""
+        super().step(commands)
+        self._scan()
+
+    def reset(
+        self, seeds: ArrayLike, worlds: ArrayLike | None = None, starts: Starts = None
+    ) -> Scenes:
+        """Starts the episode of a seed (1,) at poses (1, M, 3); see `FastSimulator.reset`."""
+        scenes = super().reset(seeds, worlds, starts)
+        self._scan()
+        return scenes
+
+    def _scan(self) -> None:
+        data = self.data
+        lidar = self.model.lidar
+        limits = lidar.range_min, lidar.range_max
+        robots = data.ranges.shape[1]
+        for m, group in enumerate(self._groups):
+            faults = data.faults[0, m]
+            if data.age[0, m] > 0 or faults[fault_kernels.SKEW] != 0.0:
+                continue
+            pose = data.pose[0, m]
+            scan = scenery.cast_scan(
+                self._dart, group, lidar, pose, self._machine.radius
+            )
+            counter = int(data.steps[0]) * robots + m
+            fault_kernels.distort(scan, limits, faults, int(data.seeds[0]), counter)
+            data.ranges[0, m] = scan

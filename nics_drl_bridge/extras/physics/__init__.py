@@ -1,0 +1,1 @@
+"""What robots on wheels with contact have in common, whichever physics engine moves them."""

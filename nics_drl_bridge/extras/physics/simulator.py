@@ -1,0 +1,327 @@
+"""Robots of a physics engine: one on an infinite floor, or several in a world."""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from nics_drl_bridge import defaults, geometry
+from nics_drl_bridge.errors import BackendError, ConfigError
+from nics_drl_bridge.extras.physics.machines import Machine, Physics
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.interface import Array
+from nics_drl_bridge.lidar.arrays import Integers
+from nics_drl_bridge.lidar.scanner import Renderer
+from nics_drl_bridge.recording.recording import Recording, Stream
+from nics_drl_bridge.recording.textbook import HOLD_S, ROW_S
+from nics_drl_bridge.robot.kinds import textbook
+from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.sim.device import DrivenSimulator
+from nics_drl_bridge.sim.randomisation import Randomisation
+from nics_drl_bridge.sim.scenes import Scenes
+from nics_drl_bridge.sim.simulator import FastSimulator, Starts
+from nics_drl_bridge.sim.world_set import AnyWorld
+
+# approximate period of encoder readings and of updates of moving obstacles
+ENCODER_PERIOD_S = 0.01
+LARGEST_TILT_RAD = 0.5
+MOTION = ("pose", "twist", "state")
+
+
+@dataclass(frozen=True)
+class Reading:
+    """State of a robot at one time."""
+
+    time: float  # time since the reset [s]
+    pose: Array  # (3,) of `base_link`: x [m], y [m], heading [rad]
+    twist: Array  # (3,) vx [m/s], vy [m/s], wz [rad/s] in `base_link`
+    state: Array  # (S,) measured by encoders, in the order of the RobotSpec
+
+
+class Rig(ABC):
+    """Access to one machine in an engine."""
+
+    def __init__(self, spec: RobotSpec, machine: Machine) -> None:
+        self.spec = spec
+        self.machine = machine
+        self._target = textbook(spec).target
+
+    @abstractmethod
+    def put(self, pose: ArrayLike) -> None:
+        """Places the robot at a pose (3,) on the floor, with its parts at rest."""
+
+    @abstractmethod
+    def launch(self, twist: Array, state: Array) -> None:
+        """Gives the body a twist (3,); motors may continue at a state (S,)."""
+
+    @abstractmethod
+    def motion(self) -> Any:
+        """Returns positions and speeds of the body and all its parts, for `resume`."""
+
+    @abstractmethod
+    def resume(self, motion: Any) -> None:
+        """Continues with the motion of another rig of this machine."""
+
+    @abstractmethod
+    def drive(self, wanted: Array) -> None:
+        """Sets the motors to a state (S,)."""
+
+    @abstractmethod
+    def read(self) -> Reading:
+        """Returns the current reading."""
+
+    @abstractmethod
+    def heading(self) -> float:
+        """Returns the heading [rad]."""
+
+    @abstractmethod
+    def encoders(self) -> Array:
+        """Returns the positions (J,) of the joints with encoders [rad]."""
+
+    @abstractmethod
+    def cosine_of_tilt(self) -> float:
+        """Returns the cosine of the angle between the robot and the vertical."""
+
+    def command(self, command: ArrayLike) -> None:
+        """Sets the motors to a command (C,), clipped to its limits. Raises BackendError for NaN."""
+        command = np.asarray(command, dtype=np.float64)
+        count = len(self.spec.command)
+        if command.shape != (count,) or not np.isfinite(command).all():
+            reason = f"must be {count} finite numbers, as robot {self.spec.name!r} takes them."
+            raise BackendError(f"command {command.tolist()} {reason}")
+        clipped = np.clip(command, self.spec.command_low, self.spec.command_high)
+        self.drive(self._target(clipped))
+
+    def require_upright(self) -> None:
+        """Raises BackendError if the robot has fallen over."""
+        if not self.cosine_of_tilt() > np.cos(LARGEST_TILT_RAD):
+            fix = "lower the acceleration of its Physics, or its command limits."
+            when = f"at {self.read().time:.2f} s"
+            raise BackendError(
+                f"robot {self.spec.name!r} has fallen over {when}; {fix}"
+            )
+
+
+class PhysicsRobot(ABC):
+    """A robot on an infinite floor, moved by motors and contact."""
+
+    engine: str  # name of the engine
+    spec: RobotSpec
+    machine: Machine
+    timestep: float  # [s]
+    rig: Any  # a Rig
+
+    @abstractmethod
+    def reset(self, pose: ArrayLike) -> Reading:
+        """Places the robot at a pose (3,), at rest and settled, and restarts the clock."""
+
+    @abstractmethod
+    def advance(self, steps: int) -> None:
+        """Moves by whole time steps."""
+
+    def step(self, command: ArrayLike, duration: float) -> Reading:
+        """Drives with a command (C,), clipped, for a duration [s] in whole time steps.
+
+        Raises BackendError.
+        """
+        self.rig.command(command)
+        self.advance(round(duration / self.timestep))
+        self.rig.require_upright()
+        return self.read()
+
+    def read(self) -> Reading:
+        """Returns the current reading."""
+        reading: Reading = self.rig.read()
+        return reading
+
+
+class PhysicsSimulator(DrivenSimulator, ABC):
+    """One world of robots with motors, wheels and contact, seeded like FastSimulator.
+
+    Commands act on motors with their own lag, so the model's latency is not added. A randomisation
+    adds its latency, but its factors on the model's kinematics have no effect. Raises ConfigError
+    if the engine, textbook kinematics, a parameter of the machine or free space is missing.
+    """
+
+    def __init__(
+        self,
+        model: SimulatorModel,
+        world: AnyWorld,
+        robots: int,
+        physics: Physics,
+        renderer: Renderer = defaults.MUJOCO_RENDERER,
+        randomisation: Randomisation | None = None,
+    ) -> None:
+        self._subperiods, self._steps, timestep = divide(
+            model.control_period, physics.timestep
+        )
+        self._physics = replace(physics, timestep=timestep)
+        self._machine = self.design(model.robot, self._physics)
+        self._twist = textbook(model.robot).twist
+        drawn: Any = {"renderer": renderer, "randomisation": randomisation}
+        super().__init__(model, world, robots=robots, **drawn)
+        self.reset([0])
+
+    @abstractmethod
+    def design(self, spec: RobotSpec, physics: Physics) -> Machine:
+        """Prepares the machine of all robots."""
+
+    @abstractmethod
+    def compile(self, bodies: Array) -> list[Any]:
+        """Builds the scene with obstacles (K, 7), and returns the rigs of robots to be placed."""
+
+    def refresh(self) -> None:
+        """Derives what depends on the robots' poses, after they were placed."""
+
+    @abstractmethod
+    def place_obstacles(self, bodies: Array) -> None:
+        """Moves the obstacles to the poses of bodies (K, 7)."""
+
+    @abstractmethod
+    def advance(self, steps: int) -> list[int]:
+        """Moves by whole time steps; returns the robots that touch something, maybe repeatedly.
+
+        Raises BackendError if the engine diverges.
+        """
+
+    def reset(
+        self, seeds: ArrayLike, worlds: ArrayLike | None = None, starts: Starts = None
+    ) -> Scenes:
+        """Starts the episode of a seed (1,) at poses (1, M, 3); see `FastSimulator.reset`."""
+        scenes = super().reset(seeds, worlds, starts)
+        self._gyro_noise = np.random.default_rng(int(self.data.seeds[0]))
+        self._rigs: list[Any] = self.compile(scenes.bodies[0])
+        for rig, pose in zip(self._rigs, self.data.pose[0], strict=True):
+            rig.put(pose)
+        self.refresh()
+        return scenes
+
+    def put_bodies(self, bodies: Array) -> None:
+        """Puts the obstacles, see `FastSimulator.put_bodies`, and rebuilds the scene."""
+        super().put_bodies(bodies)
+        motions = [rig.motion() for rig in self._rigs]
+        self._rigs = self.compile(bodies)
+        self._resume(motions)
+
+    def put_robot(self, robot: int, pose: Array, state: Array) -> None:
+        """Puts a robot, see `FastSimulator.put_robot`; the motors bring its wheels up to speed."""
+        super().put_robot(robot, pose, state)
+        rig = self._rigs[robot]
+        rig.put(pose)
+        rig.launch(self._twist(state), state)
+        self.refresh()
+
+    def take_over(
+        self, source: FastSimulator, robots: Integers, obstacles: Integers
+    ) -> None:
+        """Continues the episode of another simulator; see `FastSimulator.take_over`."""
+        super().take_over(source, robots, obstacles)
+        if isinstance(source, type(self)):
+            self.wheels[: len(robots)] = source.wheels[robots]
+            self._resume([source._rigs[r].motion() for r in robots])
+
+    def _resume(self, motions: Sequence[Any]) -> None:
+        for rig, motion in zip(self._rigs, motions, strict=False):
+            rig.resume(motion)
+        self.refresh()
+
+    def step(self, commands: ArrayLike) -> None:
+        """Moves by one control period with commands (1, M, C), clipped to their limits.
+
+        Raises ConfigError, BackendError.
+        """
+        commands = np.asarray(commands, dtype=np.float64)
+        shape = (1, len(self._rigs), len(self.model.robot.command))
+        if commands.shape != shape:
+            raise ConfigError(f"commands are {commands.shape}; they must be {shape}.")
+        if not np.isfinite(commands).all():
+            needed = f"must be finite numbers, as robot {self.model.robot.name!r} takes them."
+            raise BackendError(f"commands {commands.tolist()} {needed}")
+        self.begin_period(commands[0])
+        self._move()
+        for rig, collided in zip(self._rigs, self.data.collided[0], strict=True):
+            if not collided:
+                rig.require_upright()
+
+    def _move(self) -> None:
+        rigs = self._rigs
+        part_s = self.model.control_period / self._subperiods
+        wheels = self.wheels.copy()
+        counted = np.zeros((len(rigs), 3))
+        touched = np.zeros(len(rigs), np.bool_)
+        turned = [rig.encoders() for rig in rigs]
+        facing = [rig.heading() for rig in rigs]
+        for part in range(self._subperiods):
+            for rig, command in zip(rigs, self.in_force(part * part_s), strict=True):
+                rig.command(command)
+            self.place_obstacles(self.move_obstacles((part + 1) * part_s))
+            touched[self.advance(self._steps)] = True
+            before = turned
+            turned = [rig.encoders() for rig in rigs]
+            faced = facing
+            facing = [rig.heading() for rig in rigs]
+            pairs = zip(before, turned, strict=True)
+            mean = self._machine.state
+            means = [
+                mean(0.5 * (first + last), (last - first) / part_s)
+                for first, last in pairs
+            ]
+            counted = self._twist(np.array(means)) * self._machine.calibrated
+            if self._machine.gyro:
+                turned_by = geometry.wrap_angle(np.subtract(facing, faced))
+                counted[:, 2] = turned_by / part_s + self._draw_gyro_errors()
+            wheels = geometry.compose(wheels, geometry.exp(counted * part_s))
+        readings = [rig.read() for rig in rigs]
+        pose, twist, state = (
+            np.array([getattr(r, n) for r in readings]) for n in MOTION
+        )
+        self.end_period(pose, twist, state, wheels, counted, touched)
+
+    def _draw_gyro_errors(self) -> Array:
+        physics = self._physics
+        noise = self._gyro_noise.standard_normal(len(self._rigs))
+        return physics.gyro_bias + physics.gyro_noise * noise
+
+
+def divide(period: float, longest: float) -> tuple[int, int, float]:
+    """Divides a period: returns parts of about `ENCODER_PERIOD_S`, steps per part, step [s]."""
+    parts = max(1, round(period / ENCODER_PERIOD_S))
+    steps = max(1, math.ceil(period / parts / longest - 1e-6))
+    return parts, steps, period / parts / steps
+
+
+def record(
+    robot: PhysicsRobot,
+    rng: np.random.Generator,
+    duration: float = defaults.DRIVE_S,
+    dt: float = ROW_S,
+    hold: float = HOLD_S,
+) -> Recording:
+    """Drives at random, with a new command every `hold` [s], and records every `dt` [s].
+
+    Raises BackendError.
+    """
+    spec = robot.spec
+    per_hold = round(hold / dt)
+    holds = int(np.ceil(duration / hold))
+    held = rng.uniform(spec.command_low, spec.command_high, (holds, len(spec.command)))
+    commands = np.repeat(held, per_hold, axis=0)
+    reading = robot.reset(np.zeros(3))
+    poses = []
+    states = []
+    for command in commands:
+        poses.append(reading.pose)
+        states.append(reading.state)
+        reading = robot.step(command, dt)
+    t = np.asarray(np.arange(len(commands)) * dt, dtype=np.float64)
+    drive = Stream(t, commands), Stream(t, np.array(poses)), Stream(t, np.array(states))
+    return Recording(
+        *drive,
+        source=f"{robot.engine} {spec.name}",
+        variables=spec.variable_names,
+        measured_by="truth",
+    )
