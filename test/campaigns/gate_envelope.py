@@ -17,9 +17,10 @@ from dataclasses import replace
 import numpy as np
 from campaign import Given, Result, at_least, at_most, run_campaign
 from numpy.typing import NDArray
-from parts.gates import Gate, gate_config
+from parts.gates import gate_config
 
 from nics_drl_bridge.config import find_config, parse_yaml, read_text
+from nics_drl_bridge.gate.assurance.gate_loop import Gate
 from nics_drl_bridge.gate.inputs import Press
 from nics_drl_bridge.gate.limits import Limits
 from nics_drl_bridge.gate.state import Decision

@@ -10,6 +10,9 @@ from importlib import import_module
 import numpy as np
 import pytest
 
+from nics_drl_bridge.gate.assurance.place import POLICY, Job, Place
+from nics_drl_bridge.generator import builtin_model
+
 from .campaign import FOLDER
 
 
@@ -115,10 +118,9 @@ def test_what_nodes_of_nav2_say_to_each_other_is_not_asked_of_the_robot(
     assert topics <= nav2_names.TYPES.keys()
 
 
-def test_a_car_that_trembles_at_rest_was_walked_into(module):
-    places = module("parts.shield_places")
-    place = places.Place("ackermann", "crowd")
-    place.begin(places.Job("ram", 1, standing=True))
+def test_a_car_that_trembles_at_rest_was_walked_into():
+    place = Place(builtin_model("ackermann"), "crowd")
+    place.begin(Job("ram", 1, standing=True))
     for _ in range(80):
         place.step(np.zeros(3))
     simulator, (x, y, radius) = place._sim, place.truth.circles[0]
@@ -133,10 +135,9 @@ def test_a_car_that_trembles_at_rest_was_walked_into(module):
     assert place.outcome.path > 0.01  # its noise
 
 
-def test_a_robot_that_drives_into_something_is_in_contact(module):
-    places = module("parts.shield_places")
-    place = places.Place("mecanum", "arena")
-    place.begin(places.Job("goal", 0))  # which has the time to come to a wall
+def test_a_robot_that_drives_into_something_is_in_contact():
+    place = Place(builtin_model("mecanum"), "arena")
+    place.begin(Job(POLICY, 0))  # which has the time to come to a wall
     while not (place.outcome.contact or place.outcome.walked_into):
         place.step(np.array([0.5, 0.0, 0.0]))
     assert place.outcome.contact
