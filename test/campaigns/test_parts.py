@@ -10,9 +10,6 @@ from importlib import import_module
 import numpy as np
 import pytest
 
-from nics_drl_bridge.gate.assurance.place import POLICY, Job, Place
-from nics_drl_bridge.generator import builtin_model
-
 from .campaign import FOLDER
 
 
@@ -116,32 +113,6 @@ def test_what_nodes_of_nav2_say_to_each_other_is_not_asked_of_the_robot(
     topics, _ = nav2_names.wanted(file)
     assert topics - nav2_names.ALWAYS == {"odometry/filtered"}
     assert topics <= nav2_names.TYPES.keys()
-
-
-def test_a_car_that_trembles_at_rest_was_walked_into():
-    place = Place(builtin_model("ackermann"), "crowd")
-    place.begin(Job("ram", 1, standing=True))
-    for _ in range(80):
-        place.step(np.zeros(3))
-    simulator, (x, y, radius) = place._sim, place.truth.circles[0]
-    # People keep out of its way, so it is put where one of them is about to tread.
-    still = np.zeros(simulator.data.state.shape[-1])
-    simulator.put_robot(0, np.array([x + radius, y, 0.0]), still)
-    place._lately.append(np.array([x + radius, y]))
-    place._lately.extend(list(place._lately)[-1:] * place._lately.maxlen)
-    place.step(np.zeros(3))
-    assert place.outcome.walked_into
-    assert not place.outcome.contact
-    assert place.outcome.path > 0.01  # its noise
-
-
-def test_a_robot_that_drives_into_something_is_in_contact():
-    place = Place(builtin_model("mecanum"), "arena")
-    place.begin(Job(POLICY, 0))  # which has the time to come to a wall
-    while not (place.outcome.contact or place.outcome.walked_into):
-        place.step(np.array([0.5, 0.0, 0.0]))
-    assert place.outcome.contact
-    assert place.outcome.speed == pytest.approx(0.5, abs=0.1)
 
 
 def test_the_shipped_values_keep_room_to_brake_at_all_speeds(module):

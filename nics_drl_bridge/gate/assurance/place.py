@@ -4,7 +4,6 @@ The world moves in short steps. The robot's base reads a command once per contro
 one does.
 """
 
-from collections import deque
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -107,14 +106,13 @@ class Place:
         self.odom = np.zeros(3)  # pose by odometry, from one episode to the next
 
     def begin(self, job: Job) -> None:
-        """Places the robot in the scene of a job; it stands."""
+        """Places the robot in the scene of a job; it stands. `track` gets its true poses (3,)."""
         self.job = job
         self._steps = 0
         self.scenes = self._sim.reset([job.seed])
         self._begun = self._sim.data.odom[0, 0].copy()
         self._anchor = self.odom.copy()
-        position = self._sim.data.pose[0, 0, :2].copy()
-        self._lately = deque([position], maxlen=MOVING_STEPS + 1)
+        self.track = [self._sim.data.pose[0, 0].copy()]
         self.outcome = Outcome(job.kind, self.robot, self.world, job.seed)
         rng = np.random.default_rng([7, job.seed])
         self._phase = int(rng.integers(self.period_steps))
@@ -159,11 +157,11 @@ class Place:
         self._sim.step(self._command)
         self._steps += 1
         before = self._compute_speed()
-        position = data.pose[0, 0, :2].copy()
-        outcome.path += float(np.hypot(*(position - self._lately[-1])))
-        self._lately.append(position)
+        x, y, heading = data.pose[0, 0].tolist()
+        outcome.path += float(np.hypot(*((x, y) - self.track[-1][:2])))
+        self.track.append(np.array([x, y, heading]))
         outcome.seconds = self._steps * self.step_s
-        outcome.position = (float(position[0]), float(position[1]))
+        outcome.position = (x, y)
         if data.collided[0, 0] and not touched:
             # The touch itself may have stopped the robot.
             outcome.speed = max(before, self._compute_speed())
@@ -174,8 +172,9 @@ class Place:
 
     def _compute_speed(self) -> float:
         """Returns the true speed over the last steps; that of odometry is noisy [m/s]."""
-        steps = len(self._lately) - 1
-        distance = float(np.hypot(*(self._lately[-1] - self._lately[0])))
+        lately = self.track[-MOVING_STEPS - 1 :]
+        steps = len(lately) - 1
+        distance = float(np.hypot(*(lately[-1] - lately[0])[:2]))
         return distance / (steps * self.step_s) if steps else 0.0
 
     @property

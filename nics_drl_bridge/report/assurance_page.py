@@ -1,0 +1,212 @@
+"""The page of `nics assure`: claims with their evidence, failures, and how it was tested."""
+
+import shlex
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from nics_drl_bridge.files import format_json
+from nics_drl_bridge.gate.assurance.adversaries import ADVERSARIES
+from nics_drl_bridge.gate.assurance.episodes import (
+    MAX_COMMAND_DELAY_S,
+    MAX_SCAN_DELAY_S,
+)
+from nics_drl_bridge.gate.assurance.place import ADVERSARY_S, POLICY, POLICY_S
+from nics_drl_bridge.gate.assurance.protocol import CLAIMS, STOPS, Protocol
+from nics_drl_bridge.report import html
+
+Blocks = Sequence[str]
+HEADS = ("claim", "failures", "rate of failures, 95 %", "without the gate")
+MAX_CLUSTERS = 50
+MAX_SEEDS = 5  # of a cluster that the table shows
+NOT_SHOWN = (
+    "Safety of the vehicle: this is evidence from a simulator, not a certificate. The bounds hold "
+    "for the scenes, drivers and delays that this protocol draws.",
+    "That the vehicle brakes as its model does. Measure its latency and deceleration.",
+    "Obstacles that the lidar does not see, or that are faster than the shield's obstacle_speed.",
+    "The end of the gate's process or of the machine: there the base must stop by itself.",
+)
+
+
+def make_assurance_page(protocol: Protocol, results: Mapping[str, Any]) -> str:
+    """Makes the page of a run that is complete."""
+    subject = (
+        f"Robot {protocol.model}, policy {protocol.policy}, limits {protocol.limits}"
+    )
+    lead = (
+        f"{subject}: {results['episodes']:,} episodes that try to make the gate fail."
+    )
+    title = "Safety evidence for a command gate"
+    if protocol.control:
+        lead = f"{subject}. Control: nothing was gated, so failures must appear."
+        title = "Control of safety evidence: the gate was off"
+    sections = [
+        ("Result", _make_result(protocol, results)),
+        ("Failures", _make_failures(protocol, results)),
+        ("How it was tested", _make_method(protocol, results)),
+        ("What this does not show", [html.make_bullets(NOT_SHOWN)]),
+        ("Protocol, versions and hashes", _make_protocol(protocol)),
+    ]
+    return html.make_page(title, lead, sections)
+
+
+def tabulate(
+    protocol: Protocol, results: Mapping[str, Any]
+) -> list[tuple[str, str, str, str]]:
+    """Returns the rows of the table with the columns `HEADS`, a claim each."""
+    shown = results["control" if protocol.control else "claims"]
+    return [
+        (
+            sentence,
+            _format_counts(shown[claim]),
+            _format_bounds(shown[claim]),
+            _format_counts(results["control"][claim]),
+        )
+        for claim, sentence in CLAIMS.items()
+    ]
+
+
+def _format_counts(figures: Mapping[str, Any]) -> str:
+    """Formats failures and trials."""
+    if not figures["trials"]:
+        return "not tested"
+    return f"{figures['failures']:,} of {figures['trials']:,}"
+
+
+def _format_bounds(figures: Mapping[str, Any]) -> str:
+    """Formats the 95 % bounds of a rate of failures."""
+    if not figures["trials"]:
+        return "unknown"
+    if not figures["failures"]:
+        return f"below {figures['rate_high']:.1e}"
+    return f"{figures['rate_low']:.1e} to {figures['rate_high']:.1e}"
+
+
+def _make_result(protocol: Protocol, results: Mapping[str, Any]) -> Blocks:
+    shown = results["control" if protocol.control else "claims"]
+    tiles = []
+    for claim, sentence in CLAIMS.items():
+        figures = shown[claim]
+        good = figures["trials"] > 0 and not figures["failures"]
+        tiles.append((_format_counts(figures), f"failed. Claim: {sentence}", good))
+    sentences = []
+    if not shown[STOPS]["trials"]:
+        sentences.append(
+            "The claim on stopping in time was not tested: it needs ROS 2 and --faults."
+        )
+    clean = [f for f in shown.values() if f["trials"] and not f["failures"]]
+    if clean:
+        trials = max(figures["trials"] for figures in clean)
+        sentences.append(
+            "No failure in n trials means, with 95 % confidence, a rate below 3/n, here "
+            f"{3 / trials:.1e} for {trials:,} trials. It does not mean that the rate is 0."
+        )
+    sentences += [_describe_control(claim, results["control"]) for claim in CLAIMS]
+    return [
+        html.make_tiles(tiles),
+        html.make_table(HEADS, tabulate(protocol, results)),
+        html.make_bullets([sentence for sentence in sentences if sentence]),
+    ]
+
+
+def _describe_control(claim: str, control: Mapping[str, Any]) -> str:
+    figures = control[claim]
+    if not figures["trials"]:
+        return ""
+    name = claim.replace("_", " ")
+    if figures["failures"]:
+        return (
+            f"Control, {name}: without the gate, {_format_counts(figures)} trials fail, so this "
+            "protocol can find such a failure."
+        )
+    return f"Control, {name}: without the gate nothing fails either, so its zero proves nothing."
+
+
+def _make_failures(protocol: Protocol, results: Mapping[str, Any]) -> Blocks:
+    clusters = results["clusters"]
+    if not clusters:
+        return [html.make_paragraph("None.")]
+    rows = []
+    for cluster in clusters[:MAX_CLUSTERS]:
+        seeds = [str(seed) for seed in cluster["seeds"][:MAX_SEEDS]]
+        more = " ..." if len(cluster["seeds"]) > MAX_SEEDS else ""
+        near = ", ".join(f"{value:g}" for value in cluster["near"])
+        rows.append(
+            (
+                cluster["claim"].replace("_", " "),
+                cluster["kind"],
+                cluster["world"],
+                near,
+                str(cluster["failures"]),
+                ", ".join(seeds) + more,
+            )
+        )
+    heads = ("claim", "driver or fault", "world", "near x, y [m]", "failures", "seeds")
+    count = (
+        f"{len(results['failures']):,} trials failed, in {len(clusters):,} clusters."
+    )
+    replayed = [c["seeds"][0] for c in clusters if c["world"]][:1]
+    blocks = [html.make_paragraph(count), html.make_table(heads, rows)]
+    if replayed:
+        told = "Replay one by its seed; --out must hold this run, and gets a picture:"
+        blocks.append(html.make_paragraph(told))
+        blocks.append(html.make_code(_make_command(protocol, replayed[0])))
+    return blocks
+
+
+def _make_command(protocol: Protocol, seed: int | None = None) -> str:
+    words = ["nics", "assure", protocol.policy, "--limits", protocol.limits]
+    words += ["--model", protocol.model]
+    for world in protocol.worlds:
+        words += ["--world", world]
+    words += ["--randomisation", protocol.randomisation]
+    words += ["--episodes", str(protocol.episodes), "--seed", str(protocol.seed)]
+    if protocol.control:
+        words += ["--control", protocol.control]
+    words += ["--out", "FOLDER"]
+    if seed is not None:
+        words += ["--replay", str(seed)]
+    return shlex.join(words)
+
+
+def _make_method(protocol: Protocol, results: Mapping[str, Any]) -> Blocks:
+    drivers = [
+        f"{name}: {aim}; it knows the true scene" for name, aim in ADVERSARIES.items()
+    ]
+    drivers.append(
+        f"{POLICY}: the policy on its way to a goal, in worlds and with sensors perturbed by "
+        f"the randomisation {protocol.randomisation!r}"
+    )
+    latched = ", ".join(f"{rule} {n:,}" for rule, n in results["latched"].items())
+    path_km = results["path_m"] / 1000.0
+    hours = results["seconds"] / 3600.0
+    facts = [
+        f"Worlds: {', '.join(protocol.worlds)}. An adversary drives for {ADVERSARY_S:g} s, the "
+        f"policy for up to {POLICY_S:g} s: {path_km:.2f} km in {hours:.2f} h with the gate.",
+        f"Scans reach the gate up to {MAX_SCAN_DELAY_S:g} s late, and commands arrive up to "
+        f"{MAX_COMMAND_DELAY_S:g} s late before and after the gate; each episode draws its delays.",
+        "A touch is a failure if the robot moved. In "
+        f"{results['walked_into']:,} episodes something walked into a robot that stood.",
+        f"The gate latched a stop in {sum(results['latched'].values()):,} episodes "
+        f"({latched or 'none'}): such an episode ends at rest and still counts.",
+        f"One episode in {protocol.control_every}, and the first of each driver in each world, is "
+        "driven again without the gate, as a control.",
+        "Seeds, numbers and hashes were written to the JSON before the first episode.",
+    ]
+    return [
+        html.make_paragraph("The drivers take turns:"),
+        html.make_bullets(drivers),
+        html.make_bullets(facts),
+    ]
+
+
+def _make_protocol(protocol: Protocol) -> Blocks:
+    rows = [("protocol, SHA-256", protocol.sha256)]
+    rows += [(name, value) for name, value in protocol.hashes.items()]
+    rows += [(name, value) for name, value in protocol.versions.items()]
+    text = format_json(protocol.data, indent=1)
+    return [
+        html.make_table(("what", "value"), rows),
+        html.make_paragraph("The same run again, bit for bit with the same versions:"),
+        html.make_code(_make_command(protocol)),
+        html.make_details("The protocol as it was fixed", [html.make_code(text)]),
+    ]
