@@ -1,7 +1,11 @@
 """`nics assure`: safety evidence for a policy behind the gate, as a page and a JSON file."""
 
+import json
 import platform
 import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -9,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from typer import Argument, Option
 
-from nics_drl_bridge import __version__, defaults
+from nics_drl_bridge import __version__, defaults, extensions
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import check_above, format_json, write_bytes, write_text
@@ -62,6 +66,12 @@ def assure(
             help="Drawn in each episode of the policy: a shipped one or a YAML file.",
         ),
     ] = defaults.ASSURANCE_RANDOMISATION,
+    faults: Annotated[
+        int,
+        Option(
+            min=0, help="How many are injected over DDS, in real time; needs ROS 2."
+        ),
+    ] = defaults.ASSURANCE_FAULTS,
     control: Annotated[
         Literal["no_gate"] | None,
         Option(help="Run everything without the gate, which must find failures."),
@@ -75,7 +85,7 @@ def assure(
     ] = Path("runs/assure"),
     as_json: console.JsonOption = False,
 ) -> None:
-    """Tries to make a policy behind the gate fail; writes the evidence."""
+    """Tries to make a gated policy fail, and writes the evidence."""
     check_above(out / PAGE)
     with console.show_progress("opening robot and policy"):
         from nics_drl_bridge.commands.episodes import model_name, read_contracts
@@ -97,14 +107,14 @@ def assure(
             model=name,
             worlds=tuple(dict.fromkeys(world or defaults.ASSURANCE_WORLDS)),
             episodes=episodes,
-            faults=0,
             seed=seed,
             randomisation=randomisation,
             control=control or "",
             hashes={},
             versions=_read_versions(),
+            **_choose_faults(faults),
         )
-        order = _add_hashes(order, opened)
+        order = replace(order, hashes=_compute_hashes(order, opened))
         run = Run(order, opened)
     if replay is not None:
         _replay(run, replay, out, as_json)
@@ -119,14 +129,26 @@ def assure(
         raise typer.Exit(EXIT_FAILED)
 
 
+def _choose_faults(count: int) -> dict[str, Any]:
+    """Returns the fields of a protocol on faults: none without ROS 2."""
+    try:
+        extensions.require("nics assure --faults", "rclpy")
+    except ConfigError as error:
+        if count:
+            typer.echo(f"no faults over DDS: {error}", err=True)
+        return {"faults": 0}
+    from nics_drl_bridge.nodes.gate_faults import CONTROLS, FAULTS
+
+    kinds = tuple(FAULTS) if count else ()
+    return {"faults": count, "fault_kinds": kinds, "fault_controls": CONTROLS}
+
+
 def _read_versions() -> dict[str, str]:
     versions = {"nics_drl_bridge": __version__, "python": platform.python_version()}
     return versions | {name: version(name) for name in COMPUTED_WITH}
 
 
-def _add_hashes(order: "Protocol", model: "SimulatorModel") -> "Protocol":
-    from dataclasses import replace
-
+def _compute_hashes(order: "Protocol", model: "SimulatorModel") -> dict[str, str]:
     from nics_drl_bridge.config import find_config
     from nics_drl_bridge.files import hash_bytes
     from nics_drl_bridge.policy.file.policy_file import load_policy
@@ -149,7 +171,7 @@ def _add_hashes(order: "Protocol", model: "SimulatorModel") -> "Protocol":
     }
     for world in order.worlds:
         hashes[f"world {world}, fingerprint"] = load_world(world).fingerprint
-    return replace(order, hashes=hashes)
+    return hashes
 
 
 def _drive(run: "Run", out: Path) -> dict[str, Any]:
@@ -157,28 +179,47 @@ def _drive(run: "Run", out: Path) -> dict[str, Any]:
     from nics_drl_bridge.gate.assurance.results import summarise
     from nics_drl_bridge.report.assurance_page import make_assurance_page
 
+    order = run.protocol
+    say = partial(typer.echo, err=True)
     with console.show_progress("first episode") as advance:
-        begun: list[tuple[float, int]] = []
+        rows = runs.drive_all(
+            out / runs.LOG,
+            list(order.list_trials()),
+            partial(map, run.drive),
+            _tell_left("episodes", advance),
+        )
+        faults = order.list_faults()
+        if faults:
+            from nics_drl_bridge.nodes.gate_faults import inject_trials
 
-        def tell(done: int, total: int) -> None:
-            begun.append((time.monotonic(), done))
-            advance(f"episodes{_estimate_left(begun, total)}", done, total)
-
-        rows = runs.drive_all(run, out, tell)
+            rows += runs.drive_all(
+                out / runs.FAULT_LOG,
+                faults,
+                partial(inject_trials, order, out / "logs", say),
+                _tell_left("faults", advance),
+            )
     results = summarise(rows)
-    runs.write_result(out, run.protocol, complete=True, **results)
-    write_text(out / PAGE, make_assurance_page(run.protocol, results))
+    runs.write_result(out, order, complete=True, **results)
+    write_text(out / PAGE, make_assurance_page(order, results, str(out)))
     return results
 
 
-def _estimate_left(begun: list[tuple[float, int]], total: int) -> str:
-    """Returns the time left, by the rate of this run so far; empty before a second episode."""
-    passed_s = begun[-1][0] - begun[0][0]
-    driven = begun[-1][1] - begun[0][1]
-    if not driven:
-        return ""
-    left_s = round(passed_s / driven * (total - begun[-1][1]))
-    return f", {left_s // 3600} h {left_s // 60 % 60:02} min left"
+def _tell_left(what: str, advance: console.Tell) -> Callable[[int, int], None]:
+    """Returns a function that shows the progress with the time left, by the rate so far."""
+    begun: list[tuple[float, int]] = []
+
+    def tell(done: int, total: int) -> None:
+        if not begun:
+            begun.append((time.monotonic(), done))
+        begun_s, first = begun[0]
+        left = ""
+        if done > first:
+            left_s = (time.monotonic() - begun_s) / (done - first) * (total - done)
+            minutes = round(left_s / 60.0)
+            left = f", {minutes // 60} h {minutes % 60:02} min left"
+        advance(f"{what}{left}", done, total)
+
+    return tell
 
 
 def _replay(run: "Run", seed: int, out: Path, as_json: bool) -> None:
@@ -193,8 +234,16 @@ def _replay(run: "Run", seed: int, out: Path, as_json: bool) -> None:
     order = run.protocol
     order.check_same(runs.read_result(out)["protocol"], str(out))
     trial = order.find_trial(seed)
+    if trial in order.list_faults():
+        from nics_drl_bridge.nodes.gate_faults import inject_trials
+
+        say = partial(typer.echo, err=True)
+        (row,) = inject_trials(order, out / "logs", say, [trial])
+        listed = "\n".join(f"{name:<12} {value}" for name, value in row.items())
+        console.print_line(as_json, listed, **row)
+        return
     rows, _ = runs.read_rows(out / runs.LOG, list(order.list_trials()))
-    row = run.drive(trial)
+    row = json.loads(format_json(run.drive(trial)))
     place = run.open_place(trial.world, trial.kind)
     path = np.array(place.track)
     scene = place.scenes[0]

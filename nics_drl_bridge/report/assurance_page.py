@@ -27,8 +27,10 @@ NOT_SHOWN = (
 )
 
 
-def make_assurance_page(protocol: Protocol, results: Mapping[str, Any]) -> str:
-    """Makes the page of a run that is complete."""
+def make_assurance_page(
+    protocol: Protocol, results: Mapping[str, Any], folder: str
+) -> str:
+    """Makes the page of a run that is complete in a folder."""
     subject = (
         f"Robot {protocol.model}, policy {protocol.policy}, limits {protocol.limits}"
     )
@@ -41,7 +43,7 @@ def make_assurance_page(protocol: Protocol, results: Mapping[str, Any]) -> str:
         title = "Control of safety evidence: the gate was off"
     sections = [
         ("Result", _make_result(protocol, results)),
-        ("Failures", _make_failures(protocol, results)),
+        ("Failures", _make_failures(protocol, results, folder)),
         ("How it was tested", _make_method(protocol, results)),
         ("What this does not show", [html.make_bullets(NOT_SHOWN)]),
         ("Protocol, versions and hashes", _make_protocol(protocol)),
@@ -86,19 +88,20 @@ def _make_result(protocol: Protocol, results: Mapping[str, Any]) -> Blocks:
     tiles = []
     for claim, sentence in CLAIMS.items():
         figures = shown[claim]
-        good = figures["trials"] > 0 and not figures["failures"]
+        failed = figures["failures"] > 0
+        good = figures["trials"] > 0 and failed == bool(protocol.control)
         tiles.append((_format_counts(figures), f"failed. Claim: {sentence}", good))
     sentences = []
     if not shown[STOPS]["trials"]:
         sentences.append(
             "The claim on stopping in time was not tested: it needs ROS 2 and --faults."
         )
-    clean = [f for f in shown.values() if f["trials"] and not f["failures"]]
+    clean = {f["trials"] for f in shown.values() if f["trials"] and not f["failures"]}
     if clean:
-        trials = max(figures["trials"] for figures in clean)
+        bounds = [f"{3 / trials:.1e} for {trials:,}" for trials in sorted(clean)]
         sentences.append(
             "No failure in n trials means, with 95 % confidence, a rate below 3/n, here "
-            f"{3 / trials:.1e} for {trials:,} trials. It does not mean that the rate is 0."
+            f"{' and '.join(bounds)} trials. It does not mean that the rate is 0."
         )
     sentences += [_describe_control(claim, results["control"]) for claim in CLAIMS]
     return [
@@ -121,7 +124,9 @@ def _describe_control(claim: str, control: Mapping[str, Any]) -> str:
     return f"Control, {name}: without the gate nothing fails either, so its zero proves nothing."
 
 
-def _make_failures(protocol: Protocol, results: Mapping[str, Any]) -> Blocks:
+def _make_failures(
+    protocol: Protocol, results: Mapping[str, Any], folder: str
+) -> Blocks:
     clusters = results["clusters"]
     if not clusters:
         return [html.make_paragraph("None.")]
@@ -144,16 +149,16 @@ def _make_failures(protocol: Protocol, results: Mapping[str, Any]) -> Blocks:
     count = (
         f"{len(results['failures']):,} trials failed, in {len(clusters):,} clusters."
     )
-    replayed = [c["seeds"][0] for c in clusters if c["world"]][:1]
-    blocks = [html.make_paragraph(count), html.make_table(heads, rows)]
-    if replayed:
-        told = "Replay one by its seed; --out must hold this run, and gets a picture:"
-        blocks.append(html.make_paragraph(told))
-        blocks.append(html.make_code(_make_command(protocol, replayed[0])))
-    return blocks
+    told = "Replay one by its seed; this also draws it:"
+    return [
+        html.make_paragraph(count),
+        html.make_table(heads, rows),
+        html.make_paragraph(told),
+        html.make_code(_make_command(protocol, folder, clusters[0]["seeds"][0])),
+    ]
 
 
-def _make_command(protocol: Protocol, seed: int | None = None) -> str:
+def _make_command(protocol: Protocol, folder: str, seed: int | None = None) -> str:
     words = ["nics", "assure", protocol.policy, "--limits", protocol.limits]
     words += ["--model", protocol.model]
     for world in protocol.worlds:
@@ -162,7 +167,7 @@ def _make_command(protocol: Protocol, seed: int | None = None) -> str:
     words += ["--episodes", str(protocol.episodes), "--seed", str(protocol.seed)]
     if protocol.control:
         words += ["--control", protocol.control]
-    words += ["--out", "FOLDER"]
+    words += ["--faults", str(protocol.faults), "--out", folder]
     if seed is not None:
         words += ["--replay", str(seed)]
     return shlex.join(words)
@@ -192,6 +197,13 @@ def _make_method(protocol: Protocol, results: Mapping[str, Any]) -> Blocks:
         "driven again without the gate, as a control.",
         "Seeds, numbers and hashes were written to the JSON before the first episode.",
     ]
+    if protocol.faults:
+        facts.append(
+            f"{protocol.faults:,} faults were injected over DDS, in real time, around a process of "
+            "the gate and, where the fault is the policy's, of the policy: "
+            f"{', '.join(protocol.fault_kinds)}. {results['not_injected']:,} could not be "
+            "injected, because the robot did not move."
+        )
     return [
         html.make_paragraph("The drivers take turns:"),
         html.make_bullets(drivers),
@@ -204,9 +216,10 @@ def _make_protocol(protocol: Protocol) -> Blocks:
     rows += [(name, value) for name, value in protocol.hashes.items()]
     rows += [(name, value) for name, value in protocol.versions.items()]
     text = format_json(protocol.data, indent=1)
+    command = _make_command(protocol, "again")
     return [
         html.make_table(("what", "value"), rows),
         html.make_paragraph("The same run again, bit for bit with the same versions:"),
-        html.make_code(_make_command(protocol)),
+        html.make_code(command),
         html.make_details("The protocol as it was fixed", [html.make_code(text)]),
     ]

@@ -11,9 +11,12 @@ import time
 import pytest
 from command_line import nics, split_words
 
+from nics_drl_bridge import extensions
 from nics_drl_bridge.gate.assurance.protocol import LIMITS, STOPS, TOUCHES
 
-ORDER = "assure differential --limits differential --world arena --episodes 6"
+ORDER = (
+    "assure differential --limits differential --world arena --episodes 6 --faults 0"
+)
 DEADLINE_S = 200.0
 
 
@@ -115,6 +118,17 @@ def test_a_run_in_the_folder_of_another_is_refused_in_one_sentence(
     (sentence,) = refused.stderr.splitlines()
     assert named in sentence
     assert read(evidence)["complete"]
+
+
+def test_without_ros_2_the_claim_on_faults_is_told_as_not_tested(tmp_path, monkeypatch):
+    monkeypatch.setattr(extensions, "find_lacking", lambda modules: "rclpy")
+    words = ORDER.replace("--episodes 6 --faults 0", "--episodes 1 --faults 5")
+    done = nics(words, "--out out", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "no faults over DDS: nics assure --faults needs the module" in done.stderr
+    assert read(tmp_path)["protocol"]["faults"] == 0
+    page = (tmp_path / "out" / "assurance.html").read_text(encoding="utf-8")
+    assert "stopping in time was not tested" in page
 
 
 def test_other_limits_in_the_same_file_are_refused_by_their_hash(tmp_path):

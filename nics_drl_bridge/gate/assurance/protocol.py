@@ -48,6 +48,10 @@ class Protocol:
     control: str  # `no_gate`, or empty
     hashes: Mapping[str, str]  # of policy, limits, model and worlds
     versions: Mapping[str, str]  # of the package and what it computes with
+    fault_kinds: tuple[str, ...] = ()
+    fault_controls: tuple[
+        str, ...
+    ] = ()  # those that are injected without the gate, too
     claims: Mapping[str, str] = field(default_factory=lambda: CLAIMS)
     drivers: tuple[str, ...] = KINDS
     control_every: int = CONTROL_EVERY
@@ -57,7 +61,9 @@ class Protocol:
     @property
     def data(self) -> dict[str, Any]:
         """The protocol as plain data."""
-        return {**asdict(self), "worlds": list(self.worlds), "drivers": list(KINDS)}
+        data = asdict(self)
+        lists = {name: [*value] for name, value in data.items() if type(value) is tuple}
+        return data | lists
 
     @property
     def sha256(self) -> str:
@@ -76,12 +82,27 @@ class Protocol:
             if is_control and not self.control:
                 yield Trial(kind, world, seed, gated=False)
 
+    def list_faults(self) -> list[Trial]:
+        """Returns all injections, sorted by fault, the controls last; none is in a world."""
+        kinds = self.fault_controls if self.control else self.fault_kinds
+        first = self.seed + self.episodes
+        gated = not self.control
+        trials = [
+            Trial(kinds[k * len(kinds) // self.faults], "", first + k, gated)
+            for k in range(self.faults)
+        ]
+        if self.faults and gated:
+            for k, kind in enumerate(self.fault_controls, first + self.faults):
+                trials.append(Trial(kind, "", k, gated=False))
+        return trials
+
     def find_trial(self, seed: int) -> Trial:
-        """Returns the episode of a seed. Raises ConfigError."""
-        for trial in self.list_trials():
+        """Returns the first episode or injection of a seed. Raises ConfigError."""
+        trials = [*self.list_trials(), *self.list_faults()]
+        for trial in trials:
             if trial.seed == seed:
                 return trial
-        last = self.seed + self.episodes - 1
+        last = trials[-1].seed
         raise ConfigError(
             f"--replay {seed}: the run has the seeds {self.seed} to {last}; give one of them."
         )

@@ -13,7 +13,7 @@ from nics_drl_bridge.gate.assurance.run import Row
 CONFIDENCE = 0.95
 CELL_M = 2.0  # side of the squares of a world by which failures are clustered
 FAILED: dict[str, Callable[[Row], bool]] = {
-    STOPS: lambda row: "fault" in row and not row["in_time"],
+    STOPS: lambda row: not row.get("in_time", True),
     LIMITS: lambda row: bool(row.get("violations")),
     TOUCHES: lambda row: bool(row.get("contact")),
 }
@@ -47,6 +47,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
         "episodes": len(episodes),
         "path_m": math.fsum(row["path"] for row in episodes),
         "seconds": math.fsum(row["seconds"] for row in episodes),
+        "not_injected": sum(not row.get("injected", True) for row in rows),
         "walked_into": sum(row["walked_into"] for row in episodes),
         "latched": dict(Counter(row["latched"] for row in episodes if row["latched"])),
         "clusters": find_clusters(tried or controls),
@@ -57,7 +58,11 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
 def _judge(rows: Sequence[Row]) -> dict[str, Any]:
     figures = {}
     for claim in CLAIMS:
-        tested = [row for row in rows if ("fault" in row) == (claim == STOPS)]
+        tested = [
+            row
+            for row in rows
+            if ("fault" in row) == (claim == STOPS) and row.get("injected", True)
+        ]
         failures = sum(map(FAILED[claim], tested))
         low, high = compute_bounds(failures, len(tested))
         figures[claim] = {

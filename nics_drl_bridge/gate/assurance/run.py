@@ -2,9 +2,8 @@
 
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +19,9 @@ from nics_drl_bridge.generator import SimulatorModel
 FORMAT = "nics_drl_bridge/assurance/1"
 RESULT = "assurance.json"
 LOG = "episodes.jsonl"
-Row = dict[
-    str, Any
-]  # an episode of the log: its trial, its outcome and violations of limits
-Tell = Callable[[int, int], None]  # episodes that are done, and all
+FAULT_LOG = "faults.jsonl"
+Row = dict[str, Any]  # a trial in a log, with its outcome
+Tell = Callable[[int, int], None]  # trials that are done, and all
 
 
 class Run:
@@ -57,8 +55,7 @@ class Run:
         judge = LimitJudge(robot, self._limits, slopes=not robot.takes_turn_rate)
         outcome = drive(place, config, Job(trial.kind, trial.seed), judge.see)
         violations = {name: n for name, n in judge.violations.items() if n}
-        row = asdict(outcome) | trial._asdict() | {"violations": violations}
-        return dict(json.loads(format_json(row)))
+        return asdict(outcome) | trial._asdict() | {"violations": violations}
 
 
 def begin(folder: Path, protocol: Protocol) -> None:
@@ -67,6 +64,10 @@ def begin(folder: Path, protocol: Protocol) -> None:
     if file.exists():
         protocol.check_same(read_result(folder)["protocol"], str(folder))
         return
+    if (folder / LOG).exists():
+        raise ConfigError(
+            f"{folder}: has a {LOG} without {RESULT}; choose another --out."
+        )
     write_result(folder, protocol, complete=False)
 
 
@@ -93,22 +94,26 @@ def read_result(folder: Path) -> dict[str, Any]:
     raise ConfigError(f"{file}: is no result of nics assure; choose another --out.")
 
 
-def drive_all(run: Run, folder: Path, tell: Tell) -> list[Row]:
-    """Drives what the log lacks, and returns all rows. Raises ConfigError for another log."""
-    log = folder / LOG
+def drive_all(
+    log: Path,
+    trials: list[Trial],
+    drive_rest: Callable[[list[Trial]], Iterable[Row]],
+    tell: Tell,
+) -> list[Row]:
+    """Drives what a log lacks, and returns all rows. Raises ConfigError for another log."""
     log.touch()
-    trials = list(run.protocol.list_trials())
     rows, size = read_rows(log, trials)
     with log.open("r+b") as file:
         file.truncate(size)  # a killed run may have left part of a line
         file.seek(size)
-        for trial in islice(trials, len(rows), None):
-            tell(len(rows), len(trials))
-            row = run.drive(trial)
-            file.write(format_json(row).encode() + b"\n")
+        tell(len(rows), len(trials))
+        for row in drive_rest(trials[len(rows) :]):
+            line = format_json(row)
+            file.write(line.encode() + b"\n")
             file.flush()
             os.fsync(file.fileno())
-            rows.append(row)
+            rows.append(json.loads(line))
+            tell(len(rows), len(trials))
     return rows
 
 

@@ -5,21 +5,9 @@ from dataclasses import replace
 import pytest
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.gate.assurance.protocol import KINDS, NO_GATE, Protocol
+from nics_drl_bridge.gate.assurance.protocol import KINDS, NO_GATE
 
-PROTOCOL = Protocol(
-    policy="differential",
-    limits="differential",
-    model="differential",
-    worlds=("arena", "crowd"),
-    episodes=1500,
-    faults=0,
-    seed=7,
-    randomisation="mild",
-    control="",
-    hashes={"policy file": "1"},
-    versions={"numpy": "2"},
-)
+from .samples import FAULTS, PROTOCOL
 
 
 def test_every_episode_has_a_seed_of_its_own_known_in_advance():
@@ -72,3 +60,18 @@ def test_only_a_seed_of_the_run_is_found():
     assert PROTOCOL.find_trial(9).seed == 9
     with pytest.raises(ConfigError, match="--replay 6: the run has the seeds 7 to"):
         PROTOCOL.find_trial(6)
+
+
+def test_injections_are_sorted_by_fault_and_have_seeds_after_those_of_the_episodes():
+    trials = FAULTS.list_faults()
+    assert [trial.kind for trial in trials if trial.gated] == list("aaabbcc")
+    assert [trial.kind for trial in trials if not trial.gated] == ["a", "b"]
+    assert [trial.seed for trial in trials] == list(range(1507, 1516))
+    assert FAULTS.find_trial(1510) == trials[3]
+    assert PROTOCOL.list_faults() == []
+
+
+def test_in_a_control_only_faults_that_nothing_else_answers_are_injected():
+    trials = replace(FAULTS, control=NO_GATE).list_faults()
+    assert [trial.kind for trial in trials] == list("aaaabbb")
+    assert not any(trial.gated for trial in trials)

@@ -9,6 +9,8 @@ from nics_drl_bridge.gate.assurance.results import (
     summarise,
 )
 
+from .samples import fault, row
+
 
 @pytest.mark.parametrize(
     ("failures", "trials", "low", "high"),
@@ -31,23 +33,6 @@ def test_the_bounds_are_those_of_published_tables(failures, trials, low, high):
 def test_without_failures_the_upper_bound_is_three_in_so_many_trials(trials):
     _, high = compute_bounds(0, trials)
     assert 0.98 * 3.0 / trials < high <= 3.0 / trials
-
-
-def row(seed, **changes):
-    return {
-        "kind": "ram",
-        "world": "arena",
-        "seed": seed,
-        "gated": True,
-        "contact": False,
-        "walked_into": False,
-        "latched": "",
-        "path": 1.0,
-        "seconds": 5.0,
-        "position": [0.2, -3.1],
-        "violations": {},
-        **changes,
-    }
 
 
 def test_failures_of_one_kind_at_one_place_are_one_cluster_with_all_its_seeds():
@@ -81,3 +66,16 @@ def test_a_control_counts_for_itself_and_a_claim_without_trials_is_not_tested():
 def test_in_a_run_that_is_a_control_its_failures_are_kept():
     results = summarise([row(1, gated=False, contact=True), row(2, gated=False)])
     assert [failed["seed"] for failed in results["failures"]] == [1]
+
+
+def test_a_fault_counts_for_stopping_and_one_that_was_not_injected_for_nothing():
+    not_injected = fault(9, injected=False)
+    del not_injected["in_time"]
+    late = fault(8, in_time=False)
+    results = summarise([row(1), fault(7), late, not_injected])
+    assert results["claims"][STOPS]["trials"] == 2
+    assert results["claims"][STOPS]["failures"] == 1
+    assert results["claims"][TOUCHES]["trials"] == 1
+    assert results["not_injected"] == 1
+    assert results["failures"] == [late]
+    assert results["clusters"][0]["kind"] == "nan_scan"

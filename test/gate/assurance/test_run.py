@@ -7,7 +7,7 @@ import pytest
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.gate.assurance import run as runs
 
-from .test_protocol import PROTOCOL
+from .samples import PROTOCOL
 
 TRIALS = list(PROTOCOL.list_trials())[:4]
 LINES = [json.dumps(trial._asdict()).encode() + b"\n" for trial in TRIALS]
@@ -44,6 +44,12 @@ def test_the_protocol_is_on_disk_with_its_hash_before_any_episode(tmp_path):
     assert written["protocol_sha256"] == PROTOCOL.sha256
     assert not written["complete"]
     runs.begin(tmp_path, PROTOCOL)  # the same again
+
+
+def test_a_log_without_its_protocol_is_refused(tmp_path):
+    (tmp_path / runs.LOG).touch()
+    with pytest.raises(ConfigError, match="without assurance"):
+        runs.begin(tmp_path, PROTOCOL)
 
 
 @pytest.mark.parametrize("text", ["", "{}", '{"format": "other", "protocol": {}}', "3"])
