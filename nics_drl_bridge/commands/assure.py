@@ -156,9 +156,13 @@ def _compute_hashes(order: "Protocol", model: "SimulatorModel") -> dict[str, str
     from nics_drl_bridge.sim.randomisation import load_randomisation
     from nics_drl_bridge.sim.world import load_world
 
-    check_seeds([order.seed + order.episodes])
+    last_fault = order.list_faults()[-1:]
+    check_seeds([order.seed + order.episodes, *(trial.seed for trial in last_fault)])
     policy = load_policy(order.policy, model)
+    package = Path(__file__).parents[1]
+    sources = [path.read_bytes() for path in sorted(package.rglob("*.py"))]
     hashes = {
+        "package source, SHA-256": hash_bytes(b"".join(sources)),
         "policy file, SHA-256": hash_bytes(policy.path.read_bytes()),
         "policy graph, SHA-256": policy.contract.graph_sha256,
         "limits file, SHA-256": hash_bytes(

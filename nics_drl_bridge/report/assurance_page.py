@@ -149,7 +149,7 @@ def _make_failures(
     count = (
         f"{len(results['failures']):,} trials failed, in {len(clusters):,} clusters."
     )
-    told = "Replay one by its seed; this also draws it:"
+    told = "Replay one by its seed. An episode is the same bit for bit, and drawn:"
     return [
         html.make_paragraph(count),
         html.make_table(heads, rows),
@@ -219,7 +219,10 @@ def _make_protocol(protocol: Protocol) -> Blocks:
     command = _make_command(protocol, "again")
     return [
         html.make_table(("what", "value"), rows),
-        html.make_paragraph("The same run again, bit for bit with the same versions:"),
+        html.make_paragraph(
+            "The same run again. With these versions its episodes are the same bit for bit; faults "
+            "are injected in real time, and so at other moments:"
+        ),
         html.make_code(command),
         html.make_details("The protocol as it was fixed", [html.make_code(text)]),
     ]
