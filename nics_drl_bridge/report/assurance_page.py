@@ -90,7 +90,10 @@ def _make_result(protocol: Protocol, results: Mapping[str, Any]) -> Blocks:
         figures = shown[claim]
         failed = figures["failures"] > 0
         good = figures["trials"] > 0 and failed == bool(protocol.control)
-        tiles.append((_format_counts(figures), f"failed. Claim: {sentence}", good))
+        claim_of_tile = f"Claim: {sentence}"
+        if figures["trials"]:
+            claim_of_tile = f"failed. {claim_of_tile}"
+        tiles.append((_format_counts(figures), claim_of_tile, good))
     sentences = []
     if not shown[STOPS]["trials"]:
         sentences.append(
@@ -146,9 +149,7 @@ def _make_failures(
             )
         )
     heads = ("claim", "driver or fault", "world", "near x, y [m]", "failures", "seeds")
-    count = (
-        f"{len(results['failures']):,} trials failed, in {len(clusters):,} clusters."
-    )
+    count = f"Failed trials: {len(results['failures']):,}. Clusters: {len(clusters):,}."
     told = "Replay one by its seed. An episode is the same bit for bit, and drawn:"
     return [
         html.make_paragraph(count),
@@ -174,13 +175,16 @@ def _make_command(protocol: Protocol, folder: str, seed: int | None = None) -> s
 
 
 def _make_method(protocol: Protocol, results: Mapping[str, Any]) -> Blocks:
-    drivers = [
-        f"{name}: {aim}; it knows the true scene" for name, aim in ADVERSARIES.items()
-    ]
-    drivers.append(
-        f"{POLICY}: the policy on its way to a goal, in worlds and with sensors perturbed by "
-        f"the randomisation {protocol.randomisation!r}"
+    aims = {name: f"{aim}; knows the true scene" for name, aim in ADVERSARIES.items()}
+    aims[POLICY] = (
+        "the policy on its way to a goal, with robot and sensors perturbed by the "
+        f"randomisation {protocol.randomisation!r}"
     )
+    drivers = []
+    for name, aim in aims.items():
+        touches, tried, without_gate, controls = results["drivers"][name]
+        counts = (f"{touches:,} of {tried:,}", f"{without_gate:,} of {controls:,}")
+        drivers.append((f"{name}: {aim}", *counts))
     latched = ", ".join(f"{rule} {n:,}" for rule, n in results["latched"].items())
     path_km = results["path_m"] / 1000.0
     hours = results["seconds"] / 3600.0
@@ -205,8 +209,7 @@ def _make_method(protocol: Protocol, results: Mapping[str, Any]) -> Blocks:
             "injected, because the robot did not move."
         )
     return [
-        html.make_paragraph("The drivers take turns:"),
-        html.make_bullets(drivers),
+        html.make_table(("drivers, in turn", "touches", "without the gate"), drivers),
         html.make_bullets(facts),
     ]
 

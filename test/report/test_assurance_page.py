@@ -27,11 +27,12 @@ def test_without_failures_the_page_tells_the_bound_and_that_a_failure_can_be_fou
     assert "its zero proves nothing" in text  # of the limits, which the control kept
     assert "stopping in time was not tested" in text
     assert PROTOCOL.sha256 in text
+    assert re.search(r"ram: drives into .* 0 of 2\s+1 of 1", text)
 
 
 def test_a_failure_is_told_with_the_command_that_replays_it():
     text = read([row(1), row(9, contact=True), CONTROL])
-    assert "1 trials failed, in 1 clusters" in text
+    assert "Failed trials: 1. Clusters: 1." in text
     assert "nics assure differential --limits differential" in text
     assert "--out runs/mine --replay 9" in text
 

@@ -7,7 +7,13 @@ from typing import Any
 
 from scipy import special
 
-from nics_drl_bridge.gate.assurance.protocol import CLAIMS, LIMITS, STOPS, TOUCHES
+from nics_drl_bridge.gate.assurance.protocol import (
+    CLAIMS,
+    KINDS,
+    LIMITS,
+    STOPS,
+    TOUCHES,
+)
 from nics_drl_bridge.gate.assurance.run import Row
 
 CONFIDENCE = 0.95
@@ -44,6 +50,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
     return {
         "claims": _judge(tried),
         "control": _judge(controls),
+        "drivers": _count_touches(tried, controls),
         "episodes": len(episodes),
         "path_m": math.fsum(row["path"] for row in episodes),
         "seconds": math.fsum(row["seconds"] for row in episodes),
@@ -53,6 +60,19 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
         "clusters": find_clusters(tried or controls),
         "failures": [row for row in tried or controls if _list_failed(row)],
     }
+
+
+def _count_touches(
+    tried: Sequence[Row], controls: Sequence[Row]
+) -> dict[str, list[int]]:
+    """Returns, by driver, touches and episodes with the gate, then both without it."""
+    counts: dict[str, list[int]] = {}
+    for kind in KINDS:
+        counts[kind] = []
+        for rows in (tried, controls):
+            of_kind = [row["contact"] for row in rows if row["kind"] == kind]
+            counts[kind] += [sum(of_kind), len(of_kind)]
+    return counts
 
 
 def _judge(rows: Sequence[Row]) -> dict[str, Any]:
