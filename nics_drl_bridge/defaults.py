@@ -20,6 +20,12 @@ SHADOW_AHEAD_S: Final = 4.0  # default goal: the robot's position this much late
 CONFIRMED_BEYOND_M: Final = 5.0  # farther goals of a vehicle need confirmation
 VEHICLE_START: Final = "wait"  # until it is at the start; alternative: `present`
 
+# safety evidence: so many episodes without a failure bound its rate by 1e-4
+ASSURANCE_EPISODES: Final = 30_000
+ASSURANCE_FAULTS: Final = 1_000  # injected over DDS
+ASSURANCE_WORLDS: Final = ("arena", "clutter", "crowd")
+ASSURANCE_RANDOMISATION: Final = "mild"
+
 # importing worlds
 IMPORT_CLEARANCE_M: Final = (
     0.1  # around the footprint: imported worlds are often narrow

@@ -11,6 +11,7 @@ from typer import Option
 from typer.core import TyperGroup
 
 from nics_drl_bridge import __version__, extensions
+from nics_drl_bridge.commands.assure import assure
 from nics_drl_bridge.commands.console import (
     ROBOT_OPTIONS,
     report_in_one_sentence,
@@ -123,6 +124,7 @@ for command in (
     urdf,
     train,
     evaluate,
+    assure,
     watch,
     demo,
     warmup,

@@ -32,6 +32,10 @@ EXAMPLES = {
         "nics evaluate differential dynamic_window --world circles --in fast",
         "nics evaluate runs/mine/seed_0/policy.onnx --world doorway --episodes 100",
     ),
+    "assure": (
+        "nics assure differential --limits differential --episodes 300",
+        "nics assure my.onnx --limits my_limits.yaml --out runs/evidence",
+    ),
     "watch": (
         "nics watch differential --world circles",
         "nics watch --bag drive",

@@ -23,7 +23,6 @@ import numpy as np
 from campaign import Given, Result, at_least, at_most, run_campaign
 from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
-from parts.spun_node import SpunNode
 
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.tasks.navigation import Navigation
@@ -31,6 +30,7 @@ from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.nodes import qos
 from nics_drl_bridge.nodes.link import Link
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
+from nics_drl_bridge.nodes.spun_node import SpunNode
 
 GRACE_S, WATCH_S = 0.25, 1.2
 """A motion on `cmd_vel` so long after the exception has stayed; it is watched for so long."""

@@ -17,24 +17,22 @@ from dataclasses import replace
 import numpy as np
 from campaign import Given, Result, at_least, at_most, run_campaign
 from numpy.typing import NDArray
-from parts.gates import Gate, gate_config
+from parts.gates import gate_config
 
 from nics_drl_bridge.config import find_config, parse_yaml, read_text
+from nics_drl_bridge.gate.assurance.gate_loop import Gate
+from nics_drl_bridge.gate.assurance.limit_judge import VIOLATIONS, LimitJudge
 from nics_drl_bridge.gate.inputs import Press
 from nics_drl_bridge.gate.limits import Limits
-from nics_drl_bridge.gate.state import Decision
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
 ROBOTS = ("ackermann", "differential", "mecanum")
-VIOLATIONS = ("value", "rate", "jerk", "stop", "odd", "unused")
 LIDAR = LidarSpec(
     beams=8, angle_min=-3.0, angle_max=3.0, range_min=0.05, range_max=3.0, rate=10.0
 )
 SHORTEST_S = 1e-3
 LONGEST_S = 0.22
-TOLERANCE = 1e-6
-"""Of a finite difference: rounding of the published values, divided by the interval."""
 ODD = np.array([np.nan, np.inf, -np.inf, 1e300, -1e300, 1e3])
 LEAST_MOTION = 0.8
 """Of the steps within shipped limits are to be in motion; a late tick stops it for 0.2 s."""
@@ -45,61 +43,15 @@ FASTEST = 50.0
 Array = NDArray[np.float64]
 
 
-class Judge:
-    """Compares what is published with the limits of the file.
-
-    Attributes:
-        violations: how often a limit was exceeded, by its name.
-        sane: whether the newest command is one.
-        low, high: (C,) limits of the value.
-    """
-
-    def __init__(self, spec: RobotSpec, limits: Limits | None = None) -> None:
-        path = find_config(spec.name, "limits")
-        rows = parse_yaml(read_text(path), str(path))["commands"]
-        each = [rows[variable.name] for variable in spec.command]
-        self.low, self.high, self._rate, self._jerk = (
-            np.array([row[key] for row in each])
-            for key in ("min", "max", "rate", "jerk")
-        )
-        self._slopes = limits is None  # of others, rounding may be all there is
-        if limits is not None:
-            self.low = limits.low
-            self.high = limits.high
-        self._spec = spec
-        self._value = np.zeros(len(each))
-        self._slope = np.zeros(len(each))
-        self._time = -np.inf
-        self.sane = True
-        self.violations = dict.fromkeys(VIOLATIONS, 0)
-
-    def see(self, decision: Decision, now: float) -> None:
-        """Judges one decision of the gate."""
-        if not decision.publish:
-            return
-        value = self._spec.from_cmd_vel(decision.twist)
-        unused = not np.array_equal(self._spec.to_cmd_vel(value), decision.twist)
-        self._count("unused", unused)
-        self._count("odd", not self.sane and decision.twist.any())
-        if decision.cause is not None:
-            self._count("stop", decision.twist.any())
-            self._value, self._slope, self._time = value, np.zeros_like(value), now
-            return
-        inside = (value >= self.low) & (value <= self.high)  # False for NaN
-        self._count("value", not inside.all())
-        if not self._slopes:
-            return
-        passed = now - self._time
-        slope = (value - self._value) / passed
-        self._count("rate", not (np.abs(slope) <= self._rate * (1 + TOLERANCE)).all())
-        change = np.abs(slope - self._slope) / passed
-        self._count("jerk", not (change <= self._jerk * (1 + TOLERANCE)).all())
-        self._value = value
-        self._slope = slope
-        self._time = now
-
-    def _count(self, name: str, violated: object) -> None:
-        self.violations[name] += bool(violated)
+def read_limits(spec: RobotSpec, shipped: Limits) -> Limits:
+    """The limits as they stand in the YAML file, past the code that reads them for the gate."""
+    path = find_config(spec.name, "limits")
+    rows = parse_yaml(read_text(path), str(path))["commands"]
+    each = [rows[variable.name] for variable in spec.command]
+    low, high, rate, jerk = (
+        np.array([row[key] for row in each]) for key in ("min", "max", "rate", "jerk")
+    )
+    return replace(shipped, low=low, high=high, rate=rate, jerk=jerk)
 
 
 def random_limits(spec: RobotSpec, shipped: Limits, rng: np.random.Generator) -> Limits:
@@ -117,7 +69,9 @@ def drive(
     assert config.limits is not None
     drawn = random_limits(spec, config.limits, rng) if random else None
     limits = drawn or config.limits
-    judge = Judge(spec, drawn)
+    judged = drawn or read_limits(spec, config.limits)
+    # Of limits of any size, rounding may be all there is to a slope.
+    judge = LimitJudge(spec, judged, slopes=drawn is None)
     if control == "no_limits":
         wide = {
             key: 100.0 * getattr(limits, key) for key in ("low", "high", "rate", "jerk")
@@ -144,9 +98,9 @@ def drive(
             gate.sense(ranges, pose, twist)
             sensed = gate.now
         if whim < 0.6:
-            wish = spec.to_cmd_vel(_wish(judge, whim, rng))
+            wish = spec.to_cmd_vel(_wish(judged, whim, rng))
             wish = np.zeros(3) if control == "standing" else wish
-            reach = 50.0 * np.maximum(-judge.low, judge.high)
+            reach = 50.0 * np.maximum(-judged.low, judged.high)
             asked = np.abs(spec.from_cmd_vel(wish)) < reach
             judge.sane = bool(np.isfinite(wish).all() and asked.all())
             gate.command(wish)
@@ -159,10 +113,10 @@ def drive(
     return judge.violations, moving
 
 
-def _wish(judge: Judge, whim: float, rng: np.random.Generator) -> Array:
+def _wish(limits: Limits, whim: float, rng: np.random.Generator) -> Array:
     """A command (C,): within the limits, at them, beyond them, or nonsense."""
-    low = judge.low
-    high = judge.high
+    low = limits.low
+    high = limits.high
     share = rng.random(len(low))
     wish = low * share + high * (1.0 - share)
     if whim < 0.2:

@@ -29,16 +29,20 @@ import rclpy
 from campaign import Given, Result, at_least, at_most, run_campaign
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
-from parts.faulty_robot import PATIENCE_S, ROBOT, Robot
 from parts.processes import core_seconds, part
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Bool
 
 from nics_drl_bridge.gate.black_box import replay
+from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.nodes import command_gate, gate_log, qos
+from nics_drl_bridge.nodes.faulty_robot import Robot
 from nics_drl_bridge.nodes.processes import free_domain_id
 from nics_drl_bridge.nodes.start import start
 
+ROBOT = "ackermann"
+TWIST = np.array([0.5, 0.0, 0.1])
+PATIENCE_S = 60.0
 GATE = "command_gate"
 TICK_HZ = 50
 ODOM_HZ = 50
@@ -134,7 +138,7 @@ def measure(given: Given) -> Result:
         gate(domain_id, Path(name), given.control or "") as real,
         part(__file__, domain_id, "bare_node()", stderr=subprocess.DEVNULL) as bare,
     ):
-        robot = Robot(domain_id, odom_hz=ODOM_HZ)
+        robot = Robot(domain_id, builtin_model(ROBOT), TWIST, odom_hz=ODOM_HZ)
         try:
             if not robot.until(lambda: robot.listeners() >= 2, PATIENCE_S):
                 raise RuntimeError(

@@ -26,16 +26,19 @@ import numpy as np
 from campaign import FOLDER, Given, Result, at_least, at_most, missed_bars, run_campaign
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
-from parts.faulty_robot import PERIOD_S, ROBOT, SPEED, Robot
 from parts.lossy_link import Link, NoNamespacesError, link
-from parts.spun_node import SpunNode
 from sensor_msgs.msg import LaserScan
 from std_srvs.srv import Trigger
 
+from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.faulty_robot import PERIOD_S, Robot
 from nics_drl_bridge.nodes.processes import NodeProcess
+from nics_drl_bridge.nodes.spun_node import SpunNode
 
+ROBOT = "ackermann"
+TWIST = np.array([0.5, 0.0, 0.1])
 LOSSES = (5, 20)
 SCAN_AGE_S, TOLERANCE_S = 0.35, 0.05
 """The gate's limit, and what its tick (0.02 s) and the way to the robot may add."""
@@ -78,7 +81,7 @@ class Stack(SpunNode):
 
     def _act(self, scan: LaserScan) -> None:
         command = TwistStamped(
-            header=scan.header, twist=conversions.twist_to_ros([SPEED, 0, 0.1])
+            header=scan.header, twist=conversions.twist_to_ros(TWIST)
         )
         self._raw.publish(command)
         self._last = command.twist
@@ -118,7 +121,9 @@ def run_stack(seconds: float, folder: Path, control: str) -> None:
 def run_robot(seconds: float, folder: Path, control: str) -> None:
     """The near end: drives on a whole network, then says so and drives on."""
     skip = SLOW_SKIP if control == "slow_robot" else 1
-    robot = Robot(None, policy=True, skip=skip, sensors=qos.SENSOR)
+    robot = Robot(
+        None, builtin_model(ROBOT), TWIST, True, skip=skip, sensors=qos.SENSOR
+    )
     robot.silent.add("odometry/filtered")  # the stack has an estimate of its own
 
     def drive_until(done: Callable[[], bool], patience_s: float) -> None:

@@ -27,12 +27,12 @@ from campaign import Given, Result, at_least, missed_bars, run_campaign
 from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
 from parts.processes import core_seconds, part, use_of
-from parts.spun_node import SpunNode
 from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.nodes import qos, wire
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
+from nics_drl_bridge.nodes.spun_node import SpunNode
 
 SCAN_HZ = 10.0
 ODOM_HZ = 50.0

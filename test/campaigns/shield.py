@@ -23,10 +23,18 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from campaign import Given, Result, at_least, at_most, missed_bars, run_campaign
-from parts import shield_in_process
-from parts.adversaries import ADVERSARIES
 from parts.braking import braking_used
-from parts.shield_places import ADVERSARY_S, GOAL, Job, Outcome, Place
+
+from nics_drl_bridge.gate.assurance import episodes
+from nics_drl_bridge.gate.assurance.adversaries import ADVERSARIES
+from nics_drl_bridge.gate.assurance.place import (
+    ADVERSARY_S,
+    POLICY,
+    Job,
+    Outcome,
+    Place,
+)
+from nics_drl_bridge.generator import builtin_model
 
 ROBOTS = ("ackermann", "differential", "mecanum")
 WORLDS = ("arena", "clutter", "crowd")
@@ -43,21 +51,22 @@ NOTHING = {"latency": 0.0, "deceleration": 1e3, "margin": 0.0, "obstacle_speed":
 
 
 def plan_jobs(
-    episodes: int, seed: int, places: int, standing: bool
+    count: int, seed: int, places: int, standing: bool
 ) -> tuple[list[list[Job]], list[list[Job]]]:
     """The episodes of each place: with the shield, and without it."""
     with_it: list[list[Job]] = [[] for _ in range(places)]
     without: list[list[Job]] = [[] for _ in range(places)]
-    for index in range(episodes):
-        kind = ADVERSARIES[index // places % len(ADVERSARIES)]
+    kinds = tuple(ADVERSARIES)
+    for index in range(count):
+        kind = kinds[index // places % len(kinds)]
         job = Job(kind, seed + index, standing)
         with_it[index % places].append(job)
         if index // places % WITHOUT == 0 or (
             index < places * len(ADVERSARIES) and not index % 2
         ):
             without[index % places].append(job)
-    for index in range(max(places, episodes // GOALS)):
-        job = Job(GOAL, seed + index, standing)
+    for index in range(max(places, count // GOALS)):
+        job = Job(POLICY, seed + index, standing)
         with_it[index % places].append(job)
         without[index % places].append(job)
     return with_it, without
@@ -71,8 +80,10 @@ def drive(
     """All episodes."""
     found = []
     for place, some in zip(places, jobs, strict=True):
-        config = shield_in_process.config_of(place, shield)
-        found += shield_in_process.drive(place, config, some)
+        config = episodes.configure_gate(
+            place.model, place.robot, shield, shielded=shield is not None
+        )
+        found += [episodes.drive(place, config, job) for job in some]
         sys.stderr.write(f"{place.robot} in {place.world}: {len(some)} episodes\n")
     return found
 
@@ -117,7 +128,7 @@ def summarise(shielded: Sequence[Outcome], bare: Sequence[Outcome]) -> Result:
         "goals_reached": sum(one.reached for one in goals),
         "goals_reached_without": sum(one.reached for one in goals_without),
         "touched": [
-            f"{one.kind} {one.where} at {one.speed:.3f} m/s, "
+            f"{one.kind} {one.robot} {one.world} {one.seed} at {one.speed:.3f} m/s, "
             f"its gate silent for up to {one.silence:.2f} s"
             for one in touched
         ],
@@ -128,8 +139,14 @@ def split_by_kind(
     outcomes: Sequence[Outcome],
 ) -> tuple[list[Outcome], list[Outcome]]:
     """Episodes of adversaries, and those with a goal."""
-    tried = [one for one in outcomes if one.kind != GOAL]
-    return tried, [one for one in outcomes if one.kind == GOAL]
+    tried = [one for one in outcomes if one.kind != POLICY]
+    return tried, [one for one in outcomes if one.kind == POLICY]
+
+
+def open_place(name: str) -> Place:
+    """A shipped robot in a shipped world, by the name robot/world."""
+    robot, world = name.split("/")
+    return Place(builtin_model(robot), world)
 
 
 def judge(result: Result) -> list[str]:
@@ -157,7 +174,7 @@ def measure(given: Given) -> Result:
     """Drives all episodes, some of them without the shield as well."""
     controls = {"no_shield": None, "no_braking_distance": NOTHING}
     shield = controls.get(given.control, {})
-    places = [Place(*name.split("/")) for name in given.place]
+    places = [open_place(name) for name in given.place]
     stands = given.control == "standing"
     with_it, without = plan_jobs(given.episodes, given.seed, len(places), stands)
     held_up = [0.0]

@@ -27,13 +27,13 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from parts.processes import Use, use_of
-from parts.spun_node import SpunNode
 from std_srvs.srv import Trigger
 
 from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
+from nics_drl_bridge.nodes.spun_node import SpunNode
 
 ROBOT = "differential"
 WORLD = "empty"

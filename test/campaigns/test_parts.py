@@ -115,34 +115,6 @@ def test_what_nodes_of_nav2_say_to_each_other_is_not_asked_of_the_robot(
     assert topics <= nav2_names.TYPES.keys()
 
 
-def test_a_car_that_trembles_at_rest_was_walked_into(module):
-    places = module("parts.shield_places")
-    place = places.Place("ackermann", "crowd")
-    place.begin(places.Job("ram", 1, standing=True))
-    for _ in range(80):
-        place.step(np.zeros(3))
-    simulator, (x, y, radius) = place._sim, place.truth.circles[0]
-    # People keep out of its way, so it is put where one of them is about to tread.
-    still = np.zeros(simulator.data.state.shape[-1])
-    simulator.put_robot(0, np.array([x + radius, y, 0.0]), still)
-    place._lately.append(np.array([x + radius, y]))
-    place._lately.extend(list(place._lately)[-1:] * place._lately.maxlen)
-    place.step(np.zeros(3))
-    assert place.outcome.walked_into
-    assert not place.outcome.contact
-    assert place.outcome.path > 0.01  # its noise
-
-
-def test_a_robot_that_drives_into_something_is_in_contact(module):
-    places = module("parts.shield_places")
-    place = places.Place("mecanum", "arena")
-    place.begin(places.Job("goal", 0))  # which has the time to come to a wall
-    while not (place.outcome.contact or place.outcome.walked_into):
-        place.step(np.array([0.5, 0.0, 0.0]))
-    assert place.outcome.contact
-    assert place.outcome.speed == pytest.approx(0.5, abs=0.1)
-
-
 def test_the_shipped_values_keep_room_to_brake_at_all_speeds(module):
     braking = module("parts.braking")
     assert 0.1 in braking.SHARES

@@ -29,13 +29,13 @@ import yaml
 from campaign import FOLDER, Given, Result, run_campaign
 from geometry_msgs.msg import PoseStamped, TwistStamped
 from numpy.typing import NDArray
-from parts.spun_node import SpunNode
 from skid_rover import PILLARS
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
 from nics_drl_bridge.config import share_folder
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
+from nics_drl_bridge.nodes.spun_node import SpunNode
 
 Array = NDArray[np.float64]
 

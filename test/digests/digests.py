@@ -179,19 +179,20 @@ def numbers_of(data: Any) -> list[float]:
 
 def gate() -> Found:
     """What the gate decides about adversaries, moment by moment, with its shipped shield."""
-    from parts import shield_in_process
-    from parts.adversaries import ADVERSARIES
-    from parts.shield_places import Job, Place
+    from nics_drl_bridge.gate.assurance import episodes
+    from nics_drl_bridge.gate.assurance.adversaries import ADVERSARIES
+    from nics_drl_bridge.gate.assurance.place import Job, Place
+    from nics_drl_bridge.generator import builtin_model
 
     found = {}
     for index, robot in enumerate(ROBOTS):
-        place = Place(robot, ("crowd", "clutter", "arena")[index])
-        config = shield_in_process.config_of(place, {})
+        world = ("crowd", "clutter", "arena")[index]
+        place = Place(builtin_model(robot), world)
+        config = episodes.configure_gate(place.model, robot)
         decisions: list[float] = []
         for seed, kind in enumerate(ADVERSARIES):
-            shield_in_process.drive(
-                place, config, [Job(kind, seed)], decisions_into(decisions)
-            )
+            job = Job(kind, seed)
+            episodes.drive(place, config, job, decisions_into(decisions))
         found[robot] = projected(decisions)
     return found
 

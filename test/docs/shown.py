@@ -27,6 +27,7 @@ SHORT = {
     "train": ("--steps", "2048", "--episodes", "2"),
     "evaluate": ("--episodes", "1"),
     "watch": ("--episodes", "1"),
+    "assure": ("--episodes", "1", "--faults", "0"),
 }
 ELSEWHERE = {
     r"nics (record|doctor (--model|--policy|--namespace)|bag record|watch --ros)": "hears a robot",

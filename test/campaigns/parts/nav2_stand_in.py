@@ -12,10 +12,10 @@ from diagnostic_msgs.srv import SelfTest
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistStamped
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from numpy.typing import NDArray
-from parts.spun_node import SpunNode
 from rclpy.action import ActionClient
 
 from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.spun_node import SpunNode
 from nics_drl_bridge.policy.route import route
 
 Array = NDArray[np.float64]

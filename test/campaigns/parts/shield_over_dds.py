@@ -20,7 +20,6 @@ import numpy as np
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
-from parts.shield_places import SCAN_STEPS, SILENCE_S, STEP_S, Job, Outcome, Place
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.task import Future
@@ -28,6 +27,7 @@ from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
+from nics_drl_bridge.gate.assurance.place import STEP_S, Job, Outcome, Place
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.listener import open_context
@@ -35,6 +35,8 @@ from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 
 Array = NDArray[np.float64]
 REST_S = 1.3
+SILENCE_S = 0.5
+SCAN_STEPS = 5
 PATIENCE_S = 120.0
 BEHIND_S = 0.15
 """When this process itself was held up for longer, no base kept the latency that its shield was

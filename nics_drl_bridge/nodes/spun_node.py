@@ -1,7 +1,5 @@
 """A node that its owner spins."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from typing import Any
@@ -14,13 +12,7 @@ from nics_drl_bridge.nodes.listener import open_context
 
 
 class SpunNode:
-    """A node with a context and an executor of its own.
-
-    Args:
-        name: of the node.
-        domain_id: None for that of the environment.
-        context: instead of a new one.
-    """
+    """A node with an executor of its own, and a context of its own unless one is given."""
 
     def __init__(
         self, name: str, domain_id: int | None = None, context: Context | None = None
@@ -32,11 +24,11 @@ class SpunNode:
         self._clients: dict[str, Any] = {}
 
     def spin(self, timeout_s: float = 0.01) -> None:
-        """Handles one thing, if there is one within the time."""
+        """Handle one event, if one comes in time."""
         self._executor.spin_once(timeout_sec=timeout_s)
 
     def until(self, done: Callable[[], object], seconds: float) -> bool:
-        """Spins until something is the case; whether it came to be."""
+        """Spin until something is the case; return False if it does not come to be in time."""
         end = time.monotonic() + seconds
         while not done():
             if time.monotonic() > end:
@@ -47,7 +39,7 @@ class SpunNode:
     def call_service(
         self, kind: Any, name: str, patience_s: float, request: Any = None
     ) -> Any:
-        """Returns the answer of a service. Raises TimeoutError."""
+        """Return the answer of a service. Raises TimeoutError."""
         if name not in self._clients:
             self._clients[name] = self.node.create_client(kind, name)
         client = self._clients[name]
@@ -58,7 +50,7 @@ class SpunNode:
         return future.result()
 
     def close(self) -> None:
-        """Leaves the graph."""
+        """Leave the graph."""
         self._executor.shutdown(timeout_sec=1.0)
         self.node.destroy_node()
         self._context.try_shutdown()

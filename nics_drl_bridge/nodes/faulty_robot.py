@@ -1,10 +1,8 @@
 """A robot's topics around a gate, whole or broken, published over DDS."""
 
-from __future__ import annotations
-
+import math
 import multiprocessing
 import os
-import random
 import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
@@ -13,7 +11,6 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
-from parts.spun_node import SpunNode
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -22,17 +19,15 @@ from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
-from nics_drl_bridge.generator import builtin_model
-from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.spun_node import SpunNode
 
-ROBOT = "ackermann"
-PERIOD_S = 0.1  # between scans, commands and heartbeats of the emergency stop
-SPEED = 0.5
+PERIOD_S = 0.1  # about the time between two scans
 PATIENCE_S = 60.0
-MOTION_S = 10.0
-RECENT_S = 0.15
-"""The newest command must be younger, for the robot to be told to move now [s]."""
+MOTION_S = 10.0  # for the robot to move once it is armed
+RECENT_S = 0.15  # greatest age of the command that moves the robot when it is broken
 ALL = frozenset({"scan", "odom", "odometry/filtered", "cmd_vel_raw", "e_stop"})
 
 
@@ -41,7 +36,7 @@ class NoMotionError(RuntimeError):
 
 
 def driver_context(domain_id: int | None) -> Context:
-    """A context as a driver of somebody else's has it: as ROS 2 makes it, with shared memory."""
+    """Return a context as another vendor's driver has it, with shared memory."""
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     context = Context()
     context.init(None, domain_id=domain_id)
@@ -49,7 +44,7 @@ def driver_context(domain_id: int | None) -> Context:
 
 
 def hear(domain_id: int | None, out: Connection) -> None:
-    """The base's end of `cmd_vel`: tells when each command came [s] and which; never ends."""
+    """Send when each `cmd_vel` came [s] and its twist, as the base hears it; never ends."""
     context = driver_context(domain_id)
     node = Node("base", context=context, start_parameter_services=False)
 
@@ -64,42 +59,36 @@ def hear(domain_id: int | None, out: Connection) -> None:
 
 
 class Robot(SpunNode):
-    """A robot's topics, whole or broken. It does what `cmd_vel` says, unless it is stuck.
+    """A robot's topics, whole or broken. It drives ahead as `cmd_vel` says, unless it is stuck.
 
-    Commands are heard in a process of their own, as by a base: who publishes to a process that was
-    killed may be held up for a second by the middleware, and would hear the stop late.
-
-    Args:
-        domain_id: of ROS; None for that of the environment.
-        policy: whether a policy of its own commands; this robot's own is silent then.
-        speed: that its own policy commands [m/s].
-        relayed: whether commands go past the gate.
-        odom_hz: how often odometry and estimate come, a multiple of 10.
-        skip: only one in so many scans, heartbeats and commands is sent.
-        sensors: quality of service of scan and odometry.
-
-    Attributes:
-        silent: topics that say nothing.
-        change: alters messages by topic before they are sent.
-        stuck: odometry shows no motion.
-        heard: times [s] and twists (3,) of `cmd_vel`.
-        last: the message that each topic sent last; of `cmd_vel_raw`, also what the policy sent.
-        republished: whether the last command of the policy is sent again and again, as it was.
-        sent_s: when each topic sent a good one last [s].
-        sent: how many messages each topic has sent.
+    Commands are heard in a process of their own, as by a base: whoever publishes to a process that
+    was killed may be held up for a second by the middleware, and would hear the stop late.
     """
 
     def __init__(
         self,
         domain_id: int | None,
+        model: SimulatorModel,
+        twist: Array,
         policy: bool = False,
-        speed: float = SPEED,
         relayed: bool = False,
-        odom_hz: int = 10,
+        odom_hz: float = 0.0,
         skip: int = 1,
         sensors: QoSProfile = qos.COMMAND,
     ) -> None:
-        self._lidar = builtin_model(ROBOT).lidar
+        """Publish the robot's topics.
+
+        Args:
+            domain_id: of ROS; None for that of the environment.
+            model: of the robot.
+            twist: (3,) that its own policy commands.
+            policy: another node's policy commands; this robot's own is silent then.
+            relayed: commands go past the gate.
+            odom_hz: rate of odometry and estimate, a multiple of the lidar's; 0: what the model
+                needs.
+            skip: only one in so many scans, heartbeats and commands is sent.
+            sensors: quality of service of scan and odometry.
+        """
         super().__init__("robot", context=driver_context(domain_id))
         kinds = {
             "odom": (Odometry, sensors),
@@ -112,9 +101,9 @@ class Robot(SpunNode):
             name: self.node.create_publisher(kind, name, profile)
             for name, (kind, profile) in kinds.items()
         }
-        self.heard: list[tuple[float, np.ndarray]] = []
+        self._lidar = model.lidar
+        self._twist = twist
         self._policy = policy
-        self._speed = speed
         self._relayed = relayed
         if relayed:
             self._past = self.node.create_publisher(Twist, "cmd_vel", qos.COMMAND)
@@ -125,38 +114,49 @@ class Robot(SpunNode):
         self.node.create_subscription(
             TwistStamped, "cmd_vel_raw", self._hear_policy, qos.COMMAND
         )
-        self._every = skip * round(odom_hz * PERIOD_S)
+        scan_hz = model.lidar.rate
+        if odom_hz == 0.0:
+            needed = 1.0 / (model.control_period * scan_hz)
+            odom_hz = scan_hz * max(1, math.ceil(needed - 1e-9))
+        self._every = skip * round(odom_hz / scan_hz)
         self._ticks = 0
         self.node.create_timer(1.0 / odom_hz, self._send)
         self._offset_ns = time.time_ns() - time.monotonic_ns()
         self._now_ns = 0
-        self._x = 0.0
+        self._position = np.zeros(2)
+        self.heard: list[tuple[float, Array]] = []  # times [s] and twists of `cmd_vel`
+        # When each topic last sent a good message [s], and the last message of each. That of
+        # `cmd_vel_raw` may be another node's policy's.
         self.sent_s = dict.fromkeys(ALL, 0.0)
-        self.sent = dict.fromkeys(ALL, 0)
         self.last: dict[str, Any] = {}
+        self.sent = dict.fromkeys(ALL, 0)  # number of messages
         self.mend()
 
     def mend(self) -> None:
-        """Everything is well again."""
-        self.silent: set[str] = set()
+        """Make everything well again."""
+        self.silent: set[str] = set()  # topics that say nothing
+        # alters messages by topic before they are sent
         self.change: dict[str, Callable[[Any], Any]] = {}
-        self.stuck = False
-        self.republished = False
-        self.jump_ns = 0
+        self.stuck = False  # odometry shows no motion
+        self.republished = False  # the policy's last command is sent again and again
+        self.jump_ns = 0  # of all stamps
 
     def _hear_policy(self, message: TwistStamped) -> None:
         if self._policy and not self.republished:
             self.last["cmd_vel_raw"] = message
 
     def _send(self) -> None:
-        speed = self.heard[-1][1][0] if self.heard and not self.stuck else 0.0
+        velocity = np.zeros(2)
+        if self.heard and not self.stuck:
+            velocity = self.heard[-1][1][:2]
         before = self._now_ns
         self._now_ns = time.monotonic_ns() + self._offset_ns
-        self._x += speed * min(self._now_ns - before, NS_PER_S) / NS_PER_S
+        passed_s = min(self._now_ns - before, NS_PER_S) / NS_PER_S
+        self._position = self._position + velocity * passed_s
         stamp = self._now_ns + self.jump_ns
         odometry = conversions.odometry_to_ros(
-            [self._x, 0.0, 0.0],
-            [speed, 0.0, 0.0],
+            [*self._position, 0.0],
+            [*velocity, 0.0],
             stamp,
             ("odom", "base_link"),
             (1e-4,) * 4,
@@ -174,17 +174,16 @@ class Robot(SpunNode):
         if self._policy:
             if self.republished:
                 self._topics["cmd_vel_raw"].publish(self.last["cmd_vel_raw"])
-            return
-        turn = 0.1 if self._speed else 0.0
-        command = TwistStamped(twist=conversions.twist_to_ros([self._speed, 0.0, turn]))
-        if "scan" in self.last:  # what a policy acts on is the scan that it got
-            command.header.stamp = self.last["scan"].header.stamp
-        self._say("cmd_vel_raw", command)
+        else:
+            command = TwistStamped(twist=conversions.twist_to_ros(self._twist))
+            if "scan" in self.last:  # what a policy acts on is the scan that it got
+                command.header.stamp = self.last["scan"].header.stamp
+            self._say("cmd_vel_raw", command)
         if self._relayed and "cmd_vel_raw" in self.last:
             self._past.publish(self.last["cmd_vel_raw"].twist)
 
     def _say(self, name: str, message: Any) -> None:
-        if name in self.silent or name not in self._topics:
+        if name in self.silent:
             return
         if name in self.change:
             message = self.change[name](message)
@@ -195,39 +194,37 @@ class Robot(SpunNode):
         self.last[name] = message
 
     def press(self) -> None:
-        """Presses the emergency stop, by its topic."""
+        """Press the emergency stop, by its topic."""
         self._topics["e_stop"].publish(Bool(data=True))
 
     def until(self, done: Callable[[], object], seconds: float) -> bool:
-        """Lives on until something is the case, or the time is over; whether it came to be."""
+        """Live on until something is the case; return False if it does not come to be in time."""
 
-        def holds() -> object:
+        def is_done() -> object:
             while self._ear.poll():
                 self.heard.append(self._ear.recv())
             return done()
 
-        return super().until(holds, seconds)
+        return super().until(is_done, seconds)
 
     def call(self, service: str) -> Trigger.Response:
-        """Asks the gate for something."""
+        """Ask the gate for something."""
         return self.call_service(Trigger, f"command_gate/{service}", PATIENCE_S)
 
     def listeners(self) -> int:
-        """Of its scans."""
-        return self._topics["scan"].get_subscription_count()
+        """Return the number of listeners to its scans."""
+        return int(self._topics["scan"].get_subscription_count())
 
     @property
     def moves(self) -> bool:
-        """Whether the newest command moves it."""
+        """True if the newest command moves it."""
         return bool(self.heard) and bool(self.heard[-1][1].any())
 
-    def drive(self, patience_s: float = PATIENCE_S) -> None:
-        """Arms the gate and drives, so that a fault finds the robot in motion, at any phase.
+    def drive(self, patience_s: float = PATIENCE_S, phase_s: float = 0.0) -> None:
+        """Arm the gate and drive, so that a fault finds the robot in motion.
 
-        A busy machine may hold up this process itself, which the gate takes for a fault.
-
-        Raises:
-            NoMotionError: the robot is not told to move, or not any more.
+        A busy machine may hold up this process itself, which the gate takes for a fault. Raises
+        NoMotionError if the robot is not told to move, or not any more.
         """
         self.mend()
         self.until(lambda: False, 3 * PERIOD_S)  # of good data
@@ -238,7 +235,7 @@ class Robot(SpunNode):
             if not self._relayed:
                 self._arm()
             self.until(lambda: self.moves, min(MOTION_S, patience_s))
-        self.until(lambda: False, 0.5 + random.uniform(0.0, PERIOD_S))
+        self.until(lambda: False, 0.5 + phase_s)
         if not self.moves or time.monotonic() - self.heard[-1][0] > RECENT_S:
             raise NoMotionError(
                 "the robot was not being told to move when it was to be broken"
@@ -257,7 +254,7 @@ class Robot(SpunNode):
             )
 
     def close(self) -> None:
-        """Leaves the graph."""
+        """Leave the graph."""
         super().close()
         self._base.terminate()
         self._base.join()

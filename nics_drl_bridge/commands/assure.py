@@ -1,0 +1,279 @@
+"""`nics assure`: safety evidence for a policy behind the gate, as a page and a JSON file."""
+
+import json
+import platform
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+from typer import Argument, Option
+
+from nics_drl_bridge import __version__, defaults, extensions
+from nics_drl_bridge.commands import console
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.files import check_above, format_json, write_bytes, write_text
+
+if TYPE_CHECKING:
+    from nics_drl_bridge.gate.assurance.protocol import Protocol
+    from nics_drl_bridge.gate.assurance.run import Run
+    from nics_drl_bridge.generator import SimulatorModel
+
+PAGE = "assurance.html"
+EXIT_FAILED = 1  # a claim failed or, in a control, did not
+COMPUTED_WITH = ("numpy", "numba", "scipy", "onnxruntime")
+
+
+def assure(
+    policy: Annotated[
+        str,
+        Argument(
+            autocompletion=console.POLICIES,
+            help="A policy file, or the name of a shipped one.",
+        ),
+    ],
+    limits: Annotated[
+        str,
+        Option(
+            autocompletion=console.complete_names("limits"),
+            help="The gate's limits: shipped ones (differential) or a YAML file.",
+        ),
+    ],
+    model: console.PolicyModelOption = None,
+    world: Annotated[
+        list[str] | None,
+        Option(
+            "--world",
+            "--scene",
+            autocompletion=console.WORLDS,
+            help="A shipped world or a YAML file; repeatable; arena, clutter and crowd.",
+        ),
+    ] = None,
+    episodes: Annotated[
+        int, Option(min=1, help="How many, in process.")
+    ] = defaults.ASSURANCE_EPISODES,
+    seed: Annotated[
+        int, Option(min=0, help="Seed of the first episode.")
+    ] = defaults.EVALUATION_SEED,
+    randomisation: Annotated[
+        str,
+        Option(
+            autocompletion=console.complete_names("randomisation"),
+            help="Drawn in each episode of the policy: a shipped one or a YAML file.",
+        ),
+    ] = defaults.ASSURANCE_RANDOMISATION,
+    faults: Annotated[
+        int,
+        Option(
+            min=0, help="How many are injected over DDS, in real time; needs ROS 2."
+        ),
+    ] = defaults.ASSURANCE_FAULTS,
+    control: Annotated[
+        Literal["no_gate"] | None,
+        Option(help="Run everything without the gate, which must find failures."),
+    ] = None,
+    replay: Annotated[
+        int | None,
+        Option(min=0, metavar="SEED", help="Only drive this episode of a run again."),
+    ] = None,
+    out: Annotated[
+        Path, Option(help="Folder for all output; a run there goes on.")
+    ] = Path("runs/assure"),
+    as_json: console.JsonOption = False,
+) -> None:
+    """Tries to make a gated policy fail, and writes the evidence."""
+    check_above(out / PAGE)
+    with console.show_progress("opening robot and policy"):
+        from nics_drl_bridge.commands.episodes import model_name, read_contracts
+        from nics_drl_bridge.gate.assurance import protocol as protocols
+        from nics_drl_bridge.gate.assurance.run import Run, begin
+        from nics_drl_bridge.generator import open_model
+        from nics_drl_bridge.policy.policies import is_policy_file
+
+        if not is_policy_file(policy):
+            raise ConfigError(
+                f"{policy!r} is a baseline; give a policy file, or the name of a shipped one."
+            )
+        name = model_name(model, read_contracts([policy], model))
+        opened = open_model(name)
+        opened.robot.require_cmd_vel()
+        order = protocols.Protocol(
+            policy=policy,
+            limits=limits,
+            model=name,
+            worlds=tuple(dict.fromkeys(world or defaults.ASSURANCE_WORLDS)),
+            episodes=episodes,
+            seed=seed,
+            randomisation=randomisation,
+            control=control or "",
+            hashes={},
+            versions=_read_versions(),
+            **_choose_faults(faults),
+        )
+        order = replace(order, hashes=_compute_hashes(order, opened))
+        run = Run(order, opened)
+    if replay is not None:
+        _replay(run, replay, out, as_json)
+        return
+    begin(out, order)
+    results = _drive(run, out)
+    if as_json:
+        typer.echo(format_json(results))
+    else:
+        _tell(order, results, out)
+    if not _is_as_expected(order, results):
+        raise typer.Exit(EXIT_FAILED)
+
+
+def _choose_faults(count: int) -> dict[str, Any]:
+    """Returns the fields of a protocol on faults: none without ROS 2."""
+    try:
+        extensions.require("nics assure --faults", "rclpy")
+    except ConfigError as error:
+        if count:
+            typer.echo(f"no faults over DDS: {error}", err=True)
+        return {"faults": 0}
+    from nics_drl_bridge.nodes.gate_faults import CONTROLS, FAULTS
+
+    kinds = tuple(FAULTS) if count else ()
+    return {"faults": count, "fault_kinds": kinds, "fault_controls": CONTROLS}
+
+
+def _read_versions() -> dict[str, str]:
+    versions = {"nics_drl_bridge": __version__, "python": platform.python_version()}
+    return versions | {name: version(name) for name in COMPUTED_WITH}
+
+
+def _compute_hashes(order: "Protocol", model: "SimulatorModel") -> dict[str, str]:
+    from nics_drl_bridge.config import find_config
+    from nics_drl_bridge.files import hash_bytes
+    from nics_drl_bridge.policy.file.policy_file import load_policy
+    from nics_drl_bridge.seeds import check_seeds
+    from nics_drl_bridge.sim.randomisation import load_randomisation
+    from nics_drl_bridge.sim.world import load_world
+
+    last_fault = order.list_faults()[-1:]
+    check_seeds([order.seed + order.episodes, *(trial.seed for trial in last_fault)])
+    policy = load_policy(order.policy, model)
+    package = Path(__file__).parents[1]
+    sources = [path.read_bytes() for path in sorted(package.rglob("*.py"))]
+    hashes = {
+        "package source, SHA-256": hash_bytes(b"".join(sources)),
+        "policy file, SHA-256": hash_bytes(policy.path.read_bytes()),
+        "policy graph, SHA-256": policy.contract.graph_sha256,
+        "limits file, SHA-256": hash_bytes(
+            find_config(order.limits, "limits").read_bytes()
+        ),
+        "model, fingerprint": model.fingerprint,
+        "randomisation, fingerprint": load_randomisation(
+            order.randomisation
+        ).fingerprint,
+    }
+    for world in order.worlds:
+        hashes[f"world {world}, fingerprint"] = load_world(world).fingerprint
+    return hashes
+
+
+def _drive(run: "Run", out: Path) -> dict[str, Any]:
+    from nics_drl_bridge.gate.assurance import run as runs
+    from nics_drl_bridge.gate.assurance.results import summarise
+    from nics_drl_bridge.report.assurance_page import make_assurance_page
+
+    order = run.protocol
+    say = partial(typer.echo, err=True)
+    with console.show_progress("first episode") as advance:
+        rows = runs.drive_all(
+            out / runs.LOG,
+            list(order.list_trials()),
+            partial(map, run.drive),
+            _tell_left("episodes", advance),
+        )
+        faults = order.list_faults()
+        if faults:
+            from nics_drl_bridge.nodes.gate_faults import inject_trials
+
+            rows += runs.drive_all(
+                out / runs.FAULT_LOG,
+                faults,
+                partial(inject_trials, order, out / "logs", say),
+                _tell_left("faults", advance),
+            )
+    results = summarise(rows)
+    runs.write_result(out, order, complete=True, **results)
+    write_text(out / PAGE, make_assurance_page(order, results, str(out)))
+    return results
+
+
+def _tell_left(what: str, advance: console.Tell) -> Callable[[int, int], None]:
+    """Returns a function that shows the progress with the time left, by the rate so far."""
+    begun: list[tuple[float, int]] = []
+
+    def tell(done: int, total: int) -> None:
+        if not begun:
+            begun.append((time.monotonic(), done))
+        begun_s, first = begun[0]
+        left = ""
+        if done > first:
+            left_s = (time.monotonic() - begun_s) / (done - first) * (total - done)
+            minutes = round(left_s / 60.0)
+            left = f", {minutes // 60} h {minutes % 60:02} min left"
+        advance(f"{what}{left}", done, total)
+
+    return tell
+
+
+def _replay(run: "Run", seed: int, out: Path, as_json: bool) -> None:
+    """Drives one episode again, compares it with the run's, and draws it."""
+    import numpy as np
+
+    from nics_drl_bridge.gate.assurance import run as runs
+    from nics_drl_bridge.policy.evaluation import Episode
+    from nics_drl_bridge.report.pictures import draw_trajectories
+    from nics_drl_bridge.sim.world import load_world
+
+    order = run.protocol
+    order.check_same(runs.read_result(out)["protocol"], str(out))
+    trial = order.find_trial(seed)
+    if trial in order.list_faults():
+        from nics_drl_bridge.nodes.gate_faults import inject_trials
+
+        say = partial(typer.echo, err=True)
+        (row,) = inject_trials(order, out / "logs", say, [trial])
+        listed = "\n".join(f"{name:<12} {value}" for name, value in row.items())
+        console.print_line(as_json, listed, **row)
+        return
+    rows, _ = runs.read_rows(out / runs.LOG, list(order.list_trials()))
+    row = json.loads(format_json(run.drive(trial)))
+    place = run.open_place(trial.world, trial.kind)
+    path = np.array(place.track)
+    scene = place.scenes[0]
+    result = "contact" if row["contact"] else "no contact"
+    episode = Episode(seed, result, path, path, scene.goals[0], scene.bodies, 0.0)
+    picture = out / f"replay_{seed}.png"
+    radius = place.model.robot.footprint_radius
+    drawn = draw_trajectories({trial.kind: [episode]}, load_world(trial.world), radius)
+    write_bytes(picture, drawn)
+    kept = [one for one in rows if one["seed"] == seed and one["gated"] == trial.gated]
+    same = kept == [row]
+    told = "as in the run" if same else "not in the run, or different there"
+    listed = "\n".join(f"{name:<12} {value}" for name, value in row.items())
+    text = f"{listed}\nthis episode is {told}; its picture: {picture}"
+    console.print_line(as_json, text, **row, same=same, picture=str(picture))
+
+
+def _tell(order: "Protocol", results: dict[str, Any], out: Path) -> None:
+    from nics_drl_bridge.report.assurance_page import HEADS, tabulate
+
+    typer.echo(console.format_table(HEADS, tabulate(order, results)))
+    typer.echo(f"{PAGE} and assurance.json: {out}")
+
+
+def _is_as_expected(order: "Protocol", results: dict[str, Any]) -> bool:
+    """True if no claim failed or, in a control, if each tested claim did."""
+    shown = results["control" if order.control else "claims"]
+    failed = [f["failures"] > 0 for f in shown.values() if f["trials"]]
+    return all(failed) if order.control else not any(failed)

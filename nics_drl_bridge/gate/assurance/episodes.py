@@ -1,0 +1,121 @@
+"""Episodes behind a gate in process: the delays are those of a robot, but drawn."""
+
+from collections import deque
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from nics_drl_bridge.gate.assurance.gate_loop import Gate, Witness
+from nics_drl_bridge.gate.assurance.place import Job, Outcome, Place
+from nics_drl_bridge.gate.inputs import Command, Input, Odometry, Scan
+from nics_drl_bridge.gate.limits import load_limits
+from nics_drl_bridge.gate.state import Decision, GateConfig, replace
+from nics_drl_bridge.gate.stopping import make_gate_config, shield_config
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.interface import NS_PER_S
+
+# greatest delay of a scan to the gate, and of the command after it [s]
+MAX_SCAN_DELAY_S = 0.29
+# greatest delay of the gate's command to the base, the gate's own pauses included [s]
+MAX_COMMAND_DELAY_S = 0.1
+# This fraction of the data is late by up to the most that the episode has, the rest by a fifth.
+HURRIED = 0.25
+
+
+class Delays:
+    """Draws how late data arrive; nothing overtakes what was sent before."""
+
+    def __init__(self, rng: np.random.Generator, max_steps: float) -> None:
+        self._rng = rng
+        self._last = 0
+        self._max_steps = rng.uniform(0.0, max_steps)
+
+    def draw_arrival(self, step: int) -> int:
+        """Returns the step at which something arrives that is sent at a step."""
+        share = 1.0 if self._rng.random() < HURRIED else 0.2
+        delay = round(self._rng.uniform(0.0, self._max_steps * share))
+        self._last = max(self._last, step + delay)
+        return self._last
+
+
+def configure_gate(
+    model: SimulatorModel,
+    limits: str | Path,
+    overrides: Mapping[str, float] | None = None,
+    shielded: bool = True,
+) -> GateConfig:
+    """Returns the gate as `command_gate` sets it up; `overrides` are values of the shield."""
+    command_limits = load_limits(limits, model.robot)
+    shield = None
+    if shielded:
+        shield, _ = shield_config(model, command_limits, limits, overrides)
+    return make_gate_config(
+        model,
+        command_limits,
+        shield,
+        e_stop_required=False,
+        estimate_required=False,
+        odom_rate=model.lidar.rate,
+    )
+
+
+def drive(
+    place: Place, config: GateConfig | None, job: Job, witness: Witness | None = None
+) -> Outcome:
+    """Drives an episode with a gate of its own, or without one if `config` is None.
+
+    Without a gate, commands go to the base, and the witness sees them as decisions.
+    """
+    place.odom = np.zeros(3)
+    place.begin(job)
+    lidar = place.model.lidar
+    gate = None
+    now = begun = 0.0
+    if config is not None:
+        gate = Gate(config, lidar)
+        gate.witness = witness
+        gate.arm(place.truth.ranges, place.odom)
+        begun = gate.now
+    rng = np.random.default_rng([11, job.seed, *place.model.robot.name.encode()])
+    to_gate = Delays(rng, MAX_SCAN_DELAY_S / place.step_s)
+    behind = Delays(rng, MAX_COMMAND_DELAY_S / place.step_s)
+    to_base = Delays(rng, MAX_COMMAND_DELAY_S / place.step_s)
+    step = 0
+    coming: deque[tuple[int, Input]] = deque()
+    commands: deque[tuple[int, Command]] = deque()
+    told = deque([(0, np.zeros(3))])
+    decision = Decision(np.zeros(3), publish=True, cause=None)
+    while not place.ended:
+        now = begun + step * place.step_s
+        if step % place.period_steps == 0:
+            truth = place.truth
+            stamp = round(now * NS_PER_S)
+            arrival = to_gate.draw_arrival(step)
+            angles = (lidar.angle_min, lidar.angle_increment)
+            odometry = Odometry(stamp, place.odom.copy(), truth.twist)
+            coming += [
+                (arrival, odometry),
+                (arrival, Scan(stamp, truth.ranges, angles)),
+            ]
+            command = Command(stamp, place.wish(truth))
+            commands.append((behind.draw_arrival(arrival), command))
+        if gate is not None:
+            gate.now = now
+            for queue in (coming, commands):
+                while queue and queue[0][0] <= step:
+                    gate.give(queue.popleft()[1])
+            decision = gate.tick()
+        else:
+            while commands and commands[0][0] <= step:
+                decision = replace(decision, twist=commands.popleft()[1].twist)
+            if witness is not None:
+                witness(decision, now)
+        told.append((to_base.draw_arrival(step + 1), decision.twist))
+        while len(told) > 1 and told[1][0] <= step:
+            told.popleft()
+        place.step(told[0][1])
+        step += 1
+    if gate is not None and gate.state.latched is not None:
+        place.outcome.latched = gate.state.latched.rule
+    return place.outcome

@@ -1,0 +1,120 @@
+"""What the episodes and faults of a run show: counts with bounds, and failures in clusters."""
+
+import math
+from collections import Counter, defaultdict
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from scipy import special
+
+from nics_drl_bridge.gate.assurance.protocol import (
+    CLAIMS,
+    KINDS,
+    LIMITS,
+    STOPS,
+    TOUCHES,
+)
+from nics_drl_bridge.gate.assurance.run import Row
+
+CONFIDENCE = 0.95
+CELL_M = 2.0  # side of the squares of a world by which failures are clustered
+FAILED: dict[str, Callable[[Row], bool]] = {
+    STOPS: lambda row: not row.get("in_time", True),
+    LIMITS: lambda row: bool(row.get("violations")),
+    TOUCHES: lambda row: bool(row.get("contact")),
+}
+
+
+def compute_bounds(failures: int, trials: int) -> tuple[float, float]:
+    """Returns the 95 % bounds of a rate by Clopper and Pearson (1934), which are exact.
+
+    Without failures the upper bound is one-sided, about 3 / trials, because nothing is below 0.
+    """
+    if trials == 0:
+        return 0.0, 1.0
+    if failures == 0:
+        return 0.0, 1.0 - math.pow(1.0 - CONFIDENCE, 1.0 / trials)
+    tail = (1.0 - CONFIDENCE) / 2.0
+    passed = trials - failures
+    low = float(special.betaincinv(failures, passed + 1, tail))
+    if passed == 0:
+        return low, 1.0
+    return low, float(special.betaincinv(failures + 1, passed, 1.0 - tail))
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, Any]:
+    """Returns the results of a run's rows as plain data."""
+    tried = [row for row in rows if row["gated"]]
+    controls = [row for row in rows if not row["gated"]]
+    episodes = [row for row in tried if "fault" not in row]
+    return {
+        "claims": _judge(tried),
+        "control": _judge(controls),
+        "drivers": _count_touches(tried, controls),
+        "episodes": len(episodes),
+        "path_m": math.fsum(row["path"] for row in episodes),
+        "seconds": math.fsum(row["seconds"] for row in episodes),
+        "not_injected": sum(not row.get("injected", True) for row in rows),
+        "walked_into": sum(row["walked_into"] for row in episodes),
+        "latched": dict(Counter(row["latched"] for row in episodes if row["latched"])),
+        "clusters": find_clusters(tried or controls),
+        "failures": [row for row in tried or controls if _list_failed(row)],
+    }
+
+
+def _count_touches(
+    tried: Sequence[Row], controls: Sequence[Row]
+) -> dict[str, list[int]]:
+    """Returns, by driver, touches and episodes with the gate, then both without it."""
+    counts: dict[str, list[int]] = {}
+    for kind in KINDS:
+        counts[kind] = []
+        for rows in (tried, controls):
+            of_kind = [row["contact"] for row in rows if row["kind"] == kind]
+            counts[kind] += [sum(of_kind), len(of_kind)]
+    return counts
+
+
+def _judge(rows: Sequence[Row]) -> dict[str, Any]:
+    figures = {}
+    for claim in CLAIMS:
+        tested = [
+            row
+            for row in rows
+            if ("fault" in row) == (claim == STOPS) and row.get("injected", True)
+        ]
+        failures = sum(map(FAILED[claim], tested))
+        low, high = compute_bounds(failures, len(tested))
+        figures[claim] = {
+            "trials": len(tested),
+            "failures": failures,
+            "rate_low": low,
+            "rate_high": high,
+        }
+    return figures
+
+
+def _list_failed(row: Row) -> list[str]:
+    return [claim for claim in CLAIMS if FAILED[claim](row)]
+
+
+def find_clusters(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Returns the failures by claim, driver or fault, and place, the largest cluster first."""
+    seeds = defaultdict[tuple[Any, ...], list[int]](list)
+    for row in rows:
+        for claim in _list_failed(row):
+            near = [CELL_M * round(value / CELL_M) for value in row.get("position", ())]
+            cluster = (claim, row["kind"], row.get("world", ""), tuple(near))
+            seeds[cluster].append(row["seed"])
+    ordered = sorted(seeds.items(), key=lambda item: (-len(item[1]), item[0]))
+    return [
+        {
+            "claim": claim,
+            "kind": kind,
+            "world": world,
+            "near": near,
+            "failures": len(of_cluster),
+            "seeds": of_cluster,
+        }
+        for (claim, kind, world, near), of_cluster in ordered
+    ]

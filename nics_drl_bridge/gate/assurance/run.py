@@ -1,0 +1,138 @@
+"""A run of a protocol, which goes on where it was interrupted, and the log of its episodes."""
+
+import json
+import os
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.files import format_json, write_text
+from nics_drl_bridge.gate.assurance.episodes import configure_gate, drive
+from nics_drl_bridge.gate.assurance.limit_judge import LimitJudge
+from nics_drl_bridge.gate.assurance.place import POLICY, Job, Place
+from nics_drl_bridge.gate.assurance.protocol import Protocol, Trial
+from nics_drl_bridge.gate.limits import load_limits
+from nics_drl_bridge.generator import SimulatorModel
+
+FORMAT = "nics_drl_bridge/assurance/1"
+RESULT = "assurance.json"
+LOG = "episodes.jsonl"
+FAULT_LOG = "faults.jsonl"
+Row = dict[str, Any]  # a trial in a log, with its outcome
+Tell = Callable[[int, int], None]  # trials that are done, and all
+
+
+class Run:
+    """Drives the trials of a protocol."""
+
+    def __init__(self, protocol: Protocol, model: SimulatorModel) -> None:
+        self.protocol = protocol
+        self._model = model
+        self._limits = load_limits(protocol.limits, model.robot)
+        self._places: dict[tuple[str, bool], Place] = {}
+        # Wrong limits must fail before a long run.
+        configure_gate(model, protocol.limits)
+
+    def open_place(self, world: str, kind: str) -> Place:
+        """Returns the place of an episode; only those of the policy are randomised."""
+        is_policy = kind == POLICY
+        if (world, is_policy) not in self._places:
+            randomisation = self.protocol.randomisation if is_policy else None
+            place = Place(self._model, world, self.protocol.policy, randomisation)
+            self._places[world, is_policy] = place
+        return self._places[world, is_policy]
+
+    def drive(self, trial: Trial) -> Row:
+        """Drives an episode."""
+        place = self.open_place(trial.world, trial.kind)
+        config = None
+        if trial.gated:
+            config = configure_gate(place.model, self.protocol.limits)
+        robot = self._model.robot
+        # A car's angle follows from its turn rate only while it moves.
+        judge = LimitJudge(robot, self._limits, slopes=not robot.takes_turn_rate)
+        outcome = drive(place, config, Job(trial.kind, trial.seed), judge.see)
+        violations = {name: n for name, n in judge.violations.items() if n}
+        return asdict(outcome) | trial._asdict() | {"violations": violations}
+
+
+def begin(folder: Path, protocol: Protocol) -> None:
+    """Writes the protocol, or checks that it is that of the run that is there."""
+    file = folder / RESULT
+    if file.exists():
+        protocol.check_same(read_result(folder)["protocol"], str(folder))
+        return
+    if (folder / LOG).exists():
+        raise ConfigError(
+            f"{folder}: has a {LOG} without {RESULT}; choose another --out."
+        )
+    write_result(folder, protocol, complete=False)
+
+
+def write_result(folder: Path, protocol: Protocol, **results: Any) -> None:
+    """Writes the protocol with its hash, and results."""
+    data = {
+        "format": FORMAT,
+        "protocol": protocol.data,
+        "protocol_sha256": protocol.sha256,
+        **results,
+    }
+    write_text(folder / RESULT, format_json(data, indent=1) + "\n")
+
+
+def read_result(folder: Path) -> dict[str, Any]:
+    """Returns what `write_result` wrote. Raises ConfigError for another file."""
+    file = folder / RESULT
+    try:
+        data = json.loads(file.read_text(encoding="utf-8"))
+        if data["format"] == FORMAT and isinstance(data["protocol"], dict):
+            return dict(data)
+    except (ValueError, KeyError, TypeError):
+        pass
+    raise ConfigError(f"{file}: is no result of nics assure; choose another --out.")
+
+
+def drive_all(
+    log: Path,
+    trials: list[Trial],
+    drive_rest: Callable[[list[Trial]], Iterable[Row]],
+    tell: Tell,
+) -> list[Row]:
+    """Drives what a log lacks, and returns all rows. Raises ConfigError for another log."""
+    log.touch()
+    rows, size = read_rows(log, trials)
+    with log.open("r+b") as file:
+        file.truncate(size)  # a killed run may have left part of a line
+        file.seek(size)
+        tell(len(rows), len(trials))
+        for row in drive_rest(trials[len(rows) :]):
+            line = format_json(row)
+            file.write(line.encode() + b"\n")
+            file.flush()
+            os.fsync(file.fileno())
+            rows.append(json.loads(line))
+            tell(len(rows), len(trials))
+    return rows
+
+
+def read_rows(log: Path, trials: list[Trial]) -> tuple[list[Row], int]:
+    """Returns the whole rows of a log and their size [bytes]."""
+    *lines, _ = log.read_bytes().split(b"\n")
+    rows = list(_parse(log, lines, trials))
+    return rows, sum(len(line) + 1 for line in lines)
+
+
+def _parse(log: Path, lines: list[bytes], trials: list[Trial]) -> Iterator[Row]:
+    for number, line in enumerate(lines):
+        try:
+            row = json.loads(line)
+            if Trial(**{name: row[name] for name in Trial._fields}) == trials[number]:
+                yield row
+                continue
+        except (ValueError, KeyError, TypeError, IndexError):
+            pass
+        raise ConfigError(
+            f"{log}: line {number + 1} is no episode of this run; choose another --out."
+        )

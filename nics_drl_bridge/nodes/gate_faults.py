@@ -1,0 +1,419 @@
+"""Faults around a gate of real processes, and by when each must have stopped the robot.
+
+The gate, and for some faults the policy, are processes of their own, as on a vehicle; this one
+publishes what a robot publishes and breaks it while the robot is told to move. The time counts from
+the last good datum before the fault, or from the fault itself where it is an event, to the arrival
+of a zero on `cmd_vel`.
+"""
+
+import math
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field, replace
+from itertools import groupby, zip_longest
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import TwistStamped
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import LaserScan
+
+from nics_drl_bridge.errors import BackendError
+from nics_drl_bridge.gate.assurance.protocol import Protocol, Trial
+from nics_drl_bridge.gate.assurance.run import Row
+from nics_drl_bridge.gate.limits import load_limits
+from nics_drl_bridge.generator import open_model
+from nics_drl_bridge.interface import NS_PER_S, Array
+from nics_drl_bridge.nodes import conversions
+from nics_drl_bridge.nodes.faulty_robot import (
+    ALL,
+    PATIENCE_S,
+    PERIOD_S,
+    NoMotionError,
+    Robot,
+)
+from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
+
+SOON_S = 0.10
+LATE_S = 0.40
+FROZEN_S = 0.5
+WATCHED_S = 0.8  # after a fault's limit
+LOG_CHARACTERS = 500
+MAX_IDLE = 3  # attempts in a row to inject a fault into a robot that moves
+
+
+@dataclass(frozen=True)
+class Around:
+    """What an injection can break: the robot, and the processes of policy and gate."""
+
+    robot: Robot
+    policy: NodeProcess | None
+    gate: NodeProcess | None
+
+
+Injection = Callable[[Around], object]
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A way in which something breaks."""
+
+    limit_s: float  # time by which the robot must have been told to stop
+    inject: Injection | Sequence[Injection]  # breaks it; of several, one
+    # topic whose last good datum the limit counts from; empty for the fault itself
+    since: str = ""
+    policy: bool = False  # it needs the policy's process
+    # only the first command after the fault must be a zero; the robot may drive on then
+    first_word: bool = False
+
+
+@dataclass(frozen=True)
+class Injected:
+    """What a fault led to."""
+
+    time_s: float  # from the last good datum to zero; inf for never
+    after_s: float  # from the fault to zero
+    unsafe: int  # commands that must not have been
+
+
+@dataclass(frozen=True)
+class Setup:
+    """A gate, or nothing in its place, and a robot around it."""
+
+    model: str
+    limits: str
+    twist: Array  # (3,) that drives the robot, unless the policy does
+    low: Array  # (3,) limits of `cmd_vel`
+    high: Array
+    folder: Path  # for logs
+    policy: str = ""  # by default that of `policy_node`
+    goal: tuple[float, float] = (1e6, 0.0)  # of the policy [m]
+    gated: bool = True  # False: commands are relayed past the gate
+    parameters: Mapping[str, Any] = field(default_factory=dict)  # of the gate
+    patience_s: float = PATIENCE_S
+
+
+def _silence(*topics: str) -> Injection:
+    return lambda around: around.robot.silent.update(topics)
+
+
+def _twist(x: float, turn: float) -> Injection:
+    def change(message: TwistStamped) -> TwistStamped:
+        message.twist = conversions.twist_to_ros([x, 0.0, turn])
+        return message
+
+    return lambda around: around.robot.change.update({"cmd_vel_raw": change})
+
+
+def _stamp(topic: str, off_s: float, growing: bool = False) -> Injection:
+    """Move a topic's stamps; further with each message, if wanted."""
+
+    def inject(around: Around) -> None:
+        sent = [0]
+
+        def change(message: Any) -> Any:
+            sent[0] += 1
+            off = off_s * (sent[0] if growing else 1)
+            stamp = conversions.stamp_from_ros(message.header.stamp) + round(
+                off * NS_PER_S
+            )
+            message.header.stamp = conversions.stamp_to_ros(stamp)
+            return message
+
+        around.robot.change[topic] = change
+
+    return inject
+
+
+def _freeze(topic: str, stamped: bool = False) -> Injection:
+    """Repeat the last good message, as a frozen driver does; with the stamp of now if wanted."""
+
+    def inject(around: Around) -> None:
+        held = around.robot.last[topic]
+
+        def change(message: Any) -> Any:
+            if stamped:
+                held.header.stamp = message.header.stamp
+            return held
+
+        around.robot.change[topic] = change
+
+    return inject
+
+
+def _alternate(around: Around) -> None:
+    """Show two pictures in turn, as of a driver that swaps two buffers."""
+    shown = [list(around.robot.last["scan"].ranges)]
+    sent = [0]
+
+    def change(message: LaserScan) -> LaserScan:
+        if len(shown) < 2:
+            shown.append(list(message.ranges))
+        sent[0] += 1
+        message.ranges = shown[sent[0] % 2]
+        return message
+
+    around.robot.change["scan"] = change
+
+
+def _freeze_but_one(around: Around) -> None:
+    """Show the same picture, in which one beam flickers."""
+    shown = list(around.robot.last["scan"].ranges)
+    sent = [0]
+
+    def change(message: LaserScan) -> LaserScan:
+        sent[0] += 1
+        message.ranges = [shown[0] + 1e-3 * sent[0], *shown[1:]]
+        return message
+
+    around.robot.change["scan"] = change
+
+
+def _few_beams(around: Around) -> None:
+    def change(message: LaserScan) -> LaserScan:
+        message.ranges = message.ranges[:100]
+        return message
+
+    around.robot.change["scan"] = change
+
+
+def _nan_scan(around: Around) -> None:
+    def change(message: LaserScan) -> LaserScan:
+        message.ranges = [float("nan")] * len(message.ranges)
+        return message
+
+    around.robot.change["scan"] = change
+
+
+def _teleport(x: float, y: float) -> Injection:
+    """Show the robot elsewhere by odometry from now on."""
+
+    def change(message: Odometry) -> Odometry:
+        message.pose.pose.position.x += x
+        message.pose.pose.position.y += y
+        return message
+
+    return lambda around: around.robot.change.update({"odom": change})
+
+
+def _jump(seconds: int) -> Injection:
+    return lambda around: setattr(around.robot, "jump_ns", seconds * NS_PER_S)
+
+
+def _signal(how: signal.Signals, republished: bool = False) -> Injection:
+    """End or stop the policy; somebody may go on with its last command."""
+
+    def inject(around: Around) -> None:
+        if around.policy is not None:
+            os.kill(around.policy.pid, how)
+            around.robot.republished = republished
+
+    return inject
+
+
+def _freeze_gate(around: Around) -> None:
+    """Stop the gate itself for a while; what it said before is heard before it goes on."""
+    if around.gate is not None:
+        os.kill(around.gate.pid, signal.SIGSTOP)
+        around.robot.until(lambda: False, FROZEN_S)
+        around.robot.heard.clear()
+        os.kill(around.gate.pid, signal.SIGCONT)
+
+
+FAULTS: dict[str, Fault] = {
+    "policy_killed": Fault(LATE_S, _signal(signal.SIGKILL), policy=True),
+    "policy_frozen": Fault(LATE_S, _signal(signal.SIGSTOP), policy=True),
+    "policy_hung": Fault(
+        LATE_S, _signal(signal.SIGSTOP, republished=True), policy=True
+    ),
+    "scan_silent": Fault(LATE_S, _silence("scan"), "scan"),
+    "odom_silent": Fault(LATE_S, _silence("odom"), "odom"),
+    "nan_scan": Fault(LATE_S, _nan_scan, "scan"),
+    "clock_jump": Fault(LATE_S, (_jump(10), _jump(-10), _jump(1), _jump(-1)), "scan"),
+    "e_stop": Fault(
+        SOON_S,
+        (
+            lambda around: around.robot.press(),
+            lambda around: around.robot.call("e_stop"),
+        ),
+    ),
+    "e_stop_silent": Fault(LATE_S, _silence("e_stop"), "e_stop"),
+    "all_silent": Fault(LATE_S, _silence(*ALL), "scan"),
+    "command_silent": Fault(LATE_S, _silence("cmd_vel_raw"), "cmd_vel_raw"),
+    "command_frozen": Fault(LATE_S, _freeze("cmd_vel_raw"), "cmd_vel_raw"),
+    "command_nan": Fault(LATE_S, _twist(float("nan"), 0.0), "cmd_vel_raw"),
+    "command_inf": Fault(LATE_S, _twist(float("inf"), 0.0), "cmd_vel_raw"),
+    "command_absurd": Fault(LATE_S, _twist(1e9, 0.0), "cmd_vel_raw"),
+    "command_from_the_future": Fault(
+        LATE_S, _stamp("cmd_vel_raw", 3600.0), "cmd_vel_raw"
+    ),
+    "scan_of_another_lidar": Fault(LATE_S, _few_beams, "scan"),
+    "scan_stamps_frozen": Fault(LATE_S, _freeze("scan"), "scan"),
+    "scan_from_the_future": Fault(LATE_S, _stamp("scan", 3600.0), "scan"),
+    "stamps_run_ahead": Fault(
+        LATE_S,
+        (_stamp("scan", 0.35, growing=True), _stamp("odom", 0.35, growing=True)),
+        "scan",
+    ),
+    "stamps_creep": Fault(1.20, _stamp("scan", 0.02, growing=True), "scan"),
+    "odom_teleports": Fault(
+        LATE_S, (_teleport(3.0, 0.0), _teleport(0.0, -1.0)), "odom"
+    ),
+    "scan_frozen": Fault(1.50, _freeze("scan", stamped=True), "scan"),
+    "scan_alternates": Fault(1.50, _alternate, "scan"),
+    "scan_frozen_but_one_beam": Fault(1.50, _freeze_but_one, "scan"),
+    "no_motion": Fault(1.10, lambda around: setattr(around.robot, "stuck", True)),
+    "gate_frozen": Fault(FROZEN_S + LATE_S, _freeze_gate, first_word=True),
+}
+
+
+def inject(setup: Setup, around: Around, name: str, number: int) -> Injected:
+    """Drive, break something in a way and at a phase drawn from a number, and watch the gate."""
+    fault = FAULTS[name]
+    robot = around.robot
+    ways = [fault.inject] if callable(fault.inject) else fault.inject
+    phase_s = np.random.default_rng(number).uniform(0.0, PERIOD_S)
+    robot.drive(setup.patience_s, phase_s)
+    robot.heard.clear()
+    broken_s = time.monotonic()
+    ways[number % len(ways)](around)
+    robot.until(lambda: False, fault.limit_s + WATCHED_S)
+    good_s = broken_s
+    if fault.since:
+        good_s = min(robot.sent_s[fault.since], broken_s)
+    moving_s = [when for when, twist in robot.heard if twist.any()]
+    zeros_s = [when for when, twist in robot.heard if not twist.any()]
+    if fault.first_word:
+        first_s = min(zeros_s, default=math.inf)
+        moving_s = [when for when in moving_s if when < first_s]
+    last_s = max(moving_s, default=broken_s)
+    stopped_s = min((when for when in zeros_s if when > last_s), default=math.inf)
+    late = [when for when in moving_s if when - good_s > fault.limit_s]
+    unsafe = len(moving_s) if fault.first_word else len(late)
+    for _, twist in robot.heard:
+        unsafe += not ((twist >= setup.low) & (twist <= setup.high)).all()
+    return Injected(stopped_s - good_s, stopped_s - broken_s, int(unsafe))
+
+
+def inject_all(
+    setup: Setup, name: str, numbers: Sequence[int], tell: Callable[[str], None]
+) -> Iterator[Injected]:
+    """Yield an injection of a fault for each number; fewer if the robot does not move.
+
+    `tell` gets a line if an attempt fails. A policy that a fault ended is started again.
+    """
+    domain_id = free_domain_id()
+    fault = FAULTS[name]
+    policy_parameters: dict[str, Any] = {"model": setup.model, "goal": [*setup.goal]}
+    if setup.policy:
+        policy_parameters["policy"] = setup.policy
+    with ExitStack() as stack:
+        gate = None
+        if setup.gated:
+            gate = stack.enter_context(_start_gate(setup, domain_id))
+        model = open_model(setup.model)
+        robot = Robot(
+            domain_id, model, setup.twist, fault.policy, relayed=not setup.gated
+        )
+        stack.callback(robot.close)
+        policies = stack.enter_context(ExitStack())
+        policy: NodeProcess | None = None
+        idle = 0
+        for number in numbers:
+            injected = None
+            while injected is None:
+                if idle == MAX_IDLE:
+                    return
+                if fault.policy and policy is None:
+                    policies.close()
+                    process = NodeProcess(
+                        "policy_node", setup.folder, policy_parameters, domain_id
+                    )
+                    policy = policies.enter_context(process)
+                try:
+                    around = Around(robot, policy, gate)
+                    injected = inject(setup, around, name, number)
+                    idle = 0
+                    if not _is_alive(policy):
+                        policy = None
+                except NoMotionError as error:
+                    # Nothing was injected; a policy that was killed may leave DDS ill.
+                    tell(f"{name}: {error}. {_read_log(policy)}")
+                    policy = None
+                    idle += 1
+            yield injected
+
+
+def _start_gate(setup: Setup, domain_id: int) -> NodeProcess:
+    parameters = {
+        "model": setup.model,
+        "limits": setup.limits,
+        "e_stop_required": True,
+        "black_box": str(setup.folder / "black_box"),
+        "enable_stamped_cmd_vel": False,
+        "stop_when_held": False,  # the robot's scans do not show how it moves
+        **setup.parameters,
+    }
+    return NodeProcess("command_gate", setup.folder, parameters, domain_id)
+
+
+def _is_alive(policy: NodeProcess | None) -> bool:
+    """Let a policy go on that was stopped; return False if it has ended."""
+    if policy is None:
+        return False
+    try:
+        os.kill(policy.pid, signal.SIGCONT)
+        policy.check()
+    except (BackendError, ProcessLookupError):
+        return False
+    return True
+
+
+def _read_log(policy: NodeProcess | None) -> str:
+    if policy is None:
+        return ""
+    text = policy.log.read_text(encoding="utf-8", errors="replace")
+    return f"Another policy is started: {text[-LOG_CHARACTERS:]}"
+
+
+# faults that nothing but the gate answers, to show that an injection can fail
+CONTROLS = ("scan_silent", "odom_silent", "nan_scan", "command_nan")
+
+
+def inject_trials(
+    protocol: Protocol, folder: Path, tell: Callable[[str], None], trials: list[Trial]
+) -> Iterator[Row]:
+    """Yield a row of the log for each trial; the robot is told to move by half its limits."""
+    robot = open_model(protocol.model).robot
+    limits = load_limits(protocol.limits, robot)
+    command = 0.1 * np.where(limits.high > 0.0, limits.high, limits.low)
+    command[0] *= 5.0
+    low = np.minimum(robot.to_cmd_vel(limits.low), robot.to_cmd_vel(limits.high))
+    high = np.maximum(robot.to_cmd_vel(limits.low), robot.to_cmd_vel(limits.high))
+    setup = Setup(
+        model=protocol.model,
+        limits=protocol.limits,
+        twist=robot.to_cmd_vel(command),
+        low=low,
+        high=high,
+        folder=folder,
+        policy=protocol.policy,
+    )
+    for (name, gated), group in groupby(
+        trials, lambda trial: (trial.kind, trial.gated)
+    ):
+        of_fault = list(group)
+        numbers = [trial.seed for trial in of_fault]
+        injections = inject_all(replace(setup, gated=gated), name, numbers, tell)
+        limit_s = FAULTS[name].limit_s
+        for trial, one in zip_longest(of_fault, injections):
+            row = trial._asdict() | {"fault": True, "limit_s": limit_s}
+            row["injected"] = one is not None
+            if one is not None:
+                in_time = one.time_s <= limit_s and not one.unsafe
+                row |= asdict(one) | {"in_time": in_time}
+            yield row

@@ -1,0 +1,180 @@
+"""`nics assure`: its evidence, its resumption after a kill, its control, its refusals."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from command_line import nics, split_words
+
+from nics_drl_bridge import extensions
+from nics_drl_bridge.gate.assurance.protocol import LIMITS, STOPS, TOUCHES
+
+ORDER = (
+    "assure differential --limits differential --world arena --episodes 6 --faults 0"
+)
+DEADLINE_S = 200.0
+
+
+@pytest.fixture(scope="module")
+def evidence(tmp_path_factory):
+    """The folder above that of an uninterrupted run."""
+    folder = tmp_path_factory.mktemp("evidence")
+    done = nics(ORDER, "--out out", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    assert "0 of 6" in done.stdout
+    return folder
+
+
+def read(folder):
+    return json.loads((folder / "out" / "assurance.json").read_text(encoding="utf-8"))
+
+
+@pytest.mark.slow
+def test_the_evidence_has_counts_bounds_and_a_control_that_failed(evidence):
+    result = read(evidence)
+    assert result["complete"]
+    for claim in (LIMITS, TOUCHES):
+        assert result["claims"][claim]["trials"] == 6
+        assert result["claims"][claim]["failures"] == 0
+        assert result["claims"][claim]["rate_high"] == pytest.approx(0.393, abs=1e-3)
+        assert result["control"][claim]["failures"] > 0
+    assert result["claims"][STOPS]["trials"] == 0
+    page = (evidence / "out" / "assurance.html").read_text(encoding="utf-8")
+    assert "stopping in time was not tested" in page
+    assert result["protocol_sha256"] in page
+    for value in result["protocol"]["hashes"].values():
+        assert value in page
+
+
+@pytest.mark.slow
+@pytest.mark.process
+@pytest.mark.timeout(300)
+def test_a_run_that_was_killed_goes_on_bit_equal_to_one_that_was_not(
+    evidence, tmp_path
+):
+    log = tmp_path / "out" / "episodes.jsonl"
+    command = [sys.executable, "-m", "nics_drl_bridge.commands.cli"]
+    command += split_words(ORDER, "--out out")
+    process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + DEADLINE_S
+    while not log.exists() or log.read_bytes().count(b"\n") < 3:
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    kept = log.read_bytes()
+    begun = read(tmp_path)
+    assert not begun["complete"]
+    assert begun["protocol_sha256"] == read(evidence)["protocol_sha256"]
+    done = nics(ORDER, "--out out", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert log.read_bytes().startswith(kept[: kept.rindex(b"\n") + 1])
+    for name in ("episodes.jsonl", "assurance.json", "assurance.html"):
+        whole = (evidence / "out" / name).read_bytes()
+        assert (tmp_path / "out" / name).read_bytes() == whole
+
+
+@pytest.mark.slow
+def test_without_the_gate_failures_are_found_clustered_and_replayed(tmp_path):
+    words = ORDER.replace("--episodes 6", "--episodes 2")
+    done = nics(words, "--control no_gate --out out", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    result = read(tmp_path)
+    assert result["control"][TOUCHES]["failures"] > 0
+    failed = next(row for row in result["failures"] if row["contact"])
+    touched = [one for one in result["clusters"] if one["claim"] == TOUCHES]
+    assert failed["seed"] in [seed for one in touched for seed in one["seeds"]]
+    page = (tmp_path / "out" / "assurance.html").read_text(encoding="utf-8")
+    assert f"--replay {result['clusters'][0]['seeds'][0]}" in page
+    again = f"--control no_gate --out out --json --replay {failed['seed']}"
+    replayed = json.loads(nics(words, again, cwd=tmp_path).stdout)
+    assert replayed["same"]
+    assert replayed.items() >= failed.items()
+    assert (tmp_path / replayed["picture"]).read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        ("--seed 3", "'seed' was 1000000 and is 3"),
+        ("--episodes 7", "'episodes' was 6 and is 7"),
+        ("--randomisation strong", "'randomisation' was 'mild' and is 'strong'"),
+        ("--control no_gate", "'control' was '' and is 'no_gate'"),
+        ("--replay 999999", "--replay 999999: the run has the seeds 1000000 to"),
+    ],
+)
+def test_a_run_in_the_folder_of_another_is_refused_in_one_sentence(
+    evidence, words, named
+):
+    refused = nics(ORDER, "--out out", words, cwd=evidence)
+    assert refused.returncode == 2
+    (sentence,) = refused.stderr.splitlines()
+    assert named in sentence
+    assert read(evidence)["complete"]
+
+
+def test_without_ros_2_the_claim_on_faults_is_told_as_not_tested(tmp_path, monkeypatch):
+    monkeypatch.setattr(extensions, "find_lacking", lambda modules: "rclpy")
+    words = ORDER.replace("--episodes 6 --faults 0", "--episodes 1 --faults 5")
+    done = nics(words, "--out out", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "no faults over DDS: nics assure --faults needs the module" in done.stderr
+    assert read(tmp_path)["protocol"]["faults"] == 0
+    page = (tmp_path / "out" / "assurance.html").read_text(encoding="utf-8")
+    assert "stopping in time was not tested" in page
+
+
+def test_other_limits_in_the_same_file_are_refused_by_their_hash(tmp_path):
+    from nics_drl_bridge.config import find_config
+
+    text = find_config("differential", "limits").read_text(encoding="utf-8")
+    mine = tmp_path / "mine.yaml"
+    words = ORDER.replace("--limits differential", "--limits mine.yaml")
+    mine.write_text(text)
+    assert nics(words, "--out out --episodes 1", cwd=tmp_path).returncode == 0
+    mine.write_text(text + "\n# changed\n")
+    refused = nics(words, "--out out --episodes 1", cwd=tmp_path)
+    assert refused.returncode == 2
+    assert "'hashes.limits file, SHA-256' was" in refused.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        ("assure random --limits differential", "'random' is a baseline"),
+        ("assure differntial --limits differential", "unknown policy 'differntial'"),
+        ("assure no.onnx --limits differential", "no.onnx"),
+        ("assure differential", "Missing option '--limits'"),
+        ("assure differential --limits mecanum", "the limits are for 'mecanum'"),
+        ("assure differential --limits nothing", "unknown limits 'nothing'"),
+        ("assure mecanum --limits mecanum --model differential", "mecanum"),
+        ("assure differential --limits differential --world no", "unknown world 'no'"),
+        ("assure differential --limits differential --episodes 0", "--episodes"),
+        ("assure differential --limits differential --seed -1", "--seed"),
+        ("assure differential --limits differential --control off", "--control"),
+        ("assure differential --limits differential --replay 1", "assurance.json"),
+        (
+            "assure differential --limits differential --seed 9223372036854775800",
+            "seed",
+        ),
+        (
+            "assure differential --limits differential --randomisation hot",
+            "unknown randomisation 'hot'",
+        ),
+    ],
+)
+def test_wrong_input_is_refused_in_one_sentence_before_anything_is_written(
+    tmp_path, words, named
+):
+    refused = nics(words, cwd=tmp_path)
+    assert refused.returncode == 2
+    (sentence,) = refused.stderr.splitlines()
+    assert named in sentence
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,81 @@
+from __future__ import annotations
+
+import pytest
+
+from nics_drl_bridge.gate.assurance.protocol import LIMITS, STOPS, TOUCHES
+from nics_drl_bridge.gate.assurance.results import (
+    compute_bounds,
+    find_clusters,
+    summarise,
+)
+
+from .samples import fault, row
+
+
+@pytest.mark.parametrize(
+    ("failures", "trials", "low", "high"),
+    [
+        (0, 1, 0.0, 0.95),
+        (0, 10, 0.0, 0.2589),
+        (1, 10, 0.0025, 0.4450),
+        (5, 10, 0.1871, 0.8129),
+        (10, 10, 0.6915, 1.0),
+        (2, 100, 0.0024, 0.0704),
+        (50, 1000, 0.0373, 0.0654),
+        (0, 0, 0.0, 1.0),
+    ],
+)
+def test_the_bounds_are_those_of_published_tables(failures, trials, low, high):
+    assert compute_bounds(failures, trials) == pytest.approx((low, high), abs=6e-5)
+
+
+@pytest.mark.parametrize("trials", [100, 1000, 30_000])
+def test_without_failures_the_upper_bound_is_three_in_so_many_trials(trials):
+    _, high = compute_bounds(0, trials)
+    assert 0.98 * 3.0 / trials < high <= 3.0 / trials
+
+
+def test_failures_of_one_kind_at_one_place_are_one_cluster_with_all_its_seeds():
+    touched = [row(seed, contact=True) for seed in (3, 4)]
+    elsewhere = row(5, contact=True, position=[4.0, 0.0])
+    twice = row(6, kind="jerk", contact=True, violations={"rate": 2})
+    clusters = find_clusters([row(1), *touched, elsewhere, twice])
+    assert [cluster["seeds"] for cluster in clusters] == [[3, 4], [6], [6], [5]]
+    assert clusters[0] == {
+        "claim": TOUCHES,
+        "kind": "ram",
+        "world": "arena",
+        "near": (0.0, -4.0),
+        "failures": 2,
+        "seeds": [3, 4],
+    }
+    assert {cluster["claim"] for cluster in clusters[1:3]} == {LIMITS, TOUCHES}
+
+
+def test_a_control_counts_for_itself_and_a_claim_without_trials_is_not_tested():
+    rows = [row(1), row(1, gated=False, contact=True), row(2, walked_into=True)]
+    results = summarise(rows)
+    assert results["claims"][TOUCHES]["failures"] == 0
+    assert results["claims"][TOUCHES]["trials"] == results["episodes"] == 2
+    assert results["control"][TOUCHES]["failures"] == 1
+    assert results["claims"][STOPS]["trials"] == 0
+    assert results["failures"] == []
+    assert results["walked_into"] == 1
+
+
+def test_in_a_run_that_is_a_control_its_failures_are_kept():
+    results = summarise([row(1, gated=False, contact=True), row(2, gated=False)])
+    assert [failed["seed"] for failed in results["failures"]] == [1]
+
+
+def test_a_fault_counts_for_stopping_and_one_that_was_not_injected_for_nothing():
+    not_injected = fault(9, injected=False)
+    del not_injected["in_time"]
+    late = fault(8, in_time=False)
+    results = summarise([row(1), fault(7), late, not_injected])
+    assert results["claims"][STOPS]["trials"] == 2
+    assert results["claims"][STOPS]["failures"] == 1
+    assert results["claims"][TOUCHES]["trials"] == 1
+    assert results["not_injected"] == 1
+    assert results["failures"] == [late]
+    assert results["clusters"][0]["kind"] == "nan_scan"

@@ -1,0 +1,59 @@
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.gate.assurance import run as runs
+
+from .samples import PROTOCOL
+
+TRIALS = list(PROTOCOL.list_trials())[:4]
+LINES = [json.dumps(trial._asdict()).encode() + b"\n" for trial in TRIALS]
+
+
+def test_a_line_that_a_killed_run_left_unfinished_is_dropped(tmp_path):
+    log = tmp_path / runs.LOG
+    log.write_bytes(b"".join(LINES[:2]) + LINES[2][:20])
+    rows, size = runs.read_rows(log, TRIALS)
+    assert rows == [trial._asdict() for trial in TRIALS[:2]]
+    assert size == len(LINES[0]) + len(LINES[1])
+
+
+@pytest.mark.parametrize(
+    ("lines", "number"),
+    [
+        ([LINES[0], b"\0\0\n"], 2),
+        ([LINES[1]], 1),
+        ([LINES[0], b"[]\n"], 2),
+        ([*LINES, LINES[0]], 5),
+    ],
+)
+def test_a_log_of_other_episodes_is_refused_by_its_line(tmp_path, lines, number):
+    log = tmp_path / runs.LOG
+    log.write_bytes(b"".join(lines))
+    with pytest.raises(ConfigError, match=f"line {number} is no episode of this run"):
+        runs.read_rows(log, TRIALS)
+
+
+def test_the_protocol_is_on_disk_with_its_hash_before_any_episode(tmp_path):
+    runs.begin(tmp_path, PROTOCOL)
+    written = runs.read_result(tmp_path)
+    assert written["protocol"] == json.loads(json.dumps(PROTOCOL.data))
+    assert written["protocol_sha256"] == PROTOCOL.sha256
+    assert not written["complete"]
+    runs.begin(tmp_path, PROTOCOL)  # the same again
+
+
+def test_a_log_without_its_protocol_is_refused(tmp_path):
+    (tmp_path / runs.LOG).touch()
+    with pytest.raises(ConfigError, match="without assurance"):
+        runs.begin(tmp_path, PROTOCOL)
+
+
+@pytest.mark.parametrize("text", ["", "{}", '{"format": "other", "protocol": {}}', "3"])
+def test_another_json_file_is_no_result(tmp_path, text):
+    (tmp_path / runs.RESULT).write_text(text)
+    with pytest.raises(ConfigError, match="is no result of nics assure"):
+        runs.begin(tmp_path, PROTOCOL)

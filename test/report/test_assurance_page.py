@@ -1,0 +1,52 @@
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from html import unescape
+
+from gate.assurance.samples import FAULTS, PROTOCOL, fault, row
+
+from nics_drl_bridge.gate.assurance.protocol import NO_GATE
+from nics_drl_bridge.gate.assurance.results import summarise
+from nics_drl_bridge.report.assurance_page import make_assurance_page
+
+
+def read(rows, protocol=PROTOCOL):
+    """The text of the page of some rows."""
+    page = make_assurance_page(protocol, summarise(rows), "runs/mine")
+    return unescape(re.sub("<[^>]+>", " ", page.partition("</style>")[2]))
+
+
+CONTROL = row(1, gated=False, contact=True)
+
+
+def test_without_failures_the_page_tells_the_bound_and_that_a_failure_can_be_found():
+    text = read([row(1), row(2), CONTROL])
+    assert "a rate below 3/n, here 1.5e+00 for 2 trials" in text
+    assert "Control, touches nothing: without the gate, 1 of 1 trials fail" in text
+    assert "its zero proves nothing" in text  # of the limits, which the control kept
+    assert "stopping in time was not tested" in text
+    assert PROTOCOL.sha256 in text
+    assert re.search(r"ram: drives into .* 0 of 2\s+1 of 1", text)
+
+
+def test_a_failure_is_told_with_the_command_that_replays_it():
+    text = read([row(1), row(9, contact=True), CONTROL])
+    assert "Failed trials: 1. Clusters: 1." in text
+    assert "nics assure differential --limits differential" in text
+    assert "--out runs/mine --replay 9" in text
+
+
+def test_faults_are_listed_with_those_that_could_not_be_injected():
+    rows = [row(1), fault(7), {**fault(8), "injected": False, "in_time": True}]
+    text = read(rows, FAULTS)
+    assert "7 faults were injected over DDS" in text
+    assert "1 could not be injected" in text
+    assert "was not tested" not in text
+
+
+def test_in_a_control_failures_are_what_is_wanted():
+    text = read([CONTROL], replace(PROTOCOL, control=NO_GATE))
+    assert "the gate was off" in text
+    assert "1 of 1" in text
+    assert "⚠ 0 of 1" in text  # the limits, of which none failed
