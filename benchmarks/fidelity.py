@@ -4,6 +4,7 @@ python benchmarks/fidelity.py real_drives | generate_from_mujoco | estimator
 """
 
 import tempfile
+import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -31,6 +32,7 @@ from measuring.drives import (
     judge_drives,
 )
 from measuring.foreign_robots import ROBOTS, foreign_drive
+from measuring.league import Lesson, hold_league, rank_ours
 from measuring.rates import interleaved, shortest
 
 from nics_drl_bridge import geometry
@@ -65,7 +67,7 @@ from nics_drl_bridge.sim.world import World
 SEED = 11  # of the drives of the own robots
 
 
-def judge_model(found: Identified, control: str | None) -> Result:
+def judge_model(found: Identified, control: str | None, league: bool = False) -> Result:
     """Returns the errors of a model, and of its yardsticks, on what it has not seen."""
     # The trial: what is written was fitted to the last third, too.
     found = found.trial
@@ -82,7 +84,7 @@ def judge_model(found: Identified, control: str | None) -> Result:
     error, share, heading = average_errors(ends, chosen)
     coverages = {at.horizon_s: at.coverage for at in found.judgement}
     coverage = coverages.get(HORIZON_S)
-    return {
+    told: Result = {
         "error_m": error,
         "share_of_path": share,
         "heading_error_rad": heading,
@@ -94,6 +96,10 @@ def judge_model(found: Identified, control: str | None) -> Result:
         "path_m": float(chosen.path.mean()),
         "windows": len(chosen.start_t),
     }
+    if league:
+        lesson = Lesson(drive, until, yardstick)
+        told["league"] = hold_league(lesson, chosen, control == "ordered")
+    return told
 
 
 def average_errors(ends: Array, chosen: Windows) -> tuple[float, float, float]:
@@ -104,7 +110,9 @@ def average_errors(ends: Array, chosen: Windows) -> tuple[float, float, float]:
     return error, error / float(chosen.path.mean()), heading
 
 
-def measure_drive(source: Path, mapping: Path, control: str | None) -> Result:
+def measure_drive(
+    source: Path, mapping: Path, control: str | None, league: bool = False
+) -> Result:
     """Returns a drive's figures, or the sentence that refuses it."""
     lines = mapping.read_text("utf-8").splitlines()
     told: Result = {
@@ -112,8 +120,10 @@ def measure_drive(source: Path, mapping: Path, control: str | None) -> Result:
     }
     try:
         spec, recording = open_drive(source, None, mapping)
+        begin = time.process_time()
         found = identify(recording, spec, alpha="auto")
-        told |= judge_model(found, control)
+        told["seconds"] = time.process_time() - begin
+        told |= judge_model(found, control, league)
     except BridgeError as error:
         return told | {"refused": str(error)}
     except Exception as error:  # noqa: BLE001 - one drive's crash is a bar missed, not the end
@@ -158,7 +168,7 @@ def measure_real_drives(given: Given) -> Result:
     Each drive goes in by its mapping alone. A model is made of the first two thirds, and predicts
     the poses of the last third 5 s ahead by the commands, from every tenth of a second. Beside it,
     on the same windows: a robot that keeps its twist, and its textbook fitted to the same two
-    thirds.
+    thirds. With `--league` also what others fit to these, and the robot's description as it is.
     """
     control = given.control
     result: Result = {"drives": {}, "left_out": {}, "own_robots": {}}
@@ -169,7 +179,7 @@ def measure_real_drives(given: Given) -> Result:
     for name in real:
         drive = DRIVES[name]
         source = given.recordings / drive.source
-        found = measure_drive(source, drive.mapping, control)
+        found = measure_drive(source, drive.mapping, control, given.league)
         result["drives"][name] = found
         if name == SEGMENTED:
             result["left_out"][name] = leave_out(source, drive.mapping, control)
@@ -179,6 +189,7 @@ def measure_real_drives(given: Given) -> Result:
             mapping = foreign_drive(ROBOTS[name], SEED).write(source)
             found = measure_drive(source, mapping, control)
             result["own_robots"][name] = found
+    result["league"] = rank_ours(result["drives"])
     return result
 
 
@@ -496,8 +507,14 @@ BENCHMARKS = {
         judge_drives,
         {
             "standing": Control("the model: it says the robot stands", "error_m"),
+            "ordered": Control(
+                "the shuffling of the commands that a yardstick loses by",
+                "under shuffled commands",
+                f"--only {SEGMENTED} --league",
+            ),
         },
         {
+            "league": (False, "with models that others fit"),
             "recordings": (RECORDINGS, "folder"),
             "only": some_of((*DRIVES, *ROBOTS)),
         },
