@@ -327,8 +327,9 @@ def fit_sysid(lesson: Lesson) -> Predictor:
 # PySINDy: sparse polynomials in twist and commands
 
 DEGREES = (1, 2)
-THRESHOLDS = (0.01, 0.1, 0.5)  # in standard deviations per second
-SMOOTHED = (5, 15, 31)  # steps that a parabola is fitted to
+THRESHOLDS = (0.01, 0.3)  # in standard deviations per second
+SMOOTHED = (5, 31)  # steps that a parabola is fitted to
+RIDGES = (1.0, 30.0)
 FASTEST = 20.0  # standard deviations beyond which a roll-out has blown up
 
 
@@ -365,7 +366,7 @@ class Sparse:
 
 
 def learn_sparse(
-    lesson: Lesson, stop: float, degree: int, threshold: float, width: int
+    lesson: Lesson, stop: float, degree: int, threshold: float, width: int, ridge: float
 ) -> Sparse:
     """Fits SINDy with the commands as control inputs up to a time [s]."""
     import pysindy
@@ -385,7 +386,7 @@ def learn_sparse(
         for values in (twist, command)
     ]
     model = pysindy.SINDy(
-        optimizer=pysindy.STLSQ(threshold=threshold),
+        optimizer=pysindy.STLSQ(threshold=threshold, alpha=ridge),
         feature_library=pysindy.PolynomialLibrary(degree=degree),
         differentiation_method=pysindy.SmoothedFiniteDifference(smoother_kws=smoother),
     )
@@ -407,7 +408,7 @@ def fit_sindy(lesson: Lesson) -> Predictor:
         )
     ]
     errors = {}
-    for settings in itertools.product(DEGREES, THRESHOLDS, SMOOTHED):
+    for settings in itertools.product(DEGREES, THRESHOLDS, SMOOTHED, RIDGES):
         errors[settings] = sum(
             measure_error(learn_sparse(lesson, stop, *settings).predict(chosen), chosen)
             for stop, chosen in parts
