@@ -32,8 +32,8 @@ from measuring.drives import (
     judge_drives,
 )
 from measuring.foreign_robots import ROBOTS, foreign_drive
-from measuring.league import Lesson, hold_league, rank_ours
-from measuring.rates import interleaved, shortest
+from measuring.league import Lesson, average_errors, hold_league, rank_ours
+from measuring.rates import interleaved, make_batched, make_single, shortest
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BridgeError
@@ -44,7 +44,6 @@ from nics_drl_bridge.identify.identify import Identified, identify
 from nics_drl_bridge.identify.open_loop import (
     HORIZON_S,
     SPACING_S,
-    Windows,
     measure_open_loop_error,
     predict,
     select_windows,
@@ -55,7 +54,6 @@ from nics_drl_bridge.middleware.measurement import ODOM
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.recording.readers import open_drive
 from nics_drl_bridge.recording.recording import Recording
-from nics_drl_bridge.robot.kernels import SERIES, make_terms, run, simulate_rollouts
 from nics_drl_bridge.robot.noise import Level, Noise
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 from nics_drl_bridge.robot.taylor import TaylorModel
@@ -100,14 +98,6 @@ def judge_model(found: Identified, control: str | None, league: bool = False) ->
         lesson = Lesson(drive, until, yardstick)
         told["league"] = hold_league(lesson, chosen, control == "ordered")
     return told
-
-
-def average_errors(ends: Array, chosen: Windows) -> tuple[float, float, float]:
-    """Returns mean errors: of the position [m], as a share of the path, of the heading [rad]."""
-    apart = ends - chosen.end
-    error = float(np.hypot(apart[:, 0], apart[:, 1]).mean())
-    heading = float(np.abs(geometry.wrap_angle(apart[:, 2])).mean())
-    return error, error / float(chosen.path.mean()), heading
 
 
 def measure_drive(
@@ -231,21 +221,6 @@ def average_drives(
     }
 
 
-def run_batched(model: TaylorModel, commands: Array, pose: Array) -> None:
-    """Runs many robots, each of which gets a command every 0.1 s."""
-    terms = make_terms(model)
-    each = np.repeat(terms.coefficient[:, None], BATCH, axis=1)
-    terms = terms._replace(coefficient=each)
-    x = np.zeros((len(model.variables) + 1, BATCH))
-    x[-1] = 1.0
-    dq = np.zeros((len(model.dofs), BATCH))
-    pose[:] = 0.0
-    pose[2] = 1.0
-    for command in commands:
-        x[model.state_size : -1] = command
-        run(pose, x, dq, terms, SERIES, model.dt, round(0.1 / model.dt))
-
-
 def time_all(
     model: TaylorModel, spec: RobotSpec, physics: Callable[[Array], None]
 ) -> dict[str, float]:
@@ -255,14 +230,11 @@ def time_all(
     high = spec.command_high
     many = rng.uniform(low[:, None], high[:, None], (HOLDS, len(low), BATCH))
     held = np.repeat(rng.uniform(low, high, (1, STEPS // 10, len(low))), 10, axis=1)
-    poses = np.zeros((1, STEPS + 1, 3))
-    states = np.zeros((1, STEPS + 1, model.state_size))
-    ends = np.zeros((6, BATCH))
-    terms = make_terms(model)
-    single = partial(simulate_rollouts, poses, states, held, terms, SERIES, model.dt)
+    batched, ends = make_batched(model, many, round(0.1 / model.dt))
+    single, poses = make_single(model, held)
     slow = rng.uniform(low, high, (round(10 * PHYSICS_S), len(low)))
     calls: dict[str, Callable[[], object]] = {
-        "batched": partial(run_batched, model, many, ends),
+        "batched": batched,
         "single": single,
         "mujoco": partial(physics, slow),
     }
