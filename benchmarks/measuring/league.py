@@ -80,14 +80,14 @@ def use_nominal(lesson: Lesson) -> Predictor:
     structure = probe_structure(spec)
     assert structure is not None
     lags = [value for name, value in spec.parameters.items() if name.endswith("_lag")]
-    response = TextbookResponse(
-        0.0,
-        structure[0],
-        np.zeros(3),
-        np.array([lags[0], lags[0], lags[-1]]),
-        np.full(2, FREE),
-        structure[1],
-        lesson.textbook.response.mounting,
+    response = replace(
+        lesson.textbook.response,
+        delay_s=0.0,
+        gain=structure[0],
+        offset=np.zeros(3),
+        lag_s=np.array([lags[0], lags[0], lags[-1]]),
+        limit=np.full(2, FREE),
+        bicycle=structure[1],
     )
     nominal = replace(lesson.textbook, response=response)
     return lambda chosen: nominal.predict(lesson.drive, chosen)
@@ -143,9 +143,7 @@ class Planar:
 
     lesson: Lesson
     fixed: dict[str, float]  # constants of the model
-    scaled: dict[
-        str, float
-    ]  # first values of those that are fitted as multiples of them
+    scaled: dict[str, float]  # first values of those that are fitted, as multiples
 
     @property
     def response(self) -> TextbookResponse:
@@ -169,58 +167,44 @@ class Planar:
         )
         return ParameterDict({each.name: each for each in parameters})
 
-    def roll(self, candidates: list[Any], start_t: Array, duration: Array) -> Array:
-        """Returns poses (N, W, H, 3) of the tracked body, relative to its pose at the starts."""
+    def roll(self, candidate: Any, start_t: Array, duration: Array) -> Array:
+        """Returns poses (W, H, 3) of the tracked body, relative to its pose at the starts."""
         import mujoco
         from mujoco import rollout
 
-        steps = int(np.ceil(duration.max() / STEP_S)) + 1
-        twist = estimate_twists_at(self.lesson.drive, start_t)
+        scale = np.exp(candidate["scale"].value)
+        scaled = scale * list(self.scaled.values())
+        values = self.fixed | dict(zip(self.scaled, scaled, strict=True))
+        values["lag"] = max(values["lag"], STEP_S)
+        text = PLANAR.format(step=STEP_S, **values)
+        model = mujoco.MjModel.from_xml_string(text)
         count = len(start_t)
-        models = []
-        states = np.zeros((len(candidates), count, 9))
-        controls = np.zeros((len(candidates), count, steps, 5))
-        mountings = np.array([each["mounting"].value for each in candidates])
-        for candidate, state, control, mounting in zip(
-            candidates, states, controls, mountings, strict=True
-        ):
-            scale = np.exp(candidate["scale"].value)
-            values = self.fixed | {
-                name: value * factor
-                for (name, value), factor in zip(
-                    self.scaled.items(), scale, strict=True
-                )
-            }
-            values["lag"] = max(values["lag"], STEP_S)
-            text = PLANAR.format(step=STEP_S, **values)
-            models += count * [mujoco.MjModel.from_xml_string(text)]
-            speed, turn = self.aim(candidate).T
-            begin = start_t - candidate["delay"].value
-            at = begin[:, None] + STEP_S * np.arange(steps)
-            control[..., 0] = np.interp(at, self.lesson.grid_t, speed)
-            control[..., 1] = control[..., 2] = np.interp(at, self.lesson.grid_t, turn)
-            share = 1.0 - np.exp(-STEP_S / values["lag"])
-            angle = scipy.signal.lfilter([0.0, share], [1.0, share - 1.0], turn)
-            state[:, 4] = np.interp(begin, self.lesson.grid_t, angle)
-            arm = np.array([mounting[1], -mounting[0]]) * twist[:, 2:]
-            state[:, 5:7] = geometry.rotate(twist[:, :2], mounting[2]) + arm
-            state[:, 7] = twist[:, 2]
-        rolled, _ = rollout.rollout(
-            models,
-            [mujoco.MjData(models[0]) for _ in range(2)],
-            states.reshape(-1, 9),
-            controls.reshape(-1, steps, 5),
-        )
-        poses = np.concatenate([states.reshape(-1, 1, 9), rolled], axis=1)[..., 1:4]
-        poses = poses.reshape(len(candidates), count, steps + 1, 3)
+        steps = int(np.ceil(duration.max() / STEP_S)) + 1
+        grid = self.lesson.grid_t
+        speed, turn = self.aim(candidate).T
+        begin = start_t - candidate["delay"].value
+        at = begin[:, None] + STEP_S * np.arange(steps)
+        control = np.zeros((count, steps, 5))
+        control[..., 0] = np.interp(at, grid, speed)
+        control[..., 1] = control[..., 2] = np.interp(at, grid, turn)
+        share = 1.0 - np.exp(-STEP_S / values["lag"])
+        angle = scipy.signal.lfilter([0.0, share], [1.0, share - 1.0], turn)
+        place = candidate["mounting"].value
+        twist = estimate_twists_at(self.lesson.drive, start_t)
+        arm = np.array([place[1], -place[0]]) * twist[:, 2:]
+        state = np.zeros((count, 9))
+        state[:, 4] = np.interp(begin, grid, angle)
+        state[:, 5:7] = geometry.rotate(twist[:, :2], place[2]) + arm
+        state[:, 7] = twist[:, 2]
+        threads = [mujoco.MjData(model) for _ in range(2)]
+        rolled, _ = rollout.rollout(model, threads, state, control)
+        poses = np.concatenate([state[:, None], rolled], axis=1)[..., 1:4]
         before = (duration / STEP_S).astype(np.intp)
         part = (duration / STEP_S - before)[..., None]
         row = np.arange(count)[:, None]
-        ends = (1.0 - part) * poses[:, row, before] + part * poses[:, row, before + 1]
-        place = mountings[:, None, None]
-        return geometry.compose(
-            geometry.between(place, np.zeros(3)), geometry.compose(ends, place)
-        )
+        ends = (1.0 - part) * poses[row, before] + part * poses[row, before + 1]
+        back = geometry.between(place, np.zeros(3))
+        return geometry.compose(back, geometry.compose(ends, place))
 
     def aim(self, candidate: Any) -> Array:
         """Returns the speeds, and the angles or turn rates, (G, 2) that commands ask for."""
@@ -285,18 +269,17 @@ def fit_sysid(lesson: Lesson) -> Predictor:
     measured = geometry.between(chosen.start[:, None], np.stack(ends, axis=-1))
 
     def compare(x: Array, parameters: Any) -> tuple[list[Array], None, None]:
-        candidates = []
+        errors = []
         for column in x.reshape(len(x), -1).T:
             parameters.update_from_vector(column)
-            candidates.append(parameters.copy())
-        error = planar.roll(candidates, chosen.start_t, durations) - measured
-        error[..., 2] = geometry.wrap_angle(error[..., 2])
-        error = np.clip(error * HEADINGS / durations[..., None], -100.0, 100.0)
-        scaled = (np.nan_to_num(error) / LOSS_SCALE) ** 2
-        # whose squares sum up to the soft L1 loss that the textbook is fitted by
-        robust = np.sign(error) * np.sqrt(np.sqrt(1.0 + scaled) - 1.0)
-        flat = robust.reshape(len(candidates), -1).T
-        return [flat if x.ndim > 1 else flat[:, 0]], None, None
+            error = planar.roll(parameters, chosen.start_t, durations) - measured
+            error[..., 2] = geometry.wrap_angle(error[..., 2])
+            error = np.clip(error * HEADINGS / durations[..., None], -100.0, 100.0)
+            scaled = (np.nan_to_num(error) / LOSS_SCALE) ** 2
+            # Its squares sum up to the soft L1 loss that the textbook is fitted by.
+            robust = np.sign(error) * np.sqrt(np.sqrt(1.0 + scaled) - 1.0)
+            errors.append(robust.ravel())
+        return [np.stack(errors, axis=-1) if x.ndim > 1 else errors[0]], None, None
 
     parameters = planar.declare()
     names = list(planar.scaled)
@@ -319,8 +302,8 @@ def fit_sysid(lesson: Lesson) -> Predictor:
 
     def predict(windows: Windows) -> Array:
         duration = (windows.end_t - windows.start_t)[:, None]
-        relative = planar.roll([best], windows.start_t, duration)
-        return geometry.compose(windows.start, relative[0, :, 0])
+        relative = planar.roll(best, windows.start_t, duration)
+        return geometry.compose(windows.start, relative[:, 0])
 
     return predict
 
