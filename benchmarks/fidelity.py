@@ -482,7 +482,7 @@ BENCHMARKS = {
             "ordered": Control(
                 "the shuffling of the commands that a yardstick loses by",
                 "under shuffled commands",
-                f"--only {SEGMENTED} --league",
+                "--only ticks_02 --league",
             ),
         },
         {
