@@ -77,10 +77,13 @@ EXTRAS = {
         "dockerfile-parse",
         "flake8",
         "hypothesis",
+        # what others fit to a drive: MuJoCo's own identification, and SINDy
+        "mujoco[sysid]>=4; python_version >= '3.11'",
         "mypy",
         "nox",
         "pre-commit",
         "pyarrow",
+        "pysindy>=2.1,<2.2",
         "pytest",
         "pytest-timeout",
         "pytest-xdist",

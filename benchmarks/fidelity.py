@@ -4,6 +4,7 @@ python benchmarks/fidelity.py real_drives | generate_from_mujoco | estimator
 """
 
 import tempfile
+import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -31,7 +32,8 @@ from measuring.drives import (
     judge_drives,
 )
 from measuring.foreign_robots import ROBOTS, foreign_drive
-from measuring.rates import interleaved, shortest
+from measuring.league import Lesson, average_errors, hold_league, rank_ours
+from measuring.rates import interleaved, make_batched, make_single, shortest
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BridgeError
@@ -42,7 +44,6 @@ from nics_drl_bridge.identify.identify import Identified, identify
 from nics_drl_bridge.identify.open_loop import (
     HORIZON_S,
     SPACING_S,
-    Windows,
     measure_open_loop_error,
     predict,
     select_windows,
@@ -53,7 +54,6 @@ from nics_drl_bridge.middleware.measurement import ODOM
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.recording.readers import open_drive
 from nics_drl_bridge.recording.recording import Recording
-from nics_drl_bridge.robot.kernels import SERIES, make_terms, run, simulate_rollouts
 from nics_drl_bridge.robot.noise import Level, Noise
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 from nics_drl_bridge.robot.taylor import TaylorModel
@@ -65,7 +65,7 @@ from nics_drl_bridge.sim.world import World
 SEED = 11  # of the drives of the own robots
 
 
-def judge_model(found: Identified, control: str | None) -> Result:
+def judge_model(found: Identified, control: str | None, league: bool = False) -> Result:
     """Returns the errors of a model, and of its yardsticks, on what it has not seen."""
     # The trial: what is written was fitted to the last third, too.
     found = found.trial
@@ -82,7 +82,7 @@ def judge_model(found: Identified, control: str | None) -> Result:
     error, share, heading = average_errors(ends, chosen)
     coverages = {at.horizon_s: at.coverage for at in found.judgement}
     coverage = coverages.get(HORIZON_S)
-    return {
+    told: Result = {
         "error_m": error,
         "share_of_path": share,
         "heading_error_rad": heading,
@@ -94,17 +94,15 @@ def judge_model(found: Identified, control: str | None) -> Result:
         "path_m": float(chosen.path.mean()),
         "windows": len(chosen.start_t),
     }
+    if league:
+        lesson = Lesson(drive, until, yardstick)
+        told["league"] = hold_league(lesson, chosen, control == "ordered")
+    return told
 
 
-def average_errors(ends: Array, chosen: Windows) -> tuple[float, float, float]:
-    """Returns mean errors: of the position [m], as a share of the path, of the heading [rad]."""
-    apart = ends - chosen.end
-    error = float(np.hypot(apart[:, 0], apart[:, 1]).mean())
-    heading = float(np.abs(geometry.wrap_angle(apart[:, 2])).mean())
-    return error, error / float(chosen.path.mean()), heading
-
-
-def measure_drive(source: Path, mapping: Path, control: str | None) -> Result:
+def measure_drive(
+    source: Path, mapping: Path, control: str | None, league: bool = False
+) -> Result:
     """Returns a drive's figures, or the sentence that refuses it."""
     lines = mapping.read_text("utf-8").splitlines()
     told: Result = {
@@ -112,8 +110,10 @@ def measure_drive(source: Path, mapping: Path, control: str | None) -> Result:
     }
     try:
         spec, recording = open_drive(source, None, mapping)
+        begin = time.process_time()
         found = identify(recording, spec, alpha="auto")
-        told |= judge_model(found, control)
+        told["seconds"] = time.process_time() - begin
+        told |= judge_model(found, control, league)
     except BridgeError as error:
         return told | {"refused": str(error)}
     except Exception as error:  # noqa: BLE001 - one drive's crash is a bar missed, not the end
@@ -158,7 +158,7 @@ def measure_real_drives(given: Given) -> Result:
     Each drive goes in by its mapping alone. A model is made of the first two thirds, and predicts
     the poses of the last third 5 s ahead by the commands, from every tenth of a second. Beside it,
     on the same windows: a robot that keeps its twist, and its textbook fitted to the same two
-    thirds.
+    thirds. With `--league` also what others fit to these, and the robot's description as it is.
     """
     control = given.control
     result: Result = {"drives": {}, "left_out": {}, "own_robots": {}}
@@ -169,7 +169,7 @@ def measure_real_drives(given: Given) -> Result:
     for name in real:
         drive = DRIVES[name]
         source = given.recordings / drive.source
-        found = measure_drive(source, drive.mapping, control)
+        found = measure_drive(source, drive.mapping, control, given.league)
         result["drives"][name] = found
         if name == SEGMENTED:
             result["left_out"][name] = leave_out(source, drive.mapping, control)
@@ -179,6 +179,7 @@ def measure_real_drives(given: Given) -> Result:
             mapping = foreign_drive(ROBOTS[name], SEED).write(source)
             found = measure_drive(source, mapping, control)
             result["own_robots"][name] = found
+    result["league"] = rank_ours(result["drives"])
     return result
 
 
@@ -220,21 +221,6 @@ def average_drives(
     }
 
 
-def run_batched(model: TaylorModel, commands: Array, pose: Array) -> None:
-    """Runs many robots, each of which gets a command every 0.1 s."""
-    terms = make_terms(model)
-    each = np.repeat(terms.coefficient[:, None], BATCH, axis=1)
-    terms = terms._replace(coefficient=each)
-    x = np.zeros((len(model.variables) + 1, BATCH))
-    x[-1] = 1.0
-    dq = np.zeros((len(model.dofs), BATCH))
-    pose[:] = 0.0
-    pose[2] = 1.0
-    for command in commands:
-        x[model.state_size : -1] = command
-        run(pose, x, dq, terms, SERIES, model.dt, round(0.1 / model.dt))
-
-
 def time_all(
     model: TaylorModel, spec: RobotSpec, physics: Callable[[Array], None]
 ) -> dict[str, float]:
@@ -244,14 +230,11 @@ def time_all(
     high = spec.command_high
     many = rng.uniform(low[:, None], high[:, None], (HOLDS, len(low), BATCH))
     held = np.repeat(rng.uniform(low, high, (1, STEPS // 10, len(low))), 10, axis=1)
-    poses = np.zeros((1, STEPS + 1, 3))
-    states = np.zeros((1, STEPS + 1, model.state_size))
-    ends = np.zeros((6, BATCH))
-    terms = make_terms(model)
-    single = partial(simulate_rollouts, poses, states, held, terms, SERIES, model.dt)
+    batched, ends = make_batched(model, many, round(0.1 / model.dt))
+    single, poses = make_single(model, held)
     slow = rng.uniform(low, high, (round(10 * PHYSICS_S), len(low)))
     calls: dict[str, Callable[[], object]] = {
-        "batched": partial(run_batched, model, many, ends),
+        "batched": batched,
         "single": single,
         "mujoco": partial(physics, slow),
     }
@@ -497,8 +480,14 @@ BENCHMARKS = {
         judge_drives,
         {
             "standing": Control("the model: it says the robot stands", "error_m"),
+            "ordered": Control(
+                "the shuffling of the commands that a yardstick loses by",
+                "under shuffled commands",
+                "--only ticks_02 --league",
+            ),
         },
         {
+            "league": (False, "with models that others fit"),
             "recordings": (RECORDINGS, "folder"),
             "only": some_of((*DRIVES, *ROBOTS)),
         },

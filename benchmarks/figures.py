@@ -133,7 +133,7 @@ class Page:
             text = PLACEHOLDER.sub(lambda match: self.figure(match, run), template)
         except (LookupError, ValueError):
             return NOT_MEASURED, runs
-        return " ".join([text, *self.marks(runs)]), runs
+        return "".join([text, *self.marks(runs)]), runs
 
     def elsewhere(self, run: str) -> bool:
         """Whether a run was made on another machine than most."""

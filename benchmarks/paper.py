@@ -25,7 +25,14 @@ from bench import (
 )
 from measuring import fig4
 from measuring.environments import NotInstalledError
-from measuring.rates import interleaved, medians, shortest, slowed
+from measuring.rates import (
+    interleaved,
+    make_batched,
+    make_single,
+    medians,
+    shortest,
+    slowed,
+)
 from measuring.scenes import (
     BATCH,
     SCENES,
@@ -49,7 +56,6 @@ from nics_drl_bridge.lidar.shapes import Polygon, Shape, find_convex_hull
 from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
 from nics_drl_bridge.lidar.table import Density, LidarTable
 from nics_drl_bridge.recording.recording import Samples
-from nics_drl_bridge.robot import kernels
 from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.robot.spec import CommandVariable, RobotSpec, load_robot
 from nics_drl_bridge.robot.taylor import TaylorModel
@@ -126,37 +132,23 @@ def find_errors(model: TaylorModel, robot: Subject, seed: int) -> Array:
     return np.sqrt((np.concatenate([apart, turned], axis=1) ** 2).mean(axis=0))
 
 
-def time_batched(model: TaylorModel, robot: Subject) -> float:
-    """Returns robot-steps per second of many robots, at the origin under random inputs."""
-    terms = kernels.make_terms(model)
+def time_model(model: TaylorModel, robot: Subject) -> dict[str, float]:
+    """Returns steps per second under random inputs: of one robot, and of many at once."""
     rng = np.random.default_rng(3)
-    x = np.ones((len(model.variables) + 1, ROBOTS))
-    low = robot.spec.command_low[:, None]
-    high = robot.spec.command_high[:, None]
-    x[:-1] = rng.uniform(low, high, (len(low), ROBOTS))
-    pose = np.zeros((6, ROBOTS))
-    pose[2] = 1.0
-    each = np.repeat(terms.coefficient[:, None], ROBOTS, axis=1)
-    terms = terms._replace(coefficient=each)
-    dq = np.zeros((len(model.dofs), ROBOTS))
-    series = kernels.SERIES
-    call = partial(kernels.run, pose, x, dq, terms, series, model.dt, BATCHED_STEPS)
-    times = interleaved({"run": call}, REPEATS)
-    return ROBOTS * BATCHED_STEPS / shortest(times)["run"]
-
-
-def time_single(model: TaylorModel, robot: Subject) -> float:
-    """Returns steps per second of one robot, with a command per step, many steps in one call."""
-    rng = np.random.default_rng(4)
     low = robot.spec.command_low
-    commands = rng.uniform(low, robot.spec.command_high, (1, SINGLE_STEPS, len(low)))
-    poses = np.zeros((1, SINGLE_STEPS + 1, 3))
-    states = np.zeros((1, SINGLE_STEPS + 1, 0))
-    terms = kernels.make_terms(model)
-    call = partial(
-        kernels.simulate_rollouts, poses, states, commands, terms, kernels.SERIES, DT
-    )
-    return SINGLE_STEPS / shortest(interleaved({"run": call}, REPEATS))["run"]
+    high = robot.spec.command_high
+    size = (1, len(low), ROBOTS)
+    many = rng.uniform(low[:, None], high[:, None], size)
+    alone = rng.uniform(low, high, (1, SINGLE_STEPS, len(low)))
+    calls = {
+        "batched": make_batched(model, many, BATCHED_STEPS)[0],
+        "single": make_single(model, alone)[0],
+    }
+    seconds = shortest(interleaved(calls, REPEATS))
+    return {
+        "steps_per_s_single": SINGLE_STEPS / seconds["single"],
+        "steps_per_s_batched": ROBOTS * BATCHED_STEPS / seconds["batched"],
+    }
 
 
 def time_python(robot: Subject) -> float:
@@ -184,8 +176,7 @@ def measure_robot(name: str, control: str | None) -> Result:
         **dict(zip(ERRORS, step.tolist(), strict=True)),
         "terms_kept": model.terms_kept,
         "terms_total": found.regression.terms_total,
-        "steps_per_s_single": time_single(model, robot),
-        "steps_per_s_batched": time_batched(model, robot),
+        **time_model(model, robot),
     }
 
 

@@ -5,13 +5,19 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from bench import ROOT, at_most, missed_bars
+from bench import ROOT, at_least, at_most, missed_bars
 
 EXAMPLES = ROOT / "examples" / "recordings"
 SHIPPED = ROOT / "config" / "recordings"
 RECORDINGS = ROOT.parent / "shared" / "recordings"
 MOST_LINES = 25  # of a mapping, without comments
 COVERAGE = (0.9, 0.99)  # of the 95 % band
+
+LEAGUE = {
+    "shuffled_ratio": at_least(
+        1.2, "times the textbook's error under shuffled commands"
+    )
+}
 
 
 @dataclass(frozen=True)
@@ -102,6 +108,8 @@ def judge_drive(name: str, told: Mapping[str, Any], limits: Bars) -> list[str]:
     if limits.error_m is not None:
         bars["error_m"] = at_most(limits.error_m)
     missed = missed_bars(told, bars, f"{name}: ")
+    if "league" in told:
+        missed += missed_bars(told["league"], LEAGUE, f"{name}: ")
     low, high = COVERAGE
     if not low <= told["coverage_95"] <= high:
         missed.append(

@@ -2,9 +2,14 @@
 
 import time
 from collections.abc import Callable, Hashable, Mapping
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
+
+from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.robot.kernels import SERIES, make_terms, run, simulate_rollouts
+from nics_drl_bridge.robot.taylor import TaylorModel
 
 WARM_UP = 3
 Name = TypeVar("Name", bound=Hashable)
@@ -50,3 +55,39 @@ def medians(times: Mapping[Name, list[float]]) -> dict[Name, float]:
 def shortest(times: Mapping[Name, list[float]]) -> dict[Name, float]:
     """The shortest time of each call [s]: what others do on the machine only ever adds."""
     return {name: min(each) for name, each in times.items()}
+
+
+def make_batched(
+    model: TaylorModel, commands: Array, steps: int
+) -> tuple[Callable[[], object], Array]:
+    """Returns a call that drives N robots by commands (H, C, N) of some steps, and their poses."""
+    count = commands.shape[2]
+    terms = make_terms(model)
+    each = np.repeat(terms.coefficient[:, None], count, axis=1)
+    terms = terms._replace(coefficient=each)
+    x = np.zeros((len(model.variables) + 1, count))
+    dq = np.zeros((len(model.dofs), count))
+    pose = np.zeros((6, count))
+
+    def drive() -> None:
+        for array in (x, dq, pose):
+            array[:] = 0.0
+        x[-1] = pose[2] = 1.0
+        for command in commands:
+            x[model.state_size : -1] = command
+            run(pose, x, dq, terms, SERIES, model.dt, steps)
+
+    return drive, pose
+
+
+def make_single(
+    model: TaylorModel, commands: Array
+) -> tuple[Callable[[], object], Array]:
+    """Returns a call that drives a robot by commands (1, T, C), a step each, and its poses."""
+    steps = commands.shape[1] + 1
+    poses = np.zeros((1, steps, 3))
+    states = np.zeros((1, steps, model.state_size))
+    terms = make_terms(model)
+    return partial(
+        simulate_rollouts, poses, states, commands, terms, SERIES, model.dt
+    ), poses

@@ -110,7 +110,7 @@ def _measure_twists(drive: Drive) -> tuple[Array, Array]:
     return grid, measure_body_twists(drive, Calibration(), grid, width)
 
 
-def _select_windows(
+def select_calm_windows(
     drive: Drive, until_s: float, horizon: float, spacing: float
 ) -> tuple[Windows, Array]:
     """Selects windows without localiser jumps, and twists (W, 3) at their starts."""
@@ -277,7 +277,7 @@ def _guess_response(
     """Fits gains, lags, maybe offsets linearly to motions over `GUESS_S` at the best delay."""
     structure = probe_structure(drive.spec)
     book, bicycle = structure or (np.ones((3, len(drive.spec.command))), STRAIGHT)
-    seen, before = _select_windows(drive, until_s, GUESS_S, SPACING_S)
+    seen, before = select_calm_windows(drive, until_s, GUESS_S, SPACING_S)
     span = (seen.end_t - seen.start_t)[:, None]
     twist = geometry.log(geometry.between(seen.start, seen.end)) / span
     change = (estimate_twists_at(drive, seen.end_t) - before) / span
@@ -364,7 +364,7 @@ def fit_yardstick(
     have the same limit. Raises RecordingError if the part is too short for these horizons.
     """
     spacing = max(SPACING_S, (until_s - HORIZONS_S[-1]) / MOST_WINDOWS)
-    chosen, twist = _select_windows(drive, until_s, HORIZONS_S[-1], spacing)
+    chosen, twist = select_calm_windows(drive, until_s, HORIZONS_S[-1], spacing)
     if not len(chosen.start_t):
         fault = f"the first {until_s:.1f} s contain no window of {HORIZONS_S[-1]:g} s"
         raise RecordingError(

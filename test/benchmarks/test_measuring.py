@@ -18,9 +18,13 @@ from PIL import Image
 from nics_drl_bridge.config import list_shipped
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import builtin_model
+from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.open_loop import select_windows
+from nics_drl_bridge.identify.yardstick import fit_yardstick
 from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.policy.policies import list_shipped_policies
-from nics_drl_bridge.recording.readers import read_recording
+from nics_drl_bridge.recording.readers import open_drive, read_recording
 from nics_drl_bridge.robot.spec import load_robot
 from nics_drl_bridge.sim.randomisation import Sampler, load_randomisation
 
@@ -89,6 +93,64 @@ def test_every_mapping_that_is_shown_has_its_drive():
     # One is a link to a shipped one.
     mappings = {drive.mapping for drive in bars.DRIVES.values()}
     assert mappings == {path.resolve() for path in found}
+
+
+# The league
+
+
+@pytest.fixture
+def lesson(foreign, tmp_path):
+    """A drive of 40 s of a robot of another simulator, its textbook fitted to 26 s of it."""
+    league = import_module("measuring.league")
+    mapping = foreign.foreign_drive(foreign.ROBOTS["ticks"], 3, 40.0).write(
+        tmp_path / "ticks"
+    )
+    spec, recording = open_drive(tmp_path / "ticks", None, mapping)
+    drive = Drive(recording, spec)
+    return league.Lesson(drive, 26.0, fit_yardstick(drive, 26.0))
+
+
+@pytest.fixture
+def unseen(lesson):
+    return select_windows(lesson.drive, Calibration(), 26.0, 40.0, 5.0, 0.5)
+
+
+@pytest.mark.parametrize(("name", "share"), [("sysid", 0.03), ("sindy", 0.2)])
+def test_what_others_fit_predicts_a_drive_that_it_did_not_see(
+    monkeypatch, lesson, unseen, name, share
+):
+    league = import_module("measuring.league")
+    monkeypatch.setattr(league, "WINDOWS", 8)
+    pytest.importorskip(league.PACKAGES[name], reason="comes with the extra test")
+    ends = league.ENTRANTS[name](lesson)(unseen)
+    assert league.average_errors(ends, unseen)[1] < share
+
+
+def test_a_textbook_loses_by_shuffled_commands_and_not_by_those_in_order(
+    monkeypatch, lesson, unseen
+):
+    league = import_module("measuring.league")
+    monkeypatch.setattr(league, "ENTRANTS", {"nominal": league.use_nominal})
+    ratios = [
+        league.hold_league(lesson, unseen, ordered)["shuffled_ratio"]
+        for ordered in (False, True)
+    ]
+    limits = import_module("measuring.drives").LEAGUE
+    missed_bars = import_module("bench").missed_bars
+    missed = [missed_bars({"shuffled_ratio": each}, limits) for each in ratios]
+    assert [len(each) for each in missed] == [0, 1]
+
+
+def test_the_league_counts_first_places_and_those_within_five_per_cent():
+    rank = import_module("measuring.league").rank_ours
+    rivals = {"sysid": {"error_m": 1.0}, "shuffled_ratio": 9.0}
+    drives = {
+        name: {"error_m": error, "league": rivals}
+        for name, error in {"first": 0.9, "near": 1.04, "third": 1.2}.items()
+    }
+    found = rank(drives | {"refused": {"refused": "too short"}})
+    assert (found["near"], found["drives"]) == (2, 3)
+    assert found["worst"] == pytest.approx(1.2)
 
 
 # Scenes of the lidar
