@@ -79,6 +79,11 @@ class Findings:
     # findings on the whole drive, from `refit_model`; None if the trial's model is kept
     final: "Findings | None" = None
 
+    @property
+    def is_linear_fit(self) -> bool:
+        """True if the model is the pruned linear fit (Eq. 1 and 2), as that of an exact drive."""
+        return self.base is None and not self.replacement
+
 
 class StageOrderError(RuntimeError):
     """A stage lacks what an earlier stage should have found: a fault of the program."""

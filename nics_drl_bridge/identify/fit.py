@@ -187,10 +187,10 @@ def regress(
     excited = excitation.Excitation.of(samples, spec)
     all_powers = taylor.list_exponents(len(names), order)
     moved_powers = excitation.select_moved_terms(all_powers, names, excited.unmoved)
-    count = len(moved_powers)
     if term_filter is not None:
-        count = int(term_filter(moved_powers, spec).any(axis=0).sum())
-    excitation.check_sample_count(samples, count)
+        used = term_filter(moved_powers, spec).any(axis=0)
+        moved_powers = moved_powers[used]
+    excitation.check_sample_count(samples, len(moved_powers))
     chi = taylor.evaluate(samples.x, moved_powers)
     independent, dependent = excitation.split_independent_columns(chi)
     chi = chi[:, independent]

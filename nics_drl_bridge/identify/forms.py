@@ -21,6 +21,7 @@ from nics_drl_bridge.identify.signals import (
     average_effect,
     find_speed_index,
     list_followed_commands,
+    select_moved_commands,
     select_moved_inputs,
 )
 from nics_drl_bridge.identify.terms import (
@@ -44,13 +45,12 @@ WORTH = 0.03  # minimum fraction of the residual variance that a curve must expl
 # fraction from which it is beyond doubt; higher for the turn rate, where understeer looks alike
 CLEAR = 0.25
 STRIDE_S = 0.04
-ENOUGH_ROWS = 1000  # to rank delays
 NOTHING = 1e-6  # [m/s, rad/s]
+ENOUGH_ROWS = 1000  # to rank delays
 # order of the model in the search for a delay
 DELAY_ORDER = 2
 DELAY_STEP_S = 0.02
-LONGEST_S = 0.4
-ALIKE_S = 0.01  # delays of commands that differ by less are tried as one
+LONGEST_S = 0.4  # a delay is sought this far around where its search starts
 # step of their refinement
 DELAY_SCALE_S = 0.05
 CURVE_SCALE = 0.1
@@ -242,6 +242,18 @@ def list_followed(drive: Drive) -> tuple[tuple[str, str], ...]:
     moved = select_moved_inputs(drive.recording.command, drive.spec)
     pairs = zip(drive.spec.state, moved.tolist(), strict=False)
     return tuple((v.name, str(v.follows)) for v, has_moved in pairs if has_moved)
+
+
+def list_delays(
+    drive: Drive, calibration: Calibration
+) -> tuple[tuple[str, float], ...]:
+    """Returns a delay [s] of each command that moved: at first, what all of them share."""
+    moved = select_moved_commands(drive.recording.command)
+    names = (c.name for c in drive.spec.command)
+    pairs = zip(names, moved.tolist(), strict=True)
+    return tuple(
+        (n, calibration.command_latency_s) for n, has_moved in pairs if has_moved
+    )
 
 
 def add_limits(form: Form, state: str) -> Form:
@@ -590,35 +602,6 @@ def find_likely_delay(
     drive: Drive, calibration: Calibration, samples: Samples
 ) -> float:
     """Returns the delay [s] of the commands that best explains the rates of the state."""
-    trials, late = _delay_commands(drive, calibration, samples)
-    left = [_measure_unexplained(drive.spec, samples, command) for command in late]
-    if np.isfinite(left).all():
-        return float(trials[int(np.argmin(left))])
-    return calibration.command_latency_s
-
-
-def find_likely_delays(
-    drive: Drive, calibration: Calibration, samples: Samples
-) -> tuple[tuple[str, float], ...]:
-    """Returns the delay of each command separately, given the others; empty if they are alike."""
-    trials, late = _delay_commands(drive, calibration, samples)
-    now = int(np.abs(trials - calibration.command_latency_s).argmin())
-    delays = {}
-    for place, command in enumerate(drive.spec.command):
-        mixed = np.repeat(late[now][None], len(trials), axis=0)
-        mixed[..., place] = late[..., place]
-        left = [_measure_unexplained(drive.spec, samples, trial) for trial in mixed]
-        if np.ptp(left) > 0.0 and np.isfinite(left).all():
-            delays[command.name] = float(trials[int(np.argmin(left))])
-    if delays and np.ptp(list(delays.values())) > ALIKE_S:
-        return tuple(delays.items())
-    return ()
-
-
-def _delay_commands(
-    drive: Drive, calibration: Calibration, samples: Samples
-) -> tuple[Array, Array]:
-    """Returns possible delays (N,) [s], and the commands in effect (N, T, C) for each."""
     form = Form(calibration.inputs)
     inputs = list_inputs(drive, calibration, samples, form)
     problem = make_prediction_problem(drive, calibration, samples, form, inputs)
@@ -626,11 +609,14 @@ def _delay_commands(
     if drive.recording.pose.clock != drive.recording.command.clock:
         trials = trials - LONGEST_S / 2.0
     width = choose_half_width(drive)
-    late = []
+    left = []
     for delay in trials:
         command = problem.commands(np.append(delay, inputs.start[1:]))
-        late.append(smooth_commands(command, samples.dt, width))
-    return trials, np.array(late)
+        late = smooth_commands(command, samples.dt, width)
+        left.append(_measure_unexplained(drive.spec, samples, late))
+    if np.isfinite(left).all():
+        return float(trials[int(np.argmin(left))])
+    return calibration.command_latency_s
 
 
 def _measure_unexplained(spec: RobotSpec, samples: Samples, command: Array) -> float:

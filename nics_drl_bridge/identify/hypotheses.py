@@ -387,9 +387,11 @@ def list_changes(
         return
     # Drag and friction are hard to distinguish, so both are tried, then each without the other.
     speeds = tuple(v.name for v in drive.spec.state if v.twist == "vx")
-    late = forms.find_likely_delays(drive, calibration, samples)
+    late = forms.list_delays(drive, calibration)
     delays = "a delay of each command"
-    if late:  # first, because a wrong delay hides other effects and is hidden by them
+    if (
+        len(late) > 1
+    ):  # first, because a wrong delay hides other effects and is hidden by them
         yield delays, lambda form: replace(form, delays=late), WORTH
     if terms.has_slipping_tyres(drive.spec):
         yield "tyres that slip", lambda form: replace(form, tyres=True), WORTH
@@ -402,7 +404,7 @@ def list_changes(
         yield without, lambda form: replace(form, drag=()), 1.0 / WORTH
         without = f"without {friction}"
         yield without, lambda form: replace(form, friction=()), 1.0 / WORTH
-    if late:
+    if len(late) > 1:
         yield delays, lambda form: replace(form, delays=late), WORTH
     if speeds:
         yield (

@@ -9,7 +9,7 @@ import numpy as np
 
 from nics_drl_bridge.identify.conclusion import conclude
 from nics_drl_bridge.identify.fit import Alpha
-from nics_drl_bridge.identify.hypotheses import list_candidates
+from nics_drl_bridge.identify.hypotheses import PRUNING, list_candidates
 from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.identify.signals import select_moved_commands
 from nics_drl_bridge.identify.statistics import Curve
@@ -97,16 +97,10 @@ def _list_items(sentences: Iterable[str]) -> Iterator[str]:
         )
 
 
-def _is_pruned(identified: Identified) -> bool:
-    """True if the terms come from the pruned fit, unlike those of a motion or a textbook."""
-    findings = identified.findings
-    return findings.motion_width_s is None and not findings.replacement
-
-
 def _describe_size(identified: Identified) -> str:
     model = identified.model
     of = ""
-    if _is_pruned(identified):
+    if identified.findings.is_linear_fit:
         of = f" of {identified.fit.regression.terms_total}"
     variables = f"X = {', '.join(model.variables)}"
     kept = f"Kept {model.terms_kept}{of} terms, step {model.dt:g} s ({variables})"
@@ -229,16 +223,21 @@ def _describe_candidates(identified: Identified) -> Iterator[str]:
 
 
 def _describe_fit(identified: Identified) -> dict[str, Iterable[str]]:
-    """Describes the pruned linear fit if the terms come from it, unlike those of a motion."""
-    if not _is_pruned(identified):
-        return {}
+    """Describes the linear fit if it is the model, and the pruning of what predictions chose."""
+    findings = identified.findings
+    alpha = identified.alpha
+    if not findings.is_linear_fit:
+        if findings.replacement or findings.motion_width_s is not None:
+            return {}
+        alpha = PRUNING if alpha == "auto" else alpha
+        return {fill(_describe_pruning(alpha), WIDTH): ()}
     fit = identified.fit
     model = identified.model
     rows = zip(
         model.dofs, model.dof_units, fit.rmse, fit.r2, fit.condition, strict=True
     )
     return {
-        fill(_describe_pruning(identified.alpha), WIDTH): (),
+        fill(_describe_pruning(alpha), WIDTH): (),
         "Cross-validated error against the number of terms, largest first, * for those kept:": (
             chain.from_iterable(map(_format_curve, fit.curves))
         ),

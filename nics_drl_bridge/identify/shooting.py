@@ -8,14 +8,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy  # its parts load slowly, when used
 from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.kernels import Shot, make_used_terms, shoot, tangent
 from nics_drl_bridge.identify.open_loop import put_states
-from nics_drl_bridge.identify.statistics import estimate_clustered_covariance
+from nics_drl_bridge.identify.statistics import (
+    estimate_clustered_covariance,
+    minimise_robustly,
+)
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.taylor import TaylorModel
@@ -43,9 +45,6 @@ DRIFT_M_S = 0.01  # drift of good predictions: noise counts as this much time
 # step of finite differences by the values of inputs, relative to their scale
 DIFFERENCE = 0.02
 EVALUATIONS = 60
-# relative improvement of the loss below which a search ends: hundreds of searches rank models whose
-# errors differ by per cent
-TOLERANCE = 1e-4
 # minimum distance of a start value from its bounds, as a fraction of its range
 INSIDE = 0.05
 LEAST_SCALE = 0.02  # scale of the loss, below which errors count by their squares [m/s]
@@ -380,18 +379,11 @@ class _Search:
         # At a bound the search would not move.
         aside = np.minimum(INSIDE * (high - low)[:count], 1.0)
         start[:count] = np.clip(0.0, low[:count] + aside, high[:count] - aside)
-        solution = scipy.optimize.least_squares(
-            self.residual,
-            start,
-            jac=self.jacobian,
-            bounds=(low, high),
-            loss="soft_l1",
-            f_scale=max(float(np.median(np.abs(begun))), LEAST_SCALE),
-            max_nfev=evaluations,
-            ftol=TOLERANCE,
-            xtol=TOLERANCE,
+        size = max(float(np.median(np.abs(begun))), LEAST_SCALE)
+        best = minimise_robustly(
+            self.residual, self.jacobian, start, (low, high), size, evaluations
         )
-        return self.predictive(solution.x)
+        return self.predictive(best)
 
     def predictive(self, theta: Array) -> Predictive:
         """Returns the model with the data for its uncertainty."""

@@ -70,11 +70,11 @@ def fit_pictures(
     spec: RobotSpec, identified: Identified, paths: bool = True
 ) -> dict[str, bytes]:
     """Returns the pictures of a fit that the recording allows, as PNG by name."""
-    by_motion = identified.findings.motion_width_s is not None or bool(
-        identified.findings.replacement
-    )
-    # If motion chose the terms, pruning did not, and there is no curve.
-    pictures = {} if by_motion else {"accuracy": draw_accuracy(identified)}
+    pictures = {}
+    if (
+        identified.findings.is_linear_fit
+    ):  # where predictions chose the terms, no curve did
+        pictures["accuracy"] = draw_accuracy(identified)
     if paths and identified.held_out is not None:
         pictures["paths"] = draw_held_out_paths(identified.trial)
     if (

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
 from nics_drl_bridge.errors import ConfigError
@@ -14,6 +15,7 @@ from nics_drl_bridge.identify.statistics import (
     estimate_standard_errors,
     find_correlation_reach,
     find_knee,
+    minimise_robustly,
 )
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.recording.textbook import record
@@ -171,3 +173,58 @@ def test_an_alpha_that_is_none_is_refused(text):
 def test_alpha_is_read_as_written():
     assert parse_alpha("auto") == "auto"
     assert parse_alpha("0.9") == 0.9
+
+
+NOWHERE = np.full(2, np.inf)
+
+
+def decay(with_outliers: bool):
+    """Returns residual and Jacobian of rows that decay, by their size and their rate."""
+    t = np.linspace(0.0, 4.0, 60)
+    y = 3.0 * np.exp(-0.7 * t) + np.random.default_rng(0).normal(0.0, 0.01, len(t))
+    if with_outliers:
+        y[::7] += 2.0
+
+    def slopes(theta):
+        decayed = np.exp(-theta[1] * t)
+        return np.stack([decayed, -theta[0] * t * decayed], axis=1)
+
+    return lambda theta: theta[0] * np.exp(-theta[1] * t) - y, slopes
+
+
+@pytest.mark.parametrize("with_outliers", [False, True])
+def test_a_robust_minimum_is_that_of_another_solver(with_outliers):
+    residual, slopes = decay(with_outliers)
+    start = np.array([1.0, 0.1])
+    ours = minimise_robustly(residual, slopes, start, (-NOWHERE, NOWHERE), 0.02, 60)
+    theirs = least_squares(residual, start, slopes, loss="soft_l1", f_scale=0.02)
+    assert ours == pytest.approx(theirs.x, rel=2e-3)
+    assert ours == pytest.approx([3.0, 0.7], rel=0.01)
+
+
+def test_a_robust_minimum_lies_within_its_bounds_and_is_free_to_leave_them():
+    residual, slopes = decay(False)
+    low = np.array([0.0, 0.9])
+    start = np.array([1.0, 2.0])
+    at = minimise_robustly(residual, slopes, start, (low, NOWHERE), 0.02, 60)
+    theirs = least_squares(
+        residual, start, slopes, (low, np.inf), loss="soft_l1", f_scale=0.02
+    )
+    assert at[1] == 0.9
+    assert at == pytest.approx(theirs.x, rel=2e-3)
+    away = minimise_robustly(residual, slopes, low, (low * 0.1, NOWHERE), 0.02, 60)
+    assert away == pytest.approx([3.0, 0.7], rel=0.01)
+
+
+def test_a_robust_search_keeps_to_its_evaluations_and_gets_no_worse():
+    residual, slopes = decay(True)
+    start = np.array([1.0, 0.1])
+    asked = []
+
+    def counted(theta):
+        asked.append(theta)
+        return residual(theta)
+
+    found = minimise_robustly(counted, slopes, start, (-NOWHERE, NOWHERE), 0.02, 8)
+    assert len(asked) == 8
+    assert np.abs(residual(found)).sum() < np.abs(residual(start)).sum()

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge import generator
+from nics_drl_bridge.identify.hypotheses import Base
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.identify.report import format_report, format_with_error
 from nics_drl_bridge.recording.textbook import record
@@ -79,8 +80,10 @@ def test_a_short_drive_has_fewer_pictures():
 
 def test_what_pruning_would_have_kept_is_not_told_of_a_motion(found):
     spec, identified = found
+    base = Base(draft=None, found=None)
     by_motion = replace(
-        identified, findings=replace(identified.findings, motion_width_s=0.1)
+        identified,
+        findings=replace(identified.findings, base=base, motion_width_s=0.1),
     )
     text = format_report("here", by_motion)
     for part in (
@@ -92,6 +95,16 @@ def test_what_pruning_would_have_kept_is_not_told_of_a_motion(found):
         assert part not in text
     assert f"Kept {identified.model.terms_kept} terms, step" in text
     assert "accuracy" not in fit_pictures(spec, by_motion)
+
+
+def test_of_what_predictions_chose_only_the_pruning_is_told(found):
+    spec, identified = found
+    base = Base(draft=None, found=None)
+    noisy = replace(identified, findings=replace(identified.findings, base=base))
+    text = format_report("here", noisy)
+    assert "Pruned by Eq. 2 at alpha = 0.99" in text
+    assert "Cross-validated" not in text
+    assert "accuracy" not in fit_pictures(spec, noisy)
 
 
 @pytest.mark.parametrize(
