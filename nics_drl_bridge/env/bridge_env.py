@@ -304,7 +304,14 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
 
     def _make_commands(self, action: AnyArray) -> Array:
         given = guard.check_action(action, self.action_space, "action")
-        return self.task.drive(given.reshape(self._each), self.ended[None])
+        made = self.task.drive(given.reshape(self._each), self.ended[None])
+        needed = (1, self.robots, len(self.model.robot.command))
+        if np.shape(made) != needed:
+            raise ConfigError(
+                f"commands are {np.shape(made)}; they must be {needed}: worlds, robots, "
+                "and a robot's commands."
+            )
+        return made
 
     def halt(self) -> None:
         """Stops the robot until the next reset; any exception does this, too."""
@@ -342,10 +349,10 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
     @guard_call
     def render(self) -> Any:
         """Draws the current world from above; see Gymnasium."""
-        if self.scene is None:
-            raise gymnasium.error.ResetNeeded("call reset() before render().")
         if self.render_mode is None:
             return None
+        if self.scene is None:
+            raise gymnasium.error.ResetNeeded("call reset() before render().")
         if self._picture is None:
             self._picture = self._make_picture()
         return self._picture.draw(self.snapshot())

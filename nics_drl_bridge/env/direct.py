@@ -7,7 +7,7 @@ import numpy as np
 
 from nics_drl_bridge.env import kernels
 from nics_drl_bridge.env.sim_backend import SimBackend
-from nics_drl_bridge.env.task import BoundStep, Info, Memory, Task
+from nics_drl_bridge.env.task import Info, Memory, Task
 from nics_drl_bridge.interface import Array, Backend, RobotView
 from nics_drl_bridge.kernels import bind
 
@@ -19,7 +19,7 @@ class DirectSteps(NamedTuple):
     commands: Array  # (1, 1, C) of the next step
     # writes `commands`; returns False if an action is for `Task.drive`, or wrong
     take_action: Callable[[Any], bool]
-    advance: BoundStep  # moves the robot, and adds all of `info`
+    advance: Callable[[Memory], Any]  # moves the robot; the rest as BoundStep
 
 
 def bind_steps(backend: Backend, task: Task) -> DirectSteps | None:
@@ -82,5 +82,6 @@ def _bind_actions(task: Task, commands: Array) -> Callable[[Any], bool]:
         if getattr(type(task), name) is not getattr(Task, name):
             return lambda _: False
     if task.actions == "discrete":
-        return look_up_action
+        fits = task.discrete_commands.shape[1:] == row.shape
+        return look_up_action if fits else (lambda _: False)
     return (lambda _: False) if task.robot.takes_turn_rate else scale_action

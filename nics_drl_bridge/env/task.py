@@ -299,8 +299,8 @@ class Task(ABC):
         """Binds the steps of one robot to its view (1, 1) and its pose before (1, 1, 3), in place.
 
         A class may override it to do all parts of a step in one small call of a kernel, which saves
-        most of the time in the fast simulator. It is left out if a subclass overrides a part, or
-        `step_into`.
+        most of the time in the fast simulator. What it returns is called with the memory after each
+        move, and returns new arrays. It is left out if a subclass overrides a part, or `step_into`.
         """
         return None
 

@@ -10,6 +10,7 @@ from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.fit import Fit, Regression
 from nics_drl_bridge.identify.mounting import Mounting
 from nics_drl_bridge.identify.open_loop import OpenLoop
+from nics_drl_bridge.identify.terms import Kind
 from nics_drl_bridge.identify.yardstick import Yardstick
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.curve import InputCurve
@@ -83,6 +84,13 @@ class Findings:
     def is_linear_fit(self) -> bool:
         """True if the model is the pruned linear fit (Eq. 1 and 2), as that of an exact drive."""
         return self.base is None and not self.replacement
+
+    @property
+    def is_pruned_prediction(self) -> bool:
+        """True if predictions found the model's terms, and Eq. 2 pruned them."""
+        if self.base is None or self.replacement:
+            return False
+        return self.base.draft.library.kind is not Kind.MOTION
 
 
 class StageOrderError(RuntimeError):

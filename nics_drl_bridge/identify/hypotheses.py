@@ -387,12 +387,11 @@ def list_changes(
         return
     # Drag and friction are hard to distinguish, so both are tried, then each without the other.
     speeds = tuple(v.name for v in drive.spec.state if v.twist == "vx")
-    late = forms.list_delays(drive, calibration)
+    shared = forms.list_delays(drive, calibration)
     delays = "a delay of each command"
-    if (
-        len(late) > 1
-    ):  # first, because a wrong delay hides other effects and is hidden by them
-        yield delays, lambda form: replace(form, delays=late), WORTH
+    # First, because a wrong delay hides other effects and is hidden by them.
+    if len(shared) > 1:
+        yield delays, lambda form: replace(form, delays=shared), WORTH
     if terms.has_slipping_tyres(drive.spec):
         yield "tyres that slip", lambda form: replace(form, tyres=True), WORTH
     if speeds:
@@ -404,8 +403,8 @@ def list_changes(
         yield without, lambda form: replace(form, drag=()), 1.0 / WORTH
         without = f"without {friction}"
         yield without, lambda form: replace(form, friction=()), 1.0 / WORTH
-    if len(late) > 1:
-        yield delays, lambda form: replace(form, delays=late), WORTH
+    if len(shared) > 1:
+        yield delays, lambda form: replace(form, delays=shared), WORTH
     if speeds:
         yield (
             "a dead zone",
@@ -449,14 +448,14 @@ def _list_follower_changes(
     followed = forms.list_followed(drive)
     if not followed:
         return
-    late = tuple((c, calibration.command_latency_s) for _, c in followed)
+    shared = tuple((c, calibration.command_latency_s) for _, c in followed)
     delays = "a delay of each command"
-    if len(late) > 1:
-        yield delays, lambda form: replace(form, delays=late), WORTH
+    if len(shared) > 1:
+        yield delays, lambda form: replace(form, delays=shared), WORTH
     for state, _ in followed:
         yield f"limits of {state}", partial(forms.add_limits, state=state), WORTH
-    if len(late) > 1:
-        yield delays, lambda form: replace(form, delays=late), WORTH
+    if len(shared) > 1:
+        yield delays, lambda form: replace(form, delays=shared), WORTH
     for _, command in followed:
         bent = partial(
             forms.add_dead_zones, drive=drive, samples=samples, commands=(command,)

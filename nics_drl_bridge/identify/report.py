@@ -226,11 +226,11 @@ def _describe_fit(identified: Identified) -> dict[str, Iterable[str]]:
     """Describes the linear fit if it is the model, and the pruning of what predictions chose."""
     findings = identified.findings
     alpha = identified.alpha
-    if not findings.is_linear_fit:
-        if findings.replacement or findings.motion_width_s is not None:
-            return {}
+    if findings.is_pruned_prediction:
         alpha = PRUNING if alpha == "auto" else alpha
         return {fill(_describe_pruning(alpha), WIDTH): ()}
+    if not findings.is_linear_fit:
+        return {}
     fit = identified.fit
     model = identified.model
     rows = zip(

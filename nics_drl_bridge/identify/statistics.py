@@ -24,13 +24,12 @@ MAX_STEPS = 40
 # relative improvement of the loss below which `minimise_robustly` ends: hundreds of searches rank
 # models whose errors differ by per cent
 ROBUST_TOLERANCE = 1e-4
+# part of the improvement that its quadratic model expects, from which that is believed
+WELL_FORESEEN = 0.25
 # damping of its first step, relative to the normal equations, and its range
 FIRST_DAMPING = 1e-3
 DAMPING_RANGE = (1e-9, 1e8)
-WELL_FORESEEN = (
-    0.25  # part of the expected improvement from which a small one ends the search
-)
-EASIER = 1.0 / 3.0  # the least that a step that succeeds multiplies it by
+EASIER = 1.0 / 3.0  # smallest factor of the damping after a successful step
 BLOCKS = 5
 # terms that lower the error by less than this fraction of the rates' size are dropped
 WORTH = 1e-3
@@ -88,13 +87,16 @@ def minimise_robustly(
     """Returns the parameters (P,) within bounds that minimise a residual (n,) by its soft L1 loss.
 
     Errors far above `size` count by their magnitude, not by their square. Each step is that of
-    Levenberg and Marquardt, in the damping of Nielsen (1999), by the normal equations: a
-    decomposition of the Jacobian (n, P) would take longer than to compute it.
+    Levenberg and Marquardt, with the damping of Nielsen (1999), by the normal equations: a
+    decomposition of the Jacobian (n, P) would take longer than to compute it. A step beyond a bound
+    ends there. Raises ValueError if the residual of the start is not finite.
     """
     low, high = bounds
     theta = start
     rest = residual(theta)
     loss = _sum_softly(rest, size)
+    if not np.isfinite(loss):
+        raise ValueError("the residual of the start is not finite.")
     least, most = DAMPING_RANGE
     damping = FIRST_DAMPING
     left = evaluations - 1
@@ -106,6 +108,8 @@ def minimise_robustly(
         held = (theta <= low) & (gradient > 0.0)
         held |= (theta >= high) & (gradient < 0.0)
         free = np.flatnonzero(~held & (np.diag(normal) > 0.0))
+        if not gradient[free].any():
+            break
         inner = normal[np.ix_(free, free)]
         harder = 2.0
         improved = 0.0
@@ -125,7 +129,9 @@ def minimise_robustly(
             step = trial - theta
             expected = -float(gradient @ step + step @ normal @ step / 2.0)
             improved = (loss - trial_loss) / loss
-            gain = (loss - trial_loss) / max(expected, np.finfo(np.float64).tiny)
+            gain = 0.0  # a bound may end a step where the quadratic model is worse
+            if expected > 0.0:
+                gain = min((loss - trial_loss) / expected, 1.0)
             damping *= max(EASIER, 1.0 - (2.0 * gain - 1.0) ** 3)
             damping = max(damping, least)
             theta = trial

@@ -71,9 +71,8 @@ def fit_pictures(
 ) -> dict[str, bytes]:
     """Returns the pictures of a fit that the recording allows, as PNG by name."""
     pictures = {}
-    if (
-        identified.findings.is_linear_fit
-    ):  # where predictions chose the terms, no curve did
+    # Where predictions chose the terms, no curve did.
+    if identified.findings.is_linear_fit:
         pictures["accuracy"] = draw_accuracy(identified)
     if paths and identified.held_out is not None:
         pictures["paths"] = draw_held_out_paths(identified.trial)

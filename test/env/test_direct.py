@@ -8,6 +8,7 @@ from robots import direct_model, field
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.registry import NAVIGATION
 from nics_drl_bridge.env.tasks.navigation import Navigation
+from nics_drl_bridge.errors import ConfigError
 
 
 class Driving(Navigation):
@@ -98,3 +99,23 @@ def test_commands_beyond_what_was_fitted_are_told_of(recwarn):
     env.reset(seed=0)
     env.step(env.action_space.sample())
     assert any("was fitted to" in str(warning.message) for warning in recwarn)
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (3,), (1, 1, 2)])
+def test_commands_of_another_shape_are_refused(shape):
+    class Wrong(Navigation):
+        def drive(self, actions, ended):
+            return np.zeros(shape)
+
+    with pytest.raises(ConfigError, match=r"must be \(1, 1, 3\)"):
+        take_step(Wrong, "continuous", np.array(ACTION))
+
+
+def test_a_table_of_commands_of_another_size_is_refused():
+    class Wrong(Navigation):
+        @property
+        def discrete_commands(self):
+            return np.zeros((9, 1))
+
+    with pytest.raises(ConfigError):
+        take_step(Wrong, "discrete", 2)

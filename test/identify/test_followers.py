@@ -64,7 +64,8 @@ def test_limits_of_acceleration_are_found_and_predicted():
     assert not np.isfinite(steering).any()
     assert {"speed.fall", "speed.rise"} <= set(identified.calibration.uncertainty)
     error, textbook = ends(identified)
-    assert error < 0.65 * textbook  # that has none
+    # The textbook has no limits; these hide a second lag, which costs the model a third.
+    assert error < 0.65 * textbook
     assert "at least -0.6" in identified.model.equations()[-2]
 
 

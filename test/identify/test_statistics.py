@@ -175,7 +175,7 @@ def test_alpha_is_read_as_written():
     assert parse_alpha("0.9") == 0.9
 
 
-NOWHERE = np.full(2, np.inf)
+UNBOUNDED = np.full(2, np.inf)
 
 
 def decay(with_outliers: bool):
@@ -196,7 +196,7 @@ def decay(with_outliers: bool):
 def test_a_robust_minimum_is_that_of_another_solver(with_outliers):
     residual, slopes = decay(with_outliers)
     start = np.array([1.0, 0.1])
-    ours = minimise_robustly(residual, slopes, start, (-NOWHERE, NOWHERE), 0.02, 60)
+    ours = minimise_robustly(residual, slopes, start, (-UNBOUNDED, UNBOUNDED), 0.02, 60)
     theirs = least_squares(residual, start, slopes, loss="soft_l1", f_scale=0.02)
     assert ours == pytest.approx(theirs.x, rel=2e-3)
     assert ours == pytest.approx([3.0, 0.7], rel=0.01)
@@ -206,13 +206,13 @@ def test_a_robust_minimum_lies_within_its_bounds_and_is_free_to_leave_them():
     residual, slopes = decay(False)
     low = np.array([0.0, 0.9])
     start = np.array([1.0, 2.0])
-    at = minimise_robustly(residual, slopes, start, (low, NOWHERE), 0.02, 60)
+    at = minimise_robustly(residual, slopes, start, (low, UNBOUNDED), 0.02, 60)
     theirs = least_squares(
         residual, start, slopes, (low, np.inf), loss="soft_l1", f_scale=0.02
     )
     assert at[1] == 0.9
     assert at == pytest.approx(theirs.x, rel=2e-3)
-    away = minimise_robustly(residual, slopes, low, (low * 0.1, NOWHERE), 0.02, 60)
+    away = minimise_robustly(residual, slopes, low, (low * 0.1, UNBOUNDED), 0.02, 60)
     assert away == pytest.approx([3.0, 0.7], rel=0.01)
 
 
@@ -225,6 +225,53 @@ def test_a_robust_search_keeps_to_its_evaluations_and_gets_no_worse():
         asked.append(theta)
         return residual(theta)
 
-    found = minimise_robustly(counted, slopes, start, (-NOWHERE, NOWHERE), 0.02, 8)
+    found = minimise_robustly(counted, slopes, start, (-UNBOUNDED, UNBOUNDED), 0.02, 8)
     assert len(asked) == 8
     assert np.abs(residual(found)).sum() < np.abs(residual(start)).sum()
+
+
+@pytest.mark.parametrize(
+    "columns", [(0, 0), (1, 2), ()], ids=["twice", "with zeros", "none"]
+)
+def test_a_robust_search_bears_columns_that_tell_nothing(columns):
+    t = np.linspace(0.0, 1.0, 20)
+    slopes = np.stack([t, np.ones(20), np.zeros(20)], axis=1)[:, list(columns)]
+    target = slopes @ np.full(len(columns), 2.0)
+    asked = []
+
+    def residual(theta):
+        asked.append(theta)
+        return slopes @ theta - target
+
+    start = np.zeros(len(columns))
+    far = np.full(len(columns), np.inf)
+    found = minimise_robustly(residual, lambda _: slopes, start, (-far, far), 1.0, 40)
+    assert slopes @ found == pytest.approx(target, abs=1e-3)
+    assert len(asked) < 40
+    asked.clear()
+    minimise_robustly(residual, lambda _: slopes, start, (start, start), 1.0, 9)
+    assert len(asked) < 4  # nothing may move
+
+
+def test_a_robust_search_goes_on_where_a_bound_cuts_a_step_of_correlated_parameters():
+    slopes = np.array([[1.0, 0.99], [0.99, 1.0], [0.01, 0.0]])
+    target = slopes @ np.array([-3.0, 4.0])
+    bounds = np.array([-1.0, -10.0]), np.array([10.0, 10.0])
+    found = minimise_robustly(
+        lambda z: slopes @ z - target, lambda _: slopes, np.ones(2), bounds, 10.0, 60
+    )
+    theirs = least_squares(
+        lambda z: slopes @ z - target,
+        np.ones(2),
+        bounds=bounds,
+        loss="soft_l1",
+        f_scale=10.0,
+    )
+    assert found == pytest.approx(theirs.x, abs=0.02)
+
+
+def test_a_robust_search_refuses_a_start_that_is_not_finite():
+    with pytest.raises(ValueError, match="not finite"):
+        minimise_robustly(
+            lambda z: z * np.nan, None, np.ones(2), (-UNBOUNDED, UNBOUNDED), 1.0, 9
+        )

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge import generator
-from nics_drl_bridge.identify.hypotheses import Base
+from nics_drl_bridge.identify.hypotheses import Base, Draft
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.identify.report import format_report, format_with_error
+from nics_drl_bridge.identify.terms import Kind, Library
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.report.fit_page import fit_tile, write_fit_page
 from nics_drl_bridge.report.fit_pictures import fit_pictures, write_pictures
@@ -78,13 +79,17 @@ def test_a_short_drive_has_fewer_pictures():
     assert "accuracy" in pictures
 
 
+def predicted(identified, kind: Kind):
+    """The result of a drive whose terms predictions chose from a kind of library."""
+    library = Library(identified.drive.spec, kind, True, "auto", 3)
+    draft = Draft(library, form=None, inputs=None, problem=None)
+    base = Base(draft, found=None)
+    return replace(identified, findings=replace(identified.findings, base=base))
+
+
 def test_what_pruning_would_have_kept_is_not_told_of_a_motion(found):
     spec, identified = found
-    base = Base(draft=None, found=None)
-    by_motion = replace(
-        identified,
-        findings=replace(identified.findings, base=base, motion_width_s=0.1),
-    )
+    by_motion = predicted(identified, Kind.MOTION)
     text = format_report("here", by_motion)
     for part in (
         "Eq. 2",
@@ -99,8 +104,7 @@ def test_what_pruning_would_have_kept_is_not_told_of_a_motion(found):
 
 def test_of_what_predictions_chose_only_the_pruning_is_told(found):
     spec, identified = found
-    base = Base(draft=None, found=None)
-    noisy = replace(identified, findings=replace(identified.findings, base=base))
+    noisy = predicted(identified, Kind.FOLLOWER)
     text = format_report("here", noisy)
     assert "Pruned by Eq. 2 at alpha = 0.99" in text
     assert "Cross-validated" not in text
