@@ -162,8 +162,12 @@ def _read_robot(dart: Any, path: Path, machine: Machine, physics: Physics) -> Da
         raise ConfigError(f"robot {str(path)!r}: {error}; mend the file.") from None
     if skeleton is None:
         raise ConfigError(f"robot {str(path)!r}: DART can't read it; mend the file.")
+    if not skeleton.getNumBodyNodes() or skeleton.getRootJoint().getNumDofs() != 6:
+        fault = "its first link is fixed to the world, or it has none"
+        raise ConfigError(f"robot {str(path)!r}: {fault}; give it a free base.")
     skeleton.resetPositions()
     root = skeleton.getRootBodyNode()
+    _set_friction(root, 0.0)  # a castor that is a part of it slides
     hinges = [
         _Hinge(dart, joint, root)
         for joint in skeleton.getJoints()
@@ -172,10 +176,9 @@ def _read_robot(dart: Any, path: Path, machine: Machine, physics: Physics) -> Da
     wheels = [hinge for hinge in hinges if abs(hinge.axis[1]) > ALIGNED]
     pivots = [hinge for hinge in hinges if abs(hinge.axis[2]) > ALIGNED]
     for wheel in wheels:
-        for node in wheel.joint.getChildBodyNode().getShapeNodes():
-            if node.hasDynamicsAspect():
-                node.getDynamicsAspect().setFrictionCoeff(physics.friction)
+        _set_friction(wheel.joint.getChildBodyNode(), physics.friction)
     joints = []
+    levels = []  # of the wheels' axles, relative to the root
     for name in machine.joints:
         fitting = _find_fitting(name, pivots if name.startswith("steer") else wheels)
         if len(fitting) != 1:
@@ -186,8 +189,16 @@ def _read_robot(dart: Any, path: Path, machine: Machine, physics: Physics) -> Da
             )
         fitting[0].turn_positive()
         joints.append(fitting[0].joint)
-    height = machine.radius - float(np.mean([wheel.place[2] for wheel in wheels]))
+        if fitting[0] in wheels:
+            levels.append(fitting[0].place[2])
+    height = machine.radius - float(np.mean(levels))
     return DartBody(skeleton, joints, height)
+
+
+def _set_friction(body: Any, friction: float) -> None:
+    for node in body.getShapeNodes():
+        if node.hasDynamicsAspect():
+            node.getDynamicsAspect().setFrictionCoeff(friction)
 
 
 class _Hinge:

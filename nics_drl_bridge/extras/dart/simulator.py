@@ -250,8 +250,9 @@ class DartSimulator(PhysicsSimulator):
         for rig in rigs:
             wheels = rig.base.getSkeleton().getBodyNodes()[1:]
             scenery.forbid_contact(self._engine, wheels, obstacles + bases)
-        floor = self._engine.getSkeleton("floor").getBodyNode(0)
-        scenery.forbid_contact(self._engine, bases, [floor])
+        if self._file is None:  # a file's base may have a castor of its own
+            floor = self._engine.getSkeleton("floor").getBodyNode(0)
+            scenery.forbid_contact(self._engine, bases, [floor])
         self._groups = []
         for bumper in bumpers:
             others = [one for one in bumpers if one is not bumper]

@@ -232,6 +232,30 @@ def test_a_robot_of_an_sdf_file_drives_too(tmp_path):
 
 
 @needs_dart
+def test_a_small_wheel_of_a_castor_does_not_change_the_height_of_a_robot(tmp_path):
+    spec = load_robot("jackal")
+    file = write_urdf(tmp_path, PLACES)
+    castor = WHEEL.format(name="castor", x=0.0, y=0.0, axis=1)
+    small = castor.replace("0.098", "0.03")
+    file.write_text(file.read_text().replace("</robot>", f"{small}</robot>"))
+    heights = []
+    for robot in (DartRobot(spec, file=file), DartRobot(spec)):
+        robot.reset(np.zeros(3))
+        heights.append(robot.rig.base.getTransform().translation()[2])
+    assert heights[0] == pytest.approx(heights[1] - 0.098, abs=1e-6)  # of its footprint
+
+
+@needs_dart
+def test_a_file_whose_robot_is_fixed_to_the_world_is_refused(tmp_path):
+    file = write_urdf(tmp_path, PLACES)
+    fixed = "<link name='world'/><joint name='hold' type='fixed'><parent link='world'/>"
+    fixed += "<child link='base_footprint'/></joint></robot>"
+    file.write_text(file.read_text().replace("</robot>", fixed))
+    with pytest.raises(ConfigError, match="give it a free base"):
+        DartRobot(load_robot("jackal"), file=file)
+
+
+@needs_dart
 def test_a_file_whose_wheels_do_not_fit_is_refused_by_the_joint(tmp_path):
     three = {name: PLACES[name] for name in ("wheel_a", "wheel_b", "wheel_c")}
     file = write_urdf(tmp_path, three)
