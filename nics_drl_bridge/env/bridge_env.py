@@ -349,10 +349,10 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
     @guard_call
     def render(self) -> Any:
         """Draws the current world from above; see Gymnasium."""
-        if self.render_mode is None:
-            return None
         if self.scene is None:
             raise gymnasium.error.ResetNeeded("call reset() before render().")
+        if self.render_mode is None:
+            return None
         if self._picture is None:
             self._picture = self._make_picture()
         return self._picture.draw(self.snapshot())
