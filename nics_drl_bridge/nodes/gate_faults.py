@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
-from itertools import groupby, zip_longest
+from itertools import groupby, product, zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from sensor_msgs.msg import LaserScan
 from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.gate.assurance.protocol import Protocol, Trial
 from nics_drl_bridge.gate.assurance.run import Row
-from nics_drl_bridge.gate.limits import load_limits
+from nics_drl_bridge.gate.limits import Limits, load_limits
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.nodes import conversions
@@ -37,6 +37,7 @@ from nics_drl_bridge.nodes.faulty_robot import (
     Robot,
 )
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
+from nics_drl_bridge.robot.spec import RobotSpec
 
 SOON_S = 0.10
 LATE_S = 0.40
@@ -384,6 +385,16 @@ def _read_log(policy: NodeProcess | None) -> str:
 CONTROLS = ("scan_silent", "odom_silent", "nan_scan", "command_nan")
 
 
+def find_reach(robot: RobotSpec, limits: Limits) -> tuple[Array, Array]:
+    """Return the least and the greatest `cmd_vel` (3,) within limits.
+
+    The turn rate of a car follows from both commands, so all of their corners count, and zeros.
+    """
+    ends = zip(limits.low, np.zeros_like(limits.low), limits.high, strict=True)
+    twists = robot.to_cmd_vel(list(product(*ends)))
+    return twists.min(axis=0), twists.max(axis=0)
+
+
 def inject_trials(
     protocol: Protocol, folder: Path, tell: Callable[[str], None], trials: list[Trial]
 ) -> Iterator[Row]:
@@ -392,8 +403,7 @@ def inject_trials(
     limits = load_limits(protocol.limits, robot)
     command = 0.1 * np.where(limits.high > 0.0, limits.high, limits.low)
     command[0] *= 5.0
-    low = np.minimum(robot.to_cmd_vel(limits.low), robot.to_cmd_vel(limits.high))
-    high = np.maximum(robot.to_cmd_vel(limits.low), robot.to_cmd_vel(limits.high))
+    low, high = find_reach(robot, limits)
     setup = Setup(
         model=protocol.model,
         limits=protocol.limits,
