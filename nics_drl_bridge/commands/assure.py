@@ -15,7 +15,7 @@ from typer import Argument, Option
 
 from nics_drl_bridge import __version__, defaults, extensions
 from nics_drl_bridge.commands import console
-from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.files import check_above, format_json, write_bytes, write_text
 
 if TYPE_CHECKING:
@@ -202,7 +202,7 @@ def _drive(run: "Run", out: Path) -> dict[str, Any]:
                 partial(inject_trials, order, out / "logs", say),
                 _tell_left("faults", advance),
             )
-    results = summarise(rows)
+    results = summarise(rows, len(faults))
     runs.write_result(out, order, complete=True, **results)
     write_text(out / PAGE, make_assurance_page(order, results, str(out)))
     return results
@@ -242,7 +242,13 @@ def _replay(run: "Run", seed: int, out: Path, as_json: bool) -> None:
         from nics_drl_bridge.nodes.gate_faults import inject_trials
 
         say = partial(typer.echo, err=True)
-        (row,) = inject_trials(order, out / "logs", say, [trial])
+        rows = list(inject_trials(order, out / "logs", say, [trial]))
+        if not rows:
+            raise BackendError(
+                f"--replay {seed}: {trial.kind} could not be injected, because the robot did not "
+                "move; try again, or look into the logs."
+            )
+        (row,) = rows
         listed = "\n".join(f"{name:<12} {value}" for name, value in row.items())
         console.print_line(as_json, listed, **row)
         return
@@ -273,7 +279,9 @@ def _tell(order: "Protocol", results: dict[str, Any], out: Path) -> None:
 
 
 def _is_as_expected(order: "Protocol", results: dict[str, Any]) -> bool:
-    """True if no claim failed or, in a control, if each tested claim did."""
+    """True if all was injected, and no claim failed or, in a control, each tested claim did."""
+    if results["not_injected"]:
+        return False
     shown = results["control" if order.control else "claims"]
     failed = [f["failures"] > 0 for f in shown.values() if f["trials"]]
     return all(failed) if order.control else not any(failed)

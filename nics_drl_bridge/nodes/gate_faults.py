@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
-from itertools import groupby, product, zip_longest
+from itertools import groupby, product
 from pathlib import Path
 from typing import Any
 
@@ -398,7 +398,10 @@ def find_reach(robot: RobotSpec, limits: Limits) -> tuple[Array, Array]:
 def inject_trials(
     protocol: Protocol, folder: Path, tell: Callable[[str], None], trials: list[Trial]
 ) -> Iterator[Row]:
-    """Yield a row of the log for each trial; the robot is told to move by half its limits."""
+    """Yield a row for each trial whose fault was injected.
+
+    The robot is told to move by half its limits.
+    """
     robot = open_model(protocol.model).robot
     limits = load_limits(protocol.limits, robot)
     command = 0.1 * np.where(limits.high > 0.0, limits.high, limits.low)
@@ -420,10 +423,7 @@ def inject_trials(
         numbers = [trial.seed for trial in of_fault]
         injections = inject_all(replace(setup, gated=gated), name, numbers, tell)
         limit_s = FAULTS[name].limit_s
-        for trial, one in zip_longest(of_fault, injections):
-            row = trial._asdict() | {"fault": True, "limit_s": limit_s}
-            row["injected"] = one is not None
-            if one is not None:
-                in_time = one.time_s <= limit_s and not one.unsafe
-                row |= asdict(one) | {"in_time": in_time}
-            yield row
+        for trial, one in zip(of_fault, injections, strict=False):
+            in_time = one.time_s <= limit_s and not one.unsafe
+            told = {"fault": True, "limit_s": limit_s, "in_time": in_time}
+            yield trial._asdict() | told | asdict(one)

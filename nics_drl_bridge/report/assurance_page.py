@@ -90,12 +90,19 @@ def _make_result(protocol: Protocol, results: Mapping[str, Any]) -> Blocks:
         figures = shown[claim]
         failed = figures["failures"] > 0
         good = figures["trials"] > 0 and failed == bool(protocol.control)
+        if claim == STOPS and results["not_injected"]:
+            good = False
         claim_of_tile = f"Claim: {sentence}"
         if figures["trials"]:
             claim_of_tile = f"failed. {claim_of_tile}"
         tiles.append((_format_counts(figures), claim_of_tile, good))
     sentences = []
-    if not shown[STOPS]["trials"]:
+    if results["not_injected"]:
+        sentences.append(
+            f"{results['not_injected']:,} faults could not be injected, because the robot did not "
+            "move. So the claim on stopping in time is not met; the same command tries them again."
+        )
+    elif not shown[STOPS]["trials"]:
         sentences.append(
             "The claim on stopping in time was not tested: it needs ROS 2 and --faults."
         )
@@ -201,12 +208,13 @@ def _make_method(protocol: Protocol, results: Mapping[str, Any]) -> Blocks:
         "driven again without the gate, as a control.",
         "Seeds, numbers and hashes were written to the JSON before the first episode.",
     ]
-    if protocol.faults:
+    faults = protocol.list_faults()
+    if faults:
+        kinds = dict.fromkeys(trial.kind for trial in faults)
         facts.append(
-            f"{protocol.faults:,} faults were injected over DDS, in real time, around a process of "
-            "the gate and, where the fault is the policy's, of the policy: "
-            f"{', '.join(protocol.fault_kinds)}. {results['not_injected']:,} could not be "
-            "injected, because the robot did not move."
+            f"{len(faults) - results['not_injected']:,} faults were injected over DDS, in real "
+            "time, around a process of the gate and, where the fault is the policy's, of the "
+            f"policy: {', '.join(kinds)}."
         )
     return [
         html.make_table(("drivers, in turn", "touches", "without the gate"), drivers),

@@ -10,9 +10,12 @@ import time
 
 import pytest
 from command_line import nics, split_words
+from gate.assurance.samples import PROTOCOL, fault, row
 
 from nics_drl_bridge import extensions
+from nics_drl_bridge.commands.assure import _is_as_expected
 from nics_drl_bridge.gate.assurance.protocol import LIMITS, STOPS, TOUCHES
+from nics_drl_bridge.gate.assurance.results import summarise
 
 ORDER = (
     "assure differential --limits differential --world arena --episodes 6 --faults 0"
@@ -49,6 +52,12 @@ def test_the_evidence_has_counts_bounds_and_a_control_that_failed(evidence):
     assert result["protocol_sha256"] in page
     for value in result["protocol"]["hashes"].values():
         assert value in page
+
+
+def test_a_run_whose_faults_were_not_all_injected_is_not_as_expected():
+    results = summarise([row(1), fault(7)], faults=1)
+    assert _is_as_expected(PROTOCOL, results)
+    assert not _is_as_expected(PROTOCOL, summarise([row(1), fault(7)], faults=2))
 
 
 @pytest.mark.slow

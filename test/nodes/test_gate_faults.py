@@ -26,7 +26,7 @@ TWO = replace(PROTOCOL, faults=2, fault_kinds=tuple(FAULTS), fault_controls=CONT
 def inject(tmp_path, *trials):
     lines = []
     rows = list(inject_trials(TWO, tmp_path, lines.append, list(trials)))
-    assert all(row["injected"] for row in rows), lines
+    assert len(rows) == len(trials), lines
     return rows
 
 

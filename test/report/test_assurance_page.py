@@ -13,7 +13,8 @@ from nics_drl_bridge.report.assurance_page import make_assurance_page
 
 def read(rows, protocol=PROTOCOL):
     """The text of the page of some rows."""
-    page = make_assurance_page(protocol, summarise(rows), "runs/mine")
+    results = summarise(rows, len(protocol.list_faults()))
+    page = make_assurance_page(protocol, results, "runs/mine")
     return unescape(re.sub("<[^>]+>", " ", page.partition("</style>")[2]))
 
 
@@ -38,11 +39,18 @@ def test_a_failure_is_told_with_the_command_that_replays_it():
 
 
 def test_faults_are_listed_with_those_that_could_not_be_injected():
-    rows = [row(1), fault(7), {**fault(8), "injected": False, "in_time": True}]
-    text = read(rows, FAULTS)
-    assert "7 faults were injected over DDS" in text
-    assert "1 could not be injected" in text
+    text = read([row(1), fault(7)], FAULTS)
+    assert "1 faults were injected over DDS" in text
+    assert "of the policy: a, b, c." in text
+    assert "8 faults could not be injected" in text
+    assert "⚠ 0 of 1" in text
     assert "was not tested" not in text
+    assert "9 faults could not be injected" in read([row(1)], FAULTS)
+
+
+def test_only_kinds_of_fault_that_were_tried_are_listed():
+    text = read([row(1), fault(7)], replace(FAULTS, faults=2))
+    assert "of the policy: a, b." in text
 
 
 def test_in_a_control_failures_are_what_is_wanted():

@@ -100,21 +100,26 @@ def drive_all(
     drive_rest: Callable[[list[Trial]], Iterable[Row]],
     tell: Tell,
 ) -> list[Row]:
-    """Drives what a log lacks, and returns all rows. Raises ConfigError for another log."""
+    """Drives what a log lacks, and returns its rows in order. Raises ConfigError for another log.
+
+    A trial that gives no row is tried again by the next run.
+    """
     log.touch()
     rows, size = read_rows(log, trials)
     with log.open("r+b") as file:
         file.truncate(size)  # a killed run may have left part of a line
         file.seek(size)
         tell(len(rows), len(trials))
-        for row in drive_rest(trials[len(rows) :]):
+        done = {_read_trial(row) for row in rows}
+        for row in drive_rest([trial for trial in trials if trial not in done]):
             line = format_json(row)
             file.write(line.encode() + b"\n")
             file.flush()
             os.fsync(file.fileno())
             rows.append(json.loads(line))
             tell(len(rows), len(trials))
-    return rows
+    numbers = {trial: number for number, trial in enumerate(trials)}
+    return sorted(rows, key=lambda row: numbers[_read_trial(row)])
 
 
 def read_rows(log: Path, trials: list[Trial]) -> tuple[list[Row], int]:
@@ -125,14 +130,17 @@ def read_rows(log: Path, trials: list[Trial]) -> tuple[list[Row], int]:
 
 
 def _parse(log: Path, lines: list[bytes], trials: list[Trial]) -> Iterator[Row]:
-    for number, line in enumerate(lines):
+    left = set(trials)
+    for number, line in enumerate(lines, 1):
         try:
             row = json.loads(line)
-            if Trial(**{name: row[name] for name in Trial._fields}) == trials[number]:
-                yield row
-                continue
-        except (ValueError, KeyError, TypeError, IndexError):
-            pass
-        raise ConfigError(
-            f"{log}: line {number + 1} is no episode of this run; choose another --out."
-        )
+            left.remove(_read_trial(row))
+        except (ValueError, KeyError, TypeError):
+            raise ConfigError(
+                f"{log}: line {number} is no episode of this run; choose another --out."
+            ) from None
+        yield row
+
+
+def _read_trial(row: Row) -> Trial:
+    return Trial(**{name: row[name] for name in Trial._fields})
