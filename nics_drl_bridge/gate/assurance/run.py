@@ -64,10 +64,11 @@ def begin(folder: Path, protocol: Protocol) -> None:
     if file.exists():
         protocol.check_same(read_result(folder)["protocol"], str(folder))
         return
-    if (folder / LOG).exists():
-        raise ConfigError(
-            f"{folder}: has a {LOG} without {RESULT}; choose another --out."
-        )
+    for log in (LOG, FAULT_LOG):
+        if (folder / log).exists():
+            raise ConfigError(
+                f"{folder}: has a {log} without {RESULT}; choose another --out."
+            )
     write_result(folder, protocol, complete=False)
 
 

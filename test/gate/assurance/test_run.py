@@ -67,8 +67,9 @@ def test_the_protocol_is_on_disk_with_its_hash_before_any_episode(tmp_path):
     runs.begin(tmp_path, PROTOCOL)  # the same again
 
 
-def test_a_log_without_its_protocol_is_refused(tmp_path):
-    (tmp_path / runs.LOG).touch()
+@pytest.mark.parametrize("log", [runs.LOG, runs.FAULT_LOG])
+def test_a_log_without_its_protocol_is_refused(tmp_path, log):
+    (tmp_path / log).touch()
     with pytest.raises(ConfigError, match="without assurance"):
         runs.begin(tmp_path, PROTOCOL)
 
