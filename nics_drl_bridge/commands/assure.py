@@ -131,15 +131,16 @@ def assure(
 
 def _choose_faults(count: int) -> dict[str, Any]:
     """Returns the fields of a protocol on faults: none without ROS 2."""
+    if not count:
+        return {"faults": 0}
     try:
         extensions.require("nics assure --faults", "rclpy")
     except ConfigError as error:
-        if count:
-            typer.echo(f"no faults over DDS: {error}", err=True)
+        typer.echo(f"no faults over DDS: {error}", err=True)
         return {"faults": 0}
     from nics_drl_bridge.nodes.gate_faults import CONTROLS, FAULTS
 
-    kinds = tuple(FAULTS) if count else ()
+    kinds = tuple(FAULTS)
     return {"faults": count, "fault_kinds": kinds, "fault_controls": CONTROLS}
 
 

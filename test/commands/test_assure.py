@@ -13,7 +13,7 @@ from command_line import nics, split_words
 from gate.assurance.samples import PROTOCOL, fault, row
 
 from nics_drl_bridge import extensions
-from nics_drl_bridge.commands.assure import _is_as_expected
+from nics_drl_bridge.commands.assure import _choose_faults, _is_as_expected
 from nics_drl_bridge.gate.assurance.protocol import LIMITS, STOPS, TOUCHES
 from nics_drl_bridge.gate.assurance.results import summarise
 
@@ -127,6 +127,13 @@ def test_a_run_in_the_folder_of_another_is_refused_in_one_sentence(
     (sentence,) = refused.stderr.splitlines()
     assert named in sentence
     assert read(evidence)["complete"]
+
+
+def test_without_faults_the_protocol_is_the_same_with_ros_2_and_without(monkeypatch):
+    monkeypatch.setattr(extensions, "find_lacking", lambda modules: None)
+    with_ros_2 = _choose_faults(0)
+    monkeypatch.setattr(extensions, "find_lacking", lambda modules: "rclpy")
+    assert _choose_faults(0) == with_ros_2 == {"faults": 0}
 
 
 def test_without_ros_2_the_claim_on_faults_is_told_as_not_tested(tmp_path, monkeypatch):
