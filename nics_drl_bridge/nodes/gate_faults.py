@@ -11,7 +11,7 @@ import os
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass, field, replace
 from itertools import groupby, product
 from pathlib import Path
@@ -281,7 +281,8 @@ def inject(setup: Setup, around: Around, name: str, number: int) -> Injected:
     robot.drive(setup.patience_s, phase_s)
     robot.heard.clear()
     broken_s = time.monotonic()
-    ways[number % len(ways)](around)
+    with suppress(TimeoutError):  # without an answer, what was heard decides
+        ways[number % len(ways)](around)
     robot.until(lambda: False, fault.limit_s + WATCHED_S)
     good_s = broken_s
     if fault.since:
@@ -293,6 +294,8 @@ def inject(setup: Setup, around: Around, name: str, number: int) -> Injected:
         moving_s = [when for when in moving_s if when < first_s]
     last_s = max(moving_s, default=broken_s)
     stopped_s = min((when for when in zeros_s if when > last_s), default=math.inf)
+    if around.gate is not None and around.gate.poll() is not None:
+        stopped_s = math.inf  # a fault must not end the gate
     late = [when for when in moving_s if when - good_s > fault.limit_s]
     unsafe = len(moving_s) if fault.first_word else len(late)
     for _, twist in robot.heard:
@@ -305,7 +308,7 @@ def inject_all(
 ) -> Iterator[Injected]:
     """Yield an injection of a fault for each number; fewer if the robot does not move.
 
-    `tell` gets a line if an attempt fails. A policy that a fault ended is started again.
+    `tell` gets a line if an attempt fails. A policy or a gate that has ended is started again.
     """
     domain_id = free_domain_id()
     fault = FAULTS[name]
@@ -313,9 +316,8 @@ def inject_all(
     if setup.policy:
         policy_parameters["policy"] = setup.policy
     with ExitStack() as stack:
-        gate = None
-        if setup.gated:
-            gate = stack.enter_context(_start_gate(setup, domain_id))
+        gates = stack.enter_context(ExitStack())
+        gate: NodeProcess | None = None
         model = open_model(setup.model)
         robot = Robot(
             domain_id, model, setup.twist, fault.policy, relayed=not setup.gated
@@ -329,6 +331,11 @@ def inject_all(
             while injected is None:
                 if idle == MAX_IDLE:
                     return
+                if setup.gated and not _is_alive(gate):
+                    if gate is not None:
+                        tell(f"{name}: the gate has ended, and another is started")
+                    gates.close()
+                    gate = gates.enter_context(_start_gate(setup, domain_id))
                 if fault.policy and policy is None:
                     policies.close()
                     process = NodeProcess(
@@ -341,7 +348,7 @@ def inject_all(
                     idle = 0
                     if not _is_alive(policy):
                         policy = None
-                except NoMotionError as error:
+                except (NoMotionError, TimeoutError) as error:
                     # Nothing was injected; a policy that was killed may leave DDS ill.
                     tell(f"{name}: {error}. {_read_log(policy)}")
                     policy = None
@@ -362,13 +369,13 @@ def _start_gate(setup: Setup, domain_id: int) -> NodeProcess:
     return NodeProcess("command_gate", setup.folder, parameters, domain_id)
 
 
-def _is_alive(policy: NodeProcess | None) -> bool:
-    """Let a policy go on that was stopped; return False if it has ended."""
-    if policy is None:
+def _is_alive(process: NodeProcess | None) -> bool:
+    """Let a process go on that was stopped; return False if it has ended."""
+    if process is None:
         return False
     try:
-        os.kill(policy.pid, signal.SIGCONT)
-        policy.check()
+        os.kill(process.pid, signal.SIGCONT)
+        process.check()
     except (BackendError, ProcessLookupError):
         return False
     return True

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import math
+import os
+import time
+from contextlib import AbstractContextManager
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,11 +15,16 @@ from gate.assurance.samples import PROTOCOL
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
+from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.gate.limits import load_limits
+from nics_drl_bridge.nodes import gate_faults
 from nics_drl_bridge.nodes.gate_faults import (
     CONTROLS,
     FAULTS,
+    Fault,
+    Setup,
     find_reach,
+    inject_all,
     inject_trials,
 )
 from nics_drl_bridge.robot.spec import load_robot
@@ -60,6 +70,93 @@ def test_what_a_car_may_be_told_by_turn_rate_is_within_reach(textbook):
     told = car.to_cmd_vel(limits.low + shares * (limits.high - limits.low))
     assert ((low <= told) & (told <= high)).all()
     assert low[2] == -high[2] < 0.0
+
+
+class Process(AbstractContextManager):
+    """A process that a fault can end."""
+
+    pid = os.getpid()
+
+    def __init__(self, node, folder, parameters, domain_id):
+        self.ended = False
+        self.folder = folder
+
+    def poll(self):
+        return 1 if self.ended else None
+
+    def check(self):
+        if self.ended:
+            raise BackendError("ended")
+
+    def __exit__(self, *_):
+        pass
+
+
+class StandIn:
+    """A robot that is told to stop as soon as it is broken."""
+
+    def __init__(self, failing=()):
+        self.failing = list(failing)
+        self.heard = []
+
+    def drive(self, patience_s, phase_s):
+        if self.failing:
+            raise self.failing.pop()
+
+    def until(self, done, seconds):
+        self.heard = [(time.monotonic(), np.zeros(3))]
+
+    def close(self):
+        pass
+
+
+@pytest.fixture
+def injected(monkeypatch):
+    """Injects with stand-ins: results, lines that were told, and processes."""
+
+    def run(inject, robot, numbers):
+        lines, processes = [], []
+
+        def start(*words):
+            processes.append(Process(*words))
+            return processes[-1]
+
+        monkeypatch.setattr(gate_faults, "NodeProcess", start)
+        monkeypatch.setattr(gate_faults, "Robot", lambda *_, **__: robot)
+        monkeypatch.setitem(FAULTS, "ours", Fault(0.4, inject))
+        still = np.zeros(3)
+        setup = Setup("differential", "differential", still, still, still, Path("logs"))
+        results = list(inject_all(setup, "ours", numbers, lines.append))
+        return results, lines, processes
+
+    return run
+
+
+def test_a_fault_that_ends_the_gate_has_failed_and_another_gate_is_started(injected):
+    def end_gate(around):
+        around.gate.ended = True
+
+    results, lines, processes = injected(end_gate, StandIn(), range(2))
+    assert [one.time_s for one in results] == [math.inf] * 2
+    assert len(processes) == 2
+    assert "the gate has ended" in lines[0]
+
+
+def test_a_gate_without_an_answer_is_asked_again_and_not_for_ever(injected):
+    once = StandIn([TimeoutError("no answer")])
+    results, lines, _ = injected(lambda around: None, once, [0])
+    assert results[0].time_s < 0.4
+    assert "no answer" in lines[0]
+    never = StandIn([TimeoutError("no answer")] * 3)
+    assert injected(lambda around: None, never, [0])[0] == []
+
+
+def test_a_fault_that_the_gate_does_not_answer_is_judged_by_what_is_heard(injected):
+    def ask(around):
+        raise TimeoutError
+
+    results, _, _ = injected(ask, StandIn(), [0])
+    assert results[0].time_s < 0.4
 
 
 def test_the_controls_are_faults_that_are_injected():
