@@ -111,6 +111,7 @@ def assure(
             randomisation=randomisation,
             control=control or "",
             hashes={},
+            claims=protocols.choose_claims(opened.robot),
             versions=_read_versions(),
             **_choose_faults(faults),
         )

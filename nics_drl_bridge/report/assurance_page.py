@@ -63,7 +63,7 @@ def tabulate(
             _format_bounds(shown[claim]),
             _format_counts(results["control"][claim]),
         )
-        for claim, sentence in CLAIMS.items()
+        for claim, sentence in protocol.claims.items()
     ]
 
 
@@ -86,7 +86,7 @@ def _format_bounds(figures: Mapping[str, Any]) -> str:
 def _make_result(protocol: Protocol, results: Mapping[str, Any]) -> Blocks:
     shown = results["control" if protocol.control else "claims"]
     tiles = []
-    for claim, sentence in CLAIMS.items():
+    for claim, sentence in protocol.claims.items():
         figures = shown[claim]
         failed = figures["failures"] > 0
         good = figures["trials"] > 0 and failed == bool(protocol.control)

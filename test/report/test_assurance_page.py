@@ -6,7 +6,12 @@ from html import unescape
 
 from gate.assurance.samples import FAULTS, PROTOCOL, fault, row
 
-from nics_drl_bridge.gate.assurance.protocol import NO_GATE
+from nics_drl_bridge.gate.assurance.protocol import (
+    CLAIMS,
+    CLAIMS_BY_TURN_RATE,
+    LIMITS,
+    NO_GATE,
+)
 from nics_drl_bridge.gate.assurance.results import summarise
 from nics_drl_bridge.report.assurance_page import make_assurance_page
 
@@ -51,6 +56,13 @@ def test_faults_are_listed_with_those_that_could_not_be_injected():
 def test_only_kinds_of_fault_that_were_tried_are_listed():
     text = read([row(1), fault(7)], replace(FAULTS, faults=2))
     assert "of the policy: a, b." in text
+
+
+def test_the_page_claims_what_the_protocol_claims():
+    claims = CLAIMS_BY_TURN_RATE
+    text = read([row(1), CONTROL], replace(PROTOCOL, claims=claims))
+    assert text.count(claims[LIMITS]) >= 2
+    assert CLAIMS[LIMITS] not in text
 
 
 def test_in_a_control_failures_are_what_is_wanted():

@@ -12,7 +12,7 @@ from nics_drl_bridge.files import format_json, write_text
 from nics_drl_bridge.gate.assurance.episodes import configure_gate, drive
 from nics_drl_bridge.gate.assurance.limit_judge import LimitJudge
 from nics_drl_bridge.gate.assurance.place import POLICY, Job, Place
-from nics_drl_bridge.gate.assurance.protocol import Protocol, Trial
+from nics_drl_bridge.gate.assurance.protocol import CLAIMS, Protocol, Trial
 from nics_drl_bridge.gate.limits import load_limits
 from nics_drl_bridge.generator import SimulatorModel
 
@@ -50,9 +50,8 @@ class Run:
         config = None
         if trial.gated:
             config = configure_gate(place.model, self.protocol.limits)
-        robot = self._model.robot
-        # A car's angle follows from its turn rate only while it moves.
-        judge = LimitJudge(robot, self._limits, slopes=not robot.takes_turn_rate)
+        slopes = self.protocol.claims == CLAIMS
+        judge = LimitJudge(self._model.robot, self._limits, slopes)
         outcome = drive(place, config, Job(trial.kind, trial.seed), judge.see)
         violations = {name: n for name, n in judge.violations.items() if n}
         return asdict(outcome) | trial._asdict() | {"violations": violations}
