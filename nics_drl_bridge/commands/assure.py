@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from nics_drl_bridge.generator import SimulatorModel
 
 PAGE = "assurance.html"
-EXIT_FAILED = 1  # a claim failed or, in a control, did not
+EXIT_FAILED = 1  # a claim failed, or did not without the gate
+MIN_CONTROLS = 4  # fewer may all pass by chance
 COMPUTED_WITH = ("numpy", "numba", "scipy", "onnxruntime")
 
 
@@ -281,9 +282,17 @@ def _tell(order: "Protocol", results: dict[str, Any], out: Path) -> None:
 
 
 def _is_as_expected(order: "Protocol", results: dict[str, Any]) -> bool:
-    """True if all was injected, and no claim failed or, in a control, each tested claim did."""
+    """True if all was injected, no claim failed, and without the gate each tested claim did."""
+    from nics_drl_bridge.gate.assurance.protocol import CLAIMS, LIMITS
+
     if results["not_injected"]:
         return False
-    shown = results["control" if order.control else "claims"]
-    failed = [f["failures"] > 0 for f in shown.values() if f["trials"]]
-    return all(failed) if order.control else not any(failed)
+    if any(figures["failures"] for figures in results["claims"].values()):
+        return False
+    enough = 1 if order.control else MIN_CONTROLS
+    for claim, figures in results["control"].items():
+        # Without the gate, values alone may keep limits as wide as the robot's range.
+        must_fail = claim != LIMITS or order.claims == CLAIMS
+        if must_fail and figures["trials"] >= enough and not figures["failures"]:
+            return False
+    return True

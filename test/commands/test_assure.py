@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import pytest
 from command_line import nics, split_words
@@ -14,7 +15,13 @@ from gate.assurance.samples import PROTOCOL, fault, row
 
 from nics_drl_bridge import extensions
 from nics_drl_bridge.commands.assure import _choose_faults, _is_as_expected
-from nics_drl_bridge.gate.assurance.protocol import LIMITS, STOPS, TOUCHES
+from nics_drl_bridge.gate.assurance.protocol import (
+    CLAIMS_BY_TURN_RATE,
+    LIMITS,
+    NO_GATE,
+    STOPS,
+    TOUCHES,
+)
 from nics_drl_bridge.gate.assurance.results import summarise
 
 ORDER = (
@@ -52,6 +59,37 @@ def test_the_evidence_has_counts_bounds_and_a_control_that_failed(evidence):
     assert result["protocol_sha256"] in page
     for value in result["protocol"]["hashes"].values():
         assert value in page
+
+
+def control(number, **changes):
+    """Some episodes without the gate, which all keep what is claimed unless changed."""
+    return [row(seed, gated=False, **changes) for seed in range(number)]
+
+
+@pytest.mark.parametrize(
+    ("rows", "expected"),
+    [
+        (control(4, contact=True, violations={"rate": 1}), True),
+        (control(4, contact=True), False),
+        (control(4, violations={"rate": 1}), False),
+        (control(3), True),
+    ],
+)
+def test_enough_episodes_without_the_gate_must_fail(rows, expected):
+    assert _is_as_expected(PROTOCOL, summarise([row(1), *rows])) == expected
+
+
+def test_values_of_a_car_by_turn_rate_need_not_fail_without_the_gate():
+    by_turn_rate = replace(PROTOCOL, claims=CLAIMS_BY_TURN_RATE)
+    results = summarise([row(1), *control(4, contact=True)])
+    assert _is_as_expected(by_turn_rate, results)
+
+
+def test_in_a_control_each_claim_must_fail():
+    no_gate = replace(PROTOCOL, control=NO_GATE)
+    assert not _is_as_expected(no_gate, summarise(control(1, contact=True)))
+    both = control(1, contact=True, violations={"rate": 1})
+    assert _is_as_expected(no_gate, summarise(both))
 
 
 def test_a_run_whose_faults_were_not_all_injected_is_not_as_expected():
