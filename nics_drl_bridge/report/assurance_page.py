@@ -106,12 +106,19 @@ def _make_result(protocol: Protocol, results: Mapping[str, Any]) -> Blocks:
         sentences.append(
             "The claim on stopping in time was not tested: it needs ROS 2 and --faults."
         )
-    clean = {f["trials"] for f in shown.values() if f["trials"] and not f["failures"]}
+    clean = {
+        f["trials"]: f["rate_high"]
+        for f in shown.values()
+        if f["trials"] and not f["failures"]
+    }
     if clean:
-        bounds = [f"{3 / trials:.1e} for {trials:,}" for trials in sorted(clean)]
+        bounds = [
+            f"{high:.1e} for {trials:,}" for trials, high in sorted(clean.items())
+        ]
         sentences.append(
-            "No failure in n trials means, with 95 % confidence, a rate below 3/n, here "
-            f"{' and '.join(bounds)} trials. It does not mean that the rate is 0."
+            "No failure in n trials means, with 95 % confidence and one-sided, a rate below about "
+            f"3/n, here {' and '.join(bounds)} trials. It does not mean that the rate is 0. With "
+            "failures the bounds are two-sided."
         )
     sentences += [_describe_control(claim, results["control"]) for claim in CLAIMS]
     return [

@@ -58,6 +58,8 @@ def test_a_control_counts_for_itself_and_a_claim_without_trials_is_not_tested():
     assert results["claims"][TOUCHES]["failures"] == 0
     assert results["claims"][TOUCHES]["trials"] == results["episodes"] == 2
     assert results["control"][TOUCHES]["failures"] == 1
+    assert results["claims"][TOUCHES]["one_sided"]
+    assert not results["control"][TOUCHES]["one_sided"]
     assert results["claims"][STOPS]["trials"] == 0
     assert results["failures"] == []
     assert results["walked_into"] == 1
