@@ -245,7 +245,8 @@ def _replay(run: "Run", seed: int, out: Path, as_json: bool) -> None:
         from nics_drl_bridge.nodes.gate_faults import inject_trials
 
         say = partial(typer.echo, err=True)
-        rows = list(inject_trials(order, out / "logs", say, [trial]))
+        logs = out / "logs" / f"replay_{seed}"
+        rows = list(inject_trials(order, logs, say, [trial]))
         if not rows:
             raise BackendError(
                 f"--replay {seed}: {trial.kind} could not be injected, because the robot did not "

@@ -90,7 +90,7 @@ class Setup:
     twist: Array  # (3,) that drives the robot, unless the policy does
     low: Array  # (3,) limits of `cmd_vel`
     high: Array
-    folder: Path  # for logs
+    folder: Path  # for logs: a process gets a folder there, by its first injection
     policy: str = ""  # by default that of `policy_node`
     goal: tuple[float, float] = (1e6, 0.0)  # of the policy [m]
     gated: bool = True  # False: commands are relayed past the gate
@@ -331,15 +331,16 @@ def inject_all(
             while injected is None:
                 if idle == MAX_IDLE:
                     return
+                folder = setup.folder / (f"{number}_{idle}" if idle else f"{number}")
                 if setup.gated and not _is_alive(gate):
                     if gate is not None:
                         tell(f"{name}: the gate has ended, and another is started")
                     gates.close()
-                    gate = gates.enter_context(_start_gate(setup, domain_id))
+                    gate = gates.enter_context(_start_gate(setup, folder, domain_id))
                 if fault.policy and policy is None:
                     policies.close()
                     process = NodeProcess(
-                        "policy_node", setup.folder, policy_parameters, domain_id
+                        "policy_node", folder, policy_parameters, domain_id
                     )
                     policy = policies.enter_context(process)
                 try:
@@ -356,17 +357,17 @@ def inject_all(
             yield injected
 
 
-def _start_gate(setup: Setup, domain_id: int) -> NodeProcess:
+def _start_gate(setup: Setup, folder: Path, domain_id: int) -> NodeProcess:
     parameters = {
         "model": setup.model,
         "limits": setup.limits,
         "e_stop_required": True,
-        "black_box": str(setup.folder / "black_box"),
+        "black_box": str(folder / "black_box"),
         "enable_stamped_cmd_vel": False,
         "stop_when_held": False,  # the robot's scans do not show how it moves
         **setup.parameters,
     }
-    return NodeProcess("command_gate", setup.folder, parameters, domain_id)
+    return NodeProcess("command_gate", folder, parameters, domain_id)
 
 
 def _is_alive(process: NodeProcess | None) -> bool:
@@ -428,7 +429,9 @@ def inject_trials(
     ):
         of_fault = list(group)
         numbers = [trial.seed for trial in of_fault]
-        injections = inject_all(replace(setup, gated=gated), name, numbers, tell)
+        of_kind = folder / (name if gated else f"{name}_no_gate")
+        around = replace(setup, gated=gated, folder=of_kind)
+        injections = inject_all(around, name, numbers, tell)
         limit_s = FAULTS[name].limit_s
         for trial, one in zip(of_fault, injections, strict=False):
             in_time = one.time_s <= limit_s and not one.unsafe

@@ -58,7 +58,8 @@ def test_the_policy_under_test_drives_the_robot_whose_policy_then_dies(tmp_path)
     trial = replace(TWO, fault_kinds=("policy_killed",)).list_faults()[0]
     (row,) = inject(tmp_path, trial)
     assert row["in_time"]
-    assert (tmp_path / "policy_node.log").exists()
+    log = tmp_path / "policy_killed" / str(trial.seed) / "policy_node.log"
+    assert log.exists()
 
 
 @pytest.mark.parametrize("textbook", ["ackermann", "tricycle"])
@@ -140,6 +141,8 @@ def test_a_fault_that_ends_the_gate_has_failed_and_another_gate_is_started(injec
     assert [one.time_s for one in results] == [math.inf] * 2
     assert len(processes) == 2
     assert "the gate has ended" in lines[0]
+    folders = [str(process.folder) for process in processes]
+    assert folders == ["logs/0", "logs/1"]  # so that no log is lost
 
 
 def test_a_gate_without_an_answer_is_asked_again_and_not_for_ever(injected):
