@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.files import format_json, write_text
+from nics_drl_bridge.files import format_json, lock_file, write_text
 from nics_drl_bridge.gate.assurance.episodes import configure_gate, drive
 from nics_drl_bridge.gate.assurance.limit_judge import LimitJudge
 from nics_drl_bridge.gate.assurance.place import POLICY, Job, Place
@@ -105,8 +105,9 @@ def drive_all(
     A trial that gives no row is tried again by the next run.
     """
     log.touch()
-    rows, size = read_rows(log, trials)
     with log.open("r+b") as file:
+        lock_file(log, file)
+        rows, size = read_rows(log, trials)
         file.truncate(size)  # a killed run may have left part of a line
         file.seek(size)
         tell(len(rows), len(trials))

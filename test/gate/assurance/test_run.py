@@ -58,6 +58,18 @@ def test_a_trial_that_gave_no_row_is_tried_again(tmp_path):
     assert asked == [TRIALS, [TRIALS[1]]]
 
 
+def test_a_log_that_another_run_writes_is_refused(tmp_path):
+    log = tmp_path / runs.LOG
+
+    def drive_twice(trials):
+        with pytest.raises(ConfigError, match="another process writes it"):
+            runs.drive_all(log, TRIALS, iter, lambda *_: None)
+        return iter([])
+
+    runs.drive_all(log, TRIALS, drive_twice, lambda *_: None)
+    runs.drive_all(log, TRIALS, lambda trials: [], lambda *_: None)  # free again
+
+
 def test_the_protocol_is_on_disk_with_its_hash_before_any_episode(tmp_path):
     runs.begin(tmp_path, PROTOCOL)
     written = runs.read_result(tmp_path)
