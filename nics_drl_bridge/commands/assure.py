@@ -279,6 +279,11 @@ def _tell(order: "Protocol", results: dict[str, Any], out: Path) -> None:
     from nics_drl_bridge.report.assurance_page import HEADS, tabulate
 
     typer.echo(console.format_table(HEADS, tabulate(order, results)))
+    if results["not_injected"]:
+        again = "the same command tries them again"
+        typer.echo(
+            f"faults not injected: {results['not_injected']:,}; {again}", err=True
+        )
     typer.echo(f"{PAGE} and assurance.json: {out}")
 
 

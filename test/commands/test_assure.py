@@ -14,7 +14,7 @@ from command_line import nics, split_words
 from gate.assurance.samples import PROTOCOL, fault, row
 
 from nics_drl_bridge import extensions
-from nics_drl_bridge.commands.assure import _choose_faults, _is_as_expected
+from nics_drl_bridge.commands.assure import _choose_faults, _is_as_expected, _tell
 from nics_drl_bridge.gate.assurance.protocol import (
     CLAIMS_BY_TURN_RATE,
     LIMITS,
@@ -92,10 +92,13 @@ def test_in_a_control_each_claim_must_fail():
     assert _is_as_expected(no_gate, summarise(both))
 
 
-def test_a_run_whose_faults_were_not_all_injected_is_not_as_expected():
-    results = summarise([row(1), fault(7)], faults=1)
-    assert _is_as_expected(PROTOCOL, results)
-    assert not _is_as_expected(PROTOCOL, summarise([row(1), fault(7)], faults=2))
+def test_a_run_whose_faults_were_not_all_injected_is_not_as_expected(tmp_path, capsys):
+    whole = summarise([row(1), fault(7)], faults=1)
+    assert _is_as_expected(PROTOCOL, whole)
+    partial = summarise([row(1), fault(7)], faults=2)
+    assert not _is_as_expected(PROTOCOL, partial)
+    _tell(PROTOCOL, partial, tmp_path)
+    assert "faults not injected: 1; the same command" in capsys.readouterr().err
 
 
 @pytest.mark.slow
