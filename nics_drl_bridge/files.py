@@ -117,6 +117,20 @@ def _lock_new(path: Path, descriptor: int) -> bool:
         return False
 
 
+def lock_file(path: Path, file: BinaryIO) -> None:
+    """Locks an open file until it is closed. Raises ConfigError if another process has it."""
+    if fcntl is None:
+        return
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise ConfigError(
+            f"{path}: another process writes it; wait for its end, or choose another place."
+        ) from None
+    except OSError:  # a file system without locks
+        pass
+
+
 def remove_leftovers(folder: Path) -> None:
     """Removes what killed writers left in a folder, never what a live writer is still writing."""
     if fcntl is None:

@@ -44,7 +44,10 @@ def driver_context(domain_id: int | None) -> Context:
 
 
 def hear(domain_id: int | None, out: Connection) -> None:
-    """Send when each `cmd_vel` came [s] and its twist, as the base hears it; never ends."""
+    """Send when each `cmd_vel` came [s] and its twist, as the base hears it.
+
+    Ends with the process that started it, even if that is killed.
+    """
     context = driver_context(domain_id)
     node = Node("base", context=context, start_parameter_services=False)
 
@@ -54,8 +57,9 @@ def hear(domain_id: int | None, out: Connection) -> None:
     node.create_subscription(Twist, "cmd_vel", tell, qos.COMMAND)
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
-    while True:
-        executor.spin_once()
+    parent = multiprocessing.parent_process()
+    while parent is None or parent.is_alive():
+        executor.spin_once(timeout_sec=1.0)
 
 
 class Robot(SpunNode):

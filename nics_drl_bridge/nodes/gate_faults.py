@@ -11,9 +11,9 @@ import os
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass, field, replace
-from itertools import groupby, zip_longest
+from itertools import groupby, product
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from sensor_msgs.msg import LaserScan
 from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.gate.assurance.protocol import Protocol, Trial
 from nics_drl_bridge.gate.assurance.run import Row
-from nics_drl_bridge.gate.limits import load_limits
+from nics_drl_bridge.gate.limits import Limits, load_limits
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.nodes import conversions
@@ -37,6 +37,7 @@ from nics_drl_bridge.nodes.faulty_robot import (
     Robot,
 )
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
+from nics_drl_bridge.robot.spec import RobotSpec
 
 SOON_S = 0.10
 LATE_S = 0.40
@@ -89,7 +90,7 @@ class Setup:
     twist: Array  # (3,) that drives the robot, unless the policy does
     low: Array  # (3,) limits of `cmd_vel`
     high: Array
-    folder: Path  # for logs
+    folder: Path  # for logs: a process gets a folder there, by its first injection
     policy: str = ""  # by default that of `policy_node`
     goal: tuple[float, float] = (1e6, 0.0)  # of the policy [m]
     gated: bool = True  # False: commands are relayed past the gate
@@ -280,7 +281,8 @@ def inject(setup: Setup, around: Around, name: str, number: int) -> Injected:
     robot.drive(setup.patience_s, phase_s)
     robot.heard.clear()
     broken_s = time.monotonic()
-    ways[number % len(ways)](around)
+    with suppress(TimeoutError):  # without an answer, what was heard decides
+        ways[number % len(ways)](around)
     robot.until(lambda: False, fault.limit_s + WATCHED_S)
     good_s = broken_s
     if fault.since:
@@ -292,6 +294,8 @@ def inject(setup: Setup, around: Around, name: str, number: int) -> Injected:
         moving_s = [when for when in moving_s if when < first_s]
     last_s = max(moving_s, default=broken_s)
     stopped_s = min((when for when in zeros_s if when > last_s), default=math.inf)
+    if around.gate is not None and around.gate.poll() is not None:
+        stopped_s = math.inf  # a fault must not end the gate
     late = [when for when in moving_s if when - good_s > fault.limit_s]
     unsafe = len(moving_s) if fault.first_word else len(late)
     for _, twist in robot.heard:
@@ -304,7 +308,7 @@ def inject_all(
 ) -> Iterator[Injected]:
     """Yield an injection of a fault for each number; fewer if the robot does not move.
 
-    `tell` gets a line if an attempt fails. A policy that a fault ended is started again.
+    `tell` gets a line if an attempt fails. A policy or a gate that has ended is started again.
     """
     domain_id = free_domain_id()
     fault = FAULTS[name]
@@ -312,9 +316,8 @@ def inject_all(
     if setup.policy:
         policy_parameters["policy"] = setup.policy
     with ExitStack() as stack:
-        gate = None
-        if setup.gated:
-            gate = stack.enter_context(_start_gate(setup, domain_id))
+        gates = stack.enter_context(ExitStack())
+        gate: NodeProcess | None = None
         model = open_model(setup.model)
         robot = Robot(
             domain_id, model, setup.twist, fault.policy, relayed=not setup.gated
@@ -328,10 +331,16 @@ def inject_all(
             while injected is None:
                 if idle == MAX_IDLE:
                     return
+                folder = setup.folder / (f"{number}_{idle}" if idle else f"{number}")
+                if setup.gated and not _is_alive(gate):
+                    if gate is not None:
+                        tell(f"{name}: the gate has ended, and another is started")
+                    gates.close()
+                    gate = gates.enter_context(_start_gate(setup, folder, domain_id))
                 if fault.policy and policy is None:
                     policies.close()
                     process = NodeProcess(
-                        "policy_node", setup.folder, policy_parameters, domain_id
+                        "policy_node", folder, policy_parameters, domain_id
                     )
                     policy = policies.enter_context(process)
                 try:
@@ -340,7 +349,7 @@ def inject_all(
                     idle = 0
                     if not _is_alive(policy):
                         policy = None
-                except NoMotionError as error:
+                except (NoMotionError, TimeoutError) as error:
                     # Nothing was injected; a policy that was killed may leave DDS ill.
                     tell(f"{name}: {error}. {_read_log(policy)}")
                     policy = None
@@ -348,26 +357,26 @@ def inject_all(
             yield injected
 
 
-def _start_gate(setup: Setup, domain_id: int) -> NodeProcess:
+def _start_gate(setup: Setup, folder: Path, domain_id: int) -> NodeProcess:
     parameters = {
         "model": setup.model,
         "limits": setup.limits,
         "e_stop_required": True,
-        "black_box": str(setup.folder / "black_box"),
+        "black_box": str(folder / "black_box"),
         "enable_stamped_cmd_vel": False,
         "stop_when_held": False,  # the robot's scans do not show how it moves
         **setup.parameters,
     }
-    return NodeProcess("command_gate", setup.folder, parameters, domain_id)
+    return NodeProcess("command_gate", folder, parameters, domain_id)
 
 
-def _is_alive(policy: NodeProcess | None) -> bool:
-    """Let a policy go on that was stopped; return False if it has ended."""
-    if policy is None:
+def _is_alive(process: NodeProcess | None) -> bool:
+    """Let a process go on that was stopped; return False if it has ended."""
+    if process is None:
         return False
     try:
-        os.kill(policy.pid, signal.SIGCONT)
-        policy.check()
+        os.kill(process.pid, signal.SIGCONT)
+        process.check()
     except (BackendError, ProcessLookupError):
         return False
     return True
@@ -384,16 +393,28 @@ def _read_log(policy: NodeProcess | None) -> str:
 CONTROLS = ("scan_silent", "odom_silent", "nan_scan", "command_nan")
 
 
+def find_reach(robot: RobotSpec, limits: Limits) -> tuple[Array, Array]:
+    """Return the least and the greatest `cmd_vel` (3,) within limits.
+
+    The turn rate of a car follows from both commands, so all of their corners count, and zeros.
+    """
+    ends = zip(limits.low, np.zeros_like(limits.low), limits.high, strict=True)
+    twists = robot.to_cmd_vel(list(product(*ends)))
+    return twists.min(axis=0), twists.max(axis=0)
+
+
 def inject_trials(
     protocol: Protocol, folder: Path, tell: Callable[[str], None], trials: list[Trial]
 ) -> Iterator[Row]:
-    """Yield a row of the log for each trial; the robot is told to move by half its limits."""
+    """Yield a row for each trial whose fault was injected.
+
+    The robot is told to move by half its limits.
+    """
     robot = open_model(protocol.model).robot
     limits = load_limits(protocol.limits, robot)
     command = 0.1 * np.where(limits.high > 0.0, limits.high, limits.low)
     command[0] *= 5.0
-    low = np.minimum(robot.to_cmd_vel(limits.low), robot.to_cmd_vel(limits.high))
-    high = np.maximum(robot.to_cmd_vel(limits.low), robot.to_cmd_vel(limits.high))
+    low, high = find_reach(robot, limits)
     setup = Setup(
         model=protocol.model,
         limits=protocol.limits,
@@ -408,12 +429,11 @@ def inject_trials(
     ):
         of_fault = list(group)
         numbers = [trial.seed for trial in of_fault]
-        injections = inject_all(replace(setup, gated=gated), name, numbers, tell)
+        of_kind = folder / (name if gated else f"{name}_no_gate")
+        around = replace(setup, gated=gated, folder=of_kind)
+        injections = inject_all(around, name, numbers, tell)
         limit_s = FAULTS[name].limit_s
-        for trial, one in zip_longest(of_fault, injections):
-            row = trial._asdict() | {"fault": True, "limit_s": limit_s}
-            row["injected"] = one is not None
-            if one is not None:
-                in_time = one.time_s <= limit_s and not one.unsafe
-                row |= asdict(one) | {"in_time": in_time}
-            yield row
+        for trial, one in zip(of_fault, injections, strict=False):
+            in_time = one.time_s <= limit_s and not one.unsafe
+            told = {"fault": True, "limit_s": limit_s, "in_time": in_time}
+            yield trial._asdict() | told | asdict(one)

@@ -63,7 +63,7 @@ def tabulate(
             _format_bounds(shown[claim]),
             _format_counts(results["control"][claim]),
         )
-        for claim, sentence in CLAIMS.items()
+        for claim, sentence in protocol.claims.items()
     ]
 
 
@@ -86,25 +86,39 @@ def _format_bounds(figures: Mapping[str, Any]) -> str:
 def _make_result(protocol: Protocol, results: Mapping[str, Any]) -> Blocks:
     shown = results["control" if protocol.control else "claims"]
     tiles = []
-    for claim, sentence in CLAIMS.items():
+    for claim, sentence in protocol.claims.items():
         figures = shown[claim]
         failed = figures["failures"] > 0
         good = figures["trials"] > 0 and failed == bool(protocol.control)
+        if claim == STOPS and results["not_injected"]:
+            good = False
         claim_of_tile = f"Claim: {sentence}"
         if figures["trials"]:
             claim_of_tile = f"failed. {claim_of_tile}"
         tiles.append((_format_counts(figures), claim_of_tile, good))
     sentences = []
-    if not shown[STOPS]["trials"]:
+    if results["not_injected"]:
+        sentences.append(
+            f"{results['not_injected']:,} faults could not be injected, because the robot did not "
+            "move. So the claim on stopping in time is not met; the same command tries them again."
+        )
+    elif not shown[STOPS]["trials"]:
         sentences.append(
             "The claim on stopping in time was not tested: it needs ROS 2 and --faults."
         )
-    clean = {f["trials"] for f in shown.values() if f["trials"] and not f["failures"]}
+    clean = {
+        f["trials"]: f["rate_high"]
+        for f in shown.values()
+        if f["trials"] and not f["failures"]
+    }
     if clean:
-        bounds = [f"{3 / trials:.1e} for {trials:,}" for trials in sorted(clean)]
+        bounds = [
+            f"{high:.1e} for {trials:,}" for trials, high in sorted(clean.items())
+        ]
         sentences.append(
-            "No failure in n trials means, with 95 % confidence, a rate below 3/n, here "
-            f"{' and '.join(bounds)} trials. It does not mean that the rate is 0."
+            "No failure in n trials means, with 95 % confidence and one-sided, a rate below about "
+            f"3/n, here {' and '.join(bounds)} trials. It does not mean that the rate is 0. With "
+            "failures the bounds are two-sided."
         )
     sentences += [_describe_control(claim, results["control"]) for claim in CLAIMS]
     return [
@@ -201,12 +215,13 @@ def _make_method(protocol: Protocol, results: Mapping[str, Any]) -> Blocks:
         "driven again without the gate, as a control.",
         "Seeds, numbers and hashes were written to the JSON before the first episode.",
     ]
-    if protocol.faults:
+    faults = protocol.list_faults()
+    if faults:
+        kinds = dict.fromkeys(trial.kind for trial in faults)
         facts.append(
-            f"{protocol.faults:,} faults were injected over DDS, in real time, around a process of "
-            "the gate and, where the fault is the policy's, of the policy: "
-            f"{', '.join(protocol.fault_kinds)}. {results['not_injected']:,} could not be "
-            "injected, because the robot did not move."
+            f"{len(faults) - results['not_injected']:,} faults were injected over DDS, in real "
+            "time, around a process of the gate and, where the fault is the policy's, of the "
+            f"policy: {', '.join(kinds)}."
         )
     return [
         html.make_table(("drivers, in turn", "touches", "without the gate"), drivers),

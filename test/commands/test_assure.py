@@ -7,12 +7,22 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import pytest
 from command_line import nics, split_words
+from gate.assurance.samples import PROTOCOL, fault, row
 
 from nics_drl_bridge import extensions
-from nics_drl_bridge.gate.assurance.protocol import LIMITS, STOPS, TOUCHES
+from nics_drl_bridge.commands.assure import _choose_faults, _is_as_expected, _tell
+from nics_drl_bridge.gate.assurance.protocol import (
+    CLAIMS_BY_TURN_RATE,
+    LIMITS,
+    NO_GATE,
+    STOPS,
+    TOUCHES,
+)
+from nics_drl_bridge.gate.assurance.results import summarise
 
 ORDER = (
     "assure differential --limits differential --world arena --episodes 6 --faults 0"
@@ -49,6 +59,46 @@ def test_the_evidence_has_counts_bounds_and_a_control_that_failed(evidence):
     assert result["protocol_sha256"] in page
     for value in result["protocol"]["hashes"].values():
         assert value in page
+
+
+def control(number, **changes):
+    """Some episodes without the gate, which all keep what is claimed unless changed."""
+    return [row(seed, gated=False, **changes) for seed in range(number)]
+
+
+@pytest.mark.parametrize(
+    ("rows", "expected"),
+    [
+        (control(4, contact=True, violations={"rate": 1}), True),
+        (control(4, contact=True), False),
+        (control(4, violations={"rate": 1}), False),
+        (control(3), True),
+    ],
+)
+def test_enough_episodes_without_the_gate_must_fail(rows, expected):
+    assert _is_as_expected(PROTOCOL, summarise([row(1), *rows])) == expected
+
+
+def test_values_of_a_car_by_turn_rate_need_not_fail_without_the_gate():
+    by_turn_rate = replace(PROTOCOL, claims=CLAIMS_BY_TURN_RATE)
+    results = summarise([row(1), *control(4, contact=True)])
+    assert _is_as_expected(by_turn_rate, results)
+
+
+def test_in_a_control_each_claim_must_fail():
+    no_gate = replace(PROTOCOL, control=NO_GATE)
+    assert not _is_as_expected(no_gate, summarise(control(1, contact=True)))
+    both = control(1, contact=True, violations={"rate": 1})
+    assert _is_as_expected(no_gate, summarise(both))
+
+
+def test_a_run_whose_faults_were_not_all_injected_is_not_as_expected(tmp_path, capsys):
+    whole = summarise([row(1), fault(7)], faults=1)
+    assert _is_as_expected(PROTOCOL, whole)
+    partial = summarise([row(1), fault(7)], faults=2)
+    assert not _is_as_expected(PROTOCOL, partial)
+    _tell(PROTOCOL, partial, tmp_path)
+    assert "faults not injected: 1; the same command" in capsys.readouterr().err
 
 
 @pytest.mark.slow
@@ -118,6 +168,13 @@ def test_a_run_in_the_folder_of_another_is_refused_in_one_sentence(
     (sentence,) = refused.stderr.splitlines()
     assert named in sentence
     assert read(evidence)["complete"]
+
+
+def test_without_faults_the_protocol_is_the_same_with_ros_2_and_without(monkeypatch):
+    monkeypatch.setattr(extensions, "find_lacking", lambda modules: None)
+    with_ros_2 = _choose_faults(0)
+    monkeypatch.setattr(extensions, "find_lacking", lambda modules: "rclpy")
+    assert _choose_faults(0) == with_ros_2 == {"faults": 0}
 
 
 def test_without_ros_2_the_claim_on_faults_is_told_as_not_tested(tmp_path, monkeypatch):

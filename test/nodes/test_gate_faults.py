@@ -2,30 +2,46 @@
 
 from __future__ import annotations
 
+import math
+import os
+import time
+from contextlib import AbstractContextManager
 from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 from gate.assurance.samples import PROTOCOL
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
+from nics_drl_bridge.errors import BackendError
+from nics_drl_bridge.gate.limits import load_limits
+from nics_drl_bridge.nodes import gate_faults
 from nics_drl_bridge.nodes.gate_faults import (
     CONTROLS,
     FAULTS,
+    Fault,
+    Setup,
+    find_reach,
+    inject_all,
     inject_trials,
 )
+from nics_drl_bridge.robot.spec import load_robot
 
-pytestmark = [pytest.mark.ros, pytest.mark.process, pytest.mark.slow]
+pytestmark = pytest.mark.ros
 TWO = replace(PROTOCOL, faults=2, fault_kinds=tuple(FAULTS), fault_controls=CONTROLS)
 
 
 def inject(tmp_path, *trials):
     lines = []
     rows = list(inject_trials(TWO, tmp_path, lines.append, list(trials)))
-    assert all(row["injected"] for row in rows), lines
+    assert len(rows) == len(trials), lines
     return rows
 
 
+@pytest.mark.process
+@pytest.mark.slow
 def test_a_gate_stops_in_time_and_without_it_nothing_does(tmp_path):
     gated = replace(TWO, fault_kinds=("scan_silent",)).list_faults()[0]
     kept, control = inject(tmp_path, gated, gated._replace(gated=False))
@@ -36,11 +52,114 @@ def test_a_gate_stops_in_time_and_without_it_nothing_does(tmp_path):
     assert control["unsafe"] > 0
 
 
+@pytest.mark.process
+@pytest.mark.slow
 def test_the_policy_under_test_drives_the_robot_whose_policy_then_dies(tmp_path):
     trial = replace(TWO, fault_kinds=("policy_killed",)).list_faults()[0]
     (row,) = inject(tmp_path, trial)
     assert row["in_time"]
-    assert (tmp_path / "policy_node.log").exists()
+    log = tmp_path / "policy_killed" / str(trial.seed) / "policy_node.log"
+    assert log.exists()
+
+
+@pytest.mark.parametrize("textbook", ["ackermann", "tricycle"])
+def test_what_a_car_may_be_told_by_turn_rate_is_within_reach(textbook):
+    car = load_robot(textbook).model_copy(update={"angular_is": "turn_rate"})
+    limits = load_limits(textbook, car)
+    low, high = find_reach(car, limits)
+    shares = np.random.default_rng(0).uniform(size=(100, 2))
+    told = car.to_cmd_vel(limits.low + shares * (limits.high - limits.low))
+    assert ((low <= told) & (told <= high)).all()
+    assert low[2] == -high[2] < 0.0
+
+
+class Process(AbstractContextManager):
+    """A process that a fault can end."""
+
+    pid = os.getpid()
+
+    def __init__(self, node, folder, parameters, domain_id):
+        self.ended = False
+        self.folder = folder
+
+    def poll(self):
+        return 1 if self.ended else None
+
+    def check(self):
+        if self.ended:
+            raise BackendError("ended")
+
+    def __exit__(self, *_):
+        pass
+
+
+class StandIn:
+    """A robot that is told to stop as soon as it is broken."""
+
+    def __init__(self, failing=()):
+        self.failing = list(failing)
+        self.heard = []
+
+    def drive(self, patience_s, phase_s):
+        if self.failing:
+            raise self.failing.pop()
+
+    def until(self, done, seconds):
+        self.heard = [(time.monotonic(), np.zeros(3))]
+
+    def close(self):
+        pass
+
+
+@pytest.fixture
+def injected(monkeypatch):
+    """Injects with stand-ins: results, lines that were told, and processes."""
+
+    def run(inject, robot, numbers):
+        lines, processes = [], []
+
+        def start(*words):
+            processes.append(Process(*words))
+            return processes[-1]
+
+        monkeypatch.setattr(gate_faults, "NodeProcess", start)
+        monkeypatch.setattr(gate_faults, "Robot", lambda *_, **__: robot)
+        monkeypatch.setitem(FAULTS, "ours", Fault(0.4, inject))
+        still = np.zeros(3)
+        setup = Setup("differential", "differential", still, still, still, Path("logs"))
+        results = list(inject_all(setup, "ours", numbers, lines.append))
+        return results, lines, processes
+
+    return run
+
+
+def test_a_fault_that_ends_the_gate_has_failed_and_another_gate_is_started(injected):
+    def end_gate(around):
+        around.gate.ended = True
+
+    results, lines, processes = injected(end_gate, StandIn(), range(2))
+    assert [one.time_s for one in results] == [math.inf] * 2
+    assert len(processes) == 2
+    assert "the gate has ended" in lines[0]
+    folders = [str(process.folder) for process in processes]
+    assert folders == ["logs/0", "logs/1"]  # so that no log is lost
+
+
+def test_a_gate_without_an_answer_is_asked_again_and_not_for_ever(injected):
+    once = StandIn([TimeoutError("no answer")])
+    results, lines, _ = injected(lambda around: None, once, [0])
+    assert results[0].time_s < 0.4
+    assert "no answer" in lines[0]
+    never = StandIn([TimeoutError("no answer")] * 3)
+    assert injected(lambda around: None, never, [0])[0] == []
+
+
+def test_a_fault_that_the_gate_does_not_answer_is_judged_by_what_is_heard(injected):
+    def ask(around):
+        raise TimeoutError
+
+    results, _, _ = injected(ask, StandIn(), [0])
+    assert results[0].time_s < 0.4
 
 
 def test_the_controls_are_faults_that_are_injected():

@@ -6,14 +6,20 @@ from html import unescape
 
 from gate.assurance.samples import FAULTS, PROTOCOL, fault, row
 
-from nics_drl_bridge.gate.assurance.protocol import NO_GATE
+from nics_drl_bridge.gate.assurance.protocol import (
+    CLAIMS,
+    CLAIMS_BY_TURN_RATE,
+    LIMITS,
+    NO_GATE,
+)
 from nics_drl_bridge.gate.assurance.results import summarise
 from nics_drl_bridge.report.assurance_page import make_assurance_page
 
 
 def read(rows, protocol=PROTOCOL):
     """The text of the page of some rows."""
-    page = make_assurance_page(protocol, summarise(rows), "runs/mine")
+    results = summarise(rows, len(protocol.list_faults()))
+    page = make_assurance_page(protocol, results, "runs/mine")
     return unescape(re.sub("<[^>]+>", " ", page.partition("</style>")[2]))
 
 
@@ -22,7 +28,7 @@ CONTROL = row(1, gated=False, contact=True)
 
 def test_without_failures_the_page_tells_the_bound_and_that_a_failure_can_be_found():
     text = read([row(1), row(2), CONTROL])
-    assert "a rate below 3/n, here 1.5e+00 for 2 trials" in text
+    assert "one-sided, a rate below about 3/n, here 7.8e-01 for 2 trials" in text
     assert "Control, touches nothing: without the gate, 1 of 1 trials fail" in text
     assert "its zero proves nothing" in text  # of the limits, which the control kept
     assert "stopping in time was not tested" in text
@@ -38,11 +44,25 @@ def test_a_failure_is_told_with_the_command_that_replays_it():
 
 
 def test_faults_are_listed_with_those_that_could_not_be_injected():
-    rows = [row(1), fault(7), {**fault(8), "injected": False, "in_time": True}]
-    text = read(rows, FAULTS)
-    assert "7 faults were injected over DDS" in text
-    assert "1 could not be injected" in text
+    text = read([row(1), fault(7)], FAULTS)
+    assert "1 faults were injected over DDS" in text
+    assert "of the policy: a, b, c." in text
+    assert "8 faults could not be injected" in text
+    assert "⚠ 0 of 1" in text
     assert "was not tested" not in text
+    assert "9 faults could not be injected" in read([row(1)], FAULTS)
+
+
+def test_only_kinds_of_fault_that_were_tried_are_listed():
+    text = read([row(1), fault(7)], replace(FAULTS, faults=2))
+    assert "of the policy: a, b." in text
+
+
+def test_the_page_claims_what_the_protocol_claims():
+    claims = CLAIMS_BY_TURN_RATE
+    text = read([row(1), CONTROL], replace(PROTOCOL, claims=claims))
+    assert text.count(claims[LIMITS]) >= 2
+    assert CLAIMS[LIMITS] not in text
 
 
 def test_in_a_control_failures_are_what_is_wanted():

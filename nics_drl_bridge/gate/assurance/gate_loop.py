@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.gate.gate import decide
 from nics_drl_bridge.gate.inputs import Arm, Command, Input, Odometry, Reset, Scan, Tick
 from nics_drl_bridge.gate.state import Decision, GateConfig, begin
@@ -50,7 +51,10 @@ class Gate:
         return self.give(Tick())
 
     def arm(self, ranges: NDArray[np.float32], pose: Array) -> None:
-        """Lets the robot stand still until the gate can be armed, and arms it."""
+        """Lets the robot stand still until the gate can be armed, and arms it.
+
+        Raises BackendError if it can't be.
+        """
         self.give(Reset())
         for _ in range(SETTLE_PERIODS):
             self.now += 1.0 / self._lidar.rate
@@ -58,4 +62,4 @@ class Gate:
             self.tick()
         decision = self.give(Arm(1))
         if not decision.granted:
-            raise RuntimeError(f"the gate can't be armed: {decision.answer}")
+            raise BackendError(f"the gate can't be armed: {decision.answer}.")

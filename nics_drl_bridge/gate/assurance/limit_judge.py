@@ -1,4 +1,7 @@
-"""Compares what a gate publishes with its limits, by code that shares nothing with the gate."""
+"""Compares what a gate publishes with its limits, by code of its own.
+
+Which decisions brake or stop, and may change faster, is taken from the gate's own word.
+"""
 
 import numpy as np
 

@@ -171,11 +171,20 @@ class Place:
         self.odom = geometry.compose(self._anchor, moved)
 
     def _compute_speed(self) -> float:
-        """Returns the true speed over the last steps; that of odometry is noisy [m/s]."""
+        """Returns the true speed over the last steps; that of odometry is noisy [m/s].
+
+        It is that of the centre or, if it is greater, that of a corner about the centre.
+        """
         lately = self.track[-MOVING_STEPS - 1 :]
         steps = len(lately) - 1
-        distance = float(np.hypot(*(lately[-1] - lately[0])[:2]))
-        return distance / (steps * self.step_s) if steps else 0.0
+        if not steps:
+            return 0.0
+        x, y, turn = geometry.between(lately[0], lately[-1])
+        distance = float(np.hypot(x, y))
+        robot = self.model.robot
+        if robot.footprint is not None:  # a circle that turns sweeps nothing
+            distance = max(distance, abs(float(turn)) * robot.footprint_radius)
+        return distance / (steps * self.step_s)
 
     @property
     def ended(self) -> bool:

@@ -8,6 +8,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import format_json, hash_bytes
 from nics_drl_bridge.gate.assurance.adversaries import ADVERSARIES
 from nics_drl_bridge.gate.assurance.place import ADVERSARY_S, POLICY, POLICY_S
+from nics_drl_bridge.robot.spec import RobotSpec
 
 STOPS = "stops_in_time"
 LIMITS = "keeps_its_limits"
@@ -17,11 +18,20 @@ CLAIMS = {
     LIMITS: "What the base is told keeps the limits of value, rate and jerk.",
     TOUCHES: "The robot touches nothing while it moves.",
 }
+# A car's angle follows from its turn rate only while it moves, so only its values are judged.
+CLAIMS_BY_TURN_RATE = CLAIMS | {
+    LIMITS: "What the base is told keeps the limits of value."
+}
 KINDS = (*ADVERSARIES, POLICY)
 NO_GATE = "no_gate"  # the control: commands go past the gate
 # Each kind of driver in each world begins with a control; then one episode in so many has one. It
 # shares no factor with the number of kinds, so that all of them have controls.
 CONTROL_EVERY = 47
+
+
+def choose_claims(robot: RobotSpec) -> Mapping[str, str]:
+    """Returns the claims that can be judged of a robot."""
+    return CLAIMS_BY_TURN_RATE if robot.takes_turn_rate else CLAIMS
 
 
 class Trial(NamedTuple):

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.files import format_json, write_text
+from nics_drl_bridge.files import format_json, lock_file, write_text
 from nics_drl_bridge.gate.assurance.episodes import configure_gate, drive
 from nics_drl_bridge.gate.assurance.limit_judge import LimitJudge
 from nics_drl_bridge.gate.assurance.place import POLICY, Job, Place
-from nics_drl_bridge.gate.assurance.protocol import Protocol, Trial
+from nics_drl_bridge.gate.assurance.protocol import CLAIMS, Protocol, Trial
 from nics_drl_bridge.gate.limits import load_limits
 from nics_drl_bridge.generator import SimulatorModel
 
@@ -50,9 +50,8 @@ class Run:
         config = None
         if trial.gated:
             config = configure_gate(place.model, self.protocol.limits)
-        robot = self._model.robot
-        # A car's angle follows from its turn rate only while it moves.
-        judge = LimitJudge(robot, self._limits, slopes=not robot.takes_turn_rate)
+        slopes = self.protocol.claims == CLAIMS
+        judge = LimitJudge(self._model.robot, self._limits, slopes)
         outcome = drive(place, config, Job(trial.kind, trial.seed), judge.see)
         violations = {name: n for name, n in judge.violations.items() if n}
         return asdict(outcome) | trial._asdict() | {"violations": violations}
@@ -64,10 +63,11 @@ def begin(folder: Path, protocol: Protocol) -> None:
     if file.exists():
         protocol.check_same(read_result(folder)["protocol"], str(folder))
         return
-    if (folder / LOG).exists():
-        raise ConfigError(
-            f"{folder}: has a {LOG} without {RESULT}; choose another --out."
-        )
+    for log in (LOG, FAULT_LOG):
+        if (folder / log).exists():
+            raise ConfigError(
+                f"{folder}: has a {log} without {RESULT}; choose another --out."
+            )
     write_result(folder, protocol, complete=False)
 
 
@@ -100,21 +100,27 @@ def drive_all(
     drive_rest: Callable[[list[Trial]], Iterable[Row]],
     tell: Tell,
 ) -> list[Row]:
-    """Drives what a log lacks, and returns all rows. Raises ConfigError for another log."""
+    """Drives what a log lacks, and returns its rows in order. Raises ConfigError for another log.
+
+    A trial that gives no row is tried again by the next run.
+    """
     log.touch()
-    rows, size = read_rows(log, trials)
     with log.open("r+b") as file:
+        lock_file(log, file)
+        rows, size = read_rows(log, trials)
         file.truncate(size)  # a killed run may have left part of a line
         file.seek(size)
         tell(len(rows), len(trials))
-        for row in drive_rest(trials[len(rows) :]):
+        done = {_read_trial(row) for row in rows}
+        for row in drive_rest([trial for trial in trials if trial not in done]):
             line = format_json(row)
             file.write(line.encode() + b"\n")
             file.flush()
             os.fsync(file.fileno())
             rows.append(json.loads(line))
             tell(len(rows), len(trials))
-    return rows
+    numbers = {trial: number for number, trial in enumerate(trials)}
+    return sorted(rows, key=lambda row: numbers[_read_trial(row)])
 
 
 def read_rows(log: Path, trials: list[Trial]) -> tuple[list[Row], int]:
@@ -125,14 +131,17 @@ def read_rows(log: Path, trials: list[Trial]) -> tuple[list[Row], int]:
 
 
 def _parse(log: Path, lines: list[bytes], trials: list[Trial]) -> Iterator[Row]:
-    for number, line in enumerate(lines):
+    left = set(trials)
+    for number, line in enumerate(lines, 1):
         try:
             row = json.loads(line)
-            if Trial(**{name: row[name] for name in Trial._fields}) == trials[number]:
-                yield row
-                continue
-        except (ValueError, KeyError, TypeError, IndexError):
-            pass
-        raise ConfigError(
-            f"{log}: line {number + 1} is no episode of this run; choose another --out."
-        )
+            left.remove(_read_trial(row))
+        except (ValueError, KeyError, TypeError):
+            raise ConfigError(
+                f"{log}: line {number} is no episode of this run; choose another --out."
+            ) from None
+        yield row
+
+
+def _read_trial(row: Row) -> Trial:
+    return Trial(**{name: row[name] for name in Trial._fields})

@@ -48,7 +48,6 @@ def fault(seed, **changes):
         "seed": seed,
         "gated": True,
         "fault": True,
-        "injected": True,
         "in_time": True,
         **changes,
     }

@@ -36,6 +36,21 @@ def test_a_robot_that_drives_into_something_is_in_contact():
     assert place.outcome.speed == pytest.approx(0.5, abs=0.1)
 
 
+def test_a_robot_that_turns_a_corner_into_a_wall_is_in_contact():
+    place = Place(builtin_model("jackal"), "empty")
+    place.begin(Job("ram", 0))
+    simulator = place._sim
+    still = np.zeros(simulator.data.state.shape[-1])
+    wall = place.truth.walls[:, [0, 2]].max()
+    beside = np.array([wall - 0.28, 0.0, 0.0])  # half its length is 0.254 m
+    simulator.put_robot(0, beside, still)
+    place.track = [beside]
+    while not (place.outcome.contact or place.outcome.walked_into):
+        place.step(np.array([0.0, 0.0, 2.5]))
+    assert place.outcome.contact
+    assert place.outcome.speed > 0.1  # of the corner
+
+
 @pytest.mark.parametrize("robot", ["differential", "turtlebot3_burger"])
 def test_the_steps_of_the_world_divide_the_control_period(robot):
     place = Place(builtin_model(robot), "arena")

@@ -5,7 +5,14 @@ from dataclasses import replace
 import pytest
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.gate.assurance.protocol import KINDS, NO_GATE
+from nics_drl_bridge.gate.assurance.protocol import (
+    CLAIMS,
+    KINDS,
+    LIMITS,
+    NO_GATE,
+    choose_claims,
+)
+from nics_drl_bridge.robot.spec import load_robot
 
 from .samples import FAULTS, PROTOCOL
 
@@ -54,6 +61,14 @@ def test_another_protocol_has_another_hash_and_is_refused_by_its_difference(
     with pytest.raises(ConfigError, match=name):
         other.check_same(PROTOCOL.data, "runs/assure")
     PROTOCOL.check_same(PROTOCOL.data, "runs/assure")
+
+
+def test_of_a_car_by_turn_rate_only_values_are_claimed():
+    car = load_robot("ackermann")
+    assert choose_claims(car) == CLAIMS
+    by_turn_rate = car.model_copy(update={"angular_is": "turn_rate"})
+    assert "rate" in CLAIMS[LIMITS]
+    assert "rate" not in choose_claims(by_turn_rate)[LIMITS]
 
 
 def test_only_a_seed_of_the_run_is_found():

@@ -58,6 +58,8 @@ def test_a_control_counts_for_itself_and_a_claim_without_trials_is_not_tested():
     assert results["claims"][TOUCHES]["failures"] == 0
     assert results["claims"][TOUCHES]["trials"] == results["episodes"] == 2
     assert results["control"][TOUCHES]["failures"] == 1
+    assert results["claims"][TOUCHES]["one_sided"]
+    assert not results["control"][TOUCHES]["one_sided"]
     assert results["claims"][STOPS]["trials"] == 0
     assert results["failures"] == []
     assert results["walked_into"] == 1
@@ -68,11 +70,9 @@ def test_in_a_run_that_is_a_control_its_failures_are_kept():
     assert [failed["seed"] for failed in results["failures"]] == [1]
 
 
-def test_a_fault_counts_for_stopping_and_one_that_was_not_injected_for_nothing():
-    not_injected = fault(9, injected=False)
-    del not_injected["in_time"]
+def test_a_fault_counts_for_stopping_and_those_without_a_row_were_not_injected():
     late = fault(8, in_time=False)
-    results = summarise([row(1), fault(7), late, not_injected])
+    results = summarise([row(1), fault(7), late], faults=3)
     assert results["claims"][STOPS]["trials"] == 2
     assert results["claims"][STOPS]["failures"] == 1
     assert results["claims"][TOUCHES]["trials"] == 1

@@ -25,7 +25,7 @@ def test_a_line_that_a_killed_run_left_unfinished_is_dropped(tmp_path):
     ("lines", "number"),
     [
         ([LINES[0], b"\0\0\n"], 2),
-        ([LINES[1]], 1),
+        ([LINES[0], LINES[0]], 2),
         ([LINES[0], b"[]\n"], 2),
         ([*LINES, LINES[0]], 5),
     ],
@@ -37,6 +37,39 @@ def test_a_log_of_other_episodes_is_refused_by_its_line(tmp_path, lines, number)
         runs.read_rows(log, TRIALS)
 
 
+def test_a_trial_that_gave_no_row_is_tried_again(tmp_path):
+    asked = []
+
+    def fail_at(failing):
+        def drive(trials):
+            asked.append(list(trials))
+            yield from (one._asdict() for one in trials if one != failing)
+
+        return drive
+
+    def run(failing):
+        log = tmp_path / runs.FAULT_LOG
+        return runs.drive_all(log, TRIALS, fail_at(failing), lambda *_: None)
+
+    assert run(failing=TRIALS[1]) == [
+        one._asdict() for one in TRIALS if one != TRIALS[1]
+    ]
+    assert run(failing=None) == [one._asdict() for one in TRIALS]
+    assert asked == [TRIALS, [TRIALS[1]]]
+
+
+def test_a_log_that_another_run_writes_is_refused(tmp_path):
+    log = tmp_path / runs.LOG
+
+    def drive_twice(trials):
+        with pytest.raises(ConfigError, match="another process writes it"):
+            runs.drive_all(log, TRIALS, iter, lambda *_: None)
+        return iter([])
+
+    runs.drive_all(log, TRIALS, drive_twice, lambda *_: None)
+    runs.drive_all(log, TRIALS, lambda trials: [], lambda *_: None)  # free again
+
+
 def test_the_protocol_is_on_disk_with_its_hash_before_any_episode(tmp_path):
     runs.begin(tmp_path, PROTOCOL)
     written = runs.read_result(tmp_path)
@@ -46,8 +79,9 @@ def test_the_protocol_is_on_disk_with_its_hash_before_any_episode(tmp_path):
     runs.begin(tmp_path, PROTOCOL)  # the same again
 
 
-def test_a_log_without_its_protocol_is_refused(tmp_path):
-    (tmp_path / runs.LOG).touch()
+@pytest.mark.parametrize("log", [runs.LOG, runs.FAULT_LOG])
+def test_a_log_without_its_protocol_is_refused(tmp_path, log):
+    (tmp_path / log).touch()
     with pytest.raises(ConfigError, match="without assurance"):
         runs.begin(tmp_path, PROTOCOL)
 
