@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from measuring.rates import interleaved, shortest
 from nics_drl_bridge.lidar import map_kernels
-from nics_drl_bridge.lidar.beam_kernels import INF, LidarPose, finish
+from nics_drl_bridge.lidar.beam_kernels import INF, LidarPose
 from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.scan_kernels import scan_scratch
 
@@ -104,7 +104,8 @@ def run(
             scratch.singles,
             scratch.integers,
         )
-        finish(out[n], scratch.scan, 0.0, range_max)
+        distances = scratch.scan.view(np.float32)[: out.shape[1]]
+        out[n] = np.minimum(distances, np.float32(range_max))
 
 
 def scan_map(
@@ -115,4 +116,4 @@ def scan_map(
     scratch = scan_scratch(beams.directions.shape[1])
     call = partial(run, out, beams, at, range_max, arrays, walk, scratch)
     seconds = shortest(interleaved({"scan": call}, REPEATS))["scan"]
-    return np.minimum(out, range_max), len(at) / seconds
+    return out, len(at) / seconds
