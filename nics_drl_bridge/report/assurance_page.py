@@ -164,7 +164,10 @@ def _make_failures(
         )
     heads = ("claim", "driver or fault", "world", "near x, y [m]", "failures", "seeds")
     count = f"Failed trials: {len(results['failures']):,}. Clusters: {len(clusters):,}."
-    told = "Replay one by its seed. An episode is the same bit for bit, and drawn:"
+    told = (
+        "Replay one by its seed. An episode is the same bit for bit, and drawn; a fault is "
+        "injected again, at another moment:"
+    )
     return [
         html.make_paragraph(count),
         html.make_table(heads, rows),
