@@ -60,9 +60,111 @@ class World(NamedTuple):
     first: int  # index of the first robot
     scene: Surroundings
     tight: Tight
-    touched: Array  # (M,) 1 for robots in contact
+    touched: Array  # (M,) 1 for robots that have touched something in this episode
     series: Array  # see `robot.kernels`
     period: float  # [s]
+
+
+@kernel
+def find_near(
+    n: int,
+    m: int,
+    bodies: Array,
+    scene: Surroundings,
+    near: Integers,
+    reach: Array,
+    cells: BodyCells,
+) -> int:
+    """Return flags of what robot m of world n may meet; write row m of `near`."""
+    walls = scene.walls
+    me = bodies.shape[1] - len(near) + m
+    x = bodies[n, me, X]
+    y = bodies[n, me, Y]
+    own_reach = reach[me]
+    count = 0
+    standing = bodies.shape[1] - len(near) if scene.standing else 0
+    for f in range(collision.find_around(n, x, y, own_reach, cells)):
+        k = cells.found[f]
+        other_reach = bodies[n, k, RADIUS] if k < standing else reach[k]
+        dx = bodies[n, k, X] - x
+        dy = bodies[n, k, Y] - y
+        far = own_reach + other_reach
+        if dx * dx + dy * dy <= far * far and k != me and other_reach > 0.0:
+            # in order of the bodies, with cells or without: the bits of a contact depend on it
+            i = min(count, SEVERAL)
+            while count < SEVERAL and i > 0 and near[m, i] > k:
+                near[m, 1 + i] = near[m, i]
+                i -= 1
+            if count < SEVERAL:
+                near[m, 1 + i] = k
+            count += 1
+    near[m, 0] = count
+    meets = BODIES if count > 0 else FREE
+    for w in range(len(walls)):
+        if collision.wall_distance2(x, y, walls[w]) <= own_reach * own_reach:
+            meets |= WALLS
+            break
+    if (
+        collision.map_bound(bodies[n, me], scene.grid)
+        <= own_reach - bodies[n, me, RADIUS]
+    ):
+        meets |= MAP  # without a map, the bound is inf
+    return meets
+
+
+@kernel
+def advance(begin: float, duration: float, obstacles_move: bool, world: World) -> None:
+    """Move the robots that may meet something, and the obstacles, by a duration [s]."""
+    meets = world.tight.meets
+    motions = world.tight.motions
+    robots = len(meets)
+    fastest = _find_fastest(obstacles_move, world)
+    world.tight.fastest[0] = fastest
+    # Robots that are judged at nearly the same time are judged together: there are fewer steps.
+    early = np.inf
+    for m in range(robots):
+        if meets[m] != FREE:
+            speed = motions[m].bound + fastest
+            is_far = motions[m].room > speed * duration
+            motions[m].clock = np.inf if is_far else 0.0
+            motions[m].room -= speed * duration
+            early = min(early, 0.5 * FLOOR / speed)
+    time = 0.0
+    while time < duration:
+        end = duration
+        for m in range(robots):
+            if meets[m] != FREE:
+                if motions[m].clock <= time + early:
+                    _judge(m, begin, time, duration - time, world)
+                end = min(end, motions[m].clock)
+        if obstacles_move:
+            place_obstacles(begin + end, world)
+        for m in range(robots):
+            if meets[m] != FREE:
+                _place_robot(motions[m], world.bodies[world.first + m], end, world)
+        is_halted = True
+        while is_halted:  # robots that would overlap something
+            is_halted = False
+            for m in range(robots):
+                if meets[m] != FREE and motions[m].touches:
+                    is_halted |= _halt(m, begin, time, end, world)
+        time = end
+
+
+@kernel
+def _find_fastest(obstacles_move: bool, world: World) -> float:
+    """Greatest speed of any body but an only robot [m/s]."""
+    meets = world.tight.meets
+    fastest = 0.0
+    for k in range(world.first if obstacles_move else 0):
+        vx = world.velocity[k, 0]
+        vy = world.velocity[k, 1]
+        rim = abs(world.velocity[k, 2]) * world.bodies[k, RADIUS]
+        fastest = max(fastest, math.sqrt(vx * vx + vy * vy) + rim)
+    for m in range(len(meets) if len(meets) > 1 else 0):
+        if meets[m] != FREE:
+            fastest = max(fastest, world.tight.motions[m].bound)
+    return fastest
 
 
 @kernel
@@ -310,108 +412,6 @@ def _halt(m: int, begin: float, time: float, end: float, world: World) -> bool:
     _place_robot(motion, body, end, world)
     motion.halts += 1
     return True
-
-
-@kernel
-def _find_fastest(obstacles_move: bool, world: World) -> float:
-    """Greatest speed of any body but an only robot [m/s]."""
-    meets = world.tight.meets
-    fastest = 0.0
-    for k in range(world.first if obstacles_move else 0):
-        vx = world.velocity[k, 0]
-        vy = world.velocity[k, 1]
-        rim = abs(world.velocity[k, 2]) * world.bodies[k, RADIUS]
-        fastest = max(fastest, math.sqrt(vx * vx + vy * vy) + rim)
-    for m in range(len(meets) if len(meets) > 1 else 0):
-        if meets[m] != FREE:
-            fastest = max(fastest, world.tight.motions[m].bound)
-    return fastest
-
-
-@kernel
-def advance(begin: float, duration: float, obstacles_move: bool, world: World) -> None:
-    """Move the robots that may meet something, and the obstacles, by a duration [s]."""
-    meets = world.tight.meets
-    motions = world.tight.motions
-    robots = len(meets)
-    fastest = _find_fastest(obstacles_move, world)
-    world.tight.fastest[0] = fastest
-    # Robots that are judged at nearly the same time are judged together: there are fewer steps.
-    early = np.inf
-    for m in range(robots):
-        if meets[m] != FREE:
-            speed = motions[m].bound + fastest
-            is_far = motions[m].room > speed * duration
-            motions[m].clock = np.inf if is_far else 0.0
-            motions[m].room -= speed * duration
-            early = min(early, 0.5 * FLOOR / speed)
-    time = 0.0
-    while time < duration:
-        end = duration
-        for m in range(robots):
-            if meets[m] != FREE:
-                if motions[m].clock <= time + early:
-                    _judge(m, begin, time, duration - time, world)
-                end = min(end, motions[m].clock)
-        if obstacles_move:
-            place_obstacles(begin + end, world)
-        for m in range(robots):
-            if meets[m] != FREE:
-                _place_robot(motions[m], world.bodies[world.first + m], end, world)
-        is_halted = True
-        while is_halted:  # robots that would overlap something
-            is_halted = False
-            for m in range(robots):
-                if meets[m] != FREE and motions[m].touches:
-                    is_halted |= _halt(m, begin, time, end, world)
-        time = end
-
-
-@kernel
-def find_near(
-    n: int,
-    m: int,
-    bodies: Array,
-    scene: Surroundings,
-    near: Integers,
-    reach: Array,
-    cells: BodyCells,
-) -> int:
-    """Return flags of what robot m of world n may meet; write row m of `near`."""
-    walls = scene.walls
-    me = bodies.shape[1] - len(near) + m
-    x = bodies[n, me, X]
-    y = bodies[n, me, Y]
-    own_reach = reach[me]
-    count = 0
-    standing = bodies.shape[1] - len(near) if scene.standing else 0
-    for f in range(collision.find_around(n, x, y, own_reach, cells)):
-        k = cells.found[f]
-        other_reach = bodies[n, k, RADIUS] if k < standing else reach[k]
-        dx = bodies[n, k, X] - x
-        dy = bodies[n, k, Y] - y
-        far = own_reach + other_reach
-        if dx * dx + dy * dy <= far * far and k != me and other_reach > 0.0:
-            # in order of the bodies, with cells or without: the bits of a contact depend on it
-            i = min(count, SEVERAL)
-            while count < SEVERAL and i > 0 and near[m, i] > k:
-                near[m, 1 + i] = near[m, i]
-                i -= 1
-            if count < SEVERAL:
-                near[m, 1 + i] = k
-            count += 1
-    near[m, 0] = count
-    meets = BODIES if count > 0 else FREE
-    for w in range(len(walls)):
-        if collision.wall_distance2(x, y, walls[w]) <= own_reach * own_reach:
-            meets |= WALLS
-            break
-    if (
-        collision.map_bound(bodies[n, me], scene.grid)
-        <= own_reach - bodies[n, me, RADIUS]
-    ):
-        meets |= MAP  # without a map, the bound is inf
-    return meets
 
 
 @kernel

@@ -4,9 +4,9 @@
 
 1. `_begin_period_of_world` saves the robots' poses, and chooses the velocities of the obstacles.
 2. `move_freely` moves all robots of the block side by side, as if nothing stood in their way.
-3. `_move_world` takes that motion for robots that can meet nothing, and moves the obstacles. A
-   robot that may meet something is moved carefully instead, from where it stood, see
-   `contact_kernels`. All robots then drift.
+3. `_move_world` takes that motion for robots that can meet nothing, adds their drift, and moves
+   the obstacles. If a robot may meet something, `_move_carefully` moves and drifts it instead, from
+   where it stood, see `contact_kernels`.
 4. `_measure_world` measures the odometry.
 5. Each robot scans, and its lidar's faults are applied, see `sensing_kernels`.
 
@@ -163,6 +163,7 @@ def _step_part(part: Part, commands: Array, first_world: int) -> None:
     robots = data.pose.shape[1]
     end_world = first_world + len(commands)
     _queue_commands(data.history, commands, first_world, part.motion.terms.curves)
+    # A block fills the lanes. In a shorter last block, the other lanes are moved to no effect.
     worlds_per_block = part.scratch.lanes.pose.shape[1] // robots
     for block_begin in range(first_world, end_world, worlds_per_block):
         block_end = min(block_begin + worlds_per_block, end_world)
@@ -235,7 +236,10 @@ def _begin_period_of_world(n: int, first_lane: int, part: Part) -> None:
 
 @kernel(inline=True)
 def _measure_world(n: int, first_lane: int, scene: Surroundings, part: Part) -> None:
-    """Put the robots' bodies at their present poses, and measure their odometry."""
+    """Put the robots' bodies at their present poses, and measure their odometry.
+
+    In a crowd, the cells also take note of how far a body moved.
+    """
     data = part.data
     motion = part.motion
     single = part.scratch.single
@@ -419,7 +423,7 @@ def _move_carefully(
             ahead, left, turn = draw_drift(n, m, data, motion)
             contacts.start_motion(m, ahead, left, turn, world)
             drifts = drifts or ahead != 0.0 or left != 0.0 or turn != 0.0
-    if drifts:
+    if drifts:  # a displacement is a twist over one second; the obstacles stay
         contacts.advance(motion.substeps * motion.dt, 1.0, False, world)
     for m in range(len(meets)):
         if meets[m] != FREE:
@@ -466,7 +470,7 @@ def draw_drift(
 
     The drift grows with root time. Draws are uniform, up to sqrt(3) standard deviations, because
     that is cheap; over some periods they add up to a normal distribution. The state stays within
-    the bounds of the model. A robot that touches something does not drift.
+    the bounds of the model. A robot that has touched something does not drift in that episode.
     """
     if data.collided[n, m] != 0:
         return 0.0, 0.0, 0.0
