@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from nics_drl_bridge.policy.train import run as train
+from nics_drl_bridge.policy.train.progress import Progress
 from nics_drl_bridge.policy.train.settings import chosen_settings
 from nics_drl_bridge.report.pictures import Point, draw_training_curve
 
@@ -16,7 +17,7 @@ def main() -> None:
     settings = chosen_settings("navigation", "demo", changes)
     curve = []
 
-    def tell(progress: train.checkpoints.Progress) -> None:
+    def tell(progress: Progress) -> None:
         curve.append(Point(progress.steps, progress.success, progress.collision))
 
     result = train.run(

@@ -164,7 +164,7 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
                 if value is not None:
                     options[name] = value
             backend = make_backend(backend, self.model, self.world, **options)
-        self._backend = complete_backend(backend, self._get_row(self._rest))
+        self._backend = complete_backend(backend, self._drop_robot_axis(self._rest))
 
     @guard_call
     def reset(
@@ -197,11 +197,11 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
         memory = guard.begin_task(
             self.task, episodes, options, [self.scene], self.world, "start"
         )
-        self._view = self._lift(
-            self._backend.reset(Start(episode, self._get_row(starts)))
+        self._view = self._as_batch(
+            self._backend.reset(Start(episode, self._drop_robot_axis(starts)))
         )
         if self._direct is not None:
-            self._view = self._direct[0]
+            self._view = self._direct.view
         self.memory = memory
         self._commands = self._rest[None]
         self._facts = {}
@@ -209,17 +209,17 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
         self.ended = np.zeros(self.robots, np.bool_)
         facts: Info = {
             "episode_seed": episode,
-            "start": self._get_row(starts),
+            "start": self._drop_robot_axis(starts),
         }
         facts["bodies"] = self.scene.bodies.copy()
         drawn = self._backend.facts().get("randomisation")
         if drawn:
             facts["randomisation"] = drawn
-        seen = self.task.observation(self._view, self.memory)
-        self.task.check_result("observation", seen, self._shape)
+        observation = self.task.observation(self._view, self.memory)
+        self.task.check_result("observation", observation, self._shape)
         if self.render_mode == "human":
             self.render()
-        return seen.reshape(-1), self._make_info(self._view, facts)
+        return observation.reshape(-1), self._make_info(self._view, facts)
 
     def _try_task(self, episodes: Episodes) -> None:
         """Runs the task once before the robot moves: it is too slow to compile while driving."""
@@ -277,16 +277,16 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
         self._steps += 1
         direct = self._direct
         if direct is not None:
-            if not direct.take_action(action):
+            if not direct.try_action(action):
                 direct.commands[...] = self._make_commands(action)
             self._commands = direct.commands
             observation, terms, ended, info = direct.advance(self.memory)
             self.ended[0] = ended
             return observation, terms, info
         self._commands = self._make_commands(action)
-        seen, facts = self._backend.step(self._commands[self._row])
+        measured, facts = self._backend.step(self._commands[self._row])
         self._facts = facts
-        view = self._lift(seen)
+        view = self._as_batch(measured)
         out = np.empty(self._shape, np.float32)
         outcome = self.task.take_step(out, before, view, self.memory)
         if self.robots > 1:
@@ -318,7 +318,7 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
         self._view = None
         self._backend.halt()
 
-    def _lift(self, view: RobotView) -> RobotView:
+    def _as_batch(self, view: RobotView) -> RobotView:
         lead = (1, self.robots, -1)
         sensed = {name: reading.reshape(lead) for name, reading in view.sensed.items()}
         return RobotView(
@@ -332,7 +332,7 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
             view.sensed_age_s,
         )
 
-    def _get_row(self, rows: AnyArray) -> AnyArray:
+    def _drop_robot_axis(self, rows: AnyArray) -> AnyArray:
         return rows[0] if self.robots == 1 else rows
 
     def _make_info(self, view: RobotView, facts: Info) -> Info:

@@ -17,8 +17,8 @@ class DirectSteps(NamedTuple):
 
     view: RobotView  # what the robot knows, (1, 1)
     commands: Array  # (1, 1, C) of the next step
-    # writes `commands`; returns False if an action is for `Task.drive`, or wrong
-    take_action: Callable[[Any], bool]
+    # writes `commands`; False: the action is for `Task.drive`, which also says what is wrong
+    try_action: Callable[[Any], bool]
     advance: Callable[[Memory], Any]  # moves the robot; the rest as BoundStep
 
 
@@ -59,7 +59,7 @@ def bind_steps(backend: Backend, task: Task) -> DirectSteps | None:
 
 
 def _bind_actions(task: Task, commands: Array) -> Callable[[Any], bool]:
-    """Returns `DirectSteps.take_action`."""
+    """Returns `DirectSteps.try_action`."""
     row = np.zeros(commands.shape[2])
     scale = bind(kernels.scale_actions, commands[0], row[None], *task.command_limits)
 

@@ -173,21 +173,21 @@ def check_places(
 ) -> None:
     """Raises ConfigError for starts or goals (n, ..., 2 or 3) off the field or in a wall.
 
-    Starts (`radius` > 0) may not overlap an obstacle of the n scenes either.
+    Starts (`radius` > 0) may not overlap an obstacle in every one of the n scenes either.
     """
-    free = not radius
+    is_free_somewhere = not radius
     for scene, rows in zip(scenes, places, strict=True):
         member = world.members[int(np.asarray(scene.member))]
         at = rows.reshape(-1, rows.shape[-1])
         for x, y in at[:, :2].tolist():
             check_place(f"reset option {option!r}", member, x, y, radius)
         shapes = world.shapes
-        free = free or not any(
+        is_free_somewhere = is_free_somewhere or not any(
             _is_on(x, y, radius, body, shapes)
             for x, y in at[:, :2].tolist()
             for body in scene.bodies
         )
-    if not free and len(places):
+    if not is_free_somewhere and len(places):
         raise ConfigError(
             f"reset option {option!r}: {at.tolist()} is on an obstacle; move "
             "it, or use another seed."

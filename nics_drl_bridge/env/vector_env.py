@@ -145,7 +145,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
         self._out = np.zeros((count, robots, parts), np.float32)
         self._reward = np.zeros((count, robots))
         self.ended = np.zeros((count, robots), np.bool_)
-        self._over = np.zeros(count, np.bool_)
+        self._awaits_reset = np.zeros(count, np.bool_)
         self._first = np.zeros(count, np.int64)
         self._episode = np.full(count, -1)
         self._starts = np.zeros((count, robots, 3))
@@ -163,12 +163,11 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
         """Arrays that change from step to step, by name; see `policy.train.checkpoint`."""
         own = {
             "ended": self.ended,
-            "over": self._over,
+            "awaits_reset": self._awaits_reset,
             "first": self._first,
             "episode": self._episode,
             "starts": self._starts,
             "bodies": self._bodies,
-            "goals": self.simulator.goals,
         }
         data = {
             # Tensors have no structures, so that checkpoints hold the numbers of these.
@@ -272,7 +271,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
                 )
             self.memory[name][worlds] = rows
         self.ended[worlds] = False
-        self._over[worlds] = False
+        self._awaits_reset[worlds] = False
         seen = self.task.observation(self._make_view(worlds), fresh)
         out[worlds] = self.task.check_result(
             "observation", seen, (len(worlds), *out.shape[1:])
@@ -301,44 +300,48 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
         )
         self.ready = False
         out = np.empty_like(self._out) if self.copy else self._out
-        begun = self._over.copy()  # these worlds are reset and ignore their action
+        # In `NextStep`, worlds whose episode was over begin another. They are stepped with the
+        # others, and the outcome is dropped.
+        resetting = self._awaits_reset.copy()
         run = self.simulator.run_parts
         outcome = join_outcomes(
-            run(lambda part: self._advance(part, given[part], out, begun))
+            run(lambda part: self._advance(part, given[part], out, resetting))
         )
-        terminated = self.ended.all(axis=1) & ~begun
-        truncated = (self.simulator.data.steps >= self._limit) & ~begun
+        terminated = self.ended.all(axis=1) & ~resetting
+        truncated = (self.simulator.data.steps >= self._limit) & ~resetting
         rewards = total(self._reward)
-        reward = np.where(begun, 0.0, rewards)
-        over = terminated | truncated
+        reward = np.where(resetting, 0.0, rewards)
+        done = terminated | truncated
         infos: Info = {}
         facts = {
             "stamp_ns": self.simulator.data.steps * self._period_ns,
-            "true_pose": self._get_row(self.simulator.data.pose).copy(),
-            "true_collision": self._get_row(self.simulator.data.collided).astype(
-                np.bool_
-            ),
+            "true_pose": self._drop_robot_axis(self.simulator.data.pose).copy(),
+            "true_collision": self._drop_robot_axis(
+                self.simulator.data.collided
+            ).astype(np.bool_),
             **{
-                name: self._get_row(values).copy()
+                name: self._drop_robot_axis(values).copy()
                 for name, values in outcome.info.items()
             },
             "reward_terms": {
-                name: self._get_row(t).copy() for name, t in outcome.terms.items()
+                name: self._drop_robot_axis(t).copy()
+                for name, t in outcome.terms.items()
             },
         }
         if self._mode is AutoresetMode.NEXT_STEP:
-            self._over = over
-            self._tell(infos, facts, begun)
+            self._awaits_reset = done
+            self._add_infos(infos, facts, resetting)
         else:
-            if over.any():
-                infos |= self._get_final(flatten(out), over, facts)
-                run(lambda p: self._begin(p.start + np.flatnonzero(over[p]), out))
-            self._tell(infos, facts, over)
+            if done.any():
+                infos |= self._get_final(flatten(out), done, facts)
+                self._repeat_failed(done, facts)
+                run(lambda p: self._begin(p.start + np.flatnonzero(done[p]), out))
+            self._add_infos(infos, facts, done)
         self.ready = True
         return flatten(out), reward, terminated, truncated, infos
 
     def _advance(
-        self, part: slice, actions: AnyArray, out: Observation, begun: Flags
+        self, part: slice, actions: AnyArray, out: Observation, resetting: Flags
     ) -> Outcome:
         data = self.simulator.data
         ended = self.ended[part]
@@ -362,38 +365,44 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
         nothing = np.zeros(ended.shape)
         self._reward[part] = sum(outcome.terms.values(), nothing)
         self.ended[part] = ended | outcome.ended
-        self._begin(part.start + np.flatnonzero(begun[part]), out)
+        self._begin(part.start + np.flatnonzero(resetting[part]), out)
         return outcome
 
-    def _get_final(self, rows: Observation, over: Flags, facts: Info) -> Info:
-        """Returns the last observation and info of ended worlds; notes which of them repeat."""
-        shown = np.full(self.num_envs, None, dtype=object)
+    def _get_final(self, rows: Observation, done: Flags, facts: Info) -> Info:
+        """Returns the last observation and info of the worlds that are done."""
+        observations = np.full(self.num_envs, None, dtype=object)
         # Only for ended worlds, because each needs its own object.
-        for n in np.flatnonzero(over):
-            shown[n] = rows[n].copy()
-        if self._teacher is not None:
-            success = facts.get("is_success", over)
-            success = success.reshape(self.num_envs, -1).all(axis=1)
-            self._episode[self._teacher.find_repeats(over, success)] -= 1
+        for n in np.flatnonzero(done):
+            observations[n] = rows[n].copy()
         final = self._get_known() | facts
-        final_info = add_masks({"final_info": final}, over, True)
-        return add_masks({"final_obs": shown}, over) | final_info
+        final_info = add_masks({"final_info": final}, done, True)
+        return add_masks({"final_obs": observations}, done) | final_info
 
-    def _tell(self, infos: Info, facts: Info, begun: Flags) -> None:
-        infos |= add_masks(self._get_known(), np.ones_like(begun))
-        some = bool(begun.any())
-        if some:
-            infos |= add_masks(self._get_beginnings(), begun, True)
-        if not begun.all():
-            infos |= add_masks(facts, ~begun, some)
+    def _repeat_failed(self, done: Flags, facts: Info) -> None:
+        """Makes the teacher's choice of failed episodes begin again, from the same seed."""
+        if self._teacher is None:
+            return
+        # A task that tells no success never fails.
+        success = facts.get("is_success", done)
+        success = success.reshape(self.num_envs, -1).all(axis=1)
+        self._episode[self._teacher.find_repeats(done, success)] -= 1
+
+    def _add_infos(self, infos: Info, facts: Info, fresh: Flags) -> None:
+        infos |= add_masks(self._get_known(), np.ones_like(fresh))
+        any_fresh = bool(fresh.any())
+        if any_fresh:
+            infos |= add_masks(self._get_beginnings(), fresh, True)
+        if not fresh.all():
+            infos |= add_masks(facts, ~fresh, any_fresh)
 
     # Facts as arrays (N, ...) for worlds with one robot, or (N, M, ...) for teams.
 
     def _get_known(self) -> Info:
         known = {
-            name: self._get_row(self.memory[name]).copy() for name in self.task.shown
+            name: self._drop_robot_axis(self.memory[name]).copy()
+            for name in self.task.shown
         }
-        known["pose"] = self._get_row(self.simulator.data.odom).copy()
+        known["pose"] = self._drop_robot_axis(self.simulator.data.odom).copy()
         known["scan_age_s"] = np.zeros(self.num_envs)
         known["odom_age_s"] = np.zeros(self.num_envs)
         return known
@@ -401,18 +410,18 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
     def _get_beginnings(self) -> Info:
         beginnings: Info = {
             "episode_seed": self.simulator.data.seeds,
-            "start": self._get_row(self._starts),
+            "start": self._drop_robot_axis(self._starts),
             "bodies": self._bodies,
         }
         drawn = dict(self.simulator.drawn)
         for name, values in drawn.items():
             if values.ndim > 1:
-                drawn[name] = self._get_row(values)
+                drawn[name] = self._drop_robot_axis(values)
         if drawn:
             beginnings["randomisation"] = drawn
         return beginnings
 
-    def _get_row(self, rows: AnyArray) -> AnyArray:
+    def _drop_robot_axis(self, rows: AnyArray) -> AnyArray:
         return rows[:, 0] if self.robots == 1 else rows
 
     def close_extras(self, **_: Any) -> None:

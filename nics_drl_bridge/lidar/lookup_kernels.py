@@ -7,10 +7,10 @@ phi = heading - b. A beam at the angle a has the range
     r(a) = R(d, phi, a - b),
 
 where R(d, phi, .) is the scan of the shape straight ahead at the distance d, rotated by phi. The
-table holds R at grid distances d_i and grid rotations phi_j as rows of points at the angles c_p. A
-look-up takes the nearest grid rotation phi_j. It finds i and p with d_i <= d < d_(i+1) and
-c_p <= a - b < c_(p+1), where c_p is p fractions of a beam away from the bearing, and blends
-linearly over distance and angle:
+table holds R at grid distances d_i, which begin at the radius of the shape, and grid rotations
+phi_j as rows of points at the angles c_p, which are p / phases beams away from the bearing. A
+look-up takes the nearest grid rotation phi_j, finds i and p with d_i <= d < d_(i+1) and
+c_p <= a - b < c_(p+1), and blends linearly over distance and angle:
 
     r_i(a) = (1 - v) R(d_i, phi_j, c_p) + v R(d_i, phi_j, c_(p+1))    v: weight of the next point
     r(a)   = (1 - w) r_i(a) + w r_(i+1)(a)                            w: weight of the far row
@@ -49,7 +49,7 @@ class TableShape:
     distances_per_metre: float  # grid distances
     rotations: float  # grid rotations in a full turn, 0 for a circle
     # A period is the smallest rotation after which the shape looks the same.
-    periods_per_rotation: float
+    periods_per_grid_rotation: float
     first_cell: int
     cells_per_period: int
     second_hull: int  # first corner of the second copy of its hull
@@ -65,7 +65,7 @@ ROW_START, ROW_EXTENT, RIGHT_CORNERS, LEFT_CORNERS = range(4)
 RIGHT, LEFT = 1.0, -1.0
 # Beams are fused in blocks of so many, at least two: a varying number mispredicts a branch.
 BLOCK = 16
-FEWEST = 2 * BLOCK
+LEAST_FUSED = 2 * BLOCK
 
 
 class TableArrays(NamedTuple):
@@ -77,7 +77,9 @@ class TableArrays(NamedTuple):
     # row's first beam, counted from the bearing, and its width in beams, as two shorts; the corners
     # for the right and the left silhouette, see `find_silhouette`
     cells: ShortIntegers
-    rows: Singles  # (R,) ranges [m]; in a row all points of one phase, then those of the next
+    # (R,) ranges [m]; in a row all points of one phase, then those of the next. Padded, because
+    # whole blocks of beams are fused
+    rows: Singles
     shift: int  # log2 of the phases, which are the points per beam
     hulls: Array  # (sum V, 2) corners [m], see `shapes.Outlines`; each hull twice
 
@@ -127,8 +129,9 @@ def look_up_body(
     turns -= np.floor(turns)
     j = np.int32(turns * shape.rotations + 0.5)
     j = np.int32(max(min(j, np.int32(shape.rotations)), np.int32(0)))
-    # Only one period of the rotational symmetry is in the table.
-    period = np.int32((j + 0.5) * shape.periods_per_rotation)
+    # Only one period of the rotational symmetry is in the table: the cell of (i, j) is
+    # first_cell + (j - its grid rotations before this period) * distances + i.
+    period = np.int32((j + 0.5) * shape.periods_per_grid_rotation)
     place = shape.first_cell - period * shape.cells_per_period
     place += j * table.distances + i
     hull = shape.second_hull - period * shape.corners_per_period
@@ -169,7 +172,7 @@ def look_up_body(
 
 @kernel(contracts=True)
 def fuse_look_ups(scan: ShortIntegers, rows: Singles, found: Any) -> None:
-    """Lower the beams of a scan (B + FEWEST,) to what was found (L,): r(a), and Eq. 4.
+    """Lower the beams of a scan (B + LEAST_FUSED,) to what was found (L,): r(a), and Eq. 4.
 
     Whole blocks of beams are fused, also beyond the last beam.
     """
@@ -183,7 +186,7 @@ def fuse_look_ups(scan: ShortIntegers, rows: Singles, found: Any) -> None:
         hits = part.hits
         next_weight = part.next_weight
         far_weight = part.far_weight
-        for k in range(max((hits + BLOCK - 1) & -BLOCK, FEWEST)):
+        for k in range(max((hits + BLOCK - 1) & -BLOCK, LEAST_FUSED)):
             j = np.uintp(k)
             near_range = rows[near + j]
             far_range = rows[far + j]

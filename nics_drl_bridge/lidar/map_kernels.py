@@ -182,11 +182,11 @@ def scan_map(
     grid: GridArrays,
     exact: bool,
     singles: Singles,
-    wholes: ShortIntegers,
+    integers: ShortIntegers,
 ) -> None:
     """Fuse a map into a scan (B + LANES,), see `beam_kernels`: walks if `exact`, else jumps.
 
-    `singles` (SINGLES * LANES,) and `wholes` (INTEGERS * LANES,) are scratch memory.
+    `singles` (SINGLES * LANES,) and `integers` (INTEGERS * LANES,) are scratch memory.
     """
     squares = grid.squares
     frame = grid.frame
@@ -206,9 +206,11 @@ def scan_map(
     inside = 0.0 <= x < squares.shape[1] - 2 and 0.0 <= y < squares.shape[0] - 2
     if exact or not inside or squares[int(y) + 1, int(x) + 1] == 0:
         for i in range(count):
-            a = beams.directions[0, i]
-            b = beams.directions[1, i]
-            steps = walk(squares, u, v, c * a - s * b, s * a + c * b, limit)
+            ahead = beams.directions[0, i]
+            left = beams.directions[1, i]
+            du = c * ahead - s * left
+            dv = s * ahead + c * left
+            steps = walk(squares, u, v, du, dv, limit)
             lower(scan, i, cell * steps)
         return
     columns = squares.shape[1]
@@ -226,10 +228,10 @@ def scan_map(
             k = np.uintp(j)
             # idle lanes repeat the last beam
             beam = np.uintp(min(first + j, count - 1))
-            across = np.float32(beams.directions[0, beam])
-            ahead = np.float32(beams.directions[1, beam])
-            du = cosine * across - sine * ahead
-            dv = sine * across + cosine * ahead
+            ahead = np.float32(beams.directions[0, beam])
+            left = np.float32(beams.directions[1, beam])
+            du = cosine * ahead - sine * left
+            dv = sine * ahead + cosine * left
             right = du > zero
             up = dv > zero
             du = max(abs(du), PARALLEL)
@@ -241,18 +243,18 @@ def scan_map(
             singles[k + U] = beyond_u if right else unit - beyond_u
             singles[k + V] = beyond_v if up else unit - beyond_v
             singles[k + T] = zero
-            wholes[k + COLUMN] = 0
-            wholes[k + ROW] = 0
-            wholes[k + ASIDE] = 1 if right else -1
-            wholes[k + ABOVE] = columns if up else -columns
-            wholes[k + QUADRANT] = (0 if right else 8) + (0 if up else 16)
-        while _jump(squares.reshape(-1), start, most, singles, wholes):
+            integers[k + COLUMN] = 0
+            integers[k + ROW] = 0
+            integers[k + ASIDE] = 1 if right else -1
+            integers[k + ABOVE] = columns if up else -columns
+            integers[k + QUADRANT] = (0 if right else 8) + (0 if up else 16)
+        while _jump(squares.reshape(-1), start, most, singles, integers):
             pass
         # Fuse the lanes that ended at a solid cell, not in the border around the map.
         for j in range(LANES):
             k = np.uintp(j)
-            column = int(x) + wholes[k + COLUMN] * wholes[k + ASIDE]
-            above = wholes[k + ROW] if wholes[k + ABOVE] > 0 else -wholes[k + ROW]
+            column = int(x) + integers[k + COLUMN] * integers[k + ASIDE]
+            above = integers[k + ROW] if integers[k + ABOVE] > 0 else -integers[k + ROW]
             row = int(y) + above
             hit = (column >= 0) & (column < columns - 2)
             hit &= (row >= 0) & (row < len(squares) - 2)
@@ -267,7 +269,7 @@ def _jump(
     start: int,
     limit: np.float32,
     singles: Singles,
-    wholes: ShortIntegers,
+    integers: ShortIntegers,
 ) -> np.bool_:
     """Move each lane to the end of its free square; True if any moved."""
     # separate from the loop below, so that LLVM can vectorise that loop
@@ -275,17 +277,17 @@ def _jump(
         k = np.uintp(j)
         cell = (
             start
-            + wholes[k + COLUMN] * wholes[k + ASIDE]
-            + wholes[k + ROW] * wholes[k + ABOVE]
+            + integers[k + COLUMN] * integers[k + ASIDE]
+            + integers[k + ROW] * integers[k + ABOVE]
         )
-        square = flat[np.uintp(cell)] >> np.uint32(wholes[k + QUADRANT])
-        wholes[k + SIDE] = np.int32(square) & np.int32(LONGEST)
+        square = flat[np.uintp(cell)] >> np.uint32(integers[k + QUADRANT])
+        integers[k + SIDE] = np.int32(square) & np.int32(LONGEST)
     moved = np.int32(0)
     for j in range(LANES):
         k = np.uintp(j)
-        x = wholes[k + COLUMN]
-        y = wholes[k + ROW]
-        side = wholes[k + SIDE]
+        x = integers[k + COLUMN]
+        y = integers[k + ROW]
+        side = integers[k + SIDE]
         t = singles[k + T]
         x_side = np.int32(x + side)
         y_side = np.int32(y + side)
@@ -299,8 +301,8 @@ def _jump(
         goes = (side > np.int32(0)) & (t < limit)
         column = x_side if sideways else x_new
         row = y_new if sideways else y_side
-        wholes[k + COLUMN] = column if goes else x
-        wholes[k + ROW] = row if goes else y
+        integers[k + COLUMN] = column if goes else x
+        integers[k + ROW] = row if goes else y
         singles[k + T] = ahead if goes else t
         moved |= np.int32(goes)
     return moved > 0

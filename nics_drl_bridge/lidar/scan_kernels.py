@@ -23,7 +23,7 @@ from nics_drl_bridge.lidar.exact_kernels import (
     scan_walls,
 )
 from nics_drl_bridge.lidar.lookup_kernels import (
-    FEWEST,
+    LEAST_FUSED,
     LOOK_UP,
     TableArrays,
     fuse_look_ups,
@@ -61,7 +61,7 @@ class ScanScratch(NamedTuple):
 def scan_scratch(beam_count: int) -> ScanScratch:
     """Allocate the memory that one thread needs to scan."""
     return ScanScratch(
-        np.zeros(beam_count + max(FEWEST, map_kernels.LANES), np.int32),
+        np.zeros(beam_count + max(LEAST_FUSED, map_kernels.LANES), np.int32),
         np.zeros(MOST_FOUND, LOOK_UP),
         np.zeros(map_kernels.SINGLES * map_kernels.LANES, np.float32),
         np.zeros(map_kernels.INTEGERS * map_kernels.LANES, np.int32),

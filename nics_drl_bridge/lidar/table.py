@@ -30,7 +30,7 @@ from nics_drl_bridge.lidar.arrays import (
     ShortIntegers,
     Singles,
 )
-from nics_drl_bridge.lidar.lookup_kernels import FEWEST, TABLE_SHAPE, TableArrays
+from nics_drl_bridge.lidar.lookup_kernels import LEAST_FUSED, TABLE_SHAPE, TableArrays
 from nics_drl_bridge.lidar.shapes import Circle, Outlines, Shape
 from nics_drl_bridge.lidar.spec import LidarSpec, WithoutSensorModel
 
@@ -138,7 +138,7 @@ class LidarTable:
             self.grid[:, 0] - outlines.radii
         )
         shapes["rotations"] = np.where(circles, 0.0, rotations * orders)
-        shapes["periods_per_rotation"] = 1.0 / rotations
+        shapes["periods_per_grid_rotation"] = 1.0 / rotations
         shapes["first_cell"] = self.grid[:, 2]
         shapes["cells_per_period"] = rotations * distances
         shapes["second_hull"] = outlines.hull[:-1] + corners
@@ -150,7 +150,7 @@ class LidarTable:
         # Extent of the row, corners on the right and on the left: see `TableArrays.cells`.
         pairs = (cell[:, [0, 3, 5]] << 16) | (cell[:, [1, 2, 4]] & MOST_WIDE)
         cells = np.column_stack([self.start, pairs])
-        missing = max(FEWEST - count_padding(self.beam_angle), 0)
+        missing = max(LEAST_FUSED - count_padding(self.beam_angle), 0)
         if missing:
             rows = np.append(self.rows, np.zeros(missing, np.float32))
         else:

@@ -13,7 +13,7 @@ stands still for the rest of the substep. An obstacle that runs into a robot sto
 the period.
 
 Shared arguments: m is a robot; `begin` is a time in the period, `time` and `end` in the interval
-that is advanced [s].
+that is advanced [s], which starts at `begin`. A speed of 0 gives a time of inf: never.
 """
 
 import math
@@ -39,6 +39,10 @@ FREE = 0
 BODIES = 1
 WALLS = 2
 MAP = 4
+# What a robot may do in the rest of an interval
+MOVE = 0
+TURN_ONLY = 1
+STAND = 2
 # Maximum number of bodies listed near a robot; if there are more, all are tested
 SEVERAL = 32
 FLOOR = 4e-4  # A step brings two bodies nearer by so much at least [m]
@@ -52,7 +56,7 @@ ROUND_HEADROOM = 1.2
 CORNERED_HEADROOM = 1.7
 
 
-class World(NamedTuple):
+class ContactWorld(NamedTuple):
     """One world whose robots may meet something in the period."""
 
     bodies: Array  # (K + M, 7) obstacles, then robots, as they stand
@@ -82,10 +86,10 @@ def find_near(
     y = bodies[n, me, Y]
     own_reach = reach[me]
     count = 0
-    standing = bodies.shape[1] - len(near) if scene.standing else 0
+    standing_count = bodies.shape[1] - len(near) if scene.standing else 0
     for f in range(collision.find_around(n, x, y, own_reach, cells)):
         k = cells.found[f]
-        other_reach = bodies[n, k, RADIUS] if k < standing else reach[k]
+        other_reach = bodies[n, k, RADIUS] if k < standing_count else reach[k]
         dx = bodies[n, k, X] - x
         dy = bodies[n, k, Y] - y
         far = own_reach + other_reach
@@ -113,30 +117,33 @@ def find_near(
 
 
 @kernel
-def advance(begin: float, duration: float, obstacles_move: bool, world: World) -> None:
+def advance(
+    begin: float, duration: float, obstacles_move: bool, world: ContactWorld
+) -> None:
     """Move the robots that may meet something, and the obstacles, by a duration [s]."""
     meets = world.tight.meets
     motions = world.tight.motions
     robots = len(meets)
     fastest = _find_fastest(obstacles_move, world)
     world.tight.fastest[0] = fastest
-    # Robots that are judged at nearly the same time are judged together: there are fewer steps.
-    early = np.inf
+    # Robots that are due at nearly the same time are judged together: there are fewer steps.
+    tolerance = np.inf
     for m in range(robots):
         if meets[m] != FREE:
             speed = motions[m].bound + fastest
+            # An earlier interval may have left more clearance than this one can use up.
             is_far = motions[m].room > speed * duration
-            motions[m].clock = np.inf if is_far else 0.0
+            motions[m].safe_until = np.inf if is_far else 0.0
             motions[m].room -= speed * duration
-            early = min(early, 0.5 * FLOOR / speed)
+            tolerance = min(tolerance, 0.5 * FLOOR / speed)
     time = 0.0
     while time < duration:
         end = duration
         for m in range(robots):
             if meets[m] != FREE:
-                if motions[m].clock <= time + early:
+                if motions[m].safe_until <= time + tolerance:
                     _judge(m, begin, time, duration - time, world)
-                end = min(end, motions[m].clock)
+                end = min(end, motions[m].safe_until)
         if obstacles_move:
             place_obstacles(begin + end, world)
         for m in range(robots):
@@ -146,14 +153,17 @@ def advance(begin: float, duration: float, obstacles_move: bool, world: World) -
         while is_halted:  # robots that would overlap something
             is_halted = False
             for m in range(robots):
-                if meets[m] != FREE and motions[m].touches:
+                if meets[m] != FREE and motions[m].is_close:
                     is_halted |= _halt(m, begin, time, end, world)
         time = end
 
 
 @kernel
-def _find_fastest(obstacles_move: bool, world: World) -> float:
-    """Greatest speed of any body but an only robot [m/s]."""
+def _find_fastest(obstacles_move: bool, world: ContactWorld) -> float:
+    """Bound of the speed of anything that a robot may meet [m/s].
+
+    A single robot meets obstacles alone; of several robots, each may meet another.
+    """
     meets = world.tight.meets
     fastest = 0.0
     for k in range(world.first if obstacles_move else 0):
@@ -168,7 +178,9 @@ def _find_fastest(obstacles_move: bool, world: World) -> float:
 
 
 @kernel
-def find_contacts(m: int, limit: float, skin: float, world: World) -> tuple[float, int]:
+def find_contacts(
+    m: int, limit: float, skin: float, world: ContactWorld
+) -> tuple[float, int]:
     """Return the clearance of a robot up to `limit` [m], and the nearest body or -1.
 
     What it touches within `skin` [m] is in `world.tight.listed`.
@@ -202,7 +214,9 @@ def find_contacts(m: int, limit: float, skin: float, world: World) -> tuple[floa
 
 
 @kernel
-def start_motion(m: int, vx: float, vy: float, turn: float, world: World) -> None:
+def start_motion(
+    m: int, vx: float, vy: float, turn: float, world: ContactWorld
+) -> None:
     """Let a robot move with a twist from where it stands, at the beginning of an interval."""
     motion = world.tight.motions[m]
     body = world.bodies[world.first + m]
@@ -210,13 +224,15 @@ def start_motion(m: int, vx: float, vy: float, turn: float, world: World) -> Non
     motion.wish_y = vy
     motion.wish_turn = turn
     motion.bound = _bound_speed(body, vx, vy, turn, world)
-    motion.touches = False
-    motion.halts = 0
+    motion.is_close = False
+    motion.freedom = MOVE
     _turn_off(motion, body, 0.0, vx, vy, turn)
 
 
 @kernel
-def _bound_speed(body: Array, vx: float, vy: float, turn: float, world: World) -> float:
+def _bound_speed(
+    body: Array, vx: float, vy: float, turn: float, world: ContactWorld
+) -> float:
     """Bound of the speed of any point of a robot, even if its motion is bent [m/s]."""
     if collision.is_round(body, world.scene.outlines):
         return ROUND_HEADROOM * math.sqrt(vx * vx + vy * vy)
@@ -246,7 +262,7 @@ def _turn_off(
 
 
 @kernel
-def _place_robot(motion: Record, body: Array, time: float, world: World) -> None:
+def _place_robot(motion: Record, body: Array, time: float, world: ContactWorld) -> None:
     lasted = time - motion.since
     turned = motion.turn * lasted
     body[X], body[Y], body[COS], body[SIN] = move(
@@ -264,7 +280,7 @@ def _place_robot(motion: Record, body: Array, time: float, world: World) -> None
 
 
 @kernel
-def place_obstacles(time: float, world: World) -> None:
+def place_obstacles(time: float, world: ContactWorld) -> None:
     """Place the obstacles where they are at a time in the period."""
     for k in range(world.first):
         lasted = min(time, world.tight.stops[k])
@@ -285,13 +301,14 @@ def _place_obstacle(body: Array, start: Array, velocity: Array, time: float) -> 
 
 
 @kernel
-def _find_rate(k: int, begin: float, touch: Record, world: World) -> float:
-    """Speed at which the touched point of body k approaches the robot that touches it [m/s]."""
+def _find_approach(time: float, touch: Record, world: ContactWorld) -> float:
+    """Velocity of what a robot touches, towards the robot, at a time in the period [m/s]."""
+    k = touch.other
     if k < 0:
         return 0.0
     body = world.bodies[k]
     if k < world.first:
-        if begin >= world.tight.stops[k]:
+        if time >= world.tight.stops[k]:
             return 0.0
         vx = world.velocity[k, 0]
         vy = world.velocity[k, 1]
@@ -306,37 +323,59 @@ def _find_rate(k: int, begin: float, touch: Record, world: World) -> float:
 
 
 @kernel
-def _judge(m: int, begin: float, time: float, rest: float, world: World) -> None:
+def _judge(m: int, begin: float, time: float, rest: float, world: ContactWorld) -> None:
     """Choose how a robot moves on from a time, and until when it cannot meet anything."""
-    tight = world.tight
-    motion = tight.motions[m]
-    speed = motion.bound + tight.fastest[0]
+    motion = world.tight.motions[m]
+    fastest = world.tight.fastest[0]
+    _measure_clearance(m, begin, time, rest, world)
+    _stop_obstacles(m, begin + time, world)
+    if motion.freedom == MOVE:
+        _bend(m, time, world)
+    body = world.bodies[world.first + m]
+    speed = _bound_speed(body, motion.vx, motion.vy, motion.turn, world)
+    motion.safe_until = time + max(motion.gap, FLOOR) / (speed + fastest)
+    if world.tight.listed.number[0] > 0:
+        pushed_until = time + FLOOR / (SPRING * motion.bound)
+        motion.safe_until = min(motion.safe_until, pushed_until)
+
+
+@kernel
+def _measure_clearance(
+    m: int, begin: float, time: float, rest: float, world: ContactWorld
+) -> None:
+    """Measure the clearance of a robot, and list what it touches.
+
+    The clearance is measured as far as the robot may get in the rest of the period, so that `room`
+    may free it from being judged in later intervals.
+    """
+    motion = world.tight.motions[m]
+    speed = motion.bound + world.tight.fastest[0]
     limit = max(speed * max(rest, world.period - begin - time), SKIN)
     gap, whom = find_contacts(m, limit, SKIN, world)
-    count = tight.listed.number[0]
     if gap < -collision.OVERLAP:
         _mark(m, whom, world)
     motion.gap = gap
     motion.room = gap - speed * rest
-    motion.touches = gap < FLOOR
-    for touch in tight.listed.touches[:count]:
-        k = touch.other
-        rate = _find_rate(k, begin + time, touch, world)
-        if 0 <= k < world.first and rate > 0.0:
-            tight.stops[k] = begin + time
-            _mark(m, k, world)
-        touch.rate = min(rate, 0.0)
-    if motion.halts == 0:
-        _bend(m, time, world)
-    body = world.bodies[world.first + m]
-    speed = _bound_speed(body, motion.vx, motion.vy, motion.turn, world)
-    motion.clock = time + max(gap, FLOOR) / (speed + tight.fastest[0])
-    if count > 0:
-        motion.clock = min(motion.clock, time + FLOOR / (SPRING * motion.bound))
+    motion.is_close = gap < FLOOR
 
 
 @kernel
-def _bend(m: int, time: float, world: World) -> None:
+def _stop_obstacles(m: int, time: float, world: ContactWorld) -> None:
+    """Stop obstacles that run into a robot at a time in the period; note what recedes from it.
+
+    Nothing pushes a robot: an obstacle stops, and another robot bends its own motion.
+    """
+    listed = world.tight.listed
+    for touch in listed.touches[: listed.number[0]]:
+        approach = _find_approach(time, touch, world)
+        if 0 <= touch.other < world.first and approach > 0.0:
+            world.tight.stops[touch.other] = time
+            _mark(m, touch.other, world)
+        touch.recedes = min(approach, 0.0)
+
+
+@kernel
+def _bend(m: int, time: float, world: ContactWorld) -> None:
     """Bend the motion of a robot so that it does not approach what it touches.
 
     Each pass removes the approach at one touch after the other, by the impulse that would stop a
@@ -356,10 +395,10 @@ def _bend(m: int, time: float, world: World) -> None:
         is_done = True
         for touch in listed.touches[: listed.number[0]]:
             arm = (touch.x - body[X]) * touch.ny - (touch.y - body[Y]) * touch.nx
-            rate = touch.nx * vx + touch.ny * vy + arm * turn - touch.rate
-            if sweep == 0 and rate < -APPROACH * motion.bound:
+            away = touch.nx * vx + touch.ny * vy + arm * turn - touch.recedes
+            if sweep == 0 and away < -APPROACH * motion.bound:
                 _mark(m, touch.other, world)
-            lacks = SPRING * motion.bound * (1.0 - touch.gap / FLOOR) - rate
+            lacks = SPRING * motion.bound * (1.0 - touch.gap / FLOOR) - away
             if lacks > APPROACH * motion.bound:
                 push = lacks / (1.0 + arm * arm / inertia)
                 vx += push * touch.nx
@@ -380,7 +419,7 @@ def _bend(m: int, time: float, world: World) -> None:
 
 
 @kernel
-def _mark(m: int, k: int, world: World) -> None:
+def _mark(m: int, k: int, world: ContactWorld) -> None:
     """Mark robot m, and body k if that is a robot, as having touched something."""
     world.touched[m] = 1
     if k >= world.first:
@@ -388,7 +427,7 @@ def _mark(m: int, k: int, world: World) -> None:
 
 
 @kernel
-def _halt(m: int, begin: float, time: float, end: float, world: World) -> bool:
+def _halt(m: int, begin: float, time: float, end: float, world: ContactWorld) -> bool:
     """Let a robot that overlaps something at the end of a step only turn, or stand still.
 
     Returns:
@@ -398,7 +437,7 @@ def _halt(m: int, begin: float, time: float, end: float, world: World) -> bool:
     gap, whom = find_contacts(m, 0.0, 0.0, world)
     if gap >= min(motion.gap, 0.0):
         return False
-    if motion.halts > 1:
+    if motion.freedom == STAND:
         if 0 <= whom < world.first and world.tight.stops[whom] > begin + time:
             world.tight.stops[whom] = begin + time
             place_obstacles(begin + end, world)
@@ -406,11 +445,11 @@ def _halt(m: int, begin: float, time: float, end: float, world: World) -> bool:
         return False
     _mark(m, whom, world)
     body = world.bodies[world.first + m]
-    turn = motion.turn if motion.halts == 0 else 0.0
+    turn = motion.turn if motion.freedom == MOVE else 0.0
     _place_robot(motion, body, time, world)
     _turn_off(motion, body, time, 0.0, 0.0, turn)
     _place_robot(motion, body, end, world)
-    motion.halts += 1
+    motion.freedom = TURN_ONLY if motion.freedom == MOVE else STAND
     return True
 
 

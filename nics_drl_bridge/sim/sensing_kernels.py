@@ -58,9 +58,10 @@ def measure_odometry(
     Args:
         n: the world.
         m: the robot.
-        start: (3,) pose by the wheels at the start of the period.
-        end: (3,) pose by the wheels at the end of the period.
-        twist: (3,) or more; body twist by the wheels at the end of the period.
+        start: (3,) pose at the start of the period: by the wheels of another engine, or the true
+            one, so that the odometry of the fast simulator notices drift and contacts.
+        end: (3,) pose at the end of the period, likewise.
+        twist: (3,) or more; body twist at the end of the period, by the wheels.
         data: the state, whose `past`, `odom` and `twist` are written.
         motion: length of the period.
     """
@@ -101,9 +102,6 @@ def measure_odometry(
     row[ODOM_TWIST] = twist[0] + noise_x
     row[ODOM_TWIST + 1] = twist[1] + noise_y
     row[ODOM_TWIST + 2] = twist[2] + noise_turn
-    for i in range(3):
-        row[POSE + i] = end[i]
-        row[TRUE_TWIST + i] = twist[i]
     odom = data.odom[n, m]
     odom_twist = data.twist[n, m]
     # Without this branch, the division by `substeps` takes a thirtieth of a step.
@@ -116,6 +114,15 @@ def measure_odometry(
     lag = limit_lag(data.age[n, m], steps, rows, substeps)
     interpolate_past(past, ODOM, lag, steps, substeps, odom)
     interpolate_past(past, ODOM_TWIST, lag, steps, substeps, odom_twist)
+
+
+@kernel
+def record_truth(n: int, m: int, pose: Array, twist: Array, data: State) -> None:
+    """Keep the true pose (3,) and body twist (3,) or more of a robot at the end of a period."""
+    row = data.past[n, m, data.steps[n] % data.past.shape[2]]
+    for i in range(3):
+        row[POSE + i] = pose[i]
+        row[TRUE_TWIST + i] = twist[i]
 
 
 @kernel

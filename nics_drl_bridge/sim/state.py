@@ -220,11 +220,11 @@ class RobotMotion:
     wish_y: float
     wish_turn: float
     bound: float  # of the speed of any of its points [m/s]
-    clock: float  # time until when it cannot meet anything [s]
-    room: float  # what it may approach anything before it is judged [m]
+    safe_until: float  # time in the interval until which it cannot meet anything [s]
+    room: float  # clearance that is certainly left when the interval ends [m]
     gap: float  # its latest clearance, negative where it overlaps [m]
-    touches: bool  # True if it may meet something before its clock
-    halts: int  # 1 once it may only turn in this interval, 2 once it stands
+    is_close: bool  # True if it may meet something before `safe_until`
+    freedom: int  # what it may still do in this interval, see `contact_kernels`
 
 
 MOTION = structure_of(RobotMotion)
@@ -238,7 +238,7 @@ class Touch:
     nx: float  # unit vector to it from what it touches
     ny: float
     gap: float  # [m]
-    rate: float  # speed of what it touches along the unit vector [m/s]
+    recedes: float  # velocity of what it touches along the unit vector, 0 or less [m/s]
     other: int  # body that it touches; -1 for a wall or the map
 
 

@@ -39,7 +39,7 @@ from nics_drl_bridge.sim.collision_kernels import (
     put_in_order,
     sort_into_cells,
 )
-from nics_drl_bridge.sim.contact_kernels import FREE, World
+from nics_drl_bridge.sim.contact_kernels import FREE, ContactWorld
 from nics_drl_bridge.sim.state import (
     DRIFT_STATE,
     DRIFT_X,
@@ -141,10 +141,7 @@ def end_period(
                 n, m, start, end, wheel_twist[n, m], data, part.motion
             )
             # The lidar is where the robot truly is, not where the wheels say.
-            row = data.past[n, m, data.steps[n] % data.past.shape[2]]
-            for i in range(3):
-                row[POSE + i] = data.pose[n, m, i]
-                row[TRUE_TWIST + i] = true_twist[n, m, i]
+            sensing.record_truth(n, m, data.pose[n, m], true_twist[n, m], data)
         _sort_bodies(n, get_surroundings(n, part.world_set), part)
         waiting_count = sensing.scan_or_wait(n, waiting_count, part)
     sensing.scan_together(waiting_count, part)
@@ -250,6 +247,7 @@ def _measure_world(n: int, first_lane: int, scene: Surroundings, part: Part) -> 
         contacts.put_body(data.bodies[n, data.velocity.shape[1] + m], pose)
         compute_rates(n, m, motion.substeps - 1, data, motion, single)
         sensing.measure_odometry(n, m, start, pose, single.dq, data, motion)
+        sensing.record_truth(n, m, pose, single.dq, data)
         # The cells must know how far any body may be from where it was sorted.
         if scene.crowded:
             dx = pose[0] - start[0]
@@ -389,7 +387,7 @@ def _move_carefully(
     meets = tight.meets
     stops = tight.stops
     period = motion.dt * motion.substeps
-    world = World(
+    world = ContactWorld(
         data.bodies[n],
         data.velocity[n],
         data.velocity.shape[1],

@@ -118,7 +118,7 @@ def test_an_interrupted_training_comes_to_the_same_weights(
             raise BrokenOffError
 
     # Told of every rollout, whatever the clock says.
-    monkeypatch.setattr("nics_drl_bridge.policy.train.checkpoint.TOLD_S", 0.0)
+    monkeypatch.setattr("nics_drl_bridge.policy.train.progress.TOLD_S", 0.0)
     with pytest.raises(BrokenOffError):
         train(chosen, 1, tmp_path / "broken", interrupt)
     assert 0 < steps_in(tmp_path / "broken" / CHECKPOINT) < 1000

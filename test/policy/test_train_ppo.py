@@ -207,7 +207,7 @@ def test_a_rollout_is_that_of_stable_baselines3_over_ends_of_episodes_and_time_l
     lean.collector.networks.load_state_dict(lean.networks.state_dict())
     lean.collector.last = lean.collector.env.reset()
     driven, ended = lean.collector.collect()
-    rollout = lean.learner.judge(driven)
+    rollout = lean.learner.compute_transitions(driven)
     buffer = theirs.rollout_buffer
     assert len(ended) >= WORLDS
     for ours, other in [

@@ -36,12 +36,8 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.policy.train import algorithms
 from nics_drl_bridge.policy.train import run as train
-from nics_drl_bridge.policy.train.checkpoint import (
-    RECENT,
-    Progress,
-    read_checkpoint,
-    write_content,
-)
+from nics_drl_bridge.policy.train.checkpoint import read_checkpoint, write_content
+from nics_drl_bridge.policy.train.progress import RECENT, Progress, Tell
 from nics_drl_bridge.policy.train.settings import TrainingSettings
 from nics_drl_bridge.policy.train.vec_env import TrainVecEnv
 
@@ -62,7 +58,7 @@ class Rollout:
     """T steps of N worlds."""
 
     # (T + 1, N, O) observations; after an episode, the first of the next one
-    seen: NDArray[np.float32]
+    observations: NDArray[np.float32]
     actions: NDArray[Any]  # (T, N, ...)
     logits: NDArray[np.float32]  # (T, N, ...) parameters of the action distribution
     logp: NDArray[np.float32]  # (T, N) log probabilities of the actions
@@ -83,10 +79,12 @@ class Rollout:
                     yield self._piece(n, begin, end)
 
     def _piece(self, n: int, begin: int, end: int) -> SingleAgentEpisode:
-        last, out_of_time = self.final.get((end - 1, n), (self.seen[end, n], None))
+        last, out_of_time = self.final.get(
+            (end - 1, n), (self.observations[end, n], None)
+        )
         rows = slice(begin, end)
         return SingleAgentEpisode(
-            observations=[*self.seen[rows, n], last],
+            observations=[*self.observations[rows, n], last],
             actions=list(self.actions[rows, n]),
             rewards=list(self.rewards[rows, n]),
             terminated=out_of_time is False,
@@ -112,7 +110,7 @@ class WorldsRunner(SingleAgentEnvRunner):
         self.num_envs = self.env.num_envs
         rng = np.random.default_rng([*chosen["seed"], self.worker_index])
         self.env.seed(int(rng.integers(train.SEEDS)))
-        self._seen = self.env.reset()
+        self._last = self.env.reset()
 
     def get_spaces(self) -> dict[str, Any]:
         """Returns the observation and action spaces under RLlib's names."""
@@ -126,9 +124,11 @@ class WorldsRunner(SingleAgentEnvRunner):
         steps = int(self.config.env_config["rollout"])
         busy = self.env.stepping_s
         *arrays, finals = zip(*(self._step(t) for t in range(steps)), strict=True)
-        seen, actions, logits, logp, rewards = (np.stack(column) for column in arrays)
+        observations, actions, logits, logp, rewards = (
+            np.stack(column) for column in arrays
+        )
         final = {place: end for column in finals for place, end in column.items()}
-        whole = np.concatenate([seen, self._seen[None]])
+        whole = np.concatenate([observations, self._last[None]])
         ended = len(final)
         count = steps * self.num_envs
         self.metrics.log_value(ENDED, ended, reduce="sum")
@@ -138,7 +138,7 @@ class WorldsRunner(SingleAgentEnvRunner):
         return list(Rollout(whole, actions, logits, logp, rewards, final).episodes())
 
     def _step(self, t: int) -> tuple[Any, ...]:
-        observations = self._seen
+        observations = self._last
         out = self.module.forward_exploration(
             {Columns.OBS: torch.as_tensor(observations)}
         )
@@ -151,7 +151,7 @@ class WorldsRunner(SingleAgentEnvRunner):
         bounded = actions
         if isinstance(space, gymnasium.spaces.Box):
             bounded = np.clip(actions, space.low, space.high)
-        self._seen, rewards, done, infos = self.env.step(bounded)
+        self._last, rewards, done, infos = self.env.step(bounded)
         final = {}
         for n in np.flatnonzero(done):
             info = infos[n]
@@ -170,14 +170,14 @@ class ActorCritic(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
     def setup(self) -> None:
         """Builds the layers."""
         chosen = self.model_config
-        seen = self.observation_space
+        space = self.observation_space
         hidden = list(chosen["hidden"])
         normaliser = chosen["normaliser"]
-        self.actor = algorithms.Actor(seen, self.action_space, hidden, normaliser)
-        self.critic = algorithms.make_layers([int(seen.shape[0]), *hidden, 1], 1.0)
+        self.actor = algorithms.Actor(space, self.action_space, hidden, normaliser)
+        self.critic = algorithms.make_layers([int(space.shape[0]), *hidden, 1], 1.0)
         if not self.actor.discrete:
-            spread = torch.full(self.action_space.shape, float(chosen["log_std"]))
-            self.log_std = torch.nn.Parameter(spread)
+            log_std = torch.full(self.action_space.shape, float(chosen["log_std"]))
+            self.log_std = torch.nn.Parameter(log_std)
 
     def get_non_inference_attributes(self) -> list[str]:
         """Returns the names of attributes that env runners do not need."""
@@ -258,7 +258,7 @@ def train_on_ray(
     settings: TrainingSettings,
     seed: int,
     folder: Path,
-    tell: train.Tell = lambda _: None,
+    tell: Tell = lambda _: None,
     resumed: bool = False,
     runners: int = 1,
 ) -> train.Trained:
@@ -322,7 +322,7 @@ class Learning:
         network: ActorCritic = self.learner.module[DEFAULT_MODULE_ID].unwrapped()
         return network
 
-    def run(self, tell: train.Tell, about: dict[str, Any]) -> None:
+    def run(self, tell: Tell, about: dict[str, Any]) -> None:
         """Learns until all steps are done; saves checkpoints."""
         logger = configure(str(self.path.parent), ["tensorboard"])
         begin = heard = time.perf_counter()

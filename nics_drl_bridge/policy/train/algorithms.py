@@ -25,7 +25,8 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.arrays import AnyArray, Mask, Singles
 from nics_drl_bridge.policy.evaluation import Act
-from nics_drl_bridge.policy.train.checkpoint import RECENT, Watch, tensors
+from nics_drl_bridge.policy.train.checkpoint import tensors
+from nics_drl_bridge.policy.train.progress import RECENT, Watch
 from nics_drl_bridge.policy.train.settings import TrainingSettings
 from nics_drl_bridge.policy.train.vec_env import TrainVecEnv
 

@@ -13,7 +13,7 @@ from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.arrays import Integers, Singles
 
 ONE = np.float32(1.0)
-NONE = np.float32(0.0)
+ZERO = np.float32(0.0)
 # constant term of the normal distribution's log density
 LOG_NORM = np.float32(0.5 * np.log(2.0 * np.pi))
 
@@ -34,7 +34,7 @@ class Net(NamedTuple):
 class Transitions(NamedTuple):
     """R transitions, step by step: arrays for the kernels, tensors elsewhere."""
 
-    seen: Any  # (R, O) normalised observations
+    observations: Any  # (R, O) normalised observations
     # (R, C), or indices of discrete ones: (R,), for the kernels (R, 1) and single
     actions: Any
     log_probs: Any  # (R,) of the actions when they were drawn
@@ -43,11 +43,11 @@ class Transitions(NamedTuple):
 
 
 @kernel(allocates=True)
-def forward(net: Net, seen: Singles) -> Singles:
+def forward(net: Net, observations: Singles) -> Singles:
     """Returns the outputs (n, C) of a network for inputs (n, O); keeps all layers' outputs."""
-    n = len(seen)
+    n = len(observations)
     at = 0
-    rows = seen
+    rows = observations
     for k in range(len(net.widths) - 1):
         ins = net.widths[k]
         outs = net.widths[k + 1]
@@ -57,7 +57,8 @@ def forward(net: Net, seen: Singles) -> Singles:
         at = middle + outs
         rows = out
         bias = net.weights[middle:at]
-        least = NONE if k + 2 < len(net.widths) else -np.inf
+        # ReLU, except after the last layer
+        least = ZERO if k + 2 < len(net.widths) else -np.inf
         for i in range(n):
             for j in range(outs):
                 out[i, j] = max(out[i, j] + bias[j], np.float32(least))
@@ -65,12 +66,12 @@ def forward(net: Net, seen: Singles) -> Singles:
 
 
 @kernel(allocates=True)
-def backward(net: Net, seen: Singles, gradient: Singles) -> None:
+def backward(net: Net, observations: Singles, gradient: Singles) -> None:
     """Writes the gradients of the weights, given the outputs' gradients (n, C), after `forward`.
 
     `gradient` must be the first of the spare arrays.
     """
-    n = len(seen)
+    n = len(observations)
     at = len(net.weights)
     side = 0
     for k in range(len(net.widths) - 2, -1, -1):
@@ -78,7 +79,7 @@ def backward(net: Net, seen: Singles, gradient: Singles) -> None:
         outs = net.widths[k + 1]
         middle = at - outs
         at = middle - ins * outs
-        rows = net.kept[k - 1, : n * ins].reshape(n, ins) if k > 0 else seen
+        rows = net.kept[k - 1, : n * ins].reshape(n, ins) if k > 0 else observations
         np.dot(gradient.T, rows, net.gradients[at:middle].reshape(outs, ins))
         net.gradients[middle : middle + outs] = gradient.sum(axis=0)
         if k > 0:
@@ -87,7 +88,7 @@ def backward(net: Net, seen: Singles, gradient: Singles) -> None:
             np.dot(gradient, net.weights[at:middle].reshape(outs, ins), ahead)
             for i in range(n):
                 for j in range(ins):
-                    ahead[i, j] = ahead[i, j] if rows[i, j] > NONE else NONE
+                    ahead[i, j] = ahead[i, j] if rows[i, j] > ZERO else ZERO
             gradient = ahead
 
 
@@ -96,16 +97,16 @@ def compute_critic_gradients(
     net: Net, batch: Transitions, weight: np.float32
 ) -> np.float32:
     """Writes the gradients of the critic; returns its weighted loss."""
-    values = forward(net, batch.seen)
+    values = forward(net, batch.observations)
     n = len(values)
     out = net.spare[0, :n].reshape(n, 1)
-    loss = NONE
+    loss = ZERO
     share = weight / np.float32(n)
     for i in range(n):
         off = values[i, 0] - batch.returns[i]
         loss += share * off * off
         out[i, 0] = np.float32(2.0) * share * off
-    backward(net, batch.seen, out)
+    backward(net, batch.observations, out)
     return loss
 
 
@@ -114,60 +115,61 @@ def compute_actor_gradients(
     net: Net,
     batch: Transitions,
     log_std: Singles,
-    spread: Singles,
+    log_std_gradient: Singles,
     clip: np.float32,
-    entropy: np.float32,
+    entropy_weight: np.float32,
 ) -> np.float32:
-    """Writes the gradients of the actor and `log_std` (C,); returns their loss.
+    """Writes the gradients of the actor and of `log_std` (C,); returns their loss.
 
     With discrete actions, `log_std` has no gradient.
     """
-    raw = forward(net, batch.seen)
-    gains = batch.advantages
-    n = len(raw)
+    outputs = forward(net, batch.observations)
+    advantages = batch.advantages
+    n = len(outputs)
     actions = batch.actions
-    out = net.spare[0, : raw.size].reshape(raw.shape)
-    mean = gains.mean()
+    out = net.spare[0, : outputs.size].reshape(outputs.shape)
+    mean = advantages.mean()
     share = ONE / np.float32(n)
     scale = ONE / (
-        np.sqrt(np.square(gains - mean).sum() / np.float32(n - 1)) + np.float32(1e-8)
+        np.sqrt(np.square(advantages - mean).sum() / np.float32(n - 1))
+        + np.float32(1e-8)
     )
-    spread[:] = -entropy
-    loss = NONE
-    parts = np.empty(raw.shape[1], np.float32)
+    log_std_gradient[:] = -entropy_weight
+    loss = ZERO
+    parts = np.empty(outputs.shape[1], np.float32)
     for i in range(n):
         # The log density or log probability of the action, the entropy of all actions, and the
         # deviations or log probabilities in the parts.
-        log_prob = mixed = NONE
+        log_prob = entropy = ZERO
         if log_std.size > 0:
             for j in range(len(parts)):
-                parts[j] = (actions[i, j] - raw[i, j]) * np.exp(-log_std[j])
+                parts[j] = (actions[i, j] - outputs[i, j]) * np.exp(-log_std[j])
                 density = np.float32(0.5) * parts[j] * parts[j] + log_std[j]
                 log_prob -= density + LOG_NORM
-                mixed += log_std[j] + np.float32(0.5) + LOG_NORM
+                entropy += log_std[j] + np.float32(0.5) + LOG_NORM
         else:
-            greatest = raw[i].max()
-            total = NONE
+            greatest = outputs[i].max()
+            total = ZERO
             for j in range(len(parts)):
-                total += np.exp(raw[i, j] - greatest)
+                total += np.exp(outputs[i, j] - greatest)
             for j in range(len(parts)):
-                parts[j] = raw[i, j] - greatest - np.log(total)
-                mixed -= np.exp(parts[j]) * parts[j]
+                parts[j] = outputs[i, j] - greatest - np.log(total)
+                entropy -= np.exp(parts[j]) * parts[j]
             log_prob = parts[int(actions[i, 0])]
         ratio = np.exp(log_prob - batch.log_probs[i])
-        gain = (gains[i] - mean) * scale
-        bounded = gain * min(max(ratio, ONE - clip), ONE + clip)
-        loss -= share * (min(gain * ratio, bounded) + entropy * mixed)
-        pull = share * gain * ratio if gain * ratio <= bounded else NONE
+        advantage = (advantages[i] - mean) * scale
+        bounded = advantage * min(max(ratio, ONE - clip), ONE + clip)
+        loss -= share * (min(advantage * ratio, bounded) + entropy_weight * entropy)
+        slope = share * advantage * ratio if advantage * ratio <= bounded else ZERO
         for j in range(len(parts)):
             if log_std.size > 0:
-                out[i, j] = -pull * parts[j] * np.exp(-log_std[j])
-                spread[j] -= pull * (parts[j] * parts[j] - ONE)
+                out[i, j] = -slope * parts[j] * np.exp(-log_std[j])
+                log_std_gradient[j] -= slope * (parts[j] * parts[j] - ONE)
             else:
                 out[i, j] = np.exp(parts[j]) * (
-                    pull + share * entropy * (parts[j] + mixed)
+                    slope + share * entropy_weight * (parts[j] + entropy)
                 )
         if log_std.size == 0:
-            out[i, int(actions[i, 0])] -= pull
-    backward(net, batch.seen, out)
+            out[i, int(actions[i, 0])] -= slope
+    backward(net, batch.observations, out)
     return loss

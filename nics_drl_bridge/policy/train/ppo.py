@@ -23,8 +23,8 @@ from stable_baselines3.common.logger import Logger
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.arrays import Singles
 from nics_drl_bridge.policy.train import algorithms, kernels
-from nics_drl_bridge.policy.train.checkpoint import RECENT, Watch
 from nics_drl_bridge.policy.train.kernels import LOG_NORM, Net, Transitions
+from nics_drl_bridge.policy.train.progress import RECENT, Watch
 from nics_drl_bridge.policy.train.settings import PpoSettings, TrainingSettings
 from nics_drl_bridge.policy.train.vec_env import TrainVecEnv
 from nics_drl_bridge.threads import one_blas_thread, run_parts
@@ -36,20 +36,20 @@ GRADIENT_LIMIT = 0.5
 ADAM_EPSILON = 1e-5
 
 
-class Driven(NamedTuple):
+class Rollout(NamedTuple):
     """A rollout as collected: T steps of N worlds."""
 
-    seen: torch.Tensor  # (T + 1, N, O) normalised observations
+    observations: torch.Tensor  # (T + 1, N, O) normalised observations
     actions: torch.Tensor  # (T, N, C), or (T, N) discrete
     log_probs: torch.Tensor  # (T, N) of the actions when they were drawn
     rewards: torch.Tensor  # (T, N)
-    done: torch.Tensor  # (T, N) 1 at ends of episodes
-    cut: torch.Tensor  # (K,) indices t N + n of the truncated episodes
-    final: torch.Tensor  # (K, O) last observations of these episodes
+    dones: torch.Tensor  # (T, N) 1 at ends of episodes
+    truncated: torch.Tensor  # (K,) indices t N + n of the truncated episodes
+    final_observations: torch.Tensor  # (K, O) the last ones of these episodes
 
 
 class Networks(torch.nn.Module):
-    """Actor and critic on normalised observations, and the spread of continuous actions."""
+    """Actor and critic on normalised observations, and the deviation of continuous actions."""
 
     def __init__(
         self, actor: algorithms.Actor, hidden: tuple[int, ...], log_std: float
@@ -154,26 +154,25 @@ class Learner:
         ]
         self.core_is_free = threading.Event()  # set when the collecting thread is done
 
-    def judge(self, driven: Driven) -> Transitions:
+    def compute_transitions(self, rollout: Rollout) -> Transitions:
         """Computes advantages and returns of a rollout, with the current critic."""
         networks = self.networks
         ppo = self.ppo
         with torch.no_grad():
-            values = networks.critic(driven.seen).squeeze(-1)
-            rewards = driven.rewards.clone()
+            values = networks.critic(rollout.observations).squeeze(-1)
+            rewards = rollout.rewards.clone()
             # Bootstrap where a time limit truncated the episode.
-            rewards.view(-1)[driven.cut] += ppo.discount * networks.critic(
-                driven.final
-            ).squeeze(-1)
-        gains = estimate_advantages(
-            rewards, values, driven.done, ppo.discount, ppo.gae_lambda
+            final_values = networks.critic(rollout.final_observations).squeeze(-1)
+            rewards.view(-1)[rollout.truncated] += ppo.discount * final_values
+        advantages = estimate_advantages(
+            rewards, values, rollout.dones, ppo.discount, ppo.gae_lambda
         )
         rows = (
-            driven.seen[:-1],
-            driven.actions,
-            driven.log_probs,
-            gains,
-            gains + values[:-1],
+            rollout.observations[:-1],
+            rollout.actions,
+            rollout.log_probs,
+            advantages,
+            advantages + values[:-1],
         )
         return Transitions(*(field.flatten(0, 1) for field in rows))
 
@@ -182,7 +181,7 @@ class Learner:
         for group in self.optimiser.param_groups:
             group["lr"] = rate
         for _ in range(self.ppo.epochs):
-            order = torch.randperm(len(rollout.seen), generator=self.generator)
+            order = torch.randperm(len(rollout.observations), generator=self.generator)
             for rows in order.split(self.ppo.batch):  # the last may be smaller
                 batch = Transitions(*(field[rows] for field in rollout))
                 loss = self.differentiate(batch)
@@ -192,15 +191,20 @@ class Learner:
 
     def differentiate(self, batch: Transitions) -> torch.Tensor:
         """Sets the gradients of all weights for a batch; returns the loss."""
-        columns = batch.actions.float().view(len(batch.seen), -1)
+        columns = batch.actions.float().view(len(batch.observations), -1)
         fields = batch._replace(actions=columns)
         arrays = Transitions(*(field.numpy() for field in fields))
-        (actor, critic), spread = self._nets, self.networks.log_std
-        spread_arrays = spread.detach().numpy(), spread.grad.numpy()
-        bounds = np.float32(self.ppo.clip), np.float32(self.ppo.entropy)
+        actor, critic = self._nets
+        log_std = self.networks.log_std
         jobs: list[Callable[[], Any]] = [
             partial(
-                kernels.compute_actor_gradients, actor, arrays, *spread_arrays, *bounds
+                kernels.compute_actor_gradients,
+                actor,
+                arrays,
+                log_std.detach().numpy(),
+                log_std.grad.numpy(),
+                np.float32(self.ppo.clip),
+                np.float32(self.ppo.entropy),
             ),
             partial(
                 kernels.compute_critic_gradients,
@@ -226,52 +230,61 @@ class Collector:
         self.generator = torch.Generator().manual_seed(seed)
         self.last = np.zeros((env.num_envs, *env.observation_space.shape), np.float32)
 
-    def collect(self) -> tuple[Driven, Ended]:
+    def collect(self) -> tuple[Rollout, Ended]:
         """Steps all worlds through a rollout."""
         steps = self.ppo.rollout
         worlds = self.env.num_envs
         networks = self.networks
         space = cast("Any", self.env.action_space)
-        seen = torch.empty(steps + 1, worlds, networks.critic[0].in_features)
-        rewards, done = torch.zeros(2, steps, worlds)
-        raw = []
+        observations = torch.empty(steps + 1, worlds, networks.critic[0].in_features)
+        rewards, dones = torch.zeros(2, steps, worlds)
+        outputs = []
         actions = []
-        ended = []
-        cut = []
-        final = [seen[0, :0]]
+        outcomes = []
+        truncated = []
+        final = [observations[0, :0]]  # so that `cat` works without any truncation
         with torch.no_grad():
             for t in range(steps):
-                seen[t] = self._normalize(self.last)
-                raw.append(networks.actor.layers(seen[t]))
-                actions.append(networks.draw(raw[t], self.generator))
-                acted = actions[t].numpy()
+                observations[t] = self._normalize(self.last)
+                outputs.append(networks.actor.layers(observations[t]))
+                actions.append(networks.draw(outputs[t], self.generator))
+                env_actions = actions[t].numpy()
                 if not networks.actor.discrete:
-                    acted = np.clip(acted, space.low, space.high)
-                self.last, reward, over, infos = self.env.step(acted)
-                rewards[t], done[t] = torch.from_numpy(reward), torch.from_numpy(over)
-                for n in np.flatnonzero(over):
+                    env_actions = np.clip(env_actions, space.low, space.high)
+                self.last, reward, ended, infos = self.env.step(env_actions)
+                rewards[t] = torch.from_numpy(reward)
+                dones[t] = torch.from_numpy(ended)
+                for n in np.flatnonzero(ended):
                     info = infos[n]
-                    ended.append(
+                    outcomes.append(
                         (info.get("is_success", False), info.get("collision", False))
                     )
                     if info["TimeLimit.truncated"]:
-                        cut.append(t * worlds + int(n))
+                        truncated.append(t * worlds + int(n))
                         last = info["terminal_observation"][None]
                         final.append(self._normalize(last))
-            seen[steps] = self._normalize(self.last)
-            beyond = torch.tensor(cut, dtype=torch.int64), torch.cat(final)
-            drawn = torch.stack(actions)
-            log_probs = networks.log_probs(torch.cat(raw), drawn.flatten(0, 1)).view_as(
-                rewards
+            observations[steps] = self._normalize(self.last)
+            all_actions = torch.stack(actions)
+            log_probs = networks.log_probs(
+                torch.cat(outputs), all_actions.flatten(0, 1)
             )
-            return Driven(seen, drawn, log_probs, rewards, done, *beyond), ended
+            rollout = Rollout(
+                observations,
+                all_actions,
+                log_probs.view_as(rewards),
+                rewards,
+                dones,
+                torch.tensor(truncated, dtype=torch.int64),
+                torch.cat(final),
+            )
+            return rollout, outcomes
 
     def _normalize(self, observations: Singles) -> torch.Tensor:
         """Returns normalised observations (n, O) for the networks."""
-        seen: torch.Tensor = self.networks.actor.normaliser(
+        normalised: torch.Tensor = self.networks.actor.normaliser(
             torch.from_numpy(observations)
         )
-        return seen
+        return normalised
 
 
 class LeanPpo:
@@ -299,7 +312,7 @@ class LeanPpo:
         self.policy = actor
         self._settings = settings
         self.steps = 0  # number of steps learnt from, over all worlds
-        self._rollout: Driven | None = None  # the next rollout to learn from
+        self._rollout: Rollout | None = None  # the next rollout to learn from
         self._successes: deque[bool] = deque(maxlen=RECENT)
 
     @one_blas_thread
@@ -309,7 +322,7 @@ class LeanPpo:
         if self._rollout is None:
             self.collector.last = self.collector.env.reset()
             self._take(watch, *self.collector.collect())
-        while self._rollout:
+        while self._rollout is not None:
             watch.keep(self.steps)
             if watch.ends(self.steps, algorithms.make_act(self.policy), logger):
                 watch.report(self.steps, self._successes, logger)
@@ -319,7 +332,7 @@ class LeanPpo:
                 logger.record("train/loss", loss)
                 logger.dump(self.steps)
 
-    def _advance(self, rollout: Driven, watch: Watch) -> float:
+    def _advance(self, rollout: Rollout, watch: Watch) -> float:
         """Learns from a rollout while the next one is collected."""
         left = 1.0 - self.steps / self._total
         rate = self._ppo.learning_rate * max(left, algorithms.LEAST_RATE)
@@ -327,7 +340,7 @@ class LeanPpo:
         self.collector.networks.load_state_dict(self.networks.state_dict())
         learner = self.learner
         jobs: list[Callable[[], Any]] = [
-            lambda: learner.learn(learner.judge(rollout), rate)
+            lambda: learner.learn(learner.compute_transitions(rollout), rate)
         ]
         if self.steps < self._total:
             learner.core_is_free.clear()
@@ -340,14 +353,14 @@ class LeanPpo:
             self._take(watch, *part)
         return float(loss)
 
-    def _collect(self) -> tuple[Driven, Ended]:
+    def _collect(self) -> tuple[Rollout, Ended]:
         torch.set_num_threads(self._settings.threads)  # a per-thread setting
         try:
             return self.collector.collect()
         finally:
             self.learner.core_is_free.set()
 
-    def _take(self, watch: Watch, rollout: Driven, ended: Ended) -> None:
+    def _take(self, watch: Watch, rollout: Rollout, ended: Ended) -> None:
         self._rollout = rollout
         self._successes.extend(success for success, _ in ended)
         watch.collisions.extend(collision for _, collision in ended)
@@ -372,7 +385,7 @@ class LeanPpo:
         self.learner.optimiser.load_state_dict(state["optimiser"])
         self.steps = state["steps"]
         rollout = state["rollout"]
-        self._rollout = rollout and Driven(**rollout)
+        self._rollout = rollout and Rollout(**rollout)
         self._successes.extend(state["recent"])
         self.collector.last = state["last"].numpy()
         generators = self.collector.generator, self.learner.generator

@@ -33,6 +33,7 @@ from nics_drl_bridge.policy.train import checkpoint as checkpoints
 from nics_drl_bridge.policy.train.algorithms import Actor, Sb3Training
 from nics_drl_bridge.policy.train.export import export_policy
 from nics_drl_bridge.policy.train.ppo import LeanPpo
+from nics_drl_bridge.policy.train.progress import Tell, Watch
 from nics_drl_bridge.policy.train.settings import (
     Opened,
     TrainingSettings,
@@ -51,11 +52,10 @@ LOCK = ".lock"
 EVALUATION = "evaluation.json"
 POLICY = "policy.onnx"
 SEEDS = 2**40
-MOST_WEIGHT = 80.0  # largest log standard deviation whose exponential is finite
+MOST_WEIGHT = 80.0  # largest sane weight; exp of a log deviation below it is finite
 TRIED = 8  # number of worlds, and of steps, in the trial run of a task
 # maximum seed of numpy's global generator, which Stable-Baselines3 uses
-GREATEST_SEED = 2**32 - 1
-Tell = checkpoints.Tell
+GREATEST_SB3_SEED = 2**32 - 1
 Worlds = Mapping[str, AnyWorld]  # by their names in the settings
 
 
@@ -112,9 +112,7 @@ def train(
     if training.steps < settings.steps and not stop.over:
         logger = configure(str(folder), ["tensorboard"])
         try:
-            training.learn(
-                checkpoints.Watch(env, seed, settings, save, tell, stop), logger
-            )
+            training.learn(Watch(env, seed, settings, save, tell, stop), logger)
         except (RuntimeError, ValueError, gymnasium.error.InvalidAction):
             refuse_diverged(training, MOST_WEIGHT)
             raise
@@ -372,7 +370,7 @@ def export(
 def _check(
     settings: TrainingSettings, seeds: Sequence[int], out: Path, resumed: bool
 ) -> None:
-    check_seeds(seeds, GREATEST_SEED)
+    check_seeds(seeds, GREATEST_SB3_SEED)
     if not seeds or len(set(seeds)) < len(seeds):
         raise ConfigError(f"seeds {list(seeds)}: give one or more, without duplicates.")
     begun = any((out / f"seed_{seed}" / CHECKPOINT).is_file() for seed in seeds)

@@ -58,14 +58,16 @@ class TrainVecEnv(VecEnv):
 
     def reset(self) -> Observation:
         """Starts an episode in every world, with the seeds given to `seed`."""
-        shown = []
+        observations = []
         for env, rows in zip(self.envs, self._rows, strict=True):
             seeds_of_env = self._seeds[rows]
             seeds = None if all(seed is None for seed in seeds_of_env) else seeds_of_env
-            shown.append(env.reset(seed=seeds, options=self._options[0] or None)[0])
+            observations.append(
+                env.reset(seed=seeds, options=self._options[0] or None)[0]
+            )
         self._reset_seeds()
         self._reset_options()
-        return _join_rows(shown)
+        return _join_rows(observations)
 
     def step_async(self, actions: AnyArray) -> None:
         """Stores the actions for the next step."""
@@ -81,24 +83,26 @@ class TrainVecEnv(VecEnv):
         self._ended = []
         parts = []
         for env, rows in zip(self.envs, self._rows, strict=True):
-            seen, gain, terminated, truncated, info = env.step(self._actions[rows])
+            observation, reward, terminated, truncated, info = env.step(
+                self._actions[rows]
+            )
             ended = terminated | truncated
-            parts.append((seen, gain, ended))
+            parts.append((observation, reward, ended))
             if ended.any():
                 self._fill_infos(rows.start, ended, truncated & ~terminated, info)
-        observation, reward, done = (
+        observations, rewards, dones = (
             _join_rows(list(rows_of_envs)) for rows_of_envs in zip(*parts, strict=True)
         )
         self.stepping_s += time.perf_counter() - begin
         if self.on_step is not None:
             self.on_step()
-        return observation, reward.astype(np.float32), done, list(self._infos)
+        return observations, rewards.astype(np.float32), dones, list(self._infos)
 
     def _fill_infos(
-        self, first: int, ended: Mask, cut: Mask, info: dict[str, Any]
+        self, first: int, ended: Mask, truncated: Mask, info: dict[str, Any]
     ) -> None:
         """Fills in the infos of ended worlds of an env, the first of whose worlds is `first`."""
-        flags = {"TimeLimit.truncated": cut}
+        flags = {"TimeLimit.truncated": truncated}
         for name in {"is_success", "collision"} & info["final_info"].keys():
             values = info["final_info"][name]
             flags[name] = values.reshape(len(ended), -1).all(axis=1)
