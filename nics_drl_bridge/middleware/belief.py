@@ -20,7 +20,7 @@ MAX_COMBINATIONS = 4096
 
 
 class Belief(NamedTuple):
-    """Complete state of the filter at a time; its arrays are never modified in place."""
+    """Complete state of the filter at a time; its arrays are not modified once it is made."""
 
     time_ns: int
     mean: Array  # (3 + S,) x [m], y [m], heading [rad] in `map`, then the state of the RobotSpec
@@ -29,7 +29,7 @@ class Belief(NamedTuple):
     clone: Clone | None  # None before the first odometry that was used
     lost: bool  # True after a gap too long to predict, until an odometry or a pose
     # (3 + S, S) Jacobian of the last prediction with respect to an error in the state's rates
-    rates_jacobian: Array
+    rate_error_jacobian: Array
     # (3,) factors on the noise variances, by kind
     noise_scale: tuple[float, ...] = (1.0, 1.0, 1.0)
     innovations: Array = np.zeros((3, 3))  # (3, 3) newest innovation of each kind

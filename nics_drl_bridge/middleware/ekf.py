@@ -1,4 +1,6 @@
-"""The state estimator: filterpy's extended Kalman filter around the fitted model.
+"""The state estimator: an extended Kalman filter around the fitted model.
+
+filterpy keeps mean and covariance and computes the usual update; the kernels do the rest.
 
 How it works:
 
@@ -160,7 +162,7 @@ class Estimator:
             outliers=(0, 0, 0),
             clone=None,
             lost=False,
-            rates_jacobian=self._start_jacobian,
+            rate_error_jacobian=self._start_jacobian,
         )
         self._log = make_log(np.zeros(len(self._command_limits[0])))
 
@@ -179,7 +181,7 @@ class Estimator:
             outliers=(0, 0, 0),
             clone=None,
             lost=False,
-            rates_jacobian=self._start_jacobian,
+            rate_error_jacobian=self._start_jacobian,
             gyro=gyro,
         )
         low, high = self._command_limits
@@ -195,7 +197,7 @@ class Estimator:
             self._outliers,
             self._clone,
             self._lost,
-            self._rates_jacobian,
+            self._rate_error_jacobian,
             self._noise_scale,
             self._innovations,
             self._gyro,
@@ -209,7 +211,7 @@ class Estimator:
         self._outliers = belief.outliers
         self._clone = belief.clone
         self._lost = belief.lost
-        self._rates_jacobian = belief.rates_jacobian
+        self._rate_error_jacobian = belief.rate_error_jacobian
         self._noise_scale = belief.noise_scale
         self._innovations = belief.innovations
         self._gyro = belief.gyro
@@ -274,7 +276,7 @@ class Estimator:
         passed_ns = time_ns - self.time_ns
         if passed_ns <= 0:
             return
-        mean, covariance, twist, rates_jacobian, mean_jacobian = (
+        mean, covariance, twist, rate_error_jacobian, mean_jacobian = (
             kernels.predict_estimate(
                 self._filter.x,
                 self._filter.P,
@@ -294,7 +296,7 @@ class Estimator:
         self.time_ns = time_ns
         self._filter.x = mean
         self._filter.P = covariance
-        self._rates_jacobian = rates_jacobian
+        self._rate_error_jacobian = rate_error_jacobian
         self._twist = twist
 
     def update(
@@ -328,7 +330,7 @@ class Estimator:
         fused = self._fuse_gyro(measurement)
         if fused is not None:
             measurement = self._replace_turn(measurement, fused)
-        bridged = self._bridge(measurement)
+        bridged = self._end_gap(measurement)
         judgement = self._correct(measurement, not bridged)
         if judgement.outcome is Acceptance.OUTLIER and not bridged:
             # The relative pose of the next odometry then spans this one.
@@ -379,8 +381,11 @@ class Estimator:
             and (np.abs(twist) < REST_MEASURED).all()
         )
 
-    def _bridge(self, measurement: Measurement) -> bool:
-        """Bridges a time without data by odometry; returns False if there was no such time."""
+    def _end_gap(self, measurement: Measurement) -> bool:
+        """Ends a time without data, bridged by odometry if that can be trusted.
+
+        Returns False if there was no such time.
+        """
         if not self._lost or measurement.odom is None:
             return False
         self._lost = False
@@ -400,10 +405,12 @@ class Estimator:
         if kind is Kind.POSE:
             innovation[2] = wrap(innovation[2])
         nis = kernels.compute_nis(innovation, jacobian, self._filter.P, noise)
-        alternates = self._is_alternating(kind, innovation)
+        alternates = self._record_innovation(kind, innovation)
         outcome = Acceptance.USED
         if not nis <= GATE:
-            outcome = self._judge_outlier(kind, innovation, jacobian, noise, alternates)
+            outcome = self._prepare_for_outlier(
+                kind, innovation, jacobian, noise, alternates
+            )
         if outcome is Acceptance.OUTLIER:
             self._count_outliers(kind, self._outliers[kind] + 1)
             return Judgement(nis, outcome)
@@ -473,7 +480,7 @@ class Estimator:
             )
         kernels.repair_estimate(self._filter.x, self._filter.P, *self._state_limits)
 
-    def _judge_outlier(
+    def _prepare_for_outlier(
         self,
         kind: Kind,
         innovation: Array,
@@ -493,7 +500,9 @@ class Estimator:
         if kind is Kind.TWIST:
             doubt = np.maximum(self._stuck_variance - np.diag(covariance), 0.0)
             # Whatever changed the state since the prediction began also moved the pose.
-            moved = self._rates_jacobian @ np.linalg.inv(self._rates_jacobian[3:])
+            moved = self._rate_error_jacobian @ np.linalg.inv(
+                self._rate_error_jacobian[3:]
+            )
             doubted = covariance + (moved * doubt[3:]) @ moved.T
             if kernels.compute_nis(innovation, jacobian, doubted, noise) <= GATE:
                 self._filter.P = doubted
@@ -516,7 +525,7 @@ class Estimator:
         )
         return twist, jacobian
 
-    def _is_alternating(self, kind: Kind, innovation: Array) -> bool:
+    def _record_innovation(self, kind: Kind, innovation: Array) -> bool:
         """Records an innovation; returns True if it opposes the last one, which suggests noise."""
         before = self._innovations[kind]
         self._innovations = self._innovations.copy()

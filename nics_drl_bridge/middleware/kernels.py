@@ -238,6 +238,7 @@ def propagate_mean(
     command = np.empty(log.commands.shape[1])
     now = begin
     while now < end:
+        # "just before" the next nanosecond: also a command that takes effect now
         until = min(read_commands(command, now + 1, motion, log), end)
         steps = (until - now) // step
         rest = (until - now) % step
@@ -289,6 +290,7 @@ def predict_estimate(
     """
     # A wrong model stays wrong for a while, so the error in the state's rates is taken as constant.
     # It then moves the pose too, and a correction of the state also corrects the pose.
+    # Its covariance, `process` / time, lets the variance of the state grow by `process` * time.
     moved = mean.copy()
     width = mean.shape[0]
     time = (end - begin) / NS_PER_S
