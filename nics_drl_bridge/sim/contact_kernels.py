@@ -1,19 +1,19 @@
-"""Compiled contacts: which robots may touch something in a period, and how these robots move.
+"""Compiled contacts: find the robots that may touch something, and move these.
 
-A robot whose circle cannot meet anything within the period moves freely. For the other robots,
-`near` lists the bodies to test in each substep. If bodies are sorted into cells, a robot tests only
-those around it. In a crowd all bodies are sorted in each period; otherwise standing obstacles are
-sorted once per episode.
+A robot whose bounding circle cannot touch anything within the period moves freely. For
+the other robots, `near` lists the bodies to test in each substep. If bodies are sorted
+into cells, a robot tests only those around it. In a crowd all bodies are sorted in each
+period; otherwise static obstacles are sorted once per episode.
 
-All robots that may meet something are advanced together, by their clearance over the greatest
-speed at which it may shrink, but by `FLOOR` at least. Within the `SKIN` around a robot, its motion
-is bent so that no near point approaches: it slides, turns and leaves. A step that ends in an
-overlap all the same is not made: the robot keeps only its turn, and if that does not help, it
-stands still for the rest of the substep. An obstacle that runs into a robot stops for the rest of
-the period.
+All robots that may touch something are advanced together (conservative advancement): a
+step is the clearance, but at least `FLOOR`, divided by the maximum closing speed.
+Within the `SKIN` around a robot, its motion is deflected so that no near point
+approaches: it slides, turns and leaves. A step that would still end in an overlap is
+rejected: the robot only turns, or if that does not help, stops for the rest of the
+substep. An obstacle that runs into a robot stops for the rest of the period.
 
-Shared arguments: m is a robot; `begin` is a time in the period, `time` and `end` in the interval
-that is advanced [s].
+Shared arguments: m is a robot; `begin` is a time within the period, `time` and `end`
+are times within the interval [s].
 """
 
 import math
@@ -34,28 +34,29 @@ from nics_drl_bridge.sim.state import (
     Tight,
 )
 
-# Bit flags of what a robot may meet
+# Bit flags for what a robot may touch
 FREE = 0
 BODIES = 1
 WALLS = 2
 MAP = 4
 # Maximum number of bodies listed near a robot; if there are more, all are tested
 SEVERAL = 32
-FLOOR = 4e-4  # A step brings two bodies nearer by so much at least [m]
+FLOOR = 4e-4  # Minimum distance by which a step brings two bodies closer [m]
 SKIN = 2.0 * FLOOR  # Bodies nearer than this are in contact if they approach [m]
-# Speed at which a body in contact is moved towards a clearance of FLOOR, as a fraction of its own
+# Speed at which a body in contact is pushed to a clearance of FLOOR, as a fraction of
+# its own speed
 SPRING = 0.1
 APPROACH = 1e-6  # An approach slower than this fraction of the speed is due to rounding
-SWEEPS = 20  # Maximum number of passes over the touches of a robot to bend its motion
-# Bounds of the speed of any point of a robot whose motion is bent, as fractions of its own speed
+SWEEPS = 20  # Maximum number of passes over a robot's touches to deflect its motion
+# Bounds on the speed of any point of a deflected robot, as multiples of its own speed
 ROUND_HEADROOM = 1.2
 CORNERED_HEADROOM = 1.7
 
 
 class World(NamedTuple):
-    """One world whose robots may meet something in the period."""
+    """One world with robots that may touch something in the period."""
 
-    bodies: Array  # (K + M, 7) obstacles, then robots, as they stand
+    bodies: Array  # (K + M, 7) obstacles, then robots, at their current poses
     velocity: Array  # (K, 3) of the obstacles
     first: int  # index of the first robot
     scene: Surroundings
@@ -67,9 +68,9 @@ class World(NamedTuple):
 
 @kernel
 def find_contacts(m: int, limit: float, skin: float, world: World) -> tuple[float, int]:
-    """Return the clearance of a robot up to `limit` [m], and the nearest body or -1.
+    """Return a robot's clearance, up to `limit` [m], and the nearest body or -1.
 
-    What it touches within `skin` [m] is in `world.tight.listed`.
+    Touches within `skin` [m] are listed in `world.tight.listed`.
     """
     scene = world.scene
     near = world.tight.near
@@ -101,7 +102,7 @@ def find_contacts(m: int, limit: float, skin: float, world: World) -> tuple[floa
 
 @kernel
 def start_motion(m: int, vx: float, vy: float, turn: float, world: World) -> None:
-    """Let a robot move with a twist from where it stands, at the beginning of an interval."""
+    """Start the motion of a robot with a twist, at the beginning of an interval."""
     motion = world.tight.motions[m]
     body = world.bodies[world.first + m]
     motion.wish_x = vx
@@ -115,7 +116,7 @@ def start_motion(m: int, vx: float, vy: float, turn: float, world: World) -> Non
 
 @kernel
 def _bound_speed(body: Array, vx: float, vy: float, turn: float, world: World) -> float:
-    """Bound of the speed of any point of a robot, even if its motion is bent [m/s]."""
+    """Bound on the speed of any point of a robot, even if deflected [m/s]."""
     if collision.is_round(body, world.scene.outlines):
         return ROUND_HEADROOM * math.sqrt(vx * vx + vy * vy)
     rim = turn * body[RADIUS]
@@ -131,7 +132,7 @@ def _turn_off(
     vy: float,
     turn: float,
 ) -> None:
-    """Let a robot go on with another twist from where it stands."""
+    """Continue the motion of a robot with another twist."""
     motion.x = body[X]
     motion.y = body[Y]
     motion.heading = body[HEADING]
@@ -163,7 +164,7 @@ def _place_robot(motion: Record, body: Array, time: float, world: World) -> None
 
 @kernel
 def place_obstacles(time: float, world: World) -> None:
-    """Place the obstacles where they are at a time in the period."""
+    """Place the obstacles at their poses at a time in the period."""
     for k in range(world.first):
         lasted = min(time, world.tight.stops[k])
         _place_obstacle(
@@ -205,7 +206,7 @@ def _find_rate(k: int, begin: float, touch: Record, world: World) -> float:
 
 @kernel
 def _judge(m: int, begin: float, time: float, rest: float, world: World) -> None:
-    """Choose how a robot moves on from a time, and until when it cannot meet anything."""
+    """Choose a robot's further motion, and the time until it may touch something."""
     tight = world.tight
     motion = tight.motions[m]
     speed = motion.bound + tight.fastest[0]
@@ -235,10 +236,11 @@ def _judge(m: int, begin: float, time: float, rest: float, world: World) -> None
 
 @kernel
 def _bend(m: int, time: float, world: World) -> None:
-    """Bend the motion of a robot so that it does not approach what it touches.
+    """Deflect the motion of a robot so that it does not approach what it touches.
 
-    Each pass removes the approach at one touch after the other, by the impulse that would stop a
-    ring there: it slides without friction, and a touched corner turns it.
+    Each pass removes the approach at one touch after another, by the impulse that would
+        stop a ring there: the robot slides without friction, and a touched corner turns
+        it.
     """
     motion = world.tight.motions[m]
     body = world.bodies[world.first + m]
@@ -287,7 +289,7 @@ def _mark(m: int, k: int, world: World) -> None:
 
 @kernel
 def _halt(m: int, begin: float, time: float, end: float, world: World) -> bool:
-    """Let a robot that overlaps something at the end of a step only turn, or stand still.
+    """Make a robot that overlaps something at the end of a step only turn, or stop.
 
     Returns:
         True if it did either.
@@ -314,7 +316,7 @@ def _halt(m: int, begin: float, time: float, end: float, world: World) -> bool:
 
 @kernel
 def _find_fastest(obstacles_move: bool, world: World) -> float:
-    """Greatest speed of any body but an only robot [m/s]."""
+    """Maximum speed of any body that a robot may touch [m/s]."""
     meets = world.tight.meets
     fastest = 0.0
     for k in range(world.first if obstacles_move else 0):
@@ -330,13 +332,13 @@ def _find_fastest(obstacles_move: bool, world: World) -> float:
 
 @kernel
 def advance(begin: float, duration: float, obstacles_move: bool, world: World) -> None:
-    """Move the robots that may meet something, and the obstacles, by a duration [s]."""
+    """Move the obstacles and the robots that may touch something for a duration [s]."""
     meets = world.tight.meets
     motions = world.tight.motions
     robots = len(meets)
     fastest = _find_fastest(obstacles_move, world)
     world.tight.fastest[0] = fastest
-    # Robots that are judged at nearly the same time are judged together: there are fewer steps.
+    # Robots that are due at nearly the same time are handled together, for fewer steps.
     early = np.inf
     for m in range(robots):
         if meets[m] != FREE:
@@ -377,7 +379,7 @@ def find_near(
     reach: Array,
     cells: BodyCells,
 ) -> int:
-    """Return flags of what robot m of world n may meet; write row m of `near`."""
+    """Return flags for what robot m of world n may touch; write row m of `near`."""
     walls = scene.walls
     me = bodies.shape[1] - len(near) + m
     x = bodies[n, me, X]
@@ -392,7 +394,8 @@ def find_near(
         dy = bodies[n, k, Y] - y
         far = own_reach + other_reach
         if dx * dx + dy * dy <= far * far and k != me and other_reach > 0.0:
-            # in order of the bodies, with cells or without: the bits of a contact depend on it
+            # in the order of bodies, with or without cells, because the result's bits
+            # depend on it
             i = min(count, SEVERAL)
             while count < SEVERAL and i > 0 and near[m, i] > k:
                 near[m, 1 + i] = near[m, i]
