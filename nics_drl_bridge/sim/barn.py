@@ -1,9 +1,9 @@
 """The 250 public worlds of BARN, the Benchmark for Autonomous Robot Navigation.
 
-Fields of cylinders from "Benchmarking Metric Ground Navigation" (Perille, Truong, Xiao and Stone,
-2020), in which entrants of the BARN challenge drive 10 m. `config/worlds/barn/` names the
-source of the data. Worlds whose number is a multiple of 6 are the benchmark's test set and are not
-included.
+Fields of cylinders from "Benchmarking Metric Ground Navigation" (Perille, Truong, Xiao
+and Stone, 2020), through which entrants of the BARN challenge drive 10 m.
+`config/worlds/barn/` names the source of the data. Worlds whose number is a multiple of
+6 are the benchmark's test set and are not included.
 """
 
 from functools import lru_cache
@@ -38,7 +38,7 @@ def barn_numbers() -> tuple[int, ...]:
 
 
 def barn_world(number: int) -> World:
-    """Return a world by number, in its Gazebo world's frame. ConfigError for an unknown number."""
+    """Return a world by number, in the frame of its Gazebo world."""
     packed = _arrays()["cylinders"][_index(number)]
     cells = np.unpackbits(packed, count=ROWS * COLUMNS).reshape(ROWS, COLUMNS)
     poses = [(x, y, 0.0) for x, y in _centres(np.argwhere(cells), CORNER).tolist()]
@@ -54,7 +54,7 @@ def barn_world(number: int) -> World:
 
 
 def barn_path(number: int) -> Array:
-    """Return (P, 2) the benchmark's own shortest path in a world, from cell to cell [m]."""
+    """Return the benchmark's own shortest path (P, 2) in a world, cell by cell [m]."""
     paths = _arrays()["paths"]
     return _centres(paths[paths[:, 0] == _index(number), 1:], PATH_CORNER)
 

@@ -1,15 +1,15 @@
-"""Compiled collision: the clearance between bodies, straight walls and a static map, and touches.
+"""Compiled collision tests: clearances and touches of bodies, straight walls and a map.
 
 A `Solid` is a placed outline. The clearance of two solids is the distance between their outlines,
-at most `limit` [m]. Of solids that overlap it is negative: the distance of the first one's origin
-from the other, less the radius of the circle around the first one. Nearest points that are nearer
-than `skin` [m] are listed as touches. Shared arguments: a body (7,) has the columns of `state`, a
-wall (4,) two ends; the distances of a map are 0 in solid cells; `listed` is scratch memory for
-touches, which adds to those that it holds.
+at most `limit` [m]. It is negative if they overlap: the distance of the first one's
+origin from the other, minus the radius of the circle around the first one. Nearest
+points closer than `skin` [m] are listed as touches. Shared arguments: a body (7,) has
+the columns of `state`, a wall (4,) has two ends; the distances of a map are 0 in solid
+cells; `listed` is scratch memory, to which touches are appended.
 
-Bodies may be sorted into square cells, so that those around a point are found without testing all.
-A body lies in the cell of its centre. One that moves or is larger than a cell is in no cell and is
-always found. The outermost cells reach to infinity.
+Bodies may be sorted into square cells, so that those around a point are found without
+testing all. A body is in the cell of its centre. A body that moves or is larger than a
+cell is in no cell and is always found. The outermost cells extend to infinity.
 """
 
 import math
@@ -31,7 +31,7 @@ from nics_drl_bridge.sim.state import Array, BodyCells, MapField, Touches
 
 LEFT, BOTTOM, PER_METRE, SIDE, LARGEST, MOVED, FRAME = range(7)
 """Columns of `BodyCells.frame`: x, y of the first cell [m], cells per metre, cells in a row,
-maximum radius of the bodies in cells [m], maximum distance moved since by any of them [m]."""
+maximum radius of the bodies in cells [m], maximum distance moved since then [m]."""
 PER_BODY = 1.0  # Cells
 
 OVERLAP = 1e-12  # minimum overlap [m]
@@ -61,7 +61,7 @@ class Solid(NamedTuple):
 
 
 class Edge(NamedTuple):
-    """A straight line between two points [m]; both are the centre, of a circle."""
+    """A straight line between two points [m]; for a circle, both are the centre."""
 
     ax: float
     ay: float
@@ -85,7 +85,7 @@ def is_round(body: Array, outlines: OutlineArrays) -> bool:
 
 @kernel
 def solid_of(k: int, body: Array, outlines: OutlineArrays) -> Solid:
-    """Return a body, whose number is k, as a solid."""
+    """Return body number k as a solid."""
     outline = outline_of(body, outlines)
     radius = body[RADIUS] if is_round(body, outlines) else 0.0
     return Solid(
@@ -203,7 +203,7 @@ def _find_nearest(p: Edge, q: Edge) -> tuple[float, float, float, float]:
 
 @kernel
 def _measure_origin(x: float, y: float, solid: Solid) -> float:
-    """Signed distance of a point in the frame of a solid from it [m]."""
+    """Signed distance from a solid of a point in the solid's frame [m]."""
     if solid.radius > 0.0:
         return math.sqrt(x * x + y * y) - solid.radius
     return outline_point(x, y, solid.outline)
@@ -264,7 +264,8 @@ def find_gap(
 def _contain(one: Solid, other: Solid, x: float, y: float, c: float, s: float) -> bool:
     """True if one of two solids whose outlines do not meet is inside the other.
 
-    The first one is at (x, y) in the other's frame, turned by an angle with cosine c and sine s.
+    The first one is at (x, y) in the other's frame, rotated by an angle of cosine c and
+    sine s.
     """
     if other.radius > 0.0 or _count_edges(other.outline) > 1:
         p = _place_edge(_get_edge(0, one.outline), x, y, c, s)
@@ -340,12 +341,12 @@ def in_grid(x: float, y: float, grid: MapField) -> tuple[float, float]:
 
 @kernel
 def _bounds(x: float, y: float, grid: MapField) -> tuple[float, float]:
-    """Bound on the distance from (x, y) to a solid cell, from that of the nearest cell [m]."""
+    """Bounds on the distance from (x, y) to a solid cell, by the nearest cell's [m]."""
     rows, columns = grid.distances.shape
     size = grid.cell
     i = min(max(math.floor(y / size), 0), rows - 1)
     j = min(max(math.floor(x / size), 0), columns - 1)
-    # From outside, the nearest point of the map is nearer to each of its cells than (x, y) is.
+    # Outside the map, its nearest point is closer to each of its cells than (x, y) is.
     px = min(max(x, 0.0), columns * size)
     py = min(max(y, 0.0), rows * size)
     within = math.hypot(px - (j + 0.5) * size, py - (i + 0.5) * size)
@@ -405,7 +406,7 @@ def map_gap(
 
 
 def body_cells(worlds: int, bodies: int, ordered: bool = False) -> BodyCells:
-    """Allocate cells for K bodies in each of N worlds; 0 worlds if all bodies are looked at."""
+    """Allocate cells for K bodies in each of N worlds; 0 worlds to test all bodies."""
     rows = worlds
     if ordered:
         rows = min(worlds, 1)
@@ -438,7 +439,7 @@ def _cell(body: Array, stands: bool, frame: Array) -> int:
 
 @kernel
 def sort_into_cells(n: int, bodies: Array, standing: int, cells: BodyCells) -> None:
-    """Sort the bodies (K, 7) of a world, the first `standing` of them by cells."""
+    """Sort the bodies (K, 7) of a world; the first `standing` go into cells."""
     low_x = np.inf
     low_y = np.inf
     high_x = -np.inf
@@ -493,9 +494,10 @@ def put_in_order(
     spare: Array,
     cells: BodyCells,
 ) -> None:
-    """Sort the first `standing` bodies (K, 7) themselves, absent ones last; no others may move.
+    """Sort the first `standing` bodies (K, 7) in place, absent ones last.
 
-    Neighbours then share cache lines, so few accesses miss the cache. `spare` (K, 7) is scratch.
+    None of these may move. Neighbours then share cache lines, so that few accesses miss
+    the cache. `spare` (K, 7) is scratch.
     """
     sort_into_cells(n, bodies[:standing], standing, cells)
     first = cells.first[n]
@@ -510,16 +512,16 @@ def put_in_order(
         if spare[k, RADIUS] <= 0.0:
             _copy(spare[k], bodies[count])
             count += 1
-    first[end] = len(bodies)  # the absent, and those that move, are always found
+    first[end] = len(bodies)  # absent and moving bodies are always found
 
 
 @kernel
 def find_around(n: int, x: float, y: float, reach: float, cells: BodyCells) -> int:
-    """Write the sorted bodies that may be within `reach` [m] to `cells.found`; return how many."""
+    """Write bodies that may be within `reach` [m] to `cells.found`; return how many."""
     first = cells.first
     found = cells.found
     if len(first) == 0:
-        return len(found)  # which lists all bodies
+        return len(found)  # `found` lists all bodies
     frame = cells.frame[n]
     per_metre = frame[PER_METRE]
     side = int(frame[SIDE])

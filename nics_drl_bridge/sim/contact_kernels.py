@@ -1,19 +1,20 @@
-"""Compiled contacts: which robots may touch something in a period, and how these robots move.
+"""Compiled contacts: find the robots that may touch something, and move these.
 
-A robot whose circle cannot meet anything within the period moves freely. For the other robots,
-`near` lists the bodies to test in each substep. If bodies are sorted into cells, a robot tests only
-those around it. In a crowd all bodies are sorted in each period; otherwise standing obstacles are
-sorted once per episode.
+A robot whose bounding circle cannot touch anything within the period moves freely. For
+the other robots, `near` lists the bodies to test in each substep. If bodies are sorted
+into cells, a robot tests only those around it. In a crowd all bodies are sorted in each
+period; otherwise static obstacles are sorted once per episode.
 
-All robots that may meet something are advanced together, by their clearance over the greatest
-speed at which it may shrink, but by `FLOOR` at least. Within the `SKIN` around a robot, its motion
-is bent so that no near point approaches: it slides, turns and leaves. A step that ends in an
-overlap all the same is not made: the robot keeps only its turn, and if that does not help, it
-stands still for the rest of the substep. An obstacle that runs into a robot stops for the rest of
-the period.
+All robots that may touch something are advanced together (conservative advancement): a
+step is the clearance, but at least `FLOOR`, divided by the maximum closing speed.
+Within the `SKIN` around a robot, its motion is deflected so that no near point
+approaches: it slides, turns and leaves. A step that would still end in an overlap is
+rejected: the robot only turns, or if that does not help, stops for the rest of the
+substep. An obstacle that runs into a robot stops for the rest of the period.
 
-Shared arguments: m is a robot; `begin` is a time in the period, `time` and `end` in the interval
-that is advanced [s], which starts at `begin`. A speed of 0 gives a time of inf: never.
+Shared arguments: m is a robot; `begin` is a time within the period, `time` and `end`
+are times within the interval that starts there [s]. A speed of 0 gives a time of inf:
+never.
 """
 
 import math
@@ -34,7 +35,7 @@ from nics_drl_bridge.sim.state import (
     Tight,
 )
 
-# Bit flags of what a robot may meet
+# Bit flags for what a robot may touch
 FREE = 0
 BODIES = 1
 WALLS = 2
@@ -45,21 +46,22 @@ TURN_ONLY = 1
 STAND = 2
 # Maximum number of bodies listed near a robot; if there are more, all are tested
 SEVERAL = 32
-FLOOR = 4e-4  # A step brings two bodies nearer by so much at least [m]
+FLOOR = 4e-4  # Minimum distance by which a step brings two bodies closer [m]
 SKIN = 2.0 * FLOOR  # Bodies nearer than this are in contact if they approach [m]
-# Speed at which a body in contact is moved towards a clearance of FLOOR, as a fraction of its own
+# Speed at which a body in contact is pushed to a clearance of FLOOR, as a fraction of
+# its own speed
 SPRING = 0.1
 APPROACH = 1e-6  # An approach slower than this fraction of the speed is due to rounding
-SWEEPS = 20  # Maximum number of passes over the touches of a robot to bend its motion
-# Bounds of the speed of any point of a robot whose motion is bent, as fractions of its own speed
+SWEEPS = 20  # Maximum number of passes over a robot's touches to deflect its motion
+# Bounds on the speed of any point of a deflected robot, as multiples of its own speed
 ROUND_HEADROOM = 1.2
 CORNERED_HEADROOM = 1.7
 
 
 class ContactWorld(NamedTuple):
-    """One world whose robots may meet something in the period."""
+    """One world with robots that may touch something in the period."""
 
-    bodies: Array  # (K + M, 7) obstacles, then robots, as they stand
+    bodies: Array  # (K + M, 7) obstacles, then robots, at their current poses
     velocity: Array  # (K, 3) of the obstacles
     first: int  # index of the first robot
     scene: Surroundings
@@ -79,7 +81,7 @@ def find_near(
     reach: Array,
     cells: BodyCells,
 ) -> int:
-    """Return flags of what robot m of world n may meet; write row m of `near`."""
+    """Return flags for what robot m of world n may touch; write row m of `near`."""
     walls = scene.walls
     me = bodies.shape[1] - len(near) + m
     x = bodies[n, me, X]
@@ -120,7 +122,7 @@ def find_near(
 def advance(
     begin: float, duration: float, obstacles_move: bool, world: ContactWorld
 ) -> None:
-    """Move the robots that may meet something, and the obstacles, by a duration [s]."""
+    """Move the obstacles and the robots that may touch something for a duration [s]."""
     meets = world.tight.meets
     motions = world.tight.motions
     robots = len(meets)
@@ -160,9 +162,9 @@ def advance(
 
 @kernel
 def _find_fastest(obstacles_move: bool, world: ContactWorld) -> float:
-    """Bound of the speed of anything that a robot may meet [m/s].
+    """Bound on the speed of anything that a robot may touch [m/s].
 
-    A single robot meets obstacles alone; of several robots, each may meet another.
+    A single robot only touches obstacles; one of several may also touch another robot.
     """
     meets = world.tight.meets
     fastest = 0.0
@@ -181,9 +183,9 @@ def _find_fastest(obstacles_move: bool, world: ContactWorld) -> float:
 def find_contacts(
     m: int, limit: float, skin: float, world: ContactWorld
 ) -> tuple[float, int]:
-    """Return the clearance of a robot up to `limit` [m], and the nearest body or -1.
+    """Return a robot's clearance, up to `limit` [m], and the nearest body or -1.
 
-    What it touches within `skin` [m] is in `world.tight.listed`.
+    Touches within `skin` [m] are listed in `world.tight.listed`.
     """
     scene = world.scene
     near = world.tight.near
@@ -217,7 +219,7 @@ def find_contacts(
 def start_motion(
     m: int, vx: float, vy: float, turn: float, world: ContactWorld
 ) -> None:
-    """Let a robot move with a twist from where it stands, at the beginning of an interval."""
+    """Start the motion of a robot with a twist, at the beginning of an interval."""
     motion = world.tight.motions[m]
     body = world.bodies[world.first + m]
     motion.wish_x = vx
@@ -233,7 +235,7 @@ def start_motion(
 def _bound_speed(
     body: Array, vx: float, vy: float, turn: float, world: ContactWorld
 ) -> float:
-    """Bound of the speed of any point of a robot, even if its motion is bent [m/s]."""
+    """Bound on the speed of any point of a robot, even if deflected [m/s]."""
     if collision.is_round(body, world.scene.outlines):
         return ROUND_HEADROOM * math.sqrt(vx * vx + vy * vy)
     rim = turn * body[RADIUS]
@@ -249,7 +251,7 @@ def _turn_off(
     vy: float,
     turn: float,
 ) -> None:
-    """Let a robot go on with another twist from where it stands."""
+    """Continue the motion of a robot with another twist."""
     motion.x = body[X]
     motion.y = body[Y]
     motion.heading = body[HEADING]
@@ -281,7 +283,7 @@ def _place_robot(motion: Record, body: Array, time: float, world: ContactWorld) 
 
 @kernel
 def place_obstacles(time: float, world: ContactWorld) -> None:
-    """Place the obstacles where they are at a time in the period."""
+    """Place the obstacles at their poses at a time in the period."""
     for k in range(world.first):
         lasted = min(time, world.tight.stops[k])
         _place_obstacle(
@@ -324,13 +326,13 @@ def _find_approach(time: float, touch: Record, world: ContactWorld) -> float:
 
 @kernel
 def _judge(m: int, begin: float, time: float, rest: float, world: ContactWorld) -> None:
-    """Choose how a robot moves on from a time, and until when it cannot meet anything."""
+    """Choose a robot's further motion, and the time until it may touch something."""
     motion = world.tight.motions[m]
     fastest = world.tight.fastest[0]
     _measure_clearance(m, begin, time, rest, world)
     _stop_obstacles(m, begin + time, world)
     if motion.freedom == MOVE:
-        _bend(m, time, world)
+        _deflect(m, time, world)
     body = world.bodies[world.first + m]
     speed = _bound_speed(body, motion.vx, motion.vy, motion.turn, world)
     motion.safe_until = time + max(motion.gap, FLOOR) / (speed + fastest)
@@ -345,8 +347,8 @@ def _measure_clearance(
 ) -> None:
     """Measure the clearance of a robot, and list what it touches.
 
-    The clearance is measured as far as the robot may get in the rest of the period, so that `room`
-    may free it from being judged in later intervals.
+    The clearance is measured as far as the robot may get in the rest of the period, so
+    that `room` may show that it need not be judged in later intervals.
     """
     motion = world.tight.motions[m]
     speed = motion.bound + world.tight.fastest[0]
@@ -361,9 +363,9 @@ def _measure_clearance(
 
 @kernel
 def _stop_obstacles(m: int, time: float, world: ContactWorld) -> None:
-    """Stop obstacles that run into a robot at a time in the period; note what recedes from it.
+    """Stop obstacles that run into a robot; record how fast touched objects recede.
 
-    Nothing pushes a robot: an obstacle stops, and another robot bends its own motion.
+    Nothing pushes a robot: an obstacle stops, and another robot deflects its own motion.
     """
     listed = world.tight.listed
     for touch in listed.touches[: listed.number[0]]:
@@ -375,11 +377,12 @@ def _stop_obstacles(m: int, time: float, world: ContactWorld) -> None:
 
 
 @kernel
-def _bend(m: int, time: float, world: ContactWorld) -> None:
-    """Bend the motion of a robot so that it does not approach what it touches.
+def _deflect(m: int, time: float, world: ContactWorld) -> None:
+    """Deflect the motion of a robot so that it does not approach what it touches.
 
-    Each pass removes the approach at one touch after the other, by the impulse that would stop a
-    ring there: it slides without friction, and a touched corner turns it.
+    Each pass removes the approach at one touch after another, by the impulse that would
+        stop a ring there: the robot slides without friction, and a touched corner turns
+        it.
     """
     motion = world.tight.motions[m]
     body = world.bodies[world.first + m]
@@ -428,7 +431,7 @@ def _mark(m: int, k: int, world: ContactWorld) -> None:
 
 @kernel
 def _halt(m: int, begin: float, time: float, end: float, world: ContactWorld) -> bool:
-    """Let a robot that overlaps something at the end of a step only turn, or stand still.
+    """Make a robot that overlaps something at the end of a step only turn, or stop.
 
     Returns:
         True if it did either.

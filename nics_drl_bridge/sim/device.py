@@ -1,4 +1,4 @@
-"""One world of a simulator, as its devices see it or with robots moved by other physics."""
+"""One simulated world, as its sensors see it or with other physics for the robots."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -44,7 +44,7 @@ class DeviceWorld:
     ) -> None:
         self.simulator = simulator
         self._period = model.control_period
-        # Completes a drawn scene and returns the starts (1, M, 3) of its robots, if given.
+        # Completes a drawn scene; returns the robots' starts (1, M, 3), or None.
         self.arrange: Callable[[Scenes, Array | None], Array | None] = (
             lambda _, starts: starts
         )
@@ -65,7 +65,7 @@ class DeviceWorld:
         return [bool(collided) for collided in self.simulator.data.collided[0]]
 
     def begin(self, seed: int, starts: Array | None) -> None:
-        """Begin the episode of a seed, at x, y, heading of each robot (3 M,) if given."""
+        """Begin the episode of a seed, at `starts` (3 M,) x, y, heading if given."""
         robots = self._given
         if starts is not None and starts.size != 3 * robots:
             raise ConfigError(
@@ -90,7 +90,7 @@ class DeviceWorld:
         self._before[:] = self.simulator.data.pose[0]
 
     def exchange(self, simulator: FastSimulator, kept: Integers) -> None:
-        """Continue in another simulator, whose first robots have these numbers here."""
+        """Continue in another simulator, whose first robots are `kept` here."""
 
         def moved(old: Array, new: Array) -> Array:
             new[: len(kept)] = old[kept]
@@ -103,7 +103,7 @@ class DeviceWorld:
         self._before = simulator.data.pose[0].copy()
 
     def put(self, robot: int) -> None:
-        """Record that a robot was put elsewhere, which does not count as motion."""
+        """Record that a robot was placed elsewhere, which is not motion."""
         self._before[robot] = self.simulator.data.pose[0, robot]
 
     def advance(self) -> None:
@@ -116,7 +116,7 @@ class DeviceWorld:
         self._covariance = propagate(self._covariance, odom, data.odom[0], self._added)
 
     def sensed(self, robot: int) -> Sensed:
-        """Return the present values of one robot; the next step may overwrite them."""
+        """Return the current values of one robot; the next step may overwrite them."""
         data = self.simulator.data
         readings = {
             name: values[0, robot] for name, values in self.simulator.readings.items()
@@ -145,7 +145,7 @@ def variances(std: tuple[float, float]) -> Array:
 
 
 def step_covariance(std: tuple[float, float], period: float) -> Array:
-    """Covariance (3, 3) that one period [s] adds to that of x, y [m] and heading [rad]."""
+    """Covariance (3, 3) of x, y [m] and heading [rad] that one period [s] adds."""
     return np.diag(np.maximum(variances(std) * period * period, LEAST_VARIANCE))
 
 
@@ -154,8 +154,9 @@ def propagate(
 ) -> Array:
     """Propagate the covariances (M, 3, 3) of poses by odometry (M, 3) from before to after.
 
-    A heading error rotates the motion that follows: P' = F P F^T + Q, F the new pose's derivative
-    to the old one (Thrun et al., Probabilistic Robotics, Sec. 5.4), Q `added`.
+    A heading error rotates the motion that follows: P' = F P F^T + Q, where F is the
+        Jacobian of the new pose with respect to the old one (Thrun et al.,
+        Probabilistic Robotics, Sec. 5.4), and Q is `added`.
     """
     moved = np.subtract(after, before)
     derivative = np.tile(np.eye(3), (len(covariance), 1, 1))
@@ -165,10 +166,11 @@ def propagate(
 
 
 class DrivenSimulator(FastSimulator):
-    """One world of the fast simulator whose robots are moved from outside, by other physics.
+    """One world of the fast simulator whose robots are moved by external physics.
 
-    Scenes, obstacles, noise, faults and scans are those of the FastSimulator. Odometry is that of
-    the `wheels` (M, 3) since the start, with the model's noise. A subclass steps.
+    Scenes, obstacles, noise, faults and scans are those of the FastSimulator. Odometry
+    is the wheel odometry `wheels` (M, 3) since the start, plus the model's noise. A
+    subclass implements the step.
     """
 
     def reset(
@@ -180,7 +182,7 @@ class DrivenSimulator(FastSimulator):
         return scenes
 
     def begin_period(self, commands: Array) -> None:
-        """Take the commands (M, C) of the period that begins, and steer the obstacles in it."""
+        """Begin a period under commands (M, C) and steer the obstacles."""
         history = self.data.history[0]
         history[:, 1:] = history[:, :-1].copy()
         history[:, 0] = commands
@@ -188,7 +190,7 @@ class DrivenSimulator(FastSimulator):
         step_kernels.begin_period(self.packed[0])
 
     def in_force(self, time: float) -> Array:
-        """Commands (M, C) in effect `time` [s] after the beginning, by the drawn latency alone."""
+        """Commands (M, C) in effect `time` [s] into the period, after latency."""
         timing = self.model.timing
         late = (self.data.delay[0] - timing.delay) * timing.dt - time
         rows = np.ceil(np.maximum(late, 0.0) / self.model.control_period - 1e-6).astype(
@@ -197,7 +199,7 @@ class DrivenSimulator(FastSimulator):
         return np.asarray(self.data.history[0, np.arange(len(rows)), rows])
 
     def move_obstacles(self, time: float) -> Array:
-        """Move the obstacles (K, 7) to their poses `time` [s] after the period's beginning."""
+        """Move the obstacles (K, 7) to their poses `time` [s] into the period."""
         data = self.data
         contact_kernels.move_obstacles(data.bodies, self._start, data.velocity, 0, time)
         return data.bodies[0, : data.velocity.shape[1]]
@@ -211,10 +213,11 @@ class DrivenSimulator(FastSimulator):
         counted: Array,
         touched: Mask,
     ) -> None:
-        """Take over the motion of the robots in the period, and measure what they sense.
+        """Take over the robots' motion in the period, and make their measurements.
 
-        True poses, body twists and states (M, ...) at its end; pose and body twist (M, 3) there by
-        wheel odometry, without noise; and (M,) true for robots that touched anything.
+        The arguments hold, at the end of the period, the true poses, body twists and
+        states (M, ...); pose and body twist (M, 3) by wheel odometry without noise; and
+        (M,) true for robots that touched anything.
         """
         data = self.data
         data.pose[0] = pose

@@ -1,17 +1,19 @@
-"""Compiled motion of obstacles, each a circle: one call at reset, and one per world and period.
+"""Compiled motion of circular obstacles: one call at reset, one per world and period.
 
-Draws depend on seed, step and k alone. Pedestrians
-move by the social force model of Helbing and Molnar (1995), Phys. Rev. E 51, 4282, whose equation
-numbers are used: a drive towards the goal (2), repulsion by others along ellipses that anticipate
-their next step (3, 4) and by walls (5), less by what is out of sight (8), and a fluctuation.
-Distances are between surfaces. The anticipated step is that of the relative motion (Johansson,
-Helbing, Shukla 2007): by the other's alone, a walker pushes against a robot in its way.
+Draws depend only on seed, step and k. Pedestrians follow the social force model of
+Helbing and Molnar (1995), Phys. Rev. E 51, 4282, with its equation numbers: an
+attraction to the goal (2), repulsion by others along ellipses that anticipate their
+next step (3, 4) and by walls (5), reduced for objects out of sight (8), and a
+fluctuation. Distances are between surfaces. The anticipated step is that of the
+relative motion (Johansson, Helbing, Shukla 2007): with the other's own step, a walker
+would push against a robot in its way.
 
-`restrain` then limits each step to free space. Each wall, body and side of the field limits an
-obstacle to a half plane: along the unit vector to the nearest point it may move by `room`. Of two
-that both move, each may use half of the gap, so that neither needs to know the other's step
-(buffered Voronoi cells; Zhou, Wang, Bandyopadhyay, Schwager 2017). A displacement within all half
-planes is free of contacts throughout the period.
+`restrain` then limits each step to free space. Each wall, body and side of the field
+limits an obstacle to a half plane: it may move by at most `room` along the unit vector
+to the nearest point. If two bodies move, each may use half of the gap, so that neither
+needs to know the other's step (buffered Voronoi cells; Zhou, Wang, Bandyopadhyay,
+Schwager 2017). A displacement within all half planes stays free of contacts throughout
+the period.
 """
 
 import math
@@ -36,16 +38,16 @@ from nics_drl_bridge.sim.state import (
     Surroundings,
 )
 
-SLACK = 1e-6  # Margin that is never used [m]: rounding must not make two bodies touch
-ROBOT_GAP = 0.1  # gap that an obstacle keeps to a robot, like people [m]; less looks like contact
-# Number of times a displacement is bent before the remaining excess is shortened
+SLACK = 1e-6  # Unused margin [m], so that rounding never makes two bodies touch
+ROBOT_GAP = 0.1  # gap that an obstacle keeps from a robot [m]; less looks like contact
+# Number of times a displacement is deflected before it is shortened instead
 PASSES = 3
 FINEST = 0.25  # Minimum step along a path through a static map, in cells
 HALVINGS = 8  # Number of bisections of its last step to find the end of the free path
 
 
 class Traffic(NamedTuple):
-    """Everything that the moving obstacles of one world keep clear of in a period."""
+    """Everything that the moving obstacles of one world avoid in a period."""
 
     bodies: Array  # (K + M, 7) obstacles, then robots
     first: int  # index of the first robot
@@ -58,17 +60,17 @@ class Traffic(NamedTuple):
 
 
 DRAWS = 64  # Maximum number of draws per obstacle and period
-MOST = 10_000  # Obstacles of a world at most: draws do not depend on how many there are
+MOST = 10_000  # Maximum number of obstacles, on which the draws must not depend
 TURN = 2.0  # Maximum turn rate of an obstacle [rad/s]
 MOST_CORNERS = 32  # Maximum number of waypoints that a patrol passes in a period
 # Minimum distance for which a force is computed [m]: at 0 it has no direction
 NEAREST = 1e-3
 FAR = 8.0  # Forces beyond this many ranges are neglected
-STRONGEST = 5.0  # Maximum acceleration [m/s^2]: people reach no more, and the model's is unbounded
+STRONGEST = 5.0  # Maximum acceleration of a person [m/s^2]; the model has no bound
 ARRIVED = 0.3  # A goal is reached within this distance [m]
 ROOM = 0.2  # Free space around a walker at a new goal [m]
 LEAST_WALK = 1.0  # Minimum distance of a new goal [m], if such a goal is found
-# A goal is given up after twice the time of the straight path plus this [s]
+# A goal is abandoned after twice the time of the straight path plus this [s]
 PATIENCE = 5.0
 CANDIDATES = 16
 
@@ -115,7 +117,8 @@ def steer(
 ) -> None:
     """Set the obstacles' velocities for a period [s]; `speeds` (M, 2) are the robots' [m/s].
 
-    An obstacle stays in the field, off walls and others, and off robots that keep their velocity.
+    An obstacle stays in the field and avoids walls, other obstacles, and robots that
+    keep their velocity.
     """
     velocity = data.velocity[n]
     count = len(velocity)
@@ -124,7 +127,7 @@ def steer(
     traffic = Traffic(
         bodies, count, speeds, plans, scene.walls, scene.bounds, scene.grid, period
     )
-    # walkers first: they react to the velocities of the last period
+    # walkers first, because they react to the velocities of the last period
     for k in range(count):
         velocity[k, :] = 0.0
         if plans[k].kind == PEDESTRIAN and bodies[k, RADIUS] > 0.0:
@@ -270,7 +273,7 @@ def _from_bodies(
             row.repulsion,
             row.range,
         )
-        # Less (8) from outside the angle of sight of a walker that looks along e.
+        # Reduced by (8) outside the field of view of a walker that looks along e.
         seen = -(ex * fx + ey * fy) >= row.cos_view * math.sqrt(fx * fx + fy * fy)
         weight = 1.0 if seen else row.behind
         ax += weight * fx
@@ -312,7 +315,7 @@ def _from_walls(k: int, traffic: Traffic) -> tuple[float, float]:
 def _choose_goal(
     mark: Record, k: int, traffic: Traffic, seed: int, counter: int
 ) -> float:
-    """Draw the next goal of walker k, with room around it if found; return its distance [m]."""
+    """Draw walker k's next goal, in free space if possible; return its distance [m]."""
     body = traffic.bodies[k]
     field = traffic.field
     room = body[RADIUS] + ROOM
@@ -333,7 +336,7 @@ def _choose_goal(
 
 @kernel
 def _walk(k: int, n: int, traffic: Traffic, data: State) -> tuple[float, float]:
-    """Return the next velocity of walker k in `map` [m/s], after fewer than `DRAWS` draws."""
+    """Return the next velocity of walker k in `map` [m/s]; makes < `DRAWS` draws."""
     seed = data.seeds[n]
     step = data.steps[n]
     counter = ((step + 1) * MOST + k) * DRAWS
@@ -438,7 +441,7 @@ def _hold(
     room: float,
     bend: bool,
 ) -> tuple[float, float]:
-    """Limit a displacement to `room` along n: bend it, or shorten the whole."""
+    """Limit a displacement along n to `room`, by deflecting or shortening it."""
     ahead = dx * nx + dy * ny
     room = max(room - SLACK, 0.0)
     if ahead <= room:
@@ -570,7 +573,7 @@ def restrain(
     traffic: Traffic,
     bends: bool,
 ) -> tuple[float, float]:
-    """Return the part of a displacement [m] that obstacle k can make; with `bends` it slides."""
+    """Return the feasible part of a displacement [m]; obstacle k slides if `bends`."""
     body = traffic.bodies[k]
     for _ in range(PASSES if bends else 0):
         wished_x = dx
@@ -580,7 +583,7 @@ def restrain(
         dx, dy = _hold_map(dx, dy, body, traffic.grid, True)
         if dx == wished_x and dy == wished_y:
             break
-    # Shortening preserves limits already met, so all are met afterwards.
+    # Shortening keeps the limits that are already met, so all are met afterwards.
     dx, dy = _hold_bodies(dx, dy, k, traffic, False)
     dx, dy = _hold_walls(dx, dy, body, traffic, False)
     return _hold_map(dx, dy, body, traffic.grid, False)

@@ -1,14 +1,15 @@
-"""A world as a grid of free and occupied cells, for planners, with everything that does not move.
+"""Occupancy grid of everything static in a world, for planners.
 
 `occupancy` makes the grid in five steps, each of which only turns free cells into occupied ones:
 
-1. `_frame_of`: choose the cells. They are aligned with the world's own map if it has one, cover the
-   field, its walls and the map, and leave a border of one cell around them.
+1. `_frame_of`: choose the cells. They are aligned with the world's own map, if any,
+   cover the field, its walls and the map, and add a border of one cell.
 2. Occupy every cell whose centre lies outside a walled field.
 3. Copy the world's own map.
 4. Occupy the cells along each wall, found by points much closer than a cell.
-5. `_fill`: occupy the cells whose centre lies in an obstacle. A part thinner than a cell may
-   contain no centre; there, the cells along its outline are occupied, and of a disc its middle.
+5. `_fill`: occupy the cells whose centre lies in an obstacle. A part thinner than a
+   cell may contain no centre; the cells along its outline are then occupied, or for a
+   disc, the cell at its centre.
 
 Cells are indexed by row (along y of the grid) and column (along x).
 """
@@ -32,17 +33,17 @@ from nics_drl_bridge.sim.world import World
 
 Placed = tuple[Shape, ArrayLike]  # a shape, and its pose (3,)
 CELL = 0.01  # side of a cell [m]
-MOST_CELLS = 1_000_000  # in fields with more cells, the cells are larger
-SAMPLES = 8  # number of samples of an edge in a cell
+MOST_CELLS = 1_000_000  # in larger fields, the cells grow
+SAMPLES = 8  # number of samples per cell along an edge
 ROUNDING = 1e-6  # allowance for rounding errors [cells]
 
 
 def standing(sampler: SceneSampler, member: int, bodies: Array) -> list[Placed]:
-    """Return the obstacles that stand still, of bodies (K, 7) in a world of the sampler."""
+    """Return the static obstacles among bodies (K, 7) of one of the worlds."""
     motions = sampler.samplers[member].motions
     placed: list[Placed] = []
     for k, body in enumerate(bodies):
-        # Bodies after those of the world were added later, and never move.
+        # Bodies after the world's own were added later and never move.
         stands = k >= len(motions) or motions[k] is None
         is_present = body[RADIUS] > 0.0
         if stands and is_present:
@@ -53,18 +54,18 @@ def standing(sampler: SceneSampler, member: int, bodies: Array) -> list[Placed]:
 def occupancy(
     world: World, obstacles: Sequence[Placed] = (), cell: float = CELL
 ) -> GridMap:
-    """Return the map of a world: its own map, walls, and the given obstacles.
+    """Return the occupancy grid of a world: its own map, its walls, and obstacles.
 
-    A cell is occupied if its centre is in something solid, or a wall runs through it. A field with
-    walls is closed by cells around it. `cell` [m] is the desired size. Cells of the world's own map
-    are divided evenly, so that none of its detail is lost. Without a map, a world of more than
-    `MOST_CELLS` gets larger cells.
+    A cell is occupied if its centre is inside a solid, or if a wall crosses it. A
+    walled field is surrounded by occupied cells. `cell` [m] is the desired size. Cells
+    of the world's own map are divided evenly, so that no detail is lost. Without a map,
+    a world of more than `MOST_CELLS` gets larger cells.
     """
     frame = _frame_of(world, cell)
     origin = compose(frame.pose, [*(frame.first * frame.cell), 0.0])
     cells = np.full(frame.size, FREE, np.int8)
     made = GridMap(cells, frame.cell, tuple(origin.tolist()))
-    if world.size is not None:  # closed around the field
+    if world.size is not None:  # occupy everything around the field
         centres = made.cell_to_world(_cell_indices(cells))
         cells[(np.abs(centres) > np.array(world.size) / 2.0).any(axis=-1)] = OCCUPIED
     if world.grid is not None:  # each cell of the map becomes a square of smaller cells
@@ -85,7 +86,7 @@ def occupancy(
 class _Frame(NamedTuple):
     """Position, size and number of the cells of a grid."""
 
-    # (3,) in the world, from which columns and rows are counted along its axes
+    # (3,) pose in the world; columns and rows are counted from it along its axes
     pose: Any
     first: NDArray[np.int_]  # (2,) first column and first row, often negative
     size: tuple[int, int]  # numbers of rows and columns
@@ -124,7 +125,7 @@ def _cell_indices(cells: NDArray[Any]) -> NDArray[np.int_]:
 
 
 def _is_within(index: NDArray[np.int_], cells: NDArray[Any]) -> Mask:
-    """Return True (P,) for the indices (P, 2) of cells that a grid has."""
+    """Return True (P,) for cell indices (P, 2) inside a grid."""
     is_within = (index >= 0) & (index < cells.shape)
     return np.asarray(is_within.all(axis=-1))
 
@@ -140,7 +141,7 @@ def _along(corners: Array, cell: float) -> Array:
 
 
 def _fill(made: GridMap, shape: Shape, pose: Array) -> None:
-    """Occupy the cells in a shape; of a part that is too thin to hold a centre, its outline."""
+    """Occupy the cells in a shape, or those along its outline where it is thin."""
     # only the cells in the square around the shape's circle
     middle = made.world_to_cell(pose[:2])
     reach = math.ceil(shape.radius / made.resolution) + 1
@@ -166,7 +167,7 @@ def _fill(made: GridMap, shape: Shape, pose: Array) -> None:
 
 
 def _inside(shape: Shape, points: Array) -> Mask:
-    """Return True (...) for the points (..., 2) in a shape, by the even-odd rule."""
+    """Return True (...) for points (..., 2) inside a shape, by the even-odd rule."""
     if isinstance(shape, Circle):
         return np.hypot(points[..., 0], points[..., 1]) <= shape.radius
     within = np.zeros(points.shape[:-1], np.bool_)

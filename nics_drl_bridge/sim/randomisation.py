@@ -26,13 +26,13 @@ from nics_drl_bridge.seeds import check_seeds
 
 Bounds = tuple[Array, Array]
 MOST_OBSTACLES = 10_000
-# Columns of the noise, before those of the state; the drift of y equals that of x.
+# Columns of the noise before those of the state; y drifts as much as x.
 NOISE_NAMES = ("odom_linear", "odom_angular", "position_drift", None, "heading_drift")
-SCALED = {  # columns that a factor scales, and the levels that may be given instead
+SCALED = {  # columns scaled by a factor, and the levels that can replace it
     "noise": (slice(0, 2), ("odom_linear", "odom_angular")),
     "drift": (slice(2, None), ("position_drift", "heading_drift")),
 }
-CORNERS = 256  # Number of mixtures of minimum and maximum factors that are checked for stability
+CORNERS = 256  # Number of combinations of extreme factors checked for stability
 FAULT_COLUMNS = (  # see `lidar.fault_kernels`
     "noise_std",
     "noise_proportional",
@@ -42,7 +42,7 @@ FAULT_COLUMNS = (  # see `lidar.fault_kernels`
     "quantisation",
     "skew",
 )
-# faults drawn from words: column, values
+# faults drawn from a list of options: column, value of each option
 CHOICES: dict[str, tuple[int, Mapping[Any, int]]] = {
     "skew": (fault_kernels.SKEW, SKEW),
     "too_close": (fault_kernels.TOO_CLOSE, TOO_CLOSE),
@@ -50,7 +50,7 @@ CHOICES: dict[str, tuple[int, Mapping[Any, int]]] = {
 KINEMATICS_GROUP, LATENCY_GROUP, ODOMETRY_GROUP, LIDAR_GROUP = range(4)
 CHOICES_GROUP, SCENE_GROUP, RESPONSE_GROUP = range(4, 7)
 GROUPS = 8
-# More than a group has columns; the counters of two groups never collide
+# Larger than the number of columns of a group, so that counters of groups never collide
 PLACES = 1 << 20
 UNIT = (np.zeros(1), np.ones(1))
 
@@ -71,7 +71,7 @@ AS_IT_IS: Factor = (1.0, 1.0)
 
 
 class KinematicRanges(Schema):
-    """Factors on the coefficients of the Taylor model, drawn independently for each coefficient."""
+    """Factors on the coefficients of the Taylor model, drawn independently."""
 
     scale: Factor = AS_IT_IS  # for every coefficient
     # one factor per robot on all time constants of the state
@@ -86,7 +86,7 @@ class OdometryRanges(Schema):
     """Errors of odometry and motion: factors on the model's levels, or levels instead."""
 
     noise: Factor | None = None  # factor on the noise of the measured twist
-    # factor on the motion that the model does not explain, if measured
+    # factor on the measured motion that the model does not explain
     drift: Factor | None = None
     odom_linear: Level | None = None  # noise of velocity [m/s]
     odom_angular: Level | None = None  # noise of yaw rate [rad/s]
@@ -108,16 +108,16 @@ class OdometryRanges(Schema):
 
 
 class LidarRanges(Schema):
-    """Noise and faults in place of the model's, see `LidarFaults`; words are equally likely."""
+    """Noise and faults that replace the model's, see `LidarFaults`."""
 
     noise_std: Level | None = None  # see `LidarSpec` [m]
     noise_proportional: Level | None = None  # added to it for each metre of range [m/m]
     quantisation: Level | None = None  # returns are multiples of it [m]
     dropout: Level | None = None  # probability that a return is lost
     dropout_far: Level | None = None  # added to it at range_max
-    # words to draw from
+    # options to draw from, equally likely
     skew: tuple[Skew, ...] | None = Field(default=None, min_length=1)
-    # words to draw from
+    # options to draw from, equally likely
     too_close: tuple[TooClose, ...] | None = Field(default=None, min_length=1)
 
     @model_validator(mode="after")
@@ -125,7 +125,7 @@ class LidarRanges(Schema):
         likely = [name for name in ("dropout", "dropout_far") if getattr(self, name)]
         if sum(getattr(self, name)[1] for name in likely) > 1.0:
             raise ValueError(
-                "the greatest dropout and dropout_far must add up to at most 1"
+                "the maxima of dropout and dropout_far must add up to at most 1"
             )
         return self
 
@@ -148,7 +148,7 @@ class ObstacleRanges(Schema):
 
 
 class Randomisation(Schema):
-    """Ranges to draw from in every episode; everything else stays as in model and world."""
+    """Ranges to draw from in every episode; the rest is as in model and world."""
 
     name: str  # used in messages
     # factors on the motion of the model
@@ -162,14 +162,14 @@ class Randomisation(Schema):
 
     @property
     def sizes(self) -> tuple[float, ...]:
-        """The factors on the obstacles' size that may be drawn, ascending."""
+        """Possible factors on the obstacles' size, ascending."""
         low, high = self.obstacles.size
         return tuple(
             np.linspace(low, high, self.obstacles.rungs if high > low else 1).tolist()
         )
 
     def alone(self) -> "dict[str, Randomisation]":
-        """Each of the set ranges alone, by the name of its field."""
+        """Return, by field name, a randomisation of each range that is set."""
         ranges = {name: getattr(self, name) for name in type(self).model_fields}
         names = (name for name in ranges if name in self.model_fields_set - {"name"})
         return {
@@ -193,20 +193,20 @@ Label = tuple[str, str, int | None]
 
 @dataclass(frozen=True)
 class Draws:
-    """Draws for n episodes of M robots: every number the simulator needs, drawn or the model's."""
+    """Numbers of n episodes of M robots: drawn, or else the model's."""
 
     coefficient: (
         Array  # (n, M, T) of the kept terms, in the order of `robot.kernels.Terms`
     )
-    response: Array  # (n, M) factor on the time constants, which is in `coefficient`
-    delay: Integers  # (n, M) from a command to its effect, including the model's [substeps]
-    age: Integers  # (n, M) of scan and odometry when they are observed [substeps]
+    response: Array  # (n, M) factor on time constants, included in `coefficient`
+    delay: Integers  # (n, M) latency of commands, including the model's [substeps]
+    age: Integers  # (n, M) age of scan and odometry when observed [substeps]
     noise: Array  # (n, M, 2 + 3 + S) see `State.noise`
     faults: Array  # (n, M, P) of each lidar, columns as in `lidar.fault_kernels`
     count: Integers | None  # (n,) obstacles in the scene; None leaves it to the world
-    # (n,) index into `Randomisation.sizes`; None where there is only one
+    # (n,) index into `Randomisation.sizes`; None if there is only one size
     size: Integers | None
-    scale: Array | None  # (n,) that size
+    scale: Array | None  # (n,) factor on the size
     latency: Array  # (n, M, 2) `delay` and `age` in seconds
     # of the drawn numbers that may differ from episode to episode
     labels: tuple[Label, ...]
@@ -220,7 +220,10 @@ class Draws:
 
 
 class Sampler:
-    """Draws an episode's numbers; seed, robot, group and column fix each one in any batch."""
+    """Draws the numbers of episodes.
+
+    A number depends only on seed, robot, group and column, not on the batch.
+    """
 
     def __init__(
         self, randomisation: Randomisation, model: SimulatorModel, robots: int = 1
@@ -245,14 +248,14 @@ class Sampler:
             if words is not None:
                 numbers = [values[word] for word in words]
                 self._choices[column] = np.array(numbers, np.float64)
-        # Bounds such that flooring makes all numbers, and all sizes, equally likely.
+        # With these bounds and flooring, all numbers and all sizes are equally likely.
         least, most = randomisation.obstacles.count or (0, 0)
         self._scene = (
             np.array([least, 0.0]),
             np.array([most + 1.0, len(randomisation.sizes)]),
         )
         self._sizes = np.array(randomisation.sizes)
-        # The maximum of a command, and of an observation [substeps].
+        # Maximum latency of a command and of an observation [substeps].
         self.longest_delay, self.longest_age = (int(most) for most in self._timing[1])
         self._labels = tuple(self._name(model))
 
@@ -326,7 +329,7 @@ def _between(
     group: int,
     column: int = 0,
 ) -> Array:
-    """Draw (n, M, Q) numbers between bounds (Q,), for the columns of a group from one on."""
+    """Draw numbers (n, M, Q) between bounds (Q,), for columns from `column` on."""
     drawn = np.empty((len(seeds), robots, len(bounds[0])))
     first = group * PLACES + column
     stride = GROUPS * PLACES
@@ -356,7 +359,7 @@ def _coefficients(ranges: KinematicRanges, model: TaylorModel, where: str) -> Bo
                 powers = taylor.parse_term(term, model.variables)
                 name = taylor.format_term(powers, model.variables)
             if name not in known:
-                hint = "it has none at all: remove it."
+                hint = "the rate has no terms; remove the key."
                 if known:
                     hint = suggest(term, known)
                 raise ConfigError(
@@ -394,13 +397,14 @@ def _check_stable(model: TaylorModel, spans: Array, where: str) -> None:
     worst = np.abs(np.linalg.eigvals(steps)).max()
     if worst > max(1.0, nominal) + 1e-9:
         raise ConfigError(
-            f"{where}: key 'kinematics': with some factors the state of the robot grows by itself "
-            f"(eigenvalue {worst:.4g} of a step of {model.dt:g} s); narrow the ranges."
+            f"{where}: key 'kinematics': for some factors the state of the robot "
+            f"diverges (eigenvalue {worst:.4g} of a step of {model.dt:g} s); narrow "
+            "the ranges."
         )
 
 
 def _latencies(ranges: Randomisation, model: SimulatorModel) -> Bounds:
-    """Bound (2,) of delay and age, such that flooring the draws rounds them [substeps]."""
+    """Bounds (2,) of delay and age [substeps]; flooring a draw rounds it."""
     _, substeps, delay = model.timing
     spans = (
         np.array([ranges.action_latency, ranges.observation_latency]) * substeps + 0.5

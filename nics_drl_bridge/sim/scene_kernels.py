@@ -1,8 +1,8 @@
-"""Compiled drawing of scenes: obstacles, starts and goals of one seed after the other.
+"""Compiled drawing of scenes: obstacles, starts and goals, one seed after another.
 
-Every number is drawn from its own counter, so a seed's scene is the same in any batch. Obstacles
-are placed one by one where they overlap nothing, in cells known to be free, then starts and goals
-in pairs; if that fails, with fresh numbers.
+Every number is drawn from its own counter, so a seed's scene is the same in any batch.
+Obstacles are placed one by one without overlap, in cells known to be free. Pairs of
+starts and goals follow. If a placement fails, it is repeated with new numbers.
 """
 
 import math
@@ -34,7 +34,7 @@ from nics_drl_bridge.sim.state import BodyCells, MapField, Records, Touches
 
 TRIES = 2000
 RESTARTS = 50
-# Pairs of start and goal without a path after which the obstacles are redrawn
+# Number of start-goal pairs without a path after which the obstacles are redrawn
 DETOURS = 4
 MARGIN = 1e-9  # Minimum distance of obstacles from walls and from each other [m]
 DRAWN = 0
@@ -66,7 +66,7 @@ class DrawnPlace:
     y2: float
     least_heading: float  # [rad]
     greatest_heading: float
-    share: float  # cumulative fraction of the places up to it
+    share: float  # cumulative fraction of the places up to this one
 
 
 PLACE = structure_of(DrawnPlace)
@@ -83,10 +83,10 @@ DRAWS = structure_of(NextDraw)
 
 
 class FreeSpace(NamedTuple):
-    """Everything that stands in every scene, and where robots fit in between."""
+    """Everything that is in every scene, and the space between where robots fit."""
 
     cells: MapField  # distances to the nearest wall or solid cell of the map
-    # (rows, columns) number of the connected free space; 0 for none
+    # (rows, columns) label of the connected free area; 0 for none
     area: ShortIntegers
     bounds: Array  # (4,) minimum x, y and maximum x, y of the field [m]
     walls: Array  # (W, 4)
@@ -95,11 +95,11 @@ class FreeSpace(NamedTuple):
     # none where nothing is drawn there
     for_robots: ShortIntegers
     for_anything: ShortIntegers
-    room: float  # free space that a robot on its path needs around the centre of a cell [m]
+    room: float  # clearance that a robot on its path needs at the centre of a cell [m]
 
 
 class ScenePlan(NamedTuple):
-    """Basis of the scenes of a world: K obstacles in G groups, of H shapes in S sizes."""
+    """What scenes are drawn from: K obstacles in G groups, of H shapes in S sizes."""
 
     space: FreeSpace
     outlines: OutlineArrays  # of all shapes, the last of which is a disc
@@ -119,7 +119,7 @@ class ScenePlan(NamedTuple):
 
 
 class SceneScratch(NamedTuple):
-    """Scratch memory of one call; threads may draw at the same time."""
+    """Scratch memory of one call; each thread needs its own."""
 
     draws: Records  # (1,) of `DRAWS`
     seen: Integers  # (rows * columns,) number of the search that last visited each cell
@@ -156,7 +156,7 @@ def place_in(row: float, column: float, cells: MapField) -> tuple[float, float]:
 
 @kernel
 def cell_of(x: float, y: float, cells: MapField) -> tuple[int, int, float]:
-    """Return row and column of a point, and its distance from the centre of that cell [m]."""
+    """Return row and column of a point, and its distance from the cell's centre [m]."""
     u, v = collision.in_grid(x, y, cells)
     u /= cells.cell
     v /= cells.cell
@@ -176,7 +176,7 @@ def area_of(x: float, y: float, space: FreeSpace) -> int:
 
 @kernel
 def _within(x: float, y: float, space: FreeSpace) -> tuple[bool, float, float]:
-    """True if a point is in field and grid, and bounds of its distance to walls."""
+    """Whether a point is inside field and grid, and bounds on its distance to walls."""
     distances = space.cells.distances
     bounds = space.bounds
     i, j, off = cell_of(x, y, space.cells)
@@ -202,7 +202,7 @@ def _clear_of_walls(body: Array, room: float, plan: ScenePlan, listed: Touches) 
     if collision.is_round(body, outlines):
         if not inside or high < body[RADIUS] + room:
             return False
-    else:  # its origin may lie outside its outline
+    else:  # the origin of the shape may lie outside its outline
         first = outlines.corners[outlines.first[int(body[SHAPE])]]
         x = body[X] + body[COS] * first[0] - body[SIN] * first[1]
         y = body[Y] + body[SIN] * first[0] + body[COS] * first[1]
@@ -282,8 +282,8 @@ def _is_joined(
 ) -> bool:
     """True if a robot can move between two points of an area, from cell to cell.
 
-    Of the cells beside the present one, the nearest to the goal is visited first. The cells of both
-    points count as free.
+    Of the neighbouring cells, the one nearest to the goal is visited first. The cells
+    of both points count as free.
     """
     cells = plan.space.cells
     label = plan.space.area
@@ -341,7 +341,7 @@ def _draw_point(
 ) -> tuple[float, float]:
     """Draw a point in one of the chosen cells, given by row-major indices."""
     cell = int(_draw(scratch) * len(chosen))
-    # if all cells are allowed, the look-up would only miss the cache
+    # if all cells are allowed, skip the look-up, which would miss the cache
     if len(chosen) < cells.distances.size:
         cell = chosen[cell]
     row = cell // cells.distances.shape[1] + _draw(scratch)
@@ -375,7 +375,7 @@ def _choose_obstacles(
     bodies: Array,
     scratch: SceneScratch,
 ) -> None:
-    """Draw which obstacles the scene has, and the shape of each."""
+    """Draw the obstacles of the scene, and the shape of each."""
     total = 0
     before = 0
     k = 0
@@ -386,7 +386,7 @@ def _choose_obstacles(
         span = group.greatest - group.least + 1
         count = group.least + int(_draw(scratch) * span)
         if not group.is_fixed:
-            if wanted >= 0:  # each group gets its share
+            if wanted >= 0:  # in proportion to the size of the group
                 most = min(wanted, total)
                 up_to = most * before + total // 2
                 count = (up_to + most * group.greatest) // total - up_to // total
@@ -488,7 +488,7 @@ def _place_robots(
     goals: Array,
     scratch: SceneScratch,
 ) -> bool:
-    """Draw a start and a goal for each robot; return True if there are some for all of them."""
+    """Draw a start and a goal for each robot; return True if all were found."""
     between = 2.0 * plan.footprint + plan.clearance
     for m in range(len(starts)):
         placed = False
@@ -503,7 +503,7 @@ def _place_robots(
                 inner = plan.least * plan.least
                 ring = plan.greatest * plan.greatest - inner
                 far = math.sqrt(inner + _draw(scratch) * ring)
-                scratch.draws[0].counter += 2  # as many as a place takes
+                scratch.draws[0].counter += 2  # as many draws as a place takes
                 gx = x + far * math.cos(turn)
                 gy = y + far * math.sin(turn)
             else:
@@ -553,9 +553,10 @@ def draw_scenes(
 ) -> tuple[int, int]:
     """Draw the scenes of some seeds (n,) to bodies (n, K, 7), start (n, M, 3), goals (n, M, 2).
 
-    K may be more than the world has: the others are absent. `wanted` (n,) are numbers of random
-    obstacles, -1 for the world's own, and `sizes` (n,) rows of `plan.variants`. Returns the first
-    row that could not be drawn, or n, and the reason.
+    If K exceeds the world's number of obstacles, the remaining ones are absent.
+    `wanted` (n,) are numbers of random obstacles, -1 for the world's own number;
+    `sizes` (n,) are rows of `plan.variants`. Returns the first row that could not be
+    drawn, or n, and the reason.
     """
     plan: ScenePlan = packed.content
     count = len(plan.group)

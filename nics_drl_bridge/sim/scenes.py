@@ -1,4 +1,4 @@
-"""Scenes drawn from worlds: obstacles, starts and goals of each seed, in connected free space."""
+"""Drawn scenes: obstacles, and starts and goals in connected free space, per seed."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -32,19 +32,19 @@ from nics_drl_bridge.sim.state import NO_FIELD, MapField, Records, allocate_touc
 from nics_drl_bridge.sim.world import Goals, Motion, Starts, World, check_places
 from nics_drl_bridge.sim.world_set import AnyWorld
 
-CELL = 0.1  # Side of cells without a map [m]; larger in large fields, smaller in small ones
+CELL = 0.1  # Side of cells without a map [m], scaled with the size of the field
 FEWEST_CELLS = 20
 MOST_CELLS = 4_000_000
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Scene of one seed in a world, or in one of a set."""
+    """Scene of one seed in a world or a member of a world set."""
 
     bodies: Array  # (K, 7) obstacles, see `shapes.place`; shapes are of the sampler's `shapes`
     starts: Array  # (M, 3) pose of each robot
     goals: Array  # (M, 2) position of each goal [m]
-    member: ArrayLike = 0  # index of its world in the set
+    member: ArrayLike = 0  # index of its world in the world set
 
 
 class Scenes(Scene):
@@ -66,11 +66,11 @@ class Scenes(Scene):
 
 @dataclass(frozen=True)
 class Catalogue:
-    """Data shared by the worlds of a set: all shapes in the first size, then in the next."""
+    """Data shared by the worlds of a set. Shapes are listed size by size."""
 
     shapes: tuple[Shape, ...]
-    place: Mapping[Shape, int]  # of each shape in the first size
-    outlines: Outlines  # of the shapes, and of a disc
+    place: Mapping[Shape, int]  # index of each shape in the first size
+    outlines: Outlines  # outlines of the shapes, and of a disc
     spaces: dict[str, FreeSpace]  # shared by worlds that differ only in their obstacles
 
 
@@ -95,7 +95,7 @@ class MemberSampler:
             world.obstacles[g].motion for g in slots
         )
         self.plan = _plan(world, footprint_radius, slots, catalogue)
-        # Maximum number of cells and obstacles; threads draw with a scratch memory each.
+        # Maximum number of cells and obstacles; each thread has its own scratch memory.
         self.room = self.plan.space.area.size, len(self.plan.group)
         self.scratches: list[SceneScratch] = []
 
@@ -103,7 +103,7 @@ class MemberSampler:
     def _packed(self) -> Any:
         return pack(self.plan)
 
-    def __getstate__(self) -> dict[str, Any]:  # a copy packs its plan again
+    def __getstate__(self) -> dict[str, Any]:  # a copy rebuilds its packed plan
         return {name: value for name, value in vars(self).items() if name != "_packed"}
 
     def draw_into(
@@ -111,8 +111,8 @@ class MemberSampler:
     ) -> None:
         """Draw some rows of scenes of at least K obstacles.
 
-        `draws` are, for all rows, the seed, the number of random obstacles (-1 for the world's
-        own), and the index of their size.
+        `draws` holds, for all rows, the seed, the number of random obstacles (-1 for
+        the world's own number), and the index of their size.
         """
         try:
             scratch = self.scratches.pop()
@@ -157,11 +157,12 @@ class MemberSampler:
 class SceneSampler:
     """Draws scenes for M robots of a radius [m] in a world, or in the worlds of a set.
 
-    A seed has its world, and a scene there. Start and goal are free, with the world's clearance,
-    and a robot that keeps it can move from one to the other among walls, map and static obstacles.
-    Obstacles keep their gaps, from each other, walls and map; they may be scaled by `sizes`, and
-    `most` random ones requested if that is more than the world has. Raises ConfigError if a world
-    has no free space for such a robot.
+    A seed determines the world and the scene in it. Start and goal have the world's
+    clearance and are connected by a path with that clearance among walls, map and
+    static obstacles. Obstacles keep their gaps from each other, walls and map. `sizes`
+    are factors that may scale them, and `most` is the largest number of random ones
+    that may be requested. Raises ConfigError if a world has no free space for such a
+    robot.
     """
 
     def __init__(
@@ -190,7 +191,7 @@ class SceneSampler:
         self.robots = robots
         self._sizes = len(sizes)
         self.count = drawn + len(world.spare)
-        # those that are spare come last
+        # spare shapes come last
         self.shapes = (*catalogue.shapes, *world.spare)
 
     @property
@@ -208,11 +209,11 @@ class SceneSampler:
         count: ArrayLike | None = None,
         size: ArrayLike | None = None,
     ) -> Scenes:
-        """Draw the scenes of seeds (n,); identical in every process and batch.
+        """Draw the scenes of seeds (n,), identical in every process and batch.
 
-        The `count` (n,) of random obstacles is at most, and by default, that of the world; `size`
-        (n,) is the index of their size. K is the most of all worlds. Raises ConfigError if a world
-        has no room for a scene.
+        `count` (n,) is the number of random obstacles: by default, and at most, that of
+        the world. `size` (n,) is the index of their size. K is the maximum of all
+        worlds. Raises ConfigError if a scene does not fit into a world.
         """
         numbers = check_seeds(seeds)
         n = len(numbers)
@@ -245,7 +246,7 @@ class SceneSampler:
 
 
 def member_of(world: AnyWorld, seed: int) -> int:
-    """Return the index of the world of a set in which the scene of a seed is."""
+    """Return the index of the world in which the scene of a seed takes place."""
     chosen = np.zeros(1, np.int64)
     kernels.choose_members(check_seeds(seed), len(world.members), chosen)
     return int(chosen[0])
@@ -280,8 +281,9 @@ def _with_room(world: World, most: int) -> World:
     at_random = [group for group in world.obstacles if not group.at]
     if most and not at_random:
         raise ConfigError(
-            f"{world.source}: key 'obstacles': the randomisation draws up to {most}, but no group "
-            "has a `count`; add one, or leave `obstacles.count` out of the randomisation."
+            f"{world.source}: key 'obstacles': the randomisation draws up to {most}, "
+            "but no group has a `count`; add one, or remove `obstacles.count` from "
+            "the randomisation."
         )
     total = sum(group.counts[1] for group in at_random)
     if total >= most:
@@ -367,7 +369,7 @@ def _free_space(world: World, footprint: float, drawn: bool) -> FreeSpace:
         x, y = _centres(cells)
         inside = (x > bounds[0]) & (x < bounds[2]) & (y > bounds[1]) & (y < bounds[3])
         cells.distances[~inside] = 0.0
-    # Between two cell centres the path is nearer to a corner than at either end.
+    # Between two cell centres the path may be closer to a corner than at either end.
     room = math.hypot(footprint + world.clearance, cells.cell / 2.0)
     area, _ = ndimage.label(cells.distances >= room)
     robot = f"a robot of radius {footprint:g} m with {world.clearance:g} m around it"
@@ -396,7 +398,7 @@ def _free_space(world: World, footprint: float, drawn: bool) -> FreeSpace:
 
 
 def _closed(grid: GridMap) -> MapField:
-    """Return a map plus a border: unknown cells and everything outside the map are occupied."""
+    """Return a map with a border; unknown cells and the outside count as occupied."""
     closed = np.pad(grid.cells, 1, constant_values=OCCUPIED)
     x, y = grid.cell_to_world([-1.5, -1.5]).tolist()
     heading = grid.origin[2]

@@ -1,8 +1,9 @@
-"""Gazebo worlds in SDF (http://sdformat.org): what stands at a height above the ground.
+"""Gazebo worlds in SDF (http://sdformat.org): the obstacles at a height above ground.
 
-Only collision geometry counts, since that is what a robot touches. Poses are composed in space, of
-models, links, frames and includes; a plane at the height of the lidar then cuts the bodies. Where
-Gazebo classic saved a `<state>`, its poses replace those of the models, as they do in Gazebo.
+Only collision geometry is read, since that is what a robot can touch. Poses of models,
+links, frames and includes are composed in 3D; the bodies are then cut by a plane at the
+height of the lidar. As in Gazebo classic, the poses of a saved `<state>` replace those
+of the models.
 """
 
 import math
@@ -38,20 +39,20 @@ from nics_drl_bridge.lidar.shapes import (
 )
 from nics_drl_bridge.sim.world import MOST_OBSTACLES, Obstacles, Region
 
-TILT = 1e-3  # up to this angle [rad] a body counts as upright: a millimetre in a metre
+TILT = 1e-3  # up to this angle [rad], 1 mm per metre, a body counts as upright
 DIGITS = 6  # shapes and poses are rounded to a micrometre
 AROUND = 1.0  # margin of the bounds around starts and goals [m]
 
 
 class ShapelessError(ValueError):
-    """A body whose section is not a shape of a world; the text names the body."""
+    """The section of a body is no shape of a world; the text names the body."""
 
     def __init__(self, body: str, missing: bool = False) -> None:
         super().__init__(body)
         self.missing = missing  # its file is missing
 
 
-_Cut = tuple[Shape, float, float, float] | None  # with its pose, before rounding
+_Cut = tuple[Shape, float, float, float] | None  # shape and pose before rounding
 
 
 class Box(NamedTuple):
@@ -70,13 +71,13 @@ class Box(NamedTuple):
         return _make_rectangle(pose, along, self.size[along], self.size[across])
 
     def _cut_leaning(self, pose: Array, up: float) -> _Cut:
-        """The convex polygon through the points where the plane cuts the edges."""
+        """Return the convex polygon of the points where the plane cuts the edges."""
         signs = np.array(list(product((-0.5, 0.5), repeat=3)))
         corners = signs * self.size @ pose[:3, :3].T  # around the box's middle
         cuts = []
         for a, b in combinations(range(8), 2):
             if np.count_nonzero(signs[a] != signs[b]) > 1:
-                continue  # no edge
+                continue  # not an edge
             below = corners[a, 2] - up
             above = corners[b, 2] - up
             if below * above < 0.0:
@@ -100,7 +101,7 @@ class Cylinder(NamedTuple):
             is_cut = abs(up) < self.length / 2.0
             return _make_disc(pose, self.radius**2) if is_cut else None
         if abs(pose[2, 2]) >= math.sin(TILT):
-            raise ShapelessError("a cylinder that leans")
+            raise ShapelessError("a tilted cylinder")
         width2 = self.radius**2 - up**2
         if width2 <= 0.0:
             return None
@@ -116,7 +117,7 @@ class Capsule(NamedTuple):
     def cut(self, pose: Array, up: float) -> _Cut:
         """See `section`; `up` is the height of the plane above the origin [m]."""
         if _find_vertical_axis(pose) != 2:
-            raise ShapelessError("a capsule that leans or lies")
+            raise ShapelessError("a tilted capsule")
         beyond = max(abs(up) - self.length / 2.0, 0.0)
         return _make_disc(pose, self.radius**2 - beyond**2)
 
@@ -140,7 +141,7 @@ class Prism(NamedTuple):
     def cut(self, pose: Array, up: float) -> _Cut:
         """See `section`; `up` is the height of the plane above the origin [m]."""
         if _find_vertical_axis(pose) != 2:
-            raise ShapelessError("a polyline that leans or lies")
+            raise ShapelessError("a tilted polyline")
         upwards = float(np.sign(pose[2, 2]))
         if not 0.0 < up * upwards < self.height:
             return None
@@ -153,15 +154,15 @@ Placed = tuple[Shape, tuple[float, float, float]]  # a shape and its pose in the
 
 
 class Standing(NamedTuple):
-    """Shapes that stand in a field at the height of a plane."""
+    """Shapes in a field at the height of a plane."""
 
     placed: tuple[Placed, ...]
-    left_out: tuple[str, ...]  # a clause for each model that a world can't hold
+    left_out: tuple[str, ...]  # a clause for each model that a world can't contain
     missing: bool = False  # the file of one of these models is missing
 
     @property
     def obstacles(self) -> tuple[Obstacles, ...]:
-        """Group of obstacles of one shape each, for a `World`."""
+        """Groups of obstacles for a `World`, one group per shape."""
         groups: dict[Shape, list[tuple[float, float, float]]] = {}
         for shape, pose in self.placed:
             groups.setdefault(shape, []).append(pose)
@@ -170,7 +171,7 @@ class Standing(NamedTuple):
         )
 
     def bounds(self, *places: tuple[float, ...]) -> Region:
-        """Return the smallest field with all shapes, and 1 m around places x, y, ... [m]."""
+        """Return the smallest field around all shapes, and 1 m around places [m]."""
         around = AROUND * np.array([(-1.0, -1.0), (1.0, 1.0)])
         corners = [around + place[:2] for place in places]
         for shape, pose in self.placed:
@@ -184,15 +185,15 @@ class Standing(NamedTuple):
         return x1, y1, x2, y2
 
 
-MOST_BYTES = 2**24  # limit of a file; the largest saved worlds have some megabytes
+MOST_BYTES = 2**24  # limit of a file; the largest saved worlds have a few megabytes
 MOST_MODELS = 20_000  # including included models
 # versions of SDF
 OLDEST = (1, 4)
 NEWEST = (1, 12)
 PATHS = "GZ_SIM_RESOURCE_PATH", "IGN_GAZEBO_RESOURCE_PATH", "GAZEBO_MODEL_PATH"
-HARMLESS = "sun", "ground_plane"  # most worlds include them; they are no obstacles
+HARMLESS = "sun", "ground_plane"  # included in most worlds, but no obstacles
 MOVING = {
-    "actor": "an actor, which moves by a script",
+    "actor": "an actor, which follows a script",
     "population": "a population of models",
 }
 POSE = {"relative_to", "frame", "degrees", "rotation_format"}  # attributes
@@ -200,7 +201,7 @@ NUMBERS = {"euler_rpy": 6, "quat_xyzw": 7}  # of a pose, by its rotation_format
 
 
 class SdfError(ConfigError):
-    """An SDF file is wrong; `rest` is the sentence after the file's path."""
+    """An SDF file is wrong; `rest` continues the sentence after the file's path."""
 
     def __init__(self, file: Path, rest: str) -> None:
         super().__init__(f"{file}{rest}")
@@ -209,30 +210,30 @@ class SdfError(ConfigError):
 
 
 class AssetsError(SdfError):
-    """An SDF file contains something that is not a shape of a world, or a missing file."""
+    """An SDF file has a shape that worlds do not support, or names a missing file."""
 
     def __init__(self, file: Path, rest: str, missing: bool = False) -> None:
         super().__init__(file, rest)
-        self.missing = missing  # it is a file, and missing
+        self.missing = missing  # True for a missing file
 
 
 class Where(NamedTuple):
     """A place in an SDF file."""
 
     file: Path
-    element: str = ""  # model and element, after a separator
+    element: str = ""  # model and element, including the separator before them
 
     def at(self, element: str) -> "Where":
-        """Return the place of an element in this one."""
+        """Return the place of an element within this one."""
         return Where(self.file, self.element + element)
 
     def error(self, rest: str) -> SdfError:
-        """Return an error that names the place."""
+        """Return an error that names this place."""
         return SdfError(self.file, self.element + rest)
 
 
 class _Order:
-    """Names to leave out, the opened files, and the number of opened models."""
+    """Names to leave out, files opened so far, and number of models so far."""
 
     def __init__(self, without: tuple[str, ...]) -> None:
         self._without = without
@@ -271,7 +272,7 @@ class _Scope:
             self.pose = include.find("pose")
             self.placement = _text(include, "placement_frame")
         self.models: list[_Scope] = []
-        # name of a model, and why it can't be read
+        # why a model can't be read, by its name
         self.strange: list[tuple[str, ShapelessError]] = []
         states = element.iterfind("state/model")
         self._state = {state.get("name", ""): state.find("pose") for state in states}
@@ -377,7 +378,7 @@ class _Scope:
 
 
 class _Body(NamedTuple):
-    """A collision geometry, or an error that says why there is none."""
+    """A collision geometry, or an error that explains why there is none."""
 
     model: str
     where: Where
@@ -385,7 +386,7 @@ class _Body(NamedTuple):
     pose: Array  # (4, 4) in the world
 
     def solid(self) -> Solid | None:
-        """Return the body; None for the ground. Raises ShapelessError, ConfigError for sizes."""
+        """Return the body, or None for the ground. May raise ShapelessError."""
         if isinstance(self.geometry, ShapelessError):
             raise self.geometry
         shape = next(
@@ -398,7 +399,7 @@ class _Body(NamedTuple):
                 shape.findtext("normal", "0 0 1"), 3, self.where
             )
             if abs(normal[2]) < math.cos(TILT) * np.linalg.norm(normal):
-                raise ShapelessError("a plane that is not level")
+                raise ShapelessError("a tilted plane")
             return None
         if shape.tag == "box":
             return Box(self._lengths(shape, "size", 3))
@@ -422,12 +423,12 @@ class _Body(NamedTuple):
             points.pop()
         if len(set(points)) < 3:
             raise self.where.error(
-                ": <polyline> needs three different points; add some."
+                ": <polyline> needs at least three different points; add some."
             )
         if len(points) > MOST_CORNERS:
             raise self.where.error(
-                f": <polyline> has {len(points)} points, a shape at most "
-                f"{MOST_CORNERS}; coarsen it."
+                f": <polyline> has {len(points)} points; the maximum is "
+                f"{MOST_CORNERS}; simplify it."
             )
         return Prism(tuple(points), *self._lengths(polyline, "height"))
 
@@ -451,23 +452,25 @@ def read_sdf(
     skip_unknown: bool = False,
     may_be_empty: bool = False,
 ) -> Standing:
-    """Read what stands in a Gazebo world at a height [m] above z = 0.
+    """Read the obstacles of a Gazebo world at a height [m] above z = 0.
 
     Args:
         path: path of a `.world` or `.sdf` file.
-        height: height at which bodies count, that of the lidar [m].
-        without: names of models to leave out, in which `*` stands for anything.
-        skip_unknown: True to leave out what can't be a shape: meshes, and bodies that lean.
-        may_be_empty: True for a world in which nothing stands.
+        height: height at which bodies are cut: the lidar's [m].
+        without: names of models to leave out; `*` matches anything.
+        skip_unknown: True to leave out bodies that have no supported shape: meshes and
+            tilted bodies.
+        may_be_empty: True to accept a world without obstacles.
 
     Raises:
-        ConfigError: the file is damaged or not SDF, has an unknown shape, or nothing stands there.
+        ConfigError: the file is damaged or not SDF, has an unsupported shape, or has no
+            obstacles at that height.
     """
     check_path("path", path)
     path = Path(path)
     placed = list[Placed]()
     unknown = dict[str, list[str]]()
-    missing = set[str]()  # the models of these whose file is missing
+    missing = set[str]()  # those of these models whose file is missing
     seen = 0
     try:
         for body in _bodies(_Scope(_world(path), path, "", _Order(without)), np.eye(4)):
@@ -497,20 +500,20 @@ def read_sdf(
         fix = "put a box in its place"
         if not skip_unknown:
             fix = f"leave it out by --skip-unknown or --without MODEL, or {fix}"
-        more = f" (as {len(left_out) - 1} more models)" if len(left_out) > 1 else ""
-        reason = f"{left_out[0]}{more}, which a world can't hold"
+        more = f" (as do {len(left_out) - 1} more models)" if len(left_out) > 1 else ""
+        reason = f"{left_out[0]}{more}, which a world can't contain"
         is_missing = next(iter(unknown)) in missing
         raise AssetsError(path, f": {reason}; {fix}.", is_missing)
     if not placed and not may_be_empty:
-        reason = f"none of its {shapes} collision geometries stands at a height of {height:g} m"
+        reason = f"none of its {shapes} collision geometries is at height {height:g} m"
         raise SdfError(path, f": {reason}; choose another --height.")
     return Standing(tuple(placed), left_out, bool(missing))
 
 
 def _section_of(body: "_Body", height: float) -> Placed | None:
-    """The shape of a body at a height [m]; None for the ground and for bodies above or below.
+    """Return a body's shape at a height [m]; None for the ground, or above or below.
 
-    Raises ShapelessError, and ConfigError for a shape that no world takes.
+    Raises ShapelessError, or ConfigError for a shape that worlds reject.
     """
     solid = body.solid()
     if solid is None:
@@ -528,7 +531,7 @@ def _section_of(body: "_Body", height: float) -> Placed | None:
 
 
 def _bodies(scope: _Scope, pose: Array) -> Iterator[_Body]:
-    """Yield all collision geometries of a scope that has a pose (4, 4) in the world."""
+    """Yield all collision geometries of a scope with a pose (4, 4) in the world."""
     for name, error in scope.strange:
         yield _Body(name, scope.where, error, pose)
     for link in scope.element.iterfind("link"):
@@ -589,7 +592,7 @@ def _text(element: Element, tag: str) -> str:
 
 
 def _found(uri: str, file: Path) -> Path | None:
-    """The file of an included model, beside a file or on the paths of Gazebo, if any."""
+    """Find the file of an included model, beside a file or on Gazebo's paths."""
     kind, _, name = uri.rpartition("://")
     if kind.startswith("http"):
         return None
@@ -631,7 +634,7 @@ def _world(path: Path) -> Element:
 
 
 def root_of(path: Path) -> Element:
-    """Return the root of an SDF file, with tags as they stand there. Raises ConfigError."""
+    """Return the root of an SDF file, with its tags unchanged. Raises ConfigError."""
     root = _tree(path)
     if root.tag != "sdf":
         raise SdfError(
@@ -688,10 +691,12 @@ def section(solid: Solid, pose: Array, height: float) -> Placed | None:
         height: of the plane [m].
 
     Returns:
-        The shape, and its pose x, y [m], heading [rad]; None if the body is all above or below.
+        The shape, and its pose x, y [m], heading [rad]; None if the plane misses the
+        body.
 
     Raises:
-        ShapelessError: it leans, and its section is neither circle, rectangle nor polygon.
+        ShapelessError: the body is tilted, and its section is neither circle, rectangle
+            nor polygon.
     """
     cut = solid.cut(pose, height - float(pose[2, 3]))
     if cut is None or not cut[0].radius > SMALLEST:
@@ -702,7 +707,7 @@ def section(solid: Solid, pose: Array, height: float) -> Placed | None:
 
 
 def _find_vertical_axis(pose: Array) -> int | None:
-    """The body's own axis that is vertical, 0 to 2; None if none is."""
+    """Return which of the body's axes, 0 to 2, is vertical; None if none is."""
     upright = np.abs(pose[2, :3]) > math.cos(TILT)
     return int(np.argmax(upright)) if upright.any() else None
 
@@ -712,7 +717,7 @@ def _find_heading(pose: Array, axis: int) -> float:
 
 
 def _make_disc(pose: Array, radius2: float) -> _Cut:
-    """A circle of a radius squared around the body's origin, if it is positive."""
+    """Return a circle around the origin; None if the squared radius is not positive."""
     radius = round(math.sqrt(max(radius2, 0.0)), DIGITS)
     return (Circle(radius=radius), pose[0, 3], pose[1, 3], 0.0) if radius else None
 

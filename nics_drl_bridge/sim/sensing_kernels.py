@@ -1,11 +1,11 @@
-"""Compiled sensing of the simulator: odometry and scans, both of which may be late.
+"""Compiled sensors of the simulator: odometry and scans, both possibly delayed.
 
 At the end of each period:
 
-1. `measure_odometry` moves the pose by odometry by the displacement that the wheels measured, and
-   by noise; it records true pose and twist beside it in the ring buffer `State.past`.
-2. `scan_or_wait` scans at once from a world with a late or skewed scan. The other worlds wait for
-   `scan_together`, which is faster per scan.
+1. `measure_odometry` adds the displacement measured by the wheels, and noise, to the
+   odometry pose. It also records true pose and twist in the ring buffer `State.past`.
+2. `scan_or_wait` scans worlds with a delayed or skewed scan immediately. The other
+   worlds wait for `scan_together`, which is faster per scan.
 3. `distort_scans` applies the faults of each robot's lidar.
 
 An observation is `State.age` substeps old. Poses and twists between the ends of two periods are
@@ -36,8 +36,9 @@ from nics_drl_bridge.sim.state import (
     State,
 )
 
-# Obstacles of a late scan are moved back by their velocity for so long at most [s]: a pedestrian
-# changes it in about this time, and would otherwise be moved back through walls.
+# Maximum time by which obstacles of a delayed scan are extrapolated backwards [s]. A
+# pedestrian changes velocity within about this time, and could otherwise be moved
+# through walls.
 FURTHEST_BACK = 1.0
 
 
@@ -53,7 +54,8 @@ def measure_odometry(
 ) -> None:
     """Measure the odometry of robot m of world n, at the end of a period.
 
-    The pose by odometry drifts, because its displacement has noise; the twist has the same noise.
+    The odometry pose drifts, because its displacements are noisy; the twist has the
+    same noise.
 
     Args:
         n: the world.
@@ -81,7 +83,7 @@ def measure_odometry(
     ahead = c * dx + s * dy
     left = c * dy - s * dx
     turn = end[2] - start[2]
-    # the same displacement from the last pose by odometry
+    # the same displacement from the last odometry pose
     heading = last[ODOM + 2]
     c = math.cos(heading)
     s = math.sin(heading)
@@ -104,7 +106,7 @@ def measure_odometry(
     row[ODOM_TWIST + 2] = twist[2] + noise_turn
     odom = data.odom[n, m]
     odom_twist = data.twist[n, m]
-    # Without this branch, the division by `substeps` takes a thirtieth of a step.
+    # This branch avoids a division by `substeps`, which takes 1/30 of a step.
     if data.age[n, m] == 0:
         for i in range(3):
             odom[i] = row[ODOM + i]
@@ -127,7 +129,7 @@ def record_truth(n: int, m: int, pose: Array, twist: Array, data: State) -> None
 
 @kernel
 def _draw_odometry_noise(n: int, m: int, axis: int, data: State) -> float:
-    """Draw the noise of the measured twist: ahead (axis 0), left (1) or of the turn rate (2)."""
+    """Draw the noise of the twist: forward (axis 0), left (1), turn rate (2)."""
     std = data.noise[n, m, ODOM_ANGULAR if axis == 2 else ODOM_LINEAR]
     if std <= 0.0:
         return 0.0
@@ -138,7 +140,7 @@ def _draw_odometry_noise(n: int, m: int, axis: int, data: State) -> float:
 
 @kernel
 def limit_lag(age: int, steps: int, rows: int, substeps: int) -> int:
-    """Return an age [substeps], limited to the episode so far and to the ring buffer."""
+    """Limit an age [substeps] to the elapsed episode and to the ring buffer."""
     return max(min(age, min(steps, rows - 1) * substeps), 0)
 
 
@@ -151,10 +153,10 @@ def interpolate_past(
     substeps: int,
     out: Array,
 ) -> None:
-    """Write what a robot recorded `lag` substeps before the end of period `steps` to `out` (3,).
+    """Write a robot's record `lag` substeps before the end of period `steps` to `out`.
 
-    `past` (R, PAST_COLUMNS) is its ring buffer; `column` is the first of the three columns that are
-    written: `POSE`, `TRUE_TWIST`, `ODOM` or `ODOM_TWIST`.
+    `past` (R, PAST_COLUMNS) is its ring buffer, `out` (3,); `column` is the first of
+    three columns: `POSE`, `TRUE_TWIST`, `ODOM` or `ODOM_TWIST`.
     """
     newer = steps - lag // substeps
     fraction = (lag % substeps) / substeps
@@ -173,7 +175,7 @@ def interpolate_past(
 
 @kernel(inline=True)
 def scan_or_wait(n: int, waiting_count: int, part: Part) -> int:
-    """Scan world n, unless `scan_together` can; return how many worlds now wait for that."""
+    """Scan world n, or let it wait for `scan_together`; return how many worlds wait."""
     data = part.data
     any_late = False
     for m in range(data.age.shape[1]):
@@ -189,7 +191,7 @@ def scan_or_wait(n: int, waiting_count: int, part: Part) -> int:
 
 @kernel
 def scan_together(waiting_count: int, part: Part) -> None:
-    """Scan the worlds that wait, as they stand."""
+    """Scan the waiting worlds at their current state."""
     data = part.data
     lidar = part.lidar
     scans = part.scratch.scans
@@ -227,9 +229,9 @@ def distort_scans(first_world: int, end_world: int, part: Part) -> None:
 
 @kernel
 def _scan_from_past(n: int, m: int, part: Part) -> None:
-    """Scan from where robot m of world n was when its reported scan was taken.
+    """Scan from the pose at which robot m of world n took its reported scan.
 
-    With skew, each group of beams is scanned from its own pose during the sweep.
+    With skew, each group of beams is scanned from its own pose within the sweep.
     """
     data = part.data
     lidar = part.lidar
@@ -255,7 +257,7 @@ def _scan_from_past(n: int, m: int, part: Part) -> None:
         fault_kernels.slice_poses(
             scans.slice_poses, pose, twist, lidar.sweep_time, skew, moving
         )
-    # One call for both cases, because `scan_robot` is large and compiled for each call.
+    # One call for both cases, because `scan_robot` is large and is compiled per call.
     for group in range(groups):
         out = ranges if groups == 1 else scans.slice_ranges
         if groups > 1:
@@ -279,11 +281,12 @@ def _scan_from_past(n: int, m: int, part: Part) -> None:
 
 @kernel
 def _gather_bodies(n: int, m: int, lag: int, reach: float, part: Part) -> int:
-    """Copy the bodies around `scans.pose`, as they were `lag` substeps ago; return their number.
+    """Copy the bodies around `scans.pose` of `lag` substeps ago; return their number.
 
-    Robots are interpolated in the past. Of obstacles no past is kept: they are moved back by their
-    present velocity. That is exact within the period, and beyond it while they keep their velocity;
-    the extrapolation ends at `FURTHEST_BACK`.
+    Robots are interpolated from their recorded past. The past of obstacles is not
+        recorded: they are moved back by their current velocity. This is exact within
+        the period, and before it for as long as the velocity was constant. The
+        extrapolation is limited to `FURTHEST_BACK`.
     """
     data = part.data
     world_set = part.world_set
@@ -293,7 +296,7 @@ def _gather_bodies(n: int, m: int, lag: int, reach: float, part: Part) -> int:
     pose = scans.pose
     first_robot = data.velocity.shape[1]
     candidates = data.bodies.shape[1]
-    # The cells of a crowd hold the present positions.
+    # The cells of a crowd are sorted by current positions.
     in_cells = world_set.standing or (world_set.crowded and lag == 0)
     if in_cells:
         candidates = find_around(n, pose[0], pose[1], reach, part.scratch.cells)

@@ -49,16 +49,16 @@ from nics_drl_bridge.threads import run_parts
 
 SLICES = 16  # Number of groups of beams in which a skewed scan is rendered
 LANES = 256  # Number of robots moved side by side: their arrays stay in the L1 cache
-# Minimum number of pairs of a robot and a body for sorting bodies into cells
+# Minimum number of robot-body pairs for sorting bodies into cells
 CROWD = 4096
-# Minimum number of robots: for fewer, testing all bodies takes less time
+# Minimum number of robots; with fewer, testing all bodies is faster
 FEWEST_OF_A_CROWD = 8
-STANDING = 32  # Minimum number of obstacles for sorting them into cells once, if all of them stand
-# Limits of a simulation: robots in one world, each of which is tested against every other, and
-# numbers in the arrays of all worlds, some GB.
+STANDING = 32  # Minimum number of static obstacles for sorting them into cells once
+# Limits of a simulation: robots in one world, where each is tested against every other,
+# and array elements of all worlds, a few GB.
 MOST_ROBOTS = 1_000
 MOST_NUMBERS = 2**30
-# Numbers of a robot or an obstacle whose count depends on neither beams, history nor past [1]
+# Array elements per robot or obstacle, apart from beams, history and past
 NUMBERS_PER_BODY = 64
 
 
@@ -79,11 +79,11 @@ class Sizes:
         return self.robots >= FEWEST_OF_A_CROWD and pairs >= CROWD
 
     def count_past_rows(self, model: SimulatorModel) -> int:
-        """Return R: a row for the newest period, and one for each that an observation may lag."""
+        """Return R: the newest period, and one row per period of observation lag."""
         return count_periods(self.longest_age, model) + 1
 
     def count_history_rows(self, model: SimulatorModel) -> int:
-        """Return H: a row for the newest command, and one for each period it may be delayed."""
+        """Return H: one row for the newest command and one per period of delay."""
         own_delays = make_terms(model.kinematics).late
         longest = self.longest_delay + int(own_delays.max(initial=0))
         return count_periods(longest, model) + 1
@@ -102,9 +102,9 @@ def warn_caller(message: str) -> None:
 
 
 class CommandRange:
-    """The range of commands to which a model was fitted; reports each command that leaves it once.
+    """Range of commands that a model was fitted to; warns once for each command.
 
-    A command whose effect was assumed, not fitted, may have any value.
+    Commands whose effect was assumed instead of fitted are not checked.
     """
 
     def __init__(
@@ -116,7 +116,8 @@ class CommandRange:
         self._tell = tell
         self._names = robot.variable_names[model.state_size :]
         fitted = np.stack([model.low, model.high])[:, model.state_size :]
-        # The model's range is of commands in effect; the checked ones are those sent.
+        # The model's range refers to commands in effect; `check` gets the commands as
+        # sent.
         for curve in model.inputs:
             c = self._names.index(curve.command)
             fitted[:, c] = curve.invert(fitted[:, c])
@@ -133,7 +134,7 @@ class CommandRange:
         self._unreported = dict.fromkeys(self._names, True)
 
     def check(self, commands: Array) -> None:
-        """Report which of the commands (..., C) leave the range, each of the C commands once."""
+        """Warn about commands (..., C) outside the range, once for each of the C."""
         if not self._unreported:
             return
         flat = commands.reshape(-1, commands.shape[-1])
@@ -156,7 +157,7 @@ class CommandRange:
 Result = TypeVar("Result")
 # Poses of robots (n, M, 3), or a function that returns them for scenes; None: the scenes' poses
 Starts = ArrayLike | Callable[[Scenes], Array | None] | None
-# Commands of a part are checked when its first world has made a multiple of so many steps.
+# The commands of a part are checked once per this many steps of its first world.
 CHECK_INTERVAL = 16
 # Arrays of the state with a row for each robot.
 ROBOT_ARRAYS = (
@@ -178,23 +179,23 @@ REBUILT = (
     "_world_set",
     "packed",
     "_renders",
-)  # what a copy of a simulator makes for itself
+)  # each copy of a simulator rebuilds these
 
 
 class FastSimulator:
-    """The simulator that a SimulatorModel describes, in copies of a world or of those of a set.
+    """Simulator of a SimulatorModel, in N copies of a world or of the worlds of a set.
 
-    A world is bit-identical in any batch and any number of threads. Its M robots scan and hit each
-    other.
+    The results of a world are bit-identical in any batch and with any number of
+    threads. Its M robots appear in each other's scans and can collide with each other.
 
     Attributes:
         data: everything that changes, see `state.State`.
         goals: (N, M, 2) of the running episodes [m].
         drawn: numbers that the randomisation drew for the running episodes, by name; (N, M) per
             robot or (N,) per scene.
-        readings: (N, M, S) of each further sensor, by its name, see `lidar.sensor`.
+        readings: (N, M, S) of each additional sensor, by name, see `lidar.sensor`.
         parts: the worlds that each thread steps.
-        episodes: draws the episodes of seeds.
+        episodes: draws the episode of each seed.
         sampler: draws the scenes of `episodes`.
         footprint: shape of the robots.
     """
@@ -222,11 +223,12 @@ class FastSimulator:
             renderer: `auto`, `baked` or `exact`, see `lidar.scanner.Scanner`.
             threads: number of parts of the worlds that `step` steps in parallel.
             randomisation: of each episode; also the name of a shipped one, or of a YAML file.
-            longest_delay: maximum that `data.delay` may be set to [substeps], by default that of
-                the model; raised to the randomisation's.
-            longest_age: maximum that `data.age` may be set to [substeps]; raised likewise.
-            tell: gets one message for each command of the robot that leaves the range of the fit,
-                and never a second one.
+            longest_delay: upper limit of `data.delay` [substeps]; by default the
+                model's delay, or the maximum of the randomisation if that is longer.
+            longest_age: upper limit of `data.age` [substeps]; raised to the
+                randomisation's maximum in the same way.
+            tell: called with a message when a command leaves the fitted range, once per
+                command.
 
         Raises:
             ConfigError: the sizes are wrong or too large, or the robot is too fast for the world.
@@ -244,7 +246,8 @@ class FastSimulator:
             )
         if robots > MOST_ROBOTS:
             raise ConfigError(
-                f"{world.source} with {robots:.10g} robots: a world may have {MOST_ROBOTS}."
+                f"{world.source} with {robots:.10g} robots: a world may have at most "
+                f"{MOST_ROBOTS}."
             )
         if randomisation is not None and not isinstance(randomisation, Randomisation):
             randomisation = load_randomisation(randomisation)
@@ -280,17 +283,18 @@ class FastSimulator:
         worlds: ArrayLike | None = None,
         starts: Starts = None,
     ) -> Scenes:
-        """Begin episodes; threads may call it in parallel for different parts.
+        """Begin episodes. Threads may call this in parallel for different parts.
 
         Args:
-            seeds: (n,) each fixes scene, start, goal, noise and randomisation of an episode.
+            seeds: (n,) each determines scene, start, goal, noise and randomisation of
+                an episode.
             worlds: (n,) indices of the worlds; by default all of them.
             starts: (n, M, 3) poses of the robots, or a function that returns them for the scenes
                 that were drawn; by default those of the scenes.
 
         Returns:
-            The scenes, whose obstacles are in the order of `data`. It is the order of `scenes` only
-            if they are few or move.
+            The scenes, with obstacles in the order of `data`. This differs from the
+            order of `scenes` if there are many static obstacles.
 
         Raises:
             ConfigError: seeds, worlds, starts or a scene do not fit.
@@ -342,7 +346,7 @@ class FastSimulator:
         )
 
     def step(self, commands: ArrayLike) -> None:
-        """Move every world by one control period under commands (N, M, C), see `data`."""
+        """Advance every world by one control period under commands (N, M, C)."""
         if len(self.parts) == 1:
             part = self.parts[0]
             self._step(part, self._check_commands(part, commands))
@@ -351,11 +355,11 @@ class FastSimulator:
             self.run_parts(lambda part: self._step(part, checked[part]))
 
     def step_part(self, part: slice, commands: ArrayLike) -> None:
-        """Move the worlds of one of `parts` under commands (n, M, C), in the calling thread."""
+        """Advance the worlds of one part, in the calling thread: commands (n, M, C)."""
         self._step(part, self._check_commands(part, commands))
 
     def bind_step(self, commands: Array) -> Callable[[], None]:
-        """Return `step` by commands that change in place, of one part without further sensors."""
+        """Return a fast `step` for commands that are updated in place."""
         step_worlds = bind(step_kernels.step_worlds, self.packed[0], commands, 0)
         steps = self.data.steps
 
@@ -371,22 +375,22 @@ class FastSimulator:
         return run_parts(function, self.parts)
 
     def sense(self, worlds: Integers) -> None:
-        """Render the readings of the further sensors in some worlds (n,)."""
+        """Render the readings of the additional sensors in some worlds (n,)."""
         for name, render in self._renders.items():
             render(self.readings[name], worlds)
 
     def scenes(self, seeds: ArrayLike) -> Scenes:
-        """Return the scenes that `reset` would begin with for seeds (n,)."""
+        """Return the scenes that `reset` would draw for seeds (n,)."""
         return self.episodes.draw(seeds)[0]
 
     @property
     def moves(self) -> bool:
-        """True if an obstacle of any world moves; `data` then has them in the order of scenes."""
+        """True if any obstacle moves; `data` then keeps the order of the scenes."""
         return self._world_set.moves
 
     @property
     def obstacles(self) -> Array:
-        """(N, K, 7) the obstacles at their present poses, in the format of `scenes`."""
+        """(N, K, 7) the obstacles at their current poses, in the format of `scenes`."""
         return self.obstacles_of(np.arange(len(self.data.steps)))
 
     def obstacles_of(self, worlds: Integers) -> Array:
@@ -394,7 +398,8 @@ class FastSimulator:
         bodies = self.data.bodies[worlds, : self.sampler.count]
         of_obstacles = self._in_table[:-1]
         index = np.zeros(int(self._in_table.max()) + 1)
-        # Equal shapes share a place in the table; in reverse, because the first of them is meant.
+        # Equal shapes share a row of the table; reversed, so that the first of them is
+        # used.
         index[of_obstacles[::-1]] = np.arange(len(of_obstacles))[::-1]
         bodies[..., SHAPE] = index[bodies[..., SHAPE].astype(np.int64)]
         return bodies
@@ -402,7 +407,7 @@ class FastSimulator:
     def put_bodies(self, bodies: Array) -> None:
         """Put the obstacles of the first world at (K, 7), in the format of `scenes`.
 
-        Many obstacles that stand are sorted afterwards: row k of `data.bodies` then need not be
+        Many static obstacles are then sorted, so row k of `data.bodies` may not be
         obstacle k, see `moves`.
         """
         obstacles = self.data.bodies[0, : self.sampler.count]
@@ -411,9 +416,10 @@ class FastSimulator:
         step_kernels.sort_worlds(self.packed[0], 0, 1)
 
     def put_robot(self, robot: int, pose: Array, state: Array) -> None:
-        """Put a robot of the first world at a pose (3,) with a state (S,); odometry stays.
+        """Put a robot of the first world at a pose (3,) with a state (S,).
 
-        Late scans are then of the new pose: it is as if the robot had always stood there.
+        Its odometry is kept. Delayed scans are then taken from the new pose, as if the
+        robot had always been there.
         """
         self.data.pose[0, robot] = pose
         self.data.state[0, robot] = state
@@ -434,12 +440,13 @@ class FastSimulator:
     ) -> None:
         """Continue the episode of another simulator of this model, in its first world.
 
-        The poses of the obstacles are not taken over; `put_bodies` puts them.
+        The poses of the obstacles are not copied; set them by `put_bodies`.
 
         Args:
             source: the other simulator.
             robots: indices of its robots that become the first robots here.
-            obstacles: (K,) index of each obstacle there, whose motion continues; -1 if it is new.
+            obstacles: (K,) index in `source` of the obstacle whose motion each one
+                continues; -1 for a new obstacle.
         """
         mine = self.data
         theirs = source.data
@@ -474,7 +481,7 @@ class FastSimulator:
             float(timing.dt),
             int(timing.substeps),
         )
-        # Without cells, all bodies are tested, which takes less time if they are few.
+        # Without cells, all bodies are tested, which is faster for few bodies.
         sorted_worlds = sizes.worlds if world_set.crowded or world_set.standing else 0
         cells = body_cells(
             sorted_worlds, sizes.robots + sizes.obstacles, world_set.standing
@@ -494,7 +501,7 @@ class FastSimulator:
 
     @cached_property
     def _world_set(self) -> WorldSetArrays:
-        """The surroundings of the members of the world set, stacked."""
+        """Stacked surroundings of the members of the world set."""
         members = self.world.members
         motions = self.sampler.motions
         crowded = self._sizes.crowded
@@ -529,7 +536,7 @@ class FastSimulator:
         return {sensor.name: sensor.renderer(sensed) for sensor in self.model.sensors}
 
     def _choose_worlds(self, worlds: ArrayLike | None) -> Integers:
-        """Return the indices of the worlds to reset; kernels do not check them."""
+        """Return the indices of the worlds to reset, which kernels do not check."""
         count = len(self.data.steps)
         if worlds is None:
             return np.arange(count)
@@ -606,14 +613,14 @@ def check_speed(model: taylor.TaylorModel, robot: RobotSpec, world: AnyWorld) ->
     shortest_side = float(np.diff(corners, axis=1).min())
     if not longest < shortest_side:
         raise ConfigError(
-            f"the robot {robot.name!r} could drive {longest:.3g} m in a step of {model.dt:g} s, "
-            f"across {shortest_side:.3g} m of world; lower the limits of its commands, or generate "
-            "its model with a shorter step."
+            f"the robot {robot.name!r} could drive {longest:.3g} m in a step of "
+            f"{model.dt:g} s, across a world of {shortest_side:.3g} m; lower the "
+            "limits of its commands, or generate its model with a shorter step."
         )
 
 
 def count_periods(substeps: int, model: SimulatorModel) -> int:
-    """Return the number of control periods that so many substeps begin."""
+    """Convert substeps to control periods, rounded up."""
     return -(-substeps // model.timing.substeps)
 
 
@@ -629,9 +636,10 @@ def check_memory(model: SimulatorModel, sizes: Sizes, source: str) -> None:
     if sizes.worlds * per_world <= MOST_NUMBERS:
         return
     raise ConfigError(
-        f"{sizes.worlds:.10g} copies of {source} with {sizes.robots} robots, {sizes.obstacles} "
-        f"obstacles, delays of {sizes.longest_delay} and ages of {sizes.longest_age} substeps: "
-        f"{MOST_NUMBERS // per_world} copies of it are the most that fit in memory."
+        f"{sizes.worlds:.10g} copies of {source} with {sizes.robots} robots, "
+        f"{sizes.obstacles} obstacles, delays of {sizes.longest_delay} and ages of "
+        f"{sizes.longest_age} substeps: at most {MOST_NUMBERS // per_world} copies of "
+        "it fit in memory."
     )
 
 
@@ -667,7 +675,7 @@ def allocate_state(model: SimulatorModel, sizes: Sizes) -> records.State:
 
 
 def _share_equal_maps(grids: Sequence[GridMap | None]) -> list[GridMap | None]:
-    """Return one object for all maps of equal content, which is then baked and stored once."""
+    """Return one object for all equal maps, so that it is baked and stored once."""
     distinct: dict[Any, GridMap | None] = {}
     shared = []
     for grid in grids:
@@ -706,7 +714,7 @@ def _stack_plans(
 def _allocate_scratch(
     model: SimulatorModel, sizes: Sizes, cells: records.BodyCells, worlds: int
 ) -> records.Scratch:
-    """Allocate the memory of a thread that steps so many worlds."""
+    """Allocate the memory of a thread that steps a number of worlds."""
     kinematics = model.kinematics
     robots = sizes.robots
     obstacles = sizes.obstacles

@@ -1,12 +1,13 @@
-"""The records that the simulator's kernels take: NamedTuples of arrays.
+"""Arguments of the simulator's kernels: NamedTuples of arrays.
 
-A simulation runs N worlds. Each is a copy of one of the P members of a world set and holds M
-robots and K obstacles. `State` changes from period to period, `WorldSetArrays` and `Dynamics` do
-not, and `Scratch` is memory that a kernel writes before it reads it. One thread steps one `Part` of
-the worlds.
+A simulation runs N worlds. Each is a copy of one of the P members of a world set and
+contains M robots and K obstacles. `State` changes in each period, `WorldSetArrays` and
+`Dynamics` never change, and `Scratch` holds no information between calls. One thread
+steps one `Part` of the worlds.
 
-Further dimensions: S state, C commands, T kinematic terms, H periods of command history, R periods
-of the past, W walls, B beams, L lanes, G groups of beams, n some of the worlds.
+Other dimensions: S state, C commands, T kinematic terms, H periods of command history,
+R periods of the past, W walls, B beams, L lanes, G groups of beams, n a subset of the
+worlds.
 """
 
 from typing import Any, NamedTuple
@@ -30,8 +31,9 @@ DRIFT_X = 2
 DRIFT_Y = 3
 DRIFT_STATE = 5
 
-# Columns of `State.past`. The true twist is the model's at the end of a period: for a robot that is
-# held by a wall, the twist with which it drives against the wall, as its wheels turn.
+# Columns of `State.past`. The true twist is the model's at the end of a period. For a
+# robot that drives against a wall, it is the twist at which the wheels turn, although
+# the wall holds the robot.
 POSE = 0  # true pose: x, y, heading
 TRUE_TWIST = 3
 ODOM = 6  # pose by odometry
@@ -49,12 +51,12 @@ LANE_HEADING = 4  # unwrapped
 LANE_PATH = 5  # upper bound on the length of the path in the period [m]
 LANE_ROWS = 6
 
-# Maximum number of touches of a robot that bend its motion; beyond, it may get stuck
+# Maximum number of touches that deflect a robot; with more, it may get stuck
 MOST_TOUCHES = 512
 
 
-Records = NDArray[Any]  # of a structure
-Record = Any  # one of them, whose fields mypy does not know
+Records = NDArray[Any]  # structured array
+Record = Any  # element of `Records`; mypy does not know its fields
 
 # How an obstacle moves
 STILL = 0
@@ -66,22 +68,22 @@ class ObstaclePlan:
     """Motion of an obstacle."""
 
     kind: int
-    # of the desired speed, which is drawn per episode [m/s]
+    # range of the desired speed, which is drawn per episode [m/s]
     slowest: float
     fastest: float
-    # of a patrol: its waypoints, and how it goes through them
+    # patrol: its waypoints and their order
     first: int
     count: int
     loop: bool
     pause: float
-    # of a pedestrian, see `world.Pedestrian`
+    # pedestrian, see `world.Pedestrian`
     relaxation: float
     repulsion: float
     range: float
     wall_repulsion: float
     wall_range: float
     foresight: float
-    cos_view: float  # of half the angle of sight
+    cos_view: float  # cosine of half the field of view
     behind: float
     fluctuation: float
 
@@ -95,21 +97,22 @@ class ObstacleMark:
     speed: float  # desired in this episode [m/s]
     vx: float  # velocity in the last period [m/s]
     vy: float
-    goal_x: float  # of a pedestrian [m]
+    goal_x: float  # goal of a pedestrian [m]
     goal_y: float
-    until: float  # step at which it gives this goal up
-    index: int  # of the next waypoint of a patrol
-    way: int  # 1 forwards through its waypoints, -1 backwards
-    rest: float  # waiting time that is left [s]
+    until: float  # step at which it abandons this goal
+    index: int  # next waypoint of a patrol
+    way: int  # 1 for forwards through the waypoints, -1 for backwards
+    rest: float  # remaining waiting time [s]
 
 
 MARK = structure_of(ObstacleMark)
 
 
 class State(NamedTuple):
-    """All that changes in a simulation; `FastSimulator.data`.
+    """Everything that changes in a simulation; `FastSimulator.data`.
 
-    A reset keeps what belongs to each robot: faults, coefficient, delay, age and noise.
+    A reset keeps the properties of each robot: faults, coefficient, delay, age and
+        noise.
     """
 
     pose: Array  # (N, M, 3) true pose of `base_link` in `map`
@@ -117,18 +120,18 @@ class State(NamedTuple):
     history: Array  # (N, M, H, C) commands in effect, newest first
     # (N, K + M, BODY_COLUMNS) obstacles, then robots; columns as in `lidar.exact_kernels`
     bodies: Array
-    odom: Array  # (N, M, 3) pose by odometry, which drifts; it begins at the start pose
+    odom: Array  # (N, M, 3) pose by odometry, which starts at the true pose and drifts
     twist: Array  # (N, M, 3) measured body twist
     ranges: Singles  # (N, M, B) scan, REP-117
     collided: NDArray[np.uint8]  # (N, M) 1 once a robot has touched something
     steps: Integers  # (N,) control periods since the reset
-    seeds: Integers  # (N,) of the episode
-    member: Integers  # (N,) member of the world set that the episode takes place in
+    seeds: Integers  # (N,) seed of the episode
+    member: Integers  # (N,) member of the world set in which the episode takes place
     # (N, M, PARAMETERS) of each robot's lidar; columns as in `lidar.fault_kernels`
     faults: Array
     coefficient: Array  # (N, M, T) of each robot's terms, see `robot.kernels.Terms`
     delay: Integers  # (N, M) common latency of the commands [substeps], at most `longest_delay`
-    age: Integers  # (N, M) of scan and odometry when reported [substeps], at most `longest_age`
+    age: Integers  # (N, M) age of scan and odometry [substeps], at most `longest_age`
     noise: Array  # (N, M, 2 + 3 + S) standard deviations, columns `ODOM_LINEAR` to `DRIFT_STATE`
     # (N, K, 3) velocity of the obstacles in `map` in this period [m/s, m/s, rad/s]
     velocity: Array
@@ -137,7 +140,7 @@ class State(NamedTuple):
 
 
 class MapField(NamedTuple):
-    """Distances from the centres of square cells to what is solid; no cells without a map."""
+    """Distances from the centres of square cells to solid ones; empty without a map."""
 
     distances: Singles  # (rows, columns) [m]
     x: float  # outer corner of cell (0, 0) [m]
@@ -151,13 +154,13 @@ NO_FIELD = MapField(np.zeros((0, 0), np.float32), 0.0, 0.0, 1.0, 0.0, 1.0)
 
 
 class Surroundings(NamedTuple):
-    """Everything that stands in one world, and how its bodies are searched."""
+    """The static part of one world, and how its bodies are searched."""
 
     walls: Array  # (W, 4) x1, y1, x2, y2 [m]
     grid: MapField
     outlines: OutlineArrays
     crowded: bool  # True if all bodies are sorted into cells in each period
-    standing: bool  # True if the obstacles are put in the order of cells: none may get a velocity
+    standing: bool  # True if static obstacles are sorted by cell; none may then move
     plans: Records  # (K,) of `PLAN`, the motions of the obstacles
     waypoints: Array  # (Q, 2) of all patrols [m]
     bounds: Array  # (4,) minimum x, y and maximum x, y that obstacles stay in [m]
@@ -185,7 +188,7 @@ class Dynamics(NamedTuple):
     """Kinematics of the robots."""
 
     terms: (
-        Terms  # with the model's coefficients; those of a robot are `State.coefficient`
+        Terms  # with the model's coefficients; each robot's are in `State.coefficient`
     )
     series: Array  # `robot.kernels.SERIES`
     dt: float  # length of a substep [s]
@@ -203,27 +206,27 @@ class Lanes(NamedTuple):
 
 
 class RobotMotion:
-    """Motion of a robot that may meet something, see `contact_kernels`."""
+    """Motion of a robot that may touch something, see `contact_kernels`."""
 
-    # where the robot was when its present twist began: pose, time in the interval [s]
+    # pose of the robot when its current twist began, and time in the interval [s]
     x: float
     y: float
     heading: float
     cos: float
     sin: float
     since: float
-    # twist in the robot's frame [m/s, m/s, rad/s]; what it would be without contacts
+    # twist in the robot's frame [m/s, m/s, rad/s]; twist without contacts
     vx: float
     vy: float
     turn: float
     wish_x: float
     wish_y: float
     wish_turn: float
-    bound: float  # of the speed of any of its points [m/s]
-    safe_until: float  # time in the interval until which it cannot meet anything [s]
+    bound: float  # bound on the speed of any of its points [m/s]
+    safe_until: float  # time in the interval until which it cannot touch anything [s]
     room: float  # clearance that is certainly left when the interval ends [m]
     gap: float  # its latest clearance, negative where it overlaps [m]
-    is_close: bool  # True if it may meet something before `safe_until`
+    is_close: bool  # True if it may touch something before `safe_until`
     freedom: int  # what it may still do in this interval, see `contact_kernels`
 
 
@@ -235,10 +238,12 @@ class Touch:
 
     x: float  # nearest point of the robot [m]
     y: float
-    nx: float  # unit vector to it from what it touches
+    nx: float  # unit vector from the touched object to it
     ny: float
     gap: float  # [m]
-    recedes: float  # velocity of what it touches along the unit vector, 0 or less [m/s]
+    recedes: (
+        float  # velocity of the touched object along the unit vector, 0 or less [m/s]
+    )
     other: int  # body that it touches; -1 for a wall or the map
 
 
@@ -249,7 +254,7 @@ class Touches(NamedTuple):
     """Scratch memory of the touches of one robot."""
 
     touches: Records  # (T,) of `TOUCH`
-    number: Integers  # (1,) of those that are listed
+    number: Integers  # (1,) number of listed touches
     square: Array  # (4, 2) corners of a cell of a map [m]
 
 
@@ -260,13 +265,15 @@ def allocate_touches() -> Touches:
 
 
 class BodyCells(NamedTuple):
-    """The bodies of N worlds in G x G cells each; without rows, all bodies are always found."""
+    """The bodies of N worlds, in G x G cells each. No rows: find all."""
 
-    # (N, G^2 + 2) place in `then` of each cell's first body, those in no cell being the last
+    # (N, G^2 + 2) index in `then` of each cell's first body; bodies in no cell come
+    # last
     first: ShortIntegers
-    # (N, K) the bodies in the order of cells. One row if the bodies themselves are put into it
+    # (N, K) the bodies in the order of cells. One row if the bodies themselves are
+    # sorted
     then: ShortIntegers
-    ordered: bool  # True if they are
+    ordered: bool  # True if the bodies themselves are sorted
     frame: Array  # (N, FRAME)
     found: ShortIntegers  # (K,) scratch for one thread: the bodies around a point
 
@@ -279,7 +286,7 @@ class Single(NamedTuple):
 
 
 class Tight(NamedTuple):
-    """Scratch memory of one world, and what its robots may meet, see `contact_kernels`."""
+    """Scratch memory of one world and its contacts, see `contact_kernels`."""
 
     motions: Records  # (M,) of `MOTION`
     listed: Touches
@@ -288,7 +295,7 @@ class Tight(NamedTuple):
     fastest: Array  # (1,) speed of the fastest other body [m/s]
     near: Integers  # (M, 1 + SEVERAL) number and indices of the bodies near each robot
     meets: Integers  # (M,) bit flags of `contact_kernels`
-    reach: Array  # (K + M,) how far each body may reach from its present centre [m]
+    reach: Array  # (K + M,) maximum reach of each body from its current centre [m]
     speeds: Array  # (M, 2) velocity of the robots in `map` [m/s]
 
 
@@ -297,27 +304,27 @@ class Scans(NamedTuple):
 
     start_poses: Array  # (L, 3) poses of the robots at the start of the period
     waiting: Integers  # (n,) worlds that are scanned together
-    bodies: Array  # (K + M + 1, 7) bodies that one robot may see, as they were
-    pose: Array  # (3,) pose that one robot scans from
+    bodies: Array  # (K + M + 1, 7) bodies that one robot may see, at their past poses
+    pose: Array  # (3,) pose from which one robot scans
     twist: Array  # (3,) twist of that robot during the sweep
     slice_poses: Array  # (G, 3) poses during a sweep
-    slice_ranges: Singles  # (B,) scan from one of these poses
+    slice_ranges: Singles  # (B,) scan from one of those poses
     everybody: ShortIntegers  # (K + M + 1,) indices of `bodies`
     scratch: ScanScratch
 
 
 class Scratch(NamedTuple):
-    """Memory that one thread needs to itself."""
+    """Scratch memory of one thread."""
 
     lanes: Lanes
     single: Single
     tight: Tight
-    cells: BodyCells  # the cells of all worlds, with a list of found bodies per thread
+    cells: BodyCells  # cells of all worlds, with the thread's own list `found`
     scans: Scans
 
 
 class Part(NamedTuple):
-    """Everything that the kernels need to step the worlds of one part."""
+    """Everything that kernels need to step the worlds of one part."""
 
     data: State
     world_set: WorldSetArrays

@@ -1,20 +1,21 @@
-"""Compiled step of the simulator: the worlds of a part, by one control period.
+"""Compiled simulation step: advances the worlds of a part by one control period.
 
 `step_worlds` queues the commands, then takes the worlds in blocks, one lane for each robot:
 
-1. `_begin_period_of_world` saves the robots' poses, and chooses the velocities of the obstacles.
-2. `move_freely` moves all robots of the block side by side, as if nothing stood in their way.
-3. `_move_world` takes that motion for robots that can meet nothing, adds their drift, and moves
-   the obstacles. If a robot may meet something, `_move_carefully` moves and drifts it instead, from
-   where it stood, see `contact_kernels`.
+1. `_begin_period_of_world` saves the robots' poses and chooses the obstacles'
+   velocities.
+2. `move_freely` moves all robots of the block side by side and ignores contacts.
+3. `_move_world` keeps that motion for robots that cannot touch anything, adds their
+   drift, and moves the obstacles. If a robot may touch something, `_move_carefully`
+   moves and drifts it instead, from its old pose, see `contact_kernels`.
 4. `_measure_world` measures the odometry.
 5. Each robot scans, and its lidar's faults are applied, see `sensing_kernels`.
 
 `begin_episodes` resets worlds whose robots and obstacles are in place. `begin_period` and
 `end_period` are steps 1, 4 and 5 for worlds whose robots another engine moves.
 
-A world is bit-identical in any batch, part or thread: nothing is summed over worlds, and random
-numbers depend on the world's own seed and counter alone.
+A world is bit-identical in any batch, part or thread: nothing is summed over worlds,
+and random numbers depend only on the world's own seed and counter.
 
 Shared arguments: `packed` is a `state.Part`, packed by `kernels.pack`; n is a world, m a
 robot in it; the robot's lane is `first_lane` + m.
@@ -66,20 +67,20 @@ from nics_drl_bridge.sim.state import (
     WorldSetArrays,
 )
 
-# At least so many robots are scanned before their scans are distorted. So few scans stay in the L2
-# cache.
+# Minimum number of robots that are scanned before their scans are distorted; this few
+# scans fit into the L2 cache.
 SCANNED_TOGETHER = 48
 
 
 @kernel(allocates=True)
 def step_worlds(packed: Any, commands: Array, first_world: int) -> None:
-    """Step n worlds of a part, from `first_world` on, under commands (n, M, C) for one period."""
+    """Step n worlds of a part, starting at `first_world`, under commands (n, M, C)."""
     _step_part(packed.content, commands, first_world)
 
 
 @kernel(allocates=True)
 def begin_episodes(packed: Any, chosen: Integers) -> None:
-    """Begin episodes in the worlds `chosen` (n,), where everything is in place and stands still."""
+    """Begin episodes in worlds `chosen` (n,); everything is in place and at rest."""
     part = packed.content
     for i in range(len(chosen)):
         n = chosen[i]
@@ -95,7 +96,7 @@ def begin_episodes(packed: Any, chosen: Integers) -> None:
 
 @kernel(allocates=True)
 def sort_worlds(packed: Any, first_world: int, end_world: int) -> None:
-    """Sort the bodies of worlds [first_world, end_world) of a part into cells, as they stand."""
+    """Sort the bodies of worlds [first_world, end_world) into cells."""
     part = packed.content
     for n in range(first_world, end_world):
         _sort_bodies(n, get_surroundings(n, part.world_set), part)
@@ -120,10 +121,12 @@ def end_period(
     """Measure what the robots sense at the end of a period in which another engine moved them.
 
     Args:
-        packed: the part, whose robots and obstacles stand where the period ends.
+        packed: the part, with robots and obstacles at their poses at the end of the
+            period.
         true_twist: (N, M, 3) body twist at the end of the period.
-        wheel_start: (N, M, 3) pose by the wheels alone at the start of the period.
-        wheel_end: (N, M, 3) pose by the wheels alone at the end.
+        wheel_start: (N, M, 3) pose by wheel odometry without noise, at the start of the
+            period.
+        wheel_end: (N, M, 3) the same pose at the end.
         wheel_twist: (N, M, 3) body twist by the wheels at the end.
     """
     part = packed.content
@@ -140,7 +143,7 @@ def end_period(
             sensing.measure_odometry(
                 n, m, start, end, wheel_twist[n, m], data, part.motion
             )
-            # The lidar is where the robot truly is, not where the wheels say.
+            # The lidar moves with the true pose, not with wheel odometry.
             sensing.record_truth(n, m, data.pose[n, m], true_twist[n, m], data)
         _sort_bodies(n, get_surroundings(n, part.world_set), part)
         waiting_count = sensing.scan_or_wait(n, waiting_count, part)
@@ -152,9 +155,9 @@ def end_period(
 def _step_part(part: Part, commands: Array, first_world: int) -> None:
     """Step some worlds, see `step_worlds`.
 
-    Scans of several worlds are made together, because one lidar's scan is too short to keep the
-    processor busy. This is not done in `step_worlds` itself: there numba would count references to
-    the part's arrays, which takes longer than the step.
+    Several worlds are scanned together, because a single scan is too short to keep the
+    processor busy. This function is separate from `step_worlds`, where numba would
+    count references to the part's arrays, which takes longer than the step.
     """
     data = part.data
     robots = data.pose.shape[1]
@@ -201,9 +204,9 @@ def _queue_commands(
 
 @kernel(inline=True)
 def _begin_period_of_world(n: int, first_lane: int, part: Part) -> None:
-    """Keep the robots' poses; choose the velocities of the obstacles.
+    """Save the robots' poses; choose the velocities of the obstacles.
 
-    Where an episode begins, also record its start, at which the robots stand still.
+    If an episode begins, also record its start, with the robots at rest.
     """
     data = part.data
     speeds = part.scratch.tight.speeds
@@ -248,7 +251,7 @@ def _measure_world(n: int, first_lane: int, scene: Surroundings, part: Part) -> 
         compute_rates(n, m, motion.substeps - 1, data, motion, single)
         sensing.measure_odometry(n, m, start, pose, single.dq, data, motion)
         sensing.record_truth(n, m, pose, single.dq, data)
-        # The cells must know how far any body may be from where it was sorted.
+        # The cells must know how far any body may have moved since it was sorted.
         if scene.crowded:
             dx = pose[0] - start[0]
             dy = pose[1] - start[1]
@@ -258,7 +261,7 @@ def _measure_world(n: int, first_lane: int, scene: Surroundings, part: Part) -> 
 
 @kernel
 def _sort_bodies(n: int, scene: Surroundings, part: Part) -> None:
-    """Sort the bodies of world n into its cells, or its standing obstacles by cells."""
+    """Sort the bodies of world n into cells, or its static obstacles by cell."""
     bodies = part.data.bodies[n]
     cells = part.scratch.cells
     if scene.crowded:
@@ -270,7 +273,7 @@ def _sort_bodies(n: int, scene: Surroundings, part: Part) -> None:
 
 @kernel(view=True)
 def get_surroundings(n: int, world_set: WorldSetArrays) -> Surroundings:
-    """Return the walls, map and motions of world n: those of the member that it copies."""
+    """Return the walls, map and motions of world n, from the member that it copies."""
     member = world_set.fixtures.member[n]
     frame = world_set.fixtures.frames[member]
     distances = cells_of(world_set.distances, world_set.map_places[member])
@@ -330,7 +333,7 @@ def _move_world(n: int, first_lane: int, scene: Surroundings, part: Part) -> Non
 def _find_what_is_near(
     n: int, first_lane: int, scene: Surroundings, part: Part
 ) -> bool:
-    """Find what each robot may meet in the period; return True if an obstacle moves."""
+    """Find what each robot may touch; return True if an obstacle moves."""
     data = part.data
     lane_poses = part.scratch.lanes.pose
     tight = part.scratch.tight
@@ -351,12 +354,12 @@ def _find_what_is_near(
             longest = max(longest, moved)
             obstacles_move = True
     for m in range(data.pose.shape[1]):
-        # Each component is uniform, so at most sqrt(3) of its standard deviations.
+        # Each component is uniform, hence at most sqrt(3) standard deviations.
         sum_of_deviations = data.noise[n, m, DRIFT_X] + data.noise[n, m, DRIFT_Y]
         path = lane_poses[LANE_PATH, first_lane + m]
         body = data.bodies[n, first + m]
         if not is_round(body, scene.outlines):
-            # Where a corner touches something, a turn moves the robot away.
+            # If a corner touches something, turning moves the robot away.
             turned = lane_poses[LANE_HEADING, first_lane + m] - data.pose[n, m, 2]
             path += abs(turned) * body[RADIUS]
         path += math.sqrt(3.0 * period) * sum_of_deviations
@@ -376,9 +379,10 @@ def _find_what_is_near(
 def _move_carefully(
     n: int, obstacles_move: bool, scene: Surroundings, part: Part
 ) -> None:
-    """Move the obstacles of one world, and the robots that may meet something; let these drift.
+    """Move the obstacles of a world and the robots that may touch something.
 
-    Without contact, such a robot moves exactly as in `move_freely`.
+    These robots also drift. Without contact, such a robot moves exactly as in
+    `move_freely`.
     """
     data = part.data
     motion = part.motion
@@ -464,11 +468,12 @@ def compute_rates(
 def draw_drift(
     n: int, m: int, data: State, motion: Dynamics
 ) -> tuple[float, float, float]:
-    """Draw the drift of robot m in a period: ahead, left [m] and turn [rad]; move its state.
+    """Draw the drift of robot m: forward, left [m], heading [rad]; disturb its state.
 
-    The drift grows with root time. Draws are uniform, up to sqrt(3) standard deviations, because
-    that is cheap; over some periods they add up to a normal distribution. The state stays within
-    the bounds of the model. A robot that has touched something does not drift in that episode.
+    The drift grows with the square root of time. Draws are uniform, within sqrt(3)
+    standard deviations, which is cheap; the sum over several periods is close to
+    normal. The state stays within the bounds of the model. Once a robot has touched
+    something, it no longer drifts in that episode.
     """
     if data.collided[n, m] != 0:
         return 0.0, 0.0, 0.0
@@ -507,10 +512,10 @@ def move_freely(
     motion: Dynamics,
     lanes: Lanes,
 ) -> None:
-    """Move the robots of worlds [first_world, end_world) for one period, as if nothing stood there.
+    """Move the robots of worlds [first_world, end_world), ignoring contacts.
 
-    The result is in the lanes: robot m of world n is in lane (n - first_world) M + m. The period is
-    integrated from one change of a command to the next.
+    The result is in the lanes: robot m of world n is in lane (n - first_world) M + m.
+        The period is integrated piecewise between changes of the commands.
     """
     robots = data.pose.shape[1]
     substeps = motion.substeps
@@ -537,7 +542,7 @@ def move_freely(
     terms = robot.replace_coefficients(motion.terms, lanes.coefficient)
     substep = 0
     while substep < substeps:
-        # If no command changes any more, the next change is the end of the period.
+        # If no further command changes, integrate to the end of the period.
         next_change = substeps
         for c in range(len(change)):
             for lane in range((end_world - first_world) * robots):

@@ -1,4 +1,4 @@
-"""World files: the field of the episodes, its obstacles, and how these move."""
+"""World files: the field of the episodes, the obstacles, and their motion."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -34,7 +34,7 @@ Side = Annotated[float, Field(ge=SMALLEST_FIELD, le=LARGEST)]
 Pose = tuple[Coordinate, Coordinate, Heading]
 Point = tuple[Coordinate, Coordinate]
 Region = tuple[Coordinate, Coordinate, Coordinate, Coordinate]
-# Maximum speed of an obstacle [m/s]; beyond, a control period is too coarse
+# Maximum speed of an obstacle [m/s]; above it, a control period is too coarse
 FASTEST = 10.0
 # Upper bound on the parameters of the social force model, each in its unit
 STRONGEST = 1e3
@@ -43,13 +43,13 @@ Range = Annotated[float, Field(ge=1e-3, le=STRONGEST)]
 
 
 class Patrol(Schema):
-    """Moves from waypoint to waypoint, and waits while something is in the way."""
+    """Moves from waypoint to waypoint and waits while its path is blocked."""
 
-    kind: Literal["patrol"] = "patrol"  # which kind of motion this is
+    kind: Literal["patrol"] = "patrol"  # kind of motion
     # x, y in `map` [m]
     waypoints: tuple[Point, ...] = Field(min_length=2, max_length=1000)
     speed: float = Field(gt=0.0, le=FASTEST)  # [m/s]
-    # continue from the last waypoint to the first; otherwise back and forth
+    # return from the last waypoint to the first; otherwise go back and forth
     loop: bool = True
     # waiting time at each waypoint [s]
     pause: float = Field(default=0.0, ge=0.0, le=1e6)
@@ -65,26 +65,27 @@ class Patrol(Schema):
 class Pedestrian(Schema):
     """Walks to random goals, by the social force model of Helbing and Molnar (1995).
 
-    Symbols and defaults are those of "Social force model for pedestrian dynamics", Phys. Rev. E 51,
-    4282, but the ellipses of the repulsion follow the relative velocity (Johansson, Helbing, Shukla
-    2007), and distances are between the surfaces of the discs (Helbing, Farkas, Vicsek 2000). The
-    speeds are the paper's 1.34 m/s, plus or minus one standard deviation of 0.26 m/s.
+    Symbols and defaults are from "Social force model for pedestrian dynamics", Phys.
+    Rev. E 51, 4282, with two changes: the ellipses of the repulsion depend on the
+    relative velocity (Johansson, Helbing, Shukla 2007), and distances are between the
+    surfaces of the discs (Helbing, Farkas, Vicsek 2000). The default speeds are the
+    paper's 1.34 m/s, plus or minus one standard deviation of 0.26 m/s.
     """
 
-    kind: Literal["pedestrian"] = "pedestrian"  # which kind of motion this is
-    # range of the desired speed, drawn per episode; its upper end is a limit [m/s]
+    kind: Literal["pedestrian"] = "pedestrian"  # kind of motion
+    # range of the desired speed, drawn per episode; the maximum limits any speed [m/s]
     speed: tuple[float, float] = (1.08, 1.6)
     # tau, relaxation time to the desired velocity [s]
     relaxation: float = Field(default=0.5, ge=0.1, le=10.0)
-    repulsion: Strength = 2.1  # V0 [m^2/s^2] of walkers, obstacles and robots
+    repulsion: Strength = 2.1  # V0, for walkers, obstacles and robots [m^2/s^2]
     range: Range = 0.3  # sigma [m]
     wall_repulsion: Strength = 10.0  # U0 [m^2/s^2]
     wall_range: Range = 0.2  # R [m]
-    # delta t, the time by which the others' motion is extrapolated [s]
+    # delta t, the time over which others' motion is extrapolated [s]
     foresight: Strength = 1.0
-    # 2 phi, angle of sight [rad]
+    # 2 phi, field of view [rad]
     view: float = Field(default=math.radians(200.0), ge=0.0, le=2.0 * math.pi)
-    # c, weight of forces from outside the angle of sight
+    # c, weight of forces from outside the field of view
     behind: float = Field(default=0.5, ge=0.0, le=1.0)
     fluctuation: Strength = 0.1  # standard deviation of a random acceleration [m/s^2]
 
@@ -108,10 +109,10 @@ class Obstacles(Schema):
     shapes: tuple[Shape, ...] = Field(min_length=1, max_length=MOST_SHAPES)
     # number of obstacles, or [minimum, maximum] to draw from per episode
     count: int | tuple[int, int] | None = None
-    gap: Distance = 0.0  # free space between one of them and any other obstacle [m]
-    # fixed poses, x, y [m], heading [rad], instead of `count` at random
+    gap: Distance = 0.0  # minimum free space to any other obstacle [m]
+    # fixed poses, x, y [m], heading [rad], instead of `count` random ones
     at: tuple[Pose, ...] = ()
-    # motion; by default the obstacles stand still
+    # motion; by default the obstacles are static
     motion: Motion | None = None
 
     @field_validator("count", mode="before")
@@ -163,7 +164,7 @@ class Starts(Places):
 
 
 class Goals(Places):
-    """Places that robots are to reach: any point of the regions, or one of the given points."""
+    """Places of goals: any point of the regions, or one of the given points."""
 
     at: tuple[Point, ...] = Field(default=(), max_length=MOST_PLACES)  # x, y [m]
 
@@ -171,13 +172,14 @@ class Goals(Places):
 class World(Schema):
     """World of the episodes; everything is in the frame `map`."""
 
-    name: str  # the name that users refer to
+    name: str  # name by which users refer to the world
     # size along x, y of a walled field around the origin [m]
     size: tuple[Side, Side] | None = None
     bounds: Region | None = None  # or x1, y1, x2, y2 of a field without walls [m]
-    # further straight walls, x1, y1, x2, y2 [m]
+    # additional straight walls, x1, y1, x2, y2 [m]
     walls: tuple[Region, ...] = Field(default=(), max_length=MOST_WALLS)
-    # static map besides or instead of a field: a shipped one, or Nav2's YAML, relative to this file
+    # static map in addition to or instead of a field: a shipped one, or a Nav2 map's
+    # YAML file, relative to this file
     map: str | None = None
     obstacles: tuple[Obstacles, ...] = ()  # groups of obstacles, see `Obstacles`
     # free space around the footprint at start, goal, and on a path between them [m]
@@ -195,17 +197,18 @@ class World(Schema):
             raise ValueError("a world needs a `size`, `bounds`, or a `map`")
         if self.size is not None and self.bounds is not None:
             raise ValueError(
-                "a field has either a `size` and walls, or `bounds` and none"
+                "a field has either a `size` (with walls) or `bounds` (without "
+                "walls), not both"
             )
         x1, y1, x2, y2 = self.bounds or (0.0, 0.0, 1.0, 1.0)
         if not all(SMALLEST_FIELD <= side <= LARGEST for side in (x2 - x1, y2 - y1)):
             raise ValueError(
-                "bounds must be [least x, least y, greatest x, greatest y] in metres"
+                "bounds must be [minimum x, minimum y, maximum x, maximum y] in metres"
             )
         field = self.size or (x2 - x1, y2 - y1)
         across = math.hypot(*field)
         if across > MOST_ACROSS_M:
-            fix = f"a field may be {MOST_ACROSS_M:g} m across, the largest distance in observations"
+            fix = f"the maximum is {MOST_ACROSS_M:g} m, as for observed distances"
             raise ValueError(
                 f"the field of {field[0]:g} m x {field[1]:g} m is {across:.0f} m across; {fix}"
             )
@@ -213,18 +216,18 @@ class World(Schema):
             raise ValueError("goal_distance must be [minimum, maximum] in metres")
         if sum(group.counts[1] for group in self.obstacles) > MOST_OBSTACLES:
             raise ValueError(
-                f"all groups of obstacles together may have {MOST_OBSTACLES}"
+                f"all groups together may have at most {MOST_OBSTACLES} obstacles"
             )
         return self
 
     @property
     def members(self) -> "tuple[World, ...]":
-        """The world itself, as the only one of its set."""
+        """The world itself, like a set of one world."""
         return (self,)
 
     @property
     def spare(self) -> tuple[Shape, ...]:
-        """Shapes for which a simulator reserves one body each; scenes are drawn without them."""
+        """Shapes of spare bodies, one each, which are in no drawn scene."""
         return self._spare
 
     def with_spare(self, shapes: tuple[Shape, ...]) -> "World":
@@ -245,7 +248,7 @@ class World(Schema):
 
     @property
     def fingerprint(self) -> str:
-        """The name, and 8 digits of a SHA-256 over the content, including a map's content."""
+        """The name and 8 digits of a SHA-256 of the content, including a map's."""
         absent = {"bounds"} if self.bounds is None else set()
         content = self.model_dump_json(exclude={"map", *absent}).encode()
         if self.grid is not None:
@@ -281,7 +284,7 @@ class World(Schema):
         return x1, y1, x2, y2
 
     def all_walls(self) -> Array:
-        """Return (W, 4) the four sides of the field, if any, then the further walls [m]."""
+        """Return walls (W, 4) [m]: the sides of a walled field, then the others."""
         sides: list[Region] = []
         if self.size is not None:
             x, y = self.extent[2:]
@@ -314,19 +317,19 @@ def plan_arrays(
 
 
 def load_world(name: str | Path, also: Iterable[str] = ()) -> World:
-    """Load a shipped world by name (`arena`), or a YAML file; an error may offer `also` others."""
+    """Load a shipped world or a YAML file; errors also suggest names in `also`."""
     path = find_config(name, "worlds", also)
     world = load_yaml(path, World)
     if world.map is not None and Path(world.map).suffix in (".yaml", ".yml"):
         world = world.model_copy(update={"map": str(path.parent / world.map)})
     world._file = str(path)
-    _ = world.grid  # find an invalid map now, not in the first episode
+    _ = world.grid  # fail on an invalid map now, not in the first episode
     check_places(world)
     return world
 
 
 def check_places(world: World) -> None:
-    """Raise ConfigError for an obstacle outside the world or without space at a waypoint."""
+    """Raise ConfigError for obstacles outside the world or waypoints without space."""
     for g, group in enumerate(world.obstacles):
         where = f"{world.source}: key 'obstacles.{g}"
         for n, pose in enumerate(group.at):
@@ -351,8 +354,8 @@ def check_place(
     y: float,
     radius: float = 0.0,
 ) -> None:
-    """Raise ConfigError for a place off a world's field, or in a wall within a radius [m]."""
-    solid = 0.0 if world.grid is None else world.grid.resolution  # room in a full cell
+    """Raise ConfigError for a place off the field, or within a radius [m] of a wall."""
+    solid = 0.0 if world.grid is None else world.grid.resolution  # in a full cell
     room = room_at(world, x, y)
     if room <= max(radius, solid):
         reason = "is in a wall" if room >= 0.0 else "lies outside the world"
@@ -378,6 +381,6 @@ def room_at(world: World, x: float, y: float) -> float:
         rows, columns = world.grid.cells.shape
         if not (0 <= i < rows and 0 <= j < columns):
             return -1.0
-        # Off the centre of a cell the distance may be greater, by at most the offset.
+        # Away from a cell's centre, the distance may be larger by at most the offset.
         room = min(room, float(world.grid.distance_field[i, j]) + world.grid.resolution)
     return float(room)

@@ -31,8 +31,9 @@ from nics_drl_bridge.sim.world import (
 )
 
 MOST_CELLS = 10_000
-TRIES = 200  # fields drawn for one world, until one has a path through
-# a cell with at least, at most this many filled neighbours (of 8) is filled, emptied
+TRIES = 200  # maximum number of fields drawn until one has a path through it
+# a cell is filled with at least, and emptied with at most, this many filled neighbours
+# (of 8)
 FILLED = 5
 EMPTIED = 1
 FINE = 2  # points per cell side in the search for a path
@@ -41,9 +42,9 @@ FINE = 2  # points per cell side in the search for a path
 class Cellular(Schema):
     """Parameters of the worlds; each world draws its fill and smoothing from the given ranges."""
 
-    kind: Literal["cellular"] = "cellular"  # which kind of generator this is
+    kind: Literal["cellular"] = "cellular"  # kind of generator
     worlds: int = Field(ge=1, le=10_000)  # number of worlds
-    # seed of the generator; another seed makes other worlds
+    # seed of the generator
     seed: int = Field(default=0, ge=0)
     columns: int = Field(default=30, ge=4)  # number of cells across the field
     rows: int = Field(default=30, ge=4)  # number of cells along the field
@@ -60,12 +61,13 @@ class Cellular(Schema):
     @model_validator(mode="after")
     def _check_consistent(self) -> Cellular:
         if self.columns * self.rows > MOST_CELLS:
-            raise ValueError(f"columns times rows may be {MOST_CELLS}")
+            raise ValueError(f"columns times rows may be at most {MOST_CELLS}")
         if not 0.0 <= self.fill[0] <= self.fill[1] < 1.0:
             raise ValueError("fill must be [minimum, maximum], from 0 to below 1")
         if self.passage > self.margin:
             raise ValueError(
-                "passage may be as wide as margin, in whose middle the robot starts"
+                "passage may be at most as wide as margin, in whose middle the robot "
+                "starts"
             )
         if not 0 <= self.smoothing[0] <= self.smoothing[1] <= 100:
             raise ValueError("smoothing must be [minimum, maximum], from 0 to 100")
@@ -77,8 +79,8 @@ YAML = (".yaml", ".yml")
 GAZEBO = (".world", ".sdf")
 IMPORT = "nics world import"
 SPECIAL = "*?["
-KEYS = ("worlds", "generate")  # only a set has one of these keys
-MAP_KEYS = ("image",)  # keys of a Nav2 map's file, which may lie next to its world
+KEYS = ("worlds", "generate")  # only a world set has one of these keys
+MAP_KEYS = ("image",)  # keys of a Nav2 map's file, which may be next to its world
 BARN = "barn"  # the 250 worlds of a benchmark; one of them is `barn/7`
 
 
@@ -89,12 +91,12 @@ class SetFile(Schema):
     # names, files, folders and globs; paths are relative to the folder of this file
     worlds: tuple[str, ...] = Field(default=(), max_length=MOST_MEMBERS)
     without: tuple[str, ...] = ()  # worlds to leave out
-    generate: Cellular | None = None  # worlds to generate, in addition or instead
+    generate: Cellular | None = None  # worlds to generate
 
 
 @dataclass(frozen=True, eq=False)
 class WorldSet:
-    """Worlds; the seed of an episode draws one of them, with equal probability."""
+    """Several worlds; the seed of an episode draws one, with equal probability."""
 
     name: str
     members: tuple[World, ...]
@@ -111,7 +113,7 @@ class WorldSet:
 
     @cached_property
     def fingerprint(self) -> str:
-        """The name, and 8 digits of a SHA-256 over the content of all members."""
+        """The name and 8 digits of a SHA-256 of the content of all members."""
         content = "\n".join(world.fingerprint for world in self.members)
         return f"{self.name}-{hash_bytes(content.encode())[:8]}"
 
@@ -135,12 +137,12 @@ AnyWorld: TypeAlias = World | WorldSet
 
 
 def load_worlds(name: AnyWorld | str | Path | Sequence[str | Path]) -> AnyWorld:
-    """Load a world or a world set, unless it is given itself.
+    """Load a world or a world set; return one that is already loaded.
 
     A world is given by the name of a shipped one (`arena`, `barn/7`) or the path of a YAML file; a
     set by the name of a shipped one (`cellular`; `barn`, see `sim.barn`), a list of worlds,
     a folder, a glob (`worlds/*.yaml`), or a YAML file with the key `worlds` or `generate`. Raises
-    ConfigError for a missing or wrong file, naming the member that failed.
+    ConfigError for a missing or wrong file and names the failed member.
     """
     if isinstance(name, AnyWorld):
         return name
@@ -226,8 +228,8 @@ def _members(names: Sequence[str], base: Path) -> list[World]:
             files = [file for file in every if _content(file, MAP_KEYS) is None]
             if not files:
                 raise ConfigError(
-                    f"{pattern}: no world file (.yaml) there; check the path, or make worlds of "
-                    f"Gazebo's and of maps by `{IMPORT}`."
+                    f"{pattern}: no world file (.yaml) there; check the path, or "
+                    f"convert Gazebo worlds and maps by `{IMPORT}`."
                 )
             members += map(_member, files)
         elif name.endswith((*YAML, *GAZEBO)):
@@ -240,21 +242,20 @@ def _members(names: Sequence[str], base: Path) -> list[World]:
 def _member(path: Path) -> World:
     if _content(path, KEYS) is not None:
         raise ConfigError(
-            f"{path}: is a world set, but a set contains worlds; name its worlds."
+            f"{path}: is a world set, which can't be a member of a set; name its "
+            "worlds."
         )
     if path.suffix in GAZEBO or _content(path, MAP_KEYS) is not None:
-        kind = "a world of Gazebo" if path.suffix in GAZEBO else "a map"
-        raise ConfigError(
-            f"{path}: is {kind}; make a world of it by `{IMPORT} {path}`."
-        )
+        kind = "a Gazebo world" if path.suffix in GAZEBO else "a map"
+        raise ConfigError(f"{path}: is {kind}; convert it by `{IMPORT} {path}`.")
     return load_world(path)
 
 
-@lru_cache(2048)  # a training opens each of them several times
+@lru_cache(2048)  # training opens each of them several times
 def grow(parameters: Cellular, number: int) -> World:
-    """Return one of the worlds, which the parameters determine. ConfigError if none has a path.
+    """Generate the world of a number. Raises ConfigError if no field has a path.
 
-    The robot starts before the field, between two walls, and its goal lies beyond.
+    The robot starts in front of the field, between two walls; its goal is behind it.
     """
     rng = np.random.default_rng([parameters.seed, number])
     for _ in range(TRIES):
@@ -271,7 +272,7 @@ def _field(parameters: Cellular, rng: np.random.Generator) -> Mask:
     share = rng.uniform(*parameters.fill)
     filled = rng.random((parameters.rows, parameters.columns)) < share
     around = np.zeros((parameters.rows + 2, parameters.columns + 2), np.uint8)
-    around[1:-1] = 1  # the walls at both sides
+    around[1:-1] = 1  # the walls on both sides
     for _ in range(rng.integers(parameters.smoothing[0], parameters.smoothing[1] + 1)):
         around[1:-1, 1:-1] = filled
         three = around[:-2] + around[1:-1] + around[2:]
@@ -281,13 +282,13 @@ def _field(parameters: Cellular, rng: np.random.Generator) -> Mask:
 
 
 def _has_way(filled: Mask, parameters: Cellular) -> bool:
-    """True if a disc of the passage's width gets from before the field to behind it."""
-    # beyond, all is free
+    """True if a disc as wide as the passage can cross the field."""
+    # outside the field, everything is free
     ahead = FINE * (1 + math.ceil(parameters.passage / 2.0 / parameters.cell))
     free = np.ones(
         (FINE * parameters.rows + 2 * ahead, FINE * parameters.columns + 2), np.bool_
     )
-    free[:, [0, -1]] = False  # the walls at both sides
+    free[:, [0, -1]] = False  # the walls on both sides
     free[ahead:-ahead, 1:-1] = ~np.repeat(np.repeat(filled, FINE, axis=0), FINE, axis=1)
     away = ndimage.distance_transform_edt(free) * parameters.cell / FINE
     areas, _ = ndimage.label(away > parameters.passage / 2.0)

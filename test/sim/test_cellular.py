@@ -60,7 +60,7 @@ def test_a_disc_as_wide_as_the_passage_can_get_to_the_goal(number):
         ("{kind: cellular, worlds: 2, smoothing: [3, 1]}", "smoothing must be"),
         (
             "{kind: cellular, worlds: 2, passage: 5.0}",
-            "passage may be as wide as margin",
+            "passage may be at most as wide as margin",
         ),
         (
             "{kind: cellular, worlds: 2, rows: 1000, columns: 1000}",

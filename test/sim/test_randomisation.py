@@ -161,9 +161,9 @@ def test_a_rate_and_a_term_may_have_ranges_of_their_own():
     ("ranges", "match"),
     [
         ({"kinematics": {"dofs": {"d_sped": [1, 2]}}}, "did you mean 'd_speed'"),
-        ({"kinematics": {"terms": {"vy": {"speed": [1, 2]}}}}, "has none at all"),
+        ({"kinematics": {"terms": {"vy": {"speed": [1, 2]}}}}, "the rate has no terms"),
         ({"kinematics": {"terms": {"wz": {"speed": [1, 2]}}}}, "no term 'speed' there"),
-        ({"kinematics": {"scale": [1.0, 30.0]}}, "the robot grows by itself"),
+        ({"kinematics": {"scale": [1.0, 30.0]}}, "the robot diverges"),
         ({"lidar": {"dropout": [0.0, 0.4], "dropout_far": [0.0, 0.7]}}, "at most 1"),
     ],
 )

@@ -191,10 +191,10 @@ def test_goals_are_those_of_the_scene():
         (1, 1, {"threads": 0}, "at least 1 world, robot and thread"),
         (1, 1, {"longest_delay": -1}, "longest_delay of at least"),
         (1, 1, {"longest_age": -1}, "longest_age of at least 0"),
-        (1, 10**9, {}, "1000000000 robots: a world may have 1000"),
-        (10**9, 1, {}, "copies of it are the most"),
-        (10**4, 1, {"longest_age": 10**6}, "copies of it are the most"),
-        (10**4, 1, {"longest_delay": 10**6}, "copies of it are the most"),
+        (1, 10**9, {}, "1000000000 robots: a world may have at most 1000"),
+        (10**9, 1, {}, "copies of it fit in memory"),
+        (10**4, 1, {"longest_age": 10**6}, "copies of it fit in memory"),
+        (10**4, 1, {"longest_delay": 10**6}, "copies of it fit in memory"),
     ],
 )
 def test_sizes_that_no_simulator_has_are_refused_before_anything_is_made(
@@ -214,7 +214,7 @@ def test_commands_of_another_shape_are_refused():
 def test_obstacles_that_are_spare_or_drawn_count_for_memory():
     model = direct_model()
     copies = 300_000
-    refused = "300000 copies of .* are the most"
+    refused = "300000 copies of .* fit in memory"
     spare = field(40.0).with_spare((Circle(radius=0.1),) * 100)
     with pytest.raises(ConfigError, match=refused):
         FastSimulator(model, spare, copies)

@@ -141,7 +141,7 @@ def test_a_broken_member_is_named(folder):
         ("name: s\nworlds: [gone.yaml]\n", "no such file"),
         ("name: s\nworlds: [circles]\nwithout: [circles]\n", "contains no world"),
         ("name: s\nworlds: [circles]\nwithin: [1]\n", "unknown key 'within'"),
-        ("name: s\nworlds: [set.yaml]\n", "is a world set, but a set contains"),
+        ("name: s\nworlds: [set.yaml]\n", "is a world set, which can't be a member"),
     ],
 )
 def test_a_wrong_set_is_refused_in_one_sentence(tmp_path, text, reason):
@@ -166,9 +166,9 @@ def test_what_has_to_be_imported_is_told_with_the_command_for_it(tmp_path):
     (tmp_path / "hall.world").write_text("<sdf/>")
     plan = tmp_path / "plan.yaml"
     plan.write_text("image: plan.png\nresolution: 0.05\norigin: [0, 0, 0]\n")
-    for file, kind in (("hall.world", "a world of Gazebo"), (str(plan), "a map")):
+    for file, kind in (("hall.world", "a Gazebo world"), (str(plan), "a map")):
         for given in (file, [file]):
-            told = rf"{file}: is {kind}; make a world of it by `nics world import {file}`\."
+            told = rf"{file}: is {kind}; convert it by `nics world import {file}`\."
             with pytest.raises(ConfigError, match=told):
                 load_worlds(given)
     with pytest.raises(ConfigError, match=r"no world file .* by `nics world import`\."):
