@@ -217,11 +217,16 @@ def _signal(how: signal.Signals, republished: bool = False) -> Injection:
 
 
 def _freeze_gate(around: Around) -> None:
-    """Stop the gate itself for a while; what it said before is heard before it goes on."""
+    """Stop the gate itself for a while.
+
+    What it wrote before does not count, although the middleware, which stops with it, may send the
+    last command only when it goes on.
+    """
     if around.gate is not None:
         os.kill(around.gate.pid, signal.SIGSTOP)
         around.robot.until(lambda: False, FROZEN_S)
         around.robot.heard.clear()
+        around.robot.since_ns = time.time_ns()
         os.kill(around.gate.pid, signal.SIGCONT)
 
 

@@ -35,7 +35,11 @@ from nics_drl_bridge.exit_codes import EXIT_BAD_INPUT
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.nodes import qos
 from nics_drl_bridge.nodes.listener import open_context, spin
-from nics_drl_bridge.nodes.own_process import at_once, ending_signals, ros_arguments
+from nics_drl_bridge.nodes.own_process import (
+    at_once,
+    ending_signals,
+    list_log_arguments,
+)
 from nics_drl_bridge.nodes.parameters import MODEL, Row, frame_fault, managed, sensors
 from nics_drl_bridge.nodes.qos import BridgeNode, copied, overriding
 
@@ -71,7 +75,7 @@ def run_node(
     words = sys.argv if args is None else args
     try:
         with at_once():
-            context = open_context([*words, *ros_arguments(words)])
+            context = open_context([*words, *list_log_arguments(words)])
         return live(make, context, stopping, sole_name)
     except INPUT_ERRORS as error:
         sys.stderr.write(f"{explain(error)}\n")

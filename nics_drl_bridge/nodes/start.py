@@ -88,7 +88,7 @@ def start(node: str, args: list[str] | None = None) -> None:
     if sentence:
         sys.stderr.write(f"{sentence}\n")
         own_process.leave(EXIT_BAD_INPUT)
-    own_process.forward_output(own_process.log_file(node, words))
+    own_process.forward_output(own_process.name_log_file(node, words))
     faulthandler.enable()  # shows where Python was when a library crashes
     # In the format of the ROS 2 log, which is available only seconds later.
     sys.stderr.write(f"[INFO] [{time.time():.9f}] [{node}]: starting\n")
