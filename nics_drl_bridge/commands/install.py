@@ -14,7 +14,7 @@ from typer import Argument, Option
 from nics_drl_bridge import extensions
 from nics_drl_bridge.commands.console import JsonOption, print_line
 from nics_drl_bridge.errors import ConfigError, suggest
-from nics_drl_bridge.nodes.message_packages import shipped_packages, wheels_here
+from nics_drl_bridge.nodes.message_packages import find_wheels, list_shipped_packages
 
 if TYPE_CHECKING:
     from nics_drl_bridge.commands.message_build import Source
@@ -28,7 +28,7 @@ def install(
             help="tf2_msgs, ackermann_msgs, or the folder of another package with its msg, srv and "
             "action.",
             autocompletion=lambda incomplete: [
-                name for name in shipped_packages() if name.startswith(incomplete)
+                name for name in list_shipped_packages() if name.startswith(incomplete)
             ],
         ),
     ],
@@ -58,7 +58,7 @@ def install(
         sources = [source for source in sources if source.name not in installed]
     if not sources:
         return
-    wheels = wheels_here()
+    wheels = find_wheels()
     if wheels is None:
         extensions.require("nics install", "rclpy")
         name = sources[0].name
@@ -93,7 +93,7 @@ def find_source(name: str) -> "Source":
     """Returns a message package, shipped or in a folder. Raises ConfigError."""
     from nics_drl_bridge.commands.message_build import Source, read_source
 
-    shipped = shipped_packages()
+    shipped = list_shipped_packages()
     if name in shipped:
         return Source(name, shipped[name])
     folder = Path(name)

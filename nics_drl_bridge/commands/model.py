@@ -76,7 +76,7 @@ def record(
     if not preview:
         # This comes first because ROS 2 from wheels restarts Python.
         with extensions.require_modules("nics record"):
-            from nics_drl_bridge.nodes.own_process import forwarded_errors
+            from nics_drl_bridge.nodes.own_process import forward_errors
             from nics_drl_bridge.nodes.record_node import record as drive
     lines = draw_preview(plan, out)
     facts: dict[str, Any] = {"out": str(out), "robot": robot}
@@ -89,7 +89,7 @@ def record(
             as_json, "nothing was driven or recorded.", **facts, recorded=False
         )
         return
-    with forwarded_errors():
+    with forward_errors():
         driven = drive(parameters, arguments)
     if driven.failure is not None:
         raise BackendError(driven.line)

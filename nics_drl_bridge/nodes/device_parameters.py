@@ -17,8 +17,8 @@ from nics_drl_bridge.nodes.parameters import (
     LOCKSTEP,
     MODES,
     ROBOTS,
-    device,
-    frame_fault,
+    find_frame_fault,
+    list_device_rows,
     name_fleet,
 )
 from nics_drl_bridge.nodes.runner import declare_row, get_number, get_text
@@ -69,22 +69,22 @@ def declare_device(node: Node, laser_frame: str) -> None:
     node.declare_parameter(ROBOTS.name, ROBOTS.default, fleet)
     # Added before the others are declared, so that it also checks the values at startup.
     node.add_on_set_parameters_callback(partial(_check_episode, node))
-    for row in device(laser_frame):
+    for row in list_device_rows(laser_frame):
         declare_row(node, row)
-    fault = frame_fault(node.get_parameters_by_prefix("").values())
+    fault = find_frame_fault(node.get_parameters_by_prefix("").values())
     if fault:
         raise ConfigError(fault)
 
 
-def randomisation(node: Node) -> Randomisation | None:
+def get_randomisation(node: Node) -> Randomisation | None:
     """Return the randomisation of each episode, if any. Raises ConfigError."""
     name = get_text(node, "randomisation")
     return load_randomisation(name) if name else None
 
 
-def timing(node: Node, model: SimulatorModel) -> DeviceTiming:
+def get_timing(node: Node, model: SimulatorModel) -> DeviceTiming:
     """Return the timing given by the parameters; in lock-step, by the model alone."""
-    mode = choice(node, "mode", MODES)
+    mode = get_choice(node, "mode", MODES)
     if mode == LOCKSTEP:
         period = round(model.control_period * NS_PER_S)
         return DeviceTiming(mode, 1.0, period, period, period, (0, 0), (0, 0))
@@ -92,7 +92,7 @@ def timing(node: Node, model: SimulatorModel) -> DeviceTiming:
     dt = model.timing.dt
     odom = 1.0 / rate if rate else model.control_period
     scan = 1.0 / (get_number(node, "scan_rate") or model.lidar.rate)
-    step = common_step(dt, (odom, scan)) * dt
+    step = find_common_step(dt, (odom, scan)) * dt
     step_ns, odom_ns, scan_ns = (
         round(seconds * NS_PER_S) for seconds in (step, odom, scan)
     )
@@ -111,7 +111,7 @@ def timing(node: Node, model: SimulatorModel) -> DeviceTiming:
     )
 
 
-def timed_model(
+def apply_timing(
     node: Node, model: SimulatorModel, time: DeviceTiming
 ) -> SimulatorModel:
     """Return the model with the step of the world and the requested latency."""
@@ -129,7 +129,7 @@ def timed_model(
     return replace(model, control_period=steps * dt)
 
 
-def choice(node: Node, name: str, valid: tuple[str, ...]) -> str:
+def get_choice(node: Node, name: str, valid: tuple[str, ...]) -> str:
     """Return a parameter that must be one of `valid`. Raises ConfigError with the nearest word."""
     value = get_text(node, name)
     if value not in valid:
@@ -139,7 +139,7 @@ def choice(node: Node, name: str, valid: tuple[str, ...]) -> str:
     return value
 
 
-def frames(node: Node, namespace: str) -> Frames:
+def get_frames(node: Node, namespace: str) -> Frames:
     """Return the frames of a robot; in a fleet all but the map begin with its namespace."""
     prefix = get_text(node, "frame_prefix") + (f"{namespace}/" if namespace else "")
     world, *names = (get_text(node, f"{frame}_frame") for frame in Frames._fields[:-1])
@@ -163,7 +163,7 @@ def _check_episode(node: Node, parameters: list[Parameter]) -> SetParametersResu
     return SetParametersResult(successful=not reason, reason=reason)
 
 
-def episode_start(node: Node) -> Array | None:
+def get_episode_start(node: Node) -> Array | None:
     """Return x, y, heading of each robot (3 M,) for the next episode; None: by its seed."""
     start = np.array(node.get_parameter(START).value, dtype=np.float64)
     return None if np.isnan(start).all() else start
@@ -189,7 +189,7 @@ class TopicPace:
         return True
 
 
-def common_step(dt: float, periods: tuple[float, ...]) -> int:
+def find_common_step(dt: float, periods: tuple[float, ...]) -> int:
     """Return the longest step, in steps `dt` of the model [s], that suits the periods [s] best."""
     return math.gcd(*(max(1, round(period / dt)) for period in periods))
 

@@ -35,7 +35,7 @@ class NoMotionError(RuntimeError):
     """The gate was armed, but no command that moves the robot came."""
 
 
-def driver_context(domain_id: int | None) -> Context:
+def open_driver_context(domain_id: int | None) -> Context:
     """Return a context as another vendor's driver has it, with shared memory."""
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     context = Context()
@@ -48,7 +48,7 @@ def hear(domain_id: int | None, out: Connection) -> None:
 
     The stamp is that of its writing. Ends with the process that started it, even if that is killed.
     """
-    context = driver_context(domain_id)
+    context = open_driver_context(domain_id)
     node = Node("base", context=context, start_parameter_services=False)
 
     def tell(message: Twist, info: Mapping[str, Any]) -> None:
@@ -94,7 +94,7 @@ class Robot(SpunNode):
             skip: only one in so many scans, heartbeats and commands is sent.
             sensors: quality of service of scan and odometry.
         """
-        super().__init__("robot", context=driver_context(domain_id))
+        super().__init__("robot", context=open_driver_context(domain_id))
         kinds = {
             "odom": (Odometry, sensors),
             "scan": (LaserScan, sensors),

@@ -174,7 +174,7 @@ def _freeze_but_one(around: Around) -> None:
     around.robot.change["scan"] = change
 
 
-def _few_beams(around: Around) -> None:
+def _cut_beams(around: Around) -> None:
     def change(message: LaserScan) -> LaserScan:
         message.ranges = message.ranges[:100]
         return message
@@ -182,7 +182,7 @@ def _few_beams(around: Around) -> None:
     around.robot.change["scan"] = change
 
 
-def _nan_scan(around: Around) -> None:
+def _clear_scan(around: Around) -> None:
     def change(message: LaserScan) -> LaserScan:
         message.ranges = [float("nan")] * len(message.ranges)
         return message
@@ -190,7 +190,7 @@ def _nan_scan(around: Around) -> None:
     around.robot.change["scan"] = change
 
 
-def _teleport(x: float, y: float) -> Injection:
+def _move_odometry(x: float, y: float) -> Injection:
     """Show the robot elsewhere by odometry from now on."""
 
     def change(message: Odometry) -> Odometry:
@@ -238,7 +238,7 @@ FAULTS: dict[str, Fault] = {
     ),
     "scan_silent": Fault(LATE_S, _silence("scan"), "scan"),
     "odom_silent": Fault(LATE_S, _silence("odom"), "odom"),
-    "nan_scan": Fault(LATE_S, _nan_scan, "scan"),
+    "nan_scan": Fault(LATE_S, _clear_scan, "scan"),
     "clock_jump": Fault(LATE_S, (_jump(10), _jump(-10), _jump(1), _jump(-1)), "scan"),
     "e_stop": Fault(
         SOON_S,
@@ -257,7 +257,7 @@ FAULTS: dict[str, Fault] = {
     "command_from_the_future": Fault(
         LATE_S, _stamp("cmd_vel_raw", 3600.0), "cmd_vel_raw"
     ),
-    "scan_of_another_lidar": Fault(LATE_S, _few_beams, "scan"),
+    "scan_of_another_lidar": Fault(LATE_S, _cut_beams, "scan"),
     "scan_stamps_frozen": Fault(LATE_S, _freeze("scan"), "scan"),
     "scan_from_the_future": Fault(LATE_S, _stamp("scan", 3600.0), "scan"),
     "stamps_run_ahead": Fault(
@@ -267,7 +267,7 @@ FAULTS: dict[str, Fault] = {
     ),
     "stamps_creep": Fault(1.20, _stamp("scan", 0.02, growing=True), "scan"),
     "odom_teleports": Fault(
-        LATE_S, (_teleport(3.0, 0.0), _teleport(0.0, -1.0)), "odom"
+        LATE_S, (_move_odometry(3.0, 0.0), _move_odometry(0.0, -1.0)), "odom"
     ),
     "scan_frozen": Fault(1.50, _freeze("scan", stamped=True), "scan"),
     "scan_alternates": Fault(1.50, _alternate, "scan"),

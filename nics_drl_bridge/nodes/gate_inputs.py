@@ -33,27 +33,27 @@ RATE_WINDOW_S = 1.0  # window over which the rate of messages is measured
 
 def read_scan(lidar: LidarSpec, content: bytes) -> inputs.Scan:
     """Read a serialised LaserScan. Raises `wire.UNREADABLE`, like the other readers."""
-    ranges = from_device(wire.ranges_of(content), lidar)
-    return inputs.Scan(wire.stamp_of(content), ranges, wire.angles_of(content))
+    ranges = from_device(wire.read_ranges(content), lidar)
+    return inputs.Scan(wire.read_stamp(content), ranges, wire.read_angles(content))
 
 
 def read_sensor(sensor: Sensor, content: bytes) -> inputs.SensorReading:
     """Read a serialised message of a further sensor."""
     points = sensor.points(sensor_from_ros(sensor, content))
-    return inputs.SensorReading(wire.stamp_of(content), sensor.name, points)
+    return inputs.SensorReading(wire.read_stamp(content), sensor.name, points)
 
 
 def read_odometry(content: bytes) -> inputs.Odometry:
     """Read a serialised Odometry; without a rotation its pose is NaN."""
-    pose, twist = wire.odometry_of(content)
+    pose, twist = wire.read_odometry(content)
     if not is_rotation(*wire.numbers_of(content)[ROTATION].tolist()):
         pose = np.full(3, np.nan)
-    return inputs.Odometry(wire.stamp_of(content), pose, twist)
+    return inputs.Odometry(wire.read_stamp(content), pose, twist)
 
 
 def read_estimate(content: bytes) -> inputs.Estimate:
     """Read a serialised Odometry of an estimator."""
-    pose, twist = wire.odometry_of(content)
+    pose, twist = wire.read_odometry(content)
     covariance = wire.numbers_of(content)[wire.POSE_COVARIANCE : wire.TWIST].reshape(
         6, 6
     )
@@ -63,7 +63,7 @@ def read_estimate(content: bytes) -> inputs.Estimate:
 def read_command(content: bytes) -> inputs.Command:
     """Read a serialised TwistStamped."""
     return inputs.Command(
-        wire.stamp_of(content), np.array(wire.stamped_twist_of(content))
+        wire.read_stamp(content), np.array(wire.read_stamped_twist(content))
     )
 
 
@@ -77,8 +77,8 @@ def read_foreign_command(
     if newest is None:
         raise ValueError("no scan has arrived yet from which it could be computed")
     if kind == TWIST:
-        return inputs.Command(newest.stamp_ns, np.array(wire.twist_of(content)))
-    if 0 < wire.stamp_of(content) < oldest_ns:
+        return inputs.Command(newest.stamp_ns, np.array(wire.read_twist(content)))
+    if 0 < wire.read_stamp(content) < oldest_ns:
         raise ValueError(
             "its stamp is older than command_age; is use_sim_time the same at both?"
         )
@@ -87,7 +87,7 @@ def read_foreign_command(
 
 def read_e_stop(content: bytes) -> inputs.EStop:
     """Read a serialised Bool."""
-    return inputs.EStop(wire.truth_of(content))
+    return inputs.EStop(wire.read_bool(content))
 
 
 class Sources:
@@ -109,7 +109,9 @@ class Sources:
             return ""
         gid = bytes(publisher["data"])
         if gid not in self._names:  # named once: a name stands for its publisher
-            self._names[gid] = f"{self._node_of(gid)} (publisher {gid[-SHOWN:].hex()})"
+            self._names[gid] = (
+                f"{self._find_node(gid)} (publisher {gid[-SHOWN:].hex()})"
+            )
         return self._names[gid]
 
     def count_publishers(self) -> None:
@@ -117,10 +119,10 @@ class Sources:
         if not self._tells_publisher:
             self.publishers = max(1, self._node.count_publishers(self._topic))
 
-    def _node_of(self, gid: bytes) -> str:
+    def _find_node(self, gid: bytes) -> str:
         for endpoint in self._node.get_publishers_info_by_topic(self._topic):
             if bytes(endpoint.endpoint_gid) == gid:
-                return qos.owner(endpoint) or "a node"
+                return qos.find_owner(endpoint) or "a node"
         return "a node"
 
 

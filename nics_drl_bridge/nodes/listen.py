@@ -7,9 +7,9 @@ from typing import Any
 from rclpy.node import Node
 
 from nics_drl_bridge import defaults
-from nics_drl_bridge.nodes.conversions import message_type
+from nics_drl_bridge.nodes.conversions import find_message_type
 from nics_drl_bridge.nodes.listener import Listener
-from nics_drl_bridge.nodes.qos import offer_of, profile_of
+from nics_drl_bridge.nodes.qos import make_offer, make_profile
 from nics_drl_bridge.recording.messages import Offer
 from nics_drl_bridge.report.doctor_facts import (
     GYRO,
@@ -24,7 +24,7 @@ NAME = "nics_doctor"
 LOOK_S = 0.2
 DISCOVERY_S = 10.0
 # matches any offer, so it hears every topic
-ANY_PUBLISHER = profile_of(Offer(100, reliable=False))
+ANY_PUBLISHER = make_profile(Offer(100, reliable=False))
 
 
 def listen(
@@ -64,8 +64,8 @@ def _look(node: Node, facts: Facts, subscribed: set[str], imu: str) -> None:
         offered = {info.topic_type for info in offers} or set(kinds)
         facts.topics[topic] = Endpoints(
             tuple(sorted(offered)),
-            tuple(offer_of(info.qos_profile) for info in offers),
-            tuple(offer_of(info.qos_profile) for info in asks),
+            tuple(make_offer(info.qos_profile) for info in offers),
+            tuple(make_offer(info.qos_profile) for info in asks),
         )
     if GYRO in facts.names and GYRO not in subscribed:
         types = {
@@ -77,7 +77,7 @@ def _look(node: Node, facts: Facts, subscribed: set[str], imu: str) -> None:
         wanted = [kind for kind in there.types if kind in KINDS[role]]
         if there.offers and wanted and role not in subscribed:
             subscribed.add(role)
-            kind = message_type(wanted[0])
+            kind = find_message_type(wanted[0])
             take = partial(_take, facts, role)
             node.create_subscription(kind, topic, take, ANY_PUBLISHER)
 

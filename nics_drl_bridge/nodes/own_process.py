@@ -112,7 +112,7 @@ def finish_output(seconds: float) -> None:
 
 
 @contextlib.contextmanager
-def forwarded_errors() -> Iterator[None]:
+def forward_errors() -> Iterator[None]:
     """Within this context, let `tee` write what this process writes to stderr.
 
     For a command that is not a node's own process but moves a robot, or records one: ROS 2 and this
@@ -229,7 +229,7 @@ def leave(code: int) -> NoReturn:
     os._exit(code)
 
 
-def ending_signals() -> list[int]:
+def list_ending_signals() -> list[int]:
     """Return the signals at which this process ends cleanly.
 
     SIGHUP is not among them if the process is to outlive its terminal, as under `nohup`.
@@ -239,18 +239,18 @@ def ending_signals() -> list[int]:
 
 
 def begin_own_process() -> None:
-    """Let `at_once` take effect, because this process is a single node."""
+    """Let `end_at_once` take effect, because this process is a single node."""
     global _own_process
     _own_process = True
 
 
 @contextlib.contextmanager
-def at_once() -> Iterator[None]:
+def end_at_once() -> Iterator[None]:
     """Within this context, let ending signals end the process at once, whatever it is doing."""
     if not _own_process:
         yield
         return
-    handlers = {number: signal.getsignal(number) for number in ending_signals()}
+    handlers = {number: signal.getsignal(number) for number in list_ending_signals()}
     for number in handlers:
         signal.signal(number, signal.SIG_DFL)
     try:

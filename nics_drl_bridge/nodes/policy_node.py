@@ -21,7 +21,7 @@ from nics_drl_bridge.middleware.uncertainty import compute_uncertainty_gain
 from nics_drl_bridge.nodes import conversions, qos, runner
 from nics_drl_bridge.nodes.frames import GoalFrames
 from nics_drl_bridge.nodes.goal_answer import GoalAnswer
-from nics_drl_bridge.nodes.parameters import policy
+from nics_drl_bridge.nodes.parameters import list_policy_rows
 from nics_drl_bridge.nodes.parts import Wish, open_parts
 from nics_drl_bridge.nodes.robot_topics import SILENCE_S, RobotTopics
 from nics_drl_bridge.nodes.runner import ACTIVE, UNCONFIGURED, ManagedNode
@@ -38,7 +38,7 @@ class PolicyNode(ManagedNode):
     """Answers each scan with a `cmd_vel_raw` of the same stamp, until the goal is reached."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__("policy_node", policy(), **options)
+        super().__init__("policy_node", list_policy_rows(), **options)
         self._leaders = open_parts("policy", self)
         self._acted_ns = 0
         self._answer: GoalAnswer | None = None  # to the newest goal
@@ -84,7 +84,7 @@ class PolicyNode(ManagedNode):
         self.undo.callback(self._topics.close)
         # covariance of the pose when the goal was set
         self._covariance = self._topics.middleware.estimator.covariance[:3, :3]
-        self._topics.hear_initial_pose()
+        self._topics.subscribe_initial_pose()
         self._frames = GoalFrames(self, self._topics)
         self.undo.callback(self._frames.close)
         for leader in self._leaders:
@@ -96,9 +96,9 @@ class PolicyNode(ManagedNode):
                 self._toward,
                 lambda: begin(self._policy),
             )
-        timer = runner.steadily(self, POLLS * model.control_period, self._act)
+        timer = runner.call_periodically(self, POLLS * model.control_period, self._act)
         self.undo.callback(self.destroy_timer, timer)
-        self._due = runner.steadily(self, model.control_period, self._act)
+        self._due = runner.call_periodically(self, model.control_period, self._act)
         self._due.cancel()  # until a scan comes before an action is due
         self.undo.callback(self.destroy_timer, self._due)
 
@@ -112,7 +112,7 @@ class PolicyNode(ManagedNode):
             for leader in self._leaders:
                 leader.stop("the node is deactivated")
         finally:
-            runner.last_word(self._raw, self._message(np.zeros(3), self._acted_ns))
+            runner.publish_last(self._raw, self._message(np.zeros(3), self._acted_ns))
 
     def _open_policy(self, model: SimulatorModel) -> None:
         name = runner.get_text(self, "policy")

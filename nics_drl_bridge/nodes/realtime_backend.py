@@ -24,7 +24,11 @@ from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes.link import EpisodeServices, Link
 from nics_drl_bridge.nodes.listener import holds
 from nics_drl_bridge.nodes.parameters import NO_POSE
-from nics_drl_bridge.nodes.robot_topics import RobotTopics, data_facts, declare_sensors
+from nics_drl_bridge.nodes.robot_topics import (
+    RobotTopics,
+    declare_sensors,
+    list_data_facts,
+)
 from nics_drl_bridge.sim.world_set import AnyWorld
 
 POLL_S = 0.01
@@ -148,7 +152,7 @@ class RealtimeBackend:
             # the robot itself gets stamped commands, maybe from a gate
             stamped = chosen.stamped
             if stamped is None and chosen.gated:
-                stamped = self._link.hears_stamped(CMD_VEL, chosen.timeout_s)
+                stamped = self._link.expects_stamped(CMD_VEL, chosen.timeout_s)
             elif stamped is None:
                 stamped = self._link.stamped
             declare_sensors(self._link.node, stamped)
@@ -240,7 +244,7 @@ class RealtimeBackend:
                 "stamp_ns": self._topics.newest_ns,
                 "deadline_misses": self._misses,
             }
-            info |= data_facts(self._topics.middleware, time.monotonic_ns())
+            info |= list_data_facts(self._topics.middleware, time.monotonic_ns())
             self._scan_ns = self._topics.middleware.cache.newest[SCAN].stamp_ns
             _, self._link.frame = self._topics.frames
             return self._topics.view(), info

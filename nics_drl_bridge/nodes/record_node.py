@@ -26,11 +26,11 @@ from nics_drl_bridge.middleware.measurement import CMD_VEL
 from nics_drl_bridge.nodes import conversions, qos, runner
 from nics_drl_bridge.nodes.command_types import (
     SETTINGS,
-    deaf_subscribers,
-    heard_stamped,
+    describe_deaf_subscribers,
+    expect_stamped,
     name_of,
 )
-from nics_drl_bridge.nodes.parameters import IMU, STAMPED, drive
+from nics_drl_bridge.nodes.parameters import IMU, STAMPED, list_drive_rows
 from nics_drl_bridge.recording.bag_file import Message
 from nics_drl_bridge.recording.excite import PERIOD_S, STILL_S, DrivePlan
 from nics_drl_bridge.recording.imu_axis import GyroReader
@@ -64,7 +64,7 @@ SAME_PACE = (0.8, 1.25)
 
 def declare_drive(node: Node) -> tuple[DrivePlan, Path, TopicRoles]:
     """Declare the parameters of a drive; return plan, file and roles. Raises ConfigError."""
-    values = {row.name: runner.declare_row(node, row) for row in drive()}
+    values = {row.name: runner.declare_row(node, row) for row in list_drive_rows()}
     robot = load_robot(values["robot"])
     robot.require_cmd_vel()
     pattern = [values[name] for name in ("bound", "duration", "speed", "seed")]
@@ -198,7 +198,7 @@ class RecordNode(qos.BridgeNode):
         self._steady_origin_ns = time.time_ns() - time.monotonic_ns()
         self._log = DriveLog(self._plan.robot, roles, self._now_ns)
         self._topic: Publisher | None = None
-        if STAMPED in qos.given_values(self):
+        if STAMPED in qos.get_given_values(self):
             self._speak(runner.get_flag(self, STAMPED))
         self.create_subscription(Odometry, "odom", self._on_odometry, qos.SENSOR)
         self.create_subscription(
@@ -221,7 +221,7 @@ class RecordNode(qos.BridgeNode):
         self._frame = ""  # of the robot, by its odometry
         self._start: Array = np.zeros(3)
         # On the steady clock: the guard must not depend on the node's time source.
-        runner.steadily(self, POLL_S, self._on_time)
+        runner.call_periodically(self, POLL_S, self._on_time)
 
     def _speak(self, stamped: bool) -> None:
         self._stamped = stamped
@@ -273,7 +273,7 @@ class RecordNode(qos.BridgeNode):
     def _ready(self) -> bool:
         topic = self.resolve_topic_name(CMD_VEL)
         if self._topic is None and self.count_subscribers(topic):
-            heard = heard_stamped(self, CMD_VEL)
+            heard = expect_stamped(self, CMD_VEL)
             self._speak(runner.get_flag(self, STAMPED) if heard is None else heard)
         listened = self._topic is not None and self._topic.get_subscription_count() > 0
         if listened and self._pose is not None and self._now_ns() > 0:
@@ -294,7 +294,7 @@ class RecordNode(qos.BridgeNode):
             fix = "start the robot, or correct namespace, ROS_DOMAIN_ID or remapping."
             reason = f"{missing} within {PATIENCE_S:g} s"
             if self._pose is not None and self._topic is not None:
-                deaf = deaf_subscribers(self, CMD_VEL, self._stamped)
+                deaf = describe_deaf_subscribers(self, CMD_VEL, self._stamped)
                 if deaf:
                     setting = SETTINGS[name_of(not self._stamped)]
                     fix = f"set {setting}, or leave it out."
@@ -374,7 +374,7 @@ class RecordNode(qos.BridgeNode):
             self._send(zero)
             time.sleep(PERIOD_S)
         if self._topic is not None:
-            runner.last_word(self._topic, self._message(np.zeros(3)))
+            runner.publish_last(self._topic, self._message(np.zeros(3)))
 
     def _save(self) -> tuple[Recording | None, str]:
         try:

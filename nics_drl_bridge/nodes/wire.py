@@ -11,7 +11,7 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge.interface import NS_PER_S, Array
-from nics_drl_bridge.nodes.conversions import PLANAR, heading_of
+from nics_drl_bridge.nodes.conversions import PLANAR, compute_heading
 
 Bytes = bytes | bytearray
 HEAD = 4  # bytes of the header, not counted for alignment; the second one gives the byte order
@@ -35,29 +35,29 @@ def _order(content: Bytes) -> str:
     return "<" if content[1] else ">"
 
 
-def _after_text(content: Bytes, place: int, order: str) -> int:
-    place = _aligned(place, 4)  # a text starts with its length, aligned
+def _skip_text(content: Bytes, place: int, order: str) -> int:
+    place = _align(place, 4)  # a text starts with its length, aligned
     (length,) = struct.unpack_from(f"{order}I", content, place)
     return place + 4 + int(length)
 
 
 def _text(content: Bytes, place: int, order: str) -> str:
-    begin = _aligned(place, 4) + 4
-    end = _after_text(content, place, order)
+    begin = _align(place, 4) + 4
+    end = _skip_text(content, place, order)
     if end > len(content):
         raise ValueError("a text in it is longer than the message")
     return bytes(content[begin:end]).rstrip(b"\0").decode("utf-8", "replace")
 
 
-def _aligned(place: int, size: int) -> int:
+def _align(place: int, size: int) -> int:
     return place + (HEAD - place) % size
 
 
 def _floats(content: Bytes, order: str) -> int:
-    return _aligned(_after_text(content, FRAME, order), 4)
+    return _align(_skip_text(content, FRAME, order), 4)
 
 
-def stamp_of(content: Bytes) -> int:
+def read_stamp(content: Bytes) -> int:
     """Return the stamp of a message that begins with a header [ns]."""
     seconds, nanoseconds = struct.unpack_from(f"{_order(content)}iI", content, STAMP)
     return int(seconds) * NS_PER_S + int(nanoseconds)
@@ -66,29 +66,29 @@ def stamp_of(content: Bytes) -> int:
 def numbers_of(content: Bytes) -> Array:
     """Return all numbers (85,) of a serialised Odometry, in order."""
     order = _order(content)
-    names_end = _after_text(content, _after_text(content, FRAME, order), order)
-    return np.frombuffer(content, f"{order}f8", DOUBLES, _aligned(names_end, 8))
+    names_end = _skip_text(content, _skip_text(content, FRAME, order), order)
+    return np.frombuffer(content, f"{order}f8", DOUBLES, _align(names_end, 8))
 
 
-def frames_of(content: Bytes) -> tuple[str, str]:
+def read_frames(content: Bytes) -> tuple[str, str]:
     """Return the frame of the header and the child frame of a serialised Odometry."""
     order = _order(content)
     return _text(content, FRAME, order), _text(
-        content, _after_text(content, FRAME, order), order
+        content, _skip_text(content, FRAME, order), order
     )
 
 
-def odometry_of(content: Bytes) -> tuple[Array, Array]:
+def read_odometry(content: Bytes) -> tuple[Array, Array]:
     """Return pose (3,) and body twist (3,) of a serialised Odometry."""
     values = numbers_of(content)
     x, y, _, qx, qy, qz, qw = values[:7].tolist()
     vx = values[TWIST]
     vy = values[TWIST + 1]
     wz = values[TWIST + 5]
-    return np.array([x, y, heading_of(qx, qy, qz, qw)]), np.array([vx, vy, wz])
+    return np.array([x, y, compute_heading(qx, qy, qz, qw)]), np.array([vx, vy, wz])
 
 
-def ranges_of(content: Bytes) -> NDArray[np.float32]:
+def read_ranges(content: Bytes) -> NDArray[np.float32]:
     """Return the device's ranges (B,) of a serialised LaserScan."""
     order = _order(content)
     place = _floats(content, order) + 4 * SCAN_FIELDS
@@ -96,25 +96,25 @@ def ranges_of(content: Bytes) -> NDArray[np.float32]:
     return np.frombuffer(content, f"{order}f4", beams, place + 4)
 
 
-def angles_of(content: Bytes) -> tuple[float, float]:
+def read_angles(content: Bytes) -> tuple[float, float]:
     """Return angle_min, angle_increment [rad] of a serialised LaserScan."""
     order = _order(content)
     first, _, step = struct.unpack_from(f"{order}3f", content, _floats(content, order))
     return first, step
 
 
-def twist_of(content: Bytes, place: int = HEAD) -> tuple[float, float, float]:
+def read_twist(content: Bytes, place: int = HEAD) -> tuple[float, float, float]:
     """Return linear.x, linear.y, angular.z of a Twist serialised at an offset."""
     x, y, _, _, _, w = struct.unpack_from(f"{_order(content)}6d", content, place)
     return x, y, w
 
 
-def stamped_twist_of(content: Bytes) -> tuple[float, float, float]:
+def read_stamped_twist(content: Bytes) -> tuple[float, float, float]:
     """Return linear.x, linear.y, angular.z of a serialised TwistStamped."""
-    return twist_of(content, _aligned(_after_text(content, FRAME, _order(content)), 8))
+    return read_twist(content, _align(_skip_text(content, FRAME, _order(content)), 8))
 
 
-def truth_of(content: Bytes) -> bool:
+def read_bool(content: Bytes) -> bool:
     """Return the value of a serialised Bool."""
     _order(content)
     return bool(struct.unpack_from("B", content, HEAD)[0])
@@ -152,7 +152,7 @@ class ScanWriter:
         self._content = bytearray(serialize_message(message))
         self._stamp = struct.Struct(f"{_order(self._content)}iI")
         # writable, because it is a view of a bytearray
-        self._ranges = ranges_of(self._content)
+        self._ranges = read_ranges(self._content)
 
     def write(self, stamp_ns: int, ranges: NDArray[np.float32]) -> bytes:
         """Return a message with ranges (B,), as the device reports them."""
@@ -161,7 +161,7 @@ class ScanWriter:
         return bytes(self._content)
 
 
-def stamped_twist_to_bytes(twist: ArrayLike, stamp_ns: int, frame: str) -> bytes:
+def write_stamped_twist(twist: ArrayLike, stamp_ns: int, frame: str) -> bytes:
     """Serialise linear.x, linear.y, angular.z (3,) as a TwistStamped in a robot's frame."""
     x, y, w = np.asarray(twist, np.float64).tolist()
     seconds, nanoseconds = divmod(stamp_ns, NS_PER_S)
@@ -169,11 +169,11 @@ def stamped_twist_to_bytes(twist: ArrayLike, stamp_ns: int, frame: str) -> bytes
     header = NATIVE + struct.pack(
         f"=iII{len(text)}s", seconds, nanoseconds, len(text), text
     )
-    padding = bytes(_aligned(len(header), 8) - len(header))
+    padding = bytes(_align(len(header), 8) - len(header))
     return header + padding + struct.pack("=6d", x, y, 0.0, 0.0, 0.0, w)
 
 
-def twist_to_bytes(twist: ArrayLike) -> bytes:
+def write_twist(twist: ArrayLike) -> bytes:
     """Serialise linear.x, linear.y, angular.z (3,) as a Twist."""
     x, y, w = np.asarray(twist, np.float64).tolist()
     return NATIVE + struct.pack("=6d", x, y, 0.0, 0.0, 0.0, w)

@@ -23,7 +23,7 @@ def test_the_base_ends_with_the_process_that_started_it(monkeypatch):
     parent = Mock()
     parent.is_alive.side_effect = [True, True, False]
     monkeypatch.setattr(multiprocessing, "parent_process", lambda: parent)
-    monkeypatch.setattr(faulty_robot, "driver_context", Mock())
+    monkeypatch.setattr(faulty_robot, "open_driver_context", Mock())
     monkeypatch.setattr(faulty_robot, "Node", Mock())
     monkeypatch.setattr(
         faulty_robot, "SingleThreadedExecutor", Mock(return_value=executor)

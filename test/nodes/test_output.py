@@ -134,8 +134,8 @@ def test_a_forwarder_that_is_frozen_or_killed_delays_nothing():
 
 ERRORS = """
 import os, sys
-from nics_drl_bridge.nodes.own_process import forwarded_errors
-with forwarded_errors():
+from nics_drl_bridge.nodes.own_process import forward_errors
+with forward_errors():
     for number in range(30_000):
         print("line", number, "x" * 80, file=sys.stderr)
         if number == 0:

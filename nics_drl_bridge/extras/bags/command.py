@@ -44,7 +44,7 @@ def record(
     """Records a robot's topics without driving it."""
     with extensions.require_modules("nics bag record"):
         from nics_drl_bridge.extras.bags.live import BagOrder, record_bag
-        from nics_drl_bridge.nodes.own_process import forwarded_errors
+        from nics_drl_bridge.nodes.own_process import forward_errors
     names = tuple(topics or ())
     say = partial(typer.echo, err=True)
     order = BagOrder(
@@ -56,7 +56,7 @@ def record(
         storage,
         use_sim_time,
     )
-    with forwarded_errors():
+    with forward_errors():
         counts = dict(sorted(record_bag(order, say).items()))
     lines = [f"{topic}: {count} messages" for topic, count in counts.items()]
     lines.append(f"bag written to {out}")

@@ -22,10 +22,14 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from nics_drl_bridge import defaults
 from nics_drl_bridge.config import parse_namespace
 from nics_drl_bridge.errors import BackendError, RecordingError, suggest
-from nics_drl_bridge.nodes.conversions import message_texts, message_type, stamp_to_ros
+from nics_drl_bridge.nodes.conversions import (
+    collect_message_texts,
+    find_message_type,
+    stamp_to_ros,
+)
 from nics_drl_bridge.nodes.listener import holds, open_context
-from nics_drl_bridge.nodes.qos import BridgeNode, offer_of, profile_of
-from nics_drl_bridge.nodes.runner import DELIVERY_S, run_node, steadily
+from nics_drl_bridge.nodes.qos import BridgeNode, make_offer, make_profile
+from nics_drl_bridge.nodes.runner import DELIVERY_S, call_periodically, run_node
 from nics_drl_bridge.recording.bag_file import BagFile, open_bag
 from nics_drl_bridge.recording.messages import Offer
 from nics_drl_bridge.recording.write import BagSink, Storage, open_bag_sink
@@ -106,7 +110,7 @@ class BagRecorder(BridgeNode):
         self.skipped: dict[str, str] = {}  # topic -> sentence with the reason
         self._heard: dict[str, tuple[Offer, Subscription[Any]]] = {}
         self._began = self._flushed = time.monotonic()
-        steadily(self, LOOK_S, self._look)
+        call_periodically(self, LOOK_S, self._look)
         self._look()
 
     def _look(self) -> None:
@@ -129,13 +133,13 @@ class BagRecorder(BridgeNode):
         publishers = self.get_publishers_info_by_topic(topic)
         if not publishers or topic in self.skipped:
             return
-        offers = [offer_of(info.qos_profile) for info in publishers]
+        offers = [make_offer(info.qos_profile) for info in publishers]
         lasting = all(offer.transient_local for offer in offers)
         wanted = Offer(QUEUE, all(offer.reliable for offer in offers), lasting)
         subscribed = self._heard.get(topic)
         if subscribed is not None and subscribed[0] in (wanted, Offer(QUEUE, False)):
             return
-        kind = message_type(kinds[0])
+        kind = find_message_type(kinds[0])
         if len(kinds) > 1 or kind is None:
             why = f"is of {kinds[0]}, whose package is not installed; install it to record it"
             if len(kinds) > 1:
@@ -145,12 +149,14 @@ class BagRecorder(BridgeNode):
             return
         if subscribed is None:
             with self._end_by_fault():
-                self._sink.add_topic(topic, kinds[0], offers, message_texts(kinds[0]))
+                self._sink.add_topic(
+                    topic, kinds[0], offers, collect_message_texts(kinds[0])
+                )
             self._say(f"{topic} ({kinds[0]})")
         else:
             self.destroy_subscription(subscribed[1])
         take = partial(self._take, topic)
-        profile = profile_of(wanted)
+        profile = make_profile(wanted)
         self._heard[topic] = (
             wanted,
             self.create_subscription(kind, topic, take, profile, raw=True),
@@ -222,7 +228,7 @@ class _Player:
             self._barrier = node.create_client(GetParameters, service)
 
     def offer(self, topic: str, kind: str, offers: tuple[Offer, ...]) -> bool:
-        message_class = message_type(kind)
+        message_class = find_message_type(kind)
         if message_class is None:
             return False
         if topic in (CLOCK, "/tf", "/tf_static"):
@@ -235,7 +241,7 @@ class _Player:
             any(offer.transient_local for offer in offers),
         )
         self.publishers[topic] = self._node.create_publisher(
-            message_class, name, profile_of(best)
+            message_class, name, make_profile(best)
         )
         return True
 
