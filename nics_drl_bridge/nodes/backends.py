@@ -49,7 +49,6 @@ from nics_drl_bridge.nodes.parameters import (
     name_fleet,
 )
 from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
-from nics_drl_bridge.nodes.robot_topics import list_data_facts
 from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
 from nics_drl_bridge.sim.simulator import EpisodeSampler
 from nics_drl_bridge.sim.world_set import AnyWorld
@@ -272,7 +271,7 @@ class DdsBackend:
             arrival_ns = messages[name].arrival_ns
             self._middleware.sense(name, self._now_ns, arrival_ns, reading)
         info: dict[str, Any] = {"stamp_ns": self._now_ns}
-        info |= list_data_facts(self._middleware, time.monotonic_ns())
+        info |= self._middleware.list_facts(time.monotonic_ns())
         if self._has_truth:
             true_pose, _ = read_message(
                 TRUTH, wire.read_odometry, messages[TRUTH].content

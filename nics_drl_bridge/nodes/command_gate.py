@@ -20,6 +20,7 @@ from std_msgs.msg import Bool
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.gate import inputs, scan_motion, shield
 from nics_drl_bridge.gate.black_box import Entry
+from nics_drl_bridge.gate.e_stop_queue import EStopQueue
 from nics_drl_bridge.gate.gate import decide
 from nics_drl_bridge.gate.limits import PERIOD_S, Limits, load_limits
 from nics_drl_bridge.gate.state import (
@@ -48,7 +49,7 @@ from nics_drl_bridge.nodes import (
     wire,
 )
 from nics_drl_bridge.nodes.conversions import find_sensor_type
-from nics_drl_bridge.nodes.gate_inputs import TWIST, TWIST_STAMPED, EStopQueue, Sources
+from nics_drl_bridge.nodes.gate_inputs import TWIST, TWIST_STAMPED, Sources
 from nics_drl_bridge.nodes.gate_log import GateLog
 
 SIM_TIME = "use_sim_time"
@@ -273,7 +274,7 @@ class CommandGate(qos.BridgeNode):
     def _take_e_stop(self, content: bytes) -> None:
         """Decide on all waiting messages; a press comes first, so that it waits for no other."""
         contents = [content, *qos.take_waiting(self._button)]
-        self._queue.hear(time.monotonic(), len(contents))
+        self._queue.add(time.monotonic(), len(contents))
         messages = []
         for part in contents:
             try:

@@ -1,7 +1,6 @@
 """Conversion of messages to data and back, in pairs `x_to_ros`, `x_from_ros`; types by name."""
 
 import array
-import contextlib
 import math
 import re
 import sys
@@ -35,8 +34,6 @@ PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
 INITIAL_POSE = "initialpose"  # topic, as RViz sends it
 # variance of z, roll and pitch, which a planar robot does not measure
 UNUSED_VARIANCE = 1e6
-# the type of a field in a `.msg` file
-FIELD = re.compile(r"^\s*([A-Za-z][A-Za-z0-9_]*(?:/[A-Za-z0-9_/]+)?)")
 
 
 def stamp_to_ros(time_ns: int) -> Time:
@@ -298,35 +295,3 @@ def sensor_from_ros(sensor: Sensor, content: bytes) -> NDArray[np.float32]:
     except Exception as error:  # noqa: BLE001  (rclpy raises no public class)
         raise ValueError(f"is not a {sensor.message} ({error})") from None
     return sensor.read(message)
-
-
-def collect_message_texts(kind: str) -> dict[str, str]:
-    """Return the `.msg` texts of a type and of the types in it, as far as they are installed."""
-    texts: dict[str, str] = {}
-    waiting = [kind]
-    while waiting:
-        kind = waiting.pop()
-        file = _find_message_file(kind)
-        if kind in texts or file is None:
-            continue
-        texts[kind] = file.read_text(encoding="utf-8")
-        for field in filter(None, map(FIELD.match, texts[kind].splitlines())):
-            package, _, name = field[1].rpartition("/")
-            if package or name[0].isupper():
-                folder = (package or kind).split("/")[0]
-                waiting.append(f"{folder}/msg/{name}")
-    return texts
-
-
-def _find_message_file(kind: str) -> Path | None:
-    from ament_index_python.search_paths import get_search_paths
-
-    package, _, name = kind.split("/")
-    prefixes = [sys.prefix]
-    # the variable is not set if ROS 2 comes from wheels
-    with contextlib.suppress(OSError):
-        prefixes = [*get_search_paths(), sys.prefix]
-    files = (
-        Path(prefix) / "share" / package / "msg" / f"{name}.msg" for prefix in prefixes
-    )
-    return next((file for file in files if file.is_file()), None)

@@ -1,6 +1,5 @@
 """middleware_node: caches a robot's topics and publishes an estimate of its state."""
 
-import math
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -104,7 +103,7 @@ class MiddlewareNode(ManagedNode):
         level, trouble = judge_topics(health, awaited, self._rejected)
         self._rejected = health.rejected
         message = trouble or ("receiving" if self.state == ACTIVE else self.state)
-        shown = list_facts(health) | ({"imu": missing} if missing else {})
+        shown = health.describe() | ({"imu": missing} if missing else {})
         return runner.Condition(message, level, shown, self._hardware)
 
 
@@ -143,23 +142,6 @@ def judge_topics(
     if unusable:
         level = ERROR if refused else STALE
     return level, "; ".join([*clauses, *refused])
-
-
-def list_facts(health: Health) -> dict[str, str]:
-    """Return the health as readable keys and values."""
-    values = {}
-    for topic, data in health.topics.items():
-        values[f"{topic} received"] = str(data.received)
-        values[f"{topic} rate [Hz]"] = f"{data.rate_hz:.3g}"
-        values[f"{topic} age [s]"] = f"{data.age_s:.3f}"
-        if not math.isnan(data.innovation):
-            values[f"{topic} innovation"] = f"{data.innovation:.3g}"
-    for rejection, count in health.rejected.items():
-        values[f"rejected, {rejection}"] = str(count)
-    for event, count in health.noticed.items():
-        values[f"noticed, {event}"] = str(count)
-    values["late and put in place"] = str(health.replayed)
-    return values
 
 
 main = partial(runner.run_node, MiddlewareNode, sole_name="middleware_node")

@@ -27,7 +27,6 @@ from nics_drl_bridge.nodes.parameters import NO_POSE
 from nics_drl_bridge.nodes.robot_topics import (
     RobotTopics,
     declare_sensors,
-    list_data_facts,
 )
 from nics_drl_bridge.sim.world_set import AnyWorld
 
@@ -244,7 +243,7 @@ class RealtimeBackend:
                 "stamp_ns": self._topics.newest_ns,
                 "deadline_misses": self._misses,
             }
-            info |= list_data_facts(self._topics.middleware, time.monotonic_ns())
+            info |= self._topics.middleware.list_facts(time.monotonic_ns())
             self._scan_ns = self._topics.middleware.cache.newest[SCAN].stamp_ns
             _, self._link.frame = self._topics.frames
             return self._topics.view(), info

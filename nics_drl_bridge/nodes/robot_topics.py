@@ -332,18 +332,3 @@ class RobotTopics:
         self.middleware.command(
             None, self._robot.from_cmd_vel(conversions.twist_from_ros(message))
         )
-
-
-def list_data_facts(middleware: Middleware, now_ns: int) -> dict[str, Any]:
-    """Return facts for `info`: each topic's newest datum, and the covariance of the pose (3, 3).
-
-    Of each datum they hold its number, its stamp [ns] and the silence since it arrived [s].
-    """
-    facts: dict[str, Any] = {
-        "covariance": middleware.estimator.covariance[:3, :3].copy()
-    }
-    for topic, datum in middleware.cache.newest.items():
-        facts[f"{topic}_sequence"] = datum.sequence
-        facts[f"{topic}_stamp_ns"] = datum.stamp_ns
-        facts[f"{topic}_silence_s"] = (now_ns - datum.arrival_ns) * 1e-9
-    return facts

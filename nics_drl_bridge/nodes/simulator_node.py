@@ -45,6 +45,7 @@ from nics_drl_bridge.nodes.runner import OK, WARN
 from nics_drl_bridge.nodes.world_topics import WorldTopics
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.device import LEAST_VARIANCE, DeviceWorld, Sensed, variances
+from nics_drl_bridge.sim.pacing import RealTime, TopicPace
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
@@ -441,9 +442,9 @@ class DeviceNode(qos.BridgeNode):
         # On the steady clock: with use_sim_time the node's clock would wait for this very node.
         runner.call_periodically(self, WATCH_S, self._watch)
         step_ns = self._time.step_ns
-        self._odom_pace = device_parameters.TopicPace(self._time.odom_ns, step_ns)
-        self._scan_pace = device_parameters.TopicPace(self._time.scan_ns, step_ns)
-        self._real_time = device_parameters.RealTime(step_ns, self._time.rate)
+        self._odom_pace = TopicPace(self._time.odom_ns, step_ns)
+        self._scan_pace = TopicPace(self._time.scan_ns, step_ns)
+        self._real_time = RealTime(step_ns, self._time.rate)
         self._timer = None
         self._soon = self.create_guard_condition(self._on_time)
         self._complete = self.create_guard_condition(self._advance_if_complete)

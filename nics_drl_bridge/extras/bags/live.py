@@ -1,6 +1,9 @@
 """Bags over ROS 2: records a robot's messages as sent, and plays them back as recorded."""
 
+import contextlib
+import re
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -23,7 +26,6 @@ from nics_drl_bridge import defaults
 from nics_drl_bridge.config import parse_namespace
 from nics_drl_bridge.errors import BackendError, RecordingError, suggest
 from nics_drl_bridge.nodes.conversions import (
-    collect_message_texts,
     find_message_type,
     stamp_to_ros,
 )
@@ -58,9 +60,43 @@ CLOCK_PERIOD_NS = 10_000_000
 USUAL_DEPTH = 100  # queue depth of a topic whose quality of service is not in the bag
 NAP_S = 0.05
 PATIENCE_S = 60.0
+# the type of a field in a `.msg` file
+FIELD = re.compile(r"^\s*([A-Za-z][A-Za-z0-9_]*(?:/[A-Za-z0-9_/]+)?)")
 # time for subscribers to discover the topics before the first message [s]
 DISCOVERY_S = 1.0
 ALONE_S = 5.0  # maximum wait for a subscriber before playing without one [s]
+
+
+def collect_message_texts(kind: str) -> dict[str, str]:
+    """Return the `.msg` texts of a type and of the types in it, as far as they are installed."""
+    texts: dict[str, str] = {}
+    waiting = [kind]
+    while waiting:
+        kind = waiting.pop()
+        file = _find_message_file(kind)
+        if kind in texts or file is None:
+            continue
+        texts[kind] = file.read_text(encoding="utf-8")
+        for field in filter(None, map(FIELD.match, texts[kind].splitlines())):
+            package, _, name = field[1].rpartition("/")
+            if package or name[0].isupper():
+                folder = (package or kind).split("/")[0]
+                waiting.append(f"{folder}/msg/{name}")
+    return texts
+
+
+def _find_message_file(kind: str) -> Path | None:
+    from ament_index_python.search_paths import get_search_paths
+
+    package, _, name = kind.split("/")
+    prefixes = [sys.prefix]
+    # the variable is not set if ROS 2 comes from wheels
+    with contextlib.suppress(OSError):
+        prefixes = [*get_search_paths(), sys.prefix]
+    files = (
+        Path(prefix) / "share" / package / "msg" / f"{name}.msg" for prefix in prefixes
+    )
+    return next((file for file in files if file.is_file()), None)
 
 
 @dataclass(frozen=True)

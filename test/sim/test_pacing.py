@@ -1,7 +1,7 @@
 import pytest
 
 from nics_drl_bridge.interface import NS_PER_S
-from nics_drl_bridge.nodes.device_parameters import (
+from nics_drl_bridge.sim.pacing import (
     RealTime,
     TopicPace,
     find_common_step,
