@@ -265,11 +265,7 @@ class DdsBackend:
         device_ranges = read_message(SCAN, wire.read_ranges, scan.content)
         ranges = from_device(device_ranges, self._lidar)
         self._middleware.scan(self._now_ns, scan.arrival_ns, ranges)
-        for name, sensor in self._sensors.items():
-            read = partial(sensor_from_ros, sensor)
-            reading = read_message(name, read, messages[name].content)
-            arrival_ns = messages[name].arrival_ns
-            self._middleware.sense(name, self._now_ns, arrival_ns, reading)
+        self._take_readings()
         info: dict[str, Any] = {"stamp_ns": self._now_ns}
         info |= self._middleware.list_facts(time.monotonic_ns())
         if self._has_truth:
@@ -281,6 +277,13 @@ class DdsBackend:
         view = self._middleware.view(self._now_ns)
         self._can_send = True
         return view, info
+
+    def _take_readings(self) -> None:
+        for name, sensor in self._sensors.items():
+            message = self._inbox.messages[name]
+            read = partial(sensor_from_ros, sensor)
+            reading = read_message(name, read, message.content)
+            self._middleware.sense(name, self._now_ns, message.arrival_ns, reading)
 
     def _wait_for_data(self) -> None:
         """Wait for the data of the step; have the simulator repeat what was lost on the way.

@@ -92,19 +92,27 @@ def get_timing(node: Node, model: SimulatorModel) -> DeviceTiming:
     step_ns, odom_ns, scan_ns = (
         round(seconds * NS_PER_S) for seconds in (step, odom, scan)
     )
-    late = []
-    for topic in ("scan", "odom"):
-        delay = model.latency.measured.get(topic, Delay(least=0.0, jitter=0.0))
-        least = get_number(node, f"{topic}_latency")
-        jitter = get_number(node, "latency_jitter")
-        chosen = (
-            least if least >= 0.0 else delay.least,
-            jitter if jitter >= 0.0 else delay.jitter,
-        )
-        late.append((round(chosen[0] * NS_PER_S), round(chosen[1] * NS_PER_S)))
     return DeviceTiming(
-        mode, get_number(node, "rate"), step_ns, odom_ns, scan_ns, *late
+        mode,
+        get_number(node, "rate"),
+        step_ns,
+        odom_ns,
+        scan_ns,
+        scan_late_ns=_get_delay(node, model, "scan"),
+        odom_late_ns=_get_delay(node, model, "odom"),
     )
+
+
+def _get_delay(node: Node, model: SimulatorModel, topic: str) -> tuple[int, int]:
+    """Return the minimum delay of a topic and the maximum additional one [ns]."""
+    delay = model.latency.measured.get(topic, Delay(least=0.0, jitter=0.0))
+    least = get_number(node, f"{topic}_latency")
+    jitter = get_number(node, "latency_jitter")
+    if least < 0.0:
+        least = delay.least
+    if jitter < 0.0:
+        jitter = delay.jitter
+    return round(least * NS_PER_S), round(jitter * NS_PER_S)
 
 
 def apply_timing(

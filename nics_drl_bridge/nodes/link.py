@@ -442,13 +442,16 @@ class EpisodeServices:
         response = self._link.call(self._reset, Trigger.Request(), timeout_s)
         if not response.success:
             raise BackendError(f"the simulator could not reset: {response.message}")
-        told = self._link.call(self._test, SelfTest.Request(), timeout_s)
-        facts = {pair.key: pair.value for pair in told.status[0].values}
+        tested = self._link.call(self._test, SelfTest.Request(), timeout_s)
+        facts = {pair.key: pair.value for pair in tested.status[0].values}
+        self._require_same(facts)
+        return int(facts[EPISODE_NS])
+
+    def _require_same(self, facts: Mapping[str, str]) -> None:
         for key, mine in self._identity.items():
             if facts.get(key) != mine:
                 runs = f"the simulator runs the {key} {facts.get(key)!r}, this env {mine!r}"
                 raise ModelError(f"{runs}; start both with the same {key}.")
-        return int(facts[EPISODE_NS])
 
 
 T = TypeVar("T")

@@ -52,25 +52,8 @@ class PolicyNode(ManagedNode):
         """Open model and policy, and subscribe."""
         model = self._model = open_model(runner.get_text(self, "model"))
         self._open_policy(model)
-        self._goal: Array = np.array(self.get_parameter("goal").value, dtype=np.float64)
-        if len(self._goal) != 2 or not (
-            abs(self._goal).max() <= 1e8 or np.isnan(self._goal).all()
-        ):
-            needed = "must be [x, y] within 1e8 m, or both NaN to wait for goal_pose"
-            raise ConfigError(f"parameter 'goal': {needed}, not {self._goal.tolist()}.")
-        names = ("rate", "deadline", "late_limit")
-        rate, limit, patience = (self.get_parameter(name).value for name in names)
-        if rate < 0.0 or limit <= 0.0:
-            values = f"parameters rate {rate}, deadline {limit}"
-            raise ConfigError(f"{values}: must be at least 0, and more than 0.")
-        period = model.control_period
-        self._deadline = Deadline(0.5 * period if np.isnan(limit) else limit, patience)
-        pace_s = 0.0
-        if np.isnan(rate):
-            pace_s = period
-        elif rate > 0.0:
-            pace_s = 1.0 / rate
-        self._pace = ActionPace(pace_s)
+        self._goal = self._read_goal()
+        self._read_pace(model.control_period)
         self._acted_ns = 0
         self._answer = None
         self._raw = self.create_lifecycle_publisher(
@@ -101,6 +84,29 @@ class PolicyNode(ManagedNode):
         self._due = runner.call_periodically(self, model.control_period, self._act)
         self._due.cancel()  # until a scan comes before an action is due
         self.undo.callback(self.destroy_timer, self._due)
+
+    def _read_goal(self) -> Array:
+        goal = np.array(self.get_parameter("goal").value, dtype=np.float64)
+        if len(goal) != 2 or not (abs(goal).max() <= 1e8 or np.isnan(goal).all()):
+            needed = "must be [x, y] within 1e8 m, or both NaN to wait for goal_pose"
+            raise ConfigError(f"parameter 'goal': {needed}, not {goal.tolist()}.")
+        return goal
+
+    def _read_pace(self, period_s: float) -> None:
+        names = ("rate", "deadline", "late_limit")
+        rate, limit_s, patience = (self.get_parameter(name).value for name in names)
+        if rate < 0.0 or limit_s <= 0.0:
+            values = f"parameters rate {rate}, deadline {limit_s}"
+            raise ConfigError(f"{values}: must be at least 0, and more than 0.")
+        if np.isnan(limit_s):
+            limit_s = 0.5 * period_s
+        self._deadline = Deadline(limit_s, patience)
+        pace_s = 0.0
+        if np.isnan(rate):
+            pace_s = period_s
+        elif rate > 0.0:
+            pace_s = 1.0 / rate
+        self._pace = ActionPace(pace_s)
 
     def activate(self) -> None:
         """Start with a fresh state of the policy."""

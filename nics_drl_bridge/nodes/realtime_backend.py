@@ -330,7 +330,10 @@ class RealtimeBackend:
             return Hindrance("it is still moving", "stop whatever else drives it")
         if start is None or self._options.start == "present":
             return None
-        dx, dy, turn = geometry.between(view.pose, start.pose)
+        return self._find_start_error(view.pose, start)
+
+    def _find_start_error(self, pose: Array, start: Start) -> Hindrance | None:
+        dx, dy, turn = geometry.between(pose, start.pose)
         distance = math.hypot(dx, dy)
         max_distance, max_turn = self._options.tolerance
         if distance <= max_distance and abs(turn) <= max_turn:
