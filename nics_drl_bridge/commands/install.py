@@ -6,7 +6,7 @@ import subprocess
 import sys
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 from typer import Argument, Option
@@ -18,6 +18,13 @@ from nics_drl_bridge.nodes.message_packages import find_wheels, list_shipped_pac
 
 if TYPE_CHECKING:
     from nics_drl_bridge.commands.message_build import Source
+
+
+def _refuse_without_wheels(name: str) -> NoReturn:
+    distribution = os.environ.get("ROS_DISTRO", "DISTRO")
+    debian = f"ros-{distribution}-{name.replace('_', '-')}"
+    fix = f"install {name} with your distribution, as by `sudo apt install {debian}`"
+    raise ConfigError(f"nics install: the ROS 2 here does not come from wheels; {fix}.")
 
 
 def install(
@@ -61,15 +68,7 @@ def install(
     wheels = find_wheels()
     if wheels is None:
         extensions.require("nics install", "rclpy")
-        name = sources[0].name
-        distribution = os.environ.get("ROS_DISTRO", "DISTRO")
-        debian = f"ros-{distribution}-{name.replace('_', '-')}"
-        fix = (
-            f"install {name} with your distribution, as by `sudo apt install {debian}`"
-        )
-        raise ConfigError(
-            f"nics install: the ROS 2 here does not come from wheels; {fix}."
-        )
+        _refuse_without_wheels(sources[0].name)
     place = check_prefix(prefix or Path(sys.prefix))
     check_programs()
     with Generators(wheels, _tell) as generators:
