@@ -427,12 +427,14 @@ class PathActions:
             most = float(self._robot.to_fields(self._robot.command_high)[2])
             rate = min(max(TURNING * abs(turn), LEAST_TURN), most)
             twist = np.array([0.0, 0.0, math.copysign(rate, turn)])
-        # Scale the speed down to the limit without changing the robot's path.
+        self._report(run, robot, place, estimate.twist)
+        return self._limit_speed(twist)
+
+    def _limit_speed(self, twist: Array) -> Array:
+        """Scale the speed down to the limit without changing the robot's path."""
         share = min(1.0, self._limit / max(float(np.hypot(*twist[:2])), 1e-9))
         steers = self._robot.steers and not self._robot.takes_turn_rate
-        twist = twist * np.array([share, share, 1.0 if steers else share])
-        self._report(run, robot, place, estimate.twist)
-        return twist
+        return twist * np.array([share, share, 1.0 if steers else share])
 
     def _report(self, run: Run, robot: Array, place: Place, twist: Array) -> None:
         speed = float(np.hypot(*twist[:2]))
