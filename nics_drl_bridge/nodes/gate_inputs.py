@@ -35,7 +35,7 @@ def read_sensor(sensor: Sensor, content: bytes) -> inputs.SensorReading:
 def read_odometry(content: bytes) -> inputs.Odometry:
     """Read a serialised Odometry; without a rotation its pose is NaN."""
     pose, twist = wire.read_odometry(content)
-    if not is_rotation(*wire.numbers_of(content)[ROTATION].tolist()):
+    if not is_rotation(*wire.read_numbers(content)[ROTATION].tolist()):
         pose = np.full(3, np.nan)
     return inputs.Odometry(wire.read_stamp(content), pose, twist)
 
@@ -43,7 +43,7 @@ def read_odometry(content: bytes) -> inputs.Odometry:
 def read_estimate(content: bytes) -> inputs.Estimate:
     """Read a serialised Odometry of an estimator."""
     pose, twist = wire.read_odometry(content)
-    covariance = wire.numbers_of(content)[wire.POSE_COVARIANCE : wire.TWIST].reshape(
+    covariance = wire.read_numbers(content)[wire.POSE_COVARIANCE : wire.TWIST].reshape(
         6, 6
     )
     return inputs.Estimate(twist, pose, covariance[PLANAR].astype(np.float64))

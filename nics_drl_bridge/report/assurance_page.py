@@ -206,7 +206,7 @@ def _list_drivers(
         "the policy on its way to a goal, with robot and sensors perturbed by the "
         f"randomisation {protocol.randomisation!r}"
     )
-    drivers = []
+    drivers = list[tuple[str, ...]]()
     for name, aim in aims.items():
         touches, tried, without_gate, controls = results["drivers"][name]
         counts = (f"{touches:,} of {tried:,}", f"{without_gate:,} of {controls:,}")

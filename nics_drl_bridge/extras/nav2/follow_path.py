@@ -434,7 +434,8 @@ class PathActions:
         """Scale the speed down to the limit without changing the robot's path."""
         share = min(1.0, self._limit / max(float(np.hypot(*twist[:2])), 1e-9))
         steers = self._robot.steers and not self._robot.takes_turn_rate
-        return twist * np.array([share, share, 1.0 if steers else share])
+        limited: Array = twist * np.array([share, share, 1.0 if steers else share])
+        return limited
 
     def _report(self, run: Run, robot: Array, place: Place, twist: Array) -> None:
         speed = float(np.hypot(*twist[:2]))
