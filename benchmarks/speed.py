@@ -676,8 +676,8 @@ def measure_vehicle(given: Given) -> Result:
     from nics_drl_bridge.nodes import load, node_process
 
     if given.control == "slow":
-        make_command = node_process.module_command
-        node_process.module_command = lambda module: [
+        make_command = node_process.make_module_command
+        node_process.make_module_command = lambda module: [
             word.replace("; from", SLOW_POLICY) for word in make_command(module)
         ]
     loads, _ = load.measure_load(peers.MODEL, "differential", given.seconds)

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from nics_drl_bridge.nodes.transport import domains_in_use
+from nics_drl_bridge.nodes.transport import find_used_domains
 
 DOMAINS = range(1, 102)  # above, DDS ports may collide with those that Linux hands out
 
@@ -19,7 +19,7 @@ def claimed_domain() -> Iterator[int]:
     """A domain id that nobody uses or has asked for here; freed when the block or process ends."""
     folder = Path(tempfile.gettempdir()) / "nics_drl_bridge_test_domains"
     folder.mkdir(exist_ok=True)
-    unused = sorted(set(DOMAINS) - domains_in_use())
+    unused = sorted(set(DOMAINS) - find_used_domains())
     for domain_id in random.sample(unused, len(unused)):
         with (folder / str(domain_id)).open("w") as file:
             try:

@@ -3,7 +3,7 @@
 import json
 import platform
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
@@ -19,7 +19,7 @@ from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.files import check_above, format_json, write_bytes, write_text
 
 if TYPE_CHECKING:
-    from nics_drl_bridge.gate.assurance.protocol import Protocol
+    from nics_drl_bridge.gate.assurance.protocol import Protocol, Trial
     from nics_drl_bridge.gate.assurance.run import Run
     from nics_drl_bridge.generator import SimulatorModel
 
@@ -231,48 +231,57 @@ def _tell_left(what: str, advance: console.Tell) -> Callable[[int, int], None]:
 
 def _replay(run: "Run", seed: int, out: Path, as_json: bool) -> None:
     """Drives one episode again, compares it with the run's, and draws it."""
-    import numpy as np
-
     from nics_drl_bridge.gate.assurance import run as runs
-    from nics_drl_bridge.policy.evaluation import Episode
-    from nics_drl_bridge.report.pictures import draw_trajectories
-    from nics_drl_bridge.sim.world import load_world
 
     order = run.protocol
     order.check_same(runs.read_result(out)["protocol"], str(out))
     trial = order.find_trial(seed)
     if trial in order.list_faults():
-        from nics_drl_bridge.nodes.gate_faults import inject_trials
-
-        say = partial(typer.echo, err=True)
-        logs = out / "logs" / f"replay_{seed}"
-        rows = list(inject_trials(order, logs, say, [trial]))
-        if not rows:
-            raise BackendError(
-                f"--replay {seed}: {trial.kind} could not be injected, because the robot did not "
-                "move; try again, or look into the logs."
-            )
-        (row,) = rows
-        listed = "\n".join(f"{name:<12} {value}" for name, value in row.items())
-        console.print_line(as_json, listed, **row)
+        row = _inject_again(order, trial, out / "logs" / f"replay_{seed}")
+        console.print_line(as_json, _list_values(row), **row)
         return
     rows, _ = runs.read_rows(out / runs.LOG, list(order.list_trials()))
     row = json.loads(format_json(run.drive(trial)))
+    picture = out / f"replay_{seed}.png"
+    _draw_episode(run, trial, "contact" if row["contact"] else "no contact", picture)
+    kept = [one for one in rows if one["seed"] == seed and one["gated"] == trial.gated]
+    same = kept == [row]
+    comparison = "as in the run" if same else "not in the run, or different there"
+    text = f"{_list_values(row)}\nthis episode is {comparison}; its picture: {picture}"
+    console.print_line(as_json, text, **row, same=same, picture=str(picture))
+
+
+def _inject_again(order: "Protocol", trial: "Trial", logs: Path) -> dict[str, Any]:
+    from nics_drl_bridge.nodes.gate_faults import inject_trials
+
+    rows = list(inject_trials(order, logs, partial(typer.echo, err=True), [trial]))
+    if not rows:
+        raise BackendError(
+            f"--replay {trial.seed}: {trial.kind} could not be injected, because the robot did "
+            "not move; try again, or look into the logs."
+        )
+    return rows[0]
+
+
+def _list_values(row: Mapping[str, Any]) -> str:
+    return "\n".join(f"{name:<12} {value}" for name, value in row.items())
+
+
+def _draw_episode(run: "Run", trial: "Trial", result: str, file: Path) -> None:
+    """Draws the episode that was driven last."""
+    import numpy as np
+
+    from nics_drl_bridge.policy.evaluation import Episode
+    from nics_drl_bridge.report.pictures import draw_trajectories
+    from nics_drl_bridge.sim.world import load_world
+
     place = run.open_place(trial.world, trial.kind)
     path = np.array(place.track)
     scene = place.scenes[0]
-    result = "contact" if row["contact"] else "no contact"
-    episode = Episode(seed, result, path, path, scene.goals[0], scene.bodies, 0.0)
-    picture = out / f"replay_{seed}.png"
+    episode = Episode(trial.seed, result, path, path, scene.goals[0], scene.bodies, 0.0)
     radius = place.model.robot.footprint_radius
     drawn = draw_trajectories({trial.kind: [episode]}, load_world(trial.world), radius)
-    write_bytes(picture, drawn)
-    kept = [one for one in rows if one["seed"] == seed and one["gated"] == trial.gated]
-    same = kept == [row]
-    told = "as in the run" if same else "not in the run, or different there"
-    listed = "\n".join(f"{name:<12} {value}" for name, value in row.items())
-    text = f"{listed}\nthis episode is {told}; its picture: {picture}"
-    console.print_line(as_json, text, **row, same=same, picture=str(picture))
+    write_bytes(file, drawn)
 
 
 def _tell(order: "Protocol", results: dict[str, Any], out: Path) -> None:

@@ -9,7 +9,7 @@ from functools import wraps
 from glob import glob
 from inspect import signature
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import typer
 from typer import Option
@@ -200,12 +200,7 @@ def check_options(command: Callable[..., Any]) -> Callable[..., Any]:
         }
         with report_in_one_sentence():
             for name, value in given_options.items():
-                items = value if isinstance(value, tuple | list) else (value,)
-                for item in items:
-                    if isinstance(item, float) and not math.isfinite(item):
-                        raise ConfigError(
-                            f"{_format_option(name)} {item}: must be a finite number."
-                        )
+                _check_finite(name, value)
                 needed_names = needed_options.get(name, ())
                 if needed_names and not given_options.keys() & needed_names:
                     alternatives = " or ".join(map(_format_option, needed_names))
@@ -213,15 +208,23 @@ def check_options(command: Callable[..., Any]) -> Callable[..., Any]:
                     raise ConfigError(f"{_format_option(name)}: belongs to {fix}")
                 for conflicting in conflicting_options.get(name, ()):
                     if conflicting in given_options:
-                        refused = _format_option(conflicting)
-                        partner = _format_option(name)
-                        fix = f"leave out {refused}, or {partner}."
-                        raise ConfigError(
-                            f"{refused} does not go with {partner}; {fix}"
-                        )
+                        _refuse_both(_format_option(conflicting), _format_option(name))
             return command(**options)
 
     return run
+
+
+def _check_finite(name: str, value: Any) -> None:
+    for item in value if isinstance(value, tuple | list) else (value,):
+        if isinstance(item, float) and not math.isfinite(item):
+            raise ConfigError(
+                f"{_format_option(name)} {item}: must be a finite number."
+            )
+
+
+def _refuse_both(refused: str, partner: str) -> NoReturn:
+    fix = f"leave out {refused}, or {partner}."
+    raise ConfigError(f"{refused} does not go with {partner}; {fix}")
 
 
 def _format_option(name: str) -> str:

@@ -144,14 +144,7 @@ def run(plan: DemoPlan, say: Say) -> str:
     learned = timed("learning", learn, model)
     summaries = timed("evaluating", _evaluate, model, learned.policy)
     here = timed("driving in process", _drive, FAST, learned.policy)
-    world = load_world(plan.world)
-    radius = model.robot.footprint_radius
-    paths = "paths.png"
-    write_bytes(
-        plan.out / paths,
-        pictures.draw_trajectories({LABELS[FAST]: here}, world, radius),
-    )
-    say(f"  the paths are drawn in {plan.out / paths}")  # the report takes a while
+    _draw_paths(plan, model, here, say)
     there = timed("driving over DDS", _drive, DDS, learned.policy) if topics else []
     live = None
     if topics:
@@ -159,23 +152,35 @@ def run(plan: DemoPlan, say: Say) -> str:
         seed = succeeded[0] if succeeded else 0
         live = timed("deploying", _deploy, model, learned.policy, seed)
     durations_s["all"] = sum(durations_s.values())
-    times = [(part, f"{duration:.0f}") for part, duration in durations_s.items()]
     episodes = DemoEpisodes(summaries, here, there, live)
     sections = make_sections(plan, model, identified, learned, episodes)
-    folded = html.make_details(
-        "Wall time", [html.make_table(("part", "wall time [s]"), times)]
-    )
+    sections.append(("Time", [_fold_durations(durations_s)]))
     file = plan.out / "report.html"
     lead = (
         f"Robot {model.robot.name!r} in the world {plan.world!r}, policy {learned.policy!r}, "
         f"simulator generated from {plan.recording or 'a textbook drive'}."
     )
-    write_text(
-        file,
-        html.make_page("nics_drl_bridge: demo", lead, [*sections, ("Time", [folded])]),
-    )
+    write_text(file, html.make_page("nics_drl_bridge: demo", lead, sections))
     over = f"over DDS {successes(there)}/{plan.episodes}, " if topics else ""
     return f"demo: in process {successes(here)}/{plan.episodes}, {over}report {file}"
+
+
+def _fold_durations(durations_s: Mapping[str, float]) -> str:
+    times = [(part, f"{duration:.0f}") for part, duration in durations_s.items()]
+    table = html.make_table(("part", "wall time [s]"), times)
+    return html.make_details("Wall time", [table])
+
+
+def _draw_paths(
+    plan: DemoPlan, model: SimulatorModel, episodes: Sequence[Episode], say: Say
+) -> None:
+    """Draws the paths of the first episodes, because the report takes a while."""
+    paths = plan.out / "paths.png"
+    radius = model.robot.footprint_radius
+    shown = {LABELS[FAST]: episodes}
+    world = load_world(plan.world)
+    write_bytes(paths, pictures.draw_trajectories(shown, world, radius))
+    say(f"  the paths are drawn in {paths}")
 
 
 def _record_or_read(plan: DemoPlan, say: Say) -> tuple[RobotSpec, Recording]:
@@ -294,12 +299,15 @@ def _evaluate(
         )
         summary = evaluation.summarise(outcomes, model.control_period)
         summaries[condition] = summary
-        rates = (
-            f"{result} {100 * share.value:.1f} %"
-            for result, share in summary.shares.items()
-        )
-        say(f"  {condition.replace('_', ' ')}: {', '.join(rates)}")
+        say(f"  {condition.replace('_', ' ')}: {_format_shares(summary)}")
     return summaries
+
+
+def _format_shares(summary: Summary) -> str:
+    return ", ".join(
+        f"{result} {100 * share.value:.1f} %"
+        for result, share in summary.shares.items()
+    )
 
 
 def _drive(plan: DemoPlan, place: str, policy: str, say: Say) -> list[Episode]:
@@ -474,19 +482,6 @@ def _make_policy_lines(
         caption = "Success and collisions during exploration; every episode is new."
         curve = pictures.draw_training_curve(learned.curve)
         blocks.append(html.make_picture(curve, caption))
-    rows = list[tuple[str, ...]]()
-    perturbed = {
-        f"success with {what.replace('_', ' ')}": summary.success
-        for what, summary in episodes.summaries.items()
-        if what != AS_IT_IS
-    }
-    for name, fraction in {**summary.shares, **perturbed}.items():
-        rows.append((name, *(f"{100 * value:.1f} %" for value in astuple(fraction))))
-    for name, amount in (("path [m]", summary.length), ("time [s]", summary.time)):
-        texts = (
-            f"{value:.2f}" if isfinite(value) else "-" for value in astuple(amount)
-        )
-        rows.append((name, *texts))
     text = (
         f"{summary.episodes} unseen episodes in the world {plan.world!r}, in parallel in the fast "
         "simulator, without exploration; path and time are means of the successful ones. Below, "
@@ -495,8 +490,27 @@ def _make_policy_lines(
     return [
         *blocks,
         html.make_paragraph(text),
-        html.make_table(("", "value", "95 % from", "to"), rows),
+        html.make_table(("", "value", "95 % from", "to"), _list_results(episodes)),
     ]
+
+
+def _list_results(episodes: DemoEpisodes) -> list[tuple[str, ...]]:
+    """Returns a row for each result of the evaluation: its name, value, and 95 % bounds."""
+    summary = episodes.summary
+    perturbed = {
+        f"success with {what.replace('_', ' ')}": summary.success
+        for what, summary in episodes.summaries.items()
+        if what != AS_IT_IS
+    }
+    rows = list[tuple[str, ...]]()
+    for name, fraction in {**summary.shares, **perturbed}.items():
+        rows.append((name, *(f"{100 * value:.1f} %" for value in astuple(fraction))))
+    for name, amount in (("path [m]", summary.length), ("time [s]", summary.time)):
+        texts = (
+            f"{value:.2f}" if isfinite(value) else "-" for value in astuple(amount)
+        )
+        rows.append((name, *texts))
+    return rows
 
 
 def _format_episodes(
@@ -506,7 +520,6 @@ def _format_episodes(
     there = episodes.there
     live = episodes.live
     labels = (LABELS[FAST], LABELS[DDS])
-    columns = ("steps", "path [m]")
     world = load_world(plan.world)
     radius = model.robot.footprint_radius
     if live is None:
@@ -514,19 +527,6 @@ def _format_episodes(
         alone = {labels[0]: here[:DEMO_PANELS]}
         png = pictures.draw_trajectories(alone, world, radius)
         return [html.make_paragraph(text), html.make_picture(png, "")]
-    rows = [
-        (
-            f"{a.seed}",
-            a.result,
-            f"{a.steps}",
-            f"{a.length:.2f}",
-            b.result,
-            f"{b.steps}",
-            f"{b.length:.2f}",
-            f"{deviation(a, b):.1g}",
-        )
-        for a, b in zip(here, there, strict=True)
-    ]
     shown = {
         labels[0]: here[:DEMO_PANELS],
         labels[1]: there[:DEMO_PANELS],
@@ -540,11 +540,28 @@ def _format_episodes(
         f"its goal, that of seed {live.seed}."
     )
     about = "Deviation is the greatest distance between the two true paths at the same step."
-    table = html.make_table(
-        ("seed", labels[0], *columns, labels[1], *columns, "deviation [m]"), rows
-    )
+    table = _make_episode_table(here, there)
     return [
         html.make_paragraph(text),
         html.make_picture(pictures.draw_trajectories(shown, world, radius), ""),
         html.make_details("Episode by episode", [html.make_paragraph(about), table]),
     ]
+
+
+def _make_episode_table(here: Sequence[Episode], there: Sequence[Episode]) -> str:
+    rows = [
+        (
+            f"{a.seed}",
+            a.result,
+            f"{a.steps}",
+            f"{a.length:.2f}",
+            b.result,
+            f"{b.steps}",
+            f"{b.length:.2f}",
+            f"{deviation(a, b):.1g}",
+        )
+        for a, b in zip(here, there, strict=True)
+    ]
+    columns = ("steps", "path [m]")
+    heads = ("seed", LABELS[FAST], *columns, LABELS[DDS], *columns, "deviation [m]")
+    return html.make_table(heads, rows)

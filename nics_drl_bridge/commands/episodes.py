@@ -471,6 +471,41 @@ def summarize(result: Evaluated) -> str:
     return f"{result.policy}: success {', '.join(rates)}"
 
 
+def _examine_vehicle(model: SimulatorModel, namespace: str, imu: str, say: Say) -> None:
+    """Listens to a vehicle; raises BackendError if it does not fit its model."""
+    from nics_drl_bridge.nodes.listen import listen
+
+    say(f"listening to the vehicle for {defaults.LISTEN_S:g} s, as nics doctor does")
+    errors = []
+    heard = listen(defaults.LISTEN_S, namespace, imu=imu)
+    for finding in examine(heard, derive_expected(model)):
+        sentence = f"{finding.where}: {finding.what} ({finding.fix})"
+        say(f"  {finding.severity}: {sentence}")
+        if finding.severity == "error":
+            errors.append(sentence)
+    if errors:
+        raise BackendError(
+            f"the vehicle is not driven: {errors[0]}; see nics doctor for the rest."
+        )
+
+
+def _drive_again(
+    episodes: Sequence[Episode],
+    policy: str,
+    model: SimulatorModel,
+    world: str,
+    conditions: Conditions,
+) -> list[Episode]:
+    """Drives a vehicle's episodes in the fast simulator, from their starts to their goals."""
+    env, driver = open_env(policy, model, world, "sim", conditions, estimator=True)
+    simulated = []
+    with closing(env):
+        for driven in episodes:
+            reset_options = {"start": driven.path[0], "goal": driven.goal}
+            simulated.append(drive(env, driver, driven.seed, reset_options))
+    return simulated
+
+
 def drive_vehicle(
     order: EvaluationOrder,
     goal: tuple[float, float] | None,
@@ -510,22 +545,7 @@ def drive_vehicle(
     limited = limit_time(order.conditions, contracts, model, world, say)
     # A policy that does not fit must fail before anything moves.
     open_policy(policy, model, order.conditions.kind)
-    from nics_drl_bridge.nodes.listen import listen
-
-    say(f"listening to the vehicle for {defaults.LISTEN_S:g} s, as nics doctor does")
-    errors = []
-    heard = listen(
-        defaults.LISTEN_S, namespace, imu=options.get("imu", defaults.IMU_TOPIC)
-    )
-    for finding in examine(heard, derive_expected(model)):
-        sentence = f"{finding.where}: {finding.what} ({finding.fix})"
-        say(f"  {finding.severity}: {sentence}")
-        if finding.severity == "error":
-            errors.append(sentence)
-    if errors:
-        raise BackendError(
-            f"the vehicle is not driven: {errors[0]}; see nics doctor for the rest."
-        )
+    _examine_vehicle(model, namespace, options.get("imu", defaults.IMU_TOPIC), say)
     backend_options = {
         "mode": "realtime",
         "vehicle": True,
@@ -558,17 +578,11 @@ def drive_vehicle(
             # Only the vehicle's own estimate of its path is known.
             episodes.append(replace(driven, path=driven.estimate))
             say(f"  {report_end(episodes[-1])}")
-    env, driver = open_env(policy, model, order.world, "sim", limited, estimator=True)
-    runs: dict[str, list[Episode]] = {VEHICLE: episodes}
-    simulated = []
-    with closing(env):
-        try:
-            for driven in episodes:
-                reset_options = {"start": driven.path[0], "goal": driven.goal}
-                simulated.append(drive(env, driver, driven.seed, reset_options))
-            runs[FAST] = simulated
-        except ConfigError as error:  # the start may be inside a wall of the map
-            say(f"  not driven again in process: {error}")
+    runs = {VEHICLE: episodes}
+    try:
+        runs[FAST] = _drive_again(episodes, policy, model, order.world, limited)
+    except ConfigError as error:  # the start may be inside a wall of the map
+        say(f"  not driven again in process: {error}")
     result = judge_runs(policy, runs, model, world, order.out)
     write_evaluation(replace(order, conditions=limited), name, model, [result])
     return result

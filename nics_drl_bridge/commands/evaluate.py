@@ -2,7 +2,7 @@
 
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from typer import Argument, Option
@@ -10,6 +10,9 @@ from typer import Argument, Option
 from nics_drl_bridge import defaults, extensions
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.errors import ConfigError
+
+if TYPE_CHECKING:
+    from nics_drl_bridge.policy.shadow import Shadow
 from nics_drl_bridge.files import check_above, format_json, write_bytes, write_text
 
 
@@ -199,6 +202,28 @@ def _parse_point(text: str | None) -> tuple[float, float] | None:
     raise ConfigError(f"--goal {text!r}: must be X,Y in metres, as 2.5,-1.")
 
 
+def _list_differences(policy: str, comparison: "Shadow") -> list[tuple[str, ...]]:
+    """Returns a row for each command: its differences, and how often its sign is opposite."""
+    rows = []
+    commands = comparison.differences().items()
+    for (command, figures), unit in zip(commands, comparison.units, strict=True):
+        *amounts, opposite = figures.values()
+        cells = (f"{value:.3g}" for value in amounts)
+        rows.append((policy, command, unit, *cells, f"{100 * opposite:.1f} %"))
+    return rows
+
+
+def _describe_comparison(comparison: "Shadow") -> str:
+    """Returns where a policy was compared, and where not."""
+    left_out = ", ".join(
+        f"{count} {why}" for why, count in comparison.skipped.items() if count
+    )
+    line = f"compared at {len(comparison.time)} times; left out: {left_out or 'none'}"
+    if comparison.resets:
+        line += f"; its state was reset after {comparison.resets} gaps"
+    return line
+
+
 def _replay_shadow(
     bag: Path,
     policies: list[str],
@@ -227,7 +252,6 @@ def _replay_shadow(
             bag, open_model(name), policy, console.parse_roles(topics), goal, ahead
         )
         place = out / f"shadow_{shorten_name(policy, policies)}"
-        differences = comparison.differences()
         write_bytes(place.with_suffix(".png"), draw_shadow(comparison))
         data = {
             "bag": str(bag),
@@ -238,24 +262,12 @@ def _replay_shadow(
             "compared": len(comparison.time),
             "skipped": dict(comparison.skipped),
             "resets": comparison.resets,
-            "commands": differences,
+            "commands": comparison.differences(),
         }
         write_text(place.with_suffix(".json"), format_json(data) + "\n")
         facts.append(data)
-        for (command, figures), unit in zip(
-            differences.items(), comparison.units, strict=True
-        ):
-            *amounts, opposite = figures.values()
-            cells = (f"{value:.3g}" for value in amounts)
-            rows.append((policy, command, unit, *cells, f"{100 * opposite:.1f} %"))
-        compared = f"{policy}: compared at {len(comparison.time)} times"
-        left_out = ", ".join(
-            f"{count} {why}" for why, count in comparison.skipped.items() if count
-        )
-        line = f"{compared}; left out: {left_out or 'none'}"
-        if comparison.resets:
-            line += f"; its state was reset after {comparison.resets} gaps"
-        lines.append(line)
+        rows += _list_differences(policy, comparison)
+        lines.append(f"{policy}: {_describe_comparison(comparison)}")
     heads = (
         "policy",
         "command",

@@ -6,7 +6,7 @@ import subprocess
 import sys
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 from typer import Argument, Option
@@ -14,10 +14,17 @@ from typer import Argument, Option
 from nics_drl_bridge import extensions
 from nics_drl_bridge.commands.console import JsonOption, print_line
 from nics_drl_bridge.errors import ConfigError, suggest
-from nics_drl_bridge.nodes.message_packages import shipped_packages, wheels_here
+from nics_drl_bridge.nodes.message_packages import find_wheels, list_shipped_packages
 
 if TYPE_CHECKING:
     from nics_drl_bridge.commands.message_build import Source
+
+
+def _refuse_without_wheels(name: str) -> NoReturn:
+    distribution = os.environ.get("ROS_DISTRO", "DISTRO")
+    debian = f"ros-{distribution}-{name.replace('_', '-')}"
+    fix = f"install {name} with your distribution, as by `sudo apt install {debian}`"
+    raise ConfigError(f"nics install: the ROS 2 here does not come from wheels; {fix}.")
 
 
 def install(
@@ -28,7 +35,7 @@ def install(
             help="tf2_msgs, ackermann_msgs, or the folder of another package with its msg, srv and "
             "action.",
             autocompletion=lambda incomplete: [
-                name for name in shipped_packages() if name.startswith(incomplete)
+                name for name in list_shipped_packages() if name.startswith(incomplete)
             ],
         ),
     ],
@@ -58,18 +65,10 @@ def install(
         sources = [source for source in sources if source.name not in installed]
     if not sources:
         return
-    wheels = wheels_here()
+    wheels = find_wheels()
     if wheels is None:
         extensions.require("nics install", "rclpy")
-        name = sources[0].name
-        distribution = os.environ.get("ROS_DISTRO", "DISTRO")
-        debian = f"ros-{distribution}-{name.replace('_', '-')}"
-        fix = (
-            f"install {name} with your distribution, as by `sudo apt install {debian}`"
-        )
-        raise ConfigError(
-            f"nics install: the ROS 2 here does not come from wheels; {fix}."
-        )
+        _refuse_without_wheels(sources[0].name)
     place = check_prefix(prefix or Path(sys.prefix))
     check_programs()
     with Generators(wheels, _tell) as generators:
@@ -93,7 +92,7 @@ def find_source(name: str) -> "Source":
     """Returns a message package, shipped or in a folder. Raises ConfigError."""
     from nics_drl_bridge.commands.message_build import Source, read_source
 
-    shipped = shipped_packages()
+    shipped = list_shipped_packages()
     if name in shipped:
         return Source(name, shipped[name])
     folder = Path(name)

@@ -14,7 +14,7 @@ from nics_drl_bridge.extensions import (
     TRAINING,
     find_lacking,
 )
-from nics_drl_bridge.nodes.message_packages import how_to_install
+from nics_drl_bridge.nodes.message_packages import explain_install
 
 EXTRAS = {  # extra -> purpose, modules that it installs
     "bags": ("reading and writing rosbags", ("rosbags", "mcap")),
@@ -100,7 +100,7 @@ def _check_ros() -> list[Check]:
     messages = []
     for name, purpose in MESSAGES.items():
         messages.append(
-            Check(name, find_spec(name) is not None, purpose, how_to_install(name))
+            Check(name, find_spec(name) is not None, purpose, explain_install(name))
         )
     return [Check("ROS 2", True, text), *messages]
 

@@ -1,12 +1,15 @@
 """`nics list`: shipped robots, worlds, lidars and policies, by the names that commands take."""
 
 from collections.abc import Callable
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from typer import Argument
 
 from nics_drl_bridge.commands.console import JsonOption, format_table, print_line
 from nics_drl_bridge.config import list_shipped
+
+if TYPE_CHECKING:
+    from nics_drl_bridge.sim.world import World
 
 Row = dict[str, Any]
 
@@ -42,6 +45,13 @@ def robots() -> list[Row]:
     return rows
 
 
+def _count_obstacles(world: "World") -> str:
+    counts = [group.counts for group in world.obstacles]
+    low = sum(minimum for minimum, _ in counts)
+    high = sum(maximum for _, maximum in counts)
+    return f"{low}" if low == high else f"{low} to {high}"
+
+
 def worlds() -> list[Row]:
     """Returns the shipped worlds and world sets: name, size, goal distance, obstacles."""
     from nics_drl_bridge.sim.barn import barn_numbers
@@ -52,15 +62,9 @@ def worlds() -> list[Row]:
     for name in list_shipped("worlds"):
         world = load_world(name)
         x1, y1, x2, y2 = world.extent
-        counts = [group.counts for group in world.obstacles]
-        low = sum(minimum for minimum, _ in counts)
-        high = sum(maximum for _, maximum in counts)
-        obstacles = f"{low}" if low == high else f"{low} to {high}"
-        rows.append(
-            _describe_world(
-                name, f"{x2 - x1:g} x {y2 - y1:g}", world.goal_distance, obstacles
-            )
-        )
+        size = f"{x2 - x1:g} x {y2 - y1:g}"
+        obstacles = _count_obstacles(world)
+        rows.append(_describe_world(name, size, world.goal_distance, obstacles))
     rows.append(
         _describe_world(
             BARN, f"a set of {len(barn_numbers())} worlds, as barn/7", (), ""

@@ -250,15 +250,7 @@ class Generators(AbstractContextManager["Generators", None]):
             missing = next((name for name in used if not self._has(name)), None)
             if missing is not None:
                 left_out[file] = missing
-        is_complete = False
-        while not is_complete:  # leave out files that use a left-out message
-            is_complete = True
-            types = {file.stem: missing for file, missing in left_out.items()}
-            for file in files:
-                broken = sorted(source.find_used_types(file) & types.keys())
-                if broken and file not in left_out:
-                    left_out[file] = types[broken[0]]
-                    is_complete = False
+        _leave_out_users(source, files, left_out)
         kept = [file.resolve() for file in files if file not in left_out]
         if not kept:
             needed_files = "msg/*.msg, srv/*.srv or action/*.action"
@@ -279,23 +271,7 @@ class Generators(AbstractContextManager["Generators", None]):
     def build(self, interfaces: Interfaces, prefix: Path) -> None:
         """Builds a message package, and installs it below a prefix. Raises ConfigError."""
         place = self._work / interfaces.name
-        names = []
-        for file in interfaces.files:
-            name = f"{file.parent.name}/{file.name}"
-            (place / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(file, place / name)
-            names.append(name)
-        needed = interfaces.needed
-        lists = CMAKE_LISTS.format(
-            name=interfaces.name,
-            find="\n".join(f"find_package({name} REQUIRED)" for name in needed),
-            files=" ".join(names),
-            needed=" ".join(needed),
-        )
-        depend = "".join(f"<depend>{name}</depend>" for name in needed)
-        manifest = PACKAGE_XML.format(name=interfaces.name, depend=depend)
-        (place / "CMakeLists.txt").write_text(lists, encoding="utf-8")
-        (place / "package.xml").write_text(manifest, encoding="utf-8")
+        write_package(interfaces, place)
         python = self._prefix / "bin" / "python"
         build = str(place / "build")
         chosen = [f"-DCMAKE_INSTALL_PREFIX={prefix}", f"-DPython3_EXECUTABLE={python}"]
@@ -344,3 +320,39 @@ def write_setup(prefix: Path) -> Path:
     )
     file.write_text(text, encoding="utf-8")
     return file
+
+
+def _leave_out_users(
+    source: Source, files: Sequence[Path], left_out: dict[Path, str]
+) -> None:
+    """Leaves out files that use a left-out message, too."""
+    is_complete = False
+    while not is_complete:
+        is_complete = True
+        types = {file.stem: missing for file, missing in left_out.items()}
+        for file in files:
+            broken = sorted(source.find_used_types(file) & types.keys())
+            if broken and file not in left_out:
+                left_out[file] = types[broken[0]]
+                is_complete = False
+
+
+def write_package(interfaces: Interfaces, folder: Path) -> None:
+    """Writes a package of messages that CMake can build."""
+    names = []
+    for file in interfaces.files:
+        name = f"{file.parent.name}/{file.name}"
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(file, folder / name)
+        names.append(name)
+    needed = interfaces.needed
+    lists = CMAKE_LISTS.format(
+        name=interfaces.name,
+        find="\n".join(f"find_package({name} REQUIRED)" for name in needed),
+        files=" ".join(names),
+        needed=" ".join(needed),
+    )
+    depend = "".join(f"<depend>{name}</depend>" for name in needed)
+    manifest = PACKAGE_XML.format(name=interfaces.name, depend=depend)
+    (folder / "CMakeLists.txt").write_text(lists, encoding="utf-8")
+    (folder / "package.xml").write_text(manifest, encoding="utf-8")

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from nics_drl_bridge.identify.identify import Identified
     from nics_drl_bridge.recording.excite import DrivePlan
     from nics_drl_bridge.recording.recording import Recording
+    from nics_drl_bridge.recording.survey import TableSurvey
 
 
 def record(
@@ -76,7 +77,7 @@ def record(
     if not preview:
         # This comes first because ROS 2 from wheels restarts Python.
         with extensions.require_modules("nics record"):
-            from nics_drl_bridge.nodes.own_process import forwarded_errors
+            from nics_drl_bridge.nodes.own_process import forward_errors
             from nics_drl_bridge.nodes.record_node import record as drive
     lines = draw_preview(plan, out)
     facts: dict[str, Any] = {"out": str(out), "robot": robot}
@@ -89,7 +90,7 @@ def record(
             as_json, "nothing was driven or recorded.", **facts, recorded=False
         )
         return
-    with forwarded_errors():
+    with forward_errors():
         driven = drive(parameters, arguments)
     if driven.failure is not None:
         raise BackendError(driven.line)
@@ -153,6 +154,16 @@ def drive_summary(recording: Any, parameters: dict[str, Any]) -> tuple[str, ...]
     )
 
 
+def _print_table(table: "TableSurvey") -> None:
+    findings = "".join(
+        f"\n  {finding}" for finding in table.regularity + table.findings
+    )
+    typer.echo(f"{table.name}: {table.rows} rows{findings}")
+    rows = [(c.name, f"{c.low:.6g}", f"{c.high:.6g}") for c in table.columns]
+    if rows:
+        typer.echo(console.format_table(("column", "least", "greatest"), rows))
+
+
 def inspect(
     source: Annotated[Path, Argument(help="A bag, a table, or a folder of tables.")],
     mapping: Annotated[
@@ -197,13 +208,7 @@ def inspect(
     for line in (*([needless] if needless else ()), *doubts):
         typer.echo(line)
     for table in tables:
-        findings = "".join(
-            f"\n  {finding}" for finding in table.regularity + table.findings
-        )
-        typer.echo(f"{table.name}: {table.rows} rows{findings}")
-        rows = [(c.name, f"{c.low:.6g}", f"{c.high:.6g}") for c in table.columns]
-        if rows:
-            typer.echo(console.format_table(("column", "least", "greatest"), rows))
+        _print_table(table)
     if draft is None:
         typer.echo(
             f"no mapping was written: {needless}" if mapping is not None else needless

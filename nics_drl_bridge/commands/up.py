@@ -15,7 +15,7 @@ from nics_drl_bridge import extensions
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.errors import ConfigError, suggest
 from nics_drl_bridge.exit_codes import EXIT_BAD_INPUT
-from nics_drl_bridge.nodes.node_process import ChildProcess, command_of
+from nics_drl_bridge.nodes.node_process import ChildProcess, make_command
 from nics_drl_bridge.nodes.starting import LAUNCHES, Launch, NodeStart, complete
 
 EXIT_NODE_ENDED = 1
@@ -96,7 +96,7 @@ def run(nodes: Sequence[NodeStart]) -> None:
     """Runs nodes until a signal comes or one of this package's nodes ends; then ends them all."""
     processes: list[ChildProcess] = []
     with TemporaryDirectory(prefix="nics_up_") as folder, end_nodes_by_signals():
-        commands = [command_of(node, Path(folder)) for node in nodes]
+        commands = [make_command(node, Path(folder)) for node in nodes]
         typer.echo(
             f"starting {', '.join(map(name_of, nodes))}; Ctrl-C ends all of them"
         )

@@ -253,8 +253,7 @@ def _format_world(
 
     Raises ConfigError that names the imported file, because the new one does not exist yet.
     """
-    from nics_drl_bridge.config import dump_yaml, parse_yaml, validate
-    from nics_drl_bridge.sim.world import World, check_places
+    from nics_drl_bridge.config import dump_yaml
 
     far = round(math.hypot(*size), 3)
     if {"starts", "goals"} <= set(values):
@@ -265,8 +264,17 @@ def _format_world(
     comments = [f"# {' '.join(line.split())}\n" for line in head]
     ordered = {key: values[key] for key in KEYS if key in values}
     text = "".join(comments) + dump_yaml(ordered, one_line_rows=True)
-    made = f"{file}: the world made of it"
     obstacles = sum(len(group["at"]) for group in values.get("obstacles", ()))
+    _read_back(file, text, obstacles)
+    return text
+
+
+def _read_back(file: Path, text: str, obstacles: int) -> None:
+    """Reads a world's text. Raises ConfigError that names the file from which it was made."""
+    from nics_drl_bridge.config import parse_yaml, validate
+    from nics_drl_bridge.sim.world import World, check_places
+
+    made = f"{file}: the world made of it"
     try:
         data = parse_yaml(text, made)
     except ConfigError:
@@ -275,11 +283,10 @@ def _format_world(
         reason = f"its {obstacles} bodies make a larger file than is read"
         fix = "leave some out by --without MODEL, or split the world"
         raise ConfigError(f"{file}: {reason}; {fix}.") from None
-    checked_world = validate(data, World, made)
-    if checked_world.map is None:
-        checked_world._file = made
-        check_places(checked_world)
-    return text
+    world = validate(data, World, made)
+    if world.map is None:
+        world._file = made
+        check_places(world)
 
 
 @world.command()

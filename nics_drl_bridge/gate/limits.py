@@ -126,9 +126,8 @@ def load_limits(name: str | Path, robot: RobotSpec) -> Limits:
     return limits
 
 
-def _check(key: str, limit: CommandLimit, variable: CommandVariable) -> None:
-    """Raises ConfigError for limits beyond the robot or a period, or too low for any motion."""
-    unit = variable.unit
+def _check_bounds(key: str, limit: CommandLimit, variable: CommandVariable) -> float:
+    """Returns the robot's range. Raises ConfigError for limits beyond it."""
     low = min(variable.min, 0.0)
     high = max(variable.max, 0.0)
     for name, value, beyond, bound in (
@@ -136,9 +135,15 @@ def _check(key: str, limit: CommandLimit, variable: CommandVariable) -> None:
         ("max", limit.max, limit.max > high, f"at most {high:g}"),
     ):
         if beyond:
-            fault = f"{value:g} {unit} is beyond the robot's own limit"
+            fault = f"{value:g} {variable.unit} is beyond the robot's own limit"
             raise ConfigError(f"{key}.{name}': {fault}; give {bound}.")
-    span = high - low
+    return high - low
+
+
+def _check(key: str, limit: CommandLimit, variable: CommandVariable) -> None:
+    """Raises ConfigError for limits beyond the robot or a period, or too low for any motion."""
+    unit = variable.unit
+    span = _check_bounds(key, limit, variable)
     far = max(-limit.min, limit.max)
     for name, order, per in (("rate", 1, "/s"), ("jerk", 2, "/s^2")):
         value = getattr(limit, name)

@@ -66,6 +66,14 @@ def _get_range_noise(lidar: LidarSpec) -> tuple[float, float]:
     return lidar.noise_std, lidar.faults.noise_proportional
 
 
+def _check_spans(values: Stopping) -> None:
+    for name, value in values.model_dump().items():
+        low, high = SHIELD_SPANS[name]
+        if not low <= value <= high:
+            needed = f"it must be from {low:g} to {high:g}"
+            raise ConfigError(f"parameter 'shield_{name}' is {value:g}; {needed}.")
+
+
 def shield_config(
     model: SimulatorModel,
     limits: Limits | None,
@@ -100,11 +108,7 @@ def shield_config(
             latency=braking.reaction_s, deceleration=min(braking.deceleration, HARDEST)
         )
     values = stopping.model_copy(update=dict(overrides))
-    for name, value in values.model_dump().items():
-        low, high = SHIELD_SPANS[name]
-        if not low <= value <= high:
-            needed = f"it must be from {low:g} to {high:g}"
-            raise ConfigError(f"parameter 'shield_{name}' is {value:g}; {needed}.")
+    _check_spans(values)
     lidar = model.lidar
     config = ShieldConfig(
         latency_s=values.latency,

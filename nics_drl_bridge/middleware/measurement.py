@@ -109,3 +109,19 @@ class Health:
     # used, but unusual (`odom: news`)
     noticed: dict[str, int] = field(default_factory=dict)
     replayed: int = 0  # number of late data, inserted at their stamps
+
+    def describe(self) -> dict[str, str]:
+        """Returns readable keys and values."""
+        values = {}
+        for topic, data in self.topics.items():
+            values[f"{topic} received"] = str(data.received)
+            values[f"{topic} rate [Hz]"] = f"{data.rate_hz:.3g}"
+            values[f"{topic} age [s]"] = f"{data.age_s:.3f}"
+            if not math.isnan(data.innovation):
+                values[f"{topic} innovation"] = f"{data.innovation:.3g}"
+        for rejection, count in self.rejected.items():
+            values[f"rejected, {rejection}"] = str(count)
+        for event, count in self.noticed.items():
+            values[f"noticed, {event}"] = str(count)
+        values["late and put in place"] = str(self.replayed)
+        return values

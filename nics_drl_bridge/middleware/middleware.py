@@ -350,6 +350,18 @@ class Middleware:
             odom_age_s=self.cache.age_s(ODOM, now_ns),
         )
 
+    def list_facts(self, now_ns: int) -> dict[str, Any]:
+        """Returns facts for `info`: the covariance of the pose (3, 3), and each newest datum.
+
+        Of a datum they hold its number, its stamp [ns] and the silence since it arrived [s].
+        """
+        facts: dict[str, Any] = {"covariance": self.estimator.covariance[:3, :3].copy()}
+        for topic, datum in self.cache.newest.items():
+            facts[f"{topic}_sequence"] = datum.sequence
+            facts[f"{topic}_stamp_ns"] = datum.stamp_ns
+            facts[f"{topic}_silence_s"] = (now_ns - datum.arrival_ns) * S_PER_NS
+        return facts
+
     def health(self, arrival_ns: int) -> Health:
         """Returns the health of all topics at a time of the receiver's clock [ns]."""
         cache = self.cache

@@ -36,7 +36,7 @@ from nics_drl_bridge.lidar.spec import from_device
 from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.nodes import qos, wire
-from nics_drl_bridge.nodes.conversions import sensor_from_ros, sensor_type
+from nics_drl_bridge.nodes.conversions import find_sensor_type, sensor_from_ros
 from nics_drl_bridge.nodes.link import (
     EpisodeServices,
     Inbox,
@@ -49,7 +49,6 @@ from nics_drl_bridge.nodes.parameters import (
     name_fleet,
 )
 from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
-from nics_drl_bridge.nodes.robot_topics import data_facts
 from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
 from nics_drl_bridge.sim.simulator import EpisodeSampler
 from nics_drl_bridge.sim.world_set import AnyWorld
@@ -188,7 +187,9 @@ class DdsBackend:
     def _subscribe(self) -> None:
         kinds = dict.fromkeys(self._topics, Odometry)
         kinds[SCAN] = LaserScan
-        kinds |= {name: sensor_type(sensor) for name, sensor in self._sensors.items()}
+        kinds |= {
+            name: find_sensor_type(sensor) for name, sensor in self._sensors.items()
+        }
         self._subscriptions = {}
         for topic, kind in kinds.items():
             # Callbacks hold no reference to the backend, so that it can be garbage-collected.
@@ -225,7 +226,7 @@ class DdsBackend:
         self._middleware.reset(stamp_ns, pose)
         view, _ = self.receive()
         odometry = self._inbox.messages[ODOM]
-        _, self._link.frame = read_message(ODOM, wire.frames_of, odometry.content)
+        _, self._link.frame = read_message(ODOM, wire.read_frames, odometry.content)
         return view
 
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
@@ -261,25 +262,28 @@ class DdsBackend:
         messages = self._inbox.messages
         self._check_stamps()
         scan = messages[SCAN]
-        device_ranges = read_message(SCAN, wire.ranges_of, scan.content)
+        device_ranges = read_message(SCAN, wire.read_ranges, scan.content)
         ranges = from_device(device_ranges, self._lidar)
         self._middleware.scan(self._now_ns, scan.arrival_ns, ranges)
-        for name, sensor in self._sensors.items():
-            read = partial(sensor_from_ros, sensor)
-            reading = read_message(name, read, messages[name].content)
-            arrival_ns = messages[name].arrival_ns
-            self._middleware.sense(name, self._now_ns, arrival_ns, reading)
+        self._take_readings()
         info: dict[str, Any] = {"stamp_ns": self._now_ns}
-        info |= data_facts(self._middleware, time.monotonic_ns())
+        info |= self._middleware.list_facts(time.monotonic_ns())
         if self._has_truth:
             true_pose, _ = read_message(
-                TRUTH, wire.odometry_of, messages[TRUTH].content
+                TRUTH, wire.read_odometry, messages[TRUTH].content
             )
             info["true_pose"] = true_pose
             self._facts["true_pose"] = true_pose
         view = self._middleware.view(self._now_ns)
         self._can_send = True
         return view, info
+
+    def _take_readings(self) -> None:
+        for name, sensor in self._sensors.items():
+            message = self._inbox.messages[name]
+            read = partial(sensor_from_ros, sensor)
+            reading = read_message(name, read, message.content)
+            self._middleware.sense(name, self._now_ns, message.arrival_ns, reading)
 
     def _wait_for_data(self) -> None:
         """Wait for the data of the step; have the simulator repeat what was lost on the way.
@@ -292,7 +296,7 @@ class DdsBackend:
         while True:
             if not is_estimated and self._inbox.has(ODOM, self._now_ns):
                 odometry = self._inbox.messages[ODOM]
-                measured = read_message(ODOM, wire.odometry_of, odometry.content)
+                measured = read_message(ODOM, wire.read_odometry, odometry.content)
                 arrival_ns = odometry.arrival_ns
                 self._middleware.odometry(odometry.stamp_ns, arrival_ns, *measured)
                 is_estimated = True

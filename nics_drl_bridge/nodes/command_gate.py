@@ -20,6 +20,7 @@ from std_msgs.msg import Bool
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.gate import inputs, scan_motion, shield
 from nics_drl_bridge.gate.black_box import Entry
+from nics_drl_bridge.gate.e_stop_queue import EStopQueue
 from nics_drl_bridge.gate.gate import decide
 from nics_drl_bridge.gate.limits import PERIOD_S, Limits, load_limits
 from nics_drl_bridge.gate.state import (
@@ -47,8 +48,8 @@ from nics_drl_bridge.nodes import (
     runner,
     wire,
 )
-from nics_drl_bridge.nodes.conversions import sensor_type
-from nics_drl_bridge.nodes.gate_inputs import TWIST, TWIST_STAMPED, EStopQueue, Sources
+from nics_drl_bridge.nodes.conversions import find_sensor_type
+from nics_drl_bridge.nodes.gate_inputs import TWIST, TWIST_STAMPED, Sources
 from nics_drl_bridge.nodes.gate_log import GateLog
 
 SIM_TIME = "use_sim_time"
@@ -69,7 +70,7 @@ REFUSED = (
 
 def declare_gate(node: Node, model: SimulatorModel) -> GateConfig:
     """Declare and read a gate's parameters, and log doubts. Raises ConfigError for a bad value."""
-    for name in sorted(parameters.SPLIT.keys() & qos.given_values(node).keys()):
+    for name in sorted(parameters.SPLIT.keys() & qos.get_given_values(node).keys()):
         raise ConfigError(f"parameter {name!r}: is now {parameters.SPLIT[name]}.")
     file = str(runner.declare_row(node, parameters.LIMITS))
     limits = load_limits(file, model.robot) if file else None
@@ -103,9 +104,9 @@ def _keep_clock(simulated: bool, parameters: list[Parameter]) -> SetParametersRe
 def _declare_rules(node: Node, model: SimulatorModel) -> dict[str, Any]:
     scan_age = max(GateConfig.scan_age_s, SCAN_PERIODS / model.lidar.rate)
     rules: dict[str, Any] = {
-        "odom_rate_declared": "odom_rate" in qos.given_values(node)
+        "odom_rate_declared": "odom_rate" in qos.get_given_values(node)
     }
-    for row in parameters.gate_rules(1.0 / model.control_period, scan_age):
+    for row in parameters.list_gate_rules(1.0 / model.control_period, scan_age):
         field = f"{row.name}_s" if row.name in parameters.RULES_IN_SECONDS else row.name
         rules[field] = runner.declare_row(node, row)
     return rules
@@ -180,10 +181,10 @@ class CommandGate(qos.BridgeNode):
         if self._config.shield is not None:
             shield.warm_up()
         scan_motion.warm_up(self._config)
-        self._stamped = bool(runner.declare_row(self, parameters.stamped()))
+        self._stamped = bool(runner.declare_row(self, parameters.make_stamped_row()))
         runner.declare_row(self, parameters.FOREIGN)
         self._frame = str(runner.declare_row(self, parameters.ROBOT_FRAME))
-        fault = parameters.frame_fault(
+        fault = parameters.find_frame_fault(
             self.get_parameters_by_prefix("").values(), parameters.ROBOT_FRAME.name
         )
         if fault:
@@ -192,7 +193,7 @@ class CommandGate(qos.BridgeNode):
         self._out = self.create_publisher(kind, CMD_VEL, qos.COMMAND)
         self._queue = EStopQueue()
         self._listen()
-        runner.steadily(self, PERIOD_S, self._tick)
+        runner.call_periodically(self, PERIOD_S, self._tick)
         runner.diagnose(self, "gate", self._look)
         priority = runner.declare_row(self, parameters.PRIORITY)
         refused = take_priority(priority)
@@ -211,7 +212,7 @@ class CommandGate(qos.BridgeNode):
             ),
         )
         kinds = ("none", TWIST, TWIST_STAMPED)
-        raw = device_parameters.choice(self, parameters.FOREIGN.name, kinds)
+        raw = device_parameters.get_choice(self, parameters.FOREIGN.name, kinds)
         raw_kind = command_types.name_of(stamped=raw != TWIST)
         command_types.TypeWatch(self, inputs.RAW, raw_kind, FOREIGN_SETTINGS)
         readers: tuple[tuple[Any, str, Callable[[bytes], inputs.Input], Any], ...] = (
@@ -220,7 +221,7 @@ class CommandGate(qos.BridgeNode):
             (Odometry, inputs.ESTIMATE, gate_inputs.read_estimate, qos.SENSOR),
             *(
                 (
-                    sensor_type(sensor),
+                    find_sensor_type(sensor),
                     sensor.name,
                     partial(gate_inputs.read_sensor, sensor),
                     qos.SENSOR,
@@ -273,7 +274,7 @@ class CommandGate(qos.BridgeNode):
     def _take_e_stop(self, content: bytes) -> None:
         """Decide on all waiting messages; a press comes first, so that it waits for no other."""
         contents = [content, *qos.take_waiting(self._button)]
-        self._queue.hear(time.monotonic(), len(contents))
+        self._queue.add(time.monotonic(), len(contents))
         messages = []
         for part in contents:
             try:
@@ -297,7 +298,7 @@ class CommandGate(qos.BridgeNode):
     def _read_odometry(self, content: bytes) -> inputs.Odometry:
         event = gate_inputs.read_odometry(content)
         if not self._frame:  # no parameter names it
-            self._frame = wire.frames_of(content)[1]
+            self._frame = wire.read_frames(content)[1]
         return event
 
     def _press(self) -> tuple[bool, str]:
@@ -326,7 +327,7 @@ class CommandGate(qos.BridgeNode):
         content = self._message(decision.twist)
         if not np.isfinite(decision.twist).all():
             self._out.publish(self._message(np.zeros(3)))
-            self._log.no_number(decision.twist.tolist())
+            self._log.report_not_finite(decision.twist.tolist())
             return inputs.Press()
         if decision.cause is None and time.monotonic() - now > STALE_S:
             return inputs.Tick()
@@ -335,9 +336,9 @@ class CommandGate(qos.BridgeNode):
 
     def _message(self, twist: Array) -> bytes:
         if not self._stamped:
-            return wire.twist_to_bytes(twist)
+            return wire.write_twist(twist)
         now_ns = int(self.get_clock().now().nanoseconds)
-        return wire.stamped_twist_to_bytes(twist, now_ns, self._frame)
+        return wire.write_stamped_twist(twist, now_ns, self._frame)
 
     def _look(self) -> runner.Condition:
         self._sources.count_publishers()
@@ -354,7 +355,7 @@ class CommandGate(qos.BridgeNode):
 
     def stop(self) -> None:
         """Leave a zero command behind."""
-        runner.last_word(self._out, self._message(np.zeros(3)))
+        runner.publish_last(self._out, self._message(np.zeros(3)))
         self._log.close()
 
 

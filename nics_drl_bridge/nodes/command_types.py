@@ -25,21 +25,21 @@ def name_of(stamped: bool) -> str:
     return TWIST_STAMPED if stamped else TWIST
 
 
-def heard_stamped(node: Node, topic: str) -> bool | None:
+def expect_stamped(node: Node, topic: str) -> bool | None:
     """True if the subscribers of a command topic expect TwistStamped; None if none, or mixed."""
     ends = node.get_subscriptions_info_by_topic(node.resolve_topic_name(topic))
     kinds = {end.topic_type for end in ends} & KINDS.keys()
     return kinds == {TWIST_STAMPED} if len(kinds) == 1 else None
 
 
-def deaf_subscribers(node: Node, topic: str, stamped: bool) -> str:
+def describe_deaf_subscribers(node: Node, topic: str, stamped: bool) -> str:
     """Return a clause about subscribers that expect another type; empty if there are none."""
     ends = node.get_subscriptions_info_by_topic(node.resolve_topic_name(topic))
     kinds = sorted({end.topic_type for end in ends} - {name_of(stamped)})
     if not kinds:
         return ""
     names = sorted(
-        {qos.owner(end) or "somebody" for end in ends if end.topic_type in kinds}
+        {qos.find_owner(end) or "somebody" for end in ends if end.topic_type in kinds}
     )
     return f"{', '.join(names)} expects {' and '.join(kinds)} there, not {name_of(stamped)}"
 
@@ -63,12 +63,12 @@ class TypeWatch:
         self._heard = heard
         self._settings = settings
         self._warned: set[tuple[str, str]] = set()
-        self._timer = runner.steadily(node, LOOK_S, self._look)
+        self._timer = runner.call_periodically(node, LOOK_S, self._look)
 
     def _look(self) -> None:
         for end in self._node.get_publishers_info_by_topic(self._topic):
             kind = end.topic_type
-            who = qos.owner(end)
+            who = qos.find_owner(end)
             if who is None or kind == self._heard or (who, kind) in self._warned:
                 continue
             self._warned.add((who, kind))

@@ -1,7 +1,6 @@
 """Conversion of messages to data and back, in pairs `x_to_ros`, `x_from_ros`; types by name."""
 
 import array
-import contextlib
 import math
 import re
 import sys
@@ -35,8 +34,6 @@ PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
 INITIAL_POSE = "initialpose"  # topic, as RViz sends it
 # variance of z, roll and pitch, which a planar robot does not measure
 UNUSED_VARIANCE = 1e6
-# the type of a field in a `.msg` file
-FIELD = re.compile(r"^\s*([A-Za-z][A-Za-z0-9_]*(?:/[A-Za-z0-9_/]+)?)")
 
 
 def stamp_to_ros(time_ns: int) -> Time:
@@ -59,7 +56,7 @@ def heading_to_ros(heading: float) -> geometry.Quaternion:
     return geometry.Quaternion(z=math.sin(heading / 2.0), w=math.cos(heading / 2.0))
 
 
-def heading_of(x: float, y: float, z: float, w: float) -> float:
+def compute_heading(x: float, y: float, z: float, w: float) -> float:
     """Return the heading [rad] of a quaternion given by its components."""
     return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
@@ -149,7 +146,9 @@ def pose_from_ros(
     return np.array(messages.read_whole_pose(message)), covariance
 
 
-def initial_pose(message: geometry.PoseWithCovarianceStamped, map_frame: str) -> Array:
+def read_initial_pose(
+    message: geometry.PoseWithCovarianceStamped, map_frame: str
+) -> Array:
     """Return the pose (3,) of `initialpose` in the map. Raises ConfigError if it can't be used."""
     frame = message.header.frame_id.strip("/")
     pose = pose_from_ros(message)[0]
@@ -202,7 +201,7 @@ def map_from_ros(message: OccupancyGrid) -> GridMap:
         )
     place = info.origin.position
     turn = info.origin.orientation
-    origin = place.x, place.y, heading_of(turn.x, turn.y, turn.z, turn.w)
+    origin = place.x, place.y, compute_heading(turn.x, turn.y, turn.z, turn.w)
     return GridMap(
         cells.reshape(info.height, info.width), float(info.resolution), origin
     )
@@ -237,7 +236,7 @@ class JointWriter:
         )
 
 
-def message_type(kind: str) -> Any | None:
+def find_message_type(kind: str) -> Any | None:
     """Return the class of a type like `nav_msgs/msg/Odometry`; None if it is not installed.
 
     The name may come from any program on the network, so only packages with messages are imported.
@@ -265,12 +264,12 @@ def _has_interfaces(package: str, interface: str) -> bool:
 
 def transforms_type() -> Any | None:
     """Return the class of the messages on `/tf`; None if its package is not installed."""
-    return message_type(TRANSFORMS)
+    return find_message_type(TRANSFORMS)
 
 
-def sensor_type(sensor: Sensor) -> Any:
+def find_sensor_type(sensor: Sensor) -> Any:
     """Return the class of a further sensor's message. Raises ConfigError if it is missing."""
-    kind = message_type(sensor.message)
+    kind = find_message_type(sensor.message)
     if kind is None:
         missing = f"the message {sensor.message} is not installed; install its package"
         raise ConfigError(
@@ -283,48 +282,16 @@ def sensor_to_ros(
     sensor: Sensor, reading: NDArray[np.float32], time_ns: int, frame: str
 ) -> Any:
     """Return a reading (S,) of a further sensor as its message."""
-    message = sensor_type(sensor)(header=header_to_ros(time_ns, frame))
+    message = find_sensor_type(sensor)(header=header_to_ros(time_ns, frame))
     sensor.write(message, reading)
     return message
 
 
 def sensor_from_ros(sensor: Sensor, content: bytes) -> NDArray[np.float32]:
     """Return the reading (S,) of a serialised message. Raises ValueError for another type."""
-    kind = sensor_type(sensor)
+    kind = find_sensor_type(sensor)
     try:
         message = deserialize_message(content, kind)
     except Exception as error:  # noqa: BLE001  (rclpy raises no public class)
         raise ValueError(f"is not a {sensor.message} ({error})") from None
     return sensor.read(message)
-
-
-def message_texts(kind: str) -> dict[str, str]:
-    """Return the `.msg` texts of a type and of the types in it, as far as they are installed."""
-    texts: dict[str, str] = {}
-    waiting = [kind]
-    while waiting:
-        kind = waiting.pop()
-        file = _message_file(kind)
-        if kind in texts or file is None:
-            continue
-        texts[kind] = file.read_text(encoding="utf-8")
-        for field in filter(None, map(FIELD.match, texts[kind].splitlines())):
-            package, _, name = field[1].rpartition("/")
-            if package or name[0].isupper():
-                folder = (package or kind).split("/")[0]
-                waiting.append(f"{folder}/msg/{name}")
-    return texts
-
-
-def _message_file(kind: str) -> Path | None:
-    from ament_index_python.search_paths import get_search_paths
-
-    package, _, name = kind.split("/")
-    prefixes = [sys.prefix]
-    # the variable is not set if ROS 2 comes from wheels
-    with contextlib.suppress(OSError):
-        prefixes = [*get_search_paths(), sys.prefix]
-    files = (
-        Path(prefix) / "share" / package / "msg" / f"{name}.msg" for prefix in prefixes
-    )
-    return next((file for file in files if file.is_file()), None)

@@ -1,6 +1,5 @@
 """Parameters of a device node: devices, frames, episodes, and the rates of world and topics."""
 
-import math
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -17,19 +16,16 @@ from nics_drl_bridge.nodes.parameters import (
     LOCKSTEP,
     MODES,
     ROBOTS,
-    device,
-    frame_fault,
+    find_frame_fault,
+    list_device_rows,
     name_fleet,
 )
 from nics_drl_bridge.nodes.runner import declare_row, get_number, get_text
 from nics_drl_bridge.robot.noise import Delay
+from nics_drl_bridge.sim.pacing import find_common_step
 from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
 
 START = "episode_start"
-# fraction of a step by which it may be early, because timers are no more precise
-SLACK = 0.1
-# a backlog longer than this is dropped instead of made up for [ns]
-PATIENCE_NS = NS_PER_S // 2
 
 
 class DeviceTiming(NamedTuple):
@@ -69,22 +65,22 @@ def declare_device(node: Node, laser_frame: str) -> None:
     node.declare_parameter(ROBOTS.name, ROBOTS.default, fleet)
     # Added before the others are declared, so that it also checks the values at startup.
     node.add_on_set_parameters_callback(partial(_check_episode, node))
-    for row in device(laser_frame):
+    for row in list_device_rows(laser_frame):
         declare_row(node, row)
-    fault = frame_fault(node.get_parameters_by_prefix("").values())
+    fault = find_frame_fault(node.get_parameters_by_prefix("").values())
     if fault:
         raise ConfigError(fault)
 
 
-def randomisation(node: Node) -> Randomisation | None:
+def get_randomisation(node: Node) -> Randomisation | None:
     """Return the randomisation of each episode, if any. Raises ConfigError."""
     name = get_text(node, "randomisation")
     return load_randomisation(name) if name else None
 
 
-def timing(node: Node, model: SimulatorModel) -> DeviceTiming:
+def get_timing(node: Node, model: SimulatorModel) -> DeviceTiming:
     """Return the timing given by the parameters; in lock-step, by the model alone."""
-    mode = choice(node, "mode", MODES)
+    mode = get_choice(node, "mode", MODES)
     if mode == LOCKSTEP:
         period = round(model.control_period * NS_PER_S)
         return DeviceTiming(mode, 1.0, period, period, period, (0, 0), (0, 0))
@@ -92,26 +88,34 @@ def timing(node: Node, model: SimulatorModel) -> DeviceTiming:
     dt = model.timing.dt
     odom = 1.0 / rate if rate else model.control_period
     scan = 1.0 / (get_number(node, "scan_rate") or model.lidar.rate)
-    step = common_step(dt, (odom, scan)) * dt
+    step = find_common_step(dt, (odom, scan)) * dt
     step_ns, odom_ns, scan_ns = (
         round(seconds * NS_PER_S) for seconds in (step, odom, scan)
     )
-    late = []
-    for topic in ("scan", "odom"):
-        delay = model.latency.measured.get(topic, Delay(least=0.0, jitter=0.0))
-        least = get_number(node, f"{topic}_latency")
-        jitter = get_number(node, "latency_jitter")
-        chosen = (
-            least if least >= 0.0 else delay.least,
-            jitter if jitter >= 0.0 else delay.jitter,
-        )
-        late.append((round(chosen[0] * NS_PER_S), round(chosen[1] * NS_PER_S)))
     return DeviceTiming(
-        mode, get_number(node, "rate"), step_ns, odom_ns, scan_ns, *late
+        mode,
+        get_number(node, "rate"),
+        step_ns,
+        odom_ns,
+        scan_ns,
+        scan_late_ns=_get_delay(node, model, "scan"),
+        odom_late_ns=_get_delay(node, model, "odom"),
     )
 
 
-def timed_model(
+def _get_delay(node: Node, model: SimulatorModel, topic: str) -> tuple[int, int]:
+    """Return the minimum delay of a topic and the maximum additional one [ns]."""
+    delay = model.latency.measured.get(topic, Delay(least=0.0, jitter=0.0))
+    least = get_number(node, f"{topic}_latency")
+    jitter = get_number(node, "latency_jitter")
+    if least < 0.0:
+        least = delay.least
+    if jitter < 0.0:
+        jitter = delay.jitter
+    return round(least * NS_PER_S), round(jitter * NS_PER_S)
+
+
+def apply_timing(
     node: Node, model: SimulatorModel, time: DeviceTiming
 ) -> SimulatorModel:
     """Return the model with the step of the world and the requested latency."""
@@ -129,7 +133,7 @@ def timed_model(
     return replace(model, control_period=steps * dt)
 
 
-def choice(node: Node, name: str, valid: tuple[str, ...]) -> str:
+def get_choice(node: Node, name: str, valid: tuple[str, ...]) -> str:
     """Return a parameter that must be one of `valid`. Raises ConfigError with the nearest word."""
     value = get_text(node, name)
     if value not in valid:
@@ -139,7 +143,7 @@ def choice(node: Node, name: str, valid: tuple[str, ...]) -> str:
     return value
 
 
-def frames(node: Node, namespace: str) -> Frames:
+def get_frames(node: Node, namespace: str) -> Frames:
     """Return the frames of a robot; in a fleet all but the map begin with its namespace."""
     prefix = get_text(node, "frame_prefix") + (f"{namespace}/" if namespace else "")
     world, *names = (get_text(node, f"{frame}_frame") for frame in Frames._fields[:-1])
@@ -163,61 +167,7 @@ def _check_episode(node: Node, parameters: list[Parameter]) -> SetParametersResu
     return SetParametersResult(successful=not reason, reason=reason)
 
 
-def episode_start(node: Node) -> Array | None:
+def get_episode_start(node: Node) -> Array | None:
     """Return x, y, heading of each robot (3 M,) for the next episode; None: by its seed."""
     start = np.array(node.get_parameter(START).value, dtype=np.float64)
     return None if np.isnan(start).all() else start
-
-
-class TopicPace:
-    """Decides when a topic is due, so that its mean rate is as requested with any step."""
-
-    def __init__(self, period_ns: int, step_ns: int) -> None:
-        self._period_ns = period_ns
-        self._slack_ns = step_ns // 2 if period_ns > step_ns else 0
-        self._next_ns = 0
-
-    def begin(self, now_ns: int) -> None:
-        """Restart: the next message is due now."""
-        self._next_ns = now_ns
-
-    def due(self, now_ns: int) -> bool:
-        """True if a message is due at a time; it then counts as sent."""
-        if now_ns + self._slack_ns < self._next_ns:
-            return False
-        self._next_ns += self._period_ns
-        return True
-
-
-def common_step(dt: float, periods: tuple[float, ...]) -> int:
-    """Return the longest step, in steps `dt` of the model [s], that suits the periods [s] best."""
-    return math.gcd(*(max(1, round(period / dt)) for period in periods))
-
-
-class RealTime:
-    """Tracks by how many steps the world is behind the steady clock."""
-
-    def __init__(self, step_ns: int, rate: float) -> None:
-        self._step_ns = step_ns
-        self._rate = rate
-        self._began_ns = self._then_ns = 0
-
-    def begin(self, steady_ns: int, now_ns: int) -> None:
-        """Align a time of the steady clock with a simulated time."""
-        self._began_ns = steady_ns
-        self._then_ns = now_ns
-
-    def time_at(self, steady_ns: int) -> int:
-        """Return the simulated time [ns] at a time of the steady clock."""
-        return self._then_ns + int((steady_ns - self._began_ns) * self._rate)
-
-    def behind(self, steady_ns: int, now_ns: int) -> int:
-        """Return the steps due at a time of the steady clock, for a world at `now_ns`."""
-        missing_ns = self.time_at(steady_ns) - now_ns
-        return max(0, int((missing_ns + SLACK * self._step_ns) // self._step_ns))
-
-    def lost(self, steady_ns: int, now_ns: int) -> bool:
-        """True if the world is too far behind to catch up with real time."""
-        return (
-            self.time_at(steady_ns) - now_ns - self._step_ns > PATIENCE_NS * self._rate
-        )

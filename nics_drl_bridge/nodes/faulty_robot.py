@@ -4,7 +4,7 @@ import math
 import multiprocessing
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -35,7 +35,7 @@ class NoMotionError(RuntimeError):
     """The gate was armed, but no command that moves the robot came."""
 
 
-def driver_context(domain_id: int | None) -> Context:
+def open_driver_context(domain_id: int | None) -> Context:
     """Return a context as another vendor's driver has it, with shared memory."""
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     context = Context()
@@ -44,15 +44,16 @@ def driver_context(domain_id: int | None) -> Context:
 
 
 def hear(domain_id: int | None, out: Connection) -> None:
-    """Send when each `cmd_vel` came [s] and its twist, as the base hears it.
+    """Send the time [s] at which the base hears each `cmd_vel`, its twist, and its stamp [ns].
 
-    Ends with the process that started it, even if that is killed.
+    The stamp is that of its writing. Ends with the process that started it, even if that is killed.
     """
-    context = driver_context(domain_id)
+    context = open_driver_context(domain_id)
     node = Node("base", context=context, start_parameter_services=False)
 
-    def tell(message: Twist) -> None:
-        out.send((time.monotonic(), conversions.twist_from_ros(message)))
+    def tell(message: Twist, info: Mapping[str, Any]) -> None:
+        twist = conversions.twist_from_ros(message)
+        out.send((time.monotonic(), twist, info["source_timestamp"]))
 
     node.create_subscription(Twist, "cmd_vel", tell, qos.COMMAND)
     executor = SingleThreadedExecutor(context=context)
@@ -93,7 +94,7 @@ class Robot(SpunNode):
             skip: only one in so many scans, heartbeats and commands is sent.
             sensors: quality of service of scan and odometry.
         """
-        super().__init__("robot", context=driver_context(domain_id))
+        super().__init__("robot", context=open_driver_context(domain_id))
         kinds = {
             "odom": (Odometry, sensors),
             "scan": (LaserScan, sensors),
@@ -144,6 +145,9 @@ class Robot(SpunNode):
         self.stuck = False  # odometry shows no motion
         self.republished = False  # the policy's last command is sent again and again
         self.jump_ns = 0  # of all stamps
+        self.since_ns = (
+            0  # commands that were written before are not heard, on the system clock
+        )
 
     def _hear_policy(self, message: TwistStamped) -> None:
         if self._policy and not self.republished:
@@ -206,7 +210,9 @@ class Robot(SpunNode):
 
         def is_done() -> object:
             while self._ear.poll():
-                self.heard.append(self._ear.recv())
+                arrival_s, twist, written_ns = self._ear.recv()
+                if written_ns >= self.since_ns:
+                    self.heard.append((arrival_s, twist))
             return done()
 
         return super().until(is_done, seconds)

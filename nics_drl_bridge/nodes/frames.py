@@ -14,7 +14,7 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.message_packages import how_to_install
+from nics_drl_bridge.nodes.message_packages import explain_install
 from nics_drl_bridge.nodes.runner import get_text
 from nics_drl_bridge.recording import messages
 
@@ -42,7 +42,7 @@ def transform_from_ros(message: TransformStamped) -> tuple[str, str, Array]:
     return *messages.get_frames(message), np.array(messages.read_pose(message))
 
 
-def odom_in_map(in_map: ArrayLike, in_odom: ArrayLike) -> Array:
+def compute_odom_in_map(in_map: ArrayLike, in_odom: ArrayLike) -> Array:
     """Return the pose (3,) of `odom` in `map`, from a robot's poses (3,) in both."""
     return geometry.compose(in_map, geometry.between(in_odom, np.zeros(3)))
 
@@ -64,7 +64,7 @@ class MapToOdom:
             reason = (
                 "the package tf2_msgs is not installed, so map -> odom is not published"
             )
-            node.get_logger().warning(f"{reason}; {how_to_install('tf2_msgs')}.")
+            node.get_logger().warning(f"{reason}; {explain_install('tf2_msgs')}.")
             return
         self._publisher = node.create_publisher(self._kind, "/tf", qos.TRANSFORMS)
         self._subscription = node.create_subscription(
@@ -144,9 +144,9 @@ class GoalFrames:
     def _map(self) -> str:
         return get_text(self._node, "map_frame")
 
-    def robot_in(self, frame: str) -> Array | None:
+    def locate_robot(self, frame: str) -> Array | None:
         """Return the robot's pose (3,) in the map or `odom`; None while it is unknown."""
-        reported = self._topics.in_odom()
+        reported = self._topics.locate_in_odom()
         if reported is None or frame == self._topics.frames[0].strip("/"):
             return reported
         if frame not in ("", self._map):
@@ -167,11 +167,11 @@ class GoalFrames:
             raise ConfigError(f"goal_pose: {error}") from None
         # by a localiser, if there is one; else by the estimate
         if frame == self._map:
-            robot = None if self._odom is None else self.robot_in(self._map)
+            robot = None if self._odom is None else self.locate_robot(self._map)
             if robot is None:
                 return place[:2]
         else:
-            robot = self._topics.in_odom()
+            robot = self._topics.locate_in_odom()
             if robot is None:
                 raise ConfigError(
                     "goal_pose: its place is unknown until odometry arrives; wait for it."
@@ -194,7 +194,7 @@ class GoalFrames:
             if frame in ("", self._map):
                 return self._map, places
             if frame in bases or (frame == odom and odom):
-                reported = self._topics.in_odom()
+                reported = self._topics.locate_in_odom()
                 if reported is None or not self._topics.located:
                     why = f"a goal in the frame {asked!r} is refused"
                     why = f"{why}, because the robot's pose is not known yet"
@@ -214,6 +214,6 @@ class GoalFrames:
         heard = "one that /tf_static joins to them"
         if self._transforms is None:
             heard = "one that /tf_static joins to them, which needs tf2_msgs"
-            heard = f"{heard} ({how_to_install('tf2_msgs')})"
+            heard = f"{heard} ({explain_install('tf2_msgs')})"
         why = f"a goal in the frame {asked!r} is refused: the frame is not known here"
         raise ConfigError(f"{why}; give it in {names}, or {heard}.")

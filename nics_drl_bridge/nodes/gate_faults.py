@@ -6,6 +6,7 @@ the last good datum before the fault, or from the fault itself where it is an ev
 of a zero on `cmd_vel`.
 """
 
+import itertools
 import math
 import os
 import signal
@@ -13,7 +14,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass, field, replace
-from itertools import groupby, product
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +57,8 @@ class Around:
 
 
 Injection = Callable[[Around], object]
+# Returns what is sent instead of a message, from it, the last one before the fault, and its number.
+Change = Callable[[Any, Any, int], Any]
 
 
 @dataclass(frozen=True)
@@ -102,103 +104,88 @@ def _silence(*topics: str) -> Injection:
     return lambda around: around.robot.silent.update(topics)
 
 
-def _twist(x: float, turn: float) -> Injection:
-    def change(message: TwistStamped) -> TwistStamped:
-        message.twist = conversions.twist_to_ros([x, 0.0, turn])
-        return message
-
-    return lambda around: around.robot.change.update({"cmd_vel_raw": change})
-
-
-def _stamp(topic: str, off_s: float, growing: bool = False) -> Injection:
-    """Move a topic's stamps; further with each message, if wanted."""
+def _change(topic: str, change: Change) -> Injection:
+    """Change each further message of a topic."""
 
     def inject(around: Around) -> None:
-        sent = [0]
-
-        def change(message: Any) -> Any:
-            sent[0] += 1
-            off = off_s * (sent[0] if growing else 1)
-            stamp = conversions.stamp_from_ros(message.header.stamp) + round(
-                off * NS_PER_S
-            )
-            message.header.stamp = conversions.stamp_to_ros(stamp)
-            return message
-
-        around.robot.change[topic] = change
+        held = around.robot.last.get(topic)
+        numbers = itertools.count(1)
+        around.robot.change[topic] = lambda message: change(
+            message, held, next(numbers)
+        )
 
     return inject
+
+
+def _replace_command(x: float) -> Injection:
+    def change(message: TwistStamped, *_: object) -> TwistStamped:
+        message.twist = conversions.twist_to_ros([x, 0.0, 0.0])
+        return message
+
+    return _change("cmd_vel_raw", change)
+
+
+def _shift_stamps(topic: str, off_s: float, growing: bool = False) -> Injection:
+    """Move a topic's stamps; further with each message, if wanted."""
+
+    def change(message: Any, _: object, number: int) -> Any:
+        off_ns = round(off_s * (number if growing else 1) * NS_PER_S)
+        stamp_ns = conversions.stamp_from_ros(message.header.stamp) + off_ns
+        message.header.stamp = conversions.stamp_to_ros(stamp_ns)
+        return message
+
+    return _change(topic, change)
 
 
 def _freeze(topic: str, stamped: bool = False) -> Injection:
     """Repeat the last good message, as a frozen driver does; with the stamp of now if wanted."""
 
-    def inject(around: Around) -> None:
-        held = around.robot.last[topic]
+    def change(message: Any, held: Any, _: int) -> Any:
+        if stamped:
+            held.header.stamp = message.header.stamp
+        return held
 
-        def change(message: Any) -> Any:
-            if stamped:
-                held.header.stamp = message.header.stamp
-            return held
-
-        around.robot.change[topic] = change
-
-    return inject
+    return _change(topic, change)
 
 
-def _alternate(around: Around) -> None:
+def _alternate_scans(around: Around) -> None:
     """Show two pictures in turn, as of a driver that swaps two buffers."""
-    shown = [list(around.robot.last["scan"].ranges)]
-    sent = [0]
+    shown = [around.robot.last["scan"].ranges]
 
-    def change(message: LaserScan) -> LaserScan:
-        if len(shown) < 2:
-            shown.append(list(message.ranges))
-        sent[0] += 1
-        message.ranges = shown[sent[0] % 2]
+    def change(message: LaserScan, _: object, number: int) -> LaserScan:
+        if number == 1:
+            shown.append(message.ranges)
+        message.ranges = shown[number % 2]
         return message
 
-    around.robot.change["scan"] = change
+    _change("scan", change)(around)
 
 
-def _freeze_but_one(around: Around) -> None:
+def _freeze_but_one(message: LaserScan, held: LaserScan, number: int) -> LaserScan:
     """Show the same picture, in which one beam flickers."""
-    shown = list(around.robot.last["scan"].ranges)
-    sent = [0]
-
-    def change(message: LaserScan) -> LaserScan:
-        sent[0] += 1
-        message.ranges = [shown[0] + 1e-3 * sent[0], *shown[1:]]
-        return message
-
-    around.robot.change["scan"] = change
+    message.ranges = [held.ranges[0] + 1e-3 * number, *held.ranges[1:]]
+    return message
 
 
-def _few_beams(around: Around) -> None:
-    def change(message: LaserScan) -> LaserScan:
-        message.ranges = message.ranges[:100]
-        return message
-
-    around.robot.change["scan"] = change
+def _cut_beams(message: LaserScan, *_: object) -> LaserScan:
+    message.ranges = message.ranges[:100]
+    return message
 
 
-def _nan_scan(around: Around) -> None:
-    def change(message: LaserScan) -> LaserScan:
-        message.ranges = [float("nan")] * len(message.ranges)
-        return message
-
-    around.robot.change["scan"] = change
+def _clear_scan(message: LaserScan, *_: object) -> LaserScan:
+    message.ranges = [float("nan")] * len(message.ranges)
+    return message
 
 
-def _teleport(x: float, y: float) -> Injection:
+def _move_odometry(x: float, y: float) -> Injection:
     """Show the robot elsewhere by odometry from now on."""
 
-    def change(message: Odometry) -> Odometry:
+    def change(message: Odometry, *_: object) -> Odometry:
         message.pose.pose.position.x += x
         message.pose.pose.position.y += y
         return message
 
-    return lambda around: around.robot.change.update({"odom": change})
+    return _change("odom", change)
 
 
 def _jump(seconds: int) -> Injection:
@@ -217,11 +204,16 @@ def _signal(how: signal.Signals, republished: bool = False) -> Injection:
 
 
 def _freeze_gate(around: Around) -> None:
-    """Stop the gate itself for a while; what it said before is heard before it goes on."""
+    """Stop the gate itself for a while.
+
+    What it wrote before does not count, although the middleware, which stops with it, may send the
+    last command only when it goes on.
+    """
     if around.gate is not None:
         os.kill(around.gate.pid, signal.SIGSTOP)
         around.robot.until(lambda: False, FROZEN_S)
         around.robot.heard.clear()
+        around.robot.since_ns = time.time_ns()
         os.kill(around.gate.pid, signal.SIGCONT)
 
 
@@ -233,8 +225,12 @@ FAULTS: dict[str, Fault] = {
     ),
     "scan_silent": Fault(LATE_S, _silence("scan"), "scan"),
     "odom_silent": Fault(LATE_S, _silence("odom"), "odom"),
-    "nan_scan": Fault(LATE_S, _nan_scan, "scan"),
-    "clock_jump": Fault(LATE_S, (_jump(10), _jump(-10), _jump(1), _jump(-1)), "scan"),
+    "nan_scan": Fault(LATE_S, _change("scan", _clear_scan), "scan"),
+    "clock_jump": Fault(
+        LATE_S,
+        (_jump(10), _jump(-10), _jump(1), _jump(-1)),
+        "scan",
+    ),
     "e_stop": Fault(
         SOON_S,
         (
@@ -246,27 +242,30 @@ FAULTS: dict[str, Fault] = {
     "all_silent": Fault(LATE_S, _silence(*ALL), "scan"),
     "command_silent": Fault(LATE_S, _silence("cmd_vel_raw"), "cmd_vel_raw"),
     "command_frozen": Fault(LATE_S, _freeze("cmd_vel_raw"), "cmd_vel_raw"),
-    "command_nan": Fault(LATE_S, _twist(float("nan"), 0.0), "cmd_vel_raw"),
-    "command_inf": Fault(LATE_S, _twist(float("inf"), 0.0), "cmd_vel_raw"),
-    "command_absurd": Fault(LATE_S, _twist(1e9, 0.0), "cmd_vel_raw"),
+    "command_nan": Fault(LATE_S, _replace_command(math.nan), "cmd_vel_raw"),
+    "command_inf": Fault(LATE_S, _replace_command(math.inf), "cmd_vel_raw"),
+    "command_absurd": Fault(LATE_S, _replace_command(1e9), "cmd_vel_raw"),
     "command_from_the_future": Fault(
-        LATE_S, _stamp("cmd_vel_raw", 3600.0), "cmd_vel_raw"
+        LATE_S, _shift_stamps("cmd_vel_raw", 3600.0), "cmd_vel_raw"
     ),
-    "scan_of_another_lidar": Fault(LATE_S, _few_beams, "scan"),
+    "scan_of_another_lidar": Fault(LATE_S, _change("scan", _cut_beams), "scan"),
     "scan_stamps_frozen": Fault(LATE_S, _freeze("scan"), "scan"),
-    "scan_from_the_future": Fault(LATE_S, _stamp("scan", 3600.0), "scan"),
+    "scan_from_the_future": Fault(LATE_S, _shift_stamps("scan", 3600.0), "scan"),
     "stamps_run_ahead": Fault(
         LATE_S,
-        (_stamp("scan", 0.35, growing=True), _stamp("odom", 0.35, growing=True)),
+        (
+            _shift_stamps("scan", 0.35, growing=True),
+            _shift_stamps("odom", 0.35, growing=True),
+        ),
         "scan",
     ),
-    "stamps_creep": Fault(1.20, _stamp("scan", 0.02, growing=True), "scan"),
+    "stamps_creep": Fault(1.20, _shift_stamps("scan", 0.02, growing=True), "scan"),
     "odom_teleports": Fault(
-        LATE_S, (_teleport(3.0, 0.0), _teleport(0.0, -1.0)), "odom"
+        LATE_S, (_move_odometry(3.0, 0.0), _move_odometry(0.0, -1.0)), "odom"
     ),
     "scan_frozen": Fault(1.50, _freeze("scan", stamped=True), "scan"),
-    "scan_alternates": Fault(1.50, _alternate, "scan"),
-    "scan_frozen_but_one_beam": Fault(1.50, _freeze_but_one, "scan"),
+    "scan_alternates": Fault(1.50, _alternate_scans, "scan"),
+    "scan_frozen_but_one_beam": Fault(1.50, _change("scan", _freeze_but_one), "scan"),
     "no_motion": Fault(1.10, lambda around: setattr(around.robot, "stuck", True)),
     "gate_frozen": Fault(FROZEN_S + LATE_S, _freeze_gate, first_word=True),
 }
@@ -287,20 +286,77 @@ def inject(setup: Setup, around: Around, name: str, number: int) -> Injected:
     good_s = broken_s
     if fault.since:
         good_s = min(robot.sent_s[fault.since], broken_s)
-    moving_s = [when for when, twist in robot.heard if twist.any()]
-    zeros_s = [when for when, twist in robot.heard if not twist.any()]
-    if fault.first_word:
-        first_s = min(zeros_s, default=math.inf)
-        moving_s = [when for when in moving_s if when < first_s]
-    last_s = max(moving_s, default=broken_s)
-    stopped_s = min((when for when in zeros_s if when > last_s), default=math.inf)
+    stopped_s, unsafe = judge_commands(fault, robot.heard, good_s, broken_s)
     if around.gate is not None and around.gate.poll() is not None:
         stopped_s = math.inf  # a fault must not end the gate
-    late = [when for when in moving_s if when - good_s > fault.limit_s]
-    unsafe = len(moving_s) if fault.first_word else len(late)
     for _, twist in robot.heard:
         unsafe += not ((twist >= setup.low) & (twist <= setup.high)).all()
     return Injected(stopped_s - good_s, stopped_s - broken_s, int(unsafe))
+
+
+def judge_commands(
+    fault: Fault, heard: Sequence[tuple[float, Array]], good_s: float, broken_s: float
+) -> tuple[float, int]:
+    """Return when the robot was told to stop for good [s], and how many commands came too late.
+
+    `heard` holds times [s] and twists of commands since the fault.
+    """
+    moving_s = [when for when, twist in heard if twist.any()]
+    zeros_s = [when for when, twist in heard if not twist.any()]
+    late_s = [when for when in moving_s if when - good_s > fault.limit_s]
+    if fault.first_word:
+        first_s = min(zeros_s, default=math.inf)
+        moving_s = late_s = [when for when in moving_s if when < first_s]
+    last_s = max(moving_s, default=broken_s)
+    stopped_s = min((when for when in zeros_s if when > last_s), default=math.inf)
+    return stopped_s, len(late_s)
+
+
+class Surroundings(ExitStack):
+    """A robot, and the processes around it, which are started again once they have ended."""
+
+    def __init__(self, setup: Setup, name: str, tell: Callable[[str], None]) -> None:
+        super().__init__()
+        self._setup = setup
+        self._name = name
+        self._tell = tell
+        self._domain_id = free_domain_id()
+        self._needs_policy = FAULTS[name].policy
+        self._gates = self.enter_context(ExitStack())
+        self._gate: NodeProcess | None = None
+        self._robot = Robot(
+            self._domain_id,
+            open_model(setup.model),
+            setup.twist,
+            self._needs_policy,
+            relayed=not setup.gated,
+        )
+        self.callback(self._robot.close)
+        self._policies = self.enter_context(ExitStack())
+        self._policy: NodeProcess | None = None
+
+    def prepare(self, folder: Path) -> Around:
+        """Start what is missing, with its logs in a folder; return what an injection can break."""
+        if self._setup.gated and not _is_alive(self._gate):
+            if self._gate is not None:
+                self._tell(f"{self._name}: the gate has ended, and another is started")
+            self._gates.close()
+            gate = _start_gate(self._setup, folder, self._domain_id)
+            self._gate = self._gates.enter_context(gate)
+        if self._needs_policy and not _is_alive(self._policy):
+            self._policies.close()
+            policy = _start_policy(self._setup, folder, self._domain_id)
+            self._policy = self._policies.enter_context(policy)
+        return Around(self._robot, self._policy, self._gate)
+
+    def give_up_policy(self, error: Exception) -> None:
+        """Have another policy started: one that was killed may leave DDS ill."""
+        self._tell(f"{self._name}: {error}. {_read_log(self._policy)}")
+        self._policy = None
+
+    def __exit__(self, *details: Any) -> bool | None:
+        _is_alive(self._policy)  # one that is stopped would not end
+        return super().__exit__(*details)
 
 
 def inject_all(
@@ -310,51 +366,27 @@ def inject_all(
 
     `tell` gets a line if an attempt fails. A policy or a gate that has ended is started again.
     """
-    domain_id = free_domain_id()
-    fault = FAULTS[name]
-    policy_parameters: dict[str, Any] = {"model": setup.model, "goal": [*setup.goal]}
-    if setup.policy:
-        policy_parameters["policy"] = setup.policy
-    with ExitStack() as stack:
-        gates = stack.enter_context(ExitStack())
-        gate: NodeProcess | None = None
-        model = open_model(setup.model)
-        robot = Robot(
-            domain_id, model, setup.twist, fault.policy, relayed=not setup.gated
-        )
-        stack.callback(robot.close)
-        policies = stack.enter_context(ExitStack())
-        policy: NodeProcess | None = None
-        idle = 0
+    with Surroundings(setup, name, tell) as surroundings:
         for number in numbers:
-            injected = None
-            while injected is None:
-                if idle == MAX_IDLE:
-                    return
-                folder = setup.folder / (f"{number}_{idle}" if idle else f"{number}")
-                if setup.gated and not _is_alive(gate):
-                    if gate is not None:
-                        tell(f"{name}: the gate has ended, and another is started")
-                    gates.close()
-                    gate = gates.enter_context(_start_gate(setup, folder, domain_id))
-                if fault.policy and policy is None:
-                    policies.close()
-                    process = NodeProcess(
-                        "policy_node", folder, policy_parameters, domain_id
-                    )
-                    policy = policies.enter_context(process)
+            for attempt in range(MAX_IDLE):
+                named = f"{number}_{attempt}" if attempt else f"{number}"
                 try:
-                    around = Around(robot, policy, gate)
+                    around = surroundings.prepare(setup.folder / named)
                     injected = inject(setup, around, name, number)
-                    idle = 0
-                    if not _is_alive(policy):
-                        policy = None
-                except (NoMotionError, TimeoutError) as error:
-                    # Nothing was injected; a policy that was killed may leave DDS ill.
-                    tell(f"{name}: {error}. {_read_log(policy)}")
-                    policy = None
-                    idle += 1
-            yield injected
+                except (NoMotionError, TimeoutError) as error:  # nothing was injected
+                    surroundings.give_up_policy(error)
+                else:
+                    yield injected
+                    break
+            else:
+                return
+
+
+def _start_policy(setup: Setup, folder: Path, domain_id: int) -> NodeProcess:
+    parameters: dict[str, Any] = {"model": setup.model, "goal": [*setup.goal]}
+    if setup.policy:
+        parameters["policy"] = setup.policy
+    return NodeProcess("policy_node", folder, parameters, domain_id)
 
 
 def _start_gate(setup: Setup, folder: Path, domain_id: int) -> NodeProcess:
@@ -399,23 +431,41 @@ def find_reach(robot: RobotSpec, limits: Limits) -> tuple[Array, Array]:
     The turn rate of a car follows from both commands, so all of their corners count, and zeros.
     """
     ends = zip(limits.low, np.zeros_like(limits.low), limits.high, strict=True)
-    twists = robot.to_cmd_vel(list(product(*ends)))
+    twists = robot.to_cmd_vel(list(itertools.product(*ends)))
     return twists.min(axis=0), twists.max(axis=0)
 
 
 def inject_trials(
     protocol: Protocol, folder: Path, tell: Callable[[str], None], trials: list[Trial]
 ) -> Iterator[Row]:
-    """Yield a row for each trial whose fault was injected.
+    """Yield a row for each trial whose fault was injected."""
+    setup = choose_setup(protocol, folder)
+    kinds = itertools.groupby(trials, lambda trial: (trial.kind, trial.gated))
+    for (name, gated), group in kinds:
+        own = folder / (name if gated else f"{name}_no_gate")
+        around = replace(setup, gated=gated, folder=own)
+        yield from _inject_kind(around, name, list(group), tell)
 
-    The robot is told to move by half its limits.
-    """
+
+def _inject_kind(
+    setup: Setup, name: str, trials: list[Trial], tell: Callable[[str], None]
+) -> Iterator[Row]:
+    limit_s = FAULTS[name].limit_s
+    injections = inject_all(setup, name, [trial.seed for trial in trials], tell)
+    for trial, injected in zip(trials, injections, strict=False):
+        in_time = injected.time_s <= limit_s and not injected.unsafe
+        verdict = {"fault": True, "limit_s": limit_s, "in_time": in_time}
+        yield trial._asdict() | verdict | asdict(injected)
+
+
+def choose_setup(protocol: Protocol, folder: Path) -> Setup:
+    """Return a gate and a robot that is told to move by half its limits."""
     robot = open_model(protocol.model).robot
     limits = load_limits(protocol.limits, robot)
     command = 0.1 * np.where(limits.high > 0.0, limits.high, limits.low)
     command[0] *= 5.0
     low, high = find_reach(robot, limits)
-    setup = Setup(
+    return Setup(
         model=protocol.model,
         limits=protocol.limits,
         twist=robot.to_cmd_vel(command),
@@ -424,16 +474,3 @@ def inject_trials(
         folder=folder,
         policy=protocol.policy,
     )
-    for (name, gated), group in groupby(
-        trials, lambda trial: (trial.kind, trial.gated)
-    ):
-        of_fault = list(group)
-        numbers = [trial.seed for trial in of_fault]
-        of_kind = folder / (name if gated else f"{name}_no_gate")
-        around = replace(setup, gated=gated, folder=of_kind)
-        injections = inject_all(around, name, numbers, tell)
-        limit_s = FAULTS[name].limit_s
-        for trial, one in zip(of_fault, injections, strict=False):
-            in_time = one.time_s <= limit_s and not one.unsafe
-            told = {"fault": True, "limit_s": limit_s, "in_time": in_time}
-            yield trial._asdict() | told | asdict(one)

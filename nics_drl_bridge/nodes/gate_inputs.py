@@ -1,11 +1,5 @@
-"""What the gate hears: messages read from their bytes, who sent them, and whether some may be lost.
+"""What the gate hears: messages read from their bytes, and who sent them."""
 
-While the system does not schedule a process, its messages wait in the socket's buffer. Messages
-that do not fit are sent again only while the button still holds them; a press that was followed by
-other messages is lost. So a sleep during which the buffer may overflow counts as a press.
-"""
-
-from collections import deque
 from collections.abc import Mapping
 from typing import Any
 
@@ -24,37 +18,32 @@ TWIST = "Twist"
 TWIST_STAMPED = "TwistStamped"
 ROTATION = slice(3, 7)  # the quaternion among the numbers of an odometry
 SHOWN = 4  # displayed bytes of a publisher's id
-QUEUE_MESSAGES = 150  # certain to fit: Linux's default buffer held 254 when measured
-LONGEST_SLEEP_S = (
-    1.0  # after a longer sleep, the rate measured before it proves nothing
-)
-RATE_WINDOW_S = 1.0  # window over which the rate of messages is measured
 
 
 def read_scan(lidar: LidarSpec, content: bytes) -> inputs.Scan:
     """Read a serialised LaserScan. Raises `wire.UNREADABLE`, like the other readers."""
-    ranges = from_device(wire.ranges_of(content), lidar)
-    return inputs.Scan(wire.stamp_of(content), ranges, wire.angles_of(content))
+    ranges = from_device(wire.read_ranges(content), lidar)
+    return inputs.Scan(wire.read_stamp(content), ranges, wire.read_angles(content))
 
 
 def read_sensor(sensor: Sensor, content: bytes) -> inputs.SensorReading:
     """Read a serialised message of a further sensor."""
     points = sensor.points(sensor_from_ros(sensor, content))
-    return inputs.SensorReading(wire.stamp_of(content), sensor.name, points)
+    return inputs.SensorReading(wire.read_stamp(content), sensor.name, points)
 
 
 def read_odometry(content: bytes) -> inputs.Odometry:
     """Read a serialised Odometry; without a rotation its pose is NaN."""
-    pose, twist = wire.odometry_of(content)
-    if not is_rotation(*wire.numbers_of(content)[ROTATION].tolist()):
+    pose, twist = wire.read_odometry(content)
+    if not is_rotation(*wire.read_numbers(content)[ROTATION].tolist()):
         pose = np.full(3, np.nan)
-    return inputs.Odometry(wire.stamp_of(content), pose, twist)
+    return inputs.Odometry(wire.read_stamp(content), pose, twist)
 
 
 def read_estimate(content: bytes) -> inputs.Estimate:
     """Read a serialised Odometry of an estimator."""
-    pose, twist = wire.odometry_of(content)
-    covariance = wire.numbers_of(content)[wire.POSE_COVARIANCE : wire.TWIST].reshape(
+    pose, twist = wire.read_odometry(content)
+    covariance = wire.read_numbers(content)[wire.POSE_COVARIANCE : wire.TWIST].reshape(
         6, 6
     )
     return inputs.Estimate(twist, pose, covariance[PLANAR].astype(np.float64))
@@ -63,7 +52,7 @@ def read_estimate(content: bytes) -> inputs.Estimate:
 def read_command(content: bytes) -> inputs.Command:
     """Read a serialised TwistStamped."""
     return inputs.Command(
-        wire.stamp_of(content), np.array(wire.stamped_twist_of(content))
+        wire.read_stamp(content), np.array(wire.read_stamped_twist(content))
     )
 
 
@@ -77,8 +66,8 @@ def read_foreign_command(
     if newest is None:
         raise ValueError("no scan has arrived yet from which it could be computed")
     if kind == TWIST:
-        return inputs.Command(newest.stamp_ns, np.array(wire.twist_of(content)))
-    if 0 < wire.stamp_of(content) < oldest_ns:
+        return inputs.Command(newest.stamp_ns, np.array(wire.read_twist(content)))
+    if 0 < wire.read_stamp(content) < oldest_ns:
         raise ValueError(
             "its stamp is older than command_age; is use_sim_time the same at both?"
         )
@@ -87,7 +76,7 @@ def read_foreign_command(
 
 def read_e_stop(content: bytes) -> inputs.EStop:
     """Read a serialised Bool."""
-    return inputs.EStop(wire.truth_of(content))
+    return inputs.EStop(wire.read_bool(content))
 
 
 class Sources:
@@ -109,7 +98,9 @@ class Sources:
             return ""
         gid = bytes(publisher["data"])
         if gid not in self._names:  # named once: a name stands for its publisher
-            self._names[gid] = f"{self._node_of(gid)} (publisher {gid[-SHOWN:].hex()})"
+            self._names[gid] = (
+                f"{self._find_node(gid)} (publisher {gid[-SHOWN:].hex()})"
+            )
         return self._names[gid]
 
     def count_publishers(self) -> None:
@@ -117,45 +108,8 @@ class Sources:
         if not self._tells_publisher:
             self.publishers = max(1, self._node.count_publishers(self._topic))
 
-    def _node_of(self, gid: bytes) -> str:
+    def _find_node(self, gid: bytes) -> str:
         for endpoint in self._node.get_publishers_info_by_topic(self._topic):
             if bytes(endpoint.endpoint_gid) == gid:
-                return qos.owner(endpoint) or "a node"
+                return qos.find_owner(endpoint) or "a node"
         return "a node"
-
-
-class EStopQueue:
-    """Measures the rate of `e_stop`, and judges each sleep of the gate by it."""
-
-    def __init__(self) -> None:
-        # (time [s], number of messages read)
-        self._heard: deque[tuple[float, int]] = deque()
-        self._ticked_s: float | None = None  # last tick of the gate
-        self._ever_heard = False
-        self._since_tick = 0  # messages
-
-    def hear(self, now: float, messages: int) -> None:
-        """Account for messages that were read at a steady time [s]."""
-        self._ever_heard = True
-        self._since_tick += messages
-        self._heard.append((now, messages))
-        while now - self._heard[0][0] > RATE_WINDOW_S:
-            self._heard.popleft()
-
-    def tick(self, now: float) -> str:
-        """Return why a press may have been lost since the last tick; "" if none can be."""
-        before = self._ticked_s
-        self._ticked_s = now
-        waiting = self._since_tick
-        self._since_tick = 0
-        # if the publisher started during the sleep, there is no earlier rate
-        if waiting > QUEUE_MESSAGES:
-            return f"{waiting} messages came at once, and a press may have been lost among them"
-        if before is None or not self._ever_heard:
-            return ""
-        asleep = now - before
-        rate = sum(messages for _, messages in self._heard) / RATE_WINDOW_S
-        longest = min(LONGEST_SLEEP_S, QUEUE_MESSAGES / max(rate, 1.0))
-        if asleep <= longest:
-            return ""
-        return f"the gate slept for {asleep:.2f} s, and a press may have been lost meanwhile"

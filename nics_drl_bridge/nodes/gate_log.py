@@ -18,7 +18,7 @@ from nics_drl_bridge.gate.state import Cause, GateConfig, GateState
 from nics_drl_bridge.nodes import black_box_writer
 from nics_drl_bridge.nodes.black_box_writer import FILES_KEPT
 from nics_drl_bridge.nodes.listener import holds
-from nics_drl_bridge.nodes.node_process import module_command
+from nics_drl_bridge.nodes.node_process import make_module_command
 from nics_drl_bridge.nodes.runner import ERROR, OK, STALE, WARN, Condition
 
 BURST_S = (
@@ -91,7 +91,7 @@ class GateLog:
         if self._may_log(topic):
             self._logger.warning(f"refused: {fault}")
 
-    def no_number(self, twist: Sequence[float]) -> None:
+    def report_not_finite(self, twist: Sequence[float]) -> None:
         """Count and log a decision that is not finite; that must never happen."""
         self.counters["not finite, sent as zero"] += 1
         if self._may_log("not finite"):
@@ -199,7 +199,7 @@ class BlackBox:
     def write(self, name: str) -> None:
         """Start to write a file of what is kept."""
         self._names = [*self._names[1 - FILES_KEPT :], name]
-        program = module_command(black_box_writer.__name__)
+        program = make_module_command(black_box_writer.__name__)
         try:
             with os.fdopen(os.memfd_create("black_box"), "w+b") as memory:
                 memory.writelines(self.lines())

@@ -26,13 +26,13 @@ def describe(launch: Launch) -> Any:
         # Below the namespace of a PushRosNamespace around the launch, if any.
         pushed = configurations.get("ros_namespace", "").strip("/")
         values["namespace"] = f"{pushed}/{values['namespace'].strip('/')}".strip("/")
-        return [action_of(node) for node in launch.nodes(values)]
+        return [make_action(node) for node in launch.nodes(values)]
 
-    declared = [declaration_of(argument) for argument in launch.arguments]
+    declared = [make_declaration(argument) for argument in launch.arguments]
     return LaunchDescription([*declared, OpaqueFunction(function=start)])
 
 
-def declaration_of(argument: Argument) -> DeclareLaunchArgument:
+def make_declaration(argument: Argument) -> DeclareLaunchArgument:
     """Return the `launch` declaration of an argument."""
     return DeclareLaunchArgument(
         argument.name,
@@ -42,12 +42,14 @@ def declaration_of(argument: Argument) -> DeclareLaunchArgument:
     )
 
 
-def action_of(node: NodeStart) -> Node:
+def make_action(node: NodeStart) -> Node:
     """Return the `launch` action that starts a node."""
     files = []
     if node.params_file:
         files = [ParameterFile(node.params_file, allow_substs=True)]
-    parameters = {name: parameter_of(value) for name, value in node.parameters.items()}
+    parameters = {
+        name: make_parameter(value) for name, value in node.parameters.items()
+    }
     log_arguments = []
     if node.log_level:
         log_arguments = ["--ros-args", "--log-level", node.log_level]
@@ -63,7 +65,7 @@ def action_of(node: NodeStart) -> Node:
     )
 
 
-def parameter_of(value: Any) -> Any:
+def make_parameter(value: Any) -> Any:
     """Return the value of a parameter; a string that looks like a number stays a string."""
     if isinstance(value, str):
         return ParameterValue(TextSubstitution(text=value), value_type=str)

@@ -38,12 +38,15 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import S_PER_NS, Start
 from nics_drl_bridge.middleware.measurement import CMD_VEL
 from nics_drl_bridge.nodes import qos, wire
-from nics_drl_bridge.nodes.command_types import deaf_subscribers, heard_stamped
+from nics_drl_bridge.nodes.command_types import (
+    describe_deaf_subscribers,
+    expect_stamped,
+)
 from nics_drl_bridge.nodes.listener import holds, open_context
 from nics_drl_bridge.nodes.own_process import ENDING
-from nics_drl_bridge.nodes.parameters import stamped_by_default
-from nics_drl_bridge.nodes.runner import last_word
-from nics_drl_bridge.nodes.wire import stamped_twist_to_bytes, twist_to_bytes
+from nics_drl_bridge.nodes.parameters import is_stamped_default
+from nics_drl_bridge.nodes.runner import publish_last
+from nics_drl_bridge.nodes.wire import write_stamped_twist, write_twist
 from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.world_set import AnyWorld
 
@@ -99,7 +102,7 @@ class Link:
             self._executor.add_node(self.node)
             self._resources.executor = self._executor
             if stamped is None:
-                stamped = self.hears_stamped(command_topic, patience_s)
+                stamped = self.expects_stamped(command_topic, patience_s)
             # frame of the robot, in which commands are given; unknown until it is set
             self.frame = ""
             self.stamped = stamped
@@ -138,12 +141,12 @@ class Link:
         except ExternalShutdownException:
             self.check_open()
 
-    def hears_stamped(self, topic: str, patience_s: float) -> bool:
+    def expects_stamped(self, topic: str, patience_s: float) -> bool:
         """Wait for a subscriber of commands; True if it expects stamped ones, or by default."""
         name = self.node.resolve_topic_name(topic)
         self.wait_until(lambda: self.node.count_subscribers(name) > 0, patience_s)
-        heard = heard_stamped(self.node, topic)
-        return stamped_by_default() if heard is None else heard
+        heard = expect_stamped(self.node, topic)
+        return is_stamped_default() if heard is None else heard
 
     def begin(self) -> None:
         """Let a thread run the callbacks; call it once all subscriptions exist."""
@@ -164,9 +167,9 @@ class Link:
             raise BackendError(f"command {twist} for {self._topic}: must be {fix}")
         self._timeout.begin(moving=True)
         if self._kind is Twist:
-            self.commands.publish(twist_to_bytes(twist))
+            self.commands.publish(write_twist(twist))
         else:
-            self.commands.publish(stamped_twist_to_bytes(twist, stamp_ns, self.frame))
+            self.commands.publish(write_stamped_twist(twist, stamp_ns, self.frame))
 
     def halt(self) -> None:
         """Publish a zero command."""
@@ -196,18 +199,18 @@ class Link:
             raise BackendError(f"service {client.srv_name}: {reason}")
         return future.result()
 
-    def others_command(self) -> bool:
+    def has_rivals(self) -> bool:
         """True if another node publishes commands too."""
         with self.node.handle:  # rclpy's own count checks the name each time
             return bool(self.node.handle.get_count_publishers(self._topic) > 1)
 
     def check_alone(self) -> None:
         """Raise BackendError with the names of any other publishers of commands."""
-        if not self.others_command():
+        if not self.has_rivals():
             return
         topic = self._topic
         ends = self.node.get_publishers_info_by_topic(topic)
-        names = sorted(qos.owners(ends))
+        names = sorted(qos.list_owners(ends))
         with contextlib.suppress(ValueError):
             names.remove(self.node.get_fully_qualified_name())
         raise BackendError(
@@ -239,7 +242,7 @@ class Link:
             missing = ", no ".join(
                 name for name, there in needed.items() if not there()
             )
-            deaf = deaf_subscribers(node, self._topic, self.stamped)
+            deaf = describe_deaf_subscribers(node, self._topic, self.stamped)
             if deaf and not commands.get_subscription_count():
                 fix = f"set `stamped` to {not self.stamped}, or leave it out."
                 raise BackendError(f"topic {self._topic}: {deaf}; {fix}")
@@ -248,7 +251,7 @@ class Link:
             )
         # A publisher that was killed stays in the graph for a while.
         left_s = deadline - time.monotonic()
-        self.wait_until(lambda: not self.others_command(), left_s)
+        self.wait_until(lambda: not self.has_rivals(), left_s)
         self.check_alone()
         self._resources.has_peers = True
         gc.collect()  # now, because later it may take 0.1 s while the robot moves
@@ -367,10 +370,10 @@ class CommandTimeout:
 
     def end(self) -> None:
         """Publish the last zero, and wait for its delivery."""
-        last_word(self._publisher, self._kind())
+        publish_last(self._publisher, self._kind())
 
 
-def identity(
+def get_fingerprints(
     model: SimulatorModel, world: AnyWorld, randomisation: Randomisation | None
 ) -> dict[str, str]:
     """Return the fingerprints of what a simulator simulates; randomisation may be `none`."""
@@ -394,7 +397,7 @@ class EpisodeServices:
         randomisation: Randomisation | None = None,
     ) -> None:
         self._link = link
-        self._identity = identity(model, world, randomisation)
+        self._identity = get_fingerprints(model, world, randomisation)
         client = link.node.create_client
         setting = f"{simulator}/set_parameters_atomically"
         self._parameters = client(SetParametersAtomically, setting)
@@ -439,13 +442,16 @@ class EpisodeServices:
         response = self._link.call(self._reset, Trigger.Request(), timeout_s)
         if not response.success:
             raise BackendError(f"the simulator could not reset: {response.message}")
-        told = self._link.call(self._test, SelfTest.Request(), timeout_s)
-        facts = {pair.key: pair.value for pair in told.status[0].values}
+        tested = self._link.call(self._test, SelfTest.Request(), timeout_s)
+        facts = {pair.key: pair.value for pair in tested.status[0].values}
+        self._require_same(facts)
+        return int(facts[EPISODE_NS])
+
+    def _require_same(self, facts: Mapping[str, str]) -> None:
         for key, mine in self._identity.items():
             if facts.get(key) != mine:
                 runs = f"the simulator runs the {key} {facts.get(key)!r}, this env {mine!r}"
                 raise ModelError(f"{runs}; start both with the same {key}.")
-        return int(facts[EPISODE_NS])
 
 
 T = TypeVar("T")
@@ -474,7 +480,7 @@ class Inbox:
 
     def put(self, topic: str, content: bytes) -> None:
         """Store a message. Raises BackendError if it is damaged."""
-        stamp_ns = read_message(topic, wire.stamp_of, content)
+        stamp_ns = read_message(topic, wire.read_stamp, content)
         self.messages[topic] = Message(stamp_ns, time.monotonic_ns(), content)
 
     def has(self, topic: str, stamp_ns: int) -> bool:

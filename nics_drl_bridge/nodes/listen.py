@@ -1,15 +1,16 @@
 """Facts about a live robot, collected by listening, for `report.doctor`."""
 
 import time
+from collections.abc import Iterable
 from functools import partial
 from typing import Any
 
 from rclpy.node import Node
 
 from nics_drl_bridge import defaults
-from nics_drl_bridge.nodes.conversions import message_type
+from nics_drl_bridge.nodes.conversions import find_message_type
 from nics_drl_bridge.nodes.listener import Listener
-from nics_drl_bridge.nodes.qos import offer_of, profile_of
+from nics_drl_bridge.nodes.qos import make_offer, make_profile
 from nics_drl_bridge.recording.messages import Offer
 from nics_drl_bridge.report.doctor_facts import (
     GYRO,
@@ -24,7 +25,7 @@ NAME = "nics_doctor"
 LOOK_S = 0.2
 DISCOVERY_S = 10.0
 # matches any offer, so it hears every topic
-ANY_PUBLISHER = profile_of(Offer(100, reliable=False))
+ANY_PUBLISHER = make_profile(Offer(100, reliable=False))
 
 
 def listen(
@@ -55,18 +56,7 @@ def listen(
 
 def _look(node: Node, facts: Facts, subscribed: set[str], imu: str) -> None:
     for topic, kinds in node.get_topic_names_and_types():
-        offers = node.get_publishers_info_by_topic(topic)
-        asks = [
-            i
-            for i in node.get_subscriptions_info_by_topic(topic)
-            if i.node_name != NAME
-        ]
-        offered = {info.topic_type for info in offers} or set(kinds)
-        facts.topics[topic] = Endpoints(
-            tuple(sorted(offered)),
-            tuple(offer_of(info.qos_profile) for info in offers),
-            tuple(offer_of(info.qos_profile) for info in asks),
-        )
+        facts.topics[topic] = _find_endpoints(node, topic, kinds)
     if GYRO in facts.names and GYRO not in subscribed:
         types = {
             topic: ends.types for topic, ends in facts.topics.items() if ends.offers
@@ -77,9 +67,25 @@ def _look(node: Node, facts: Facts, subscribed: set[str], imu: str) -> None:
         wanted = [kind for kind in there.types if kind in KINDS[role]]
         if there.offers and wanted and role not in subscribed:
             subscribed.add(role)
-            kind = message_type(wanted[0])
+            kind = find_message_type(wanted[0])
             take = partial(_take, facts, role)
             node.create_subscription(kind, topic, take, ANY_PUBLISHER)
+
+
+def _find_endpoints(node: Node, topic: str, kinds: Iterable[str]) -> Endpoints:
+    """Return who publishes a topic, and who else subscribes to it."""
+    publishers = node.get_publishers_info_by_topic(topic)
+    subscribers = node.get_subscriptions_info_by_topic(topic)
+    offered = {info.topic_type for info in publishers} or set(kinds)
+    return Endpoints(
+        tuple(sorted(offered)),
+        tuple(make_offer(info.qos_profile) for info in publishers),
+        tuple(
+            make_offer(info.qos_profile)
+            for info in subscribers
+            if info.node_name != NAME
+        ),
+    )
 
 
 def _take(facts: Facts, role: str, message: Any, info: Any) -> None:

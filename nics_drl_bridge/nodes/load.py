@@ -31,7 +31,7 @@ from nics_drl_bridge.middleware.measurement import CMD_VEL, ODOM, SCAN
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.core_share import CoreShare
 from nics_drl_bridge.nodes.listener import Listener, holds
-from nics_drl_bridge.nodes.operator import Call, TriggerAnswer, insist
+from nics_drl_bridge.nodes.operator import Call, TriggerAnswer, ask_until_granted
 from nics_drl_bridge.nodes.parameters import STAMPED
 from nics_drl_bridge.nodes.processes import NodeProcess, unused_domain_id
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -100,7 +100,7 @@ class StandIn(Listener):
         self._e_stop = self.create_publisher(Bool, inputs.E_STOP, qos.COMMAND)
         self._readings = {
             sensor: self.create_publisher(
-                conversions.sensor_type(sensor), sensor.name, quality
+                conversions.find_sensor_type(sensor), sensor.name, quality
             )
             for sensor in model.sensors
         }
@@ -120,7 +120,7 @@ class StandIn(Listener):
             return Call(self, GATE, "arm").wait_for_answer(REPLY_S)
 
         deadline = time.monotonic() + ARMING_S
-        answer = insist(ask, deadline, lambda _: None, GATE)
+        answer = ask_until_granted(ask, deadline, lambda _: None, GATE)
         if not answer.granted:
             raise BackendError(f"the gate does not arm: {answer.told}.")
 

@@ -15,7 +15,7 @@ class Wheels(NamedTuple):
     versions: Mapping[str, str]  # by name
 
 
-def wheels_here() -> Wheels | None:
+def find_wheels() -> Wheels | None:
     """Return the installed wheels of ROS 2; None if ROS 2 is missing or installed otherwise."""
     versions = {}
     for package in distributions():
@@ -28,14 +28,14 @@ def wheels_here() -> Wheels | None:
     return None
 
 
-def shipped_packages() -> dict[str, Path]:
+def list_shipped_packages() -> dict[str, Path]:
     """Return the folders of the message packages shipped with this package, by name."""
     folder = share_folder() / "config" / "messages"
     return {path.name: path for path in sorted(folder.iterdir()) if path.is_dir()}
 
 
-def how_to_install(package: str) -> str:
+def explain_install(package: str) -> str:
     """Return the instruction for installing a message package."""
-    if package in shipped_packages() and wheels_here() is not None:
+    if package in list_shipped_packages() and find_wheels() is not None:
         return f"install it by `nics install {package}`"
     return "install it with your ROS 2 distribution"

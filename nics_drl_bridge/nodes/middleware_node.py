@@ -1,6 +1,5 @@
 """middleware_node: caches a robot's topics and publishes an estimate of its state."""
 
-import math
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -13,8 +12,8 @@ from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.middleware.measurement import Health, Rejection
 from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes import conversions, qos, runner
-from nics_drl_bridge.nodes.frames import MapToOdom, odom_in_map
-from nics_drl_bridge.nodes.parameters import BASE_FRAME, MAP_FRAME, middleware
+from nics_drl_bridge.nodes.frames import MapToOdom, compute_odom_in_map
+from nics_drl_bridge.nodes.parameters import BASE_FRAME, MAP_FRAME, list_middleware_rows
 from nics_drl_bridge.nodes.robot_topics import SILENCE_S, RobotTopics
 from nics_drl_bridge.nodes.runner import (
     ACTIVE,
@@ -30,7 +29,7 @@ class MiddlewareNode(ManagedNode):
     """Listens to a robot's topics; publishes `odometry/filtered` and `/diagnostics`."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__("middleware_node", middleware(), **options)
+        super().__init__("middleware_node", list_middleware_rows(), **options)
         self._rejected: dict[Rejection, int] = {}  # counts at the last look
         runner.serve(self, "~/reset", self._reset)
         runner.diagnose(self, "topics", self._look)
@@ -45,7 +44,7 @@ class MiddlewareNode(ManagedNode):
         )
         self._topics = RobotTopics(self, model, on_odometry=self._publish)
         self.undo.callback(self._topics.close)
-        self._topics.hear_initial_pose()
+        self._topics.subscribe_initial_pose()
         self._map_to_odom: MapToOdom | None = None
         if self.get_parameter("publish_map_to_odom").value:
             tolerance = runner.get_number(self, "transform_tolerance")
@@ -71,9 +70,9 @@ class MiddlewareNode(ManagedNode):
             estimator.twist_covariance
         )
         self._filtered.publish(message)
-        reported = self._topics.in_odom()
+        reported = self._topics.locate_in_odom()
         if self._map_to_odom is not None and reported is not None:
-            home = odom_in_map(self._topics.view().pose, reported)
+            home = compute_odom_in_map(self._topics.view().pose, reported)
             self._map_to_odom.publish(
                 home, stamp_ns, (map_frame, self._topics.frames[0])
             )
@@ -104,7 +103,7 @@ class MiddlewareNode(ManagedNode):
         level, trouble = judge_topics(health, awaited, self._rejected)
         self._rejected = health.rejected
         message = trouble or ("receiving" if self.state == ACTIVE else self.state)
-        shown = facts(health) | ({"imu": missing} if missing else {})
+        shown = health.describe() | ({"imu": missing} if missing else {})
         return runner.Condition(message, level, shown, self._hardware)
 
 
@@ -143,23 +142,6 @@ def judge_topics(
     if unusable:
         level = ERROR if refused else STALE
     return level, "; ".join([*clauses, *refused])
-
-
-def facts(health: Health) -> dict[str, str]:
-    """Return the health as readable keys and values."""
-    values = {}
-    for topic, data in health.topics.items():
-        values[f"{topic} received"] = str(data.received)
-        values[f"{topic} rate [Hz]"] = f"{data.rate_hz:.3g}"
-        values[f"{topic} age [s]"] = f"{data.age_s:.3f}"
-        if not math.isnan(data.innovation):
-            values[f"{topic} innovation"] = f"{data.innovation:.3g}"
-    for rejection, count in health.rejected.items():
-        values[f"rejected, {rejection}"] = str(count)
-    for event, count in health.noticed.items():
-        values[f"noticed, {event}"] = str(count)
-    values["late and put in place"] = str(health.replayed)
-    return values
 
 
 main = partial(runner.run_node, MiddlewareNode, sole_name="middleware_node")

@@ -11,10 +11,10 @@ from typing import TypeVar
 
 from nics_drl_bridge.config import PACKAGE, dump_yaml
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.nodes.starting import NodeStart, prefix_of
+from nics_drl_bridge.nodes.starting import NodeStart, find_prefix
 
 
-def module_command(module: str) -> list[str]:
+def make_module_command(module: str) -> list[str]:
     """Return the command that runs a module; its arguments may follow.
 
     `python -m` looks for modules in the working folder first. That folder may hold arbitrary data,
@@ -29,7 +29,7 @@ PR_SET_PDEATHSIG = 1
 PATIENCE_S = 5.0  # time limit for a process to end [s]
 
 
-def interruptible() -> None:
+def restore_interrupt() -> None:
     """Let SIGINT end a process that is about to begin, even if its shell ignores SIGINT.
 
     Shells make background jobs ignore SIGINT, as in `make test &`, and children inherit this.
@@ -40,12 +40,12 @@ def interruptible() -> None:
 def _prepared() -> Callable[[], None]:
     """Return the preparation of a node's process; on Linux it then ends with its parent."""
     if sys.platform != "linux":
-        return interruptible
+        return restore_interrupt
     prctl = ctypes.CDLL(None).prctl
     parent = os.getpid()
 
     def prepare() -> None:
-        interruptible()
+        restore_interrupt()
         prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
         if os.getppid() != parent:  # the parent died in between
             os._exit(1)
@@ -53,7 +53,7 @@ def _prepared() -> Callable[[], None]:
     return prepare
 
 
-def command_of(node: NodeStart, folder: Path) -> list[str]:
+def make_command(node: NodeStart, folder: Path) -> list[str]:
     """Return the command line of a node, and write its parameters to a file in a folder."""
     place = f"/{node.namespace}/{node.executable}".replace("//", "/")
     # In a parameter file, values for this very node take precedence over those for all nodes.
@@ -61,7 +61,7 @@ def command_of(node: NodeStart, folder: Path) -> list[str]:
     file = folder / f"{place.strip('/').replace('/', '.')}.yaml"
     parameters = {nodes: {"ros__parameters": dict(node.parameters)}}
     file.write_text(dump_yaml(parameters, quote_text=True), encoding="utf-8")
-    words = [*program_of(node), *node.arguments, "--ros-args"]
+    words = [*find_program(node), *node.arguments, "--ros-args"]
     if node.log_level:
         words += ["--log-level", node.log_level]
     rules = list(node.remappings)
@@ -78,11 +78,11 @@ def command_of(node: NodeStart, folder: Path) -> list[str]:
     return words
 
 
-def program_of(node: NodeStart) -> list[str]:
+def find_program(node: NodeStart) -> list[str]:
     """Return the words that start a node's program. Raises ConfigError if it is missing."""
     if node.own:
-        return [*module_command(f"{PACKAGE}.nodes.start"), node.executable]
-    prefix = prefix_of(node.package)
+        return [*make_module_command(f"{PACKAGE}.nodes.start"), node.executable]
+    prefix = find_prefix(node.package)
     if prefix is None:
         fix = "install it with your ROS 2 distribution, or start without it"
         raise ConfigError(

@@ -55,7 +55,9 @@ class GoalRequest(NamedTuple):
 Answer = TypeVar("Answer", TriggerAnswer, GoalAnswer)
 
 
-def insist(ask: Callable[[], Answer], deadline: float, tell: Tell, what: str) -> Answer:
+def ask_until_granted(
+    ask: Callable[[], Answer], deadline: float, tell: Tell, what: str
+) -> Answer:
     """Ask until the answer is granted or a time comes; tell once that it is refused."""
     answer = ask()
     left_s = deadline - time.monotonic()
@@ -107,7 +109,7 @@ class Call:
         return self._future is not None and bool(self._future.done())
 
 
-def space_of(name: str) -> str:
+def get_namespace_of(name: str) -> str:
     """Return the namespace of a node by its full name; empty for the root."""
     return name.rpartition("/")[0]
 
@@ -137,7 +139,9 @@ class Operator(AbstractContextManager["Operator", None]):
 
         if reset:
             call("reset")
-        return insist(partial(call, "arm"), deadline, tell, f"{gate} does not arm")
+        return ask_until_granted(
+            partial(call, "arm"), deadline, tell, f"{gate} does not arm"
+        )
 
     def stop(self, namespace: str | None, seconds: float) -> Iterator[TriggerAnswer]:
         """Press the e-stop of one gate, or of all if no namespace is given; yield each answer.
@@ -186,7 +190,7 @@ class Operator(AbstractContextManager["Operator", None]):
                 f"{name} hears no goals, its state is {condition!r}; see its log."
             )
         send = partial(self._send, topic, goal, name, deadline)
-        return insist(send, deadline, tell, f"{name} does not take the goal")
+        return ask_until_granted(send, deadline, tell, f"{name} does not take the goal")
 
     def _send(
         self, topic: Publisher, goal: GoalRequest, name: str, deadline: float
@@ -221,7 +225,9 @@ class Operator(AbstractContextManager["Operator", None]):
         space = parse_namespace(namespace)
 
         def find() -> str | None:
-            return next((name for name in names() if space_of(name) == space), None)
+            return next(
+                (name for name in names() if get_namespace_of(name) == space), None
+            )
 
         holds(find, seconds, POLL_S)
         name = find()
@@ -250,7 +256,7 @@ class Operator(AbstractContextManager["Operator", None]):
         fault = f"no {what} was seen {where} within {seconds:g} s"
         if not others:
             return f"{fault}; start one, as by `nics up simulation`, in the same ROS_DOMAIN_ID."
-        first = space_of(others[0]).strip("/")
+        first = get_namespace_of(others[0]).strip("/")
         fix = f"say --namespace {first}" if first else "leave --namespace out"
         return f"{fault}; there is {', '.join(others)}: {fix}."
 

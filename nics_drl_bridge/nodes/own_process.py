@@ -2,8 +2,8 @@
 
 ROS 2, its libraries and Python write to the file descriptors 1 and 2. A terminal halted by Ctrl-S,
 or a pipe that nobody reads, would block them. So both descriptors lead into a non-blocking pipe,
-and a small process forwards its content (`output_forwarder.py`). The terminal itself must not be
-made non-blocking, because that would affect every process that uses it.
+whose content `tee` forwards to the output and to the log file; what does not fit is dropped. The
+terminal itself must not be made non-blocking, because that would affect every process that uses it.
 
 Python runs signal handlers between two of its own instructions, so none runs while LLVM compiles
 for seconds. Until a node runs, it has nothing to clean up, and signals keep their default effect:
@@ -20,16 +20,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Any, NoReturn, TextIO
 
-PROGRAM = Path(__file__).with_name("output_forwarder.py")
 STDOUT = 1
 STDERR = 2
 PIPE_BYTES = 2**20  # Linux's maximum for an unprivileged process
 FINISH_S = 1.0  # time for writing the last lines [s]
-# variable of ROS 2 that sets whether log lines are coloured, "0" or "1"
-COLOUR = "RCUTILS_COLORIZED_OUTPUT"
 
 DISABLE_FILES = ["--ros-args", "--disable-external-lib-logs"]
 FILE_CHOICES = (
@@ -38,7 +34,8 @@ FILE_CHOICES = (
     "--log-file-name",
 )
 
-_forwarder: subprocess.Popen[bytes] | None = None
+Forwarder = subprocess.Popen[bytes]
+_forwarders: list[Forwarder] = []  # of this process
 
 
 class _DroppingFile(io.RawIOBase):
@@ -55,22 +52,23 @@ class _DroppingFile(io.RawIOBase):
         return True
 
     def write(self, data: bytes) -> int:  # type: ignore[override]
-        with contextlib.suppress(OSError):  # the forwarder does not read, or has ended
+        with contextlib.suppress(OSError):  # the pipe is full, or its reader has ended
             os.write(self._descriptor, data)
         return len(data)
 
 
-def ros_arguments(words: Sequence[str]) -> list[str]:
-    """Return ROS 2 arguments that turn off its log file, because the forwarder writes one.
+def list_log_arguments(words: Sequence[str]) -> list[str]:
+    """Return ROS 2 arguments that turn off its log file, because `tee` writes one.
 
-    If the user's words choose a log file themselves, ROS 2 writes it.
+    ROS 2 writes it within a node's call, which a slow disk would block. If the user's words choose
+    a log file themselves, it does.
     """
-    if _forwarder is None or any(word in FILE_CHOICES for word in words):
+    if not _forwarders or any(word in FILE_CHOICES for word in words):
         return []
     return DISABLE_FILES
 
 
-def log_file(node: str, words: Sequence[str]) -> str:
+def name_log_file(node: str, words: Sequence[str]) -> str:
     """Return a node's log file, where ROS 2 would write it; empty if the words choose another."""
     if any(word in FILE_CHOICES for word in words):
         return ""
@@ -81,56 +79,58 @@ def log_file(node: str, words: Sequence[str]) -> str:
 
 
 def forward_output(log: str = "") -> None:
-    """Let a separate process write the output of this one, and to the file `log` if it is named.
+    """Let `tee` write the output of this process, and to the file `log` if it is named.
 
     Call this before any thread exists.
     """
-    global _forwarder
-    if _forwarder is not None:
+    if _forwarders:
         return
-    descriptors = _different_outputs()
-    if os.isatty(STDERR):
-        os.environ.setdefault(COLOUR, "1")
-    _forwarder = _forward(log, descriptors)
-    if _forwarder is None:
+    if log:
+        with contextlib.suppress(OSError):  # the output is forwarded all the same
+            os.makedirs(os.path.dirname(log), exist_ok=True)
+    descriptors = _list_outputs()
+    _forwarders.extend(filter(None, [_forward(each, log) for each in descriptors]))
+    if not _forwarders:
         return
     if STDOUT not in descriptors:
         os.dup2(STDERR, STDOUT)
-    sys.stdout = _dropping_text(STDOUT)
-    sys.stderr = _dropping_text(STDERR)
+    sys.stdout = _open_dropping(STDOUT)
+    sys.stderr = _open_dropping(STDERR)
 
 
 def finish_output(seconds: float) -> None:
     """Wait until all output is written, or for some time; nothing can be written after that."""
-    if _forwarder is None:
+    if not _forwarders:
         return
     nowhere = os.open(os.devnull, os.O_WRONLY)
     for descriptor in (STDOUT, STDERR):
         os.dup2(nowhere, descriptor)
-    with contextlib.suppress(subprocess.TimeoutExpired):
-        _forwarder.wait(seconds)
+    deadline = time.monotonic() + seconds
+    for forwarder in _forwarders:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            forwarder.wait(max(0.0, deadline - time.monotonic()))
 
 
 @contextlib.contextmanager
-def forwarded_errors() -> Iterator[None]:
-    """Within this context, let a separate process write what this one writes to stderr.
+def forward_errors() -> Iterator[None]:
+    """Within this context, let `tee` write what this process writes to stderr.
 
     For a command that is not a node's own process but moves a robot, or records one: ROS 2 and this
     package log to stderr meanwhile. At the end, wait for a moment until all is written.
     """
-    if _forwarder is not None:
+    if _forwarders:
         yield
         return
     python_errors = sys.stderr
     direct = os.dup(STDERR)
-    forwarder = _forward("", [STDERR])
+    forwarder = _forward(STDERR)
     if forwarder is None:
         os.close(direct)
         yield
         return
     if _writes_to_stderr(python_errors):
         python_errors.flush()
-        sys.stderr = _dropping_text(STDERR)
+        sys.stderr = _open_dropping(STDERR)
     try:
         yield
     finally:
@@ -148,12 +148,12 @@ def _writes_to_stderr(stream: TextIO) -> bool:
         return False
 
 
-def _dropping_text(descriptor: int) -> TextIO:
+def _open_dropping(descriptor: int) -> TextIO:
     file: Any = _DroppingFile(descriptor)
     return io.TextIOWrapper(file, "utf-8", "backslashreplace", write_through=True)
 
 
-def _different_outputs() -> list[int]:
+def _list_outputs() -> list[int]:
     """Return the outputs' descriptors; only one if both are the same, so that order is kept."""
     for descriptor in (0, STDOUT, STDERR):
         try:
@@ -165,31 +165,31 @@ def _different_outputs() -> list[int]:
     return [STDERR, STDOUT]
 
 
-def _forward(log: str, descriptors: Sequence[int]) -> subprocess.Popen[bytes] | None:
-    """Replace outputs by pipes to a separate process; None if it can't be started."""
-    pipes = {descriptor: os.pipe() for descriptor in descriptors}
-    pairs = [f"{exit_}:{descriptor}" for descriptor, (exit_, _) in pipes.items()]
+def _forward(descriptor: int, log: str = "") -> Forwarder | None:
+    """Replace an output by a pipe to `tee`, which writes to it and to a file, if one is named.
+
+    Returns None if `tee` can't be started.
+    """
+    exit_, entrance = os.pipe()
     try:
         forwarder = subprocess.Popen(
-            [sys.executable, "-I", "-S", str(PROGRAM), log, *pairs],
-            stdin=subprocess.DEVNULL,
-            pass_fds=[exit_ for exit_, _ in pipes.values()],
+            ["tee", "-a", *([log] if log else [])],
+            stdin=exit_,
+            stdout=descriptor,
+            stderr=subprocess.DEVNULL,
             start_new_session=True,  # neither Ctrl-C nor Ctrl-Z of the terminal reaches it
+            restore_signals=False,  # it goes on with the file if the output's reader has gone
         )
-    except OSError as error:
-        sys.stderr.write(
-            f"output is written directly, and may block ({error.strerror})\n"
-        )
-        return None
-    else:
-        for descriptor, (_, entrance) in pipes.items():
-            widen_pipe(entrance)
-            os.dup2(entrance, descriptor)
+        widen_pipe(entrance)
+        os.dup2(entrance, descriptor)
         return forwarder
+    except OSError as error:
+        reason = f"output is written directly, and may block ({error.strerror})"
+        sys.stderr.write(f"{reason}\n")
+        return None
     finally:
-        for exit_, entrance in pipes.values():
-            os.close(exit_)
-            os.close(entrance)
+        os.close(exit_)
+        os.close(entrance)
 
 
 def widen_pipe(entrance: int) -> None:
@@ -229,7 +229,7 @@ def leave(code: int) -> NoReturn:
     os._exit(code)
 
 
-def ending_signals() -> list[int]:
+def list_ending_signals() -> list[int]:
     """Return the signals at which this process ends cleanly.
 
     SIGHUP is not among them if the process is to outlive its terminal, as under `nohup`.
@@ -239,18 +239,18 @@ def ending_signals() -> list[int]:
 
 
 def begin_own_process() -> None:
-    """Let `at_once` take effect, because this process is a single node."""
+    """Let `end_at_once` take effect, because this process is a single node."""
     global _own_process
     _own_process = True
 
 
 @contextlib.contextmanager
-def at_once() -> Iterator[None]:
+def end_at_once() -> Iterator[None]:
     """Within this context, let ending signals end the process at once, whatever it is doing."""
     if not _own_process:
         yield
         return
-    handlers = {number: signal.getsignal(number) for number in ending_signals()}
+    handlers = {number: signal.getsignal(number) for number in list_ending_signals()}
     for number in handlers:
         signal.signal(number, signal.SIG_DFL)
     try:

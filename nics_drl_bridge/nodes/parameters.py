@@ -40,7 +40,7 @@ class Row(NamedTuple):
     shown: str = ""  # the default in words, if it depends on other values
 
 
-def stamped_by_default() -> bool:
+def is_stamped_default() -> bool:
     """True if this ROS 2 distribution uses TwistStamped for commands: Kilted and newer."""
     return not is_before_kilted(os.environ.get("ROS_DISTRO", ""))
 
@@ -59,12 +59,12 @@ def _is_wheel(name: str) -> bool:
         return False
 
 
-def stamped() -> Row:
+def make_stamped_row() -> Row:
     """Return the parameter that selects the type of `cmd_vel`."""
     about = (
         "Use TwistStamped for cmd_vel, the default on Kilted and newer; false: Twist."
     )
-    return Row(STAMPED, stamped_by_default(), about)
+    return Row(STAMPED, is_stamped_default(), about)
 
 
 IMU = "imu"
@@ -87,7 +87,7 @@ ROBOT_FRAME = Row(
 )
 
 
-def frame_fault(parameters: Iterable[Any], *may_be_empty: str) -> str:
+def find_frame_fault(parameters: Iterable[Any], *may_be_empty: str) -> str:
     """Return a sentence about the first invalid frame id; empty if all are valid.
 
     If a name occurs twice, its last value counts.
@@ -110,7 +110,7 @@ def frame_fault(parameters: Iterable[Any], *may_be_empty: str) -> str:
     return ""
 
 
-def managed() -> list[Row]:
+def list_managed_rows() -> list[Row]:
     """Return the parameters of a managed node."""
     about = (
         "Configure and activate automatically at startup, without a lifecycle manager."
@@ -118,7 +118,7 @@ def managed() -> list[Row]:
     return [Row("autostart", True, about), MODEL]
 
 
-def sensors() -> list[Row]:
+def list_sensor_rows() -> list[Row]:
     """Return the parameters of a robot's sensors other than scan and odometry."""
     upside_down = "The lidar is mounted upside down, so that its beams run clockwise."
     types = ", ".join((NO_POSE, *POSE_TYPES))
@@ -130,11 +130,11 @@ def sensors() -> list[Row]:
         ),
         Row("lidar_upside_down", False, upside_down),
         Row(IMU, defaults.IMU_TOPIC, ABOUT_IMU),
-        stamped(),
+        make_stamped_row(),
     ]
 
 
-def middleware() -> list[Row]:
+def list_middleware_rows() -> list[Row]:
     """Return the parameters that only `middleware_node` has."""
     return [
         MAP_FRAME,
@@ -153,7 +153,7 @@ def middleware() -> list[Row]:
     ]
 
 
-def policy() -> list[Row]:
+def list_policy_rows() -> list[Row]:
     """Return the parameters that only `policy_node` has."""
     return [
         BASE_FRAME,
@@ -189,7 +189,7 @@ def policy() -> list[Row]:
     ]
 
 
-def nav2() -> list[Row]:
+def list_nav2_rows() -> list[Row]:
     """Return the parameters of Nav2's controller server that `policy_node` supports."""
     return [
         Row(
@@ -259,7 +259,7 @@ CHECKS = {  # what the fields of `GoalCheck` and `ProgressCheck` mean
 }
 
 
-def checkers(goals: Sequence[str], progress: Sequence[str]) -> list[Row]:
+def list_checker_rows(goals: Sequence[str], progress: Sequence[str]) -> list[Row]:
     """Return the parameters of the named checks; they are those of Nav2's checkers."""
     from nics_drl_bridge.policy.follow import GoalCheck, ProgressCheck
 
@@ -288,7 +288,7 @@ STANDARD = Row(
 )
 
 
-def device(laser_frame: str = "") -> list[Row]:
+def list_device_rows(laser_frame: str = "") -> list[Row]:
     """Return the parameters of all simulators except `robots`, which is a count or names."""
     return [
         Row("world", defaults.WORLD, "Name of a shipped world, or a world file."),
@@ -299,7 +299,7 @@ def device(laser_frame: str = "") -> list[Row]:
             "Randomisation of each episode: mild, strong or a file; empty: none.",
         ),
         Row("mode", REALTIME, f"How time runs: {', '.join(MODES)}."),
-        stamped(),
+        make_stamped_row(),
         Row(
             "frame_prefix",
             "",
@@ -428,7 +428,7 @@ URDF = Row(
 )
 
 
-def renderer(default: str) -> Row:
+def make_renderer_row(default: str) -> Row:
     """Return the parameter that selects the renderer of a simulator's lidar."""
     return Row("renderer", default, "Renderer of the lidar: baked or exact.")
 
@@ -469,7 +469,9 @@ PRIORITY = Row(
 )
 
 
-def gate_rules(odom_rate: float = math.nan, scan_age: float = math.nan) -> list[Row]:
+def list_gate_rules(
+    odom_rate: float = math.nan, scan_age: float = math.nan
+) -> list[Row]:
     """Return the parameters of a gate's rules.
 
     Those in `RULES_IN_SECONDS` set fields of `GateConfig` whose names end in `_s`.
@@ -562,15 +564,15 @@ FOREIGN = Row(
 )
 
 
-def gate() -> list[Row]:
+def list_gate_rows() -> list[Row]:
     """Return all parameters of `command_gate`."""
     shield = [SHIELD, *SHIELD_NUMBERS]
     return [
         MODEL,
         LIMITS,
         *shield,
-        *gate_rules(),
-        stamped(),
+        *list_gate_rules(),
+        make_stamped_row(),
         ROBOT_FRAME,
         FOREIGN,
         BLACK_BOX,
@@ -578,7 +580,7 @@ def gate() -> list[Row]:
     ]
 
 
-def drive() -> list[Row]:
+def list_drive_rows() -> list[Row]:
     """Return the parameters of `record_node`."""
     from nics_drl_bridge.recording.excite import (
         LONGEST_S,
@@ -620,7 +622,7 @@ def drive() -> list[Row]:
             "Stop after this silence of odom [s].",
             (0.05, 10.0),
         ),
-        stamped(),
+        make_stamped_row(),
     ]
 
 
@@ -666,7 +668,7 @@ NODES: dict[str, Callable[[], NodeFacts]] = {
         DRIVEN_BY,
         TOLD,
         SERVED,
-        [MODEL, ROBOTS, *device(), renderer(defaults.RENDERER)],
+        [MODEL, ROBOTS, *list_device_rows(), make_renderer_row(defaults.RENDERER)],
         "-p world:=corridor -p odom_rate:=50.0",
     ),
     "mujoco_node": lambda: NodeFacts(
@@ -674,7 +676,13 @@ NODES: dict[str, Callable[[], NodeFacts]] = {
         DRIVEN_BY,
         TOLD,
         SERVED,
-        [MODEL, ROBOTS, *device(), renderer(defaults.MUJOCO_RENDERER), FRICTION],
+        [
+            MODEL,
+            ROBOTS,
+            *list_device_rows(),
+            make_renderer_row(defaults.MUJOCO_RENDERER),
+            FRICTION,
+        ],
         "-p model:=mecanum -p world:=empty",
     ),
     "dart_node": lambda: NodeFacts(
@@ -682,7 +690,7 @@ NODES: dict[str, Callable[[], NodeFacts]] = {
         DRIVEN_BY,
         TOLD,
         SERVED,
-        [MODEL, ROBOTS, *device(), FRICTION, GYRO_BIAS, GYRO_NOISE, URDF],
+        [MODEL, ROBOTS, *list_device_rows(), FRICTION, GYRO_BIAS, GYRO_NOISE, URDF],
         "-p model:=jackal -p gyro_bias:=0.01",
     ),
     "middleware_node": lambda: NodeFacts(
@@ -690,7 +698,7 @@ NODES: dict[str, Callable[[], NodeFacts]] = {
         (*HEARD, "initialpose"),
         ("odometry/filtered", "/tf (with tf2_msgs)", "/diagnostics"),
         ("~/reset",),
-        [*managed(), *sensors(), *middleware()],
+        [*list_managed_rows(), *list_sensor_rows(), *list_middleware_rows()],
         "-p imu:=imu/data -r __ns:=/car",
     ),
     "policy_node": lambda: NodeFacts(
@@ -705,11 +713,11 @@ NODES: dict[str, Callable[[], NodeFacts]] = {
         ("cmd_vel_raw", "/diagnostics"),
         ("follow_path, navigate_to_pose (actions, with nav2_msgs)",),
         [
-            *managed(),
-            *sensors(),
-            *policy(),
-            *nav2(),
-            *checkers(("general_goal_checker",), ("progress_checker",)),
+            *list_managed_rows(),
+            *list_sensor_rows(),
+            *list_policy_rows(),
+            *list_nav2_rows(),
+            *list_checker_rows(("general_goal_checker",), ("progress_checker",)),
         ],
         '-p policy:=my_policy.onnx -p "goal:=[1.0, 2.0]"',
     ),
@@ -725,7 +733,7 @@ NODES: dict[str, Callable[[], NodeFacts]] = {
         ),
         ("cmd_vel", "/diagnostics"),
         ("~/arm", "~/reset", "~/e_stop"),
-        gate(),
+        list_gate_rows(),
         f"-p limits:={DEFAULT_ROBOT}",
     ),
     "record_node": lambda: NodeFacts(
@@ -733,7 +741,7 @@ NODES: dict[str, Callable[[], NodeFacts]] = {
         ("odom", "joint_states", "imu or imu/data", "pose"),
         ("cmd_vel",),
         (),
-        drive(),
+        list_drive_rows(),
         "-p bound:=3.0 -p out:=drive.npz",
     ),
 }

@@ -21,7 +21,7 @@ from nics_drl_bridge.middleware.uncertainty import compute_uncertainty_gain
 from nics_drl_bridge.nodes import conversions, qos, runner
 from nics_drl_bridge.nodes.frames import GoalFrames
 from nics_drl_bridge.nodes.goal_answer import GoalAnswer
-from nics_drl_bridge.nodes.parameters import policy
+from nics_drl_bridge.nodes.parameters import list_policy_rows
 from nics_drl_bridge.nodes.parts import Wish, open_parts
 from nics_drl_bridge.nodes.robot_topics import SILENCE_S, RobotTopics
 from nics_drl_bridge.nodes.runner import ACTIVE, UNCONFIGURED, ManagedNode
@@ -38,7 +38,7 @@ class PolicyNode(ManagedNode):
     """Answers each scan with a `cmd_vel_raw` of the same stamp, until the goal is reached."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__("policy_node", policy(), **options)
+        super().__init__("policy_node", list_policy_rows(), **options)
         self._leaders = open_parts("policy", self)
         self._acted_ns = 0
         self._answer: GoalAnswer | None = None  # to the newest goal
@@ -52,25 +52,8 @@ class PolicyNode(ManagedNode):
         """Open model and policy, and subscribe."""
         model = self._model = open_model(runner.get_text(self, "model"))
         self._open_policy(model)
-        self._goal: Array = np.array(self.get_parameter("goal").value, dtype=np.float64)
-        if len(self._goal) != 2 or not (
-            abs(self._goal).max() <= 1e8 or np.isnan(self._goal).all()
-        ):
-            needed = "must be [x, y] within 1e8 m, or both NaN to wait for goal_pose"
-            raise ConfigError(f"parameter 'goal': {needed}, not {self._goal.tolist()}.")
-        names = ("rate", "deadline", "late_limit")
-        rate, limit, patience = (self.get_parameter(name).value for name in names)
-        if rate < 0.0 or limit <= 0.0:
-            values = f"parameters rate {rate}, deadline {limit}"
-            raise ConfigError(f"{values}: must be at least 0, and more than 0.")
-        period = model.control_period
-        self._deadline = Deadline(0.5 * period if np.isnan(limit) else limit, patience)
-        pace_s = 0.0
-        if np.isnan(rate):
-            pace_s = period
-        elif rate > 0.0:
-            pace_s = 1.0 / rate
-        self._pace = ActionPace(pace_s)
+        self._goal = self._read_goal()
+        self._read_pace(model.control_period)
         self._acted_ns = 0
         self._answer = None
         self._raw = self.create_lifecycle_publisher(
@@ -84,7 +67,7 @@ class PolicyNode(ManagedNode):
         self.undo.callback(self._topics.close)
         # covariance of the pose when the goal was set
         self._covariance = self._topics.middleware.estimator.covariance[:3, :3]
-        self._topics.hear_initial_pose()
+        self._topics.subscribe_initial_pose()
         self._frames = GoalFrames(self, self._topics)
         self.undo.callback(self._frames.close)
         for leader in self._leaders:
@@ -96,11 +79,34 @@ class PolicyNode(ManagedNode):
                 self._toward,
                 lambda: begin(self._policy),
             )
-        timer = runner.steadily(self, POLLS * model.control_period, self._act)
+        timer = runner.call_periodically(self, POLLS * model.control_period, self._act)
         self.undo.callback(self.destroy_timer, timer)
-        self._due = runner.steadily(self, model.control_period, self._act)
+        self._due = runner.call_periodically(self, model.control_period, self._act)
         self._due.cancel()  # until a scan comes before an action is due
         self.undo.callback(self.destroy_timer, self._due)
+
+    def _read_goal(self) -> Array:
+        goal = np.array(self.get_parameter("goal").value, dtype=np.float64)
+        if len(goal) != 2 or not (abs(goal).max() <= 1e8 or np.isnan(goal).all()):
+            needed = "must be [x, y] within 1e8 m, or both NaN to wait for goal_pose"
+            raise ConfigError(f"parameter 'goal': {needed}, not {goal.tolist()}.")
+        return goal
+
+    def _read_pace(self, period_s: float) -> None:
+        names = ("rate", "deadline", "late_limit")
+        rate, limit_s, patience = (self.get_parameter(name).value for name in names)
+        if rate < 0.0 or limit_s <= 0.0:
+            values = f"parameters rate {rate}, deadline {limit_s}"
+            raise ConfigError(f"{values}: must be at least 0, and more than 0.")
+        if np.isnan(limit_s):
+            limit_s = 0.5 * period_s
+        self._deadline = Deadline(limit_s, patience)
+        pace_s = 0.0
+        if np.isnan(rate):
+            pace_s = period_s
+        elif rate > 0.0:
+            pace_s = 1.0 / rate
+        self._pace = ActionPace(pace_s)
 
     def activate(self) -> None:
         """Start with a fresh state of the policy."""
@@ -112,7 +118,7 @@ class PolicyNode(ManagedNode):
             for leader in self._leaders:
                 leader.stop("the node is deactivated")
         finally:
-            runner.last_word(self._raw, self._message(np.zeros(3), self._acted_ns))
+            runner.publish_last(self._raw, self._message(np.zeros(3), self._acted_ns))
 
     def _open_policy(self, model: SimulatorModel) -> None:
         name = runner.get_text(self, "policy")

@@ -17,10 +17,10 @@ from nics_drl_bridge.config import PACKAGE
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.listener import GREATEST_DOMAIN_ID, Listener, holds
-from nics_drl_bridge.nodes.node_process import ChildProcess, command_of
-from nics_drl_bridge.nodes.operator import Call, TriggerAnswer, insist
+from nics_drl_bridge.nodes.node_process import ChildProcess, make_command
+from nics_drl_bridge.nodes.operator import Call, TriggerAnswer, ask_until_granted
 from nics_drl_bridge.nodes.starting import NodeStart
-from nics_drl_bridge.nodes.transport import domains_in_use
+from nics_drl_bridge.nodes.transport import find_used_domains
 
 LAST_DOMAIN_ID = 101  # above it DDS ports may collide with Linux's ephemeral ports
 LOG_LINES = 5
@@ -47,7 +47,7 @@ def unused_domain_id() -> int:
     own = {
         int(word) for word in [os.environ.get("ROS_DOMAIN_ID", "0")] if word.isdecimal()
     }
-    unused = set(every) - domains_in_use() - own
+    unused = set(every) - find_used_domains() - own
     return random.SystemRandom().choice(sorted(unused) or every)
 
 
@@ -75,7 +75,7 @@ class NodeProcess(ChildProcess):
             "ROS_DOMAIN_ID": str(domain_id),
             "ROS_AUTOMATIC_DISCOVERY_RANGE": discovery,
         }
-        super().__init__(node, command_of(start, folder), chosen, self.log)
+        super().__init__(node, make_command(start, folder), chosen, self.log)
 
     def check(self) -> None:
         """Raise BackendError with the end of its log if the node has ended by itself."""
@@ -132,7 +132,9 @@ class Witness(AbstractContextManager["Witness", None]):
         def arm() -> TriggerAnswer:
             return Call(self._node, gate, "arm").wait_for_answer(REPLY_S)
 
-        answer = insist(arm, time.monotonic() + timeout_s, lambda _: None, gate)
+        answer = ask_until_granted(
+            arm, time.monotonic() + timeout_s, lambda _: None, gate
+        )
         return "" if answer.granted else answer.told
 
     def touched(self, simulator: str, timeout_s: float) -> bool:

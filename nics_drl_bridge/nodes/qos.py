@@ -35,7 +35,7 @@ except ModuleNotFoundError:  # Humble
     )
 
 
-def profile_of(offer: Offer) -> QoSProfile:
+def make_profile(offer: Offer) -> QoSProfile:
     """Return an offer, or a request, as a profile."""
     reliability = rclpy_qos.ReliabilityPolicy
     durability = rclpy_qos.DurabilityPolicy
@@ -49,7 +49,7 @@ def profile_of(offer: Offer) -> QoSProfile:
     )
 
 
-def offer_of(profile: QoSProfile) -> Offer:
+def make_offer(profile: QoSProfile) -> Offer:
     """Return what a publisher offers, or a subscriber requests."""
     return Offer(
         max(profile.depth, 1),
@@ -58,16 +58,16 @@ def offer_of(profile: QoSProfile) -> Offer:
     )
 
 
-SENSOR = profile_of(Offer(5, reliable=False))
+SENSOR = make_profile(Offer(5, reliable=False))
 """Subscriptions to scans, odometry, poses, IMU; they match every publisher. A new datum is worth
 more than a repeated old one: on a lossy link a reliable scan arrives half a second late and looks
 fresh. Lock-step uses this too: acknowledging each datum takes a tenth of a step, and lost data are
 requested again."""
 
 # publishers of the same topics; they match subscribers of both kinds
-SENSOR_RELIABLE = profile_of(Offer(10))
+SENSOR_RELIABLE = make_profile(Offer(10))
 
-EVERY_COMMAND = profile_of(Offer(10))
+EVERY_COMMAND = make_profile(Offer(10))
 """Commands in lock-step: each one moves the world, so a second publisher must not replace the
 first one's command unnoticed."""
 
@@ -80,16 +80,16 @@ E_STOP = QoSProfile(
 another publisher, must not push it out of the queue while nobody reads."""
 
 # commands and goals: only the newest counts, and it must arrive
-COMMAND = profile_of(Offer(1))
+COMMAND = make_profile(Offer(1))
 # Commands whose publisher the gate checks: one that a second publisher sends at the same moment
 # must not replace the first one's unnoticed.
-EVERY_POLICY = profile_of(Offer(10))
+EVERY_POLICY = make_profile(Offer(10))
 # `/tf`: like tf2's own, whose listeners request reliable
-TRANSFORMS = profile_of(Offer(100))
+TRANSFORMS = make_profile(Offer(100))
 # `/tf_static`, `map`: late joiners get them too
-LATCHED = profile_of(Offer(1, transient_local=True))
+LATCHED = make_profile(Offer(1, transient_local=True))
 # as the diagnostic aggregator expects `/diagnostics`
-DIAGNOSTICS = profile_of(Offer(10))
+DIAGNOSTICS = make_profile(Offer(10))
 
 UNKNOWN = "_UNKNOWN_"
 MOST_WAITING = 10_000  # most messages taken at once, in case a publisher never pauses
@@ -100,21 +100,21 @@ OVERRIDES = "qos_overrides."
 FIXED_TOPICS = (CMD_VEL, inputs.RAW, inputs.E_STOP, "ackermann_cmd")
 
 
-def given_values(node: Node) -> dict[str, Parameter]:
+def get_given_values(node: Node) -> dict[str, Parameter]:
     """Return the initial values that the user has given to a node's parameters, by their names."""
     values: dict[str, Parameter] = getattr(node, "given", {})
     return values
 
 
 @contextlib.contextmanager
-def overriding(node: Node, topic: str, end: str) -> Iterator[dict[str, Any]]:
+def override_qos(node: Node, topic: str, end: str) -> Iterator[dict[str, Any]]:
     """Yield the options with which rclpy makes a `publisher` or `subscription` of a topic.
 
     Raises ConfigError for a topic whose quality of service is fixed, and within the context for a
     value that rclpy refuses.
     """
     prefix = f"{OVERRIDES}{node.resolve_topic_name(topic)}.{end}."
-    given = given_values(node)
+    given = get_given_values(node)
     names = sorted(name for name in given if name.startswith(prefix))
     if names and topic.rsplit("/", 1)[-1] in FIXED_TOPICS:
         reason = "can't be overridden, because the robot's stop depends on it"
@@ -162,18 +162,18 @@ class BridgeNode(Node):
         self, kind: Any, topic: str, qos: Any, **options: Any
     ) -> Publisher:
         """Create a publisher; see rclpy."""
-        with overriding(self, topic, "publisher") as chosen:
+        with override_qos(self, topic, "publisher") as chosen:
             return super().create_publisher(
-                kind, topic, copied(qos), **chosen, **options
+                kind, topic, copy_profile(qos), **chosen, **options
             )
 
     def create_subscription(
         self, kind: Any, topic: str, callback: Any, qos: Any, **options: Any
     ) -> Subscription:
         """Create a subscription; see rclpy."""
-        with overriding(self, topic, "subscription") as chosen:
+        with override_qos(self, topic, "subscription") as chosen:
             return super().create_subscription(
-                kind, topic, callback, copied(qos), **chosen, **options
+                kind, topic, callback, copy_profile(qos), **chosen, **options
             )
 
     def create_lossless_subscription(
@@ -210,18 +210,18 @@ def take_waiting(subscription: Subscription) -> list[bytes]:
     return contents
 
 
-def copied(qos: Any) -> QoSProfile:
+def copy_profile(qos: Any) -> QoSProfile:
     """Return a copy of a profile, because rclpy writes overridden policies into its argument."""
     return copy.copy(qos) if isinstance(qos, QoSProfile) else QoSProfile(depth=qos)
 
 
-def owner(end: Any) -> str | None:
+def find_owner(end: Any) -> str | None:
     """Return the full name of an endpoint's node, or None until it is discovered."""
     name = f"{end.node_namespace.rstrip('/')}/{end.node_name}"
     return None if UNKNOWN in name else name
 
 
-def owners(ends: Iterable[Any]) -> list[str]:
+def list_owners(ends: Iterable[Any]) -> list[str]:
     """Return the full names of the nodes of endpoints, as far as they are discovered."""
-    names = map(owner, ends)
+    names = map(find_owner, ends)
     return [name for name in names if name is not None]

@@ -24,7 +24,10 @@ from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes.link import EpisodeServices, Link
 from nics_drl_bridge.nodes.listener import holds
 from nics_drl_bridge.nodes.parameters import NO_POSE
-from nics_drl_bridge.nodes.robot_topics import RobotTopics, data_facts, declare_sensors
+from nics_drl_bridge.nodes.robot_topics import (
+    RobotTopics,
+    declare_sensors,
+)
 from nics_drl_bridge.sim.world_set import AnyWorld
 
 POLL_S = 0.01
@@ -148,7 +151,7 @@ class RealtimeBackend:
             # the robot itself gets stamped commands, maybe from a gate
             stamped = chosen.stamped
             if stamped is None and chosen.gated:
-                stamped = self._link.hears_stamped(CMD_VEL, chosen.timeout_s)
+                stamped = self._link.expects_stamped(CMD_VEL, chosen.timeout_s)
             elif stamped is None:
                 stamped = self._link.stamped
             declare_sensors(self._link.node, stamped)
@@ -240,7 +243,7 @@ class RealtimeBackend:
                 "stamp_ns": self._topics.newest_ns,
                 "deadline_misses": self._misses,
             }
-            info |= data_facts(self._topics.middleware, time.monotonic_ns())
+            info |= self._topics.middleware.list_facts(time.monotonic_ns())
             self._scan_ns = self._topics.middleware.cache.newest[SCAN].stamp_ns
             _, self._link.frame = self._topics.frames
             return self._topics.view(), info
@@ -327,7 +330,10 @@ class RealtimeBackend:
             return Hindrance("it is still moving", "stop whatever else drives it")
         if start is None or self._options.start == "present":
             return None
-        dx, dy, turn = geometry.between(view.pose, start.pose)
+        return self._find_start_error(view.pose, start)
+
+    def _find_start_error(self, pose: Array, start: Start) -> Hindrance | None:
+        dx, dy, turn = geometry.between(pose, start.pose)
         distance = math.hypot(dx, dy)
         max_distance, max_turn = self._options.tolerance
         if distance <= max_distance and abs(turn) <= max_turn:

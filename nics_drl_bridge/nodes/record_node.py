@@ -2,7 +2,6 @@
 
 import sys
 import time
-from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -19,161 +18,50 @@ from rclpy.publisher import Publisher
 from sensor_msgs.msg import Imu, JointState
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.errors import BackendError, BridgeError, RecordingError
+from nics_drl_bridge.errors import BackendError, BridgeError
 from nics_drl_bridge.exit_codes import EXIT_BAD_INPUT
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.middleware.measurement import CMD_VEL
 from nics_drl_bridge.nodes import conversions, qos, runner
 from nics_drl_bridge.nodes.command_types import (
     SETTINGS,
-    deaf_subscribers,
-    heard_stamped,
+    describe_deaf_subscribers,
+    expect_stamped,
     name_of,
 )
-from nics_drl_bridge.nodes.parameters import IMU, STAMPED, drive
-from nics_drl_bridge.recording.bag_file import Message
+from nics_drl_bridge.nodes.parameters import IMU, STAMPED, list_drive_rows
+from nics_drl_bridge.recording.drive_log import DriveLog
 from nics_drl_bridge.recording.excite import PERIOD_S, STILL_S, DrivePlan
 from nics_drl_bridge.recording.imu_axis import GyroReader
 from nics_drl_bridge.recording.messages import (
     get_stamp,
     read_imu,
     read_pose,
-    read_twist,
 )
 from nics_drl_bridge.recording.recording import Recording
-from nics_drl_bridge.recording.role_mapping import read_joint_streams
-from nics_drl_bridge.recording.stamping import Nanoseconds, TopicData, stamp_streams
 from nics_drl_bridge.recording.topic_roles import (
     TopicRoles,
     list_imu_topics,
     load_topic_roles,
 )
 from nics_drl_bridge.recording.write import check_out, write_drive
-from nics_drl_bridge.robot.spec import RobotSpec, load_robot
+from nics_drl_bridge.robot.spec import load_robot
 
 PATIENCE_S = 10.0
 POLL_S = 0.01
 # zero is repeated for this long [s]: a best-effort subscriber may miss one
 HALT_S = 0.5
 PERIOD_NS = round(PERIOD_S * NS_PER_S)
-PLACE = "recording"
-FEWEST = 2
-# plausible rate of stamps relative to receipt; otherwise they are of another kind of time
-SAME_PACE = (0.8, 1.25)
 
 
 def declare_drive(node: Node) -> tuple[DrivePlan, Path, TopicRoles]:
     """Declare the parameters of a drive; return plan, file and roles. Raises ConfigError."""
-    values = {row.name: runner.declare_row(node, row) for row in drive()}
+    values = {row.name: runner.declare_row(node, row) for row in list_drive_rows()}
     robot = load_robot(values["robot"])
     robot.require_cmd_vel()
     pattern = [values[name] for name in ("bound", "duration", "speed", "seed")]
     out = check_out(Path(values["out"]))
     return DrivePlan(robot, *pattern), out, load_topic_roles(values["topics"] or None)
-
-
-class DriveLog:
-    """Keeps a drive in memory; `now` is the clock of receipt [ns], the same as for the stamps."""
-
-    def __init__(
-        self, spec: RobotSpec, roles: TopicRoles, now: Callable[[], int]
-    ) -> None:
-        self._spec = spec
-        self._roles = roles
-        self._now = now
-        # Topic, or `odom twist` -> receipt [ns], stamp [ns] or 0, and values of each message.
-        self.rows: dict[str, list[tuple[int, int, Array]]] = defaultdict(list)
-        self._joints: list[Message] = []
-
-    @property
-    def seconds(self) -> float:
-        """Time over which commands were sent [s]."""
-        return (self.rows[CMD_VEL][-1][0] - self.rows[CMD_VEL][0][0]) / NS_PER_S
-
-    def add(self, topic: str, header_ns: int, values: ArrayLike) -> bool:
-        """Add a message; return False if it is not finite or not newer than the last one."""
-        rows = self.rows[topic]
-        values = np.asarray(values, np.float64)
-        if (rows and 0 != header_ns <= rows[-1][1]) or not np.isfinite(values).all():
-            return False
-        rows.append((self._now(), header_ns, values))
-        return True
-
-    def odometry(self, message: Odometry) -> Array | None:
-        """Record an odometry; return its pose (3,), or None if it is old, NaN or inf."""
-        header = get_stamp(message)
-        pose = np.array(read_pose(message))
-        if not self.add("odom", header, pose):
-            return None
-        self.add("odom twist", header, read_twist(message))
-        return pose
-
-    def joints(self, message: JointState) -> None:
-        """Record the data of the joints."""
-        self._joints.append(Message(self._now(), message))
-
-    def check(self) -> None:
-        """Raise BridgeError if a state is not measured or stamps run at another rate."""
-        measured = [v.name for v in self._spec.state if v.must_be_measured]
-        if self._joints:
-            read_joint_streams(
-                "joint_states", self._joints, self._spec, self._roles, PLACE
-            )
-        elif measured or self._roles.state:
-            what = f"{(measured or ['the state'])[0]} of robot {self._spec.name!r}"
-            fix = "has to be measured; start the joints' publisher, or remap the topic."
-            raise BackendError(
-                f"topic 'joint_states': nothing has arrived, but {what} {fix}"
-            )
-        receive, header = np.array([row[:2] for row in self.rows["odom"]]).T
-        heard = (receive[-1] - receive[0]) / NS_PER_S
-        rate = pace(receive, header)
-        if not SAME_PACE[0] <= rate <= SAME_PACE[1]:
-            off = f"its stamps advanced by {rate * heard:.2f} s within {heard:.2f} s"
-            fix = "take the time of a simulator by --use-sim-time, or -p use_sim_time:=true."
-            raise BackendError(f"topic 'odom': {off}; {fix}")
-
-    def recording(self) -> Recording:
-        """Return all streams on their clocks. Raises RecordingError if too little was received."""
-        topics = {"command": CMD_VEL, "pose": "odom", "imu": "imu"}
-        if len(self.rows["pose"]) >= FEWEST:
-            # for the noise of the odometry
-            topics |= {"pose": "pose", "odometry": "odom twist"}
-        data: dict[str, TopicData] = {}
-        for name, topic in topics.items():
-            if len(self.rows[topic]) >= FEWEST:
-                times_and_values = map(np.array, zip(*self.rows[topic], strict=True))
-                data[name] = TopicData(topic.removesuffix(" twist"), *times_and_values)
-        if not data.keys() >= {"command", "pose"}:
-            raise RecordingError("recording: nothing was received that could be saved.")
-        if len(self._joints) >= FEWEST:
-            data |= read_joint_streams(
-                "joint_states", self._joints, self._spec, self._roles, PLACE
-            )
-        try:
-            kept: Any = stamp_streams(data, self._roles.stamps, PLACE)
-        except RecordingError:
-            # The drive is over: a recording with poorer stamps is better than none.
-            kept = stamp_streams(data, "receive", PLACE)
-        tracked = len(self.rows["pose"]) >= FEWEST
-        return Recording(
-            **kept,
-            source=PLACE,
-            variables=self._spec.variable_names,
-            measured_by="tracker" if tracked else "odometry",
-        )
-
-
-def pace(receive: Nanoseconds, header: Nanoseconds) -> float:
-    """Return stamped seconds per second of receipt, from the least delayed message of each half."""
-    heard = receive[-1] - receive[0]
-    stamped = header[-1] - header[0]
-    if heard <= 0 or stamped <= 0:
-        return 1.0
-    delay = receive - header
-    half = len(receive) // 2
-    apart = heard * half / (len(delay) - 1)
-    return float(1.0 - (delay[half:].min() - delay[:half].min()) / apart)
 
 
 @dataclass(frozen=True)
@@ -198,11 +86,11 @@ class RecordNode(qos.BridgeNode):
         self._steady_origin_ns = time.time_ns() - time.monotonic_ns()
         self._log = DriveLog(self._plan.robot, roles, self._now_ns)
         self._topic: Publisher | None = None
-        if STAMPED in qos.given_values(self):
+        if STAMPED in qos.get_given_values(self):
             self._speak(runner.get_flag(self, STAMPED))
         self.create_subscription(Odometry, "odom", self._on_odometry, qos.SENSOR)
         self.create_subscription(
-            JointState, "joint_states", self._log.joints, qos.SENSOR
+            JointState, "joint_states", self._log.take_joints, qos.SENSOR
         )
         take_pose = partial(self._take, "pose", read_pose)
         self.create_subscription(PoseStamped, "pose", take_pose, qos.SENSOR)
@@ -221,7 +109,7 @@ class RecordNode(qos.BridgeNode):
         self._frame = ""  # of the robot, by its odometry
         self._start: Array = np.zeros(3)
         # On the steady clock: the guard must not depend on the node's time source.
-        runner.steadily(self, POLL_S, self._on_time)
+        runner.call_periodically(self, POLL_S, self._on_time)
 
     def _speak(self, stamped: bool) -> None:
         self._stamped = stamped
@@ -248,7 +136,7 @@ class RecordNode(qos.BridgeNode):
         self._stamp_ns = max(
             self._stamp_ns, conversions.stamp_from_ros(message.header.stamp)
         )
-        pose = self._log.odometry(message)
+        pose = self._log.take_odometry(message)
         if pose is None:
             return
         self._pose = pose
@@ -273,7 +161,7 @@ class RecordNode(qos.BridgeNode):
     def _ready(self) -> bool:
         topic = self.resolve_topic_name(CMD_VEL)
         if self._topic is None and self.count_subscribers(topic):
-            heard = heard_stamped(self, CMD_VEL)
+            heard = expect_stamped(self, CMD_VEL)
             self._speak(runner.get_flag(self, STAMPED) if heard is None else heard)
         listened = self._topic is not None and self._topic.get_subscription_count() > 0
         if listened and self._pose is not None and self._now_ns() > 0:
@@ -294,7 +182,7 @@ class RecordNode(qos.BridgeNode):
             fix = "start the robot, or correct namespace, ROS_DOMAIN_ID or remapping."
             reason = f"{missing} within {PATIENCE_S:g} s"
             if self._pose is not None and self._topic is not None:
-                deaf = deaf_subscribers(self, CMD_VEL, self._stamped)
+                deaf = describe_deaf_subscribers(self, CMD_VEL, self._stamped)
                 if deaf:
                     setting = SETTINGS[name_of(not self._stamped)]
                     fix = f"set {setting}, or leave it out."
@@ -374,11 +262,11 @@ class RecordNode(qos.BridgeNode):
             self._send(zero)
             time.sleep(PERIOD_S)
         if self._topic is not None:
-            runner.last_word(self._topic, self._message(np.zeros(3)))
+            runner.publish_last(self._topic, self._message(np.zeros(3)))
 
     def _save(self) -> tuple[Recording | None, str]:
         try:
-            recording = self._log.recording()
+            recording = self._log.make_recording()
             write_drive(recording, self._out, self._plan.robot)
         except (BridgeError, OSError) as error:
             return None, f"nothing was saved ({error})"

@@ -28,13 +28,13 @@ from nics_drl_bridge.middleware.ekf import ANYWHERE, START_STD
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.command_types import KINDS, TypeWatch, name_of
-from nics_drl_bridge.nodes.conversions import INITIAL_POSE, initial_pose
+from nics_drl_bridge.nodes.conversions import INITIAL_POSE, read_initial_pose
 from nics_drl_bridge.nodes.parameters import (
     IMU,
     NO_POSE,
     POSE_TYPES,
     STAMPED,
-    sensors,
+    list_sensor_rows,
 )
 from nics_drl_bridge.nodes.runner import declare_row, get_flag, get_text
 from nics_drl_bridge.recording import messages
@@ -49,7 +49,7 @@ KINDS_OF_POSE = {
 
 def declare_sensors(node: Node, stamped: bool | None = None) -> None:
     """Declare a robot's sensors except scan and odometry, and the command type, if known."""
-    for row in sensors():
+    for row in list_sensor_rows():
         if row.name == STAMPED and stamped is not None:
             row = row._replace(default=stamped)
         declare_row(node, row)
@@ -111,12 +111,12 @@ class RobotTopics:
             heard[measurement.POSE] = (KINDS_OF_POSE[pose_type], self._take_pose)
         for sensor in model.sensors:
             take_reading = partial(self._take_reading, sensor)
-            heard[sensor.name] = (conversions.sensor_type(sensor), take_reading)
+            heard[sensor.name] = (conversions.find_sensor_type(sensor), take_reading)
         for topic, (type_, take) in heard.items():
             self._subscribe(topic, type_, take, qos.SENSOR)
         self.expected = tuple(heard)
         self.expected_topics = self.expected
-        self._hear_imu()
+        self._subscribe_imu()
 
     def _subscribe(
         self, topic: str, kind: Any, take: Callable[[Any], None], quality: Any
@@ -135,7 +135,7 @@ class RobotTopics:
             return False
         return not any(self._node.count_publishers(topic) for topic in IMU_NAMES)
 
-    def _hear_imu(self) -> None:
+    def _subscribe_imu(self) -> None:
         """Subscribe to the gyro if one is named or the model was made with one."""
         wanted = get_text(self._node, IMU)
         topics = list_imu_topics(wanted, self._model.gyro)
@@ -174,7 +174,7 @@ class RobotTopics:
         """Define `map` so that the robot's present pose in it is `pose` (3,)."""
         self.middleware.place(pose, START_STD**2 * np.eye(3))
 
-    def hear_initial_pose(self) -> None:
+    def subscribe_initial_pose(self) -> None:
         """Subscribe to `initialpose`, the robot's pose in the map."""
         kind = PoseWithCovarianceStamped
         self._subscribe(INITIAL_POSE, kind, self._take_initial_pose, qos.COMMAND)
@@ -182,7 +182,7 @@ class RobotTopics:
     def _take_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
         logger = self._node.get_logger()
         try:
-            pose = initial_pose(message, get_text(self._node, "map_frame"))
+            pose = read_initial_pose(message, get_text(self._node, "map_frame"))
             self._placed = pose, self._initial_covariance(message)
         except ConfigError as error:
             logger.error(f"{error} The estimate stays as it is.")
@@ -205,7 +205,7 @@ class RobotTopics:
                 raise ConfigError(f"{INITIAL_POSE}: {error}; {fix}") from None
         return START_STD**2 * np.eye(3) if covariance is None else covariance
 
-    def in_odom(self) -> Array | None:
+    def locate_in_odom(self) -> Array | None:
         """Return the robot's odometry pose (3,) at the newest datum; None before any."""
         newest = self.middleware.cache.newest.get(measurement.ODOM)
         if newest is None:
@@ -243,7 +243,7 @@ class RobotTopics:
         stamp = messages.get_stamp(message)
         if stamp < self._since_ns:
             return
-        reader = self._reader_for(message)
+        reader = self._find_reader(message)
         if reader is None:
             self.middleware.cache.reject(measurement.SCAN, "another lidar")
             return
@@ -255,7 +255,7 @@ class RobotTopics:
         ):
             self._on_scan(stamp)
 
-    def _reader_for(self, message: LaserScan) -> Reader | None:
+    def _find_reader(self, message: LaserScan) -> Reader | None:
         fields = [
             message.angle_min,
             message.angle_increment,
@@ -332,18 +332,3 @@ class RobotTopics:
         self.middleware.command(
             None, self._robot.from_cmd_vel(conversions.twist_from_ros(message))
         )
-
-
-def data_facts(middleware: Middleware, now_ns: int) -> dict[str, Any]:
-    """Return facts for `info`: each topic's newest datum, and the covariance of the pose (3, 3).
-
-    Of each datum they hold its number, its stamp [ns] and the silence since it arrived [s].
-    """
-    facts: dict[str, Any] = {
-        "covariance": middleware.estimator.covariance[:3, :3].copy()
-    }
-    for topic, datum in middleware.cache.newest.items():
-        facts[f"{topic}_sequence"] = datum.sequence
-        facts[f"{topic}_stamp_ns"] = datum.stamp_ns
-        facts[f"{topic}_silence_s"] = (now_ns - datum.arrival_ns) * 1e-9
-    return facts

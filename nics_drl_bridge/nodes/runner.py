@@ -35,9 +35,19 @@ from nics_drl_bridge.exit_codes import EXIT_BAD_INPUT
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.nodes import qos
 from nics_drl_bridge.nodes.listener import open_context, spin
-from nics_drl_bridge.nodes.own_process import at_once, ending_signals, ros_arguments
-from nics_drl_bridge.nodes.parameters import MODEL, Row, frame_fault, managed, sensors
-from nics_drl_bridge.nodes.qos import BridgeNode, copied, overriding
+from nics_drl_bridge.nodes.own_process import (
+    end_at_once,
+    list_ending_signals,
+    list_log_arguments,
+)
+from nics_drl_bridge.nodes.parameters import (
+    MODEL,
+    Row,
+    find_frame_fault,
+    list_managed_rows,
+    list_sensor_rows,
+)
+from nics_drl_bridge.nodes.qos import BridgeNode, copy_profile, override_qos
 
 UNCONFIGURED = "unconfigured"
 INACTIVE = "inactive"
@@ -52,7 +62,7 @@ RANGES = {
 SHARED = "model"  # a file may also set it for nodes without a model
 
 
-def last_word(publisher: Publisher, message: Any) -> None:
+def publish_last(publisher: Publisher, message: Any) -> None:
     """Publish a message that must arrive although the publisher is destroyed next."""
     publisher.publish(message)
     publisher.wait_for_all_acked(Duration(seconds=DELIVERY_S))
@@ -66,19 +76,19 @@ def run_node(
     A known error prints one sentence, and ends with exit code 2.
     """
     stopping = threading.Event()
-    for number in ending_signals():
+    for number in list_ending_signals():
         signal.signal(number, lambda *_: stopping.set())
     words = sys.argv if args is None else args
     try:
-        with at_once():
-            context = open_context([*words, *ros_arguments(words)])
-        return live(make, context, stopping, sole_name)
+        with end_at_once():
+            context = open_context([*words, *list_log_arguments(words)])
+        return run_until_end(make, context, stopping, sole_name)
     except INPUT_ERRORS as error:
         sys.stderr.write(f"{explain(error)}\n")
         raise SystemExit(EXIT_BAD_INPUT) from None
 
 
-def live(
+def run_until_end(
     make: Callable[..., Node],
     context: Context,
     stopping: threading.Event,
@@ -90,15 +100,15 @@ def live(
     """
     with contextlib.ExitStack() as undo:
         undo.callback(context.try_shutdown)
-        with at_once():
+        with end_at_once():
             if sole_name:
-                undo.enter_context(sole(context, sole_name))
+                undo.enter_context(claim_name(context, sole_name))
             node = make(context=context)
             undo.callback(_end, node)
             if hasattr(node, "start"):
                 node.start()
         gc.collect()  # now, because later it may take 0.1 s while the robot moves
-        for sentence in unknown(node):  # rclpy ignores them silently
+        for sentence in explain_ignored_values(node):  # rclpy ignores them silently
             node.get_logger().warning(sentence)
         if getattr(node, "state", ACTIVE) == ACTIVE:
             node.get_logger().info("running")
@@ -121,7 +131,7 @@ def explain(error: Exception) -> str:
 
 
 @contextlib.contextmanager
-def sole(context: Context, name: str) -> Iterator[None]:
+def claim_name(context: Context, name: str) -> Iterator[None]:
     """Ensure a single instance on this machine while a node runs. Raises BackendError."""
     # The probe resolves its name exactly like the node.
     probe = Node(
@@ -144,7 +154,7 @@ def sole(context: Context, name: str) -> Iterator[None]:
         yield
 
 
-def steadily(node: Node, period_s: float, call: Callable[[], Any]) -> Timer:
+def call_periodically(node: Node, period_s: float, call: Callable[[], Any]) -> Timer:
     """Call a function periodically on the steady clock, even while simulated time stands still."""
     return node.create_timer(
         period_s, call, clock=Clock(clock_type=ClockType.STEADY_TIME)
@@ -197,15 +207,15 @@ def declare_row(node: Node, row: Row) -> Any:
         kind, field = RANGES[type(row.default)]
         setattr(descriptor, field, [kind(from_value=low, to_value=high)])
     # rclpy refuses whole numbers for a floating-point parameter, as in `rate:=2`.
-    given = qos.given_values(node).get(row.name)
+    given = qos.get_given_values(node).get(row.name)
     value = row.default
-    if given is not None and _are_whole_numbers(row.default, given):
+    if given is not None and _holds_whole_numbers(row.default, given):
         value = np.asarray(given.value, np.float64).tolist()
     is_whole = value is not row.default
     return node.declare_parameter(row.name, value, descriptor, is_whole).value
 
 
-def _are_whole_numbers(default: Any, given: Parameter) -> bool:
+def _holds_whole_numbers(default: Any, given: Parameter) -> bool:
     """True if whole numbers are given for one or more floats."""
     if isinstance(default, list):
         is_list_of_floats = all(isinstance(value, float) for value in default)
@@ -213,7 +223,7 @@ def _are_whole_numbers(default: Any, given: Parameter) -> bool:
     return isinstance(default, float) and given.type_ == Parameter.Type.INTEGER
 
 
-def unknown(node: Node) -> list[str]:
+def explain_ignored_values(node: Node) -> list[str]:
     """Return a sentence for each value whose parameter the node does not have.
 
     A managed node that is not configured has no topics yet, whose quality of service it could set.
@@ -226,7 +236,7 @@ def unknown(node: Node) -> list[str]:
     ignores = getattr(node, "ignores", lambda _: False)
     has_topics = getattr(node, "state", ACTIVE) != UNCONFIGURED
     sentences = []
-    for name in sorted(qos.given_values(node)):
+    for name in sorted(qos.get_given_values(node)):
         if name == SHARED or node.has_parameter(name) or ignores(name):
             continue
         if not name.startswith(qos.OVERRIDES):
@@ -276,7 +286,7 @@ def diagnose(node: Node, part: str, look: Callable[[], Condition]) -> None:
         message.header.stamp = node.get_clock().now().to_msg()
         topic.publish(message)
 
-    steadily(node, DIAGNOSTICS_S, publish)
+    call_periodically(node, DIAGNOSTICS_S, publish)
 
 
 SUCCESS = TransitionCallbackReturn.SUCCESS
@@ -293,8 +303,9 @@ class ManagedNode(BridgeNode, LifecycleNode):
         super().__init__(name, **options)
         self.fixed: set[str] = set()
         self.undo = ExitStack()
-        values = [declare_row(self, row) for row in (*managed(), *sensors(), *rows)]
-        fault = frame_fault(self.get_parameters_by_prefix("").values())
+        every = (*list_managed_rows(), *list_sensor_rows(), *rows)
+        values = [declare_row(self, row) for row in every]
+        fault = find_frame_fault(self.get_parameters_by_prefix("").values())
         if fault:
             raise ConfigError(fault)
         self._autostart = bool(values[0])
@@ -306,9 +317,9 @@ class ManagedNode(BridgeNode, LifecycleNode):
 
     def create_lifecycle_publisher(self, kind: Any, topic: str, qos: Any) -> Publisher:
         """Create a publisher, until clean-up, that is silent unless the node is active."""
-        with overriding(self, topic, "publisher") as options:
+        with override_qos(self, topic, "publisher") as options:
             made = super().create_lifecycle_publisher(
-                kind, topic, copied(qos), **options
+                kind, topic, copy_profile(qos), **options
             )
         self.undo.callback(self.destroy_lifecycle_publisher, made)
         return made
@@ -344,7 +355,9 @@ class ManagedNode(BridgeNode, LifecycleNode):
 
     def _check_fixed(self, parameters: list[Parameter]) -> SetParametersResult:
         late = sorted(self.fixed & {parameter.name for parameter in parameters})
-        reason = frame_fault((*self.get_parameters_by_prefix("").values(), *parameters))
+        reason = find_frame_fault(
+            (*self.get_parameters_by_prefix("").values(), *parameters)
+        )
         if late and self.state != UNCONFIGURED:
             lead = f"`ros2 lifecycle set {self.get_fully_qualified_name()} deactivate`"
             fix = f"return it to unconfigured by {lead}, then `cleanup`."
@@ -353,7 +366,7 @@ class ManagedNode(BridgeNode, LifecycleNode):
 
     def on_configure(self, _: LifecycleState) -> TransitionCallbackReturn:
         """Configure the node; a failure leaves it unconfigured."""
-        with at_once():  # opening a policy may compile; nothing was commanded yet
+        with end_at_once():  # opening a policy may compile; nothing was commanded yet
             done = self._attempt(self.configure, INACTIVE)
         if done == FAILURE:
             self.undo.close()

@@ -36,15 +36,16 @@ from nics_drl_bridge.nodes import (
     wire,
 )
 from nics_drl_bridge.nodes.command_types import KINDS, TypeWatch, name_of
-from nics_drl_bridge.nodes.conversions import sensor_to_ros, sensor_type
-from nics_drl_bridge.nodes.frames import odom_in_map, transform_to_ros
-from nics_drl_bridge.nodes.link import EPISODE_NS, identity
-from nics_drl_bridge.nodes.message_packages import how_to_install
+from nics_drl_bridge.nodes.conversions import find_sensor_type, sensor_to_ros
+from nics_drl_bridge.nodes.frames import compute_odom_in_map, transform_to_ros
+from nics_drl_bridge.nodes.link import EPISODE_NS, get_fingerprints
+from nics_drl_bridge.nodes.message_packages import explain_install
 from nics_drl_bridge.nodes.parts import open_parts
 from nics_drl_bridge.nodes.runner import OK, WARN
 from nics_drl_bridge.nodes.world_topics import WorldTopics
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.device import LEAST_VARIANCE, DeviceWorld, Sensed, variances
+from nics_drl_bridge.sim.pacing import RealTime, TopicPace
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
@@ -148,7 +149,7 @@ class RobotPort:
             (
                 sensor,
                 frames.prefix + sensor.frame,
-                publisher(sensor_type(sensor), sensor.name),
+                publisher(find_sensor_type(sensor), sensor.name),
             )
             for sensor in model.sensors
         ]
@@ -188,7 +189,7 @@ class RobotPort:
         frames = self.frames
         moving = [transform_to_ros(frames.odom, frames.base, sensed.odom, now_ns)]
         if self._locates:
-            home = odom_in_map(sensed.pose, sensed.odom)
+            home = compute_odom_in_map(sensed.pose, sensed.odom)
             moving.append(transform_to_ros(frames.map, frames.odom, home, now_ns))
         return moving
 
@@ -242,7 +243,9 @@ class CommandInlet:
         self._topic = self._commands.topic_name
         self.heard = [self._commands]
         self._types = TypeWatch(node, self._topic, kind)
-        drive = conversions.message_type("ackermann_msgs/msg/AckermannDriveStamped")
+        drive = conversions.find_message_type(
+            "ackermann_msgs/msg/AckermannDriveStamped"
+        )
         if robot.steers and drive is not None:  # its package is optional
             topic = f"{namespace}ackermann_cmd"
             self.heard.append(
@@ -264,10 +267,10 @@ class CommandInlet:
         stamp_ns = 0
         try:
             if stamped:
-                stamp_ns = wire.stamp_of(content)
-                twist = wire.stamped_twist_of(content)
+                stamp_ns = wire.read_stamp(content)
+                twist = wire.read_stamped_twist(content)
             else:
-                twist = wire.twist_of(content)
+                twist = wire.read_twist(content)
         except wire.UNREADABLE as error:
             self._complain(f"a message that can't be read ({error}) is ignored")
             return
@@ -315,10 +318,10 @@ class DeviceNode(qos.BridgeNode):
         super().__init__(name, **options)
         model = runner.declare_model(self)
         device_parameters.declare_device(self, model.lidar.frame)
-        self._time = device_parameters.timing(self, model)
+        self._time = device_parameters.get_timing(self, model)
         self._names = parameters.name_fleet(self.get_parameter("robots").value)
         self._given = model
-        self.model = device_parameters.timed_model(self, model, self._time)
+        self.model = device_parameters.apply_timing(self, model, self._time)
         self._make = make
         self.use_world(load_worlds(runner.get_text(self, "world")))
         self.paused = False
@@ -340,8 +343,8 @@ class DeviceNode(qos.BridgeNode):
         simulator = self.make_simulator(world, len(self._names))
         self.world = world
         self.device = DeviceWorld(simulator, self.model, len(self._names))
-        self._identity = identity(
-            self._given, world, device_parameters.randomisation(self)
+        self._identity = get_fingerprints(
+            self._given, world, device_parameters.get_randomisation(self)
         )
 
     def make_simulator(self, world: AnyWorld, robots: int) -> FastSimulator:
@@ -381,7 +384,7 @@ class DeviceNode(qos.BridgeNode):
 
     def _open_robot(self, name: str) -> None:
         space = f"{name}/" if name else ""
-        frames = device_parameters.frames(self, name.strip("/"))
+        frames = device_parameters.get_frames(self, name.strip("/"))
         port = RobotPort(self, space, self.model, frames, self._time, self._outbox)
         port.inlet = CommandInlet(
             self,
@@ -419,7 +422,7 @@ class DeviceNode(qos.BridgeNode):
         self._transforms: Any = conversions.transforms_type()
         if self._transforms is None:
             silent = "so neither /tf nor /tf_static is published"
-            fix = how_to_install("tf2_msgs")
+            fix = explain_install("tf2_msgs")
             self.get_logger().warning(
                 f"the package tf2_msgs is not installed, {silent}; {fix}."
             )
@@ -437,11 +440,11 @@ class DeviceNode(qos.BridgeNode):
 
     def _start_time(self) -> None:
         # On the steady clock: with use_sim_time the node's clock would wait for this very node.
-        runner.steadily(self, WATCH_S, self._watch)
+        runner.call_periodically(self, WATCH_S, self._watch)
         step_ns = self._time.step_ns
-        self._odom_pace = device_parameters.TopicPace(self._time.odom_ns, step_ns)
-        self._scan_pace = device_parameters.TopicPace(self._time.scan_ns, step_ns)
-        self._real_time = device_parameters.RealTime(step_ns, self._time.rate)
+        self._odom_pace = TopicPace(self._time.odom_ns, step_ns)
+        self._scan_pace = TopicPace(self._time.scan_ns, step_ns)
+        self._real_time = RealTime(step_ns, self._time.rate)
         self._timer = None
         self._soon = self.create_guard_condition(self._on_time)
         self._complete = self.create_guard_condition(self._advance_if_complete)
@@ -450,14 +453,16 @@ class DeviceNode(qos.BridgeNode):
             # If data are published later than measured, use a tick that divides the step.
             late = any((*self._time.scan_late_ns, *self._time.odom_late_ns))
             ticks = max(1.0, np.ceil(period / LONGEST_TICK_S)) if late else 1.0
-            self._timer = runner.steadily(self, period / ticks, self._on_time)
+            self._timer = runner.call_periodically(self, period / ticks, self._on_time)
             if period * NS_PER_S > CLOCK_NS:
-                runner.steadily(self, CLOCK_NS / NS_PER_S, self._on_clock)
+                runner.call_periodically(self, CLOCK_NS / NS_PER_S, self._on_clock)
         elif not self._time.lockstep:
-            runner.steadily(self, 0.0, lambda: None if self.paused else self.step())
+            runner.call_periodically(
+                self, 0.0, lambda: None if self.paused else self.step()
+            )
 
     def _watch(self) -> None:
-        names = set(qos.owners(self.get_publishers_info_by_topic(CLOCK)))
+        names = set(qos.list_owners(self.get_publishers_info_by_topic(CLOCK)))
         for name in names - self._clocks:
             self.get_logger().warning(
                 f"{name} publishes {CLOCK} too, and nodes with use_sim_time hear both; give each "
@@ -565,7 +570,7 @@ class DeviceNode(qos.BridgeNode):
         """Begin the episode of the parameters; if `rewind`, set time back to its start."""
         seed = int(self.get_parameter("episode_seed").value)
         # comes first: if it raises, the present episode goes on
-        self.device.begin(seed, device_parameters.episode_start(self))
+        self.device.begin(seed, device_parameters.get_episode_start(self))
         if rewind:
             self.now_ns = self._first_ns
         for port in self._ports:
@@ -656,20 +661,20 @@ class DeviceNode(qos.BridgeNode):
 
 def declare_renderer(node: Node, default: Renderer) -> Renderer:
     """Declare the parameter `renderer`, and return its value."""
-    runner.declare_row(node, parameters.renderer(default))
-    return cast(Renderer, device_parameters.choice(node, "renderer", RENDERERS))
+    runner.declare_row(node, parameters.make_renderer_row(default))
+    return cast(Renderer, device_parameters.get_choice(node, "renderer", RENDERERS))
 
 
-def fast_simulator(
+def make_fast_simulator(
     node: Node, model: SimulatorModel, world: AnyWorld, robots: int
 ) -> FastSimulator:
     """Make the fast simulator with the lidar renderer that the parameter `renderer` names."""
     renderer = declare_renderer(node, defaults.RENDERER)
     tell = node.get_logger().warning
-    drawn = device_parameters.randomisation(node)
+    drawn = device_parameters.get_randomisation(node)
     options: Any = {"renderer": renderer, "randomisation": drawn, "tell": tell}
     return FastSimulator(model, world, robots=robots, **options)
 
 
-SimulatorNode = partial(DeviceNode, "simulator_node", fast_simulator)
+SimulatorNode = partial(DeviceNode, "simulator_node", make_fast_simulator)
 main = partial(runner.run_node, SimulatorNode, sole_name="simulator_node")

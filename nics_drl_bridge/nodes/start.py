@@ -21,7 +21,7 @@ END = "--"
 WIDTH = 100
 
 
-def help_of(node: str) -> str:
+def format_help(node: str) -> str:
     """Return the help of a node by the name of its executable."""
     if node not in NODES:
         return f"usage: {node} [{ROS} -p NAME:=VALUE -r FROM:=TO ...]\n"
@@ -42,7 +42,9 @@ def help_of(node: str) -> str:
         "\n".join(topics),
         "parameters, with their defaults:",
         "\n".join(
-            hang(f"    {row.name} = {row.shown or words_of(row.default)}: {row.about}")
+            hang(
+                f"    {row.name} = {row.shown or format_value(row.default)}: {row.about}"
+            )
             for row in facts.parameters
         ),
         "and `use_sim_time`, like every ROS 2 node. `ros2 param describe` also shows the ranges.",
@@ -51,17 +53,17 @@ def help_of(node: str) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def words_of(value: Any) -> str:
+def format_value(value: Any) -> str:
     """Return a value as it is written after `:=`."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, list):
-        return f"[{', '.join(map(words_of, value))}]"
+        return f"[{', '.join(map(format_value, value))}]"
     text = str(value) if value != "" else "''"
     return f".{text}" if text == "nan" else text
 
 
-def wrong_with(node: str, words: Sequence[str]) -> str:
+def find_fault(node: str, words: Sequence[str]) -> str:
     """Return a sentence about the first word that is not an argument of a node, or ""."""
     ours = True  # False for the words that ROS 2 itself checks
     for word in words:
@@ -78,17 +80,17 @@ def wrong_with(node: str, words: Sequence[str]) -> str:
 
 def start(node: str, args: list[str] | None = None) -> None:
     """Run a node by its name and end the process; bad input gives one sentence and exit code 2."""
-    for number in own_process.ending_signals():  # importing the node takes seconds
+    for number in own_process.list_ending_signals():  # importing the node takes seconds
         signal.signal(number, signal.SIG_DFL)
     words = sys.argv[1:] if args is None else args[1:]
     if any(word in HELP for word in words):
-        sys.stdout.write(help_of(node))
+        sys.stdout.write(format_help(node))
         own_process.leave(0)
-    sentence = wrong_with(node, words)
+    sentence = find_fault(node, words)
     if sentence:
         sys.stderr.write(f"{sentence}\n")
         own_process.leave(EXIT_BAD_INPUT)
-    own_process.forward_output(own_process.log_file(node, words))
+    own_process.forward_output(own_process.name_log_file(node, words))
     faulthandler.enable()  # shows where Python was when a library crashes
     # In the format of the ROS 2 log, which is available only seconds later.
     sys.stderr.write(f"[INFO] [{time.time():.9f}] [{node}]: starting\n")
@@ -97,7 +99,7 @@ def start(node: str, args: list[str] | None = None) -> None:
     try:
         transport.set_transport(os.environ)
         own_process.begin_own_process()
-        main = _main_of(node)
+        main = _load_main(node)
         main(args)
     except SystemExit as end:
         code = end.code
@@ -109,7 +111,7 @@ def start(node: str, args: list[str] | None = None) -> None:
     own_process.leave(code if isinstance(code, int) else 1)
 
 
-def _main_of(node: str) -> Any:
+def _load_main(node: str) -> Any:
     from importlib import import_module
     from importlib.util import find_spec
 

@@ -156,7 +156,7 @@ class Setup:
 
     def description(self) -> str:
         """Return the URDF of the robot. Raises ConfigError if no argument names the robot."""
-        own_file = self["params_file"] not in ("", shipped_parameters())
+        own_file = self["params_file"] not in ("", find_shipped_parameters())
         if own_file and not (self["model"] or self["urdf"]):
             fix = "say model:=ROBOT or urdf:=FILE, or use_robot_state_pub:=false"
             raise ConfigError(
@@ -350,7 +350,7 @@ def common(use_sim_time: str) -> list[Argument]:
     ]
 
 
-def shipped_parameters() -> str:
+def find_shipped_parameters() -> str:
     """Return the path of the parameter file that is used by default."""
     return str(find_config("bridge", "nodes"))
 
@@ -362,7 +362,7 @@ def of_nodes() -> list[Argument]:
         "empty: params_file, else TwistStamped on Kilted and newer"
     )
     return [
-        Argument("params_file", shipped_parameters(), "Parameters of all nodes"),
+        Argument("params_file", find_shipped_parameters(), "Parameters of all nodes"),
         Argument("stamped", "", stamped),
     ]
 
@@ -412,7 +412,7 @@ def e_stop_required(default: str) -> Argument:
 
 def of_description() -> list[Argument]:
     """Return the arguments of the description, which draws a robot in RViz."""
-    installed = "true" if prefix_of(STATE_PUBLISHER) else "false"
+    installed = "true" if find_prefix(STATE_PUBLISHER) else "false"
     view = str(share_folder() / "config" / "rviz" / "bridge.rviz")
     return [
         Argument("use_robot_state_pub", installed, "Start robot_state_publisher"),
@@ -422,7 +422,7 @@ def of_description() -> list[Argument]:
     ]
 
 
-def prefix_of(package: str) -> Path | None:
+def find_prefix(package: str) -> Path | None:
     """Return the folder in which a ROS 2 package is installed, or None."""
     folders = [*os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep), sys.prefix]
     for folder in map(Path, filter(None, folders)):

@@ -80,7 +80,7 @@ def has_chosen(environment: Mapping[str, str]) -> bool:
     )
 
 
-def domains_in_use() -> set[int]:
+def find_used_domains() -> set[int]:
     """Return the DDS domains with a participant on this machine."""
     if not TABLE.is_file():
         return set()

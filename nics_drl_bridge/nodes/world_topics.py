@@ -10,7 +10,7 @@ from nav_msgs.msg import OccupancyGrid
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.nodes import conversions, qos, runner
-from nics_drl_bridge.nodes.conversions import INITIAL_POSE, initial_pose
+from nics_drl_bridge.nodes.conversions import INITIAL_POSE, read_initial_pose
 from nics_drl_bridge.sim.device import DeviceWorld
 from nics_drl_bridge.sim.occupancy import occupancy, standing
 
@@ -31,7 +31,7 @@ class WorldTopics:
         self._cell = runner.get_number(node, "map_resolution")
         self._map = node.create_publisher(OccupancyGrid, "map", qos.LATCHED)
         self._shown: Any = None  # the world that was published, and what stood in it
-        runner.steadily(node, LOOK_S, self._look)
+        runner.call_periodically(node, LOOK_S, self._look)
 
     def hear(self, namespace: str, robot: Callable[[], int]) -> Any:
         """Subscribe for a robot; `robot` returns its number at each message."""
@@ -66,7 +66,7 @@ class WorldTopics:
         logger = self._node.get_logger()
         simulator = self._world().simulator
         try:
-            pose = initial_pose(message, self._frame)
+            pose = read_initial_pose(message, self._frame)
             x1, y1, x2, y2 = simulator.world.members[
                 int(simulator.data.member[0])
             ].extent

@@ -314,16 +314,20 @@ def _compare_with_motion(
             continue
         name = f"{command.column.table.name}:{command.column.name}"
         best = int(np.argmax(likeness))
-        lag = lags[best]
-        if likeness[best] < LEAST_CORRELATION:
-            problem = f"the motion hardly follows {name}"
-            yield f"{problem}; check that it was sent to the robot"
-        elif likeness[best] > CLEAR_CORRELATION and lag > IMPLAUSIBLE_LATENCY_S:
-            problem = f"the motion follows {name} after {lag:.1f} s"
-            yield f"{problem}, which no latency explains; check `time:` and the command"
-        elif likeness[best] > CLEAR_CORRELATION and lag < PRECEDES_S:
-            problem = f"the motion precedes {name} by {-lag:.1f} s"
-            yield f"{problem}, like a measurement; check `time:` and the command"
+        yield from _doubt_lag(name, float(likeness[best]), float(lags[best]))
+
+
+def _doubt_lag(name: str, likeness: float, lag: float) -> Iterator[str]:
+    """Yields a sentence if the motion follows a command hardly, or at a strange lag [s]."""
+    if likeness < LEAST_CORRELATION:
+        problem = f"the motion hardly follows {name}"
+        yield f"{problem}; check that it was sent to the robot"
+    elif likeness > CLEAR_CORRELATION and lag > IMPLAUSIBLE_LATENCY_S:
+        problem = f"the motion follows {name} after {lag:.1f} s"
+        yield f"{problem}, which no latency explains; check `time:` and the command"
+    elif likeness > CLEAR_CORRELATION and lag < PRECEDES_S:
+        problem = f"the motion precedes {name} by {-lag:.1f} s"
+        yield f"{problem}, like a measurement; check `time:` and the command"
 
 
 def _compute_rates(t: Array, pose: Array) -> tuple[Array, Array, Array] | None:

@@ -95,6 +95,14 @@ class _Episode(Source):
         return self._table
 
 
+def _is_only_table(reader: MappedReader, mapping: Mapping, table: Table) -> bool:
+    pose = mapping.pose
+    values = (*mapping.command.values(), *mapping.state.values())
+    used = [reader.locate(value.from_)[0] for value in values]
+    used.append(reader.locate(pose.x.from_ if pose.x else 0, pose.in_)[0])
+    return all(other is table for other in used)
+
+
 def _split_table(
     source: Source, mapping: Mapping, episode: Reference
 ) -> list[tuple[str, Source]]:
@@ -105,12 +113,8 @@ def _split_table(
     """
     reader = MappedReader(source, mapping)
     table, reference = reader.locate(episode)
-    pose = mapping.pose
-    values = (*mapping.command.values(), *mapping.state.values())
-    used = [reader.locate(value.from_)[0] for value in values]
-    used.append(reader.locate(pose.x.from_ if pose.x else 0, pose.in_)[0])
     # Stamps that come with the rows continue from one episode to the next.
-    if any(other is not table for other in used) or table.stamps("") is not None:
+    if not _is_only_table(reader, mapping, table) or table.stamps("") is not None:
         return []
     name = next(name for name in source.names if source.get_table(name) is table)
     column = table.column(reference)
@@ -421,7 +425,14 @@ def _read_heading(
         )
     if recordings.is_w_first(stream.values):
         raise RecordingError(f"{place}: {recordings.W_FIRST}.")
-    x, y, z, w = stream.values.T
+    _check_tilt(stream.values, place)
+    headings = recordings.compute_heading(*stream.values.T)
+    return Series(stream.t, headings, stream.clock)
+
+
+def _check_tilt(quaternions: Array, place: str) -> None:
+    """Raises RecordingError for a body that, by its quaternions (T, 4), does not stand upright."""
+    x, y, _, _ = quaternions.T
     cosine = np.clip(np.abs(1.0 - 2.0 * (x * x + y * y)), 0.0, 1.0)
     tilt = np.degrees(np.median(np.arccos(cosine)))
     if tilt > MOST_TILT_DEG:
@@ -429,7 +440,6 @@ def _read_heading(
             f"{place}: by its quaternion the body is tilted by {tilt:.0f} deg; list "
             "its columns in the order x, y, z, w, or, if y is up, as [qz, qx, qy, qw]."
         )
-    return Series(stream.t, recordings.compute_heading(x, y, z, w), stream.clock)
 
 
 POSES = (
@@ -463,6 +473,19 @@ def _complete_pose(reader: MappedReader, pose: PoseSource) -> PoseSource:
     )
 
 
+def _list_covariances(
+    reader: MappedReader, pose: PoseSource, reference: str
+) -> list[str]:
+    """Returns the elements of a field that is a covariance. Raises RecordingError."""
+    table, field = reader.locate(reference, pose.in_)
+    count = sum(name.startswith(f"{field}[") for name in table.names)
+    if count not in schema.COVARIANCES:
+        raise RecordingError(
+            f"{table.place}: {field!r} has {count} numbers; a covariance has 3, 9 or 36."
+        )
+    return [f"{reference}[{k}]" for k in range(count)]
+
+
 def _read_deviations(
     reader: MappedReader,
     pose: PoseSource,
@@ -471,14 +494,7 @@ def _read_deviations(
 ) -> Array | None:
     """Returns standard deviations (T, 3) from variances or a matrix; None if none is known."""
     if isinstance(references, str):
-        table, field = reader.locate(references, pose.in_)
-        count = sum(name.startswith(f"{field}[") for name in table.names)
-        if count not in schema.COVARIANCES:
-            raise RecordingError(
-                f"{table.place}: {field!r} has {count} numbers; a covariance has 3, 9 "
-                "or 36."
-            )
-        references = [f"{references}[{k}]" for k in range(count)]
+        references = _list_covariances(reader, pose, references)
     columns = []
     for k in schema.COVARIANCES[len(references)]:
         value = Value.model_validate({"from": references[k]})

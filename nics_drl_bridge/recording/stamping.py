@@ -137,6 +137,27 @@ def has_continuous_headers(parts: Iterable[TopicData]) -> bool:
     return bool((np.abs(step_ns) * S_PER_NS < MAX_WANDER_S).all())
 
 
+def _measure_delay(delay_ns: Nanoseconds, place: str, topic: str) -> int:
+    """Returns the median delay (T,) of a topic [ns]. Raises RecordingError if they wander."""
+    median = int(np.median(delay_ns))
+    minimum = delay_ns.min()
+    maximum = delay_ns.max()
+    late = np.percentile(delay_ns, 100.0 - STALLED)
+    wander = max(late - median, median - minimum) * S_PER_NS
+    if wander > MAX_WANDER_S or (maximum - median) * S_PER_NS > MAX_STALL_S:
+        fault = (
+            f"its header stamps lie {minimum * S_PER_NS:.3f} to "
+            f"{maximum * S_PER_NS:.3f} s before their receipt, so they are of "
+            "several clocks or of a simulated time at another rate"
+        )
+        advice = (
+            f"{USE_RECEIPT}, or for a simulation `stamps: header` (`time: header`), and record "
+            "it with `ros2 bag record --use-sim-time`"
+        )
+        raise _make_error(place, topic, fault, advice)
+    return median
+
+
 def _assign_clocks(
     data: Mapping[str, TopicData], headers: Mapping[str, Nanoseconds | None], place: str
 ) -> dict[str, tuple[str, int]]:
@@ -147,23 +168,7 @@ def _assign_clocks(
         if ns is None:
             continue
         topic = data[name].topic
-        delay = data[name].receive_ns - ns
-        median = int(np.median(delay))
-        minimum = delay.min()
-        maximum = delay.max()
-        late = np.percentile(delay, 100.0 - STALLED)
-        wander = max(late - median, median - minimum) * S_PER_NS
-        if wander > MAX_WANDER_S or (maximum - median) * S_PER_NS > MAX_STALL_S:
-            fault = (
-                f"its header stamps lie {minimum * S_PER_NS:.3f} to "
-                f"{maximum * S_PER_NS:.3f} s before their receipt, so they are of "
-                "several clocks or of a simulated time at another rate"
-            )
-            advice = (
-                f"{USE_RECEIPT}, or for a simulation `stamps: header` (`time: header`), and record "
-                "it with `ros2 bag record --use-sim-time`"
-            )
-            raise _make_error(place, topic, fault, advice)
+        median = _measure_delay(data[name].receive_ns - ns, place, topic)
         if SAME_CLOCK_S[0] <= median * S_PER_NS <= SAME_CLOCK_S[1]:
             continue
         clock = HEADER
@@ -348,22 +353,28 @@ def repair_order(t: Array, name: str) -> tuple[Array, NDArray[np.intp], str]:
         )
         t = t[order]
         rows = rows[order]
+    t, note = _join_after_jumps(t, rows, name)
+    return t, rows, " ".join([*notes, note]).strip()
+
+
+def _join_after_jumps(t: Array, rows: NDArray[np.intp], name: str) -> tuple[Array, str]:
+    """Joins the parts between which the clock was set; returns stamps (T,) [s] and a note."""
     step = np.diff(t)
     is_jump = (step < 0.0) | (step > MAX_CLOCK_PAUSE_S)
-    if is_jump.any() and not is_jump.all():
-        usual = float(np.median(step[~is_jump]))
-        k = int(np.argmax(is_jump))
-        first = f"row {rows[k + 1]}, by {abs(step[k]):.3g} s"
-        direction = "ahead"
-        if step[k] < 0.0:
-            direction = "back"
-        count = format_times(int(is_jump.sum()))
-        notes.append(
-            f"{name}: the clock was set {direction} {count} ({first}); the parts were "
-            f"joined, a usual step of {usual:.3g} s apart."
-        )
-        t = t + np.append(0.0, np.cumsum(np.where(is_jump, usual - step, 0.0)))
-    return t, rows, " ".join(notes)
+    if not is_jump.any() or is_jump.all():
+        return t, ""
+    usual = float(np.median(step[~is_jump]))
+    k = int(np.argmax(is_jump))
+    first = f"row {rows[k + 1]}, by {abs(step[k]):.3g} s"
+    direction = "ahead"
+    if step[k] < 0.0:
+        direction = "back"
+    count = format_times(int(is_jump.sum()))
+    note = (
+        f"{name}: the clock was set {direction} {count} ({first}); the parts were "
+        f"joined, a usual step of {usual:.3g} s apart."
+    )
+    return t + np.append(0.0, np.cumsum(np.where(is_jump, usual - step, 0.0))), note
 
 
 def _find_stray(t: Array) -> NDArray[np.bool_]:

@@ -45,6 +45,12 @@ MISSING = ("", "na", "n/a", "null", "none", "-", "--", "#n/a")
 WORDS = {"true": "1", "false": "0", **dict.fromkeys(MISSING, "nan")}
 
 
+def _choose_head(above: Sequence[list[str]], width: int) -> list[str] | None:
+    """Returns the last title with the most distinct names: a row of units below it repeats some."""
+    titles = [row for row in above if len(row) > 1 or width == 1]
+    return max(reversed(titles), key=lambda row: len(set(row)), default=None)
+
+
 def read_text_table(path: Path) -> Table:
     """Reads a table. Raises RecordingError with the file, the line and the fix."""
     lines, comments = _read_lines(path)
@@ -57,9 +63,7 @@ def read_text_table(path: Path) -> Table:
         path, rows[first:], line_numbers[first:], above, width
     )
     columns = [list(column) for column in zip(*rows, strict=True)]
-    # The last title with the most distinct names: a row of units below it repeats some.
-    titles = [row for row in above if len(row) > 1 or width == 1]
-    head = max(reversed(titles), key=lambda row: len(set(row)), default=None)
+    head = _choose_head(above, width)
     if head is None and comments:
         head = _find_title(comments[-1], separator, width)
     may_be_tum = separator is None or path.suffix == TUM_SUFFIX

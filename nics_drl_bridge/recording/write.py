@@ -92,13 +92,19 @@ def write_bag(
                 receive = stamps + round(float(command.t[0] - stream.t[0]) * NS_PER_S)
                 stamps = stamps - APART_NS
             for k, values in enumerate(stream.values):
-                seconds, nanoseconds = divmod(int(stamps[k]), NS_PER_S)
-                stamp = {"sec": seconds, "nanosec": nanoseconds}
-                header = {"stamp": stamp, "frame_id": FRAMES[0]}
+                header = _make_header(int(stamps[k]))
                 content = {"header": header, **write_content(values)}
                 message = _make_message(store, kind, content)
                 data = bytes(store.serialize_cdr(message, kind))
                 sink.write(topic, int(receive[k]), data)
+
+
+def _make_header(stamp_ns: int) -> dict[str, Any]:
+    seconds, nanoseconds = divmod(stamp_ns, NS_PER_S)
+    return {
+        "stamp": {"sec": seconds, "nanosec": nanoseconds},
+        "frame_id": FRAMES[0],
+    }
 
 
 def _list_topics(

@@ -96,6 +96,17 @@ def _make_result(protocol: Protocol, results: Mapping[str, Any]) -> Blocks:
         if figures["trials"]:
             claim_of_tile = f"failed. {claim_of_tile}"
         tiles.append((_format_counts(figures), claim_of_tile, good))
+    sentences = _list_limits(results, shown)
+    sentences += [_describe_control(claim, results["control"]) for claim in CLAIMS]
+    return [
+        html.make_tiles(tiles),
+        html.make_table(HEADS, tabulate(protocol, results)),
+        html.make_bullets([sentence for sentence in sentences if sentence]),
+    ]
+
+
+def _list_limits(results: Mapping[str, Any], shown: Mapping[str, Any]) -> list[str]:
+    """Returns sentences on what the results do not show."""
     sentences = []
     if results["not_injected"]:
         sentences.append(
@@ -120,12 +131,7 @@ def _make_result(protocol: Protocol, results: Mapping[str, Any]) -> Blocks:
             f"3/n, here {' and '.join(bounds)} trials. It does not mean that the rate is 0. With "
             "failures the bounds are two-sided."
         )
-    sentences += [_describe_control(claim, results["control"]) for claim in CLAIMS]
-    return [
-        html.make_tiles(tiles),
-        html.make_table(HEADS, tabulate(protocol, results)),
-        html.make_bullets([sentence for sentence in sentences if sentence]),
-    ]
+    return sentences
 
 
 def _describe_control(claim: str, control: Mapping[str, Any]) -> str:
@@ -191,17 +197,24 @@ def _make_command(protocol: Protocol, folder: str, seed: int | None = None) -> s
     return shlex.join(words)
 
 
-def _make_method(protocol: Protocol, results: Mapping[str, Any]) -> Blocks:
+def _list_drivers(
+    protocol: Protocol, results: Mapping[str, Any]
+) -> list[tuple[str, ...]]:
+    """Returns a row for each driver: what it does, and how often it touched something."""
     aims = {name: f"{aim}; knows the true scene" for name, aim in ADVERSARIES.items()}
     aims[POLICY] = (
         "the policy on its way to a goal, with robot and sensors perturbed by the "
         f"randomisation {protocol.randomisation!r}"
     )
-    drivers = []
+    drivers = list[tuple[str, ...]]()
     for name, aim in aims.items():
         touches, tried, without_gate, controls = results["drivers"][name]
         counts = (f"{touches:,} of {tried:,}", f"{without_gate:,} of {controls:,}")
         drivers.append((f"{name}: {aim}", *counts))
+    return drivers
+
+
+def _make_method(protocol: Protocol, results: Mapping[str, Any]) -> Blocks:
     latched = ", ".join(f"{rule} {n:,}" for rule, n in results["latched"].items())
     path_km = results["path_m"] / 1000.0
     hours = results["seconds"] / 3600.0
@@ -226,8 +239,9 @@ def _make_method(protocol: Protocol, results: Mapping[str, Any]) -> Blocks:
             "time, around a process of the gate and, where the fault is the policy's, of the "
             f"policy: {', '.join(kinds)}."
         )
+    heads = ("drivers, in turn", "touches", "without the gate")
     return [
-        html.make_table(("drivers, in turn", "touches", "without the gate"), drivers),
+        html.make_table(heads, _list_drivers(protocol, results)),
         html.make_bullets(facts),
     ]
 

@@ -20,6 +20,7 @@ from nics_drl_bridge.identify.report import (
 )
 from nics_drl_bridge.report import fit_pictures, html
 from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.robot.taylor import TaylorModel
 
 Blocks = Sequence[str]
 Tile = tuple[str, str, bool]
@@ -95,6 +96,21 @@ def model_blocks(spec: RobotSpec, identified: Identified, report: str) -> Blocks
     ]
 
 
+def _make_tiles(model: TaylorModel, conclusion: Conclusion) -> list[Tile]:
+    gaps = len(conclusion.gaps)
+    terms = f"terms of a model with a step of {model.dt:g} s"
+    tiles = [
+        (str(gaps), "gaps in what the drive taught", not gaps),
+        (str(model.terms_kept), terms, True),
+    ]
+    assumed = len(model.assumed)
+    if assumed:
+        tiles.append(
+            (str(assumed), "of the terms are assumed from the textbook", False)
+        )
+    return tiles
+
+
 def write_fit_page(
     file: Path, source: str, spec: RobotSpec, identified: Identified, report: str
 ) -> None:
@@ -103,24 +119,7 @@ def write_fit_page(
     folder = file.parent
     # The spec may be of a textbook robot with another state.
     spec = identified.drive.spec
-    tile = fit_tile(identified)
-    model = identified.model
-    terms = (
-        str(model.terms_kept),
-        f"terms of a model with a step of {model.dt:g} s",
-        True,
-    )
-    assumed = len(model.assumed)
-    gaps = (
-        str(len(conclusion.gaps)),
-        "gaps in what the drive taught",
-        not conclusion.gaps,
-    )
-    figures = [tile, gaps, terms]
-    if assumed:
-        figures.append(
-            (str(assumed), "of the terms are assumed from the textbook", False)
-        )
+    figures = [fit_tile(identified), *_make_tiles(identified.model, conclusion)]
     train = f"nics train --robot {folder} --world arena --seeds 0 --out runs/first"
     commands = (train,) if conclusion.ready else ()
     sections = [

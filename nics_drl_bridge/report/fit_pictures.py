@@ -21,6 +21,7 @@ from nics_drl_bridge.identify.open_loop import (
 from nics_drl_bridge.identify.signals import average_held
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot import taylor
+from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.curve import delays as delays_of
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.style import (
@@ -203,6 +204,24 @@ def draw_residuals(identified: Identified, unseen: Samples) -> bytes:
     return render_png(figure, grid[0])
 
 
+def _draw_command(
+    axes: Any, spec: RobotSpec, identified: Identified, c: int, t: Array, begin: float
+) -> None:
+    """Draws command c at times (T,) [s], as stamped and as it takes effect."""
+    calibration = identified.calibration
+    dt = identified.samples.dt
+    command = identified.recording.command
+    name = spec.command[c].name
+    delay = float(delays_of([name], calibration.inputs)[0])
+    for late, style, label in (
+        (0.0, ":", "as stamped"),
+        (calibration.command_latency_s + delay, "-", "as it takes effect"),
+    ):
+        value = average_held(command, spec, t - late, t - late + dt)[:, c]
+        axes.plot(t - begin, value, style, label=label, **MODEL_LINE)
+    axes.set_ylabel(f"{name} [{spec.command[c].unit}]", color=MODEL)
+
+
 def draw_alignment(spec: RobotSpec, identified: Identified) -> bytes:
     """Draws each changing command, as stamped and as it takes effect, with the main response."""
     samples = identified.samples
@@ -214,24 +233,14 @@ def draw_alignment(spec: RobotSpec, identified: Identified) -> bytes:
     )
     begin = samples.t[0] + SETTLED_S
     shown = (samples.t >= begin) & (samples.t < begin + SHOWN_S)
-    t = samples.t[shown]
-    latency = calibration.command_latency_s
     for axes, c in zip(grid, moved, strict=True):
-        name = spec.command[c].name
-        unit = spec.command[c].unit
-        acts = latency + float(delays_of([name], calibration.inputs)[0])
-        for late, style, label in (
-            (0.0, ":", "as stamped"),
-            (acts, "-", "as it takes effect"),
-        ):
-            value = average_held(command, spec, t - late, t - late + samples.dt)[:, c]
-            axes.plot(t - begin, value, style, label=label, **MODEL_LINE)
-        axes.set_ylabel(f"{name} [{unit}]", color=MODEL)
+        _draw_command(axes, spec, identified, int(c), samples.t[shown], begin)
         _draw_response(axes, samples, shown, len(spec.state) + int(c), identified)
     grid[-1].set_xlabel("time on the commands' clock [s]")
     grid[0].plot([], [], label="response", **MEASURED_LINE)
-    title = f"clock offset {calibration.clock_offset_s:.4g} s, command latency {latency:.4g} s"
-    grid[0].set_title(title)
+    offset = f"clock offset {calibration.clock_offset_s:.4g} s"
+    latency = f"command latency {calibration.command_latency_s:.4g} s"
+    grid[0].set_title(f"{offset}, {latency}")
     return render_png(figure, grid[0])
 
 
@@ -282,26 +291,26 @@ def draw_inputs(spec: RobotSpec, identified: Identified) -> bytes | None:
         _draw_restraint(axes, identified, dof)
     names = [command.name for command in spec.command]
     for axes, curve in zip(grid, curves, strict=False):
-        place = names.index(curve.command)
-        sent = identified.recording.command.values[:, place]
-        unit = spec.command[place].unit
-        command = np.linspace(sent.min(), sent.max(), CURVE_POINTS)
-        axes.plot(command, command, ":", color=OTHER, label="as commanded")
-        axes.plot(command, curve.of(command), color=MODEL, label="in effect")
-        sigma = identified.calibration.uncertainty.get(f"{curve.command}.dead", 0.0)
-        for edge in (-curve.dead, curve.dead) if sigma else ():
-            axes.axvspan(
-                edge - 2.0 * sigma, edge + 2.0 * sigma, color=MODEL, alpha=0.25
-            )
-        rug: dict[str, Any] = {"transform": axes.get_xaxis_transform(), "alpha": 0.05}
-        axes.plot(
-            sent, np.full(len(sent), 0.03), "|", color=MEASURED, markersize=9, **rug
-        )
-        axes.set(
-            xlabel=f"{curve.command} [{unit}]", ylabel=f"{curve.command}' [{unit}]"
-        )
-        _finish(axes, curve.equation.replace("-+", "∓"))
+        _draw_curve(axes, spec, identified, curve, names.index(curve.command))
     return render_png(figure)
+
+
+def _draw_curve(
+    axes: Any, spec: RobotSpec, identified: Identified, curve: InputCurve, place: int
+) -> None:
+    """Draws an input curve over the commands that were sent."""
+    sent = identified.recording.command.values[:, place]
+    unit = spec.command[place].unit
+    command = np.linspace(sent.min(), sent.max(), CURVE_POINTS)
+    axes.plot(command, command, ":", color=OTHER, label="as commanded")
+    axes.plot(command, curve.of(command), color=MODEL, label="in effect")
+    sigma = identified.calibration.uncertainty.get(f"{curve.command}.dead", 0.0)
+    for edge in (-curve.dead, curve.dead) if sigma else ():
+        axes.axvspan(edge - 2.0 * sigma, edge + 2.0 * sigma, color=MODEL, alpha=0.25)
+    rug: dict[str, Any] = {"transform": axes.get_xaxis_transform(), "alpha": 0.05}
+    axes.plot(sent, np.full(len(sent), 0.03), "|", color=MEASURED, markersize=9, **rug)
+    axes.set(xlabel=f"{curve.command} [{unit}]", ylabel=f"{curve.command}' [{unit}]")
+    _finish(axes, curve.equation.replace("-+", "∓"))
 
 
 def _draw_restraint(axes: Axes, identified: Identified, dof: str) -> None:

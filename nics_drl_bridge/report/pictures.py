@@ -214,6 +214,22 @@ def draw_shadow(shadow: Shadow) -> bytes:
     return render_png(figure, grid[0])
 
 
+def _draw_regions(axes: Any, world: World) -> None:
+    """Draws the regions of starts and goals."""
+    for kind, places, colour in (
+        ("starts", world.starts, GREEN),
+        ("goals", world.goals, GOAL),
+    ):
+        for number, (x1, y1, x2, y2) in enumerate(places.regions if places else ()):
+            area: dict[str, Any] = {
+                "facecolor": (colour, 0.12),
+                "edgecolor": colour,
+                "ls": "--",
+            }
+            area["label"] = None if number else f"region of {kind}"
+            axes.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, zorder=0.5, **area))
+
+
 def draw_seeded_world(
     world: World,
     footprint: float,
@@ -238,18 +254,7 @@ def draw_seeded_world(
     view = make_view(low, high, WORLD_SIDE)
     figure, (axes,) = make_panels(1, 1)
     draw_world(axes, world, scene.bodies)
-    for kind, places, colour in (
-        ("starts", world.starts, GREEN),
-        ("goals", world.goals, GOAL),
-    ):
-        for number, (x1, y1, x2, y2) in enumerate(places.regions if places else ()):
-            area: dict[str, Any] = {
-                "facecolor": (colour, 0.12),
-                "edgecolor": colour,
-                "ls": "--",
-            }
-            area["label"] = None if number else f"region of {kind}"
-            axes.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, zorder=0.5, **area))
+    _draw_regions(axes, world)
     _draw_movers(axes, sampler.motions[0], scene)
     look: dict[str, Any] = {
         "facecolor": MEASURED,

@@ -76,7 +76,7 @@ class Listener(SpunNode):
         def odom(message: bytes) -> None:
             counts["odom"] += 1
             if counts["odom"] % int(ODOM_HZ / COMMAND_HZ) == 0:
-                place = wire.odometry_of(message)[0][:2]
+                place = wire.read_odometry(message)[0][:2]
                 gone = float(np.hypot(*(place - self._starts.setdefault(name, place))))
                 self.driven[name] = max(self.driven[name], gone)
 
@@ -119,7 +119,7 @@ def command(robots: int) -> None:
         commander.node.create_publisher(Twist, f"robot{k + 1}/cmd_vel", qos.COMMAND)
         for k in range(robots)
     ]
-    message = wire.twist_to_bytes(np.array(COMMAND))
+    message = wire.write_twist(np.array(COMMAND))
     parent = os.getppid()
     while os.getppid() == parent:
         for topic in topics:

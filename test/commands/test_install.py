@@ -14,7 +14,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.nodes import message_packages
 from nics_drl_bridge.nodes.message_packages import (
     Wheels,
-    how_to_install,
+    explain_install,
 )
 
 WHEELS = Wheels("ros-", {"ros-rclpy": "9.1.2"})
@@ -30,7 +30,7 @@ print(TFMessage.get_fields_and_field_types())
 def absent(monkeypatch):
     """An environment with the wheels and without messages beside theirs."""
     monkeypatch.setattr(install, "find_spec", lambda name: None)
-    monkeypatch.setattr(install, "wheels_here", lambda: WHEELS)
+    monkeypatch.setattr(install, "find_wheels", lambda: WHEELS)
 
 
 @pytest.mark.parametrize(
@@ -48,7 +48,7 @@ def test_what_can_not_be_built_is_one_sentence(
     (tmp_path / "leg_msgs").mkdir()
     monkeypatch.setattr(message_build.shutil, "which", lambda name: None)
     if name == "ackermann_msgs":  # beside a ROS 2 of a distribution
-        monkeypatch.setattr(install, "wheels_here", lambda: None)
+        monkeypatch.setattr(install, "find_wheels", lambda: None)
         monkeypatch.setattr(install.extensions, "require", lambda user, module: None)
         monkeypatch.setenv("ROS_DISTRO", "kilted")
     done = nics("install", name, cwd=tmp_path)
@@ -70,7 +70,7 @@ def test_a_broken_build_is_built_again(tmp_path, monkeypatch):
 
     monkeypatch.setattr(install, "find_spec", lambda name: True)
     monkeypatch.setattr(install, "check_import", fail)
-    monkeypatch.setattr(install, "wheels_here", lambda: WHEELS)
+    monkeypatch.setattr(install, "find_wheels", lambda: WHEELS)
     monkeypatch.setattr(message_build.shutil, "which", lambda name: None)
     done = nics("install tf2_msgs", cwd=tmp_path)
     assert done.stdout == ""
@@ -150,18 +150,18 @@ def test_a_prefix_with_a_space_and_a_dollar_can_be_sourced(tmp_path):
 
 
 def test_only_what_the_wheels_lack_and_this_package_has_is_named(monkeypatch):
-    monkeypatch.setattr(message_packages, "wheels_here", lambda: WHEELS)
-    assert how_to_install("tf2_msgs") == "install it by `nics install tf2_msgs`"
-    assert how_to_install("nav2_msgs") == "install it with your ROS 2 distribution"
-    monkeypatch.setattr(message_packages, "wheels_here", lambda: None)
-    assert how_to_install("tf2_msgs") == "install it with your ROS 2 distribution"
+    monkeypatch.setattr(message_packages, "find_wheels", lambda: WHEELS)
+    assert explain_install("tf2_msgs") == "install it by `nics install tf2_msgs`"
+    assert explain_install("nav2_msgs") == "install it with your ROS 2 distribution"
+    monkeypatch.setattr(message_packages, "find_wheels", lambda: None)
+    assert explain_install("tf2_msgs") == "install it with your ROS 2 distribution"
 
 
 @pytest.mark.package
 @pytest.mark.process
 @pytest.mark.timeout(1200)
 def test_the_messages_that_were_built_can_be_used(tmp_path):
-    if message_packages.wheels_here() is None:
+    if message_packages.find_wheels() is None:
         pytest.skip("needs the wheels of ROS 2")
     done = nics("install tf2_msgs --prefix", tmp_path / "built", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

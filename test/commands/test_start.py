@@ -144,9 +144,12 @@ def test_a_command_that_is_interrupted_ends_with_130_whatever_the_moment(
 @pytest.mark.skipif(sys.platform != "linux", reason="is about POSIX shells")
 def test_a_node_below_a_shell_that_ignores_ctrl_c_takes_it_again():
     ignoring = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); "
-    run = "import subprocess, sys; from nics_drl_bridge.nodes.node_process import interruptible; "
+    name = "nics_drl_bridge.nodes.node_process"
+    run = f"import subprocess, sys; from {name} import restore_interrupt; "
     ask = "import signal; print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)"
-    child = f"subprocess.run([sys.executable, '-c', {ask!r}], preexec_fn=interruptible)"
+    child = (
+        f"subprocess.run([sys.executable, '-c', {ask!r}], preexec_fn=restore_interrupt)"
+    )
     done = subprocess.run(
         [sys.executable, "-c", f"{ignoring}{run}{child}"],
         capture_output=True,

@@ -46,7 +46,7 @@ def test_a_wrong_argument_is_one_sentence_and_starts_nothing(
     words, sentence, tmp_path, monkeypatch
 ):
     for module in (starting, node_process):
-        monkeypatch.setattr(module, "prefix_of", lambda package: None)
+        monkeypatch.setattr(module, "find_prefix", lambda package: None)
     done = nics(*words.split(), cwd=tmp_path)
     assert done.returncode == 2
     assert sentence in done.stderr
@@ -295,7 +295,7 @@ def test_a_node_gets_text_as_text_above_the_values_of_the_users_file(tmp_path):
         "on": True,
     }
     node = NodeStart("nics_drl_bridge", "policy_node", "ant", parameters, "own.yaml")
-    words = node_process.command_of(node, tmp_path)
+    words = node_process.make_command(node, tmp_path)
     assert words[words.index("-r") + 1] == "__ns:=/ant"
     files = [words[k + 1] for k, word in enumerate(words) if word == "--params-file"]
     assert files[0] == "own.yaml"

@@ -64,7 +64,7 @@ class NodeThread(AbstractContextManager["NodeThread", None]):
 
     def _run(self, arguments: list[str], domain_id: int) -> None:
         try:
-            made = runner.live(
+            made = runner.run_until_end(
                 partial(make_logged, self.node, self.lines),
                 open_context(arguments, domain_id),
                 self.stopping,

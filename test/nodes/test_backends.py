@@ -365,7 +365,7 @@ def test_somebody_else_who_moves_the_simulator_is_found_out(
     )  # the simulator, and the listener
     try:
         with monkeypatch.context() as patch:  # first by its deeds alone
-            patch.setattr(backend._link, "others_command", lambda: False)
+            patch.setattr(backend._link, "has_rivals", lambda: False)
             backend.reset(START)
             intruder.publish(Twist())
             peer.until(
@@ -387,7 +387,7 @@ def test_somebody_else_who_moves_the_simulator_is_found_out(
             backend.step(np.array([0.5, 0.0]))
     finally:
         peer.node.destroy_publisher(intruder)
-    peer.until(lambda: not backend._link.others_command(), "the intruder is gone")
+    peer.until(lambda: not backend._link.has_rivals(), "the intruder is gone")
     drive(backend)
 
 

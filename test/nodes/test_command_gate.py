@@ -23,7 +23,7 @@ from std_srvs.srv import Trigger
 from nics_drl_bridge.gate.black_box import replay
 from nics_drl_bridge.gate.inputs import Press, Tick
 from nics_drl_bridge.nodes import command_gate, conversions, qos
-from nics_drl_bridge.nodes.wire import stamped_twist_of
+from nics_drl_bridge.nodes.wire import read_stamped_twist
 from nodes.peer import DEADLINE_S, odometry
 
 pytestmark = pytest.mark.ros
@@ -253,7 +253,7 @@ def test_a_motion_that_was_decided_on_before_a_freeze_is_never_published(
     use(freeze)
     monkeypatch.setattr(command_gate.time, "monotonic", lambda: clock[0])
     node._decide(Tick())
-    assert list(map(stamped_twist_of, sent)) == [(0.0, 0.0, 0.0)]
+    assert list(map(read_stamped_twist, sent)) == [(0.0, 0.0, 0.0)]
 
 
 @pytest.mark.parametrize("wrong", [math.nan, math.inf])
@@ -270,7 +270,7 @@ def test_a_decision_that_is_no_number_leaves_as_zero_and_latches(decided, wrong)
 
     use(fail)
     node._decide(Tick())
-    assert list(map(stamped_twist_of, sent)) == [(0.0, 0.0, 0.0)]
+    assert list(map(read_stamped_twist, sent)) == [(0.0, 0.0, 0.0)]
     found = node._look()
     assert found.message.startswith("e_stop_pressed")
     assert found.facts["not finite, sent as zero"] == 1

@@ -31,7 +31,7 @@ def over_the_wire(message):
 
 
 def yaw(q):
-    return conversions.heading_of(q.x, q.y, q.z, q.w)
+    return conversions.compute_heading(q.x, q.y, q.z, q.w)
 
 
 @given(st.integers(0, 2**61))

@@ -18,7 +18,7 @@ from sensor_msgs.msg import LaserScan
 from std_srvs.srv import Trigger
 
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.device_parameters import declare_device, timing
+from nics_drl_bridge.nodes.device_parameters import declare_device, get_timing
 from nics_drl_bridge.nodes.link import EPISODE_NS
 from nics_drl_bridge.robot.noise import Delay, Latency
 from nodes.peer import pose_of, stamp_ns
@@ -233,7 +233,7 @@ def test_a_device_is_as_late_as_was_measured_unless_told_otherwise_and_never_in_
     )
     node = make_node(*(f"{name}:={value}" for name, value in given.items()))
     declare_device(node, "laser")
-    time = timing(node, replace(model, latency=latency))
+    time = get_timing(node, replace(model, latency=latency))
     assert (time.scan_late_ns, time.odom_late_ns) == (scan_ns, odom_ns)
 
 

@@ -27,7 +27,7 @@ class Left(Node):
 
 def make(context):
     node = Left("left", context=context)
-    runner.steadily(node, 0.1, lambda: print("runs", flush=True))
+    runner.call_periodically(node, 0.1, lambda: print("runs", flush=True))
     return node
 
 runner.run_node(make)

@@ -26,7 +26,7 @@ from nics_drl_bridge.extras.nav2.follow_path import FOLLOW, NAVIGATE, PathAction
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import conversions, policy_node, qos
 from nics_drl_bridge.nodes.policy_node import PolicyNode
-from nics_drl_bridge.nodes.runner import unknown
+from nics_drl_bridge.nodes.runner import explain_ignored_values
 from nodes.peer import pose_of
 
 pytestmark = pytest.mark.ros
@@ -319,7 +319,7 @@ def test_nav2s_own_parameter_file_is_taken_under_the_name_of_its_controller_serv
         archive.extract(name, tmp_path, filter="data")
     words = ("--params-file", str(tmp_path / name), *CONTROLLER)
     node = make_node(words=words, kind=PolicyNode)
-    assert unknown(node) == []
+    assert explain_ignored_values(node) == []
     goal, progress = node._leaders[0].parameters.checks(
         "general_goal_checker", "progress_checker"
     )
@@ -338,7 +338,7 @@ def test_the_progress_checker_of_humble_is_taken_by_its_own_name(make_node, tmp_
     )
     words = ("--params-file", str(file), *CONTROLLER)
     node = make_node(words=words, kind=PolicyNode)
-    assert unknown(node) == []
+    assert explain_ignored_values(node) == []
     assert node._leaders[0].parameters.names["progress_checker"] == ("progress",)
     _, progress = node._leaders[0].parameters.checks("general_goal_checker", "progress")
     assert progress.movement_time_allowance == 7.0
@@ -355,7 +355,7 @@ def test_checkers_go_by_their_plugins_and_unknown_headings_do_not_count(make_nod
         "action_server_result_timeout:=10.0",
     ]
     node = make_node(*words, kind=PolicyNode)
-    assert unknown(node) == []
+    assert explain_ignored_values(node) == []
     found = [
         node._leaders[0].parameters.checks(*names)
         for names in (("exact", "slow"), ("near", "turning"))
@@ -389,12 +389,12 @@ def test_a_policy_begins_anew_with_another_goal_and_not_with_another_way_to_it(
 
 
 def test_results_of_distributions_without_codes_are_filled_as_far_as_they_go():
-    from nics_drl_bridge.extras.nav2.follow_path import result_of
+    from nics_drl_bridge.extras.nav2.follow_path import make_result
 
     class Bare:
         class Result:
             pass
 
-    assert vars(result_of(Bare, "TF_ERROR", "why")) == {}
-    told = result_of(FollowPath, "TF_ERROR", "why")
+    assert vars(make_result(Bare, "TF_ERROR", "why")) == {}
+    told = make_result(FollowPath, "TF_ERROR", "why")
     assert (told.error_code, told.error_msg) == (CODES.TF_ERROR, "why")

@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
-from nics_drl_bridge.nodes.conversions import message_type
+from nics_drl_bridge.nodes.conversions import find_message_type
 
 pytestmark = pytest.mark.ros
 
@@ -82,7 +82,9 @@ def test_every_path_of_the_layout_leads_to_a_number(graph):
 def field_of(kind, fields):
     """The type of a field of a message, "" if there is none."""
     for name in fields.split("."):
-        known = message_type(kind if "/msg/" in kind else kind.replace("/", "/msg/"))
+        known = find_message_type(
+            kind if "/msg/" in kind else kind.replace("/", "/msg/")
+        )
         kind = known.get_fields_and_field_types().get(name, "") if known else ""
     return kind
 

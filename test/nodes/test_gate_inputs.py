@@ -13,11 +13,6 @@ from nics_drl_bridge.gate import inputs
 from nics_drl_bridge.gate.intake import estimate_malformed
 from nics_drl_bridge.lidar.spec import from_device, load_lidar
 from nics_drl_bridge.nodes import conversions, gate_inputs, wire
-from nics_drl_bridge.nodes.gate_inputs import (
-    LONGEST_SLEEP_S,
-    QUEUE_MESSAGES,
-    EStopQueue,
-)
 
 STAMP_NS = 1_763_000_000_123_456_789
 LIDAR = load_lidar("paper")
@@ -152,45 +147,3 @@ def test_another_controllers_command_is_refused_if_it_is_old_or_before_any_scan(
         "TwistStamped", 1, scanned(STAMP_NS), unstamped
     )
     assert kept.stamp_ns == STAMP_NS
-
-
-def heard_at(rate, seconds=2.0):
-    """A queue that has heard messages at a rate, up to a last tick at the time 0."""
-    queue = EStopQueue()
-    for k in range(round(rate * seconds), -1, -1):
-        queue.hear(-k / rate, 1)
-        assert queue.tick(-k / rate) == ""
-    return queue
-
-
-@pytest.mark.parametrize("rate", [5.0, 100.0, 1000.0])
-def test_a_sleep_in_which_all_messages_fit_is_no_press(rate):
-    fits = min(QUEUE_MESSAGES / rate, LONGEST_SLEEP_S)
-    assert heard_at(rate).tick(0.9 * fits) == ""
-
-
-@pytest.mark.parametrize("rate", [5.0, 100.0, 1000.0])
-def test_a_sleep_in_which_more_may_have_come_counts_as_a_press(rate):
-    fits = min(QUEUE_MESSAGES / rate, LONGEST_SLEEP_S)
-    assert "the gate slept for" in heard_at(rate).tick(1.1 * fits)
-
-
-def test_more_messages_at_once_than_surely_fit_count_as_a_press():
-    """A second publisher at 1 kHz began in a short sleep, of whose rate nothing is known yet."""
-    queue = heard_at(100.0)
-    queue.hear(0.4, 250)
-    assert "250 messages came at once" in queue.tick(0.4)
-    queue.hear(0.42, 20)
-    assert queue.tick(0.42) == ""
-
-
-def test_without_a_button_a_sleep_loses_no_press():
-    queue = EStopQueue()
-    queue.tick(0.0)
-    assert queue.tick(100.0) == ""
-
-
-def test_the_first_tick_follows_no_sleep():
-    queue = EStopQueue()
-    queue.hear(0.0, 1)
-    assert queue.tick(100.0) == ""

@@ -12,7 +12,7 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.nodes import conversions
 from nics_drl_bridge.nodes.frames import GoalFrames
-from nics_drl_bridge.nodes.parameters import policy
+from nics_drl_bridge.nodes.parameters import list_policy_rows
 from nics_drl_bridge.nodes.runner import declare_row
 
 pytestmark = pytest.mark.ros
@@ -31,7 +31,7 @@ class Topics:
         self.newest_ns = 200_000_000
         self.reported = geometry.compose(REPORTED, [0.1, 0.0, 0.0])
 
-    def in_odom(self):
+    def locate_in_odom(self):
         return self.reported
 
     def view(self):
@@ -41,7 +41,7 @@ class Topics:
 @pytest.fixture
 def frames(make_node):
     node = make_node()
-    for row in policy():
+    for row in list_policy_rows():
         declare_row(node, row)
     return GoalFrames(node, Topics())
 
@@ -93,7 +93,7 @@ def test_with_a_localiser_a_goal_of_the_map_lies_as_far_from_the_robot_as_in_its
     other.transform.rotation.w = 1.0
     frames._follow(SimpleNamespace(transforms=[other]))
     now = geometry.compose([-5.0, 0.0, 0.0], frames._topics.reported)
-    assert frames.robot_in("map") == pytest.approx(now)
+    assert frames.locate_robot("map") == pytest.approx(now)
     wanted = geometry.compose(ESTIMATE, geometry.between(now, [1.0, -2.0, 0.0]))[:2]
     assert frames.in_map(goal("map", 1.0, -2.0)) == pytest.approx(wanted)
 

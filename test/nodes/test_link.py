@@ -56,7 +56,7 @@ def make_fleet(model, world, **options):
 
 CASES = {
     "publisher": (lambda _, **o: Link(**o), (link, "CommandTimeout")),
-    "listeners": (lambda _, **o: Link(**o), (Link, "hears_stamped")),
+    "listeners": (lambda _, **o: Link(**o), (Link, "expects_stamped")),
     "services": (partial(make, DdsBackend), (backends, "EpisodeServices")),
     "services of a fleet": (partial(make, make_fleet), (backends, "EpisodeServices")),
     "no simulator": (partial(make, DdsBackend), BackendError),

@@ -57,14 +57,14 @@ def test_each_node_is_measured_while_commands_go_through_to_the_robot():
 
 
 def test_a_policy_that_takes_long_answers_late(monkeypatch):
-    made = node_process.module_command
+    made = node_process.make_module_command
 
     def make_slow(module):
         *words, code = made(module)
         path, _, run = code.partition("; from runpy")
         return [*words, f"{path}\n{SLOW}\nfrom runpy{run}"]
 
-    monkeypatch.setattr(node_process, "module_command", make_slow)
+    monkeypatch.setattr(node_process, "make_module_command", make_slow)
     assert measure().policy.median_ms > 1e3 * LATE_S
 
 

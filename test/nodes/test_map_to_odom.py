@@ -10,21 +10,21 @@ from std_srvs.srv import Trigger
 from nics_drl_bridge import geometry
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.frames import (
-    odom_in_map,
+    compute_odom_in_map,
     transform_from_ros,
     transform_to_ros,
 )
 from nodes.peer import odometry, pose_of, stamp_ns
 
 pytestmark = pytest.mark.ros
-TFS = conversions.message_type("tf2_msgs/msg/TFMessage")
+TFS = conversions.find_message_type("tf2_msgs/msg/TFMessage")
 needs_tf2_msgs = pytest.mark.skipif(TFS is None, reason="tf2_msgs is not installed")
 
 
 def test_odom_lies_in_the_map_so_that_both_tell_of_the_same_robot():
     in_map = np.array([1.0, 2.0, 0.7])
     in_odom = np.array([-3.0, 0.5, -2.0])
-    home = odom_in_map(in_map, in_odom)
+    home = compute_odom_in_map(in_map, in_odom)
     assert geometry.compose(home, in_odom) == pytest.approx(in_map)
 
 

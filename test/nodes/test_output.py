@@ -1,9 +1,8 @@
-"""A node never waits for who reads its output; what is dropped is counted and told."""
+"""A node never waits for who reads its output; what is too much is dropped."""
 
 import contextlib
 import os
 import pty
-import re
 import signal
 import subprocess
 import sys
@@ -16,7 +15,7 @@ pytestmark = pytest.mark.process
 DEADLINE_S = 30.0
 LINES = [*(f"line {k}" for k in range(50)), "over"]
 TALKER = """
-import os, sys, time
+import os, sys
 from nics_drl_bridge.nodes.own_process import leave
 from nics_drl_bridge.nodes.own_process import forward_output
 forward_output(*sys.argv[2:])
@@ -25,8 +24,8 @@ for number in range(int(sys.argv[1])):
     while line:
         try:
             line = line[os.write(2, line):]
-        except BlockingIOError:  # the forwarder takes it in a moment, whoever reads its output
-            time.sleep(0.001)
+        except BlockingIOError:  # the pipe is full
+            break
 print("over", flush=True)
 leave(3)
 """
@@ -76,7 +75,7 @@ def test_a_closed_output_is_no_error(closed):
     assert done.returncode == 3
 
 
-def test_a_pipe_that_nobody_reads_delays_nothing_and_the_dropped_lines_are_told():
+def test_a_pipe_that_nobody_reads_delays_nothing():
     count = 30_000
     exit_, entrance = os.pipe()
     talker = start(TALKER, str(count), stdout=entrance, stderr=entrance)
@@ -84,15 +83,8 @@ def test_a_pipe_that_nobody_reads_delays_nothing_and_the_dropped_lines_are_told(
     assert talker.wait(DEADLINE_S) == 3
     lines = read_all(exit_).splitlines()
     os.close(exit_)
-    dropped = [
-        int(found[1])
-        for line in lines
-        if (found := re.match(r"\((\d+) lines were", line))
-    ]
-    arrived = [line for line in lines if line.startswith("line ")]
-    assert dropped
-    assert len(arrived) + sum(dropped) == count
-    assert arrived[-1].startswith(f"line {count - 1} ")
+    assert lines[0].startswith("line 0 ")
+    assert 1_000 < len(lines) < count
 
 
 def test_a_terminal_that_was_halted_delays_nothing():
@@ -104,8 +96,9 @@ def test_a_terminal_that_was_halted_delays_nothing():
     os.close(master)
 
 
-def test_all_lines_are_in_the_log_file_though_nobody_reads_the_output(tmp_path):
-    exit_, entrance = full_pipe()
+def test_all_lines_are_in_the_log_file_though_who_read_the_output_has_gone(tmp_path):
+    exit_, entrance = os.pipe()
+    os.close(exit_)
     talker = start(
         TALKER, "50", str(tmp_path / "log" / "file"), stdout=entrance, stderr=entrance
     )
@@ -113,26 +106,24 @@ def test_all_lines_are_in_the_log_file_though_nobody_reads_the_output(tmp_path):
     assert talker.wait(DEADLINE_S) == 3
     lines = (tmp_path / "log" / "file").read_text().splitlines()
     assert [line.split(" .")[0] for line in lines] == LINES
-    os.close(exit_)
 
 
 def test_a_log_file_that_hangs_delays_nothing(tmp_path):
     os.mkfifo(tmp_path / "file")  # nobody opens it for reading
     log = str(tmp_path / "file")
-    talker = start(
-        TALKER, "30000", log, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
-    )
-    assert talker.communicate(timeout=DEADLINE_S)[1].count(b"line ") > 0
-    assert talker.returncode == 3
+    nobody = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    assert start(TALKER, "30000", log, **nobody).wait(DEADLINE_S) == 3
+    with open(log, "rb"):  # `tee` opens it, too, and ends
+        pass
 
 
 def test_a_forwarder_that_is_frozen_or_killed_delays_nothing():
     code = (
         "import os, signal\nfrom nics_drl_bridge.nodes import own_process\n"
         "own_process.forward_output()\n"
-        "os.kill(own_process._forwarder.pid, signal.{})\n"
+        "os.kill(own_process._forwarders[0].pid, signal.{})\n"
         "for _ in range(100_000): print('line', 'x' * 80, flush=True)\n"
-        "own_process._forwarder.kill()\nos._exit(3)"
+        "own_process._forwarders[0].kill()\nos._exit(3)"
     )
     for name in ("SIGSTOP", "SIGKILL"):
         talker = start(
@@ -143,8 +134,8 @@ def test_a_forwarder_that_is_frozen_or_killed_delays_nothing():
 
 ERRORS = """
 import os, sys
-from nics_drl_bridge.nodes.own_process import forwarded_errors
-with forwarded_errors():
+from nics_drl_bridge.nodes.own_process import forward_errors
+with forward_errors():
     for number in range(30_000):
         print("line", number, "x" * 80, file=sys.stderr)
         if number == 0:

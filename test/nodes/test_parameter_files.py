@@ -27,7 +27,7 @@ def test_a_node_has_every_parameter_that_a_shipped_file_gives_it(
     monkeypatch.chdir(tmp_path)
     section = yaml.safe_load(file.read_text(encoding="utf-8")).get(f"/**/{name}", {})
     node = make_node(words=("--params-file", str(file)), kind=node_class(name))
-    assert runner.unknown(node) == []
+    assert runner.explain_ignored_values(node) == []
     for key, value in section.get("ros__parameters", {}).items():
         found = node.get_parameter(key).value
         assert found == pytest.approx(value, nan_ok=True), key

@@ -11,8 +11,8 @@ from rclpy.parameter import Parameter
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.nodes import parameters
-from nics_drl_bridge.nodes.parameters import NODES, frame_fault, stamped_by_default
-from nics_drl_bridge.nodes.qos import given_values
+from nics_drl_bridge.nodes.parameters import NODES, find_frame_fault, is_stamped_default
+from nics_drl_bridge.nodes.qos import get_given_values
 from nodes.in_process import node_class
 
 pytestmark = pytest.mark.ros
@@ -77,7 +77,9 @@ def given(values):
 
 @pytest.mark.parametrize("frame", ["", "a b", "/map", "m\n", "x" * 5000])
 def test_a_frame_that_tf_does_not_know_is_one_short_sentence(frame):
-    told = frame_fault(given({"map_frame": "map", "base_frame": frame, "rate": 1.0}))
+    told = find_frame_fault(
+        given({"map_frame": "map", "base_frame": frame, "rate": 1.0})
+    )
     assert told.startswith(
         "parameter 'base_frame': must be 1 to 255 characters, without blanks"
     )
@@ -91,11 +93,11 @@ def test_the_frame_of_the_robot_is_its_own_and_a_footprint_may_be_none():
         "base_frame": "r/base",
         "footprint_frame": "",
     }
-    assert not frame_fault(given(good))
-    assert not frame_fault(
+    assert not find_frame_fault(given(good))
+    assert not find_frame_fault(
         given(good) + given({"map_frame": "odom"})
     )  # without localisation
-    told = frame_fault(given(good) + given({"base_frame": "odom"}))
+    told = find_frame_fault(given(good) + given({"base_frame": "odom"}))
     assert (
         told
         == "parameter 'base_frame': is 'odom', like 'odom_frame'; they must differ."
@@ -127,7 +129,7 @@ def test_a_running_node_refuses_such_a_frame_and_keeps_its_own(frame, make_node)
 )
 def test_commands_are_stamped_since_kilted(monkeypatch, distribution, stamped):
     monkeypatch.setenv("ROS_DISTRO", distribution)
-    assert stamped_by_default() is stamped
+    assert is_stamped_default() is stamped
     for node in NODES:
         rows = {row.name: row.default for row in NODES[node]().parameters}
         assert rows["enable_stamped_cmd_vel"] is stamped
@@ -136,14 +138,14 @@ def test_commands_are_stamped_since_kilted(monkeypatch, distribution, stamped):
 def test_without_a_sourced_distribution_its_wheels_tell_which_it_is(monkeypatch):
     monkeypatch.delenv("ROS_DISTRO", raising=False)
     monkeypatch.setattr(parameters, "_is_wheel", lambda name: name == "jazzy")
-    assert not stamped_by_default()
+    assert not is_stamped_default()
     monkeypatch.setattr(parameters, "_is_wheel", lambda name: False)
-    assert stamped_by_default()
+    assert is_stamped_default()
 
 
 def test_values_that_are_given_are_known_before_they_are_declared(make_node):
     node = make_node("plugins:=[]", "rate:=2")
-    given = {name: value.value for name, value in given_values(node).items()}
+    given = {name: value.value for name, value in get_given_values(node).items()}
     assert given["plugins"] is None  # an empty list has no type yet
     assert given["rate"] == 2
     assert not node.has_parameter("rate")

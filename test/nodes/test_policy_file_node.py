@@ -39,7 +39,7 @@ sys.meta_path.insert(0, Block())
 """
 
 
-def ranges_of(angles):
+def read_ranges(angles):
     """A smooth surrounding, in sight of every lidar."""
     return (1.6 + 0.7 * np.cos(angles) + 0.3 * np.sin(2.0 * angles)).astype(np.float32)
 
@@ -50,7 +50,7 @@ def scan_of(angles, backwards=False):
     ordered = angles[::-1] if backwards else angles
     message.angle_min, message.angle_max = float(ordered[0]), float(ordered[-1])
     message.angle_increment = float((ordered[-1] - ordered[0]) / (len(ordered) - 1))
-    message.ranges = array.array("f", ranges_of(ordered).tobytes())
+    message.ranges = array.array("f", read_ranges(ordered).tobytes())
     return message
 
 
@@ -120,7 +120,7 @@ def wanted(file, model):
     policy = load_policy(file)
     task = policy.make_task(model)
     view = RobotView(
-        np.zeros(3), np.zeros(3), ranges_of(model.lidar.angles), 0.0, 0.0, 0.0
+        np.zeros(3), np.zeros(3), read_ranges(model.lidar.angles), 0.0, 0.0, 0.0
     )
     action = policy.act(task.observation(view, {"goal": np.array(GOAL)}))
     return task.robot.to_cmd_vel(task.command(action))
@@ -253,7 +253,7 @@ def stateful(launch, meet, domain_id, remembering):
 
 def scan_at(angles, phase):
     scan = scan_of(angles)
-    scan.ranges = array.array("f", ranges_of(angles + phase).tobytes())
+    scan.ranges = array.array("f", read_ranges(angles + phase).tobytes())
     return scan
 
 
@@ -292,7 +292,7 @@ def driven_in_process(file, model, phases, x):
     policy, task = open_policy(str(file), model)
     commands = []
     for phase in phases:
-        seen = ranges_of(model.lidar.angles + phase)
+        seen = read_ranges(model.lidar.angles + phase)
         view = RobotView(np.zeros(3), np.zeros(3), seen, 0.0, 0.0, 0.0)
         action = policy.act(task.observation(view, {"goal": np.array([x, GOAL[1]])}))
         commands.append(task.robot.to_cmd_vel(task.command(action)))

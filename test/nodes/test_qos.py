@@ -10,7 +10,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.nodes import qos
 from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.nodes.qos import BridgeNode
-from nics_drl_bridge.nodes.runner import unknown
+from nics_drl_bridge.nodes.runner import explain_ignored_values
 
 pytestmark = pytest.mark.ros
 
@@ -86,5 +86,5 @@ def test_an_override_that_can_not_be_is_refused_with_its_topic(overridden, overr
 def test_a_policy_that_does_not_exist_is_told_with_the_nearest(overridden):
     node = overridden("/scan.publisher.reliabilty:=reliable")
     node.create_publisher(Bool, "scan", qos.SENSOR_RELIABLE)
-    (line,) = unknown(node)
+    (line,) = explain_ignored_values(node)
     assert "'qos_overrides./scan.publisher.reliabilty' is ignored" in line

@@ -13,7 +13,11 @@ from nics_drl_bridge.nodes.listener import open_context
 from nics_drl_bridge.nodes.parameters import Row
 from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
 from nics_drl_bridge.nodes.record_node import declare_drive
-from nics_drl_bridge.nodes.runner import declare_model, declare_row, unknown
+from nics_drl_bridge.nodes.runner import (
+    declare_model,
+    declare_row,
+    explain_ignored_values,
+)
 from nics_drl_bridge.sim.world import load_world
 
 pytestmark = pytest.mark.ros
@@ -89,7 +93,7 @@ def test_a_description_and_a_range_are_told_to_ros2_param_describe(make_node):
 def test_a_misspelt_parameter_is_named_with_the_nearest_one(make_node):
     node = make_node("command_timout:=2.0")
     declare_row(node, Row("command_timeout", 0.5, "Silence."))
-    (line,) = unknown(node)
+    (line,) = explain_ignored_values(node)
     assert "'command_timout'" in line
     assert "did you mean 'command_timeout'?" in line
 
@@ -97,5 +101,5 @@ def test_a_misspelt_parameter_is_named_with_the_nearest_one(make_node):
 def test_a_quality_of_service_for_a_topic_that_the_node_has_not_is_told(make_node):
     node = make_node("qos_overrides./scam.publisher.depth:=3")
     node.create_publisher(Bool, "/scan", 1)
-    (line,) = unknown(node)
+    (line,) = explain_ignored_values(node)
     assert "'qos_overrides./scam.publisher.depth' is ignored" in line

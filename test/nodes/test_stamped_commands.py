@@ -16,7 +16,7 @@ from nics_drl_bridge.nodes import qos, record_node
 from nics_drl_bridge.nodes.backends import DdsBackend
 from nics_drl_bridge.nodes.command_gate import CommandGate
 from nics_drl_bridge.nodes.link import Link
-from nics_drl_bridge.nodes.parameters import stamped_by_default
+from nics_drl_bridge.nodes.parameters import is_stamped_default
 from nics_drl_bridge.sim.world import load_world
 from nodes.peer import stamp_ns
 
@@ -75,7 +75,7 @@ def test_an_env_follows_the_type_that_a_simulator_hears_and_its_frame(
 
 def test_without_anybody_who_listens_it_is_the_distributions_type(domain_id):
     link = Link(domain_id=domain_id)
-    assert link.stamped is stamped_by_default()
+    assert link.stamped is is_stamped_default()
     link.begin()
     link.close()
 
@@ -96,7 +96,7 @@ def test_a_drive_whose_chosen_type_nobody_hears_names_who_hears_the_other(
 ):
     monkeypatch.setattr(record_node, "PATIENCE_S", 2.0)
     peer = meet(domain_id)
-    other = not stamped_by_default()
+    other = not is_stamped_default()
     peer.listen(KINDS[other], "cmd_vel", qos.COMMAND)
     odom = peer.node.create_publisher(Odometry, "odom", qos.SENSOR_RELIABLE)
     peer.node.create_timer(0.02, lambda: odom.publish(Odometry()))

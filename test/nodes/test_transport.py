@@ -20,7 +20,7 @@ from nics_drl_bridge.nodes.transport import (
     RMW,
     TRANSPORTS,
     UDP,
-    domains_in_use,
+    find_used_domains,
     set_transport,
 )
 
@@ -64,10 +64,10 @@ def test_an_environment_gets_udp_on_this_machine_unless_it_chooses_otherwise(
 
 
 def test_a_domain_is_in_use_while_a_port_of_it_is_bound():
-    domain_id = min(set(range(1, 101)) - domains_in_use())
+    domain_id = min(set(range(1, 101)) - find_used_domains())
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as end:
         end.bind(("127.0.0.1", FIRST_PORT + PORTS_OF_A_DOMAIN * domain_id + 10))
-        assert domain_id in domains_in_use()
+        assert domain_id in find_used_domains()
 
 
 def is_apart(process, domain_id):

@@ -4,7 +4,7 @@ import sys
 import pytest
 
 from nics_drl_bridge.nodes.parameters import NODES
-from nics_drl_bridge.nodes.start import help_of, wrong_with
+from nics_drl_bridge.nodes.start import find_fault, format_help
 
 # As where no ROS 2 is installed: what is imported in vain is missed.
 WITHOUT = """
@@ -29,12 +29,12 @@ def run(*words):
 def test_help_is_told_without_ros_and_ends_well():
     done = run("policy_node", "--ros-args", "-p", "rate:=2.0", "--help")
     assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout == help_of("policy_node")
+    assert done.stdout == format_help("policy_node")
 
 
 @pytest.mark.parametrize("node", NODES)
 def test_help_names_each_parameter_with_its_default_and_an_example(node):
-    text = help_of(node)
+    text = format_help(node)
     for row in NODES[node]().parameters:
         assert f"\n    {row.name} = " in text
     assert f"ros2 run nics_drl_bridge {node} --ros-args -p " in text
@@ -42,10 +42,10 @@ def test_help_names_each_parameter_with_its_default_and_an_example(node):
 
 
 def test_defaults_are_written_as_they_are_given():
-    assert "\n    rate = .nan: " in help_of("policy_node")
-    assert "\n    goal = [.nan, .nan]: " in help_of("policy_node")
-    assert "\n    limits = '': " in help_of("command_gate")
-    assert "\n    autostart = true: " in help_of("middleware_node")
+    assert "\n    rate = .nan: " in format_help("policy_node")
+    assert "\n    goal = [.nan, .nan]: " in format_help("policy_node")
+    assert "\n    limits = '': " in format_help("command_gate")
+    assert "\n    autostart = true: " in format_help("middleware_node")
 
 
 @pytest.mark.process
@@ -70,6 +70,6 @@ def test_a_parameter_without_ros_args_is_one_sentence():
 )
 def test_the_first_word_that_is_not_for_ros_is_named(words, wrong):
     assert (
-        f"there is no argument {wrong};" in wrong_with("policy_node", words)
+        f"there is no argument {wrong};" in find_fault("policy_node", words)
     ) == bool(wrong)
-    assert bool(wrong_with("policy_node", words)) == bool(wrong)
+    assert bool(find_fault("policy_node", words)) == bool(wrong)

@@ -44,7 +44,7 @@ def record(
     """Records a robot's topics without driving it."""
     with extensions.require_modules("nics bag record"):
         from nics_drl_bridge.extras.bags.live import BagOrder, record_bag
-        from nics_drl_bridge.nodes.own_process import forwarded_errors
+        from nics_drl_bridge.nodes.own_process import forward_errors
     names = tuple(topics or ())
     say = partial(typer.echo, err=True)
     order = BagOrder(
@@ -56,7 +56,7 @@ def record(
         storage,
         use_sim_time,
     )
-    with forwarded_errors():
+    with forward_errors():
         counts = dict(sorted(record_bag(order, say).items()))
     lines = [f"{topic}: {count} messages" for topic, count in counts.items()]
     lines.append(f"bag written to {out}")
@@ -94,6 +94,25 @@ def info(
 
 
 @bag.command()
+def _replay_estimator(
+    path: Path, model: str, roles: list[str], out: Path | None, as_json: bool
+) -> None:
+    from nics_drl_bridge.generator import open_model
+    from nics_drl_bridge.middleware import playback
+
+    estimates = playback.estimate(path, open_model(model), console.parse_roles(roles))
+    if out is not None:
+        playback.write_estimate(estimates, out)
+    rejected = dict(sorted(estimates.rejected.items()))
+    number = len(estimates.stamp_ns)
+    x, y, heading = last = estimates.pose[-1].tolist()
+    lines = [f"not used: {count} of {reason}" for reason, count in rejected.items()]
+    lines.append(f"{number} estimates; the last is {x:.3f} m, {y:.3f} m, {heading:.3f}")
+    facts = {"estimates": number, "last": last, "not_used": rejected}
+    line = "\n".join((*lines, f"sha256 {estimates.digest}"))
+    console.print_line(as_json, line, **facts, sha256=estimates.digest)
+
+
 def replay(
     path: BagArgument,
     rate: Annotated[
@@ -130,24 +149,7 @@ def replay(
 ) -> None:
     """Plays a bag over ROS 2, or runs the middleware's estimator on it."""
     if estimate:
-        from nics_drl_bridge.generator import open_model
-        from nics_drl_bridge.middleware import playback
-
-        estimates = playback.estimate(
-            path, open_model(model), console.parse_roles(topic or [])
-        )
-        if out is not None:
-            playback.write_estimate(estimates, out)
-        rejected = dict(sorted(estimates.rejected.items()))
-        number = len(estimates.stamp_ns)
-        x, y, heading = last = estimates.pose[-1].tolist()
-        lines = [f"not used: {count} of {reason}" for reason, count in rejected.items()]
-        lines.append(
-            f"{number} estimates; the last is {x:.3f} m, {y:.3f} m, {heading:.3f}"
-        )
-        facts = {"estimates": number, "last": last, "not_used": rejected}
-        line = "\n".join((*lines, f"sha256 {estimates.digest}"))
-        console.print_line(as_json, line, **facts, sha256=estimates.digest)
+        _replay_estimator(path, model, topic or [], out, as_json)
         return
     with extensions.require_modules("nics bag replay"):
         from nics_drl_bridge.extras.bags.live import play_bag

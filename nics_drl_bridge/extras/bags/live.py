@@ -1,6 +1,9 @@
 """Bags over ROS 2: records a robot's messages as sent, and plays them back as recorded."""
 
+import contextlib
+import re
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -22,10 +25,13 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from nics_drl_bridge import defaults
 from nics_drl_bridge.config import parse_namespace
 from nics_drl_bridge.errors import BackendError, RecordingError, suggest
-from nics_drl_bridge.nodes.conversions import message_texts, message_type, stamp_to_ros
+from nics_drl_bridge.nodes.conversions import (
+    find_message_type,
+    stamp_to_ros,
+)
 from nics_drl_bridge.nodes.listener import holds, open_context
-from nics_drl_bridge.nodes.qos import BridgeNode, offer_of, profile_of
-from nics_drl_bridge.nodes.runner import DELIVERY_S, run_node, steadily
+from nics_drl_bridge.nodes.qos import BridgeNode, make_offer, make_profile
+from nics_drl_bridge.nodes.runner import DELIVERY_S, call_periodically, run_node
 from nics_drl_bridge.recording.bag_file import BagFile, open_bag
 from nics_drl_bridge.recording.messages import Offer
 from nics_drl_bridge.recording.write import BagSink, Storage, open_bag_sink
@@ -54,9 +60,43 @@ CLOCK_PERIOD_NS = 10_000_000
 USUAL_DEPTH = 100  # queue depth of a topic whose quality of service is not in the bag
 NAP_S = 0.05
 PATIENCE_S = 60.0
+# the type of a field in a `.msg` file
+FIELD = re.compile(r"^\s*([A-Za-z][A-Za-z0-9_]*(?:/[A-Za-z0-9_/]+)?)")
 # time for subscribers to discover the topics before the first message [s]
 DISCOVERY_S = 1.0
 ALONE_S = 5.0  # maximum wait for a subscriber before playing without one [s]
+
+
+def collect_message_texts(kind: str) -> dict[str, str]:
+    """Return the `.msg` texts of a type and of the types in it, as far as they are installed."""
+    texts: dict[str, str] = {}
+    waiting = [kind]
+    while waiting:
+        kind = waiting.pop()
+        file = _find_message_file(kind)
+        if kind in texts or file is None:
+            continue
+        texts[kind] = file.read_text(encoding="utf-8")
+        for field in filter(None, map(FIELD.match, texts[kind].splitlines())):
+            package, _, name = field[1].rpartition("/")
+            if package or name[0].isupper():
+                folder = (package or kind).split("/")[0]
+                waiting.append(f"{folder}/msg/{name}")
+    return texts
+
+
+def _find_message_file(kind: str) -> Path | None:
+    from ament_index_python.search_paths import get_search_paths
+
+    package, _, name = kind.split("/")
+    prefixes = [sys.prefix]
+    # the variable is not set if ROS 2 comes from wheels
+    with contextlib.suppress(OSError):
+        prefixes = [*get_search_paths(), sys.prefix]
+    files = (
+        Path(prefix) / "share" / package / "msg" / f"{name}.msg" for prefix in prefixes
+    )
+    return next((file for file in files if file.is_file()), None)
 
 
 @dataclass(frozen=True)
@@ -106,7 +146,7 @@ class BagRecorder(BridgeNode):
         self.skipped: dict[str, str] = {}  # topic -> sentence with the reason
         self._heard: dict[str, tuple[Offer, Subscription[Any]]] = {}
         self._began = self._flushed = time.monotonic()
-        steadily(self, LOOK_S, self._look)
+        call_periodically(self, LOOK_S, self._look)
         self._look()
 
     def _look(self) -> None:
@@ -129,13 +169,13 @@ class BagRecorder(BridgeNode):
         publishers = self.get_publishers_info_by_topic(topic)
         if not publishers or topic in self.skipped:
             return
-        offers = [offer_of(info.qos_profile) for info in publishers]
+        offers = [make_offer(info.qos_profile) for info in publishers]
         lasting = all(offer.transient_local for offer in offers)
         wanted = Offer(QUEUE, all(offer.reliable for offer in offers), lasting)
         subscribed = self._heard.get(topic)
         if subscribed is not None and subscribed[0] in (wanted, Offer(QUEUE, False)):
             return
-        kind = message_type(kinds[0])
+        kind = find_message_type(kinds[0])
         if len(kinds) > 1 or kind is None:
             why = f"is of {kinds[0]}, whose package is not installed; install it to record it"
             if len(kinds) > 1:
@@ -145,12 +185,14 @@ class BagRecorder(BridgeNode):
             return
         if subscribed is None:
             with self._end_by_fault():
-                self._sink.add_topic(topic, kinds[0], offers, message_texts(kinds[0]))
+                self._sink.add_topic(
+                    topic, kinds[0], offers, collect_message_texts(kinds[0])
+                )
             self._say(f"{topic} ({kinds[0]})")
         else:
             self.destroy_subscription(subscribed[1])
         take = partial(self._take, topic)
-        profile = profile_of(wanted)
+        profile = make_profile(wanted)
         self._heard[topic] = (
             wanted,
             self.create_subscription(kind, topic, take, profile, raw=True),
@@ -222,7 +264,7 @@ class _Player:
             self._barrier = node.create_client(GetParameters, service)
 
     def offer(self, topic: str, kind: str, offers: tuple[Offer, ...]) -> bool:
-        message_class = message_type(kind)
+        message_class = find_message_type(kind)
         if message_class is None:
             return False
         if topic in (CLOCK, "/tf", "/tf_static"):
@@ -235,7 +277,7 @@ class _Player:
             any(offer.transient_local for offer in offers),
         )
         self.publishers[topic] = self._node.create_publisher(
-            message_class, name, profile_of(best)
+            message_class, name, make_profile(best)
         )
         return True
 

@@ -145,11 +145,8 @@ class _Builder:
         self._weigh(body, ROLLER_MASS, np.full(3, across + ROTOR_INERTIA))
 
 
-def _read_robot(dart: Any, path: Path, machine: Machine, physics: Physics) -> DartBody:
-    """Reads a robot from a URDF or SDF file; its wheels are found by axles and places.
-
-    Raises ConfigError if it can't be read, or has no wheel, or several, where the machine has one.
-    """
+def _read_skeleton(dart: Any, path: Path) -> Any:
+    """Reads links and joints from a URDF or SDF file. Raises ConfigError."""
     if not path.is_file():
         raise ConfigError(f"robot {str(path)!r}: no such file.")
     uri = dart.common.Uri(path.absolute().as_uri())
@@ -166,6 +163,15 @@ def _read_robot(dart: Any, path: Path, machine: Machine, physics: Physics) -> Da
         fault = "its first link is fixed to the world, or it has none"
         raise ConfigError(f"robot {str(path)!r}: {fault}; give it a free base.")
     skeleton.resetPositions()
+    return skeleton
+
+
+def _read_robot(dart: Any, path: Path, machine: Machine, physics: Physics) -> DartBody:
+    """Reads a robot from a URDF or SDF file; its wheels are found by axles and places.
+
+    Raises ConfigError if it can't be read, or has no wheel, or several, where the machine has one.
+    """
+    skeleton = _read_skeleton(dart, path)
     root = skeleton.getRootBodyNode()
     _set_friction(root, 0.0)  # a castor that is a part of it slides
     hinges = [

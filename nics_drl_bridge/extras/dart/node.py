@@ -10,7 +10,7 @@ from nics_drl_bridge.extras.dart.scenery import load_dart
 from nics_drl_bridge.extras.dart.simulator import PHYSICS, DartSimulator
 from nics_drl_bridge.extras.physics.machines import design_machine
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.nodes.device_parameters import randomisation
+from nics_drl_bridge.nodes.device_parameters import get_randomisation
 from nics_drl_bridge.nodes.parameters import FRICTION, GYRO_BIAS, GYRO_NOISE, URDF
 from nics_drl_bridge.nodes.runner import declare_row, run_node
 from nics_drl_bridge.nodes.simulator_node import DeviceNode
@@ -37,7 +37,7 @@ def dart_simulator(
         world,
         robots,
         replace(PHYSICS, **rows),
-        randomisation(node),
+        get_randomisation(node),
         Path(file) if file else None,
     )
 

@@ -95,6 +95,21 @@ def let_touch(node: Any, friction: float = BUMPER_FRICTION) -> None:
     node.getDynamicsAspect().setFrictionCoeff(friction)
 
 
+def _add_sides(
+    dart: Any, body: Any, corners: Array, level: float, height: float
+) -> None:
+    """Adds a thin box along each side of a polygon with corners (V, 2)."""
+    for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        along = end - start
+        length = float(np.hypot(*along))
+        inward = np.array([-along[1], along[0]]) / length
+        middle = 0.5 * (start + end + RIM * inward)
+        heading = float(np.arctan2(along[1], along[0]))
+        side = dart.dynamics.BoxShape([length, RIM, height])
+        transform = make_transform(dart, [*middle, level], heading)
+        let_touch(add_shape(body, side, transform))
+
+
 def add_solid(
     dart: Any,
     body: Any,
@@ -121,15 +136,7 @@ def add_solid(
         let_touch(add_shape(body, capsule, transform))
         return add_shape(body, shapes.CylinderShape(solid.radius, height), transform)
     corners = pose[:2] + geometry.rotate(solid.corners, pose[2])
-    for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        along = end - start
-        length = float(np.hypot(*along))
-        inward = np.array([-along[1], along[0]]) / length
-        middle = 0.5 * (start + end + RIM * inward)
-        heading = float(np.arctan2(along[1], along[0]))
-        side = shapes.BoxShape([length, RIM, height])
-        transform = make_transform(dart, [*middle, level], heading)
-        let_touch(add_shape(body, side, transform))
+    _add_sides(dart, body, corners, level, height)
     middle = corners.mean(axis=0)
     ends = (-0.5 * height, 0.5 * height)
     spheres = [(EDGE, [x, y, end]) for x, y in corners - middle for end in ends]

@@ -2,6 +2,7 @@
 
 import math
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -136,6 +137,22 @@ def description_of(place: Path) -> Path | None:
     return descriptions[0] if descriptions else None
 
 
+def _read_network(path: Path, parameters: Parameters, place: str) -> bytes:
+    """Reads the network of a node of a bundle. Raises PolicyError."""
+    if parameters.backend != "onnx":
+        reason = (
+            f"is {parameters.backend!r}, which is not supported; export it with 'onnx'."
+        )
+        raise PolicyError(str(path), f"{place}.backend", reason)
+    data = _read_file(path, parameters.model_path, f"{place}.model_path")
+    if hash_bytes(data) != parameters.sha256sum:
+        reason = (
+            f"does not match {parameters.model_path!r}, which was changed or damaged."
+        )
+        raise PolicyError(str(path), f"{place}.sha256sum", reason)
+    return data
+
+
 def read_bundle(path: Path) -> Bundle:
     """Reads a bundle and checks its networks. Raises ConfigError or PolicyError."""
     source = str(path)
@@ -144,16 +161,9 @@ def read_bundle(path: Path) -> Bundle:
     models = {}
     digests = []
     for name, node in description.models.items():
-        place = f"models.{name}.parameters"
         parameters = node.parameters
-        if parameters.backend != "onnx":
-            reason = f"is {parameters.backend!r}, which is not supported; export it with 'onnx'."
-            raise PolicyError(source, f"{place}.backend", reason)
-        data = _read_file(path, parameters.model_path, f"{place}.model_path")
-        digests.append(hash_bytes(data))
-        if digests[-1] != parameters.sha256sum:
-            reason = f"does not match {parameters.model_path!r}, which was changed or damaged."
-            raise PolicyError(source, f"{place}.sha256sum", reason)
+        data = _read_network(path, parameters, f"models.{name}.parameters")
+        digests.append(parameters.sha256sum)
         file = str(path.parent / parameters.model_path)
         rehearsal.rehearse(data, file, runs=False)
         models[name] = onnx_graph.parse(data, file)
@@ -260,13 +270,16 @@ def _join(
         if value.name not in names:
             reason = f"no earlier node supplies {value.name!r}; connect it."
             raise PolicyError(source, "pipeline.data_flow", reason)
-    graph = joined.graph
+    _rename_ends(joined.graph, names)
+    return joined
+
+
+def _rename_ends(graph: Any, names: Mapping[str, str]) -> None:
     for value in (*graph.input, *graph.output):
         value.name = names.get(value.name, value.name)
     for node in graph.node:
         node.input[:] = [names.get(name, name) for name in node.input]
         node.output[:] = [names.get(name, name) for name in node.output]
-    return joined
 
 
 # The mapping of a foreign bundle, as far as the bundle states it.

@@ -10,7 +10,7 @@ from nics_drl_bridge.extras.mujoco.machines import build_machine, load_mujoco
 from nics_drl_bridge.extras.mujoco.simulator import MujocoSimulator
 from nics_drl_bridge.extras.physics.machines import Physics
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.nodes.device_parameters import randomisation
+from nics_drl_bridge.nodes.device_parameters import get_randomisation
 from nics_drl_bridge.nodes.parameters import FRICTION
 from nics_drl_bridge.nodes.runner import declare_row, run_node
 from nics_drl_bridge.nodes.simulator_node import DeviceNode, declare_renderer
@@ -30,7 +30,9 @@ def mujoco_simulator(
     """Makes robots in MuJoCo, with the lidar and floor of the node's parameters."""
     renderer = declare_renderer(node, defaults.MUJOCO_RENDERER)
     physics = replace(Physics(), friction=declare_row(node, FRICTION))
-    return MujocoSimulator(model, world, robots, renderer, physics, randomisation(node))
+    return MujocoSimulator(
+        model, world, robots, renderer, physics, get_randomisation(node)
+    )
 
 
 MujocoNode = partial(DeviceNode, "mujoco_node", mujoco_simulator)

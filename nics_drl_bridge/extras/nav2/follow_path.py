@@ -16,7 +16,10 @@ from rclpy.node import Node, NodeNameNonExistentError
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.extras.nav2.nav2_parameters import ControllerParameters, chosen
+from nics_drl_bridge.extras.nav2.nav2_parameters import (
+    ControllerParameters,
+    choose_plugin,
+)
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import S_PER_NS, Array
 from nics_drl_bridge.lidar.maps import GridMap
@@ -124,7 +127,7 @@ class Run:
 
 
 @contextlib.contextmanager
-def refusing(goal: Goal, code: str) -> Iterator[None]:
+def refuse_config_errors(goal: Goal, code: str) -> Iterator[None]:
     """Within this context, what is wrong with a goal raises Refusal with a code."""
     try:
         yield
@@ -170,7 +173,7 @@ class PathActions:
         self._limit = math.inf  # of the speed [m/s]
         self._period_s = model.control_period
         self._kinds = {
-            name: conversions.message_type(kind) for name, kind in KINDS.items()
+            name: conversions.find_message_type(kind) for name, kind in KINDS.items()
         }
         if None in self._kinds.values():
             why = (
@@ -181,10 +184,10 @@ class PathActions:
         self._serve(FOLLOW, self._follow)
         if node.get_parameter(NAVIGATE).value:
             self._serve(NAVIGATE, self._navigate)
-            timer = runner.steadily(node, LOOK_S, self._look)
+            timer = runner.call_periodically(node, LOOK_S, self._look)
             self._undo.append(partial(node.destroy_timer, timer))
         topic = runner.get_text(node, "speed_limit_topic")
-        limit_type = conversions.message_type(SPEED_LIMIT)
+        limit_type = conversions.find_message_type(SPEED_LIMIT)
         for heard in (
             node.create_subscription(OccupancyGrid, "map", self._take_map, qos.LATCHED),
             node.create_subscription(limit_type, topic, self._take_limit, qos.COMMAND),
@@ -279,7 +282,7 @@ class PathActions:
         asked = goal.handle.request
         names = []
         for kind, names_of_kind in self.parameters.names.items():
-            name, wrong = chosen(
+            name, wrong = choose_plugin(
                 kind.replace("_", " "), getattr(asked, f"{kind}_id", ""), names_of_kind
             )
             if wrong:  # the code of Nav2's own server
@@ -298,14 +301,14 @@ class PathActions:
             reason = f"behaviour trees such as {asked.behavior_tree!r} are not supported; {fix}."
             raise Refusal("FAILED_TO_LOAD_BEHAVIOR_TREE", f"{NAVIGATE}: {reason}")
         end = np.array([read_pose(asked.pose)])
-        with refusing(goal, "TF_ERROR"):
+        with refuse_config_errors(goal, "TF_ERROR"):
             frame, end = self._frames.fixed(asked.pose.header.frame_id, end)
-        with refusing(goal, goal.code):
+        with refuse_config_errors(goal, goal.code):
             PlannedPath(end)
         # on the map if there is one, else straight
         points = np.stack([self._robot_in(NAVIGATE, frame)[:2], end[0, :2]])
         if self._map is not None and frame in ("", self._map[0]):
-            with refusing(goal, goal.code):
+            with refuse_config_errors(goal, goal.code):
                 radius = self._robot.footprint_radius
                 points = route(self._map[1], points[0], points[1], radius)
         way = np.column_stack([points, np.full(len(points), end[0, 2])])
@@ -315,7 +318,7 @@ class PathActions:
         return self._begin(goal, frame, way, checks)
 
     def _robot_in(self, name: str, frame: str) -> Array:
-        robot = self._frames.robot_in(frame)
+        robot = self._frames.locate_robot(frame)
         if robot is None:
             fix = "send the goal again once odometry and pose have arrived"
             raise Refusal(
@@ -326,27 +329,27 @@ class PathActions:
     def _begin(
         self, goal: Goal, frame: str, poses: Array, checks: Sequence[str]
     ) -> Run:
-        with refusing(goal, goal.code):
+        with refuse_config_errors(goal, goal.code):
             PlannedPath(poses)  # before its frame is looked at
-        with refusing(goal, "TF_ERROR"):
+        with refuse_config_errors(goal, "TF_ERROR"):
             frame, poses = self._frames.fixed(frame, poses)
         path = PlannedPath(poses)
         self._robot_in(goal.name, frame)
         self._require_on_map(goal, frame, poses)
         arrival, progress = self.parameters.checks(*checks)
-        checkers = (
+        list_checker_rows = (
             GoalChecker(arrival, not self._robot.steers),
             ProgressChecker(progress),
         )
         now_s = time.monotonic()
-        return Run(goal, frame, path, *checkers, now_s, now_s)
+        return Run(goal, frame, path, *list_checker_rows, now_s, now_s)
 
     def _require_on_map(self, goal: Goal, frame: str, poses: Array) -> None:
         if self._map is None:
             return
         wanted, grid = self._map
-        here = self._frames.robot_in(frame)
-        there = self._frames.robot_in(wanted)
+        here = self._frames.locate_robot(frame)
+        there = self._frames.locate_robot(wanted)
         if here is None or there is None:
             return
         points = geometry.compose(there, geometry.between(here, poses))[:, :2]
@@ -424,12 +427,15 @@ class PathActions:
             most = float(self._robot.to_fields(self._robot.command_high)[2])
             rate = min(max(TURNING * abs(turn), LEAST_TURN), most)
             twist = np.array([0.0, 0.0, math.copysign(rate, turn)])
-        # Scale the speed down to the limit without changing the robot's path.
+        self._report(run, robot, place, estimate.twist)
+        return self._limit_speed(twist)
+
+    def _limit_speed(self, twist: Array) -> Array:
+        """Scale the speed down to the limit without changing the robot's path."""
         share = min(1.0, self._limit / max(float(np.hypot(*twist[:2])), 1e-9))
         steers = self._robot.steers and not self._robot.takes_turn_rate
-        twist = twist * np.array([share, share, 1.0 if steers else share])
-        self._report(run, robot, place, estimate.twist)
-        return twist
+        limited: Array = twist * np.array([share, share, 1.0 if steers else share])
+        return limited
 
     def _report(self, run: Run, robot: Array, place: Place, twist: Array) -> None:
         speed = float(np.hypot(*twist[:2]))
@@ -475,11 +481,11 @@ class PathActions:
             self._node.get_logger().info(
                 "goal reached" if end == SUCCEED else "goal cancelled"
             )
-        result = result_of(goal.kind, code, sentence)
+        result = make_result(goal.kind, code, sentence)
         goal.server.finish(goal.handle, end, result)
 
 
-def result_of(kind: Any, code: str, sentence: str = "") -> Any:
+def make_result(kind: Any, code: str, sentence: str = "") -> Any:
     """Return an action's result; by distribution it has no fields, a code, or code and sentence."""
     result = kind.Result()
     if hasattr(result, "error_code"):

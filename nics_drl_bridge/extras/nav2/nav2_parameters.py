@@ -9,7 +9,7 @@ from typing import Any
 from rclpy.node import Node
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.nodes.parameters import checkers, nav2
+from nics_drl_bridge.nodes.parameters import list_checker_rows, list_nav2_rows
 from nics_drl_bridge.nodes.runner import declare_row, get_text
 from nics_drl_bridge.policy.follow import GoalCheck, ProgressCheck
 
@@ -38,7 +38,7 @@ class ControllerParameters:
 
     def __init__(self, node: Node) -> None:
         self._node = node
-        values = {row.name: declare_row(node, row) for row in nav2()}
+        values = {row.name: declare_row(node, row) for row in list_nav2_rows()}
         self.names = {kind: tuple(values[f"{kind}_plugins"] or ()) for kind in KINDS}
         empty = [kind for kind, names in self.names.items() if not names]
         if empty:
@@ -48,7 +48,9 @@ class ControllerParameters:
         checker = values["progress_checker_plugin"]
         if checker:
             self.names["progress_checker"] = (checker,)
-        for row in checkers(self.names["goal_checker"], self.names["progress_checker"]):
+        for row in list_checker_rows(
+            self.names["goal_checker"], self.names["progress_checker"]
+        ):
             declare_row(node, row)
 
     def checks(self, goal: str, progress: str) -> tuple[GoalCheck, ProgressCheck]:
@@ -74,7 +76,7 @@ class ControllerParameters:
         return name in UNUSED or name.split(".")[0] in chain(*self.names.values())
 
 
-def chosen(what: str, asked: str, known: Sequence[str]) -> tuple[str, str]:
+def choose_plugin(what: str, asked: str, known: Sequence[str]) -> tuple[str, str]:
     """Return a plugin's name and what is wrong with it; an empty name selects the only plugin."""
     if not asked and len(known) == 1:
         return known[0], ""

@@ -13,7 +13,7 @@ def open_services(node: Any) -> "Server | None":
     """Offer the standard services at a device node; None without its messages, or if unwanted."""
     if not runner.declare_row(node, STANDARD):
         return None
-    if conversions.message_type(NEWEST) is None:
+    if conversions.find_message_type(NEWEST) is None:
         missing = "the package simulation_interfaces, 2.1 or newer, is not installed"
         node.get_logger().info(f"{missing}, so that its services are not offered")
         return None

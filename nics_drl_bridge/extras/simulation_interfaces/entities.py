@@ -15,7 +15,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.extras.simulation_interfaces.host import (
     Host,
     RefusalError,
-    local_path,
+    find_local_path,
     refused,
 )
 from nics_drl_bridge.extras.simulation_interfaces.models import (
@@ -180,7 +180,7 @@ class EntityServices:
             )
         scan = host.resolve_topic_name(f"{space}/scan")
         taken = scan in [publisher.topic_name for publisher in host.publishers]
-        if taken or device_parameters.frames(host, space.strip("/")) in host.frames:
+        if taken or device_parameters.get_frames(host, space.strip("/")) in host.frames:
             fault = f"the namespace {space!r} is that of another robot"
             raise RefusalError(
                 SpawnResult.NAMESPACE_INVALID,
@@ -204,7 +204,7 @@ class EntityServices:
         if uri == robot:
             return None
         if uri:
-            path = local_path(uri, codes, SUFFIXES)
+            path = find_local_path(uri, codes, SUFFIXES)
             try:
                 if not path.suffix:
                     path = find_config(str(path), SHIPPED)
@@ -236,7 +236,7 @@ class EntityServices:
         if not NAME.fullmatch(wanted):
             fault = f"the name {wanted!r} is not valid; use up to 120 letters, digits, and _ . / -"
             raise RefusalError(SpawnResult.NAME_INVALID, f"{fault} between them.")
-        free = self._simulation.entities.free_name(wanted)
+        free = self._simulation.entities.find_free_name(wanted)
         if free != wanted and not request.allow_renaming:
             fix = "give another, or set allow_renaming"
             raise RefusalError(
@@ -262,6 +262,6 @@ def pose_from_ros(pose: Any, base: Array, code: int) -> Array:
         fault = "leans, but the world is flat; turn about z alone"
     if fault:
         raise RefusalError(code, f"the pose {fault}.")
-    local = np.array([place.x, place.y, conversions.heading_of(*quaternion)])
+    local = np.array([place.x, place.y, conversions.compute_heading(*quaternion)])
     pose_in_map: Array = geometry.compose(base, local)
     return pose_in_map

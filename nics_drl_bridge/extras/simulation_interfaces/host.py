@@ -67,7 +67,7 @@ def served(handler: Handler, host: Host) -> Callable[[Any, Any], Any]:
     return reply
 
 
-def local_path(uri: str, codes: Codes, formats: tuple[str, ...]) -> Path:
+def find_local_path(uri: str, codes: Codes, formats: tuple[str, ...]) -> Path:
     """Return the path that a URI or a plain path means, or a name. Raises RefusalError."""
     fault = "is not on this machine; give file:// or a path"
     place = uri

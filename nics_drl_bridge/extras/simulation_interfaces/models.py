@@ -62,7 +62,7 @@ def model_of_sdf(text: str, z: float, source: str = TEXT) -> Model:
     Raises ConfigError unless the text is SDF with one model of known shapes, AssetsError for a mesh
     or a missing file, BridgeError for too many shapes.
     """
-    with file_of(text, source) as file:
+    with write_file(text, source) as file:
         root = root_of(file)  # refuses XML entities that grow
     models = root.findall("model")
     if len(models) != 1 or root.find("world") is not None:
@@ -72,7 +72,7 @@ def model_of_sdf(text: str, z: float, source: str = TEXT) -> Model:
     pose = models[0].find("pose")
     if pose is not None:
         models[0].remove(pose)  # it is spawned where the request says
-    with file_of(ElementTree.tostring(root, encoding="unicode"), source) as file:
+    with write_file(ElementTree.tostring(root, encoding="unicode"), source) as file:
         try:
             standing = read_sdf(file, HEIGHT - z)
         except AssetsError:
@@ -85,7 +85,7 @@ def model_of_sdf(text: str, z: float, source: str = TEXT) -> Model:
 
 
 @contextmanager
-def file_of(text: str, source: str = TEXT) -> Iterator[Path]:
+def write_file(text: str, source: str = TEXT) -> Iterator[Path]:
     """Yield a temporary file with a text; errors name `source` instead of its path."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "text.sdf"

@@ -209,7 +209,7 @@ class Entities:
         self._table = bodies
         self.simulator.put_bodies(bodies)
 
-    def free_name(self, name: str) -> str:
+    def find_free_name(self, name: str) -> str:
         """Return an unused name: the given one, or the given one with a number."""
         taken = {entity.name for entity in self}
         # Names of the world's own obstacles may return with the next episode.

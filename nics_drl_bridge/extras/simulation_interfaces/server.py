@@ -82,7 +82,7 @@ class Server:
         self._offer("GetSimulatorFeatures", self._tell)
 
     def _offer(self, name: str, reply: Callable[[Any, Any], Any]) -> None:
-        kind = conversions.message_type(f"simulation_interfaces/srv/{name}")
+        kind = conversions.find_message_type(f"simulation_interfaces/srv/{name}")
         if kind is not None:  # in an older version of the standard there are fewer
             self._host.create_service(kind, snake_case(name), reply)
 

@@ -9,7 +9,7 @@ from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.extras.simulation_interfaces.host import (
     Host,
     RefusalError,
-    local_path,
+    find_local_path,
     refused,
 )
 from nics_drl_bridge.extras.simulation_interfaces.roster import Entities
@@ -74,7 +74,9 @@ class Simulation:
             fault = f"state {wanted} can't be set; choose one of {states}."
             raise RefusalError(codes.INCORRECT_TRANSITION, fault)
         if wanted == QUITTING:
-            runner.steadily(self._host, GOODBYE_S, self._host.context.try_shutdown)
+            runner.call_periodically(
+                self._host, GOODBYE_S, self._host.context.try_shutdown
+            )
         if wanted == STOPPED:
             try:
                 self._reset_all()
@@ -153,7 +155,7 @@ class Simulation:
         with refused(CODES):
             name = resource.uri
             if not any(sign in name for sign in SPECIAL):
-                name = str(local_path(name, CODES, (".yaml", ".yml")))
+                name = str(find_local_path(name, CODES, (".yaml", ".yml")))
             world = load_worlds(name)
         self._restore()
         self._host.use_world(world)

@@ -8,16 +8,16 @@ from nics_drl_bridge.interface import NS_PER_S
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
 from geometry_msgs.msg import PoseStamped
+from nodes.peer import odometry
 from sensor_msgs.msg import Imu
 
 from nics_drl_bridge.errors import BackendError, RecordingError
 from nics_drl_bridge.nodes import conversions
-from nics_drl_bridge.nodes.record_node import DriveLog
+from nics_drl_bridge.recording.drive_log import DriveLog
 from nics_drl_bridge.recording.messages import get_stamp, read_imu, read_pose
 from nics_drl_bridge.recording.recording import check
 from nics_drl_bridge.recording.topic_roles import TopicRoles
 from nics_drl_bridge.robot.spec import load_robot
-from nodes.peer import odometry
 
 pytestmark = pytest.mark.ros
 
@@ -39,7 +39,7 @@ class Drive:
         stamp = START_NS + k * PERIOD_NS if stamp_ns is None else stamp_ns
         pose = [0.1 * k if x is None else x, 0.0, 0.0]
         self.now_ns = START_NS + k * PERIOD_NS + PERIOD_NS // 5
-        return self.log.odometry(odometry(stamp, pose, twist))
+        return self.log.take_odometry(odometry(stamp, pose, twist))
 
     def sends(self, k):
         """Command number k."""
@@ -54,7 +54,7 @@ class Drive:
 
 
 def test_commands_are_on_the_clock_of_the_stamps_of_odometry():
-    recording = check(Drive().goes(0, 30).log.recording(), CAR)
+    recording = check(Drive().goes(0, 30).log.make_recording(), CAR)
     assert recording.command.clock == recording.pose.clock
     # By stamp, not by receipt 20 ms later.
     assert recording.pose.t == pytest.approx(recording.command.t)
@@ -69,7 +69,7 @@ def test_odometry_that_is_old_repeated_or_no_number_is_no_news():
     assert drive.hears(11, stamp_ns=START_NS + 5 * PERIOD_NS) is None
     assert drive.hears(12, x=math.nan) is None
     assert drive.hears(13)[0] == pytest.approx(1.3)
-    assert len(drive.log.recording().pose.t) == 11
+    assert len(drive.log.make_recording().pose.t) == 11
 
 
 def test_without_stamps_the_time_of_receipt_counts():
@@ -78,7 +78,7 @@ def test_without_stamps_the_time_of_receipt_counts():
         drive.sends(k)
         assert drive.hears(k, stamp_ns=0) is not None
     drive.log.check()
-    recording = drive.log.recording()
+    recording = drive.log.make_recording()
     assert np.diff(recording.pose.t) == pytest.approx(np.full(19, 0.1))
     assert recording.pose.t[0] - recording.command.t[0] == pytest.approx(0.02)
 
@@ -96,7 +96,7 @@ def test_the_pose_of_motion_capture_and_the_imu_are_taken():
         imu.linear_acceleration.x, imu.angular_velocity.z = 0.3, -0.7
         drive.log.add("pose", get_stamp(pose), read_pose(pose))
         drive.log.add("imu", get_stamp(imu), read_imu(imu))
-    recording = drive.log.recording()
+    recording = drive.log.make_recording()
     assert recording.pose.values[-1] == pytest.approx([0.0, 3.8, 0.5])
     assert recording.imu.values[-1] == pytest.approx([0.3, 0.0, -0.7])
 
@@ -109,7 +109,7 @@ def test_beside_a_pose_of_motion_capture_the_twist_of_the_odometry_is_taken():
         pose = PoseStamped()
         pose.header.stamp = conversions.stamp_to_ros(START_NS + k * PERIOD_NS)
         drive.log.add("pose", get_stamp(pose), read_pose(pose))
-    recording = check(drive.log.recording(), CAR)
+    recording = check(drive.log.make_recording(), CAR)
     assert recording.odometry.values[-1] == pytest.approx([1.9, 0.0, -0.2])
     assert len(recording.odometry.t) == 19
     assert recording.odometry.clock == recording.command.clock
@@ -125,9 +125,9 @@ def test_measured_wheels_are_the_state():
     for k in range(5, 30):
         drive.goes(k, k + 1)
         stamp = START_NS + k * PERIOD_NS
-        drive.log.joints(joints.write(np.array([0.5 * k, -0.5 * k]), stamp))
+        drive.log.take_joints(joints.write(np.array([0.5 * k, -0.5 * k]), stamp))
     drive.log.check()
-    assert drive.log.recording().state.values[-1] == pytest.approx([14.5, -14.5])
+    assert drive.log.make_recording().state.values[-1] == pytest.approx([14.5, -14.5])
 
 
 def test_stamps_at_another_pace_than_the_receipt_are_a_simulators():
@@ -145,9 +145,9 @@ def test_stamps_of_several_clocks_do_not_lose_a_drive_that_is_over():
     for k in range(20, 40):
         drive.sends(k)
         drive.hears(k, stamp_ns=START_NS + (k + 600) * PERIOD_NS)
-    assert len(drive.log.recording().pose.t) == 40
+    assert len(drive.log.make_recording().pose.t) == 40
 
 
 def test_nothing_received_is_no_recording():
     with pytest.raises(RecordingError, match="nothing was received"):
-        Drive().log.recording()
+        Drive().log.make_recording()

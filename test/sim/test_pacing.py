@@ -1,7 +1,11 @@
 import pytest
 
 from nics_drl_bridge.interface import NS_PER_S
-from nics_drl_bridge.nodes.device_parameters import RealTime, TopicPace, common_step
+from nics_drl_bridge.sim.pacing import (
+    RealTime,
+    TopicPace,
+    find_common_step,
+)
 
 STEP = NS_PER_S // 50
 
@@ -35,7 +39,7 @@ def test_after_a_reset_a_message_is_due_at_once():
     [((0.1, 0.02), 2), ((0.1, 0.1), 10), ((0.025, 0.02), 2), ((0.001,), 1)],
 )
 def test_the_world_moves_by_the_longest_step_that_meets_all_periods(periods, steps):
-    assert common_step(0.01, periods) == steps
+    assert find_common_step(0.01, periods) == steps
 
 
 def test_steps_that_were_missed_are_made_up_for():
