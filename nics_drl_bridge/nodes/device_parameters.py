@@ -21,8 +21,8 @@ from nics_drl_bridge.nodes.parameters import (
     name_fleet,
 )
 from nics_drl_bridge.nodes.runner import declare_row, get_number, get_text
+from nics_drl_bridge.pacing import find_common_step
 from nics_drl_bridge.robot.noise import Delay
-from nics_drl_bridge.sim.pacing import find_common_step
 from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
 
 START = "episode_start"

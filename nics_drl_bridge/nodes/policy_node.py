@@ -25,8 +25,8 @@ from nics_drl_bridge.nodes.parameters import list_policy_rows
 from nics_drl_bridge.nodes.parts import Wish, open_parts
 from nics_drl_bridge.nodes.robot_topics import SILENCE_S, RobotTopics
 from nics_drl_bridge.nodes.runner import ACTIVE, UNCONFIGURED, ManagedNode
+from nics_drl_bridge.pacing import ActionPace, Answer, Deadline
 from nics_drl_bridge.policy.file.stateful import begin, resume
-from nics_drl_bridge.policy.pacing import ActionPace, Answer, Deadline
 from nics_drl_bridge.policy.policies import open_policy
 
 # time between two looks at cancelled goals and silent data, as a fraction of the control period

@@ -43,9 +43,9 @@ from nics_drl_bridge.nodes.message_packages import explain_install
 from nics_drl_bridge.nodes.parts import open_parts
 from nics_drl_bridge.nodes.runner import OK, WARN
 from nics_drl_bridge.nodes.world_topics import WorldTopics
+from nics_drl_bridge.pacing import RealTime, TopicPace
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.device import LEAST_VARIANCE, DeviceWorld, Sensed, variances
-from nics_drl_bridge.sim.pacing import RealTime, TopicPace
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 

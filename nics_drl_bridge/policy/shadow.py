@@ -14,8 +14,8 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import S_PER_NS, Array, RobotView
 from nics_drl_bridge.middleware.measurement import CMD_VEL, ODOM, POSE, SCAN
 from nics_drl_bridge.middleware.playback import Playback, merge_messages, read_messages
+from nics_drl_bridge.pacing import ActionPace
 from nics_drl_bridge.policy.file.stateful import resume
-from nics_drl_bridge.policy.pacing import ActionPace
 from nics_drl_bridge.policy.policies import open_policy
 from nics_drl_bridge.recording.messages import read_robot_command
 
