@@ -174,7 +174,7 @@ def inspect(
 ) -> None:
     """Lists the contents of any recording and drafts its mapping."""
     from nics_drl_bridge.files import write_text
-    from nics_drl_bridge.recording.guess import propose_mapping
+    from nics_drl_bridge.recording.mapping_draft import propose_mapping
     from nics_drl_bridge.recording.readers import explain_no_mapping, open_source
     from nics_drl_bridge.recording.recording import is_recording
     from nics_drl_bridge.recording.survey import inspect_tables

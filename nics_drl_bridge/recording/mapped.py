@@ -279,7 +279,9 @@ def _check_kind(name: str, value: Value, kinds: Sequence[str]) -> None:
         )
 
 
-def _check_units(reader: MappedReader, pose: Stream, spec: RobotSpec | None) -> None:
+def _refuse_implausible_pose(
+    reader: MappedReader, pose: Stream, spec: RobotSpec | None
+) -> None:
     """Refuses poses that only a wrong unit explains (RecordingError)."""
     mapping = reader.mapping
     radius = 0.0
@@ -383,7 +385,7 @@ def read_pose(
             east, north = east_and_north(parts[0].values, parts[1].values)
             parts = [parts[0]._replace(values=east), parts[1]._replace(values=north)]
             factors = [1.0, 1.0]
-    _check_units(reader, combine_series("pose", parts, held=False), spec)
+    _refuse_implausible_pose(reader, combine_series("pose", parts, held=False), spec)
     # A heading can be interpolated only once it is unwrapped.
     parts[2] = parts[2]._replace(values=np.unwrap(parts[2].values))
     stream = combine_series("pose", parts, held=False)

@@ -58,7 +58,7 @@ def open_drive(
         )
     spec = _build_with_ranges(known, drive)
     if isinstance(mapping, Mapping):
-        _check_units(mapping, spec)
+        _check_units_fit_robot(mapping, spec)
     return spec, reorder_variables(drive, spec)
 
 
@@ -220,7 +220,7 @@ def explain_no_mapping(path: Path) -> str:
     return f"has topics of known names and types ({used})"
 
 
-def _check_units(mapping: Mapping, spec: RobotSpec) -> None:
+def _check_units_fit_robot(mapping: Mapping, spec: RobotSpec) -> None:
     """Refuses commands and states whose units are not of the robot's kind (ConfigError)."""
     for stream, values in (("command", spec.command), ("state", spec.state)):
         for variable in values:

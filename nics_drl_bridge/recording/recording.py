@@ -423,7 +423,7 @@ def find_implausible_pose(
     return (
         _find_too_slow(t)
         or _find_degrees(t, pose)
-        or _find_radians(pose[_select_spaced(t)])
+        or _find_wrong_degrees(pose[_select_spaced(t)])
         or _find_too_fast(t, pose, fastest, hardest)
     )
 
@@ -448,7 +448,7 @@ def _find_degrees(t: Array, pose: Array) -> Implausible | None:
     return Implausible(reason, cause, "heading_unit: deg")
 
 
-def _find_radians(pose: Array) -> Implausible | None:
+def _find_wrong_degrees(pose: Array) -> Implausible | None:
     if not _is_only_along(pose, 180.0 / np.pi):
         return None
     cause = "it was in radians, and is taken as degrees"

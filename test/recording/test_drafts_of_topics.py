@@ -8,7 +8,7 @@ import pytest
 
 from nics_drl_bridge.config import parse_yaml
 from nics_drl_bridge.recording import topic_roles as kinds
-from nics_drl_bridge.recording.guess import propose_mapping
+from nics_drl_bridge.recording.mapping_draft import propose_mapping
 from nics_drl_bridge.recording.survey import Field, TableSurvey
 
 from .test_drafts import COUNT, M

@@ -1,7 +1,8 @@
 """Guesses what the columns of a recording are, by their names, units and types.
 
 A column counts as a command only if its name, or the name and type of its topic, says so. A column
-that may be a command is listed as a candidate. Measurements are neither.
+that may be a command is listed as a candidate. Measurements are neither. The guesses serve only the
+draft of a mapping: opening a recording never guesses.
 """
 
 import re

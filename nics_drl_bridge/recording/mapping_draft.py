@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from nics_drl_bridge.geometry import Array, east_and_north
-from nics_drl_bridge.recording.guesses import (
+from nics_drl_bridge.recording.column_guesses import (
     GLOBE,
     Candidate,
     CommandGuess,
