@@ -14,8 +14,8 @@ from nics_drl_bridge.identify.acceptance import (
 )
 from nics_drl_bridge.identify.conclusion import conclude
 from nics_drl_bridge.identify.identify import Identified, identify
-from nics_drl_bridge.recording.mapping_draft import propose_mapping
 from nics_drl_bridge.recording.mapping import Mapping
+from nics_drl_bridge.recording.mapping_draft import propose_mapping
 from nics_drl_bridge.recording.readers import open_drive, open_source
 from nics_drl_bridge.recording.survey import inspect_tables
 

@@ -14,8 +14,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from nics_drl_bridge.config import parse_yaml
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.recording.bag_file import open_bag
-from nics_drl_bridge.recording.mapping_draft import propose_mapping
 from nics_drl_bridge.recording.mapping import Mapping
+from nics_drl_bridge.recording.mapping_draft import propose_mapping
 from nics_drl_bridge.recording.readers import open_source, read_recording
 from nics_drl_bridge.recording.survey import inspect_tables
 from nics_drl_bridge.robot.spec import load_robot

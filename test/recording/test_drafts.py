@@ -10,8 +10,8 @@ import pytest
 
 from nics_drl_bridge.config import parse_yaml
 from nics_drl_bridge.errors import ConfigError, RecordingError
-from nics_drl_bridge.recording.mapping_draft import propose_mapping
 from nics_drl_bridge.recording.mapping import Mapping, load_mapping
+from nics_drl_bridge.recording.mapping_draft import propose_mapping
 from nics_drl_bridge.recording.readers import open_source, read_recording
 from nics_drl_bridge.recording.survey import inspect_tables, split_unit
 from nics_drl_bridge.robot.spec import load_robot

@@ -6,8 +6,8 @@ import bags
 import numpy as np
 import pytest
 
-from nics_drl_bridge.recording.mapping_draft import propose_mapping
 from nics_drl_bridge.recording.imu_axis import GyroReader, UpAxis, find_up_axis
+from nics_drl_bridge.recording.mapping_draft import propose_mapping
 from nics_drl_bridge.recording.readers import open_source, read_recording
 from nics_drl_bridge.recording.survey import inspect_tables
 from nics_drl_bridge.recording.topic_roles import IMU, TopicRoles

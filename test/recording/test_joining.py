@@ -8,9 +8,9 @@ import pytest
 from nics_drl_bridge import geometry
 from nics_drl_bridge.config import parse_yaml
 from nics_drl_bridge.errors import ConfigError, RecordingError
-from nics_drl_bridge.recording.mapping_draft import propose_mapping
 from nics_drl_bridge.recording.joining import APART_S, LEARNT_SHARE, join
 from nics_drl_bridge.recording.mapping import Mapping
+from nics_drl_bridge.recording.mapping_draft import propose_mapping
 from nics_drl_bridge.recording.readers import open_source, read_recording
 from nics_drl_bridge.recording.recording import (
     Recording,

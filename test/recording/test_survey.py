@@ -5,8 +5,8 @@ import pytest
 
 from nics_drl_bridge.config import parse_yaml
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.recording.mapping_draft import propose_mapping
 from nics_drl_bridge.recording.mapping import Mapping
+from nics_drl_bridge.recording.mapping_draft import propose_mapping
 from nics_drl_bridge.recording.names import split_words
 from nics_drl_bridge.recording.readers import (
     explain_no_mapping,
