@@ -58,9 +58,10 @@ def decide(
     cause, latching_cause = _find_causes(config, state, now)
     if cause is not None:
         publish = is_tick or bool(state.value.any())
-        stopped_s = now if publish else state.moved_s
+        stopped_s = now if publish else state.published_s
         state = _stop(config, state, stopped_s, latching_cause)
-    elif is_tick and not now - state.moved_s < limits.MIN_STEP_S:
+    # `not <`: an age of NaN publishes, too
+    elif is_tick and not now - state.published_s < limits.MIN_STEP_S:
         publish = True
         state, cause = _move(config, state, now)
         is_shielded = state.shielded
@@ -93,7 +94,7 @@ def _stop(
     """
     zero = np.zeros_like(state.value)
     recent = state.recent
-    if stopped_s > state.moved_s:  # the stop is published
+    if stopped_s > state.published_s:  # the stop is published
         recent = shield.append_command(config, state, zero, stopped_s)
     if latching is not None and state.armed:
         state = replace(state, latched=latching)
@@ -101,7 +102,7 @@ def _stop(
         state,
         value=zero,
         slope=zero,
-        moved_s=stopped_s,
+        published_s=stopped_s,
         push=None,
         shielded=False,
         recent=recent,
@@ -127,7 +128,7 @@ def _move(
         state,
         value=motion.value,
         slope=motion.slope,
-        moved_s=now,
+        published_s=now,
         recent=shield.append_command(config, state, motion.value, now),
         shielded=motion.shielded,
     )
@@ -140,7 +141,8 @@ class Rule(NamedTuple):
     Attributes:
         judge: returns the cause of a stop at a time [s], or None; its name is that of the rule.
         latches: the stop stays until a reset.
-        needs_clock: it measures elapsed time, which is unknown while the gate's clock is at fault.
+        needs_clock: it latches by elapsed time, so it is not judged while the gate's clock is at
+            fault. Other rules may judge a wrong age: `own_clock` stops the robot anyway.
     """
 
     judge: Callable[[GateConfig, GateState, float], Cause | None]
@@ -197,7 +199,7 @@ def follow(config: GateConfig, state: GateState, motion: Motion, now: float) -> 
     """Limits rate and jerk, see `limits.follow`."""
     if config.limits is None:
         return motion
-    dt = now - state.moved_s if math.isfinite(state.moved_s) else config.gap_s
+    dt = now - state.published_s if math.isfinite(state.published_s) else config.gap_s
     # A turn need not wait for a speed that the shield holds back.
     waits = not state.shielded
     value, slope = limits.follow(

@@ -149,7 +149,8 @@ def _can_stop_calmly(
 ) -> bool:
     """True if the robot can stop from a command (C,) after the next scan, before what stands."""
     twists = _span_twists(config, shield, value[None], None)
-    # Until the command is followed, the next scan comes, and the stop is decided and followed.
+    # The robot follows the command after a latency. The next scan comes after a period and is
+    # decided on after `hold_s`. The robot follows the stop after another latency.
     reaction_s = (
         1.0 / config.scan_rate + (shield.hold_s + shield.latency_s) + shield.latency_s
     )
@@ -243,6 +244,8 @@ def list_stops(
     if turn.least_path < SHORT_STOP:
         fractions.append((turn.least_path, 1.0))
     stops = []
+    # A stop that ends early, at a fraction of its path v t + v^2 / (2 a), may have had less
+    # latency and braked harder: by up to the missing latency, and with a / fraction.
     for path_fraction, turn_fraction in fractions:
         path_reaction_s = reaction_s - (1.0 - path_fraction) * shield.latency_s
         turn_latencies = latencies - (1.0 - turn_fraction)

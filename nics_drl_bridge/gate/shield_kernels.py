@@ -1,6 +1,7 @@
 """Compiled: sweeps a footprint along the arcs of a robot that stops, and looks for contacts.
 
-The robot keeps a twist for a reaction time and then brakes evenly, so it stays on one arc. With a
+The robot keeps a twist for a reaction time and then brakes evenly. It stays on one arc, unless its
+turn brakes by itself, see `_fill_places_of_separate_turn`. With a
 speed v and a deceleration a it gets as far as in the time T = reaction + v / (2 a) at full speed.
 `is_free` checks such a stop in four steps:
 
@@ -13,7 +14,8 @@ speed v and a deceleration a it gets as far as in the time T = reaction + v / (2
 
 Shared arguments:
     twist (3,): of the robot before it stops: vx, vy [m/s], turn rate [rad/s].
-    speed: the one that is braked [m/s], as `_bound_path` returns it.
+    braked_speed: the one that is braked [m/s], as `_bound_path` returns it; `speed` is that of the
+        origin.
     reaction: time from now until the speed is braked [s].
     deceleration: of the speed [m/s^2].
 """
@@ -94,8 +96,10 @@ def is_free(
     longest_time = 0.0
     most_steps = 0
     for k in range(twists.shape[0]):
-        path, speed = _bound_path(twists[k], body, reaction, deceleration)
-        rest_time = _compute_rest_time(twists[k], speed, body, reaction, deceleration)
+        path, braked_speed = _bound_path(twists[k], body, reaction, deceleration)
+        rest_time = _compute_rest_time(
+            twists[k], braked_speed, body, reaction, deceleration
+        )
         longest_path = max(longest_path, path)
         longest_time = max(longest_time, rest_time)
         most_steps = max(most_steps, math.ceil(path / step))
@@ -104,22 +108,23 @@ def is_free(
         return True
     all_places = np.empty((most_steps + 1, 5))
     for k in range(twists.shape[0]):
-        path, speed = _bound_path(twists[k], body, reaction, deceleration)
+        path, braked_speed = _bound_path(twists[k], body, reaction, deceleration)
         steps = math.ceil(path / step)
         if steps == 0:
             continue
         places = all_places[: steps + 1]
-        duration = reaction + speed / (2.0 * deceleration)
+        duration = reaction + braked_speed / (2.0 * deceleration)
         step_time = duration / steps
-        # Braking makes the last step longest: it moves by speed * step_time, and ends at rest.
+        # Braking makes the last step longest: it moves by braked_speed * step_time, and ends at
+        # rest.
         longest_step_time = step_time + math.sqrt(
-            2.0 * speed * step_time / deceleration
+            2.0 * braked_speed * step_time / deceleration
         )
         is_filled = False
         if body.turn_deceleration > 0.0:
             is_filled = True
             longest_step_time = _fill_places_of_separate_turn(
-                places, path, twists[k], speed, body, reaction, deceleration
+                places, path, twists[k], braked_speed, body, reaction, deceleration
             )
         for p in range(near.shape[0]):
             loss_per_step = path / steps + near[p, APPROACH] * longest_step_time
@@ -127,7 +132,9 @@ def is_free(
             s = _count_safe_steps(spare, loss_per_step, steps)
             if s <= steps and not is_filled:
                 is_filled = True
-                _fill_places(places, duration, twists[k], speed, reaction, deceleration)
+                _fill_places(
+                    places, duration, twists[k], braked_speed, reaction, deceleration
+                )
             while s <= steps:
                 dx = near[p, X] - places[s, X]
                 dy = near[p, Y] - places[s, Y]
@@ -171,10 +178,14 @@ def _bound_path(
 
 @kernel
 def _compute_rest_time(
-    twist: Array, speed: float, body: Body, reaction: float, deceleration: float
+    twist: Array,
+    braked_speed: float,
+    body: Body,
+    reaction: float,
+    deceleration: float,
 ) -> float:
     """Returns the time until a braking robot rests [s]."""
-    rest_time = reaction + speed / deceleration
+    rest_time = reaction + braked_speed / deceleration
     if body.turn_deceleration > 0.0:
         turn_time = abs(twist[2]) / body.turn_deceleration
         rest_time = max(rest_time, reaction + body.turn_delay + turn_time)
@@ -224,7 +235,7 @@ def _fill_places(
     places: Array,
     duration: float,
     twist: Array,
-    speed: float,
+    braked_speed: float,
     reaction: float,
     deceleration: float,
 ) -> None:
@@ -238,7 +249,7 @@ def _fill_places(
         places[s, COSINE] = cosine
         places[s, SINE] = sine
         places[s, TIME] = _compute_braking_time(
-            full_speed_time, speed, reaction, deceleration
+            full_speed_time, braked_speed, reaction, deceleration
         )
 
 

@@ -276,7 +276,7 @@ class GateState:
 
     value: Array  # (C,) last published command
     slope: Array  # (C,) its change per second
-    moved_s: float = -INF  # time of that publication
+    published_s: float = -INF  # time of that publication
     shielded: bool = False  # the shield reduced it
     now_s: float = -INF  # greatest time seen
     tick_s: float | None = None  # of the last tick
