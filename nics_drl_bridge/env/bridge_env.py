@@ -89,10 +89,11 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
             keyword `robot` means the same.
         world: a World, its YAML file, the name of a shipped one, or a list of these (a world set).
         task: a name, `path/to/file.py:ClassName`, a class, or a Task; see `env.registry.make_task`.
-        task_options: further arguments of the task's class.
-        estimator: True puts the robot's middleware (cache and EKF) between simulator and task, so
-            that `sim` gives the same numbers as `dds`, which always has it. False, the default of
-            `sim`, takes pose and twist from odometry, bit-identical to the vector env.
+        task_options: arguments of the task's class.
+        estimator: True inserts the robot's middleware (cache and EKF) between simulator
+            and task, so that `sim` returns the same numbers as `dds`, which always uses
+            it. False, the default of `sim`, takes pose and twist from odometry,
+            bit-identical to the vector env.
         backend_options: arguments of a backend by name, see `SimBackend` and `DdsBackend`; it also
             gets `estimator`, `randomisation` and the number of robots if they are given.
         randomisation: quantities drawn in each episode: the name of a shipped one, a YAML file, or
@@ -138,7 +139,7 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
         self.memory: Memory = {}
         self.scene: Scene | None = None
         self.ended = np.zeros(self.robots, np.bool_)
-        self._view: RobotView | None = None  # always a batch of one, which tasks expect
+        self._view: RobotView | None = None  # always a batch of one, as tasks expect
         self._shape = (1, self.robots, self.task.observation_space.shape[0])
         self._row: Any = (0, 0) if self.robots == 1 else 0
         self._each = (1, self.robots, *(self.task.action_space.shape or ()))
@@ -147,7 +148,7 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
         self._episode = -1
         self._rehearsed = False
         self._picture: Any = None
-        # of the last step, for pictures
+        # outcome of the last step, for pictures
         self._commands = self._rest[None]
         self._facts = Info()
         self._steps = 0
@@ -222,7 +223,7 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
         return observation.reshape(-1), self._make_info(self._view, facts)
 
     def _try_task(self, episodes: Episodes) -> None:
-        """Runs the task once before the robot moves: it is too slow to compile while driving."""
+        """Runs the task once at rest, because compiling while driving is too slow."""
         shape = (1, self.robots, self.model.lidar.beams)
         free = np.full(shape, np.inf, np.float32)
         sensed = unread(self.model.sensors, 1, self.robots)
@@ -263,7 +264,7 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
     def advance(self, action: AnyArray) -> tuple[Singles, Terms, Info]:
         """Advances one period; returns observations (M, O), reward terms (M,) by name, and `info`.
 
-        Robots of a team that have `ended` (M,) get the command nearest to zero and no more reward.
+        Robots of a team that have `ended` (M,) get the stop command and no more reward.
         """
         observation, terms, info = self._advance(action)
         rows = {name: np.reshape(term, self.robots) for name, term in terms.items()}
@@ -314,7 +315,7 @@ class BridgeEnv(gymnasium.Env[Singles, AnyArray]):
         return made
 
     def halt(self) -> None:
-        """Stops the robot until the next reset; any exception does this, too."""
+        """Stops the robot until the next reset; any exception does so too."""
         self._view = None
         self._backend.halt()
 

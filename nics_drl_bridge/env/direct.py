@@ -1,4 +1,4 @@
-"""Steps of one robot whose task judges the simulator's own arrays, in less than half the time."""
+"""Fast steps of one robot, computed directly on the simulator's arrays."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -15,15 +15,15 @@ from nics_drl_bridge.kernels import bind
 class DirectSteps(NamedTuple):
     """Steps of one robot, bound to arrays that change in place."""
 
-    view: RobotView  # what the robot knows, (1, 1)
+    view: RobotView  # (1, 1) the robot's view
     commands: Array  # (1, 1, C) of the next step
-    # writes `commands`; False: the action is for `Task.drive`, which also says what is wrong
+    # writes `commands`; returns False for an action that `Task.drive` must handle
     try_action: Callable[[Any], bool]
     advance: Callable[[Memory], Any]  # moves the robot; the rest as BoundStep
 
 
 def bind_steps(backend: Backend, task: Task) -> DirectSteps | None:
-    """Returns direct steps, or None if backend or task moves, measures or judges in its own way."""
+    """Returns direct steps, or None if backend or task overrides a part of a step."""
     if task.robots > 1 or type(backend) is not SimBackend or not task.binds_all:
         return None
     view = backend.get_live_view()

@@ -69,7 +69,7 @@ def refuse_after_close(
 def guard_call(
     method: Callable[Concatenate[Any, P], T],
 ) -> Callable[Concatenate[Any, P], T]:
-    """Does what `refuse_after_close` and `stop_on_error` do, in one call, which saves time."""
+    """Combines `refuse_after_close` and `stop_on_error` in one call, which saves time."""
 
     @wraps(method)
     def call_guarded(self: Any, /, *args: P.args, **kwargs: P.kwargs) -> T:
@@ -87,7 +87,7 @@ def guard_call(
 
 @contextlib.contextmanager
 def delay_interrupts() -> Iterator[None]:
-    """Defers Ctrl-C to the end of the block, so that it can't interrupt the stopping of a robot."""
+    """Defers Ctrl-C to the end of the block, so that it can't interrupt stopping a robot."""
     if threading.current_thread() is not threading.main_thread():
         yield  # Ctrl-C never interrupts other threads
         return
@@ -108,7 +108,7 @@ def delay_interrupts() -> Iterator[None]:
 
 
 def check_reset(seed: Any, options: Any, worlds: int = 1) -> None:
-    """Raises ConfigError for wrong options, or a wrong seed (one for all worlds, or one each)."""
+    """Raises ConfigError for wrong options or seeds (one for all worlds, or one each)."""
     several = isinstance(seed, list | tuple | np.ndarray)
     named = seed if several else [seed]
     seeds = [one for one in named if one is not None]
@@ -128,10 +128,10 @@ def begin_task(
     world: AnyWorld,
     *of_env: str,
 ) -> dict[str, AnyArray]:
-    """Returns the memory of a Task in starting Episodes, with values of `reset(options=...)`.
+    """Returns a Task's memory for starting Episodes, with values of `reset(options=...)`.
 
-    The values are written into all rows of the arrays that they name. Options in `of_env` belong to
-    the env, even if the task's memory has an entry of that name.
+    Each value is written into all rows of the array of its name. Options in `of_env`
+    belong to the env, even if the task's memory has an entry of that name.
     """
     memory: dict[str, AnyArray] = task.start_episodes(episodes)
     for name, value in (options or {}).items():

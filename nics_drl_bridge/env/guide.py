@@ -1,6 +1,6 @@
-"""Guide: remaining path lengths of robots to their goals, around everything in a scene.
+"""Guide: remaining path lengths of robots to their goals, around the obstacles of a scene.
 
-Only a simulator knows them; they serve as a reward in training.
+Only a simulator knows them; they are used as a reward in training.
 """
 
 import numpy as np
@@ -73,7 +73,7 @@ class Guide:
         )
 
     def measure_lengths(self, rows: slice | NDArray[np.intp], data: State) -> Array:
-        """Path lengths (n, M) [m] from the present places of the robots of some worlds.
+        """Path lengths (n, M) [m] from the current positions of the robots of some worlds.
 
         Near obstacles, a metre counts as more than one; see `guide_kernels`.
         """

@@ -1,8 +1,9 @@
-"""Compiled path lengths from robots to their goals, around everything that stands.
+"""Compiled path lengths from robots to their goals, around static obstacles.
 
-They are the arrival times of a front that starts at the goal (eikonal equation), computed on square
-cells by fast sweeping (Zhao 2005). Near obstacles the front is slower, so wide paths count as
-shorter than tight ones. Inside obstacles it is slow but does not stop, so every place has a path.
+They are arrival times of a front that starts at the goal (eikonal equation), computed
+on square cells by fast sweeping (Zhao 2005). The front is slower near obstacles, so
+wide paths count as shorter than narrow ones. Inside obstacles it is slow but does not
+stop, so every place has a path.
 """
 
 import math
@@ -17,7 +18,7 @@ from nics_drl_bridge.sim import collision_kernels as collision
 from nics_drl_bridge.sim import scene_kernels
 from nics_drl_bridge.sim.state import MapField
 
-# free space around the robot's circle above which a path is no longer tight [m]
+# clearance around the robot's circle above which a path is wide [m]
 COMFORT = 0.3
 TIGHT, SQUEEZED, BLOCKED = 2.0, 6.0, 12.0
 """Cost of a metre where the circle just fits, where only the outline fits, and where neither fits;
@@ -27,7 +28,7 @@ ROUNDS, SETTLED = 20, np.float32(1e-3)
 
 
 class GuideGrid(NamedTuple):
-    """Cells over the P worlds of a set, and everything that stands in every scene."""
+    """Cells over the P worlds of a set, and the static parts of every scene."""
 
     walls: Singles  # (P, rows, columns) distance to walls and map [m]
     frames: Array  # (P, 3) minimum x, y and the cells' side [m]
@@ -42,7 +43,7 @@ class GuideGrid(NamedTuple):
 def sample_walls(out: Singles, extent: Array, cell: float, cells: MapField) -> None:
     """Write the distances of `cells` to walls and map for coarser cells (rows, columns).
 
-    The field is `extent` (4,), beyond which nothing is free.
+    Everything outside the field `extent` (4,) is solid.
     """
     for i in range(len(out)):
         for j in range(out.shape[1]):
@@ -104,7 +105,7 @@ def _lower_space(
     cell: float,
     grid: GuideGrid,
 ) -> None:
-    """Lower the space (rows, columns) around cells to that beside a body [m]."""
+    """Lower the clearance (rows, columns) of cells to the distance from a body [m]."""
     far = body[RADIUS] + grid.outer + COMFORT
     first = max(int((body[Y] - far - y) / cell), 0)
     last = min(int((body[Y] + far - y) / cell), len(space) - 1)
@@ -126,7 +127,7 @@ def _lower_space(
 
 @kernel
 def _find_cost(space: float, grid: GuideGrid) -> float:
-    """Cost of a metre at a place, given the free space around it [m]."""
+    """Cost of a metre at a place, given the clearance there [m]."""
     beside = space - grid.outer
     if beside >= COMFORT:
         return 1.0

@@ -20,25 +20,25 @@ from nics_drl_bridge.random_kernels import episode_seed
 LIMIT = 1000.0
 ONE = np.float32(1.0).view(np.int32)
 BLOCK = 64  # number of beams checked together
-# maximum magnitude of a beam's contribution to a contact [m]
+# limit of a beam's contribution to a contact [m]
 FURTHEST = np.float32(0.04)
 
 
 class ScanScale(NamedTuple):
     """Conversion of a scan to observation parts and contacts."""
 
-    # inverse of the range that a fraction of 1 stands for [1/m], float32
+    # inverse of the range of a fraction of 1 [1/m], float32
     per_metre: np.float32
     # (B,) float32 range at which each beam leaves the footprint [m]
     leaves: Singles
-    # number of neighbouring beams on either side that also decide on a contact
+    # number of neighbouring beams on either side that are averaged for contacts
     beside: int
     sectors: int  # number of observed sectors; 0 if beams are observed
     plan: SectorPlan  # mapping of beams to sectors
 
 
 class NavigationRules(NamedTuple):
-    """What `navigation.Navigation` is made with; see its fields."""
+    """Parameters of `navigation.Navigation`; see its fields."""
 
     scale: Any  # a ScanScale, packed
     goal_radius: float
@@ -98,9 +98,10 @@ def look(shares: Singles, ranges: Singles, scale: ScanScale) -> bool:
 
 @kernel
 def has_contact(ranges: Singles, scale: ScanScale) -> bool:
-    """Returns True if a beam of a scan (B,) and its neighbours' mean end within the footprint.
+    """Returns True if a beam (B,), and its mean with its neighbours, end in the footprint.
 
-    A single beam is too noisy: of hundreds, one is nearly always off by three standard deviations.
+    A single beam is too noisy: among hundreds, one is nearly always off by three
+        standard deviations.
     """
     count = len(ranges)
     for begin in range(0, count, BLOCK):

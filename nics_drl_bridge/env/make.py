@@ -1,4 +1,4 @@
-"""Makes environments of a task, with their classes' arguments."""
+"""Makes environments of a task."""
 
 from typing import Any
 
@@ -51,7 +51,7 @@ def make_vec(
     if "vectorization_mode" in arguments:
         mode = format_value(arguments["vectorization_mode"])
         raise ConfigError(
-            f"make_vec: vectorization_mode={mode}: one process steps all worlds together; leave "
-            "it out; threads=2 uses two cores."
+            f"make_vec: vectorization_mode={mode}: one process steps all worlds "
+            "together; remove the argument, and set threads=2 to use two cores."
         )
     return BridgeVectorEnv(num_envs, task=task, **arguments)

@@ -29,8 +29,8 @@ class BridgeParallelEnv(ParallelEnv[str, Singles, AnyArray]):
     ## Description
 
     The agents are `robot_0` to `robot_<M - 1>`; all values equal those of `BridgeEnv` with the
-    same arguments. An agent whose episode is over leaves `agents`; its robot stops and becomes
-    another obstacle.
+    same arguments. An agent whose episode is over leaves `agents`; its robot stops and
+    remains as an obstacle.
 
     ## Spaces, Rewards, Starting State, Episode End
 
@@ -161,7 +161,7 @@ class BridgeParallelEnv(ParallelEnv[str, Singles, AnyArray]):
         return seen, rewards, ended, truncated, infos
 
     def halt(self) -> None:
-        """Stops every robot until the next reset; any exception does this, too."""
+        """Stops every robot until the next reset; any exception does so too."""
         self.env.halt()
 
     def _of(self, value: Any, m: int) -> Any:

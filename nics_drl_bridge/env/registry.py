@@ -1,4 +1,4 @@
-"""Finds tasks by name or by path of a user's file, and registers ids with Gymnasium."""
+"""Finds tasks by name or by a user's file, and registers ids with Gymnasium."""
 
 from collections.abc import Iterable
 from inspect import Parameter, signature
@@ -34,7 +34,7 @@ def make_task(
         name = type(task).__name__
         if options:
             raise ConfigError(
-                f"task {name} already exists; set {sorted(options)} when making it."
+                f"task {name} is already made; set {sorted(options)} when you make it."
             )
         if task.robot != model.robot or task.lidar != model.lidar:
             raise ConfigError(
@@ -66,7 +66,7 @@ def make_task(
                 )
         options["sensors"] = tuple(known[name] for name in names)
     try:
-        # The error of a missing option names it here, without the constructor.
+        # Remove the constructor's name from the error of a missing option.
         signature(task_class).bind(model.robot, model.lidar, **options)
         made = task_class(model.robot, model.lidar, **options)
     except TypeError as error:

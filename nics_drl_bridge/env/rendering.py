@@ -49,7 +49,7 @@ class WorldPicture:
         self._axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
 
     def draw(self, shot: Snapshot, trails: Sequence[Array] = ()) -> NDArray[np.uint8]:
-        """Returns a snapshot's pixels (H, W, 3), with the robots' paths (T, 2) so far."""
+        """Returns a snapshot's pixels (H, W, 3), with the robots' past paths (T, 2)."""
         axes = self._axes
         axes.clear()
         axes.set_axis_off()

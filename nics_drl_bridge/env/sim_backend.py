@@ -1,4 +1,4 @@
-"""Backends of an env: the fast simulator in this process, and registered or user-defined ones."""
+"""Backends of an env: the fast simulator in process, and registered or user-defined ones."""
 
 import math
 from inspect import signature
@@ -25,7 +25,7 @@ from nics_drl_bridge.sim.world_set import AnyWorld
 
 
 def _decode_pose(pose: Array) -> Array:
-    """Returns a pose (3,) as decoded from a message: the quaternion rounds the heading."""
+    """Returns a pose (3,) as decoded from a message, whose quaternion rounds the heading."""
     half = float(pose[2]) / 2.0
     z = math.sin(half)
     w = math.cos(half)
@@ -37,8 +37,9 @@ class SimBackend:
     """One world of the fast simulator, in this process.
 
     With `estimator`, each robot's scan and odometry pass through its middleware, as in the nodes,
-    so that this backend and the DDS backend return the same numbers. Without it, poses come from
-    odometry: bit-identical to a world of the vector env, and several times as fast. Views and
+    so that this backend and the DDS backend return the same numbers. Without it, poses
+        come from odometry: results are bit-identical to the vector env, and several
+        times as fast. Views and
     commands have a leading (M,) for M > 1 `robots`; `simulation` is passed to the FastSimulator.
     """
 
@@ -101,7 +102,7 @@ class SimBackend:
         return RobotView(data.odom, data.twist, data.ranges, 0.0, 0.0, 0.0)
 
     def facts(self) -> BackendFacts:
-        """Returns the truth, the obstacles and the drawn values; see `interface.Backend`."""
+        """Returns true poses, obstacles and drawn values; see `interface.Backend`."""
         simulator = self.simulator
         known: BackendFacts = {
             **self._get_truth(),
@@ -184,7 +185,7 @@ class CompletedBackend:
         return view, facts
 
     def halt(self) -> None:
-        """Steps with the standstill command unless there was no step since the last halt."""
+        """Steps with the stop command, unless there was no step since the last halt."""
         if self._moved:
             self._backend.step(self._still.copy())
             self._moved = False

@@ -1,4 +1,4 @@
-"""Task: what a robot does, written once for one robot over ROS 2 and for thousands in arrays."""
+"""Task: written once for one robot over ROS 2 and for thousands of robots in arrays."""
 
 import math
 from abc import ABC, abstractmethod
@@ -42,10 +42,10 @@ DRIVES = (
     (-1, 0, 1),
     (-1, 0, -1),
 )
-"""Signs of linear.x, linear.y, angular.z: stop, then forward and backward, each straight, left and
-right, as in the paper's code (efc-robot/MultiVehicleEnv). A robot that can't reverse turns in place
-instead if it can."""
-SIDEWAYS = ((0, 1, 0), (0, -1, 0))  # two more for a robot that moves sideways
+"""Signs of linear.x, linear.y, angular.z: stop, then forward and backward, each straight,
+left and right, as in the paper's code (efc-robot/MultiVehicleEnv). A robot that can't
+reverse turns in place instead, if possible."""
+SIDEWAYS = ((0, 1, 0), (0, -1, 0))  # additional commands of a robot that moves sideways
 PARTS = ("update", "observation", "judge", "reward", "end", "info")
 """Methods of a step, see `Task.take_step`."""
 CONTACT_ANGLE = math.radians(4.0)  # 2 cm at a distance of 0.3 m
@@ -69,7 +69,7 @@ class Episodes:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of a step: reward terms, whose sum is the reward; ended robots; facts for `info`."""
+    """Outcome of a step: reward terms (their sum is the reward), ended robots, and `info`."""
 
     terms: Terms
     ended: Flags
@@ -85,7 +85,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Sight:
-    """Scan parts: directions (P,) [rad], origin (2,) [m], and the range of a fraction of 1 [m]."""
+    """Scan parts: directions (P,) [rad], origin (2,) [m], and range of a fraction of 1 [m]."""
 
     angles: Array
     origin: Array
@@ -98,9 +98,10 @@ class Task(ABC):
 
     Subclass it as a frozen dataclass and implement `observation_space`, `reset`, `observation`,
     `reward` and `end`; `docs/tasks.md` walks through an example. Every view has the leading
-    dimensions (n, M): n worlds of M robots. A task of one robot that works element by element also
-    accepts the view () of a robot over ROS 2. Results per element must not depend on n: use
-    `bearing` and `distance` instead of numpy's trigonometric functions.
+    dimensions (n, M): n worlds of M robots. A task of one robot with only element-wise
+    operations also accepts the view () of a robot over ROS 2. Results per element must
+    not depend on n: use `bearing` and `distance` instead of numpy's trigonometric
+    functions.
     """
 
     # True if a method uses `before.ranges`; see `needs_last_scan`
@@ -114,13 +115,15 @@ class Task(ABC):
     lidar: LidarSpec  # lidar of the scan
     # a Box, or `discrete`: the paper's motion commands, see `DRIVES`
     actions: Actions = "continuous"
-    # hits this close to the footprint, averaged over `CONTACT_ANGLE`, count as a contact [m]
+    # returns this close to the footprint, averaged over `CONTACT_ANGLE`, count as a
+    # contact [m]
     contact_margin: float = 0.02
     # additional limit of the commands with unit m/s [m/s]
     top_speed: float | None = None
-    # sectors instead of beams, the same for any lidar; contacts are judged from the beams
+    # observed sectors, the same for any lidar, instead of beams; contacts still use the
+    # beams
     scan: ScanLayout | None = None
-    # additional sensors, whose fractions end each observation
+    # additional sensors, whose fractions come last in each observation
     sensors: tuple[Sensor, ...] = ()
 
     def __post_init__(self) -> None:
@@ -134,7 +137,7 @@ class Task(ABC):
         if self.sensors and not self.observes_sensors:
             name = type(self).__name__
             raise ConfigError(
-                f"task option sensors: {name} does not observe further sensors."
+                f"task option sensors: {name} does not observe additional sensors."
             )
         _ = self.plan  # raises if the lidar can't fill the layout
 
@@ -175,7 +178,7 @@ class Task(ABC):
 
     @abstractmethod
     def end(self, view: RobotView, memory: Memory) -> Flags:
-        """Returns True for robots (...) whose episode is over; a team ends with its last robot."""
+        """Returns True for robots (...) whose episode is over; a team ends with its last."""
 
     def info(self, view: RobotView, memory: Memory) -> Facts:
         """Returns facts for `info`; an evaluation reads `is_success` and `collision`."""
@@ -185,7 +188,7 @@ class Task(ABC):
         """Updates the memory in place after a step, before it is used."""
 
     def command(self, action: ArrayLike) -> Array:
-        """Returns the command (..., C) of actions: discrete, or (..., C) and clamped to [-1, 1]."""
+        """Returns commands (..., C) for actions: discrete, or (..., C) clamped to [-1, 1]."""
         if self.actions == "discrete":
             return np.asarray(self.discrete_commands[np.asarray(action)])
         actions = np.ascontiguousarray(action)
@@ -193,7 +196,8 @@ class Task(ABC):
         rows = actions.reshape(-1, actions.shape[-1])
         low, high = self.command_limits
         kernels.scale_actions(out.reshape(rows.shape), rows, low, high)
-        # Don't teach what a vehicle can't do: a car driven by turn rates can't steer at rest.
+        # Do not teach infeasible motions: a car commanded by turn rates can't turn at
+        # rest.
         if self._takes_turn_rate:
             return self.robot.pass_through_cmd_vel(out)
         return out
@@ -203,10 +207,10 @@ class Task(ABC):
         return self.robot.takes_turn_rate
 
     def drive(self, actions: ArrayLike, ended: Flags) -> Array:
-        """Returns the checked commands (n, M, C) of actions; robots that have ended stand still."""
+        """Returns the checked commands (n, M, C) for actions; robots that have ended stop."""
         shape = (*ended.shape, len(self.robot.command))
         command = self.command(actions)
-        # Between finite limits, only a user's own command may be infinite.
+        # Since the limits are finite, only a user's own `command` can return inf.
         if type(self).command is not Task.command or command.shape != shape:
             command = guard.check_command(command, shape)
         if self.robots > 1 and ended.any():
@@ -224,17 +228,17 @@ class Task(ABC):
 
     @cached_property
     def is_fused(self) -> bool:
-        """True if `step_into` of the task's class does all parts of a step in its own way."""
+        """True if the class's own `step_into` implements all parts of a step."""
         return self._covers_all("step_into")
 
     @cached_property
     def binds_all(self) -> bool:
-        """True if `bind` of the task's class does all parts of a step in its own way."""
+        """True if the class's own `bind` implements all parts of a step."""
         return self._covers_all("bind", (*PARTS, "step_into", "take_step"))
 
     @cached_property
     def needs_last_scan(self) -> bool:
-        """False if `before.ranges` may be the new ranges, to save a copy."""
+        """False if `before.ranges` may hold the new ranges, which saves a copy."""
         return self.keeps_last_scan or not self._covers_all("keeps_last_scan")
 
     def take_step(
@@ -242,7 +246,8 @@ class Task(ABC):
     ) -> Outcome:
         """Returns the outcome of a step and writes the observation, for an env.
 
-        `step_into` of a class is left out if a subclass overrides a part that it would not call.
+        A class's `step_into` is skipped if a subclass overrides a part that it would
+        not call.
         """
         if self.is_fused:
             return self.step_into(out, before, after, memory)
@@ -251,14 +256,15 @@ class Task(ABC):
     def step_into(
         self, out: Observation, before: RobotView, after: RobotView, memory: Memory
     ) -> Outcome:
-        """Takes a step through its parts; a class may override it to do them in one pass."""
+        """Computes the parts of a step one by one; a class may override it with a single pass."""
         kept = dict(memory)
         self.update(before, after, memory)
         if memory.keys() != kept.keys():
             raise self._make_error(
                 f"memory {sorted(memory)}", f"must keep {sorted(kept)} from `reset`"
             )
-        # Copy rebound arrays into the env's rows. Read all first, because they may alias.
+        # Copy replaced arrays into the env's rows. Read all of them first: they may
+        # alias.
         rebound = {
             name: np.array(memory[name])
             for name, rows in kept.items()
@@ -296,11 +302,12 @@ class Task(ABC):
         return Outcome(terms, ended, info)
 
     def bind(self, before: Array, view: RobotView) -> BoundStep | None:
-        """Binds the steps of one robot to its view (1, 1) and its pose before (1, 1, 3), in place.
+        """Binds steps of one robot to its view (1, 1) and last pose (1, 1, 3), updated in place.
 
-        A class may override it to do all parts of a step in one small call of a kernel, which saves
-        most of the time in the fast simulator. What it returns is called with the memory after each
-        move, and returns new arrays. It is left out if a subclass overrides a part, or `step_into`.
+        A class may override it to compute all parts of a step in one small kernel call,
+        which saves most of the time in the fast simulator. The returned function is
+        called with the memory after each move, and returns new arrays. It is not used
+        if a subclass overrides a part or `step_into`.
         """
         return None
 
@@ -329,7 +336,7 @@ class Task(ABC):
         return ConfigError(f"task {type(self).__name__}: its {what} {fault}.")
 
     def check_result(self, what: str, given: Any, shape: tuple[int, ...]) -> Any:
-        """Returns a user's result. Raises ConfigError unless it is finite and of this shape."""
+        """Returns a user's result. Raises ConfigError unless it is finite and has this shape."""
         if np.shape(given) != shape or not _is_finite(given):
             raise self._make_error(
                 what,
@@ -365,7 +372,7 @@ class Task(ABC):
     # Building blocks of tasks.
 
     def box(self, low: ArrayLike, high: ArrayLike) -> gymnasium.spaces.Box:
-        """Returns the space of P scan fractions, parts with these limits, Q sensor fractions."""
+        """Returns the space of P scan fractions, values with these limits, Q sensor fractions."""
         parts = self.scan_parts
         further = sum(sensor.parts for sensor in self.sensors)
         low = np.asarray(low, np.float32)
@@ -439,7 +446,7 @@ class Task(ABC):
     def __getstate__(self) -> dict[str, Any]:
         state = {}
         for name, value in vars(self).items():
-            if not isinstance(value, Packed):  # a copy packs its own
+            if not isinstance(value, Packed):  # each copy packs its own
                 state[name] = value
         return state
 
@@ -453,7 +460,7 @@ def _is_finite(given: Any) -> bool:
 
 
 def discrete_commands(robot: RobotSpec) -> Array:
-    """Returns the discrete actions' commands (A, C): `DRIVES`, or each command alone, at limits."""
+    """Returns the discrete actions' commands (A, C): `DRIVES`, or single commands at limits."""
     drives = np.array(DRIVES)
     if robot.moves_sideways:
         drives = np.concatenate([drives, SIDEWAYS])
@@ -470,7 +477,7 @@ def discrete_commands(robot: RobotSpec) -> Array:
 
 
 def still(robot: RobotSpec) -> Array:
-    """Returns the command (C,) nearest to zero, which stops a robot."""
+    """Returns the allowed command (C,) closest to zero, which stops a robot."""
     nearest_zero: Array = np.clip(0.0, robot.command_low, robot.command_high)
     return nearest_zero
 
@@ -512,7 +519,7 @@ def distance(pose: ArrayLike, points: ArrayLike) -> Array:
 
 
 def limited(twist: Array) -> Array:
-    """Clamps a twist (..., 3) to +-`kernels.LIMIT`, so that observations stay in their space."""
+    """Clamps a twist (..., 3) to +-`kernels.LIMIT`, the limits of the observation space."""
     return np.minimum(np.maximum(twist, -kernels.LIMIT), kernels.LIMIT)
 
 

@@ -16,9 +16,9 @@ from nics_drl_bridge.sim.simulator import FastSimulator
 class Teaching(Schema):
     """Rewards from the ground truth, and repetition of failed episodes; off by default."""
 
-    # reward for a contact that the task does not detect; such a contact ends the episode
+    # reward for a contact that the task does not detect; it also ends the episode
     contact: float | None = None
-    # reward per metre by which the path around obstacles to the goal gets shorter
+    # reward per metre by which the path to the goal around obstacles shortens
     path: float = 0.0
     # maximum number of repetitions of a failed episode
     retries: int = Field(default=0, ge=0, le=1000)
@@ -50,7 +50,7 @@ class Teacher:
         return known
 
     def begin(self, worlds: NDArray[np.intp], scenes: Scenes) -> None:
-        """Starts episodes in worlds (n,), whose scenes contain the robots."""
+        """Starts episodes in worlds (n,), given their scenes."""
         if self._guide is not None:
             self._guide.begin(worlds, scenes)
             self._left[worlds] = self._guide.measure_lengths(worlds, self._data)

@@ -53,9 +53,10 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
 
     ## Description
 
-    Task, spaces, rewards and ends are those of `BridgeEnv` with `backend="sim"`, and so are the
-    results: world i after `reset(seed=s)` is bit-identical to a single env after
-    `reset(seed=s + i)`, even in later episodes, for any `num_envs` and number of threads.
+    Task, spaces, rewards, ends and results equal those of `BridgeEnv` with
+    `backend="sim"`: world i after `reset(seed=s)` is bit-identical to a single env
+    after `reset(seed=s + i)`, even in later episodes, for any `num_envs` and number of
+    threads.
 
     ## Spaces, Rewards, Starting State, Episode End
 
@@ -68,13 +69,14 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
 
     `num_envs` is N; `model` (or `robot`), `world`, `task`, `task_options` are those of `BridgeEnv`.
     An episode is truncated after `max_episode_steps`. `autoreset_mode` is `NextStep` (an ended
-    world is reset in the next step, which ignores its action) or `SameStep` (at once; the last
-    observation is in `info["final_obs"]`). With `copy=True` the caller may keep what
-    `step` returns; with False the next step reuses the observation array. `render_mode` is
-    `rgb_array`, of every world, or None. Further arguments are those of the FastSimulator:
-    `renderer` (`baked` by default, or `exact`), `threads`, which does not affect the results, and
-    `randomisation`, see `BridgeEnv`. Raises ConfigError or ModelError for an unknown name or a
-    wrong file.
+    world is reset in the next step, which ignores its action) or `SameStep`
+    (immediately; the last observation is in `info["final_obs"]`). With `copy=True` the
+    caller may keep what `step` returns; with False the next step reuses the observation
+    array. `render_mode` is `rgb_array`, of every world, or None. Other arguments are
+        those of the FastSimulator: `renderer` (`baked` by default, or `exact`),
+        `threads`,
+    which does not affect the results, and `randomisation`, see `BridgeEnv`. Raises
+    ConfigError or ModelError for an unknown name or a wrong file.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - Gymnasium's own declaration
@@ -151,7 +153,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
         self._starts = np.zeros((count, robots, 3))
         self._bodies = np.zeros((count, self.simulator.sampler.count, BODY))
         self.memory: Memory = {}
-        # False also after an exception, which may leave some worlds a step behind
+        # also False after an exception, which may leave some worlds a step behind
         self.ready = False
 
     def teach(self, given: Teaching) -> None:
@@ -170,7 +172,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
             "bodies": self._bodies,
         }
         data = {
-            # Tensors have no structures, so that checkpoints hold the numbers of these.
+            # Tensors have no structured types, so checkpoints store the plain numbers.
             f"data.{name}": rows.view(np.int64) if rows.dtype.names else rows
             for name, rows in self.simulator.data._asdict().items()
         }
@@ -201,7 +203,8 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
             raise gymnasium.error.ResetNeeded(
                 "reset all worlds before you reset some of them."
             )
-        # These worlds restart with a seed: their own one, or that of the first world plus theirs.
+        # These worlds restart with a seed: their own, or the first world's plus their
+        # index.
         if isinstance(seed, Sequence | np.ndarray):
             if len(seed) != count:
                 raise ConfigError(
@@ -445,7 +448,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, AnyArray, AnyArray
         )
 
     def snapshot(self, n: int) -> Snapshot:
-        """Returns the current state of world n for a picture; `step` does not change its arrays."""
+        """Returns the state of world n for a picture, in arrays that `step` does not change."""
         data = self.simulator.data
         return Snapshot(
             data.pose[n].copy(),
@@ -479,7 +482,7 @@ def join_outcomes(parts: Sequence[Outcome]) -> Outcome:
 
 
 def zeros(shape: tuple[int, ...], dtype: np.dtype[Any]) -> AnyArray:
-    """Returns zeros; pages of large arrays cost neither time nor memory unless written.
+    """Returns zeros; unwritten pages of large arrays cost neither time nor memory.
 
     `numpy.zeros` does the same until the C library reuses such memory and has to clear all of it,
     which took a fifth of a step with many obstacles.

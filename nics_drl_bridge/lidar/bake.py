@@ -19,7 +19,8 @@ TOUCHING = 1e-6  # excess of the nearest grid distance over the radius, as a fra
 COARSE = np.radians(2.0)
 MOST_NUMBERS = 2**31 - 2**20
 FIRST_BEAM = -(2**15)  # minimum first beam of a row, relative to the bearing
-# if two corners miss an edge by more than this [beams], it is found by climbing the hull
+# if both corners miss an edge by more than this [beams], it is found by climbing the
+# hull
 MISS = 0.02
 
 
@@ -120,7 +121,7 @@ def make_grid(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> 
             two, climb = _choose_corners(wound, parts, len(hull))
             miss = _miss(hull, two, edges[..., side], turns, distances, parts)
             far_off = miss > MISS * spec.angle_increment
-            # close to contact, the rim of a cell does not bound its interior
+            # close to contact, the border of a cell does not bound its interior
             far_off[:, 0] = True
             cell[..., 2 + 2 * side : 4 + 2 * side] = np.where(
                 far_off[..., None], climb, two
@@ -134,7 +135,7 @@ def make_grid(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> 
 
 
 def _reduce_cells(values: AnyArray, parts: int, outer: np.ufunc) -> AnyArray:
-    """Outermost value in each cell (T, D) up to the next cell: two distances are blended."""
+    """Outermost value in each cell (T, D) and its neighbour, since two distances are blended."""
     count = len(values) // parts
     turned = outer.reduce(
         [values[k:][: count * parts : parts] for k in range(parts + 1)]
@@ -163,10 +164,11 @@ def _wound(hull: Array, hints: Integers, along: Array) -> Integers:
 def _choose_corners(
     wound: Integers, parts: int, corners: int
 ) -> tuple[Integers, Integers]:
-    """Two corners (T, D, 2) that can be an edge within each cell, or a start for climbing.
+    """Return two corners (T, D, 2) that may be an edge in a cell, or a start for climbing.
 
-    Along a line and around a circle outside, the corner changes monotonically: those at the rim of
-    a cell enclose all others. If more than two, those at one and three quarters represent all.
+    Along a line and around an outer circle, the corner changes monotonically, so those
+    at the border of a cell enclose all others. If there are more than two, the ones at
+    one and three quarters represent them.
     """
     low = _reduce_cells(wound, parts, np.minimum)
     high = _reduce_cells(wound, parts, np.maximum)
@@ -186,7 +188,7 @@ def _miss(
     distances: Array,
     parts: int,
 ) -> Array:
-    """Error (T, D) of the nearer of two corners against the edge at the rim of a cell [rad]."""
+    """Error (T, D) of the better of two corners at the border of a cell [rad]."""
     count = len(two)
     worst = np.zeros(two.shape[:2])
     for k in range(parts + 1):

@@ -14,7 +14,9 @@ from nics_drl_bridge.lidar.exact_kernels import (
     scan_polygon,
 )
 
-EDGE = 1e-6  # ranges at an edge are taken this far inside it, as a fraction of the whole width
+EDGE = (
+    1e-6  # ranges at an edge are taken this far inside it, as a fraction of the width
+)
 
 
 @kernel

@@ -1,8 +1,8 @@
-"""Beams of a lidar: where they point, which of them lie between two bearings, and their ranges.
+"""Beams of a lidar: their directions, the beams between two bearings, and their ranges.
 
-While a scan (B,) is made, its ranges [m], float32, are kept as the whole numbers of the same bits:
-those of positive floats have the same order, and LLVM would mask the store of a float's minimum.
-`lower` takes the minimum of Eq. 4 for one beam.
+During a scan (B,), its float32 ranges [m] are kept as integers of the same bits.
+Positive floats and these integers have the same order, but LLVM would mask the store of
+a float minimum. `lower` takes the minimum of Eq. 4 for one beam.
 """
 
 import math
@@ -15,7 +15,7 @@ from nics_drl_bridge.lidar.arrays import Array, ShortIntegers
 
 TWO_PI = 2.0 * math.pi
 HALF_PI = 0.5 * math.pi
-# Beams this near to a bearing count as between [beams].
+# Beams this close to a bearing count as inside a span [beams].
 ROUNDING = 1e-6
 TINY = 1e-300  # avoids NaN for the angle of a zero vector
 # Coefficients of r, r^3, r^5... in the arc tangent of r in [0, 1].
@@ -41,7 +41,7 @@ class Beams(NamedTuple):
     directions: Array  # (2, B) cosines and sines, in rows that vectorise
     first: float  # angle of beam 0 [rad]
     step: float  # between beams [rad]
-    # (2, 2) unit vectors: what lies farther along both than its radius is behind all beams
+    # (2, 2) unit vectors: a body farther along both than its radius is behind all beams
     behind: Array
 
 
@@ -59,7 +59,8 @@ class LidarPose(NamedTuple):
 def make_beams(directions: Array, first: float, step: float) -> Beams:
     """Return the beams of directions (2, B) that are a `step` apart, from `first` on [rad]."""
     count = directions.shape[1]
-    # Half of the angle without beams, less half a step so that rounding does not matter.
+    # Half of the angle without beams, minus half a step so that rounding does not
+    # matter.
     blind = min(max(math.pi - 0.5 * step * count, 0.0), HALF_PI)
     back = first + 0.5 * step * (count - 1) + math.pi
     behind = np.empty((2, 2))
@@ -104,8 +105,8 @@ def arctan2(y: float, x: float) -> float:
 class Span(NamedTuple):
     """Two bearings as fractional indices of beams, the second to the left of the first.
 
-    The first lies in the turn that begins with beam 0. The second may lie in the next turn, where
-    beam 0 follows again after a full turn.
+    The first is in the turn that begins with beam 0. The second may be in the next
+    turn, where beam 0 comes again after a full turn.
     """
 
     right: float
@@ -115,7 +116,7 @@ class Span(NamedTuple):
 
 @kernel(contracts=True, inline=True)
 def span_beams(bearing: float, width: float, beams: Beams) -> Span:
-    """Return the span from a bearing to the one that is `width` further to the left [rad]."""
+    """Return the span from a bearing to `width` further left [rad]."""
     beams_per_rad = 1.0 / beams.step
     full_turn = TWO_PI * beams_per_rad
     turns_per_beam = 1.0 / full_turn
@@ -126,10 +127,9 @@ def span_beams(bearing: float, width: float, beams: Beams) -> Span:
 
 @kernel(inline=True)
 def beams_within(span: Span, turned_by: float, beam_count: int) -> tuple[int, int]:
-    """Return the first of the beams in a span, and the one after the last.
+    """Return the first beam in a span, and the one after the last.
 
-    A span that reaches into the next turn covers the beams there too, where it is to be `turned_by`
-    a full turn.
+    For the part of a span in the next turn, `turned_by` is a full turn.
     """
     right = np.ceil(span.right - turned_by - ROUNDING)
     left = np.floor(span.left - turned_by + ROUNDING)
@@ -138,5 +138,5 @@ def beams_within(span: Span, turned_by: float, beam_count: int) -> tuple[int, in
 
 @kernel(inline=True)
 def lower(scan: ShortIntegers, i: int, distance: float | np.float32) -> None:
-    """Lower the range of beam i of a scan to a distance [m], if it is nearer (Eq. 4)."""
+    """Lower the range of beam i to a distance [m], if that is nearer (Eq. 4)."""
     scan[i] = min(scan[i], np.float32(distance).view(np.int32))

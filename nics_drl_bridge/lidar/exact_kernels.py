@@ -1,7 +1,8 @@
 """Compiled exact scanner: the ranges of one object in one scan.
 
-Each function lowers the ranges of the beams that hit its object in a scan, see `beam_kernels`;
-applied one after the other, they compute the minimum of Eq. 4. Positions are in the lidar's frame.
+Each function lowers the ranges of the beams that hit its object, see `beam_kernels`;
+one call after another computes the minimum of Eq. 4. Positions are in the lidar's
+frame.
 """
 
 import math
@@ -21,7 +22,9 @@ from nics_drl_bridge.lidar.beam_kernels import (
     span_beams,
 )
 
-IN_LINE = 1e-9  # a wall whose line passes a lidar nearer than this is seen edge-on [m]
+IN_LINE = (
+    1e-9  # a wall is seen edge-on if its line passes the lidar closer than this [m]
+)
 X, Y, HEADING, COS, SIN, RADIUS, SHAPE = range(7)
 """Columns of a placed body; an absent body has radius 0, and `SHAPE` is an index."""
 
@@ -37,7 +40,7 @@ class OutlineArrays(NamedTuple):
 def scan_circle(
     scan: ShortIntegers, beams: Beams, x: float, y: float, radius: float
 ) -> None:
-    """Fuse the exact ranges to a circle at (x, y): its near side, or the far one from inside."""
+    """Fuse the exact ranges to a circle at (x, y): the near side, or from inside the far one."""
     distance = math.sqrt(x * x + y * y)
     is_inside = distance <= radius
     half = math.pi if is_inside else math.asin(radius / distance)
@@ -103,7 +106,7 @@ def scan_polygon(
     s: float,
     corners: Array,
 ) -> None:
-    """Fuse the exact ranges to the outline `corners` (V, 2), turned by (c, s), at (x, y)."""
+    """Fuse the exact ranges to the outline `corners` (V, 2), rotated by (c, s), at (x, y)."""
     corner_x, corner_y = place_corner(x, y, c, s, corners[-1])
     start = corner_x, corner_y, arctan2(corner_y, corner_x)
     for v in range(len(corners)):

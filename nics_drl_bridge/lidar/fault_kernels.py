@@ -1,8 +1,9 @@
 """Compiled faults of a lidar: deviations of a real device from the exact ranges.
 
-They apply in the order of the device: skew (beams are measured from different poses), geometry (the
-scanner), then too close, noise, quantisation and dropouts (`distort`). The faults of one robot are
-a row (P,) of numbers; a fault whose numbers are 0 takes no time and draws nothing.
+They are applied in the order in which they arise in a device: skew (beams are measured
+from different poses), geometry (the scanner), then too close, noise, quantisation and
+dropouts (`distort`). The faults of one robot are a row (P,) of parameters; a fault
+whose parameters are 0 takes no time and draws no numbers.
 """
 
 import math
@@ -25,22 +26,23 @@ CLOCKWISE = -1
 AT_ONCE = 0
 COUNTER_CLOCKWISE = 1
 ROUNDING = 1e-9  # rounding error of a multiple of the quantisation step [m]
-# Ranges are raised as whole numbers, in the same order, by the greater of the two: where LLVM knows
-# that a range may stay it masks the store, which takes longer than all the rest.
+# Ranges are raised as integers, which have the same order, by the maximum of two
+# numbers: if a range might stay unchanged, LLVM would mask the store, which is slower
+# than everything else here.
 INF, MINUS_INF, NONE = np.array([np.inf, -np.inf, -2.0], np.float32).view(np.int32)
 
 
 class Distortion(NamedTuple):
-    """Faults of a device, prepared to apply to a return; a missing fault changes nothing."""
+    """Faults of a device, prepared for use on a return; a missing fault has no effect."""
 
     least: np.float32  # [m]
     most: np.float32
     close: np.float32  # value of a return that is too close
-    std: np.float32  # of a range of 0, for a draw of 1 [m]
-    grows: np.float32  # with the range [1]
+    std: np.float32  # standard deviation at a range of 0 [m]
+    grows: np.float32  # increase of `std` with the range [1]
     per_step: np.float32  # 1 / step of the quantisation [1/m]
     step: np.float32  # [m]
-    rest: np.float32  # of the step, beyond float32
+    rest: np.float32  # remainder of the step beyond float32
     first: np.float32  # smallest multiple of the step within the limits, in steps
     last: np.float32
 
@@ -200,7 +202,7 @@ def slice_poses(
         twist: (3,) of the body during the sweep.
         sweep: duration of the sweep [s].
         direction: a value of SKEW; the newest beam is the last, or beam 0 if it turns clockwise.
-        moving: for how long the robot has been moving [s]; before that it stood where it began.
+        moving: time since the robot began to move [s]; before that it was at rest.
     """
     count = len(out)
     for g in range(count):

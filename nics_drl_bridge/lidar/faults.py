@@ -1,4 +1,4 @@
-"""LidarFaults: the faults of a real device's ranges, each off by default."""
+"""LidarFaults: deviations of a real device's ranges, each off by default."""
 
 from typing import Literal
 
@@ -27,11 +27,13 @@ SKEW: dict[Skew, int] = {
 class LidarFaults(Schema):
     """The faults of a device, in addition to the `noise_std` of its LidarSpec.
 
-    They act in this order: skew, geometry, too_close, noise, quantisation, dropout. With a skew the
-    device turns while the robot moves, and its newest beam is measured at the time of the scan;
-    without, all are at once. A return nearer than range_min is reported as `-inf` (REP-117), as
-    `range_min`, as no return, or as a `ghost` anywhere within the limits. `dropout_far` acts with
-    the square of the range, in full at range_max.
+    They are applied in this order: skew, geometry, too_close, noise, quantisation,
+        dropout. With skew, the device turns while the robot moves, and its newest beam
+        is measured at the time of the scan; without skew, all beams are measured at
+        once. A return nearer than range_min is reported as `-inf` (REP-117), as
+        `range_min`, as no return, or as a `ghost` at a random range within the limits.
+        `dropout_far` grows with the square of the range up to its full value at
+        range_max.
     """
 
     # direction in which the device turns while the robot moves; none: all beams at once

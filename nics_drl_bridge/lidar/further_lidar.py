@@ -1,4 +1,4 @@
-"""A further lidar, as a `Sensor`: the second one of a robot, or the third."""
+"""An additional lidar of a robot, as a `Sensor`."""
 
 import array
 from typing import Any, Literal
@@ -40,7 +40,7 @@ class FurtherLidar(Sensor):
         return self.lidar.mount
 
     def renderer(self, around: SensedWorlds) -> Render:
-        """Scan bodies, walls and map like the first lidar, with this one's faults."""
+        """Return a renderer of bodies, walls and map, with the faults of this lidar."""
         scanner = make_scanner(self.lidar, around.shapes, around.renderer)
         state = around.state
         lidar = scanner.arguments
@@ -81,7 +81,7 @@ class FurtherLidar(Sensor):
         off = abs(message.angle_min - header.angle_min)
         off += abs(message.angle_increment - header.angle_increment) * (beams - 1)
         if len(message.ranges) != beams or not off <= ANGLE_TOLERANCE:
-            raise ValueError(f"is of another lidar, with {len(message.ranges)} beams")
+            raise ValueError(f"is from another lidar, with {len(message.ranges)} beams")
         return from_device(message.ranges, self.lidar)
 
     def shares(self, readings: Readings) -> Readings:
@@ -91,7 +91,7 @@ class FurtherLidar(Sensor):
         return shares.astype(np.float32)
 
     def points(self, reading: Readings) -> Array:
-        """End of the beams that hit something (Q, 2); what is too close counts as at range_min."""
+        """Ends (Q, 2) of the beams that hit something; too close counts as range_min."""
         x, y, heading = self.mount
         near = np.where(
             np.isneginf(reading), self.lidar.range_min, reading.astype(np.float64)

@@ -6,8 +6,8 @@ by their range. For each ring, `find_lookup_distances`
 1. places the shape at random in the ring (`_place_around`), and again so that the lidar is nearly
    in line with one of its edges (`_turn_edge_on`), where rare beams have large errors;
 2. scans all placements by both renderers, and compares the beams that have a return in both;
-3. adds up the squared errors of the random placements by placement and band, and keeps the largest
-   error of any beam, also of the slanted placements.
+3. sums the squared errors of the random placements by placement and band, and keeps the
+   largest error of any beam, including the edge-on placements.
 
 Then it takes the widest interval of rings in which no beam is off by more than
 `OUTLIER` and `_is_small` holds in each ring, and in each band over all rings of the interval:
@@ -19,7 +19,8 @@ With the sum of squared errors q_p and the number of beams n_p of each placement
     mean = sum(q_p) / sum(n_p)
     spread = sqrt(sum((q_p - mean * n_p)^2)) / sum(n_p)    the standard deviation of this mean
 
-Beams of one placement err alike, so placements are the independent samples, not beams.
+The errors of the beams of one placement are correlated, so placements are the
+independent samples, not beams.
 """
 
 from typing import NamedTuple
@@ -41,7 +42,7 @@ SEED = 0
 # of the nearest ring from the shape's circle, as a fraction of the lidar's range
 TOUCHING = 1e-3
 OUTLIER = 0.3  # maximum allowed error of any beam [m]
-DEVIATIONS = 2.0  # safety margin on the squared error, in standard deviations: rare beams dominate
+DEVIATIONS = 2.0  # safety margin on the squared error, in standard deviations
 # maximum angle between line of sight and edge in the search for outliers [rad]
 SLANT = np.radians(1.5)
 # minimum interval of looked-up distances, as a fraction of the lidar's range
@@ -53,9 +54,11 @@ def find_lookup_distances(
 ) -> tuple[float, float]:
     """Find the distances between which looking up a shape has an RMSE of at most `greatest` [m].
 
-    So it must be in each ring of distances and each band of ranges over all rings, and no beam off
-    by more than `OUTLIER`: long thin shapes err when near and seen at a slant, distant ones where a
-    beam grazes them. Only beams with a return in both count: which ones hit is exact. Placements
+    This must hold in each ring of distances and in each band of ranges over all rings,
+        and no beam may be off by more than `OUTLIER`: long thin shapes have large
+        errors when they are near and seen edge-on, distant ones where a beam grazes
+        them. Only beams with a return in both scans count, because which beams hit is
+        exact. Placements
     are the same for all shapes. `exact` and `baked` are `Scanner.arguments` of these renderers, the
     shape is an index in the table with its radius [m]. Returns the minimum and the maximum distance
     to its origin [m]; both inf if it may not be looked up.

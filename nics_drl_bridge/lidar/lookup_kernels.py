@@ -15,9 +15,10 @@ c_p <= a - b < c_(p+1), and blends linearly over distance and angle:
     r_i(a) = (1 - v) R(d_i, phi_j, c_p) + v R(d_i, phi_j, c_(p+1))    v: weight of the next point
     r(a)   = (1 - w) r_i(a) + w r_(i+1)(a)                            w: weight of the far row
 
-Rotations are not blended. Instead, the exact silhouettes of the body, its outermost directions to
-the right and to the left, decide which beams hit: a plain look-up errs most where it puts an edge
-on the wrong side of a beam. Beams between the silhouettes have the range r(a), others `inf`.
+Rotations are not blended. Instead, the exact silhouettes of the body, its outermost
+directions to the right and left, decide which beams hit: a plain look-up has its
+largest errors where it puts an edge on the wrong side of a beam. Beams between the
+silhouettes have the range r(a), others `inf`.
 
 Eq. 4: a beam's range in the scan is the minimum of r(a) over all bodies.
 
@@ -63,7 +64,8 @@ TABLE_SHAPE = structure_of(TableShape)
 ROW_START, ROW_EXTENT, RIGHT_CORNERS, LEFT_CORNERS = range(4)
 # Sides of a shape as seen from the lidar.
 RIGHT, LEFT = 1.0, -1.0
-# Beams are fused in blocks of so many, at least two: a varying number mispredicts a branch.
+# Beams are fused in at least two blocks of this size: a varying number would mispredict
+# a branch.
 BLOCK = 16
 LEAST_FUSED = 2 * BLOCK
 
@@ -112,10 +114,10 @@ def look_up_body(
 ) -> int:
     """Look up a body (7,), and append what `found` (L,) needs to fuse it: see `LOOK_UP`.
 
-    Returns the `count` of what was found so far. Two places more must be left before: a body across
-    the seam between the last beam and the first takes both.
+    Returns the new `count` of look-ups. Two more must fit: a body across the seam
+    between the last and first beam takes two.
     """
-    # d, b, and the place of (d, phi) in the table
+    # d, b, and the location of (d, phi) in the table
     dx = body[X] - lidar.x
     dy = body[Y] - lidar.y
     distance = math.sqrt(dx * dx + dy * dy)
@@ -172,7 +174,7 @@ def look_up_body(
 
 @kernel(contracts=True)
 def fuse_look_ups(scan: ShortIntegers, rows: Singles, found: Any) -> None:
-    """Lower the beams of a scan (B + LEAST_FUSED,) to what was found (L,): r(a), and Eq. 4.
+    """Lower the beams of a scan (B + LEAST_FUSED,) to the look-ups (L,): r(a), and Eq. 4.
 
     Whole blocks of beams are fused, also beyond the last beam.
     """
@@ -221,9 +223,9 @@ def find_silhouette(
 
     Args:
         view: of the shape.
-        packed: two corners of the hull, as shorts, either of which may be the silhouette in a cell.
-            If there are more than two, the second is negative: minus the first stride of
-            `climb_hull`, which starts at the first.
+        packed: two corners of the hull, as shorts; one of them is the silhouette. If a
+            cell has more than two candidates, the second number is minus the first
+            stride of `climb_hull`, which starts at the first corner.
         hull: index in `hulls` from which its corners are counted.
         hulls: see `TableArrays.hulls`.
         shape: its `TABLE_SHAPE`.
@@ -261,8 +263,9 @@ def climb_hull(
 ) -> tuple[float, float]:
     """Climb from corner to corner to a silhouette; return that corner, see `view_corner`.
 
-    Seen from outside, the direction of the corners rises and falls once around the hull, so that a
-    local optimum is the global one. Only shapes with many corners need it, at short distances.
+    Seen from outside, the direction of the corners rises and falls once around the
+    hull, so a local optimum is the global one. Only shapes with many corners need this,
+    at short distances.
 
     Args:
         view: of the shape.
@@ -299,8 +302,8 @@ def find_points(
 ) -> tuple[int, int]:
     """Find where a point of a row is in `TableArrays.rows`, and the next one.
 
-    Those of the further beams follow one by one. With the last phase of a beam, the next point is
-    the first phase of the next beam.
+    Those of the next beams follow one by one. After the last phase of a beam, the next
+    point is the first phase of the next beam.
     """
     phases = 1 << table.shift
     row_beam = cell[ROW_EXTENT] >> 16

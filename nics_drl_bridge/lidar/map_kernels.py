@@ -1,11 +1,12 @@
 """Compiled static maps: the ranges of one scan in a grid of solid squares.
 
-`walk` goes from cell to cell in float64 (Amanatides and Woo, 1987). `jump` goes over free squares:
-for each free cell and quadrant of directions, the bake stores the side of the largest free square
-that opens towards the quadrant (an anisotropic chessboard distance; Sramek and Kaufman, 2000). A
-beam leaves it through its two far sides only, which are grid lines: no range is blended or rounded
-to a cell. `jump` works in float32 relative to the lidar's cell: the relative error of a range is at
-most 3e-7, and a beam within 1e-6 cells of a corner may pass on its other side.
+`walk` goes from cell to cell in float64 (Amanatides and Woo, 1987). `jump` crosses free
+squares: for each free cell and quadrant of directions, the bake stores the side of the
+largest free square in that quadrant (an anisotropic chessboard distance; Sramek and
+Kaufman, 2000). A beam can leave it only through its two far sides, which are grid
+lines, so no range is blended or rounded to a cell. `jump` works in float32 relative to
+the lidar's cell: the relative error of a range is at most 3e-7, and a beam within 1e-6
+cells of a corner may pass on the other side.
 """
 
 import math
@@ -24,7 +25,7 @@ from nics_drl_bridge.lidar.arrays import (
 )
 from nics_drl_bridge.lidar.beam_kernels import Beams, LidarPose, lower
 
-LANES = 48  # beams that jump together: several vector registers hide the latency of look-ups
+LANES = 48  # beams that jump together; several vector registers hide the latency of look-ups
 SINGLES = 7
 INTEGERS = 6
 DU, DV, PER_U, PER_V, U, V, T = (np.uintp(k * LANES) for k in range(SINGLES))
@@ -43,7 +44,7 @@ SLACK = 1.0 + 1e-6
 
 
 class GridArrays(NamedTuple):
-    """A static map for the kernels; without cells where there is none."""
+    """A static map for the kernels; empty if there is none."""
 
     # (rows + 2, columns + 2), a byte per quadrant: 0 in solid cells and the border around the map
     squares: NDArray[np.uint32]
@@ -132,9 +133,10 @@ def _find_entry(at: float, step: float, size: int) -> tuple[float, float]:
 def walk(
     squares: NDArray[np.uint32], u: float, v: float, du: float, dv: float, limit: float
 ) -> float:
-    """Exact distance [cells] from (u, v) to the boundary of the solid cells, `inf` beyond `limit`.
+    """Exact distance [cells] from (u, v) to the border of solid cells, `inf` beyond `limit`.
 
-    That is where the beam enters a solid cell, or leaves it if it starts inside. Outside is free.
+    This is where the beam enters a solid cell, or leaves it if it starts inside. The
+    outside is free.
     """
     rows = len(squares) - 2
     columns = squares.shape[1] - 2
@@ -295,7 +297,8 @@ def _jump(
         y_line = (np.float32(y_side) - singles[k + V]) * singles[k + PER_V]
         sideways = x_line < y_line
         ahead = x_line if sideways else y_line
-        # Never back across a line: rounding might move a lane back and forth forever.
+        # Never cross a line backwards: rounding might move a lane back and forth
+        # forever.
         x_new = max(np.int32(singles[k + U] + singles[k + DU] * ahead), x)
         y_new = max(np.int32(singles[k + V] + singles[k + DV] * ahead), y)
         goes = (side > np.int32(0)) & (t < limit)

@@ -30,7 +30,7 @@ from nics_drl_bridge.lidar.lookup_kernels import (
     look_up_body,
 )
 
-# Look-ups that wait to be fused: while one waits for memory, the next ones go on.
+# Look-ups that are fused together: while one waits for memory, the next ones proceed.
 MOST_FOUND = 64
 
 
@@ -42,7 +42,7 @@ class LidarArrays(NamedTuple):
     range_min: float  # [m]
     range_max: float  # [m]
     sweep_time: float  # duration of a sweep [s]
-    # (H, 2) squares of the minimum and maximum distance of a look-up, for each shape [m^2]
+    # (H, 2) squared minimum and maximum distance of a look-up, per shape [m^2]
     between: Array
     outlines: OutlineArrays  # of the shapes
     table: TableArrays
@@ -88,8 +88,8 @@ def scan_worlds(
         chosen: (n,) the worlds to scan.
         bodies: (N, K, 7).
         nearby: indices of the bodies to consider.
-        first_robot: index of the first robot's own body, which the other robots' follow; -1 if
-            robots have no bodies.
+        first_robot: index of the body of the first robot; those of the other robots
+            follow. -1 if robots have no bodies.
         fixtures: walls and maps of the worlds.
         lidar: the lidar of every robot.
         scratch: scratch memory.
@@ -133,7 +133,7 @@ def scan_robot(
         pose: of the lidar.
         bodies: (K, 7) of the world.
         nearby: indices of the bodies to consider.
-        own_body: index of the robot's own body, which it does not see; -1 for none.
+        own_body: index of the robot's own body, which is skipped; -1 for none.
         fixtures: walls and maps.
         lidar: the lidar.
         scratch: scratch memory.
@@ -170,7 +170,7 @@ def scan_robot(
             scratch.singles,
             scratch.integers,
         )
-    # Too far becomes `inf`, too close `-inf` (REP-117).
+    # Ranges that are too far become `inf`, those too close `-inf` (REP-117).
     low = np.float32(lidar.range_min)
     high = np.float32(lidar.range_max)
     distances = scan.view(np.float32)
@@ -185,7 +185,7 @@ def scan_robot(
 def classify_body(
     body: Array, pose: LidarPose, lidar: LidarArrays
 ) -> tuple[bool, bool]:
-    """Return whether a body (7,) is visible, and whether it is looked up.
+    """Return whether a body (7,) is visible, and whether to look it up.
 
     It is visible unless it is absent, out of range, or behind all beams. A visible body that is not
     looked up is scanned exactly: the lidar is within its circle, or the table is too coarse.

@@ -30,7 +30,8 @@ NO_WALLS = np.zeros((0, 4))
 GREATEST_ERROR = 0.01
 # cache of `find_lookup_distances`
 _MEASURED: dict[tuple[Any, ...], tuple[float, float]] = {}
-# `auto` scans beams farther apart exactly: rows of few points err [rad]
+# `auto` scans beams farther apart exactly, because rows of few points are inaccurate
+# [rad]
 WIDEST_BEAMS = 0.2
 
 
@@ -38,11 +39,12 @@ WIDEST_BEAMS = 0.2
 class Scanner:
     """A lidar with its table, ready to scan.
 
-    The renderer `baked` looks up every shape; `exact` computes every ray; `auto` looks up, except
-    shapes larger than the range, in whose circle the lidar nearly always is, shapes with an error
-    of more than `GREATEST_ERROR` (any shape that is very near; long thin ones and deep notches
-    farther away, or anywhere), and beams wider than `WIDEST_BEAMS`. All renderers compute straight
-    walls, and a body in whose circle the lidar is.
+    The renderer `baked` looks up every shape; `exact` computes every ray; `auto` looks
+    shapes up, with three exceptions: shapes larger than the range, whose circle nearly
+    always contains the lidar; distances at which a shape has an error above
+    `GREATEST_ERROR` (any shape when very near; long thin shapes and deep notches at
+    larger or all distances); and beams wider than `WIDEST_BEAMS`. All renderers scan
+    straight walls exactly, and also bodies whose circle contains the lidar.
     """
 
     spec: LidarSpec
@@ -126,7 +128,7 @@ class Scanner:
         return np.asarray(np.square(between))
 
     def place(self, shapes: Sequence[Shape], poses: ArrayLike) -> Array:
-        """Bodies (..., K, 7) of K shapes at poses (..., K, 3); ModelError if one is not baked."""
+        """Return bodies (..., K, 7) of K shapes at poses (..., K, 3); ModelError if not baked."""
         index = [self.table.outlines.index_of(shape) for shape in shapes]
         return place(poses, self.table.outlines.radii[index], index)
 
@@ -197,7 +199,7 @@ class Scanner:
         index = bodies[..., SHAPE]
         count = len(self.table.shapes)
         if index.size and not (index.min() >= 0 and index.max() < count):
-            reason = f"none of the {count} in the lidar table"  # the kernels would read beyond it
+            reason = f"none of the {count} in the lidar table"  # kernels don't check
             raise ModelError(
                 f"a body's shape is {reason}; make bodies by `place` of its scanner."
             )
@@ -210,7 +212,7 @@ def make_scanner(
     renderer: Renderer = DEFAULT_RENDERER,
     grid: GridMap | None = None,
 ) -> Scanner:
-    """Return a scanner of shapes, baked now if needed; ConfigError as `Scanner` and `bake`."""
+    """Return a scanner of shapes and bake them if needed. Raises ConfigError."""
     if renderer == "exact":
         table = LidarTable.without_rows(spec, shapes)
     else:

@@ -59,7 +59,7 @@ def resample(out: Singles, ranges: Singles, plan: SectorPlan) -> None:
 
 @kernel(allocates=True)
 def _fill_by_place(out: Singles, ranges: Singles, plan: SectorPlan) -> None:
-    """Fill each sector from its returns, or the nearer of the neighbouring beams around it."""
+    """Fill each sector from its returns, or else from the nearer of the adjacent beams."""
     sectors = len(out)
     beams = len(ranges)
     where = np.empty(beams, np.int32)
@@ -82,7 +82,7 @@ def _fill_by_place(out: Singles, ranges: Singles, plan: SectorPlan) -> None:
             continue
         gap = (where[after] - where[b]) % around
         step = 1
-        if gap > around // 2:  # the other way round is shorter
+        if gap > around // 2:  # the other direction is shorter
             step = -1
             gap = around - gap
         near = min(value[b], value[after])

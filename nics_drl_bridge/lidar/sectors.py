@@ -27,14 +27,15 @@ from nics_drl_bridge.lidar.spec import (
 Ranges = Singles
 # Beams farther apart are rejected: at 1 m they miss objects 0.2 m wide
 COARSEST_RAD = 0.21
-# A beam this near to a border counts in both: headers have angles in float32
+# A beam this close to a border counts in both sectors, because headers have float32
+# angles
 BORDER_RAD = 1e-4
-# fraction by which a lidar's range may fall below the layout's, because of float32
+# fraction by which a lidar's range may be below the layout's, because of float32
 RANGE_TOLERANCE = 1e-5
 
 
 class ScanLayout(Schema):
-    """The scan that a policy sees: the nearest return in each sector, seen from the viewpoint."""
+    """The scan that a policy observes: the nearest return in each sector, from a viewpoint."""
 
     sectors: int = Field(ge=4, le=1440)  # S
     # start of the first sector in `base_link`; sectors follow counter-clockwise [rad]
@@ -70,7 +71,8 @@ LAYOUTS = {  # the full circle, and the 270 deg that most front-mounted lidars c
 def layout_of(setting: Any, lidar: LidarSpec) -> ScanLayout | None:
     """Return the layout for a user's setting. Raises ConfigError if it is invalid.
 
-    It is None, a ScanLayout, a name in `LAYOUTS`, its fields, or a number of sectors over the view.
+    It may be None, a ScanLayout or its fields, a name in `LAYOUTS`, or a number of
+    sectors over the view.
     """
     if setting is None or isinstance(setting, ScanLayout):
         return setting
@@ -126,7 +128,7 @@ NO_PLAN = SectorPlan(  # for policies that observe the beams themselves
 
 
 def plan_of(lidar: LidarSpec, layout: ScanLayout) -> SectorPlan:
-    """Return the plan by which a lidar fills a layout; ConfigError if it sees too little."""
+    """Return the plan for a lidar and a layout; ConfigError if the lidar can't fill it."""
     x, y, heading = lidar.mount
     angles = lidar.angles + heading
     _check(lidar, layout, angles)
@@ -138,7 +140,7 @@ def plan_of(lidar: LidarSpec, layout: ScanLayout) -> SectorPlan:
         if inside.any():
             first[s] = begins[0] if len(begins) > 0 else 0
             count[s] = inside.sum()
-        else:  # the adjacent ones
+        else:  # the adjacent beams
             below = int(np.argmax(np.where(away < 0.0, away, -np.inf)))
             above = int(np.argmin(np.where(away >= 0.0, away, np.inf)))
             beside = [b for b in (below, above) if abs(away[b]) <= COARSEST_RAD]
@@ -216,8 +218,9 @@ def make_reader(
 ) -> Reader:
     """Return the reader for scans of B beams with the header of a LaserScan.
 
-    A negative `angle_increment` means clockwise beams, and so does `upside_down`. `like` gives
-    mount, frame and value for no return. Raises ConfigError if the header describes no lidar.
+    A negative `angle_increment` means clockwise beams, and so does `upside_down`.
+    Mount, frame and value for no return are those of `like`. Raises ConfigError if the
+    header describes no lidar.
     """
     begin = header.angle_min
     step = header.angle_increment
@@ -227,8 +230,8 @@ def make_reader(
     if not (np.isfinite([begin, step]).all() and step != 0.0 and beams > 1):
         angles = f"angle_min {header.angle_min:g}, angle_increment {header.angle_increment:g}"
         raise ConfigError(
-            f"LaserScan of {beams} beams, {angles}: describes no lidar; fix "
-            "the driver's parameters."
+            f"LaserScan of {beams} beams, {angles}: describes no valid lidar; fix the "
+            "driver's parameters."
         )
     backwards = step < 0.0
     if backwards:
@@ -264,7 +267,7 @@ def match_reader(
     if not same:
         return reader
     turned = reader.lidar.angles - like.angles
-    # the beams may be the same, off by full turns
+    # the beams may be the same, shifted by full turns
     whole = 2.0 * np.pi * np.round(turned[0] / (2.0 * np.pi))
     if np.abs(turned - whole).max() < 0.1 * like.angle_increment:
         return Reader(like, reader.backwards)

@@ -1,7 +1,8 @@
-"""Sensor: what a robot has beside its lidar. A kind of sensor is one file with one class.
+"""Sensor: base class of sensors besides the lidar. A kind of sensor is one class in one file.
 
-The simulator renders its readings, the nodes publish and read its messages, the middleware caches
-them by name, views hold them in `sensed`, tasks observe `shares`, the gate keeps clear of `points`.
+The simulator renders its readings, the nodes publish and read its messages, the
+middleware caches them by name, views contain them in `sensed`, tasks observe `shares`,
+and the gate avoids `points`.
 """
 
 from abc import ABC, abstractmethod
@@ -22,41 +23,43 @@ from nics_drl_bridge.lidar.scanner import Renderer
 from nics_drl_bridge.lidar.shapes import Shape
 
 Readings = Singles
-# Topics of a robot that are no sensor's.
+# Topics of a robot that sensors may not use.
 TAKEN = ("scan", "odom", "pose", "imu", "joint_states", "ground_truth", "cmd_vel")
 
 
 @dataclass(frozen=True)
 class SensedWorlds:
-    """All that a sensor can see in N worlds of M robots and K other bodies.
+    """Everything that a sensor can see in N worlds of M robots and K other bodies.
 
-    `state`, changed in place, has the true `pose` (N, M, 3) of `base_link` in `map`, `bodies` (N, K
-    + M, 7) as in `lidar.exact_kernels`, robots last, `seeds` and `steps` (N,) of the episodes.
+    `state` is updated in place. It has the true `pose` (N, M, 3) of `base_link` in
+    `map`, the `bodies` (N, K + M, 7) as in `lidar.exact_kernels`, robots last, and
+    `seeds` and `steps` (N,) of the episodes.
     """
 
     state: Any
-    shapes: tuple[Shape, ...]  # of the bodies, by the index in their column `SHAPE`
+    shapes: tuple[Shape, ...]  # shapes of the bodies, indexed by their column `SHAPE`
     first: int  # K, the body of robot 0
     fixtures: Fixtures  # walls and static map of each world
     renderer: Renderer  # of the lidar
 
 
-# Writes the readings (N, M, S) of some worlds (n,) in place, of all their robots.
+# Writes the readings (N, M, S) of all robots of some worlds (n,) in place.
 Render = Callable[[Readings, Integers], None]
 
 
 class Sensor(Schema, ABC):
     """A sensor of a robot in addition to its lidar.
 
-    A subclass is found by its `kind`, the name of an entry point of `nics_drl_bridge.sensors`, or
-    of a class that `add_sensor_kind` imported. A reading is S numbers, float32; NaN is unknown.
+    A subclass is found by its `kind`: the name of an entry point in
+        `nics_drl_bridge.sensors`, or of a class imported by `add_sensor_kind`. A
+        reading is S float32 numbers; NaN means unknown.
     """
 
-    # type of its message, such as sensor_msgs/msg/LaserScan; it must have a header
+    # message type, such as sensor_msgs/msg/LaserScan; it must have a header
     message: ClassVar[str]
 
     kind: str
-    # also the name of its topic, below the robot's namespace
+    # also the name of its topic in the robot's namespace
     name: str = Field(pattern="^[a-z][a-z0-9_]*$")
 
     @property
@@ -81,22 +84,22 @@ class Sensor(Schema, ABC):
 
     @abstractmethod
     def renderer(self, around: SensedWorlds) -> Render:
-        """Prepare to render readings; equal seeds and steps must give equal bits in any batch."""
+        """Return a renderer; equal seeds and steps must give equal bits in any batch."""
 
     @abstractmethod
     def write(self, message: Any, reading: Readings) -> None:
-        """Fill a message with a reading (S,); its header is filled in already."""
+        """Fill a message with a reading (S,); its header is already set."""
 
     @abstractmethod
     def read(self, message: Any) -> Readings:
-        """Return the reading (S,) of a message. Raises ValueError if it is not of this sensor."""
+        """Return the reading (S,) of a message. Raises ValueError for another sensor's."""
 
     @abstractmethod
     def shares(self, readings: Readings) -> Readings:
-        """Return the part of an observation (..., P), in [0, 1], of readings (..., S)."""
+        """Convert readings (..., S) to parts of an observation (..., P), in [0, 1]."""
 
     def points(self, reading: Readings) -> Array:
-        """Return points (Q, 2) in `base_link` that a reading (S,) shows [m]; none here."""
+        """Return points (Q, 2) in `base_link` that a reading (S,) shows [m]; by default none."""
         return np.zeros((0, 2))
 
 
@@ -116,7 +119,7 @@ def add_sensor_kind(place: str) -> type[Sensor]:
 
 
 def sensor_of_data(entries: Sensor | Mapping[str, Any]) -> Sensor:
-    """Return a sensor from the entries of a file, which must name a known kind and never code.
+    """Return a sensor from a file's entries, which name a known kind and never code.
 
     Raises ConfigError if they describe no sensor.
     """
@@ -136,7 +139,7 @@ def sensor_of_data(entries: Sensor | Mapping[str, Any]) -> Sensor:
 
 
 def load_sensor(file: Path) -> Sensor:
-    """Read a sensor from a YAML file. Raises ConfigError for what is wrong with it."""
+    """Read a sensor from a YAML file. Raises ConfigError if it is wrong."""
     content = parse_yaml(read_text(file), str(file))  # its errors name the file
     try:
         return sensor_of_data(content)
@@ -159,8 +162,8 @@ def check_sensors(sensors: tuple[Sensor, ...], frames: tuple[str, ...]) -> None:
     for sensor in sensors:
         if sensor.name in names or sensor.frame in used:
             raise ConfigError(
-                f"sensor {sensor.name!r} with frame {sensor.frame!r}: another has that name or "
-                "frame already; choose others."
+                f"sensor {sensor.name!r} with frame {sensor.frame!r}: the name or "
+                "frame is already in use; choose another."
             )
         names.append(sensor.name)
         used.append(sensor.frame)

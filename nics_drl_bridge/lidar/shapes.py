@@ -4,14 +4,14 @@ A shape is data with a `kind`, as in YAML files. It has an outline (V, 2) of cor
 frame, counter-clockwise, and the radius of the circle around its origin that encloses it. A circle
 has no corners.
 
-The kernels know shapes by their index in `Outlines`, which lists the corners of all shapes in one
-array. `place` turns shapes at poses into bodies (..., 7): x, y, heading, cosine and sine of the
-heading, radius, and the index of the shape.
+Kernels refer to shapes by their index in `Outlines`, which lists the corners of all
+shapes in one array. `place` turns shapes at poses into bodies (..., 7): x, y, heading,
+cosine and sine of the heading, radius, and the index of the shape.
 
-Baking needs two more properties of a shape. `find_convex_hull` determines its silhouette: the
-leftmost and the rightmost corner, as seen from outside, are corners of the hull.
-`find_rotational_order` counts the rotations that map the shape onto itself, so that a table needs
-only one of their sectors.
+Baking needs two more properties of a shape. `find_convex_hull` determines its
+silhouette: seen from outside, the leftmost and rightmost corners are corners of the
+hull. `find_rotational_order` counts the rotations that map the shape onto itself, so
+that a table needs only one of their sectors.
 """
 
 from collections.abc import Sequence
@@ -29,7 +29,8 @@ from nics_drl_bridge.lidar.exact_kernels import COS, RADIUS, SHAPE, SIN, Outline
 
 MOST_CORNERS = 16_384
 MOST_SHAPES = 1_000  # in one group of obstacles
-# minimum and maximum extent of a shape [m]: smaller is invisible, larger fits in no world
+# minimum and maximum extent of a shape [m]: smaller ones are invisible, larger ones fit
+# in no world
 SMALLEST = 1e-6
 LARGEST = 1e4
 # corners within this distance, as a fraction of the shape's radius, coincide
@@ -182,9 +183,9 @@ def find_convex_hull(points: Array) -> Array:
 def _find_half_hull(
     ordered: Sequence[tuple[float, float]], smallest_area: float
 ) -> list[tuple[float, float]]:
-    """Lower hull of points from left to right, or upper one from right to left, without its end.
+    """Lower hull of points from left to right, or upper hull from right to left, without its end.
 
-    Corners that span less than an area [m^2] are collinear.
+    Corners that span less than `smallest_area` [m^2] count as collinear.
     """
     chain: list[tuple[float, float]] = []
     for x, y in ordered:
@@ -212,7 +213,7 @@ def find_rotational_order(outline: Array, hull: Array) -> int:
 
 
 def _is_symmetric(corners: Array, order: int, tolerance: float) -> bool:
-    """Return True if turning corners (V, 2) by a whole turn / order only renumbers them."""
+    """Return True if a rotation by a full turn / order only renumbers the corners (V, 2)."""
     if len(corners) % order:
         return False
     angle = 2.0 * np.pi / order
@@ -225,7 +226,7 @@ def _is_symmetric(corners: Array, order: int, tolerance: float) -> bool:
 
 @dataclass(frozen=True)
 class Outlines:
-    """A set of shapes as flat arrays; hulls are stored twice, so an index may run past the end."""
+    """Shapes as flat arrays. Hulls are stored twice, so that indices may pass the end."""
 
     shapes: tuple[Shape, ...]  # H
     corners: Array  # (sum V, 2) of all outlines, one after the other [m]
@@ -274,8 +275,8 @@ class Outlines:
         except ValueError:
             held = ", ".join(map(describe, self.shapes)) or "none"
             raise ModelError(
-                f"the shape {describe(shape)} is not in the lidar table, which holds "
-                f"{held}; bake it as well."
+                f"the shape {describe(shape)} is not in the lidar table, which "
+                f"contains {held}; bake it as well."
             ) from None
 
 

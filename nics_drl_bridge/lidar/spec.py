@@ -1,9 +1,10 @@
 """LidarSpec: the single definition of a lidar's beams, limits and header fields.
 
-In the package, ranges follow REP-117: `inf` is no return, `-inf` is too close, NaN is an invalid
-measurement, and everything else is within the limits. Devices differ: `LidarSpec.no_return` names
-the convention, and only this module handles it. Limits are compared in float32, as in the message:
-a limit of 0.16 m becomes slightly less, and a return at 0.16 m still counts.
+Within the package, ranges follow REP-117: `inf` is no return, `-inf` is too close, NaN
+is an invalid measurement, and all other values are within the limits. Devices differ:
+`LidarSpec.no_return` names their convention, which only this module handles. Limits are
+compared in float32, as in the message: a limit of 0.16 m becomes slightly less, and a
+return at 0.16 m still counts.
 """
 
 from functools import cached_property
@@ -29,9 +30,7 @@ class ScanHeader(NamedTuple):
     angle_min: float  # of the first beam [rad]
     angle_max: float  # of the last beam, also for a full circle [rad]
     angle_increment: float  # between neighbouring beams [rad]
-    time_increment: (
-        float  # the same [s]; 0 if all are measured at once, negative if clockwise
-    )
+    time_increment: float  # [s]; 0 if all are measured at once, negative if clockwise
     scan_time: float  # between scans [s]
     range_min: float  # nearest return [m]
     range_max: float  # farthest return [m]
@@ -48,7 +47,7 @@ def check_angles(angle_min: float, angle_max: float) -> None:
 
 
 class WithoutSensorModel(Schema):
-    """A schema whose files may hold an empty `sensor_model`, as an earlier version wrote it."""
+    """A schema that accepts an empty `sensor_model`, which an earlier version wrote."""
 
     @model_validator(mode="before")
     @classmethod
@@ -57,7 +56,7 @@ class WithoutSensorModel(Schema):
             return data
         if data["sensor_model"]:
             raise ValueError(
-                "sensor models are no longer simulated; take the key sensor_model out"
+                "sensor models are no longer supported; remove the key sensor_model"
             )
         return {key: value for key, value in data.items() if key != "sensor_model"}
 
@@ -82,7 +81,7 @@ class LidarSpec(WithoutSensorModel):
     no_return: NoReturn = (
         "inf"  # the device's value for no return; the package uses `inf`
     )
-    faults: LidarFaults = LidarFaults()  # further faults of the device's ranges
+    faults: LidarFaults = LidarFaults()  # other faults of the device's ranges
 
     @model_validator(mode="after")
     def _check_consistent(self) -> "LidarSpec":
@@ -94,7 +93,7 @@ class LidarSpec(WithoutSensorModel):
                 "faults.quantisation must be less than range_max - range_min"
             )
         if self.no_return == "zero" and self.range_min == 0.0:
-            raise ValueError("range_min must be greater than 0 where no_return is zero")
+            raise ValueError("range_min must be greater than 0 if no_return is zero")
         return self
 
     @property
@@ -173,7 +172,8 @@ def to_device(ranges: ArrayLike, spec: LidarSpec) -> Ranges:
 def from_device(values: ArrayLike, spec: LidarSpec) -> Ranges:
     """Convert ranges (..., B) of a device to those of the package.
 
-    A finite value below range_min is too close, unless it means no return: that is not free space.
+    A finite value below range_min means too close, unless it is the value for no
+    return.
     """
     out = np.array(values, np.float32)
     if spec.no_return != "inf":

@@ -45,7 +45,7 @@ MOST_WIDE = 0xFFFF  # maximum number of beams in a row
 
 
 class Density(Schema):
-    """Sampling density of a table; a shape with rotational symmetry is baked for one period."""
+    """Sampling density of a table. Shapes with rotational symmetry are baked for one period."""
 
     # number of grid distances, from the shape's radius to out of range
     distances: int = Field(default=100, ge=3, le=10_000)
@@ -54,7 +54,7 @@ class Density(Schema):
 
     @classmethod
     def for_beams(cls, beam_angle: float) -> "Density":
-        """Return the default for an angle between beams [rad]; wide ones need several points."""
+        """Return the default for an angle between beams [rad]; wide angles need more points."""
         wanted = math.ceil(math.log2(max(beam_angle / POINT_ANGLE, 1.0)))
         return cls.model_validate({"phases": min(2**wanted, MOST_PHASES)})
 
@@ -69,7 +69,7 @@ class TableAbout(WithoutSensorModel):
 
 
 def count_padding(beam_angle: float) -> int:
-    """Maximum number of values that a look-up reads from a row: half a turn, a block."""
+    """Maximum number of values that a look-up reads from a row: half a turn and a block."""
     return math.ceil(math.pi / beam_angle) + 1 + 16
 
 
@@ -77,14 +77,15 @@ def count_padding(beam_angle: float) -> int:
 class LidarTable:
     """Ranges of shapes as rows over angle, on a grid of distances and rotations.
 
-    A cell is one grid distance at one grid rotation. Its row has only the directions that the
-    shape can cover up to the next cells, once for each phase: the points of one phase are one beam
-    apart, so that those for the beams of a scan are contiguous.
+    A cell is one grid distance at one grid rotation. Its row contains only the
+    directions that the shape can cover up to the next cells, once for each phase. The
+    points of one phase are one beam apart, so that those for the beams of a scan are
+    contiguous.
 
     The columns of a cell are the first beam of its row, relative to the bearing; its width in beams
-    (unsigned, see `widths`); a corner of the hull that can be the right edge within the cell; the
-    only other such corner, or the same one, or, if there are more, minus the initial stride for
-    climbing; the same two for the left edge.
+    (unsigned, see `widths`); a corner of the hull that can be the right edge within the
+    cell; the other such corner (or the same one if there is no other, or minus the
+    initial stride for climbing if there are more); the same two for the left edge.
     """
 
     shapes: tuple[Shape, ...]  # H
@@ -92,13 +93,13 @@ class LidarTable:
     beam_angle: float  # between the beams that it was baked for [rad]
     # (H, 3) maximum distance [m], rotations in a period, first cell
     grid: Array
-    start: ShortIntegers  # (cells,) begin of each row in `rows`
+    start: ShortIntegers  # (cells,) start of each row in `rows`
     cell: NDArray[np.int16]  # (cells, 6) see above
     rows: Singles  # (R,) ranges [m], padded by what one look-up can read
 
     @classmethod
     def without_rows(cls, spec: LidarSpec, shapes: Sequence[Shape]) -> "LidarTable":
-        """Create a table of shapes that are only scanned exactly, without limits or baking."""
+        """Create a table of shapes for exact scans only, without limits or baking."""
         shapes = tuple(dict.fromkeys(shapes))
         grid = np.ones((len(shapes), 3))
         grid[:, 0] = [spec.range_max + 2.0 * shape.radius for shape in shapes]
@@ -185,7 +186,7 @@ class LidarTable:
         return digest.hexdigest()
 
     def save(self, folder: str | Path) -> None:
-        """Write the table as a folder, whole or not at all; ConfigError if not of its kind."""
+        """Write the table as a folder, atomically; ConfigError if the folder is something else."""
         names = {*TABLE_FILES, SUMS}
         with write_whole_folder(folder, ABOUT_FILE, names.__contains__) as temporary:
             write_text(temporary / ABOUT_FILE, self._about)
@@ -250,7 +251,7 @@ class LidarTable:
         ends = self.start + widths
         last = len(self.rows) - count_padding(self.beam_angle)
         if cells and (self.start.min() < 0 or widths.min() < 1 or ends.max() > last):
-            raise ValueError("a row lies outside of the table")
+            raise ValueError("a row is outside the table")
         corners = np.repeat(np.diff(self.outlines.hull) // 2, counts.astype(np.int64))[
             :, None
         ]
@@ -261,13 +262,13 @@ class LidarTable:
             or (hint >= corners).any()
             or (np.abs(climb) >= corners).any()
         ):
-            raise ValueError("a cell names a corner that its shape does not have")
+            raise ValueError("a cell refers to a corner that its shape does not have")
 
 
 def _map_file(path: Path) -> AnyArray:
     """Map a `.npy` file into memory; writing to the array never changes the file."""
     try:
-        with np.errstate(over="raise"):  # of a shape whose size is no number
+        with np.errstate(over="raise"):  # a shape with an overflowing size
             array = np.load(path, mmap_mode="c", allow_pickle=False)
         if not isinstance(array, np.memmap):
             raise TypeError("an archive of arrays")

@@ -92,7 +92,7 @@ class UnobservedMotion:
         return speed * longest, min(rate * longest, np.pi)
 
     def widen(self, covariance: Array, seconds: float) -> Array:
-        """Returns a covariance (3 + S, 3 + S) that lets the robot be anywhere within reach."""
+        """Returns a covariance (3 + S, 3 + S) that covers everywhere the robot may have gone."""
         widened = decorrelate_pose(covariance)
         distance, turn = self.bound_motion(seconds)
         variance = np.maximum(self._stuck_variance, np.diag(widened))

@@ -9,15 +9,16 @@ How it works:
 2. **Absolute measurements.** A pose corrects by the usual update, which filterpy computes. A yaw
    rate corrects nothing by itself: the next odometry's turn is fused with it, see `turning`.
 3. **Odometry** is two measurements. The twist is a snapshot and corrects by the usual update. The
-   pose relative to the previous odometry integrates the wheels' motion in between: it measures the
-   difference of two states, the present one and an earlier one. The filter therefore keeps a
-   `Clone` of the state at the newest odometry used, and its covariance with the present state
-   (stochastic cloning; Roumeliotis and Burdick 2002). Predictions and other measurements keep the
-   clone up to date; the next relative pose corrects the present state, and a new clone is made.
-   `kernels.correct_by_odometry` computes both updates at once.
+   pose relative to the previous odometry integrates the wheels' motion in between: it
+   measures the difference between the current state and an earlier one. The filter
+   therefore keeps a `Clone` of the state at the newest odometry used, and its
+   covariance with the present state (stochastic cloning; Roumeliotis and Burdick 2002).
+   Predictions and other measurements keep the clone up to date; the next relative pose
+   corrects the current state, and a new clone is made. `kernels.correct_by_odometry`
+   computes both updates at once.
 4. **Gates.** A measurement whose normalised innovation squared (NIS) is too large is an outlier,
    unless it is plausible for a robot that is stuck or pushed (news), or follows so many outliers
-   that it is believed (a jump).
+   that it is accepted (a jump).
 5. **Late measurements** are not handled here: `timeline` resets the filter to the `Belief` before
    them, and replays everything since.
 """
@@ -73,15 +74,16 @@ GATE = 16.27  # 99.9 % of chi-squared with 3 degrees of freedom
 MEDIAN_NIS = 2.37  # median of chi-squared with 3 degrees of freedom
 # Number of consecutive outliers after which they are believed
 PATIENCE = {Kind.TWIST: 3, Kind.POSE: 5}
-# Noise larger than stated would turn nearly all measurements into outliers. Its variance is
-# therefore scaled up after noisy outliers, and down again after measurements that fit well.
+# If noise exceeds its stated level, nearly all measurements become outliers. The
+# variance is therefore scaled up after noisy outliers, and down again after
+# measurements that fit.
 NOISE_GROWTH = 4.0
 NOISE_DECAY = 0.93
 MAX_NOISE_SCALE = 100.0
 # Possible error of the state of a stuck or pushed robot, as a fraction of its range
 STUCK_DEVIATION = 0.5
 RANGE_FACTOR = 2.0  # states and commands are clipped to this multiple of their range
-MAX_INNOVATION = 1e8  # no larger innovation is ever believed [m, rad, m/s, rad/s]
+MAX_INNOVATION = 1e8  # larger innovations are never accepted [m, rad, m/s, rad/s]
 # A robot counts as at rest below these speeds [m/s, rad/s], by the model and by odometry.
 REST_EXPECTED = 0.01
 REST_MEASURED = 0.05
@@ -94,8 +96,8 @@ class Estimator:
     """Pose and state of one robot, predicted by the fitted model and corrected by measurements.
 
     The model's drift is Q, its sensor noise is R, and its latency delays the commands. Time is in
-    integer nanoseconds, so that results are bit-identical. Measurements apply at the present time;
-    `Timeline` inserts late ones.
+    integer nanoseconds, so that results are bit-identical. Measurements apply at the
+    current time; `Timeline` inserts late ones.
     """
 
     def __init__(self, model: SimulatorModel) -> None:
@@ -230,7 +232,7 @@ class Estimator:
         return covariance + MIN_TWIST_STD**2 * np.eye(3)
 
     def clone_state(self, odom: Array, twist: Array) -> None:
-        """Clones the present state for an odometry with pose (3,) and body twist (3,)."""
+        """Clones the current state for an odometry with pose (3,) and body twist (3,)."""
         covariance = self._filter.P
         odometry = Odometry(self.time_ns, odom, twist)
         cross = covariance[:, :3].copy()
@@ -245,7 +247,8 @@ class Estimator:
     ) -> bool:
         """Adds a command (C,) sent at a time [ns]; returns False if that time already has one.
 
-        Keeps the commands in effect from `needed_ns` on, by default from the present estimate on.
+        Keeps the commands in effect from `needed_ns` on, by default from the current
+        estimate on.
         """
         if needed_ns is None:
             needed_ns = self.time_ns
@@ -324,7 +327,7 @@ class Estimator:
         return Judgement(nis, Acceptance.OUTLIER)
 
     def correct(self, measurement: Measurement) -> Judgement:
-        """Corrects by a measurement at the present time, after bridging unobserved motion."""
+        """Corrects by a measurement at the current time, after bridging unobserved motion."""
         if measurement.kind is Kind.YAW_RATE:
             return self.take_yaw_rate(self.time_ns, measurement)
         fused = self._fuse_gyro(measurement)
@@ -466,7 +469,7 @@ class Estimator:
         jacobian: Array,
         noise: Array,
     ) -> None:
-        """Corrects clone and present state by a pose, or by a twist alone."""
+        """Corrects clone and current state by a pose, or by a twist only."""
         if self._clone is not None and self._clone.correlated:
             self._clone = kernels.correct_clone(
                 self._clone, innovation, jacobian, self._filter.P, noise

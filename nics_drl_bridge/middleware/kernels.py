@@ -35,14 +35,15 @@ class Odometry(NamedTuple):
 class Clone(NamedTuple):
     """Copy of the state at the newest odometry used (stochastic cloning).
 
-    Later measurements correct the copy as well. It is no longer `correlated` once the pose has been
-    set directly, because its covariance with the present state is then unknown.
+    Later measurements correct the copy as well. It is no longer `correlated` once the
+    pose has been set directly, because its covariance with the current state is then
+    unknown.
     """
 
     odometry: Odometry
     mean: Array
     covariance: Array
-    cross: Array  # (3 + S, 3) covariance of the present state with the cloned pose
+    cross: Array  # (3 + S, 3) covariance of the current state with the cloned pose
     correlated: bool = True
 
 
@@ -312,7 +313,7 @@ def predict_estimate(
 def look_ahead(
     mean: Array, begin: int, end: int, motion: MotionModel, log: CommandLog
 ) -> tuple[Array, Array]:
-    """Predicts mean and body twist (3,) at `end`; returns the present ones if that is earlier."""
+    """Predicts mean and body twist (3,) at `end`; returns the current ones if that is earlier."""
     moved = mean.copy()
     if end > begin:
         transition = make_transition(mean.shape[0], 0.0)
@@ -344,7 +345,7 @@ def compute_update(
 def correct_clone(
     clone: Clone, innovation: Array, jacobian: Array, covariance: Array, noise: Array
 ) -> Clone:
-    """Returns the clone after a measurement of the present state, which has the `covariance`.
+    """Returns the clone after a measurement of the current state, which has the `covariance`.
 
     The measurement has innovation (n,), Jacobian (n, 3 + S) and noise (n, n).
     """
@@ -360,7 +361,7 @@ def correct_clone(
 
 @kernel
 def compute_displacement(start: Array, end: Array) -> tuple[float, float]:
-    """Returns how far `end` lies ahead of `start` and to its left [m]."""
+    """Returns the displacement from `start` to `end`, forward and left [m]."""
     c = math.cos(start[2])
     s = math.sin(start[2])
     x = end[0] - start[0]

@@ -46,7 +46,9 @@ class Acceptance(IntEnum):
 
     USED = 0  # used, within its gate
     NEWS = 1  # used, beyond its gate, but plausible for a robot that is stuck or pushed
-    JUMP = 2  # used, beyond its gate too many times in a row to be an outlier
+    JUMP = (
+        2  # used, because too many consecutive ones were beyond the gate to be outliers
+    )
     OUTLIER = 3  # rejected
 
 
@@ -91,7 +93,7 @@ class TopicHealth:
 
 
 class Rejection(NamedTuple):
-    """Why data of a topic are not used."""
+    """Reason why data of a topic are not used."""
 
     topic: str
     reason: str

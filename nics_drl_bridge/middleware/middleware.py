@@ -38,7 +38,7 @@ RATE_WINDOW = 32  # number of arrivals over which rates are computed
 
 
 class Datum(NamedTuple):
-    """A message with its stamp, arrival on the receiver's clock, and the number of earlier ones."""
+    """A message with stamp, arrival on the receiver's clock, and number of earlier messages."""
 
     stamp_ns: int
     arrival_ns: int
@@ -171,7 +171,8 @@ class Middleware:
             return self.cache.reject(CMD_VEL, reason)
         if not np.isfinite(value).all():
             return self.cache.reject(CMD_VEL, NOT_FINITE)
-        # The robot follows it whatever its stamp, because the clock may have been set meanwhile.
+        # The robot follows it regardless of its stamp, because the clock may have been
+        # set.
         self._commanded = value
         refusal = self._stamps.find_fault(stamp_ns, arrival_ns)
         if refusal is None:
@@ -188,7 +189,7 @@ class Middleware:
     def sense(
         self, name: str, stamp_ns: int, arrival_ns: int, reading: NDArray[np.float32]
     ) -> bool:
-        """Takes a reading (S,) of another sensor; True if it was used. Only the newest is kept."""
+        """Takes a reading (S,) of an additional sensor; True if used. Only the newest is kept."""
         size = next(sensor.size for sensor in self._sensors if sensor.name == name)
         return self._keep(name, stamp_ns, arrival_ns, reading, size)
 
@@ -218,8 +219,9 @@ class Middleware:
         """Takes an odometry: pose (3,) in `odom`, body twist (3,); True if it was accepted.
 
         The twist and the pose relative to the previous odometry correct the estimate. The pose
-        itself drifts, so it only bridges motion without other data. The larger the variance of the
-        twist's yaw rate, by default the model's, the more the gyro's turn counts.
+        itself drifts, so it only bridges motion without other data. The larger the
+        variance of the twist's yaw rate (by default the model's), the higher the weight
+        of the gyro's turn.
         """
         value = np.array((pose, twist), dtype=np.float64)
         if not np.isfinite(value).all():
@@ -228,7 +230,8 @@ class Middleware:
         if refusal is not None:
             return self.cache.reject(ODOM, refusal.reason)
         if stamp_ns == self._start_ns and ODOM not in self.cache.newest:
-            # The pose is known at a reset, so the odometry of that time adds nothing.
+            # The pose is known at a reset, so odometry at that time adds no
+            # information.
             self._timeline.clone_start(value[0])
             self._stamps.accept(stamp_ns, arrival_ns)
             self.cache.take(ODOM, stamp_ns, arrival_ns, value)
@@ -290,7 +293,7 @@ class Middleware:
     def _measure(
         self, stamp_ns: int, arrival_ns: int, measurement: Measurement, datum: Array
     ) -> Refusal | None:
-        """Takes a measurement and caches its datum; returns why it is not used, or None."""
+        """Takes a measurement and caches its datum; returns the reason for a refusal, or None."""
         topic = measurement.kind.topic
         refusal = self._stamps.find_fault(stamp_ns, arrival_ns)
         if refusal is None:
@@ -318,7 +321,7 @@ class Middleware:
 
     @property
     def commanded(self) -> Array:
-        """Latest command (C,), whatever its stamp."""
+        """Latest command (C,), regardless of its stamp."""
         return self._commanded
 
     @property

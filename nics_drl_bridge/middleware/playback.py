@@ -1,4 +1,4 @@
-"""Runs a recorded drive through the middleware in order of receipt, bit for bit reproducible."""
+"""Runs a recorded drive through the middleware in order of receipt, reproducibly."""
 
 import io
 from collections.abc import Iterator, Mapping
@@ -150,7 +150,7 @@ def choose_topics(bag: BagFile, topics: Mapping[str, str]) -> dict[str, str]:
             )
         roles[role] = topic
     if ODOM not in roles:
-        fix = "say which topic it is, as in --topic odom=/wheel_odom"
+        fix = "name its topic, as in --topic odom=/wheel_odom"
         names = ", ".join(sorted(bag.types))
         raise RecordingError(
             f"{bag.place}: has no odometry; {fix}; its topics are {names}."
@@ -181,9 +181,10 @@ def _check_clocks(
         offset_s = float(np.median(times[:, 1] - expected)) * 1e-9
         if abs(offset_s) > MAX_OFFSET_S:
             raise RecordingError(
-                f"{place}: the stamps of {roles[role]!r} are {offset_s:+.3f} s off those of "
-                f"{roles[ODOM]!r}, so they are of two clocks; synchronise the clocks (NTP, or "
-                "use_sim_time on all nodes or none) and record again, or leave the topic out."
+                f"{place}: the stamps of {roles[role]!r} are {offset_s:+.3f} s off "
+                f"those of {roles[ODOM]!r}, so they come from two clocks; synchronise "
+                "the clocks (NTP, or use_sim_time on all nodes or none) and record "
+                "again, or leave the topic out."
             )
 
 

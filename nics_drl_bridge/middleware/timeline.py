@@ -22,22 +22,22 @@ from nics_drl_bridge.middleware.measurement import (
 HISTORY_NS = NS_PER_S  # maximum age of late data [ns]
 # A stamp may be ahead by this [ns], or by two control periods if these are longer
 FUTURE_NS = NS_PER_S
-# Number of consecutive odometries with rejected stamps that shows that a clock was set
+# A clock was set if this many consecutive odometries have rejected stamps
 CLOCK_JUMP = 10
 
 
 class Refusal(NamedTuple):
-    """Why a datum is not used."""
+    """Reason why a datum is not used."""
 
     reason: str
-    may_be_clock: bool = False  # True if a clock that was set would explain it
+    may_be_clock: bool = False  # True if setting a clock would explain it
 
 
 BEFORE_START = Refusal("not after the reset", may_be_clock=True)
 TOO_OLD = Refusal(f"older than {HISTORY_NS / NS_PER_S:g} s", may_be_clock=True)
 DUPLICATE = Refusal("duplicate")
 NO_INTEGER = Refusal("stamp is not an integer")
-# Stamp [ns] and kind. Measurements are ordered by both, whatever their order of arrival.
+# Stamp [ns] and kind. Measurements are sorted by both, regardless of their arrival.
 Moment = tuple[int, int]
 
 
@@ -62,7 +62,7 @@ class Timeline:
         self.reset()
 
     def reset(self) -> None:
-        """Forgets the past; starts with the present state of the estimator."""
+        """Forgets the past; starts with the current state of the estimator."""
         self._start_ns = self._estimator.time_ns
         # Counts of measurements by kind and outcome; NIS of the newest of each kind
         self.outcomes: Counter[tuple[Kind, Acceptance]] = Counter()
@@ -82,7 +82,7 @@ class Timeline:
             self._entries[0].belief = self._estimator.belief
 
     def measure(self, stamp_ns: int, measurement: Measurement) -> Refusal | None:
-        """Takes a measurement; returns why it is not used, or None."""
+        """Takes a measurement; returns the reason for a refusal, or None."""
         moment = (stamp_ns, measurement.kind)
         if stamp_ns <= self._start_ns:
             return BEFORE_START
@@ -103,7 +103,7 @@ class Timeline:
         return None
 
     def command(self, stamp_ns: int, command: ArrayLike) -> Refusal | None:
-        """Takes a command (C,); returns why it is not used, or None."""
+        """Takes a command (C,); returns the reason for a refusal, or None."""
         if stamp_ns < self._start_ns:
             return BEFORE_START
         effective_ns = self._estimator.compute_effect_time(stamp_ns)
@@ -145,9 +145,9 @@ class Timeline:
 class Stamps:
     """Compares the progress of time stamps with that of the receiver's clock.
 
-    Only differences count, so a clock may be off. A simulation may run slower than real time, or
-    ahead of it by at most a tolerance, which grows with the control period [ns]. The first datum
-    after a reset gives the offset.
+    Only differences count, so clocks may have an offset. A simulation may run slower
+    than real time, or ahead of it by at most a tolerance, which grows with the control
+    period [ns]. The first datum after a reset gives the offset.
     """
 
     def __init__(self, period_ns: int = 0) -> None:
@@ -163,7 +163,7 @@ class Stamps:
         self._rejected = 0
 
     def find_fault(self, stamp_ns: int, arrival_ns: int | None) -> Refusal | None:
-        """Returns what is wrong with a stamp, or None; without arrival, checks only its type."""
+        """Returns the fault of a stamp, or None; without arrival, checks only its type."""
         try:
             index(stamp_ns)
         except TypeError:

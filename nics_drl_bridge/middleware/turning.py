@@ -1,9 +1,10 @@
 """Fuses the turns of odometry and a gyro, weighted by their stated and observed variances.
 
-Wheels slip when a robot turns: those of a skid-steer may overstate the turn by a third. A gyro does
-not slip, but has noise and a bias that changes slowly. The bias is estimated while the wheels stand
-still and, with less weight, while they roll. The fused turn replaces odometry's own, in its twist
-and in its relative pose; the wheels' displacements stay as they are.
+Wheels slip when a robot turns: those of a skid-steer robot may overestimate the turn by
+a third. A gyro does not slip, but has noise and a bias that changes slowly. The bias is
+estimated while the wheels are at rest and, with less weight, while they roll. The fused
+turn replaces that of odometry, in its twist and its relative pose; the wheels'
+displacements are kept.
 """
 
 import math
@@ -21,7 +22,9 @@ MIN_GYRO_STD = 1e-4  # [rad/s]
 MAX_VARIANCE = 1.0  # a larger one means that the rate is unknown [rad^2/s^2]
 BIAS_STD = 0.1  # deviation of the bias of a gyro that was never at rest [rad/s]
 BIAS_WALK = 1e-4  # random walk of a bias [rad/s / sqrt(s)]
-REST_BIAS_STD = 3e-4  # deviation of a standing robot's yaw rate from the bias [rad/s]
+REST_BIAS_STD = (
+    3e-4  # deviation of the yaw rate of a robot at rest from the bias [rad/s]
+)
 VARIANCE_RATIO = 25.0  # factor by which stated and observed variance may differ
 MIN_SAMPLES = 30  # yaw rates after which the observed variance counts
 SMOOTHING = 0.05  # weight of a new yaw rate in running means
@@ -34,7 +37,7 @@ MIN_STEP = 0.3  # change from one yaw rate to the next that is always accepted [
 # A push may turn a robot at its maximum rate times this factor, plus this rate [rad/s].
 RATE_FACTOR = 2.0
 PUSH_RATE = 1.0
-MAX_REJECTED = 5  # number of sudden changes in a row, the last of which is believed
+MAX_REJECTED = 5  # number of consecutive sudden changes, the last of which is accepted
 MAX_REJECTED_FRACTION = 0.2  # maximum rejected fraction of the latest yaw rates
 # Wheels
 ASSUMED_SLIP = 0.1  # fraction of a turn, until more is known
@@ -42,7 +45,9 @@ ASSUMED_SLIP = 0.1  # fraction of a turn, until more is known
 ASSUMED_SLIP_WEIGHT = 1e-3
 MIN_SLIP_FRACTION = 0.05
 MEMORY_S = 30.0  # time constant of slip and scatter
-MIN_COMPARED_TURN = 0.5  # by the wheels, before they can judge the gyro [rad]
+MIN_COMPARED_TURN = (
+    0.5  # turn of the wheels before they can be compared with the gyro [rad]
+)
 # Bounds on the slope of gyro turns over wheel turns; beyond them, the gyro's axis or unit is wrong
 MIN_SLOPE = -0.3
 MAX_SLOPE = 3.0
@@ -124,8 +129,9 @@ class Gyro(NamedTuple):
     ) -> bool:
         """Returns True if the turn of an unproven gyro contradicts the wheels' turn.
 
-        It then has the opposite sign or is several times as large, beyond what the `variance`
-        [rad^2] explains. Once the gyro is proven, the wheels may have slipped that much.
+        The turn then has the opposite sign or is several times as large, more than
+        `variance` [rad^2] explains. Once the gyro is proven, such a difference may be
+        slip.
         """
         if self.wheels_turned >= MIN_COMPARED_TURN:
             return False
@@ -146,7 +152,7 @@ class Gyro(NamedTuple):
         return self._replace(rejected=self.rejected + 1, rejected_fraction=fraction)
 
     def restart(self) -> "Gyro":
-        """Returns what is still known after the clock was set: bias, noise and slip."""
+        """Returns the estimates that remain valid after the clock was set: bias, noise and slip."""
         return self._replace(since_ns=NEVER_NS, rejected=0)
 
 
@@ -294,7 +300,7 @@ def fuse_odometry(
     wheels_variance = max(wheels_variance, slip_variance)
     weight = wheels_variance / (wheels_variance + gyro_variance)
     if wheels_stand and abs(unbiased) <= SIGMAS * math.sqrt(gyro_variance):
-        weight = 0.0  # standing wheels do not turn the robot
+        weight = 0.0  # wheels at rest do not turn the robot
     step[2] = weight * unbiased + (1.0 - weight) * by_wheels
     fused_twist = np.array(twist)
     fused_twist[2] = weight * (gyro.rate - updated.bias) + (1.0 - weight) * twist[2]

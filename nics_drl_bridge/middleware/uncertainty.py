@@ -1,4 +1,4 @@
-"""How much less certain a pose estimate has become over time."""
+"""Growth of the uncertainty of a pose estimate over time."""
 
 import math
 from typing import NamedTuple

@@ -26,7 +26,7 @@ from nics_drl_bridge.seeds import check_seeds
 Act = Callable[[Singles], NDArray[Any]]
 
 FIRST_SEED = defaults.EVALUATION_SEED
-# allowance for odometry drift: a robot stops where it believes its goal is [m]
+# allowance for odometry drift, since a robot stops where it believes its goal is [m]
 DRIFT_M = 0.1
 ELSEWHERE = "elsewhere"
 CONFIDENCE = 0.95
@@ -34,7 +34,7 @@ CONFIDENCE = 0.95
 
 @dataclass(frozen=True)
 class Episode:
-    """Record of an episode; the true `result` is success, collision, time-out or elsewhere."""
+    """Record of an episode. The true `result` is success, collision, time-out or elsewhere."""
 
     seed: int
     result: str
@@ -147,7 +147,8 @@ def drive(
         if "true_pose" not in info:
             return Episode(seed, believed, *driven, uncertain=uncertain)
         collisions = info.get("true_collision")
-        # Without the truth, `touched` decides if given, otherwise the robot itself.
+        # Without ground truth, use `touched` if given, otherwise the robot's own
+        # judgement.
         if collisions is None:
             collisions = believed == "collision" if touched is None else touched()
         hit = bool(np.any(collisions))
@@ -226,7 +227,7 @@ def drive_worlds(env: BridgeVectorEnv, act: Act, seeds: Sequence[int]) -> Outcom
     """
     width = env.num_envs
     checked_seeds = check_seeds(seeds)
-    # Seeds that fill up the last batch are run but not counted.
+    # Seeds that pad the last batch are run but not counted.
     batches = (
         np.resize(checked_seeds[k : k + width], width)
         for k in range(0, len(checked_seeds), width)

@@ -83,7 +83,7 @@ class PlannedPath:
         return float(self._along[-1])
 
     def locate(self, pose: Array, lookahead: float) -> Place:
-        """Returns the place of a robot at a pose (3,), and a sub-goal up to `lookahead` [m] ahead.
+        """Locates a robot at a pose (3,), with a sub-goal up to `lookahead` [m] ahead.
 
         Advances the progress to the nearest point.
         """

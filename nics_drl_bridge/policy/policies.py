@@ -1,4 +1,4 @@
-"""Policies by name: baselines that any trained policy must beat, planners, and policy files."""
+"""Policies by name: baselines that a trained policy must beat, planners, and policy files."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -134,7 +134,7 @@ def is_policy_file(name: str) -> bool:
 
 
 def check_policy_file(name: str) -> None:
-    """Raises PolicyError or ConfigError unless a policy file can be read, for whatever robot."""
+    """Raises PolicyError or ConfigError unless a policy file can be read, for any robot."""
     from nics_drl_bridge.policy.file.policy_file import load_policy
 
     if name.endswith(MAPPINGS):

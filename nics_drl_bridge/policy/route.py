@@ -32,12 +32,13 @@ Cell = tuple[int, int]  # row, column
 
 
 def route(grid: GridMap, start: ArrayLike, goal: ArrayLike, radius: float) -> Array:
-    """Returns a path (P, 2) [m] from start to goal that keeps a radius [m] off occupied cells.
+    """Returns a path (P, 2) [m] from start to goal, a radius [m] away from occupied cells.
 
     It keeps a greater distance where there is space. The cells of start and goal count as free.
-    Unknown cells count as free, too, unless the map says that they stop. A cell of the coarser map
-    is occupied if any part of it is, so a gap must be wider than the disc by up to two cells.
-    Raises ConfigError if start or goal is off the map, or if there is no path.
+    Unknown cells also count as free, unless the map treats them as solid. A cell of the
+    coarser map is occupied if any part of it is, so a gap must be wider than the disc
+    by up to two cells. Raises ConfigError if start or goal is off the map, or if there
+    is no path.
     """
     coarse = _coarsen(grid, max(1, math.ceil(CELL / grid.resolution - 1e-6)))
     start_cell = _find_cell(coarse, "start", start)

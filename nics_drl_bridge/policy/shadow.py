@@ -172,9 +172,7 @@ def _compare_moments(
         reasons = ", ".join(
             f"{count} times {why}" for why, count in skipped.items() if count
         )
-        raise RecordingError(
-            f"nothing to compare the policy by: {reasons}; choose another goal."
-        )
+        raise RecordingError(f"nothing to compare: {reasons}; choose another goal.")
     stamps, poses, aims, wanted, driven = (
         np.array(column) for column in zip(*rows, strict=True)
     )

@@ -1,4 +1,4 @@
-"""Braking: how far a robot still moves after the command to stop, found by simulating its model.
+"""Braking: how far a robot moves after the command to stop, by simulation of its model.
 
 The model is brought to the steady motion of many commands over their range: forwards, backwards,
 sideways, turning, and mixtures. Each motion is then stopped. The stops yield a reaction time and a
@@ -21,7 +21,7 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import STATE_MARGIN, TaylorModel
 
-MAX_STOP_S = 60.0  # a robot that still moves after this time counts as not stopping
+MAX_STOP_S = 60.0  # a robot that still moves after this time does not stop
 MAX_START_S = 30.0  # time in which a held command reaches its steady motion
 # A robot is at rest if no point of its footprint moves faster [m/s].
 CREEP = 0.05
@@ -61,7 +61,7 @@ _CACHE: "OrderedDict[Any, Braking]" = OrderedDict()  # least recently used first
 
 @dataclass(frozen=True)
 class Drift:
-    """How a braking robot leaves its arc, because parts of its motion end before the rest.
+    """Deviation of a braking robot from its arc, if parts of its motion end early.
 
     The components of a twist are compared as speeds, a turn as the speed of the footprint's edge.
     While the largest component is braked, a smaller one moves the robot by a factor times its
@@ -84,7 +84,7 @@ NO_DRIFT = Drift()
 
 @dataclass(frozen=True)
 class TurnBraking:
-    """How a turn ends that brakes independently of the speed.
+    """Braking of a turn that is independent of the speed's braking.
 
     The robot turns no further than if it kept its turn rate for the reaction time, and then braked
     with the constant deceleration. It may stop sooner, see `least_turn` and `least_path`.
@@ -104,7 +104,7 @@ class TurnBraking:
 
 @dataclass(frozen=True)
 class Braking:
-    """An upper bound on a robot's stops.
+    """An upper bound on the motion of a stopping robot.
 
     After the command to stop, a robot moves no further than if it kept its twist for the reaction
     time, and then braked its `pace` with the constant deceleration.
@@ -117,8 +117,8 @@ class Braking:
     # Factor of the turn rate in the pace [m]; wheels that also turn the robot brake both motions
     lever_m: float = 0.0
     drift: Drift = NO_DRIFT  # off its arc while it brakes
-    # Order of the norm of forward and sideways speed: infinite if each stops as if it were alone,
-    # 1 if the brakes have to remove the sum, 2 otherwise
+    # Order of the norm of forward and sideways speed: infinite if they stop
+    # independently, 1 if the brakes have to remove their sum, 2 otherwise
     order: float = 2.0
     turn: TurnBraking | None = None  # None if the turn brakes together with the speed
 
@@ -428,10 +428,11 @@ def _require_rest(robot: RobotSpec, stops: Stops) -> None:
         return
     k = int(np.argmax(left))
     raise ConfigError(
-        f"robot {robot.name!r}: according to its model, it does not stop: {MAX_STOP_S:g} s after "
-        f"the command to stop from {speeds[k]:.3g} m/s and {abs(stops.twist[k, 2]):.3g} rad/s it "
-        f"moves at {left[k]:.3g} m/s; generate the model from a drive that stops several times, or "
-        "correct what brakes it (its terms, `friction`, `drag` or `limits`)."
+        f"robot {robot.name!r}: its model does not stop: {MAX_STOP_S:g} s after the "
+        f"command to stop from {speeds[k]:.3g} m/s and {abs(stops.twist[k, 2]):.3g} "
+        f"rad/s it moves at {left[k]:.3g} m/s; generate the model from a drive with "
+        "several stops, or correct the parts that brake it (its terms, `friction`, "
+        "`drag` or `limits`)."
     )
 
 
@@ -618,7 +619,7 @@ def _measure_slack(bound: Braking, stops: Stops, radius: float) -> float:
 
 
 def _find_drift(stops: Stops, radius: float) -> Drift:
-    """Returns how smaller components of a twist outlast the largest one, or end before it."""
+    """Returns how much longer or shorter smaller components of a twist last than the largest."""
     scale = np.array([1.0, 1.0, radius])
     sizes = np.abs(stops.twist) * scale
     largest = sizes.max(axis=1)

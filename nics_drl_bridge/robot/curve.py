@@ -18,8 +18,8 @@ class InputCurve(Schema):
     """A dead zone about zero, unequal gains, and saturation: a monotone curve of one command."""
 
     command: str
-    # dead zone in the command's unit: smaller commands have no effect; if negative, every effect is
-    # larger by its size
+    # dead zone in the command's unit: smaller commands have no effect; a negative value
+    # instead increases every effect by its magnitude
     dead: float = Field(default=0.0, allow_inf_nan=False)
     # commands saturate at this minimum, in their unit; the effect of 0 is 0
     least: End = -np.inf

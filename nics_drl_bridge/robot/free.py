@@ -1,4 +1,4 @@
-"""Any robot: only a recording shows what its commands do."""
+"""Any robot: the effects of its commands are known only from a recording."""
 
 from nics_drl_bridge.robot.kinds import RobotKind, draw_disc
 from nics_drl_bridge.robot.spec import POSE_RATES

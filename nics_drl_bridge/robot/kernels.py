@@ -262,7 +262,7 @@ def _compute_chord(
     cosc: float,
     dt: float,
 ) -> tuple[float, float]:
-    """Returns the chord of an arc, ahead and left [m], from sin(t) / t and (1 - cos(t)) / t."""
+    """Returns the chord of an arc, forward and left [m], from sin(t) / t and (1 - cos(t)) / t."""
     return (sinc * vx - cosc * vy) * dt, (cosc * vx + sinc * vy) * dt
 
 
@@ -277,7 +277,7 @@ def _turn_and_shift(
     sine: float,
     versine: float,
 ) -> Moved:
-    """Shifts a place, and turns its heading by an angle with this sine and 1 - cosine."""
+    """Shifts a pose and rotates its heading by an angle, given its sine and 1 - cosine."""
     x = x + (c * ahead - s * left)
     y = y + (s * ahead + c * left)
     return x, y, c - (c * versine + s * sine), s - (s * versine - c * sine)

@@ -41,7 +41,7 @@ class Textbook:
     """Textbook kinematics of a robot."""
 
     twist: Callable[[Array], Array]  # body twist (..., 3) for a state (..., S)
-    target: Callable[[Array], Array]  # state (..., S) that a command (..., C) requests
+    target: Callable[[Array], Array]  # state (..., S) to which a command (..., C) tends
     lag: Array  # (S,) time constants of first-order actuators [s]
     rate: Array  # (S,) maximum rates of actuators [their unit/s]; inf for first-order ones
     # Terms that may occur (products of states), by component of the twist
@@ -54,7 +54,7 @@ class Textbook:
         return self.twist(self.target(command))
 
     def respond(self, state: Array, goal: Array, t: Array | float) -> Array:
-        """Returns the exact state (..., S) at time t [s] on its way from `state` to `goal`."""
+        """Returns the exact state (..., S) at time t [s] from `state` to `goal`."""
         gap = state - goal
         rate = np.where(self.limited, self.rate, 0)
         ramp = np.sign(gap) * np.maximum(np.abs(gap) - rate * t, 0)
@@ -88,7 +88,7 @@ class Wheel:
 
 @dataclass(frozen=True)
 class Drawing:
-    """Looks of a robot: its body and its wheels."""
+    """Appearance of a robot: its body and its wheels."""
 
     # length and width of a box, or radius of a cylinder [m]
     body: tuple[float, float] | float
@@ -172,7 +172,7 @@ def textbook(spec: RobotSpec) -> Textbook:
         raise _make_error(
             spec,
             f"need a state of {len(book.lag)} actuators, not {names}; correct "
-            "`state:`, or leave it to the kind.",
+            "`state:`, or remove it to use the kind's.",
         )
     return book
 
@@ -279,7 +279,7 @@ def compute_steady_twist(spec: RobotSpec, command: ArrayLike) -> Array:
 def find_command(spec: RobotSpec, twist: ArrayLike) -> Array:
     """Returns the command (..., C) within its limits that leads to a body twist (..., 3), if any.
 
-    A car that is asked to turn on the spot stands still. Raises ConfigError like
+    A car that should turn on the spot stops instead. Raises ConfigError like
     `compute_steady_twist`.
     """
     twist = np.asarray(twist, dtype=np.float64)
@@ -291,8 +291,9 @@ def find_command(spec: RobotSpec, twist: ArrayLike) -> Array:
         book = find_actuator_kinematics(spec)
         if book.command is None:
             raise ConfigError(
-                f"robot {spec.name!r}: the kind {spec.textbook!r} does not say which "
-                "command leads to a twist; use continuous actions, no planner."
+                f"robot {spec.name!r}: the kind {spec.textbook!r} does not define "
+                "which command leads to a twist; use continuous actions and no "
+                "planner."
             )
         command = book.command(twist)
     return np.clip(command, spec.command_low, spec.command_high)
@@ -319,7 +320,7 @@ def _combine_ends(spec: RobotSpec) -> Array:
 
 
 def describe_overdrive(spec: RobotSpec) -> str | None:
-    """Returns a sentence if commands ask for more than the limits of wheels or steering."""
+    """Returns a sentence if commands exceed the limits of wheels or steering."""
     if not (has_textbook(spec) and spec.state and _has_actuator_state(spec)):
         return None
     targets = textbook(spec).target(_combine_ends(spec))
@@ -329,7 +330,7 @@ def describe_overdrive(spec: RobotSpec) -> str | None:
         high = v.max + LIMIT_TOLERANCE * abs(v.max)
         if not low <= worst <= high:
             return (
-                f"the commands ask for {v.name} at {worst:.3g} {v.unit}, beyond its "
+                f"the commands require {v.name} of {worst:.3g} {v.unit}, beyond its "
                 f"limits {v.min:g} and {v.max:g}; narrow the commands, or widen the "
                 "limits of the state."
             )

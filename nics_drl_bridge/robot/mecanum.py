@@ -1,7 +1,8 @@
 """A robot on four mecanum wheels: front left, front right, rear left, rear right.
 
 Its commands are the body twist: speeds forward and to the left [m/s], and the turn rate [rad/s].
-`base_link` is the centre of the wheels, which stand at `half_length` and `half_width` [m] from it.
+`base_link` is the centre of the wheels, which are at `half_length` and `half_width` [m]
+from it.
 """
 
 import numpy as np

@@ -3,8 +3,8 @@
 Its commands are its body twist, or the speeds of both sides [rad/s]. Its drive converts turn rates
 to wheel speeds by the `track` [m]. Its actual turn rate follows from the `effective_track` [m]: the
 distance between the centres about which its sides turn, which is at least the track (Mandow et al.
-2007). Its four wheels stand at `half_length` and `half_width` [m] from `base_link`, by default half
-a track.
+2007). Its four wheels are at `half_length` and `half_width` [m] from `base_link`, by
+default half a track each.
 """
 
 from nics_drl_bridge.robot import differential

@@ -109,7 +109,7 @@ class StateVariable(Variable):
     """A component of the state. It is measured, `follows` a command, or is part of the `twist`."""
 
     follows: str | None = None  # name of the command that it follows with a lag
-    # the component of the body twist that it is; taken from the pose if nothing measures it
+    # component of the body twist that it equals; taken from the pose if not measured
     twist: PoseRate | None = None
 
     @property
@@ -141,11 +141,12 @@ class CommandVariable(Variable):
 
 
 class RobotSpec(Schema):
-    """Definition of a robot."""
+    """A robot: its state, commands, footprint and parameters."""
 
     name: str  # used in messages and in names of files
     description: str = ""  # one sentence for people who read the file
-    # its kind, whose textbook kinematics make recordings and fill in what a drive did not show
+    # its kind, whose textbook kinematics make recordings and replace what a drive did
+    # not show
     textbook: str | None = None
     # parameters of its kind [m, s], see the kind's module
     parameters: dict[str, float] = Field(default_factory=dict)
@@ -197,7 +198,7 @@ class RobotSpec(Schema):
     def _check_name(self) -> "RobotSpec":
         if any(part in self.name for part in ("/", "\\", "..")):
             raise ValueError(
-                f"name {self.name!r}: it names files, so leave out .., / and \\"
+                f"name {self.name!r}: it is used in file names, so remove .., / and \\"
             )
         return self
 
@@ -206,7 +207,7 @@ class RobotSpec(Schema):
         if not self.footprint_radius <= MAX_RADIUS:
             raise ValueError(
                 f"its footprint reaches {self.footprint_radius:.6g} m from base_link, "
-                f"at most {MAX_RADIUS:g} m can be; lengths are in metres"
+                f"the maximum is {MAX_RADIUS:g} m; lengths are in metres"
             )
         if self.footprint is not None:
             if geometry.has_crossing_edges(np.array(self.footprint)):
@@ -217,8 +218,8 @@ class RobotSpec(Schema):
             radius = self.footprint_radius
             if not math.isclose(reach, radius, rel_tol=1e-6):
                 raise ValueError(
-                    f"footprint reaches {reach:.6g} m from base_link, footprint_radius is "
-                    f"{radius:.6g} m; leave footprint_radius out"
+                    f"footprint reaches {reach:.6g} m from base_link, footprint_radius "
+                    f"is {radius:.6g} m; remove footprint_radius"
                 )
         return self
 
@@ -241,7 +242,7 @@ class RobotSpec(Schema):
     def _check_variables(self) -> "RobotSpec":
         names = self.variable_names
         if len(set(names)) != len(names):
-            raise ValueError("every state and command variable needs a name of its own")
+            raise ValueError("every state and command variable needs a unique name")
         commands = [c.name for c in self.command]
         for v in self.state:
             if v.follows is not None and v.follows not in commands:
@@ -265,8 +266,8 @@ class RobotSpec(Schema):
     def grow_footprint(self, margin: float) -> "RobotSpec":
         """Returns the robot with a footprint that is larger all around by a margin [m].
 
-        With a polygon, `footprint_radius` stays the same because worlds place robots by it. The
-        grown robot is therefore placed wherever the original would be.
+        With a polygon, `footprint_radius` is kept, because worlds use it to place
+        robots; the larger robot is thus placed where the original would be.
         """
         if self.footprint is None:
             radius = self.footprint_radius + margin
@@ -457,8 +458,9 @@ def build_robot(
 ) -> RobotSpec:
     """Builds a robot from a shipped robot's name, the path of a YAML file, or its content.
 
-    With a `kind` instead of `textbook`, everything that the kind knows may be left out: names,
-    units and ranges of commands, state and parameters. `ranges` (minimum, maximum) of recorded
+    With a `kind` instead of `textbook`, all defaults of the kind may be omitted: names,
+        units and ranges of commands, state and parameters. `ranges` (minimum, maximum)
+        of recorded
     commands, by name, are the defaults of their ranges. Raises ConfigError for a faulty definition.
     """
     ranges = ranges or {}
@@ -474,8 +476,8 @@ def build_robot(
         is_recorded = end in ranges.get(c.name, ())  # then the mapping is at fault
         if c.steers and abs(end) > FARTHEST_STEERED and not is_recorded:
             raise ConfigError(
-                f"{source}: key 'command': {c.name} reaches {end:g} rad, and no wheel "
-                "steers so far; angles are in radians."
+                f"{source}: key 'command': {c.name} reaches {end:g} rad, which is no "
+                "steering angle of a wheel; angles are in radians."
             )
     return spec
 

@@ -25,7 +25,7 @@ class TaylorModel:
 
     The commands in X are those in effect, after the input curves. Back-EMF weakens a motor as it
     turns faster. The rate of a state is clipped to its limits; then quadratic drag slows the state,
-    and dry friction draws it to zero, where it sticks.
+    and dry friction reduces it to zero, where it stays.
     """
 
     variables: tuple[str, ...]  # V names of X = [state, command]
@@ -49,7 +49,8 @@ class TaylorModel:
     friction: Array = field(default_factory=lambda: np.zeros(0))
     # (S,) [1 / (unit of the state s)]
     drag: Array = field(default_factory=lambda: np.zeros(0))
-    # (S, C) rate at which a command in effect brakes a state, by its size [1 / (its unit s)]
+    # (S, C) rate at which a command in effect brakes a state, per command magnitude [1
+    # / (its unit s)]
     back_emf: Array = field(default_factory=lambda: np.zeros((0, 0)))
     # (S, 2) minimum and maximum of each state's rate [unit of the state / s]
     limits: Array = field(default_factory=lambda: np.zeros((0, 2)))

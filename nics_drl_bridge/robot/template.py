@@ -1,4 +1,4 @@
-"""Templates: the defaults of a kind of robot, which a robot's file may leave out."""
+"""Templates: defaults of a kind of robot, which a robot's file may omit."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -94,7 +94,7 @@ class Template:
         defaults = {name: round(k * radius, 4) for name, k in self.lengths.items()}
         defaults |= self.parameters
         missing = defaults.keys() - parameters.keys()
-        for name in parameters:  # any name is allowed that does not look misspelt
+        for name in parameters:  # any name is allowed unless it looks misspelt
             if get_close_matches(str(name), missing, 1, MISSPELT_PARAMETER):
                 raise ConfigError(
                     f"robot {data['name']!r}: unknown parameter {name!r}; "

@@ -160,8 +160,8 @@ MISTAKES = {
     "bag replay bag --rate nan": "--rate.*(must be a finite number|Input should be)",
     "world import house.world --start 0 nan 0": "--start nan: must be a finite number",
     # What a policy sees, and where results go.
-    "evaluate differential --lidar hokuyo_ust_10lx --in fast": "needs more than this lidar "
-    "sees: .* in base_link, the scan layout needs .*; use another lidar, or a policy trained for",
+    "evaluate differential --lidar hokuyo_ust_10lx --in fast": "does not suit this "
+    "lidar: .* in base_link, the scan layout needs .*; use another lidar, or a policy trained for",
     "evaluate straight --in fast --out text.txt": "text.txt is a file, not a folder",
     "evaluate straight --backend sim": "--backend 'sim'",
     "evaluate straight random --backend dds --hardware": "one policy at a time",

@@ -31,7 +31,7 @@ def test_a_robots_file_becomes_a_model_and_a_recording_by_a_textbook_drive(tmp_p
     assert done.returncode == 0, done.stderr
     assert done.stdout.endswith("next: nics train --robot mine\n")
     first = " ".join(done.stdout.partition("\n\n")[0].split())
-    assert "the commands ask for" in first
+    assert "the commands require" in first
     assert "beyond its limits -10 and 10" in first
     model = load_model(tmp_path / "mine")
     assert model.lidar.mount == (0.05, 0.0, 0.0)

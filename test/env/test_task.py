@@ -69,7 +69,7 @@ def test_a_task_from_a_file_passes_the_checker_and_steps_alike_alone_and_in_a_ve
         ("nowhere.py:Patrol", None, "task 'nowhere.py': no such file"),
         (f"{OWN}:Patrole", None, "has no such Task; did you mean 'Patrol'?"),
         ("cooperative_reaching", {"robots": 2.5}, "robots=2.5: must be a whole number"),
-        ("cooperative_reaching", {"robots": 1}, "a team has at least 2"),
+        ("cooperative_reaching", {"robots": 1}, "a team needs at least 2"),
         ("pursuit_evasion", {"evaders": 0}, "at least 1 each"),
         (
             Navigation(DIRECT, lidar(beams=36)),

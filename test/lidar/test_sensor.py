@@ -118,7 +118,7 @@ def test_a_second_lidar_scans_what_the_exact_scanner_sees_from_its_place(model):
 
 
 def test_its_noise_is_its_own_and_the_same_in_any_batch(model):
-    with pytest.raises(ConfigError, match="another has that name"):
+    with pytest.raises(ConfigError, match="the name or frame is already in use"):
         replace(model, sensors=(rear(), rear()))
     other = FurtherLidar(name="other", lidar=rear(noise_std=0.05, frame="other").lidar)
     noisy = replace(model, sensors=(rear(noise_std=0.05), other))
@@ -200,7 +200,7 @@ def test_what_is_no_sensor_is_refused(given, named):
 
 
 def test_a_task_that_observes_no_sensors_refuses_them(model):
-    with pytest.raises(BridgeError, match="does not observe further sensors"):
+    with pytest.raises(BridgeError, match="does not observe additional sensors"):
         make_task("cooperative_reaching", model, {"sensors": ["rear"]})
     with pytest.raises(ConfigError, match=r"no sensor 'raer'.*rear"):
         make_task("navigation", model, {"sensors": ["raer"]})

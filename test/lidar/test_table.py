@@ -162,7 +162,7 @@ def test_a_hostile_array_is_refused_although_its_checksum_is_right(folder, conte
     ("change", "reason"),
     [
         (lambda t: {"format": "nics_drl_bridge/lidar_table/3"}, "its format is not"),
-        (lambda t: {"rows": t.rows[:-1]}, "a row lies outside"),
+        (lambda t: {"rows": t.rows[:-1]}, "a row is outside"),
         (
             lambda t: {"rows": t.rows.astype(np.float64)},
             "an array has another number type",
@@ -172,7 +172,7 @@ def test_a_hostile_array_is_refused_although_its_checksum_is_right(folder, conte
         (lambda t: {"cell": t.cell * np.int16(30)}, "a "),
         (
             lambda t: {"cell": np.where(np.arange(6) == 3, np.int16(-9), t.cell)},
-            "a cell names a corner",
+            "a cell refers to a corner",
         ),
         (lambda t: {"grid": t.grid[0]}, "the grid"),
         (lambda t: {"grid": t.grid * np.nan}, "the grid"),

@@ -122,7 +122,7 @@ def test_an_estimate_is_written_exactly(bag, tmp_path):
                 ]
             },
             {"pose": "/pose"},
-            "of two clocks",
+            "from two clocks",
         ),
         ({}, {"pose": "/mocap"}, "has no topic '/mocap'"),
         ({}, {"odom": "/pose"}, "odom needs messages of nav_msgs/msg/Odometry"),

@@ -1,1 +1,1 @@
-"""The tasks that are shipped, one robot or a team each."""
+"""The shipped tasks, each for one robot or a team."""

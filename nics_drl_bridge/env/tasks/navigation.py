@@ -1,4 +1,4 @@
-"""The paper's task: navigation to a goal by lidar, without touching anything (Sec. VI-B)."""
+"""The paper's task: lidar navigation to a goal without contact (Sec. VI-B)."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -24,7 +24,7 @@ from nics_drl_bridge.env.task import (
 from nics_drl_bridge.interface import Array, RobotView
 from nics_drl_bridge.kernels import bind, pack
 
-# rewards in the order of `kernels.navigate`, whose last row is none
+# rewards in the order of `kernels.navigate`, whose last row is not a reward
 TERMS = ("progress", "time", "success", "collision")
 
 
@@ -70,8 +70,8 @@ class Navigation(Task):
 
     ## Episode End
 
-    The robot is within 0.3 m of the goal, or something touches its footprint, judged by the robot's
-    own estimate and scan. A contact at the goal is not a success.
+    The robot is within 0.3 m of the goal, or something touches its footprint, according
+    to the robot's own estimate and scan. A contact at the goal is not a success.
     """
 
     keeps_last_scan: ClassVar[bool] = False
@@ -139,7 +139,7 @@ class Navigation(Task):
         return Outcome(dict(zip(TERMS, terms, strict=False)), flags[3], facts)
 
     def bind(self, before: Array, view: RobotView) -> BoundStep | None:
-        """Binds steps to a view; see `Task.bind`. There are none with further sensors."""
+        """Binds steps to a view; see `Task.bind`. Returns None if there are additional sensors."""
         if self.sensors:
             return None
         observation = np.empty(self.observation_space.shape, np.float32)
@@ -184,7 +184,7 @@ class Navigation(Task):
         memory: Memory,
         out: Observation | None = None,
     ) -> tuple[Observation, Array, Flags]:
-        """Returns what `kernels.navigate` writes; the observation is `out` if given."""
+        """Returns the results of `kernels.navigate`; written to `out` if given."""
         lead = now.pose.shape[:-1]
         terms = np.empty((5, *lead))
         flags = np.empty((4, *lead), np.bool_)

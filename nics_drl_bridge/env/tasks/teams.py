@@ -56,7 +56,7 @@ def join_parts(*parts: NDArray[Any]) -> Observation:
 
 @dataclass(frozen=True)
 class CooperativeReaching(Task):
-    """M robots have to reach M goals; a goal counts for all once any robot has reached it.
+    """M robots have to reach M goals; a goal is done once any robot has reached it.
 
     ## Observation Space
 
@@ -89,8 +89,9 @@ class CooperativeReaching(Task):
 
     ## Episode End
 
-    A robot ends when it touches something; it then stands still as another obstacle. All robots end
-    when the last goal is reached, that is, when a robot is within `goal_radius` [m] of it.
+    A robot's episode ends when it touches something; it then stops and remains as an
+    obstacle. All robots end when the last goal is reached, that is, when a robot is
+    within `goal_radius` [m] of it.
     """
 
     keeps_last_scan: ClassVar[bool] = False
@@ -108,7 +109,7 @@ class CooperativeReaching(Task):
         self.check_above_zero("goal_radius", self.goal_radius)
         if self.robots < 2:
             raise ConfigError(
-                f"task option robots={self.robots}: a team has at least 2."
+                f"task option robots={self.robots}: a team needs at least 2."
             )
 
     @cached_property
@@ -183,7 +184,7 @@ class CooperativeReaching(Task):
 
 @dataclass(frozen=True)
 class PursuitEvasion(Task):
-    """P pursuers have to get close to E evaders, which have to keep away; all robots are equal.
+    """P pursuers have to get close to E evaders, which have to escape; all robots are alike.
 
     The first P of the M = P + E robots pursue.
 
@@ -221,9 +222,10 @@ class PursuitEvasion(Task):
 
     ## Episode End
 
-    An evader ends when the free space between it and a pursuer is below `capture_gap` [m]. Any
-    robot ends when it touches something else; it then stands still as another obstacle. All end
-    when all evaders, or all pursuers, are out. The pursuers succeed when every evader is caught.
+    An evader is out when the free space between it and a pursuer is below `capture_gap`
+    [m]. Any robot is out when it touches something else; it then stops and remains as
+    an obstacle. All robots end when all evaders, or all pursuers, are out. The pursuers
+    succeed when every evader is caught.
     """
 
     keeps_last_scan: ClassVar[bool] = False
@@ -278,7 +280,7 @@ class PursuitEvasion(Task):
         memory["out"] |= caught | self._find_collided(after, memory)
 
     def _find_gaps(self, view: RobotView, memory: Memory) -> Array:
-        """Returns distances (..., M) [m] to the nearest active robot of the other side, or inf."""
+        """Returns distances (..., M) [m] to the nearest active opponent, or inf."""
         distances = find_distances(view.pose, view.pose[..., :2])
         is_active = ~memory["out"][..., None, :]
         is_foe = (self.pursues[:, None] != self.pursues) & is_active
@@ -302,7 +304,7 @@ class PursuitEvasion(Task):
 
     def reward(self, before: RobotView, after: RobotView, memory: Memory) -> Terms:
         """Returns the reward terms (..., M)."""
-        # Evaders caught in this step still count in it.
+        # Evaders caught in this step still count in this step.
         known = dict(memory)
         known["out"] = memory["out"] & ~memory["newly"]
         gap_before = self._find_gaps(before, known)

@@ -102,7 +102,7 @@ class Contract(Schema):
     format: Literal["nics_drl_bridge/policy/1"]
     robot: RobotSpec
     lidar: LidarSpec
-    # sectors of the observed scan; None: the beams of this very lidar
+    # sectors of the observed scan; None: the beams of exactly this lidar
     scan: ScanLayout | None
     sensors: tuple[AnySensor, ...] = ()  # additional sensors that the policy observes
     task: TaskEntry
@@ -111,7 +111,7 @@ class Contract(Schema):
     state: StateEntry | None = None
     # maximum number of observations per run; None: no maximum
     batch: Literal[1] | None = None
-    # a foreign network between numpy functions: the meaning of its inputs and outputs, see
+    # foreign network: the meaning of its inputs and outputs, see
     # `extras.foreign_policies`
     foreign: dict[str, Any] | None = None
     actions: Literal["continuous", "discrete"]

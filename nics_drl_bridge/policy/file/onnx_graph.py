@@ -19,7 +19,7 @@ SEAL = "sha256"  # key of the metadata entry at the file's end: the checksum of 
 SIZE_LIMIT = 32 * 2**20
 # maximum size of the contract [bytes], mostly golden observations
 CONTRACT_LIMIT = 4 * 2**20
-# maximum number of observations per run; a file is first opened with as many, see `rehearsal`
+# maximum number of observations per run; `rehearsal` checks files with this number
 MOST_ROWS = 256
 # maximum number of operators; a shipped policy has 30, and the time to open a graph grows faster
 # than their number
@@ -141,7 +141,7 @@ def check_seal(data: bytes, source: str) -> None:
     seal = add_seal(b"")
     mark = seal[: -len(hash_bytes(b""))]
     if not data[-len(seal) :].startswith(mark):
-        reason = "does not end with the checksum of a policy file, so it is none or truncated"
+        reason = "does not end with the checksum of a policy file; it is another file or truncated"
         raise PolicyError(source, "file", f"{reason}; export or copy it again.")
     if data != add_seal(data[: -len(seal)]):
         raise PolicyError(
@@ -234,7 +234,7 @@ def _list_tensors(graph: Any) -> Iterator[Any]:
 
 
 def list_inputs(model: Any) -> list[Any]:
-    """Returns the inputs of a graph that are no weights, as onnx.ValueInfoProto."""
+    """Returns the inputs of a graph other than weights, as onnx.ValueInfoProto."""
     weights = {tensor.name for tensor in model.graph.initializer}
     return [value for value in model.graph.input if value.name not in weights]
 
@@ -246,7 +246,7 @@ def has_open_rows(model: Any) -> bool:
 
 
 def fix_rows(model: Any, rows: int) -> Any:
-    """Returns a model for `rows` observations at once, without the shapes that it states itself."""
+    """Returns a model for `rows` observations at once, without its own shape annotations."""
     bare = onnx.ModelProto()
     bare.CopyFrom(model)
     del bare.graph.value_info[:]
@@ -262,7 +262,8 @@ def fix_rows(model: Any, rows: int) -> Any:
 def check_sizes(model: Any, source: str) -> None:
     """Raises PolicyError for sizes that depend on the observation, or divisions of integers.
 
-    The inputs have known shapes, and what depends on these alone is folded already.
+    The inputs have known shapes, and everything that depends only on these is already
+    folded.
     """
     try:
         graph = onnx.shape_inference.infer_shapes(

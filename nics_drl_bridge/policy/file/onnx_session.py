@@ -16,11 +16,11 @@ Rows = NDArray[np.float32]
 
 
 def check_network(data: bytes, source: str, runs: bool) -> None:
-    """Checks the form of a network; if it `runs`, also its sizes, and runs it on zeros.
+    """Checks the form of a network, and if it `runs`, also its sizes by a run on zeros.
 
-    An open first dimension of its inputs is the number of observations, of which as many are run as
-    are ever run at once. The cost of all this is known only afterwards; see `rehearsal`. Raises
-    PolicyError.
+    An open first dimension of its inputs is the number of observations; the run uses
+    the largest number that is ever run at once. The cost cannot be predicted; see
+    `rehearsal`. Raises PolicyError.
     """
     model = onnx_graph.parse(data, source)
     onnx_graph.check_graph(model, source)
@@ -28,8 +28,9 @@ def check_network(data: bytes, source: str, runs: bool) -> None:
         return
     fixed = onnx_graph.fix_rows(model, onnx_graph.MOST_ROWS)
     checked = fixed
-    # With a number of rows that stays open, nothing that depends on it may be folded: it would be
-    # checked for this number alone. Else onnxruntime computes all that does not depend on values.
+    # If the number of rows is open, nothing that depends on it may be folded, because
+    # the check would hold only for this number. Otherwise onnxruntime precomputes
+    # everything that does not depend on values.
     if not onnx_graph.has_open_rows(model):
         with TemporaryDirectory() as folder:
             file = Path(folder) / "folded.onnx"
@@ -48,7 +49,7 @@ def check_network(data: bytes, source: str, runs: bool) -> None:
 def open_session(data: bytes, source: str, folded: Path | None = None) -> Any:
     """Opens a session on one thread. Raises ConfigError without onnxruntime, or PolicyError.
 
-    `folded` is a file for the graph after the optimisations that keep its operators.
+    `folded` is a file to which the graph is written after constant folding.
     """
     try:
         import onnxruntime

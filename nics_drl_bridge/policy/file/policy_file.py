@@ -160,7 +160,7 @@ class PolicyFile:
             try:
                 plan_of(lidar, self.contract.scan)
             except ConfigError as error:
-                reason = f"needs more than this lidar sees: {error.reason}"
+                reason = f"does not suit this lidar: {error.reason}"
                 raise PolicyError(
                     str(self.path),
                     "scan",

@@ -1,9 +1,9 @@
 """Opens a policy's network first in a separate process with limited memory and time.
 
 The cost of parsing a graph, inferring its shapes and preparing it can't be predicted: a few
-hundred kilobytes can request gigabytes. So foreign content is first opened where it can do no
-harm, and opened here only if that succeeds. Files are remembered by content, so each costs a
-fraction of a second once per process.
+hundred kilobytes can request gigabytes. Foreign content is therefore opened in another
+process first, where it can do no harm. Checked files are remembered by content, so each
+costs a fraction of a second once per process.
 """
 
 import json
@@ -29,7 +29,7 @@ _remembered: dict[str, None] = {}
 
 
 def rehearse(data: bytes, source: str, runs: bool = True) -> None:
-    """Does `onnx_session.check_network` in another process. Raises PolicyError."""
+    """Runs `onnx_session.check_network` in another process. Raises PolicyError."""
     digest = _hash_request(data, runs)
     if digest in _remembered:
         return
@@ -40,7 +40,7 @@ def rehearse(data: bytes, source: str, runs: bool = True) -> None:
 
 
 def remember(data: bytes) -> None:
-    """Marks a policy file as rehearsed: this process made its graph, or rehearsed its parts."""
+    """Marks a policy file as checked: this process made its graph, or checked its parts."""
     _remember(_hash_request(data, runs=True))
 
 

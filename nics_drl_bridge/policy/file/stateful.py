@@ -64,8 +64,8 @@ class Stateful:
             self._state = np.tile(self._start, (*lead, 1))
         if self._state.shape[:-1] != lead:
             raise ConfigError(
-                f"the state is of {self._state.shape[:-1]} worlds, the observations of {lead}; "
-                "reset the policy when episodes begin."
+                f"the state has {self._state.shape[:-1]} worlds, the observations "
+                f"{lead}; reset the policy when episodes begin."
             )
         action, self._state = self._step(observation, self._state)
         return action

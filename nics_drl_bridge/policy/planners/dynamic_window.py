@@ -33,8 +33,8 @@ STEP = 1.5
 class DynamicWindow:
     """The dynamic-window approach (Fox, Burgard, Thrun 1997).
 
-    Path lengths to the goal lead around visible obstacles (Brock, Khatib 1999). Raises ConfigError
-    if the robot's twists are unknown, see `compute_steady_twist`.
+    Path lengths to the goal are measured around visible obstacles (Brock, Khatib 1999).
+    Raises ConfigError if the robot's twists are unknown, see `compute_steady_twist`.
     """
 
     task: Navigation
@@ -67,7 +67,7 @@ class DynamicWindow:
 
     @cached_property
     def ahead(self) -> LookAhead:
-        """How far to look ahead, and how the robot brakes."""
+        """Parameters of the look-ahead and of braking."""
         lags = self.task.robot.parameters.items()
         lag = max((value for name, value in lags if name.endswith("_lag")), default=0.0)
         if self.model is None:
@@ -95,7 +95,8 @@ class DynamicWindow:
         if braking.turn is not None:
             turn_reaction = held + round(braking.turn.reaction_s, 2)
             turn_slowness = 1.0 / braking.turn.deceleration
-        # Look ahead for as long as the robot needs to stop, but only over ground that it sees.
+        # Look ahead for as long as the robot needs to stop, but only within the
+        # observed area.
         step = STEP * period
         slowest = float(braking.mean_time_s(self.twists).max()) - braking.reaction_s
         count = max(STEPS, math.ceil((reaction + slowest) / step))

@@ -8,9 +8,9 @@ from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.arrays import Integers
 from nics_drl_bridge.policy.planners import local_map_kernels as maps
 
-# Weights of the terms in the cost of a twist: of the path length left to the goal [1/m], of the
-# heading error, which is 0 towards the goal and 1 away from it, of the nearest obstacle on the
-# path, which is 0 far away and 1 at the margin, and of the time until a contact
+# Weights in the cost of a twist: remaining path length [1/m]; heading error, from 0
+# towards the goal to 1 away from it; nearest obstacle on the path, from 0 far away to 1
+# at the margin; and time until a contact
 WAY_WEIGHT = 1.0
 AIM_WEIGHT = 0.6
 CLEARANCE_WEIGHT = 0.3
@@ -27,7 +27,7 @@ class LookAhead(NamedTuple):
     period: float  # time step [s]
     steps: int
     reaction: float  # time from a stop command to the start of braking [s]
-    slowness: float  # inverse of the deceleration then [s^2/m]
+    slowness: float  # inverse of the braking deceleration [s^2/m]
     lever: float  # factor that converts a turn rate to the speed it adds to braking [m]
     # reaction time of a turn that brakes independently of the speed, else 0 [s]
     turn_reaction: float
@@ -64,8 +64,8 @@ def choose_twists(
                 moves |= candidates[k, i] != 0.0
                 far |= abs(candidates[k, i] - twist[i]) > ahead.reach[i]
             cost = find_cost(around, candidates[k], twist, ahead)
-            # If braking takes time, the cost starts from the present twist, so every twist is
-            # allowed.
+            # If braking takes time, the cost starts from the current twist, so every
+            # twist is allowed.
             cost += 1e6 if far and not brakes else 0.0
             cost += 1e6 if late and moves else 0.0
             if cost < least:
@@ -79,7 +79,8 @@ def find_cost(
 ) -> float:
     """Returns the cost of holding a twist (3,), inadmissible if it hits something before stopping.
 
-    If braking takes time, the robot starts from its present twist (3,), which may be faster.
+    If braking takes time, the robot starts from its current twist (3,), which may be
+    faster.
     """
     period = ahead.period
     steps = ahead.steps

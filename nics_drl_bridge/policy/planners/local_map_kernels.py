@@ -19,7 +19,7 @@ ARRIVED_M = 0.15
 APART_M = 0.02  # hits closer than this to the previous one are left out
 COARSE = 2  # side of a cell of `ways`, in cells of `distances`
 BLOCKED, NEAR = 30.0, 3.0
-"""Extra cost per metre where the robot can't stand, and next to such cells."""
+"""Additional cost per metre where the robot does not fit, and next to such cells."""
 AHEAD_M = 0.3  # distance ahead at which a heading is judged
 ROUNDS, SETTLED_M = 6, 0.02
 """Maximum number of sweep rounds, and change of a path length below which it has converged [m]."""
@@ -60,7 +60,7 @@ class Clearance(NamedTuple):
 
 
 class Situation(NamedTuple):
-    """A robot that has to keep clear of obstacles, its goal, and the map of its latest scan."""
+    """A robot that avoids obstacles, its goal, and the map of its latest scan."""
 
     rays: ScanRays
     outline: FootprintDiscs
@@ -85,7 +85,8 @@ def map_scan(shares: Array, goal: Array, around: Situation) -> None:
 def find_hits(hits: Array, shares: Array, rays: ScanRays) -> int:
     """Writes end points of range fractions (P,) into hits (P, 2) [m]; returns their number.
 
-    Fractions of 0 are left out: they are unknown, or too close to tell from the robot itself.
+    Fractions of 0 are left out: they are unknown, or too close to distinguish from the
+        robot itself.
     """
     count = 0
     for p in range(len(shares)):

@@ -77,7 +77,7 @@ class Mppi:
 
     @cached_property
     def _free(self) -> list[tuple[Situation, RollOuts]]:
-        return []  # memory that no thread is using
+        return []  # memory not in use by any thread
 
     @cached_property
     def _outline(self) -> FootprintDiscs:
@@ -155,7 +155,7 @@ class Mppi:
         latency = float(model.delays.max(initial=0.0))
         if self.model is not None:
             latency += max(0.0, self.model.calibration.command_latency_s)
-        # The shortest lag, of a state that decays by itself, decides on the step.
+        # The shortest lag of a decaying state determines the step.
         decays = (terms.dof >= 3) & (terms.degree == 1)
         decays &= terms.factors[:, 0] == terms.dof - 3
         fastest = np.abs(terms.coefficient[decays]).max(initial=0.0)

@@ -17,15 +17,16 @@ from nics_drl_bridge.robot.kernels import Terms, advance, apply_curve, rates, ru
 
 SPREADS = (0.4, 0.2)  # standard deviation of the noise in the rounds after the first
 TEMPERATURE = 0.05  # of the weights of rollouts, as a path length [m]
-# Weights of the terms in the cost of a rollout: of driving all of it at the margin [m], of the mean
-# path length to the goal, where that at the end has the rest of 1, of the squared change of actions
-# between knots [m], and of a final heading that leads away from the goal [m]
+# Weights in the cost of a rollout: driving all of it at the margin [m]; the mean path
+# length to the goal (the final one has the complementary weight); squared changes of
+# actions between knots [m]; and a final heading away from the goal [m]
 NEAR = 4.0
 EARLY = 0.3
 CHANGE = 0.02
 ASTRAY = 0.2
 HIT = 1e3  # cost of an immediate contact; later ones cost less
-# multiple of the range from which proposals are drawn before clamping, so many lie at its ends
+# proposals are drawn from this multiple of the range and clamped, so that many are
+# extreme
 BEYOND = 1.3
 # passes over the commands when fitting them to a twist
 PASSES = 12
@@ -69,7 +70,7 @@ class RollOuts(NamedTuple):
     dq: Array  # (3 + S, K)
     actions: Array  # (K, Q, C)
     nominal: Array  # (Q, C)
-    held: Array  # (C,) held command that explains the present twist
+    held: Array  # (C,) held command that explains the current twist
     x_single: Array  # (S + C + 1,) of one robot
     rate: Array  # (3 + S,)
     start: Array  # (3,)
@@ -240,7 +241,7 @@ def _roll_out(
 
 @kernel
 def _begin(plant: Plant, lanes: RollOuts) -> None:
-    """Puts all lanes at the start; begins their costs with the changes of action between knots."""
+    """Puts all lanes at the start; initialises their costs with the changes between knots."""
     states, count = plant.settled.shape
     x = lanes.start[0]
     y = lanes.start[1]
@@ -276,7 +277,7 @@ def _add_cost(
     sampling: Sampling,
     lanes: RollOuts,
 ) -> None:
-    """Adds the cost of period t in lane k: of the way and of contacts, or of those in a stop."""
+    """Adds the cost of period t in lane k: path length and contacts, or contacts while stopping."""
     periods = len(sampling.between)
     x = lanes.pose[0, k]
     y = lanes.pose[1, k]

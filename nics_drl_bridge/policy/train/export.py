@@ -145,7 +145,9 @@ def export_policy(
     )
     onnx.helper.set_model_props(graph, {onnx_graph.KEY: text})
     data = onnx_graph.add_seal(graph.SerializeToString(deterministic=True))
-    check_network(data, str(file), runs=True)  # here: this process made the network
+    check_network(
+        data, str(file), runs=True
+    )  # not in another process, because this one made the network
     rehearsal.remember(data)
     policy = policy_file.policy_of(data, file)
     write_bytes(file, data)

@@ -35,7 +35,7 @@ class Transitions(NamedTuple):
     """R transitions, step by step: arrays for the kernels, tensors elsewhere."""
 
     observations: Any  # (R, O) normalised observations
-    # (R, C), or indices of discrete ones: (R,), for the kernels (R, 1) and single
+    # (R, C), or indices of discrete actions: (R,), or (R, 1) float32 for the kernels
     actions: Any
     log_probs: Any  # (R,) of the actions when they were drawn
     advantages: Any  # (R,)

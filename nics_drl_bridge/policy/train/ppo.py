@@ -1,10 +1,11 @@
 """The lean engine: PPO that collects on one core while it learns on another.
 
-Proximal policy optimisation (Schulman and others 2017) with the loss of Stable-Baselines3. The
-learner's data are collected with weights one update older; PPO's ratio accounts for that, because
-the probabilities at the time of drawing are kept. Collecting and learning synchronise after each
-rollout, so results do not depend on which of them is faster. If collecting finishes first, actor
-and critic learn on one core each for the rest of the update.
+Proximal policy optimisation (Schulman and others 2017) with the loss of
+Stable-Baselines3. The data are collected with weights that are one update old. PPO's
+ratio accounts for this, because it uses the probabilities at the time of drawing.
+Collecting and learning synchronise after each rollout, so results do not depend on
+which of them is faster. If collecting finishes first, actor and critic learn on one
+core each for the rest of the update.
 """
 
 from __future__ import annotations

@@ -181,7 +181,7 @@ def check_same(old: dict[str, Any], new: dict[str, Any], path: Path) -> None:
         or "seed" not in old
     ):
         raise ConfigError(
-            f"{path}: does not say which training it belongs to; train again."
+            f"{path}: does not record which training it belongs to; train again."
         )
     for key, value in new["settings"].items():
         then = old["settings"].get(key)
@@ -405,7 +405,8 @@ def seeds_of(out: Path) -> list[int]:
 def read_run_settings(out: Path, task: str | None = None) -> TrainingSettings:
     """Reads the settings of an existing run. Raises ConfigError if there is none.
 
-    If the run trains a user's task, `task` must name it again: a folder never starts a program.
+    If the run trains a user's task, `task` must name it again: a folder never runs
+    code.
     """
     if not (out / SETTINGS).is_file():
         raise ConfigError(

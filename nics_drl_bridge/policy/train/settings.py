@@ -1,4 +1,4 @@
-"""Settings of a training: task, worlds, algorithm, duration, and what fits a robot's pace."""
+"""Training settings: task, worlds, algorithm, duration, and their fit to a robot."""
 
 from __future__ import annotations
 
@@ -162,7 +162,7 @@ class TrainingSettings(Schema):
 def load_training(name: str | Path, task: str | None = None) -> TrainingSettings:
     """Loads settings by the name of a shipped file, or by path. Raises ConfigError.
 
-    A user's task is a program. A file may name the task it is for, but only a `task` named by the
+    A user's task is code. A file may name its task, but only a `task` named by the
     caller is run; it replaces the file's.
     """
     return read_settings(find_config(name, "training"), task)
@@ -172,7 +172,7 @@ def read_settings(path: Path, task: str | None) -> TrainingSettings:
     """Reads settings from a file, with the caller's own task if given; see `load_training`."""
     settings = load_yaml(path, TrainingSettings)
     if is_code(settings.task) and not (task is not None and is_code(task)):
-        reason = "is a program, which a data file must not start"
+        reason = "is code, which a data file must not run"
         raise ConfigError(
             f"{path}: key 'task' {settings.task!r}: {reason}; name it yourself: --task "
             "path/to/file.py:ClassName, or task= in Python."
@@ -354,7 +354,7 @@ def fit_settings(settings: TrainingSettings, opened: Opened, inherited: bool) ->
             f"{pace.far:g} m at {pace.speed:g} m/s"
         )
         if inherited and pace.steps > defaults.EPISODE_STEPS:
-            # The episodes are so many times as long as those of the other robot.
+            # Episodes are longer than the other robot's by this factor.
             factor = pace.steps / defaults.EPISODE_STEPS
             reward = options.get("time_reward")
             if reward:
