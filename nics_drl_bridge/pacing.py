@@ -68,7 +68,7 @@ class RealTime:
 
 @dataclass
 class ActionPace:
-    """Allows at most one action per period, as soon as data arrive; a period of 0 allows all."""
+    """Allows at most one action per period, as soon as data arrive; a period of 0 has no limit."""
 
     period_s: float
     due_s: float = -math.inf  # time of the next action
