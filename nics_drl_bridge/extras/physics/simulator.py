@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from nics_drl_bridge import defaults, geometry
 from nics_drl_bridge.errors import BackendError, ConfigError
+from nics_drl_bridge.extras.physics.driven import DrivenSimulator
 from nics_drl_bridge.extras.physics.machines import Machine, Physics
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import Array
@@ -20,7 +21,6 @@ from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.recording.textbook import HOLD_S, ROW_S
 from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.robot.spec import RobotSpec
-from nics_drl_bridge.sim.device import DrivenSimulator
 from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.scenes import Scenes
 from nics_drl_bridge.sim.simulator import FastSimulator, Starts
