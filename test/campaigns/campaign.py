@@ -95,6 +95,16 @@ CAMPAIGNS: dict[str, Campaign] = {
         },
         ROS,
     ),
+    "barn_in_dart": Campaign(
+        "--every 50 --poses 4",
+        {
+            "moved": Control(
+                "the place: this package's worlds are moved by 5 cm",
+                "beams within 1 cm",
+            )
+        },
+        ("dartpy",),
+    ),
     "damaged_input": Campaign(
         "--rounds 40 --seed 5",
         {
@@ -379,6 +389,21 @@ CAMPAIGNS: dict[str, Campaign] = {
             )
         },
         FILES,
+    ),
+    "transfer": Campaign(
+        "--episodes 2 --robots differential --engines fast,mujoco,dart",
+        {
+            "standing": Control(
+                "the driving: the policy stands still", "success in the fast simulator"
+            ),
+            "ice": Control(
+                "the grip of the tyres: the floor of the engines is ice",
+                "points of success apart",
+                "--episodes 10 --robots differential --engines fast,dart",
+            ),
+        },
+        ("mujoco", "dartpy"),
+        timeout_s=1200.0,
     ),
     "unknown_robot": Campaign(
         "--goals 10",
