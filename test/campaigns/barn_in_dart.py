@@ -30,7 +30,11 @@ CYLINDER = """
       <static>1</static>
       <pose>{x:.6f} {y:.6f} 0 0 0 0</pose>
       <link name="link">
-        <inertial><mass>1</mass></inertial>
+        <inertial>
+          <mass>1</mass>
+          <inertia><ixx>0.1</ixx><iyy>0.1</iyy><izz>0.1</izz>
+            <ixy>0</ixy><ixz>0</ixz><iyz>0</iyz></inertia>
+        </inertial>
         <collision name="collision">
           <geometry>
             <cylinder><radius>{radius}</radius><length>{length}</length></cylinder>

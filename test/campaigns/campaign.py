@@ -235,6 +235,15 @@ CAMPAIGNS: dict[str, Campaign] = {
         ("rclpy", "nav2_msgs", "nav2"),
         timeout_s=900.0,
     ),
+    "generated": Campaign(
+        "--engines dart --robots differential --train 40 --unseen 15",
+        {
+            "standing": Control(
+                "what was learnt: the model stands still", "error over the path"
+            )
+        },
+        ("mujoco", "dartpy"),
+    ),
     "node_endings": Campaign(
         "--times 2 --loops 0 --nodes middleware_node --phases starting compiling native",
         {

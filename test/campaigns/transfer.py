@@ -90,24 +90,22 @@ def make_simulator(
     engine: str,
     model: SimulatorModel,
     world: AnyWorld,
-    drawn: Randomisation,
-    friction: float | None = None,
+    drawn: Randomisation | None = None,
+    **physics: float,
 ) -> FastSimulator:
-    """Returns an engine's world with one robot. Raises ConfigError if it is not installed."""
+    """Returns an engine's world with one robot, of which some parameters of `Physics` differ.
+
+    Raises ConfigError if the engine is not installed.
+    """
     if engine == "mujoco":
-        physics = change_friction(Physics(), friction)
-        return MujocoSimulator(model, world, physics=physics, randomisation=drawn)
+        changed = replace(Physics(), **physics)
+        return MujocoSimulator(model, world, physics=changed, randomisation=drawn)
     if engine == "dart":
-        physics = change_friction(DART_PHYSICS, friction)
-        return DartSimulator(model, world, physics=physics, randomisation=drawn)
+        changed = replace(DART_PHYSICS, **physics)
+        return DartSimulator(model, world, physics=changed, randomisation=drawn)
     from parts.pybullet_simulator import PHYSICS, PybulletSimulator
 
-    physics = change_friction(PHYSICS, friction)
-    return PybulletSimulator(model, world, physics, drawn)
-
-
-def change_friction(physics: Physics, friction: float | None) -> Physics:
-    return physics if friction is None else replace(physics, friction=friction)
+    return PybulletSimulator(model, world, replace(PHYSICS, **physics), drawn)
 
 
 def find_missing(engine: str) -> str:
@@ -136,8 +134,8 @@ def drive_job(job: Job) -> list[Row]:
     drawn = load_randomisation(job.randomisation)
     backend = SimBackend(model, world, estimator=True, randomisation=drawn)
     if job.engine != FAST:
-        friction = ICE if job.control == "ice" else None
-        backend.simulator = make_simulator(job.engine, model, world, drawn, friction)
+        floor = {"friction": ICE} if job.control == "ice" else {}
+        backend.simulator = make_simulator(job.engine, model, world, drawn, **floor)
     gated = GatedBackend(backend, model, job.robot)
     env, policy = make_env(gated, job.robot, model, world, Conditions())
     if job.control == "standing":
