@@ -95,6 +95,16 @@ CAMPAIGNS: dict[str, Campaign] = {
         },
         ROS,
     ),
+    "barn_in_dart": Campaign(
+        "--every 50 --poses 4",
+        {
+            "moved": Control(
+                "the place: this package's worlds are moved by 5 cm",
+                "beams within 1 cm",
+            )
+        },
+        ("dartpy",),
+    ),
     "damaged_input": Campaign(
         "--rounds 40 --seed 5",
         {
@@ -224,6 +234,15 @@ CAMPAIGNS: dict[str, Campaign] = {
         },
         ("rclpy", "nav2_msgs", "nav2"),
         timeout_s=900.0,
+    ),
+    "generated": Campaign(
+        "--engines dart --robots differential --train 40 --unseen 15",
+        {
+            "standing": Control(
+                "what was learnt: the model stands still", "error over the path"
+            )
+        },
+        ("mujoco", "dartpy"),
     ),
     "node_endings": Campaign(
         "--times 2 --loops 0 --nodes middleware_node --phases starting compiling native",
@@ -379,6 +398,21 @@ CAMPAIGNS: dict[str, Campaign] = {
             )
         },
         FILES,
+    ),
+    "transfer": Campaign(
+        "--episodes 2 --robots differential --engines fast,mujoco,dart",
+        {
+            "standing": Control(
+                "the driving: the policy stands still", "success in the fast simulator"
+            ),
+            "ice": Control(
+                "the grip of the tyres: the floor of the engines is ice",
+                "points of success apart",
+                "--episodes 10 --robots differential --engines fast,dart",
+            ),
+        },
+        ("mujoco", "dartpy"),
+        timeout_s=1200.0,
     ),
     "unknown_robot": Campaign(
         "--goals 10",

@@ -121,3 +121,52 @@ def test_the_shipped_values_keep_room_to_brake_at_all_speeds(module):
     for robot in ("ackermann", "differential", "mecanum"):
         assert 0.8 < braking.braking_used(robot, {}) <= 1.0
     assert braking.braking_used("ackermann", {"latency": 0.17}) > 1.0
+
+
+def drove(engine: str, seed: int, result: str, world: str = "room") -> dict:
+    """A row of the campaign `transfer`."""
+    return {
+        "robot": "rover",
+        "engine": engine,
+        "seed": seed,
+        "world": world,
+        "result": result,
+        "believed": result,
+    }
+
+
+def test_engines_are_compared_by_the_episodes_that_all_have_driven(module):
+    transfer = module("transfer")
+    rows = [drove("fast", seed, "success") for seed in range(5)]
+    rows += [drove("dart", seed, "success") for seed in range(1, 4)]
+    rows += [drove("dart", 4, "collision")]
+    told = transfer.compare_engines(rows, ["rover"], ["fast", "dart"])["rover"]
+    assert told["fast"]["episodes"] == told["dart"]["episodes"] == 4
+    assert told["dart"]["points"] == -25.0
+    assert (told["dart"]["lost"], told["dart"]["gained"]) == (1, 0)
+    missed = transfer.judge({"engines": {"rover": told}})
+    assert [line.split(": ")[0] for line in missed] == ["rover in dart"] * 2
+
+
+def test_failures_are_told_by_place_and_end_the_most_frequent_first(module):
+    transfer = module("transfer")
+    rows = [drove("fast", 0, "success"), drove("fast", 1, "time-out")]
+    rows += [drove("dart", seed, "time-out") for seed in (0, 1)]
+    first, second = transfer.find_clusters(rows)
+    assert (first["engine"], first["failures"], first["seeds"]) == ("dart", 2, [0, 1])
+    assert first["not_in_fast"] == 1
+    assert (second["engine"], second["not_in_fast"]) == ("fast", 0)
+
+
+def test_a_run_goes_on_where_the_file_ends(module, tmp_path):
+    transfer = module("transfer")
+    file = tmp_path / "rows.jsonl"
+    asked = {"worlds": ["room"], "randomisation": "mild", "control": None}
+    transfer.Book(file, asked).add([drove("fast", transfer.FIRST_SEED, "success")])
+    with file.open("a") as torn:
+        torn.write('{"robot": "rov')
+    given = Namespace(episodes=3, robots=["rover"], **asked)
+    (job,) = transfer.plan_jobs(given, ["fast"], transfer.Book(file, asked))
+    assert job.seeds == (transfer.FIRST_SEED + 1, transfer.FIRST_SEED + 2)
+    with pytest.raises(SystemExit, match="another run"):
+        transfer.Book(file, asked | {"control": "ice"})

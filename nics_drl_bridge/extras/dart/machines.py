@@ -9,6 +9,9 @@ import numpy as np
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.extras.dart import scenery
 from nics_drl_bridge.extras.physics.machines import (
+    CASTOR_MASS,
+    PIVOT_INERTIA,
+    PIVOT_MASS,
     ROLLER_MASS,
     Machine,
     Physics,
@@ -20,13 +23,6 @@ from nics_drl_bridge.interface import Array
 
 Z = np.array([0.0, 0.0, 1.0])
 Y = np.array([0.0, 1.0, 0.0])
-SPHERES = 5  # that form a roller; nine take twice the time, and move it the same
-# fraction of a roller's length beyond which its spheres would end in a point
-ROLLER_END = 0.95
-CASTOR_MASS = 0.03  # [kg]
-PIVOT_MASS = 0.02  # of what steers a wheel [kg]
-PIVOT_INERTIA = 1e-4  # [kg m^2]
-ROTOR_INERTIA = 2e-7  # added to a roller's, which is too small to compute with [kg m^2]
 ALIGNED = 0.9  # minimum component of an axle along y, or of a pivot along z
 
 
@@ -130,19 +126,13 @@ class _Builder:
         axle = np.array(roller.axle) / np.linalg.norm(roller.axle)
         name = f"{wheel.getName()}_{wheel.getNumChildBodyNodes()}"
         body = self._add_joint(wheel, name, axle, np.array([x, 0.0, z]))
-        a = roller.across
-        b = roller.along
-        # Each sphere touches the ellipsoid from within.
-        places = np.linspace(-ROLLER_END, ROLLER_END, SPHERES) * (b - a * a / b)
-        radii = a * np.sqrt(1.0 - places**2 / (b * b - a * a))
-        for r, s in zip(radii, places, strict=True):
-            transform = scenery.make_transform(self._dart, s * axle)
-            ball = scenery.add_shape(
-                body, self._dart.dynamics.SphereShape(r), transform
+        for radius, along in zip(*roller.spheres, strict=True):
+            transform = scenery.make_transform(self._dart, along * axle)
+            ball = self._dart.dynamics.SphereShape(radius)
+            scenery.let_touch(
+                scenery.add_shape(body, ball, transform), self._physics.friction
             )
-            scenery.let_touch(ball, self._physics.friction)
-        across = 0.2 * ROLLER_MASS * (a * a + b * b)
-        self._weigh(body, ROLLER_MASS, np.full(3, across + ROTOR_INERTIA))
+        self._weigh(body, ROLLER_MASS, np.full(3, roller.inertia))
 
 
 def _read_skeleton(dart: Any, path: Path) -> Any:

@@ -15,6 +15,8 @@ from nics_drl_bridge.extras.physics.scenery import (
     Box,
     Cylinder,
     Solid,
+    aim_beams,
+    make_scan,
 )
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.lidar.arrays import Singles
@@ -175,16 +177,12 @@ def cast_scan(
     dart: Any, group: Any, lidar: LidarSpec, pose: Array, height: float
 ) -> Singles:
     """Scans (B,) [m], REP-117, from a robot's pose (3,), at a height [m] among a group's shapes."""
-    x, y, heading = geometry.compose(pose, np.array(lidar.mount))
-    start = np.array([x, y, height])
-    ends = np.full((lidar.beams, 3), height)
-    ends[:, :2] = [x, y] + lidar.range_max * geometry.rotate(lidar.directions, heading)
+    start, ends = aim_beams(lidar, pose, height)
     option = dart.collision.RaycastOption()
     result = dart.collision.RaycastResult()
-    ranges = np.full(lidar.beams, np.inf)
+    fractions = np.full(lidar.beams, np.inf)
     for i, end in enumerate(ends):
         result.clear()
         if group.raycast(start, end, option, result):
-            ranges[i] = lidar.range_max * result.mRayHits[0].mFraction
-    ranges[ranges < lidar.range_min] = -np.inf
-    return ranges.astype(np.float32)
+            fractions[i] = result.mRayHits[0].mFraction
+    return make_scan(lidar, fractions)

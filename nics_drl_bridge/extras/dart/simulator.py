@@ -21,30 +21,24 @@ from nics_drl_bridge.extras.physics.scenery import (
 )
 from nics_drl_bridge.extras.physics.simulator import (
     PhysicsRobot,
-    PhysicsSimulator,
+    RayCastingSimulator,
     Reading,
-    Rig,
+    ServoRig,
 )
 from nics_drl_bridge.generator import SimulatorModel, footprint_shape
 from nics_drl_bridge.interface import Array
-from nics_drl_bridge.lidar import fault_kernels
+from nics_drl_bridge.lidar.arrays import Singles
 from nics_drl_bridge.lidar.exact_kernels import RADIUS, SHAPE
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.randomisation import Randomisation
-from nics_drl_bridge.sim.scenes import Scenes
-from nics_drl_bridge.sim.simulator import Starts
 from nics_drl_bridge.sim.world_set import AnyWorld
 
 PHYSICS = Physics(timestep=0.002)
 GRAVITY = 9.81  # [m/s^2]
 
 
-class DartRig(Rig):
-    """Access to one robot in a world of DART, and its motors.
-
-    Motors follow a wanted state with their lag, and hold its speeds while the tyres can. A
-    differential between driven wheels gives each the speed of its own circle.
-    """
+class DartRig(ServoRig):
+    """Access to one robot in a world of DART, and its motors."""
 
     def __init__(
         self,
@@ -55,7 +49,7 @@ class DartRig(Rig):
         body: DartBody,
         physics: Physics,
     ) -> None:
-        super().__init__(spec, machine)
+        super().__init__(spec, machine, physics.timestep)
         self._world = world
         self._skeleton = body.skeleton
         self._height = body.height
@@ -69,16 +63,11 @@ class DartRig(Rig):
             limit = STEERING_TORQUE if name.startswith("steer") else torque
             joint.setForceLowerLimit(0, -limit)
             joint.setForceUpperLimit(0, limit)
-        self._timestep = physics.timestep
-        self._follows = -np.expm1(-physics.timestep / np.array(machine.lags))
-        self._wanted = np.zeros(len(machine.lags))
-        self._followed = np.zeros(len(machine.lags))
 
     def put(self, pose: ArrayLike) -> None:
         """See `Rig`."""
         scenery.place_body(self.base, np.asarray(pose), self._height)
-        self._wanted = np.zeros_like(self._wanted)
-        self._followed = np.zeros_like(self._wanted)
+        self._stop_motors()
 
     def launch(self, twist: Array, state: Array) -> None:
         """See `Rig`."""
@@ -100,21 +89,8 @@ class DartRig(Rig):
         self._skeleton.setPositions(positions)
         self._skeleton.setVelocities(speeds)
 
-    def drive(self, wanted: Array) -> None:
-        """See `Rig`."""
-        self._wanted = wanted
-
-    def turn_wheels(self) -> None:
-        """Sets the speeds of the joints for the next time step."""
-        missing = self._wanted - self._followed
-        self._followed = self._followed + self._follows * missing
-        speeds = self.machine.controls(self._followed)
-        if self.machine.kind == "ackermann":
-            split = self.machine.half_ratio * np.tan(self._followed[1])
-            engine, *angles = speeds
-            turning = (angles - self.encoders()[2:]) / self._timestep
-            wheels = engine * (1.0 - split), engine * (1.0 + split)
-            speeds = np.array([*wheels, *turning])
+    def set_speeds(self, speeds: Array) -> None:
+        """See `ServoRig`."""
         self._skeleton.setCommands(self._joints, speeds)
 
     def read(self) -> Reading:
@@ -178,11 +154,8 @@ class DartRobot(PhysicsRobot):
             self._world.step()
 
 
-class DartSimulator(PhysicsSimulator):
-    """One world of robots in DART, which also casts the lidar's rays; for `file` see DartRobot.
-
-    Scans that are late or skewed are the FastSimulator's, because they need the past.
-    """
+class DartSimulator(RayCastingSimulator):
+    """One world of robots in DART; for `file` see DartRobot."""
 
     def __init__(
         self,
@@ -277,32 +250,9 @@ class DartSimulator(PhysicsSimulator):
             ]
         return bumped
 
-    def step(self, commands: ArrayLike) -> None:
-        """See `PhysicsSimulator`."""
-        super().step(commands)
-        self._scan()
-
-    def reset(
-        self, seeds: ArrayLike, worlds: ArrayLike | None = None, starts: Starts = None
-    ) -> Scenes:
-        """Starts the episode of a seed (1,) at poses (1, M, 3); see `FastSimulator.reset`."""
-        scenes = super().reset(seeds, worlds, starts)
-        self._scan()
-        return scenes
-
-    def _scan(self) -> None:
-        data = self.data
-        lidar = self.model.lidar
-        limits = lidar.range_min, lidar.range_max
-        robots = data.ranges.shape[1]
-        for m, group in enumerate(self._groups):
-            faults = data.faults[0, m]
-            if data.age[0, m] > 0 or faults[fault_kernels.SKEW] != 0.0:
-                continue
-            pose = data.pose[0, m]
-            scan = scenery.cast_scan(
-                self._dart, group, lidar, pose, self._machine.radius
-            )
-            counter = int(data.steps[0]) * robots + m
-            fault_kernels.distort(scan, limits, faults, int(data.seeds[0]), counter)
-            data.ranges[0, m] = scan
+    def cast_scan(self, robot: int) -> Singles:
+        """See `RayCastingSimulator`."""
+        pose = self.data.pose[0, robot]
+        group = self._groups[robot]
+        height = self._machine.radius
+        return scenery.cast_scan(self._dart, group, self.model.lidar, pose, height)

@@ -18,6 +18,13 @@ STEERING_TORQUE = 1.0
 # maximum radius of a roller, relative to the radius of the wheel
 MAX_ROLLER_RADIUS = 0.25
 ROLLER_MASS = 0.005
+SPHERES = 5  # that form a roller; nine take twice the time, and move it the same
+# fraction of a roller's length beyond which its spheres would end in a point
+ROLLER_END = 0.95
+ROTOR_INERTIA = 2e-7  # added to a roller's, which is too small to compute with [kg m^2]
+CASTOR_MASS = 0.03  # [kg]
+PIVOT_MASS = 0.02  # of what steers a wheel [kg]
+PIVOT_INERTIA = 1e-4  # [kg m^2]
 ROLLED = 1.0, 0.9884, 1.0  # measured on rollers under load, in sideways drives
 
 
@@ -226,6 +233,20 @@ class Roller:
     axle: tuple[float, float, float]  # direction in the wheel, not of unit length
     across: float  # semi-axis across the axle [m]
     along: float  # semi-axis along the axle [m]
+
+    @property
+    def spheres(self) -> tuple[Array, Array]:
+        """Radii and places along the axle (SPHERES,) [m] of spheres that touch it from within."""
+        a = self.across
+        b = self.along
+        places = np.linspace(-ROLLER_END, ROLLER_END, SPHERES) * (b - a * a / b)
+        return a * np.sqrt(1.0 - places**2 / (b * b - a * a)), places
+
+    @property
+    def inertia(self) -> float:
+        """About its middle, with the rotor's [kg m^2]."""
+        across = 0.2 * ROLLER_MASS * (self.across**2 + self.along**2)
+        return across + ROTOR_INERTIA
 
 
 def place_rollers(radius: float, rollers: int, lean: int) -> list[Roller]:

@@ -4,10 +4,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.interface import Array
+from nics_drl_bridge.lidar.arrays import Singles
 from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.shapes import (
     Circle,
@@ -16,6 +17,7 @@ from nics_drl_bridge.lidar.shapes import (
     Shape,
     find_convex_hull,
 )
+from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.sim.world import World
 
 HEIGHT = 0.5  # height of walls and obstacles [m]
@@ -91,6 +93,22 @@ def _cut_map(grid: GridMap) -> Iterator[Box]:
         )
         size = (side * (column - first), side * (row - first_row))
         yield Box(middle, grid.origin[2], size)
+
+
+def aim_beams(lidar: LidarSpec, pose: Array, height: float) -> tuple[Array, Array]:
+    """Returns start (3,) and ends (B, 3) of rays at a height, from a robot's pose [m]."""
+    x, y, heading = geometry.compose(pose, np.array(lidar.mount))
+    start = np.array([x, y, height])
+    ends = np.full((lidar.beams, 3), height)
+    ends[:, :2] = [x, y] + lidar.range_max * geometry.rotate(lidar.directions, heading)
+    return start, ends
+
+
+def make_scan(lidar: LidarSpec, fractions: ArrayLike) -> Singles:
+    """Returns ranges (B,) [m], REP-117, of rays that end at fractions (B,); inf: without a hit."""
+    ranges = lidar.range_max * np.asarray(fractions)
+    ranges[ranges < lidar.range_min] = -np.inf
+    return ranges.astype(np.float32)
 
 
 def split_convex(outline: Array) -> list[Array]:

@@ -15,7 +15,8 @@ from nics_drl_bridge.extras.physics.driven import DrivenSimulator
 from nics_drl_bridge.extras.physics.machines import Machine, Physics
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import Array
-from nics_drl_bridge.lidar.arrays import Integers
+from nics_drl_bridge.lidar import fault_kernels
+from nics_drl_bridge.lidar.arrays import Integers, Singles
 from nics_drl_bridge.lidar.scanner import Renderer
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.recording.textbook import HOLD_S, ROW_S
@@ -104,6 +105,45 @@ class Rig(ABC):
             raise BackendError(
                 f"robot {self.spec.name!r} has fallen over {when}; {fix}"
             )
+
+
+class ServoRig(Rig):
+    """A rig whose motors hold speeds while the tyres can, set again before each time step.
+
+    The speeds follow a wanted state with the motors' lags. A differential between driven wheels
+    gives each the speed of its own circle.
+    """
+
+    def __init__(self, spec: RobotSpec, machine: Machine, timestep: float) -> None:
+        super().__init__(spec, machine)
+        self._timestep = timestep
+        self._follows = -np.expm1(-timestep / np.array(machine.lags))
+        self._stop_motors()
+
+    def _stop_motors(self) -> None:
+        self._wanted = np.zeros(len(self.machine.lags))
+        self._followed = np.zeros(len(self.machine.lags))
+
+    @abstractmethod
+    def set_speeds(self, speeds: Array) -> None:
+        """Sets the speeds (J,) of the joints with encoders [rad/s]."""
+
+    def drive(self, wanted: Array) -> None:
+        """See `Rig`."""
+        self._wanted = wanted
+
+    def turn_wheels(self) -> None:
+        """Sets the speeds of the joints for the next time step."""
+        missing = self._wanted - self._followed
+        self._followed = self._followed + self._follows * missing
+        speeds = self.machine.controls(self._followed)
+        if self.machine.kind == "ackermann":
+            split = self.machine.half_ratio * np.tan(self._followed[1])
+            engine, *angles = speeds
+            turning = (angles - self.encoders()[2:]) / self._timestep
+            wheels = engine * (1.0 - split), engine * (1.0 + split)
+            speeds = np.array([*wheels, *turning])
+        self.set_speeds(speeds)
 
 
 class PhysicsRobot(ABC):
@@ -285,6 +325,44 @@ class PhysicsSimulator(DrivenSimulator, ABC):
         physics = self._physics
         noise = self._gyro_noise.standard_normal(len(self._rigs))
         return physics.gyro_bias + physics.gyro_noise * noise
+
+
+class RayCastingSimulator(PhysicsSimulator):
+    """A PhysicsSimulator whose engine also casts the lidar's rays.
+
+    Scans that are late or skewed are the FastSimulator's, because they need the past.
+    """
+
+    @abstractmethod
+    def cast_scan(self, robot: int) -> Singles:
+        """Returns the scan (B,) of a robot from its present pose [m], without noise."""
+
+    def step(self, commands: ArrayLike) -> None:
+        """See `PhysicsSimulator`."""
+        super().step(commands)
+        self._scan()
+
+    def reset(
+        self, seeds: ArrayLike, worlds: ArrayLike | None = None, starts: Starts = None
+    ) -> Scenes:
+        """Starts the episode of a seed (1,) at poses (1, M, 3); see `FastSimulator.reset`."""
+        scenes = super().reset(seeds, worlds, starts)
+        self._scan()
+        return scenes
+
+    def _scan(self) -> None:
+        data = self.data
+        lidar = self.model.lidar
+        limits = lidar.range_min, lidar.range_max
+        robots = data.ranges.shape[1]
+        for m in range(robots):
+            faults = data.faults[0, m]
+            if data.age[0, m] > 0 or faults[fault_kernels.SKEW] != 0.0:
+                continue
+            scan = self.cast_scan(m)
+            counter = int(data.steps[0]) * robots + m
+            fault_kernels.distort(scan, limits, faults, int(data.seeds[0]), counter)
+            data.ranges[0, m] = scan
 
 
 def divide(period: float, longest: float) -> tuple[int, int, float]:

@@ -1,0 +1,327 @@
+"""Whether one policy drives as well in physics engines that nobody here wrote.
+
+The shipped policy of each robot drives the same episodes, seed by seed, in the fast simulator and
+in MuJoCo, DART and PyBullet: the same worlds, starts, goals, lidar, mild randomisation, gate and
+shield, all in process. What counts is where the robot truly ended and whether it truly touched
+something. Of two simulators, McNemar's test tells by the episodes that ended well in one of them
+alone whether they differ by more than chance. PyBullet has a wheel for Python 3.11 alone:
+`pip install pybullet==3.2.7`; without it, the other engines are compared.
+
+`--out FILE` keeps each episode at once, and the next run goes on where an earlier one ended.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import closing
+from dataclasses import asdict, dataclass, replace
+from itertools import product
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from campaign import (
+    Given,
+    Result,
+    at_least,
+    at_most,
+    missed_bars,
+    run_campaign,
+    some_of,
+)
+from measuring.evaluations import Standing
+from measuring.perturbations import open_real_model
+
+from nics_drl_bridge.commands.episodes import Conditions, make_env
+from nics_drl_bridge.env.sim_backend import SimBackend
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.extras.dart.simulator import PHYSICS as DART_PHYSICS
+from nics_drl_bridge.extras.dart.simulator import DartSimulator
+from nics_drl_bridge.extras.mujoco.simulator import MujocoSimulator
+from nics_drl_bridge.extras.physics.machines import Physics
+from nics_drl_bridge.gate.gated_backend import GatedBackend
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.policy.evaluation import compare_pairs, drive, rate
+from nics_drl_bridge.policy.policies import list_shipped_policies, open_policy
+from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
+from nics_drl_bridge.sim.simulator import FastSimulator
+from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
+
+FAST = "fast"
+ENGINES = (FAST, "mujoco", "dart", "pybullet")
+WORLDS = (
+    "arena",
+    "circles",
+    "clutter",
+    "corridor",
+    "crowd",
+    "doorway",
+    "empty",
+    "room",
+)
+RANDOMISATION = "mild"
+FIRST_SEED = 4_000_000
+BLOCK = 10  # episodes that one process drives before it tells
+AT_ONCE = 2
+ICE = 0.02  # friction of tyres on ice
+FAST_SUCCESS = at_least(0.95, "success in the fast simulator")
+APART = at_most(3.0, "points of success apart from the fast simulator")
+COLLISIONS = at_most(0.01, "collisions")
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Job:
+    """Some episodes of a robot in an engine."""
+
+    robot: str
+    engine: str
+    seeds: tuple[int, ...]
+    worlds: tuple[str, ...]
+    randomisation: str
+    control: str | None
+
+
+def make_simulator(
+    engine: str,
+    model: SimulatorModel,
+    world: AnyWorld,
+    drawn: Randomisation | None = None,
+    **physics: float,
+) -> FastSimulator:
+    """Returns an engine's world with one robot, of which some parameters of `Physics` differ.
+
+    Raises ConfigError if the engine is not installed.
+    """
+    if engine == "mujoco":
+        changed = replace(Physics(), **physics)
+        return MujocoSimulator(model, world, physics=changed, randomisation=drawn)
+    if engine == "dart":
+        changed = replace(DART_PHYSICS, **physics)
+        return DartSimulator(model, world, physics=changed, randomisation=drawn)
+    from parts.pybullet_simulator import PHYSICS, PybulletSimulator
+
+    return PybulletSimulator(model, world, replace(PHYSICS, **physics), drawn)
+
+
+def find_missing(engine: str) -> str:
+    """Returns why an engine can't be driven here; nothing if it can."""
+    from parts.pybullet_simulator import load_pybullet
+
+    from nics_drl_bridge.extras.dart.scenery import load_dart
+    from nics_drl_bridge.extras.mujoco.machines import load_mujoco
+
+    load: dict[str, Callable[[], Any]] = {
+        "mujoco": load_mujoco,
+        "dart": load_dart,
+        "pybullet": load_pybullet,
+    }
+    try:
+        load.get(engine, lambda: None)()
+    except ConfigError as error:
+        return str(error)
+    return ""
+
+
+def drive_job(job: Job) -> list[Row]:
+    """Drives the episodes of a job; returns a row for each."""
+    model = open_real_model(job.robot)
+    world = load_worlds(list(job.worlds))
+    drawn = load_randomisation(job.randomisation)
+    backend = SimBackend(model, world, estimator=True, randomisation=drawn)
+    if job.engine != FAST:
+        floor = {"friction": ICE} if job.control == "ice" else {}
+        backend.simulator = make_simulator(job.engine, model, world, drawn, **floor)
+    gated = GatedBackend(backend, model, job.robot)
+    env, policy = make_env(gated, job.robot, model, world, Conditions())
+    if job.control == "standing":
+        policy = Standing(open_policy(job.robot, model)[1])
+    rows = []
+    with closing(env):
+        for seed in job.seeds:
+            episode = drive(env, policy, seed)
+            member = int(backend.simulator.data.member[0])
+            row = {
+                "robot": job.robot,
+                "engine": job.engine,
+                "seed": seed,
+                "world": world.members[member].name,
+                "result": episode.result,
+                "believed": episode.believed,
+                "steps": episode.steps,
+                "length": round(episode.length, 3),
+                "miss": round(episode.miss, 3),
+            }
+            rows.append(row)
+    return rows
+
+
+class Book:
+    """The rows of a run, in a file if there is one, whose first line says what was asked for."""
+
+    def __init__(self, file: Path | None, asked: Row) -> None:
+        self.file = file
+        self.rows: list[Row] = []
+        if file is None:
+            return
+        if not file.exists():
+            file.write_text(json.dumps(asked) + "\n")
+        first, *rows = file.read_text().splitlines()
+        if json.loads(first) != asked:
+            raise SystemExit(f"{file}: is of another run, {first}; name another file.")
+        self.rows = [json.loads(row) for row in rows if row.endswith("}")]
+
+    def add(self, rows: Sequence[Row]) -> None:
+        """Keeps rows."""
+        self.rows += rows
+        if self.file is not None:
+            with self.file.open("a") as file:
+                file.write("".join(json.dumps(row) + "\n" for row in rows))
+
+    def has(self, robot: str, engine: str, seed: int) -> bool:
+        """Returns whether an episode was driven."""
+        return (robot, engine, seed) in {
+            (row["robot"], row["engine"], row["seed"]) for row in self.rows
+        }
+
+
+def plan_jobs(given: Given, engines: Sequence[str], book: Book) -> list[Job]:
+    """Returns what is still to be driven, all engines of a block of seeds before the next."""
+    end = FIRST_SEED + given.episodes
+    jobs = []
+    for first in range(FIRST_SEED, end, BLOCK):
+        block = range(first, min(first + BLOCK, end))
+        for robot, engine in product(given.robots, engines):
+            seeds = tuple(seed for seed in block if not book.has(robot, engine, seed))
+            how = tuple(given.worlds), given.randomisation, given.control
+            if seeds:
+                jobs.append(Job(robot, engine, seeds, *how))
+    return jobs
+
+
+def measure(given: Given) -> Result:
+    """Drives all episodes that are not in the file yet, and compares the engines."""
+    missing = {engine: find_missing(engine) for engine in given.engines}
+    for engine, reason in missing.items():
+        if reason:
+            sys.stderr.write(f"{engine} is left out: {reason}\n")
+    engines = [engine for engine in given.engines if not missing[engine]]
+    about = ("worlds", "randomisation", "control")
+    book = Book(given.out, {name: getattr(given, name) for name in about})
+    jobs = plan_jobs(given, engines, book)
+    with ProcessPoolExecutor(AT_ONCE, mp_context=get_context("spawn")) as pool:
+        pending = {pool.submit(drive_job, job): job for job in jobs}
+        for count, done in enumerate(as_completed(pending), 1):
+            job = pending[done]
+            rows = done.result()
+            book.add(rows)
+            well = sum(row["result"] == "success" for row in rows)
+            told = f"{job.robot} in {job.engine}: {well} of {len(rows)}"
+            sys.stderr.write(f"{count} of {len(jobs)}: {told}\n")
+    clusters = find_clusters(book.rows)
+    return {
+        "clusters": clusters,
+        "left_out": {engine: why for engine, why in missing.items() if why},
+        "engines": compare_engines(book.rows, given.robots, engines),
+    }
+
+
+def find_clusters(rows: Sequence[Row]) -> list[Row]:
+    """Returns the failures by robot, engine, world and end, the largest cluster first."""
+    ended = {(row["robot"], row["engine"], row["seed"]): row["result"] for row in rows}
+    seeds = defaultdict[tuple[str, ...], list[int]](list)
+    for row in rows:
+        if row["result"] != "success":
+            cluster = row["robot"], row["engine"], row["world"], row["result"]
+            seeds[cluster].append(row["seed"])
+    ordered = sorted(seeds.items(), key=lambda item: (-len(item[1]), item[0]))
+    return [
+        {
+            "robot": robot,
+            "engine": engine,
+            "world": world,
+            "result": result,
+            "failures": len(failed),
+            "not_in_fast": sum(
+                ended.get((robot, FAST, seed)) == "success" for seed in failed
+            ),
+            "seeds": failed,
+        }
+        for (robot, engine, world, result), failed in ordered
+    ]
+
+
+def compare_engines(
+    rows: Sequence[Row], robots: Sequence[str], engines: Sequence[str]
+) -> dict[str, dict[str, Row]]:
+    """Returns robot -> engine -> figures of the episodes that all engines have driven."""
+    ended: dict[tuple[str, str], dict[int, Row]] = defaultdict(dict)
+    for row in rows:
+        ended[row["robot"], row["engine"]][row["seed"]] = row
+    compared: dict[str, dict[str, Row]] = {robot: {} for robot in robots}
+    for robot, engine in product(robots, engines):
+        common = set.intersection(*(set(ended[robot, each]) for each in engines))
+        seeds = sorted(common)
+        own = [ended[robot, engine][seed] for seed in seeds]
+        success = [row["result"] == "success" for row in own]
+        hits = sum(row["result"] == "collision" for row in own)
+        figures = {
+            "episodes": len(own),
+            "success": asdict(rate(sum(success), len(own))),
+            "collision": asdict(rate(hits, len(own))),
+            "believed": sum(row["believed"] == "success" for row in own),
+        }
+        if FAST in engines and engine != FAST:
+            fast = [ended[robot, FAST][seed]["result"] == "success" for seed in seeds]
+            figures |= asdict(compare_pairs(fast, success))
+        compared[robot][engine] = figures
+    return compared
+
+
+def judge(result: Result) -> list[str]:
+    missed = []
+    for robot, engines in result["engines"].items():
+        for engine, told in engines.items():
+            who = f"{robot} in {engine}: "
+            figures = {
+                "collision": told["collision"]["value"],
+                "success": told["success"]["value"],
+            }
+            bars = {"collision": COLLISIONS}
+            if engine == FAST:
+                bars["success"] = FAST_SUCCESS
+            elif "points" in told:
+                figures["points"] = abs(told["points"])
+                bars["points"] = APART
+            missed += missed_bars(figures, bars, who)
+    return missed
+
+
+def split_engines(words: str) -> list[str]:
+    """Returns engines that are named with commas between them."""
+    names = words.split(",")
+    unknown = [name for name in names if name not in ENGINES]
+    if unknown:
+        raise ValueError(f"no engine {unknown[0]!r}; there are {', '.join(ENGINES)}")
+    return names
+
+
+OPTIONS = {
+    "engines": {
+        "type": split_engines,
+        "default": list(ENGINES),
+        "help": "with commas between them; those that are not installed are left out",
+    },
+    "episodes": (200, "of each robot in each engine"),
+    "robots": some_of(list_shipped_policies()),
+    "worlds": some_of(WORLDS),
+    "randomisation": (RANDOMISATION, "of each episode"),
+    "out": {"type": Path, "help": "keep the episodes there, and go on with it"},
+}
+
+if __name__ == "__main__":
+    run_campaign(measure, judge, OPTIONS)
