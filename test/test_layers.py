@@ -21,7 +21,7 @@ LAYERS = (
     ("errors", "geometry", "interface"),
     ("kernels",),
     ("arguments", "extensions", "random_kernels", "seeds"),
-    ("config", "files", "pacing", "style", "threads"),
+    ("confidence", "config", "files", "pacing", "style", "threads"),
     ("robot",),
     ("recording",),
     ("identify",),

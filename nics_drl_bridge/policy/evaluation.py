@@ -7,10 +7,14 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from scipy import special
+from numpy.typing import NDArray
 
 from nics_drl_bridge import defaults
+from nics_drl_bridge.confidence import (
+    ConfidenceInterval,
+    estimate_mean,
+    estimate_rate,
+)
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.guard import delay_interrupts
 from nics_drl_bridge.env.tasks.navigation import Navigation
@@ -29,7 +33,6 @@ FIRST_SEED = defaults.EVALUATION_SEED
 # allowance for odometry drift, since a robot stops where it believes its goal is [m]
 DRIFT_M = 0.1
 ELSEWHERE = "elsewhere"
-CONFIDENCE = 0.95
 
 
 @dataclass(frozen=True)
@@ -278,74 +281,6 @@ def _get_flags(info: dict[str, Any], name: str) -> Mask:
 
 
 @dataclass(frozen=True)
-class ConfidenceInterval:
-    """A statistic and its 95 % interval: NaN without observations, infinite with only one."""
-
-    value: float
-    low: float
-    high: float
-
-    def text(self, unit: str) -> str:
-        """Formats the statistic with its interval, or whichever part is known."""
-        if math.isnan(self.value):
-            return "unknown"
-        formatted = f"{self.value:.2f} {unit}"
-        return formatted + (
-            f" ({self.low:.2f} to {self.high:.2f})" if math.isfinite(self.low) else ""
-        )
-
-
-def rate(hits: int, trials: int) -> ConfidenceInterval:
-    """Returns the fraction of hits, with Wilson's interval (1927), valid even for few trials."""
-    if trials < 1:
-        return ConfidenceInterval(math.nan, 0.0, 1.0)
-    share = hits / trials
-    z = float(special.ndtri(0.5 + CONFIDENCE / 2.0))
-    scale = 1.0 + z * z / trials
-    middle = (share + z * z / (2.0 * trials)) / scale
-    half = (
-        z
-        / scale
-        * math.sqrt(share * (1.0 - share) / trials + (z / (2.0 * trials)) ** 2)
-    )
-    # If all trials agree, rounding must not move the bound away from 0 or 1.
-    low = 0.0 if hits == 0 else middle - half
-    return ConfidenceInterval(share, low, 1.0 if hits == trials else middle + half)
-
-
-@dataclass(frozen=True)
-class PairedComparison:
-    """What the same episodes show of two simulators, or two policies."""
-
-    points: float  # success of the second less that of the first [percentage points]
-    lost: int  # episodes that succeeded in the first alone
-    gained: int  # episodes that succeeded in the second alone
-    p: float  # probability of such a difference, or a larger one, by chance
-
-
-def compare_pairs(first: Sequence[bool], second: Sequence[bool]) -> PairedComparison:
-    """Compares the successes of the same episodes by McNemar's exact test (1947)."""
-    pairs = list(zip(first, second, strict=True))
-    lost = sum(before and not after for before, after in pairs)
-    gained = sum(after and not before for before, after in pairs)
-    points = 100.0 * (gained - lost) / len(pairs) if pairs else math.nan
-    # If chance alone decides, each of the unequal pairs is lost or gained like a coin toss.
-    tail = float(special.bdtr(min(lost, gained), lost + gained, 0.5))
-    return PairedComparison(points, lost, gained, min(1.0, 2.0 * tail))
-
-
-def mean(values: ArrayLike) -> ConfidenceInterval:
-    """Returns the mean of observations (n,) with the interval of Student's t."""
-    seen = np.asarray(values, np.float64)
-    middle = float(seen.mean()) if len(seen) else math.nan
-    if len(seen) < 2:
-        return ConfidenceInterval(middle, -math.inf, math.inf)
-    quantile = float(special.stdtrit(len(seen) - 1, 0.5 + CONFIDENCE / 2.0))
-    half = quantile * float(seen.std(ddof=1)) / math.sqrt(len(seen))
-    return ConfidenceInterval(middle, middle - half, middle + half)
-
-
-@dataclass(frozen=True)
 class Summary:
     """Success rates of episodes; mean path length [m] and duration [s] of successful ones."""
 
@@ -371,8 +306,8 @@ def summarise(outcomes: Outcomes, control_period: float) -> Summary:
     flags = arrived, outcomes.collision, outcomes.time_out, outcomes.believed
     length = outcomes.length[arrived]
     time = outcomes.steps[arrived] * control_period
-    shares = (rate(int(flag.sum()), count) for flag in flags)
-    return Summary(count, *shares, *map(mean, (length, time)))
+    shares = (estimate_rate(int(flag.sum()), count) for flag in flags)
+    return Summary(count, *shares, *map(estimate_mean, (length, time)))
 
 
 @dataclass(frozen=True)
@@ -415,7 +350,7 @@ def tallies(
             **vars(summarise(outcomes, control_period)),
             same=sum(episode.result == reference.result for episode, reference in pairs)
             / len(pairs),
-            deviation=mean(gaps),
+            deviation=estimate_mean(gaps),
             greatest_deviation=max(gaps),
         )
     return by_place

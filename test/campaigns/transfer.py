@@ -37,6 +37,7 @@ from measuring.evaluations import Standing
 from measuring.perturbations import open_real_model
 
 from nics_drl_bridge.commands.episodes import Conditions, make_env
+from nics_drl_bridge.confidence import compare_pairs, estimate_rate
 from nics_drl_bridge.env.sim_backend import SimBackend
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.extras.dart.simulator import PHYSICS as DART_PHYSICS
@@ -45,7 +46,7 @@ from nics_drl_bridge.extras.mujoco.simulator import MujocoSimulator
 from nics_drl_bridge.extras.physics.machines import Physics
 from nics_drl_bridge.gate.gated_backend import GatedBackend
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.policy.evaluation import compare_pairs, drive, rate
+from nics_drl_bridge.policy.evaluation import drive
 from nics_drl_bridge.policy.policies import list_shipped_policies, open_policy
 from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
 from nics_drl_bridge.sim.simulator import FastSimulator
@@ -271,8 +272,8 @@ def compare_engines(
         hits = sum(row["result"] == "collision" for row in own)
         figures = {
             "episodes": len(own),
-            "success": asdict(rate(sum(success), len(own))),
-            "collision": asdict(rate(hits, len(own))),
+            "success": asdict(estimate_rate(sum(success), len(own))),
+            "collision": asdict(estimate_rate(hits, len(own))),
             "believed": sum(row["believed"] == "success" for row in own),
         }
         if FAST in engines and engine != FAST:

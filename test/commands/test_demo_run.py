@@ -18,9 +18,10 @@ from nics_drl_bridge.commands.demo_run import (
     learn,
     make_sections,
 )
+from nics_drl_bridge.confidence import ConfidenceInterval, estimate_rate
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import builtin_model, generate, mount_lidar
-from nics_drl_bridge.policy.evaluation import ConfidenceInterval, Episode, Summary, rate
+from nics_drl_bridge.policy.evaluation import Episode, Summary
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.report.pictures import Point
 from nics_drl_bridge.robot.spec import load_robot
@@ -85,7 +86,9 @@ def test_the_report_begins_with_success_in_three_worlds_and_folds_the_figures(
     drive = record(robot, np.random.default_rng(0), 30.0)
     model, identified = generate(drive, robot, mount_lidar(robot), ())
     arrivals = int(500 * share)
-    rates = [rate(count, 500) for count in (arrivals, 500 - arrivals, 0, arrivals)]
+    rates = [
+        estimate_rate(count, 500) for count in (arrivals, 500 - arrivals, 0, arrivals)
+    ]
     length = ConfidenceInterval(3.0, 2.9, 3.1)
     summary = Summary(500, *rates, length, length)
     live = episode(0, "success" if arrived else "time-out")

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from gymnasium.wrappers import TimeLimit
 from robots import direct_model, field
-from scipy import stats
 
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.tasks.navigation import Navigation
@@ -21,13 +20,10 @@ from nics_drl_bridge.policy.evaluation import (
     ELSEWHERE,
     Episode,
     Outcomes,
-    compare_pairs,
     deviation,
     drive,
     drive_all,
     drive_worlds,
-    mean,
-    rate,
     summarise,
     tallies,
 )
@@ -292,47 +288,6 @@ def test_what_the_robot_took_for_a_success_is_told_beside_what_was_one():
     )
     assert lied.plain()["believed"] == "success"
     assert lied.plain()["goal_distance_m"] == pytest.approx(2.0)
-
-
-@pytest.mark.parametrize(
-    ("hits", "trials"), [(0, 10), (1, 3), (7, 10), (480, 500), (500, 500)]
-)
-def test_the_interval_of_a_rate_is_wilsons(hits, trials):
-    wanted = stats.binomtest(hits, trials).proportion_ci(method="wilson")
-    found = rate(hits, trials)
-    assert found.value == hits / trials
-    assert (found.low, found.high) == pytest.approx(
-        (wanted.low, wanted.high), abs=1e-12
-    )
-    assert found.low <= found.value <= found.high
-
-
-@pytest.mark.parametrize(("lost", "gained"), [(0, 0), (5, 0), (8, 1), (3, 3), (2, 9)])
-def test_pairs_are_compared_by_mcnemars_exact_test(lost, gained):
-    first = [True] * lost + [False] * gained + [True] * 20 + [False] * 4
-    second = [False] * lost + [True] * gained + [True] * 20 + [False] * 4
-    found = compare_pairs(first, second)
-    unequal = lost + gained
-    wanted = stats.binomtest(lost, unequal).pvalue if unequal else 1.0
-    assert (found.lost, found.gained) == (lost, gained)
-    assert found.p == pytest.approx(wanted)
-    assert found.points == pytest.approx(100.0 * (gained - lost) / len(first))
-
-
-def test_the_interval_of_a_mean_is_students():
-    seen = np.random.default_rng(0).normal(3.0, 2.0, 17)
-    found = mean(seen)
-    low, high = stats.t.interval(0.95, 16, loc=seen.mean(), scale=stats.sem(seen))
-    assert (found.value, found.low, found.high) == pytest.approx(
-        (seen.mean(), low, high)
-    )
-
-
-def test_nothing_observed_leaves_everything_open():
-    assert (rate(0, 0).low, rate(0, 0).high) == (0.0, 1.0)
-    assert math.isnan(mean([]).value)
-    assert mean([2.0]).value == 2.0
-    assert mean([2.0]).high == math.inf
 
 
 @pytest.mark.parametrize("arrived", [0, 1, 2])

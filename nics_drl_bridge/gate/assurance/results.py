@@ -5,8 +5,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from scipy import special
-
+from nics_drl_bridge.confidence import bound_rate
 from nics_drl_bridge.gate.assurance.protocol import (
     CLAIMS,
     KINDS,
@@ -16,31 +15,12 @@ from nics_drl_bridge.gate.assurance.protocol import (
 )
 from nics_drl_bridge.gate.assurance.run import Row
 
-CONFIDENCE = 0.95
 CELL_M = 2.0  # side of the squares of a world by which failures are clustered
 FAILED: dict[str, Callable[[Row], bool]] = {
     STOPS: lambda row: not row.get("in_time", True),
     LIMITS: lambda row: bool(row.get("violations")),
     TOUCHES: lambda row: bool(row.get("contact")),
 }
-
-
-def compute_bounds(failures: int, trials: int) -> tuple[float, float]:
-    """Returns the 95 % bounds of a rate by Clopper and Pearson (1934).
-
-    Without failures the upper bound is one-sided, about 3 / trials; a two-sided one would be 3.7 /
-    trials. Since the data choose between the two, at least 92.5 % holds for both together.
-    """
-    if trials == 0:
-        return 0.0, 1.0
-    if failures == 0:
-        return 0.0, 1.0 - math.pow(1.0 - CONFIDENCE, 1.0 / trials)
-    tail = (1.0 - CONFIDENCE) / 2.0
-    passed = trials - failures
-    low = float(special.betaincinv(failures, passed + 1, tail))
-    if passed == 0:
-        return low, 1.0
-    return low, float(special.betaincinv(failures + 1, passed, 1.0 - tail))
 
 
 def summarise(rows: Sequence[Row], faults: int = 0) -> dict[str, Any]:
@@ -81,7 +61,7 @@ def _judge(rows: Sequence[Row]) -> dict[str, Any]:
     for claim in CLAIMS:
         tested = [row for row in rows if ("fault" in row) == (claim == STOPS)]
         failures = sum(map(FAILED[claim], tested))
-        low, high = compute_bounds(failures, len(tested))
+        low, high = bound_rate(failures, len(tested))
         figures[claim] = {
             "trials": len(tested),
             "failures": failures,

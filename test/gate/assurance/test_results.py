@@ -1,38 +1,12 @@
 from __future__ import annotations
 
-import pytest
-
 from nics_drl_bridge.gate.assurance.protocol import LIMITS, STOPS, TOUCHES
 from nics_drl_bridge.gate.assurance.results import (
-    compute_bounds,
     find_clusters,
     summarise,
 )
 
 from .samples import fault, row
-
-
-@pytest.mark.parametrize(
-    ("failures", "trials", "low", "high"),
-    [
-        (0, 1, 0.0, 0.95),
-        (0, 10, 0.0, 0.2589),
-        (1, 10, 0.0025, 0.4450),
-        (5, 10, 0.1871, 0.8129),
-        (10, 10, 0.6915, 1.0),
-        (2, 100, 0.0024, 0.0704),
-        (50, 1000, 0.0373, 0.0654),
-        (0, 0, 0.0, 1.0),
-    ],
-)
-def test_the_bounds_are_those_of_published_tables(failures, trials, low, high):
-    assert compute_bounds(failures, trials) == pytest.approx((low, high), abs=6e-5)
-
-
-@pytest.mark.parametrize("trials", [100, 1000, 30_000])
-def test_without_failures_the_upper_bound_is_three_in_so_many_trials(trials):
-    _, high = compute_bounds(0, trials)
-    assert 0.98 * 3.0 / trials < high <= 3.0 / trials
 
 
 def test_failures_of_one_kind_at_one_place_are_one_cluster_with_all_its_seeds():

@@ -1,0 +1,97 @@
+"""Rates and means with their 95 % intervals, and comparisons of pairs."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import special
+
+CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True)
+class ConfidenceInterval:
+    """A statistic and its 95 % interval: NaN without observations, infinite with only one."""
+
+    value: float
+    low: float
+    high: float
+
+    def text(self, unit: str) -> str:
+        """Formats the statistic with its interval, or whichever part is known."""
+        if math.isnan(self.value):
+            return "unknown"
+        formatted = f"{self.value:.2f} {unit}"
+        return formatted + (
+            f" ({self.low:.2f} to {self.high:.2f})" if math.isfinite(self.low) else ""
+        )
+
+
+def estimate_rate(hits: int, trials: int) -> ConfidenceInterval:
+    """Returns the fraction of hits, with Wilson's interval (1927), valid even for few trials."""
+    if trials < 1:
+        return ConfidenceInterval(math.nan, 0.0, 1.0)
+    share = hits / trials
+    z = float(special.ndtri(0.5 + CONFIDENCE / 2.0))
+    scale = 1.0 + z * z / trials
+    middle = (share + z * z / (2.0 * trials)) / scale
+    half = (
+        z
+        / scale
+        * math.sqrt(share * (1.0 - share) / trials + (z / (2.0 * trials)) ** 2)
+    )
+    # If all trials agree, rounding must not move the bound away from 0 or 1.
+    low = 0.0 if hits == 0 else middle - half
+    return ConfidenceInterval(share, low, 1.0 if hits == trials else middle + half)
+
+
+@dataclass(frozen=True)
+class PairedComparison:
+    """What the same episodes show of two simulators, or two policies."""
+
+    points: float  # success of the second less that of the first [percentage points]
+    lost: int  # episodes that succeeded in the first alone
+    gained: int  # episodes that succeeded in the second alone
+    p: float  # probability of such a difference, or a larger one, by chance
+
+
+def compare_pairs(first: Sequence[bool], second: Sequence[bool]) -> PairedComparison:
+    """Compares the successes of the same episodes by McNemar's exact test (1947)."""
+    pairs = list(zip(first, second, strict=True))
+    lost = sum(before and not after for before, after in pairs)
+    gained = sum(after and not before for before, after in pairs)
+    points = 100.0 * (gained - lost) / len(pairs) if pairs else math.nan
+    # If chance alone decides, each of the unequal pairs is lost or gained like a coin toss.
+    tail = float(special.bdtr(min(lost, gained), lost + gained, 0.5))
+    return PairedComparison(points, lost, gained, min(1.0, 2.0 * tail))
+
+
+def estimate_mean(values: ArrayLike) -> ConfidenceInterval:
+    """Returns the mean of observations (n,) with the interval of Student's t."""
+    observed = np.asarray(values, np.float64)
+    middle = float(observed.mean()) if len(observed) else math.nan
+    if len(observed) < 2:
+        return ConfidenceInterval(middle, -math.inf, math.inf)
+    quantile = float(special.stdtrit(len(observed) - 1, 0.5 + CONFIDENCE / 2.0))
+    half = quantile * float(observed.std(ddof=1)) / math.sqrt(len(observed))
+    return ConfidenceInterval(middle, middle - half, middle + half)
+
+
+def bound_rate(failures: int, trials: int) -> tuple[float, float]:
+    """Returns the 95 % bounds of a rate by Clopper and Pearson (1934).
+
+    Without failures the upper bound is one-sided, about 3 / trials; a two-sided one would be 3.7 /
+    trials. Since the data choose between the two, at least 92.5 % holds for both together.
+    """
+    if trials == 0:
+        return 0.0, 1.0
+    if failures == 0:
+        return 0.0, 1.0 - math.pow(1.0 - CONFIDENCE, 1.0 / trials)
+    tail = (1.0 - CONFIDENCE) / 2.0
+    passed = trials - failures
+    low = float(special.betaincinv(failures, passed + 1, tail))
+    if passed == 0:
+        return low, 1.0
+    return low, float(special.betaincinv(failures + 1, passed, 1.0 - tail))
