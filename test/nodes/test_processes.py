@@ -114,11 +114,15 @@ def test_leaving_the_block_ends_a_node_that_runs_and_one_that_hangs(
 
 
 def test_a_node_that_ended_by_itself_is_named_with_its_code_and_log(
-    tmp_path, domain_id, meet
+    tmp_path, domain_id, meet, monkeypatch
 ):
-    with NodeProcess(
-        "policy_node", tmp_path, {"policy": "dynamic_widow"}, domain_id
-    ) as node:
+    """In a folder with modules of its own, as that of a model may have, which are not loaded."""
+    canary = tmp_path / "canary"
+    for name in ("yaml", "numpy", "numba", "rclpy"):
+        (tmp_path / f"{name}.py").write_text(f"open({str(canary)!r}, 'w')\n")
+    monkeypatch.chdir(tmp_path)
+    wrong = {"policy": "dynamic_widow"}
+    with NodeProcess("policy_node", tmp_path / "log", wrong, domain_id) as node:
         meet(domain_id).until(lambda: node._process.poll() is not None, "its end")
         expected = (
             "policy_node ended with code 2: unknown policy 'dynamic_widow'; did you mean "
@@ -126,6 +130,7 @@ def test_a_node_that_ended_by_itself_is_named_with_its_code_and_log(
         )
         with pytest.raises(BackendError, match=f"^{re.escape(expected)}$"):
             node.check()
+    assert not canary.exists()
 
 
 def test_the_domain_id_is_the_environments_or_drawn(monkeypatch):
@@ -142,18 +147,3 @@ def test_a_wrong_domain_id_of_the_environment_is_one_sentence(monkeypatch, given
     monkeypatch.setenv("ROS_DOMAIN_ID", given)
     with pytest.raises(ConfigError, match=f"ROS_DOMAIN_ID is '{given}'"):
         free_domain_id()
-
-
-def test_the_working_folder_holds_no_modules_for_a_node(
-    tmp_path, monkeypatch, domain_id
-):
-    """`python -m` looks for modules in the working folder first, which may be that of a model."""
-    canary = tmp_path / "canary"
-    for name in ("yaml", "numpy", "numba", "rclpy"):
-        (tmp_path / f"{name}.py").write_text(f"open({str(canary)!r}, 'w')\n")
-    monkeypatch.chdir(tmp_path)
-    told = {"model": "no/such/model"}
-    with NodeProcess("middleware_node", tmp_path / "log", told, domain_id) as node:
-        assert node._process.wait(60) != 0
-    assert not canary.exists()
-    assert "no such folder" in node.log.read_text()
