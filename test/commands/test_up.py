@@ -8,9 +8,10 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from unittest import mock
 
 import pytest
-from command_line import nics, split_words
+from command_line import nics
 from domains import claimed_domain
 
 from nics_drl_bridge.commands import up
@@ -139,8 +140,12 @@ class Up:
             assert time.monotonic() < deadline, self.text
             time.sleep(POLL_S)
 
-    def tell(self, *words: object) -> subprocess.CompletedProcess[str]:
-        command = [*NICS, *split_words(*words)]
+    def tell(self, words: str) -> subprocess.CompletedProcess[str]:
+        with mock.patch.dict(os.environ, self.environment):
+            return nics(words, cwd=self.log.parent)
+
+    def tell_by_process(self, words: str) -> subprocess.CompletedProcess[str]:
+        command = [*NICS, *words.split()]
         return subprocess.run(
             command, env=self.environment, capture_output=True, text=True
         )
@@ -205,13 +210,13 @@ def test_a_simulation_is_armed_driven_stopped_and_ended_by_nics_alone(start):
     assert "nics arm" in up.text
     with Witness(domain_id) as witness:
         assert witness.sees(ENDED_S)
-        armed = up.tell("arm")
+        armed = up.tell_by_process("arm")
         assert armed.returncode == 0, armed.stderr
         assert "/command_gate is armed" in armed.stdout
-        goal = up.tell("goal 1 -0.5 --wait 90")
+        goal = up.tell("goal 0.8 -0.3 --wait 90")
         assert goal.returncode == 0, goal.stderr
-        assert "drives to (1.00, -0.50) m in the map" in goal.stdout
-        assert drives(up, witness, (1.0, -0.5)), up.text
+        assert "drives to (0.80, -0.30) m in the map" in goal.stdout
+        assert drives(up, witness, (0.8, -0.3)), up.text
         stopped = up.tell("stop")
         assert stopped.returncode == 0, stopped.stderr
         assert "/command_gate has stopped its robot" in stopped.stdout
@@ -242,7 +247,7 @@ def test_a_simulation_is_armed_driven_stopped_and_ended_by_nics_alone(start):
     "number",
     [
         signal.SIGTERM,
-        signal.SIGKILL,
+        pytest.param(signal.SIGKILL, marks=pytest.mark.campaign),
         pytest.param(signal.SIGHUP, marks=pytest.mark.campaign),
     ],
 )

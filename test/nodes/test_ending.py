@@ -11,6 +11,7 @@ pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
 from geometry_msgs.msg import Twist
 
+from nics_drl_bridge.nodes import own_process
 from nodes.test_command_gate import PATIENT, Robot
 
 pytestmark = [pytest.mark.ros, pytest.mark.process]
@@ -86,7 +87,17 @@ def test_a_reader_that_has_gone_does_not_end_it_but_any_other_signal_does_in_ord
     assert node.returncode == 0
 
 
-def test_a_lost_terminal_does_not_end_what_was_started_by_nohup(domain_id):
+def test_a_lost_terminal_does_not_end_what_was_started_by_nohup():
+    assert signal.SIGHUP in own_process.ending_signals()
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        assert signal.SIGHUP not in own_process.ending_signals()
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.campaign
+def test_a_node_below_nohup_goes_on_without_its_terminal(domain_id):
     process = subprocess.Popen(
         [sys.executable, "-c", NODE],
         env=os.environ | {"ROS_DOMAIN_ID": str(domain_id)},
