@@ -68,7 +68,7 @@ def node(request, launch_process, module_domain_id, robot):
         },
     )
     process.check()
-    process.close()
+    assert process.close() == 0
 
 
 @pytest.mark.process
