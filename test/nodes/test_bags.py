@@ -12,6 +12,7 @@ pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 pytest.importorskip("rosbags", reason="needs the extra 'bags'")
 
 import bags
+import command_line
 from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import LaserScan
@@ -196,7 +197,7 @@ def test_a_replay_in_lock_step_gives_the_estimate_in_process_bit_for_bit(
 
 
 def test_the_doctor_finds_a_second_driver_beside_the_simulator_and_nothing_else(
-    launch, meet, domain_id, model_folder
+    launch, meet, domain_id, model_folder, tmp_path, monkeypatch
 ):
     launch("simulator_node", domain_id, world="empty")
     peer = meet(domain_id)
@@ -204,8 +205,9 @@ def test_the_doctor_finds_a_second_driver_beside_the_simulator_and_nothing_else(
     peer.until(lambda: scans, "a scan", ENDS_S)
     for _ in range(2):
         peer.speak(Twist, "cmd_vel")
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain_id))
     options = ("--model", model_folder, "--duration", "6", "--json")
-    out, err, code = ended(nics(domain_id, "doctor", *options))
-    (finding,) = json.loads(out)["findings"]
-    assert code == 1, err
+    done = command_line.nics("doctor", *options, cwd=tmp_path)
+    (finding,) = json.loads(done.stdout)["findings"]
+    assert done.returncode == 1, done.stderr
     assert (finding["check"], finding["where"]) == ("publishers", "/cmd_vel")
