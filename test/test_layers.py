@@ -236,11 +236,13 @@ def test_importing_the_package_imports_nothing_heavy():
 
 @pytest.mark.process
 @pytest.mark.ros
-def test_the_gate_loads_no_part_of_scipy():
+def test_the_gate_loads_nothing_that_is_slow_learns_or_infers():
     pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
     loaded = modules_after(f"import {PACKAGE}.nodes.command_gate")
     assert "rclpy" in loaded
     assert not loaded & {"scipy.linalg", "scipy.ndimage", "scipy.stats", "matplotlib"}
+    assert not loaded & {"torch", "onnx", "onnxruntime", "stable_baselines3"}
+    assert "gymnasium" not in loaded
 
 
 @pytest.mark.process

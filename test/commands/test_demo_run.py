@@ -77,14 +77,20 @@ def episode(seed, result="success"):
     return Episode(seed, result, path, path, path[-1, :2], np.zeros((0, 7)), 1.0)
 
 
+@pytest.fixture(scope="module")
+def generated():
+    """A model and the report on how it was identified."""
+    robot = load_robot("differential")
+    drive = record(robot, np.random.default_rng(0), 30.0)
+    return generate(drive, robot, mount_lidar(robot), ())
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("share", "arrived"), [(0.986, True), (0.42, False)])
 def test_the_report_begins_with_success_in_three_worlds_and_folds_the_figures(
-    tmp_path, share, arrived
+    generated, tmp_path, share, arrived
 ):
-    robot = load_robot("differential")
-    drive = record(robot, np.random.default_rng(0), 30.0)
-    model, identified = generate(drive, robot, mount_lidar(robot), ())
+    model, identified = generated
     arrivals = int(500 * share)
     rates = [
         estimate_rate(count, 500) for count in (arrivals, 500 - arrivals, 0, arrivals)

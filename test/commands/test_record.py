@@ -27,14 +27,16 @@ def invoke(*words):
 def test_a_preview_tells_and_draws_the_drive_and_needs_no_ros(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rclpy", None)
     monkeypatch.chdir(tmp_path)
-    done = invoke("--preview --out new/drive.npz")
+    done = invoke("--preview --duration 20 --out new/drive.npz")
     assert done.exit_code == 0, done.output
     told = done.stdout.splitlines()
-    assert told[0].startswith("preview of 60 s: a path of ")
+    assert told[0].startswith("preview of 20 s: a path of ")
     assert told[-1] == "its path is drawn in new/drive_preview.png"
     assert (tmp_path / "new" / "drive_preview.png").read_bytes().startswith(PNG)
     assert os.listdir(tmp_path / "new") == ["drive_preview.png"]
-    facts = json.loads(invoke("--preview --out new/drive.npz --json").stdout)
+    facts = json.loads(
+        invoke("--preview --duration 20 --out new/drive.npz --json").stdout
+    )
     assert facts == {"out": "new/drive.npz", "robot": DEFAULT_ROBOT, "told": told}
 
 
@@ -43,7 +45,7 @@ def test_a_preview_tells_and_draws_the_drive_and_needs_no_ros(tmp_path, monkeypa
 def test_it_asks_before_the_robot_moves(tmp_path, monkeypatch, as_json):
     pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
     monkeypatch.chdir(tmp_path)
-    done = invoke("--out drive.npz", "--json" if as_json else "")
+    done = invoke("--duration 20 --out drive.npz", "--json" if as_json else "")
     assert done.exit_code == 0, done.output
     assert "Drive the robot now? [y/N]: n" in done.output
     if as_json:
@@ -80,6 +82,6 @@ def test_an_outcome_becomes_lines_or_an_error(monkeypatch, tmp_path, complete):
     for failure, code in ((None, 0 if complete else 130), (BackendError("odom"), 2)):
         outcome = record_node.DriveResult(complete, failure, None, "over")
         monkeypatch.setattr(record_node, "record", lambda *_, outcome=outcome: outcome)
-        done = invoke("--yes --out", tmp_path / "drive.npz")
+        done = invoke("--yes --duration 20 --out", tmp_path / "drive.npz")
         assert done.exit_code == code
         assert done.output.endswith("over\n")

@@ -1,6 +1,4 @@
 import math
-import subprocess
-import sys
 import time
 from dataclasses import replace
 from functools import partial
@@ -20,6 +18,7 @@ from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
+from nics_drl_bridge.gate import shield_kernels
 from nics_drl_bridge.gate.black_box import replay
 from nics_drl_bridge.gate.inputs import Press, Tick
 from nics_drl_bridge.nodes import command_gate, conversions, qos
@@ -185,41 +184,21 @@ def robot(launch, meet, module_domain_id, model, black_box):
     gate.check()
 
 
-@pytest.mark.process
-def test_it_imports_nothing_that_learns_or_infers():
-    code = (
-        "import sys\nfrom nics_drl_bridge.nodes import command_gate\n"
-        "print(*{name.partition('.')[0] for name in sys.modules})"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    )
-    loaded = set(done.stdout.split())
-    assert "rclpy" in loaded
-    assert not loaded & {
-        "torch",
-        "onnxruntime",
-        "onnx",
-        "stable_baselines3",
-        "gymnasium",
-    }
+def test_it_does_not_listen_before_its_shield_is_compiled(make_node, monkeypatch):
+    """The first call of a kernel compiles it."""
+    is_free = shield_kernels.is_free
+    steps = []
 
+    def compile_kernel(*values):
+        steps.append("compiled")
+        return is_free(*values)
 
-@pytest.mark.process
-def test_it_does_not_listen_before_its_shield_is_compiled(domain_id):
-    code = f"""
-from nics_drl_bridge.nodes.command_gate import CommandGate
-from nics_drl_bridge.nodes.listener import open_context
-from nics_drl_bridge.gate.shield_kernels import is_free
-CommandGate._listen = lambda _: print(len(is_free.signatures))
-node = CommandGate(context=open_context([], domain_id={domain_id}))
-node.destroy_node()
-node.context.try_shutdown()
-"""
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    monkeypatch.setattr(shield_kernels, "is_free", compile_kernel)
+    monkeypatch.setattr(
+        command_gate.CommandGate, "_listen", lambda _: steps.append("listens")
     )
-    assert done.stdout.split() == ["1"]
+    make_node(kind=command_gate.CommandGate)
+    assert steps == ["compiled", "listens"]
 
 
 @pytest.fixture

@@ -11,6 +11,7 @@ pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
 from geometry_msgs.msg import Twist
 
+from nics_drl_bridge.nodes import own_process
 from nodes.test_command_gate import PATIENT, Robot
 
 pytestmark = [pytest.mark.ros, pytest.mark.process]
@@ -33,8 +34,8 @@ def make(context):
 runner.run_node(make)
 own_process.leave(0)
 """
-ENDS = [signal.SIGHUP, signal.SIGRTMAX]
 FURTHER_ENDS = [
+    signal.SIGHUP,
     signal.SIGQUIT,
     signal.SIGINT,
     signal.SIGTERM,
@@ -54,7 +55,7 @@ def rarely(number):
 
 def usual_signals():
     """As in a terminal, whatever the shell that started the tests ignores."""
-    for number in (*ENDS, *FURTHER_ENDS):
+    for number in (signal.SIGRTMAX, *FURTHER_ENDS):
         signal.signal(number, signal.SIG_DFL)
 
 
@@ -74,20 +75,29 @@ def node(domain_id):
     process.communicate()
 
 
-@pytest.mark.parametrize("number", [*ENDS, *map(rarely, FURTHER_ENDS)])
-def test_a_signal_that_would_end_it_stops_it_in_order(node, number):
+@pytest.mark.parametrize("number", [signal.SIGRTMAX, *map(rarely, FURTHER_ENDS)])
+def test_a_reader_that_has_gone_does_not_end_it_but_any_other_signal_does_in_order(
+    node, number
+):
+    node.send_signal(signal.SIGPIPE)
+    assert [node.stdout.readline() for _ in range(5)] == ["runs\n"] * 5
+    assert node.poll() is None
     node.send_signal(number)
     assert "stopped\n" in node.communicate(timeout=DEADLINE_S)[0]
     assert node.returncode == 0
 
 
-def test_a_reader_that_has_gone_does_not_end_it(node):
-    node.send_signal(signal.SIGPIPE)
-    assert [node.stdout.readline() for _ in range(5)] == ["runs\n"] * 5
-    assert node.poll() is None
+def test_a_lost_terminal_does_not_end_what_was_started_by_nohup():
+    assert signal.SIGHUP in own_process.ending_signals()
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        assert signal.SIGHUP not in own_process.ending_signals()
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
-def test_a_lost_terminal_does_not_end_what_was_started_by_nohup(domain_id):
+@pytest.mark.campaign
+def test_a_node_below_nohup_goes_on_without_its_terminal(domain_id):
     process = subprocess.Popen(
         [sys.executable, "-c", NODE],
         env=os.environ | {"ROS_DOMAIN_ID": str(domain_id)},

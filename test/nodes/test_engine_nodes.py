@@ -1,6 +1,5 @@
 """Nodes of other physics engines: the same robots over topics as in this process."""
 
-import subprocess
 import sys
 from importlib import import_module
 
@@ -69,7 +68,7 @@ def node(request, launch_process, module_domain_id, robot):
         },
     )
     process.check()
-    process.close()
+    assert process.close() == 0
 
 
 @pytest.mark.process
@@ -106,19 +105,13 @@ def test_it_refuses_to_be_taken_for_another_model(node, robot):
         backend.close()
 
 
-@pytest.mark.process
 @pytest.mark.parametrize("node", ENGINES)
-def test_without_its_engine_a_node_ends_with_one_sentence(node):
+def test_without_its_engine_a_node_ends_with_one_sentence(
+    node, launch, domain_id, monkeypatch
+):
     library, extra, name = ENGINES[node]
-    code = (
-        f"import sys; sys.modules[{library!r}] = None; sys.argv = [{node!r}]\n"
-        f"from nics_drl_bridge.nodes.start import {node}; {node}()"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=200
-    )
-    assert done.returncode == 2
-    first, sentence = done.stderr.strip().splitlines()
-    assert first.endswith(f"[{node}]: starting")
+    monkeypatch.setitem(sys.modules, library, None)
+    started = launch(node, domain_id)
+    assert started.wait() == 2
     fix = f"run pip install 'nics_drl_bridge[{extra}]'."
-    assert sentence == f"{name} is not installed; {fix}"
+    assert started.lines[-1] == f"{name} is not installed; {fix}"

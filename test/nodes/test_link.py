@@ -102,3 +102,17 @@ def test_ctrl_c_at_any_moment_leaves_the_callbacks_running(domain_id):
     finally:
         robot.close()
         signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_that_would_end_the_program_is_an_exception(number, domain_id):
+    """So all that a program leaves by `finally` is left, and a zero command is the last."""
+    before = signal.signal(number, signal.SIG_DFL)
+    try:
+        opened = Link(domain_id=domain_id)
+        with pytest.raises(SystemExit) as caught:
+            signal.raise_signal(number)
+        opened.close()
+    finally:
+        signal.signal(number, before)
+    assert caught.value.code == 128 + number

@@ -116,7 +116,7 @@ def said(process, text, told=""):
     ("what", "until", "signals", "code"),
     [
         ("step", "stepped", [signal.SIGINT] * 5, -signal.SIGINT),
-        ("step", "stepped", [signal.SIGTERM], 128 + signal.SIGTERM),
+        many("step", "stepped", [signal.SIGTERM], 128 + signal.SIGTERM),
         many("step", "stepped", [signal.SIGHUP], 128 + signal.SIGHUP),
         many("exit", "stepped", [], 0),
         many("reset", "off its start", [signal.SIGINT] * 5, -signal.SIGINT),
