@@ -4,9 +4,10 @@ from pathlib import Path
 
 import numpy as np
 
+from nics_drl_bridge.confidence import estimate_rate
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.generator import open_model
-from nics_drl_bridge.policy.evaluation import drive_worlds, rate
+from nics_drl_bridge.policy.evaluation import drive_worlds
 from nics_drl_bridge.policy.policies import open_policy
 from nics_drl_bridge.style import make_panels, render_png
 
@@ -25,7 +26,7 @@ def main() -> None:
     for name, simulation in CONDITIONS.items():
         envs = BridgeVectorEnv(len(EPISODES), model, "circles", task, **simulation)
         success = drive_worlds(envs, policy.act, EPISODES).success
-        found.append(rate(int(success.sum()), len(EPISODES)))
+        found.append(estimate_rate(int(success.sum()), len(EPISODES)))
         print(
             f"{name}: {found[-1].value:.0%} ({found[-1].low:.0%} to {found[-1].high:.0%})"
         )

@@ -88,10 +88,10 @@ def test_a_reader_that_has_gone_does_not_end_it_but_any_other_signal_does_in_ord
 
 
 def test_a_lost_terminal_does_not_end_what_was_started_by_nohup():
-    assert signal.SIGHUP in own_process.ending_signals()
+    assert signal.SIGHUP in own_process.list_ending_signals()
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        assert signal.SIGHUP not in own_process.ending_signals()
+        assert signal.SIGHUP not in own_process.list_ending_signals()
     finally:
         signal.signal(signal.SIGHUP, before)
 
