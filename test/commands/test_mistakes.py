@@ -46,7 +46,7 @@ FILES = {
     "kind.yaml": "name: mine\nkind: diferential\nfootprint_radius: 0.2\n",
     "far.yaml": ROBOT.replace("min: 0.0, max: 1.0", "min: 0.0, max: 0.01"),
     "settings.yaml": "tsak: navigation\n",
-    "stop.jsonl": "no black box\n",
+    "stop.jsonl": "not a black box\n",
     "paced.yaml": "robot: differential\nworlds: {room: 4}\ntask_options: {top_speed: 0.5 m/s}\n",
     "shapeless.yaml": "name: mine\nkind: differential\nfootprint: wide\n",
     "units.yaml": "robot: differential\npose: {x: x, y: x, heading: x, unit: [m, m, rad]}\n",

@@ -1,4 +1,4 @@
-"""What the episodes and faults of a run show: counts with bounds, and failures in clusters."""
+"""Results of the episodes and faults of a run: rates with bounds, and clusters of failures."""
 
 import math
 from collections import Counter, defaultdict
@@ -29,7 +29,8 @@ def compute_bounds(failures: int, trials: int) -> tuple[float, float]:
     """Returns the 95 % bounds of a rate by Clopper and Pearson (1934).
 
     Without failures the upper bound is one-sided, about 3 / trials; a two-sided one would be 3.7 /
-    trials. Since the data choose between the two, at least 92.5 % holds for both together.
+    trials. Since the data decide which of the two is used, the joint confidence is at
+    least 92.5 %.
     """
     if trials == 0:
         return 0.0, 1.0
@@ -44,7 +45,7 @@ def compute_bounds(failures: int, trials: int) -> tuple[float, float]:
 
 
 def summarise(rows: Sequence[Row], faults: int = 0) -> dict[str, Any]:
-    """Returns the results of a run's rows, of which so many should be faults, as plain data."""
+    """Returns the results of a run's rows as plain data; `faults` of them should be faults."""
     tried = [row for row in rows if row["gated"]]
     controls = [row for row in rows if not row["gated"]]
     episodes = [row for row in tried if "fault" not in row]
@@ -66,7 +67,7 @@ def summarise(rows: Sequence[Row], faults: int = 0) -> dict[str, Any]:
 def _count_touches(
     tried: Sequence[Row], controls: Sequence[Row]
 ) -> dict[str, list[int]]:
-    """Returns, by driver, touches and episodes with the gate, then both without it."""
+    """Returns, by driver, contacts and episodes with the gate, then both without it."""
     counts: dict[str, list[int]] = {}
     for kind in KINDS:
         counts[kind] = []
