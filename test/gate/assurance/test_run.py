@@ -33,7 +33,9 @@ def test_a_line_that_a_killed_run_left_unfinished_is_dropped(tmp_path):
 def test_a_log_of_other_episodes_is_refused_by_its_line(tmp_path, lines, number):
     log = tmp_path / runs.LOG
     log.write_bytes(b"".join(lines))
-    with pytest.raises(ConfigError, match=f"line {number} is not an episode of this run"):
+    with pytest.raises(
+        ConfigError, match=f"line {number} is not an episode of this run"
+    ):
         runs.read_rows(log, TRIALS)
 
 
