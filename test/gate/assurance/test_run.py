@@ -64,7 +64,7 @@ def test_a_log_that_another_run_writes_is_refused(tmp_path):
     log = tmp_path / runs.LOG
 
     def drive_twice(trials):
-        with pytest.raises(ConfigError, match="another process writes it"):
+        with pytest.raises(ConfigError, match="another process is writing it"):
             runs.drive_all(log, TRIALS, iter, lambda *_: None)
         return iter([])
 
