@@ -225,8 +225,8 @@ HOSTILE = {
         merges(*size): f"more than {MAX_VALUES} values"
         for size in ((7, 9), (24, 2), (2, 60_000))
     },
-    "a: &a {<<: *a}": "the alias 'a' stands within itself",
-    "a: &a [1, *a]": "line 1: the alias 'a' stands within itself",
+    "a: &a {<<: *a}": "the alias 'a' contains itself",
+    "a: &a [1, *a]": "line 1: the alias 'a' contains itself",
     **{f"x: 1\na: {tag} {'[1]'}": "line 2: the tag" for tag in ("!!int", "!!set")},
     "x: 1\na: !!python/name:os.system 1": "line 2: the tag",
     "!!int abc: 1": "the tag",
